@@ -28,7 +28,7 @@ SUBJECTS = {
     "Effect of σ²": ("ablation", "weights", "color_covariance"),
     "Uncertainty": ("uncertainty", "uncertainty_weights", "pose_covariance"),
     "Camera tracking": ("tracking", "pose_gradient", "relocalisation"),
-    "Robustness": ("robustness", "failure_probability"),
+    "Robustness": ("robustness", "failure_probability", "fuzz"),
     "Loops and submaps": ("loops", "drift_rule"),
     "Consistent maps": ("consistency",),
     "Exported maps": ("export_sizes",),

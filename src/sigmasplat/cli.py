@@ -1,8 +1,12 @@
 """Run the command line: a table of commands, and their exit codes."""
 
+import os
 import resource
 import sys
+import warnings
 from collections.abc import Callable, Sequence
+from contextlib import suppress
+from typing import TextIO
 
 import tyro
 
@@ -23,8 +27,9 @@ from sigmasplat.commands.run import demo, resume, run
 from sigmasplat.commands.view import view
 from sigmasplat.config.text import nearest
 from sigmasplat.errors import ConfigError, SigmaSplatError, is_out_of_memory, out_of_memory
+from sigmasplat.reading.guard import cause
 
-REFUSED, INTERRUPTED = 2, 130
+REFUSED, INTERRUPTED, CLOSED = 2, 130, 141
 LEAST_MEMORY = 1_200_000_000
 """Address space, bytes: a run of tiny images needs that much (1.0 GB was too little with torch 2.13)."""
 DESCRIPTION = """RGB-D SLAM on 3D Gaussian splats, with uncertainty.
@@ -81,28 +86,61 @@ def _run_command(arguments: Sequence[str]) -> int:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run a command and exit: 0 done, 1 problems found (doctor, inspect), no image found (localise) or a run failed
-    (batch, bench table), 2 refused with one line, 130 interrupted."""
+    (batch, bench table), 2 refused with one line, 130 interrupted, 141 standard output was closed (as by `| head`)."""
     given = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
     if given == ["--version"]:
         print(f"sigmasplat {sigmasplat.__version__}")
         sys.exit(0)
+    warnings.filterwarnings("ignore", "Image size .* exceeds limit")  # our limit is lower (`reading/pictures.py`)
     try:
         env.switches()
         _refuse_unknown(given[0])
         _refuse_memory_limit()
+        _refuse_nul(given)
         code = _run_command(given)
+        sys.stdout.flush()
     except SigmaSplatError as problem:
-        print(f"sigmasplat: {problem}", file=sys.stderr)
-        code = REFUSED
+        code = _refused(str(problem))
+    except BrokenPipeError:
+        _silence(sys.stdout)
+        code = CLOSED
     except KeyboardInterrupt:
-        print("sigmasplat: interrupted", file=sys.stderr)
+        _print_error("sigmasplat: interrupted")
         code = INTERRUPTED
     except Exception as problem:
-        if not is_out_of_memory(problem):
+        if is_out_of_memory(problem):
+            code = _refused(out_of_memory(problem))
+        elif isinstance(problem, OSError):
+            name = "" if problem.filename is None else f"{problem.filename}: "
+            code = _refused(f"{name}{cause(problem)}; check the path, its permissions and the free space")
+        else:
             raise
-        print(f"sigmasplat: {out_of_memory(problem)}", file=sys.stderr)
-        code = REFUSED
     sys.exit(code)
+
+
+def _refuse_nul(given: Sequence[str]) -> None:
+    """Raise ConfigError if an argument has a NUL character, which no path can have."""
+    for word in given:
+        if "\0" in word:
+            raise ConfigError(f"the argument {word!r} has a NUL character; remove it")
+
+
+def _refused(message: str) -> int:
+    _print_error(f"sigmasplat: {' '.join(message.splitlines())}")
+    return REFUSED
+
+
+def _print_error(line: str) -> None:
+    try:
+        print(line, file=sys.stderr, flush=True)
+    except OSError:  # closed, too: the exit code must do
+        _silence(sys.stderr)
+
+
+def _silence(stream: TextIO) -> None:
+    """Send a stream whose reader has gone to /dev/null, so that flushing it at exit does not fail."""
+    with suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 if __name__ == "__main__":

@@ -54,7 +54,7 @@ def read(environment: Mapping[str, str]) -> Switches:
 
 def _whole_number(environment: Mapping[str, str], name: str) -> int:
     text = environment.get(name, "").strip() or "0"
-    if not (text.isascii() and text.isdigit()):
+    if not (text.isascii() and text.isdecimal()):
         raise ConfigError(f"{name} is {text!r}; give a whole number of threads, 0 for all cores")
     return int(text)
 

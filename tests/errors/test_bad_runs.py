@@ -92,17 +92,21 @@ def test_damaged_files_are_named(tmp_path: Path) -> None:
     with pytest.raises(RunError, match=r"checkpoint .* is damaged"):
         run.read_checkpoint()
     (run.path / "metrics.json").write_text("{")
-    with pytest.raises(RunError, match=r"metrics\.json is not JSON"):
+    with pytest.raises(RunError, match=r"metrics\.json.*JSON"):
         run.read_metrics()
     (run.path / "metrics.json").write_text("[1]")
     with pytest.raises(RunError, match="is not a JSON object"):
         run.read_metrics()
-    for text, complaint in (("{", r"loops\.json is not JSON"), ("{}", "a list of loops"), ("[1]", "a list of loops")):
+    for text, complaint in (
+        ("{", r"loops\.json: not read"),
+        ("{}", "a list of loops"),
+        ("[1]", "a list of loops"),
+    ):
         (run.path / "loops.json").write_text(text)
         with pytest.raises(RunError, match=complaint):
             run.read_loops()
     (run.path / "run.json").write_text("half a f")
-    with pytest.raises(RunError, match=r"run\.json is not JSON"):
+    with pytest.raises(RunError, match=r"run\.json: not readable as JSON"):
         RunFolder.open(run.path)
     (run.path / "config.json").write_text('{"sede": 1}')
     with pytest.raises(ConfigError, match="unknown setting 'sede'"):

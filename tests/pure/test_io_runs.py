@@ -73,7 +73,7 @@ def test_an_incomplete_last_line_is_skipped_and_other_damage_is_an_error(run: Ru
     log.write_text(log.read_text() + '{"index": 1, "sec')
     assert run.read_log() == [{"index": 0}]
     log.write_text('{"index": 0}\n{"ind\n{"index": 2}\n')
-    with pytest.raises(RunError, match=r"log\.jsonl:2: not JSON"):
+    with pytest.raises(RunError, match=r"log\.jsonl:2: not readable as JSON"):
         run.read_log()
 
 

@@ -55,13 +55,13 @@ def test_a_bad_line_is_named(tmp_path: Path, line: str, complaint: str) -> None:
 
 
 def test_missing_empty_and_binary_files(tmp_path: Path) -> None:
-    with pytest.raises(SourceError, match="cannot read trajectory"):
+    with pytest.raises(SourceError, match="cannot read"):
         read_trajectory(tmp_path / "no.txt")
     (tmp_path / "empty.txt").write_text("# nothing\n")
     with pytest.raises(SourceError, match="no poses in"):
         read_trajectory(tmp_path / "empty.txt")
     (tmp_path / "image.txt").write_bytes(b"\x89PNG\xff\xfe")
-    with pytest.raises(SourceError, match="cannot read trajectory"):
+    with pytest.raises(SourceError, match="cannot read"):
         read_trajectory(tmp_path / "image.txt")
     with pytest.raises(RunError, match="cannot write"):
         write_trajectory(tmp_path / "no" / "t.txt", some_path(2))

@@ -2,7 +2,6 @@
 `presets`."""
 
 import dataclasses
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,6 +18,7 @@ from sigmasplat.config.submaps import FinalConfig, LoopConfig, RegistrationConfi
 from sigmasplat.config.surface import SurfaceConfig
 from sigmasplat.config.uncertainty import UncertaintyConfig
 from sigmasplat.errors import ConfigError
+from sigmasplat.reading.structured import read_json
 
 __all__ = [
     "Config", "DensifyConfig", "FeatureConfig", "FinalConfig", "InputConfig", "LoopConfig", "MappingConfig",
@@ -125,10 +125,11 @@ class Config:
     @staticmethod
     def load(path: Path) -> "Config":
         """Read a config.json. Raises ConfigError if it is missing, not JSON, or has unknown settings."""
+        values = read_json(path, ConfigError)
         try:
-            return Config.from_dict(json.loads(path.read_text()))
-        except (OSError, json.JSONDecodeError) as problem:
-            raise ConfigError(f"cannot read settings from {path}: {problem}") from problem
+            return Config.from_dict(values)
+        except ConfigError as problem:
+            raise ConfigError(f"{path}: {problem}") from problem
 
 
 SECTIONS: dict[str, type[Section]] = {

@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import BinaryIO
 
 from sigmasplat.errors import SourceError
+from sigmasplat.reading.files import open_regular
+from sigmasplat.reading.guard import guarded
 
 
 @contextmanager
 def open_binary(path: Path, error: str) -> Iterator[BinaryIO]:
-    """Open a file for reading. If opening or reading fails, raises SourceError with `error` as start of its message."""
-    try:
-        with path.open("rb") as file:
-            yield file
-    except OSError as problem:
-        raise SourceError(f"{error} {path}: {problem.strerror or problem}") from problem
+    """Open a regular file for reading. If opening or reading fails, or the block cannot use its content, raises
+    SourceError; `error` begins the message about a file that cannot be opened."""
+    with open_regular(path, SourceError, failed=error) as file, guarded(path, "copy or download it again", SourceError):
+        yield file

@@ -10,6 +10,8 @@ from torch import Tensor
 
 from sigmasplat.errors import RunError
 from sigmasplat.io.atomic import write_text, write_text_on_full_disk
+from sigmasplat.reading import files, structured
+from sigmasplat.reading.structured import MOST_OWN_JSON_BYTES, parse_json
 
 
 def to_json(value: Any) -> Any:
@@ -41,10 +43,7 @@ def _json_text(values: Any) -> str:
 
 def read_json(path: Path) -> Any:
     """Read a file. Raises RunError if it cannot be read or is not JSON."""
-    try:
-        return json.loads(read_text(path))
-    except json.JSONDecodeError as problem:
-        raise RunError(f"{path} is not JSON: {problem}") from problem
+    return structured.read_json(path, RunError, MOST_OWN_JSON_BYTES)
 
 
 def json_line(values: Any) -> str:
@@ -70,16 +69,10 @@ def read_lines(path: Path) -> list[Any]:
     *complete, _incomplete = read_text(path).split("\n")
     values = []
     for number, line in enumerate(complete, 1):
-        try:
-            values.append(json.loads(line))
-        except json.JSONDecodeError as problem:
-            raise RunError(f"{path}:{number}: not JSON: {line[:60]!r}") from problem
+        values.append(parse_json(line, f"{path}:{number}", RunError))
     return values
 
 
 def read_text(path: Path) -> str:
     """Read UTF-8 text. Raises RunError if it cannot be read."""
-    try:
-        return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as problem:
-        raise RunError(f"cannot read {path}: {problem}") from problem
+    return files.read_text(path, RunError, MOST_OWN_JSON_BYTES)

@@ -3,6 +3,7 @@
 PLY and GLB also contain depth_std_m, if it is known. The unit is the metre.
 """
 
+import os
 from pathlib import Path
 from typing import BinaryIO
 
@@ -86,7 +87,7 @@ def _header(file: BinaryIO, path: Path) -> tuple[str, list[ElementHeader]]:
             order = BYTE_ORDERS.get(" ".join(words[1:2]), "")
             if not order:
                 raise SourceError(f"{path}: the PLY is not binary ({' '.join(words)}); save it as binary")
-        elif words[:1] == ["element"] and len(words) == 3 and words[2].isdigit():
+        elif words[:1] == ["element"] and len(words) == 3 and words[2].isdecimal():
             elements.append((words[1], int(words[2]), []))
         elif words[:1] == ["property"] and elements:
             elements[-1][2].append(words[1:])
@@ -110,7 +111,8 @@ def _rows(
         else:
             fields.append((words[-1], f"{order}{kinds[0]}"))
     row = np.dtype(fields)
-    data = file.read(count * row.itemsize)
+    left = os.fstat(file.fileno()).st_size - file.tell()
+    data = file.read(min(count * row.itemsize, left))
     whole = np.frombuffer(data[: len(data) // max(row.itemsize, 1) * row.itemsize], row)
     if len(whole) < count and not any((whole[k] != length).any() for k in row.names or () if k.endswith(" count")):
         raise SourceError(f"{path} is truncated: its header says {count} of element {name}, found {len(whole)}")

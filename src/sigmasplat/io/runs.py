@@ -19,6 +19,7 @@ from sigmasplat.io.frames import RunFrames
 from sigmasplat.io.json_files import append_line, read_json, read_lines, write_json, write_json_on_full_disk
 from sigmasplat.io.leftovers import remove_leftovers
 from sigmasplat.io.lock import LOCK, locked, no_warning
+from sigmasplat.io.run_values import FACTS, check_checkpoint, check_fields, check_log
 from sigmasplat.io.splats import ply
 from sigmasplat.io.submaps import DiskStore
 from sigmasplat.io.tensors import open_tensors, write_tensors
@@ -173,7 +174,7 @@ class RunFolder:
 
     def facts(self) -> dict[str, Any]:
         """Read run.json: source, version, machine, status and facts of `note`. Raises RunError if it is damaged."""
-        return self._read_values("run.json")
+        return check_fields(self._read_values("run.json"), FACTS, (), self.path / "run.json")
 
     def note(self, **facts: Any) -> None:
         """Add or change facts in run.json, for instance status="complete" or "interrupted", wall_s=…"""
@@ -201,9 +202,8 @@ class RunFolder:
     def read_log(self) -> list[dict[str, Any]]:
         """Read the lines of log.jsonl; an incomplete last line, left by an interruption, is skipped.
 
-        Raises RunError if it is missing or another line is damaged.
-        """
-        return read_lines(self._existing("log.jsonl"))
+        Raises RunError if it is missing, or another line is damaged or has a wrong value."""
+        return check_log(read_lines(path := self._existing("log.jsonl")), path)
 
     def write_loops(self, records: list[dict[str, Any]]) -> None:
         """Write loops.json: all tried pairs of submaps with their latest results."""
@@ -230,7 +230,6 @@ class RunFolder:
 
     def read_frames(self) -> RunFrames:
         """Read log.jsonl and trajectory.txt together: the state of each frame at the end of the run, and its pose.
-
         Raises RunError or SourceError as `read_log` and `read_trajectory` do.
         """
         return RunFrames.of(self.read_log(), self.read_trajectory())
@@ -299,8 +298,9 @@ class RunFolder:
 
     def read_checkpoint(self) -> tuple[dict[str, Tensor], dict[str, str]]:
         """Read checkpoint.safetensors: tensors and text. Raises RunError if it is missing or damaged."""
-        with open_tensors(self._existing("checkpoint.safetensors"), "checkpoint") as file:
-            return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
+        with open_tensors(path := self._existing("checkpoint.safetensors"), "checkpoint") as file:
+            tensors, text = {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
+        return check_checkpoint(tensors, path), text
 
     def read_odometry(self) -> Trajectory | None:
         """Return the path of tracking alone, without loop closure; None if the run has no such path or no loop.

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from sigmasplat.errors import RunError
+from sigmasplat.io.state_types import wrong_field
 from sigmasplat.io.tensors import open_tensors, write_tensors
 
 INLINE = 64
@@ -119,7 +120,11 @@ class _Decoder:
         if "tuple" in value:
             return tuple(self.decode(item) for item in value["tuple"])
         if "object" in value:
-            return self.classes[value["object"]](**{n: self.decode(v) for n, v in value["fields"].items()})
+            owner = self.classes[value["object"]]
+            fields = {n: self.decode(v) for n, v in value["fields"].items()}
+            if wrong := wrong_field(owner, fields):
+                raise ValueError(wrong)
+            return owner(**fields)
         return self._array(value)
 
     def _array(self, value: dict[str, Any]) -> Any:

@@ -13,6 +13,10 @@ from torch import Tensor
 
 from sigmasplat.errors import RunError
 from sigmasplat.io.atomic import replacing
+from sigmasplat.reading.files import open_regular
+from sigmasplat.reading.guard import DAMAGED, cause
+
+ERRORS: tuple[type[Exception], ...] = (SafetensorError, *DAMAGED)
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], text: dict[str, str]) -> None:
@@ -34,10 +38,12 @@ def open_tensors(path: Path, what: str) -> Iterator[Any]:
     Raises RunError if it is damaged, or if the block does not find a tensor or cannot use it.
     """
     try:
+        with open_regular(path, RunError):  # a pipe would wait for a writer
+            pass
         with safe_open(path, "pt") as file:
             yield file
-    except (SafetensorError, OSError, KeyError, IndexError, TypeError, ValueError) as problem:
-        raise RunError(f"{what} {path} is damaged: {problem}") from problem
+    except ERRORS as problem:
+        raise RunError(f"{what} {path} is damaged: {cause(problem)}") from problem
 
 
 def _sort_metadata(path: Path) -> None:

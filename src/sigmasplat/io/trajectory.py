@@ -8,6 +8,7 @@ from sigmasplat.errors import SourceError
 from sigmasplat.io.atomic import write_text
 from sigmasplat.model import se3
 from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.reading.files import read_text
 from sigmasplat.types import Matrix
 
 COLUMNS = "t tx ty tz qx qy qz qw"
@@ -36,10 +37,7 @@ def read_trajectory(path: Path, may_be_empty: bool = False) -> Trajectory:
     Raises SourceError with file and line if it is missing, not text, empty (unless `may_be_empty`), or if a line does
     not have eight finite numbers or has a zero quaternion.
     """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as problem:
-        raise SourceError(f"cannot read trajectory {path}: {problem}") from problem
+    lines = read_text(path).splitlines()
     stripped = ((number, line.split("#")[0].strip()) for number, line in enumerate(lines, 1))
     rows = [_parse(line, f"{path}:{number}") for number, line in stripped if line]
     if not rows and not may_be_empty:

@@ -8,9 +8,11 @@ from sigmasplat.errors import RunError
 from sigmasplat.fit.adam import VectorAdam
 from sigmasplat.io.atomic import write_text
 from sigmasplat.io.json_files import read_text
+from sigmasplat.io.run_values import STATE_FIELDS, check_fields
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.io.state import read_state, write_state
 from sigmasplat.model.field import GaussianField, Rows
+from sigmasplat.reading.guard import guarded
 from sigmasplat.run.same_conditions import refuse_other_sequence
 from sigmasplat.run.session import run_now
 from sigmasplat.slam.refinement import Refined
@@ -85,9 +87,10 @@ class RefinementFile:
         """Return the saved refinement; None if nothing usable is saved."""
         if not self.run.refinement.is_file():
             return None
-        tree = read_state(self.run.refinement, REFINEMENT_CLASSES, {})
-        if tree["frames"] != len(self.slam.steps):
-            return None
+        with guarded(self.run.refinement, "delete it, or run it again", RunError, "damaged"):
+            tree = read_state(self.run.refinement, REFINEMENT_CLASSES, {})
+            if tree["frames"] != len(self.slam.steps):
+                return None
         refined: Refined = tree["refined"]
         return refined
 
@@ -116,9 +119,11 @@ def resume(run: RunFolder, source: Source) -> StartPoint:
     camera = source.camera.prepared(config.input.width, config.input.crop_px)
     onto = "onto" in run.facts() and len(run.submaps)
     slam.prepare(run.submaps.load(0).camera if onto else camera, resample=bool(onto))
-    tree = read_state(run.state, CLASSES, fixed(slam))
-    _truncate(run, frames=len(tree["steps"]), submaps=tree["submaps"])
-    restore(slam, tree)
+    with guarded(run.state, "run it again", RunError, "the state is damaged"):
+        tree = read_state(run.state, CLASSES, fixed(slam))
+        check_fields(tree, STATE_FIELDS, tuple(STATE_FIELDS), run.state)
+        _truncate(run, frames=len(tree["steps"]), submaps=tree["submaps"])
+        restore(slam, tree)
     return StartPoint(slam, tree["index"] + 1, tree["wall_s"])
 
 

@@ -14,6 +14,7 @@ from sigmasplat.model.camera import Camera
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.mesh import Mesh
 from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.reading.guard import guarded
 from sigmasplat.sources.files.prefetch import read_ahead
 
 
@@ -107,7 +108,8 @@ class Source(ABC):
         found = first > 0  # an earlier pass has read some
         for i in range(first, len(self)):
             try:
-                frame = self.frame(i)
+                with guarded(f"{self.name}, frame {i}", "copy its files again", SourceError):
+                    frame = self.frame(i)
             except SourceError as error:
                 self._skip(error)
                 continue

@@ -16,6 +16,7 @@ import numpy as np
 from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.reading.files import exists
 from sigmasplat.sources.camera.calibration import (
     ICL_NUIM,
     TUM_UNITS_PER_METRE,
@@ -72,7 +73,7 @@ def _truth(folder: Path, path: Path | None) -> Trajectory | None:
         recorded = read_poses(path)
         return Trajectory(recorded.timestamps_s / FRAMES_PER_SECOND, MIRROR @ recorded.T_world_camera @ MIRROR)
     plain = folder / "groundtruth.txt"
-    return read_poses(plain) if plain.is_file() else None
+    return read_poses(plain) if exists(plain) else None
 
 
 def _list_in(folder: Path) -> Path | None:

@@ -39,7 +39,11 @@ def open_nerfstudio(folder: Path, settings: InputConfig) -> RecordedSource:
         raise SourceError(
             f'{path}: no frame has a "depth_file_path"; export depth with the images, see docs/data.md#without-depth'
         )
-    skipped = [f"{path}: {frame['file_path']} has no depth_file_path" for frame in named if frame not in frames]
+    skipped = [
+        f"{path}: {frame['file_path']} has no depth_file_path"
+        for frame in named
+        if not isinstance(frame.get("depth_file_path"), str)
+    ]
     images = [ImagePair(i / FRAMES_PER_SECOND, *_files(folder, frame)) for i, frame in enumerate(frames)]
     calibration = _calibration(path, fields, frames, images, settings)
     truth = build_trajectory((i.timestamp_s, read_pose(path, frame)) for i, frame in zip(images, frames, strict=True))

@@ -4,6 +4,7 @@ import importlib
 import pkgutil
 import sys
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields, replace
 from functools import cache
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import Any
 from sigmasplat.config import InputConfig
 from sigmasplat.config.text import nearest
 from sigmasplat.errors import ConfigError, SourceError
+from sigmasplat.reading.guard import guarded
 from sigmasplat.sources.base import Source, Subset
 from sigmasplat.sources.files.color_only import without_depth
 
@@ -56,9 +58,16 @@ def open_source(path: str | Path, settings: InputConfig | None = None, **changes
     ConfigError on an unknown setting.
     """
     chosen = with_changes(settings or InputConfig(), changes)
-    source = format_of(path).open(str(path), chosen)
+    known = format_of(path)
+    with _guarded(path):
+        source = known.open(str(path), chosen)
     part = chosen.stride > 1 or chosen.limit or chosen.start_s or chosen.end_s
     return Subset(source, chosen) if part and not source.live else source
+
+
+def _guarded(path: str | Path) -> AbstractContextManager[None]:
+    """Return a context that turns what the readers of formats do not catch themselves into SourceError."""
+    return guarded(path, "check its files and permissions, or copy it again", SourceError, "cannot be used")
 
 
 def format_of(path: str | Path) -> Format:
@@ -70,7 +79,8 @@ def format_of(path: str | Path) -> Format:
 
 
 def _matching_format(path: str | Path) -> Format | None:
-    return next((known for known in formats() if known.recognises(str(path))), None)
+    with _guarded(path):
+        return next((known for known in formats() if known.recognises(str(path))), None)
 
 
 def with_changes(settings: InputConfig, changes: Mapping[str, Any]) -> InputConfig:
@@ -84,12 +94,13 @@ def with_changes(settings: InputConfig, changes: Mapping[str, Any]) -> InputConf
 
 def _unknown_format(path: Path) -> SourceError:
     """Return the error for a path that no format recognises: missing, of several sequences, without depth, unknown."""
-    if not path.exists():
+    if not path.exists():  # a loop of links, or a name that is too long, was refused before
         return SourceError(
             f"no such folder or file: {path}; give a recording, or 'synthetic' for the built-in room, "
             "or 'realsense' for the camera"
         )
-    entries = sorted(path.iterdir()) if path.is_dir() else []
+    with _guarded(path):
+        entries = sorted(path.iterdir()) if path.is_dir() else []
     candidates = (entry for entry in entries if entry.is_dir() or entry.suffix in PACKED)
     inner = [(entry.name, known) for entry in candidates if (known := _matching_format(entry))]
     if inner:

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
+from sigmasplat.reading.files import exists
 from sigmasplat.sources.camera.calibration import MM_PER_METRE, resolve_calibration
 from sigmasplat.sources.files.color_only import without_depth
 from sigmasplat.sources.files.folders import (
@@ -44,7 +45,7 @@ def open_plain(folder: Path, settings: InputConfig) -> RecordedSource:
     images = [ImagePair(t, *pair) for t, pair in zip(times_s, pairs, strict=True)]
     calibration = resolve_calibration(folder, None, first_size([i.color for i in images]), settings, MM_PER_METRE)
     truth_path = folder / "groundtruth.txt"
-    truth = read_poses(truth_path) if truth_path.is_file() else None
+    truth = read_poses(truth_path) if exists(truth_path) else None
     return RecordedSource(folder.resolve().name, images, calibration, settings, truth, skipped)
 
 

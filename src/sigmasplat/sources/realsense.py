@@ -128,7 +128,7 @@ def _parsed(text: str) -> dict[str, Any]:
     options: dict[str, Any] = {**OPTIONS, "serial": ""}
     for part in filter(None, text.partition(":")[2].split(",")):
         key, _, value = (word.strip() for word in part.partition("="))
-        if key not in options or not value or (key in OPTIONS and not (value.isdigit() and int(value))):
+        if key not in options or not value or (key in OPTIONS and not (value.isdecimal() and int(value))):
             raise SourceError(f"realsense: unknown option {part!r}; the options are {', '.join(options)}")
         options[key] = int(value) if key in OPTIONS else value
     return options

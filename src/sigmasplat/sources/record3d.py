@@ -9,7 +9,6 @@ issues 7 and 27; nerfstudio, record3d_utils.py. Depth has fewer pixels than colo
 0, 1 or 2, and readings with confidence 0 are ignored.
 """
 
-import json
 import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,6 +21,8 @@ from numpy.typing import NDArray
 from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.reading.guard import DAMAGED
+from sigmasplat.reading.structured import MOST_JSON_BYTES, parse_json
 from sigmasplat.sources.camera.calibration import (
     Calibration,
     build_camera,
@@ -132,10 +133,7 @@ def open_record3d(path: Path, settings: InputConfig) -> RecordedSource:
 
 
 def _metadata(archive: Archive, name: str) -> dict[str, Any]:
-    try:
-        content = json.loads(archive.read(name))
-    except ValueError as error:
-        raise SourceError(f"{archive.path / name}: not readable as JSON ({error}); export it again") from error
+    content = parse_json(archive.read(name, MOST_JSON_BYTES), archive.path / name)
     if not isinstance(content, dict):
         raise SourceError(f"{archive.path / name}: holds a {type(content).__name__}, not an object with K, w, h")
     return content
@@ -203,7 +201,7 @@ def _recognises(path: str) -> bool:
         try:
             with zipfile.ZipFile(place) as archive:
                 return any(name.startswith("rgbd/") for name in archive.namelist())
-        except (OSError, zipfile.BadZipFile):
+        except DAMAGED:
             return place.suffix.lower() == ".r3d"
     return any((place / "rgbd").glob("*.depth")) or (
         (place / "metadata.json").is_file() and any((place / "depth").glob("*.exr"))

@@ -17,6 +17,7 @@ import numpy as np
 from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.reading.files import open_regular
 from sigmasplat.sources.camera.calibration import (
     MM_PER_METRE,
     PRIMESENSE,
@@ -70,7 +71,8 @@ def _timed(folder: Path, colors: list[Path], depths: list[Path]) -> tuple[list[I
     pairs = associate(times_s[0], times_s[1])
     if not len(pairs):
         raise no_pairs(folder, {"colour": times_s[0], "depth": times_s[1]})
-    skipped = [f"{path}: no depth within {MAX_GAP_S:g} s" for i, path in enumerate(colors) if i not in pairs[:, 0]]
+    paired = set(pairs[:, 0].tolist())
+    skipped = [f"{path}: no depth within {MAX_GAP_S:g} s" for i, path in enumerate(colors) if i not in paired]
     return [ImagePair(float(times_s[1][j]), colors[i], depths[j]) for i, j in pairs], skipped
 
 
@@ -120,9 +122,11 @@ def _log_in(folder: Path) -> Path | None:
 
 
 def _begins_as_trajectory(path: Path) -> bool:
-    with path.open(encoding="utf-8", errors="replace") as file:
-        words = file.readline(200).split()
-    return len(words) == 3 and all(word.isdigit() for word in words)
+    if not path.is_file():
+        return False
+    with open_regular(path) as file:
+        words = file.readline(200).decode("utf-8", "replace").split()
+    return len(words) == 3 and all(word.isdecimal() for word in words)
 
 
 def _intrinsic_file(folder: Path) -> Path | None:

@@ -14,6 +14,7 @@ from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.model import se3
 from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.reading.files import exists, read_text
 from sigmasplat.sources.camera.calibration import REPLICA, Calibration, read_replica_calibration, resolve_calibration
 from sigmasplat.sources.files.folders import FRAMES_PER_SECOND, pair_images
 from sigmasplat.sources.opening import Format
@@ -58,9 +59,9 @@ def _surface(folder: Path) -> Path | None:
 
 def _truth(path: Path, numbers: list[int]) -> Trajectory | None:
     """Read the poses of the given frames. Raises SourceError naming the line whose pose is not rigid."""
-    if not path.is_file():
+    if not exists(path):
         return None
-    lines = [line for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
+    lines = [line for line in read_text(path).splitlines() if line.strip()]
     if numbers[-1] >= len(lines):
         raise SourceError(
             f"{path}: {len(lines)} poses, but the last image has number {numbers[-1]}; is the file truncated?"

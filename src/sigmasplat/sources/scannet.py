@@ -18,6 +18,7 @@ from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
+from sigmasplat.reading.files import read_text
 from sigmasplat.sources.camera.calibration import (
     MM_PER_METRE,
     Calibration,
@@ -95,7 +96,7 @@ def _matrices(folder: Path) -> tuple[dict[str, Path], dict[str, Matrix], float]:
     """Return file and value of each matrix by `{color|depth}_{intrinsic|extrinsic}`, and depth units per metre."""
     where, found, units = {}, {}, MM_PER_METRE
     for info in (folder / name for name in INFO_NAMES if (folder / name).is_file()):
-        entries = dict(_entry(line) for line in info.read_text("utf-8", "replace").splitlines() if "=" in line)
+        entries = dict(_entry(line) for line in read_text(info, errors="replace").splitlines() if "=" in line)
         if shift := entries.get("m_depthShift"):
             units = check_positive(info, "m_depthShift", parse_numbers(info, 1, [shift])[0])
         for key, kind in (("Color", "color"), ("Depth", "depth")):

@@ -10,22 +10,22 @@ share one number. The clock of imu.csv is that of the frames, and its axes are t
 DatasetEncoder.swift). Recordings of 2021, whose odometry.csv has no header, are not supported.
 """
 
-import csv
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.model import se3
 from sigmasplat.model.gyroscope import Gyroscope, gyroscope_from_samples
 from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.reading.files import read_text
+from sigmasplat.reading.structured import csv_rows
 from sigmasplat.sources.camera.calibration import MM_PER_METRE, Calibration, build_camera, resolve_calibration
-from sigmasplat.sources.files.images import guard_decoding, image_size, read_depth
+from sigmasplat.sources.files.images import image_size, read_depth, read_values
 from sigmasplat.sources.files.video import Video
 from sigmasplat.sources.opening import Format
 from sigmasplat.sources.recorded import ImagePair, RecordedSource, Size, first_size
@@ -56,7 +56,7 @@ class StrayImagePair(ImagePair):
         depth_m = read_depth(self.depth, units_per_metre)
         if not self.confidence.is_file():
             return depth_m
-        confidence = guard_decoding(self.confidence, lambda: np.asarray(Image.open(self.confidence)))
+        confidence = read_values(self.confidence)
         if confidence.shape != depth_m.shape:
             raise SourceError(
                 f"{self.confidence}: {confidence.shape} values for depth of {depth_m.shape}; copy it again"
@@ -104,24 +104,23 @@ def with_coarser_depth(calibration: Calibration, depth_size: Size) -> Calibratio
 
 
 def _numbered(folder: Path) -> dict[int, Path]:
-    return {int(path.stem): path for path in sorted(folder.glob("*.png")) if path.stem.isdigit()}
+    return {int(path.stem): path for path in sorted(folder.glob("*.png")) if path.stem.isdecimal()}
 
 
 def _odometry(path: Path) -> Rows:
     """Read odometry.csv as rows by frame number. Raises SourceError naming file and line."""
     if not path.is_file():
         raise SourceError(f"{path} is missing: it holds the times of the frames; copy the whole folder again")
-    with path.open(newline="", encoding="utf-8") as file:
-        lines = [[word.strip() for word in line] for line in csv.reader(file) if line]
-    if not lines or not set(POSE) <= set(lines[0]):
+    lines = csv_rows(path)
+    _, names = next(lines, (0, []))
+    if not set(POSE) <= set(names):
         raise SourceError(
-            f"{path}: expected columns {', '.join(POSE)} in the first line, "
-            f"found {', '.join(lines[0] if lines else [])}; "
+            f"{path}: expected columns {', '.join(POSE)} in the first line, found {', '.join(names)[:200]}; "
             "record with a Stray Scanner of 2022 or later"
         )
     rows = {}
-    for number, line in enumerate(lines[1:], 2):
-        row = _row(f"{path}:{number}", lines[0], line)
+    for number, line in lines:
+        row = _row(f"{path}:{number}", names, line)
         rows[int(row["frame"])] = row
     return rows
 
@@ -152,9 +151,9 @@ def _matrix(path: Path) -> list[float]:
     """Read fx, fy, cx, cy. Raises SourceError naming the file."""
     try:
         rows = np.array(
-            [[float(word) for word in line.split(",")] for line in path.read_text().split("\n") if line.strip()]
+            [[float(word) for word in line.split(",")] for line in read_text(path).split("\n") if line.strip()]
         )
-    except (OSError, ValueError) as error:
+    except ValueError as error:
         raise SourceError(f"{path}: expected a 3×3 matrix of numbers ({error}); copy it again") from error
     if rows.shape != (3, 3):
         raise SourceError(f"{path}: expected a 3×3 matrix, found {rows.shape}; copy it again")
@@ -178,12 +177,12 @@ def _gyroscope(path: Path, frame_times_s: NDArray[np.float64]) -> Gyroscope | No
     """
     if not path.is_file():
         return None
-    with path.open(newline="", encoding="utf-8", errors="replace") as file:
-        lines = [[word.strip() for word in line] for line in csv.reader(file) if line]
-    if not lines or not {"timestamp", *ANGULAR} <= set(lines[0]):
+    lines = csv_rows(path, errors="replace")
+    _, names = next(lines, (0, []))
+    if not {"timestamp", *ANGULAR} <= set(names):
         return None
-    columns, samples = [lines[0].index(name) for name in ("timestamp", *ANGULAR)], []
-    for line in lines[1:]:
+    columns, samples = [names.index(name) for name in ("timestamp", *ANGULAR)], []
+    for _, line in lines:
         with suppress(ValueError, IndexError):
             samples.append([float(line[column]) for column in columns])
     values = np.array(samples).reshape(-1, 4)

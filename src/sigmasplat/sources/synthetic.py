@@ -179,7 +179,7 @@ def open_synthetic(text: str) -> SyntheticRoom:
     options: dict[str, Any] = {}
     for part in filter(None, text.partition(":")[2].split(",")):
         key, _, value = (word.strip() for word in part.partition("="))
-        if key not in _OPTIONS or not value.lstrip("-").isdigit():
+        if key not in _OPTIONS or not value.lstrip("-").isdecimal():
             raise SourceError(f"synthetic room: unknown option {part!r}; give whole numbers for {', '.join(_OPTIONS)}")
         options[key] = int(value)
     for key in ("noise", "exposure_change"):

@@ -22,6 +22,7 @@ from sigmasplat.model.frame import Frame
 from sigmasplat.model.frame_arrays import UINT16_MAX
 from sigmasplat.model.gyroscope import Gyroscope
 from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.reading.files import exists, read_text
 from sigmasplat.sources.base import Source
 from sigmasplat.sources.camera.calibration import (
     TUM_UNITS_PER_METRE,
@@ -65,14 +66,14 @@ def open_tum(
     ]
     truth_path = folder / "groundtruth.txt"
     # Read now: damaged ground truth must stop the run before it starts, not its evaluation an hour later.
-    truth = read_poses(truth_path) if truth_path.is_file() else None
+    truth = read_poses(truth_path) if exists(truth_path) else None
     if truth and camera_path:
         truth = camera_path(truth)
     size = first_size([pair.color for pair in images])
     calibration = resolve_calibration(
         folder, camera or freiburg_calibration(folder), size, settings, TUM_UNITS_PER_METRE
     )
-    gyroscope = read_gyroscope(folder / "gyroscope.txt") if (folder / "gyroscope.txt").is_file() else None
+    gyroscope = read_gyroscope(folder / "gyroscope.txt") if exists(folder / "gyroscope.txt") else None
     return RecordedSource(folder.resolve().name, images, calibration, settings, truth, skipped, gyroscope=gyroscope)
 
 
@@ -178,11 +179,7 @@ def read_gyroscope(path: Path) -> Gyroscope:
 
 def read_lines(path: Path) -> Iterator[tuple[int, list[str]]]:
     """Yield (line number from 1, words) of every line that is not empty or a comment."""
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise SourceError(f"{path}: not readable as text ({error})") from error
-    for number, line in enumerate(text.splitlines(), 1):
+    for number, line in enumerate(read_text(path).splitlines(), 1):
         words = line.split("#")[0].replace(",", " ").split()
         if words:
             yield number, words

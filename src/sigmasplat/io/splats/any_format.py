@@ -8,6 +8,7 @@ from sigmasplat.io.binary import open_binary
 from sigmasplat.io.ply_elements import read_header
 from sigmasplat.io.splats import compressed_ply, gltf, ply, sog, splat, spz, spz_container, usd
 from sigmasplat.model.field import GaussianField
+from sigmasplat.reading.guard import guarded
 
 READABLE = ".ply, .compressed.ply, .splat, .spz, .sog, .glb, .gltf, .usda, .usdc or .usd"
 START = 4096
@@ -38,6 +39,11 @@ def read_any(path: Path) -> GaussianField:
     """
     if path.is_dir():
         raise SourceError(f"{path} is a folder, not a map; give a file: {READABLE}")
+    with guarded(path, "copy or download it again", SourceError, "damaged"):
+        return _read_known(path)
+
+
+def _read_known(path: Path) -> GaussianField:
     with open_binary(path, "cannot read map") as file:
         start = file.read(START)
     if start[:3] == b"ply" and start[3:4].isspace():

@@ -27,7 +27,7 @@ from sigmasplat.io.atomic import replacing
 from sigmasplat.io.binary import open_binary
 from sigmasplat.io.splats.codebooks import LEVELS, levels, palette
 from sigmasplat.io.splats.quaternions import Doubles, from_smallest_three, smallest_three
-from sigmasplat.io.splats.values import SH_C0, SplatValues, morton_order, opacities_of, opacity_bytes
+from sigmasplat.io.splats.values import SH_C0, SplatValues, check_count, morton_order, opacities_of, opacity_bytes
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.harmonics import DEGREES, count
 
@@ -154,6 +154,7 @@ class _Archive:
 
 def _read(given: _Archive) -> SplatValues:
     size = given.whole("count", most=given.packed_size * MAX_RATIO)
+    check_count(size, given.packed_size, given.path)
 
     def pixels(group: str, index: int = 0) -> Pixels:
         """Return the pixels of the splats. Other writers round width and height up to multiples of four."""

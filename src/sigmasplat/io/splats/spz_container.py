@@ -17,6 +17,7 @@ from typing import BinaryIO
 import zstandard
 
 from sigmasplat.errors import SourceError
+from sigmasplat.io.splats.values import check_count
 from sigmasplat.model.harmonics import DEGREES, count
 
 MAGIC = b"NGSP"
@@ -53,6 +54,7 @@ class SpzHeader:
                 f"{path} is SPZ version {self.version} with harmonics of degree {self.degree}; "
                 "save it as version 2 to 4 with degree 0 to 3, or as PLY"
             )
+        check_count(self.size, packed_size, path)
         needed = self.size * sum(self.widths)
         if needed > packed_size * MAX_RATIO:
             raise SourceError(f"{path} is truncated: its header says {self.size} splats = {needed} bytes")

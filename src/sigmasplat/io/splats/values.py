@@ -18,6 +18,9 @@ R_RUB_RDF = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
 """Rotates axes x right, y down, z forward to x right, y up, z back, and back."""
 MORTON_BITS, ROUNDING = 20, 1e-6
 
+MOST_REPEATED = 1_000_000
+"""Number of splats that any compressed file may announce."""
+
 
 @dataclass(frozen=True)
 class SplatValues:
@@ -114,6 +117,15 @@ def morton_order(points: Doubles) -> NDArray[np.intp]:
         for axis in range(3):
             code |= ((cells[:, axis] >> np.uint64(bit)) & np.uint64(1)) << np.uint64(3 * bit + axis)
     return np.argsort(code, kind="stable")
+
+
+def check_count(count: int, packed_size: int, path: Path) -> None:
+    """Raise SourceError if a compressed file of `packed_size` bytes announces more splats than it can hold: a splat
+    needs 8 bytes or more, but equal splats, as in tests, compress further."""
+    if count > max(MOST_REPEATED, packed_size):
+        raise SourceError(
+            f"{path} is damaged: its header says {count} splats, which do not fit into {packed_size} bytes"
+        )
 
 
 def check_values(params: NDArray[np.float32], path: Path) -> None:

@@ -1,6 +1,5 @@
 """List the cameras of the public data sets, and read the calibration of a recording."""
 
-import json
 import re
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,6 +12,8 @@ from sigmasplat.config import InputConfig
 from sigmasplat.errors import ConfigError, SourceError
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
+from sigmasplat.reading.files import exists
+from sigmasplat.reading.structured import read_json
 
 Distortion = tuple[float, ...]
 """Radial and tangential distortion k1, k2, p1, p2, k3 [, k4, k5, k6 of the rational model's denominator]."""
@@ -44,6 +45,9 @@ class CameraUnknown(SourceError):
         super().__init__(message)
         self.size = size
 
+
+MOST_NUMBER = 1e100
+"""Larger numbers are refused: their squares are not finite, and no field of a recording needs them."""
 
 TUM_UNITS_PER_METRE = 5000.0
 
@@ -134,7 +138,7 @@ def resolve_calibration(
     CameraUnknown if no focal length is given.
     """
     beside = folder / "calibration.json"
-    if settings.calibration or beside.is_file():
+    if settings.calibration or exists(beside):
         recorded = read_calibration(Path(settings.calibration or beside), size, default_units)
     if recorded is None and not settings.fx:
         place = "a file for --calibration" if folder.is_file() else beside
@@ -164,10 +168,7 @@ def read_replica_calibration(path: Path) -> Calibration:
 
 def read_json_object(path: Path) -> dict[str, Any]:
     """Read a JSON file that holds one object. Raises SourceError naming the file."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise SourceError(f"{path}: not readable as JSON ({error}); correct it") from error
+    content = read_json(path)
     if not isinstance(content, dict):
         raise SourceError(f"{path}: holds a {type(content).__name__}, not an object with fx, fy, cx, cy")
     return content
@@ -178,8 +179,8 @@ def json_number(path: Path, fields: dict[str, Any], key: str, default: float | N
     value = fields.get(key, default)
     if value is None:
         raise SourceError(f'{path}: field "{key}" is missing (found {", ".join(sorted(fields)) or "nothing"}); add it')
-    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
-        raise SourceError(f'{path}: field "{key}" is {value!r}, expected a finite number')
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= MOST_NUMBER:
+        raise SourceError(f'{path}: field "{key}" is {str(value)[:60]}, expected a finite number')
     return float(value)
 
 

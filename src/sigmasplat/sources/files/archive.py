@@ -2,10 +2,14 @@
 
 import re
 import zipfile
-import zlib
 from pathlib import Path
 
 from sigmasplat.errors import SourceError
+from sigmasplat.reading.files import read_bytes
+from sigmasplat.reading.guard import guarded
+
+MOST_MEMBER_BYTES = 128 << 20
+"""Largest file of an archive after unzipping: an image, or its depth."""
 
 
 class Archive:
@@ -17,23 +21,25 @@ class Archive:
         if path.is_dir():
             self.names = [str(entry.relative_to(path)) for part in ("*", "*/*") for entry in path.glob(part)]
             return
-        try:
+        with guarded(path, "copy it again", SourceError, "not a complete zip archive"):
             self._zip = zipfile.ZipFile(path)
-        except (OSError, zipfile.BadZipFile) as error:
-            raise SourceError(f"{path}: not a complete zip archive ({error}); copy it again") from error
         self.names = self._zip.namelist()
 
     def __contains__(self, name: str) -> bool:
         return name in self.names
 
-    def read(self, name: str) -> bytes:
-        """Return the bytes of a file. Raises SourceError naming it if it is missing or damaged."""
-        try:
-            return (self.path / name).read_bytes() if self._zip is None else self._zip.read(name)
-        except (OSError, KeyError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError) as error:
-            raise SourceError(
-                f"{self.path / name}: cannot be read from its archive ({error}); copy it again"
-            ) from error
+    def read(self, name: str, most: int = MOST_MEMBER_BYTES) -> bytes:
+        """Return the bytes of a file. Raises SourceError naming it if it is missing, damaged, encrypted, or has more
+        than `most` bytes."""
+        where = self.path / name
+        if self._zip is None:
+            return read_bytes(where, SourceError, most)
+        failed = "cannot be read from its archive"
+        with guarded(where, "copy it again", SourceError, failed), self._zip.open(name) as member:
+            data = member.read(most + 1)
+        if len(data) > most:
+            raise SourceError(f"{where}: unzips to more than {most / 1e6:.0f} MB; is it the right file?")
+        return data
 
     def by_number(self, folder: str, endings: str) -> dict[int, str]:
         """Map N to each name folder/N.ending, in order of N; `endings` is a regular expression such as "jpg|png"."""

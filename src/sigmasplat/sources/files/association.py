@@ -17,11 +17,17 @@ UNIT_RATIO = 200.0
 """Median steps of two lists that differ by this factor are in different units, such as s and ms."""
 
 
+MOST_CANDIDATES = 100
+"""Largest mean number of images that may be within the tolerance of an image: a camera of 1000 Hz has 40. Equal times
+would need memory for the square of the number of images."""
+
+
 def associate(first_s: Times, second_s: Times, tolerance_s: float = MAX_GAP_S) -> NDArray[np.intp]:
     """Pair timestamps [N] and [M], seconds, that differ by less than `tolerance_s`; return indices [K, 2] by time.
 
     Every index is used at most once, and the closest pairs are chosen first. The lists may be unsorted. Ties go to the
-    earlier entry of the first list, then of the second, so the result does not depend on the sorting algorithm.
+    earlier entry of the first list, then of the second, so the result does not depend on the sorting algorithm. Raises
+    SourceError if so many times are equal that they cannot pair images.
     """
     rows, columns = _candidates(first_s, second_s, tolerance_s)
     gaps_s = np.abs(first_s[rows] - second_s[columns])
@@ -67,6 +73,12 @@ def _candidates(first_s: Times, second_s: Times, tolerance_s: float) -> tuple[ND
     ordered = second_s[order]
     low = np.searchsorted(ordered, first_s - tolerance_s, "left")
     high = np.searchsorted(ordered, first_s + tolerance_s, "right")
+    most = MOST_CANDIDATES * (len(first_s) + len(second_s))
+    if (found := int((high - low).sum())) > most:
+        raise SourceError(
+            f"{len(first_s)} and {len(second_s)} images have {found} pairs of times within {tolerance_s:g} s, so their "
+            "times do not pair them; give every image its own time, in seconds"
+        )
     rows = np.repeat(np.arange(len(first_s)), high - low)
     starts = np.repeat(low, high - low)
     within = np.arange(len(rows)) - np.repeat(np.cumsum(high - low) - (high - low), high - low)

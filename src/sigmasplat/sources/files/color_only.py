@@ -6,9 +6,8 @@ from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
 
-from PIL import Image
-
 from sigmasplat.errors import SourceError
+from sigmasplat.reading.pictures import open_image
 from sigmasplat.sources.files.folders import COLOR_ENDINGS
 
 VIDEO_ENDINGS = (".mp4", ".mov", ".m4v", ".avi", ".webm", ".3gp", ".mts")
@@ -68,9 +67,9 @@ def _is_color_image(path: Path) -> bool:
     if path.suffix.lower() not in PHOTO_ENDINGS:
         return False
     try:
-        with Image.open(path) as image:
+        with open_image(path) as image:
             return not image.mode.startswith(("I", "F"))
-    except (OSError, ValueError, SyntaxError):
+    except SourceError:
         return True  # .heic, .dng, or damaged: then its name decides
 
 

@@ -33,7 +33,7 @@ def list_images(folder: Path | None, endings: Sequence[str]) -> list[Path]:
 
 def natural_key(path: Path | str) -> list[tuple[int, str]]:
     """Return a sort key that compares digits in a name as numbers and the rest as text."""
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"([0-9]+)", str(path)) if part]
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"([0-9]+)", str(path)) if part]
 
 
 def index_by_number(paths: Iterable[Path]) -> dict[int, Path]:

@@ -1,37 +1,45 @@
 """Read colour and depth images; every problem becomes a SourceError that names the file."""
 
-import io
-import struct
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from sigmasplat.errors import SourceError
 from sigmasplat.model.frame_arrays import depth_from_integers
-
-Value = TypeVar("Value")
+from sigmasplat.reading.pictures import npy_shape, open_image, read_npy
 
 
 def read_color(path: Path) -> NDArray[np.uint8]:
     """Read an image as 8-bit RGB [H, W, 3]. Raises SourceError naming a missing, truncated or damaged file."""
-    return _guard_reading(path, lambda: _decode(path, "RGB"))
+    _refuse_missing(path)
+    with open_image(path) as image:
+        return np.asarray(image.convert("RGB"))
 
 
 def decode_color(path: Path, data: bytes) -> NDArray[np.uint8]:
     """Decode an image in memory as 8-bit RGB [H, W, 3]; `path` names it. Raises SourceError if it is damaged."""
-    return guard_decoding(path, lambda: np.asarray(Image.open(io.BytesIO(data)).convert("RGB")))
+    with open_image(path, data) as image:
+        return np.asarray(image.convert("RGB"))
 
 
-def image_size(path: Path) -> tuple[int, int]:
-    """Return (width, height) in pixels from the file header. Raises SourceError if the file is not an image."""
-    if path.suffix == ".npy":
-        height, width = _guard_reading(path, lambda: np.load(path, mmap_mode="r").shape[:2])
-        return int(width), int(height)
-    return _guard_reading(path, lambda: _header_size(path))
+def read_values(path: Path, data: bytes | None = None) -> NDArray[Any]:
+    """Decode an image file, or `data` of one, without converting its values. Raises SourceError if it is damaged."""
+    with open_image(path, data) as image:
+        return np.asarray(image)
+
+
+def image_size(path: Path, data: bytes | None = None) -> tuple[int, int]:
+    """Return (width, height) in pixels from the header of a file, or of `data`. Raises SourceError if it is not an
+    image."""
+    if data is None:
+        _refuse_missing(path)
+        if path.suffix == ".npy":
+            height, width = npy_shape(path)[:2]
+            return width, height
+    with open_image(path, data) as image:
+        return image.size
 
 
 def read_depth(path: Path, units_per_metre: float) -> NDArray[np.float32]:
@@ -40,9 +48,9 @@ def read_depth(path: Path, units_per_metre: float) -> NDArray[np.float32]:
     Whole numbers (16-bit PNG, integer .npy) are divided by `units_per_metre`; floats (.tiff, .npy) are in metres.
     Raises SourceError if the file is unreadable, not a single-channel depth image, negative, or holds NaN or inf.
     """
-    return depth_to_metres(
-        path, _guard_reading(path, lambda: np.load(path) if path.suffix == ".npy" else _decode(path)), units_per_metre
-    )
+    _refuse_missing(path)
+    raw = read_npy(path) if path.suffix == ".npy" else read_values(path)
+    return depth_to_metres(path, raw, units_per_metre)
 
 
 def depth_to_metres(path: Path, raw: NDArray[Any], units_per_metre: float) -> NDArray[np.float32]:
@@ -65,28 +73,6 @@ def _checked_metres(path: Path, depth_m: NDArray[np.float32]) -> NDArray[np.floa
     return depth_m
 
 
-def _decode(path: Path, mode: str | None = None) -> NDArray[Any]:
-    with Image.open(path) as image:
-        return np.asarray(image if mode is None else image.convert(mode))
-
-
-def _header_size(path: Path) -> tuple[int, int]:
-    with Image.open(path) as image:
-        return image.size
-
-
-def _guard_reading(path: Path, read: Callable[[], Value]) -> Value:
-    """Call a reader of a file. Raises SourceError if the file is missing or unreadable."""
+def _refuse_missing(path: Path) -> None:
     if not path.is_file():
         raise SourceError(f"{path}: the image is missing; download it again or remove it from the list")
-    return guard_decoding(path, read)
-
-
-def guard_decoding(path: Path, read: Callable[[], Value]) -> Value:
-    """Call a decoder. Raises SourceError naming `path` for any of the exceptions that damaged data can cause."""
-    try:
-        return read()
-    except (OSError, ValueError, SyntaxError, EOFError, IndexError, KeyError, TypeError, struct.error) as error:
-        raise SourceError(f"{path}: unreadable image ({error}); download or copy it again") from error
-    except Image.DecompressionBombError as error:
-        raise SourceError(f"{path}: unreadable image ({error})") from error

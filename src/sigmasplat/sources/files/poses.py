@@ -10,7 +10,10 @@ from numpy.typing import ArrayLike
 from sigmasplat.errors import SourceError
 from sigmasplat.model import se3
 from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.reading.files import read_text
 from sigmasplat.types import Matrix
+
+MOST_MATRIX_BYTES = 1 << 16
 
 RIGID_TOLERANCE = 1e-2
 """Published poses are rounded; a matrix within this tolerance of a rotation is orthonormalised."""
@@ -24,10 +27,10 @@ FLIP_YZ = np.diag([1.0, -1.0, -1.0, 1.0])
 
 def read_matrix(path: Path) -> Matrix:
     """Read 3×4 or 4×4 numbers by rows as [4, 4]; they may be infinite. Raises SourceError naming the file."""
+    text = read_text(path, most=MOST_MATRIX_BYTES)
     try:
-        text = path.read_text(encoding="utf-8")
         return to_matrix(str(path), [float(word) for word in text.replace(",", " ").split()])
-    except (OSError, ValueError) as error:
+    except ValueError as error:
         raise SourceError(f"{path}: not readable as a matrix of numbers ({error}); download it again") from error
 
 

@@ -76,7 +76,12 @@ def read_pose(path: Path, frame: Fields) -> Matrix | None:
 def _focal(path: Path, fields: Fields, width: int, height: int) -> list[float]:
     """Return fx, fy, cx, cy; a file may give the field of view instead of the focal length."""
     if "fl_x" not in fields and "camera_angle_x" in fields:
-        fx = 0.5 * width / float(np.tan(0.5 * json_number(path, fields, "camera_angle_x")))
+        angle = json_number(path, fields, "camera_angle_x")
+        if not 0.0 < angle < np.pi:
+            raise SourceError(
+                f'{path}: field "camera_angle_x" is {angle:g}, expected a field of view in radians, 0 to π'
+            )
+        fx = 0.5 * width / float(np.tan(0.5 * angle))
     else:
         fx = json_number(path, fields, "fl_x")
     fy = json_number(path, fields, "fl_y", fx)

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from sigmasplat.errors import SourceError
+from sigmasplat.reading.files import open_regular
 from sigmasplat.sources.files.optional import import_optional
 
 Message = Any
@@ -70,7 +71,9 @@ class Bag:
 
     def first_message(self, name: str) -> Message:
         """Read the first message of a topic. Raises SourceError if it is damaged."""
-        return next(self.messages(name))
+        for message in self.messages(name):
+            return message
+        raise SourceError(f"{self.path}: unreadable bag (topic {name} has no message); copy it again")
 
     def messages(self, name: str) -> Iterator[Message]:
         """Read the messages of a topic in recording order. Raises SourceError if one is damaged."""
@@ -102,6 +105,8 @@ class Bag:
 
     def _stamp_ns(self, raw: bytes) -> int:
         """Read the time of a header: ROS 1 starts with a sequence number, CDR with four bytes for the byte order."""
+        if len(raw) < 12:
+            raise SourceError(f"{self.path}: unreadable bag (a message of {len(raw)} bytes); copy it again")
         order = "<" if self.ros1 or raw[1] & 1 else ">"
         seconds, nanoseconds = struct.unpack_from(f"{order}II", raw, 4)
         return int(seconds) * 10**9 + int(nanoseconds)
@@ -131,7 +136,10 @@ def is_bag(path: Path) -> bool:
     """Return whether a path is a ROS bag: a file by its first bytes, a folder by its metadata.yaml."""
     if path.is_dir():
         metadata = path / "metadata.yaml"
-        return metadata.is_file() and b"rosbag2_bagfile_information" in metadata.read_bytes()[:4096]
+        if not metadata.is_file():
+            return False
+        with open_regular(metadata) as file:
+            return b"rosbag2_bagfile_information" in file.read(4096)
     return path.is_file() and _magic(path).startswith((ROS1_MAGIC, MCAP_MAGIC, SQLITE_MAGIC))
 
 
@@ -142,5 +150,5 @@ def list_topics(topics: Iterable[Topic], most: int = 12) -> str:
 
 
 def _magic(path: Path) -> bytes:
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         return file.read(16)

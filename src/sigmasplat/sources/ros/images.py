@@ -5,17 +5,15 @@ compressed_depth: a header of 12 bytes (format, two quantisation parameters a an
 holds the values, for 32FC1 it holds a / depth + b.
 """
 
-import io
 import struct
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from sigmasplat.errors import SourceError
-from sigmasplat.sources.files.images import decode_color, depth_to_metres, guard_decoding
+from sigmasplat.sources.files.images import decode_color, depth_to_metres, image_size, read_values
 from sigmasplat.sources.ros.bag import Message
 
 RAW, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
@@ -50,7 +48,7 @@ def message_size(path: Path, message: Message) -> tuple[int, int]:
         return int(message.width), int(message.height)
     data = message.data.tobytes()
     start = HEADER_BYTES if "compressedDepth" in message.format else 0
-    return guard_decoding(path, lambda: Image.open(io.BytesIO(data[start:])).size)
+    return image_size(path, data[start:])
 
 
 def decode_color_message(path: Path, message: Message) -> NDArray[np.uint8]:
@@ -81,7 +79,7 @@ def _decompressed(path: Path, message: Message, units_per_metre: float) -> NDArr
         raise SourceError(f"{path}: depth is compressed as RVL, which is not supported; republish it as PNG or raw")
     data = message.data.tobytes()
     has_header = "compressedDepth" in message.format
-    raw = guard_decoding(path, lambda: np.asarray(Image.open(io.BytesIO(data[HEADER_BYTES * has_header :]))))
+    raw = read_values(path, data[HEADER_BYTES * has_header :])
     if not (has_header and message.format.startswith("32FC1")):
         return depth_to_metres(path, raw, units_per_metre)
     a, b = struct.unpack_from("<ff", data, 4)

@@ -1,0 +1,146 @@
+"""Check the values in the files of a run when they are read: a damaged file is named, with the value that is wrong."""
+
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sigmasplat.errors import RunError
+from sigmasplat.model.component import APART, LOST, RELOCALISED, TRACKED
+
+Test = Callable[[Any], bool]
+MOST_NUMBER = 1e15
+REMEDY = "restore the file, or run it again"
+
+
+def _number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= MOST_NUMBER
+
+
+def _whole(value: Any) -> bool:
+    return _number(value) and isinstance(value, int)
+
+
+def _number_or_null(value: Any) -> bool:
+    return value is None or _number(value)
+
+
+def _numbers(value: Any) -> bool:
+    return isinstance(value, dict) and all(_number_or_null(item) or isinstance(item, bool) for item in value.values())
+
+
+def _pose(value: Any) -> bool:
+    rows = isinstance(value, list) and len(value) == 4 and all(isinstance(row, list) and len(row) == 4 for row in value)
+    return rows and all(_number(item) for row in value for item in row)
+
+
+def _seconds(value: Any) -> bool:
+    return isinstance(value, dict) and all(_number(item) for item in value.values())
+
+
+def _texts(value: Any) -> bool:
+    return isinstance(value, list) and all(isinstance(item, str) for item in value)
+
+
+def _records(value: Any) -> bool:
+    return isinstance(value, list) and all(isinstance(item, dict) for item in value)
+
+
+def is_kind(*kinds: type) -> Test:
+    """Return a test for instances of some types."""
+    return lambda value: isinstance(value, kinds)
+
+
+LOG: Mapping[str, Test] = {
+    "index": lambda value: _whole(value) and value >= 0, "timestamp_s": _number, "is_keyframe": is_kind(bool),
+    "lost": is_kind(bool), "state": lambda value: value in (TRACKED, RELOCALISED, LOST, APART), "component": _whole,
+    "p_off": _number_or_null, "splats": _whole, "submap": _whole, "tracking": _numbers, "seconds": _seconds,
+    "T_world_camera": _pose, "loops": _records,
+}  # fmt: skip
+"""Values of a line of log.jsonl."""
+FACTS: Mapping[str, Test] = {
+    "source": is_kind(str), "source_path": is_kind(str), "status": is_kind(str), "skipped": _texts,
+    "wall_s": _number_or_null, "finish_s": _number_or_null, "final_steps": _number_or_null, "machine": is_kind(dict),
+    "onto": is_kind(dict),
+}  # fmt: skip
+"""Values of run.json that commands use."""
+STATE_FIELDS: Mapping[str, Test] = {"index": _whole, "wall_s": _number, "submaps": _whole, "steps": is_kind(list)}
+"""Values of a saved state beside those of `Slam`."""
+POSES = (4, 4)
+CHECKPOINT: Mapping[str, tuple[int, ...]] = {
+    "timestamps_s": (), "T_world_camera": POSES, "T_world_camera_odometry": POSES, "T_world_submap": POSES,
+}  # fmt: skip
+"""Tensors of a checkpoint that must be finite, and the shape of each of their rows."""
+WHOLE = ("keyframes", "submap_component")
+
+
+def check_fields(values: Any, tests: Mapping[str, Test], required: tuple[str, ...], where: object) -> dict[str, Any]:
+    """Return an object with the required fields. Raises RunError naming `where` if a field is missing or mistyped."""
+    if not isinstance(values, dict):
+        raise RunError(f"{where}: {_short(values)} is not an object; {REMEDY}")
+    for name in required:
+        if name not in values:
+            raise RunError(f"{where}: field {name!r} is missing; {REMEDY}")
+    for name, value in values.items():
+        if name in tests and not tests[name](value):
+            raise RunError(f"{where}: field {name!r} has the value {_short(value)}; {REMEDY}")
+    checked: dict[str, Any] = values
+    return checked
+
+
+class Record(dict[str, Any]):
+    """A line of log.jsonl; a missing field raises RunError. Logs of older versions lack some fields."""
+
+    def __init__(self, values: Mapping[str, Any], where: str) -> None:
+        super().__init__(values)
+        self.where = where
+
+    def __missing__(self, name: str) -> Any:
+        raise RunError(f"{self.where}: field {name!r} is missing; {REMEDY}")
+
+
+def check_log(records: list[Any], path: Path) -> list[dict[str, Any]]:
+    """Return the records of a log. Raises RunError naming the line of a wrong value."""
+    places = (f"{path}:{number}" for number in range(1, len(records) + 1))
+    return [Record(check_fields(record, LOG, (), where), where) for record, where in zip(records, places, strict=True)]
+
+
+class Tensors(dict[str, Tensor]):
+    """The tensors of a file by name; a missing one raises RunError."""
+
+    def __init__(self, found: Mapping[str, Tensor], path: Path) -> None:
+        super().__init__(found)
+        self.path = path
+
+    def __missing__(self, name: str) -> Tensor:
+        raise RunError(f"{self.path}: tensor {name!r} is missing; {REMEDY}")
+
+
+def check_checkpoint(found: Mapping[str, Tensor], path: Path) -> Tensors:
+    """Return the tensors of a checkpoint. Raises RunError if one has a wrong type or shape, or is not finite."""
+    for name, row in CHECKPOINT.items():
+        tensor = found.get(name)
+        if tensor is None:
+            continue
+        if not tensor.is_floating_point() or tensor.ndim != 1 + len(row) or tuple(tensor.shape[1:]) != row:
+            raise RunError(f"{path}: tensor {name!r} is {tensor.dtype} {list(tensor.shape)}; {REMEDY}")
+        if not bool(torch.isfinite(tensor).all()) or (tensor.numel() and float(tensor.abs().max()) > MOST_NUMBER):
+            raise RunError(f"{path}: tensor {name!r} has nan, inf or very large numbers; {REMEDY}")
+    for name in WHOLE:
+        tensor = found.get(name)
+        if tensor is not None and (tensor.ndim != 1 or tensor.is_floating_point() or tensor.is_complex()):
+            raise RunError(f"{path}: tensor {name!r} is {tensor.dtype} {list(tensor.shape)}; {REMEDY}")
+    frames = [len(found[name]) for name in ("timestamps_s", "T_world_camera") if name in found]
+    if len(set(frames)) > 1:
+        raise RunError(f"{path}: {frames[0]} times and {frames[1]} poses; {REMEDY}")
+    return Tensors(found, path)
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, int) and not isinstance(value, bool) and not math.log10(abs(value) + 1) < 60:
+        return "a very large number"
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:60]} …"

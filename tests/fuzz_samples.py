@@ -1,0 +1,149 @@
+"""Small valid inputs of every format, as files in memory, with the commands that read them."""
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+import torch
+
+import layouts
+import recordings
+from bag_recordings import Recorder, aligned
+from command_line import exit_code
+from room_run import made_run
+from sigmasplat.io.runs import RunFolder
+from sigmasplat.io.splats import compressed_ply, gltf, ply, sog, splat, spz
+from sigmasplat.model.field import GaussianField
+from sigmasplat.run.resume import StateFile
+
+Files = dict[str, bytes]
+INPUT, OUT = "INPUT", "OUT"
+"""Words of a command that stand for the input and for a new path beside it."""
+QUICK = tuple(
+    word
+    for setting in ("input.width=32", "mapping.first_iterations=2", "mapping.iterations=1", "tracking.iterations=2",
+                    "final.iterations=1")
+    for word in ("--set", setting)
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Sample:
+    """A valid input: its files by relative path, the path that a command gets, and the commands that read it.
+
+    weight: share among all samples; slow: its commands take a second or more.
+    """
+
+    name: str
+    files: Files
+    entry: str
+    commands: tuple[tuple[str, ...], ...]
+    weight: float = 1.0
+
+
+INSPECT = ("inspect", INPUT, "--out", f"{OUT}.png")
+RUN = ("run", INPUT, "--out", OUT, "--no-eval", *QUICK)
+READ = (RUN,) * 9 + (INSPECT,)
+"""Commands that read a recording: `inspect` takes eight times as long as a run of four tiny frames."""
+EXPORTS = tuple(("export", INPUT, "--out", f"{OUT}{ending}") for ending in (".ply", ".spz", ".splat"))
+OF_RUN = tuple(
+    ("export", INPUT, "--format", name, "--out", OUT)
+    for name in ("trajectory", "nerfstudio", "colmap", "spz", "bag", "points")
+)
+OF_FINISHED = (
+    ("eval", INPUT),
+    ("mesh", INPUT, "--out", f"{OUT}.ply"),
+    ("export", INPUT, "--format", "plan", "--out", f"{OUT}.png"),
+    ("export", INPUT, "--format", "covariance", "--out", OUT),
+    ("localise", "synthetic:frames=1", "--in", INPUT),
+)
+
+
+def samples(folder: Path) -> Iterator[Sample]:
+    """Make the samples below a new folder."""
+    for name, layout in layouts.LAYOUTS.items():
+        place = folder / name
+        path = layout.write(place, layouts.sample())
+        if layout.size == layouts.VGA:  # small images, so the calibration must be given
+            fields = asdict(layouts.SMALL_CAMERA) | {
+                "depth_scale": 5000 if name in ("tum", "bonn", "icl_nuim") else 1000
+            }
+            layouts.save_text(path / "calibration.json", json.dumps(fields))
+        yield _sample(name, place, path, READ)
+    yield from _npy(folder)
+    yield from _phones(folder)
+    yield from _bags(folder)
+    yield from _maps(folder)
+    yield from _runs(folder)
+
+
+def _sample(name: str, place: Path, entry: Path, commands: tuple[tuple[str, ...], ...], weight: float = 1.0) -> Sample:
+    files = {str(path.relative_to(place)): path.read_bytes() for path in sorted(place.rglob("*")) if path.is_file()}
+    return Sample(name, files, str(entry.relative_to(place)), commands, weight)
+
+
+def _npy(folder: Path) -> Iterator[Sample]:
+    path = layouts.plain(folder / "npy", layouts.sample())
+    for number, depth in enumerate(layouts.sample().depth_mm):
+        (path / f"depth/{number + 8}.png").unlink()
+        np.save(path / f"depth/{number + 8}.npy", depth / np.float32(1000.0))
+    yield _sample("npy", folder / "npy", path, READ)
+
+
+def _phones(folder: Path) -> Iterator[Sample]:
+    (folder / "stray").mkdir()
+    path = recordings.write_stray(folder / "stray" / "walk", recordings.scene())
+    rows = "".join(f"{1000 + i / 100:.3f}, 0, 0, 9.8, 0.1, 0.2, 0.05\n" for i in range(20))
+    (path / "imu.csv").write_text("timestamp, a_x, a_y, a_z, alpha_x, alpha_y, alpha_z\n" + rows)
+    yield _sample("stray", folder / "stray", path, READ)
+    (folder / "r3d").mkdir()
+    members = recordings.r3d_members(recordings.scene())
+    yield _sample("r3d", folder / "r3d", recordings.write_zip(folder / "r3d" / "walk.r3d", members), READ)
+    path = recordings.write_exr_export(folder / "exr" / "walk", recordings.scene())
+    yield _sample("exr", folder / "exr", path, READ)
+
+
+def _bags(folder: Path) -> Iterator[Sample]:
+    for name, ros1, storage in (("bag1", True, ""), ("sqlite", False, "sqlite3"), ("mcap", False, "mcap")):
+        (folder / name).mkdir()
+        recorder = aligned(Recorder(ros1), recordings.scene())
+        path = recorder.write(folder / name / ("walk.bag" if ros1 else "walk"), storage)
+        yield _sample(name, folder / name, path, READ)
+
+
+def _maps(folder: Path) -> Iterator[Sample]:
+    field = GaussianField(torch.randn(6, 17, generator=torch.Generator().manual_seed(0)))
+    field.get_or_create("harmonics").params[:] = 0.25
+    writers: dict[str, Callable[..., None]] = {
+        ".ply": ply.write_field, ".compressed.ply": compressed_ply.write_field, ".splat": splat.write_field,
+        ".spz": spz.write_field, ".sog": sog.write_field, ".glb": gltf.write_field, ".gltf": gltf.write_field,
+    }  # fmt: skip
+    for ending, write in writers.items():
+        place = folder / f"map{ending}"
+        place.mkdir()
+        write(place / f"map{ending}", field)
+        yield _sample(f"map{ending}", place, place / f"map{ending}", EXPORTS)
+    place = folder / "map4.spz"
+    place.mkdir()
+    spz.write_field(place / "map.spz", field, version=4)
+    yield _sample("map4.spz", place, place / "map.spz", EXPORTS)
+
+
+def _runs(folder: Path) -> Iterator[Sample]:
+    for name, submaps in (("run", True), ("whole_run", False)):
+        run = made_run(folder / name / "walk", submaps)
+        run.note(status="complete", source_path="synthetic:frames=6,width=40,height=30")
+        yield _sample(name, folder / name, run.path, OF_RUN, 2.0)
+    place = folder / "resumed"
+    path = place / "walk"
+    with mock.patch.object(StateFile, "delete"):  # keeps the state, as an interruption does
+        code = exit_code("run", "synthetic:frames=3,width=48,height=36", "--out", str(path), "--no-eval", *QUICK)
+    assert code == 0
+    RunFolder(path).note(status="interrupted")
+    yield _sample("resumed", place, path, (("resume", INPUT, "--no-eval"),), 1.5)
+    RunFolder(path).note(status="complete")
+    (path / "images/view.png").write_bytes(b"")  # a sample has no empty folders
+    yield _sample("finished", place, path, OF_FINISHED, 1.0)
