@@ -19,7 +19,7 @@ power_loss = import_module("power_loss")
 def test_killed_commands_and_power_failures_lose_nothing(tmp_path: Path) -> None:
     command = [sys.executable, str(BENCHMARKS / "crashes.py"), "--quick", "--scratch", str(tmp_path)]
     ended = subprocess.run(
-        [*command, "--kills", "8", "--power-cuts", "6"], capture_output=True, text=True, env=os.environ
+        [*command, "--kills", "4", "--power-cuts", "4"], capture_output=True, text=True, env=os.environ
     )
     assert ended.returncode == 0, ended.stdout + ended.stderr
     assert "| kill -9 | **all** |" in ended.stdout and "| power failure | **all** |" in ended.stdout
