@@ -19,7 +19,7 @@ from sigmasplat.io.frames import RunFrames
 from sigmasplat.io.json_files import append_line, read_json, read_lines, write_json, write_json_on_full_disk
 from sigmasplat.io.leftovers import remove_leftovers
 from sigmasplat.io.lock import LOCK, locked, no_warning
-from sigmasplat.io.run_values import FACTS, check_checkpoint, check_fields, check_log
+from sigmasplat.io.run_values import FACTS, check_checkpoint, check_fields, check_log, check_profile
 from sigmasplat.io.splats import ply
 from sigmasplat.io.submaps import DiskStore
 from sigmasplat.io.tensors import open_tensors, write_tensors
@@ -323,7 +323,7 @@ class RunFolder:
 
     def read_profile(self) -> dict[str, float]:
         """Read profile.json. Raises RunError if it is missing or damaged."""
-        return self._read_values("profile.json")
+        return check_profile(self._read_values("profile.json"), self.path / "profile.json")
 
     def read_metrics(self) -> dict[str, Any]:
         """Read metrics.json. Raises RunError if it is missing or damaged."""

@@ -47,6 +47,10 @@ class Bag:
     def __init__(self, path: Path) -> None:
         """Open the bag. Raises SourceError if the rosbags package is missing, or the file is damaged."""
         self.path, self._lock = path, threading.Lock()
+        for file in sorted(path.iterdir()) if path.is_dir() else [path]:
+            if not file.is_dir():
+                with open_regular(file):  # the reader would wait for ever for the writer of a pipe
+                    pass
         self.ros1 = path.is_file() and _magic(path).startswith(ROS1_MAGIC)
         reader = import_optional(
             "rosbags.rosbag1" if self.ros1 else "rosbags.rosbag2", "ros", f"{path}: a ROS bag"
