@@ -56,6 +56,16 @@ class InputConfig:
     """Smaller depth readings are ignored: below its range a sensor returns noise."""
     max_depth_m: float = 8.0
     """Larger depth readings are ignored: their errors grow with the square of the depth."""
+    stereo_disparities: int = 0
+    """Range of disparities that stereo matching searches, in pixels, rounded up to a multiple of 16. It limits the
+    smallest depth to f·b / range. 0 = an eighth of the image width."""
+    stereo_std_px: float = 0.3
+    """Standard deviation σ_d of the disparity in pixels. Stereo depth z has σ_z = z²·σ_d / (f·b)."""
+    stereo_max_std: float = 0.05
+    """Stereo depth is ignored where its standard deviation σ_z is larger than this share of it."""
+    scene_scale: float = 1.0
+    """Size of the scene relative to a room. Fixed limits in metres are multiplied by it. `run` sets it for stereo
+    recordings, together with all other settings that are lengths."""
     denoise_depth: bool = False
     """Whether depth images that are noisier than those of a structured-light sensor are smoothed."""
 
@@ -67,5 +77,10 @@ class InputConfig:
             )
         if self.hold_every < 0 or self.hold_every == 1:
             raise ConfigError(f"input.hold_every must be 0 or at least 2, found {self.hold_every}")
+        if not self.scene_scale > 0 or not self.stereo_std_px > 0:
+            raise ConfigError(
+                "input.scene_scale and input.stereo_std_px must be above 0, "
+                f"found {self.scene_scale:g} and {self.stereo_std_px:g}"
+            )
         if self.start_s < 0 or (self.end_s and self.end_s <= self.start_s):
             raise ConfigError(f"input.end_s must be after input.start_s, found {self.start_s:g} to {self.end_s:g} s")
