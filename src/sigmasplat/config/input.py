@@ -63,9 +63,6 @@ class InputConfig:
     """Standard deviation σ_d of the disparity in pixels. Stereo depth z has σ_z = z²·σ_d / (f·b)."""
     stereo_max_std: float = 0.05
     """Stereo depth is ignored where its standard deviation σ_z is larger than this share of it."""
-    scene_scale: float = 1.0
-    """Size of the scene relative to a room. Fixed limits in metres are multiplied by it. `run` sets it for stereo
-    recordings, together with all other settings that are lengths."""
     denoise_depth: bool = False
     """Whether depth images that are noisier than those of a structured-light sensor are smoothed."""
 
@@ -77,10 +74,7 @@ class InputConfig:
             )
         if self.hold_every < 0 or self.hold_every == 1:
             raise ConfigError(f"input.hold_every must be 0 or at least 2, found {self.hold_every}")
-        if not self.scene_scale > 0 or not self.stereo_std_px > 0:
-            raise ConfigError(
-                "input.scene_scale and input.stereo_std_px must be above 0, "
-                f"found {self.scene_scale:g} and {self.stereo_std_px:g}"
-            )
+        if self.stereo_std_px <= 0:
+            raise ConfigError(f"input.stereo_std_px must be above 0, found {self.stereo_std_px:g}")
         if self.start_s < 0 or (self.end_s and self.end_s <= self.start_s):
             raise ConfigError(f"input.end_s must be after input.start_s, found {self.start_s:g} to {self.end_s:g} s")

@@ -10,15 +10,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.fit.pyramid import HIDDEN_M, Pyramid
+from sigmasplat.fit.pyramid import HIDDEN_M, NOISE_PER_M, Pyramid
 from sigmasplat.types import Matrix
 
 LEVEL = 0
 """Pyramid level that is compared: coarser ones have no depth where the sensor is noisy."""
 STEP = 4
 """Every fourth row and column of that level is compared."""
-NOISE_RELATIVE, NOISE_M = 0.003, 0.002
-"""Standard deviation of a depth reading: a share of z² (Khoshelham & Elberink 2012) plus a constant."""
+NOISE_M = 0.002
+"""Standard deviation of a depth reading at a distance of 0; a share of z² is added (`Pyramid.noise_per_m`)."""
 CLOSE_SIGMA, CLOSE_M = 3.0, 0.02
 """Two surfaces are the same if they are closer than this many standard deviations plus a tolerance for the pose."""
 LEAST_PIXELS = 50
@@ -76,8 +76,9 @@ def compare(reference: Pyramid, live: Pyramid, T_live_reference: Matrix) -> Comp
     count, comparable = int(other.sum()), len(u) - int((hidden[top, left] & ~other).sum())
     if count < LEAST_PIXELS:
         return NOTHING
-    difference, noise = difference[other], (NOISE_RELATIVE * seen[other] ** 2 + NOISE_M) * noise_scale(live_depth)
-    limit = CLOSE_SIGMA * noise + CLOSE_M
+    difference, noise = difference[other], noise_m(seen[other], live.noise_per_m, live.scene_scale)
+    noise = noise * noise_scale(live_depth, live.noise_per_m, live.scene_scale)
+    limit = CLOSE_SIGMA * noise + CLOSE_M * live.scene_scale
     covered = min(1.0, count / max(int(np.count_nonzero(live_depth[::STEP, ::STEP])), 1))
     front = difference <= -limit
     close, behind = (float(np.mean(found)) for found in (np.abs(difference) < limit, difference >= limit))
@@ -91,7 +92,12 @@ def compare(reference: Pyramid, live: Pyramid, T_live_reference: Matrix) -> Comp
     return Comparison(common, close, before, behind, residual, correlation, count, covered)
 
 
-def noise_scale(depth: NDArray[np.float32]) -> float:
+def noise_m(depth_m: Matrix, noise_per_m: float = NOISE_PER_M, scene_scale: float = 1.0) -> Matrix:
+    """Return the standard deviation assumed for depth readings, metres; its constant grows with the scene."""
+    return np.asarray(noise_per_m * depth_m**2 + NOISE_M * scene_scale)
+
+
+def noise_scale(depth: NDArray[np.float32], noise_per_m: float = NOISE_PER_M, scene_scale: float = 1.0) -> float:
     """Return the factor, at least 1, by which a depth image [h, w] is noisier than assumed.
 
     It is measured by the difference of each reading from the mean of its two neighbours in the row. Without noise, this
@@ -103,7 +109,7 @@ def noise_scale(depth: NDArray[np.float32]) -> float:
     read = (left > 0) & (middle > 0) & (right > 0)
     if read.sum() < LEAST_PIXELS:
         return 1.0
-    noise = NOISE_RELATIVE * middle[read].astype(np.float64) ** 2 + NOISE_M
+    noise = noise_m(middle[read].astype(np.float64), noise_per_m, scene_scale)
     bend = np.abs(middle[read] - 0.5 * (left[read] + right[read])) / noise
     # For normal noise the bend has 1.22 standard deviations, and the median of its absolute value is 0.67 of these.
     return max(1.0, float(np.median(bend)) / (1.2247 * 0.6745))

@@ -26,7 +26,8 @@ class Source(ABC):
     depth_registered: whether the source itself moved depth to the colour camera; registrable: whether it could do so,
     because the depth camera is known;
     computed_depth: whether the source computes depth itself, from a stereo pair;
-    scene_scale: size of the scene relative to a room, above 1 outdoors (`config.scale.scaled`);
+    scene_scale: size of the scene relative to a room, above 1 outdoors; depth_noise_per_m: standard deviation
+    of depth, times z²; None if it is unknown (`config.scale.for_scene` uses both);
     live: whether frames come from a live camera: each only once, and their number is unknown (LiveSource);
     arrived_s: when the last frame arrived, by `time.perf_counter`, if frames do not wait for the consumer (Arrivals);
     dropped: number of frames that were dropped because the consumer was late.
@@ -40,6 +41,7 @@ class Source(ABC):
     registrable: bool = False
     computed_depth: bool = False
     scene_scale: float = 1.0
+    depth_noise_per_m: float | None = None
     live: bool = False
     arrived_s: float | None = None
     dropped: int = 0
@@ -147,6 +149,7 @@ class Subset(Source):
         self.depth_units_per_metre = whole.depth_units_per_metre
         self.depth_registered, self.registrable = whole.depth_registered, whole.registrable
         self.computed_depth, self.scene_scale = whole.computed_depth, whole.scene_scale
+        self.depth_noise_per_m = whole.depth_noise_per_m
         self._whole = whole
         self._indices = _within(whole, settings)[:: settings.stride][: settings.limit or None]
         if not len(self._indices):

@@ -66,8 +66,12 @@ class StereoPair(ImagePair):
 
     def read_depth(self, units_per_metre: float) -> NDArray[np.float32]:
         """Match both images: depth of the left one in metres [H, W]. Raises SourceError naming the file."""
+        return self.depth_and_std_m()[0]
+
+    def depth_and_std_m(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Match both images: depth of the left one and its standard deviation, m [H, W]. Raises SourceError."""
         right = self.rig.rectification.right(self._read(self.depth))
-        return self.rig.matcher.depth_m(self.read_color(), right)
+        return self.rig.matcher.depth_and_std_m(self.read_color(), right)
 
     def _read(self, path: Path) -> NDArray[np.uint8]:
         image, (width, height) = read_color(path), self.rig.size
@@ -102,17 +106,18 @@ class StereoSource(RecordedSource):
         rectification = StereoRectification.of(cameras)
         if rectification.baseline_m <= 0:
             raise SourceError(f"{name}: the second camera is not to the right of the first one; swap both")
-        self._matcher = StereoMatcher(rectification.camera, rectification.baseline_m, settings)
-        rig = StereoRig((cameras.left.width, cameras.left.height), rectification, self._matcher)
-        images = [StereoPair(*pair, rig) for pair in pairs]
+        matcher = StereoMatcher(rectification.camera, rectification.baseline_m, settings)
+        rig = StereoRig((cameras.left.width, cameras.left.height), rectification, matcher)
+        images = self._pairs = [StereoPair(*pair, rig) for pair in pairs]
         if truth is not None:
             truth = Trajectory(truth.timestamps_s, truth.T_world_camera @ rectification.T_left_rectified)
         super().__init__(name, images, Calibration(rectification.camera, 1.0), settings, truth, skipped)
+        self.depth_noise_per_m = matcher.noise_per_m
         self.scene_scale = scene_scale(self.depth_of, len(self))
 
     def depth_std_of(self, i: int) -> NDArray[np.float32]:
         """Return the standard deviation of the depth of frame i, m [H, W]; 0 without a reading."""
-        return self._matcher.std_m(self.depth_of(i))
+        return self._pairs[self._checked_index(i)].depth_and_std_m()[1]
 
 
 def open_stereo(folder: Path, settings: InputConfig) -> StereoSource:

@@ -41,7 +41,8 @@ class SyntheticRoom(Source):
     gain varies by ±8 % over the sequence; rooms: number of rooms, joined by doorways; overrun: how far the path
     continues past its start, percent of a round; drift: standard deviation of the depth calibration's slow drift
     (`room.sensor.drifted_depth`), tenths of a percent of the depth; test_views: number of exact views away from the
-    path (`SyntheticRoom.test_views`).
+    path (`SyntheticRoom.test_views`); stereo: if above 0, depth is computed from a stereo pair with this baseline in cm
+    instead of being exact (`right_image`).
 
     A path with loops to close: frames=720,rooms=2,overrun=20,noise=1,drift=6. A round of 600 frames is a slow pace. The
     way back looks in other directions than the way out, so drift accumulates over a whole round; the last 120 frames
@@ -70,7 +71,8 @@ class SyntheticRoom(Source):
         for key, value in counts.items():
             if value < 1:
                 raise SourceError(f"synthetic room: {key} must be at least 1, found {value}")
-        for key, value in {"seed": seed, "overrun": overrun, "drift": drift, "test_views": test_views, "stereo": stereo}.items():
+        others = {"seed": seed, "overrun": overrun, "drift": drift, "test_views": test_views, "stereo": stereo}
+        for key, value in others.items():
             if value < 0:
                 raise SourceError(f"synthetic room: {key} must be at least 0, found {value}")
         focal_px = FOCAL_PER_WIDTH * width
@@ -81,6 +83,7 @@ class SyntheticRoom(Source):
         self._test_views = test_views
         self.computed_depth, self._baseline_m = stereo > 0, stereo / 100
         self._matcher = StereoMatcher(camera, self._baseline_m, InputConfig()) if stereo else None
+        self.depth_noise_per_m = self._matcher.noise_per_m if self._matcher else None
         self._T_world_camera = camera_path(frames, loops, rooms, seed, overrun / 100)
 
     def __len__(self) -> int:
@@ -98,7 +101,7 @@ class SyntheticRoom(Source):
             color, depth_m = measured_color(color, rng), measured_depth(depth_m, self.camera, rng)
         bytes_ = np.rint(color * 255.0).astype(np.uint8)
         if self._matcher:
-            depth_m = self._matcher.depth_m(bytes_, self.right_image(i))
+            depth_m, _ = self._matcher.depth_and_std_m(bytes_, self.right_image(i))
         return Frame(i, self.timestamp_s(i), color_from_bytes(bytes_), depth_m, self.camera)
 
     def right_image(self, i: int) -> NDArray[np.uint8]:
@@ -115,7 +118,10 @@ class SyntheticRoom(Source):
 
     def depth_std_of(self, i: int) -> NDArray[np.float32] | None:
         """Return the standard deviation of stereo depth; None without `stereo`."""
-        return self._matcher.std_m(self.frame(i).depth_m) if self._matcher else None
+        if self._matcher is None:
+            return None
+        left = np.rint(self.frame(i).color * 255.0).astype(np.uint8)
+        return self._matcher.depth_and_std_m(left, self.right_image(i))[1]
 
     def timestamp_s(self, i: int) -> float:
         """Return the time of frame i, without rendering it."""

@@ -52,7 +52,8 @@ def read_stereo_cameras(path: Path, left: Calibration) -> StereoCameras:
         camera = read_camera(path, inner, (camera.width, camera.height))
         lens = read_distortion(path, inner)
     if "T_right_left" in fields:
-        return StereoCameras(left.camera, camera, read_rigid_transform(path, fields, "T_right_left"), left.distortion, lens)
+        T_right_left = read_rigid_transform(path, fields, "T_right_left")
+        return StereoCameras(left.camera, camera, T_right_left, left.distortion, lens)
     T_right_left = np.eye(4)
     T_right_left[0, 3] = -check_positive(path, "baseline_m", json_number(path, fields, "baseline_m"))
     return StereoCameras(left.camera, camera, T_right_left, left.distortion, lens)
