@@ -21,8 +21,8 @@ HUBER_GRAY = (0.02, 0.05, 0.1, 0.2)
 """Huber width of the gray residual per pyramid level, finest level first. It is wider on coarse levels because
 residuals are large far from the solution."""
 HUBER_DEPTH_RELATIVE = (0.003, 0.006, 0.012, 0.05)
-"""Huber width of the depth residual per level, times z² (m), for depth with `NOISE_PER_M`. The finest value is the noise of a structured-light sensor
-(Khoshelham & Elberink 2012)."""
+"""Huber width of the depth residual per level, times z² (m), for depth with `NOISE_PER_M`; it grows with the noise. The
+finest value is the noise of a structured-light sensor (Khoshelham & Elberink 2012)."""
 DEPTH_GATES_M = (0.1, 0.3, 0.8, 2.0)
 """Depth residuals above this limit are assumed to belong to other surfaces; finest level first."""
 MIN_PIXELS = 60

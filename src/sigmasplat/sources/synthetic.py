@@ -114,7 +114,7 @@ class SyntheticRoom(Source):
         color = np.clip(color * np.float32(self._gain(i)), 0.0, 1.0)
         if self._noise:
             color = measured_color(color, np.random.default_rng((self._seed, i, 9)))
-        return np.rint(color * 255.0).astype(np.uint8)
+        return np.asarray(np.rint(color * 255.0), np.uint8)
 
     def depth_std_of(self, i: int) -> NDArray[np.float32] | None:
         """Return the standard deviation of stereo depth; None without `stereo`."""

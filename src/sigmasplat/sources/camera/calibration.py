@@ -120,12 +120,8 @@ def read_calibration(path: Path, size: tuple[int, int], default_units_per_metre:
     if not isinstance(inner, dict):
         raise SourceError(f'{path}: field "depth_camera" is {inner!r}, expected an object with fx, fy, cx, cy')
     camera, lens = read_camera(path, inner, size), read_distortion(path, inner)
-    return replace(
-        calibration,
-        depth_camera=camera,
-        depth_distortion=lens,
-        T_color_depth=read_rigid_transform(path, fields, "T_color_depth"),
-    )
+    T_color_depth = read_rigid_transform(path, fields, "T_color_depth")
+    return replace(calibration, depth_camera=camera, depth_distortion=lens, T_color_depth=T_color_depth)
 
 
 def resolve_calibration(

@@ -32,7 +32,7 @@ SPECKLE_PX, SPECKLE_STEP_PX = 100, 1
 """Regions with fewer pixels are removed; within a region neighbours differ by at most this disparity."""
 SUBPIXELS = 16.0
 """OpenCV's unit of disparity, per pixel."""
-REACH_PX, MOST_BEND_PX = 2, 1.0
+REACH_PX, MOST_BEND_PX = 2, 0.6
 """Readings are removed where the disparity differs by more than `MOST_BEND_PX` from the mean of its neighbours at this
 distance, or next to such places: those are edges and wrong matches."""
 STD_LEAST, STD_TEXTURE, STD_BEND = 0.53, 1.17, 1.33
@@ -77,7 +77,7 @@ class StereoRectification:
         T_left_rectified = np.eye(4)
         T_left_rectified[:3, :3] = R_left.T
         baseline_m = float(-P_right[0, 3] / P_right[0, 0])
-        return cls(camera, baseline_m, se3.orthonormalise(T_left_rectified), maps)  # type: ignore[arg-type]
+        return cls(camera, baseline_m, se3.orthonormalise(T_left_rectified), maps)
 
     def left(self, image: Bytes) -> Bytes:
         """Rectify the left image, uint8 [H, W] or [H, W, 3]."""
