@@ -10,8 +10,8 @@ from layouts import save, save_text, tum_line
 from sigmasplat.checks.recording import inspect_source
 from sigmasplat.config.scale import for_scene, scaled
 from sigmasplat.errors import SourceError
+from sigmasplat.opencv import opencv
 from sigmasplat.presets import preset
-from sigmasplat.slam.features.opencv import opencv
 from sigmasplat.sources import open_source
 from sigmasplat.sources.camera.stereo import StereoRectification
 from sigmasplat.sources.camera.stereo_cameras import StereoCameras

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from sigmasplat.config import InputConfig
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
-from sigmasplat.slam.features.opencv import opencv
+from sigmasplat.opencv import opencv
 from sigmasplat.sources.camera.stereo_cameras import StereoCameras
 from sigmasplat.types import Matrix
 
@@ -65,7 +65,7 @@ class StereoRectification:
         cv2, size = opencv(), (cameras.left.width, cameras.left.height)
         inner = [(_matrix(cameras.left), np.array(cameras.left_distortion or (0.0,) * 5))]
         inner += [(_matrix(cameras.right), np.array(cameras.right_distortion or (0.0,) * 5))]
-        R, t = cameras.T_right_left[:3, :3], cameras.T_right_left[:3, 3]
+        R, t = cameras.T_right_left[:3, :3].copy(), cameras.T_right_left[:3, 3:].copy()
         R_left, R_right, P_left, P_right, *_ = cv2.stereoRectify(
             *inner[0], *inner[1], size, R, t, flags=cv2.CALIB_ZERO_DISPARITY, alpha=0
         )
