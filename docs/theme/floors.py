@@ -31,7 +31,7 @@ class Floor:
 
 
 FLOORS = (
-    Floor(("errors", "env", "types", "opencv"), "base", "errors, environment, shared types"),
+    Floor(("errors", "env", "types"), "base", "errors, environment, shared types"),
     Floor(("config",), "base", "every setting, with units"),
     Floor(("presets",), "base", "values of the published systems"),
     Floor(("native",), "base", "C++ and CUDA kernels"),

@@ -10,7 +10,7 @@ from layouts import save, save_text, tum_line
 from sigmasplat.checks.recording import inspect_source
 from sigmasplat.config.scale import for_scene, scaled
 from sigmasplat.errors import SourceError
-from sigmasplat.opencv import opencv
+from sigmasplat.model.opencv import opencv
 from sigmasplat.presets import preset
 from sigmasplat.sources import open_source
 from sigmasplat.sources.camera.stereo import StereoRectification
@@ -70,7 +70,7 @@ def test_depth_of_every_layout_is_that_of_the_left_image(layout, tmp_path):
     depth_m, exact_m = source.frame(1).depth_m, ROOM.exact_depth_of(1)
     read = depth_m > 0
     assert len(source) == 2 and source.timestamp_s(1) == pytest.approx(0.1)
-    assert read.mean() > 0.4 and source.computed_depth
+    assert read.mean() > 0.3 and source.computed_depth
     assert np.median(np.abs(depth_m - exact_m)[read] / exact_m[read]) < 0.03
     if layout is not euroc:
         np.testing.assert_allclose(source.truth().T_world_camera, ROOM.truth().T_world_camera[:2], atol=1e-5)

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from sigmasplat.config.features import FeatureConfig
 from sigmasplat.model.camera import Camera
-from sigmasplat.opencv import opencv
+from sigmasplat.model.opencv import opencv
 from sigmasplat.slam.features.base import Features, Gray, Pairs, matched_by_distance, no_features, reduced, rounded
 
 SIFT_CONTRAST = 0.02

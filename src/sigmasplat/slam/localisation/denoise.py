@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from sigmasplat.fit.compare import noise_scale
 from sigmasplat.fit.pyramid import NOISE_PER_M
-from sigmasplat.opencv import opencv
+from sigmasplat.model.opencv import opencv
 
 DIAMETER_PX = 5
 """Each reading becomes the weighted mean of the readings in a window of this width."""

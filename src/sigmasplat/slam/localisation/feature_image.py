@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.frame import Detail, Frame
-from sigmasplat.opencv import opencv
+from sigmasplat.model.opencv import opencv
 from sigmasplat.slam.features import (
     Extractor,
     Features,

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from sigmasplat.config import InputConfig
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
-from sigmasplat.opencv import opencv
+from sigmasplat.model.opencv import opencv
 from sigmasplat.sources.camera.stereo_cameras import StereoCameras
 from sigmasplat.types import Matrix
 
