@@ -36,10 +36,10 @@ from sigmasplat.fit.gray import gray_of
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.frame import Frame
+from sigmasplat.model.opencv import opencv
 from sigmasplat.presets import default_preset, preset as preset_of
 from sigmasplat.slam.features import depth_readings, landmarks_of, make_extractor, pose_from_landmarks
 from sigmasplat.slam.features.base import Features, Pairs, matched_by_distance
-from sigmasplat.slam.features.opencv import opencv
 from sigmasplat.sources import open_source
 from sigmasplat.sources.base import Source
 

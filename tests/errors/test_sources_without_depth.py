@@ -75,7 +75,6 @@ def euroc(folder: Path) -> None:
 def kitti(folder: Path) -> None:
     for camera in ("image_2", "image_3"):
         save(folder / camera / "000000.png", COLOR)
-    write(folder / "calib.txt")
 
 
 def left_and_right(folder: Path) -> None:

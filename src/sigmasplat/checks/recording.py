@@ -52,7 +52,7 @@ def inspect_source(path: str | Path, settings: InputConfig, samples: int = SAMPL
     frames = _sampled(source, samples)
     if not frames:
         raise SourceError(f"{source.name}: none of {samples} sampled frames can be read; check the image files")
-    agreement = edge_agreement(frames)
+    agreement = None if source.computed_depth else edge_agreement(frames)  # stereo depth has the left image's pixels
     times_s = times_of(source)
     first = max(0, (len(source) - CONSECUTIVE) // 2)
     warnings = [
@@ -136,7 +136,8 @@ def _depth_rows(source: Source, frames: list[Frame], settings: InputConfig) -> l
     if not len(readings):
         return [("depth", "no depth reading in the sampled frames")]
     low, middle, high = np.percentile(readings, (1, 50, 99))
-    used = ((readings >= settings.min_depth_m) & (readings <= settings.max_depth_m)).mean()
+    scale = source.scene_scale
+    used = ((readings >= settings.min_depth_m * scale) & (readings <= settings.max_depth_m * scale)).mean()
     return [
         ("depth unit", f"{units:g} per metre" if units else "metres"),
         ("depth", f"{low:.2f} to {high:.2f} m, median {middle:.2f} m; {used:.0%} within the limits of the run"),
@@ -176,10 +177,11 @@ def _depth_warnings(source: Source, frames: list[Frame], settings: InputConfig) 
     warnings = _warnings_of_one(depth_warning(source))
     if _holes(frames) > MANY_HOLES:
         warnings.append(f"{_holes(frames):.0%} of the pixels have no depth; the map will have holes")
-    beyond = np.mean([(frame.depth_m > settings.max_depth_m).mean() for frame in frames])
+    max_depth_m = settings.max_depth_m * source.scene_scale
+    beyond = np.mean([(frame.depth_m > max_depth_m).mean() for frame in frames])
     if beyond > 0.2:
         warnings.append(
-            f"{beyond:.0%} of the pixels are beyond {settings.max_depth_m:g} m and are not used; "
+            f"{beyond:.0%} of the pixels are beyond {max_depth_m:g} m and are not used; "
             "to use them: --set input.max_depth_m=METRES"
         )
     return warnings

@@ -20,7 +20,8 @@ from sigmasplat.commands.robot_output import (
     robot_output,
 )
 from sigmasplat.commands.view import keep_showing, serve_viewer
-from sigmasplat.config.text import full_path
+from sigmasplat.config.scale import for_scene
+from sigmasplat.config.text import full_path, override, split_settings
 from sigmasplat.errors import ConfigError
 from sigmasplat.presets import default_preset
 
@@ -104,6 +105,10 @@ def run(
     if earlier:
         earlier.refuse_other_size(config)
     source, config = _opened(screen, path, config, record)
+    if not earlier:  # values that the user gives are used as they are
+        config = override(for_scene(config, source.scene_scale, source.depth_noise_per_m), split_settings(settings))
+        if source.scene_scale != 1.0:
+            screen.say(f"{source.name}: settings in metres are multiplied by {source.scene_scale:g}, the scene's scale")
     with (
         _viewer(screen, run_options) as viewer,
         new_run(out, config, source, overwrite, onto, screen.warn, source_path=full_path(path)) as folder,

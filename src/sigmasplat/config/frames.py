@@ -26,6 +26,12 @@ class RenderConfig(Section, name="render"):
     """Scale s of the median gate, in metres; 0 = off (papers). In the rendered depth a splat at a distance δ behind the
     median depth counts as at δ·exp(−(δ/s)²) behind it, so that splats far behind the surface do not change the depth
     (GauS-SLAM). Not supported on CUDA."""
+    scene_scale: Above0 = 1.0
+    """Size of the scene relative to a room. Fixed limits in metres, such as the gates of alignment, are multiplied by
+    it. `run` sets it for stereo recordings, together with all settings that are lengths (`config.scale.scaled`)."""
+    depth_noise_per_m: Above0 = 0.003
+    """Standard deviation of depth readings z is assumed to be this times z², per metre. 0.003 is a structured-light
+    sensor (Khoshelham & Elberink 2012). `run` sets σ_d/(f·b) for stereo recordings."""
     covariance_pose_gradient: bool = True
     """Whether the pose gradient includes the path through the 2D covariance."""
     mean_pose_gradient: bool = True

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from sigmasplat.errors import BackendError
 from sigmasplat.fit.interface import AlignRules, ImageKernels, LevelPlanes
-from sigmasplat.fit.pyramid import LEVELS, Pyramid
+from sigmasplat.fit.pyramid import LEVELS, NOISE_PER_M, Pyramid
 from sigmasplat.model import se3
 from sigmasplat.types import Matrix
 
@@ -21,8 +21,8 @@ HUBER_GRAY = (0.02, 0.05, 0.1, 0.2)
 """Huber width of the gray residual per pyramid level, finest level first. It is wider on coarse levels because
 residuals are large far from the solution."""
 HUBER_DEPTH_RELATIVE = (0.003, 0.006, 0.012, 0.05)
-"""Huber width of the depth residual per level, times z² (m). The finest value is the noise of a structured-light sensor
-(Khoshelham & Elberink 2012)."""
+"""Huber width of the depth residual per level, times z² (m), for depth with `NOISE_PER_M`; it grows with the noise. The
+finest value is the noise of a structured-light sensor (Khoshelham & Elberink 2012)."""
 DEPTH_GATES_M = (0.1, 0.3, 0.8, 2.0)
 """Depth residuals above this limit are assumed to belong to other surfaces; finest level first."""
 MIN_PIXELS = 60
@@ -75,7 +75,9 @@ class Alignment:
         basis, unknown = directions[:, decided], directions[:, ~decided]
         slope = basis.T @ _slope(around, steps) @ basis
         bread = basis @ np.linalg.inv(slope) @ basis.T
-        return np.asarray(bread @ n.S @ bread.T + UNKNOWN_M**2 * unknown @ unknown.T)
+        return np.asarray(
+            bread @ n.S @ bread.T + (UNKNOWN_M * self.pair.reference.scene_scale) ** 2 * unknown @ unknown.T
+        )
 
     @property
     def bias(self) -> Matrix:
@@ -101,9 +103,9 @@ class Pair:
     def level(self, k: int) -> LevelPlanes:
         """Return one pyramid level of both images in the layout of the kernels."""
         r, live, width = self.reference, self.live, min(k, LEVELS - 1)
-        c = r.cameras[k]
+        c, scale, noise = r.cameras[k], r.scene_scale, live.noise_per_m / NOISE_PER_M
         options = [self.weight_color, 1.0 - self.weight_color]
-        options += [HUBER_GRAY[width], HUBER_DEPTH_RELATIVE[width], DEPTH_GATES_M[width]]
+        options += [HUBER_GRAY[width], HUBER_DEPTH_RELATIVE[width] * noise, DEPTH_GATES_M[width] * scale]
         return LevelPlanes(
             r.gray[k], r.depth[k], r.weight[k], r.weight_depth[k], live.gray[k], live.depth[k],
             [c.fx, c.fy, c.cx, c.cy], options,

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.fit.pyramid import HIDDEN_M, Pyramid
+from sigmasplat.fit.pyramid import HIDDEN_M, NOISE_PER_M, Pyramid
 from sigmasplat.native import kernels
 from sigmasplat.types import Matrix
 
@@ -18,8 +18,8 @@ LEVEL = 0
 """Pyramid level that is compared: coarser ones have no depth where the sensor is noisy."""
 STEP = 4
 """Every fourth row and column of that level is compared."""
-NOISE_RELATIVE, NOISE_M = 0.003, 0.002
-"""Standard deviation of a depth reading: a share of z² (Khoshelham & Elberink 2012) plus a constant."""
+NOISE_M = 0.002
+"""Standard deviation of a depth reading at a distance of 0; a share of z² is added (`Pyramid.noise_per_m`)."""
 CLOSE_SIGMA, CLOSE_M = 3.0, 0.02
 """Two surfaces are the same if they are closer than this many standard deviations plus a tolerance for the pose."""
 LEAST_PIXELS = 50
@@ -62,7 +62,9 @@ def compare(reference: Pyramid, live: Pyramid, T_live_reference: Matrix) -> Comp
     host, c, found = reference.kernels.to_host, reference.cameras[level], np.empty(8)
     images = [host(plane[level]) for plane in (reference.depth, reference.gray, live.depth, live.gray)]
     T = np.ascontiguousarray(T_live_reference, np.float64)
-    if not core.compare(*images, [c.fx, c.fy, c.cx, c.cy], T, _rules(HIDDEN_M), found):
+    if not core.compare(
+        *images, [c.fx, c.fy, c.cx, c.cy], T, _rules(HIDDEN_M, live.noise_per_m, live.scene_scale), found
+    ):
         return NOTHING
     common, close, front, behind, residual, correlation, points, covered = found.tolist()
     return Comparison(common, close, front, behind, residual, correlation, int(points), covered)
@@ -92,11 +94,9 @@ def compare_in_numpy(reference: Pyramid, live: Pyramid, T_live_reference: Matrix
     count, comparable = int(other.sum()), len(u) - int((hidden[top, left] & ~other).sum())
     if count < LEAST_PIXELS:
         return NOTHING
-    difference, noise = (
-        difference[other],
-        (NOISE_RELATIVE * seen[other] ** 2 + NOISE_M) * noise_scale_in_numpy(live_depth),
-    )
-    limit = CLOSE_SIGMA * noise + CLOSE_M
+    difference, noise = difference[other], noise_m(seen[other], live.noise_per_m, live.scene_scale)
+    noise = noise * noise_scale_in_numpy(live_depth, live.noise_per_m, live.scene_scale)
+    limit = CLOSE_SIGMA * noise + CLOSE_M * live.scene_scale
     covered = min(1.0, count / max(int(np.count_nonzero(live_depth[::STEP, ::STEP])), 1))
     front = difference <= -limit
     close, behind = (float(np.mean(found)) for found in (np.abs(difference) < limit, difference >= limit))
@@ -110,7 +110,12 @@ def compare_in_numpy(reference: Pyramid, live: Pyramid, T_live_reference: Matrix
     return Comparison(common, close, before, behind, residual, correlation, count, covered)
 
 
-def noise_scale(depth: NDArray[np.float32]) -> float:
+def noise_m(depth_m: Matrix, noise_per_m: float = NOISE_PER_M, scene_scale: float = 1.0) -> Matrix:
+    """Return the standard deviation assumed for depth readings, metres; its constant grows with the scene."""
+    return np.asarray(noise_per_m * depth_m**2 + NOISE_M * scene_scale)
+
+
+def noise_scale(depth: NDArray[np.float32], noise_per_m: float = NOISE_PER_M, scene_scale: float = 1.0) -> float:
     """Return the factor, at least 1, by which a depth image [h, w] is noisier than assumed.
 
     It is measured by the difference of each reading from the mean of its two neighbours in the row. Without noise, this
@@ -118,12 +123,14 @@ def noise_scale(depth: NDArray[np.float32]) -> float:
     """
     core = kernels()
     if core is None:
-        return noise_scale_in_numpy(depth)
-    scale: float = core.noise_scale(np.ascontiguousarray(depth), _rules(float("inf")))
+        return noise_scale_in_numpy(depth, noise_per_m, scene_scale)
+    scale: float = core.noise_scale(np.ascontiguousarray(depth), _rules(float("inf"), noise_per_m, scene_scale))
     return scale
 
 
-def noise_scale_in_numpy(depth: NDArray[np.float32]) -> float:
+def noise_scale_in_numpy(
+    depth: NDArray[np.float32], noise_per_m: float = NOISE_PER_M, scene_scale: float = 1.0
+) -> float:
     """Return the same value as `noise_scale`, also where the kernels are not built."""
     rows = depth[::STEP]
     width = (rows.shape[1] - 2) // STEP * STEP
@@ -131,15 +138,16 @@ def noise_scale_in_numpy(depth: NDArray[np.float32]) -> float:
     read = (left > 0) & (middle > 0) & (right > 0)
     if read.sum() < LEAST_PIXELS:
         return 1.0
-    noise = NOISE_RELATIVE * middle[read].astype(np.float64) ** 2 + NOISE_M
+    noise = noise_m(middle[read].astype(np.float64), noise_per_m, scene_scale)
     bend = np.abs(middle[read] - 0.5 * (left[read] + right[read])) / noise
     # For normal noise the bend has 1.22 standard deviations, and the median of its absolute value is 0.67 of these.
     return max(1.0, float(np.median(bend)) / (1.2247 * 0.6745))
 
 
-def _rules(hidden_m: float) -> list[float]:
+def _rules(hidden_m: float, noise_per_m: float, scene_scale: float) -> list[float]:
     """Return the constants of a comparison in the order of the kernels; readings from hidden_m on are left out."""
-    return [STEP, LEAST_PIXELS, NOISE_RELATIVE, NOISE_M, CLOSE_SIGMA, CLOSE_M, FLAT, hidden_m]
+    metres = NOISE_M * scene_scale, CLOSE_M * scene_scale
+    return [STEP, LEAST_PIXELS, noise_per_m, metres[0], CLOSE_SIGMA, metres[1], FLAT, hidden_m]
 
 
 def _nearest_surface(

@@ -1,6 +1,6 @@
 """Make image pyramids for coarse-to-fine alignment."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -9,6 +9,8 @@ from sigmasplat.fit.interface import ImageKernels, Plane
 from sigmasplat.model.camera import Camera
 
 LEVELS = 4
+NOISE_PER_M = 0.003
+"""Standard deviation of the depth readings of a structured-light sensor, times z² (Khoshelham & Elberink 2012)."""
 HIDDEN_M = 1000.0
 """Depth of live pixels where something in front hides the scene. Alignment takes them for another surface at every
 level, and uses neither their depth nor their colour."""
@@ -19,6 +21,8 @@ class Pyramid:
     """Gray in [0, 1] and depth in metres (0 = none) at halving sizes, finest first; weights of both; cameras.
 
     backend: its image kernels halve and align the planes. Only the planes of CUDA are not in host memory.
+    scene_scale: size of the scene relative to a room (`render.scene_scale`); noise_per_m: standard deviation of depth
+    readings, times z² (`render.depth_noise_per_m`).
     """
 
     gray: list[Plane]
@@ -27,6 +31,8 @@ class Pyramid:
     weight_depth: list[Plane | None]
     cameras: list[Camera]
     backend: str = "cpu"
+    scene_scale: float = 1.0
+    noise_per_m: float = NOISE_PER_M
 
     @property
     def kernels(self) -> ImageKernels:
@@ -49,7 +55,7 @@ class Pyramid:
             gray_weights.append(on_gray)
             depth_weights.append(on_depth)
         own = gray_weights if weight_depth is None else depth_weights
-        return Pyramid(self.gray, self.depth, gray_weights, own, self.cameras, self.backend)
+        return replace(self, weight=gray_weights, weight_depth=own)
 
     @staticmethod
     def of(
@@ -59,9 +65,11 @@ class Pyramid:
         weight: Plane | None = None,
         levels: int = LEVELS,
         backend: str = "cpu",
+        scene_scale: float = 1.0,
+        noise_per_m: float = NOISE_PER_M,
     ) -> "Pyramid":
         """Build a pyramid of at most `levels` sizes from gray [H, W], depth [H, W] and an optional weight [H, W]."""
-        p = Pyramid([], [], [None], [None], [camera], backend)
+        p = Pyramid([], [], [None], [None], [camera], backend, scene_scale, noise_per_m)
         p.gray.append(p.kernels.contiguous(gray))
         p.depth.append(p.kernels.contiguous(depth_m))
         for _ in range(levels - 1):

@@ -8,6 +8,7 @@ from sigmasplat.config import TrackingConfig
 from sigmasplat.fit.backends import fits_of
 from sigmasplat.fit.compare import Comparison, compare
 from sigmasplat.fit.gray import Image
+from sigmasplat.fit.interface import Plane
 from sigmasplat.fit.predicted_variance import predicted_at, use_predicted_depth_variance, use_predicted_variance
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.target import Target
@@ -40,7 +41,15 @@ class Reference:
 def live_image(view: View, color: Image, depth_m: Image, target: Target) -> Pyramid:
     """Make the pyramid of a camera image, colour [H, W, 3] and depth [H, W] m, on the device that aligns it."""
     gray, depth = fits_of(view).live_planes(view, color, depth_m, target)
-    return Pyramid.of(gray, depth, target.camera, backend=view.backend)
+    return _pyramid(view, gray, depth, target.camera)
+
+
+def _pyramid(view: View, gray: Plane, depth: Plane, camera: Camera) -> Pyramid:
+    """Build a pyramid on the device of a view, with its assumptions on scene and sensor."""
+    o = view.options
+    return Pyramid.of(
+        gray, depth, camera, backend=view.backend, scene_scale=o.scene_scale, noise_per_m=o.depth_noise_per_m
+    )
 
 
 def picture_images(view: View, picture: Picture, camera: Camera) -> tuple[Target, Pyramid]:
@@ -68,7 +77,7 @@ def map_reference(
     if config.align_depth_by == "U":
         _render(view, params, T_camera_world, fits.images.as_tensor(maps.depth), background)
         maps = fits.reference_maps(view, config, view.moment)
-    image = Pyramid.of(maps.gray, maps.depth, view.camera, backend=view.backend)
+    image = _pyramid(view, maps.gray, maps.depth, view.camera)
     return Reference(image.weighed(*maps.weights), T_camera_world)
 
 

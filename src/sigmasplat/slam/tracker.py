@@ -279,10 +279,10 @@ class Tracker:
 
     def _leaps(self, fit: PoseFit, predicted: Matrix) -> bool:
         """Return whether a verified pose is so far from the predicted one that the camera cannot have moved there."""
-        if fit.comparison is None or self.lost:
+        if fit.comparison is None or self.lost or self.keyframe is None:
             return False
         apart = se3.inverse(fit.T_camera_world)[:3, 3] - predicted[:3, 3]
-        return self.usual.is_leap(float(np.linalg.norm(apart)))
+        return self.usual.is_leap(float(np.linalg.norm(apart)), self.keyframe.pyramid.scene_scale)
 
     def _doubts(self, fit: PoseFit) -> bool:
         if fit.comparison is not None:

@@ -26,6 +26,9 @@ class Source(ABC):
     depth_units_per_metre: divisor of whole-number depth, None if depth is stored in metres;
     depth_registered: whether the source itself moved depth to the colour camera; registrable: whether it could do so,
     because the depth camera is known;
+    computed_depth: whether the source computes depth itself, from a stereo pair;
+    scene_scale: size of the scene relative to a room, above 1 outdoors; depth_noise_per_m: standard deviation
+    of depth, times z²; None if it is unknown (`config.scale.for_scene` uses both);
     live: whether frames come from a live camera: each only once, and their number is unknown (LiveSource);
     arrived_s: when the last frame arrived, by `time.perf_counter`, if frames do not wait for the consumer (Arrivals);
     dropped: number of frames that were dropped because the consumer was late.
@@ -37,6 +40,9 @@ class Source(ABC):
     depth_units_per_metre: float | None = None
     depth_registered: bool = False
     registrable: bool = False
+    computed_depth: bool = False
+    scene_scale: float = 1.0
+    depth_noise_per_m: float | None = None
     live: bool = False
     arrived_s: float | None = None
     dropped: int = 0
@@ -65,6 +71,11 @@ class Source(ABC):
 
     def exact_depth_of(self, i: int) -> NDArray[np.float32] | None:
         """Return the exact depth of frame i, m [H, W], 0 where there is no surface; None if it is unknown."""
+        return None
+
+    def depth_std_of(self, i: int) -> NDArray[np.float32] | None:
+        """Return the standard deviation of the depth of frame i, m [H, W], 0 without a reading; None if it is
+        unknown."""
         return None
 
     @abstractmethod
@@ -139,6 +150,8 @@ class Subset(Source):
         self.skipped = whole.skipped
         self.depth_units_per_metre = whole.depth_units_per_metre
         self.depth_registered, self.registrable = whole.depth_registered, whole.registrable
+        self.computed_depth, self.scene_scale = whole.computed_depth, whole.scene_scale
+        self.depth_noise_per_m = whole.depth_noise_per_m
         self._whole = whole
         self._indices = _within(whole, settings)[:: settings.stride][: settings.limit or None]
         if not len(self._indices):
@@ -165,6 +178,10 @@ class Subset(Source):
     def exact_depth_of(self, i: int) -> NDArray[np.float32] | None:
         """Return the exact depth of the i-th selected frame, None if it is unknown."""
         return self._whole.exact_depth_of(self._indices[self._checked_index(i)])
+
+    def depth_std_of(self, i: int) -> NDArray[np.float32] | None:
+        """Return the standard deviation of the depth of the i-th selected frame, None if it is unknown."""
+        return self._whole.depth_std_of(self._indices[self._checked_index(i)])
 
     def truth(self) -> Trajectory | None:
         """Return the ground-truth path of the whole source; it has its own timestamps."""

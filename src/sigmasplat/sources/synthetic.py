@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
@@ -13,6 +14,7 @@ from sigmasplat.model.frame_arrays import color_from_bytes
 from sigmasplat.model.mesh import Mesh
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.sources.base import Source
+from sigmasplat.sources.camera.stereo import StereoMatcher
 from sigmasplat.sources.opening import Format
 from sigmasplat.sources.room.furnish import furnish_rooms
 from sigmasplat.sources.room.render import RoomScene, build_scene, render_scene
@@ -39,7 +41,8 @@ class SyntheticRoom(Source):
     gain varies by ±8 % over the sequence; rooms: number of rooms, joined by doorways; overrun: how far the path
     continues past its start, percent of a round; drift: standard deviation of the depth calibration's slow drift
     (`room.sensor.drifted_depth`), tenths of a percent of the depth; test_views: number of exact views away from the
-    path (`SyntheticRoom.test_views`).
+    path (`SyntheticRoom.test_views`); stereo: if above 0, depth is computed from a stereo pair with this baseline in cm
+    instead of being exact (`right_image`).
 
     A path with loops to close: frames=720,rooms=2,overrun=20,noise=1,drift=6. A round of 600 frames is a slow pace. The
     way back looks in other directions than the way out, so drift accumulates over a whole round; the last 120 frames
@@ -61,13 +64,15 @@ class SyntheticRoom(Source):
         overrun: int = 0,
         drift: int = 0,
         test_views: int = 0,
+        stereo: int = 0,
     ) -> None:
         """Compute the camera path, no image yet. Raises SourceError unless counts and sizes are ≥ 1, the rest ≥ 0."""
         counts = {"frames": frames, "width": width, "height": height, "loops": loops, "rooms": rooms}
         for key, value in counts.items():
             if value < 1:
                 raise SourceError(f"synthetic room: {key} must be at least 1, found {value}")
-        for key, value in {"seed": seed, "overrun": overrun, "drift": drift, "test_views": test_views}.items():
+        others = {"seed": seed, "overrun": overrun, "drift": drift, "test_views": test_views, "stereo": stereo}
+        for key, value in others.items():
             if value < 0:
                 raise SourceError(f"synthetic room: {key} must be at least 0, found {value}")
         focal_px = FOCAL_PER_WIDTH * width
@@ -76,6 +81,9 @@ class SyntheticRoom(Source):
         self._seed, self._noise, self._rooms = seed, noise, rooms
         self._exposure_change, self._drift = exposure_change, drift / 1000
         self._test_views = test_views
+        self.computed_depth, self._baseline_m = stereo > 0, stereo / 100
+        self._matcher = StereoMatcher(camera, self._baseline_m, InputConfig()) if stereo else None
+        self.depth_noise_per_m = self._matcher.noise_per_m if self._matcher else None
         self._T_world_camera = camera_path(frames, loops, rooms, seed, overrun / 100)
 
     def __len__(self) -> int:
@@ -92,7 +100,28 @@ class SyntheticRoom(Source):
             rng = np.random.default_rng((self._seed, i, 7))
             color, depth_m = measured_color(color, rng), measured_depth(depth_m, self.camera, rng)
         bytes_ = np.rint(color * 255.0).astype(np.uint8)
+        if self._matcher:
+            depth_m, _ = self._matcher.depth_and_std_m(bytes_, self.right_image(i))
         return Frame(i, self.timestamp_s(i), color_from_bytes(bytes_), depth_m, self.camera)
+
+    def right_image(self, i: int) -> NDArray[np.uint8]:
+        """Render the right image of frame i of the stereo pair, RGB [H, W, 3]: the baseline to the right of the left
+        one, with the same exposure."""
+        T_left_right = np.eye(4)
+        T_left_right[0, 3] = self._baseline_m
+        T_world_right = self._T_world_camera[self._checked_index(i)] @ T_left_right
+        color = render_scene(build_scene(self._rooms, self._seed), self.camera, T_world_right)[0]
+        color = np.clip(color * np.float32(self._gain(i)), 0.0, 1.0)
+        if self._noise:
+            color = measured_color(color, np.random.default_rng((self._seed, i, 9)))
+        return np.asarray(np.rint(color * 255.0), np.uint8)
+
+    def depth_std_of(self, i: int) -> NDArray[np.float32] | None:
+        """Return the standard deviation of stereo depth; None without `stereo`."""
+        if self._matcher is None:
+            return None
+        left = np.rint(self.frame(i).color * 255.0).astype(np.uint8)
+        return self._matcher.depth_and_std_m(left, self.right_image(i))[1]
 
     def timestamp_s(self, i: int) -> float:
         """Return the time of frame i, without rendering it."""
@@ -190,6 +219,7 @@ def open_synthetic(text: str) -> SyntheticRoom:
 
 _OPTIONS = (
     "frames", "width", "height", "seed", "noise", "loops", "exposure_change", "rooms", "overrun", "drift", "test_views",
+    "stereo",
 )  # fmt: skip
 
 FORMAT = Format(

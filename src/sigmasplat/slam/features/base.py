@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from sigmasplat.config.features import FeatureConfig
 from sigmasplat.model.camera import Camera
-from sigmasplat.slam.features.opencv import opencv
+from sigmasplat.model.opencv import opencv
 
 Gray = NDArray[np.uint8]
 Pairs = NDArray[np.intp]

@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 from sigmasplat.config.features import FeatureConfig
 from sigmasplat.model import se3
+from sigmasplat.model.opencv import opencv
 from sigmasplat.slam.features.base import Features
 from sigmasplat.slam.features.landmarks import Landmarks, depth_sigma_m
-from sigmasplat.slam.features.opencv import opencv
 from sigmasplat.types import Matrix
 
 LEAST_INLIERS = 8

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from sigmasplat.config.features import FeatureConfig
 from sigmasplat.model.camera import Camera
+from sigmasplat.model.opencv import opencv
 from sigmasplat.slam.features.base import Features, Gray, Pairs, matched_by_distance, no_features, reduced, rounded
-from sigmasplat.slam.features.opencv import opencv
 
 SIFT_CONTRAST = 0.02
 """Half of OpenCV's contrast threshold: indoor walls have weak texture."""

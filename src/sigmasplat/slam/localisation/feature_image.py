@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.frame import Detail, Frame
+from sigmasplat.model.opencv import opencv
 from sigmasplat.slam.features import (
     Extractor,
     Features,
@@ -17,7 +18,6 @@ from sigmasplat.slam.features import (
     landmarks_of,
     pose_from_landmarks,
 )
-from sigmasplat.slam.features.opencv import opencv
 
 
 def detail_of(frame: Frame, width: int) -> Detail:

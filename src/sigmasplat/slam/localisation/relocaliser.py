@@ -125,7 +125,8 @@ class Relocaliser:
         candidates = self._candidates(wanted, seen)
         best: dict[bool, Relocation] = {}
         for tried in (pose for where in candidates for pose in self._poses(known, view, seen, where)):
-            verdict = recognised(tried.comparison, tried.inliers) and tried.position_m <= MOST_SPREAD_M
+            spread_m = MOST_SPREAD_M * view.options.scene_scale
+            verdict = recognised(tried.comparison, tried.inliers) and tried.position_m <= spread_m
             if verdict not in best or tried.score > best[verdict].score:
                 best[verdict] = tried
             if verdict and tried.score > ENOUGH:

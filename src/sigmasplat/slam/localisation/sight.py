@@ -91,7 +91,10 @@ def working_frame(frame: Frame, config: Config, camera: Camera | None = None) ->
     working = frame.prepared(i.width, i.min_depth_m, i.max_depth_m, i.crop_px)
     if camera is not None and working.camera != camera:
         working = frame.seen_by(camera).prepared(0, i.min_depth_m, i.max_depth_m)
-    depth_m = denoised(working.depth_m) if i.denoise_depth else working.depth_m
+    if not i.denoise_depth:
+        return working
+    r = config.render
+    depth_m = denoised(working.depth_m, r.depth_noise_per_m, r.scene_scale)
     return working if depth_m is working.depth_m else replace(working, depth_m=depth_m)
 
 

@@ -132,9 +132,9 @@ class Usual:
         """Return the usual median depth difference, in standard deviations of a reading; NaN if it is not known."""
         return _median(self.residuals, float("nan"))
 
-    def is_leap(self, apart_m: float) -> bool:
+    def is_leap(self, apart_m: float, scene_scale: float = 1.0) -> bool:
         """Return whether a camera that has moved as usual cannot be this far from where it was expected."""
-        return apart_m > LEAP_M + LEAP_HOPS * _median(self.hops_m, 0.0)
+        return apart_m > LEAP_M * scene_scale + LEAP_HOPS * _median(self.hops_m, 0.0)
 
     def doubts(self, c: Comparison) -> bool:
         """Return whether a pose is clearly worse than usual."""

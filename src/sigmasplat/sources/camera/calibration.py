@@ -116,17 +116,16 @@ def read_calibration(path: Path, size: tuple[int, int], default_units_per_metre:
     fields = read_json_object(path)
     units = json_number(path, fields, "depth_scale", default_units_per_metre)
     calibration = Calibration(
-        _camera(path, fields, size), check_positive(path, "depth_scale", units), _distortion(path, fields)
+        read_camera(path, fields, size), check_positive(path, "depth_scale", units), read_distortion(path, fields)
     )
     inner = fields.get("depth_camera")
     if inner is None:
         return calibration
     if not isinstance(inner, dict):
         raise SourceError(f'{path}: field "depth_camera" is {inner!r}, expected an object with fx, fy, cx, cy')
-    camera, lens = _camera(path, inner, size), _distortion(path, inner)
-    return replace(
-        calibration, depth_camera=camera, depth_distortion=lens, T_color_depth=_rigid_transform(path, fields)
-    )
+    camera, lens = read_camera(path, inner, size), read_distortion(path, inner)
+    T_color_depth = read_rigid_transform(path, fields, "T_color_depth")
+    return replace(calibration, depth_camera=camera, depth_distortion=lens, T_color_depth=T_color_depth)
 
 
 def resolve_calibration(
@@ -244,25 +243,27 @@ def fields_of_view_deg(camera: Camera) -> tuple[float, float]:
     )
 
 
-def _camera(path: Path, fields: dict[str, Any], size: tuple[int, int]) -> Camera:
+def read_camera(path: Path, fields: dict[str, Any], size: tuple[int, int]) -> Camera:
+    """Read fx, fy, cx, cy and width, height, by default `size`. Raises SourceError naming file and field."""
     width, height = json_number(path, fields, "width", size[0]), json_number(path, fields, "height", size[1])
     return build_camera(
         path, int(width), int(height), [json_number(path, fields, key) for key in ("fx", "fy", "cx", "cy")]
     )  # fmt: skip
 
 
-def _rigid_transform(path: Path, fields: dict[str, Any]) -> NDArray[np.float64]:
-    """Read T_color_depth, identity if absent. Raises SourceError unless it is a rigid 4×4 matrix."""
+def read_rigid_transform(path: Path, fields: dict[str, Any], key: str) -> NDArray[np.float64]:
+    """Read a transform, identity if absent. Raises SourceError unless it is a rigid 4×4 matrix."""
     try:
-        T = np.array(fields.get("T_color_depth", np.eye(4)), np.float64)
+        T = np.array(fields.get(key, np.eye(4)), np.float64)
     except (ValueError, TypeError):
         T = np.zeros(0)
     if T.shape != (4, 4) or not se3.is_rigid(T):
-        raise SourceError(f'{path}: field "T_color_depth" is not a rigid 4×4 matrix by rows, metres')
+        raise SourceError(f'{path}: field "{key}" is not a rigid 4×4 matrix by rows, metres')
     return T
 
 
-def _distortion(path: Path, fields: dict[str, Any]) -> tuple[float, ...] | None:
+def read_distortion(path: Path, fields: dict[str, Any]) -> tuple[float, ...] | None:
+    """Read distortion [k1, k2, p1, p2, k3], None if it is absent or 0. Raises SourceError naming file and field."""
     values = fields.get("distortion")
     if values is None:
         return None

@@ -16,9 +16,12 @@ KNOWN_UNITS_PER_METRE = {1000.0: "millimetres", 5000.0: "TUM's unit", 6553.5: "R
 def depth_warning(source: Source, samples: int = 5) -> str | None:
     """Return a warning if the depth scale looks wrong, with the median and a suggestion; None if it is plausible.
 
+    It is also None if the source computes depth in metres from a stereo pair, because streets are deeper than rooms.
     The median is over all readings of `samples` frames spread evenly; unreadable frames are left out.
     """
     medians = _frame_medians_m(source, _spread(len(source), samples))
+    if medians and source.computed_depth:
+        return None
     if not medians:
         return f"{source.name}: no depth reading in the frames sampled"
     median_m = float(np.median(medians))

@@ -15,7 +15,8 @@ def opencv() -> Any:
         cv2 = importlib.import_module("cv2")
     except ImportError as problem:
         raise ConfigError(
-            f"sparse features need OpenCV, which does not load ({problem}): {install_package('opencv-python-headless')}"
+            f"features and stereo pairs need OpenCV, which does not load ({problem}): "
+            f"{install_package('opencv-python-headless')}"
         ) from problem
     if switches().threads:
         cv2.setNumThreads(switches().threads)

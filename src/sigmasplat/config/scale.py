@@ -1,0 +1,38 @@
+"""Scale all settings that are lengths to a scene that is larger than a room."""
+
+from sigmasplat.config import Config
+
+POWERS = {
+    "input": {"min_depth_m": 1, "max_depth_m": 1},
+    "render": {"scene_scale": 1, "near_m": 1, "depth_gate_m": 1},
+    "seeding": {"depth_error_least_m": 1, "min_distance_m": 1, "voxel_m": 1},
+    "mapping": {
+        "weight_depth": -1, "weight_mean_depth": -1, "weight_alignment": -1, "weight_isotropy": -1,
+        "weight_moment": -2, "lr_means": 1, "lr_means_first": 1, "lr_pose_translation": 1,
+    },
+    "primitives": {"uncertain_m2": 2, "split_scale_m": 1, "most_scale_m": 1},
+    "tracking": {"lr_translation": 1},
+    "submaps": {"distance_m": 1, "uncertainty_m": 1},
+    "loops": {"near_m": 1},
+    "registration": {"lr_translation": 1, "overlap_m": 1, "spread_m": 1},
+    "final": {"lr_pose_translation": 1, "lr_means_last": 1, "spacing_m": 1, "merge_m": 1},
+}  # fmt: skip
+"""The power of a length in each setting. Weights of losses in metres have −1, so that a loss keeps its value."""
+
+
+def for_scene(config: Config, scene_scale: float, depth_noise_per_m: float | None) -> Config:
+    """Return the settings for a scene of this size, and depth of this noise (None = unknown, the setting stays)."""
+    config = scaled(config, scene_scale)
+    return config if depth_noise_per_m is None else config.changed(render={"depth_noise_per_m": depth_noise_per_m})
+
+
+def scaled(config: Config, factor: float) -> Config:
+    """Return the settings for a scene `factor` times as large as a room: lengths and learning rates of lengths grow,
+    weights of losses in metres shrink. With factor 1 the settings are unchanged."""
+    if factor == 1.0:
+        return config
+    sections = {
+        section: {name: getattr(getattr(config, section), name) * factor**power for name, power in powers.items()}
+        for section, powers in POWERS.items()
+    }
+    return config.changed(**sections)

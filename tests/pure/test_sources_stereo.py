@@ -1,0 +1,156 @@
+"""Stereo pairs become RGB-D: every layout, rectification, depth errors against exact depth, and the scene's scale."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from layouts import save, save_text, tum_line
+from sigmasplat.checks.recording import inspect_source
+from sigmasplat.config.scale import for_scene, scaled
+from sigmasplat.errors import SourceError
+from sigmasplat.model.opencv import opencv
+from sigmasplat.presets import preset
+from sigmasplat.sources import open_source
+from sigmasplat.sources.camera.stereo import StereoRectification
+from sigmasplat.sources.camera.stereo_cameras import StereoCameras
+
+BASELINE_M = 0.1
+ROOM = open_source("synthetic:frames=40,stereo=10")
+LEFT = [np.rint(ROOM.frame(i).color * 255).astype(np.uint8) for i in (0, 1)]
+RIGHT = [ROOM.right_image(i) for i in (0, 1)]
+
+
+def tum_like(folder):
+    c = ROOM.camera
+    for name, part, images in (("rgb.txt", "rgb", LEFT), ("right.txt", "right", RIGHT)):
+        for i, image in enumerate(images):
+            save(folder / part / f"{i}.png", image)
+        save_text(folder / name, "".join(f"{i / 10} {part}/{i}.png\n" for i in range(2)))
+    save_text(folder / "groundtruth.txt", "".join(tum_line(i / 10, ROOM.truth().T_world_camera[i]) for i in range(2)))
+    fields = {"fx": c.fx, "fy": c.fy, "cx": c.cx, "cy": c.cy, "baseline_m": BASELINE_M}
+    save_text(folder / "calibration.json", json.dumps(fields))
+    return folder
+
+
+def kitti(folder):
+    c = ROOM.camera
+    for part, images in (("image_2", LEFT), ("image_3", RIGHT)):
+        for i, image in enumerate(images):
+            save(folder / part / f"{i:06d}.png", image)
+    lines = [f"P{k}: {c.fx} 0 {c.cx} {-c.fx * x} 0 {c.fy} {c.cy} 0 0 0 1 0\n" for k, x in ((2, 0.0), (3, BASELINE_M))]
+    save_text(folder / "calib.txt", "".join(lines))
+    save_text(folder / "times.txt", "0\n0.1\n")
+    rows = [" ".join(map(str, T[:3].ravel())) + "\n" for T in ROOM.truth().T_world_camera[:2]]
+    save_text(folder / "poses.txt", "".join(rows))
+    return folder
+
+
+def euroc(folder):
+    c = ROOM.camera
+    for name, images, x in (("cam0", LEFT, 0.0), ("cam1", RIGHT, BASELINE_M)):
+        for i, image in enumerate(images):
+            save(folder / "mav0" / name / "data" / f"{i * 10**8}.png", image)
+        lines = "".join(f"{i * 10**8},{i * 10**8}.png\n" for i in range(2))
+        save_text(folder / "mav0" / name / "data.csv", "#timestamp [ns],filename\n" + lines)
+        T = f"1, 0, 0, {x}, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1"
+        save_text(
+            folder / "mav0" / name / "sensor.yaml",
+            f"T_BS:\n  cols: 4\n  rows: 4\n  data: [{T}]\nresolution: [{c.width}, {c.height}]\n"
+            f"intrinsics: [{c.fx}, {c.fy}, {c.cx}, {c.cy}] #fu, fv, cu, cv\n"
+            "distortion_model: radial-tangential\ndistortion_coefficients: [0, 0, 0, 0]\n",
+        )
+    return folder
+
+
+@pytest.mark.parametrize("layout", [tum_like, kitti, euroc], ids=lambda layout: layout.__name__)
+def test_depth_of_every_layout_is_that_of_the_left_image(layout, tmp_path):
+    source = open_source(layout(tmp_path))
+    depth_m, exact_m = source.frame(1).depth_m, ROOM.exact_depth_of(1)
+    read = depth_m > 0
+    assert len(source) == 2 and source.timestamp_s(1) == pytest.approx(0.1)
+    assert read.mean() > 0.3 and source.computed_depth
+    assert np.median(np.abs(depth_m - exact_m)[read] / exact_m[read]) < 0.03
+    if layout is not euroc:
+        np.testing.assert_allclose(source.truth().T_world_camera, ROOM.truth().T_world_camera[:2], atol=1e-5)
+
+
+def test_standard_deviations_cover_the_errors_on_exact_depth():
+    room = open_source("synthetic:frames=40,stereo=10,noise=1")
+    ratios = []
+    for i in (3, 23):
+        depth_m, std_m = room.frame(i).depth_m, room.depth_std_of(i)
+        read = depth_m > 0
+        assert np.array_equal(read, std_m > 0) and (std_m <= 0.05 * depth_m + 1e-6).all()
+        ratios.append((np.abs(depth_m - room.exact_depth_of(i)) / np.where(read, std_m, 1))[read])
+    found = np.concatenate(ratios)
+    assert abs((found < 1).mean() - 0.683) < 0.08 and (found < 1.96).mean() > 0.85
+
+
+def test_depth_does_not_depend_on_the_number_of_threads():
+    cv2, before = opencv(), opencv().getNumThreads()
+    found = []
+    try:
+        for threads in (1, 3):
+            cv2.setNumThreads(threads)
+            found.append(ROOM.frame(5).depth_m)
+    finally:
+        cv2.setNumThreads(before)
+    assert np.array_equal(*found)
+
+
+def test_rectification_aligns_the_rows_of_a_turned_and_distorted_pair():
+    camera = ROOM.camera
+    turn = opencv().Rodrigues(np.array([0.02, -0.03, 0.015]))[0]
+    T_right_left = np.eye(4)
+    T_right_left[:3, :3], T_right_left[:3, 3] = turn, turn @ [-0.1, 0.004, -0.002]
+    lens = (-0.1, 0.02, 0.001, -0.001, 0.0)
+    stereo = StereoCameras(camera, replace(camera, fx=camera.fx * 1.02), T_right_left, lens, lens)
+    found = StereoRectification.of(stereo)
+    assert found.baseline_m == pytest.approx(np.linalg.norm([0.1, 0.004, 0.002]), rel=1e-6)
+    points = np.array([[0.2, 0.1, 2.0], [-0.5, 0.3, 3.0], [0.1, -0.4, 1.5]])  # in the recorded left camera
+    rectified = points @ found.T_left_rectified[:3, :3]
+    column, row = (found.camera.fx * rectified[:, 0] / rectified[:, 2] + found.camera.cx,
+                   found.camera.fy * rectified[:, 1] / rectified[:, 2] + found.camera.cy)  # fmt: skip
+    disparity = found.camera.fx * found.baseline_m / rectified[:, 2]
+    in_right = (points @ T_right_left[:3, :3].T) + T_right_left[:3, 3]
+    K = np.array([[stereo.right.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    seen = opencv().projectPoints(in_right, np.zeros(3), np.zeros(3), K, np.array(lens))[0][:, 0]
+    for u, v, d, recorded in zip(column, row, disparity, seen, strict=True):
+        at = [opencv().remap(plane, np.float32([[u - d]]), np.float32([[v]]), 1)[0, 0] for plane in found.maps[1]]
+        np.testing.assert_allclose(at, recorded, atol=0.05)
+
+
+def test_a_pair_without_baseline_or_with_swapped_cameras_is_refused(tmp_path):
+    folder = tum_like(tmp_path)
+    fields = json.loads((folder / "calibration.json").read_text())
+    del fields["baseline_m"]
+    save_text(folder / "calibration.json", json.dumps(fields))
+    with pytest.raises(SourceError, match="baseline_m"):
+        open_source(folder)
+    T = np.eye(4)
+    T[0, 3] = 0.1
+    save_text(folder / "calibration.json", json.dumps(fields | {"T_right_left": T.tolist()}))
+    with pytest.raises(SourceError, match="swap"):
+        open_source(folder)
+
+
+def test_a_deep_scene_has_a_scale_and_no_warning_about_its_depth(tmp_path):
+    folder = tum_like(tmp_path)
+    fields = json.loads((folder / "calibration.json").read_text())
+    save_text(folder / "calibration.json", json.dumps(fields | {"baseline_m": 1.0}))  # all depths are 10 times larger
+    source = open_source(folder)
+    assert source.scene_scale > 5
+    warnings = inspect_source(folder, preset("sigma").input).warnings
+    assert not any("scale" in text or "registered" in text for text in warnings)
+
+
+def test_settings_that_are_lengths_follow_the_scale_of_the_scene():
+    config = preset("sigma")
+    assert scaled(config, 1.0) == config and for_scene(config, 1.0, None) == config
+    large = for_scene(config, 5.0, 0.001)
+    assert large.input.max_depth_m == 5 * config.input.max_depth_m
+    assert large.submaps.distance_m == 5 * config.submaps.distance_m
+    assert large.mapping.weight_mean_depth == config.mapping.weight_mean_depth / 5
+    assert (large.render.scene_scale, large.render.depth_noise_per_m) == (5.0, 0.001)
