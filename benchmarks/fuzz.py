@@ -7,6 +7,7 @@ the first ones and the corpus of past failures.
 
 import argparse
 import json
+import os
 import random
 import sys
 import tempfile
@@ -17,11 +18,12 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.append(str(ROOT / "tests"))
+os.environ |= {"OMP_NUM_THREADS": "1", "SIGMASPLAT_THREADS": "1"}  # a fork has none of its parent's threads
 
 import record  # noqa: E402
 
 import fuzz_server  # noqa: E402
-from fuzz_corpus import save  # noqa: E402
+from fuzz_corpus import cases, read, save  # noqa: E402
 from fuzz_mutations import mutated  # noqa: E402
 from fuzz_samples import samples  # noqa: E402
 
@@ -34,9 +36,12 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", default="", help="samples whose names contain this text")
     parser.add_argument("--keep", type=Path, help="folder for one input of each kind of failure, as in tests/corpus")
+    parser.add_argument("--corpus", action="store_true", help="run the past failures instead of new inputs")
     parser.add_argument("--quiet", action="store_true", help="write no results")
     given = parser.parse_args()
     fuzz_server.warm_up()
+    if given.corpus:
+        sys.exit(_failures_of_corpus())
     counts: Counter[str] = Counter()
     by_sample: dict[str, Counter[str]] = {}
     seen: set[str] = set()
@@ -72,6 +77,19 @@ def main() -> None:
         }  # fmt: skip
         record.write(record.results("fuzz", figures, seeds=[given.seed]))
     sys.exit(bool(sum(counts[kind] for kind in fuzz_server.FAILURES)))
+
+
+def _failures_of_corpus() -> int:
+    """Run the inputs of past failures and print those that fail; return their number."""
+    failures = 0
+    with tempfile.TemporaryDirectory() as temporary:
+        found = {sample.name: sample for sample in samples(Path(temporary) / "samples")}
+        for path in cases():
+            ending = fuzz_server.run_files(*read(path, found), Path(temporary) / path.stem)
+            if ending.kind in fuzz_server.FAILURES:
+                failures += 1
+                print(f"{path.stem}: {ending.kind}, exit {ending.code}\n{ending.error[-1800:]}", flush=True)
+    return failures
 
 
 def _signature(ending: fuzz_server.Ending) -> str:

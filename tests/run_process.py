@@ -1,6 +1,7 @@
 """Run `sigmasplat run` in a separate process, to interrupt or kill it."""
 
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -19,12 +20,19 @@ def running(out: Path, *settings: str, room: str = ROOM, more: Sequence[str] = (
     """Start a run in a separate process, with additional settings and options; kill it at the end."""
     set_to = [word for setting in (*QUICK, *settings) for word in ("--set", setting)]
     command = [sys.executable, "-m", "sigmasplat.cli", "run", room, "--out", str(out), *set_to, *more]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ)
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ, preexec_fn=_hang_up_ends
+    )
     try:
         yield process
     finally:
         process.kill()
         process.communicate()
+
+
+def _hang_up_ends() -> None:
+    """Undo what nohup did to the tests: an ignored SIGHUP stays ignored in child processes."""
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 def wait_for(process: subprocess.Popen[str], happened: Callable[[], bool]) -> None:

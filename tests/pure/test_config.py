@@ -67,7 +67,7 @@ def test_override_reaches_every_setting() -> None:
         ("tracking.tau", "warm", "needs a number, found 'warm'"),
         ("tracking.tau", "nan", "must be finite"),
         ("tracking.tau", "inf", "must be finite"),
-        ("mapping.iterations", "-1", "not negative"),
+        ("mapping.iterations", "-1", "at least 0"),
         ("tracking.uncertainty", "maybe", "must be one of true"),
         ("tracking.method", "guess", "must be one of adam, align, found 'guess'"),
     ],

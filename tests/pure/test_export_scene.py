@@ -63,7 +63,7 @@ def test_options_of_other_formats_and_wrong_values_are_refused(here: Path, capsy
             "--voxel-m cannot be used with format video, only with points",
         ),
         (["kitchen", "--out", "a.kitti.txt", "--pictures"], "only with nerfstudio, colmap"),
-        (["kitchen", "--out", "a.gif", "--fps", "0"], "a video must have 1 to 120 images/s"),
+        (["kitchen", "--out", "a.gif", "--fps", "0"], "--fps must be between 1 and 120"),
         (["kitchen", "--format", "video", "--out", "a.avi"], "give a name that ends in .webm, .mp4, .gif, .webp"),
         (["kitchen", "--out", "missing/a.kitti.txt"], "choose a writable place"),
         (["map.ply", "--out", "a.png"], "can be exported only as another map"),

@@ -203,7 +203,7 @@ def test_without_a_true_surface_the_mesh_has_no_score(run: RunFolder) -> None:
 
 
 def test_no_keyframes_and_zero_voxels_are_refused(run: RunFolder) -> None:
-    with pytest.raises(ConfigError, match="a voxel must be above 0"):
+    with pytest.raises(ConfigError, match="--voxel-m must be above 0"):
         FusionInput.of(run, CAMERA).surface(voxel_m=0.0, renderer=KnownView())
     write_checkpoint(run, [])
     with pytest.raises(RunError, match="no keyframes in its checkpoint"):
@@ -253,7 +253,7 @@ def test_the_command_makes_a_mesh_of_a_real_run(tmp_path: Path, capsys: pytest.C
         (["--out", str(tmp_path / "a.glb"), "--axes", "z-up"], "a GLB has y up by definition"),
         (["--triangles", "-1"], "--triangles must be at least 0"),
         (["--out", str(tmp_path / "run" / "mesh.ply")], "exists; give another --out"),
-        (["--voxel-m", "-1"], "a voxel must be above 0"),
+        (["--voxel-m", "-1"], "--voxel-m must be above 0"),
         (["--source", str(tmp_path / "nowhere")], "no such folder"),
     ):
         capsys.readouterr()

@@ -32,8 +32,6 @@ class Range:
     def __str__(self) -> str:
         """Describe the range so that it fits after "must be"."""
         below = f"{'above' if self.open_below else 'at least'} {self.least:.10g}"
-        if (self.least, self.open_below) == (0, False):
-            below = "not negative"
         if math.isinf(self.least):
             words = "finite" if math.isinf(self.most) else f"at most {self.most:.10g}"
         elif math.isinf(self.most):
@@ -58,14 +56,15 @@ RatioLimit = Annotated[float, Range(1, or_zero=True)]
 class Section:
     """Base class of the sections of `Config`. Checks every value when a section is made, also by `replace`.
 
-    A subclass gives its name: `class InputConfig(Section, name="input")`.
+    A subclass gives its name: `class InputConfig(Section, name="input")`; a subclass of a section keeps its name.
     """
 
     section: ClassVar[str]
 
-    def __init_subclass__(cls, name: str) -> None:
+    def __init_subclass__(cls, name: str = "") -> None:
         super().__init_subclass__()
-        cls.section = name
+        if name:
+            cls.section = name
 
     def __post_init__(self) -> None:
         refuse(self.problems())
