@@ -203,7 +203,7 @@ def test_without_a_true_surface_the_mesh_has_no_score(run: RunFolder) -> None:
 
 
 def test_no_keyframes_and_zero_voxels_are_refused(run: RunFolder) -> None:
-    with pytest.raises(ConfigError, match="--voxel-m must be above 0"):
+    with pytest.raises(ConfigError, match="a voxel must be above 0"):
         FusionInput.of(run, CAMERA).surface(voxel_m=0.0, renderer=KnownView())
     write_checkpoint(run, [])
     with pytest.raises(RunError, match="no keyframes in its checkpoint"):
