@@ -13,7 +13,7 @@ from torch import Tensor
 
 from sigmasplat.errors import RunError
 from sigmasplat.io.atomic import replacing
-from sigmasplat.reading.files import open_regular
+from sigmasplat.reading.files import refuse_special
 from sigmasplat.reading.guard import DAMAGED, cause
 
 ERRORS: tuple[type[Exception], ...] = (SafetensorError, *DAMAGED)
@@ -38,8 +38,7 @@ def open_tensors(path: Path, what: str) -> Iterator[Any]:
     Raises RunError if it is damaged, or if the block does not find a tensor or cannot use it.
     """
     try:
-        with open_regular(path, RunError):  # a pipe would wait for a writer
-            pass
+        refuse_special(path, RunError)
         with safe_open(path, "pt") as file:
             yield file
     except ERRORS as problem:

@@ -39,6 +39,12 @@ def open_regular(
         raise error(f"{failed} {path}: {cause(problem)}; check that it exists and may be read") from problem
 
 
+def refuse_special(path: Path, error: type[SigmaSplatError] = SourceError) -> None:
+    """Raise `error` as `open_regular` does; call it before a library opens a file, which would wait at a pipe."""
+    with open_regular(path, error):
+        pass
+
+
 def exists(path: Path) -> bool:
     """Return whether there is an entry of this name, also if it is a broken link, which reading then refuses."""
     return os.path.lexists(path)

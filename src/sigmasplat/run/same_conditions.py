@@ -8,8 +8,6 @@ from typing import Any
 from sigmasplat import env
 from sigmasplat.errors import RunError
 from sigmasplat.io.frames import SAME_TIME_S
-from sigmasplat.io.json_files import read_lines
-from sigmasplat.io.run_values import check_log
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.sources.base import Source
 
@@ -53,8 +51,7 @@ def _other_camera(facts: Mapping[str, Any], source: Source) -> str:
 
 def _other_frame(run: RunFolder, source: Source) -> str:
     """Compare the times of the logged frames."""
-    log = run.path / "log.jsonl"
-    for record in check_log(read_lines(log), log) if log.is_file() else ():
+    for record in run.read_log() if (run.path / "log.jsonl").is_file() else ():
         index, time_s = record["index"], record["timestamp_s"]
         if index >= len(source):
             return f"it has {len(source)} frames, but frame {index} was already processed"

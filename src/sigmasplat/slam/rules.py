@@ -99,8 +99,10 @@ def draw_keyframes(
 
 
 def unless(hurried: Asked, guesses: Iterable[Item]) -> Iterator[Item]:
-    """Yield guesses while `hurried` returns False."""
-    for guess in guesses:
-        if hurried():
+    """Yield guesses while `hurried` returns False; a guess is not made before it is asked."""
+    waiting = iter(guesses)
+    while not hurried():
+        try:
+            yield next(waiting)
+        except StopIteration:
             return
-        yield guess

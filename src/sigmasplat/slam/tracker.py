@@ -101,7 +101,7 @@ class Tracker:
         expected = self._expected(R_inertial_camera)
         best = self._fit(field, view, seen, expected.predicted)
         best, shown = self._uncovered(field, view, seen, expected.predicted, best)
-        if (self._is_wide(best, view) or self._doubts(best)) and not hurried():
+        if self._is_wide(best, view) or self._doubts(best):
             guesses = unless(hurried, self._other_guesses(shown, expected))
             best = max([best, *(self._fit(field, view, shown, guess) for guess in guesses)], key=self._score)
         if self._doubts(best):
@@ -232,10 +232,9 @@ class Tracker:
         starts = [expected.last] if odometry is None else [odometry, expected.last]
         fits = [fit, *(self._fit(field, view, seen, start, 2) for start in unless(hurried, starts))]
         by_map = self.config.method == "align" and self.config.align_to == "keyframe"  # with "map", `_fit` has tried it
-        if by_map and not hurried():
-            for start in unless(hurried, starts):
-                reference = map_reference(field.params, view, se3.inverse(start), self.config)
-                fits.append(self._aligned(reference, seen.live, se3.inverse(start)))
+        for start in unless(hurried, starts if by_map else ()):
+            reference = map_reference(field.params, view, se3.inverse(start), self.config)
+            fits.append(self._aligned(reference, seen.live, se3.inverse(start)))
         best = max(fits, key=self._score)
         if self._is_lost(best):
             best.T_camera_world = se3.inverse(starts[0])

@@ -22,11 +22,8 @@ from sigmasplat.errors import SourceError
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.sources.camera.calibration import (
-    Calibration,
-    build_camera,
-    resolve_calibration,
-)
+from sigmasplat.reading.files import read_text
+from sigmasplat.sources.camera.calibration import Calibration, build_camera, resolve_calibration
 from sigmasplat.sources.camera.stereo import StereoMatcher, StereoRectification, scene_scale
 from sigmasplat.sources.camera.stereo_cameras import StereoCameras, read_stereo_cameras
 from sigmasplat.sources.files.association import associate, no_pairs
@@ -268,10 +265,7 @@ def _euroc_list(camera: Path) -> tuple[NDArray[np.float64], list[Path]]:
 
 def _euroc_sensor(path: Path) -> tuple[Camera, tuple[float, ...], Matrix]:
     """Read camera, distortion and T_body_camera of a sensor.yaml. Raises SourceError naming file and field."""
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise SourceError(f"{path}: not readable as text ({error})") from error
+    text = read_text(path)
 
     def numbers(key: str, count: int) -> list[float]:
         block = re.search(rf"^\s*{key}:[^\[]*\[([^\]]*)\]", text, re.MULTILINE)

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from sigmasplat.errors import SourceError
-from sigmasplat.reading.files import open_regular
+from sigmasplat.reading.files import open_regular, refuse_special
 from sigmasplat.sources.files.optional import import_optional
 
 Message = Any
@@ -49,8 +49,7 @@ class Bag:
         self.path, self._lock = path, threading.Lock()
         for file in sorted(path.iterdir()) if path.is_dir() else [path]:
             if not file.is_dir():
-                with open_regular(file):  # the reader would wait for ever for the writer of a pipe
-                    pass
+                refuse_special(file)
         self.ros1 = path.is_file() and _magic(path).startswith(ROS1_MAGIC)
         reader = import_optional(
             "rosbags.rosbag1" if self.ros1 else "rosbags.rosbag2", "ros", f"{path}: a ROS bag"
