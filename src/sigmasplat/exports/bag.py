@@ -108,6 +108,9 @@ class _FinishedPath:
         """Return T_odom_camera [F, 4, 4] of all frames, and whether all motions up to each frame were tracked [F]."""
         tensors, frames = self.checkpoint, self.reader.frames
         chain = tensors.get("T_world_camera_odometry", tensors["T_world_camera"]).numpy()
+        if len(chain) < len(frames):
+            run = self.reader.run.path
+            raise RunError(f"{run}: {len(chain)} poses in the checkpoint for {len(frames)} frames; run it again")
         components = [0] * len(frames)
         if "submap_component" in tensors:
             components = tensors["submap_component"][tensors["frame_submap"]].tolist()
