@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.errors import ConfigError
+from sigmasplat.errors import ConfigError, SigmaSplatError
 from sigmasplat.floorplan.ground import floor_frame
 from sigmasplat.floorplan.rescan import RescanMaps, RescanRegion, find_rescan_regions
 from sigmasplat.floorplan.surface_samples import SurfacePredictor, SurfaceRenderer, SurfaceSample, sample_surfaces
@@ -33,6 +33,8 @@ WALL_LAYERS = 8
 MIN_POINTS = 2
 """A single point in a layer is ignored as noise."""
 MARGIN_CELLS = 4
+MOST_CELLS = 4_000_000
+"""Cells of the largest plan: 100 m × 100 m with cells of 5 cm, which take 0.7 GB."""
 
 Grid = NDArray[np.float32]
 
@@ -106,7 +108,7 @@ def floor_plan(
 
     predictor: predicts the errors of the map, if they are known (`render.predictive.predict`). Calls
     `progress(poses done, total)`. Raises ConfigError unless 1 mm ≤ cell_m ≤ 1 m; SigmaSplatError if no surface is
-    visible.
+    visible, or the plan has more than `MOST_CELLS`.
     """
     if not 0.001 <= cell_m <= 1.0:
         raise ConfigError(f"a cell of the floor plan must be 0.001 to 1 m wide, found {cell_m}")
@@ -155,6 +157,11 @@ class _Cells:
         high = np.maximum(np.quantile(flat, 0.998, axis=0), path[:, :2].max(0))
         first = np.floor(low / cell_m).astype(int) - MARGIN_CELLS
         count = np.ceil(high / cell_m).astype(int) + MARGIN_CELLS - first
+        if np.prod(count, dtype=np.float64) > MOST_CELLS:
+            size = " × ".join(f"{n * cell_m:.0f}" for n in count)
+            raise SigmaSplatError(
+                f"a floor plan of {size} m has too many cells of {cell_m} m (at most {MOST_CELLS:,}); use larger cells"
+            )
         return _Cells(first * cell_m, (int(count[1]), int(count[0])), cell_m)
 
     def cell_index(self, points: Matrix) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:

@@ -1,12 +1,9 @@
-"""Check the values in the files of a run when they are read: a damaged file is named, with the value that is wrong."""
+"""Check values in the JSON files of a run when they are read: a damaged file is named, with the wrong value."""
 
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
-
-import torch
-from torch import Tensor
 
 from sigmasplat.errors import RunError
 from sigmasplat.model.component import APART, LOST, RELOCALISED, TRACKED
@@ -70,12 +67,6 @@ FACTS: Mapping[str, Test] = {
 """Values of run.json that commands use."""
 STATE_FIELDS: Mapping[str, Test] = {"index": _whole, "wall_s": _number, "submaps": _whole, "steps": is_kind(list)}
 """Values of a saved state beside those of `Slam`."""
-POSES = (4, 4)
-CHECKPOINT: Mapping[str, tuple[int, ...]] = {
-    "timestamps_s": (), "T_world_camera": POSES, "T_world_camera_odometry": POSES, "T_world_submap": POSES,
-}  # fmt: skip
-"""Tensors of a checkpoint that must be finite, and the shape of each of their rows."""
-WHOLE = ("keyframes", "submap_component")
 
 
 def check_fields(values: Any, tests: Mapping[str, Test], required: tuple[str, ...], where: object) -> dict[str, Any]:
@@ -112,37 +103,6 @@ def check_log(records: list[Any], path: Path) -> list[dict[str, Any]]:
     """Return the records of a log. Raises RunError naming the line of a wrong value."""
     places = (f"{path}:{number}" for number in range(1, len(records) + 1))
     return [Record(check_fields(record, LOG, (), where), where) for record, where in zip(records, places, strict=True)]
-
-
-class Tensors(dict[str, Tensor]):
-    """The tensors of a file by name; a missing one raises RunError."""
-
-    def __init__(self, found: Mapping[str, Tensor], path: Path) -> None:
-        super().__init__(found)
-        self.path = path
-
-    def __missing__(self, name: str) -> Tensor:
-        raise RunError(f"{self.path}: tensor {name!r} is missing; {REMEDY}")
-
-
-def check_checkpoint(found: Mapping[str, Tensor], path: Path) -> Tensors:
-    """Return the tensors of a checkpoint. Raises RunError if one has a wrong type or shape, or is not finite."""
-    for name, row in CHECKPOINT.items():
-        tensor = found.get(name)
-        if tensor is None:
-            continue
-        if not tensor.is_floating_point() or tensor.ndim != 1 + len(row) or tuple(tensor.shape[1:]) != row:
-            raise RunError(f"{path}: tensor {name!r} is {tensor.dtype} {list(tensor.shape)}; {REMEDY}")
-        if not bool(torch.isfinite(tensor).all()) or (tensor.numel() and float(tensor.abs().max()) > MOST_NUMBER):
-            raise RunError(f"{path}: tensor {name!r} has nan, inf or very large numbers; {REMEDY}")
-    for name in WHOLE:
-        tensor = found.get(name)
-        if tensor is not None and (tensor.ndim != 1 or tensor.is_floating_point() or tensor.is_complex()):
-            raise RunError(f"{path}: tensor {name!r} is {tensor.dtype} {list(tensor.shape)}; {REMEDY}")
-    frames = [len(found[name]) for name in ("timestamps_s", "T_world_camera") if name in found]
-    if len(set(frames)) > 1:
-        raise RunError(f"{path}: {frames[0]} times and {frames[1]} poses; {REMEDY}")
-    return Tensors(found, path)
 
 
 def _short(value: Any) -> str:

@@ -14,12 +14,13 @@ from sigmasplat.config import Config
 from sigmasplat.errors import RunError
 from sigmasplat.io import machine, trajectory as tum, uncertainty as uncertainty_files
 from sigmasplat.io.atomic import part_of, replacing, sync_file, write_text
+from sigmasplat.io.checkpoint_values import check_checkpoint
 from sigmasplat.io.components import COMPONENT_FILES, component_numbers, write_components
 from sigmasplat.io.frames import RunFrames
 from sigmasplat.io.json_files import append_line, read_json, read_lines, write_json, write_json_on_full_disk
 from sigmasplat.io.leftovers import remove_leftovers
 from sigmasplat.io.lock import LOCK, locked, no_warning
-from sigmasplat.io.run_values import FACTS, check_checkpoint, check_fields, check_log, check_profile
+from sigmasplat.io.run_values import FACTS, check_fields, check_log, check_profile
 from sigmasplat.io.splats import ply
 from sigmasplat.io.submaps import DiskStore
 from sigmasplat.io.tensors import open_tensors, write_tensors
@@ -45,9 +46,9 @@ FILES = (
 )  # fmt: skip
 """Files that a run may have in addition to run.json, which always exists and identifies the folder as ours."""
 COMPONENTS = "components"
-"""The folder of components that are not connected to the world."""
+"""Components that are not connected to the world."""
 FIRST_FILES = {part_of(Path("run.json")).name, LOCK}
-"""The only files of a run that was killed before its run.json was complete."""
+"""The only files of a run that was killed before run.json."""
 
 
 @dataclass(frozen=True)
@@ -69,13 +70,9 @@ class RunFolder:
         """
         run = RunFolder(Path(path))
         facts = {
-            "program": PROGRAM,
-            "version": machine.package_version(),
-            "code": machine.code_version(),
-            "source": source_name,
-            "machine": machine.describe(),
-            "status": "running",
-        }
+            "program": PROGRAM, "version": machine.package_version(), "code": machine.code_version(),
+            "source": source_name, "machine": machine.describe(), "status": "running",
+        }  # fmt: skip
         try:
             run._claim(overwrite, facts)
         except OSError as problem:
@@ -292,15 +289,15 @@ class RunFolder:
         """Return the size of map.ply. Raises RunError if it is missing."""
         return self._existing("map.ply").stat().st_size
 
-    def write_checkpoint(self, tensors: dict[str, Tensor], metadata: dict[str, str]) -> None:
+    def write_checkpoint(self, tensors: dict[str, Tensor], text: dict[str, str]) -> None:
         """Write checkpoint.safetensors: named tensors and text."""
-        write_tensors(self.path / "checkpoint.safetensors", tensors, metadata)
+        write_tensors(self.path / "checkpoint.safetensors", tensors, text)
 
     def read_checkpoint(self) -> tuple[dict[str, Tensor], dict[str, str]]:
         """Read checkpoint.safetensors: tensors and text. Raises RunError if it is missing or damaged."""
         with open_tensors(path := self._existing("checkpoint.safetensors"), "checkpoint") as file:
-            tensors, text = {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
-        return check_checkpoint(tensors, path), text
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            return check_checkpoint(tensors, path), file.metadata() or {}
 
     def read_odometry(self) -> Trajectory | None:
         """Return the path of tracking alone, without loop closure; None if the run has no such path or no loop.

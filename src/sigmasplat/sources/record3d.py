@@ -21,7 +21,9 @@ from numpy.typing import NDArray
 from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.reading.files import refuse_special
 from sigmasplat.reading.guard import DAMAGED
+from sigmasplat.reading.pictures import check_pixels
 from sigmasplat.reading.structured import MOST_JSON_BYTES, parse_json
 from sigmasplat.sources.camera.calibration import (
     Calibration,
@@ -92,12 +94,18 @@ class ExrImagePair(ImagePair):
 
     def sizes(self) -> tuple[Size, Size]:
         """Return (width, height) of colour and depth. Raises SourceError naming the file."""
-        low, high = self._opened().header()["dataWindow"]
-        return image_size(self.color), (int(high[0] - low[0]) + 1, int(high[1] - low[1]) + 1)
+        return image_size(self.color), self._size()
 
-    def _opened(self) -> Any:
+    def _size(self) -> Size:
+        low, high = self._opened(header_only=True).header()["dataWindow"]
+        return int(high[0] - low[0]) + 1, int(high[1] - low[1]) + 1
+
+    def _opened(self, header_only: bool = False) -> Any:
+        if not header_only:
+            check_pixels(self.depth, self._size(), SourceError)
+        refuse_special(self.depth)
         try:
-            return self.openexr.File(str(self.depth), separate_channels=True)
+            return self.openexr.File(str(self.depth), separate_channels=True, header_only=header_only)
         except Exception as error:  # the library can raise any C++ exception
             raise SourceError(f"{self.depth}: unreadable EXR file ({error}); export it again") from error
 

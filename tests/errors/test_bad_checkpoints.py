@@ -1,0 +1,84 @@
+"""A damaged checkpoint is refused in one line that names the tensor, whatever is wrong with it."""
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from sigmasplat.config import Config
+from sigmasplat.errors import RunError, SigmaSplatError
+from sigmasplat.floorplan.floor_plan import floor_plan
+from sigmasplat.io.runs import RunFolder
+from sigmasplat.model.atlas import UNKNOWN_HOP, Atlas, Place
+from sigmasplat.model.camera import Camera
+from sigmasplat.model.field import GaussianField
+from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.slam.checkpoint import checkpoint_of
+from sigmasplat.slam.loop_closure.pose_graph import Edge
+
+Tensors = dict[str, torch.Tensor]
+
+
+def changed(name: str, change: Callable[[torch.Tensor], torch.Tensor]) -> Callable[[Tensors], Tensors]:
+    return lambda tensors: tensors | {name: change(tensors[name])}
+
+
+DAMAGES = {
+    "0-d": (changed("keyframe_submap", lambda t: t[0].clone()), r"'keyframe_submap' is torch.int64 \[\]"),
+    "keyframe that does not exist": (changed("keyframes", lambda t: t + (1 << 40)), "'keyframes' has the number"),
+    "negative submap": (changed("frame_submap", lambda t: t - 1), "'frame_submap' has the number -1"),
+    "floats as numbers": (changed("frame_keyframe", torch.Tensor.double), "'frame_keyframe' is torch.float64"),
+    "fewer poses": (changed("T_world_camera", lambda t: t[1:].clone()), "'T_world_camera' has"),
+    "no number": (changed("edge_T_a_b", lambda t: t.new_full((1, 4, 4), torch.nan)), "'edge_T_a_b' has"),
+    "numbers as flags": (changed("edge_is_loop", torch.Tensor.long), "'edge_is_loop' is torch.int64"),
+    "keyframe of another submap": (changed("frame_keyframe", lambda t: t.clamp(min=1)), "counts keyframes|but there"),
+}  # fmt: skip
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> RunFolder:
+    """Return a run with the path of three frames in two submaps, the errors of the path, and no map."""
+    T = np.eye(4)
+    places, hops = [Place(0, 0, T), Place(0, 1, T), Place(1, 0, T)], [[UNKNOWN_HOP] * 2, [UNKNOWN_HOP]]
+    atlas = Atlas([T] * 2, [T] * 2, [[T] * 2, [T]], hops, places, [0, 0])
+    edges = [Edge(0, 1, T, np.eye(6), loop=True)]
+    run = RunFolder.create(tmp_path / "run", Config(), "room")
+    trajectory = Trajectory(np.arange(3.0), np.tile(np.eye(4), (3, 1, 1)))
+    run.write_checkpoint(checkpoint_of(GaussianField.empty(), trajectory, atlas, [0, 1, 2], edges), {})
+    return run
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_tensor_is_named(run: RunFolder, damage: str) -> None:
+    change, words = DAMAGES[damage]
+    path = run.path / "checkpoint.safetensors"
+    save_file(change(load_file(path)), path)
+    with pytest.raises(RunError, match=words) as refusal:
+        run.read_checkpoint()
+    assert str(path) in str(refusal.value) and "run it again" in str(refusal.value)
+    assert "\n" not in str(refusal.value)
+
+
+def test_an_older_checkpoint_with_fewer_tensors_is_read(run: RunFolder) -> None:
+    path = run.path / "checkpoint.safetensors"
+    older = {name: tensor for name, tensor in load_file(path).items() if not re.match("edge|hop|frame_key", name)}
+    save_file(older, path)
+    assert set(run.read_checkpoint()[0]) == set(older)
+
+
+def test_a_floor_plan_of_kilometres_is_refused_before_memory_is_taken() -> None:
+    field = GaussianField.from_values(
+        torch.tensor([[0.0, 0.0, 2.0], [0.1, 0.0, 2.0]]),
+        torch.full((2, 3), 0.5),
+        torch.full((2, 3), 0.5),
+        opacities=0.99,
+    )  # fmt: skip
+    poses = torch.eye(4).repeat(2, 1, 1).double().numpy()
+    poses[1, 0, 3] = 1e7
+    path, camera = Trajectory(torch.arange(2).double().numpy(), poses), Camera(64, 48, 60.0, 60.0, 32.0, 24.0)
+    with pytest.raises(SigmaSplatError, match=r"too many cells of 0.05 m.*use larger cells"):
+        floor_plan(field, path, camera)
