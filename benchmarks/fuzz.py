@@ -7,6 +7,7 @@ the first ones and the corpus of past failures.
 
 import argparse
 import json
+import multiprocessing
 import os
 import random
 import sys
@@ -14,6 +15,7 @@ import tempfile
 import time
 import traceback
 from collections import Counter
+from functools import partial
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -25,7 +27,7 @@ import record  # noqa: E402
 import fuzz_server  # noqa: E402
 from fuzz_corpus import cases, read, save  # noqa: E402
 from fuzz_mutations import mutated  # noqa: E402
-from fuzz_samples import samples  # noqa: E402
+from fuzz_samples import Sample, samples  # noqa: E402
 
 
 def main() -> None:
@@ -34,6 +36,7 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=20_000, help="number of inputs")
     parser.add_argument("--minutes", type=float, default=1e9, help="stop after this time")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="processes")
     parser.add_argument("--only", default="", help="samples whose names contain this text")
     parser.add_argument("--keep", type=Path, help="folder for one input of each kind of failure, as in tests/corpus")
     parser.add_argument("--corpus", action="store_true", help="run the past failures instead of new inputs")
@@ -42,32 +45,13 @@ def main() -> None:
     fuzz_server.warm_up()
     if given.corpus:
         sys.exit(_failures_of_corpus())
-    counts: Counter[str] = Counter()
-    by_sample: dict[str, Counter[str]] = {}
-    seen: set[str] = set()
     started_s = time.monotonic()
     with tempfile.TemporaryDirectory() as temporary:
-        found = [s for s in samples(Path(temporary) / "samples") if given.only in s.name]
-        weights = [sample.weight for sample in found]
-        for number in range(given.count):
-            if time.monotonic() - started_s > 60 * given.minutes:
-                break
-            rng = random.Random(f"{given.seed}/{number}")
-            sample = rng.choices(found, weights)[0]
-            command, files = rng.choice(sample.commands), mutated(sample.files, rng)
-            ending = fuzz_server.run_files(sample, files, command, Path(temporary) / f"case-{number}")
-            counts[ending.kind] += 1
-            by_sample.setdefault(sample.name, Counter())[ending.kind] += 1
-            if ending.kind in fuzz_server.FAILURES:
-                what = _signature(ending)
-                if what not in seen:
-                    seen.add(what)
-                    cost = f"{ending.cpu_s:.1f} s, {ending.peak_bytes / 1e6:.0f} MB"
-                    print(f"#{number} {sample.name} {' '.join(command)}: {ending.kind}, exit {ending.code}, {cost}")
-                    print(f"{ending.error[-1800:]}\n", flush=True)
-                    if given.keep:
-                        save(given.keep / f"{sample.name}-{given.seed}-{number}.zip", sample, files, command)
-    seconds = round(time.monotonic() - started_s, 1)
+        found = samples(Path(temporary) / "samples")
+        part = partial(_run_part, given, [s for s in found if given.only in s.name], Path(temporary), started_s)
+        with multiprocessing.get_context("fork").Pool(given.jobs) as pool:
+            by_sample = _added(pool.map(part, range(given.jobs), chunksize=1))
+    counts, seconds = sum(by_sample.values(), Counter()), round(time.monotonic() - started_s, 1)
     print(json.dumps({"inputs": counts.total(), **counts, "seconds": seconds}))
     if not given.quiet:
         kinds = (fuzz_server.REFUSED, fuzz_server.HARMLESS, *fuzz_server.FAILURES)
@@ -77,6 +61,38 @@ def main() -> None:
         }  # fmt: skip
         record.write(record.results("fuzz", figures, seeds=[given.seed]))
     sys.exit(bool(sum(counts[kind] for kind in fuzz_server.FAILURES)))
+
+
+def _run_part(
+    given: argparse.Namespace, found: list[Sample], folder: Path, started_s: float, job: int
+) -> dict[str, Counter[str]]:
+    """Run every `jobs`-th input, print failures that this job sees for the first time, and count the endings."""
+    by_sample, seen, weights = dict[str, Counter[str]](), set[str](), [sample.weight for sample in found]
+    for number in range(job, given.count, given.jobs):
+        if time.monotonic() - started_s > 60 * given.minutes:
+            break
+        rng = random.Random(f"{given.seed}/{number}")
+        sample = rng.choices(found, weights)[0]
+        command, files = rng.choice(sample.commands), mutated(sample.files, rng)
+        ending = fuzz_server.run_files(sample, files, command, folder / f"case-{number}")
+        by_sample.setdefault(sample.name, Counter())[ending.kind] += 1
+        if ending.kind in fuzz_server.FAILURES and (what := _signature(ending)) not in seen:
+            seen.add(what)
+            cost = f"{ending.cpu_s:.1f} s, {ending.peak_bytes / 1e6:.0f} MB"
+            print(f"#{number} {sample.name} {' '.join(command)}: {ending.kind}, exit {ending.code}, {cost}")
+            print(f"{ending.error[-1800:]}\n", flush=True)
+            if given.keep:
+                save(given.keep / f"{sample.name}-{given.seed}-{number}.zip", sample, files, command)
+    return by_sample
+
+
+def _added(parts: list[dict[str, Counter[str]]]) -> dict[str, Counter[str]]:
+    """Add the counts of all jobs."""
+    total = dict[str, Counter[str]]()
+    for part in parts:
+        for name, counts in part.items():
+            total.setdefault(name, Counter()).update(counts)
+    return total
 
 
 def _failures_of_corpus() -> int:
