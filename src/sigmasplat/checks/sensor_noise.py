@@ -70,7 +70,7 @@ def measure_noise(frames: Sequence[Frame]) -> SensorNoise | None:
 
     Patches are sorted by distance into bins of equal size; the median of a bin is robust to patches that are not flat.
     """
-    found = [flat_patches(frame) for frame in frames]
+    found = [(np.zeros(0), np.zeros(0)), *(flat_patches(frame) for frame in frames)]
     z, std = (np.concatenate([values[k] for values in found]) for k in (0, 1))
     if len(z) < LEAST_PATCHES:
         return None
