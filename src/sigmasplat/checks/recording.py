@@ -3,14 +3,17 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
 
 from sigmasplat.checks.motion import Motion, motion_warnings
 from sigmasplat.checks.registration import EdgeAgreement, edge_agreement, overlay
+from sigmasplat.checks.sensor_noise import measure_noise
 from sigmasplat.checks.timing import time_warnings, times_of
 from sigmasplat.config import InputConfig
+from sigmasplat.config.sensors import AUTO
 from sigmasplat.drawing import colormap, contact_sheet
 from sigmasplat.errors import SourceError
 from sigmasplat.model.frame import Frame
@@ -37,13 +40,19 @@ MAX_BRIGHTNESS_STEP = 0.2
 
 @dataclass(frozen=True, eq=False)
 class Inspection:
-    """Results: rows of (name, value), warnings with a fix, a contact sheet, and the check of depth registration."""
+    """Results: rows of (name, value), warnings with a fix, a contact sheet, the check of depth registration, and the
+    noise of depth (`SensorNoise.record`)."""
 
     title: str
     rows: list[tuple[str, str]]
     warnings: list[str]
     sheet: Image.Image
     agreement: EdgeAgreement | None
+    noise: dict[str, Any] | None = None
+
+    def record(self) -> dict[str, Any]:
+        """Return what was found as values for JSON."""
+        return {"title": self.title, "found": dict(self.rows), "warnings": self.warnings, "depth_noise": self.noise}
 
 
 def inspect_source(path: str | Path, settings: InputConfig, samples: int = SAMPLES) -> Inspection:
@@ -53,6 +62,7 @@ def inspect_source(path: str | Path, settings: InputConfig, samples: int = SAMPL
     if not frames:
         raise SourceError(f"{source.name}: none of {samples} sampled frames can be read; check the image files")
     agreement = None if source.computed_depth else edge_agreement(frames)  # stereo depth has the left image's pixels
+    noise, sensor = measure_noise(frames), (source.sensor or AUTO) if settings.sensor == AUTO else settings.sensor
     times_s = times_of(source)
     first = max(0, (len(source) - CONSECUTIVE) // 2)
     warnings = [
@@ -69,13 +79,15 @@ def inspect_source(path: str | Path, settings: InputConfig, samples: int = SAMPL
         ("format", format_.name),
         *_size_rows(source, frames[0]),
         *_depth_rows(source, frames, settings),
+        ("depth noise", "unknown: too few flat surfaces" if noise is None else noise.row(sensor)),
         ("colour–depth alignment", "unknown: no outlines in depth" if agreement is None else agreement.sentence()),
         ("poses", source.described_truth() or "none: the error of the path cannot be measured"),
         *_gyroscope_rows(frames),
         ("skipped", f"{len(source.skipped)} files (first: {source.skipped[0]})" if source.skipped else "nothing"),
         ("suggested preset", _suggested(format_.name)),
     ]
-    return Inspection(source.name, rows, warnings, _sheet(frames), agreement)
+    record = None if noise is None else noise.record(sensor)
+    return Inspection(source.name, rows, warnings, _sheet(frames), agreement, record)
 
 
 def _opened(path: str | Path, settings: InputConfig) -> tuple[Source, list[str]]:

@@ -16,12 +16,18 @@ SheetFile = Annotated[
     tyro.conf.arg(metavar="FILE", help="contact sheet, PNG", help_behavior_hint="(default: runs/inspect/NAME.png)"),
 ]
 
+JsonFile = Annotated[
+    Path | None,
+    tyro.conf.arg(metavar="FILE", help="write what was found as JSON", help_behavior_hint=""),
+]
+
 
 def inspect(
     path: options.SourcePath,
     input_options: options.InputOptionsFlat = options.DEFAULT_INPUT_OPTIONS,
     settings: options.Settings = (),
     out: SheetFile = None,
+    json: JsonFile = None,
 ) -> int:
     """Check a recording before a run: format, depth, poses, and problems; draws a contact sheet.
 
@@ -31,6 +37,7 @@ def inspect(
 
     from sigmasplat.checks.recording import inspect_source
     from sigmasplat.io.atomic import replacing
+    from sigmasplat.io.json_files import write_json
     from sigmasplat.run.terminal import Screen
 
     screen = Screen()
@@ -46,4 +53,6 @@ def inspect(
     with replacing(target) as temporary:
         found.sheet.save(temporary, "PNG")
     screen.say(f"contact sheet: {target}")
+    if json is not None:
+        write_json(json, found.record())
     return WARNED if found.warnings else OK

@@ -106,7 +106,8 @@ def run(
         earlier.refuse_other_size(config)
     source, config = _opened(screen, path, config, record)
     if not earlier:  # values that the user gives are used as they are
-        config = override(for_scene(config, source.scene_scale, source.depth_noise_per_m), split_settings(settings))
+        fitting = for_scene(config, source.scene_scale, source.depth_noise_per_m, source.sensor)
+        config = override(fitting, split_settings(settings))
         if source.scene_scale != 1.0:
             screen.say(f"{source.name}: settings in metres are multiplied by {source.scene_scale:g}, the scene's scale")
     with (

@@ -93,6 +93,9 @@ class SeedConfig(Section, name="seeding"):
     """With `voxel_m`: no seed is placed in a voxel that has this many splats."""
     max_splats: Count = 0
     """Maximum number of splats in a submap; 0 = no limit."""
+    sensor_noise: bool = False
+    """Whether pixels whose depth is unsure for their distance, at edges and grazing surfaces, become splats last; it
+    needs the σ of readings (`input.sensor`)."""
 
 
 @dataclass(frozen=True)
@@ -183,6 +186,8 @@ class MappingConfig(Section, name="mapping"):
     covisibility: Literal["splats", "frustum", "descriptor"] = "splats"
     """How the overlap of the window's keyframes is measured: by common dominant splats, by depth readings that the
     other keyframe sees too, or by the image descriptor of `loops`."""
+    sensor_noise: bool = False
+    """Whether the losses of depth weigh each reading by 1/σ (`input.sensor`), with a mean of 1 over the image."""
     frames_per_step: Count = 1
     """Each step minimises the mean loss of this many keyframes of the window; 0 = of all of them (CG-SLAM)."""
 
@@ -206,6 +211,9 @@ class TrackingConfig(Section, name="tracking"):
     of the map (CG-SLAM eq. 10)."""
     align_stop: NotNegative = 1e-4
     """Alignment ends a pyramid level when a step is smaller than this (metres and radians)."""
+    sensor_noise: bool = False
+    """Whether alignment weighs each reading of a keyframe by its own 1/σ² (`input.sensor`) instead of the law of
+    `render.depth_noise_per_m`."""
     align_weight_color: Share = 0.5
     """Weight of gray residuals in alignment; depth residuals have 1 minus this."""
     amsgrad: bool = False

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from sigmasplat.config.ranges import WIDTHS_PX, Above0, AtLeastOne, Count, NotNegative, Range, Section
+from sigmasplat.config.sensors import sensor_problems
 
 
 @dataclass(frozen=True)
@@ -63,6 +64,10 @@ class InputConfig(Section, name="input"):
     """Standard deviation σ_d of the disparity in pixels. Stereo depth z has σ_z = z²·σ_d / (f·b)."""
     stereo_max_std: Above0 = 0.05
     """Stereo depth is ignored where its standard deviation σ_z is larger than this share of it."""
+    sensor: str = "auto"
+    """Model of the standard deviation of depth readings: kinect-v1, realsense-stereo, lidar-iphone, time-of-flight;
+    generic = the law of `render.depth_noise_per_m`; or a model as in `base:0.001,z2:0.0015` (parts: base, z1, z2, edge,
+    grazing, most). auto = that of the sensor if the source knows it, otherwise generic. `inspect` measures one."""
     denoise_depth: bool = False
     """Whether depth images that are noisier than those of a structured-light sensor are smoothed."""
 
@@ -72,6 +77,7 @@ class InputConfig(Section, name="input"):
             return found
         if self.end_s and self.end_s <= self.start_s:
             found.append(f"input.end_s must be after input.start_s, found {self.start_s:g} to {self.end_s:g} s")
+        found += sensor_problems(self.sensor)
         if self.max_depth_m <= self.min_depth_m:
             found.append(
                 "input.max_depth_m must be above input.min_depth_m, "

@@ -1,6 +1,7 @@
 """Scale all settings that are lengths to a scene that is larger than a room."""
 
 from sigmasplat.config import Config
+from sigmasplat.config.sensors import AUTO
 
 POWERS = {
     "input": {"min_depth_m": 1, "max_depth_m": 1},
@@ -20,9 +21,12 @@ POWERS = {
 """The power of a length in each setting. Weights of losses in metres have −1, so that a loss keeps its value."""
 
 
-def for_scene(config: Config, scene_scale: float, depth_noise_per_m: float | None) -> Config:
-    """Return the settings for a scene of this size, and depth of this noise (None = unknown, the setting stays)."""
+def for_scene(config: Config, scene_scale: float, depth_noise_per_m: float | None, sensor: str | None = None) -> Config:
+    """Return the settings for a scene of this size, depth of this noise, and this sensor (None = unknown, the setting
+    stays). A sensor that the settings name stays."""
     config = scaled(config, scene_scale)
+    if sensor is not None and config.input.sensor == AUTO:
+        config = config.changed(input={"sensor": sensor})
     return config if depth_noise_per_m is None else config.changed(render={"depth_noise_per_m": depth_noise_per_m})
 
 

@@ -138,7 +138,8 @@ class AlignedPose(NamedTuple):
 
 
 class LevelPlanes(NamedTuple):
-    """One level of two images to align, and the weights of its residuals, in the layout of the kernels' `Level`."""
+    """One level of two images to align, and the weights of its residuals, in the layout of the kernels' `Level`; noise:
+    σ of each reference reading relative to the z² law, None: all follow it."""
 
     reference_gray: Plane
     reference_depth: Plane
@@ -148,6 +149,7 @@ class LevelPlanes(NamedTuple):
     live_depth: Plane
     intrinsics: Sequence[float]
     options: Sequence[float]
+    noise: Plane | None = None
 
 
 NORMAL_TERMS = 53

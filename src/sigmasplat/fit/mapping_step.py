@@ -59,6 +59,8 @@ def image_gradients(view: View, target: Target, weights: Weights) -> tuple[Tenso
         "depth_target": target.depth_image,
         "valid": target.depth_image > 0,
     }
+    if target.depth_weight is not None:
+        maps["depth_weight"] = target.depth_weight[:h, :w]
     if len(v.sums) >= 7:
         maps["variance"] = variance_of(sums)
     loss = losses.total(used, maps)

@@ -22,7 +22,7 @@ class Pyramid:
 
     backend: its image kernels halve and align the planes. Only the planes of CUDA are not in host memory.
     scene_scale: size of the scene relative to a room (`render.scene_scale`); noise_per_m: standard deviation of depth
-    readings, times z² (`render.depth_noise_per_m`).
+    readings, times z² (`render.depth_noise_per_m`); noise: σ of each reading relative to that law, None: all follow it.
     """
 
     gray: list[Plane]
@@ -30,6 +30,7 @@ class Pyramid:
     weight: list[Plane | None]
     weight_depth: list[Plane | None]
     cameras: list[Camera]
+    noise: list[Plane | None]
     backend: str = "cpu"
     scene_scale: float = 1.0
     noise_per_m: float = NOISE_PER_M
@@ -67,18 +68,21 @@ class Pyramid:
         backend: str = "cpu",
         scene_scale: float = 1.0,
         noise_per_m: float = NOISE_PER_M,
+        noise: Plane | None = None,
     ) -> "Pyramid":
-        """Build a pyramid of at most `levels` sizes from gray [H, W], depth [H, W] and an optional weight [H, W]."""
-        p = Pyramid([], [], [None], [None], [camera], backend, scene_scale, noise_per_m)
+        """Build a pyramid of at most `levels` sizes from gray [H, W], depth [H, W] and an optional weight [H, W] and
+        noise [H, W]."""
+        p = Pyramid([], [], [None], [None], [camera], [noise], backend, scene_scale, noise_per_m)
         p.gray.append(p.kernels.contiguous(gray))
         p.depth.append(p.kernels.contiguous(depth_m))
         for _ in range(levels - 1):
             c = p.cameras[-1]
             if min(c.width, c.height) < 32:
                 break
-            half_gray, _, half_depth = p.kernels.halve((p.gray[-1], None), p.depth[-1])
+            half_gray, half_noise, half_depth = p.kernels.halve((p.gray[-1], p.noise[-1]), p.depth[-1])
             p.gray.append(half_gray)
             p.depth.append(half_depth)
+            p.noise.append(half_noise)
             # With odd sizes the last row or column is dropped, so the scale is exactly ½.
             p.cameras.append(
                 Camera(c.width // 2, c.height // 2, c.fx / 2, c.fy / 2, (c.cx - 0.5) / 2, (c.cy - 0.5) / 2)

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+import numpy as np
+import torch
 from torch import Tensor
 
 from sigmasplat.config import TrackingConfig
@@ -14,6 +16,7 @@ from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.target import Target
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
+from sigmasplat.model.depth_std import generic_std
 from sigmasplat.model.map_uncertainty import Background
 from sigmasplat.model.submap import Picture
 from sigmasplat.render.view import View
@@ -38,18 +41,31 @@ class Reference:
         return compare(self.pyramid, live, T_camera_world @ se3.inverse(self.T_camera_world))
 
 
-def live_image(view: View, color: Image, depth_m: Image, target: Target) -> Pyramid:
-    """Make the pyramid of a camera image, colour [H, W, 3] and depth [H, W] m, on the device that aligns it."""
+def live_image(view: View, color: Image, depth_m: Image, target: Target, noise: Image | None = None) -> Pyramid:
+    """Make the pyramid of a camera image, colour [H, W, 3] and depth [H, W] m, on the device that aligns it; noise:
+    that of its readings (`relative_noise`)."""
     gray, depth = fits_of(view).live_planes(view, color, depth_m, target)
-    return _pyramid(view, gray, depth, target.camera)
+    on_device = torch.from_numpy(noise).to(depth.device) if noise is not None and isinstance(depth, Tensor) else noise
+    return _pyramid(view, gray, depth, target.camera, on_device)
 
 
-def _pyramid(view: View, gray: Plane, depth: Plane, camera: Camera) -> Pyramid:
+def relative_noise(view: View, target: Target) -> Image | None:
+    """Return σ of each reading of a target relative to the law of `render.depth_noise_per_m` [H, W], 1 without a
+    reading; None if σ is unknown."""
+    std_m = target.depth_std_image
+    if std_m is None:
+        return None
+    law_m = generic_std(target.depth_image.numpy(), view.options.depth_noise_per_m)
+    return np.divide(std_m, law_m, out=np.ones_like(law_m), where=law_m > 0)
+
+
+def _pyramid(view: View, gray: Plane, depth: Plane, camera: Camera, noise: Plane | None = None) -> Pyramid:
     """Build a pyramid on the device of a view, with its assumptions on scene and sensor."""
     o = view.options
     return Pyramid.of(
-        gray, depth, camera, backend=view.backend, scene_scale=o.scene_scale, noise_per_m=o.depth_noise_per_m
-    )
+        gray, depth, camera, backend=view.backend, scene_scale=o.scene_scale, noise_per_m=o.depth_noise_per_m,
+        noise=noise,
+    )  # fmt: skip
 
 
 def picture_images(view: View, picture: Picture, camera: Camera) -> tuple[Target, Pyramid]:

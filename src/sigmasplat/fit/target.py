@@ -10,6 +10,7 @@ from torch import Tensor
 from sigmasplat.fit.adam import VectorAdam
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
+from sigmasplat.model.depth_std import mean_one_weights
 from sigmasplat.model.frame import Detail, Frame
 from sigmasplat.model.photo import Photo
 from sigmasplat.model.submap import Picture
@@ -19,12 +20,18 @@ from sigmasplat.native import kernels
 @dataclass(eq=False)
 class Target:
     """The image that a view should render: color [3, rows, columns], depth [rows, columns] m (0 = no reading or
-    padding)."""
+    padding).
+
+    depth_std [rows, columns]: the standard deviation of each reading, m, None if it is unknown; depth_weight [rows,
+    columns]: weight of each reading in the loss, 1 on average, None: all 1.
+    """
 
     camera: Camera
     color: Tensor
     depth: Tensor
     valid_pixels: int
+    depth_std: Tensor | None = None
+    depth_weight: Tensor | None = None
     _on_device: "Target | None" = dataclass_field(default=None, init=False, repr=False)
 
     def to(self, device: torch.device) -> "Target":
@@ -32,7 +39,9 @@ class Target:
         if self.depth.device == device:
             return self
         if self._on_device is None or self._on_device.depth.device != device:
-            self._on_device = Target(self.camera, self.color.to(device), self.depth.to(device), self.valid_pixels)
+            planes = (None if p is None else p.to(device) for p in (self.depth_std, self.depth_weight))
+            color, depth = self.color.to(device), self.depth.to(device)
+            self._on_device = Target(self.camera, color, depth, self.valid_pixels, *planes)
         return self._on_device
 
     @staticmethod
@@ -43,7 +52,7 @@ class Target:
             return Target.in_torch(frame, size)
         color, depth = torch.empty(3, *size), torch.empty(size)
         readings: int = core.image_planes(frame.color, frame.depth_m, color.numpy(), depth.numpy())
-        return Target(frame.camera, color, depth, readings)
+        return Target(frame.camera, color, depth, readings, padded(frame.depth_std_m, size))
 
     @staticmethod
     def in_torch(frame: Frame, size: tuple[int, int]) -> "Target":
@@ -52,7 +61,7 @@ class Target:
         color, depth = torch.zeros(3, *size), torch.zeros(size)
         color[:, :h, :w] = torch.tensor(frame.color).movedim(-1, 0)
         depth[:h, :w] = torch.tensor(frame.depth_m)
-        return Target(frame.camera, color, depth, int((frame.depth_m > 0).sum()))
+        return Target(frame.camera, color, depth, int((frame.depth_m > 0).sum()), padded(frame.depth_std_m, size))
 
     @property
     def image(self) -> Tensor:
@@ -64,18 +73,33 @@ class Target:
         """Return the depth as [H, W], metres."""
         return self.depth[: self.camera.height, : self.camera.width]
 
+    @property
+    def depth_std_image(self) -> NDArray[np.float32] | None:
+        """Return the standard deviation of the readings as [H, W], metres; None if it is unknown."""
+        if self.depth_std is None:
+            return None
+        return np.asarray(self.depth_std[: self.camera.height, : self.camera.width].numpy())
+
+    def weighed_by_std(self) -> "Target":
+        """Return the target whose loss weighs each reading by its standard deviation, if that is known."""
+        std = self.depth_std_image
+        if std is None:
+            return self
+        return replace(self, depth_weight=padded(mean_one_weights(std), (self.depth.shape[0], self.depth.shape[1])))
+
     def with_depth(self, depth_m: NDArray[np.float32]) -> "Target":
         """Return the same colour with other depth [H, W], m."""
         depth = torch.zeros_like(self.depth)
         depth[: self.camera.height, : self.camera.width] = torch.from_numpy(depth_m)
-        return Target(self.camera, self.color, depth, int((depth_m > 0).sum()))
+        readings = int((depth_m > 0).sum())
+        return Target(self.camera, self.color, depth, readings, self.depth_std, self.depth_weight)
 
     def without_exposure(self, exposure: NDArray[np.float64]) -> "Target":
         """Return the same depth with the colours in the exposure of the map (`model.exposure`), in [0, 1]."""
         gain, offset = torch.from_numpy(exposure).float().T[..., None, None]
         color, inside = torch.zeros_like(self.color), np.s_[:, : self.camera.height, : self.camera.width]
         color[inside] = ((self.color[inside] - offset) / gain).clamp_(0.0, 1.0)
-        return Target(self.camera, color, self.depth, self.valid_pixels)
+        return Target(self.camera, color, self.depth, self.valid_pixels, self.depth_std, self.depth_weight)
 
     def picture(self) -> Picture:
         """Return the image; colour is rounded to 256 steps, as a camera delivers it."""
@@ -83,9 +107,20 @@ class Target:
         return Picture(np.ascontiguousarray(color), self.depth_image.numpy().copy())
 
     @staticmethod
-    def of_picture(picture: Picture, camera: Camera, size: tuple[int, int]) -> "Target":
-        """Make the target of an earlier keyframe's picture."""
-        return Target.of(Frame(0, 0.0, picture.unit_color, picture.depth_m, camera), size)
+    def of_picture(
+        picture: Picture, camera: Camera, size: tuple[int, int], std_m: NDArray[np.float32] | None = None
+    ) -> "Target":
+        """Make the target of an earlier keyframe's picture; std_m [H, W]: the standard deviation of its readings."""
+        return Target.of(Frame(0, 0.0, picture.unit_color, picture.depth_m, camera, depth_std_m=std_m), size)
+
+
+def padded(image: NDArray[np.float32] | None, size: tuple[int, int]) -> Tensor | None:
+    """Return an image [H, W] on a plane of `size` = (rows, columns), 0 outside it; None stays None."""
+    if image is None:
+        return None
+    plane = torch.zeros(size)
+    plane[: image.shape[0], : image.shape[1]] = torch.tensor(image)
+    return plane
 
 
 @dataclass(eq=False)

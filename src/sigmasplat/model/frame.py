@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from sigmasplat.errors import SourceError
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
-from sigmasplat.model.resizing import resized_color, resized_depth, within
+from sigmasplat.model.resizing import resized_color, resized_depth, resized_std, within
 from sigmasplat.types import Matrix
 
 COLOR_LIMITS = (-1.0, 2.0)
@@ -34,10 +34,11 @@ class Frame:
     color: float32 [H, W, 3] in [0, 1]; depth_m: float32 [H, W] along the optical axis in metres, 0 = no reading;
     camera: the pinhole of both; timestamp_s: seconds; index: position in the source; R_inertial_camera [3, 3]: rotation
     from the camera's axes to fixed axes, the same for all frames, measured by a gyroscope; None = not measured. Only
-    the rotation between two frames is used, so any fixed axes will do. The frame keeps read-only views of both arrays
+    the rotation between two frames is used, so any fixed axes will do; depth_std_m: float32 [H, W], the standard
+    deviation of each depth reading, metres, if the sensor knows it. The frame keeps read-only views of the arrays
     and does not copy them: do not write to them later (`frame_from_arrays` copies). Raises SourceError if an array is
-    not float32, on inconsistent shapes, values that are not finite, colour in 0…255, negative depth, or a matrix
-    that is not a rotation.
+    not float32, on inconsistent shapes, values that are not finite, colour in 0…255, negative depth, a
+    reading whose standard deviation is not above 0, or a matrix that is not a rotation.
     """
 
     index: int
@@ -46,6 +47,7 @@ class Frame:
     depth_m: NDArray[np.float32]
     camera: Camera
     R_inertial_camera: Matrix | None = None
+    depth_std_m: NDArray[np.float32] | None = None
 
     def __post_init__(self) -> None:
         for name, array in (("colour", self.color), ("depth", self.depth_m)):
@@ -61,15 +63,22 @@ class Frame:
                 f"{size[1]}×{size[0]}; register depth to colour and give both one size"
             )
         self._check_values()
+        if self.depth_std_m is not None:
+            self._check_std(self.depth_std_m)
         if self.R_inertial_camera is not None and not se3.is_rotation(self.R_inertial_camera):
             raise SourceError(
                 f"frame {self.index}: R_inertial_camera is not a rotation [3, 3]; give None if it is not measured"
             )
-        self._keep(self.color, self.depth_m)
+        self._keep(self.color, self.depth_m, self.depth_std_m)
 
-    def _keep(self, color: NDArray[np.float32], depth_m: NDArray[np.float32]) -> None:
-        """Keep read-only views of both images; the caller's arrays stay writeable."""
-        for name, array in (("color", color), ("depth_m", depth_m)):
+    def _keep(
+        self, color: NDArray[np.float32], depth_m: NDArray[np.float32], depth_std_m: NDArray[np.float32] | None
+    ) -> None:
+        """Keep read-only views of the images; the caller's arrays stay writeable."""
+        for name, array in (("color", color), ("depth_m", depth_m), ("depth_std_m", depth_std_m)):
+            if array is None:
+                object.__setattr__(self, name, None)
+                continue
             view = np.ascontiguousarray(array).view()
             view.setflags(write=False)
             object.__setattr__(self, name, view)
@@ -86,12 +95,26 @@ class Frame:
         if nearest_m < 0.0:
             raise SourceError(f"frame {self.index}: depth is negative ({nearest_m:.3f} m); 0 means no reading")
 
+    def _check_std(self, std_m: NDArray[np.float32]) -> None:
+        """Raise SourceError unless every reading has a standard deviation above 0."""
+        if not isinstance(std_m, np.ndarray) or std_m.dtype != np.float32 or std_m.shape != self.depth_m.shape:
+            raise SourceError(
+                f"frame {self.index}: depth_std_m is {described(std_m)}; give float32, one value per pixel of depth"
+            )
+        wrong = ~(np.isfinite(std_m) & (std_m > 0)) & (self.depth_m > 0)
+        if wrong.any():
+            raise SourceError(
+                f"frame {self.index}: {int(wrong.sum())} depth readings have a standard deviation that is not above 0; "
+                "give finite metres above 0, or depth 0 where there is no reading"
+            )
+
     def resized(self, width: int, height: int) -> "Frame":
         """Return the frame at another size: colour averaged over the pixel's area, depth by `resized_depth`."""
         if (width, height) == (self.camera.width, self.camera.height):
             return self
         color, depth_m = resized_color(self.color, width, height), resized_depth(self.depth_m, width, height)
-        return self._with_images(color, depth_m, self.camera.resized(width, height))
+        std_m = resized_std(self.depth_std_m, depth_m)
+        return self._with_images(color, depth_m, self.camera.resized(width, height), std_m)
 
     def prepared(self, width: int, min_depth_m: float, max_depth_m: float, crop_px: int = 0) -> "Frame":
         """Return the working frame: the size of `Camera.prepared`, and depth 0 outside the range.
@@ -110,13 +133,24 @@ class Frame:
         if color is self.color and depth_m is self.depth_m and not crop_px:
             return self
         inner = np.s_[crop_px : crop_px + camera.height, crop_px : crop_px + camera.width]
-        return self._with_images(color[inner], depth_m[inner], camera)
+        std_m = resized_std(self.depth_std_m, depth_m)
+        return self._with_images(color[inner], depth_m[inner], camera, None if std_m is None else std_m[inner])
 
-    def _with_images(self, color: NDArray[np.float32], depth_m: NDArray[np.float32], camera: Camera) -> "Frame":
+    def with_depth(self, depth_m: NDArray[np.float32], depth_std_m: NDArray[np.float32] | None) -> "Frame":
+        """Return the frame with depth, and its standard deviation, that were made from its own."""
+        return self._with_images(self.color, depth_m, self.camera, depth_std_m)
+
+    def _with_images(
+        self,
+        color: NDArray[np.float32],
+        depth_m: NDArray[np.float32],
+        camera: Camera,
+        depth_std_m: NDArray[np.float32] | None,
+    ) -> "Frame":
         """Return the frame with images that were made from its own: their values need no check."""
         frame = copy.copy(self)
         object.__setattr__(frame, "camera", camera)
-        frame._keep(color, depth_m)
+        frame._keep(color, depth_m, depth_std_m)
         return frame
 
     def seen_by(self, camera: Camera) -> "Frame":
@@ -132,9 +166,13 @@ class Frame:
         color = _interpolated(_interpolated(resized_color(self.color, width, height), rows).swapaxes(0, 1), columns)
         u, v = (np.rint(pixels).astype(np.intp) for pixels in camera.pixels_in(self.camera))
         read = ((v >= 0) & (v < size[1]))[:, None] & (u >= 0) & (u < size[0])
-        depth = self.depth_m[np.clip(v, 0, size[1] - 1)][:, np.clip(u, 0, size[0] - 1)]
-        color, depth = np.ascontiguousarray(color.swapaxes(0, 1)), np.where(read, depth, np.float32(0.0))
-        return replace(self, color=color, depth_m=depth, camera=camera)
+
+        def nearest(image: NDArray[np.float32]) -> NDArray[np.float32]:
+            return np.where(read, image[np.clip(v, 0, size[1] - 1)][:, np.clip(u, 0, size[0] - 1)], np.float32(0.0))
+
+        std = None if self.depth_std_m is None else nearest(self.depth_std_m)
+        color = np.ascontiguousarray(color.swapaxes(0, 1))
+        return replace(self, color=color, depth_m=nearest(self.depth_m), camera=camera, depth_std_m=std)
 
 
 def described(value: object) -> str:

@@ -83,6 +83,16 @@ def within(depth_m: Depth, least_m: float, most_m: float) -> Depth:
     return depth_m if keep.all() else np.where(keep, depth_m, np.float32(0.0))
 
 
+def resized_std(std_m: Depth | None, depth_m: Depth) -> Depth | None:
+    """Return the standard deviation [H, W] of resized depth [H, W], both m: that of the reading nearest to each pixel's
+    centre, 0 without depth. None stays None."""
+    if std_m is None:
+        return None
+    height, width = depth_m.shape
+    small = std_m if std_m.shape == depth_m.shape else _nearest_depth(std_m, width, height)
+    return np.where(depth_m > 0, small, np.float32(0.0))
+
+
 def resized_depth_in_numpy(depth_m: Depth, width: int, height: int) -> Depth:
     """Return what `resized_depth` returns without limits."""
     if depth_m.shape == (height, width):

@@ -74,6 +74,7 @@ def mapping_losses(
     g_moment: Array | None,
     g_alpha: Array | None,
     losses: Array,
+    depth_weight: Array | None = None,
 ) -> None: ...
 def tracking_loss(
     sums: Array,
@@ -167,6 +168,7 @@ class Level:
         live_depth: Array,
         intrinsics: list[float],
         options: list[float],
+        noise: Array | None = None,
     ) -> None: ...
 
 class Harmonics:

@@ -33,15 +33,15 @@ static LivePairs side_by_side(const AlignLevel& L, Buffer<float>& memory) {
 SIGMA_INLINE void add_pixels(const AlignLevel& L, const LivePairs& live, const AlignOptions& o, const Motion& T, int x, int y, vf* acc, vf* pull) {
     const size_t at = size_t(y) * L.width + x;
     const int lanes = L.width - x < W ? L.width - x : W;
-    alignas(64) float edge[4][W] = {};
-    const float* planes[4] = {L.reference_depth, L.reference_gray, L.weight_gray, L.weight_depth};
-    for (int k = 0; k < 4; k++) {
+    alignas(64) float edge[5][W] = {};
+    const float* planes[5] = {L.reference_depth, L.reference_gray, L.weight_gray, L.weight_depth, L.noise};
+    for (int k = 0; k < 5; k++) {
         if (!planes[k]) continue;
         planes[k] += at;
         if (lanes < W) { memcpy(edge[k], planes[k], lanes * 4); planes[k] = edge[k]; }
     }
     const vf off_x = lane_index() + (float(x) - L.cx);
-    add_residuals(L, live, o, T, off_x, float(y) - L.cy, first_lanes(lanes), {planes[0], planes[1], planes[2], planes[3]}, acc, pull);
+    add_residuals(L, live, o, T, off_x, float(y) - L.cy, first_lanes(lanes), {planes[0], planes[1], planes[2], planes[3], planes[4]}, acc, pull);
 }
 
 static void linearise(const AlignLevel& L, const LivePairs& live, const AlignOptions* o, const double* T, double* H, double* b, double* S, double* sums) {

@@ -1,7 +1,8 @@
 // One level of two images to align, the weights of its residuals, and when steps end. Has no includes and no namespace.
 
-struct AlignPlanes {                       // planes of width × height, contiguous; weights may be null
+struct AlignPlanes {                       // planes of width × height, contiguous; weights and noise may be null
     const float *reference_gray, *reference_depth, *weight_gray, *weight_depth, *live_gray, *live_depth;
+    const float* noise;                    // factor on the Huber width of depth: σ of a reading over that of the z² law
 };
 struct AlignPinhole { int width, height; float fx, fy, cx, cy; };
 struct AlignLevel : AlignPlanes, AlignPinhole {};

@@ -40,7 +40,7 @@ SIGMA_INLINE Motion motion_of(const double* T) {
     return m;
 }
 
-struct ReferencePixels { const float *depth, *gray, *weight_gray, *weight_depth; };   // weights may be null
+struct ReferencePixels { const float *depth, *gray, *weight_gray, *weight_depth, *noise; };   // weights and noise may be null
 
 // The number of a cell's pixels that both cameras see: those in view, unless live depth has a large hole there. Holes
 // that are scattered do not matter as long as a quarter of the pixels fall on a reading.
@@ -92,7 +92,8 @@ SIGMA_INLINE void add_residuals(const AlignLevel& L, const Live& live, const Ali
     const Mask smooth = both(both(agrees, planar), gt(0.03f * pz, farthest - nearest));
     const Mask color_ok = both(ok, mask_or(agrees, mask_not(read)));
     const vf weight_gray = pixels.weight_gray ? load(pixels.weight_gray) : splat(1.f), weight_depth = pixels.weight_depth ? load(pixels.weight_depth) : splat(1.f);
-    const vf hd = splat(o.huber_depth_relative) * pz * pz;    // sensor noise grows with z²
+    vf hd = splat(o.huber_depth_relative) * pz * pz;          // sensor noise grows with z², unless readings have their own
+    if (pixels.noise) hd = hd * max(load(pixels.noise), splat(1e-3f));
     const vf wi = only(color_ok, weight_gray * (o.weight_color / (o.huber_gray * o.huber_gray)) * huber_weight(r_gray, splat(o.huber_gray)));
     const vf wd = only(smooth, weight_depth * (o.weight_depth / (hd * hd)) * huber_weight(r_depth, hd));
     const vf fxz = L.fx * iz, fyz = L.fy * iz, zero = splat(0.f);

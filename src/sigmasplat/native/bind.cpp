@@ -64,17 +64,19 @@ struct Level {
     ConstFloats live_gray, live_depth;
     std::vector<float> intrinsics;
     AlignOptions options;
+    Maybe<ConstFloats> noise;
 
-    Level(ConstFloats rg, ConstFloats rd, Maybe<ConstFloats> wg, Maybe<ConstFloats> wd, ConstFloats lg, ConstFloats ld, std::vector<float> camera, std::vector<float> o)
-        : reference_gray(rg), reference_depth(rd), weight_gray(wg), weight_depth(wd), live_gray(lg), live_depth(ld), intrinsics(camera) {
+    Level(ConstFloats rg, ConstFloats rd, Maybe<ConstFloats> wg, Maybe<ConstFloats> wd, ConstFloats lg, ConstFloats ld, std::vector<float> camera, std::vector<float> o,
+          Maybe<ConstFloats> noise_factor)
+        : reference_gray(rg), reference_depth(rd), weight_gray(wg), weight_depth(wd), live_gray(lg), live_depth(ld), intrinsics(camera), noise(noise_factor) {
         need(camera.size() == 4 && o.size() == 5, "a level has 4 intrinsics and 5 options");
         need(rg.ndim() == 2 && rd.size() == rg.size() && lg.size() == rg.size() && ld.size() == rg.size()
-             && (!wg || wg->size() == rg.size()) && (!wd || wd->size() == rg.size()), "the planes of a level are of one size");
+             && (!wg || wg->size() == rg.size()) && (!wd || wd->size() == rg.size()) && (!noise || noise->size() == rg.size()), "the planes of a level are of one size");
         options = {o[0], o[1], o[2], o[3], o[4]};
     }
     AlignLevel planes() const {
         return {{reference_gray.data(), reference_depth.data(), weight_gray ? weight_gray->data() : nullptr, weight_depth ? weight_depth->data() : nullptr,
-                 live_gray.data(), live_depth.data()},
+                 live_gray.data(), live_depth.data(), noise ? noise->data() : nullptr},
                 {int(reference_gray.shape(1)), int(reference_gray.shape(0)), intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]}};
     }
 };
@@ -250,18 +252,18 @@ NB_MODULE(_core, m) {
     }, nb::arg("image"), nb::arg("target"), nb::arg("cache"), nb::arg("width"), nb::arg("height"), nb::arg("mask").none(), nb::arg("weight"), nb::arg("gradient"));
     m.def("mapping_losses", [](ConstFloats sums, Maybe<ConstFloats> median_depth, Maybe<ConstFloats> moment, Maybe<ConstFloats> alpha,
                                ConstFloats target_color, ConstFloats target_depth, int height, std::vector<float> weights, double valid_pixels, Floats g_sums,
-                               Maybe<Floats> g_median_depth, Maybe<Floats> g_moment, Maybe<Floats> g_alpha, Doubles losses) {
+                               Maybe<Floats> g_median_depth, Maybe<Floats> g_moment, Maybe<Floats> g_alpha, Doubles losses, Maybe<ConstFloats> depth_weight) {
         need(weights.size() == LOSS_TERMS && losses.size() == LOSS_TERMS, "mapping_losses: seven weights, seven losses");
         need(!median_depth == !g_median_depth && !moment == !g_moment && !alpha == !g_alpha, "a gradient goes with its plane");
         const size_t stride = sums.shape(2), plane = sums.shape(1) * stride;
         const LossWeights w{weights[0], weights[1], weights[2], weights[3], weights[4], weights[5], weights[6]};
         nb::gil_scoped_release unlocked;
         active->mapping_losses(sums.data(), target_color.data(), target_depth.data(), height, stride, plane, sums.shape(0) >= 7,
-                               {pointer(median_depth), pointer(moment), pointer(alpha)}, w, valid_pixels,
+                               {pointer(median_depth), pointer(moment), pointer(alpha), pointer(depth_weight)}, w, valid_pixels,
                                g_sums.data(), {pointer(g_median_depth), pointer(g_moment), pointer(g_alpha)}, losses.data());
     }, nb::arg("sums"), nb::arg("median_depth").none(), nb::arg("moment").none(), nb::arg("alpha").none(), nb::arg("target_color"), nb::arg("target_depth"),
        nb::arg("height"), nb::arg("weights"), nb::arg("valid_pixels"), nb::arg("g_sums"), nb::arg("g_median_depth").none(), nb::arg("g_moment").none(),
-       nb::arg("g_alpha").none(), nb::arg("losses"));
+       nb::arg("g_alpha").none(), nb::arg("losses"), nb::arg("depth_weight").none() = nb::none());
     m.def("tracking_loss", [](ConstFloats sums, ConstFloats alpha, ConstFloats target_color, ConstFloats target_depth, int width, int height,
                               std::vector<float> options, bool uncertainty, bool kept, float gain, float offset, Floats g_sums, Doubles g_exposure) {
         need(g_exposure.size() == 2, "g_exposure has 2 numbers");
@@ -287,9 +289,9 @@ NB_MODULE(_core, m) {
         mesh_depth({u.data(), v.data(), z.data(), faces.data(), faces.shape(0)}, width, height, near_m, depth.data(), face.data());
     });
     nb::class_<Level>(m, "Level")
-        .def(nb::init<ConstFloats, ConstFloats, Maybe<ConstFloats>, Maybe<ConstFloats>, ConstFloats, ConstFloats, std::vector<float>, std::vector<float>>(),
+        .def(nb::init<ConstFloats, ConstFloats, Maybe<ConstFloats>, Maybe<ConstFloats>, ConstFloats, ConstFloats, std::vector<float>, std::vector<float>, Maybe<ConstFloats>>(),
              nb::arg("reference_gray"), nb::arg("reference_depth"), nb::arg("weight_gray").none(), nb::arg("weight_depth").none(), nb::arg("live_gray"),
-             nb::arg("live_depth"), nb::arg("intrinsics"), nb::arg("options"));
+             nb::arg("live_depth"), nb::arg("intrinsics"), nb::arg("options"), nb::arg("noise").none() = nb::none());
     m.def("align_step", [](const Level& level, Doubles T, Doubles H, Doubles b, Doubles S, Doubles sums) {
         need(T.size() >= 12 && H.size() == 21 && b.size() == 6 && S.size() == 21 && sums.size() == 5, "align_step: wrong sizes");
         const AlignLevel planes = level.planes();

@@ -38,7 +38,7 @@ struct SplatGradients { float *means2d, *conics, *z, *opacities, *features; };
 
 constexpr int LOSS_TERMS = 7;
 struct LossWeights { float l1, depth, nll_color, nll_depth, median_depth, moment, mean_depth; };
-struct DepthMaps { const float *median_depth, *moment, *alpha; };                      // null where their weight is 0
+struct DepthMaps { const float *median_depth, *moment, *alpha, *weight; };   // null where their weight is 0; weight: of each reading, or null
 struct DepthGradients { float *median_depth, *moment, *alpha; };
 
 struct AdamOptions { const float* rates; float beta1, beta2, epsilon; int step; };   // rates: one per column

@@ -62,7 +62,10 @@ def final_map(
         return FinalMap(field)
     if found is None:
         field.keep(torch.from_numpy(z_order(field.means.numpy())))
-    on_device, keyframes = field.to(view.sums.device), KeyframeReader(store, anchors, view)
+    on_device, keyframes = (
+        field.to(view.sums.device),
+        KeyframeReader(store, anchors, view, config.input.sensor if config.mapping.sensor_noise else None),
+    )
     if found is not None:
         keyframes.take(found)
         random.bit_generator.state = found.numbers

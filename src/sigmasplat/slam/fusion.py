@@ -16,6 +16,7 @@ from sigmasplat.config import Config
 from sigmasplat.fit.confidence import uncertainty_weights
 from sigmasplat.model import isosurface, se3
 from sigmasplat.model.camera import Camera
+from sigmasplat.model.depth_std import std_by_model
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.mesh import Mesh
 from sigmasplat.model.submap import Picture, SubmapStore
@@ -124,7 +125,8 @@ def fuse(
         depth_m, color = surface_of(seen, config)
         weight = certainty(seen, config) if weigh else None
         if at.picture is not None:
-            depth_m, color, weight = with_readings(depth_m, color, at.picture)
+            std_m = reading_std(at.picture.depth_m, at.camera, config)
+            depth_m, color, weight = with_readings(depth_m, color, at.picture, std_m)
         volume.integrate(depth_m, color, at.camera, at.T_world_camera, weight)
         progress(done, total)
     mesh = isosurface.surface(volume)
@@ -141,7 +143,14 @@ def surface_of(seen: Render, config: Config) -> tuple[Floats, Floats]:
     return depth_m, np.clip(_array(seen.color) / opaque[..., None], 0.0, 1.0)
 
 
-def with_readings(depth_m: Floats, color: Floats, picture: Picture) -> tuple[Floats, Floats, Floats]:
+def reading_std(depth_m: Floats, camera: Camera, config: Config) -> Floats | None:
+    """Return the standard deviation of readings [H, W], m, by the model of the sensor; None if it is not used."""
+    return std_by_model(depth_m, camera, config.input.sensor) if config.surface.sensor_noise else None
+
+
+def with_readings(
+    depth_m: Floats, color: Floats, picture: Picture, std_m: Floats | None = None
+) -> tuple[Floats, Floats, Floats]:
     """Combine rendered depth [H, W] and colour [H, W, 3] with a keyframe's readings; return both and the weight [H, W].
 
     Depth is the mean of the render and the reading, weighted by the inverse of their variances. Where they differ by
@@ -151,6 +160,9 @@ def with_readings(depth_m: Floats, color: Floats, picture: Picture) -> tuple[Flo
     reading_m = picture.depth_m
     rendered_m = np.where(silhouettes(depth_m), np.float32(0.0), depth_m)
     of_reading = _inverse_variance(reading_m)
+    if std_m is not None and (reading_m > 0).any():  # the same weight as without σ, in the median
+        usual = np.median((of_reading * std_m * std_m)[reading_m > 0])
+        of_reading = np.divide(usual, std_m * std_m, out=np.zeros_like(std_m), where=std_m > 0, dtype=np.float32)
     agree = np.abs(rendered_m - reading_m) < AGREE_SHARE * reading_m
     of_render = np.where((reading_m > 0) & ~agree, np.float32(0.0), RENDER_WEIGHT * _inverse_variance(rendered_m))
     weight = of_reading + of_render

@@ -24,7 +24,7 @@ from sigmasplat.render.view import View
 from sigmasplat.slam.densify import densify_mask, multiply, split, too_large
 from sigmasplat.slam.pruning import fade, splat_depth_residuals, splat_uncertainty, still_uncertain
 from sigmasplat.slam.rules import draw_keyframes
-from sigmasplat.slam.seeding import first_pixels, later_pixels, make_splats, thin_out
+from sigmasplat.slam.seeding import first_pixels, later_pixels, make_splats, sureness, thin_out
 from sigmasplat.slam.window import choose_window, dominating
 from sigmasplat.types import Slices, completed
 
@@ -195,7 +195,7 @@ class Mapper:
         else:
             view.forward(self.field.params, se3.inverse(T_world_camera))
             wanted = later_pixels(PoseMaps.of(view), target, c)
-            pixels = thin_out(wanted, c, self.random)
+            pixels = thin_out(wanted, c, self.random, sureness(target, c))
         spacing_px = float(np.sqrt(wanted.sum() / max(pixels.sum(), 1)))
         new = make_splats(target, T_world_camera, pixels, spacing_px, self.field, c)
         room = c.max_splats - len(self.field) if c.max_splats else len(new)

@@ -15,6 +15,7 @@ from sigmasplat.fit.exposure import fit_exposure
 from sigmasplat.fit.field import fit_field
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.model import se3
+from sigmasplat.model.depth_std import std_by_model
 from sigmasplat.model.exposure import NEUTRAL, centred
 from sigmasplat.model.field import COLUMNS, GaussianField
 from sigmasplat.model.submap import SubmapStore
@@ -60,12 +61,13 @@ class KeyframeReader:
 
     anchors: T_world_submap [4, 4] of each submap; `places`: submap and number of each keyframe; `poses`: their
     T_world_camera [4, 4], which `refine` may move; `motions`: Adam's state of each pose; `exposures` [K, 3, 2]: those
-    of the images relative to the map, as fitted last; `left`: the keyframes left in the current epoch. Raises
+    of the images relative to the map, as fitted last; `left`: the keyframes left in the current epoch; `sensor`: the
+    text of the model by which depth is weighed, None: all readings weigh the same. Raises
     SigmaSplatError if there is no keyframe, or a submap's camera is not the view's.
     """
 
-    def __init__(self, store: SubmapStore, anchors: Sequence[Matrix], view: View) -> None:
-        self.store, self.camera = store, view.camera
+    def __init__(self, store: SubmapStore, anchors: Sequence[Matrix], view: View, sensor: str | None = None) -> None:
+        self.store, self.camera, self.sensor = store, view.camera, sensor
         self.size = (view.alpha.shape[0], view.alpha.shape[1])
         self.places: list[tuple[int, int]] = []
         self.poses: list[Matrix] = []
@@ -132,7 +134,10 @@ class KeyframeReader:
         return [found[submap_of == index] for index in range(len(self.store))]
 
     def _read(self, i: int) -> Target:
-        return Target.of_picture(self.store.picture(*self.places[i]), self.camera, self.size)
+        picture = self.store.picture(*self.places[i])
+        std_m = None if self.sensor is None else std_by_model(picture.depth_m, self.camera, self.sensor)
+        target = Target.of_picture(picture, self.camera, self.size, std_m)
+        return target if std_m is None else target.weighed_by_std()
 
 
 def refine(

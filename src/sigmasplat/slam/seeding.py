@@ -24,10 +24,10 @@ STRETCH_MOST = 3.0
 
 def first_pixels(target: Target, config: SeedConfig, random: np.random.Generator) -> Mask:
     """Choose pixels for an empty map, bool [H, W]: uniform, by gradient, and on Canny edges; only with depth."""
-    valid = target.depth_image.numpy() > 0
+    valid, sure = target.depth_image.numpy() > 0, sureness(target, config)
     gray = gray_of(target.image.numpy())
-    chosen = _draw(valid.astype(float), config.first_uniform, random)
-    chosen |= _draw(gradient_magnitude(gray) * valid, config.first_gradient, random)
+    chosen = _draw(valid * sure, config.first_uniform, random)
+    chosen |= _draw(gradient_magnitude(gray) * valid * sure, config.first_gradient, random)
     if config.first_edges:
         edges = canny(gray, low_threshold=100 / 255, high_threshold=200 / 255)  # type: ignore[no-untyped-call]
         chosen |= binary_dilation(edges, np.ones((2, 2), bool))
@@ -50,10 +50,25 @@ def later_pixels(maps: PoseMaps, target: Target, config: SeedConfig) -> Mask:
     return chosen
 
 
-def thin_out(pixels: Mask, config: SeedConfig, random: np.random.Generator) -> Mask:
-    """Keep a random share of the pixels, bool [H, W]: `density` of them, at most `later_max`."""
+def sureness(target: Target, config: SeedConfig) -> NDArray[np.float64]:
+    """Return with which weight pixels are drawn [H, W]: 1/σ² of their readings relative to others at the same depth, so
+    that edges and grazing surfaces are seeded last, but far surfaces are not; 1 without σ or `sensor_noise`."""
+    std_m = target.depth_std_image if config.sensor_noise else None
+    if std_m is None:
+        return np.ones(target.depth_image.shape)
+    depth_m = target.depth_image.numpy().astype(np.float64)
+    relative = np.divide(std_m, depth_m * depth_m, out=np.ones_like(depth_m), where=depth_m > 0)
+    return relative**-2.0
+
+
+def thin_out(
+    pixels: Mask, config: SeedConfig, random: np.random.Generator, sure: NDArray[np.float64] | None = None
+) -> Mask:
+    """Keep a random share of the pixels, bool [H, W]: `density` of them, at most `later_max`; sure [H, W]: their
+    weights (`sureness`)."""
     count = round(config.density * int(pixels.sum()))
-    return _draw(pixels.astype(float), min(count, config.later_max) if config.later_max else count, random)
+    most = min(count, config.later_max) if config.later_max else count
+    return _draw(pixels * (1.0 if sure is None else sure), most, random)
 
 
 def _draw(weight: NDArray[np.floating], count: int, random: np.random.Generator) -> Mask:

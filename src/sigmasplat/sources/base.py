@@ -29,6 +29,7 @@ class Source(ABC):
     computed_depth: whether the source computes depth itself, from a stereo pair;
     scene_scale: size of the scene relative to a room, above 1 outdoors; depth_noise_per_m: standard deviation
     of depth, times z²; None if it is unknown (`config.scale.for_scene` uses both);
+    sensor: the depth sensor (`config.sensors`), None if it is unknown;
     live: whether frames come from a live camera: each only once, and their number is unknown (LiveSource);
     arrived_s: when the last frame arrived, by `time.perf_counter`, if frames do not wait for the consumer (Arrivals);
     dropped: number of frames that were dropped because the consumer was late.
@@ -43,6 +44,7 @@ class Source(ABC):
     computed_depth: bool = False
     scene_scale: float = 1.0
     depth_noise_per_m: float | None = None
+    sensor: str | None = None
     live: bool = False
     arrived_s: float | None = None
     dropped: int = 0
@@ -151,7 +153,7 @@ class Subset(Source):
         self.depth_units_per_metre = whole.depth_units_per_metre
         self.depth_registered, self.registrable = whole.depth_registered, whole.registrable
         self.computed_depth, self.scene_scale = whole.computed_depth, whole.scene_scale
-        self.depth_noise_per_m = whole.depth_noise_per_m
+        self.depth_noise_per_m, self.sensor = whole.depth_noise_per_m, whole.sensor
         self._whole = whole
         self._indices = _within(whole, settings)[:: settings.stride][: settings.limit or None]
         if not len(self._indices):

@@ -55,4 +55,5 @@ FORMAT = Format(
     recognises,
     lambda path, settings: open_bonn(Path(path), settings),
     priority=2,
+    sensor="kinect-v1",
 )

@@ -29,7 +29,8 @@ class Format:
     looked_for: names the files that identify the format, for messages;
     open(path, settings): builds the source of all its frames;
     priority: formats of higher priority are asked first, so that a special format comes before a general one. Above 0:
-    other formats recognise the same files; below 0: the format is a guess.
+    other formats recognise the same files; below 0: the format is a guess;
+    sensor: the depth sensor of all its recordings (`config.sensors`), None if it varies.
     """
 
     name: str
@@ -37,6 +38,7 @@ class Format:
     recognises: Callable[[str], bool]
     open: Callable[[str, InputConfig], Source]
     priority: int = 0
+    sensor: str | None = None
 
 
 @cache
@@ -61,6 +63,7 @@ def open_source(path: str | Path, settings: InputConfig | None = None, **changes
     known = format_of(path)
     with _guarded(path):
         source = known.open(str(path), chosen)
+    source.sensor = source.sensor or known.sensor
     part = chosen.stride > 1 or chosen.limit or chosen.start_s or chosen.end_s
     return Subset(source, chosen) if part and not source.live else source
 

@@ -221,4 +221,5 @@ FORMAT = Format(
     "a .r3d file, or metadata.json with rgb/ and depth/*.exr",
     _recognises,
     lambda path, settings: open_record3d(Path(path), settings),
+    sensor="lidar-iphone",
 )

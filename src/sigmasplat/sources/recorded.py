@@ -46,6 +46,10 @@ class ImagePair:
         """Read depth in metres [H, W], 0 = no reading; whole numbers are divided. Raises SourceError naming `depth`."""
         return read_depth(self.depth, units_per_metre)
 
+    def read_depth_and_std(self, units_per_metre: float) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+        """Read depth as `read_depth` does, and its standard deviation, m [H, W], if it is known."""
+        return self.read_depth(units_per_metre), None
+
     def sizes(self) -> tuple[Size, Size]:
         """Return (width, height) of colour and of depth in pixels. Raises SourceError naming the unreadable file."""
         return image_size(self.color), image_size(self.depth)
@@ -77,7 +81,7 @@ class RecordedSource(Source):
         super().__init__(name, self._rectified.camera, settings.strict)
         self.depth_units_per_metre: float = calibration.depth_units_per_metre
         self.depth_registered = self._rectified.moves_depth
-        self.registrable = calibration.depth_camera is not None
+        self.registrable, self.sensor = calibration.depth_camera is not None, calibration.sensor
         self.skipped = list(skipped)
         self._images, self._truth, self._test, self._gyroscope = images, truth, test, gyroscope
         self._surface = surface
@@ -96,12 +100,12 @@ class RecordedSource(Source):
         """Read frame i: colour and depth of one camera, lens distortion removed."""
         files = self._images[self._checked_index(i)]
         color = color_from_bytes(files.read_color())
-        depth_m = files.read_depth(self.depth_units_per_metre)
+        depth_m, std_m = files.read_depth_and_std(self.depth_units_per_metre)
         check_image_sizes(self._rectified, files.color, color.shape[1::-1], files.depth, depth_m.shape[::-1])
         color, depth_m = self._rectified(color, depth_m)
         color = resized_color(color, self.camera.width, self.camera.height)
         R_inertial_camera = None if self._gyroscope is None else self._gyroscope.R_inertial_camera(files.timestamp_s)
-        return Frame(i, files.timestamp_s, color, depth_m, self.camera, R_inertial_camera)
+        return Frame(i, files.timestamp_s, color, depth_m, self.camera, R_inertial_camera, std_m)
 
     def depth_of(self, i: int) -> NDArray[np.float32]:
         """Read the depth of frame i as `frame` does, without reading colour."""

@@ -148,4 +148,5 @@ FORMAT = Format(
     "color/, depth/ and camera_intrinsic.json or trajectory.log",
     recognises,
     lambda path, settings: open_redwood(Path(path), settings),
+    sensor="kinect-v1",
 )

@@ -141,4 +141,5 @@ FORMAT = Format(
     "color/, depth/ and pose/",
     recognises,
     lambda path, settings: open_scannet(Path(path), settings),
+    sensor="kinect-v1",
 )

@@ -78,4 +78,5 @@ FORMAT = Format(
     "frame-*.color.png",
     recognises,
     lambda path, settings: open_seven_scenes(Path(path), settings),
+    sensor="kinect-v1",
 )

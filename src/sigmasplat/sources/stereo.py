@@ -65,6 +65,10 @@ class StereoPair(ImagePair):
         """Match both images: depth of the left one in metres [H, W]. Raises SourceError naming the file."""
         return self.depth_and_std_m()[0]
 
+    def read_depth_and_std(self, units_per_metre: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Match both images. Raises SourceError naming the file."""
+        return self.depth_and_std_m()
+
     def depth_and_std_m(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Match both images: depth of the left one and its standard deviation, m [H, W]. Raises SourceError."""
         right = self.rig.rectification.right(self._read(self.depth))

@@ -200,4 +200,5 @@ FORMAT = Format(
     "rgb.mp4, depth/ and odometry.csv",
     _recognises,
     lambda path, settings: open_stray_scanner(Path(path), settings),
+    sensor="lidar-iphone",
 )

@@ -99,10 +99,10 @@ class SyntheticRoom(Source):
         if self._noise:
             rng = np.random.default_rng((self._seed, i, 7))
             color, depth_m = measured_color(color, rng), measured_depth(depth_m, self.camera, rng)
-        bytes_ = np.rint(color * 255.0).astype(np.uint8)
+        bytes_, std_m = np.rint(color * 255.0).astype(np.uint8), None
         if self._matcher:
-            depth_m, _ = self._matcher.depth_and_std_m(bytes_, self.right_image(i))
-        return Frame(i, self.timestamp_s(i), color_from_bytes(bytes_), depth_m, self.camera)
+            depth_m, std_m = self._matcher.depth_and_std_m(bytes_, self.right_image(i))
+        return Frame(i, self.timestamp_s(i), color_from_bytes(bytes_), depth_m, self.camera, depth_std_m=std_m)
 
     def right_image(self, i: int) -> NDArray[np.uint8]:
         """Render the right image of frame i of the stereo pair, RGB [H, W, 3]: the baseline to the right of the left

@@ -62,7 +62,7 @@ class CompiledImages:
         alpha, g_alpha = (v.alpha, v.g_alpha) if weights.get("mean_depth") else (None, None)
         self.core.mapping_losses(
             v.sums, median, moment, alpha, target.color, target.depth, height, of_pixels.tolist(),
-            target.valid_pixels, v.g_sums, g_median, g_moment, g_alpha, self.parts,
+            target.valid_pixels, v.g_sums, g_median, g_moment, g_alpha, self.parts, target.depth_weight,
         )  # fmt: skip
         loss = float(np.dot(of_pixels, self.parts))
         if weights["ssim"]:

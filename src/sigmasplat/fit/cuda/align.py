@@ -41,14 +41,16 @@ STATE = np.dtype([("loop", LOOP), ("descent", DESCENT), ("readings", "f8")], ali
 class CudaLevel:
     """One level of two images to align, and the weights of its residuals, like `_core.Level` on the CPU.
 
-    Planes [H, W], float32, on one device; weights may be None. Raises ValueError if shapes, types or devices differ.
+    Planes [H, W], float32, on one device; weights and noise may be None. Raises ValueError if shapes, types or devices
+    differ.
     """
 
     def __init__(
         self, reference_gray: Tensor, reference_depth: Tensor, weight_gray: Tensor | None, weight_depth: Tensor | None,
         live_gray: Tensor, live_depth: Tensor, intrinsics: Sequence[float], options: Sequence[float],
+        noise: Tensor | None = None,
     ) -> None:  # fmt: skip
-        self.planes = (reference_gray, reference_depth, weight_gray, weight_depth, live_gray, live_depth)
+        self.planes = (reference_gray, reference_depth, weight_gray, weight_depth, live_gray, live_depth, noise)
         given = [plane for plane in self.planes if plane is not None]
         if len({(p.shape, p.dtype, p.device) for p in given}) > 1 or reference_gray.dtype != torch.float32:
             raise ValueError("the planes of a level are float32, of one size, on one device")

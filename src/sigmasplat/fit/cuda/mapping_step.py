@@ -47,7 +47,8 @@ class CudaStep:
         median, on_median = (v.layers.median_depth, v.g_median_depth) if weights.get("median_depth") else (None, None)
         moment, on_moment = (v.moment, v.g_moment) if weights.get("moment") else (None, None)
         alpha, on_alpha = (v.alpha, v.g_alpha) if weights.get("mean_depth") else (None, None)
-        planes = (v.sums, target.color, target.depth, median, moment, alpha, v.g_sums, on_median, on_moment, on_alpha)
+        maps = v.sums, target.color, target.depth, median, moment, alpha
+        planes = (*maps, v.g_sums, on_median, on_moment, on_alpha, target.depth_weight)
         blocks = blocks_for(self._pixels)
         sums = v.raster.empty(blocks, 1, dtype=torch.float64)
         v.raster.launch_fit(

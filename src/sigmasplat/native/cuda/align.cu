@@ -94,7 +94,7 @@ inline void store_cell(const AlignLevel& L, const AlignOptions& o, const double*
     if (x < L.width && y < L.height) {
         const size_t at = size_t(y) * L.width + x;
         const ReferencePixels pixel = {L.reference_depth + at, L.reference_gray + at, L.weight_gray ? L.weight_gray + at : nullptr,
-                                       L.weight_depth ? L.weight_depth + at : nullptr};
+                                       L.weight_depth ? L.weight_depth + at : nullptr, L.noise ? L.noise + at : nullptr};
         add_residuals(L, LivePlanes{L.live_gray, L.live_depth, L.width}, o, motion_of(T), float(x) - L.cx, float(y) - L.cy, true, pixel, terms, terms + PULL);
     }
     of_warps[thread / 32][thread % 32] = sum_of_lanes<16>(terms);

@@ -14,6 +14,7 @@ inline float signed_weight(float error, float weight) { return error > 0.f ? wei
 struct LossPlanes {                        // median_depth, moment, alpha and their gradients are null if their weight is 0
     const float *sums, *color, *depth, *median_depth, *moment, *alpha;
     float *on_sums, *on_median_depth, *on_moment, *on_alpha;
+    const float* weight;                   // of each reading, 1 on average; may be null
 };
 struct LossWeights { float l1, depth, nll_color, nll_depth, median_depth, moment, mean_depth; };
 
@@ -25,8 +26,9 @@ KERNEL mapping_losses(LossPlanes p, int pixels, int variance, float per_pixel, L
         const float reading = p.depth[at], per_value = per_pixel / 3.f;
         const bool valid = reading > 0.f;
         const float depth = p.sums[3 * size_t(pixels) + at], depth_error = valid ? depth - reading : 0.f;
-        cost = weights.depth * per_pixel * fabsf(depth_error);
-        float on_depth = signed_weight(depth_error, weights.depth * per_pixel);
+        const float sure = p.weight ? p.weight[at] : 1.f;
+        cost = sure * weights.depth * per_pixel * fabsf(depth_error);
+        float on_depth = sure * signed_weight(depth_error, weights.depth * per_pixel);
         if (p.median_depth) {              // both depths get a gradient; median depth 0 = none
             const float median = p.median_depth[at], apart = valid && median > 0.f ? depth - median : 0.f;
             const float pull = signed_weight(apart, weights.median_depth * per_pixel);
@@ -36,14 +38,14 @@ KERNEL mapping_losses(LossPlanes p, int pixels, int variance, float per_pixel, L
         }
         if (p.moment) {
             const float U = valid ? p.moment[at] : 0.f;
-            cost += weights.moment * per_pixel * fabsf(U);
-            p.on_moment[at] = signed_weight(U, weights.moment * per_pixel);
+            cost += sure * weights.moment * per_pixel * fabsf(U);
+            p.on_moment[at] = sure * signed_weight(U, weights.moment * per_pixel);
         }
         if (p.alpha) {                     // D̂/A; no gradient where A is small
             const float A = p.alpha[at], inverse = 1.f / fmaxf(A, 0.5f), mean = depth * inverse;
             const float off = valid && A > 0.5f ? mean - reading : 0.f;
-            const float pull = signed_weight(off, weights.mean_depth * per_pixel) * inverse;
-            cost += weights.mean_depth * per_pixel * fabsf(off);
+            const float pull = sure * signed_weight(off, weights.mean_depth * per_pixel) * inverse;
+            cost += sure * weights.mean_depth * per_pixel * fabsf(off);
             on_depth += pull;
             p.on_alpha[at] = -pull * mean;
         }

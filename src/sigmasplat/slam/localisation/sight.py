@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 from sigmasplat.config import Config
 from sigmasplat.errors import SourceError
 from sigmasplat.fit.pyramid import HIDDEN_M, Pyramid
-from sigmasplat.fit.references import Reference, live_image
+from sigmasplat.fit.references import Reference, live_image, relative_noise
 from sigmasplat.fit.target import Target
 from sigmasplat.model.camera import Camera
+from sigmasplat.model.depth_std import std_by_model
 from sigmasplat.model.exposure import gray_exposure, unexposed
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.photo import Photo, photo_size
@@ -54,7 +55,8 @@ class Sight:
 
     def _with_depth(self, depth_m: NDArray[np.float32], view: View) -> tuple[Target, Pyramid]:
         target = self.target.with_depth(depth_m)
-        return target, live_image(view, target.image.numpy(), depth_m, target)
+        noise = None if self.live.noise[0] is None else relative_noise(view, self.target)
+        return target, live_image(view, target.image.numpy(), depth_m, target, noise)
 
 
 @dataclass(eq=False)
@@ -85,24 +87,27 @@ def view_of(camera: Camera, config: Config) -> View:
 
 
 def working_frame(frame: Frame, config: Config, camera: Camera | None = None) -> Frame:
-    """Return a frame at working size, with depth denoised if the settings say so; if `camera` is given and differs, the
-    frame is resampled to it."""
+    """Return a frame at working size, with depth denoised if the settings say so, and with the standard deviation of
+    its readings if `input.sensor` names a model; if `camera` is given and differs, the frame is resampled to it."""
     i = config.input
     working = frame.prepared(i.width, i.min_depth_m, i.max_depth_m, i.crop_px)
     if camera is not None and working.camera != camera:
         working = frame.seen_by(camera).prepared(0, i.min_depth_m, i.max_depth_m)
-    if not i.denoise_depth:
-        return working
-    r = config.render
-    depth_m = denoised(working.depth_m, r.depth_noise_per_m, r.scene_scale)
-    return working if depth_m is working.depth_m else replace(working, depth_m=depth_m)
+    depth_m, std_m, r = working.depth_m, working.depth_std_m, config.render
+    if i.denoise_depth:
+        depth_m = denoised(depth_m, r.depth_noise_per_m, r.scene_scale)
+    modelled = std_by_model(depth_m, working.camera, i.sensor)
+    return working.with_depth(depth_m, std_m if modelled is None else modelled)
 
 
 def observe(whole: Frame, working: Frame, view: View, config: Config, extractor: Extractor | None) -> Observation:
     """Return a frame in the forms that tracking needs: features are found in the whole frame, everything else is made
     from the working frame."""
     target = Target.of(working, (view.sums.shape[1], view.sums.shape[2]))
-    live, image = live_image(view, working.color, working.depth_m, target), None
+    if config.mapping.sensor_noise:
+        target = target.weighed_by_std()
+    noise = relative_noise(view, target) if config.tracking.sensor_noise else None
+    live, image = live_image(view, working.color, working.depth_m, target, noise), None
     if extractor is not None:
         image = FeatureImage(LateDetail(whole, config.features.width), working.depth_m, working.camera)
     return Observation(target, live, image, frame=working, whole=whole)

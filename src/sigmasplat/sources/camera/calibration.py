@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.config import InputConfig
+from sigmasplat.config.sensors import sensor_problems
 from sigmasplat.errors import ConfigError, SourceError
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
@@ -26,7 +27,8 @@ class Calibration:
     camera, distortion: of the colour image, None for no distortion; depth_units_per_metre: of whole-number depth;
     depth_camera, depth_distortion: of depth images that are not registered to colour, None if they are registered;
     T_color_depth [4, 4]: transforms points of the depth camera to the colour camera, metres;
-    register_by_default: whether unregistered depth is moved to colour if input.register_depth is "auto".
+    register_by_default: whether unregistered depth is moved to colour if input.register_depth is "auto"; sensor: the
+    depth sensor or its model (`config.sensors`), None if it is unknown.
     """
 
     camera: Camera
@@ -36,6 +38,7 @@ class Calibration:
     depth_distortion: Distortion | None = None
     T_color_depth: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
     register_by_default: bool = True
+    sensor: str | None = None
 
 
 class CameraUnknown(SourceError):
@@ -108,16 +111,19 @@ def freiburg_calibration(folder: Path) -> Calibration | None:
 
 
 def read_calibration(path: Path, size: tuple[int, int], default_units_per_metre: float) -> Calibration:
-    """Read `calibration.json`: fx, fy, cx, cy; optional width, height, depth_scale (PNG units per metre), distortion.
+    """Read `calibration.json`: fx, fy, cx, cy; optional width, height, depth_scale (PNG units per metre), distortion,
+    sensor (`config.sensors`).
 
     For depth that is not registered to colour: depth_camera, an object of the same fields, and T_color_depth, 4 rows.
     `size` (width, height) in pixels is the default for a missing size. Raises SourceError naming file and field.
     """
     fields = read_json_object(path)
     units = json_number(path, fields, "depth_scale", default_units_per_metre)
-    calibration = Calibration(
-        read_camera(path, fields, size), check_positive(path, "depth_scale", units), read_distortion(path, fields)
-    )
+    lens, sensor = read_distortion(path, fields), fields.get("sensor")
+    if problems := sensor_problems(sensor) if isinstance(sensor, str) else [f"sensor is {sensor!r}"] * bool(sensor):
+        raise SourceError(f'{path}: field "sensor": {problems[0]}')
+    scale = check_positive(path, "depth_scale", units)
+    calibration = Calibration(read_camera(path, fields, size), scale, lens, sensor=sensor)
     inner = fields.get("depth_camera")
     if inner is None:
         return calibration
