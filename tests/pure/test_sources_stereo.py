@@ -6,12 +6,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from command_line import exit_code
 from layouts import save, save_text, tum_line
+from sigmasplat.batch.job import Job
+from sigmasplat.batch.make_run import make_run
 from sigmasplat.checks.recording import inspect_source
 from sigmasplat.config.scale import for_scene, scaled
+from sigmasplat.config.text import override
 from sigmasplat.errors import SourceError
+from sigmasplat.evaluation import ablation
+from sigmasplat.evaluation.ablation import run_job
+from sigmasplat.io.runs import RunFolder
 from sigmasplat.model.opencv import opencv
 from sigmasplat.presets import preset
+from sigmasplat.run.scene import open_scene
+from sigmasplat.run.terminal import Screen
 from sigmasplat.sources import open_source
 from sigmasplat.sources.camera.stereo import StereoRectification
 from sigmasplat.sources.camera.stereo_cameras import StereoCameras
@@ -136,10 +145,14 @@ def test_a_pair_without_baseline_or_with_swapped_cameras_is_refused(tmp_path):
         open_source(folder)
 
 
-def test_a_deep_scene_has_a_scale_and_no_warning_about_its_depth(tmp_path):
-    folder = tum_like(tmp_path)
-    fields = json.loads((folder / "calibration.json").read_text())
+def deep(folder):
+    fields = json.loads((tum_like(folder) / "calibration.json").read_text())
     save_text(folder / "calibration.json", json.dumps(fields | {"baseline_m": 1.0}))  # all depths are 10 times larger
+    return folder
+
+
+def test_a_deep_scene_has_a_scale_and_no_warning_about_its_depth(tmp_path):
+    folder = deep(tmp_path)
     source = open_source(folder)
     assert source.scene_scale > 5
     warnings = inspect_source(folder, preset("sigma").input).warnings
@@ -154,3 +167,32 @@ def test_settings_that_are_lengths_follow_the_scale_of_the_scene():
     assert large.submaps.distance_m == 5 * config.submaps.distance_m
     assert large.mapping.weight_mean_depth == config.mapping.weight_mean_depth / 5
     assert (large.render.scene_scale, large.render.depth_noise_per_m) == (5.0, 0.001)
+
+
+SHORT = {
+    "input.width": "64", "input.limit": "1", "final.iterations": "0", "mapping.iterations": "1",
+    "mapping.first_iterations": "2",
+}  # fmt: skip
+
+
+def test_every_caller_gets_the_settings_of_the_scene_and_keeps_those_that_are_given(tmp_path, monkeypatch):
+    folder, usual = deep(tmp_path / "deep"), override(preset("sigma"), SHORT | {"render.near_m": "0.05"})
+    source, config = open_scene(folder, usual, ["render.near_m"])
+    assert config.render.scene_scale == source.scene_scale and config.render.near_m == 0.05
+    assert config.submaps.distance_m == source.scene_scale * usual.submaps.distance_m
+    assert open_scene("synthetic:frames=2,width=64,height=48", usual)[1] == usual
+    no_scores = lambda run, *_, **__: run.write_metrics({})  # noqa: E731
+    monkeypatch.setattr("sigmasplat.batch.make_run.evaluate", no_scores)
+    monkeypatch.setattr("sigmasplat.evaluation.evaluate.evaluate", no_scores)
+    given = ("render.near_m",)
+    run_job(ablation.Job("deep", str(folder), "none", 0, usual, given), tmp_path / "ablation", Screen())
+    table = Job("one", (str(folder),), usual, given=given)
+    make_run(Job.from_json(table.to_json()), tmp_path / "one", None, 60.0)
+    assert table.finished_in(tmp_path / "one") and not replace(table, given=()).finished_in(tmp_path / "one")
+    assert RunFolder(tmp_path / "ablation").config() == RunFolder(tmp_path / "one").config() == config
+    words = [word for name, value in SHORT.items() for word in ("--set", f"{name}={value}")]
+    out = ("--out", str(tmp_path / "onto"))
+    assert exit_code("run", "synthetic:frames=40", "--onto", str(tmp_path / "one"), *out, "--no-eval", *words) == 0
+    onto = RunFolder(tmp_path / "onto").config()
+    assert onto.input.max_depth_m == config.input.max_depth_m
+    assert onto.submaps.distance_m == config.submaps.distance_m and onto.render.depth_noise_per_m == 0.003
