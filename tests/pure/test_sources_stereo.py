@@ -21,9 +21,10 @@ from sigmasplat.model.opencv import opencv
 from sigmasplat.presets import preset
 from sigmasplat.run.scene import open_scene
 from sigmasplat.run.terminal import Screen
-from sigmasplat.sources import open_source
+from sigmasplat.sources import open_source, stereo
 from sigmasplat.sources.camera.stereo import StereoRectification
 from sigmasplat.sources.camera.stereo_cameras import StereoCameras
+from sigmasplat.sources.files.images import read_color
 
 BASELINE_M = 0.1
 ROOM = open_source("synthetic:frames=40,stereo=10")
@@ -85,6 +86,13 @@ def test_depth_of_every_layout_is_that_of_the_left_image(layout, tmp_path):
         np.testing.assert_allclose(source.truth().T_world_camera, ROOM.truth().T_world_camera[:2], atol=1e-5)
 
 
+def test_a_frame_reads_each_image_once(tmp_path, monkeypatch):
+    source, read = open_source(tum_like(tmp_path)), []
+    monkeypatch.setattr(stereo, "read_color", lambda path: read.append(path.parent.name) or read_color(path))
+    source.frame(1)
+    assert sorted(read) == ["rgb", "right"]
+
+
 def test_standard_deviations_cover_the_errors_on_exact_depth():
     room = open_source("synthetic:frames=40,stereo=10,noise=1")
     ratios = []
@@ -115,8 +123,8 @@ def test_rectification_aligns_the_rows_of_a_turned_and_distorted_pair():
     T_right_left = np.eye(4)
     T_right_left[:3, :3], T_right_left[:3, 3] = turn, turn @ [-0.1, 0.004, -0.002]
     lens = (-0.1, 0.02, 0.001, -0.001, 0.0)
-    stereo = StereoCameras(camera, replace(camera, fx=camera.fx * 1.02), T_right_left, lens, lens)
-    found = StereoRectification.of(stereo)
+    pair = StereoCameras(camera, replace(camera, fx=camera.fx * 1.02), T_right_left, lens, lens)
+    found = StereoRectification.of(pair)
     assert found.baseline_m == pytest.approx(np.linalg.norm([0.1, 0.004, 0.002]), rel=1e-6)
     points = np.array([[0.2, 0.1, 2.0], [-0.5, 0.3, 3.0], [0.1, -0.4, 1.5]])  # in the recorded left camera
     rectified = points @ found.T_left_rectified[:3, :3]
@@ -124,7 +132,7 @@ def test_rectification_aligns_the_rows_of_a_turned_and_distorted_pair():
                    found.camera.fy * rectified[:, 1] / rectified[:, 2] + found.camera.cy)  # fmt: skip
     disparity = found.camera.fx * found.baseline_m / rectified[:, 2]
     in_right = (points @ T_right_left[:3, :3].T) + T_right_left[:3, 3]
-    K = np.array([[stereo.right.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    K = np.array([[pair.right.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
     seen = opencv().projectPoints(in_right, np.zeros(3), np.zeros(3), K, np.array(lens))[0][:, 0]
     for u, v, d, recorded in zip(column, row, disparity, seen, strict=True):
         at = [opencv().remap(plane, np.float32([[u - d]]), np.float32([[v]]), 1)[0, 0] for plane in found.maps[1]]
