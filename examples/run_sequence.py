@@ -6,15 +6,15 @@ python examples/run_sequence.py PATH [OUT]      PATH as for `sigmasplat run`, OU
 import sys
 from pathlib import Path
 
-from sigmasplat import SigmaSplatError, Slam, open_source, preset
+from sigmasplat import SigmaSplatError, Slam, open_scene, preset
 from sigmasplat.io.splats.ply import write_field
 from sigmasplat.io.trajectory import write_trajectory
 
 
 def main(path: str, out: str = "sequence-out") -> None:
     """Track and map every frame of `path`; write trajectory.txt (TUM text) and map.ply (3DGS PLY) into `out`."""
-    source = open_source(path)
-    slam = Slam(preset("varsplat-fast"))
+    source, config = open_scene(path, preset("varsplat-fast"))
+    slam = Slam(config)
     for frame in source:
         step = slam.step(frame)
         x, y, z = step.T_world_camera[:3, 3]

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from sigmasplat.model.field import GaussianField as GaussianField
     from sigmasplat.model.frame import Frame as Frame
     from sigmasplat.presets import preset as preset
+    from sigmasplat.run.scene import open_scene as open_scene
     from sigmasplat.slam.real_time.system import RealTime as RealTime
     from sigmasplat.slam.slam import Slam as Slam
     from sigmasplat.sources import open_source as open_source
@@ -34,6 +35,7 @@ _HOMES = {
     "RealTime": "sigmasplat.slam.real_time.system",
     "SigmaSplatError": "sigmasplat.errors",
     "Slam": "sigmasplat.slam.slam",
+    "open_scene": "sigmasplat.run.scene",
     "open_source": "sigmasplat.sources",
     "preset": "sigmasplat.presets",
 }

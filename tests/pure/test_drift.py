@@ -7,7 +7,9 @@ import pytest
 from numpy.typing import NDArray
 
 from sigmasplat.config import SubmapConfig
+from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.model import se3
+from sigmasplat.model.camera import Camera
 from sigmasplat.slam.drift import BIAS, HOP_M, HOP_RAD, Drift
 from sigmasplat.slam.rules import ends_submap
 
@@ -100,3 +102,15 @@ def test_each_rule_alone_ends_a_submap_unless_it_is_off() -> None:
         ("", SubmapConfig()),
     ):
         assert ends_submap(T, 10, 0.02, config, 0.06) == rule
+
+
+def test_constant_errors_in_metres_follow_the_scale_of_the_scene() -> None:
+    room, street = Drift(), Drift(scene_scale=5.0)
+    for drift in (room, street):
+        drift.hop(np.eye(4), None)
+    ratio = np.diag(street.usual) / np.diag(room.usual)
+    np.testing.assert_allclose(ratio, [25.0] * 3 + [1.0] * 3)
+    z = np.zeros((64, 64), np.float32) + 8.0
+    z[::2] += 0.1  # the ground, far away
+    of = [Pyramid.of(np.ones_like(z), z, Camera(64, 64, 60, 60, 31.5, 31.5), scene_scale=s) for s in (1.0, 5.0)]
+    assert not of[0].depth[1].any() and (of[1].depth[1] > 0).all()

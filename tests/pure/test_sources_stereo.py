@@ -6,15 +6,25 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from command_line import exit_code
 from layouts import save, save_text, tum_line
+from sigmasplat.batch.job import Job
+from sigmasplat.batch.make_run import make_run
 from sigmasplat.checks.recording import inspect_source
 from sigmasplat.config.scale import for_scene, scaled
+from sigmasplat.config.text import override
 from sigmasplat.errors import SourceError
+from sigmasplat.evaluation import ablation
+from sigmasplat.evaluation.ablation import run_job
+from sigmasplat.io.runs import RunFolder
 from sigmasplat.model.opencv import opencv
 from sigmasplat.presets import preset
-from sigmasplat.sources import open_source
+from sigmasplat.run.scene import open_scene
+from sigmasplat.run.terminal import Screen
+from sigmasplat.sources import open_source, stereo
 from sigmasplat.sources.camera.stereo import StereoRectification
 from sigmasplat.sources.camera.stereo_cameras import StereoCameras
+from sigmasplat.sources.files.images import read_color
 
 BASELINE_M = 0.1
 ROOM = open_source("synthetic:frames=40,stereo=10")
@@ -76,6 +86,13 @@ def test_depth_of_every_layout_is_that_of_the_left_image(layout, tmp_path):
         np.testing.assert_allclose(source.truth().T_world_camera, ROOM.truth().T_world_camera[:2], atol=1e-5)
 
 
+def test_a_frame_reads_each_image_once(tmp_path, monkeypatch):
+    source, read = open_source(tum_like(tmp_path)), []
+    monkeypatch.setattr(stereo, "read_color", lambda path: read.append(path.parent.name) or read_color(path))
+    source.frame(1)
+    assert sorted(read) == ["rgb", "right"]
+
+
 def test_standard_deviations_cover_the_errors_on_exact_depth():
     room = open_source("synthetic:frames=40,stereo=10,noise=1")
     ratios = []
@@ -106,8 +123,8 @@ def test_rectification_aligns_the_rows_of_a_turned_and_distorted_pair():
     T_right_left = np.eye(4)
     T_right_left[:3, :3], T_right_left[:3, 3] = turn, turn @ [-0.1, 0.004, -0.002]
     lens = (-0.1, 0.02, 0.001, -0.001, 0.0)
-    stereo = StereoCameras(camera, replace(camera, fx=camera.fx * 1.02), T_right_left, lens, lens)
-    found = StereoRectification.of(stereo)
+    pair = StereoCameras(camera, replace(camera, fx=camera.fx * 1.02), T_right_left, lens, lens)
+    found = StereoRectification.of(pair)
     assert found.baseline_m == pytest.approx(np.linalg.norm([0.1, 0.004, 0.002]), rel=1e-6)
     points = np.array([[0.2, 0.1, 2.0], [-0.5, 0.3, 3.0], [0.1, -0.4, 1.5]])  # in the recorded left camera
     rectified = points @ found.T_left_rectified[:3, :3]
@@ -115,7 +132,7 @@ def test_rectification_aligns_the_rows_of_a_turned_and_distorted_pair():
                    found.camera.fy * rectified[:, 1] / rectified[:, 2] + found.camera.cy)  # fmt: skip
     disparity = found.camera.fx * found.baseline_m / rectified[:, 2]
     in_right = (points @ T_right_left[:3, :3].T) + T_right_left[:3, 3]
-    K = np.array([[stereo.right.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    K = np.array([[pair.right.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
     seen = opencv().projectPoints(in_right, np.zeros(3), np.zeros(3), K, np.array(lens))[0][:, 0]
     for u, v, d, recorded in zip(column, row, disparity, seen, strict=True):
         at = [opencv().remap(plane, np.float32([[u - d]]), np.float32([[v]]), 1)[0, 0] for plane in found.maps[1]]
@@ -136,10 +153,14 @@ def test_a_pair_without_baseline_or_with_swapped_cameras_is_refused(tmp_path):
         open_source(folder)
 
 
-def test_a_deep_scene_has_a_scale_and_no_warning_about_its_depth(tmp_path):
-    folder = tum_like(tmp_path)
-    fields = json.loads((folder / "calibration.json").read_text())
+def deep(folder):
+    fields = json.loads((tum_like(folder) / "calibration.json").read_text())
     save_text(folder / "calibration.json", json.dumps(fields | {"baseline_m": 1.0}))  # all depths are 10 times larger
+    return folder
+
+
+def test_a_deep_scene_has_a_scale_and_no_warning_about_its_depth(tmp_path):
+    folder = deep(tmp_path)
     source = open_source(folder)
     assert source.scene_scale > 5
     warnings = inspect_source(folder, preset("sigma").input).warnings
@@ -154,3 +175,32 @@ def test_settings_that_are_lengths_follow_the_scale_of_the_scene():
     assert large.submaps.distance_m == 5 * config.submaps.distance_m
     assert large.mapping.weight_mean_depth == config.mapping.weight_mean_depth / 5
     assert (large.render.scene_scale, large.render.depth_noise_per_m) == (5.0, 0.001)
+
+
+SHORT = {
+    "input.width": "64", "input.limit": "1", "final.iterations": "0", "mapping.iterations": "1",
+    "mapping.first_iterations": "2",
+}  # fmt: skip
+
+
+def test_every_caller_gets_the_settings_of_the_scene_and_keeps_those_that_are_given(tmp_path, monkeypatch):
+    folder, usual = deep(tmp_path / "deep"), override(preset("sigma"), SHORT | {"render.near_m": "0.05"})
+    source, config = open_scene(folder, usual, ["render.near_m"])
+    assert config.render.scene_scale == source.scene_scale and config.render.near_m == 0.05
+    assert config.submaps.distance_m == source.scene_scale * usual.submaps.distance_m
+    assert open_scene("synthetic:frames=2,width=64,height=48", usual)[1] == usual
+    no_scores = lambda run, *_, **__: run.write_metrics({})  # noqa: E731
+    monkeypatch.setattr("sigmasplat.batch.make_run.evaluate", no_scores)
+    monkeypatch.setattr("sigmasplat.evaluation.evaluate.evaluate", no_scores)
+    given = ("render.near_m",)
+    run_job(ablation.Job("deep", str(folder), "none", 0, usual, given), tmp_path / "ablation", Screen())
+    table = Job("one", (str(folder),), usual, given=given)
+    make_run(Job.from_json(table.to_json()), tmp_path / "one", None, 60.0)
+    assert table.finished_in(tmp_path / "one") and not replace(table, given=()).finished_in(tmp_path / "one")
+    assert RunFolder(tmp_path / "ablation").config() == RunFolder(tmp_path / "one").config() == config
+    words = [word for name, value in SHORT.items() for word in ("--set", f"{name}={value}")]
+    out = ("--out", str(tmp_path / "onto"))
+    assert exit_code("run", "synthetic:frames=40", "--onto", str(tmp_path / "one"), *out, "--no-eval", *words) == 0
+    onto = RunFolder(tmp_path / "onto").config()
+    assert onto.input.max_depth_m == config.input.max_depth_m
+    assert onto.submaps.distance_m == config.submaps.distance_m and onto.render.depth_noise_per_m == 0.003

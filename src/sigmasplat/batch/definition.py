@@ -152,7 +152,7 @@ class Table:
         name = "".join(
             c if c.isalnum() or c in "._-" else "-" for c in f"{scene.name}-{system.name}-seed{seed}".lower()
         )
-        return Job(name, paths, config, self.mesh)
+        return Job(name, paths, config, self.mesh, (*dict(system.settings), *settings))
 
 
 @dataclass(frozen=True)

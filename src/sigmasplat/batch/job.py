@@ -12,6 +12,7 @@ from sigmasplat.config import Config
 from sigmasplat.errors import SigmaSplatError, SourceError
 from sigmasplat.io.machine import INSTALLED, code_digest
 from sigmasplat.io.runs import RunFolder
+from sigmasplat.run.scene import config_of_facts
 
 FACT = "batch"
 """The entry of run.json that says which job a run folder belongs to."""
@@ -19,12 +20,14 @@ FACT = "batch"
 
 @dataclass(frozen=True)
 class Job:
-    """One run. `name` is that of its folder; `paths` are the places where its sequence may be, relative to the data."""
+    """One run. `name` is that of its folder; `paths` are the places where its sequence may be, relative to the data;
+    `given` names the settings that keep their values in every scene."""
 
     name: str
     paths: tuple[str, ...]
     config: Config
     mesh: bool = False
+    given: tuple[str, ...] = ()
 
     def to_json(self) -> str:
         """Return the job as text, for another process."""
@@ -34,7 +37,8 @@ class Job:
     def from_json(text: str) -> "Job":
         """Read a job from text."""
         values = json.loads(text)
-        return Job(values["name"], tuple(values["paths"]), Config.from_dict(values["config"]), values["mesh"])
+        config, given = Config.from_dict(values["config"]), tuple(values["given"])
+        return Job(values["name"], tuple(values["paths"]), config, values["mesh"], given)
 
     def sequence(self, data: str | None) -> str:
         """Return the path of the sequence below the folder `data`. Raises SourceError if it is not there."""
@@ -59,7 +63,8 @@ class Job:
             settings = json.loads((folder / "config.json").read_text(encoding="utf-8"))
         except (OSError, ValueError):
             return False
-        return self.facts().items() <= noted.items() and bool(settings == json.loads(json.dumps(self.config.to_dict())))
+        used = config_of_facts(facts, self.config, self.given)
+        return self.facts().items() <= noted.items() and bool(settings == json.loads(json.dumps(used.to_dict())))
 
     def finished_in(self, folder: Path) -> bool:
         """Return whether a folder has the complete, scored run of this job."""

@@ -24,6 +24,7 @@ from sigmasplat.evaluation.evaluate import evaluate
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.metrics.lpips import find_lpips
 from sigmasplat.run.resume import RefinementFile, StartPoint, StateFile, resume
+from sigmasplat.run.scene import config_for
 from sigmasplat.run.session import Session, new_folder
 from sigmasplat.slam.slam import Slam
 from sigmasplat.sources import open_source
@@ -71,8 +72,9 @@ def _started(job: Job, folder: Path, source: Source, path: str) -> tuple[RunFold
             start = resume(run, source)
             run.note(status="running", source_path=path)
             return run, start
-    run = new_folder(folder, job.config, source, overwrite=True, source_path=path, batch=job.facts())
-    return run, StartPoint(Slam(job.config, run.submaps))
+    config = config_for(source, job.config, job.given)
+    run = new_folder(folder, config, source, overwrite=True, source_path=path, batch=job.facts())
+    return run, StartPoint(Slam(config, run.submaps))
 
 
 @contextmanager

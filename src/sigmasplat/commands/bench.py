@@ -12,6 +12,7 @@ from sigmasplat.commands import options
 from sigmasplat.commands.bench_table import PaperTable
 from sigmasplat.commands.bench_uncertainty import Uncertainty
 from sigmasplat.commands.options import prepare_torch
+from sigmasplat.config.text import split_settings
 from sigmasplat.errors import ConfigError
 from sigmasplat.evaluation.ablation import COMPARED, Job, Results, Runner, Study, common_config, run_job, run_jobs
 from sigmasplat.presets import default_preset
@@ -52,7 +53,8 @@ class Ablation:
         if not self.sources:
             raise ConfigError("no SOURCE given; give one or more folders of sequences")
         config = common_config(self.preset, self.settings, self.tau)
-        return Study(tuple(dict.fromkeys(self.sources)), config, self.seeds, self.limit, self.without_variance)
+        sources, given = tuple(dict.fromkeys(self.sources)), tuple(split_settings(self.settings))
+        return Study(sources, config, self.seeds, self.limit, self.without_variance, given)
 
     def run(self, runner: Runner | None = None) -> int:
         """Make the missing runs, write FILE after each run, print a table for each sequence, and return 0.

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from sigmasplat.commands import options
 from sigmasplat.commands.options import prepare_torch
+from sigmasplat.config.text import split_settings
 from sigmasplat.errors import ConfigError
 from sigmasplat.presets import default_preset
 
@@ -56,7 +57,8 @@ class Uncertainty:
             raise ConfigError("no SOURCE given; give one or more folders of sequences")
         config = study_config(self.preset, self.settings)
         sources = tuple(dict.fromkeys(self.sources))
-        return Study(sources, config, self.seeds, self.limit, self.hold_every, self.views)
+        given = tuple(split_settings(self.settings))
+        return Study(sources, config, self.seeds, self.limit, self.hold_every, self.views, given)
 
     def run(self) -> int:
         """Make the missing runs, score all of them, print the tables, and return 0. Raises SigmaSplatError."""
@@ -96,11 +98,11 @@ def run_job(job: "Job", views: int, screen: "Screen") -> "Measured":
     """Run SLAM with a job's settings and collect its samples."""
     from sigmasplat.evaluation.finished_run import run_slam
     from sigmasplat.evaluation.uncertainty_benchmark import measure
-    from sigmasplat.sources import open_source
+    from sigmasplat.run.scene import open_scene
 
-    source = open_source(job.path, job.config.input)
+    source, config = open_scene(job.path, job.config, job.given)
     with screen.steps(len(source)) as show:
-        run = run_slam(job.config, source, show)
+        run = run_slam(config, source, show)
     with screen.counting("views") as progress:
         return measure(run, source, views, progress=progress)
 

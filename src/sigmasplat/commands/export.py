@@ -48,7 +48,7 @@ class ExportOptions:
     spz_version: SpzVersion = None
     plain: options.Plain = False
     pictures: options.Pictures = False
-    voxel_m: options.VoxelM = 0.01
+    voxel_m: options.VoxelM = None
     size: picture_options.FilmSize = 0
     fps: picture_options.FilmRate = 25.0
     seconds: picture_options.FilmSeconds = None

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from sigmasplat.commands import options
 from sigmasplat.commands.options import prepare_torch, refuse_existing, working_images
+from sigmasplat.config.scale import for_scene
 from sigmasplat.config.text import override, split_settings
 from sigmasplat.errors import ConfigError, RunError
 
@@ -46,6 +47,7 @@ def localise(
     screen, finished = Screen(), FinishedMap.of(RunFolder.open(run))
     config = search_settings(finished.config, settings, input_options)
     source = open_source(path, config.input)
+    config = for_scene(config, 1.0, source.depth_noise_per_m, split_settings(settings))  # its lengths are the map's
     if source.live:
         raise RunError("a live camera cannot be localised; record it first, then give the folder of the recording")
     finished.refuse_other_view(source.camera.prepared(config.input.width, config.input.crop_px))

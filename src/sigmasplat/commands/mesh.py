@@ -14,9 +14,10 @@ if TYPE_CHECKING:
 
 def make_mesh(
     run: options.RunPath,
-    voxel_m: options.VoxelM = 0.01,
+    voxel_m: options.VoxelM = None,
     triangles: mesh_options.Triangles = 300_000,
     axes: mesh_options.MeshAxes = None,
+    fill_gaps: mesh_options.FillGaps = 0.0,
     out: mesh_options.MeshFile = None,
     overwrite: options.Overwrite = False,
     moved_to: options.MovedSource = None,
@@ -31,6 +32,7 @@ def make_mesh(
     from sigmasplat.io.mesh import check_ending, write_mesh
     from sigmasplat.io.runs import MESH, RunFolder
     from sigmasplat.model.decimation import decimated, refuse_budget
+    from sigmasplat.model.gap_filling import filled
     from sigmasplat.run.terminal import Screen
 
     screen, folder, target = Screen(), RunFolder.open(run), out or run / MESH
@@ -44,6 +46,11 @@ def make_mesh(
         fusion_input = FusionInput.of(folder, source.camera)
         with screen.counting("surface") as progress:
             surface = fusion_input.surface(voxel_m, progress=progress)
+        seen, surface = len(surface.vertices), filled(surface, fill_gaps)
+        if fill_gaps:
+            screen.say(
+                f"gaps up to {fill_gaps:g} m are closed: {len(surface.vertices) - seen:,} vertices nobody has seen"
+            )
         if len(surface.faces) > triangles > 0:
             screen.say(f"{len(surface.faces):,} triangles are reduced to {triangles:,} (--triangles)")
             surface = decimated(surface, triangles)

@@ -18,6 +18,14 @@ MeshFile = Annotated[
     ),
 ]
 Triangles = Annotated[int, Range(0), arg(metavar="N", help="largest number of triangles; 0 = no limit")]
+FillGaps = Annotated[
+    float,
+    Range(0),
+    arg(
+        metavar="M",
+        help="close gaps that are at most M metres across by smooth patches, which have a high depth_std_m; 0 = none",
+    ),
+]
 MeshAxes = Annotated[
     Literal["y-up", "z-up", "y-down", "camera"] | None,
     arg(

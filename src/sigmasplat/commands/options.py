@@ -138,9 +138,13 @@ Record = Annotated[
     ),
 ]
 VoxelM = Annotated[
-    float,
+    float | None,
     Range(0, open_below=True),
-    arg(metavar="M", help="edge of a voxel in metres; the truncation distance is 4 voxels"),
+    arg(
+        metavar="M",
+        help="edge of a voxel in metres; the truncation distance is 4 voxels",
+        help_behavior_hint="(default: 0.01, times the scale of the scene)",
+    ),
 ]
 WithMesh = Annotated[
     bool,

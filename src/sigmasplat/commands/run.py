@@ -3,7 +3,7 @@
 The order of a run: open the source, start the viewer, create the run folder, run the session (`run/session.py`), score.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -20,8 +20,7 @@ from sigmasplat.commands.robot_output import (
     robot_output,
 )
 from sigmasplat.commands.view import keep_showing, serve_viewer
-from sigmasplat.config.scale import for_scene
-from sigmasplat.config.text import full_path, override, split_settings
+from sigmasplat.config.text import full_path, split_settings
 from sigmasplat.errors import ConfigError
 from sigmasplat.presets import default_preset
 
@@ -29,6 +28,7 @@ if TYPE_CHECKING:
     from sigmasplat.config import Config
     from sigmasplat.io.runs import RunFolder
     from sigmasplat.robots.live import LiveRobot
+    from sigmasplat.run.finished_map import FinishedMap
     from sigmasplat.run.protocols import Callback
     from sigmasplat.run.resume import StartPoint
     from sigmasplat.run.session import Outcome
@@ -104,12 +104,7 @@ def run(
     config = configured(preset, settings, seed, input_options, earlier.config if earlier else None)
     if earlier:
         earlier.refuse_other_size(config)
-    source, config = _opened(screen, path, config, record)
-    if not earlier:  # values that the user gives are used as they are
-        fitting = for_scene(config, source.scene_scale, source.depth_noise_per_m, source.sensor)
-        config = override(fitting, split_settings(settings))
-        if source.scene_scale != 1.0:
-            screen.say(f"{source.name}: settings in metres are multiplied by {source.scene_scale:g}, the scene's scale")
+    source, config = _opened(screen, path, config, record, split_settings(settings), earlier)
     with (
         _viewer(screen, run_options) as viewer,
         new_run(out, config, source, overwrite, onto, screen.warn, source_path=full_path(path)) as folder,
@@ -158,14 +153,22 @@ def resume_line(next_index: int, frames: int) -> str:
     return f"resuming at frame {next_index} of {frames}"
 
 
-def _opened(screen: "Screen", path: str, config: "Config", record: Path | None) -> tuple["Source", "Config"]:
-    """Open the source and warn of doubtful depth; the settings of a live camera become those of its recording."""
+def _opened(
+    screen: "Screen", path: str, config: "Config", record: Path | None, given: Mapping[str, str],
+    earlier: "FinishedMap | None",
+) -> tuple["Source", "Config"]:  # fmt: skip
+    """Open the source and warn of doubtful depth; return it with the settings for its scene, or for the earlier map."""
     from sigmasplat.checks.timing import time_warnings, times_of
-    from sigmasplat.sources import open_source
+    from sigmasplat.run.scene import open_scene
     from sigmasplat.sources.camera.depth_units import depth_warning
     from sigmasplat.sources.live import LiveSource, recording_settings
 
-    source = open_source(path, config.input)
+    asked = config
+    source, config = open_scene(path, asked, given)
+    if earlier:
+        config = earlier.config_for(source, asked, given)
+    elif source.scene_scale != 1.0:
+        screen.say(f"{source.name}: settings in metres are multiplied by {source.scene_scale:g}, the scene's scale")
     if isinstance(source, LiveSource):
         config = replace(config, input=recording_settings(config.input))
         if record:

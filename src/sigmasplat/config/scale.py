@@ -1,5 +1,7 @@
 """Scale all settings that are lengths to a scene that is larger than a room."""
 
+from collections.abc import Collection
+
 from sigmasplat.config import Config
 from sigmasplat.config.sensors import AUTO
 
@@ -21,22 +23,37 @@ POWERS = {
 """The power of a length in each setting. Weights of losses in metres have −1, so that a loss keeps its value."""
 
 
-def for_scene(config: Config, scene_scale: float, depth_noise_per_m: float | None, sensor: str | None = None) -> Config:
+def for_scene(
+    config: Config,
+    scene_scale: float,
+    depth_noise_per_m: float | None,
+    given: Collection[str] = (),
+    sensor: str | None = None,
+) -> Config:
     """Return the settings for a scene of this size, depth of this noise, and this sensor (None = unknown, the setting
-    stays). A sensor that the settings name stays."""
-    config = scaled(config, scene_scale)
+    stays).
+
+    given: names of settings that keep their values, as in ["input.max_depth_m"].
+    """
+    config = scaled(config, scene_scale, given)
     if sensor is not None and config.input.sensor == AUTO:
         config = config.changed(input={"sensor": sensor})
-    return config if depth_noise_per_m is None else config.changed(render={"depth_noise_per_m": depth_noise_per_m})
+    if depth_noise_per_m is None or "render.depth_noise_per_m" in given:
+        return config
+    return config.changed(render={"depth_noise_per_m": depth_noise_per_m})
 
 
-def scaled(config: Config, factor: float) -> Config:
+def scaled(config: Config, factor: float, given: Collection[str] = ()) -> Config:
     """Return the settings for a scene `factor` times as large as a room: lengths and learning rates of lengths grow,
-    weights of losses in metres shrink. With factor 1 the settings are unchanged."""
+    weights of losses in metres shrink. With factor 1 the settings are unchanged, and those of `given` are always."""
     if factor == 1.0:
         return config
     sections = {
-        section: {name: getattr(getattr(config, section), name) * factor**power for name, power in powers.items()}
+        section: {
+            name: getattr(getattr(config, section), name) * factor**power
+            for name, power in powers.items()
+            if f"{section}.{name}" not in given
+        }
         for section, powers in POWERS.items()
     }
     return config.changed(**sections)

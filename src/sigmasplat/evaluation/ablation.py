@@ -48,13 +48,15 @@ SEED = "{seed}"
 
 @dataclass(frozen=True)
 class Job:
-    """One run: the sequence as given and as opened, the variant, the seed, all settings."""
+    """One run: the sequence as given and as opened, the variant, the seed, all settings; `given` names those that keep
+    their values in every scene."""
 
     source: str
     path: str
     variant: str
     seed: int
     config: Config
+    given: tuple[str, ...] = ()
 
     @property
     def key(self) -> tuple[str, str, int]:
@@ -73,13 +75,15 @@ Runner = Callable[[Job, Path], Mapping[str, Any]]
 
 @dataclass(frozen=True)
 class Study:
-    """What to compare: sequences, each with every variant and seeds 0, 1, …, and the settings that all runs share."""
+    """What to compare: sequences, each with every variant and seeds 0, 1, …, and the settings that all runs share;
+    `given` names those that keep their values in every scene."""
 
     sources: Sequence[str]
     config: Config
     seeds: int = 3
     limit: int | None = None
     without_variance: bool = False
+    given: tuple[str, ...] = ()
 
     @property
     def variants(self) -> list[str]:
@@ -92,6 +96,7 @@ class Study:
             Job(
                 source, full_path(source.replace(SEED, str(seed))), variant, seed,
                 override(self.config, VARIANTS[variant] | {"seed": str(seed), "input.limit": str(self.limit or 0)}),
+                self.given,
             )
             for seed in range(self.seeds)
             for variant in self.variants
@@ -101,6 +106,7 @@ class Study:
         """Return what all runs of an ablation must share: settings, length, code, machine."""
         return {
             "config": self.config.to_dict(),
+            "given": sorted(self.given),
             "limit": self.limit,
             "code": code_digest(Path(sigmasplat.__file__).parent, INSTALLED),
             "machine": machine.describe(),
@@ -218,14 +224,14 @@ def run_job(job: Job, folder: Path, screen: "Screen") -> dict[str, Any]:
     Raises KeyboardInterrupt if Ctrl-C stopped the run: its metrics would not be comparable.
     """
     from sigmasplat.evaluation.evaluate import evaluate
+    from sigmasplat.run.scene import open_scene
     from sigmasplat.run.session import Session, new_folder
     from sigmasplat.slam.slam import Slam
-    from sigmasplat.sources import open_source
 
-    source = open_source(job.path, job.config.input)
-    run = new_folder(folder, job.config, source, True, source_path=job.path)
+    source, config = open_scene(job.path, job.config, job.given)
+    run = new_folder(folder, config, source, True, source_path=job.path)
     with screen.steps(len(source)) as callback:
-        outcome = Session(Slam(job.config, run.submaps), source, run, callback).execute()
+        outcome = Session(Slam(config, run.submaps), source, run, callback).execute()
     if outcome.status == "interrupted":
         raise KeyboardInterrupt
     with screen.counting("evaluation") as progress:

@@ -52,17 +52,20 @@ TRAINING_VIEWS = 40
 
 @dataclass(frozen=True)
 class Job:
-    """One run: the sequence as given and as opened, the seed, all settings."""
+    """One run: the sequence as given and as opened, the seed, all settings; `given` names those that keep their values
+    in every scene."""
 
     source: str
     path: str
     seed: int
     config: Config
+    given: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class Study:
-    """What to measure: sequences, each with seeds 0, 1, …, and the settings that all runs share."""
+    """What to measure: sequences, each with seeds 0, 1, …, and the settings that all runs share; `given` names those
+    that keep their values in every scene."""
 
     sources: Sequence[str]
     config: Config
@@ -70,6 +73,7 @@ class Study:
     limit: int | None = None
     hold_every: int = 8
     views: int = 24
+    given: tuple[str, ...] = ()
 
     def jobs(self) -> list[Job]:
         """List the runs; {seed} in a sequence is replaced by the number."""
@@ -78,7 +82,7 @@ class Study:
         return [
             Job(
                 source, full_path(source.replace(SEED, str(seed))), seed,
-                override(self.config, held | {"seed": str(seed)}),
+                override(self.config, held | {"seed": str(seed)}), self.given,
             )
             for source, seed in numbers
         ]  # fmt: skip

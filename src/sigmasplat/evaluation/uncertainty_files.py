@@ -48,6 +48,7 @@ class StudyFolder:
         facts = {
             "path": job.path,
             "config": job.config.to_dict(),
+            "given": sorted(job.given),
             "views": self.study.views,
             "code": code_digest(Path(sigmasplat.__file__).parent, INSTALLED),
             "machine": machine.describe(),

@@ -170,7 +170,7 @@ def _export_views(
         return f"{count:,} views with their pictures{reader.left_out(keyframes=True)}"
 
 
-def _points(source: ExportSource, target: Path, *, voxel_m: float, axes: "Axes | None") -> str:
+def _points(source: ExportSource, target: Path, *, voxel_m: float | None, axes: "Axes | None") -> str:
     from sigmasplat.evaluation.reconstruct import FusionInput
     from sigmasplat.exports.axes import levelled, transform_to
     from sigmasplat.exports.points import export_points

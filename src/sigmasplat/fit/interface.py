@@ -152,6 +152,8 @@ class LevelPlanes(NamedTuple):
     noise: Plane | None = None
 
 
+DEPTH_STEP_M = 0.05
+"""Readings of a cell that differ by this much are not averaged, in a room."""
 NORMAL_TERMS = 53
 """Number of values in one linearisation: H 21, b 6, sums 5, S 21 (native/align_pixel.h)."""
 
@@ -166,10 +168,12 @@ class ImageKernels:
     """Return a plane as an array in host memory."""
     as_tensor: Callable[[Plane], Tensor]
     """Return a plane as a tensor that a view accepts as reference depth."""
-    halve: Callable[[tuple[Plane | None, Plane | None], Plane | None], tuple[Plane | None, Plane | None, Plane | None]]
+    halve: Callable[
+        [tuple[Plane | None, Plane | None], Plane | None, float], tuple[Plane | None, Plane | None, Plane | None]
+    ]
     """Halve up to three planes of equal size: two are averaged over 2×2 cells; depth over the readings of a cell, if
-    there are two or more and they show one surface. None stays None. With odd sizes the last row or column is
-    dropped."""
+    there are two or more and they differ by less than a step, the last argument, m. None stays None. With odd sizes the
+    last row or column is dropped."""
     readings_of: Callable[[Plane, Plane], Any]
     """Return the mean depth of the coarsest level in metres (1 without readings), and how many pixels of the finest
     level have a reading, float64 [2]."""

@@ -5,7 +5,7 @@ from functools import cached_property
 from typing import Any
 
 from sigmasplat.fit.backends import fits_of
-from sigmasplat.fit.interface import ImageKernels, Plane
+from sigmasplat.fit.interface import DEPTH_STEP_M, ImageKernels, Plane
 from sigmasplat.model.camera import Camera
 
 LEVELS = 4
@@ -52,7 +52,7 @@ class Pyramid:
         given = (None if w is None else self.kernels.contiguous(w) for w in (weight, weight_depth))
         gray_weights, depth_weights = ([w] for w in given)
         for _ in self.cameras[1:]:
-            on_gray, on_depth, _ = self.kernels.halve((gray_weights[-1], depth_weights[-1]), None)
+            on_gray, on_depth, _ = self.kernels.halve((gray_weights[-1], depth_weights[-1]), None, DEPTH_STEP_M)
             gray_weights.append(on_gray)
             depth_weights.append(on_depth)
         own = gray_weights if weight_depth is None else depth_weights
@@ -79,7 +79,9 @@ class Pyramid:
             c = p.cameras[-1]
             if min(c.width, c.height) < 32:
                 break
-            half_gray, half_noise, half_depth = p.kernels.halve((p.gray[-1], p.noise[-1]), p.depth[-1])
+            half_gray, half_noise, half_depth = p.kernels.halve(
+                (p.gray[-1], p.noise[-1]), p.depth[-1], DEPTH_STEP_M * scene_scale
+            )
             p.gray.append(half_gray)
             p.depth.append(half_depth)
             p.noise.append(half_noise)

@@ -24,7 +24,8 @@ SQUARE_OF_MEAN = (3.0 * math.pi / 8.0, math.pi / 2.0)
 PSEUDO_PIXELS = 1.0
 """Weight of the mean residual of the map in the variance of a splat, in pixels: it decides for splats hardly seen."""
 FARTHEST_M = 0.3
-"""Limit of a depth residual in the mean of a splat's residuals, m: beyond it the reading is of another surface."""
+"""Limit of a depth residual in the mean of a splat's residuals, m, in a room: beyond it the reading is of another
+surface."""
 
 
 def background_of(keyframes: Iterable[Keyframe]) -> Background:
@@ -56,7 +57,8 @@ def splat_residuals(field: GaussianField, keyframes: Iterable[Keyframe], options
         image, depth = (plane.to(seen.alpha) for plane in (target.image, target.depth_image))
         errors, known = squared_errors(seen.color, seen.depth, seen.alpha, image, depth)
         off_m = (seen.depth / seen.alpha.clamp(min=COVERED) - depth) * known[..., 1]
-        off_m = off_m.clamp(-FARTHEST_M, FARTHEST_M)[..., None]
+        farthest_m = FARTHEST_M * options.scene_scale
+        off_m = off_m.clamp(-farthest_m, farthest_m)[..., None]
         found = seen.gather(torch.cat([errors.sqrt() * known, known, off_m, off_m.square()], -1)).cpu().double()
         sums += found
         rows = seen.rows

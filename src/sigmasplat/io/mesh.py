@@ -1,6 +1,7 @@
 """Write surfaces as PLY, OBJ or GLB with a normal and a colour per vertex, or as STL; read PLY.
 
-PLY and GLB also contain depth_std_m, if it is known. The unit is the metre.
+PLY and GLB also contain depth_std_m, if it is known; PLY also `filled`, the vertices that only close gaps. The unit is
+the metre.
 """
 
 import os
@@ -129,16 +130,19 @@ def _length_after(file: BinaryIO, start: np.dtype[np.void]) -> int:
 
 def _ply(mesh: Mesh, note: str) -> bytes:
     """Return the mesh as binary little-endian PLY: float x y z, float nx ny nz, uchar red green blue, float depth_std_m
-    if it is known, faces as lists of int."""
+    if it is known, uchar filled (1 = closes a gap) if gaps were closed, faces as lists of int."""
     points, normals, colors = ("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue")
     columns = [(name, "<f4") for name in (*points, *normals)] + [(name, "u1") for name in colors]
     columns += [] if mesh.depth_std_m is None else [("depth_std_m", "<f4")]
+    columns += [] if mesh.filled is None else [("filled", "u1")]
     vertices = np.zeros(len(mesh.vertices), np.dtype(columns))
     for names, values in ((points, mesh.vertices), (normals, mesh.normals()), (colors, _bytes(mesh))):
         for k, name in enumerate(names):
             vertices[name] = values[:, k]
     if mesh.depth_std_m is not None:
         vertices["depth_std_m"] = mesh.depth_std_m
+    if mesh.filled is not None:
+        vertices["filled"] = mesh.filled
     faces = np.zeros(len(mesh.faces), np.dtype([("count", "u1"), ("corners", "<i4", 3)]))
     faces["count"], faces["corners"] = 3, mesh.faces
     properties = [f"property {'float' if kind == '<f4' else 'uchar'} {name}" for name, kind in columns]

@@ -62,7 +62,7 @@ FACTS: Mapping[str, Test] = {
     "source": is_kind(str), "source_path": is_kind(str), "status": is_kind(str), "skipped": _texts,
     "wall_s": _number_or_null, "finish_s": _number_or_null, "final_steps": _number_or_null, "machine": is_kind(dict),
     "onto": is_kind(dict), "camera": is_kind(dict), "source_frames": _whole, "depth_units_per_metre": _number_or_null,
-    "isa": is_kind(str, type(None)),
+    "isa": is_kind(str, type(None)), "scene_scale": _number_or_null, "depth_noise_per_m": _number_or_null,
 }  # fmt: skip
 """Values of run.json that commands use."""
 STATE_FIELDS: Mapping[str, Test] = {"index": _whole, "wall_s": _number, "submaps": _whole, "steps": is_kind(list)}

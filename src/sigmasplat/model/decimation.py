@@ -46,4 +46,5 @@ def decimated(mesh: Mesh, triangles: int) -> Mesh:
 
     colors = None if mesh.colors is None else np.stack([averaged(channel) for channel in mesh.colors.T], 1)
     std = None if mesh.depth_std_m is None else averaged(mesh.depth_std_m)
-    return Mesh(small.vertices, small.faces, colors, std)
+    filled = None if mesh.filled is None else averaged(mesh.filled.astype(np.float32)) > 0.5
+    return Mesh(small.vertices, small.faces, colors, std, filled)

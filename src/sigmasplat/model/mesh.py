@@ -16,7 +16,8 @@ Indices = NDArray[np.int32]
 @dataclass(frozen=True, eq=False)
 class Mesh:
     """Triangles: vertices [V, 3] m, world frame; faces [F, 3], counter-clockwise from outside; colors [V, 3] in [0, 1];
-    depth_std_m [V]: standard deviation of the depth of the surface at each vertex, m.
+    depth_std_m [V]: standard deviation of the depth of the surface at each vertex, m; filled [V]: whether a vertex only
+    closes a gap and was not seen.
 
     Raises SigmaSplatError on inconsistent shapes, values that are not finite, or faces with unknown vertices.
     """
@@ -25,6 +26,7 @@ class Mesh:
     faces: Indices
     colors: Floats | None = None
     depth_std_m: Floats | None = None
+    filled: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
         v, f, c = self.vertices, self.faces, self.colors
@@ -35,6 +37,8 @@ class Mesh:
             raise SigmaSplatError(
                 f"a mesh with {len(v)} vertices needs depth_std_m [V], found {self.depth_std_m.shape}"
             )
+        if self.filled is not None and self.filled.shape != (len(v),):
+            raise SigmaSplatError(f"a mesh with {len(v)} vertices needs filled [V], found {self.filled.shape}")
         if not np.isfinite(v).all() or not (c is None or np.isfinite(c).all()):
             raise SigmaSplatError("a mesh needs finite vertices and colors, found NaN or inf")
         if f.size and (f.min() < 0 or f.max() >= len(v)):
@@ -92,8 +96,8 @@ class Mesh:
         used = np.zeros(len(self.vertices), bool)
         used[faces] = True
         number = np.cumsum(used, dtype=np.int32) - np.int32(1)
-        of_vertices = (None if values is None else values[used] for values in (self.colors, self.depth_std_m))
-        return Mesh(self.vertices[used], number[faces], *of_vertices)
+        colors, std = (None if values is None else values[used] for values in (self.colors, self.depth_std_m))
+        return Mesh(self.vertices[used], number[faces], colors, std, None if self.filled is None else self.filled[used])
 
     def subdivided(self, largest_edge_m: float) -> "Mesh":
         """Return the same surface in faces without a longer edge; a mesh of small faces is returned unchanged.
@@ -106,7 +110,10 @@ class Mesh:
         large = self._longest_edges() > largest_edge_m
         if not large.any():
             return self
-        small, mesh = [replace(self.with_faces(~large), colors=None, depth_std_m=None)], self.with_faces(large)
+        small, mesh = (
+            [replace(self.with_faces(~large), colors=None, depth_std_m=None, filled=None)],
+            self.with_faces(large),
+        )
         while len(mesh.faces):
             a, b, c = np.moveaxis(mesh.corners, 1, 0)
             ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2

@@ -1,14 +1,17 @@
 """Read the map of a finished run, to find cameras in it or to continue it in another run."""
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
 
 from sigmasplat.config import Config
+from sigmasplat.config.scale import for_scene
 from sigmasplat.errors import RunError
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.io.submaps import DiskStore
 from sigmasplat.model.camera import Camera
+from sigmasplat.run.scene import noted_scale
 from sigmasplat.slam.continuation import continued, refuse_without_relocalisation, take_over
 from sigmasplat.slam.slam import Slam
 from sigmasplat.sources.base import Source
@@ -67,6 +70,14 @@ class FinishedMap:
     def members(self) -> list[int]:
         """Return the submaps that are connected to the world."""
         return [index for index, component in enumerate(self.components) if component == 0]
+
+    def config_for(self, source: Source, config: Config, given: Collection[str]) -> Config:
+        """Return the settings for a source in this map: their scale is the map's, the noise of depth the source's.
+
+        Settings named in `given` keep their values.
+        """
+        of_map = ("input.min_depth_m", "input.max_depth_m")  # `config` has the map's already
+        return for_scene(config, noted_scale(self.run.facts()), source.depth_noise_per_m, {*given, *of_map})
 
     def refuse_other_size(self, config: Config) -> None:
         """Raise RunError if settings make working images of another size than those of the map."""

@@ -9,6 +9,7 @@ from sigmasplat import env
 from sigmasplat.errors import RunError
 from sigmasplat.io.frames import SAME_TIME_S
 from sigmasplat.io.runs import RunFolder
+from sigmasplat.run.scene import scene_facts
 from sigmasplat.sources.base import Source
 
 SAME_SHARE = 1e-6
@@ -16,14 +17,14 @@ SAME_SHARE = 1e-6
 
 
 def start_facts(source: Source) -> dict[str, Any]:
-    """Return what run.json keeps to recognise the sequence when the run is resumed, and the kernels' instruction set.
+    """Return what run.json keeps: the sequence, to recognise it on resume, its scene, and the kernels' instruction set.
 
     A live camera is compared by its image size and intrinsics alone: its recording has its own depth unit.
     """
     facts: dict[str, Any] = {"camera": asdict(source.camera), "isa": instruction_set()}
     if not source.live:
         facts |= {"source_frames": len(source), "depth_units_per_metre": source.depth_units_per_metre}
-    return facts
+    return facts | scene_facts(source)
 
 
 def refuse_other_sequence(run: RunFolder, source: Source) -> None:

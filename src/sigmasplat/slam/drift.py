@@ -13,9 +13,9 @@ from sigmasplat.types import Matrix
 
 HOP_M, HOP_RAD = 0.002, 0.002
 """Standard deviation added per hop: the estimated covariance contains noise but no bias."""
-FLOOR = np.diag(np.repeat([0.005**2, 0.003**2], 3))
-"""Minimum covariance of a pose between two maps, or in another map, m² and rad²: two maps of the same wall differ by
-about this much."""
+FLOOR_M, FLOOR_RAD = 0.005, 0.003
+"""Least standard deviation of a pose between two maps, or in another map: two maps of the same wall differ by about
+this much."""
 OPAQUE = 0.95
 """V is averaged where the rendered alpha is above this; elsewhere V has no meaning."""
 UNKNOWN = np.diag([1.0] * 6)
@@ -32,7 +32,8 @@ class Drift:
     Each frame is tracked against the newest keyframe, so errors accumulate per keyframe, not per frame. First order:
     hops are independent, and their covariances add after transformation to the submap's frame. `covariance` sums the
     estimates of alignment; `usual` sums the constant errors that alignment cannot estimate. `variance_sum` sums the
-    mean V of tracked frames, if a rule reads it.
+    mean V of tracked frames, if a rule reads it. scene_scale: size of the scene relative to a room; constant errors in
+    metres grow with it.
     """
 
     covariance: Matrix = field(default_factory=lambda: np.zeros((6, 6)))
@@ -41,6 +42,7 @@ class Drift:
     turned_rad: float = 0.0
     last: Matrix = field(default_factory=lambda: np.eye(4))
     variance_sum: float = 0.0
+    scene_scale: float = 1.0
 
     def hop(self, T_submap_camera: Matrix, covariance: Matrix | None) -> None:
         """Add a hop to the keyframe at T_submap_camera [4, 4], `covariance` [6, 6] of T_camera_reference's left twist.
@@ -49,7 +51,7 @@ class Drift:
         covariance None: unknown, only the constant error is added. Infinite: the images have no overlap.
         """
         A = se3.adjoint(T_submap_camera)
-        self.usual = symmetric(self.usual + A @ np.diag(np.repeat([HOP_M**2, HOP_RAD**2], 3)) @ A.T)
+        self.usual = symmetric(self.usual + A @ hop_errors(self.scene_scale) @ A.T)
         if covariance is not None:
             known = covariance if np.isfinite(covariance).all() else UNKNOWN
             self.covariance = symmetric(self.covariance + A @ known @ A.T)
@@ -74,6 +76,16 @@ class Drift:
         """
         bent = np.repeat([(BIAS * self.travelled_m) ** 2, (BIAS * self.turned_rad) ** 2], 3)
         return symmetric(np.asarray(np.linalg.inv(self.covariance + self.usual + np.diag(bent)), np.float64))
+
+
+def hop_errors(scene_scale: float = 1.0) -> Matrix:
+    """Return the constant covariance [6, 6] of a hop, m² and rad²."""
+    return np.diag(np.repeat([(HOP_M * scene_scale) ** 2, HOP_RAD**2], 3))
+
+
+def floor(scene_scale: float = 1.0) -> Matrix:
+    """Return the least covariance [6, 6] of a pose between two maps, m² and rad²."""
+    return np.diag(np.repeat([(FLOOR_M * scene_scale) ** 2, FLOOR_RAD**2], 3))
 
 
 def mean_variance(field: GaussianField, view: View, T_camera_submap: Matrix) -> float:

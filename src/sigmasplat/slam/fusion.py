@@ -106,7 +106,7 @@ def fuse(
     total: int,
     config: Config,
     *,
-    voxel_m: float = VOXEL_M,
+    voxel_m: float | None = None,
     weigh: bool = False,
     renderer: Renderer | None = None,
     progress: Progress = no_progress,
@@ -115,8 +115,10 @@ def fuse(
 
     A view with a picture is fused with its readings (`with_readings`). Depth outside the range of the input settings is
     ignored. weigh: weight the other pixels by their colour uncertainty, w̃ with the τ of tracking (VarSplat §3). Calls
-    `progress(views done, total)`. Raises ConfigError unless voxel_m > 0.
+    `progress(views done, total)`. voxel_m None: 1 cm, times the scale of the scene. Raises ConfigError unless it is
+    above 0.
     """
+    voxel_m = VOXEL_M * config.render.scene_scale if voxel_m is None else voxel_m
     volume = Tsdf(voxel_m, TRUNCATION_VOXELS * voxel_m)
     renderer = renderer or FieldRenderer(config.render, config.backend)
     for done, at in enumerate(views, 1):

@@ -119,7 +119,7 @@ class MapWork(World):
         self.atlas.begin_submap(T_parent_camera, parent)
         self.confidence.begun(parent, std_of(information))
         self.mapper = Mapper(self.config, self.random, field).successor(self.view, T_parent_camera)
-        self.drift = Drift()
+        self.drift = Drift(scene_scale=self.config.render.scene_scale)
 
     def begin_first(self, seen: Sight) -> Relocation | None:
         """Start the first submap of a session; return where the map of an earlier session shows the camera, if it
@@ -135,7 +135,8 @@ class MapWork(World):
         """Finish the active submap and begin a component at the camera, in slices; return the loops tried."""
         loops = yield from self.finish_submap()
         self._begin_component()
-        self.mapper, self.drift = Mapper(self.config, self.random), Drift()
+        self.mapper = Mapper(self.config, self.random)
+        self.drift = Drift(scene_scale=self.config.render.scene_scale)
         return loops
 
     def _begin_component(self) -> None:
@@ -154,7 +155,7 @@ class MapWork(World):
         known = [descriptor for descriptor in descriptors if descriptor is not None]
         yield
         loops = yield from self.closer.closing(submap, known, self.atlas, self.view)
-        self.confidence.closed(loops)
+        self.confidence.closed(loops, self.config.render.scene_scale)
         return loops
 
     # ---- search and join ----
@@ -197,7 +198,7 @@ class MapWork(World):
         if place is None:
             return
         link = Link(place.where[0], submap, place.T_submap_camera @ se3.inverse(T_submap_camera), place.information)
-        if self.recovery.confirms(link, self.atlas):
+        if self.recovery.confirms(link, self.atlas, self.config.render.scene_scale):
             kept, moved = sorted((link.a, link.b), key=self.atlas.components.__getitem__)
             members = self.atlas.members(self.atlas.components[moved])
             self.confidence.joined(members, moved, kept, std_of(link.information))

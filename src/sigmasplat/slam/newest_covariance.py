@@ -6,12 +6,12 @@ import numpy as np
 
 from sigmasplat.model import se3
 from sigmasplat.model.atlas import Atlas, Hop
-from sigmasplat.slam.drift import HOP_M, HOP_RAD
+from sigmasplat.slam.drift import hop_errors
 from sigmasplat.slam.loop_closure.closer import LoopCloser
 from sigmasplat.slam.path_covariance import Factors, PathCovariance
 from sigmasplat.types import Matrix
 
-FIRST_HOP = np.diag(np.repeat([HOP_M**2, HOP_RAD**2], 3))
+FIRST_HOP = hop_errors()
 """Covariance of a frame's motion from its keyframe before any motion between keyframes was measured, m² and rad²."""
 
 

@@ -144,11 +144,12 @@ class Tracker:
         """Find what is in front at a pose: in places that the newest keyframe saw to be free."""
         if self.keyframe is None:
             return None
-        depth, front = self.keyframe.pyramid.depth[0], self.keyframe_front
-        scene_m = self.keyframe.pyramid.kernels.to_host(depth) if front is None else front.scene_m
+        pyramid, front = self.keyframe.pyramid, self.keyframe_front
+        scene_m = pyramid.kernels.to_host(pyramid.depth[0]) if front is None else front.scene_m
         scene = Earlier(scene_m, self.keyframe.T_camera_world @ T_world_camera)
         last = None if before is None else Earlier(before.depth_m, se3.inverse(self.previous) @ T_world_camera)
-        return foreground(scene, last, seen.target.depth_image.numpy(), seen.target.camera)
+        live_m, camera = seen.target.depth_image.numpy(), seen.target.camera
+        return foreground(scene, last, live_m, camera, pyramid.scene_scale)
 
     def _remember(self, fit: PoseFit, seen: Sight) -> None:
         """Keep what the next frame needs."""

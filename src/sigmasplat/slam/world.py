@@ -65,7 +65,7 @@ class World:
         self.extractor = make_extractor(self.config.features) if wanted else None
         self.tracker = Tracker(self.config.tracking, self.extractor if self.config.tracking.features else None)
         self.mapper = Mapper(self.config, self.random)
-        self.drift = Drift()
+        self.drift = Drift(scene_scale=self.config.render.scene_scale)
         self.probes = Probes(self.config.uncertainty.probes, self.config.mapping.every)
         self.descriptor = make_descriptor(self.config.loops)
         self.closer = LoopCloser(self.config, self.store, self.extractor if self.config.tracking.features else None)

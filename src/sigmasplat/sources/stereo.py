@@ -63,16 +63,19 @@ class StereoPair(ImagePair):
 
     def read_depth(self, units_per_metre: float) -> NDArray[np.float32]:
         """Match both images: depth of the left one in metres [H, W]. Raises SourceError naming the file."""
-        return self.depth_and_std_m()[0]
+        return self.read(units_per_metre)[1]
 
-    def read_depth_and_std(self, units_per_metre: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Match both images. Raises SourceError naming the file."""
-        return self.depth_and_std_m()
+    def read(self, units_per_metre: float) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32]]:
+        """Read both images once: the left one, rectified, its depth and the standard deviation of depth, m."""
+        left = self.read_color()
+        return left, *self._match(left)
 
     def depth_and_std_m(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Match both images: depth of the left one and its standard deviation, m [H, W]. Raises SourceError."""
-        right = self.rig.rectification.right(self._read(self.depth))
-        return self.rig.matcher.depth_and_std_m(self.read_color(), right)
+        return self._match(self.read_color())
+
+    def _match(self, left: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        return self.rig.matcher.depth_and_std_m(left, self.rig.rectification.right(self._read(self.depth)))
 
     def _read(self, path: Path) -> NDArray[np.uint8]:
         image, (width, height) = read_color(path), self.rig.size

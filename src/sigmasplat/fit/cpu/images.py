@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from sigmasplat.fit.gray import Image, gray_of
-from sigmasplat.fit.interface import NORMAL_TERMS, AlignedPose, AlignRules, ImageKernels, LevelPlanes
+from sigmasplat.fit.interface import DEPTH_STEP_M, NORMAL_TERMS, AlignedPose, AlignRules, ImageKernels, LevelPlanes
 from sigmasplat.fit.target import Target
 from sigmasplat.native import kernels
 from sigmasplat.render.backend import backend_module
@@ -19,14 +19,11 @@ if TYPE_CHECKING:
 
 Half = Image | None
 
-DEPTH_STEP_M = 0.05
-"""Readings of a cell that differ by this much are not averaged."""
 
-
-def halve(averaged: tuple[Half, Half], depth: Half) -> tuple[Half, Half, Half]:
+def halve(averaged: tuple[Half, Half], depth: Half, step_m: float) -> tuple[Half, Half, Half]:
     """Implement `ImageKernels.halve`."""
     first, second = (None if image is None else halved(image) for image in averaged)
-    return first, second, None if depth is None else halved_depth(depth)
+    return first, second, None if depth is None else halved_depth(depth, step_m)
 
 
 def halved(image: Image) -> Image:
@@ -39,13 +36,13 @@ def halved(image: Image) -> Image:
     return half
 
 
-def halved_depth(depth: Image) -> Image:
+def halved_depth(depth: Image, step_m: float = DEPTH_STEP_M) -> Image:
     """Average the readings of 2×2 cells. A cell gets no reading if it has a single one or contains a depth step."""
     core = kernels()
     if core is None:
-        return halved_depth_in_numpy(depth)
+        return halved_depth_in_numpy(depth, step_m)
     half = np.empty((depth.shape[0] // 2, depth.shape[1] // 2), np.float32)
-    core.halve_depth(depth, DEPTH_STEP_M, half)
+    core.halve_depth(depth, step_m, half)
     return half
 
 
@@ -54,13 +51,13 @@ def halved_in_numpy(image: Image) -> Image:
     return np.asarray(_quarter(image).mean(0))
 
 
-def halved_depth_in_numpy(depth: Image) -> Image:
+def halved_depth_in_numpy(depth: Image, step_m: float = DEPTH_STEP_M) -> Image:
     """Return the same bytes as `halved_depth`, also where the kernels are not built."""
     cells = _quarter(depth)
     readings = (cells > 0).sum(0, dtype=np.float32)
     near, far = np.where(cells > 0, cells, np.float32(np.inf)).min(0), cells.max(0)
     mean = cells.sum(0) / np.maximum(readings, 1)
-    return np.where((readings > 1) & (far - near < DEPTH_STEP_M), mean, np.float32(0.0))
+    return np.where((readings > 1) & (far - near < step_m), mean, np.float32(0.0))
 
 
 def _quarter(image: Image) -> Image:

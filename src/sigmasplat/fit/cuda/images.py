@@ -17,7 +17,7 @@ from sigmasplat.render.view import View
 Half = Tensor | None
 
 
-def halve(averaged: tuple[Half, Half], depth: Half) -> tuple[Half, Half, Half]:
+def halve(averaged: tuple[Half, Half], depth: Half, step_m: float) -> tuple[Half, Half, Half]:
     """Implement `ImageKernels.halve`."""
     given = (*averaged, depth)
     one = next((image for image in given if image is not None), None)
@@ -28,7 +28,7 @@ def halve(averaged: tuple[Half, Half], depth: Half) -> tuple[Half, Half, Half]:
     halves = [None if image is None else torch.empty(size, device=one.device) for image in given]
     cuda_launch.launcher_for(one.device)(
         ALIGNING, "halve_images", blocks_for(size[0] * size[1]), averaged, (halves[0], halves[1]), depth,
-        halves[2], width, height,
+        halves[2], step_m, width, height,
     )  # fmt: skip
     return halves[0], halves[1], halves[2]
 

@@ -49,7 +49,8 @@ struct Halved { float *a, *b; };
 
 // Halve images [height, width]: two are averaged over 2×2 cells. Depth is averaged over the readings of a cell; it gets
 // no reading if there is only one, or if they do not belong to one surface.
-KERNEL halve_images(Averaged from, Halved to, const float* depth, float* half_depth, int width, int height) {
+KERNEL halve_images(Averaged from, Halved to, const float* depth, float* half_depth, float step_m,
+                    int width, int height) {
     const int w = width / 2, h = height / 2, i = thread_number();
     if (i >= w * h) return;
     const size_t at = size_t(i / w) * 2 * width + i % w * 2, below = at + width;
@@ -64,7 +65,7 @@ KERNEL halve_images(Averaged from, Halved to, const float* depth, float* half_de
         farthest = fmaxf(farthest, z[k]);
         readings += 1.f;
     }
-    half_depth[i] = readings > 1.f && farthest - nearest < 0.05f ? (z[0] + z[1] + z[2] + z[3]) / readings : 0.f;
+    half_depth[i] = readings > 1.f && farthest - nearest < step_m ? (z[0] + z[1] + z[2] + z[3]) / readings : 0.f;
 }
 
 // ---- normal equations -----------------------------------------------------------------------------------------------

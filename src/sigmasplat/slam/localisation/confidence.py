@@ -16,7 +16,7 @@ from sigmasplat.slam.loop_closure.closer import Loop
 from sigmasplat.types import Matrix
 
 LOOP_STD_M = 0.01
-"""Standard deviation of the position that a loop gives."""
+"""Standard deviation of the position that a loop gives, in a room."""
 NEVER_LOST = 1_000_000
 """Number of frames since the last lost one, before any was lost."""
 MEMORY = 20.0
@@ -55,11 +55,11 @@ class Confidence:
         for s in members:
             self.spread_m[s] = math.hypot(path_m, self.spread_m[s])
 
-    def closed(self, loops: Sequence[Loop]) -> None:
-        """Take the loops of a finished submap into account."""
+    def closed(self, loops: Sequence[Loop], scene_scale: float = 1.0) -> None:
+        """Take the loops of a finished submap into account; scene_scale: size of the scene relative to a room."""
         for loop in loops:
             if loop.accepted:
-                ours, theirs = loop.query, math.hypot(self.spread_m[loop.database], LOOP_STD_M)
+                ours, theirs = loop.query, math.hypot(self.spread_m[loop.database], LOOP_STD_M * scene_scale)
                 self.spread_m[ours] = min(self.spread_m[ours], theirs)
 
     def position_std_m(self, in_submap_m: float) -> float:

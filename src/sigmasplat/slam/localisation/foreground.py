@@ -53,16 +53,18 @@ class Earlier:
     T_earlier_live: Matrix
 
 
-def foreground(scene: Earlier, before: Earlier | None, live_m: Depth, camera: Camera) -> Foreground | None:
+def foreground(
+    scene: Earlier, before: Earlier | None, live_m: Depth, camera: Camera, scene_scale: float = 1.0
+) -> Foreground | None:
     """Find what has moved in front of the camera; None without.
 
     scene: the reference; before: what was in front in the last image; live_m [H, W]: live depth, m. A whole region
     between depth steps is in front, also its part whose place the reference did not see, but not pixels that fit to the
-    reference.
+    reference. scene_scale: size of the scene relative to a room.
     """
     depth = live_m[::STEP, ::STEP]
     depth = np.where(depth > 0, depth, maximum_filter(depth, 3))  # fill scattered holes
-    free, again, same = _places(scene, before, depth, camera)
+    free, again, same = _places(scene, before, depth, camera, CLEAR_M * scene_scale)
     nearest = minimum_filter(np.where(depth > 0, depth, np.float32(np.inf)), 3)
     regions, count = label((depth > 0) & ~same & (depth <= (1 + EDGE_RELATIVE) * nearest), np.ones((3, 3)))
     sizes, in_free, old = (np.bincount(regions[chosen], minlength=count + 1) for chosen in (regions > 0, free, again))
@@ -89,7 +91,9 @@ def _behind(scene: Earlier, camera: Camera) -> Depth:
     return np.where(seen > 0, seen, maximum_filter(seen, 3))
 
 
-def _places(scene: Earlier, before: Earlier | None, depth: Depth, camera: Camera) -> tuple[Mask, Mask, Mask]:
+def _places(
+    scene: Earlier, before: Earlier | None, depth: Depth, camera: Camera, clear_m: float
+) -> tuple[Mask, Mask, Mask]:
     """Return which pixels of every STEP-th row and column are in places that were free, which are where something was
     in front already, and which are on surfaces of the scene."""
     v, u = np.nonzero(depth > 0)
@@ -97,14 +101,14 @@ def _places(scene: Earlier, before: Earlier | None, depth: Depth, camera: Camera
     near = minimum_filter(np.where(scene.depth_m > 0, scene.depth_m, np.float32(np.inf)), AROUND_PX)
     far = maximum_filter(scene.depth_m, AROUND_PX)
     inside, row, column, z = _projected(points, camera, scene.T_earlier_live)
-    known, limit = inside & (far[row, column] > 0), CLEAR_M + CLEAR_RELATIVE * z
+    known, limit = inside & (far[row, column] > 0), clear_m + CLEAR_RELATIVE * z
     places = np.zeros((3, *depth.shape), bool)
     free, again, same = places
     free[v, u] = known & (z < near[row, column] - limit)
     if before is not None:
         in_last, at_row, at_column, z_last = _projected(points, camera, before.T_earlier_live)
         front = before.depth_m[at_row, at_column]
-        again[v, u] = in_last & (front > 0) & (z_last < front + CLEAR_M + CLEAR_RELATIVE * z_last)
+        again[v, u] = in_last & (front > 0) & (z_last < front + clear_m + CLEAR_RELATIVE * z_last)
     same[v, u] = known & (z < far[row, column] + limit)
     return free, again & ~free, same & ~free & ~again
 

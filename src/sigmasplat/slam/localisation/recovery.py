@@ -15,7 +15,7 @@ LEAST_READINGS = 0.05
 LEAST_CONTRAST = 5.0
 """A frame whose gray values, 0 to 255, have a smaller standard deviation is not usable either."""
 SAME_M, SAME_RAD = 0.1, np.deg2rad(5.0)
-"""Two observations of the pose between two components agree if they differ by less than this."""
+"""Two observations of the pose between two components agree if they differ by less than this, in a room."""
 
 
 def usable(seen: Sight) -> bool:
@@ -67,7 +67,7 @@ class Recovery:
         """Restart the counts: the camera has been found, or a new map has begun."""
         self.lost = self.steady = 0
 
-    def confirms(self, link: Link, atlas: Atlas) -> bool:
+    def confirms(self, link: Link, atlas: Atlas, scene_scale: float = 1.0) -> bool:
         """Return whether a new observation agrees with the last one; keep the new one for the next call."""
         before, self.link = self.link, link
         if before is None or {atlas.components[s] for s in (before.a, before.b)} != {
@@ -79,4 +79,5 @@ class Recovery:
         between = atlas.anchors[before.a] @ before.T_a_b @ se3.inverse(atlas.anchors[before.b])
         expected = se3.inverse(atlas.anchors[link.a]) @ between @ atlas.anchors[link.b]
         apart = se3.inverse(expected) @ link.T_a_b
-        return float(np.linalg.norm(apart[:3, 3])) < SAME_M and se3.rotation_angle(apart[:3, :3]) < SAME_RAD
+        near = float(np.linalg.norm(apart[:3, 3])) < SAME_M * scene_scale
+        return near and se3.rotation_angle(apart[:3, :3]) < SAME_RAD

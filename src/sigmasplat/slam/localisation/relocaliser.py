@@ -16,7 +16,7 @@ from sigmasplat.fit.pose import PoseFit, fit_pose_align
 from sigmasplat.fit.references import Reference, map_reference, picture_images
 from sigmasplat.model import se3
 from sigmasplat.render.view import View
-from sigmasplat.slam.drift import FLOOR, symmetric
+from sigmasplat.slam.drift import floor, symmetric
 from sigmasplat.slam.features import Extractor, Features, Landmarks, matches_by_descriptor
 from sigmasplat.slam.localisation.feature_image import pose_by_features
 from sigmasplat.slam.localisation.known_map import KnownKeyframe, KnownMap, Where
@@ -47,6 +47,7 @@ class Relocation:
     inliers: int
     fit: PoseFit
     comparison: Comparison
+    scene_scale: float = 1.0
 
     @property
     def T_submap_camera(self) -> Matrix:
@@ -61,7 +62,7 @@ class Relocation:
     @property
     def covariance(self) -> Matrix:
         """Return the covariance [6, 6] of the camera's translation and rotation in its own axes, m and rad."""
-        return self._estimated + FLOOR
+        return self._estimated + floor(self.scene_scale)
 
     @property
     def position_m(self) -> float:
@@ -72,7 +73,7 @@ class Relocation:
     def information(self) -> Matrix:
         """Return the information [6, 6] of T_submap_camera's left twist, m and rad."""
         A = se3.adjoint(self.T_submap_camera)
-        covariance = A @ self._estimated @ A.T + FLOOR
+        covariance = A @ self._estimated @ A.T + floor(self.scene_scale)
         return symmetric(np.asarray(np.linalg.inv(symmetric(covariance)), np.float64))
 
     def values(self) -> dict[str, float]:
@@ -175,12 +176,13 @@ class Relocaliser:
         if found is None:
             return
         guess = found.T_live_reference @ se3.inverse(keyframe.T_submap_camera)
+        scale = view.options.scene_scale
         _, pyramid = picture_images(view, keyframe.picture, view.camera)
         own = FoundKeyframe(pyramid, se3.inverse(keyframe.T_submap_camera), keyframe.image(view.camera))
-        yield Relocation(where, own, found.inliers, *aligned(own, seen, guess, self.config.tracking))
+        yield Relocation(where, own, found.inliers, *aligned(own, seen, guess, self.config.tracking), scale)
         params = known.splats(where[0]).params.to(view.sums.device)
         rendered = map_reference(params, view, guess, self.config.tracking)
-        yield Relocation(where, own, found.inliers, *aligned(rendered, seen, guess, self.config.tracking))
+        yield Relocation(where, own, found.inliers, *aligned(rendered, seen, guess, self.config.tracking), scale)
 
 
 def aligned(

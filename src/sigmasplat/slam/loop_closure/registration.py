@@ -22,7 +22,7 @@ from sigmasplat.model import se3
 from sigmasplat.model.map_uncertainty import Background
 from sigmasplat.model.submap import Picture, Submap, SubmapStore
 from sigmasplat.render.view import View
-from sigmasplat.slam.drift import FLOOR, symmetric
+from sigmasplat.slam.drift import floor, symmetric
 from sigmasplat.slam.features import Extractor
 from sigmasplat.slam.localisation.feature_image import pose_by_features
 from sigmasplat.slam.localisation.known_map import KnownKeyframe
@@ -191,7 +191,8 @@ class Registrar:
         if overlap < c.overlap_least:
             return refused(T_a_b, agreed, len(agreed), f"overlap {overlap:.2f} is below {c.overlap_least}", overlap)
         residual = float(np.mean([f.residual for f in agreed]))
-        return Registration(mean, information(agreed, mean), residual, len(agreed), overlap, True, "accepted")
+        edge = information(agreed, mean, self.view.options.scene_scale)
+        return Registration(mean, edge, residual, len(agreed), overlap, True, "accepted")
 
 
 def rendered_picture(maps: PoseMaps) -> Picture:
@@ -262,7 +263,7 @@ def combined(found: Sequence[Localisation]) -> Matrix:
     return se3.orthonormalise(mean)
 
 
-def information(found: Sequence[Localisation], mean: Matrix) -> Matrix:
+def information(found: Sequence[Localisation], mean: Matrix, scene_scale: float = 1.0) -> Matrix:
     """Return the information [6, 6] of the mean T_a_b: the inverse of estimated covariance + spread + floor.
 
     mean: T_a_b [4, 4]; of its left twist, m and rad. The covariance is not divided by the number of localisations: they
@@ -270,7 +271,7 @@ def information(found: Sequence[Localisation], mean: Matrix) -> Matrix:
     """
     twists = np.stack([se3.log(f.T_a_b @ se3.inverse(mean)) for f in found])
     covariance = np.mean([f.covariance for f in found], 0) + twists.T @ twists / len(found)
-    return symmetric(np.asarray(np.linalg.inv(symmetric(covariance) + FLOOR), np.float64))
+    return symmetric(np.asarray(np.linalg.inv(symmetric(covariance) + floor(scene_scale)), np.float64))
 
 
 def shared(a: Submap, b: Submap, T_a_b: Matrix, distance_m: float) -> float:

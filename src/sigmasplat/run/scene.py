@@ -1,0 +1,42 @@
+"""Open a sequence together with the settings that belong to its scene: every run gets both from here."""
+
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from typing import Any
+
+from sigmasplat.config import Config
+from sigmasplat.config.scale import for_scene
+from sigmasplat.sources.base import Source
+from sigmasplat.sources.opening import open_source
+
+
+def open_scene(path: str | Path, config: Config | None = None, given: Collection[str] = ()) -> tuple[Source, Config]:
+    """Open a sequence; return it with the settings for its scene, which differ from `config` outdoors and for stereo.
+
+    given: names of settings that keep their values, as in ["input.max_depth_m"]. Raises as `open_source`.
+    """
+    config = config or Config()
+    source = open_source(path, config.input)
+    return source, config_for(source, config, given)
+
+
+def config_for(source: Source, config: Config, given: Collection[str] = ()) -> Config:
+    """Return the settings for the scene of a source; those named in `given` keep their values."""
+    return for_scene(config, source.scene_scale, source.depth_noise_per_m, given, source.sensor)
+
+
+def scene_facts(source: Source) -> dict[str, Any]:
+    """Return what run.json keeps of the scene: its size, the noise of depth, and the sensor."""
+    return {
+        "scene_scale": source.scene_scale, "depth_noise_per_m": source.depth_noise_per_m, "sensor": source.sensor
+    }  # fmt: skip
+
+
+def config_of_facts(facts: Mapping[str, Any], config: Config, given: Collection[str] = ()) -> Config:
+    """Return the settings that a run with these facts (run.json) used if it was asked for `config`."""
+    return for_scene(config, noted_scale(facts), facts.get("depth_noise_per_m"), given, facts.get("sensor"))
+
+
+def noted_scale(facts: Mapping[str, Any]) -> float:
+    """Return the size of a run's scene from its facts (run.json), 1 for runs of older versions."""
+    return float(facts.get("scene_scale") or 1.0)
