@@ -25,6 +25,7 @@ from sigmasplat.slam.predicted_submaps import PredictedSubmaps
 from sigmasplat.slam.slam import Slam
 from sigmasplat.sources import open_source
 from sigmasplat.sources.base import Source
+from sigmasplat.types import completed
 
 Matrix = NDArray[np.float64]
 Rows = list[dict[str, Any]]
@@ -184,7 +185,7 @@ def registrations(
             a, b = slam.store.load(i), slam.store.load(j)
             T_a_b = se3.inverse(truth[i][0]) @ truth[j][0]
             pair = SubmapPair(Candidate(i, q[0], j, d[0], 1.0, 1.0), q, d)
-            result = registrar.register(pair, a, b, T_a_b @ start)
+            result = completed(registrar.register(pair, a, b, T_a_b @ start))
             off = differs(result.T_a_b, T_a_b, b.T_submap_camera[d[0]][:3, 3])
             errors[name].append(off if result.accepted else None)
     common = [k for k in range(len(chosen)) if all(found[k] is not None for found in errors.values())]

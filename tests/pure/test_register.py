@@ -20,6 +20,7 @@ from sigmasplat.slam.loop_closure.candidates import Candidate, SubmapPair
 from sigmasplat.slam.loop_closure.closer import LoopCloser
 from sigmasplat.slam.loop_closure.registration import Localisation, Registrar, Registration
 from sigmasplat.slam.seeding import make_splats
+from sigmasplat.types import completed
 from small_room import frame_at, walk
 
 Matrix = NDArray[np.float64]
@@ -58,7 +59,7 @@ def registered(
     T_a_b = se3.inverse(truth[a[0]]) @ truth[b[0]]
     pair = SubmapPair(Candidate(0, 0, 1, 0, 1.0, 1.0), (0, 1), (0, 1))
     view = make_view("cpu", walk().camera, RenderConfig())
-    return Registrar(config, store, view).register(pair, ours, theirs, error @ T_a_b), T_a_b
+    return completed(Registrar(config, store, view).register(pair, ours, theirs, error @ T_a_b)), T_a_b
 
 
 def off(found: Matrix, truth: Matrix) -> tuple[float, float]:

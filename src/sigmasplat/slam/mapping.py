@@ -22,7 +22,7 @@ from sigmasplat.slam.loop_closure.closer import Loop
 from sigmasplat.slam.mapper import Mapper
 from sigmasplat.slam.rules import ends_submap
 from sigmasplat.slam.world import World
-from sigmasplat.types import Matrix, Slices
+from sigmasplat.types import Matrix, Slices, completed
 
 LAST_TRIES = 3
 """Number of keyframes per submap that is apart with which other components are searched at the end."""
@@ -164,12 +164,19 @@ class MapWork(World):
         self, seen: Sight, apart_from: int | None = None, index_at_most: int | None = INDEX_AT_MOST
     ) -> Relocation | None:
         """Search the map for the camera; apart_from: only in components that are not that of this submap."""
+        return completed(self.relocalising(seen, apart_from, index_at_most))
+
+    def relocalising(
+        self, seen: Sight, apart_from: int | None = None, index_at_most: int | None = INDEX_AT_MOST
+    ) -> Slices[Relocation | None]:
+        """Search the map as `relocalise` does, in slices."""
         if not self.config.recovery.relocalise or not usable(seen):
             return None
         components = self.atlas.components
         wanted = [apart_from is None or number != components[apart_from] for number in components]
         with self._timer.stage("relocalise"):
-            return self.relocaliser.find(self._known(wanted), self.view, seen, index_at_most)
+            result = yield from self.relocaliser.searching(self._known(wanted), self.view, seen, index_at_most)
+            return result.found
 
     def _known(self, wanted: Sequence[bool]) -> KnownMap:
         """Return the map as relocalisation reads it; wanted [S]: which submaps are searched."""
@@ -179,10 +186,10 @@ class MapWork(World):
     def _splats_of(self, place: Relocation) -> GaussianField:
         return self.store.load(place.where[0]).field.to(self.view.sums.device)
 
-    def seek_component(self, seen: Sight, T_submap_camera: Matrix) -> None:
-        """Look for a place of another component; two observations that agree join the components."""
+    def seek_component(self, seen: Sight, T_submap_camera: Matrix) -> Slices[None]:
+        """Look for a place of another component, in slices; two observations that agree join the components."""
         if len(set(self.atlas.components)) > 1:
-            self._seek_link(seen, len(self.store), T_submap_camera)
+            yield from self._seek_link(seen, len(self.store), T_submap_camera)
 
     def _connect_components(self) -> None:
         """When all is mapped, search other components for the keyframes of those that are apart."""
@@ -190,11 +197,11 @@ class MapWork(World):
             for k in sorted({round(i) for i in np.linspace(0, len(poses) - 1, LAST_TRIES)}):
                 if self.atlas.components[s]:
                     keyframe = self._known([True] * len(self.atlas.components)).keyframe((s, k))
-                    self._seek_link(sight_of(keyframe, self.view), s, keyframe.T_submap_camera)
+                    completed(self._seek_link(sight_of(keyframe, self.view), s, keyframe.T_submap_camera))
 
-    def _seek_link(self, seen: Sight, submap: int, T_submap_camera: Matrix) -> None:
-        """Search other components for a camera of a submap; if a second observation agrees, join them."""
-        place = self.relocalise(seen, apart_from=submap)
+    def _seek_link(self, seen: Sight, submap: int, T_submap_camera: Matrix) -> Slices[None]:
+        """Search other components for a camera of a submap, in slices; if a second observation agrees, join them."""
+        place = yield from self.relocalising(seen, apart_from=submap)
         if place is None:
             return
         link = Link(place.where[0], submap, place.T_submap_camera @ se3.inverse(T_submap_camera), place.information)

@@ -49,7 +49,7 @@ class Slam(MapWork, ArrayInterface):
             if self.config.mapping.exposure:
                 seen = seen.without_exposure(found.exposure)
             self._map(seen, found)
-            self.seek_component(seen, found.T_submap_camera)
+            completed(self.seek_component(seen, found.T_submap_camera))
         else:
             self._offer_probe(seen, found)
         self.atlas.place_frame(found.T_submap_camera)

@@ -22,7 +22,7 @@ from sigmasplat.slam.localisation.feature_image import pose_by_features
 from sigmasplat.slam.localisation.known_map import KnownKeyframe, KnownMap, Where
 from sigmasplat.slam.localisation.sight import FoundKeyframe, Sight
 from sigmasplat.slam.localisation.verdict import MOST_SPREAD_M, recognised, score
-from sigmasplat.types import Matrix
+from sigmasplat.types import Matrix, Slices, completed
 
 STRONGEST = 400
 """Number of features of each image that are compared to choose candidates."""
@@ -121,8 +121,14 @@ class Relocaliser:
         self, known: KnownMap, view: View, seen: Sight, index_at_most: int | None = INDEX_AT_MOST
     ) -> SearchResult:
         """Search as `find` does, and also return what was refused."""
+        return completed(self.searching(known, view, seen, index_at_most))
+
+    def searching(
+        self, known: KnownMap, view: View, seen: Sight, index_at_most: int | None = INDEX_AT_MOST
+    ) -> Slices[SearchResult]:
+        """Search as `search` does, in slices: the features of one keyframe, one pose. `known` must not change."""
         wanted = known.keyframes()
-        self._index(known, view, wanted, index_at_most)
+        yield from self._index(known, view, wanted, index_at_most)
         candidates = self._candidates(wanted, seen)
         best: dict[bool, Relocation] = {}
         for tried in (pose for where in candidates for pose in self._poses(known, view, seen, where)):
@@ -132,15 +138,17 @@ class Relocaliser:
                 best[verdict] = tried
             if verdict and tried.score > ENOUGH:
                 break
+            yield
         return SearchResult(best.get(True), len(candidates), best.get(False))
 
-    def _index(self, known: KnownMap, view: View, wanted: Sequence[Where], at_most: int | None) -> None:
+    def _index(self, known: KnownMap, view: View, wanted: Sequence[Where], at_most: int | None) -> Slices[None]:
         """Add keyframes to the search, and find the features that are missing, also those of a resumed run."""
         have = set(self.indexed)
         self.indexed += [where for where in wanted if where not in have][:at_most]
         for where in self.indexed:
             if where not in self._strongest:
                 self._landmarks_of(known, view, where)
+                yield
 
     def _landmarks_of(self, known: KnownMap, view: View, where: Where) -> Landmarks:
         """Return the landmarks of a keyframe; those used last stay in memory."""

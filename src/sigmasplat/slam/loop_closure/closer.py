@@ -148,7 +148,7 @@ class LoopCloser:
     def closing(
         self, submap: Submap, descriptors: Sequence[NDArray[np.float32]], atlas: Atlas, view: View
     ) -> Slices[list[Loop]]:
-        """Look for loops as `submap_finished` does, in slices of one pair."""
+        """Look for loops as `submap_finished` does, in slices of one alignment."""
         if not self.config.loops.close or not descriptors:
             return []
         query = self._described(submap, descriptors)
@@ -157,7 +157,7 @@ class LoopCloser:
         tried = list[Loop]()
         for pair in pairs:
             yield
-            tried.append(self._try(pair, submap, atlas, view))
+            tried.append((yield from self._try(pair, submap, atlas, view)))
         if any(loop.accepted for loop in tried):
             self._correct(atlas, atlas.components[submap.index])
         return self.loops[len(self.loops) - len(tried) :]
@@ -178,12 +178,12 @@ class LoopCloser:
             pairs += [pair for pair in near if pair.best.database_submap not in known]
         return pairs[: c.most] if c.most else pairs
 
-    def _try(self, pair: SubmapPair, a: Submap, atlas: Atlas, view: View) -> Loop:
-        """Register a pair, with `a` as the query, and record the result, accepted or not."""
+    def _try(self, pair: SubmapPair, a: Submap, atlas: Atlas, view: View) -> Slices[Loop]:
+        """Register a pair in slices, with `a` as the query, and record the result, accepted or not."""
         b = self.store.load(pair.best.database_submap)
         known = se3.inverse(atlas.anchors[a.index]) @ atlas.anchors[b.index]
         registrar = Registrar(self.config, self.store, view, self.extractor, self.predicted)
-        found = registrar.register(pair, a, b, known)
+        found = yield from registrar.register(pair, a, b, known)
         loop = described(pair.best, a, b, found, known)
         self.loops.append(loop)
         if found.accepted:

@@ -1,7 +1,7 @@
 """Register two submaps: keyframes of each are localised in the other, and the results must agree (VarSplat §5)."""
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -29,7 +29,7 @@ from sigmasplat.slam.localisation.known_map import KnownKeyframe
 from sigmasplat.slam.localisation.verdict import confirmed
 from sigmasplat.slam.loop_closure.candidates import SubmapPair
 from sigmasplat.slam.predicted_submaps import PredictedSubmaps
-from sigmasplat.types import Matrix
+from sigmasplat.types import Matrix, Slices
 
 HOPELESS = 0.5
 """If alignment explains less than this share of `share_least`, the keyframe is not refined further."""
@@ -95,30 +95,34 @@ class Registrar:
         self.verify, self.seed = config.tracking.verify, config.seed
         self.tracking = tracking_of(config.registration, config.tracking)
 
-    def register(self, pair: SubmapPair, a: Submap, b: Submap, T_a_b: Matrix) -> Registration:
-        """Register the submaps a (query) and b (database) of a pair; T_a_b [4, 4] is the current estimate."""
-        found = [self._localise(a, k, b, pair.database_keyframes, T_a_b) for k in pair.query_keyframes]
-        back = [self._localise(b, k, a, pair.query_keyframes, se3.inverse(T_a_b)) for k in pair.database_keyframes]
-        found += [inverted(localisation) for localisation in back]
+    def register(self, pair: SubmapPair, a: Submap, b: Submap, T_a_b: Matrix) -> Slices[Registration]:
+        """Register the submaps a (query) and b (database) of a pair, in slices of one alignment; T_a_b [4, 4] is the
+        current estimate."""
+        found = list[Localisation]()
+        for k in pair.query_keyframes:
+            found.append((yield from self._localise(a, k, b, pair.database_keyframes, T_a_b)))
+        for k in pair.database_keyframes:
+            found.append(inverted((yield from self._localise(b, k, a, pair.query_keyframes, se3.inverse(T_a_b)))))
         centre_b = b.T_submap_camera[pair.best.database_keyframe][:3, 3]
         return self._judge(a, b, found, centre_b, T_a_b)
 
     def _localise(
         self, own: Submap, keyframe: int, other: Submap, alike: Sequence[int], T_own_other: Matrix
-    ) -> Localisation:
-        """Localise a keyframe of `own` in `other`: align from the expected pose and from the poses of similar
+    ) -> Slices[Localisation]:
+        """Localise a keyframe of `own` in `other`, in slices: align from the expected pose and from those of similar
         keyframes, then refine the best one by gradient descent on the uncertainty-weighted loss with exposure."""
         T_own_camera, other_map = own.T_submap_camera[keyframe], self._map_of(other)
         target, live = picture_images(self.view, self._picture(own, keyframe), own.camera)
         expected = se3.inverse(T_own_camera) @ T_own_other
         guesses = [expected, *(se3.inverse(other.T_submap_camera[k]) for k in alike)]
-        fit = max((self._aligned(other_map, live, guess) for guess in guesses), key=score)
+        fit = max((yield from self._all_aligned(other_map, live, guesses)), key=score)
         if score(fit) < DOUBTFUL:
-            found = (self._aligned(other_map, live, guess) for guess in self._by_features(own, keyframe, other, alike))
-            fit = max((fit, *found), key=score)
+            by_features = self._by_features(own, keyframe, other, alike)
+            fit = max((fit, *(yield from self._all_aligned(other_map, live, by_features))), key=score)
         if fit.alignment is None or score(fit) > HOPELESS * self.config.share_least:
             start, steps = fit.T_camera_world, self.config.iterations
             fit = fit_pose_adam(other_map.params, self.view, target, start, self.tracking, steps)
+            yield
         A = se3.adjoint(T_own_camera)
         covariance, comparison = self._checked(other_map, live, fit.T_camera_world)
         T_own_other = T_own_camera @ fit.T_camera_world
@@ -152,6 +156,14 @@ class Registrar:
         if not c.uncertainty or c.variance == "published":
             return WeighedMap(submap.field.params.to(device))
         return WeighedMap(self.predicted.rows(submap.index).to(device), self.predicted.background(submap.index))
+
+    def _all_aligned(self, other: WeighedMap, live: Pyramid, guesses: Iterable[Matrix]) -> Slices[list[PoseFit]]:
+        """Align a keyframe from each guess, in slices."""
+        fits = list[PoseFit]()
+        for guess in guesses:
+            fits.append(self._aligned(other, live, guess))
+            yield
+        return fits
 
     def _aligned(self, other: WeighedMap, live: Pyramid, guess: Matrix) -> PoseFit:
         """Align a keyframe to the map rendered at a guess, then again to the map rendered at the result."""

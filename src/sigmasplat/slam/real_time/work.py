@@ -128,7 +128,7 @@ class MapClock:
         if system.submap_ends(number, T):
             yield from system.cut(T)
             T = yield from system.map_keyframe(seen, number, np.eye(4), hurried=self._keyframe_waits)
-        system.seek_component(seen, T)
+        yield from system.seek_component(seen, T)
         self._done(each)
         self._spare = system.config.realtime.spare_iterations
         self._publish(number, self._reference(seen, T, offer), {number: T}, state)
@@ -171,7 +171,7 @@ class MapClock:
         """Search the whole map for a frame, and tell tracking the result."""
         system, number = self.system, each.number
         self._timer, recovered = system.start_timer(), self._has_recovered(search)
-        place = None if recovered else system.relocalise(search.seen)
+        place = None if recovered else (yield from system.relocalising(search.seen))
         yield
         better = place is not None and (search.comparison is None or is_better(place.comparison, search.comparison))
         if place is not None and better:
