@@ -6,7 +6,7 @@ from dataclasses import dataclass, field as dataclass_field
 
 import numpy as np
 
-from sigmasplat.config import TrackingConfig
+from sigmasplat.config import MovingConfig, TrackingConfig
 from sigmasplat.errors import ConfigError
 from sigmasplat.fit.align import Alignment, align
 from sigmasplat.fit.backends import fits_of
@@ -17,11 +17,15 @@ from sigmasplat.fit.references import Reference, map_reference
 from sigmasplat.model import se3
 from sigmasplat.render.view import View
 from sigmasplat.slam.features import Extractor
+from sigmasplat.slam.localisation.expected import Expected
 from sigmasplat.slam.localisation.feature_image import FeatureImage, pose_by_features
-from sigmasplat.slam.localisation.foreground import Earlier, Foreground, foreground
+from sigmasplat.slam.localisation.foreground import Foreground
+from sigmasplat.slam.localisation.memory import Memory, together
+from sigmasplat.slam.localisation.rest import Rest
 from sigmasplat.slam.localisation.sight import FoundKeyframe, Sight
 from sigmasplat.slam.localisation.tracked_keyframe import Splats, TrackedKeyframe, found_keyframe, mapped_keyframe
 from sigmasplat.slam.localisation.verdict import LEAST_COMMON, Usual, confirmed, score, stands
+from sigmasplat.slam.localisation.watch import in_front, is_part_of_scene, resting, without_gone
 from sigmasplat.slam.rules import Asked, is_lost, jumped, never, unless
 from sigmasplat.types import Matrix
 
@@ -35,29 +39,14 @@ FRONT = 0.03
 """What is in front is looked for if at least this share of the compared points is nearer than the reference."""
 
 
-@dataclass(frozen=True, eq=False)
-class Expected:
-    """Expected motion and pose of the camera, known before its image is used.
-
-    motion: T_previous_camera with constant velocity; turn: T_previous_camera without translation; predicted:
-    T_world_camera, the first guess; last: T_world_camera, the last pose. If a gyroscope measured the rotation since the
-    last frame (`measured`), this rotation is part of all four.
-    """
-
-    motion: Matrix
-    turn: Matrix
-    predicted: Matrix
-    last: Matrix
-    measured: bool
-
-
 @dataclass(eq=False)
 class Tracker:
     """Keeps the last pose, the velocity, the last image, the reference keyframe, and statistics of recent fits.
 
     R_inertial_camera: that of the last frame; lost: tracking of the last frame failed; doubtful: number of frames in a
     row whose best pose the images contradict (`_contradicted`); front: what was in front of the scene in the last
-    frame, None if there was nothing or the frame was lost; keyframe_front: the same for the newest keyframe.
+    frame, None if there was nothing or the frame was lost; keyframe_front: the same for the newest keyframe; rest: how
+    long it stays in its place; memory: what recent frames saw.
     Raises ConfigError on settings that do not fit together.
     """
 
@@ -71,6 +60,9 @@ class Tracker:
     keyframe_features: FeatureImage | None = None
     keyframe_front: Foreground | None = None
     front: Foreground | None = None
+    moving: MovingConfig = dataclass_field(default_factory=MovingConfig)
+    rest: Rest | None = None
+    memory: Memory = dataclass_field(default_factory=Memory)
     agreements: list[float] = dataclass_field(default_factory=list)
     first_losses: list[float] = dataclass_field(default_factory=list)
     usual: Usual = dataclass_field(default_factory=Usual)
@@ -112,6 +104,7 @@ class Tracker:
             self.front = None
         self.doubtful = self.doubtful + 1 if self._contradicted(best) else 0
         best.T_camera_world = se3.orthonormalise(best.T_camera_world)
+        self._came_to_rest(seen, se3.inverse(best.T_camera_world))
         self._remember(best, seen.without(self.front, view))
         return best
 
@@ -123,32 +116,58 @@ class Tracker:
         Returns the same fit and frame if nothing is in front, or if the images contradict the pose without it.
         """
         before, self.front = self.front, None
-        nothing_before = before is None and self.keyframe_front is None
-        if fit.comparison is None or self.lost or (fit.comparison.front < FRONT and nothing_before):
+        if fit.comparison is None or self.lost:
             return fit, seen
+        slow = self._slow(seen, se3.inverse(fit.T_camera_world))
+        if slow is None and not self._suspects(fit.comparison, before):
+            return fit, seen
+        keyframe = self.keyframe
         for guess in (predicted, se3.inverse(fit.T_camera_world)):
             for _ in range(2):  # a better pose shows better what is in front
-                front = self._front(seen, before, guess)
-                if front is None:
+                front, self.keyframe = together(self._front(seen, before, guess), slow), keyframe
+                if keyframe is not None and self.moving.find:
+                    self.keyframe = without_gone(keyframe, seen, guess)
+                if front is None and self.keyframe is keyframe:
                     break
-                shown = seen.aside(front, view)
+                shown = seen if front is None else seen.aside(front, view)
                 found = self._fit(field, view, shown, guess)
                 guess = se3.inverse(found.T_camera_world)
             else:
                 if not (self._is_lost(found) or self._contradicted(found) or self._leaps(found, predicted)):
                     self.front = front
                     return found, shown
+        self.keyframe = keyframe
         return fit, seen
 
-    def _front(self, seen: Sight, before: Foreground | None, T_world_camera: Matrix) -> Foreground | None:
-        """Find what is in front at a pose: in places that the newest keyframe saw to be free."""
-        if self.keyframe is None:
+    def _suspects(self, found: Comparison, before: Foreground | None) -> bool:
+        """Return whether something may be in front of the scene, or may have left its place in it."""
+        known = before is not None or self.keyframe_front is not None
+        return known or found.front >= FRONT or (self.moving.find and found.behind >= FRONT)
+
+    def _slow(self, seen: Sight, T_world_camera: Matrix) -> Foreground | None:
+        """Find what moves too slowly to show against the newest keyframe."""
+        if not self.moving.find:
             return None
-        depth, front = self.keyframe.pyramid.depth[0], self.keyframe_front
-        scene_m = self.keyframe.pyramid.kernels.to_host(depth) if front is None else front.scene_m
-        scene = Earlier(scene_m, self.keyframe.T_camera_world @ T_world_camera)
-        last = None if before is None else Earlier(before.depth_m, se3.inverse(self.previous) @ T_world_camera)
-        return foreground(scene, last, seen.target.depth_image.numpy(), seen.target.camera)
+        target = seen.target
+        return self.memory.in_front(target.depth_image.numpy(), T_world_camera, target.camera, self.moving.still_frames)
+
+    def _came_to_rest(self, seen: Sight, T_world_camera: Matrix) -> None:
+        """Count the frames that what is in front stays in its place; after enough of them it is part of the scene."""
+        if not self.moving.find:
+            return
+        if not self.lost:
+            self.memory = self.memory.after(seen.target.depth_image.numpy(), self.front, T_world_camera)
+        if self.front is None:
+            self.rest = None
+            return
+        self.rest = resting(self.rest, self.front, seen, T_world_camera)
+        if is_part_of_scene(self.rest, self.moving):
+            self.front = self.keyframe_front = self.rest = None
+
+    def _front(self, seen: Sight, before: Foreground | None, T_world_camera: Matrix) -> Foreground | None:
+        T_last_live = se3.inverse(self.previous) @ T_world_camera
+        whole = self.moving.find
+        return in_front(self.keyframe, self.keyframe_front, before, T_last_live, seen, T_world_camera, whole)
 
     def _remember(self, fit: PoseFit, seen: Sight) -> None:
         """Keep what the next frame needs."""
@@ -303,6 +322,7 @@ class Tracker:
 
     def keep_keyframe(self, field: Splats, view: View, seen: Sight, T_world_camera: Matrix) -> None:
         """Use a keyframe that was just mapped: its refined pose, and its image as the reference of the next frames."""
+        self._express_watched(T_world_camera @ se3.inverse(self.previous))
         self.previous, self.lost = T_world_camera, False
         self.follow(mapped_keyframe(field.params, view, seen, T_world_camera, self.config, self.front))
 
@@ -314,6 +334,7 @@ class Tracker:
     def move_to(self, field: Splats, view: View, keyframe: FoundKeyframe, T_world_camera: Matrix) -> None:
         """Continue at another pose, with a keyframe as the reference of the next frames."""
         self.previous, self.velocity, self.lost = T_world_camera, np.eye(4), False
+        self.memory, self.rest = Memory(), None
         self.follow(found_keyframe(field.params, view, keyframe, self.config))
 
     def move_by(self, T_new_old: Matrix) -> None:
@@ -322,11 +343,18 @@ class Tracker:
         if self.keyframe is not None:
             T_camera_new = self.keyframe.T_camera_world @ se3.inverse(T_new_old)
             self.keyframe = dataclasses.replace(self.keyframe, T_camera_world=T_camera_new)
+        self._express_watched(T_new_old)
+
+    def _express_watched(self, T_new_old: Matrix) -> None:
+        """Express what is known of moving things in other coordinates [4, 4]."""
+        self.memory = self.memory.moved_by(T_new_old)
+        self.rest = self.rest and self.rest.moved_by(T_new_old)
 
     def forget(self) -> None:
         """Restart at the identity, as for the first frame."""
         self.previous, self.velocity, self.keyframe, self.keyframe_features = np.eye(4), np.eye(4), None, None
-        self.front = self.keyframe_front = None
+        self.front = self.keyframe_front = self.rest = None
+        self.memory = Memory()
 
     def hop(self, fit: PoseFit, live: Pyramid) -> Alignment | None:
         """Return the alignment to the newest keyframe that gives the covariance of a fit; None without the kernels.

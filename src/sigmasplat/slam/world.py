@@ -63,7 +63,8 @@ class World:
         self.atlas = Atlas()
         wanted = self.config.tracking.features or self.config.recovery.relocalise
         self.extractor = make_extractor(self.config.features) if wanted else None
-        self.tracker = Tracker(self.config.tracking, self.extractor if self.config.tracking.features else None)
+        features = self.extractor if self.config.tracking.features else None
+        self.tracker = Tracker(self.config.tracking, features, moving=self.config.moving)
         self.mapper = Mapper(self.config, self.random)
         self.drift = Drift()
         self.probes = Probes(self.config.uncertainty.probes, self.config.mapping.every)

@@ -19,7 +19,7 @@ Depth = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 STEP = 2
-"""Every second row and column of the live image is tested."""
+"""Every second row and column of the live image is tested, unless another step is given."""
 CLEAR_M, CLEAR_RELATIVE = 0.05, 0.05
 """A place was free if the reference saw a surface farther than it by this distance plus this share of its depth."""
 AROUND_PX = 5
@@ -53,35 +53,54 @@ class Earlier:
     T_earlier_live: Matrix
 
 
-def foreground(scene: Earlier, before: Earlier | None, live_m: Depth, camera: Camera) -> Foreground | None:
+def foreground(
+    scene: Earlier,
+    before: Earlier | None,
+    live_m: Depth,
+    camera: Camera,
+    whole_objects: bool = False,
+    step: int = STEP,
+) -> Foreground | None:
     """Find what has moved in front of the camera; None without.
 
     scene: the reference; before: what was in front in the last image; live_m [H, W]: live depth, m. A whole region
     between depth steps is in front, also its part whose place the reference did not see, but not pixels that fit to the
-    reference.
+    reference. With `whole_objects` these belong to it too, if the region is an object by itself: something that has
+    moved by less than its size covers its own earlier place. step: of the rows and columns that are tested.
     """
-    depth = live_m[::STEP, ::STEP]
+    depth = live_m[::step, ::step]
     depth = np.where(depth > 0, depth, maximum_filter(depth, 3))  # fill scattered holes
-    free, again, same = _places(scene, before, depth, camera)
-    nearest = minimum_filter(np.where(depth > 0, depth, np.float32(np.inf)), 3)
-    regions, count = label((depth > 0) & ~same & (depth <= (1 + EDGE_RELATIVE) * nearest), np.ones((3, 3)))
-    sizes, in_free, old = (np.bincount(regions[chosen], minlength=count + 1) for chosen in (regions > 0, free, again))
-    chosen = (in_free >= LEAST_REGION * depth.size) & (in_free + old >= LEAST_SHARE * sizes)
-    chosen[0] = False
-    if not chosen.any():
+    free, again, same = _places(scene, before, depth, camera, step)
+    if np.count_nonzero(free) < LEAST_REGION * depth.size:
         return None
-    whole = np.repeat(np.repeat(chosen[regions], STEP, 0), STEP, 1)[: live_m.shape[0], : live_m.shape[1]]
+    nearest = minimum_filter(np.where(depth > 0, depth, np.float32(np.inf)), 3)
+    smooth = (depth > 0) & (depth <= (1 + EDGE_RELATIVE) * nearest)
+    moved = _regions(smooth & ~same, free, again)
+    if whole_objects:
+        moved |= _regions(smooth, free, again)
+    if not moved.any():
+        return None
+    whole = np.repeat(np.repeat(moved, step, 0), step, 1)[: live_m.shape[0], : live_m.shape[1]]
     hidden = maximum_filter(whole, 2 * MARGIN_PX + 1)
     return Foreground(
         hidden, np.where(whole, live_m, np.float32(0.0)), np.where(hidden, _behind(scene, camera), live_m)
     )
 
 
+def _regions(inside: Mask, free: Mask, again: Mask) -> Mask:
+    """Return the connected regions of pixels that are in places which were free, or where something was before."""
+    regions, count = label(inside, np.ones((3, 3)))
+    sizes, in_free, old = (np.bincount(regions[chosen], minlength=count + 1) for chosen in (regions > 0, free, again))
+    chosen = (in_free >= LEAST_REGION * free.size) & (in_free + old >= LEAST_SHARE * sizes)
+    chosen[0] = False
+    return np.asarray(chosen[regions])
+
+
 def _behind(scene: Earlier, camera: Camera) -> Depth:
     """Return the scene as the live camera would see it, m, 0 where it is not known."""
     v, u = np.nonzero(scene.depth_m > 0)
     points = camera.rays()[v, u].T.astype(np.float64) * scene.depth_m[v, u]
-    inside, row, column, z = _projected(points, camera, se3.inverse(scene.T_earlier_live))
+    inside, row, column, z = projected(points, camera, se3.inverse(scene.T_earlier_live))
     found = np.flatnonzero(inside)
     found = found[np.argsort(-z[found], kind="stable")]  # the nearest surface is written last
     seen = np.zeros(scene.depth_m.shape, np.float32)
@@ -89,27 +108,27 @@ def _behind(scene: Earlier, camera: Camera) -> Depth:
     return np.where(seen > 0, seen, maximum_filter(seen, 3))
 
 
-def _places(scene: Earlier, before: Earlier | None, depth: Depth, camera: Camera) -> tuple[Mask, Mask, Mask]:
-    """Return which pixels of every STEP-th row and column are in places that were free, which are where something was
+def _places(scene: Earlier, before: Earlier | None, depth: Depth, camera: Camera, step: int) -> tuple[Mask, Mask, Mask]:
+    """Return which pixels of every `step`-th row and column are in places that were free, which are where something was
     in front already, and which are on surfaces of the scene."""
     v, u = np.nonzero(depth > 0)
-    points = camera.rays()[STEP * v, STEP * u].T.astype(np.float64) * depth[v, u]
+    points = camera.rays()[step * v, step * u].T.astype(np.float64) * depth[v, u]
     near = minimum_filter(np.where(scene.depth_m > 0, scene.depth_m, np.float32(np.inf)), AROUND_PX)
     far = maximum_filter(scene.depth_m, AROUND_PX)
-    inside, row, column, z = _projected(points, camera, scene.T_earlier_live)
+    inside, row, column, z = projected(points, camera, scene.T_earlier_live)
     known, limit = inside & (far[row, column] > 0), CLEAR_M + CLEAR_RELATIVE * z
     places = np.zeros((3, *depth.shape), bool)
     free, again, same = places
     free[v, u] = known & (z < near[row, column] - limit)
     if before is not None:
-        in_last, at_row, at_column, z_last = _projected(points, camera, before.T_earlier_live)
+        in_last, at_row, at_column, z_last = projected(points, camera, before.T_earlier_live)
         front = before.depth_m[at_row, at_column]
         again[v, u] = in_last & (front > 0) & (z_last < front + CLEAR_M + CLEAR_RELATIVE * z_last)
     same[v, u] = known & (z < far[row, column] + limit)
     return free, again & ~free, same & ~free & ~again
 
 
-def _projected(
+def projected(
     points: Matrix, camera: Camera, T_earlier_live: Matrix
 ) -> tuple[Mask, NDArray[np.intp], NDArray[np.intp], Matrix]:
     """Project live points [3, n] into an earlier image: whether they are inside, row, column (0 outside), depth."""

@@ -53,7 +53,7 @@ class RealTime(ArrayInterface):
         self.slam, self._hurried, c = slam, hurried, slam.config
         wanted = c.tracking.features or c.recovery.relocalise
         self._extractor = make_extractor(c.features) if wanted else None  # not shared with the mapping thread
-        tracker = Tracker(c.tracking, self._extractor if c.tracking.features else None)
+        tracker = Tracker(c.tracking, self._extractor if c.tracking.features else None, moving=c.moving)
         self._camera = CameraClock(c, tracker, Recovery(c.recovery))
         self._snapshots: queue.SimpleQueue[Snapshot] = queue.SimpleQueue()
         self._map = MapClock(slam, self._snapshots.put)

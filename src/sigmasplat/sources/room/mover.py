@@ -57,7 +57,7 @@ def mover(T_world_camera: Matrix, camera: Camera, share: float) -> Mover:
 def _done(at: Matrix) -> NDArray[np.float64]:
     """Return the share of the path that is behind the ball at a share of the sequence."""
     ends = np.cumsum([0.0, *((until - since) * pace for since, until, pace in PACE)])
-    return np.interp(at, [0.0, *(until for _, until, _ in PACE)], ends / ends[-1])
+    return np.asarray(np.interp(at, [0.0, *(until for _, until, _ in PACE)], ends / ends[-1]))
 
 
 def _share(T_world_camera: Matrix, camera: Camera, centers_m: Matrix, radius_m: float) -> float:
