@@ -34,10 +34,11 @@ class Frame:
     color: float32 [H, W, 3] in [0, 1]; depth_m: float32 [H, W] along the optical axis in metres, 0 = no reading;
     camera: the pinhole of both; timestamp_s: seconds; index: position in the source; R_inertial_camera [3, 3]: rotation
     from the camera's axes to fixed axes, the same for all frames, measured by a gyroscope; None = not measured. Only
-    the rotation between two frames is used, so any fixed axes will do. The frame keeps read-only views of both arrays
-    and does not copy them: do not write to them later (`frame_from_arrays` copies). Raises SourceError if an array is
-    not float32, on inconsistent shapes, values that are not finite, colour in 0…255, negative depth, or a matrix
-    that is not a rotation.
+    the rotation between two frames is used, so any fixed axes will do. ignored: pixels of the frame as it was read
+    (`ignored_by` resamples them) whose colour is not used either, None = none; they have no depth. The frame keeps
+    read-only views of both arrays and does not copy them: do not write to them later (`frame_from_arrays` copies).
+    Raises SourceError if an array is not float32, on inconsistent shapes, values that are not finite, colour in 0…255,
+    negative depth, or a matrix that is not a rotation.
     """
 
     index: int
@@ -46,6 +47,7 @@ class Frame:
     depth_m: NDArray[np.float32]
     camera: Camera
     R_inertial_camera: Matrix | None = None
+    ignored: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
         for name, array in (("colour", self.color), ("depth", self.depth_m)):
@@ -118,6 +120,15 @@ class Frame:
         object.__setattr__(frame, "camera", camera)
         frame._keep(color, depth_m)
         return frame
+
+    def ignored_by(self, camera: Camera) -> NDArray[np.bool_] | None:
+        """Return the ignored pixels as a camera with other intrinsics at the same pose sees them, by the nearest pixel;
+        None without any. This frame must be as it was read."""
+        if self.ignored is None or not self.ignored.any():
+            return None
+        columns, rows = (np.rint(pixels).astype(np.intp) for pixels in camera.pixels_in(self.camera))
+        height, width = self.ignored.shape
+        return np.asarray(self.ignored[np.clip(rows, 0, height - 1)][:, np.clip(columns, 0, width - 1)])
 
     def seen_by(self, camera: Camera) -> "Frame":
         """Return the frame as a camera with other intrinsics at the same pose sees it: a homography, exact for depth.

@@ -22,6 +22,7 @@ from sigmasplat.slam.localisation.recovery import Link, Recovery
 from sigmasplat.slam.localisation.relocaliser import Relocaliser
 from sigmasplat.slam.localisation.rest import Rest
 from sigmasplat.slam.localisation.verdict import Usual
+from sigmasplat.slam.localisation.watch import Watch
 from sigmasplat.slam.loop_closure.candidates import SubmapDescriptor
 from sigmasplat.slam.loop_closure.closer import Loop, LoopCloser
 from sigmasplat.slam.loop_closure.pose_graph import Edge
@@ -34,7 +35,8 @@ from sigmasplat.slam.tracker import Tracker
 CLASSES: tuple[type, ...] = (
     Atlas, Camera, Confidence, Detail, Drift, Edge, FeatureImage, Foreground, GaussianField, Hop, Keyframe, Link, Loop,
     LoopCloser, Mapper, Memory, Photo, Picture, Place, Probe, Probes, Pyramid, Recovery, Reference, Relocaliser, Rest,
-    Rows, Seen, Step, SubmapDescriptor, Target, Tracker, Usual, VectorAdam,
+    Rows, Seen, Step, SubmapDescriptor, Target, Tracker, Usual,
+    VectorAdam, Watch,
 )  # fmt: skip
 """The classes that a state may contain."""
 

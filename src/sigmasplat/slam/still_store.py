@@ -72,8 +72,8 @@ def without_moving(store: SubmapStore, anchors: Sequence[Matrix], config: Moving
         for early in others:
             close = frames[late] - frames[early] <= config.still_frames or not config.still_frames
             for own, other in ((early, late), (late, early))[: 1 + close]:
-                depths = [still.picture(*places[n]).depth_m for n in (own, other)]
-                pixels = contradicted(*depths, se3.inverse(poses[other]) @ poses[own], camera)
+                own_m, other_m = (still.picture(*places[n]).depth_m for n in (own, other))
+                pixels = contradicted(own_m, other_m, se3.inverse(poses[other]) @ poses[own], camera)
                 if pixels is not None:
                     still.hide(places[own], pixels)
     return still

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field as dataclass_field
 
 import numpy as np
 
-from sigmasplat.config import MovingConfig, TrackingConfig
+from sigmasplat.config import TrackingConfig
 from sigmasplat.errors import ConfigError
 from sigmasplat.fit.align import Alignment, align
 from sigmasplat.fit.backends import fits_of
@@ -19,24 +19,22 @@ from sigmasplat.render.view import View
 from sigmasplat.slam.features import Extractor
 from sigmasplat.slam.localisation.expected import Expected
 from sigmasplat.slam.localisation.feature_image import FeatureImage, pose_by_features
-from sigmasplat.slam.localisation.foreground import Foreground
-from sigmasplat.slam.localisation.memory import Memory, together
-from sigmasplat.slam.localisation.rest import Rest
+from sigmasplat.slam.localisation.foreground import Foreground, objects
+from sigmasplat.slam.localisation.memory import together
 from sigmasplat.slam.localisation.sight import FoundKeyframe, Sight
 from sigmasplat.slam.localisation.tracked_keyframe import Splats, TrackedKeyframe, found_keyframe, mapped_keyframe
 from sigmasplat.slam.localisation.verdict import LEAST_COMMON, Usual, confirmed, score, stands
-from sigmasplat.slam.localisation.watch import in_front, is_part_of_scene, resting, without_gone
+from sigmasplat.slam.localisation.watch import Watch, in_front, without_gone
 from sigmasplat.slam.rules import Asked, is_lost, jumped, never, unless
 from sigmasplat.types import Matrix
 
 DOUBT = 0.7
 """A pose is doubtful if its agreement × overlap falls below this share of the usual value."""
+AGREES_MORE = 0.05
+"""Something that moves has spoilt a pose if the correlation of the gray values is higher by this without it."""
 WIDE = 0.065
 """A motion between two frames is wide if it moves the image by more than this share of its width: the basin of
 convergence of alignment ends near there."""
-
-FRONT = 0.03
-"""What is in front is looked for if at least this share of the compared points is nearer than the reference."""
 
 
 @dataclass(eq=False)
@@ -45,8 +43,8 @@ class Tracker:
 
     R_inertial_camera: that of the last frame; lost: tracking of the last frame failed; doubtful: number of frames in a
     row whose best pose the images contradict (`_contradicted`); front: what was in front of the scene in the last
-    frame, None if there was nothing or the frame was lost; keyframe_front: the same for the newest keyframe; rest: how
-    long it stays in its place; memory: what recent frames saw.
+    frame, None if there was nothing or the frame was lost; keyframe_front: the same for the newest keyframe; watch:
+    what is known of moving things.
     Raises ConfigError on settings that do not fit together.
     """
 
@@ -60,9 +58,7 @@ class Tracker:
     keyframe_features: FeatureImage | None = None
     keyframe_front: Foreground | None = None
     front: Foreground | None = None
-    moving: MovingConfig = dataclass_field(default_factory=MovingConfig)
-    rest: Rest | None = None
-    memory: Memory = dataclass_field(default_factory=Memory)
+    watch: Watch = dataclass_field(default_factory=Watch)
     agreements: list[float] = dataclass_field(default_factory=list)
     first_losses: list[float] = dataclass_field(default_factory=list)
     usual: Usual = dataclass_field(default_factory=Usual)
@@ -91,8 +87,9 @@ class Tracker:
         velocity is reset.
         """
         expected = self._expected(R_inertial_camera)
-        best = self._fit(field, view, seen, expected.predicted)
-        best, shown = self._uncovered(field, view, seen, expected.predicted, best)
+        shown = seen.shown(view)
+        best = self._fit(field, view, shown, expected.predicted)
+        best, shown = self._uncovered(field, view, seen, shown, expected.predicted, best)
         if self._is_wide(best, view) or self._doubts(best):
             guesses = unless(hurried, self._other_guesses(shown, expected))
             best = max([best, *(self._fit(field, view, shown, guess) for guess in guesses)], key=self._score)
@@ -104,32 +101,40 @@ class Tracker:
             self.front = None
         self.doubtful = self.doubtful + 1 if self._contradicted(best) else 0
         best.T_camera_world = se3.orthonormalise(best.T_camera_world)
-        self._came_to_rest(seen, se3.inverse(best.T_camera_world))
+        if not self.lost:
+            self.watch = self.watch.after(seen, self.front, se3.inverse(best.T_camera_world))
+            if self.watch.has_rest:
+                self.front = self.keyframe_front = None
         self._remember(best, seen.without(self.front, view))
         return best
 
     def _uncovered(
-        self, field: Splats, view: View, seen: Sight, predicted: Matrix, fit: PoseFit
+        self, field: Splats, view: View, seen: Sight, first: Sight, predicted: Matrix, fit: PoseFit
     ) -> tuple[PoseFit, Sight]:
         """Find what is in front of the scene, and fit the pose without it; return the fit and the frame without it.
 
-        Returns the same fit and frame if nothing is in front, or if the images contradict the pose without it.
+        first: the frame as it was fitted. Returns the same fit and this frame if nothing is in front, or if the images
+        contradict the pose without it.
         """
         before, self.front = self.front, None
         if fit.comparison is None or self.lost:
-            return fit, seen
-        slow = self._slow(seen, se3.inverse(fit.T_camera_world))
-        if slow is None and not self._suspects(fit.comparison, before):
-            return fit, seen
+            return fit, first
+        found = self._without_contradicted(field, view, seen, predicted, fit)
+        if found is not None:
+            return found
+        slow = self.watch.slow(seen, se3.inverse(fit.T_camera_world))
+        known = before is not None or self.keyframe_front is not None
+        if slow is None and not self.watch.suspects(fit.comparison, known):
+            return fit, first
         keyframe = self.keyframe
         for guess in (predicted, se3.inverse(fit.T_camera_world)):
             for _ in range(2):  # a better pose shows better what is in front
                 front, self.keyframe = together(self._front(seen, before, guess), slow), keyframe
-                if keyframe is not None and self.moving.find:
+                if keyframe is not None and self.watch.config.find:
                     self.keyframe = without_gone(keyframe, seen, guess)
                 if front is None and self.keyframe is keyframe:
                     break
-                shown = seen if front is None else seen.aside(front, view)
+                shown = first if front is None else seen.aside(front, view)
                 found = self._fit(field, view, shown, guess)
                 guess = se3.inverse(found.T_camera_world)
             else:
@@ -137,36 +142,29 @@ class Tracker:
                     self.front = front
                     return found, shown
         self.keyframe = keyframe
-        return fit, seen
+        return fit, first
 
-    def _suspects(self, found: Comparison, before: Foreground | None) -> bool:
-        """Return whether something may be in front of the scene, or may have left its place in it."""
-        known = before is not None or self.keyframe_front is not None
-        return known or found.front >= FRONT or (self.moving.find and found.behind >= FRONT)
-
-    def _slow(self, seen: Sight, T_world_camera: Matrix) -> Foreground | None:
-        """Find what moves too slowly to show against the newest keyframe."""
-        if not self.moving.find:
+    def _without_contradicted(
+        self, field: Splats, view: View, seen: Sight, predicted: Matrix, fit: PoseFit
+    ) -> tuple[PoseFit, Sight] | None:
+        """If the images contradict a pose, look for the one thing in front without which they do not: it moves, and has
+        drawn the pose with it. Return the fit and the frame without it; None if there is none."""
+        if not self.watch.config.find or fit.comparison is None or not self._contradicted(fit):
             return None
-        target = seen.target
-        return self.memory.in_front(target.depth_image.numpy(), T_world_camera, target.camera, self.moving.still_frames)
-
-    def _came_to_rest(self, seen: Sight, T_world_camera: Matrix) -> None:
-        """Count the frames that what is in front stays in its place; after enough of them it is part of the scene."""
-        if not self.moving.find:
-            return
-        if not self.lost:
-            self.memory = self.memory.after(seen.target.depth_image.numpy(), self.front, T_world_camera)
-        if self.front is None:
-            self.rest = None
-            return
-        self.rest = resting(self.rest, self.front, seen, T_world_camera)
-        if is_part_of_scene(self.rest, self.moving):
-            self.front = self.keyframe_front = self.rest = None
+        for front in objects(seen.target.depth_image.numpy()):
+            shown = seen.aside(front, view)
+            found = self._fit(field, view, shown, predicted)
+            agrees = (
+                found.comparison is not None and found.comparison.correlation > fit.comparison.correlation + AGREES_MORE
+            )
+            if agrees and not (self._is_lost(found) or self._contradicted(found) or self._leaps(found, predicted)):
+                self.front = front
+                return found, shown
+        return None
 
     def _front(self, seen: Sight, before: Foreground | None, T_world_camera: Matrix) -> Foreground | None:
         T_last_live = se3.inverse(self.previous) @ T_world_camera
-        whole = self.moving.find
+        whole = self.watch.config.find
         return in_front(self.keyframe, self.keyframe_front, before, T_last_live, seen, T_world_camera, whole)
 
     def _remember(self, fit: PoseFit, seen: Sight) -> None:
@@ -322,7 +320,7 @@ class Tracker:
 
     def keep_keyframe(self, field: Splats, view: View, seen: Sight, T_world_camera: Matrix) -> None:
         """Use a keyframe that was just mapped: its refined pose, and its image as the reference of the next frames."""
-        self._express_watched(T_world_camera @ se3.inverse(self.previous))
+        self.watch = self.watch.moved_by(T_world_camera @ se3.inverse(self.previous))
         self.previous, self.lost = T_world_camera, False
         self.follow(mapped_keyframe(field.params, view, seen, T_world_camera, self.config, self.front))
 
@@ -334,7 +332,7 @@ class Tracker:
     def move_to(self, field: Splats, view: View, keyframe: FoundKeyframe, T_world_camera: Matrix) -> None:
         """Continue at another pose, with a keyframe as the reference of the next frames."""
         self.previous, self.velocity, self.lost = T_world_camera, np.eye(4), False
-        self.memory, self.rest = Memory(), None
+        self.watch = self.watch.cleared()
         self.follow(found_keyframe(field.params, view, keyframe, self.config))
 
     def move_by(self, T_new_old: Matrix) -> None:
@@ -343,18 +341,12 @@ class Tracker:
         if self.keyframe is not None:
             T_camera_new = self.keyframe.T_camera_world @ se3.inverse(T_new_old)
             self.keyframe = dataclasses.replace(self.keyframe, T_camera_world=T_camera_new)
-        self._express_watched(T_new_old)
-
-    def _express_watched(self, T_new_old: Matrix) -> None:
-        """Express what is known of moving things in other coordinates [4, 4]."""
-        self.memory = self.memory.moved_by(T_new_old)
-        self.rest = self.rest and self.rest.moved_by(T_new_old)
+        self.watch = self.watch.moved_by(T_new_old)
 
     def forget(self) -> None:
         """Restart at the identity, as for the first frame."""
         self.previous, self.velocity, self.keyframe, self.keyframe_features = np.eye(4), np.eye(4), None, None
-        self.front = self.keyframe_front = self.rest = None
-        self.memory = Memory()
+        self.front, self.keyframe_front, self.watch = None, None, self.watch.cleared()
 
     def hop(self, fit: PoseFit, live: Pyramid) -> Alignment | None:
         """Return the alignment to the newest keyframe that gives the covariance of a fit; None without the kernels.

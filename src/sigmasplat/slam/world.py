@@ -27,6 +27,7 @@ from sigmasplat.slam.localisation.confidence import Confidence
 from sigmasplat.slam.localisation.recovery import Recovery
 from sigmasplat.slam.localisation.relocaliser import Relocaliser
 from sigmasplat.slam.localisation.sight import Observation, observe, view_of, working_frame
+from sigmasplat.slam.localisation.watch import Watch
 from sigmasplat.slam.loop_closure.closer import Loop, LoopCloser, make_descriptor
 from sigmasplat.slam.mapper import Mapper
 from sigmasplat.slam.merged import components_apart, merged_field
@@ -64,7 +65,7 @@ class World:
         wanted = self.config.tracking.features or self.config.recovery.relocalise
         self.extractor = make_extractor(self.config.features) if wanted else None
         features = self.extractor if self.config.tracking.features else None
-        self.tracker = Tracker(self.config.tracking, features, moving=self.config.moving)
+        self.tracker = Tracker(self.config.tracking, features, watch=Watch(self.config.moving))
         self.mapper = Mapper(self.config, self.random)
         self.drift = Drift()
         self.probes = Probes(self.config.uncertainty.probes, self.config.mapping.every)

@@ -28,6 +28,14 @@ EDGE_RELATIVE = 0.05
 """A depth step, where a region ends: neighbouring pixels differ by more than this share of the nearer depth."""
 LEAST_REGION, LEAST_SHARE = 0.01, 0.15
 """A region is in front if at least this share of the image's pixels, and of its own, are in places that were free."""
+WHOLE_SHARE = 0.05
+"""The least share of a region that is an object by itself: an object that moves slowly covers most of its old place."""
+SAME_THING = 0.6
+"""A region is what was in front in the last image if at least this share of it is there."""
+OBJECT_SHARE, MOST_OBJECTS = (0.02, 0.7), 3
+"""Share of the image of a thing that stands free, and how many are considered."""
+RING, FREE_AROUND = 3, 0.6
+"""Something stands free if at least this share of the pixels at this distance around it is farther."""
 MARGIN_PX = 3
 """The mask is wider than the regions by this much: sensors mix depth and colour at an edge."""
 
@@ -71,20 +79,64 @@ def foreground(
     depth = live_m[::step, ::step]
     depth = np.where(depth > 0, depth, maximum_filter(depth, 3))  # fill scattered holes
     free, again, same = _places(scene, before, depth, camera, step)
-    if np.count_nonzero(free) < LEAST_REGION * depth.size:
+    if np.count_nonzero(free | again) < LEAST_REGION * depth.size:
         return None
-    nearest = minimum_filter(np.where(depth > 0, depth, np.float32(np.inf)), 3)
-    smooth = (depth > 0) & (depth <= (1 + EDGE_RELATIVE) * nearest)
+    smooth = _smooth(depth)
     moved = _regions(smooth & ~same, free, again)
     if whole_objects:
-        moved |= _regions(smooth, free, again)
+        moved |= _objects(smooth, free, again)
     if not moved.any():
         return None
-    whole = np.repeat(np.repeat(moved, step, 0), step, 1)[: live_m.shape[0], : live_m.shape[1]]
-    hidden = maximum_filter(whole, 2 * MARGIN_PX + 1)
+    whole, hidden = _enlarged(moved, step, live_m)
     return Foreground(
         hidden, np.where(whole, live_m, np.float32(0.0)), np.where(hidden, _behind(scene, camera), live_m)
     )
+
+
+def objects(live_m: Depth) -> list[Foreground]:
+    """Return the things that stand free in an image [H, W], m, in front of farther surfaces all around, the largest
+    first, at most `MOST_OBJECTS`. What is behind them is not known."""
+    depth = live_m[::STEP, ::STEP]
+    depth = np.where(depth > 0, depth, maximum_filter(depth, 3))
+    regions, count = label(_smooth(depth), np.ones((3, 3)))
+    sizes = np.bincount(regions.ravel(), minlength=count + 1) / depth.size
+    sizes[0] = 0.0
+    found = []
+    for region in np.argsort(-sizes, kind="stable"):
+        if sizes[region] < OBJECT_SHARE[0] or len(found) == MOST_OBJECTS:
+            break
+        inside = regions == region
+        far_m = np.median(depth[inside]) * (1 + EDGE_RELATIVE)
+        ring = maximum_filter(inside, 2 * RING + 1) & ~maximum_filter(inside, 2 * RING - 1) & (depth > 0)
+        if sizes[region] > OBJECT_SHARE[1] or not ring.any() or (depth[ring] > far_m).mean() < FREE_AROUND:
+            continue
+        whole, hidden = _enlarged(inside, STEP, live_m)
+        depths = np.where(whole, live_m, np.float32(0.0)), np.where(hidden, np.float32(0.0), live_m)
+        found.append(Foreground(hidden, *depths))
+    return found
+
+
+def _smooth(depth: Depth) -> Mask:
+    """Return the pixels with a reading that are not on the far side of a depth step."""
+    nearest = minimum_filter(np.where(depth > 0, depth, np.float32(np.inf)), 3)
+    return np.asarray((depth > 0) & (depth <= (1 + EDGE_RELATIVE) * nearest))
+
+
+def _enlarged(small: Mask, step: int, live_m: Depth) -> tuple[Mask, Mask]:
+    """Return a mask of every `step`-th pixel at the size of the image, and the same with a margin."""
+    whole = np.repeat(np.repeat(small, step, 0), step, 1)[: live_m.shape[0], : live_m.shape[1]]
+    return whole, np.asarray(maximum_filter(whole, 2 * MARGIN_PX + 1))
+
+
+def _objects(inside: Mask, free: Mask, again: Mask) -> Mask:
+    """Return the whole regions of which a small part is in places that were free, or the larger part is where something
+    was before."""
+    regions, count = label(inside, np.ones((3, 3)))
+    sizes, in_free, old = (np.bincount(regions[chosen], minlength=count + 1) for chosen in (regions > 0, free, again))
+    moved = (in_free >= LEAST_REGION * free.size) & (in_free + old >= WHOLE_SHARE * sizes)
+    chosen = moved | ((sizes >= LEAST_REGION * free.size) & (in_free + old >= SAME_THING * sizes))
+    chosen[0] = False
+    return np.asarray(chosen[regions])
 
 
 def _regions(inside: Mask, free: Mask, again: Mask) -> Mask:
