@@ -20,7 +20,6 @@ from sigmasplat.slam.localisation.foreground import Foreground
 from sigmasplat.slam.localisation.memory import Memory, Seen
 from sigmasplat.slam.localisation.recovery import Link, Recovery
 from sigmasplat.slam.localisation.relocaliser import Relocaliser
-from sigmasplat.slam.localisation.rest import Rest
 from sigmasplat.slam.localisation.verdict import Usual
 from sigmasplat.slam.localisation.watch import Watch
 from sigmasplat.slam.loop_closure.candidates import SubmapDescriptor
@@ -34,8 +33,8 @@ from sigmasplat.slam.tracker import Tracker
 
 CLASSES: tuple[type, ...] = (
     Atlas, Camera, Confidence, Detail, Drift, Edge, FeatureImage, Foreground, GaussianField, Hop, Keyframe, Link, Loop,
-    LoopCloser, Mapper, Memory, Photo, Picture, Place, Probe, Probes, Pyramid, Recovery, Reference, Relocaliser, Rest,
-    Rows, Seen, Step, SubmapDescriptor, Target, Tracker, Usual,
+    LoopCloser, Mapper, Memory, Photo, Picture, Place, Probe, Probes, Pyramid, Recovery, Reference, Relocaliser, Rows,
+    Seen, Step, SubmapDescriptor, Target, Tracker, Usual,
     VectorAdam, Watch,
 )  # fmt: skip
 """The classes that a state may contain."""

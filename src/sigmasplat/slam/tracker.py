@@ -17,14 +17,14 @@ from sigmasplat.fit.references import Reference, map_reference
 from sigmasplat.model import se3
 from sigmasplat.render.view import View
 from sigmasplat.slam.features import Extractor
-from sigmasplat.slam.localisation.expected import Expected
-from sigmasplat.slam.localisation.feature_image import FeatureImage, pose_by_features
+from sigmasplat.slam.localisation.expected import Expected, odometry
+from sigmasplat.slam.localisation.feature_image import FeatureImage, motion_by_features
 from sigmasplat.slam.localisation.foreground import Foreground, objects
 from sigmasplat.slam.localisation.memory import together
 from sigmasplat.slam.localisation.sight import FoundKeyframe, Sight
 from sigmasplat.slam.localisation.tracked_keyframe import Splats, TrackedKeyframe, found_keyframe, mapped_keyframe
 from sigmasplat.slam.localisation.verdict import LEAST_COMMON, Usual, confirmed, score, stands
-from sigmasplat.slam.localisation.watch import Watch, in_front, without_gone
+from sigmasplat.slam.localisation.watch import Watch
 from sigmasplat.slam.rules import Asked, is_lost, jumped, never, unless
 from sigmasplat.types import Matrix
 
@@ -102,9 +102,7 @@ class Tracker:
         self.doubtful = self.doubtful + 1 if self._contradicted(best) else 0
         best.T_camera_world = se3.orthonormalise(best.T_camera_world)
         if not self.lost:
-            self.watch = self.watch.after(seen, self.front, se3.inverse(best.T_camera_world))
-            if self.watch.has_rest:
-                self.front = self.keyframe_front = None
+            self._notice_rest(seen, se3.inverse(best.T_camera_world))
         self._remember(best, seen.without(self.front, view))
         return best
 
@@ -119,53 +117,61 @@ class Tracker:
         before, self.front = self.front, None
         if fit.comparison is None or self.lost:
             return fit, first
-        found = self._without_contradicted(field, view, seen, predicted, fit)
-        if found is not None:
-            return found
-        slow = self.watch.slow(seen, se3.inverse(fit.T_camera_world))
-        known = before is not None or self.keyframe_front is not None
-        if slow is None and not self.watch.suspects(fit.comparison, known):
-            return fit, first
+        found = self._without_front(field, view, seen, first, predicted, fit, before)
+        if found is None and self.watch.config.find and self._contradicted(fit):
+            found = self._without_object(field, view, seen, predicted, fit.comparison)
+        return (fit, first) if found is None else found
+
+    def _without_front(
+        self, field: Splats, view: View, seen: Sight, first: Sight, predicted: Matrix, fit: PoseFit,
+        before: Foreground | None,
+    ) -> tuple[PoseFit, Sight] | None:  # fmt: skip
+        """Return the fit and the frame without what is in space that was free, and the newest keyframe without what has
+        left it; None if there is nothing, or if the images contradict the pose. before: in front in the last frame."""
+        slow, known = self.watch.slow(seen, se3.inverse(fit.T_camera_world)), before or self.keyframe_front
+        if fit.comparison is None or (slow is None and not self.watch.suspects(fit.comparison, known is not None)):
+            return None
         keyframe = self.keyframe
         for guess in (predicted, se3.inverse(fit.T_camera_world)):
             for _ in range(2):  # a better pose shows better what is in front
-                front, self.keyframe = together(self._front(seen, before, guess), slow), keyframe
-                if keyframe is not None and self.watch.config.find:
-                    self.keyframe = without_gone(keyframe, seen, guess)
+                front = self.watch.in_front(keyframe, self.keyframe_front, before, self.previous, seen, guess)
+                front = together(front, slow)
+                self.keyframe = self.watch.without_gone(keyframe, seen, guess)
                 if front is None and self.keyframe is keyframe:
                     break
                 shown = first if front is None else seen.aside(front, view)
                 found = self._fit(field, view, shown, guess)
                 guess = se3.inverse(found.T_camera_world)
             else:
-                if not (self._is_lost(found) or self._contradicted(found) or self._leaps(found, predicted)):
+                if self._stands(found, predicted):
                     self.front = front
                     return found, shown
         self.keyframe = keyframe
-        return fit, first
+        return None
 
-    def _without_contradicted(
-        self, field: Splats, view: View, seen: Sight, predicted: Matrix, fit: PoseFit
+    def _without_object(
+        self, field: Splats, view: View, seen: Sight, predicted: Matrix, contradicted: Comparison
     ) -> tuple[PoseFit, Sight] | None:
-        """If the images contradict a pose, look for the one thing in front without which they do not: it moves, and has
-        drawn the pose with it. Return the fit and the frame without it; None if there is none."""
-        if not self.watch.config.find or fit.comparison is None or not self._contradicted(fit):
-            return None
+        """Look for the one thing in front without which the images do not contradict the pose: it moves, and has drawn
+        the pose with it. Return the fit and the frame without it; None if there is none."""
         for front in objects(seen.target.depth_image.numpy()):
             shown = seen.aside(front, view)
             found = self._fit(field, view, shown, predicted)
-            agrees = (
-                found.comparison is not None and found.comparison.correlation > fit.comparison.correlation + AGREES_MORE
-            )
-            if agrees and not (self._is_lost(found) or self._contradicted(found) or self._leaps(found, predicted)):
+            agrees = 0.0 if found.comparison is None else found.comparison.correlation
+            if agrees > contradicted.correlation + AGREES_MORE and self._stands(found, predicted):
                 self.front = front
                 return found, shown
         return None
 
-    def _front(self, seen: Sight, before: Foreground | None, T_world_camera: Matrix) -> Foreground | None:
-        T_last_live = se3.inverse(self.previous) @ T_world_camera
-        whole = self.watch.config.find
-        return in_front(self.keyframe, self.keyframe_front, before, T_last_live, seen, T_world_camera, whole)
+    def _notice_rest(self, seen: Sight, T_world_camera: Matrix) -> None:
+        """Take what has come to rest for a part of the scene, and remember the frame."""
+        front = self.watch.still_moving(self.front, seen, T_world_camera)
+        if self.front is not None and front is None:
+            self.keyframe_front = None
+        self.front, self.watch = front, self.watch.after(seen, front, T_world_camera)
+
+    def _stands(self, fit: PoseFit, predicted: Matrix) -> bool:
+        return not (self._is_lost(fit) or self._contradicted(fit) or self._leaps(fit, predicted))
 
     def _remember(self, fit: PoseFit, seen: Sight) -> None:
         """Keep what the next frame needs."""
@@ -196,7 +202,7 @@ class Tracker:
         """Fit from an initial T_world_camera; patience: factor on the number of iterations of gradient descent."""
         T_camera_world = se3.inverse(guess)
         if self.config.method == "adam":
-            config = self.config if self.started else _without_motion(self.config)
+            config = self.config if self.started else self.config.without_motion()
             steps = patience * config.iterations
             return fit_pose_adam(field.params, view, seen.target, T_camera_world, config, steps)
         if self.config.align_to == "keyframe" and self.keyframe is not None:
@@ -220,23 +226,16 @@ class Tracker:
 
     def _other_guesses(self, seen: Sight, expected: Expected) -> Iterator[Matrix]:
         """Yield T_world_camera by features, and by constant velocity alone if a gyroscope changed the first guess."""
-        yield from self._guesses_by_features(seen)
+        if self.extractor is not None and seen.image is not None:
+            known = None if self.keyframe is None else self.keyframe_features
+            motion = motion_by_features(known, seen.image, self.extractor)
+            if self.keyframe is not None and motion is not None:
+                yield se3.inverse(motion @ self.keyframe.T_camera_world)
+            motion = motion_by_features(self.last_features, seen.image, self.extractor)
+            if motion is not None:
+                yield self.previous @ se3.inverse(motion)
         if expected.measured:
             yield self.previous @ self.velocity if self.config.motion_model else self.previous
-
-    def _guesses_by_features(self, seen: Sight) -> Iterator[Matrix]:
-        """Yield T_world_camera by features of the newest keyframe and of the last image, where they give a pose."""
-        if self.extractor is None or seen.image is None:
-            return
-        if self.keyframe is not None and self.keyframe_features is not None:
-            landmarks = self.keyframe_features.landmarks(self.extractor)
-            found = pose_by_features(landmarks, seen.image, self.extractor, seed=0)
-            if found is not None:
-                yield se3.inverse(found.T_live_reference @ self.keyframe.T_camera_world)
-        if self.last_features is not None:
-            found = pose_by_features(self.last_features.landmarks(self.extractor), seen.image, self.extractor, seed=0)
-            if found is not None:
-                yield self.previous @ se3.inverse(found.T_live_reference)
 
     def _retry(
         self, field: Splats, view: View, seen: Sight, fit: PoseFit, expected: Expected, hurried: Asked
@@ -261,15 +260,8 @@ class Tracker:
         """Align the last image to this one and return T_world_camera; None if this fails too."""
         if self.last_image is None or (self.config.method == "adam" and not fits_of(view).aligns):
             return None  # alignment needs the compiled kernels
-        guesses = (se3.inverse(expected.motion), expected.turn.T.copy())  # the inverse, because it has no translation
-        found = [
-            align(self.last_image, live, g, 2 * self.config.align_iterations, self.config.align_weight_color)
-            for g in guesses
-        ]
-        best = max(found, key=lambda a: a.agreement * a.overlap)
-        if best.agreement * best.overlap < self.config.lost_share:
-            return None
-        return np.asarray(self.previous @ se3.inverse(best.T_live_reference))
+        T_live_last = odometry(self.last_image, live, expected, self.config)
+        return None if T_live_last is None else np.asarray(self.previous @ se3.inverse(T_live_last))
 
     # ---- verdicts ----
 
@@ -357,12 +349,3 @@ class Tracker:
             return fit.alignment
         T_live_keyframe = fit.T_camera_world @ se3.inverse(self.keyframe.T_camera_world)
         return align(self.keyframe.pyramid, live, T_live_keyframe, 0, self.config.align_weight_color)
-
-
-def _without_motion(config: TrackingConfig) -> TrackingConfig:
-    """Return the settings for the second frame of a sequence, which has no motion model yet (CG-SLAM's code)."""
-    return dataclasses.replace(
-        config,
-        iterations=config.first_iterations or config.iterations,
-        lr_rotation=config.first_lr_rotation or config.lr_rotation,
-    )

@@ -81,13 +81,13 @@ def foreground(
     free, again, same = _places(scene, before, depth, camera, step)
     if np.count_nonzero(free | again) < LEAST_REGION * depth.size:
         return None
-    smooth = _smooth(depth)
-    moved = _regions(smooth & ~same, free, again)
+    inside = smooth(depth)
+    moved = _regions(inside & ~same, free, again)
     if whole_objects:
-        moved |= _objects(smooth, free, again)
+        moved |= _objects(inside, free, again)
     if not moved.any():
         return None
-    whole, hidden = _enlarged(moved, step, live_m)
+    whole, hidden = enlarged(moved, step, live_m)
     return Foreground(
         hidden, np.where(whole, live_m, np.float32(0.0)), np.where(hidden, _behind(scene, camera), live_m)
     )
@@ -98,10 +98,10 @@ def objects(live_m: Depth) -> list[Foreground]:
     first, at most `MOST_OBJECTS`. What is behind them is not known."""
     depth = live_m[::STEP, ::STEP]
     depth = np.where(depth > 0, depth, maximum_filter(depth, 3))
-    regions, count = label(_smooth(depth), np.ones((3, 3)))
+    regions, count = label(smooth(depth), np.ones((3, 3)))
     sizes = np.bincount(regions.ravel(), minlength=count + 1) / depth.size
     sizes[0] = 0.0
-    found = []
+    found = list[Foreground]()
     for region in np.argsort(-sizes, kind="stable"):
         if sizes[region] < OBJECT_SHARE[0] or len(found) == MOST_OBJECTS:
             break
@@ -110,19 +110,19 @@ def objects(live_m: Depth) -> list[Foreground]:
         ring = maximum_filter(inside, 2 * RING + 1) & ~maximum_filter(inside, 2 * RING - 1) & (depth > 0)
         if sizes[region] > OBJECT_SHARE[1] or not ring.any() or (depth[ring] > far_m).mean() < FREE_AROUND:
             continue
-        whole, hidden = _enlarged(inside, STEP, live_m)
+        whole, hidden = enlarged(inside, STEP, live_m)
         depths = np.where(whole, live_m, np.float32(0.0)), np.where(hidden, np.float32(0.0), live_m)
         found.append(Foreground(hidden, *depths))
     return found
 
 
-def _smooth(depth: Depth) -> Mask:
+def smooth(depth: Depth) -> Mask:
     """Return the pixels with a reading that are not on the far side of a depth step."""
     nearest = minimum_filter(np.where(depth > 0, depth, np.float32(np.inf)), 3)
     return np.asarray((depth > 0) & (depth <= (1 + EDGE_RELATIVE) * nearest))
 
 
-def _enlarged(small: Mask, step: int, live_m: Depth) -> tuple[Mask, Mask]:
+def enlarged(small: Mask, step: int, live_m: Depth) -> tuple[Mask, Mask]:
     """Return a mask of every `step`-th pixel at the size of the image, and the same with a margin."""
     whole = np.repeat(np.repeat(small, step, 0), step, 1)[: live_m.shape[0], : live_m.shape[1]]
     return whole, np.asarray(maximum_filter(whole, 2 * MARGIN_PX + 1))
@@ -178,6 +178,20 @@ def _places(scene: Earlier, before: Earlier | None, depth: Depth, camera: Camera
         again[v, u] = in_last & (front > 0) & (z_last < front + CLEAR_M + CLEAR_RELATIVE * z_last)
     same[v, u] = known & (z < far[row, column] + limit)
     return free, again & ~free, same & ~free & ~again
+
+
+def seen_again(scene: Earlier, depth: Depth, camera: Camera, step: int) -> tuple[Mask, Mask]:
+    """Return which pixels of every `step`-th row and column [h, w], m, are in places that an earlier image shows, and
+    which of these are on a surface of it."""
+    v, u = np.nonzero(depth > 0)
+    points = camera.rays()[step * v, step * u].T.astype(np.float64) * depth[v, u]
+    inside, row, column, z = projected(points, camera, scene.T_earlier_live)
+    near = minimum_filter(np.where(scene.depth_m > 0, scene.depth_m, np.float32(np.inf)), AROUND_PX)[row, column]
+    far, limit = maximum_filter(scene.depth_m, AROUND_PX)[row, column], CLEAR_M + CLEAR_RELATIVE * z
+    known, same = np.zeros((2, *depth.shape), bool)
+    known[v, u] = inside & (far > 0) & (z < far + limit)  # what is farther was hidden
+    same[v, u] = known[v, u] & (z > near - limit)
+    return known, same
 
 
 def projected(
