@@ -235,6 +235,15 @@ class InputOptions:
         Path | None,
         arg(metavar="FILE", help="calibration.json to use instead of the recorded calibration", help_behavior_hint=""),
     ] = None
+    masks: Annotated[
+        Path | None,
+        arg(
+            metavar="FOLDER",
+            help="ignore pixels: one image per frame of the recording, not 0 = ignored, such as people found by a "
+            "segmenter",
+            help_behavior_hint="",
+        ),
+    ] = None
     fx: Annotated[
         From0,
         arg(
@@ -268,6 +277,7 @@ class InputOptions:
         given = {field.name: getattr(self, field.name) for field in fields(self)}
         given["register_depth"] = None if self.register_depth == "auto" else self.register_depth
         given["calibration"] = self.calibration and self.calibration.resolve()  # a later eval may run in another folder
+        given["masks"] = self.masks and self.masks.resolve()
         return {
             f"input.{names.get(name, name)}": str(value) for name, value in given.items() if value not in (None, False)
         }

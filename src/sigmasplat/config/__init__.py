@@ -12,6 +12,7 @@ from sigmasplat.config.densify import DensifyConfig
 from sigmasplat.config.features import FeatureConfig
 from sigmasplat.config.frames import MappingConfig, RenderConfig, SeedConfig, TrackingConfig
 from sigmasplat.config.input import InputConfig
+from sigmasplat.config.moving import MovingConfig
 from sigmasplat.config.ranges import Count, Section, kinds_of, problems_of, refuse, shown
 from sigmasplat.config.real_time import RealTimeConfig
 from sigmasplat.config.recovery import RecoveryConfig
@@ -23,8 +24,8 @@ from sigmasplat.reading.structured import read_json
 
 __all__ = [
     "Config", "DensifyConfig", "FeatureConfig", "FinalConfig", "InputConfig", "LoopConfig", "MappingConfig",
-    "RealTimeConfig", "RecoveryConfig", "RegistrationConfig", "RenderConfig", "SeedConfig", "SubmapConfig",
-    "SurfaceConfig", "TrackingConfig", "UncertaintyConfig",
+    "MovingConfig", "RealTimeConfig", "RecoveryConfig", "RegistrationConfig", "RenderConfig", "SeedConfig",
+    "SubmapConfig", "SurfaceConfig", "TrackingConfig", "UncertaintyConfig",
 ]  # fmt: skip
 
 
@@ -48,6 +49,7 @@ class Config:
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
     features: FeatureConfig = field(default_factory=FeatureConfig)
     recovery: RecoveryConfig = field(default_factory=RecoveryConfig)
+    moving: MovingConfig = field(default_factory=MovingConfig)
     submaps: SubmapConfig = field(default_factory=SubmapConfig)
     loops: LoopConfig = field(default_factory=LoopConfig)
     registration: RegistrationConfig = field(default_factory=RegistrationConfig)

@@ -1,6 +1,6 @@
 """Settings of the work per frame: rendering, seeding, mapping, tracking."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
 from sigmasplat.config.ranges import Above0, AtLeastOne, Count, NotNegative, Range, Section, Share, WeightBound
@@ -287,3 +287,8 @@ class TrackingConfig(Section, name="tracking"):
     cuda_graphs: bool = True
     """On a CUDA device, whether several iterations of descent are launched as one CUDA graph; off = each kernel is
     launched on its own."""
+
+    def without_motion(self) -> "TrackingConfig":
+        """Return the settings for the second frame of a sequence, which has no motion model yet (CG-SLAM's code)."""
+        iterations = self.first_iterations or self.iterations
+        return replace(self, iterations=iterations, lr_rotation=self.first_lr_rotation or self.lr_rotation)

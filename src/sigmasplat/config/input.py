@@ -31,6 +31,9 @@ class InputConfig(Section, name="input"):
 
     calibration: str = ""
     """Path of a calibration.json that replaces the calibration of the recording; empty = as recorded."""
+    masks: str = ""
+    """Path of a folder with one image per frame of the recording, in the order of the numbers in their names: pixels
+    that are not 0 are ignored in tracking, in the map and in scores; empty = none."""
     fx: NotNegative = 0.0
     """Horizontal focal length of the colour camera in pixels; 0 = as recorded."""
     fy: NotNegative = 0.0

@@ -1,9 +1,10 @@
 """Make references for alignment: the rendered map, or a keyframe's own image weighted by the map's V."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.config import TrackingConfig
@@ -35,6 +36,17 @@ class Reference:
         """Return the weight of each pixel [H, W] in host memory; None if all are equal."""
         weight = self.pyramid.weight[0]
         return None if weight is None else self.pyramid.kernels.to_host(weight)
+
+    def without(self, hidden: NDArray[np.bool_]) -> "Reference":
+        """Return the reference without depth at some pixels [H, W], so that nothing is aligned to them."""
+        p = self.pyramid
+        depth, kept = p.depth[0], (~hidden).astype(np.float32)
+        shown = depth * (torch.from_numpy(kept).to(depth.device) if isinstance(depth, Tensor) else kept)
+        made = Pyramid.of(
+            p.gray[0], shown, p.cameras[0], backend=p.backend, scene_scale=p.scene_scale, noise_per_m=p.noise_per_m
+        )
+        pyramid = replace(made, weight=p.weight, weight_depth=p.weight_depth)
+        return Reference(pyramid, self.T_camera_world)
 
     def compared(self, live: Pyramid, T_camera_world: Matrix) -> Comparison:
         """Compare a live image at its pose T_camera_world [4, 4] with this reference."""

@@ -35,10 +35,11 @@ class Frame:
     camera: the pinhole of both; timestamp_s: seconds; index: position in the source; R_inertial_camera [3, 3]: rotation
     from the camera's axes to fixed axes, the same for all frames, measured by a gyroscope; None = not measured. Only
     the rotation between two frames is used, so any fixed axes will do; depth_std_m: float32 [H, W], the standard
-    deviation of each depth reading, metres, if the sensor knows it. The frame keeps read-only views of the arrays
-    and does not copy them: do not write to them later (`frame_from_arrays` copies). Raises SourceError if an array is
-    not float32, on inconsistent shapes, values that are not finite, colour in 0…255, negative depth, a
-    reading whose standard deviation is not above 0, or a matrix that is not a rotation.
+    deviation of each depth reading, metres, if the sensor knows it; ignored: pixels of the frame as it was read
+    (`ignored_by` resamples them) whose colour is not used either, None = none; they have no depth. The frame keeps
+    read-only views of the arrays and does not copy them: do not write to them later (`frame_from_arrays` copies).
+    Raises SourceError if an array is not float32, on inconsistent shapes, values that are not finite, colour in 0…255,
+    negative depth, a reading whose standard deviation is not above 0, or a matrix that is not a rotation.
     """
 
     index: int
@@ -48,6 +49,7 @@ class Frame:
     camera: Camera
     R_inertial_camera: Matrix | None = None
     depth_std_m: NDArray[np.float32] | None = None
+    ignored: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
         for name, array in (("colour", self.color), ("depth", self.depth_m)):
@@ -152,6 +154,15 @@ class Frame:
         object.__setattr__(frame, "camera", camera)
         frame._keep(color, depth_m, depth_std_m)
         return frame
+
+    def ignored_by(self, camera: Camera) -> NDArray[np.bool_] | None:
+        """Return the ignored pixels as a camera with other intrinsics at the same pose sees them, by the nearest pixel;
+        None without any. This frame must be as it was read."""
+        if self.ignored is None or not self.ignored.any():
+            return None
+        columns, rows = (np.rint(pixels).astype(np.intp) for pixels in camera.pixels_in(self.camera))
+        height, width = self.ignored.shape
+        return np.asarray(self.ignored[np.clip(rows, 0, height - 1)][:, np.clip(columns, 0, width - 1)])
 
     def seen_by(self, camera: Camera) -> "Frame":
         """Return the frame as a camera with other intrinsics at the same pose sees it: a homography, exact for depth.

@@ -21,6 +21,7 @@ from sigmasplat.slam.full_resolution import refine_on_photos
 from sigmasplat.slam.fusion import count_keyframes, fuse, fusion_views
 from sigmasplat.slam.predicted_submaps import PredictedSubmaps
 from sigmasplat.slam.refinement import Clock, KeyframeReader, SavedRefinement, refine
+from sigmasplat.slam.still_store import carved, without_moving
 from sigmasplat.types import Matrix, Progress, no_progress
 
 CELL_M, BITS = 0.01, 16
@@ -57,7 +58,11 @@ def final_map(
     _refuse_misfits(store, anchors)
     seed = seeded_on_surface if config.final.seed_from == "mesh" else merged
     found = None if saved is None else saved.load()
+    if config.moving.find:
+        store = without_moving(store, anchors, config.moving)
     field = seed(store, anchors, config) if found is None else found.field
+    if config.moving.find and found is None:
+        carved(field, store, anchors, config.moving)
     if not config.final.iterations:
         return FinalMap(field)
     if found is None:

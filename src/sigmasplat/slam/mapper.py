@@ -22,12 +22,15 @@ from sigmasplat.model.photo import Photo
 from sigmasplat.model.submap import Picture, Submap
 from sigmasplat.render.view import View
 from sigmasplat.slam.densify import densify_mask, multiply, split, too_large
+from sigmasplat.slam.moving import carve, mask_keyframes
 from sigmasplat.slam.pruning import fade, splat_depth_residuals, splat_uncertainty, still_uncertain
 from sigmasplat.slam.rules import draw_keyframes
 from sigmasplat.slam.seeding import first_pixels, later_pixels, make_splats, sureness, thin_out
 from sigmasplat.slam.window import choose_window, dominating
 from sigmasplat.types import Slices, completed
 
+RECENT = 10
+"""Splats are carved away by the newest keyframes, at most this many."""
 LEAST_SHARE = 1 / 3
 """Share of a keyframe's iterations that are made even if another keyframe waits."""
 
@@ -73,6 +76,7 @@ class Mapper:
         if begun and len(self.keyframes) == 1:
             self._note_visible(view)
             return FieldFit()
+        self._leave_out_moving()
         self._seed(view, newest.target, newest.T_world_camera)
         yield
         if c.fresh_adam:
@@ -98,6 +102,7 @@ class Mapper:
     def add(self, view: View, keyframe: Keyframe) -> None:
         """Add a keyframe and seed splats at it, without fitting them. The submap must have a keyframe."""
         self._append(keyframe)
+        self._leave_out_moving()
         self._note_visible(view)
         self._seed(view, keyframe.target, keyframe.T_world_camera)
 
@@ -112,6 +117,13 @@ class Mapper:
         """Add a keyframe to the list; the first one of a submap is fixed."""
         keyframe.fixed = not self.keyframes
         self.keyframes.append(keyframe)
+
+    def _leave_out_moving(self) -> None:
+        """Mask what moves in the newest keyframe and has gone from earlier ones, and remove splats from free space."""
+        c = self.config.moving
+        if c.find:
+            mask_keyframes(self.keyframes, c)
+            carve(self.field, self.keyframes[-RECENT:], c.carve_votes)
 
     def _window(self, view: View) -> list[Keyframe]:
         """Return the keyframes to fit, the newest first; all of them if `mapping.window` is 0."""

@@ -17,9 +17,11 @@ from sigmasplat.slam.drift import Drift
 from sigmasplat.slam.localisation.confidence import Confidence
 from sigmasplat.slam.localisation.feature_image import FeatureImage
 from sigmasplat.slam.localisation.foreground import Foreground
+from sigmasplat.slam.localisation.memory import Memory, Seen
 from sigmasplat.slam.localisation.recovery import Link, Recovery
 from sigmasplat.slam.localisation.relocaliser import Relocaliser
 from sigmasplat.slam.localisation.verdict import Usual
+from sigmasplat.slam.localisation.watch import Watch
 from sigmasplat.slam.loop_closure.candidates import SubmapDescriptor
 from sigmasplat.slam.loop_closure.closer import Loop, LoopCloser
 from sigmasplat.slam.loop_closure.pose_graph import Edge
@@ -31,8 +33,9 @@ from sigmasplat.slam.tracker import Tracker
 
 CLASSES: tuple[type, ...] = (
     Atlas, Camera, Confidence, Detail, Drift, Edge, FeatureImage, Foreground, GaussianField, Hop, Keyframe, Link, Loop,
-    LoopCloser, Mapper, Photo, Picture, Place, Probe, Probes, Pyramid, Recovery, Reference, Relocaliser, Rows, Step,
-    SubmapDescriptor, Target, Tracker, Usual, VectorAdam,
+    LoopCloser, Mapper, Memory, Photo, Picture, Place, Probe, Probes, Pyramid, Recovery, Reference, Relocaliser, Rows,
+    Seen, Step, SubmapDescriptor, Target, Tracker, Usual,
+    VectorAdam, Watch,
 )  # fmt: skip
 """The classes that a state may contain."""
 
@@ -48,7 +51,7 @@ def fixed(slam: Slam) -> dict[str, Any]:
     """Return the objects that a state refers to but does not contain: settings, store, view, random numbers, and the
     extractor of features, if there is one."""
     c = slam.config
-    settings = {"config": c, "tracking": c.tracking, "recovery": c.recovery}
+    settings = {"config": c, "tracking": c.tracking, "recovery": c.recovery, "moving": c.moving}
     extractor = {} if slam.extractor is None else {"extractor": slam.extractor}
     return settings | extractor | {"store": slam.store, "view": slam.view, "random": slam.random}
 

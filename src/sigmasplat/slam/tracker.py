@@ -17,38 +17,24 @@ from sigmasplat.fit.references import Reference, map_reference
 from sigmasplat.model import se3
 from sigmasplat.render.view import View
 from sigmasplat.slam.features import Extractor
-from sigmasplat.slam.localisation.feature_image import FeatureImage, pose_by_features
-from sigmasplat.slam.localisation.foreground import Earlier, Foreground, foreground
+from sigmasplat.slam.localisation.expected import Expected, odometry
+from sigmasplat.slam.localisation.feature_image import FeatureImage, motion_by_features
+from sigmasplat.slam.localisation.foreground import Foreground, objects
+from sigmasplat.slam.localisation.memory import together
 from sigmasplat.slam.localisation.sight import FoundKeyframe, Sight
 from sigmasplat.slam.localisation.tracked_keyframe import Splats, TrackedKeyframe, found_keyframe, mapped_keyframe
 from sigmasplat.slam.localisation.verdict import LEAST_COMMON, Usual, confirmed, score, stands
+from sigmasplat.slam.localisation.watch import Watch
 from sigmasplat.slam.rules import Asked, is_lost, jumped, never, unless
 from sigmasplat.types import Matrix
 
 DOUBT = 0.7
 """A pose is doubtful if its agreement × overlap falls below this share of the usual value."""
+AGREES_MORE = 0.05
+"""Something that moves has spoilt a pose if the correlation of the gray values is higher by this without it."""
 WIDE = 0.065
 """A motion between two frames is wide if it moves the image by more than this share of its width: the basin of
 convergence of alignment ends near there."""
-
-FRONT = 0.03
-"""What is in front is looked for if at least this share of the compared points is nearer than the reference."""
-
-
-@dataclass(frozen=True, eq=False)
-class Expected:
-    """Expected motion and pose of the camera, known before its image is used.
-
-    motion: T_previous_camera with constant velocity; turn: T_previous_camera without translation; predicted:
-    T_world_camera, the first guess; last: T_world_camera, the last pose. If a gyroscope measured the rotation since the
-    last frame (`measured`), this rotation is part of all four.
-    """
-
-    motion: Matrix
-    turn: Matrix
-    predicted: Matrix
-    last: Matrix
-    measured: bool
 
 
 @dataclass(eq=False)
@@ -57,7 +43,8 @@ class Tracker:
 
     R_inertial_camera: that of the last frame; lost: tracking of the last frame failed; doubtful: number of frames in a
     row whose best pose the images contradict (`_contradicted`); front: what was in front of the scene in the last
-    frame, None if there was nothing or the frame was lost; keyframe_front: the same for the newest keyframe.
+    frame, None if there was nothing or the frame was lost; keyframe_front: the same for the newest keyframe; watch:
+    what is known of moving things.
     Raises ConfigError on settings that do not fit together.
     """
 
@@ -71,6 +58,7 @@ class Tracker:
     keyframe_features: FeatureImage | None = None
     keyframe_front: Foreground | None = None
     front: Foreground | None = None
+    watch: Watch = dataclass_field(default_factory=Watch)
     agreements: list[float] = dataclass_field(default_factory=list)
     first_losses: list[float] = dataclass_field(default_factory=list)
     usual: Usual = dataclass_field(default_factory=Usual)
@@ -99,8 +87,9 @@ class Tracker:
         velocity is reset.
         """
         expected = self._expected(R_inertial_camera)
-        best = self._fit(field, view, seen, expected.predicted)
-        best, shown = self._uncovered(field, view, seen, expected.predicted, best)
+        shown = seen.shown(view)
+        best = self._fit(field, view, shown, expected.predicted)
+        best, shown = self._uncovered(field, view, seen, shown, expected.predicted, best)
         if self._is_wide(best, view) or self._doubts(best):
             guesses = unless(hurried, self._other_guesses(shown, expected))
             best = max([best, *(self._fit(field, view, shown, guess) for guess in guesses)], key=self._score)
@@ -112,44 +101,78 @@ class Tracker:
             self.front = None
         self.doubtful = self.doubtful + 1 if self._contradicted(best) else 0
         best.T_camera_world = se3.orthonormalise(best.T_camera_world)
+        if not self.lost:
+            self._notice_rest(seen, se3.inverse(best.T_camera_world))
         self._remember(best, seen.without(self.front, view))
         return best
 
     def _uncovered(
-        self, field: Splats, view: View, seen: Sight, predicted: Matrix, fit: PoseFit
+        self, field: Splats, view: View, seen: Sight, first: Sight, predicted: Matrix, fit: PoseFit
     ) -> tuple[PoseFit, Sight]:
         """Find what is in front of the scene, and fit the pose without it; return the fit and the frame without it.
 
-        Returns the same fit and frame if nothing is in front, or if the images contradict the pose without it.
+        first: the frame as it was fitted. Returns the same fit and this frame if nothing is in front, or if the images
+        contradict the pose without it.
         """
         before, self.front = self.front, None
-        nothing_before = before is None and self.keyframe_front is None
-        if fit.comparison is None or self.lost or (fit.comparison.front < FRONT and nothing_before):
-            return fit, seen
+        if fit.comparison is None or self.lost:
+            return fit, first
+        found = self._without_front(field, view, seen, first, predicted, fit, before)
+        if found is None and self.watch.config.find and self._contradicted(fit):
+            found = self._without_object(field, view, seen, predicted, fit.comparison)
+        return (fit, first) if found is None else found
+
+    def _without_front(
+        self, field: Splats, view: View, seen: Sight, first: Sight, predicted: Matrix, fit: PoseFit,
+        before: Foreground | None,
+    ) -> tuple[PoseFit, Sight] | None:  # fmt: skip
+        """Return the fit and the frame without what is in space that was free, and the newest keyframe without what has
+        left it; None if there is nothing, or if the images contradict the pose. before: in front in the last frame."""
+        slow, known = self.watch.slow(seen, se3.inverse(fit.T_camera_world)), before or self.keyframe_front
+        if fit.comparison is None or (slow is None and not self.watch.suspects(fit.comparison, known is not None)):
+            return None
+        keyframe = self.keyframe
         for guess in (predicted, se3.inverse(fit.T_camera_world)):
             for _ in range(2):  # a better pose shows better what is in front
-                front = self._front(seen, before, guess)
-                if front is None:
+                front = together(
+                    self.watch.in_front(keyframe, self.keyframe_front, before, self.previous, seen, guess), slow
+                )
+                self.keyframe = self.watch.without_gone(keyframe, seen, guess)
+                if front is None and self.keyframe is keyframe:
                     break
-                shown = seen.aside(front, view)
+                shown = first if front is None else seen.aside(front, view)
                 found = self._fit(field, view, shown, guess)
                 guess = se3.inverse(found.T_camera_world)
             else:
-                if not (self._is_lost(found) or self._contradicted(found) or self._leaps(found, predicted)):
+                if self._stands(found, predicted):
                     self.front = front
                     return found, shown
-        return fit, seen
+        self.keyframe = keyframe
+        return None
 
-    def _front(self, seen: Sight, before: Foreground | None, T_world_camera: Matrix) -> Foreground | None:
-        """Find what is in front at a pose: in places that the newest keyframe saw to be free."""
-        if self.keyframe is None:
-            return None
-        pyramid, front = self.keyframe.pyramid, self.keyframe_front
-        scene_m = pyramid.kernels.to_host(pyramid.depth[0]) if front is None else front.scene_m
-        scene = Earlier(scene_m, self.keyframe.T_camera_world @ T_world_camera)
-        last = None if before is None else Earlier(before.depth_m, se3.inverse(self.previous) @ T_world_camera)
-        live_m, camera = seen.target.depth_image.numpy(), seen.target.camera
-        return foreground(scene, last, live_m, camera, pyramid.scene_scale)
+    def _without_object(
+        self, field: Splats, view: View, seen: Sight, predicted: Matrix, contradicted: Comparison
+    ) -> tuple[PoseFit, Sight] | None:
+        """Look for the one thing in front without which the images do not contradict the pose: it moves, and has drawn
+        the pose with it. Return the fit and the frame without it; None if there is none."""
+        for front in objects(seen.target.depth_image.numpy()):
+            shown = seen.aside(front, view)
+            found = self._fit(field, view, shown, predicted)
+            agrees = 0.0 if found.comparison is None else found.comparison.correlation
+            if agrees > contradicted.correlation + AGREES_MORE and self._stands(found, predicted):
+                self.front = front
+                return found, shown
+        return None
+
+    def _notice_rest(self, seen: Sight, T_world_camera: Matrix) -> None:
+        """Take what has come to rest for a part of the scene, and remember the frame."""
+        front = self.watch.still_moving(self.front, seen, T_world_camera)
+        if self.front is not None and front is None:
+            self.keyframe_front = None
+        self.front, self.watch = front, self.watch.after(seen, front, T_world_camera)
+
+    def _stands(self, fit: PoseFit, predicted: Matrix) -> bool:
+        return not (self._is_lost(fit) or self._contradicted(fit) or self._leaps(fit, predicted))
 
     def _remember(self, fit: PoseFit, seen: Sight) -> None:
         """Keep what the next frame needs."""
@@ -180,7 +203,7 @@ class Tracker:
         """Fit from an initial T_world_camera; patience: factor on the number of iterations of gradient descent."""
         T_camera_world = se3.inverse(guess)
         if self.config.method == "adam":
-            config = self.config if self.started else _without_motion(self.config)
+            config = self.config if self.started else self.config.without_motion()
             steps = patience * config.iterations
             return fit_pose_adam(field.params, view, seen.target, T_camera_world, config, steps)
         if self.config.align_to == "keyframe" and self.keyframe is not None:
@@ -204,23 +227,16 @@ class Tracker:
 
     def _other_guesses(self, seen: Sight, expected: Expected) -> Iterator[Matrix]:
         """Yield T_world_camera by features, and by constant velocity alone if a gyroscope changed the first guess."""
-        yield from self._guesses_by_features(seen)
+        if self.extractor is not None and seen.image is not None:
+            known = None if self.keyframe is None else self.keyframe_features
+            motion = motion_by_features(known, seen.image, self.extractor)
+            if self.keyframe is not None and motion is not None:
+                yield se3.inverse(motion @ self.keyframe.T_camera_world)
+            motion = motion_by_features(self.last_features, seen.image, self.extractor)
+            if motion is not None:
+                yield self.previous @ se3.inverse(motion)
         if expected.measured:
             yield self.previous @ self.velocity if self.config.motion_model else self.previous
-
-    def _guesses_by_features(self, seen: Sight) -> Iterator[Matrix]:
-        """Yield T_world_camera by features of the newest keyframe and of the last image, where they give a pose."""
-        if self.extractor is None or seen.image is None:
-            return
-        if self.keyframe is not None and self.keyframe_features is not None:
-            landmarks = self.keyframe_features.landmarks(self.extractor)
-            found = pose_by_features(landmarks, seen.image, self.extractor, seed=0)
-            if found is not None:
-                yield se3.inverse(found.T_live_reference @ self.keyframe.T_camera_world)
-        if self.last_features is not None:
-            found = pose_by_features(self.last_features.landmarks(self.extractor), seen.image, self.extractor, seed=0)
-            if found is not None:
-                yield self.previous @ se3.inverse(found.T_live_reference)
 
     def _retry(
         self, field: Splats, view: View, seen: Sight, fit: PoseFit, expected: Expected, hurried: Asked
@@ -245,15 +261,8 @@ class Tracker:
         """Align the last image to this one and return T_world_camera; None if this fails too."""
         if self.last_image is None or (self.config.method == "adam" and not fits_of(view).aligns):
             return None  # alignment needs the compiled kernels
-        guesses = (se3.inverse(expected.motion), expected.turn.T.copy())  # the inverse, because it has no translation
-        found = [
-            align(self.last_image, live, g, 2 * self.config.align_iterations, self.config.align_weight_color)
-            for g in guesses
-        ]
-        best = max(found, key=lambda a: a.agreement * a.overlap)
-        if best.agreement * best.overlap < self.config.lost_share:
-            return None
-        return np.asarray(self.previous @ se3.inverse(best.T_live_reference))
+        T_live_last = odometry(self.last_image, live, expected, self.config)
+        return None if T_live_last is None else np.asarray(self.previous @ se3.inverse(T_live_last))
 
     # ---- verdicts ----
 
@@ -304,6 +313,7 @@ class Tracker:
 
     def keep_keyframe(self, field: Splats, view: View, seen: Sight, T_world_camera: Matrix) -> None:
         """Use a keyframe that was just mapped: its refined pose, and its image as the reference of the next frames."""
+        self.watch = self.watch.moved_by(T_world_camera @ se3.inverse(self.previous))
         self.previous, self.lost = T_world_camera, False
         self.follow(mapped_keyframe(field.params, view, seen, T_world_camera, self.config, self.front))
 
@@ -315,6 +325,7 @@ class Tracker:
     def move_to(self, field: Splats, view: View, keyframe: FoundKeyframe, T_world_camera: Matrix) -> None:
         """Continue at another pose, with a keyframe as the reference of the next frames."""
         self.previous, self.velocity, self.lost = T_world_camera, np.eye(4), False
+        self.watch = self.watch.cleared()
         self.follow(found_keyframe(field.params, view, keyframe, self.config))
 
     def move_by(self, T_new_old: Matrix) -> None:
@@ -323,11 +334,12 @@ class Tracker:
         if self.keyframe is not None:
             T_camera_new = self.keyframe.T_camera_world @ se3.inverse(T_new_old)
             self.keyframe = dataclasses.replace(self.keyframe, T_camera_world=T_camera_new)
+        self.watch = self.watch.moved_by(T_new_old)
 
     def forget(self) -> None:
         """Restart at the identity, as for the first frame."""
         self.previous, self.velocity, self.keyframe, self.keyframe_features = np.eye(4), np.eye(4), None, None
-        self.front = self.keyframe_front = None
+        self.front, self.keyframe_front, self.watch = None, None, self.watch.cleared()
 
     def hop(self, fit: PoseFit, live: Pyramid) -> Alignment | None:
         """Return the alignment to the newest keyframe that gives the covariance of a fit; None without the kernels.
@@ -338,12 +350,3 @@ class Tracker:
             return fit.alignment
         T_live_keyframe = fit.T_camera_world @ se3.inverse(self.keyframe.T_camera_world)
         return align(self.keyframe.pyramid, live, T_live_keyframe, 0, self.config.align_weight_color)
-
-
-def _without_motion(config: TrackingConfig) -> TrackingConfig:
-    """Return the settings for the second frame of a sequence, which has no motion model yet (CG-SLAM's code)."""
-    return dataclasses.replace(
-        config,
-        iterations=config.first_iterations or config.iterations,
-        lr_rotation=config.first_lr_rotation or config.lr_rotation,
-    )

@@ -27,6 +27,7 @@ from sigmasplat.slam.localisation.confidence import Confidence
 from sigmasplat.slam.localisation.recovery import Recovery
 from sigmasplat.slam.localisation.relocaliser import Relocaliser
 from sigmasplat.slam.localisation.sight import Observation, observe, view_of, working_frame
+from sigmasplat.slam.localisation.watch import Watch
 from sigmasplat.slam.loop_closure.closer import Loop, LoopCloser, make_descriptor
 from sigmasplat.slam.mapper import Mapper
 from sigmasplat.slam.merged import components_apart, merged_field
@@ -63,7 +64,8 @@ class World:
         self.atlas = Atlas()
         wanted = self.config.tracking.features or self.config.recovery.relocalise
         self.extractor = make_extractor(self.config.features) if wanted else None
-        self.tracker = Tracker(self.config.tracking, self.extractor if self.config.tracking.features else None)
+        features = self.extractor if self.config.tracking.features else None
+        self.tracker = Tracker(self.config.tracking, features, watch=Watch(self.config.moving))
         self.mapper = Mapper(self.config, self.random)
         self.drift = Drift(scene_scale=self.config.render.scene_scale)
         self.probes = Probes(self.config.uncertainty.probes, self.config.mapping.every)

@@ -16,6 +16,7 @@ from sigmasplat.errors import ConfigError, SourceError
 from sigmasplat.reading.guard import guarded
 from sigmasplat.sources.base import Source, Subset
 from sigmasplat.sources.files.color_only import without_depth
+from sigmasplat.sources.masked import Masked
 
 PACKED = (".bag", ".mcap", ".db3", ".r3d")
 """Endings of files that may each be a whole sequence. A folder of such files is refused with their names."""
@@ -63,7 +64,8 @@ def open_source(path: str | Path, settings: InputConfig | None = None, **changes
     known = format_of(path)
     with _guarded(path):
         source = known.open(str(path), chosen)
-    source.sensor = source.sensor or known.sensor
+        source.sensor = source.sensor or known.sensor
+        source = Masked(source, Path(chosen.masks)) if chosen.masks else source
     part = chosen.stride > 1 or chosen.limit or chosen.start_s or chosen.end_s
     return Subset(source, chosen) if part and not source.live else source
 

@@ -17,6 +17,7 @@ from sigmasplat.sources.base import Source
 from sigmasplat.sources.camera.stereo import StereoMatcher
 from sigmasplat.sources.opening import Format
 from sigmasplat.sources.room.furnish import furnish_rooms
+from sigmasplat.sources.room.mover import mask_of, mover as moving_ball
 from sigmasplat.sources.room.render import RoomScene, build_scene, render_scene
 from sigmasplat.sources.room.sensor import drifted_depth, measured_color, measured_depth
 from sigmasplat.sources.room.solid import triangulate
@@ -29,6 +30,7 @@ EXPOSURE_SWING = 0.08
 AWAY_M, AWAY_RAD = np.array([0.45, 0.25, 0.45]), np.deg2rad([12.0, 40.0, 8.0])
 """Largest motion of a test view from the path, camera x, y, z, and rotation about them."""
 CLEARANCE_M = 0.3
+MOST_MOVER = 50
 
 Floats = NDArray[np.float32]
 
@@ -42,7 +44,8 @@ class SyntheticRoom(Source):
     continues past its start, percent of a round; drift: standard deviation of the depth calibration's slow drift
     (`room.sensor.drifted_depth`), tenths of a percent of the depth; test_views: number of exact views away from the
     path (`SyntheticRoom.test_views`); stereo: if above 0, depth is computed from a stereo pair with this baseline in cm
-    instead of being exact (`right_image`).
+    instead of being exact (`right_image`); mover: the share of the image, in percent on average, that a ball covers
+    which moves through the room by itself (`room.mover`); scored views and the true surface show the room without it.
 
     A path with loops to close: frames=720,rooms=2,overrun=20,noise=1,drift=6. A round of 600 frames is a slow pace. The
     way back looks in other directions than the way out, so drift accumulates over a whole round; the last 120 frames
@@ -65,6 +68,7 @@ class SyntheticRoom(Source):
         drift: int = 0,
         test_views: int = 0,
         stereo: int = 0,
+        mover: int = 0,
     ) -> None:
         """Compute the camera path, no image yet. Raises SourceError unless counts and sizes are ≥ 1, the rest ≥ 0."""
         counts = {"frames": frames, "width": width, "height": height, "loops": loops, "rooms": rooms}
@@ -75,6 +79,9 @@ class SyntheticRoom(Source):
         for key, value in others.items():
             if value < 0:
                 raise SourceError(f"synthetic room: {key} must be at least 0, found {value}")
+        if not 0 <= mover <= MOST_MOVER or (mover and rooms > 1):
+            found = f"{mover} and rooms={rooms}" if rooms > 1 else str(mover)
+            raise SourceError(f"synthetic room: mover is 0 to {MOST_MOVER} percent and needs rooms=1, found {found}")
         focal_px = FOCAL_PER_WIDTH * width
         camera = Camera(width, height, focal_px, focal_px, (width - 1) / 2, (height - 1) / 2)
         super().__init__("synthetic", camera)
@@ -85,6 +92,7 @@ class SyntheticRoom(Source):
         self._matcher = StereoMatcher(camera, self._baseline_m, InputConfig()) if stereo else None
         self.depth_noise_per_m = self._matcher.noise_per_m if self._matcher else None
         self._T_world_camera = camera_path(frames, loops, rooms, seed, overrun / 100)
+        self.mover = moving_ball(self._T_world_camera, camera, mover / 100) if mover else None
 
     def __len__(self) -> int:
         return len(self._T_world_camera)
@@ -92,7 +100,7 @@ class SyntheticRoom(Source):
     def frame(self, i: int) -> Frame:
         """Render frame i; colour has steps of 1/255, as from a camera."""
         T_world_camera = self._T_world_camera[self._checked_index(i)]
-        color, depth_m = render_scene(build_scene(self._rooms, self._seed), self.camera, T_world_camera)
+        color, depth_m = render_scene(self._scene(i), self.camera, T_world_camera)
         color = np.clip(color * np.float32(self._gain(i)), 0.0, 1.0)
         if self._drift:
             depth_m = drifted_depth(depth_m, i, self._seed, self._drift)
@@ -110,7 +118,7 @@ class SyntheticRoom(Source):
         T_left_right = np.eye(4)
         T_left_right[0, 3] = self._baseline_m
         T_world_right = self._T_world_camera[self._checked_index(i)] @ T_left_right
-        color = render_scene(build_scene(self._rooms, self._seed), self.camera, T_world_right)[0]
+        color = render_scene(self._scene(i), self.camera, T_world_right)[0]
         color = np.clip(color * np.float32(self._gain(i)), 0.0, 1.0)
         if self._noise:
             color = measured_color(color, np.random.default_rng((self._seed, i, 9)))
@@ -130,7 +138,19 @@ class SyntheticRoom(Source):
     def exact_depth_of(self, i: int) -> NDArray[np.float32]:
         """Return the depth of frame i without noise and drift."""
         T_world_camera = self._T_world_camera[self._checked_index(i)]
-        return render_scene(build_scene(self._rooms, self._seed), self.camera, T_world_camera)[1]
+        return render_scene(self._scene(i), self.camera, T_world_camera)[1]
+
+    def moving_of(self, i: int) -> NDArray[np.bool_]:
+        """Return the pixels [H, W] of frame i that show the ball which moves through the room."""
+        depth_m = self.exact_depth_of(i)
+        if self.mover is None:
+            return np.zeros(depth_m.shape, np.bool_)
+        return mask_of(self.mover.shape(i), self.camera, self._T_world_camera[i], depth_m)
+
+    def _scene(self, i: int) -> RoomScene:
+        """Return the room as it is at frame i."""
+        room = build_scene(self._rooms, self._seed)
+        return room if self.mover is None else RoomScene([*room.shapes, self.mover.shape(i)], room.lights)
 
     def test_views(self) -> Source | None:
         """Return exact views (no noise, gain 1) up to 0.7 m and 40° away from the path; None without `test_views`."""
@@ -219,7 +239,7 @@ def open_synthetic(text: str) -> SyntheticRoom:
 
 _OPTIONS = (
     "frames", "width", "height", "seed", "noise", "loops", "exposure_change", "rooms", "overrun", "drift", "test_views",
-    "stereo",
+    "stereo", "mover",
 )  # fmt: skip
 
 FORMAT = Format(

@@ -18,6 +18,7 @@ from sigmasplat.slam.features import (
     landmarks_of,
     pose_from_landmarks,
 )
+from sigmasplat.types import Matrix
 
 
 def detail_of(frame: Frame, width: int) -> Detail:
@@ -116,3 +117,11 @@ def pose_by_features(reference: Landmarks, live: FeatureImage, extractor: Extrac
     pairs = extractor.match(reference.features, seen)
     depth_m = depth_readings(seen, live.depth_m, live.camera)
     return pose_from_landmarks(reference, seen, pairs, seed, depth_m, extractor.config)
+
+
+def motion_by_features(reference: FeatureImage | None, live: FeatureImage, extractor: Extractor) -> Matrix | None:
+    """Return T_live_reference by the features of two images; None if they do not give it, or without a reference."""
+    if reference is None:
+        return None
+    found = pose_by_features(reference.landmarks(extractor), live, extractor, seed=0)
+    return None if found is None else found.T_live_reference

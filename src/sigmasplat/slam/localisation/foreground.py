@@ -19,7 +19,7 @@ Depth = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 STEP = 2
-"""Every second row and column of the live image is tested."""
+"""Every second row and column of the live image is tested, unless another step is given."""
 CLEAR_M, CLEAR_RELATIVE = 0.05, 0.05
 """A place was free if the reference saw a surface farther than it by this distance plus this share of its depth."""
 AROUND_PX = 5
@@ -28,6 +28,14 @@ EDGE_RELATIVE = 0.05
 """A depth step, where a region ends: neighbouring pixels differ by more than this share of the nearer depth."""
 LEAST_REGION, LEAST_SHARE = 0.01, 0.15
 """A region is in front if at least this share of the image's pixels, and of its own, are in places that were free."""
+WHOLE_SHARE = 0.05
+"""The least share of a region that is an object by itself: an object that moves slowly covers most of its old place."""
+SAME_THING = 0.6
+"""A region is what was in front in the last image if at least this share of it is there."""
+OBJECT_SHARE, MOST_OBJECTS = (0.02, 0.7), 3
+"""Share of the image of a thing that stands free, and how many are considered."""
+RING, FREE_AROUND = 3, 0.6
+"""Something stands free if at least this share of the pixels at this distance around it is farther."""
 MARGIN_PX = 3
 """The mask is wider than the regions by this much: sensors mix depth and colour at an edge."""
 
@@ -54,36 +62,99 @@ class Earlier:
 
 
 def foreground(
-    scene: Earlier, before: Earlier | None, live_m: Depth, camera: Camera, scene_scale: float = 1.0
+    scene: Earlier,
+    before: Earlier | None,
+    live_m: Depth,
+    camera: Camera,
+    whole_objects: bool = False,
+    step: int = STEP,
+    scene_scale: float = 1.0,
 ) -> Foreground | None:
     """Find what has moved in front of the camera; None without.
 
     scene: the reference; before: what was in front in the last image; live_m [H, W]: live depth, m. A whole region
     between depth steps is in front, also its part whose place the reference did not see, but not pixels that fit to the
-    reference. scene_scale: size of the scene relative to a room.
+    reference. With `whole_objects` these belong to it too, if the region is an object by itself: something that has
+    moved by less than its size covers its own earlier place. step: of the rows and columns that are tested.
+    scene_scale: size of the scene relative to a room.
     """
-    depth = live_m[::STEP, ::STEP]
+    depth = live_m[::step, ::step]
     depth = np.where(depth > 0, depth, maximum_filter(depth, 3))  # fill scattered holes
-    free, again, same = _places(scene, before, depth, camera, CLEAR_M * scene_scale)
-    nearest = minimum_filter(np.where(depth > 0, depth, np.float32(np.inf)), 3)
-    regions, count = label((depth > 0) & ~same & (depth <= (1 + EDGE_RELATIVE) * nearest), np.ones((3, 3)))
-    sizes, in_free, old = (np.bincount(regions[chosen], minlength=count + 1) for chosen in (regions > 0, free, again))
-    chosen = (in_free >= LEAST_REGION * depth.size) & (in_free + old >= LEAST_SHARE * sizes)
-    chosen[0] = False
-    if not chosen.any():
+    free, again, same = _places(scene, before, depth, camera, step, CLEAR_M * scene_scale)
+    if np.count_nonzero(free | again) < LEAST_REGION * depth.size:
         return None
-    whole = np.repeat(np.repeat(chosen[regions], STEP, 0), STEP, 1)[: live_m.shape[0], : live_m.shape[1]]
-    hidden = maximum_filter(whole, 2 * MARGIN_PX + 1)
+    inside = smooth(depth)
+    moved = _regions(inside & ~same, free, again)
+    if whole_objects:
+        moved |= _objects(inside, free, again)
+    if not moved.any():
+        return None
+    whole, hidden = enlarged(moved, step, live_m)
     return Foreground(
         hidden, np.where(whole, live_m, np.float32(0.0)), np.where(hidden, _behind(scene, camera), live_m)
     )
+
+
+def objects(live_m: Depth) -> list[Foreground]:
+    """Return the things that stand free in an image [H, W], m, in front of farther surfaces all around, the largest
+    first, at most `MOST_OBJECTS`. What is behind them is not known."""
+    depth = live_m[::STEP, ::STEP]
+    depth = np.where(depth > 0, depth, maximum_filter(depth, 3))
+    regions, count = label(smooth(depth), np.ones((3, 3)))
+    sizes = np.bincount(regions.ravel(), minlength=count + 1) / depth.size
+    sizes[0] = 0.0
+    found = list[Foreground]()
+    for region in np.argsort(-sizes, kind="stable"):
+        if sizes[region] < OBJECT_SHARE[0] or len(found) == MOST_OBJECTS:
+            break
+        inside = regions == region
+        far_m = np.median(depth[inside]) * (1 + EDGE_RELATIVE)
+        ring = maximum_filter(inside, 2 * RING + 1) & ~maximum_filter(inside, 2 * RING - 1) & (depth > 0)
+        if sizes[region] > OBJECT_SHARE[1] or not ring.any() or (depth[ring] > far_m).mean() < FREE_AROUND:
+            continue
+        whole, hidden = enlarged(inside, STEP, live_m)
+        depths = np.where(whole, live_m, np.float32(0.0)), np.where(hidden, np.float32(0.0), live_m)
+        found.append(Foreground(hidden, *depths))
+    return found
+
+
+def smooth(depth: Depth) -> Mask:
+    """Return the pixels with a reading that are not on the far side of a depth step."""
+    nearest = minimum_filter(np.where(depth > 0, depth, np.float32(np.inf)), 3)
+    return np.asarray((depth > 0) & (depth <= (1 + EDGE_RELATIVE) * nearest))
+
+
+def enlarged(small: Mask, step: int, live_m: Depth) -> tuple[Mask, Mask]:
+    """Return a mask of every `step`-th pixel at the size of the image, and the same with a margin."""
+    whole = np.repeat(np.repeat(small, step, 0), step, 1)[: live_m.shape[0], : live_m.shape[1]]
+    return whole, np.asarray(maximum_filter(whole, 2 * MARGIN_PX + 1))
+
+
+def _objects(inside: Mask, free: Mask, again: Mask) -> Mask:
+    """Return the whole regions of which a small part is in places that were free, or the larger part is where something
+    was before."""
+    regions, count = label(inside, np.ones((3, 3)))
+    sizes, in_free, old = (np.bincount(regions[chosen], minlength=count + 1) for chosen in (regions > 0, free, again))
+    moved = (in_free >= LEAST_REGION * free.size) & (in_free + old >= WHOLE_SHARE * sizes)
+    chosen = moved | ((sizes >= LEAST_REGION * free.size) & (in_free + old >= SAME_THING * sizes))
+    chosen[0] = False
+    return np.asarray(chosen[regions])
+
+
+def _regions(inside: Mask, free: Mask, again: Mask) -> Mask:
+    """Return the connected regions of pixels that are in places which were free, or where something was before."""
+    regions, count = label(inside, np.ones((3, 3)))
+    sizes, in_free, old = (np.bincount(regions[chosen], minlength=count + 1) for chosen in (regions > 0, free, again))
+    chosen = (in_free >= LEAST_REGION * free.size) & (in_free + old >= LEAST_SHARE * sizes)
+    chosen[0] = False
+    return np.asarray(chosen[regions])
 
 
 def _behind(scene: Earlier, camera: Camera) -> Depth:
     """Return the scene as the live camera would see it, m, 0 where it is not known."""
     v, u = np.nonzero(scene.depth_m > 0)
     points = camera.rays()[v, u].T.astype(np.float64) * scene.depth_m[v, u]
-    inside, row, column, z = _projected(points, camera, se3.inverse(scene.T_earlier_live))
+    inside, row, column, z = projected(points, camera, se3.inverse(scene.T_earlier_live))
     found = np.flatnonzero(inside)
     found = found[np.argsort(-z[found], kind="stable")]  # the nearest surface is written last
     seen = np.zeros(scene.depth_m.shape, np.float32)
@@ -92,28 +163,42 @@ def _behind(scene: Earlier, camera: Camera) -> Depth:
 
 
 def _places(
-    scene: Earlier, before: Earlier | None, depth: Depth, camera: Camera, clear_m: float
+    scene: Earlier, before: Earlier | None, depth: Depth, camera: Camera, step: int, clear_m: float
 ) -> tuple[Mask, Mask, Mask]:
-    """Return which pixels of every STEP-th row and column are in places that were free, which are where something was
+    """Return which pixels of every `step`-th row and column are in places that were free, which are where something was
     in front already, and which are on surfaces of the scene."""
     v, u = np.nonzero(depth > 0)
-    points = camera.rays()[STEP * v, STEP * u].T.astype(np.float64) * depth[v, u]
+    points = camera.rays()[step * v, step * u].T.astype(np.float64) * depth[v, u]
     near = minimum_filter(np.where(scene.depth_m > 0, scene.depth_m, np.float32(np.inf)), AROUND_PX)
     far = maximum_filter(scene.depth_m, AROUND_PX)
-    inside, row, column, z = _projected(points, camera, scene.T_earlier_live)
+    inside, row, column, z = projected(points, camera, scene.T_earlier_live)
     known, limit = inside & (far[row, column] > 0), clear_m + CLEAR_RELATIVE * z
     places = np.zeros((3, *depth.shape), bool)
     free, again, same = places
     free[v, u] = known & (z < near[row, column] - limit)
     if before is not None:
-        in_last, at_row, at_column, z_last = _projected(points, camera, before.T_earlier_live)
+        in_last, at_row, at_column, z_last = projected(points, camera, before.T_earlier_live)
         front = before.depth_m[at_row, at_column]
         again[v, u] = in_last & (front > 0) & (z_last < front + clear_m + CLEAR_RELATIVE * z_last)
     same[v, u] = known & (z < far[row, column] + limit)
     return free, again & ~free, same & ~free & ~again
 
 
-def _projected(
+def seen_again(scene: Earlier, depth: Depth, camera: Camera, step: int) -> tuple[Mask, Mask]:
+    """Return which pixels of every `step`-th row and column [h, w], m, are in places that an earlier image shows, and
+    which of these are on a surface of it."""
+    v, u = np.nonzero(depth > 0)
+    points = camera.rays()[step * v, step * u].T.astype(np.float64) * depth[v, u]
+    inside, row, column, z = projected(points, camera, scene.T_earlier_live)
+    near = minimum_filter(np.where(scene.depth_m > 0, scene.depth_m, np.float32(np.inf)), AROUND_PX)[row, column]
+    far, limit = maximum_filter(scene.depth_m, AROUND_PX)[row, column], CLEAR_M + CLEAR_RELATIVE * z
+    known, same = np.zeros((2, *depth.shape), bool)
+    known[v, u] = inside & (far > 0) & (z < far + limit)  # what is farther was hidden
+    same[v, u] = known[v, u] & (z > near - limit)
+    return known, same
+
+
+def projected(
     points: Matrix, camera: Camera, T_earlier_live: Matrix
 ) -> tuple[Mask, NDArray[np.intp], NDArray[np.intp], Matrix]:
     """Project live points [3, n] into an earlier image: whether they are inside, row, column (0 outside), depth."""

@@ -26,11 +26,17 @@ from sigmasplat.slam.localisation.foreground import Foreground
 
 @dataclass(eq=False)
 class Sight:
-    """A frame in the forms that tracking needs: the target of the fits, its pyramid, and the image for features."""
+    """A frame in the forms that tracking needs: the target of the fits, its pyramid, the image for features, and the
+    pixels [H, W] that the user wants to be ignored, which have no depth."""
 
     target: Target
     live: Pyramid
     image: FeatureImage | None = None
+    ignored: NDArray[np.bool_] | None = None
+
+    def shown(self, view: View) -> Self:
+        """Return the frame for fits of its pose, which do not use the pixels that are to be ignored."""
+        return self if self.ignored is None else self.aside(None, view)
 
     def without(self, front: Foreground | None, view: View) -> Self:
         """Return the frame without depth where something is in front: it is neither mapped nor a reference there."""
@@ -40,9 +46,12 @@ class Sight:
         image = None if self.image is None else self.image.with_depth(target.depth_image.numpy())
         return replace(self, target=target, live=live, image=image)
 
-    def aside(self, front: Foreground, view: View) -> Self:
-        """Return the frame for fits of its pose, which are to use neither depth nor colour of what is in front."""
-        depth_m = np.where(front.hidden, np.float32(HIDDEN_M), self.target.depth_image.numpy())
+    def aside(self, front: Foreground | None, view: View) -> Self:
+        """Return the frame for fits of its pose, which are to use neither depth nor colour of what is in front or
+        ignored."""
+        hidden = np.zeros((), np.bool_) if front is None else front.hidden
+        hidden = hidden if self.ignored is None else hidden | self.ignored
+        depth_m = np.where(hidden, np.float32(HIDDEN_M), self.target.depth_image.numpy())
         return replace(self.without(front, view), live=self._with_depth(depth_m, view)[1])
 
     def separate(self) -> Self:
@@ -103,6 +112,9 @@ def working_frame(frame: Frame, config: Config, camera: Camera | None = None) ->
 def observe(whole: Frame, working: Frame, view: View, config: Config, extractor: Extractor | None) -> Observation:
     """Return a frame in the forms that tracking needs: features are found in the whole frame, everything else is made
     from the working frame."""
+    ignored = whole.ignored_by(working.camera)
+    if ignored is not None:
+        working = replace(working, depth_m=np.where(ignored, np.float32(0.0), working.depth_m))
     target = Target.of(working, (view.sums.shape[1], view.sums.shape[2]))
     if config.mapping.sensor_noise:
         target = target.weighed_by_std()
@@ -110,7 +122,7 @@ def observe(whole: Frame, working: Frame, view: View, config: Config, extractor:
     live, image = live_image(view, working.color, working.depth_m, target, noise), None
     if extractor is not None:
         image = FeatureImage(LateDetail(whole, config.features.width), working.depth_m, working.camera)
-    return Observation(target, live, image, frame=working, whole=whole)
+    return Observation(target, live, image, ignored, frame=working, whole=whole)
 
 
 @dataclass(eq=False)

@@ -20,6 +20,7 @@ from sigmasplat.slam.features import make_extractor
 from sigmasplat.slam.listeners import Events
 from sigmasplat.slam.localisation.recovery import Recovery
 from sigmasplat.slam.localisation.sight import view_of, working_frame
+from sigmasplat.slam.localisation.watch import Watch
 from sigmasplat.slam.loop_closure.closer import Loop
 from sigmasplat.slam.real_time.messages import Snapshot, Task
 from sigmasplat.slam.real_time.schedule import MappingThread, Schedule
@@ -53,7 +54,7 @@ class RealTime(ArrayInterface):
         self.slam, self._hurried, c = slam, hurried, slam.config
         wanted = c.tracking.features or c.recovery.relocalise
         self._extractor = make_extractor(c.features) if wanted else None  # not shared with the mapping thread
-        tracker = Tracker(c.tracking, self._extractor if c.tracking.features else None)
+        tracker = Tracker(c.tracking, self._extractor if c.tracking.features else None, watch=Watch(c.moving))
         self._camera = CameraClock(c, tracker, Recovery(c.recovery))
         self._snapshots: queue.SimpleQueue[Snapshot] = queue.SimpleQueue()
         self._map = MapClock(slam, self._snapshots.put)

@@ -1,0 +1,89 @@
+"""Watch for what moves relative to the newest keyframe: what came in front of it, and what has left its place."""
+
+from dataclasses import dataclass, field, replace
+
+from sigmasplat.config import MovingConfig
+from sigmasplat.fit.compare import Comparison
+from sigmasplat.fit.references import Reference
+from sigmasplat.model import se3
+from sigmasplat.slam.localisation.foreground import Earlier, Foreground, foreground
+from sigmasplat.slam.localisation.memory import Memory
+from sigmasplat.slam.localisation.sight import Sight
+from sigmasplat.types import Matrix
+
+FRONT = 0.03
+"""What is in front is looked for if at least this share of the compared points is nearer than the reference."""
+
+
+@dataclass(frozen=True, eq=False)
+class Watch:
+    """What is known of moving things between two frames: what recent frames saw. Without `config.find` nothing is
+    remembered."""
+
+    config: MovingConfig = field(default_factory=MovingConfig)
+    memory: Memory = field(default_factory=Memory)
+
+    def suspects(self, found: Comparison, known: bool) -> bool:
+        """Return whether something may be in front of the scene, or may have left its place in it; known: something was
+        in front in the last frame or in the newest keyframe."""
+        return known or found.front >= FRONT or (self.config.find and found.behind >= FRONT)
+
+    def in_front(
+        self,
+        keyframe: Reference | None,
+        keyframe_front: Foreground | None,
+        last: Foreground | None,
+        T_world_last: Matrix,
+        seen: Sight,
+        T_world_camera: Matrix,
+    ) -> Foreground | None:
+        """Find what is in front of the scene at a pose: in places that the newest keyframe saw to be free.
+
+        keyframe_front, last: what was in front in the newest keyframe and in the last frame, whose pose is given.
+        """
+        if keyframe is None:
+            return None
+        depth = keyframe.pyramid.depth[0]
+        scene_m = keyframe.pyramid.kernels.to_host(depth) if keyframe_front is None else keyframe_front.scene_m
+        scene, target = Earlier(scene_m, keyframe.T_camera_world @ T_world_camera), seen.target
+        before = None if last is None else Earlier(last.depth_m, se3.inverse(T_world_last) @ T_world_camera)
+        live_m, scale = target.depth_image.numpy(), keyframe.pyramid.scene_scale
+        return foreground(scene, before, live_m, target.camera, self.config.find, scene_scale=scale)
+
+    def without_gone(self, keyframe: Reference | None, seen: Sight, T_world_camera: Matrix) -> Reference | None:
+        """Return the newest keyframe without what has moved away since, at a pose of the live camera."""
+        if keyframe is None or not self.config.find:
+            return keyframe
+        depth_m, live_m = keyframe.pyramid.kernels.to_host(keyframe.pyramid.depth[0]), seen.target.depth_image.numpy()
+        live = Earlier(live_m, se3.inverse(keyframe.T_camera_world @ T_world_camera))
+        gone = foreground(live, None, depth_m, seen.target.camera, whole_objects=True)
+        return keyframe if gone is None else keyframe.without(gone.hidden)
+
+    def slow(self, seen: Sight, T_world_camera: Matrix) -> Foreground | None:
+        """Find what moves too slowly to show against the newest keyframe."""
+        if not self.config.find:
+            return None
+        target, most = seen.target, self.config.still_frames
+        return self.memory.in_front(target.depth_image.numpy(), T_world_camera, target.camera, most)
+
+    def after(self, seen: Sight, front: Foreground | None, T_world_camera: Matrix) -> "Watch":
+        """Return what is known after a frame that is not lost."""
+        if not self.config.find:
+            return self
+        depth_m, most = seen.target.depth_image.numpy(), self.config.still_frames
+        return replace(self, memory=self.memory.after(depth_m, front, T_world_camera, most))
+
+    def still_moving(self, front: Foreground | None, seen: Sight, T_world_camera: Matrix) -> Foreground | None:
+        """Return what is in front without what has come to rest, which is part of the scene again."""
+        if front is None or not self.config.find:
+            return front
+        target, frames = seen.target, self.config.still_frames
+        return self.memory.still_moving(front, target.depth_image.numpy(), T_world_camera, target.camera, frames)
+
+    def moved_by(self, T_new_old: Matrix) -> "Watch":
+        """Return the same in other coordinates [4, 4]."""
+        return replace(self, memory=self.memory.moved_by(T_new_old))
+
+    def cleared(self) -> "Watch":
+        """Return the watch with nothing remembered."""
+        return Watch(self.config)

@@ -1,0 +1,110 @@
+"""Keep what moves out of the map: compare keyframes with each other, and remove splats from space that is free.
+
+Two keyframes contradict each other where one shows a surface in space that the other one sees through. If the other one
+is later, the surface has gone: it is masked in the earlier one. If it is earlier, the surface has come; it is masked in
+the later one if both are so close in time that it may still be moving. Masked pixels have no depth.
+"""
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter, minimum_filter
+
+from sigmasplat.config import MovingConfig
+from sigmasplat.fit.target import Keyframe
+from sigmasplat.model import se3
+from sigmasplat.model.camera import Camera
+from sigmasplat.model.field import GaussianField
+from sigmasplat.slam.localisation.foreground import (
+    AROUND_PX,
+    CLEAR_M,
+    CLEAR_RELATIVE,
+    Depth,
+    Earlier,
+    Mask,
+    foreground,
+    projected,
+)
+from sigmasplat.types import Matrix
+
+COLUMNS_TESTED = 80
+"""About so many columns of a keyframe are tested."""
+SUPPORT = 4
+"""A splat stays if a surface at its place was seen at least once for this many times that the place was free."""
+
+
+def contradicted(own_m: Depth, other_m: Depth, T_other_own: Matrix, camera: Camera) -> Mask | None:
+    """Return the pixels [H, W] of a depth image, m, that show something in space which another image sees to be free;
+    None without any."""
+    step = max(2, camera.width // COLUMNS_TESTED)
+    found = foreground(Earlier(other_m, T_other_own), None, own_m, camera, whole_objects=True, step=step)
+    return None if found is None else found.hidden
+
+
+def mask_keyframes(keyframes: Sequence[Keyframe], config: MovingConfig) -> None:
+    """Mask what moves in the newest keyframe, and what has gone since in earlier ones, in depth of their targets."""
+    newest = keyframes[-1]
+    for earlier in chosen(keyframes[:-1], config.compared):
+        came = newest.index - earlier.index <= config.still_frames or not config.still_frames
+        _mask(earlier, newest)
+        if came:
+            _mask(newest, earlier)
+
+
+def chosen(earlier: Sequence[Keyframe], count: int) -> list[Keyframe]:
+    """Return keyframes to compare the next one with: the one before it, and ever older ones (1, 3, 6, 10, … before)."""
+    back = [n * (n + 1) // 2 for n in range(1, count + 1)]
+    return [earlier[-n] for n in back if n <= len(earlier)]
+
+
+def _mask(own: Keyframe, other: Keyframe) -> None:
+    own_m, other_m = (keyframe.target.depth_image.numpy() for keyframe in (own, other))
+    T_other_own = se3.inverse(other.T_world_camera) @ own.T_world_camera
+    hidden = contradicted(own_m, other_m, T_other_own, own.target.camera)
+    if hidden is not None:
+        own.target = own.target.with_depth(np.where(hidden, np.float32(0.0), own_m))
+
+
+# ---- splats in free space ----
+
+
+def carve(field: GaussianField, keyframes: Sequence[Keyframe], votes: int) -> None:
+    """Remove the splats whose place the newest keyframe and others see to be free, `votes` in all, unless one in
+    `SUPPORT` shows a surface there."""
+    points = field.means.double().cpu().numpy()
+    free, _ = _seen(points, keyframes[-1])
+    rows = np.flatnonzero(free)
+    if len(rows):
+        gone = _is_free(points[rows], keyframes, votes)
+        keep = torch.ones(len(field), dtype=torch.bool)
+        keep[torch.from_numpy(rows[gone])] = False
+        field.keep(keep.to(field.params.device))
+
+
+def carve_everywhere(field: GaussianField, keyframes: Iterable[Keyframe], votes: int) -> None:
+    """Remove the splats whose place at least `votes` of the keyframes see to be free, as `carve`."""
+    gone = _is_free(field.means.double().numpy(), keyframes, votes)
+    field.keep(torch.from_numpy(~gone))
+
+
+def _is_free(points: Matrix, keyframes: Iterable[Keyframe], votes: int) -> Mask:
+    """Return which points [n, 3] m are in free space."""
+    through, there = np.zeros(len(points), np.int64), np.zeros(len(points), np.int64)
+    for keyframe in keyframes:
+        free, surface = _seen(points, keyframe)
+        through += free
+        there += surface
+    return np.asarray((through >= votes) & (through > SUPPORT * there))
+
+
+def _seen(points: Matrix, keyframe: Keyframe) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return which points [n, 3] m a keyframe sees through, and at which it shows a surface."""
+    camera, depth = keyframe.target.camera, keyframe.target.depth_image.numpy()
+    inside, row, column, z = projected(points.T, camera, se3.inverse(keyframe.T_world_camera))
+    near = minimum_filter(np.where(depth > 0, depth, np.float32(np.inf)), AROUND_PX)
+    limit, read = CLEAR_M + CLEAR_RELATIVE * z, inside & (depth[row, column] > 0)
+    free = read & (z + limit < near[row, column])
+    around = maximum_filter(depth, AROUND_PX)[row, column]
+    return free, inside & (z > near[row, column] - limit) & (z < around + limit)
