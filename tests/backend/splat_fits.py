@@ -65,7 +65,7 @@ def random_gradient(view: Any, step: int) -> None:
     view.g_sums[:, :h, :w] = torch.as_tensor(drawn).float()
 
 
-RATES = Rates(torch.linspace(1e-4, 5e-3, 17) * (torch.arange(17) != 5))
+RATES = Rates(torch.linspace(1e-4, 5e-3, 17) * (torch.arange(17) != 5), beta2=0.99)
 
 
 WAITS = {

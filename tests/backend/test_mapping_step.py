@@ -191,7 +191,7 @@ def test_settling_follows_its_definition(every_kernels: str, n: int) -> None:
     start = want.params.clone()
     settle_by = fits_of(view_on(every_kernels, SMALL)).settle
     settle_by(got, RATES)
-    settle(want, Rates(RATES.per_column.double()))
+    settle(want, Rates(RATES.per_column.double(), RATES.beta2))
     if n > 1:
         assert_same_vector(got.params - start, want.params - start, 1e-3, "steps")
     assert_same_vector(got.moment1, want.moment1, 1e-5, "moment1")

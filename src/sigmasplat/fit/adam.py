@@ -22,9 +22,11 @@ ROWS_AT_ONCE = 8192
 
 @dataclass(frozen=True, eq=False)
 class Rates:
-    """Learning rates [m], one per column of `GaussianField.params` or of an attribute; 0 freezes a column."""
+    """Learning rates [m], one per column of `GaussianField.params` or of an attribute; 0 freezes a column. beta2: the
+    decay of Adam's second moment."""
 
     per_column: Tensor
+    beta2: float = BETA2
 
     @staticmethod
     def of(config: MappingConfig) -> "Rates":
@@ -48,7 +50,8 @@ class Rates:
     def of_attribute(self, name: str) -> "Rates":
         """Return the rates of an attribute, for a field that has these rates."""
         columns, share = ATTRIBUTE_RATES[name]
-        return Rates(self.per_column.new_full((ATTRIBUTES[name],), share * float(self.per_column[COLUMNS[columns]][0])))
+        rate = share * float(self.per_column[COLUMNS[columns]][0])
+        return Rates(self.per_column.new_full((ATTRIBUTES[name],), rate), self.beta2)
 
 
 def adam_step(field: Rows, grad: Tensor, rates: Rates, visible: Tensor) -> None:
@@ -66,9 +69,10 @@ def adam_step(field: Rows, grad: Tensor, rates: Rates, visible: Tensor) -> None:
 def adam_rows(field: Rows, rows: Tensor, g: Tensor, rates: Rates) -> None:
     """Step the rows with indices [n] with their gradients g [n, m], as `adam_step` does."""
     params, moment1, moment2 = _catch_up(field, rows, rates, field.steps - 1)
+    beta2 = rates.beta2
     moment1.lerp_(g, 1 - BETA1)
-    moment2.mul_(BETA2).addcmul_(g, g, value=1 - BETA2)
-    _move(params, moment1, moment2, rates, 1 / (1 - BETA1**field.steps), (1 - BETA2**field.steps) ** -0.5)
+    moment2.mul_(beta2).addcmul_(g, g, value=1 - beta2)
+    _move(params, moment1, moment2, rates, 1 / (1 - BETA1**field.steps), (1 - beta2**field.steps) ** -0.5)
     for all_rows, some in ((field.params, params), (field.moment1, moment1), (field.moment2, moment2)):
         all_rows.index_copy_(0, rows, some)
     field.last_step[rows] = field.steps
@@ -88,14 +92,14 @@ def _catch_up(field: Rows, rows: Tensor, rates: Rates, to: int) -> tuple[Tensor,
     of the bias correction during these steps is neglected.
     """
     last = field.last_step[rows][:, None].to(field.params)
-    missed, ratio, moved = to - last, BETA1 / BETA2**0.5, last > 0
+    missed, ratio, moved = to - last, BETA1 / rates.beta2**0.5, last > 0
     params, moment1, moment2 = (x.index_select(0, rows) for x in (field.params, field.moment1, field.moment2))
     if bool((missed > 0).any()):
         steps = torch.where(moved, ratio * (1 - ratio**missed) / (1 - ratio), 0.0)
         unbias1 = steps / torch.where(moved, 1 - BETA1**last, 1.0)
-        _move(params, moment1, moment2, rates, unbias1, torch.where(moved, 1 - BETA2**last, 1.0).rsqrt())
+        _move(params, moment1, moment2, rates, unbias1, torch.where(moved, 1 - rates.beta2**last, 1.0).rsqrt())
         moment1.mul_(BETA1**missed)
-        moment2.mul_(BETA2**missed)
+        moment2.mul_(rates.beta2**missed)
     return params, moment1, moment2
 
 

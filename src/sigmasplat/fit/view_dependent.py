@@ -65,7 +65,7 @@ class ViewDependentStep:
         grad, cost = torch.zeros_like(field.params), 0.0
         twist = self.view.backward(self.rows, grad, grad2d)
         harmonics = self._begin(field.get_or_create("harmonics"))
-        harmonic_rates = Rates(rates.of_attribute("harmonics").per_column[: self.width])
+        harmonic_rates = Rates(rates.of_attribute("harmonics").per_column[: self.width], rates.beta2)
         visible = self.view.visible(len(field)).nonzero().squeeze(1)
         for rows in torch.split(visible, ROWS_AT_ONCE):
             g, own, k = (x.index_select(0, rows) for x in (grad, field.params, harmonics.params))

@@ -10,7 +10,7 @@ import numpy as np
 
 from sigmasplat.config import Config, FinalConfig, MappingConfig
 from sigmasplat.errors import SigmaSplatError
-from sigmasplat.fit.adam import Rates, VectorAdam
+from sigmasplat.fit.adam import BETA2, Rates, VectorAdam
 from sigmasplat.fit.exposure import fit_exposure
 from sigmasplat.fit.field import fit_field
 from sigmasplat.fit.target import Keyframe, Target
@@ -204,8 +204,8 @@ class Clock:
 
 
 def _changes_rates(final: FinalConfig) -> bool:
-    """Return whether the learning rates differ from those of mapping."""
-    return bool(final.lr_means_last) or (final.lr_factor, final.lr_decay) != (1.0, 1.0)
+    """Return whether the learning rates, or Adam's β₂, differ from those of mapping."""
+    return bool(final.lr_means_last) or (final.lr_factor, final.lr_decay, final.beta2) != (1.0, 1.0, BETA2)
 
 
 def decaying(mapping: MappingConfig, final: FinalConfig, done: int, clock: Clock) -> Iterator[Rates]:
@@ -216,7 +216,7 @@ def decaying(mapping: MappingConfig, final: FinalConfig, done: int, clock: Clock
     `mapping.lr_means` to `final.lr_means_last` if this is set.
     """
     for step in range(done, final.iterations + 1):
-        rates, share = Rates.of(mapping), _share(step, final, clock)
+        rates, share = replace(Rates.of(mapping), beta2=final.beta2), _share(step, final, clock)
         rates.per_column.mul_(final.lr_factor * final.lr_decay**share)
         rates.per_column[COLUMNS["means"]] /= final.lr_factor
         if final.lr_means_last:

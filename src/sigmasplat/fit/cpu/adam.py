@@ -1,6 +1,6 @@
 """Settle a field's Adam state with the compiled CPU kernels (native/adam.h)."""
 
-from sigmasplat.fit.adam import BETA1, BETA2, EPSILON, Rates
+from sigmasplat.fit.adam import BETA1, EPSILON, Rates
 from sigmasplat.model.field import Rows
 
 
@@ -10,5 +10,5 @@ def settle(field: Rows, rates: Rates) -> None:
 
     _core.adam_settle(
         field.params, field.moment1, field.moment2, field.last_step, rates.per_column.numpy(),
-        BETA1, BETA2, EPSILON, field.steps,
+        BETA1, rates.beta2, EPSILON, field.steps,
     )  # fmt: skip

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sigmasplat.fit.adam import BETA1, BETA2, EPSILON, Rates
+from sigmasplat.fit.adam import BETA1, EPSILON, Rates
 from sigmasplat.fit.fused_terms import PIXEL_TERMS, SHAPE_TERMS, kernel_weights, pixel_weights
 from sigmasplat.fit.interface import Weights
 from sigmasplat.fit.mapping_step import GradientAccumulator, render_for
@@ -35,7 +35,7 @@ def step_rows(
     g_alpha = view.g_alpha if weights.get("mean_depth") else None
     cost = view.raster.step(
         field.params, field.moment1, field.moment2, field.last_step, view.g_sums, g_moment,
-        g_alpha, median_id, g_median_depth, rates.per_column.numpy(), BETA1, BETA2, EPSILON, field.steps,
+        g_alpha, median_id, g_median_depth, rates.per_column.numpy(), BETA1, rates.beta2, EPSILON, field.steps,
         kernel_weights(SHAPE_TERMS, weights, "cpu").tolist(), frozen_colors, harmonics, grad2d, twist,
         view.seconds[3:],
     )  # fmt: skip

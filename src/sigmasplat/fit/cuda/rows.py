@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sigmasplat.fit.adam import BETA1, BETA2, EPSILON, Rates
+from sigmasplat.fit.adam import BETA1, EPSILON, Rates
 from sigmasplat.fit.fused_terms import SHAPE_TERMS, kernel_weights
 from sigmasplat.fit.interface import Twist, Weights
 from sigmasplat.model.field import ATTRIBUTES, GaussianField, Rows
@@ -38,7 +38,8 @@ def step_rows(view: CudaView, visible: Tensor, rows: Rows, gradient: Tensor, rat
     used, step = gradient.shape[1], rows.steps
     per_column = np.zeros(MOST_COLUMNS, np.float32)
     per_column[:used] = rates.per_column.numpy()
-    numbers = [BETA1, BETA2, EPSILON, 1.0 / (1.0 - BETA1**step), 1.0 / (1.0 - BETA2**step)]
+    beta2 = rates.beta2
+    numbers = [BETA1, beta2, EPSILON, 1.0 / (1.0 - BETA1**step), 1.0 / (1.0 - beta2**step)]
     with view.stages.of("project_backward"):
         view.raster.launch_fit(
             "adam", blocks_for(gradient.numel()), rows.params, rows.moment1, rows.moment2, rows.last_step, visible,

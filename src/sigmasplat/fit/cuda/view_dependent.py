@@ -51,7 +51,7 @@ class CudaViewDependentStep:
             twist[:3] += on_camera
         step_rows(view, visible, field, gradient, rates)
         harmonics.steps += 1
-        of_harmonics = Rates(rates.of_attribute("harmonics").per_column[: self.width])
+        of_harmonics = Rates(rates.of_attribute("harmonics").per_column[: self.width], rates.beta2)
         step_rows(view, visible, harmonics, on_harmonics, of_harmonics)
         return twist, cost
 
