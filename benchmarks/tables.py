@@ -35,6 +35,7 @@ SUBJECTS = {
     "Geometry": ("four_frames", "away_from_path"),
     "Kernels": ("cpu", "versus", "gpu", "kernels"),
     "Real time": ("realtime", "long_live"),
+    "Depth noise": ("sensor_models",),
     "Stereo": ("stereo",),
     "Long runs": ("long_run", "viewer_memory"),
     "Killed runs": ("crashes",),

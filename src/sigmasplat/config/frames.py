@@ -212,8 +212,8 @@ class TrackingConfig(Section, name="tracking"):
     align_stop: NotNegative = 1e-4
     """Alignment ends a pyramid level when a step is smaller than this (metres and radians)."""
     sensor_noise: bool = False
-    """Whether alignment weighs each reading of a keyframe by its own 1/σ² (`input.sensor`) instead of the law of
-    `render.depth_noise_per_m`."""
+    """Whether alignment uses the part of σ that depends on the distance, by the model of `input.sensor`, instead of
+    the law of `render.depth_noise_per_m`."""
     align_weight_color: Share = 0.5
     """Weight of gray residuals in alignment; depth residuals have 1 minus this."""
     amsgrad: bool = False

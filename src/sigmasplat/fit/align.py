@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.errors import BackendError
-from sigmasplat.fit.interface import AlignRules, ImageKernels, LevelPlanes
+from sigmasplat.fit.interface import AlignRules, ImageKernels, LevelPlanes, Plane
 from sigmasplat.fit.pyramid import LEVELS, NOISE_PER_M, Pyramid
 from sigmasplat.model import se3
 from sigmasplat.types import Matrix
@@ -108,8 +108,20 @@ class Pair:
         options += [HUBER_GRAY[width], HUBER_DEPTH_RELATIVE[width] * noise, DEPTH_GATES_M[width] * scale]
         return LevelPlanes(
             r.gray[k], r.depth[k], r.weight[k], r.weight_depth[k], live.gray[k], live.depth[k],
-            [c.fx, c.fy, c.cx, c.cy], options, r.noise[k],
+            [c.fx, c.fy, c.cx, c.cy], options, _noise_at(r.noise[k], width),
         )  # fmt: skip
+
+
+def _noise_at(noise: Plane | None, width: int) -> Plane | None:
+    """Return the factor on the Huber width of depth at a level for relative noise [h, w].
+
+    The width of a coarse level contains, besides noise, what the pose is off there. Only the part that is noise, the
+    width of the finest level, is replaced. A noise of 1 gives exactly 1.
+    """
+    if noise is None or width == 0:
+        return noise
+    share = (HUBER_DEPTH_RELATIVE[0] / HUBER_DEPTH_RELATIVE[width]) ** 2
+    return (1.0 + (noise * noise - 1.0) * share) ** 0.5
 
 
 @dataclass(eq=False)

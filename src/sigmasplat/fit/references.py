@@ -8,16 +8,17 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.config import TrackingConfig
+from sigmasplat.config.sensors import SensorModel
 from sigmasplat.fit.backends import fits_of
 from sigmasplat.fit.compare import Comparison, compare
 from sigmasplat.fit.gray import Image
 from sigmasplat.fit.interface import Plane
 from sigmasplat.fit.predicted_variance import predicted_at, use_predicted_depth_variance, use_predicted_variance
-from sigmasplat.fit.pyramid import Pyramid
+from sigmasplat.fit.pyramid import NOISE_PER_M, Pyramid
 from sigmasplat.fit.target import Target
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
-from sigmasplat.model.depth_std import generic_std
+from sigmasplat.model.depth_std import distance_std, generic_std
 from sigmasplat.model.map_uncertainty import Background
 from sigmasplat.model.submap import Picture
 from sigmasplat.render.view import View
@@ -53,21 +54,22 @@ class Reference:
         return compare(self.pyramid, live, T_camera_world @ se3.inverse(self.T_camera_world))
 
 
-def live_image(view: View, color: Image, depth_m: Image, target: Target, noise: Image | None = None) -> Pyramid:
+def live_image(view: View, color: Image, depth_m: Image, target: Target, noise: Plane | None = None) -> Pyramid:
     """Make the pyramid of a camera image, colour [H, W, 3] and depth [H, W] m, on the device that aligns it; noise:
     that of its readings (`relative_noise`)."""
     gray, depth = fits_of(view).live_planes(view, color, depth_m, target)
-    on_device = torch.from_numpy(noise).to(depth.device) if noise is not None and isinstance(depth, Tensor) else noise
+    in_memory = isinstance(noise, np.ndarray) and isinstance(depth, Tensor)
+    on_device = torch.from_numpy(noise).to(depth.device) if in_memory else noise
     return _pyramid(view, gray, depth, target.camera, on_device)
 
 
-def relative_noise(view: View, target: Target) -> Image | None:
-    """Return σ of each reading of a target relative to the law of `render.depth_noise_per_m` [H, W], 1 without a
-    reading; None if σ is unknown."""
-    std_m = target.depth_std_image
-    if std_m is None:
-        return None
-    law_m = generic_std(target.depth_image.numpy(), view.options.depth_noise_per_m)
+def relative_noise(depth_m: Image, sensor: SensorModel, noise_per_m: float = NOISE_PER_M) -> Image:
+    """Return σ of readings [H, W] relative to the law noise_per_m · z², 1 without a reading.
+
+    Only the part of σ that depends on the distance counts: readings at edges and on slanted surfaces are noisier, but
+    they are those that decide the pose.
+    """
+    std_m, law_m = distance_std(depth_m, sensor), generic_std(depth_m, noise_per_m)
     return np.divide(std_m, law_m, out=np.ones_like(law_m), where=law_m > 0)
 
 

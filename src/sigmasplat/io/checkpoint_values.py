@@ -63,7 +63,7 @@ def _checked_shapes(found: Mapping[str, Tensor], path: Path) -> dict[str, int]:
     """Return how many frames, keyframes, places, submaps and edges there are; all tensors agree on it."""
     lengths, first = dict[str, int](), dict[str, str]()
     kinds = {name: (rows, row) for name, (rows, row, _) in WHOLE.items()}
-    for name, (rows, row) in (FINITE | UNKNOWN | kinds | FLAGS).items():
+    for name, (rows, row) in {**FINITE, **UNKNOWN, **kinds, **FLAGS}.items():
         if (tensor := found.get(name)) is None:
             continue
         if not _has_type(name, tensor) or tensor.ndim != 1 + len(row) or tuple(tensor.shape[1:]) != row:

@@ -19,16 +19,20 @@ LEAST_COSINE = 0.2
 
 def modelled_std(depth_m: Floats, model: SensorModel, camera: Camera) -> Floats:
     """Return the standard deviation of depth readings [H, W], m, 0 without a reading."""
-    z = depth_m
-    linear, square = np.float32(model.z1) * z, np.float32(model.z2) * z * z
-    std = np.sqrt(np.float32(model.base) ** 2 + linear * linear + square * square)
+    std = distance_std(depth_m, model)
     if model.edge != 1.0:
         std = np.where(beside_steps(depth_m), np.float32(model.edge) * std, std)
     if model.grazing:
         std = std * cosines(depth_m, camera) ** np.float32(-model.grazing)
     if model.most < 1.0:
-        std = np.minimum(std, np.float32(model.most) * z)
+        std = np.minimum(std, np.float32(model.most) * depth_m)
     return np.where(depth_m > 0, std, np.float32(0.0)).astype(np.float32)
+
+
+def distance_std(depth_m: Floats, model: SensorModel) -> Floats:
+    """Return the part of σ that depends on the distance alone, m [H, W]: √(base² + (z1·z)² + (z2·z²)²)."""
+    linear, square = np.float32(model.z1) * depth_m, np.float32(model.z2) * depth_m * depth_m
+    return np.asarray(np.sqrt(np.float32(model.base) ** 2 + linear * linear + square * square), np.float32)
 
 
 def std_by_model(depth_m: Floats, camera: Camera, sensor: str) -> Floats | None:

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.config import Config
+from sigmasplat.config.sensors import sensor_model
 from sigmasplat.errors import SourceError
 from sigmasplat.fit.pyramid import HIDDEN_M, Pyramid
 from sigmasplat.fit.references import Reference, live_image, relative_noise
@@ -64,8 +65,7 @@ class Sight:
 
     def _with_depth(self, depth_m: NDArray[np.float32], view: View) -> tuple[Target, Pyramid]:
         target = self.target.with_depth(depth_m)
-        noise = None if self.live.noise[0] is None else relative_noise(view, self.target)
-        return target, live_image(view, target.image.numpy(), depth_m, target, noise)
+        return target, live_image(view, target.image.numpy(), depth_m, target, self.live.noise[0])
 
 
 @dataclass(eq=False)
@@ -118,7 +118,8 @@ def observe(whole: Frame, working: Frame, view: View, config: Config, extractor:
     target = Target.of(working, (view.sums.shape[1], view.sums.shape[2]))
     if config.mapping.sensor_noise:
         target = target.weighed_by_std()
-    noise = relative_noise(view, target) if config.tracking.sensor_noise else None
+    sensor = sensor_model(config.input.sensor) if config.tracking.sensor_noise else None
+    noise = None if sensor is None else relative_noise(working.depth_m, sensor, config.render.depth_noise_per_m)
     live, image = live_image(view, working.color, working.depth_m, target, noise), None
     if extractor is not None:
         image = FeatureImage(LateDetail(whole, config.features.width), working.depth_m, working.camera)
