@@ -21,6 +21,7 @@ from sigmasplat.sources.ros.gyroscope import read_bag_gyroscope
 from sigmasplat.sources.ros.images import decode_color_message, decode_depth_message, message_size
 from sigmasplat.sources.ros.topics import color_topic, depth_topic
 from sigmasplat.sources.ros.truth import read_truth
+from sigmasplat.sources.stereo_bag import open_stereo_bag, stereo_topics
 
 Times = NDArray[np.float64]
 
@@ -53,6 +54,8 @@ class BagImagePair(ImagePair):
 def open_bag(path: Path, settings: InputConfig) -> RecordedSource:
     """Open a bag. Raises SourceError if it is damaged, its topics are ambiguous, or its cameras are unknown."""
     bag = Bag(path)
+    if pair := stereo_topics(bag, settings):
+        return open_stereo_bag(bag, *pair, settings)
     color, depth = color_topic(bag, settings.color_topic), depth_topic(bag, settings.depth_topic)
     calibration = read_bag_calibration(bag, color, depth, settings)
     found = bag.index(color.name, depth.name)
