@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.config import InputConfig
-from sigmasplat.sources.files.association import MAX_GAP_S, associate, no_pairs
+from sigmasplat.sources.files.association import MAX_GAP_S, associate, no_pairs, refuse_other_units
 from sigmasplat.sources.opening import Format
 from sigmasplat.sources.recorded import ImagePair, RecordedSource, Size
 from sigmasplat.sources.ros.bag import Bag, Entry, is_bag
@@ -61,6 +61,8 @@ def open_bag(path: Path, settings: InputConfig) -> RecordedSource:
     found = bag.index(color.name, depth.name)
     entries = found[color.name], found[depth.name]
     pairs, recorded_time = _paired(entries)
+    named = {name: _times_s(found[name], recorded_time) for name in (color.name, depth.name)}
+    refuse_other_units(path, named)
     if not len(pairs):
         raise no_pairs(path, {name: _times_s(found[name], True) for name in (color.name, depth.name)})
     truth = read_truth(bag, color.frame, recorded_time)
