@@ -127,7 +127,7 @@ class MotionWatch:
 
 
 def reduced(color: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return a gray image about `WIDTH` pixels wide from colours [H, W, 3]: means of squares of at most about 2 × 2 pixels;
+    """Return a gray image about `WIDTH` pixels wide from colours [H, W, 3]: means of squares of about 2 × 2 pixels;
     of larger images only some rows and columns are read."""
     apart = max(1, color.shape[1] // (2 * WIDTH))
     color = color[::apart, ::apart]
