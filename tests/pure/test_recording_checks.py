@@ -8,13 +8,16 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
+import bag_recordings
+import layouts
 from command_line import exit_code
-from sigmasplat.checks.motion import Motion, motion_warnings
+from sigmasplat.checks.motion import Motion, MotionWatch, motion_warnings
 from sigmasplat.checks.recording import inspect_source
 from sigmasplat.checks.timing import time_warnings
 from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.model.camera import Camera
+from sigmasplat.model.frame import Frame
 from sigmasplat.sources import open_source
 from sigmasplat.sources.camera.calibration import refuse_impossible_camera, unlikely_camera
 
@@ -66,6 +69,14 @@ def test_swapped_and_black_frames_and_jumps_are_found() -> None:
     dark = steady.gray.copy()
     dark[30:40] = 0.0
     assert replace(steady, gray=dark).black() == list(range(30, 40))
+    far = np.concatenate([steady.gray[:25], 1.0 - steady.gray[25:, :, ::-1]])
+    for images in (steady.gray, steady.gray[order], dark, far):  # a run finds the same while it takes the frames
+        watch, whole = MotionWatch(), replace(steady, gray=images)
+        for i, image in enumerate(images):
+            color = np.repeat(image[..., None], 3, axis=2)
+            watch(Frame(i + 7, i / 30.0, color, steady.depth_m[0], Camera(80, 8, 60.0, 60.0, 39.5, 3.5)))
+        assert watch.warnings() == motion_warnings(whole, 7)
+    assert "jumps 1 times (first: before frame 32)" in watch.warnings()[0]
 
 
 def test_times_are_checked_for_unit_order_and_gaps() -> None:
@@ -111,3 +122,23 @@ def test_images_without_depth_are_counted_with_the_reason(tiny_tum: Path) -> Non
     file.write_text("\n".join(file.read_text().splitlines()[:-2]) + "\n")
     warnings = inspect_source(tiny_tum, InputConfig()).warnings
     assert any("2 of 4 images are not used" in warning and "no depth within" in warning for warning in warnings)
+
+
+def test_times_of_a_bag_and_of_redwood_in_different_units_are_refused(tmp_path: Path) -> None:
+    sample = layouts.sample()
+    folder = layouts.redwood(tmp_path, sample)
+    for i, file in enumerate(sorted((folder / "depth").iterdir())):  # milliseconds instead of microseconds
+        file.rename(file.with_name(f"{i + 1:07d}-{33 * (i + 1):012d}.png"))
+    with pytest.raises(SourceError, match="times are in different units"):
+        open_source(folder)
+    pytest.importorskip("rosbags", reason="bags need the extra ros")
+    recorder = bag_recordings.Recorder()
+    for i in range(4):
+        for topic, unit, image, kind in (
+            (bag_recordings.CAMERA_TOPICS[0], 1.0, sample.color[0], "rgb8"),
+            (bag_recordings.CAMERA_TOPICS[1], 1000.0, sample.depth_mm[0], "16UC1"),
+        ):
+            recorder.image(topic, unit * (1 + i / 30), image, kind, "camera")
+    recorder.info("/camera/color/camera_info", 1.0, (32, 24), bag_recordings.FOCAL, "camera")
+    with pytest.raises(SourceError, match="times are in different units"):
+        open_source(recorder.write(tmp_path / "bag"))

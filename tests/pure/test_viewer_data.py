@@ -1,5 +1,6 @@
 """The viewer's data, without a browser: splats within a budget, filtering by σ, paths, rendered layers."""
 
+import html
 from dataclasses import replace
 
 import numpy as np
@@ -24,6 +25,7 @@ from sigmasplat.viewer.layers import (
     render_predicted,
     surface_normals,
 )
+from sigmasplat.viewer.panel import escaped
 from sigmasplat.viewer.snapshot import CameraPath, Piece, Snapshot, thin, within_budget
 from sigmasplat.viewer.splats import (
     VisibilityFilter,
@@ -303,3 +305,9 @@ def test_a_legend_shows_the_palette_from_end_to_end() -> None:
     drawn = draw_legend(Legend(colormap.INFERNO, 0.0, 0.25, " m"))
     np.testing.assert_array_equal(drawn[0, [0, -1]], colormap.INFERNO[[0, -1]])
     assert len(np.unique(drawn[20:].reshape(-1, 3), axis=0)) > 2
+
+
+def test_names_from_files_are_shown_and_not_run() -> None:
+    shown = escaped("<b>{alert(1)}</b> **küche**_1.2")
+    assert not set("<>{}*_`[]") & set(shown)
+    assert html.unescape(shown) == "<b>{alert(1)}</b> **küche**_1.2"

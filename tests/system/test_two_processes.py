@@ -76,8 +76,20 @@ def test_commands_that_only_read_need_no_lock(tmp_path: Path, capsys: pytest.Cap
         assert holder.stdout is not None and holder.stdout.readline() == b"held\n"
         assert "is in use" in refusal(capsys, "eval", str(out))
         assert exit_code("export", str(out), "--out", str(target)) == 0
+        assert "is in use" in refusal(capsys, "run", ROOM, "--onto", str(out), "--out", str(tmp_path / "onto"), *SHORT)
         holder.communicate()
     assert target.is_file() and exit_code("eval", str(out)) == 0
+    program, other = HOLD.replace("locked", "output_locked"), tmp_path / "other.ply"
+    with subprocess.Popen(
+        [sys.executable, "-c", program, str(other)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=os.environ
+    ) as holder:
+        assert holder.stdout is not None and holder.stdout.readline() == b"held\n"
+        for command in (["mesh"], ["export"], ["export", "--format", "colmap"]):
+            line = refusal(capsys, *command, str(out), "--out", str(other))
+            assert f"output {other} is in use by process {holder.pid}" in line
+        holder.communicate()
+    assert exit_code("export", str(out), "--out", str(other)) == 0
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["map.ply", "other.ply", "run"]
     assert not any(entry.name.startswith(".") for entry in out.iterdir())
 
 

@@ -6,13 +6,11 @@ A stopped run is resumed from its last saved state; the result has the same byte
 ends when its standard input is closed, so it does not outlive the program that started it, even if that was killed.
 """
 
-import fcntl
 import os
 import sys
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 
 import torch
@@ -21,6 +19,7 @@ from sigmasplat import env
 from sigmasplat.batch.job import Job
 from sigmasplat.errors import SigmaSplatError, is_out_of_memory, out_of_memory
 from sigmasplat.evaluation.evaluate import evaluate
+from sigmasplat.io.lock import locked
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.metrics.lpips import find_lpips
 from sigmasplat.run.resume import RefinementFile, StartPoint, StateFile, resume
@@ -38,30 +37,34 @@ def make_run(job: Job, folder: Path, data: str | None, save_every_s: float) -> N
 
     Raises SigmaSplatError if the sequence or the run cannot be used, KeyboardInterrupt if Ctrl-C stopped the run.
     """
-    with only_one(folder):
-        if job.finished_in(folder):
-            return
-        path = job.sequence(data)
-        source = open_source(path, job.config.input)
-        _make_and_score(job, RunFolder(folder), source, path, save_every_s)
+    try:
+        with locked(folder, wait=True):  # a second process waits
+            if job.finished_in(folder):
+                return
+            path = job.sequence(data)
+            source = open_source(path, job.config.input)
+            _make_and_score(job, RunFolder(folder), source, path, save_every_s)
+    except BaseException:
+        with suppress(OSError):  # the lock has created the folder
+            folder.rmdir()
+        raise
 
 
 def _make_and_score(job: Job, run: RunFolder, source: Source, path: str, save_every_s: float) -> None:
     """Make or resume the run unless it is complete, then score it."""
-    with run.locked():
-        if not (job.started_in(run.path) and run.facts().get("status") == "complete"):
-            run, start = _started(job, run.path, source, path)
-            state = StateFile(start.slam, run, save_every_s)
-            start.slam.saved_refinement = RefinementFile(start.slam, run, save_every_s)
-            outcome = Session(
-                start.slam, source, run, checkpointer=state, first_index=start.next_index, wall_s=start.wall_s
-            ).execute()
-            if outcome.status == "interrupted":
-                raise KeyboardInterrupt
-        started_s = time.perf_counter()
-        lpips, _ = find_lpips(env.LPIPS_FOLDER)
-        evaluate(run, source, mesh=job.mesh, lpips=lpips)
-        run.note(batch=job.facts() | {"scored": True, "scoring_s": time.perf_counter() - started_s})
+    if not (job.started_in(run.path) and run.facts().get("status") == "complete"):
+        run, start = _started(job, run.path, source, path)
+        state = StateFile(start.slam, run, save_every_s)
+        start.slam.saved_refinement = RefinementFile(start.slam, run, save_every_s)
+        outcome = Session(
+            start.slam, source, run, checkpointer=state, first_index=start.next_index, wall_s=start.wall_s
+        ).execute()
+        if outcome.status == "interrupted":
+            raise KeyboardInterrupt
+    started_s = time.perf_counter()
+    lpips, _ = find_lpips(env.LPIPS_FOLDER)
+    evaluate(run, source, mesh=job.mesh, lpips=lpips)
+    run.note(batch=job.facts() | {"scored": True, "scoring_s": time.perf_counter() - started_s})
 
 
 def _started(job: Job, folder: Path, source: Source, path: str) -> tuple[RunFolder, StartPoint]:
@@ -75,16 +78,6 @@ def _started(job: Job, folder: Path, source: Source, path: str) -> tuple[RunFold
     config = config_for(source, job.config, job.given)
     run = new_folder(folder, config, source, overwrite=True, source_path=path, batch=job.facts())
     return run, StartPoint(Slam(config, run.submaps))
-
-
-@contextmanager
-def only_one(folder: Path) -> Iterator[None]:
-    """Hold a lock file beside the folder, so that two processes never write one run; a second one waits."""
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    with folder.with_name(f".{folder.name}.lock").open("w") as file:
-        with suppress(OSError):  # a file system without locks
-            fcntl.flock(file, fcntl.LOCK_EX)
-        yield
 
 
 def _end_with_parent() -> None:

@@ -6,7 +6,7 @@ them.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,23 +87,69 @@ class Motion:
 
     def swapped(self) -> list[int]:
         """Return the frames that should be one place later: the next frame fits the one before it clearly better."""
-        one, two = self.changes(), self.changes(2)
-        if len(one) < 3:
-            return []
-        between = (one[1:-1] < one[:-2]) & (one[1:-1] < one[2:])
-        found = between & (two[:-1] < SWAPPED * one[:-2]) & (two[1:] < SWAPPED * one[2:])
-        return [int(i) + 1 for i in np.flatnonzero(found)]
+        return swapped_in(self.changes(), self.changes(2))
 
     def jumps(self) -> list[int]:
         """Return the frames whose view is far from that of the frame before, compared with the frames around."""
-        change = self.changes()
-        usual = ndimage.median_filter(change, size=min(21, len(change)), mode="nearest") if len(change) else change
-        found = (change > JUMP * usual) & (change > JUMP_LEAST)
-        return [int(i) + 1 for i in np.flatnonzero(found)]
+        return jumps_in(self.changes())
 
     def black(self) -> list[int]:
         """Return the frames that are black."""
         return [int(i) for i in np.flatnonzero(np.percentile(self.gray, 99, axis=(1, 2)) < BLACK)]
+
+
+@dataclass(eq=False)
+class MotionWatch:
+    """Looks for swapped, black and jumping frames during a run. It keeps three numbers per frame, and two images."""
+
+    numbers: list[int] = field(default_factory=list)
+    black: list[int] = field(default_factory=list)
+    one: list[float] = field(default_factory=list)
+    two: list[float] = field(default_factory=list)
+    last: list[NDArray[np.float32]] = field(default_factory=list)
+
+    def __call__(self, frame: Frame) -> None:
+        """Take the next frame into account."""
+        gray = reduced(frame.color)
+        if float(np.percentile(gray, 99)) < BLACK:
+            self.black.append(frame.index)
+        gray -= gray.mean()
+        for earlier, changes in zip(self.last[::-1], (self.one, self.two), strict=False):
+            changes.append(float(np.abs(gray - earlier).mean()))
+        self.numbers.append(frame.index)
+        self.last = [*self.last[-1:], gray]
+
+    def warnings(self) -> list[str]:
+        """Return warnings about the frames so far."""
+        one, two = np.array(self.one), np.array(self.two)
+        swapped, jumps = ([self.numbers[i] for i in found] for found in (swapped_in(one, two), jumps_in(one)))
+        return frame_warnings(self.black, swapped, jumps)
+
+
+def reduced(color: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return a gray image about `WIDTH` pixels wide from colours [H, W, 3]: means of squares of about 2 × 2 pixels;
+    of larger images only some rows and columns are read."""
+    apart = max(1, color.shape[1] // (2 * WIDTH))
+    color = color[::apart, ::apart]
+    step = max(1, color.shape[1] // WIDTH)
+    height, width = (size // step * step for size in color.shape[:2])
+    rows = color[:height, :width].reshape(height // step, step, width // step, step * 3)
+    return np.asarray(rows.mean((1, 3)), np.float32)
+
+
+def swapped_in(one: Numbers, two: Numbers) -> list[int]:
+    """Return the frames that should be one place later, from the changes to the next frame and to the one after it."""
+    if len(one) < 3:
+        return []
+    between = (one[1:-1] < one[:-2]) & (one[1:-1] < one[2:])
+    found = between & (two[:-1] < SWAPPED * one[:-2]) & (two[1:] < SWAPPED * one[2:])
+    return [int(i) + 1 for i in np.flatnonzero(found)]
+
+
+def jumps_in(change: Numbers) -> list[int]:
+    """Return the frames before which the view jumps, from the changes to the next frame."""
+    usual = ndimage.median_filter(change, size=min(21, len(change)), mode="nearest") if len(change) else change
+    return [int(i) + 1 for i in np.flatnonzero((change > JUMP * usual) & (change > JUMP_LEAST))]
 
 
 def _varying(energy: Numbers) -> Numbers:
@@ -132,14 +178,19 @@ def motion_warnings(motion: Motion, first: int = 0) -> list[str]:
             f"{late} is {seconds:.3f} s ({abs(delay):.1f} frames) behind {early}, judged by the motion of both; "
             f"subtract this from the times of {late}"
         )
-    found = {"black": motion.black(), "swapped with the next": motion.swapped()}
-    for name, frames in found.items():
-        if frames:
-            warnings.append(
-                f"{len(frames)} frames are {name} (first: frame {first + frames[0]}); remove or correct them"
-            )
-    if jumps := motion.jumps():
+    faults = ([first + i for i in found] for found in (motion.black(), motion.swapped(), motion.jumps()))
+    return warnings + frame_warnings(*faults)
+
+
+def frame_warnings(black: list[int], swapped: list[int], jumps: list[int]) -> list[str]:
+    """Return warnings about the frames with these numbers."""
+    warnings = [
+        f"{len(frames)} frames are {name} (first: frame {frames[0]}); remove or correct them"
+        for name, frames in {"black": black, "swapped with the next": swapped}.items()
+        if frames
+    ]
+    if jumps:
         warnings.append(
-            f"the view jumps {len(jumps)} times (first: before frame {first + jumps[0]}); tracking may be lost there"
+            f"the view jumps {len(jumps)} times (first: before frame {jumps[0]}); tracking may be lost there"
         )
     return warnings

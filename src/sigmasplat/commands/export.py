@@ -10,6 +10,7 @@ from sigmasplat.commands import options, picture_options
 from sigmasplat.commands.options import prepare_torch, refuse_existing, source_of
 from sigmasplat.config.ranges import Range
 from sigmasplat.exports.formats import FORMATS, ExportSource, choose, listed, refuse_unused
+from sigmasplat.io.lock import output_locked
 
 MaxSplats = Annotated[
     options.Whole,
@@ -85,7 +86,9 @@ def export(
     target = out or Path(source.name + chosen.endings[0])
     refuse_existing(target, overwrite)
     prepare_torch()
-    content = chosen.write(source, target, **{name: getattr(asked, name) for name in chosen.options})
+    with output_locked(target):
+        refuse_existing(target, overwrite)  # another process may have written it meanwhile
+        content = chosen.write(source, target, **{name: getattr(asked, name) for name in chosen.options})
     print(f"{target}: {content}{_size(target)}")
     return 0
 

@@ -1,6 +1,5 @@
 """Extract a surface from a run's map: sigmasplat mesh."""
 
-from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -29,6 +28,7 @@ def make_mesh(
     from sigmasplat.evaluation.reconstruct import FusionInput
     from sigmasplat.exports.axes import levelled, transform_to
     from sigmasplat.exports.run_reader import RunReader
+    from sigmasplat.io.lock import output_locked
     from sigmasplat.io.mesh import check_ending, write_mesh
     from sigmasplat.io.runs import MESH, RunFolder
     from sigmasplat.model.decimation import decimated, refuse_budget
@@ -42,7 +42,7 @@ def make_mesh(
     refuse_existing(out, overwrite)
     source = source_of(folder, moved_to)
     prepare_torch()
-    with nullcontext() if out else folder.locked(screen.warn):
+    with output_locked(out, screen.warn) if out else folder.locked(screen.warn):
         fusion_input = FusionInput.of(folder, source.camera)
         with screen.counting("surface") as progress:
             surface = fusion_input.surface(voxel_m, progress=progress)

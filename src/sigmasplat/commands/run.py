@@ -229,6 +229,7 @@ def _run_and_score(
 
     Raises KeyboardInterrupt if Ctrl-C came before the first frame was done.
     """
+    from sigmasplat.checks.motion import MotionWatch
     from sigmasplat.render.cuda import stages as cuda_stages
     from sigmasplat.run.resume import RefinementFile, StateFile
     from sigmasplat.run.session import Session
@@ -251,7 +252,8 @@ def _run_and_score(
         session = Session(
             system or start.slam, read, folder, callback, state, start.next_index, start.wall_s, run_options.all_poses
         )
-        session.watch = robot.watch if robot else session.watch
+        motion = MotionWatch()
+        session.watch = robot.watch if robot else motion if not (system or source.live) else session.watch
         session.later = system.between_frames if system else session.later
         outcome = session.execute()
     if outcome.status == "interrupted" and not outcome.frames:
@@ -261,6 +263,8 @@ def _run_and_score(
     _warn_of_skipped_frames(screen, source)
     _warn_of_dropped_frames(screen, read)
     _warn_if_never_recognised(screen, folder)
+    for warning in motion.warnings():
+        screen.warn(warning)
     if outcome.status == "interrupted":
         _say_interrupted(screen, outcome, folder)
         return INTERRUPTED

@@ -1,11 +1,11 @@
-"""Lock a run folder while a command writes to it, so that two processes never write one run."""
+"""Lock what a command writes, a run folder or another output, so that two processes never write the same."""
 
 import fcntl
 import os
 import socket
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,18 +32,34 @@ def no_warning(line: str) -> None:
     """Ignore a warning."""
 
 
-@contextmanager
-def locked(folder: Path, warn: Callable[[str], None] = no_warning) -> Iterator[None]:
+def locked(folder: Path, warn: Callable[[str], None] = no_warning, wait: bool = False) -> AbstractContextManager[None]:
     """Hold the lock of a run folder, which is created if it does not exist. Blocks of one process share the lock.
 
-    The operating system removes the lock when the process ends, even if it is killed. Calls `warn` if the file system
-    has no locks. Raises RunError, with the process that holds the lock, or if the folder cannot be written.
+    The operating system removes the lock when the process ends, even if it is killed. wait: until another process ends
+    its lock. Calls `warn` if the file system has no locks. Raises RunError, with the process that holds the lock, or if
+    the folder cannot be written.
     """
-    key = folder.resolve()
+    return _locked(folder / LOCK, f"run {folder}", warn, wait, make_folder)
+
+
+def output_locked(target: Path, warn: Callable[[str], None] = no_warning) -> AbstractContextManager[None]:
+    """Hold the lock of a file or folder to write, which need not exist; the lock is a hidden file beside it.
+
+    Raises RunError as `locked`.
+    """
+    return _locked(target.with_name(f".{target.name}{LOCK}"), f"output {target}", warn, False, lambda folder: None)
+
+
+@contextmanager
+def _locked(
+    path: Path, what: str, warn: Callable[[str], None], wait: bool, prepare: Callable[[Path], None]
+) -> Iterator[None]:
+    """Hold the lock of a file; prepare: called with its folder."""
+    key = path.parent.resolve() / path.name
     with _guard:
         held = _held.get(key)
         if held is None:
-            held = _held[key] = _Held(_acquired(folder, warn))
+            held = _held[key] = _Held(_acquired(path, what, warn, wait, prepare))
         held.blocks += 1
     try:
         yield
@@ -52,27 +68,30 @@ def locked(folder: Path, warn: Callable[[str], None] = no_warning) -> Iterator[N
             held.blocks -= 1
             if not held.blocks:
                 del _held[key]
-                _release(key / LOCK, held.file)
+                _release(key, held.file)
 
 
-def _acquired(folder: Path, warn: Callable[[str], None]) -> int | None:
-    """Lock the file of a folder and write this process into it; return it, or None if the file system has no locks."""
-    path = folder / LOCK
+def _acquired(
+    path: Path, what: str, warn: Callable[[str], None], wait: bool, prepare: Callable[[Path], None]
+) -> int | None:
+    """Lock a file and write this process into it; return it, or None if the file system has no locks."""
     while True:
-        make_folder(folder)
+        prepare(path.parent)
         try:
             file = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
         except OSError as problem:
-            raise cannot_write(folder, problem) from problem
+            raise cannot_write(path.parent, problem) from problem
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
         except BlockingIOError as problem:
             holder = os.pread(file, 200, 0).decode(errors="replace")
             os.close(file)
-            raise RunError(f"run {folder} is in use by {_described(holder)}") from problem
+            raise RunError(f"{what} is in use by {_described(holder)}") from problem
         except OSError as problem:
             os.close(file)
-            warn(f"the file system of {folder} has no locks ({problem.strerror}); start no second command on this run")
+            warn(
+                f"the file system of {path.parent} has no locks ({problem.strerror}); start no second command on {what}"
+            )
             return None
         if _is(path, file):
             with suppress(OSError):  # a full disk: the lock holds without the number of the process

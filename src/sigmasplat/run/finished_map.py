@@ -1,7 +1,10 @@
 """Read the map of a finished run, to find cameras in it or to continue it in another run."""
 
-from collections.abc import Collection
+import os
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -27,7 +30,7 @@ class FinishedMap:
 
     anchors: T_world_submap [4, 4] of each submap, or T_component_submap if its component is not connected to the world;
     components: one number per submap, 0 is the world; keyframe_poses: T_submap_camera [4, 4] of their keyframes;
-    frames: number of frames of the run.
+    frames: number of frames of the run; facts: its run.json.
     """
 
     run: RunFolder
@@ -38,11 +41,13 @@ class FinishedMap:
     keyframe_poses: list[list[Matrix]]
     frames: int
     camera: Camera
+    facts: dict[str, Any]
 
     @staticmethod
     def of(run: RunFolder) -> "FinishedMap":
         """Read a run. Raises RunError if it is not complete or kept no submaps."""
-        status = run.facts().get("status")
+        facts = run.facts()
+        status = facts.get("status")
         if status != "complete":
             raise RunError(
                 f"run {run.path} is not complete (status: {status}); finish it first: sigmasplat resume {run.path}"
@@ -64,7 +69,7 @@ class FinishedMap:
         submaps = [store.load(index) for index in range(len(store))]
         poses = [list(np.asarray(submap.T_submap_camera, np.float64)) for submap in submaps]
         frames = len(tensors["timestamps_s"])
-        return FinishedMap(run, run.config(), store, list(anchors), components, poses, frames, submaps[0].camera)
+        return FinishedMap(run, run.config(), store, list(anchors), components, poses, frames, submaps[0].camera, facts)
 
     @property
     def members(self) -> list[int]:
@@ -78,6 +83,17 @@ class FinishedMap:
         """
         of_map = ("input.min_depth_m", "input.max_depth_m")  # `config` has the map's already
         return for_scene(config, noted_scale(self.run.facts()), source.depth_noise_per_m, {*given, *of_map})
+
+    @contextmanager
+    def unchanged(self) -> Iterator[None]:
+        """Hold the run during the block, so that no process overwrites it. Raises RunError if one has or does.
+
+        A run that this user cannot write is not locked.
+        """
+        with self.run.locked() if os.access(self.run.path, os.W_OK) else nullcontext():
+            if self.run.facts() != self.facts:
+                raise RunError(f"run {self.run.path} was changed by another process; start this command again")
+            yield
 
     def refuse_other_size(self, config: Config) -> None:
         """Raise RunError if settings make working images of another size than those of the map."""
@@ -102,12 +118,14 @@ def continue_map(earlier: FinishedMap, config: Config, source: Source, run: RunF
     """Copy the world of an earlier run to a new run's folder, and return a system that continues it.
 
     run.json of the new run names the earlier one under `onto`. Raises RunError if the camera of the source sees too
-    little of what the map's camera sees, ConfigError if relocalisation is off.
+    little of what the map's camera sees, or another process has begun to write the earlier run; ConfigError if
+    relocalisation is off.
     """
     camera = source.camera.prepared(config.input.width, config.input.crop_px)
     earlier.refuse_other_view(camera)
     refuse_without_relocalisation(config)
-    take_over(earlier.store, earlier.members, earlier.frames, run.submaps)
+    with earlier.unchanged():
+        take_over(earlier.store, earlier.members, earlier.frames, run.submaps)
     anchors = [earlier.anchors[index] for index in earlier.members]
     run.note(onto={"run": str(earlier.run.path.resolve()), "submaps": len(anchors), "T_world_submap": anchors})
     return continued(config, run.submaps, anchors)

@@ -28,7 +28,7 @@ from sigmasplat.sources.camera.calibration import (
     read_json_object,
     resolve_calibration,
 )
-from sigmasplat.sources.files.association import MAX_GAP_S, associate, no_pairs
+from sigmasplat.sources.files.association import MAX_GAP_S, associate, no_pairs, refuse_other_units
 from sigmasplat.sources.files.folders import (
     COLOR_ENDINGS,
     COLOR_FOLDERS,
@@ -68,9 +68,11 @@ def _timed(folder: Path, colors: list[Path], depths: list[Path]) -> tuple[list[I
     if not (colors and depths and all(_TIMED.fullmatch(path.stem) for path in colors + depths)):
         return None
     times_s = [np.array([int(path.stem.split("-")[1]) * 1e-6 for path in paths]) for paths in (colors, depths)]
+    named = {"colour": times_s[0], "depth": times_s[1]}
+    refuse_other_units(folder, named)
     pairs = associate(times_s[0], times_s[1])
     if not len(pairs):
-        raise no_pairs(folder, {"colour": times_s[0], "depth": times_s[1]})
+        raise no_pairs(folder, named)
     paired = set(pairs[:, 0].tolist())
     skipped = [f"{path}: no depth within {MAX_GAP_S:g} s" for i, path in enumerate(colors) if i not in paired]
     return [ImagePair(float(times_s[1][j]), colors[i], depths[j]) for i, j in pairs], skipped

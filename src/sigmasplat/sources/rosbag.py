@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.config import InputConfig
-from sigmasplat.sources.files.association import MAX_GAP_S, associate, no_pairs
+from sigmasplat.sources.files.association import MAX_GAP_S, associate, no_pairs, refuse_other_units
 from sigmasplat.sources.opening import Format
 from sigmasplat.sources.recorded import ImagePair, RecordedSource, Size
 from sigmasplat.sources.ros.bag import Bag, Entry, is_bag
@@ -21,6 +21,7 @@ from sigmasplat.sources.ros.gyroscope import read_bag_gyroscope
 from sigmasplat.sources.ros.images import decode_color_message, decode_depth_message, message_size
 from sigmasplat.sources.ros.topics import color_topic, depth_topic
 from sigmasplat.sources.ros.truth import read_truth
+from sigmasplat.sources.stereo_bag import open_stereo_bag, stereo_topics
 
 Times = NDArray[np.float64]
 
@@ -53,11 +54,15 @@ class BagImagePair(ImagePair):
 def open_bag(path: Path, settings: InputConfig) -> RecordedSource:
     """Open a bag. Raises SourceError if it is damaged, its topics are ambiguous, or its cameras are unknown."""
     bag = Bag(path)
+    if pair := stereo_topics(bag, settings):
+        return open_stereo_bag(bag, *pair, settings)
     color, depth = color_topic(bag, settings.color_topic), depth_topic(bag, settings.depth_topic)
     calibration = read_bag_calibration(bag, color, depth, settings)
     found = bag.index(color.name, depth.name)
     entries = found[color.name], found[depth.name]
     pairs, recorded_time = _paired(entries)
+    named = {name: _times_s(found[name], recorded_time) for name in (color.name, depth.name)}
+    refuse_other_units(path, named)
     if not len(pairs):
         raise no_pairs(path, {name: _times_s(found[name], True) for name in (color.name, depth.name)})
     truth = read_truth(bag, color.frame, recorded_time)

@@ -10,7 +10,7 @@ Depth belongs to the left image. It is computed from both images when a frame is
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -77,8 +77,12 @@ class StereoPair(ImagePair):
     def _match(self, left: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         return self.rig.matcher.depth_and_std_m(left, self.rig.rectification.right(self._read(self.depth)))
 
+    def decoded(self, path: Path) -> NDArray[np.uint8]:
+        """Read one of the two recorded images, RGB [H, W, 3]. Raises SourceError naming the file."""
+        return read_color(path)
+
     def _read(self, path: Path) -> NDArray[np.uint8]:
-        image, (width, height) = read_color(path), self.rig.size
+        image, (width, height) = self.decoded(path), self.rig.size
         if image.shape[:2] != (height, width):
             raise SourceError(
                 f"{path} is {image.shape[1]}×{image.shape[0]} but the calibration is for {width}×{height}; "
@@ -100,8 +104,10 @@ class StereoSource(RecordedSource):
         settings: InputConfig,
         truth: Trajectory | None,
         skipped: Sequence[str] = (),
+        pair_of: Callable[[float, Path, Path, StereoRig], StereoPair] = StereoPair,
     ) -> None:
-        """Prepare rectification and matching. `truth` is the path of the recorded left camera.
+        """Prepare rectification and matching. `truth` is the path of the recorded left camera; `pair_of` makes a pair
+        from its time, left and right image.
 
         Raises SourceError if the images do not match the calibration, or no frame has depth.
         """
@@ -112,7 +118,7 @@ class StereoSource(RecordedSource):
             raise SourceError(f"{name}: the second camera is not to the right of the first one; swap both")
         matcher = StereoMatcher(rectification.camera, rectification.baseline_m, settings)
         rig = StereoRig((cameras.left.width, cameras.left.height), rectification, matcher)
-        images = self._pairs = [StereoPair(*pair, rig) for pair in pairs]
+        images = self._pairs = [pair_of(*pair, rig) for pair in pairs]
         if truth is not None:
             truth = Trajectory(truth.timestamps_s, truth.T_world_camera @ rectification.T_left_rectified)
         super().__init__(name, images, Calibration(rectification.camera, 1.0), settings, truth, skipped)
@@ -181,7 +187,7 @@ def _open_kitti(folder: Path, settings: InputConfig) -> StereoSource:
             raise SourceError(f"{folder / 'calib.txt'}: no projection P{name[-1]} of {name}; complete the file")
         cameras.append((build_camera(folder / "calib.txt", *size, [P[0, 0], P[1, 1], P[0, 2], P[1, 2]]), P))
     (left, P_left), (_, P_right) = cameras
-    left = _given(left, settings)
+    left = given_intrinsics(left, settings)
     T_right_left = np.eye(4)
     T_right_left[0, 3] = (P_right[0, 3] - P_left[0, 3]) / P_left[0, 0]
     truth = _kitti_truth(folder / "poses.txt", times_s, P_left[0, 3] / P_left[0, 0])
@@ -248,7 +254,7 @@ def _open_euroc(folder: Path, settings: InputConfig) -> StereoSource:
     sensors = [_euroc_sensor(root / name / "sensor.yaml") for name in ("cam0", "cam1")]
     (left, left_lens, T_body_left), (right, right_lens, T_body_right) = sensors
     cameras = StereoCameras(
-        _given(left, settings), right, se3.inverse(T_body_right) @ T_body_left, left_lens, right_lens
+        given_intrinsics(left, settings), right, se3.inverse(T_body_right) @ T_body_left, left_lens, right_lens
     )
     path = root / "state_groundtruth_estimate0" / "data.csv"
     truth = None
@@ -294,7 +300,7 @@ def _euroc_sensor(path: Path) -> tuple[Camera, tuple[float, ...], Matrix]:
     return build_camera(path, width, height, numbers("intrinsics", 4)), (k1, k2, p1, p2, 0.0), se3.orthonormalise(T)
 
 
-def _given(camera: Camera, settings: InputConfig) -> Camera:
+def given_intrinsics(camera: Camera, settings: InputConfig) -> Camera:
     """Return the camera with the intrinsics that the settings give."""
     return replace(camera, **{key: value for key in ("fx", "fy", "cx", "cy") if (value := getattr(settings, key))})
 

@@ -19,7 +19,7 @@ from sigmasplat.viewer.layers import (
     render_layer,
     render_predicted,
 )
-from sigmasplat.viewer.panel import PREDICTED_MODES, ControlPanel, ControlState
+from sigmasplat.viewer.panel import PREDICTED_MODES, ControlPanel, ControlState, escaped
 from sigmasplat.viewer.scene import ViserScene, camera_pose, move_camera, set_initial_camera
 from sigmasplat.viewer.snapshot import BUDGET, Piece, Snapshot, within_budget
 from sigmasplat.viewer.splats import (
@@ -244,8 +244,9 @@ class ViewerApp:
         submaps = int(path.submaps[-1]) + 1 if len(path) else 0
         outside = int((~path.inside & ~path.lost).sum())
         apart = f", {outside} apart (not shown)" if outside else ""
+        title, status = escaped(snapshot.title), escaped(snapshot.status)
         facts = (
-            f"**{snapshot.title}** ({snapshot.status})  \n{len(path)} frames, {len(path.keyframes)} keyframes, "
+            f"**{title}** ({status})  \n{len(path)} frames, {len(path.keyframes)} keyframes, "
             f"{int(path.lost.sum())} lost{apart}, {submaps} submap{'s' * (submaps != 1)}  \n"
             f"{kept:,} of {splats:,} splats shown"
         )
@@ -272,7 +273,7 @@ class ViewerApp:
         try:
             image = snapshot.image(row)
         except SigmaSplatError as problem:
-            self.panel.show_image(f"frame {row}: {problem}", None)
+            self.panel.show_image(f"frame {row}: {escaped(str(problem))}", None)
             return
         missing = "" if image is not None else ": its image was not kept"
         self.panel.show_image(f"frame {row}{missing}", image)

@@ -188,6 +188,12 @@ class ControlPanel:
         self.image.visible = pixels is not None
 
 
+def escaped(text: str) -> str:
+    """Return text from a file or a path so that the browser shows it and runs nothing: viser's Markdown has tags, and
+    expressions in braces."""
+    return "".join(c if c.isalnum() or c in " .,-" or not c.isascii() else f"&#{ord(c)};" for c in text)
+
+
 def _mode_options(absent: frozenset[str]) -> tuple[str, ...]:
     return tuple(MODE_LABELS[mode] for mode in VIEW_MODES if mode not in absent)
 

@@ -35,10 +35,16 @@ SUBPIXELS = 16.0
 REACH_PX, MOST_BEND_PX = 2, 0.6
 """Readings are removed where the disparity differs by more than `MOST_BEND_PX` from the mean of its neighbours at this
 distance, or next to such places: those are edges and wrong matches."""
-STD_LEAST, STD_TEXTURE, STD_BEND = 0.53, 1.17, 1.33
+STD_LEAST, STD_TEXTURE, STD_BEND, STD_HOLE, STD_RANGE = 0.45, 0.42, 3.4, 0.76, 0.33
 """Parts of σ_d in units of `input.stereo_std_px`: everywhere; divided by the horizontal gradient of the image in gray
-values per pixel; times the bend of the disparity in pixels. Fitted to exact depth of the synthetic room."""
-LEAST_GRADIENT = 0.2
+values per pixel; times the bend of the disparity in pixels; at a pixel without a reading, where the surface ends or the
+images differ, falling by e every `HOLE_PX`; times the range of disparities around, as a near surface looks wider than
+it is. Fitted to exact depth of synthetic rooms (seeds 1 to 4; baselines of 6, 10 and 18 cm)."""
+LEAST_GRADIENT = 0.5
+HOLE_PX, AROUND_PX, MOST_RANGE_PX = 8.0, 13, 2.0
+"""The window of the range of disparities, and its largest value."""
+LEAST_TOGETHER = 0.85
+"""Readings are removed where a smaller share of this window has a match: those are often wrong by several pixels."""
 INDOOR_MEDIAN_M = 2.0
 """Median depth of a usual indoor recording: the default settings are made for it."""
 SMALL_SCENE = 2.0
@@ -100,7 +106,8 @@ class StereoMatcher:
 
     def depth_and_std_m(self, left: Bytes, right: Bytes) -> tuple[Floats, Floats]:
         """Match two rectified RGB images [H, W, 3]: depth z of the left one, m [H, W], 0 = no reading, and its standard
-        deviation σ_z = z² σ_d / (f b), m [H, W]. σ_d is larger where there is little texture or the surface bends."""
+        deviation σ_z = z² σ_d / (f b), m [H, W]. σ_d is larger where there is little texture, where the surface bends,
+        and near its edges."""
         cv2, n = opencv(), self._count
         # The columns left of the image let far points near the left edge be matched.
         gray = [
@@ -109,17 +116,12 @@ class StereoMatcher:
         ]
         found = self._matcher().compute(*gray)[:, n:].astype(np.float32) / np.float32(SUBPIXELS)
         column = np.arange(left.shape[1], dtype=np.float32)
-        seen = (found > 0) & (column - found >= BLOCK_PX // 2)
-        bend_px = _bend(found, seen)
-        seen &= bend_px <= MOST_BEND_PX
+        matched = (found > 0) & (column - found >= BLOCK_PX // 2)
+        bend_px = _bend(found, matched)
+        together = cv2.blur(matched.astype(np.float32), (AROUND_PX, AROUND_PX)) >= LEAST_TOGETHER
+        seen = matched & together & (bend_px <= MOST_BEND_PX)
         depth_m = np.divide(self._focal_baseline, found, out=np.zeros_like(found), where=seen)
-        gradient = cv2.Sobel(gray[0][:, n:].astype(np.float32), cv2.CV_32F, 1, 0, scale=1 / 8)
-        texture = np.sqrt(cv2.blur(gradient * gradient, (BLOCK_PX, BLOCK_PX)))
-        std_px = self._std_px * np.sqrt(
-            STD_LEAST**2
-            + (STD_TEXTURE / np.maximum(texture, LEAST_GRADIENT)) ** 2
-            + (STD_BEND * np.where(seen, bend_px, 0.0)) ** 2
-        )
+        std_px = self._std_px * _relative_std(gray[0][:, n:], found, matched, seen, bend_px)
         std_m = depth_m * depth_m * std_px / self._focal_baseline
         usable = std_m <= self._max_std * depth_m
         return np.where(usable, depth_m, 0.0).astype(np.float32), np.where(usable, std_m, 0.0).astype(np.float32)
@@ -149,6 +151,28 @@ def scene_scale(depth_of: Callable[[int], Floats], frames: int) -> float:
             ratio = float(np.median(depth_m[depth_m > 0])) / INDOOR_MEDIAN_M
             return float(f"{ratio:.2g}") if ratio >= SMALL_SCENE else 1.0
     return 1.0
+
+
+def _relative_std(
+    gray: Bytes, disparity: Floats, matched: NDArray[np.bool_], seen: NDArray[np.bool_], bend_px: Floats
+) -> Floats:
+    """Return σ_d in units of `input.stereo_std_px` [H, W]; matched: pixels with a disparity, seen: those with depth."""
+    cv2, window = opencv(), np.ones((AROUND_PX, AROUND_PX))
+    gradient = cv2.Sobel(gray.astype(np.float32), cv2.CV_32F, 1, 0, scale=1 / 8)
+    texture = np.sqrt(cv2.blur(gradient * gradient, (BLOCK_PX, BLOCK_PX)))
+    far, near = (np.where(matched, sign * disparity, np.float32(-1e6)) for sign in (-1.0, 1.0))
+    range_px = cv2.dilate(near, window) + cv2.dilate(far.astype(np.float32), window)
+    to_hole_px = cv2.distanceTransform(seen.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return np.asarray(
+        np.sqrt(
+            STD_LEAST**2
+            + (STD_TEXTURE / np.maximum(texture, LEAST_GRADIENT)) ** 2
+            + (STD_BEND * np.where(seen, bend_px, 0.0)) ** 2
+            + (STD_HOLE * np.exp(-to_hole_px / HOLE_PX)) ** 2
+            + (STD_RANGE * np.clip(range_px, 0.0, MOST_RANGE_PX)) ** 2
+        ),
+        np.float32,
+    )
 
 
 def _bend(disparity: Floats, seen: NDArray[np.bool_]) -> Floats:

@@ -74,13 +74,11 @@ def is_registered(color: ImageTopic, depth: ImageTopic) -> bool:
 
 def read_optics(bag: Bag, topic: ImageTopic) -> Optics | None:
     """Read the CameraInfo of an image topic; None if it is missing or empty. Raises SourceError if it is damaged."""
-    infos = {info.name for info in bag.topics_of_type("sensor_msgs/msg/CameraInfo")}
-    names = (f"{topic.camera}/camera_info", f"{topic.base.removesuffix('/image/data')}/info/camera_info")
-    found = [name for name in names if name in infos]
-    if not found:
+    name = _info_name(bag, topic)
+    if name is None:
         return None
-    info = bag.first_message(found[0])
-    rectified, where = "rect" in topic.base.rpartition("/")[2], bag.path / found[0].lstrip("/")
+    info = bag.first_message(name)
+    rectified, where = "rect" in topic.base.rpartition("/")[2], bag.path / name.lstrip("/")
     k = np.asarray(_field(info, "p")).reshape(3, 4)[:, :3] if rectified else np.asarray(_field(info, "k")).reshape(3, 3)
     if rectified and k[0, 0] <= 0:
         k = np.asarray(_field(info, "k")).reshape(3, 3)
@@ -88,7 +86,21 @@ def read_optics(bag: Bag, topic: ImageTopic) -> Optics | None:
         return None
     width, height = int(info.width) or topic.size[0], int(info.height) or topic.size[1]
     camera = build_camera(where, width, height, [float(v) for v in (k[0, 0], k[1, 1], k[0, 2], k[1, 2])])
-    return Optics(camera, None if rectified else _lens(f"{bag.path}: {found[0]}", info))
+    return Optics(camera, None if rectified else _lens(f"{bag.path}: {name}", info))
+
+
+def _info_name(bag: Bag, topic: ImageTopic) -> str | None:
+    infos = {info.name for info in bag.topics_of_type("sensor_msgs/msg/CameraInfo")}
+    names = (f"{topic.camera}/camera_info", f"{topic.base.removesuffix('/image/data')}/info/camera_info")
+    return next((name for name in names if name in infos), None)
+
+
+def info_of(bag: Bag, topic: ImageTopic) -> Matrix | None:
+    """Return the projection P [3, 4] of an image topic's CameraInfo, None without one."""
+    name = _info_name(bag, topic)
+    if name is None:
+        return None
+    return np.asarray(_field(bag.first_message(name), "p"), np.float64).reshape(3, 4)
 
 
 def depth_units(bag: Bag, depth: ImageTopic) -> float:

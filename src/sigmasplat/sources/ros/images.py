@@ -29,6 +29,7 @@ COLOR_ORDER = {
 }
 """Positions of red, green and blue in a pixel."""
 DEPTH_TYPE = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
+GRAY = ("mono8", "8UC1")
 HEADER_BYTES = 12
 
 
@@ -59,6 +60,13 @@ def decode_color_message(path: Path, message: Message) -> NDArray[np.uint8]:
         raise _encoding(path, "colour", message.encoding, COLOR_ORDER)
     pixels = _pixels(path, message, "u1", 4 if message.encoding in ("rgba8", "bgra8", "8UC4") else 3)
     return np.ascontiguousarray(pixels[..., COLOR_ORDER[message.encoding]])
+
+
+def decode_any_color(path: Path, message: Message) -> NDArray[np.uint8]:
+    """Return 8-bit RGB [H, W, 3] of a colour or a gray image, such as infrared. Raises as `decode_color_message`."""
+    if getattr(message, "encoding", "") in GRAY:
+        return np.repeat(_pixels(path, message, "u1", 1), 3, axis=2)
+    return decode_color_message(path, message)
 
 
 def decode_depth_message(path: Path, message: Message, units_per_metre: float) -> NDArray[np.float32]:
