@@ -13,6 +13,7 @@ from sigmasplat.model.field import COLUMNS
 from sigmasplat.model.frame import Frame
 from sigmasplat.render.reference.view import ReferenceView
 from sigmasplat.slam.mapper import Mapper
+from sigmasplat.types import completed
 
 CAMERA = Camera(16, 12, 15.0, 15.0, 7.5, 5.5)
 PIXELS = 16 * 12
@@ -62,6 +63,18 @@ def test_what_the_map_explains_is_not_seeded_again() -> None:
     assert len(made.field) == PIXELS + 5 * 12
     new = made.field.means[PIXELS:]
     assert float(new[:, 2].max()) < 1.1 and float(new[:, 0].max()) < 0.0, "the object, and nothing else"
+
+
+def test_the_steps_of_the_first_keyframe_are_divided_where_asked() -> None:
+    made = mapper(mapping=replace(NO_FIT, iterations=2, first_iterations=7, first_divided=True))
+    assert len(made.map(view(), 0, target(), np.eye(4)).losses) == 2
+    taken = list[int]()
+    while made.owed:
+        completed(made.refining(view(), min(2, made.owed), lambda: False))
+        taken.append(made.field.steps)
+    assert taken == [4, 6, 7]
+    assert len(made.map(view(), 1, target(), np.eye(4)).losses) == 2
+    assert not made.owed  # only the first keyframe of a map has more steps
 
 
 def test_faded_splats_are_pruned() -> None:

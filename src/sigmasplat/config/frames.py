@@ -111,6 +111,10 @@ class MappingConfig(Section, name="mapping"):
     first_iterations: Count = 100
     """Optimisation steps for the first keyframe of a map. Until about 150 steps, a new map renders surfaces too
     close."""
+    first_divided: bool = False
+    """Whether the steps of the first keyframe are divided: `iterations` of them at once, and as many at each of the
+    next frames that are not mapped, until `first_iterations` are made. The first frame then takes no longer than
+    others."""
     newest_probability: Share = 0.4
     """Probability that a step uses the newest keyframe; the other steps use older ones, drawn uniformly."""
     weight_l1: NotNegative = 0.8

@@ -12,7 +12,13 @@ from sigmasplat.presets import varsplat
 # map is ours, too (docs/final-map.md).
 SIGMA = varsplat.FAST.changed(
     input={"denoise_depth": True},
-    mapping={"iterations": 15, "weight_moment": 0.1, "weight_depth": 0.0, "weight_mean_depth": 2.0},
+    mapping={
+        "iterations": 15,
+        "first_divided": True,
+        "weight_moment": 0.1,
+        "weight_depth": 0.0,
+        "weight_mean_depth": 2.0,
+    },
     render={"depth": "ray"},
     tracking={"features": True, "verify": True},
     recovery={"relocalise": True, "new_map_after": 20, "steady_frames": 2},

@@ -37,12 +37,16 @@ LEAST_SHARE = 1 / 3
 
 @dataclass(eq=False)
 class Mapper:
-    """Owns the field and the keyframes of the active submap. Poses are in the submap's frame."""
+    """Owns the field and the keyframes of the active submap. Poses are in the submap's frame.
+
+    owed: the steps of the first keyframe that are still to be made (`mapping.first_divided`).
+    """
 
     config: Config
     random: np.random.Generator
     field: GaussianField = dataclass_field(default_factory=GaussianField.empty)
     keyframes: list[Keyframe] = dataclass_field(default_factory=list)
+    owed: int = 0
 
     def map(
         self,
@@ -83,6 +87,9 @@ class Mapper:
             self.field.forget()
         steps = c.iterations if begun else c.first_iterations
         rates = iter([Rates.of(c)] * steps if begun else Rates.falling(c, steps))
+        if c.first_divided and not begun:
+            steps = min(c.iterations, steps)
+            self.owed = c.first_iterations - steps
         window = self._window(view)
         stats = DensifyStats.of(self.keyframes[-1], len(self.field), self.field.params.device)
         self._choose_movable(c.poses_from == "start")
@@ -108,10 +115,12 @@ class Mapper:
 
     def refining(self, view: View, steps: int, hurried: Callable[[], bool]) -> Slices[None]:
         """Fit the map to its keyframes for more steps, in slices of one, until `hurried` returns True; the keyframes
-        keep their poses."""
+        keep their poses. Steps that are owed count as made."""
         self._choose_movable(False)
         rates = iter([Rates.of(self.config.mapping)] * steps)
-        yield from self._fit(view, self._window(view), steps, rates, 0, None, hurried, least_share=0.0)
+        for _ in self._fit(view, self._window(view), steps, rates, 0, None, hurried, least_share=0.0):
+            self.owed = max(self.owed - 1, 0)
+            yield
 
     def _append(self, keyframe: Keyframe) -> None:
         """Add a keyframe to the list; the first one of a submap is fixed."""

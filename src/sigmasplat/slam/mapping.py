@@ -20,7 +20,7 @@ from sigmasplat.slam.localisation.relocaliser import INDEX_AT_MOST, Relocation, 
 from sigmasplat.slam.localisation.sight import Observation, Sight
 from sigmasplat.slam.loop_closure.closer import Loop
 from sigmasplat.slam.mapper import Mapper
-from sigmasplat.slam.rules import ends_submap
+from sigmasplat.slam.rules import ends_submap, never
 from sigmasplat.slam.world import World
 from sigmasplat.types import Matrix, Slices, completed
 
@@ -55,6 +55,12 @@ class MapWork(World):
         """Add frame number `index` to the keyframes of the active submap without fitting the map; return its pose."""
         self.mapper.add(self.view, self._keyframe(seen, index, T_submap_camera))
         return self._placed(index, hop)
+
+    def refining(self, at_most: int, hurried: Callable[[], bool] = never) -> Slices[None]:
+        """Make steps of the active submap's first keyframe that are owed, in slices, until `hurried` returns True."""
+        if self.mapper.owed:
+            with self._timer.stage("map"):
+                yield from self.mapper.refining(self.view, min(at_most, self.mapper.owed), hurried)
 
     def _keyframe(self, seen: Observation, index: int, T_submap_camera: Matrix) -> Keyframe:
         frame = seen.frame
@@ -146,6 +152,7 @@ class MapWork(World):
 
     def finish_submap(self) -> Slices[list[Loop]]:
         """Move the active submap to the store and look for its loops, which may move anchors, in slices."""
+        yield from self.refining(self.mapper.owed)
         submap, pictures = self.mapper.finished(len(self.store))
         submap, probes = self.probes.of(submap)
         yield

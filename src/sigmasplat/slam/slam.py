@@ -52,6 +52,7 @@ class Slam(MapWork, ArrayInterface):
             completed(self.seek_component(seen, found.T_submap_camera))
         else:
             self._offer_probe(seen, found)
+            completed(self.refining(self.config.mapping.iterations))
         self.atlas.place_frame(found.T_submap_camera)
         self.steps.append(self._step_result(seen.frame, found))
         return self.steps[-1]
@@ -64,6 +65,7 @@ class Slam(MapWork, ArrayInterface):
         the uncertainty is measured at; without both the total is 1. Does nothing when no rule cuts submaps and
         `final.iterations` is 0. Components that are not connected to the world are left out of the final map.
         """
+        completed(self.refining(self.mapper.owed))
         if not self.steps or not (len(self.store) or self.cuts or self.config.final.iterations):
             return
         steps, measures = self._refinement_steps(), self.config.uncertainty.probes > 0

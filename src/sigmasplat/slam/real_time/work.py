@@ -83,6 +83,7 @@ class MapClock:
         self._place(each)
         if each.search is not None:
             yield from self._search(each, each.search)
+        yield from self.system.refining(self.system.config.mapping.iterations, self._keyframe_waits)
 
     def _place(self, each: TrackedFrame) -> None:
         """Place a frame relative to the newest keyframe."""
