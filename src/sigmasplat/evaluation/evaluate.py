@@ -10,6 +10,7 @@ from sigmasplat.config import Config, FinalConfig
 from sigmasplat.errors import RunError
 from sigmasplat.evaluation import reconstruct
 from sigmasplat.evaluation.frame_states import score_states
+from sigmasplat.evaluation.moving_views import show_moving
 from sigmasplat.evaluation.path_scores import score_frame_sets
 from sigmasplat.evaluation.pose_covariance import score_pose_covariance
 from sigmasplat.evaluation.view_scoring import ViewScoring, score_full_resolution, score_test_views
@@ -89,6 +90,7 @@ def evaluate(
     metrics["pose_covariance"] = score_pose_covariance(run, frames, known)
     metrics["calibration"] = _calibration(run) if standard else None
     metrics["test_views"] = score_test_views(scoring, config.input, strips)
+    show_moving(strips, source, config.input, run.submaps, records)
     run.write_metrics(metrics)
     plots = _draw_plots(run, frames, known, loops)
     plan = report_plan(run, frames.path, source.camera) if standard else None

@@ -166,8 +166,7 @@ class Tracker:
     def _notice_rest(self, seen: Sight, T_world_camera: Matrix) -> None:
         """Take what has come to rest for a part of the scene, and remember the frame."""
         front = self.watch.still_moving(self.front, seen, T_world_camera)
-        if self.front is not None and front is None:
-            self.keyframe_front = None
+        self.keyframe_front = None if self.front is not None and front is None else self.keyframe_front
         self.front, self.watch = front, self.watch.after(seen, front, T_world_camera)
 
     def _stands(self, fit: PoseFit, predicted: Matrix) -> bool:
