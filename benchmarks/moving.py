@@ -157,7 +157,7 @@ def measure_still(source: str, seed: int, find: int, options: Options) -> dict[s
     path, truth, scores = run.slam.trajectory(), recording.truth(), []
     for i in range(HOLD_EVERY - 1, len(recording), HOLD_EVERY):
         frame = working_frame(recording.frame(i), config)
-        rendered = render(run.slam.field, frame.camera, se3.inverse(path.T_world_camera[i]), config.render)
+        rendered = render(run.slam.field, frame.camera, se3.inverse(path.T_world_camera[i]), options=config.render)
         scores.append(psnr(np.clip(rendered.color.numpy(), 0.0, 1.0), frame.color))
     return {
         "source": source, "seed": seed, "find": find, "psnr_db": float(np.mean(scores)),
