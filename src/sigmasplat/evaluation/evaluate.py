@@ -74,8 +74,7 @@ def evaluate(
     known = None if problem else truth
     chosen = {kind: evenly_spread(views, views_per_kind) for kind, views in _kinds(log).items()}
     strips, config, loops = ViewStrips(run, strips_per_kind), run.config(), run.read_loops()
-    standard = renderer is None
-    renderer = renderer or FieldRenderer(config.render, config.backend)
+    standard, renderer = renderer is None, renderer or FieldRenderer(config.render, config.backend)
     maps = _map_sources(run, field, records, config.final)
     maps, predictions = _with_prediction(maps, run, frames, config) if standard else (maps, views.PredictionScores())
     aligned = _alignment(frames, known)
