@@ -164,8 +164,8 @@ class FinalConfig(Section, name="final"):
     """Learning rates of splats and poses in the last refinement step, as a share of those in the first; they decay
     exponentially. 1 = constant."""
     beta2: Annotated[float, Range(0, 0.9999)] = 0.999
-    """Decay β₂ of Adam's second moment during refinement. With 0.99 the size of a step follows the gradients of the last
-    hundred steps, and fewer steps make an equally sharp map."""
+    """Decay β₂ of Adam's second moment during refinement. With 0.99 the size of a step follows the last hundred
+    gradients, and fewer steps make an equally sharp map."""
     lr_means_last: NotNegative = 0.0
     """Learning rate of positions in the last refinement step; it decays exponentially from `mapping.lr_means` (3DGS). 0
     = `mapping.lr_means` throughout."""

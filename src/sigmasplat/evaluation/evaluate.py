@@ -10,6 +10,7 @@ from sigmasplat.config import Config, FinalConfig
 from sigmasplat.errors import RunError
 from sigmasplat.evaluation import reconstruct
 from sigmasplat.evaluation.frame_states import score_states
+from sigmasplat.evaluation.moving_views import show_moving
 from sigmasplat.evaluation.path_scores import score_frame_sets
 from sigmasplat.evaluation.pose_covariance import score_pose_covariance
 from sigmasplat.evaluation.view_scoring import ViewScoring, score_full_resolution, score_test_views
@@ -75,8 +76,7 @@ def evaluate(
     known = None if problem else truth
     chosen = {kind: evenly_spread(views, views_per_kind) for kind, views in _kinds(log).items()}
     strips, config, loops = ViewStrips(run, strips_per_kind), run.config(), run.read_loops()
-    standard = renderer is None
-    renderer = renderer or FieldRenderer(config.render, config.backend)
+    standard, renderer = renderer is None, renderer or FieldRenderer(config.render, config.backend)
     maps = _map_sources(run, field, records, config.final)
     maps, predictions = _with_prediction(maps, run, frames, config) if standard else (maps, views.PredictionScores())
     aligned = _alignment(frames, known)
@@ -93,6 +93,7 @@ def evaluate(
     metrics["pose_covariance"] = score_pose_covariance(run, frames, known)
     metrics["calibration"] = _calibration(run) if standard else None
     metrics["test_views"] = score_test_views(scoring, config.input, strips)
+    show_moving(strips, source, config.input, run.submaps, records)
     run.write_metrics(metrics)
     plots = _draw_plots(run, frames, known, loops)
     plan = report_plan(run, frames.path, source.camera) if standard else None

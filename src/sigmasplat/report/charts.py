@@ -30,6 +30,11 @@ SUBMAPS_CAPTION = (
     "A line connects two frames that were compared as a loop."
 )
 
+MOVING_CAPTION = (
+    "The share of each image that was taken for moving. It was used neither for the path nor for the map. What stays "
+    "in its place for a while becomes part of the map again."
+)
+
 
 class LoopLink(NamedTuple):
     """A loop between two frames, as rows of the path, and whether it was accepted."""
@@ -46,12 +51,15 @@ def run_charts(
     frames: RunFrames, truth: Matrix | None, loops: Sequence[dict[str, Any]] = ()
 ) -> dict[str, tuple[list[Chart], str]]:
     """Return the charts of a run with captions, by name: trajectory; states if known; submaps if there are several;
-    seconds if known. Without a believed frame there are only the seconds.
+    moving if anything moved; seconds if known. Without a believed frame there are only the seconds.
 
     truth: [B, 3] of the believed frames, as in `trajectory_charts`.
     """
     log = frames.log
     found = _path_charts(frames, truth, loops) if len(frames.rows) else {}
+    shares = np.array([(record.get("tracking") or {}).get("moving", 0.0) for record in log])
+    if shares.any():
+        found["moving"] = [moving_chart(np.array([record["index"] for record in log]), shares)], MOVING_CAPTION
     if any(frame_seconds(record) for record in log):
         stages = {name: np.array([(r.get("seconds") or {}).get(name, 0.0) for r in log]) for name in _stages(log)}
         stages["total"] = np.array([frame_seconds(record) for record in log])
@@ -154,6 +162,12 @@ def _p_off_chart(frames: RunFrames) -> Chart:
         if at.any():
             curves.append(Curve(name, top[at], colour, dots=True))
     return Chart("Probability along the path", "right, m", "forward, m", curves, square=True)
+
+
+def moving_chart(frames: NDArray[np.int_], shares: Matrix) -> Chart:
+    """Return the chart of the share of each image that was taken for moving: frames [N], shares [N]."""
+    curve = Curve("", np.stack([frames, 100 * shares], 1).astype(np.float64), ACCENT)
+    return Chart("Taken for moving", "frame", "% of the image", [curve], from_zero=True)
 
 
 def seconds_chart(frames: NDArray[np.int_], stages: dict[str, Matrix]) -> Chart:

@@ -116,6 +116,7 @@ def build_report(contents: Contents) -> str:
         _rescan(contents),
         _plot(contents, "trajectory", "Trajectory"),
         _states(contents),
+        _plot(contents, "moving", "What moved"),
         _strips(contents),
         _submaps(contents),
         _tables(contents.metrics),

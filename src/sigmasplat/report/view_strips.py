@@ -48,13 +48,13 @@ class ViewStrips:
         the heading if the view was not rendered from the final map.
         """
         name, heading = f"view-{view.kind.replace(' ', '-')}", HEADINGS.get(view.kind, f"{view.kind} views") + place
-        self._draw(f"{name}{place and '-submap'}-{view.index:06d}.png", heading, view_panels(view))
+        self.draw(f"{name}{place and '-submap'}-{view.index:06d}.png", heading, view_panels(view))
         if view.predicted is not None:
             panels = predicted_panels(view, view.predicted)
             for quantity, of_quantity in (("color", panels[:4]), ("depth", panels[4:])):
-                self._draw(f"{name}-predicted-{quantity}-{view.index:06d}.png", heading, of_quantity)
+                self.draw(f"{name}-predicted-{quantity}-{view.index:06d}.png", heading, of_quantity)
 
-    def _draw(self, name: str, heading: str, panels: list[ViewPanel]) -> None:
+    def draw(self, name: str, heading: str, panels: list[ViewPanel]) -> None:
         """Write a strip, and keep its panels for the page."""
         self.run.write_image(name, draw_view_strip(panels))
         self.figures.setdefault(heading, []).append([panel_figure(panel) for panel in panels])

@@ -15,6 +15,7 @@ from sigmasplat.slam.drift import mean_variance
 from sigmasplat.slam.final import final_map
 from sigmasplat.slam.found import Found
 from sigmasplat.slam.listeners import notifying
+from sigmasplat.slam.localisation.foreground import share_of
 from sigmasplat.slam.localisation.recovery import usable
 from sigmasplat.slam.localisation.relocaliser import Relocation
 from sigmasplat.slam.localisation.sight import Observation, refuse_first_without_depth, working_frame
@@ -199,7 +200,7 @@ class Slam(MapWork, ArrayInterface):
         state = APART if component and found.state != LOST else found.state
         found.tracking |= {
             "position_std_m": self.confidence.position_std_m(in_submap_m), "doubtful": float(self.tracker.doubtful),
-            "usual_residual": self.tracker.usual.residual,
+            "usual_residual": self.tracker.usual.residual, "moving": share_of(self.tracker.front),
         }  # fmt: skip
         p_off = self.confidence.probability(state, found.tracking)
         return Step(

@@ -167,8 +167,7 @@ class Tracker:
     def _notice_rest(self, seen: Sight, T_world_camera: Matrix) -> None:
         """Take what has come to rest for a part of the scene, and remember the frame."""
         front = self.watch.still_moving(self.front, seen, T_world_camera)
-        if self.front is not None and front is None:
-            self.keyframe_front = None
+        self.keyframe_front = None if self.front is not None and front is None else self.keyframe_front
         self.front, self.watch = front, self.watch.after(seen, front, T_world_camera)
 
     def _stands(self, fit: PoseFit, predicted: Matrix) -> bool:
@@ -204,8 +203,7 @@ class Tracker:
         T_camera_world = se3.inverse(guess)
         if self.config.method == "adam":
             config = self.config if self.started else self.config.without_motion()
-            steps = patience * config.iterations
-            return fit_pose_adam(field.params, view, seen.target, T_camera_world, config, steps)
+            return fit_pose_adam(field.params, view, seen.target, T_camera_world, config, patience * config.iterations)
         if self.config.align_to == "keyframe" and self.keyframe is not None:
             return self._aligned(self.keyframe, seen.live, T_camera_world)
         return self._aligned(map_reference(field.params, view, T_camera_world, self.config), seen.live, T_camera_world)

@@ -53,6 +53,11 @@ class Foreground:
     scene_m: Depth
 
 
+def share_of(front: Foreground | None) -> float:
+    """Return the share of the image that is in front."""
+    return 0.0 if front is None else float(front.hidden.mean())
+
+
 @dataclass(frozen=True, eq=False)
 class Earlier:
     """Depth of an earlier image [H, W] m, 0 where it is not known, and its pose relative to a live camera, [4, 4]."""

@@ -17,6 +17,7 @@ from sigmasplat.render.view import View
 from sigmasplat.slam.drift import Drift
 from sigmasplat.slam.found import Found
 from sigmasplat.slam.localisation.confidence import Confidence
+from sigmasplat.slam.localisation.foreground import share_of
 from sigmasplat.slam.localisation.recovery import Recovery, usable
 from sigmasplat.slam.localisation.sight import Observation, refuse_first_without_depth
 from sigmasplat.slam.localisation.tracked_keyframe import TrackedKeyframe
@@ -205,6 +206,7 @@ class CameraClock:
         found.tracking |= {
             "position_std_m": self.confidence.position_std_m(in_submap_m), "doubtful": float(self.tracker.doubtful),
             "usual_residual": self.tracker.usual.residual, "waiting": float(len(self.waits)),
+            "moving": share_of(self.tracker.front),
         }  # fmt: skip
         p_off = self.confidence.probability(state, found.tracking)
         anchor, splats = (np.eye(4), 0) if s is None else (s.T_world_submap, len(s.params))
