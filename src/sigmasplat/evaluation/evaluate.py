@@ -58,10 +58,9 @@ def evaluate(
     Training views are the run's keyframes; held-out views are the frames that no map was fitted to. At most
     `views_per_kind` of each are scored, evenly spread. They are rendered from the final map at the estimated poses and
     the run's working resolution, with `renderer` or the run's render settings. If the run kept its submaps, each view
-    is also rendered from the submap of its frame, as it was before the final map was made. If the run has
-    uncertainty.json and no `renderer` is given, the predictive variances are scored too. LPIPS needs its network. With
-    `full_resolution` the views are also scored at the size of the recording, else at that of the final map's last stage
-    if its images are larger than those of tracking. Calls `progress(done, total)` with views. With `mesh` the keyframes
+    is also rendered from the submap of its frame. If the run has uncertainty.json and no `renderer` is given, the
+    predictive variances are scored too. LPIPS needs its network. With `full_resolution` the views are also scored at
+    the size of the recording, else at that of the final map's last stage. Calls `progress(done, total)` with views. With `mesh` the keyframes
     are fused into mesh.ply, which is scored against `true_mesh`, in the world frame of the truth, or the true surface
     of the source; `random_views`: the number of random views for its depth (`metrics.published_reconstruction`);
     `fill_gaps_m`: score it also with gaps up to this size closed (`model.gap_filling`).
@@ -75,29 +74,26 @@ def evaluate(
     path_scores, problem = score_path(frames.path, _believed_odometry(run, frames), truth)
     known = None if problem else truth
     chosen = {kind: evenly_spread(views, views_per_kind) for kind, views in _kinds(log).items()}
-    strips, config, loops = ViewStrips(run, strips_per_kind), run.config(), run.read_loops()
+    strips, config = ViewStrips(run, strips_per_kind), run.config()
     standard, renderer = renderer is None, renderer or FieldRenderer(config.render, config.backend)
     maps = _map_sources(run, field, records, config.final)
     maps, predictions = _with_prediction(maps, run, frames, config) if standard else (maps, views.PredictionScores())
     aligned = _alignment(frames, known)
     scoring = ViewScoring(source, config.input, maps, chosen, renderer, views_per_kind, aligned, lpips)
-    metrics = _facts(run, source, records, field, loops) | score_states(run, frames, known) | path_scores
+    metrics = _facts(run, source, records, field) | score_states(run, frames, known) | path_scores
     metrics |= score_frame_sets(run, frames, known) | _score_views(scoring, config.final, predictions, strips, progress)
     metrics |= {"lpips_network": lpips.net if lpips else None, "reconstruction": None, "reconstruction_published": None}
     metrics["full_resolution"] = score_full_resolution(scoring, config, full_resolution, progress)
     if mesh:
-        surface = true_mesh or reconstruct.known_surface(source)
-        metrics |= reconstruct.fuse_and_score(
-            run, source.camera, surface, known, random_views, fill_gaps_m, renderer, progress
-        )
+        of_mesh = true_mesh or reconstruct.known_surface(source), known, random_views, fill_gaps_m, renderer, progress
+        metrics |= reconstruct.fuse_and_score(run, source.camera, *of_mesh)
     metrics["pose_covariance"] = score_pose_covariance(run, frames, known)
-    metrics["calibration"] = _calibration(run) if standard else None
+    metrics |= {"calibration": _calibration(run) if standard else None}
     metrics["test_views"] = score_test_views(scoring, config.input, strips)
     show_moving(strips, source, config.input, run.submaps, records)
     run.write_metrics(metrics)
-    plots = _draw_plots(run, frames, known, loops)
     plan = report_plan(run, frames.path, source.camera) if standard else None
-    write_page(run, metrics, strips.figures, plots, [str(problem)] if problem else [], plan)
+    write_page(run, metrics, strips.figures, _draw_plots(run, frames, known), [str(problem)] if problem else [], plan)
     if problem:
         raise problem
     return metrics
@@ -235,8 +231,9 @@ def _keeps_variance(final: FinalConfig) -> bool:
     return final.uncertainty if final.iterations else final.seed_from == "submaps"
 
 
-def _facts(run: RunFolder, source: Source, log: Log, field: GaussianField, loops: Log) -> dict[str, Any]:
+def _facts(run: RunFolder, source: Source, log: Log, field: GaussianField) -> dict[str, Any]:
     """Return counts, size and speed of the run."""
+    loops = run.read_loops()
     return {
         "source": source.name,
         "status": run.facts().get("status"),
@@ -273,7 +270,7 @@ def _worst_frame_s(log: Log) -> float | None:
     return max(map(charts.frame_seconds, log[1:]), default=0.0) or None
 
 
-def _draw_plots(run: RunFolder, frames: RunFrames, truth: Trajectory | None, loops: Log) -> dict[str, str]:
+def _draw_plots(run: RunFolder, frames: RunFrames, truth: Trajectory | None) -> dict[str, str]:
     """Draw the charts of path, states, submaps and times, and write truth.txt; return the captions by name."""
     times, estimate = frames.path.timestamps_s, frames.path.T_world_camera[:, :3, 3]
     known: NDArray[np.float64] | None = None
@@ -283,7 +280,7 @@ def _draw_plots(run: RunFolder, frames: RunFrames, truth: Trajectory | None, loo
         known = np.full_like(estimate, np.nan)
         known[rows] = aligned.T_world_camera[:, :3, 3]
     _write_truth(run, aligned)
-    return write_charts(run, charts.run_charts(frames, known, loops))
+    return write_charts(run, charts.run_charts(frames, known, run.read_loops()))
 
 
 def _write_truth(run: RunFolder, aligned: Trajectory | None) -> None:
