@@ -62,11 +62,9 @@ def evaluate(
     `full_resolution` the views are also scored at the size of the recording, else at that of the final map's last stage
     if its images are larger than those of tracking. Calls `progress(done, total)` with views. With `mesh` the keyframes
     are fused into mesh.ply, which is scored against `true_mesh`, in the world frame of the truth, or the true surface
-    of the source; `random_views`: the number of random views for its depth (`metrics.published_reconstruction`);
-    `fill_gaps_m`: score it also with gaps up to this size closed (`model.gap_filling`).
-
-    Raises RunError if the run stopped before it had a map; SourceError if truth and run share no timestamps, after
-    everything else has been written.
+    of the source, with `random_views` for its depth, and also with gaps up to `fill_gaps_m` closed. Raises
+    RunError if the run stopped before it had a map; SourceError, after everything else has been written, if truth and
+    run share no timestamps.
     """
     frames, field = _read_frames(run), run.read_map()
     records, log = frames.log, frames.posed_log()
@@ -86,10 +84,8 @@ def evaluate(
     metrics |= {"lpips_network": lpips.net if lpips else None, "reconstruction": None, "reconstruction_published": None}
     metrics["full_resolution"] = score_full_resolution(scoring, config, full_resolution, progress)
     if mesh:
-        surface = true_mesh or reconstruct.known_surface(source)
-        metrics |= reconstruct.fuse_and_score(
-            run, source.camera, surface, known, random_views, fill_gaps_m, renderer, progress
-        )
+        how = true_mesh or reconstruct.known_surface(source), known, random_views, fill_gaps_m, renderer, progress
+        metrics |= reconstruct.fuse_and_score(run, source.camera, *how)
     metrics["pose_covariance"] = score_pose_covariance(run, frames, known)
     metrics["calibration"] = _calibration(run) if standard else None
     metrics["test_views"] = score_test_views(scoring, config.input, strips)
