@@ -14,8 +14,9 @@ import numpy as np
 
 from sigmasplat.sources import SyntheticRoom
 
-stream = Enum("stream", "depth color")
-format_ = Enum("format", "z16 rgb8")
+stream = Enum("stream", "depth color infrared")
+format_ = Enum("format", "z16 rgb8 y8")
+option = Enum("option", "emitter_enabled")
 distortion = Enum(
     "distortion", "none brown_conrady inverse_brown_conrady modified_brown_conrady kannala_brandt4 ftheta"
 )
@@ -34,6 +35,8 @@ class Device:
         self.must_align = True
         self.asked: list[tuple[Any, ...]] = []
         self.serial = ""
+        self.baseline_m = 0.0
+        self.set: list[tuple[str, float]] = []
         self.started = self.stopped = 0
         self.number = 0
         self.on_frame: Callable[[int], None] = lambda number: None
@@ -42,7 +45,7 @@ class Device:
     def module(self) -> ModuleType:
         """Return the module for `import pyrealsense2`."""
         made = ModuleType("pyrealsense2")
-        names = {"stream": stream, "format": format_, "distortion": distortion}
+        names = {"stream": stream, "format": format_, "distortion": distortion, "option": option}
         for name, value in names.items():
             setattr(made, name, value)
         made.pipeline = lambda: _Pipeline(self)  # type: ignore[attr-defined]
@@ -65,8 +68,11 @@ class _Config:
     def enable_device(self, serial: str) -> None:
         self.device.serial = serial
 
-    def enable_stream(self, kind: Any, width: int, height: int, pixels: Any, framerate: int) -> None:
-        self.device.asked.append((kind.name, width, height, pixels.name, framerate))
+    def enable_stream(self, kind: Any, *mode: Any) -> None:
+        """Take (width, height, format, rate), for infrared after the number of the image, as the SDK does."""
+        *numbers, pixels, framerate = mode
+        assert len(numbers) == (3 if kind is stream.infrared else 2)
+        self.device.asked.append((kind.name, *numbers, pixels.name, framerate))
 
 
 class _Pipeline:
@@ -77,13 +83,17 @@ class _Pipeline:
         if not self.device.plugged_in:
             raise RuntimeError("No device connected")
         self.device.started += 1
-        sensor = SimpleNamespace(get_depth_scale=lambda: self.device.scale_m)
+        sensor = SimpleNamespace(
+            get_depth_scale=lambda: self.device.scale_m, supports=lambda option: True,
+            set_option=lambda option, value: self.device.set.append((option.name, value)),
+        )  # fmt: skip
         # Depth is rendered from the colour camera, so that aligning does not change it.
         same = SimpleNamespace(rotation=list(np.eye(3).T.reshape(-1)), translation=[0.0, 0.0, 0.0])
+        same.translation[0] = -self.device.baseline_m
         profile = SimpleNamespace(get_intrinsics=self.device.intrinsics, get_extrinsics_to=lambda other: same)
         return SimpleNamespace(
             get_device=lambda: SimpleNamespace(first_depth_sensor=lambda: sensor),
-            get_stream=lambda kind: SimpleNamespace(as_video_stream_profile=lambda: profile),
+            get_stream=lambda kind, number=0: SimpleNamespace(as_video_stream_profile=lambda: profile),
         )
 
     def stop(self) -> None:
@@ -119,6 +129,11 @@ class _Frames:
     def get_depth_frame(self) -> Any:
         assert self.aligned or not self.device.must_align, "depth is aligned to colour only after align.process()"
         return self._frame(np.rint(self.device.seen(self.number).depth_m / self.device.scale_m).astype(np.uint16))
+
+    def get_infrared_frame(self, side: int) -> Any:
+        room, number = self.device.room, self.number % len(self.device.room)
+        image = np.rint(room.frame(number).color * 255) if side == 1 else room.right_image(number)
+        return self._frame(np.asarray(image, np.uint8)[..., 1])
 
     def _frame(self, data: np.ndarray) -> Any:
         milliseconds = 1000.0 * self.number / 30.0

@@ -3,7 +3,7 @@
 The order of a run: open the source, start the viewer, create the run folder, run the session (`run/session.py`), score.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -25,6 +25,7 @@ from sigmasplat.errors import ConfigError
 from sigmasplat.presets import default_preset
 
 if TYPE_CHECKING:
+    from sigmasplat.checks.motion import MotionWatch
     from sigmasplat.config import Config
     from sigmasplat.io.runs import RunFolder
     from sigmasplat.robots.live import LiveRobot
@@ -260,7 +261,7 @@ def _run_and_score(
         raise KeyboardInterrupt  # the folder has no results, and no state to resume from
     if run_options.profile:
         screen.profile(folder.read_profile())
-    _warn_of_frames(screen, source, read, folder, motion.warnings())
+    _warn_at_the_end(screen, source, read, folder, motion)
     if outcome.status == "interrupted":
         _say_interrupted(screen, outcome, folder)
         return INTERRUPTED
@@ -273,17 +274,6 @@ def _run_and_score(
     if viewer:
         keep_showing(screen, viewer, folder, source)
     return OK
-
-
-def _warn_of_frames(
-    screen: "Screen", source: "Source", read: "Source", folder: "RunFolder", of_motion: Sequence[str]
-) -> None:
-    """Warn of frames that were not used, and of what spoils a map."""
-    _warn_of_skipped_frames(screen, source)
-    _warn_of_dropped_frames(screen, read)
-    _warn_if_never_recognised(screen, folder)
-    for warning in of_motion:
-        screen.warn(warning)
 
 
 @contextmanager
@@ -308,6 +298,17 @@ def _progress(
         if system:
             readers = [BetweenFrames(reader, system.between_frames) for reader in readers]
         yield CallbackList(steps, *logs, *readers)
+
+
+def _warn_at_the_end(
+    screen: "Screen", source: "Source", read: "Source", folder: "RunFolder", motion: "MotionWatch"
+) -> None:
+    """Print what was wrong with the frames."""
+    _warn_of_skipped_frames(screen, source)
+    _warn_of_dropped_frames(screen, read)
+    _warn_if_never_recognised(screen, folder)
+    for warning in motion.warnings():
+        screen.warn(warning)
 
 
 def _warn_of_skipped_frames(screen: "Screen", source: "Source") -> None:

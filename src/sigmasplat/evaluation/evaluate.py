@@ -60,13 +60,12 @@ def evaluate(
     the run's working resolution, with `renderer` or the run's render settings. If the run kept its submaps, each view
     is also rendered from the submap of its frame. If the run has uncertainty.json and no `renderer` is given, the
     predictive variances are scored too. LPIPS needs its network. With `full_resolution` the views are also scored at
-    the size of the recording, else at that of the final map's last stage. Calls `progress(done, total)` with views. With `mesh` the keyframes
-    are fused into mesh.ply, which is scored against `true_mesh`, in the world frame of the truth, or the true surface
-    of the source; `random_views`: the number of random views for its depth (`metrics.published_reconstruction`);
-    `fill_gaps_m`: score it also with gaps up to this size closed (`model.gap_filling`).
+    the size of the recording, else at that of the final map's last stage. Calls `progress(done, total)` with views. With
+    `mesh` the keyframes are fused into mesh.ply, which is scored against `true_mesh`, in the world frame of the truth,
+    or the true surface of the source, with `random_views` for its depth, and also with gaps up to `fill_gaps_m` closed.
 
-    Raises RunError if the run stopped before it had a map; SourceError if truth and run share no timestamps, after
-    everything else has been written.
+    Raises RunError if the run stopped before it had a map; SourceError, after everything else has been written, if truth and
+    run share no timestamps.
     """
     frames, field = _read_frames(run), run.read_map()
     records, log = frames.log, frames.posed_log()
@@ -85,10 +84,10 @@ def evaluate(
     metrics |= {"lpips_network": lpips.net if lpips else None, "reconstruction": None, "reconstruction_published": None}
     metrics["full_resolution"] = score_full_resolution(scoring, config, full_resolution, progress)
     if mesh:
-        of_mesh = true_mesh or reconstruct.known_surface(source), known, random_views, fill_gaps_m, renderer, progress
-        metrics |= reconstruct.fuse_and_score(run, source.camera, *of_mesh)
+        how = true_mesh or reconstruct.known_surface(source), known, random_views, fill_gaps_m, renderer, progress
+        metrics |= reconstruct.fuse_and_score(run, source.camera, *how)
     metrics["pose_covariance"] = score_pose_covariance(run, frames, known)
-    metrics |= {"calibration": _calibration(run) if standard else None}
+    metrics["calibration"] = _calibration(run) if standard else None
     metrics["test_views"] = score_test_views(scoring, config.input, strips)
     show_moving(strips, source, config.input, run.submaps, records)
     run.write_metrics(metrics)

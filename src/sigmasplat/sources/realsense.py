@@ -3,6 +3,7 @@
 "realsense" or "realsense:width=848,height=480,fps=30,serial=012345678901". Intrinsics, lens distortion and depth unit
 come from the device. The SDK moves depth to the colour camera's pixels, but keeps the distances along the axis of the
 depth camera, which differ by some millimetres. With input.register_depth=on depth is registered exactly, but slower.
+With "realsense:stereo=1" the projector is off, and depth is computed here from the two infrared images.
 """
 
 import weakref
@@ -22,10 +23,14 @@ from sigmasplat.model.frame_arrays import color_from_bytes
 from sigmasplat.model.resizing import resized_color
 from sigmasplat.sources.camera.calibration import Calibration, Distortion, resolve_calibration
 from sigmasplat.sources.camera.rectification import Rectification
+from sigmasplat.sources.camera.stereo import StereoMatcher, StereoRectification
+from sigmasplat.sources.camera.stereo_cameras import StereoCameras
 from sigmasplat.sources.files.optional import import_optional
 from sigmasplat.sources.live import LiveSource
 from sigmasplat.sources.opening import Format
 
+Images = tuple[NDArray[np.float32], NDArray[np.float32]]
+"""Colour [H, W, 3] and depth in metres [H, W]."""
 OPTIONS = {"width": 640, "height": 480, "fps": 30}
 TIMEOUT_MS = 5000
 WARM_UP_FRAMES = 15
@@ -35,42 +40,29 @@ WARM_UP_FRAMES = 15
 class RealSense(LiveSource):
     """A RealSense camera that is running."""
 
-    def __init__(self, sdk: Any, pipeline: Any, profile: Any, settings: InputConfig) -> None:
-        """Read the calibration. Raises SourceError if the settings need more than the camera provides."""
-        scale_m = float(profile.get_device().first_depth_sensor().get_depth_scale())
-        color, depth = (
-            profile.get_stream(kind).as_video_stream_profile() for kind in (sdk.stream.color, sdk.stream.depth)
-        )
-        camera, lens = _optics(sdk, color.get_intrinsics())
-        recorded = Calibration(camera, round(1.0 / scale_m, 3), lens)
-        size = (camera.width, camera.height)
-        calibration = resolve_calibration(Path("realsense"), recorded, size, settings, recorded.depth_units_per_metre)
-        if settings.register_depth == "on" and not settings.calibration:
-            depth_camera, depth_lens = _optics(sdk, depth.get_intrinsics())
-            T = _transform(depth.get_extrinsics_to(color))
-            calibration = replace(calibration, depth_camera=depth_camera, depth_distortion=depth_lens, T_color_depth=T)
-        self._rectified = Rectification("realsense", calibration, settings)
-        super().__init__("realsense", self._rectified.camera, settings)
-        self.depth_units_per_metre: float = calibration.depth_units_per_metre
-        self._sdk, self._pipeline = sdk, pipeline
+    def __init__(self, pipeline: Any, images: "DepthImages | InfraredImages", settings: InputConfig) -> None:
+        """images: turns what the SDK delivers into colour and depth."""
+        super().__init__("realsense", images.camera, settings)
+        self.depth_units_per_metre = images.depth_units_per_metre
+        self.computed_depth, self.depth_noise_per_m = images.computed, images.noise_per_m
+        self._images, self._pipeline = images, pipeline
         self._stop = weakref.finalize(self, pipeline.stop)
 
     def captured(self) -> Iterator[Frame]:
         """Yield the newest frame repeatedly. Raises SourceError if no frame arrives at all."""
-        align = self._sdk.align(self._sdk.stream.color)
         last: int | None = None
         index = 0
         try:
             for frames in self._framesets():
-                pair = frames if self._rectified.moves_depth else align.process(frames)
-                color, depth = pair.get_color_frame(), pair.get_depth_frame()
-                # If only depth is new, the SDK repeats the last colour image.
-                if not color or not depth or color.get_frame_number() == last:
+                first, second = self._images.pair(frames)
+                # If only one of both is new, the SDK repeats the other one.
+                if not first or not second or first.get_frame_number() == last:
                     continue
-                number = color.get_frame_number()
+                number = first.get_frame_number()
                 self.dropped += max(number - last - 1, 0) if last is not None else 0
                 last = number
-                yield self._to_frame(index, color, depth)
+                rgb, depth_m = self._images.read(first, second)
+                yield Frame(index, float(first.get_timestamp()) / 1000.0, rgb, depth_m, self.camera)
                 index += 1
         finally:
             self._stop()
@@ -91,12 +83,73 @@ class RealSense(LiveSource):
             if count > WARM_UP_FRAMES:
                 yield frames
 
-    def _to_frame(self, index: int, color: Any, depth: Any) -> Frame:
+
+class DepthImages:
+    """Colour, and depth that the camera computes: aligned by the SDK, or registered here."""
+
+    computed, noise_per_m = False, None
+
+    def __init__(self, sdk: Any, profile: Any, settings: InputConfig) -> None:
+        """Read the calibration. Raises SourceError if the settings need more than the camera provides."""
+        scale_m = float(profile.get_device().first_depth_sensor().get_depth_scale())
+        color, depth = (
+            profile.get_stream(kind).as_video_stream_profile() for kind in (sdk.stream.color, sdk.stream.depth)
+        )
+        camera, lens = _optics(sdk, color.get_intrinsics())
+        recorded = Calibration(camera, round(1.0 / scale_m, 3), lens)
+        size = (camera.width, camera.height)
+        calibration = resolve_calibration(Path("realsense"), recorded, size, settings, recorded.depth_units_per_metre)
+        if settings.register_depth == "on" and not settings.calibration:
+            depth_camera, depth_lens = _optics(sdk, depth.get_intrinsics())
+            T = _transform(depth.get_extrinsics_to(color))
+            calibration = replace(calibration, depth_camera=depth_camera, depth_distortion=depth_lens, T_color_depth=T)
+        self._rectified = Rectification("realsense", calibration, settings)
+        self.camera = self._rectified.camera
+        self.depth_units_per_metre: float | None = calibration.depth_units_per_metre
+        self._align = sdk.align(sdk.stream.color)
+
+    def pair(self, frames: Any) -> tuple[Any, Any]:
+        """Return colour and depth of a set of frames."""
+        both = frames if self._rectified.moves_depth else self._align.process(frames)
+        return both.get_color_frame(), both.get_depth_frame()
+
+    def read(self, color: Any, depth: Any) -> Images:
+        """Return the images of a pair."""
         pixels = color_from_bytes(np.array(color.get_data(), np.uint8))
         units = np.asarray(depth.get_data()).astype(np.float32)
-        rgb, depth_m = self._rectified(pixels, units / np.float32(self.depth_units_per_metre))
-        rgb = resized_color(rgb, self.camera.width, self.camera.height)
-        return Frame(index, float(color.get_timestamp()) / 1000.0, rgb, depth_m, self.camera)
+        rgb, depth_m = self._rectified(pixels, units / np.float32(self.depth_units_per_metre or 1.0))
+        return resized_color(rgb, self.camera.width, self.camera.height), depth_m
+
+
+class InfraredImages:
+    """The left and the right infrared image, from which depth is computed here (`sources.camera.stereo`)."""
+
+    computed = True
+
+    def __init__(self, sdk: Any, profile: Any, settings: InputConfig) -> None:
+        """Read the calibration, and switch off the projector, whose dots move with the camera."""
+        left, right = (profile.get_stream(sdk.stream.infrared, side).as_video_stream_profile() for side in (1, 2))
+        (camera, lens), (other, other_lens) = (_optics(sdk, stream.get_intrinsics()) for stream in (left, right))
+        cameras = StereoCameras(camera, other, _transform(left.get_extrinsics_to(right)), lens, other_lens)
+        self._rectification = StereoRectification.of(cameras)
+        self.camera = self._rectification.camera
+        self._matcher = StereoMatcher(self.camera, self._rectification.baseline_m, settings)
+        self.depth_units_per_metre: float | None = None
+        self.noise_per_m = self._matcher.noise_per_m
+        sensor = profile.get_device().first_depth_sensor()
+        if sensor.supports(sdk.option.emitter_enabled):
+            sensor.set_option(sdk.option.emitter_enabled, 0)
+
+    def pair(self, frames: Any) -> tuple[Any, Any]:
+        """Return the left and the right image of a set of frames."""
+        return frames.get_infrared_frame(1), frames.get_infrared_frame(2)
+
+    def read(self, left: Any, right: Any) -> Images:
+        """Return the left image, gray, and its depth."""
+        r = self._rectification
+        gray = [np.repeat(np.array(image.get_data(), np.uint8)[..., None], 3, axis=2) for image in (left, right)]
+        seen = r.left(gray[0])
+        return color_from_bytes(seen), self._matcher.depth_and_std_m(seen, r.right(gray[1]))[0]
 
 
 def open_realsense(text: str, settings: InputConfig) -> RealSense:
@@ -107,8 +160,12 @@ def open_realsense(text: str, settings: InputConfig) -> RealSense:
     if options["serial"]:
         wanted.enable_device(options["serial"])
     width, height, fps = (options[key] for key in OPTIONS)
-    wanted.enable_stream(sdk.stream.depth, width, height, sdk.format.z16, fps)
-    wanted.enable_stream(sdk.stream.color, width, height, sdk.format.rgb8, fps)
+    if options["stereo"]:
+        for side in (1, 2):
+            wanted.enable_stream(sdk.stream.infrared, side, width, height, sdk.format.y8, fps)
+    else:
+        wanted.enable_stream(sdk.stream.depth, width, height, sdk.format.z16, fps)
+        wanted.enable_stream(sdk.stream.color, width, height, sdk.format.rgb8, fps)
     try:
         profile = pipeline.start(wanted)
     except RuntimeError as error:
@@ -117,7 +174,8 @@ def open_realsense(text: str, settings: InputConfig) -> RealSense:
             "close other programs that use it, or try realsense:width=848,height=480,fps=30"
         ) from error
     try:
-        return RealSense(sdk, pipeline, profile, settings)
+        images = (InfraredImages if options["stereo"] else DepthImages)(sdk, profile, settings)
+        return RealSense(pipeline, images, settings)
     except BaseException:
         pipeline.stop()
         raise
@@ -125,12 +183,13 @@ def open_realsense(text: str, settings: InputConfig) -> RealSense:
 
 def _parsed(text: str) -> dict[str, Any]:
     """Read the options after the colon. Raises SourceError on an unknown option."""
-    options: dict[str, Any] = {**OPTIONS, "serial": ""}
+    options: dict[str, Any] = {**OPTIONS, "stereo": 0, "serial": ""}
     for part in filter(None, text.partition(":")[2].split(",")):
         key, _, value = (word.strip() for word in part.partition("="))
-        if key not in options or not value or (key in OPTIONS and not (value.isdecimal() and int(value))):
+        wrong = (key in OPTIONS and not (value.isdecimal() and int(value))) or (key == "stereo" and value not in "01")
+        if key not in options or not value or wrong:
             raise SourceError(f"realsense: unknown option {part!r}; the options are {', '.join(options)}")
-        options[key] = int(value) if key in OPTIONS else value
+        options[key] = value if key == "serial" else int(value)
     return options
 
 
@@ -144,7 +203,7 @@ def _optics(sdk: Any, intrinsics: Any) -> tuple[Camera, Distortion | None]:
         return camera, None
     if intrinsics.model not in known:
         raise SourceError(
-            f"realsense: lens model {intrinsics.model} of the colour camera is not supported; give --calibration FILE"
+            f"realsense: lens model {intrinsics.model} of the camera is not supported; give --calibration FILE"
         )
     return camera, values
 
