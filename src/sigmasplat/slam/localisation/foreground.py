@@ -6,6 +6,7 @@ view saw through.
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,6 +65,24 @@ class Earlier:
 
     depth_m: Depth
     T_earlier_live: Matrix
+    known_range: tuple[Depth, Depth] | None = None
+
+    @property
+    def range_m(self) -> tuple[Depth, Depth]:
+        """Return the least and the largest reading around each pixel (`range_of`)."""
+        return range_of(self.depth_m) if self.known_range is None else self.known_range
+
+
+def range_of(depth_m: Depth) -> tuple[Depth, Depth]:
+    """Return the least (inf without any) and the largest reading (0 without any) in a window around each pixel."""
+    near = minimum_filter(np.where(depth_m > 0, depth_m, np.float32(np.inf)), AROUND_PX)
+    return near, maximum_filter(depth_m, AROUND_PX)
+
+
+@lru_cache(maxsize=8)
+def coarse_rays(camera: Camera, step: int) -> Matrix:
+    """Return the rays of every `step`-th row and column of a camera [h, w, 3], float64."""
+    return camera.rays()[::step, ::step].astype(np.float64)
 
 
 def foreground(
@@ -173,9 +192,8 @@ def _places(
     """Return which pixels of every `step`-th row and column are in places that were free, which are where something was
     in front already, and which are on surfaces of the scene."""
     v, u = np.nonzero(depth > 0)
-    points = camera.rays()[step * v, step * u].T.astype(np.float64) * depth[v, u]
-    near = minimum_filter(np.where(scene.depth_m > 0, scene.depth_m, np.float32(np.inf)), AROUND_PX)
-    far = maximum_filter(scene.depth_m, AROUND_PX)
+    points = coarse_rays(camera, step)[v, u].T * depth[v, u]
+    near, far = scene.range_m
     inside, row, column, z = projected(points, camera, scene.T_earlier_live)
     known, limit = inside & (far[row, column] > 0), clear_m + CLEAR_RELATIVE * z
     places = np.zeros((3, *depth.shape), bool)
@@ -193,10 +211,9 @@ def seen_again(scene: Earlier, depth: Depth, camera: Camera, step: int) -> tuple
     """Return which pixels of every `step`-th row and column [h, w], m, are in places that an earlier image shows, and
     which of these are on a surface of it."""
     v, u = np.nonzero(depth > 0)
-    points = camera.rays()[step * v, step * u].T.astype(np.float64) * depth[v, u]
+    points = coarse_rays(camera, step)[v, u].T * depth[v, u]
     inside, row, column, z = projected(points, camera, scene.T_earlier_live)
-    near = minimum_filter(np.where(scene.depth_m > 0, scene.depth_m, np.float32(np.inf)), AROUND_PX)[row, column]
-    far, limit = maximum_filter(scene.depth_m, AROUND_PX)[row, column], CLEAR_M + CLEAR_RELATIVE * z
+    (near, far), limit = (plane[row, column] for plane in scene.range_m), CLEAR_M + CLEAR_RELATIVE * z
     known, same = np.zeros((2, *depth.shape), bool)
     known[v, u] = inside & (far > 0) & (z < far + limit)  # what is farther was hidden
     same[v, u] = known[v, u] & (z > near - limit)

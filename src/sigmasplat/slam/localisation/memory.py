@@ -1,7 +1,7 @@
 """Remember what recent frames saw, to notice what moves too slowly to show against the newest keyframe."""
 
 from dataclasses import dataclass, replace
-from functools import reduce
+from functools import cached_property
 
 import numpy as np
 from scipy.ndimage import label, maximum_filter
@@ -15,6 +15,7 @@ from sigmasplat.slam.localisation.foreground import (
     Foreground,
     enlarged,
     foreground,
+    range_of,
     seen_again,
     smooth,
 )
@@ -22,8 +23,9 @@ from sigmasplat.types import Matrix
 
 EVERY = 5
 """Every fifth frame is remembered."""
-AGES = (3, 6)
-"""A frame is compared with the remembered ones of these places, counted from the newest one."""
+AGES, LOOK_EVERY = (3, 6), 2
+"""Every second frame is compared with a remembered one, at these places in turn, counted from the newest one. What was
+in front in the last frame is found without it."""
 COLUMNS_TESTED = 80
 """About so many columns of an image are tested."""
 AT_REST, KNOWN = 0.85, 0.3
@@ -39,6 +41,11 @@ class Seen:
     depth_m: Depth
     scene_m: Depth
     T_world_camera: Matrix
+
+    @cached_property
+    def scene_range_m(self) -> tuple[Depth, Depth]:
+        """Return the range of depth with what is behind moving things, around each pixel (`range_of`)."""
+        return range_of(self.scene_m)
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,15 +69,17 @@ class Memory:
         return replace(self, seen=tuple(replace(s, T_world_camera=T_new_old @ s.T_world_camera) for s in self.seen))
 
     def in_front(self, depth_m: Depth, T_world_camera: Matrix, camera: Camera, most_frames: int) -> Foreground | None:
-        """Find what is in places that a remembered frame, at most `most_frames` old (0 = any), saw to be free."""
-        chosen = {max(len(self.seen) - age, 0) for age in AGES} if self.seen else set[int]()
-        found = []
-        for earlier in (self.seen[place] for place in sorted(chosen)):
-            if most_frames and self.frames - earlier.number > most_frames:
-                continue
-            scene = Earlier(earlier.scene_m, se3.inverse(earlier.T_world_camera) @ T_world_camera)
-            found.append(foreground(scene, None, depth_m, camera, whole_objects=True, step=_step(camera)))
-        return reduce(together, found, None)
+        """Find what is in places that a remembered frame, at most `most_frames` old (0 = any), saw to be free; None in
+        the frames that are not compared."""
+        turn, rest = divmod(self.frames, LOOK_EVERY)
+        if rest or not self.seen:
+            return None
+        earlier = self.seen[max(len(self.seen) - AGES[turn % len(AGES)], 0)]
+        if most_frames and self.frames - earlier.number > most_frames:
+            return None
+        T_earlier_live = se3.inverse(earlier.T_world_camera) @ T_world_camera
+        scene = Earlier(earlier.scene_m, T_earlier_live, earlier.scene_range_m)
+        return foreground(scene, None, depth_m, camera, whole_objects=True, step=_step(camera))
 
     def still_moving(
         self, front: Foreground, depth_m: Depth, T_world_camera: Matrix, camera: Camera, frames: int
