@@ -60,12 +60,11 @@ def evaluate(
     the run's working resolution, with `renderer` or the run's render settings. If the run kept its submaps, each view
     is also rendered from the submap of its frame. If the run has uncertainty.json and no `renderer` is given, the
     predictive variances are scored too. LPIPS needs its network. With `full_resolution` the views are also scored at
-    the size of the recording, else at that of the final map's last stage. Calls `progress(done, total)` with views. With
-    `mesh` the keyframes are fused into mesh.ply, which is scored against `true_mesh`, in the world frame of the truth,
-    or the true surface of the source, with `random_views` for its depth, and also with gaps up to `fill_gaps_m` closed.
-
-    Raises RunError if the run stopped before it had a map; SourceError, after everything else has been written, if truth and
-    run share no timestamps.
+    the size of the recording, else at that of the final map's last stage. Calls `progress(done, total)` with views.
+    With `mesh` the keyframes are fused into mesh.ply, which is scored against `true_mesh`, in the world frame of the
+    truth, or the source's true surface, with `random_views` for its depth, and also with gaps up to `fill_gaps_m`
+    closed. Raises RunError if the run stopped before it had a map; SourceError if truth and run share no timestamps,
+    after everything else has been written.
     """
     frames, field = _read_frames(run), run.read_map()
     records, log = frames.log, frames.posed_log()
