@@ -23,6 +23,8 @@ from sigmasplat.io import machine
 from sigmasplat.io.atomic import write_text
 from sigmasplat.io.machine import INSTALLED, code_digest
 from sigmasplat.presets import preset as preset_of
+from sigmasplat.reading.files import read_text
+from sigmasplat.reading.guard import guarded
 
 if TYPE_CHECKING:
     from sigmasplat.run.terminal import Screen
@@ -181,13 +183,14 @@ def _key(run: Mapping[str, Any]) -> tuple[str, str, int]:
 
 def _read(path: Path) -> dict[str, Any]:
     """Read the file of an ablation. Raises RunError if it cannot be read or is another file."""
-    from sigmasplat.io.json_files import read_json
     from sigmasplat.io.run_values import are_numbers, check_fields, is_kind, is_number, is_whole  # loads torch
 
     text = is_kind(str)
     stored = {"source": text, "path": text, "variant": text, "seed": is_whole, "wall_s": is_number,
               "figures": are_numbers}  # fmt: skip
-    found = read_json(path)
+    content = read_text(path, RunError)
+    with guarded(path, "give another --out", RunError):
+        found = json.loads(content)
     if not isinstance(found, dict) or found.get("made_by") != MADE_BY or not isinstance(found.get("runs"), list):
         raise RunError(f"{path} is not a file of sigmasplat bench ablation; give another --out")
     for number, run in enumerate(found["runs"], 1):
