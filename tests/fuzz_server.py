@@ -25,7 +25,7 @@ REFUSED, HARMLESS, TRACEBACK, HANG, MEMORY = "refused", "harmless", "traceback",
 FAILURES = (TRACEBACK, HANG, MEMORY)
 MOST_S, MOST_BYTES = 10.0, 1 << 30
 CRASHED = 70
-USAGE = "For full helptext, run sigmasplat"
+USAGE = "For full helptext, "
 """The end of what is printed if options are unknown or lack their value: a box with the reason."""
 FINE = {0, 1}
 """Exit codes of commands that have used the input: 1 means that they warn, or find no image."""
