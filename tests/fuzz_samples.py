@@ -1,6 +1,7 @@
 """Small valid inputs of every format, as files in memory, with the commands that read them."""
 
 import json
+import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -14,9 +15,12 @@ import recordings
 from bag_recordings import Recorder, aligned
 from command_line import exit_code
 from room_run import made_run
+from sigmasplat.batch.job import Job
+from sigmasplat.commands.options import DEFAULT_INPUT_OPTIONS, configured
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.io.splats import compressed_ply, gltf, ply, sog, splat, spz
 from sigmasplat.model.field import GaussianField
+from sigmasplat.presets.table_files import TABLES
 from sigmasplat.run.resume import StateFile
 
 Files = dict[str, bytes]
@@ -59,7 +63,49 @@ OF_FINISHED = (
     ("export", INPUT, "--format", "plan", "--out", f"{OUT}.png"),
     ("export", INPUT, "--format", "covariance", "--out", OUT),
     ("localise", "synthetic:frames=1", "--in", INPUT),
+    ("view", INPUT, "--port", "0"),
 )
+ROOM = "synthetic:frames=3,width=48,height=36"
+OPTIONS = """--limit
+2
+--stride
+1
+--start
+0
+--end
+9.5
+--hold-out
+2
+--fx
+40
+--cx
+24
+--depth-scale
+1
+--seed
+1
+--save-every
+5.5
+--set
+input.width=32
+--set
+input.max_depth_m=8.5
+--set
+mapping.every=1
+--set
+tracking.tau=3
+--set
+loops.near_m=0.5
+--set
+submaps.frames=2
+--set
+seeding.opacity=0.5
+--calibration
+INPUT
+--register-depth
+auto
+"""
+"""Options of `run`, one word per line. None of them makes a run of two frames long."""
 
 
 def samples(folder: Path) -> Iterator[Sample]:
@@ -78,6 +124,7 @@ def samples(folder: Path) -> Iterator[Sample]:
     yield from _bags(folder)
     yield from _maps(folder)
     yield from _runs(folder)
+    yield from _studies(folder)
 
 
 def _sample(name: str, place: Path, entry: Path, commands: tuple[tuple[str, ...], ...], weight: float = 1.0) -> Sample:
@@ -147,3 +194,32 @@ def _runs(folder: Path) -> Iterator[Sample]:
     RunFolder(path).note(status="complete")
     (path / "images/view.png").write_bytes(b"")  # a sample has no empty folders
     yield _sample("finished", place, path, OF_FINISHED, 1.0)
+
+
+def _studies(folder: Path) -> Iterator[Sample]:
+    """Make the files of commands that make many runs, and options. Their runs are finished, or their scenes missing."""
+    place = folder / "options"
+    layouts.save_text(place / "calibration.json", json.dumps(asdict(layouts.SMALL_CAMERA) | {"depth_scale": 1}))
+    layouts.save_text(place / "options.txt", OPTIONS)
+    words = ("run", ROOM, "--out", OUT, "--no-eval", *QUICK, "@options.txt")
+    yield _sample("options", place, place / "calibration.json", (words,))
+    place = folder / "ablation"
+    metrics = {"ate": {"rmse_m": 0.01}, "held_out": {"psnr_db": 20.0}, "lost": 0, "frames_per_s": 9.0}
+    given = ("--seeds", "1", "--limit", "2", *QUICK, "--out")
+    place.mkdir()
+    with mock.patch("sigmasplat.commands.bench.run_job", lambda job, run, screen: metrics):
+        assert exit_code("bench", "ablation", ROOM, *given, str(place / "study.json")) == 0
+    yield _sample("ablation", place, place / "study.json", (("bench", "ablation", ROOM, *given, INPUT),), 0.5)
+    place = folder / "table"
+    text = (TABLES / "cgslam-ablation.toml").read_text(encoding="utf-8")
+    layouts.save_text(place / "table.toml", text)
+    table = ("bench", "table", INPUT, "--data", f"{INPUT}/..", "--out", OUT)
+    yield _sample("table", place, place / "table.toml", (table,), 0.5)
+    name = "synthetic-frames-3-width-48-height-36"
+    run = RunFolder(folder / "batch" / name)
+    shutil.copytree(folder / "resumed" / "walk", run.path)
+    config = configured("sigma", tuple(word for word in QUICK if word != "--set"), None, DEFAULT_INPUT_OPTIONS)
+    run.note(status="complete", batch=Job(name, (ROOM,), config).facts() | {"scored": True})
+    run.write_metrics(metrics | {"frames": 3})
+    command = ("batch", ROOM, "--out", f"{INPUT}/..", *QUICK)
+    yield _sample("batch", folder / "batch", run.path, (command,), 0.3)

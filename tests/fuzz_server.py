@@ -10,11 +10,13 @@ import resource
 import shutil
 import signal
 import sys
+import threading
 import time
 import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from fuzz_mutations import Files, write_files
 from fuzz_samples import INPUT, OUT, Sample
@@ -23,6 +25,8 @@ REFUSED, HARMLESS, TRACEBACK, HANG, MEMORY = "refused", "harmless", "traceback",
 FAILURES = (TRACEBACK, HANG, MEMORY)
 MOST_S, MOST_BYTES = 10.0, 1 << 30
 CRASHED = 70
+USAGE = "For full helptext, "
+"""The end of what is printed if options are unknown or lack their value: a box with the reason."""
 FINE = {0, 1}
 """Exit codes of commands that have used the input: 1 means that they warn, or find no image."""
 
@@ -64,10 +68,30 @@ def run_files(sample: Sample, files: Files, command: Sequence[str], folder: Path
     place.mkdir(parents=True)
     try:
         write_files(place, files)
-        words = [word.replace(INPUT, str(place / sample.entry)).replace(OUT, str(folder / "out")) for word in command]
+        words = [w for word in command for w in (_lines(place / word[1:]) if word.startswith("@") else [word])]
+        words = [word.replace(INPUT, str(place / sample.entry)).replace(OUT, str(folder / "out")) for word in words]
         return run_command(words, folder)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+
+
+def _lines(path: Path) -> list[str]:
+    """Return the lines of a file of options as a shell passes them: no NUL."""
+    return path.read_text(errors="surrogateescape").replace("\0", "").splitlines() if path.is_file() else []
+
+
+def _show_once() -> None:
+    """Make `view` end when it has shown a run, as with Ctrl-C."""
+    from sigmasplat.viewer import finished
+
+    follow = finished.follow_run
+
+    def follow_once(run: Any, show: Any, stop: threading.Event, source: Any = None) -> None:
+        stop.set()
+        follow(run, show, stop, source)
+        raise KeyboardInterrupt
+
+    finished.follow_run = follow_once
 
 
 def run_command(arguments: Sequence[str], folder: Path) -> Ending:
@@ -101,7 +125,7 @@ def _kind(code: int, error: str, slow: bool, peak: int) -> str:
     if peak > MOST_BYTES:
         return MEMORY
     lines = [line for line in error.splitlines() if line.startswith("sigmasplat: ")]
-    if code == 2 and len(lines) == 1 and "Traceback" not in error:
+    if code == 2 and (len(lines) == 1 or USAGE in error) and "Traceback" not in error:
         return REFUSED
     return HARMLESS if code in FINE and "Traceback" not in error else TRACEBACK
 
@@ -116,7 +140,7 @@ def _run_in_child(arguments: Sequence[str], errors: Path, folder: Path) -> None:
         os.dup2(null, 0)
         os.dup2(null, 1)
         os.dup2(file, 2)
-        sys.stdout, sys.stderr = open(1, "w", closefd=False), open(2, "w", closefd=False)  # noqa: SIM115
+        sys.stdout, sys.stderr = open(1, "w", closefd=False), open(2, "w", errors="backslashreplace", closefd=False)  # noqa: SIM115
         before = _status("VmRSS")
         with open("/proc/self/clear_refs", "w") as reset:  # 5: the peak starts again
             reset.write("5")
@@ -125,6 +149,8 @@ def _run_in_child(arguments: Sequence[str], errors: Path, folder: Path) -> None:
         resource.setrlimit(resource.RLIMIT_CPU, (int(MOST_S) + 2, int(MOST_S) + 4))
         from sigmasplat import cli
 
+        if arguments[:1] == ["view"]:
+            _show_once()
         try:
             cli.main(arguments)
         except SystemExit as left:

@@ -1,18 +1,21 @@
 """The definition of a table: scenes, systems, scores and published numbers. The format: docs/tables.md."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, get_args, get_origin, get_type_hints
 
 from sigmasplat.batch.job import Job
 from sigmasplat.config import Config
 from sigmasplat.config.text import nearest, override
 from sigmasplat.errors import ConfigError
+from sigmasplat.io.run_values import MOST_NUMBER
 from sigmasplat.presets import list_presets, preset
 from sigmasplat.presets.table_files import read_table
+from sigmasplat.reading.guard import guarded
 
 MEAN = "mean"
 """The name of the column with the mean over scenes."""
+MOST_DIGITS = 15
 
 
 @dataclass(frozen=True)
@@ -47,6 +50,10 @@ class Score:
     digits: int = 2
     better: str = "less"
 
+    def __post_init__(self) -> None:
+        if isinstance(self.digits, int) and not 0 <= self.digits <= MOST_DIGITS:
+            raise ValueError(f"score {self.name!r} has {self.digits} digits, allowed are 0 to {MOST_DIGITS}")
+
     @property
     def title(self) -> str:
         """Return name, unit, and an arrow in the better direction."""
@@ -59,7 +66,7 @@ class Score:
             found: Any = record
             for part in key.split("."):
                 found = found.get(part) if isinstance(found, Mapping) else None
-            if isinstance(found, int | float):
+            if isinstance(found, int | float) and abs(found) <= MOST_NUMBER:
                 return self.factor * found
         return None
 
@@ -92,14 +99,12 @@ class Table:
     def read(name: str) -> "Table":
         """Read a definition. Raises ConfigError if it is unknown or not valid."""
         values = read_table(name)
-        try:
-            parts = {"scenes": Scene, "systems": System, "scores": Score, "published": Published}
+        parts = {"scenes": Scene, "systems": System, "scores": Score, "published": Published}
+        with guarded(f"table {name}", "docs/tables.md shows a definition", ConfigError, "not valid"):
             built: dict[str, Any] = {
-                key: tuple(kind(**row) for row in values.pop(key, [])) for key, kind in parts.items()
+                key: tuple(_typed(kind(**row)) for row in values.pop(key, [])) for key, kind in parts.items()
             }
-            table = Table(name=name.rpartition("/")[2].removesuffix(".toml"), **built, **values)
-        except TypeError as problem:
-            raise ConfigError(f"table {name} is not valid: {problem}") from problem
+            table: Table = _typed(Table(name=name.rpartition("/")[2].removesuffix(".toml"), **built, **values))
         known, scenes = {score.name for score in table.scores}, {scene.name for scene in table.scenes} | {MEAN}
         for published in table.published:
             strange = [
@@ -163,3 +168,25 @@ class Cell:
     system: str
     seed: int
     job: Job
+
+
+def _typed(part: Any) -> Any:
+    """Return a part of a definition. Raises TypeError if a value is not of the type of its field."""
+    hints = get_type_hints(type(part))
+    for each in fields(part):
+        if not _fits(value := getattr(part, each.name), hints[each.name]):
+            raise TypeError(f"{each.name} of a {type(part).__name__.lower()} cannot be {value!r:.60}")
+    return part
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    """Return whether a value from TOML has a type; numbers of a size that formats and products can take."""
+    parts = get_args(hint)
+    if get_origin(hint) is Mapping:
+        return isinstance(value, dict) and all(_fits(item, parts[1]) for item in value.values())
+    if get_origin(hint) is Sequence:
+        return isinstance(value, list | tuple) and all(_fits(item, parts[0]) for item in value)
+    if hint is float or hint is int:
+        allowed = int | float if hint is float else int
+        return isinstance(value, allowed) and not isinstance(value, bool) and 0 <= abs(value) <= MOST_NUMBER
+    return isinstance(value, hint)

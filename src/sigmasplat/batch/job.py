@@ -10,6 +10,7 @@ from typing import Any
 import sigmasplat
 from sigmasplat.config import Config
 from sigmasplat.errors import SigmaSplatError, SourceError
+from sigmasplat.io.json_files import read_json
 from sigmasplat.io.machine import INSTALLED, code_digest
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.run.scene import config_of_facts
@@ -58,13 +59,21 @@ class Job:
         facts = _facts(folder)
         if not facts:
             return False
-        noted = facts.get(FACT, {})
+        noted = facts.get(FACT)
         try:
-            settings = json.loads((folder / "config.json").read_text(encoding="utf-8"))
-        except (OSError, ValueError):
+            settings = read_json(folder / "config.json")
+        except SigmaSplatError:
             return False
+<<<<<<< HEAD
         used = config_of_facts(facts, self.config, self.given)
         return self.facts().items() <= noted.items() and bool(settings == json.loads(json.dumps(used.to_dict())))
+=======
+        return (
+            isinstance(noted, dict)
+            and self.facts().items() <= noted.items()
+            and bool(settings == json.loads(json.dumps(self.config.to_dict())))
+        )
+>>>>>>> ae86cff51b5af521ebb30003fdcae49d0e85c912
 
     def finished_in(self, folder: Path) -> bool:
         """Return whether a folder has the complete, scored run of this job."""

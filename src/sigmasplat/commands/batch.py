@@ -75,19 +75,20 @@ def _show(screen: "Screen", made: "Batch") -> None:
     """Print the main figures of every finished run."""
     from rich.table import Table
 
+    from sigmasplat.batch.definition import Score
     from sigmasplat.io.runs import RunFolder
     from sigmasplat.report.tables import number
 
-    table = Table("run", "frames", "lost", "ATE RMSE, cm", "PSNR, dB", "frames/s")
+    shown = (
+        Score("frames", ("frames",), digits=0), Score("lost", ("lost",), digits=0),
+        Score("ATE RMSE, cm", ("ate.rmse_m",), factor=100.0),
+        Score("PSNR, dB", ("held_out.psnr_db", "training.psnr_db")), Score("frames/s", ("frames_per_s",)),
+    )  # fmt: skip
+    table = Table("run", *(score.name for score in shown))
     for column in table.columns[1:]:
         column.justify = "right"
     for job in made.finished():
         metrics = RunFolder(made.out / job.name).read_metrics()
-        table.add_row(
-            job.name, str(metrics["frames"]), str(metrics["lost"]),
-            number((metrics["ate"] or {}).get("rmse_m"), 2, 100.0),
-            number(((metrics["held_out"] or metrics["training"]) or {}).get("psnr_db"), 2),
-            number(metrics["frames_per_s"], 2),
-        )  # fmt: skip
+        table.add_row(job.name, *(number(score.value(metrics), score.digits) for score in shown))
     screen.out.print(table)
     screen.say(f"{len(made.finished())} of {len(made.jobs)} runs: {made.out}")

@@ -23,6 +23,8 @@ from sigmasplat.io import machine
 from sigmasplat.io.atomic import write_text
 from sigmasplat.io.machine import INSTALLED, code_digest
 from sigmasplat.presets import preset as preset_of
+from sigmasplat.reading.files import read_text
+from sigmasplat.reading.guard import guarded
 
 if TYPE_CHECKING:
     from sigmasplat.run.terminal import Screen
@@ -187,12 +189,18 @@ def _key(run: Mapping[str, Any]) -> tuple[str, str, int]:
 
 def _read(path: Path) -> dict[str, Any]:
     """Read the file of an ablation. Raises RunError if it cannot be read or is another file."""
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as problem:
-        raise RunError(f"cannot read {path}: {problem}; give another --out") from problem
+    from sigmasplat.io.run_values import are_numbers, check_fields, is_kind, is_number, is_whole  # loads torch
+
+    text = is_kind(str)
+    stored = {"source": text, "path": text, "variant": text, "seed": is_whole, "wall_s": is_number,
+              "figures": are_numbers}  # fmt: skip
+    content = read_text(path, RunError)
+    with guarded(path, "give another --out", RunError):
+        found = json.loads(content)
     if not isinstance(found, dict) or found.get("made_by") != MADE_BY or not isinstance(found.get("runs"), list):
         raise RunError(f"{path} is not a file of sigmasplat bench ablation; give another --out")
+    for number, run in enumerate(found["runs"], 1):
+        check_fields(run, stored, tuple(stored), f"{path}: run {number}")
     return found
 
 

@@ -66,14 +66,14 @@ def figures_of(metrics: Mapping[str, Any]) -> dict[str, float | None]:
 
 def columns(runs: Sequence[Run]) -> list[Figure]:
     """List the figures to show; if no final map was refined, there is one PSNR instead of two."""
-    if any(run["figures"][BEFORE] is not None for run in runs):
+    if any(run["figures"].get(BEFORE) is not None for run in runs):
         return list(FIGURES)
     return [replace(f, title="PSNR") if f.name == AFTER else f for f in FIGURES if f.name != BEFORE]
 
 
 def by_seed(runs: Sequence[Run], variant: str, figure: Figure) -> dict[int, float]:
     """Return a figure of a variant's runs in its unit, by seed; runs without it are left out."""
-    found = {run["seed"]: run["figures"][figure.name] for run in runs if run["variant"] == variant}
+    found = {run["seed"]: run["figures"].get(figure.name) for run in runs if run["variant"] == variant}
     return {seed: figure.factor * value for seed, value in found.items() if value is not None}
 
 

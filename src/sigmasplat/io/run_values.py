@@ -13,29 +13,32 @@ MOST_NUMBER = 1e15
 REMEDY = "restore the file, or run it again"
 
 
-def _number(value: Any) -> bool:
+def is_number(value: Any) -> bool:
+    """Return whether a value is a number of a usable size."""
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= MOST_NUMBER
 
 
-def _whole(value: Any) -> bool:
-    return _number(value) and isinstance(value, int)
+def is_whole(value: Any) -> bool:
+    """Return whether a value is a whole number of a usable size."""
+    return is_number(value) and isinstance(value, int)
 
 
 def _number_or_null(value: Any) -> bool:
-    return value is None or _number(value)
+    return value is None or is_number(value)
 
 
-def _numbers(value: Any) -> bool:
+def are_numbers(value: Any) -> bool:
+    """Return whether a value is an object of numbers, null and flags."""
     return isinstance(value, dict) and all(_number_or_null(item) or isinstance(item, bool) for item in value.values())
 
 
 def _pose(value: Any) -> bool:
     rows = isinstance(value, list) and len(value) == 4 and all(isinstance(row, list) and len(row) == 4 for row in value)
-    return rows and all(_number(item) for row in value for item in row)
+    return rows and all(is_number(item) for row in value for item in row)
 
 
 def _seconds(value: Any) -> bool:
-    return isinstance(value, dict) and all(_number(item) for item in value.values())
+    return isinstance(value, dict) and all(is_number(item) for item in value.values())
 
 
 def _texts(value: Any) -> bool:
@@ -52,20 +55,25 @@ def is_kind(*kinds: type) -> Test:
 
 
 LOG: Mapping[str, Test] = {
-    "index": lambda value: _whole(value) and value >= 0, "timestamp_s": _number, "is_keyframe": is_kind(bool),
-    "lost": is_kind(bool), "state": lambda value: value in (TRACKED, RELOCALISED, LOST, APART), "component": _whole,
-    "p_off": _number_or_null, "splats": _whole, "submap": _whole, "tracking": _numbers, "seconds": _seconds,
+    "index": lambda value: is_whole(value) and value >= 0, "timestamp_s": is_number, "is_keyframe": is_kind(bool),
+    "lost": is_kind(bool), "state": lambda value: value in (TRACKED, RELOCALISED, LOST, APART), "component": is_whole,
+    "p_off": _number_or_null, "splats": is_whole, "submap": is_whole, "tracking": are_numbers, "seconds": _seconds,
     "T_world_camera": _pose, "loops": _records,
 }  # fmt: skip
 """Values of a line of log.jsonl."""
 FACTS: Mapping[str, Test] = {
     "source": is_kind(str), "source_path": is_kind(str), "status": is_kind(str), "skipped": _texts,
     "wall_s": _number_or_null, "finish_s": _number_or_null, "final_steps": _number_or_null, "machine": is_kind(dict),
+<<<<<<< HEAD
     "onto": is_kind(dict), "camera": is_kind(dict), "source_frames": _whole, "depth_units_per_metre": _number_or_null,
     "isa": is_kind(str, type(None)), "scene_scale": _number_or_null, "depth_noise_per_m": _number_or_null,
+=======
+    "onto": is_kind(dict), "camera": is_kind(dict), "source_frames": is_whole, "depth_units_per_metre": _number_or_null,
+    "isa": is_kind(str, type(None)),
+>>>>>>> ae86cff51b5af521ebb30003fdcae49d0e85c912
 }  # fmt: skip
 """Values of run.json that commands use."""
-STATE_FIELDS: Mapping[str, Test] = {"index": _whole, "wall_s": _number, "submaps": _whole, "steps": is_kind(list)}
+STATE_FIELDS: Mapping[str, Test] = {"index": is_whole, "wall_s": is_number, "submaps": is_whole, "steps": is_kind(list)}
 """Values of a saved state beside those of `Slam`."""
 
 
@@ -85,7 +93,7 @@ def check_fields(values: Any, tests: Mapping[str, Test], required: tuple[str, ..
 
 def check_profile(values: Any, path: Path) -> dict[str, float]:
     """Return the seconds of each stage of a run. Raises RunError naming the file if one is not a number."""
-    return check_fields(values, dict.fromkeys(values, _number) if isinstance(values, dict) else {}, (), path)
+    return check_fields(values, dict.fromkeys(values, is_number) if isinstance(values, dict) else {}, (), path)
 
 
 class Record(dict[str, Any]):

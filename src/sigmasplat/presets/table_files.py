@@ -6,6 +6,8 @@ from typing import Any
 
 from sigmasplat.config.text import nearest
 from sigmasplat.errors import ConfigError
+from sigmasplat.reading.files import read_text
+from sigmasplat.reading.guard import guarded
 
 TABLES = Path(__file__).parent / "tables"
 
@@ -20,7 +22,6 @@ def read_table(name: str) -> dict[str, Any]:
     path = Path(name) if name.endswith(".toml") else TABLES / f"{name}.toml"
     if path.parent == TABLES and name not in list_tables():
         raise ConfigError(f"no table {name!r}{nearest(name, list_tables())}; known: {', '.join(list_tables())}")
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as problem:
-        raise ConfigError(f"cannot read the table {path}: {problem}") from problem
+    text = read_text(path, ConfigError)
+    with guarded(f"cannot read the table {path}", "docs/tables.md shows a definition", ConfigError, "not TOML"):
+        return tomllib.loads(text)
