@@ -366,7 +366,7 @@ def test_sigma_adds_to_fast_and_removes_nothing() -> None:
     added = changed_settings(sigma, fast)
     uncertainty = {"mapping.iterations", "mapping.weight_moment", "primitives.uncertain_m2", "uncertainty.probes"}
     assert added == uncertainty | {
-        "input.denoise_depth", "tracking.features", "tracking.verify",
+        "input.denoise_depth", "tracking.features", "tracking.verify", "moving.find",
         "final.iterations", "final.merge_m", "final.order", "final.lr_factor", "final.lr_decay", "final.weight_moment",
         "final.lr_pose_translation", "final.lr_pose_rotation", "final.prune_weight_px",
         "recovery.relocalise", "recovery.new_map_after", "recovery.steady_frames", "surface.depth",

@@ -89,7 +89,7 @@ class Tracker:
         expected = self._expected(R_inertial_camera)
         shown = seen.shown(view)
         best = self._fit(field, view, shown, expected.predicted)
-        best, shown = self._uncovered(field, view, seen, shown, expected.predicted, best)
+        best, shown = self._uncovered(field, view, seen, shown, expected.predicted, best, hurried)
         if self._is_wide(best, view) or self._doubts(best):
             guesses = unless(hurried, self._other_guesses(shown, expected))
             best = max([best, *(self._fit(field, view, shown, guess) for guess in guesses)], key=self._score)
@@ -107,7 +107,7 @@ class Tracker:
         return best
 
     def _uncovered(
-        self, field: Splats, view: View, seen: Sight, first: Sight, predicted: Matrix, fit: PoseFit
+        self, field: Splats, view: View, seen: Sight, first: Sight, predicted: Matrix, fit: PoseFit, hurried: Asked
     ) -> tuple[PoseFit, Sight]:
         """Find what is in front of the scene, and fit the pose without it; return the fit and the frame without it.
 
@@ -118,7 +118,7 @@ class Tracker:
         if fit.comparison is None or self.lost:
             return fit, first
         found = self._without_front(field, view, seen, first, predicted, fit, before)
-        if found is None and self.watch.config.find and self._contradicted(fit):
+        if found is None and self.watch.config.find and self._contradicted(fit) and not hurried():
             found = self._without_object(field, view, seen, predicted, fit.comparison)
         return (fit, first) if found is None else found
 
