@@ -64,16 +64,10 @@ class Job:
             settings = read_json(folder / "config.json")
         except SigmaSplatError:
             return False
-<<<<<<< HEAD
+        if not isinstance(noted, dict):
+            return False
         used = config_of_facts(facts, self.config, self.given)
         return self.facts().items() <= noted.items() and bool(settings == json.loads(json.dumps(used.to_dict())))
-=======
-        return (
-            isinstance(noted, dict)
-            and self.facts().items() <= noted.items()
-            and bool(settings == json.loads(json.dumps(self.config.to_dict())))
-        )
->>>>>>> ae86cff51b5af521ebb30003fdcae49d0e85c912
 
     def finished_in(self, folder: Path) -> bool:
         """Return whether a folder has the complete, scored run of this job."""

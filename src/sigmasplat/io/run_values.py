@@ -64,13 +64,9 @@ LOG: Mapping[str, Test] = {
 FACTS: Mapping[str, Test] = {
     "source": is_kind(str), "source_path": is_kind(str), "status": is_kind(str), "skipped": _texts,
     "wall_s": _number_or_null, "finish_s": _number_or_null, "final_steps": _number_or_null, "machine": is_kind(dict),
-<<<<<<< HEAD
-    "onto": is_kind(dict), "camera": is_kind(dict), "source_frames": _whole, "depth_units_per_metre": _number_or_null,
-    "isa": is_kind(str, type(None)), "scene_scale": _number_or_null, "depth_noise_per_m": _number_or_null,
-=======
     "onto": is_kind(dict), "camera": is_kind(dict), "source_frames": is_whole, "depth_units_per_metre": _number_or_null,
-    "isa": is_kind(str, type(None)),
->>>>>>> ae86cff51b5af521ebb30003fdcae49d0e85c912
+    "isa": is_kind(str, type(None)), "scene_scale": _number_or_null, "depth_noise_per_m": _number_or_null,
+    "sensor": is_kind(str, type(None)),
 }  # fmt: skip
 """Values of run.json that commands use."""
 STATE_FIELDS: Mapping[str, Test] = {"index": is_whole, "wall_s": is_number, "submaps": is_whole, "steps": is_kind(list)}
