@@ -45,6 +45,7 @@ def tiny(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     pytest.importorskip("sigmasplat.native._core", reason="sigmasplat.native._core is not built")
     small, short = open_source(TINY, limit=3), override(preset("varsplat-fast"), TINY_SETTINGS)
     monkeypatch.setattr(sigmasplat, "open_source", lambda path: small)
+    monkeypatch.setattr(sigmasplat, "open_scene", lambda path, config: (small, config))
     monkeypatch.setattr(sigmasplat, "preset", lambda name: dataclasses.replace(short, name=preset(name).name))
     monkeypatch.chdir(tmp_path)
     return tmp_path

@@ -179,7 +179,8 @@ def corridor(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Corridor:
     scores.evaluate = evaluate  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, module.__name__, module)
     monkeypatch.setitem(sys.modules, scores.__name__, scores)
-    monkeypatch.setattr("sigmasplat.sources.open_source", lambda path, settings=None: source)
+    for place in ("sigmasplat.sources", "sigmasplat.run.scene"):
+        monkeypatch.setattr(f"{place}.open_source", lambda path, settings=None: source)
     monkeypatch.setattr(MadeUpSlam, "at", {}, raising=False)
     monkeypatch.setattr(MadeUpSlam, "lost", set(), raising=False)
     monkeypatch.setattr(MadeUpSlam, "tried", {}, raising=False)

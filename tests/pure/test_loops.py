@@ -18,6 +18,7 @@ from sigmasplat.slam.loop_closure.candidates import SubmapPair
 from sigmasplat.slam.loop_closure.closer import LoopCloser, make_descriptor
 from sigmasplat.slam.loop_closure.descriptors import OrientationGrid
 from sigmasplat.slam.loop_closure.registration import Registration
+from sigmasplat.types import Slices
 
 CAMERA = Camera(4, 3, 4.0, 4.0, 1.5, 1.0)
 STEP = se3.exp(np.array([1.0, 0, 0, 0, 0, 0.0]))
@@ -33,10 +34,14 @@ class Registered:
     def __init__(self, *_: object) -> None:
         pass
 
-    def register(self, pair: SubmapPair, a: Submap, b: Submap, known: np.ndarray) -> Registration:
+    def registered(self, pair: SubmapPair, a: Submap, b: Submap, known: np.ndarray) -> Registration:
         assert (a.index, b.index) == (pair.best.query_submap, pair.best.database_submap)
         T_a_b = self.lies.get((a.index, b.index), se3.inverse(self.truth[a.index]) @ self.truth[b.index])
         return Registration(T_a_b, SURE, 0.1, 4, 0.9, True, "accepted")
+
+    def register(self, pair: SubmapPair, a: Submap, b: Submap, known: np.ndarray) -> Slices[Registration]:
+        yield
+        return self.registered(pair, a, b, known)
 
 
 def make_closer(
@@ -112,9 +117,9 @@ def test_switched_off_nothing_is_tried(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_refused_registration_makes_no_edge(monkeypatch: pytest.MonkeyPatch) -> None:
     made = make_closer(monkeypatch, {})
-    plain = Registered.register
+    plain = Registered.registered
     monkeypatch.setattr(
-        Registered, "register", lambda *a: replace(plain(*a), accepted=False, reason="overlap 0.05 is below 0.2")
+        Registered, "registered", lambda *a: replace(plain(*a), accepted=False, reason="overlap 0.05 is below 0.2")
     )
     atlas = walked(made)
     assert made.closed == []

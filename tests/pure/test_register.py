@@ -14,7 +14,7 @@ from sigmasplat.model import se3
 from sigmasplat.model.field import COLUMNS, GaussianField
 from sigmasplat.model.submap import MemoryStore, Submap
 from sigmasplat.render.backend import make_view
-from sigmasplat.slam.drift import FLOOR
+from sigmasplat.slam.drift import floor
 from sigmasplat.slam.loop_closure import registration
 from sigmasplat.slam.loop_closure.candidates import Candidate, SubmapPair
 from sigmasplat.slam.loop_closure.closer import LoopCloser
@@ -175,7 +175,7 @@ def test_disagreement_costs_information() -> None:
     apart = [localisation(se3.exp(np.array([s * 0.03, 0, 0, 0, 0, 0.0]))) for s in (-1.0, 1.0)]
     sure, unsure = (registration.information(found, np.eye(4)) for found in (close, apart))
     assert np.linalg.inv(unsure)[0, 0] == pytest.approx(np.linalg.inv(sure)[0, 0] + 0.03**2)
-    assert np.linalg.inv(sure)[0, 0] == pytest.approx(1e-6 + FLOOR[0, 0])
+    assert np.linalg.inv(sure)[0, 0] == pytest.approx(1e-6 + floor()[0, 0])
 
 
 def test_overlap_is_the_larger_share_of_splats_with_a_neighbour() -> None:

@@ -60,8 +60,11 @@ def test_a_model_is_named_or_spelled_and_everything_else_is_refused() -> None:
     for wrong in ("kinect", "z3:1", "z2", "z2:x", "z2:-1", "z2:nan", "edge:2", ""):
         with pytest.raises(ConfigError, match=r"input\.sensor"):
             InputConfig(sensor=wrong)
-    assert for_scene(Config(), 1.0, None, "kinect-v1").input.sensor == "kinect-v1"
-    assert for_scene(Config().changed(input={"sensor": "generic"}), 1.0, None, "kinect-v1").input.sensor == "generic"
+    assert for_scene(Config(), 1.0, None, sensor="kinect-v1").input.sensor == "kinect-v1"
+    assert (
+        for_scene(Config().changed(input={"sensor": "generic"}), 1.0, None, sensor="kinect-v1").input.sensor
+        == "generic"
+    )
 
 
 def test_a_calibration_names_its_sensor(tmp_path: Path) -> None:

@@ -67,7 +67,8 @@ def test_slam_and_session_never_read_the_truth(tmp_path: Path) -> None:
 
 
 def test_the_command_line_reads_the_truth_only_to_evaluate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sigmasplat.sources.open_source", lambda path, settings=None: SourceWithoutTruth())
+    for place in ("sigmasplat.sources", "sigmasplat.run.scene"):
+        monkeypatch.setattr(f"{place}.open_source", lambda path, settings=None: SourceWithoutTruth())
     assert exit_code("run", "room", "--out", str(tmp_path / "run"), "--no-eval", *OPTIONS) == 0
     assert exit_code("mesh", str(tmp_path / "run"), "--voxel-m", "0.1") == 0
     with pytest.raises(TruthWasRead):

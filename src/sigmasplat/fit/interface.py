@@ -166,6 +166,8 @@ class ImageKernels:
     """Return a contiguous copy of a plane, or the plane itself if it is contiguous."""
     to_host: Callable[[Plane], NDArray[np.float32]]
     """Return a plane as an array in host memory."""
+    beside: Callable[[NDArray[np.float32], Plane], Plane]
+    """Return an array of host memory as a plane in the memory of another plane."""
     as_tensor: Callable[[Plane], Tensor]
     """Return a plane as a tensor that a view accepts as reference depth."""
     halve: Callable[

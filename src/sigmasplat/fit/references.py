@@ -3,7 +3,6 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -41,8 +40,7 @@ class Reference:
     def without(self, hidden: NDArray[np.bool_]) -> "Reference":
         """Return the reference without depth at some pixels [H, W], so that nothing is aligned to them."""
         p = self.pyramid
-        depth, kept = p.depth[0], (~hidden).astype(np.float32)
-        shown = depth * (torch.from_numpy(kept).to(depth.device) if isinstance(depth, Tensor) else kept)
+        shown = p.depth[0] * p.kernels.beside((~hidden).astype(np.float32), p.depth[0])
         made = Pyramid.of(
             p.gray[0], shown, p.cameras[0], backend=p.backend, scene_scale=p.scene_scale, noise_per_m=p.noise_per_m
         )
@@ -54,13 +52,12 @@ class Reference:
         return compare(self.pyramid, live, T_camera_world @ se3.inverse(self.T_camera_world))
 
 
-def live_image(view: View, color: Image, depth_m: Image, target: Target, noise: Plane | None = None) -> Pyramid:
+def live_image(view: View, color: Image, depth_m: Image, target: Target, noise: Image | None = None) -> Pyramid:
     """Make the pyramid of a camera image, colour [H, W, 3] and depth [H, W] m, on the device that aligns it; noise:
     that of its readings (`relative_noise`)."""
-    gray, depth = fits_of(view).live_planes(view, color, depth_m, target)
-    in_memory = isinstance(noise, np.ndarray) and isinstance(depth, Tensor)
-    on_device = torch.from_numpy(noise).to(depth.device) if in_memory else noise
-    return _pyramid(view, gray, depth, target.camera, on_device)
+    fits = fits_of(view)
+    gray, depth = fits.live_planes(view, color, depth_m, target)
+    return _pyramid(view, gray, depth, target.camera, None if noise is None else fits.images.beside(noise, depth))
 
 
 def relative_noise(depth_m: Image, sensor: SensorModel, noise_per_m: float = NOISE_PER_M) -> Image:

@@ -56,8 +56,12 @@ def _to_host(plane: Tensor) -> NDArray[np.float32]:
     return array
 
 
+def _beside(array: NDArray[np.float32], plane: Tensor) -> Tensor:
+    return torch.from_numpy(array).to(plane.device)
+
+
 def _as_tensor(plane: Tensor) -> Tensor:
     return plane
 
 
-CUDA_IMAGES = ImageKernels(_contiguous, _to_host, _as_tensor, halve, readings_of, align, normal_equations)
+CUDA_IMAGES = ImageKernels(_contiguous, _to_host, _beside, _as_tensor, halve, readings_of, align, normal_equations)
