@@ -21,6 +21,7 @@ from sigmasplat.render.cpu.view import CpuView
 from sigmasplat.render.cuda.view import CudaView
 from sigmasplat.render.reference.view import ReferenceView
 from sigmasplat.render.view import View
+from sigmasplat.slam.localisation import memory, watch
 from sigmasplat.slam.localisation.sight import Sight
 from sigmasplat.slam.localisation.verdict import Usual
 from sigmasplat.slam.loop_closure.registration import Registrar, WeighedMap
@@ -142,10 +143,14 @@ def test_a_keyframe_is_aligned_to_a_submap_as_on_the_cpu() -> None:
 def test_what_a_tracker_remembers_is_kept_and_read_back(tmp_path: Path) -> None:
     view, _ = views()
     kept = reference("keyframe", view, CONFIGS["V"])
-    tracker, classes = Tracker(CONFIGS["V"], keyframe=kept), (Tracker, Reference, Pyramid, Camera, Usual)
+    tracker, classes = (
+        Tracker(CONFIGS["V"], keyframe=kept),
+        (Tracker, Reference, Pyramid, Camera, Usual, watch.Watch, memory.Memory),
+    )
     tracker.start(Sight(seen_from(view, TRUTH), kept.pyramid))
-    write_state(tmp_path / "state", tracker, classes, {"tracking": CONFIGS["V"]})
-    again = read_state(tmp_path / "state", classes, {"tracking": CONFIGS["V"]})
+    fixed = {"tracking": CONFIGS["V"], "moving": tracker.watch.config}
+    write_state(tmp_path / "state", tracker, classes, fixed)
+    again = read_state(tmp_path / "state", classes, fixed)
     assert again.keyframe.pyramid.backend == "cuda"
     for ours, theirs in zip(again.keyframe.pyramid.weight, kept.pyramid.weight, strict=True):
         assert torch.equal(ours, theirs)

@@ -235,7 +235,7 @@ def sigmasplat(
         ("map.ply --out x.spz --std-below-m -1", "--std-below-m must be at least 0, found -1"),
         ("map.ply --out x.spz --std-below-m 1", "map.ply has no calibrated uncertainty"),
         ("map.ply --out x.spz --sigma-below 0", "no splat of map.ply is left (median σ and opacity are "),
-        ("map.ply --out no/x.spz", "cannot write no/x.spz"),
+        ("map.ply --out no/x.spz", "cannot write no: "),
         ("map.ply --out x.spz --spz-version 5", "--spz-version must be between 2 and 4, found 5"),
         ("map.ply --out x.sog --spz-version 4", "--spz-version cannot be used with format sog, only with spz"),
         ("map.ply --out x.glb --axes z-up", "--axes z-up cannot be used with this format, only y-up, camera"),

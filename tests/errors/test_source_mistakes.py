@@ -123,7 +123,8 @@ def one_lost(folder: Path) -> None:
 
 def another_time(folder: Path) -> None:
     for path in list(folder.glob("depth/*")):
-        path.rename(path.with_name(f"{path.stem}999999.png"))
+        number, time_us = path.stem.split("-")
+        path.rename(path.with_name(f"{number}-{int(time_us) + 10**9:012d}.png"))
 
 
 def scaled(frame: dict) -> None:

@@ -541,7 +541,10 @@ def test_a_wrong_depth_unit_gives_a_warning(corridor: Corridor, capsys: pytest.C
 
 def test_options_of_eval_reach_the_evaluation(corridor: Corridor, capsys: pytest.CaptureFixture[str]) -> None:
     assert exit_code("run", "corridor", "--out", "mine") == 0
-    plain = {"mesh": False, "true_mesh": None, "random_views": 1000, "full_resolution": False, "lpips": None}
+    plain = {
+        "mesh": False, "true_mesh": None, "random_views": 1000, "full_resolution": False, "lpips": None,
+        "fill_gaps_m": 0.0,
+    }  # fmt: skip
     assert plain == GIVEN and "LPIPS" not in capsys.readouterr().out
     write_mesh(Path("wall.ply"), Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32)))
     write_weights(Path("data/lpips/alex"), "alex")

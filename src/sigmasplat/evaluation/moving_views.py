@@ -26,6 +26,8 @@ def show_moving(
 ) -> None:
     """Add a strip of keyframes in which something moved, tinted where the map does not use them; nothing without."""
     shares = [(record.get("tracking") or {}).get("moving", 0.0) for record in log]
+    if not any(share >= LEAST_SHARE for share in shares):
+        return
     places = [(row, s, k) for s in range(len(store)) for k, row in enumerate(store.load(s).frames) if row >= 0]
     moving = [place for place in places if place[0] < len(log) and shares[place[0]] >= LEAST_SHARE]
     panels = []

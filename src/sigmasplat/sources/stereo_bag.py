@@ -58,7 +58,7 @@ def stereo_topics(bag: Bag, settings: InputConfig) -> tuple[ImageTopic, ImageTop
         return None if right.kind == "depth" and not _is_right(right.name) else (left, right)
     if settings.color_topic or settings.depth_topic:
         return None
-    if any(not _is_side(topic.name) for topic in image_topics(bag, "depth")):
+    if any("depth" in topic.name.lower() or not _is_side(topic.name) for topic in image_topics(bag, "depth")):
         return None
     found = {topic.name: topic for kind in ("", "colour", "depth") for topic in image_topics(bag, kind)}
     for of_left, of_right in PAIRS:
