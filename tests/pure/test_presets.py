@@ -366,7 +366,7 @@ def test_sigma_adds_to_fast_and_removes_nothing() -> None:
     added = changed_settings(sigma, fast)
     uncertainty = {"mapping.iterations", "mapping.weight_moment", "primitives.uncertain_m2", "uncertainty.probes"}
     assert added == uncertainty | {
-        "input.denoise_depth", "tracking.features", "tracking.verify", "moving.find",
+        "input.denoise_depth", "tracking.features", "tracking.verify",
         "final.iterations", "final.beta2", "final.merge_m", "final.order", "final.lr_factor", "final.lr_decay",
         "final.weight_moment", "mapping.first_divided",
         "final.lr_pose_translation", "final.lr_pose_rotation", "final.prune_weight_px",

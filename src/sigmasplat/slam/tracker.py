@@ -117,19 +117,22 @@ class Tracker:
         before, self.front = self.front, None
         if fit.comparison is None or self.lost:
             return fit, first
-        found = self._without_front(field, view, seen, first, predicted, fit, before)
+        found = self._without_front(field, view, seen, first, predicted, fit, before, hurried)
         if found is None and self.watch.config.find and self._contradicted(fit) and not hurried():
             found = self._without_object(field, view, seen, predicted, fit.comparison)
         return (fit, first) if found is None else found
 
     def _without_front(
         self, field: Splats, view: View, seen: Sight, first: Sight, predicted: Matrix, fit: PoseFit,
-        before: Foreground | None,
+        before: Foreground | None, hurried: Asked,
     ) -> tuple[PoseFit, Sight] | None:  # fmt: skip
         """Return the fit and the frame without what is in space that was free, and the newest keyframe without what has
         left it; None if there is nothing, or if the images contradict the pose. before: in front in the last frame."""
-        slow, known = self.watch.slow(seen, se3.inverse(fit.T_camera_world)), before or self.keyframe_front
-        if fit.comparison is None or (slow is None and not self.watch.suspects(fit.comparison, known is not None)):
+        slow, known = (
+            self.watch.slow(seen, se3.inverse(fit.T_camera_world)),
+            (before or self.keyframe_front) is not None,
+        )
+        if fit.comparison is None or (slow is None and not self.watch.suspects(fit.comparison, known, hurried)):
             return None
         keyframe = self.keyframe
         for guess in (predicted, se3.inverse(fit.T_camera_world)):

@@ -9,6 +9,7 @@ from sigmasplat.model import se3
 from sigmasplat.slam.localisation.foreground import Earlier, Foreground, foreground
 from sigmasplat.slam.localisation.memory import Memory
 from sigmasplat.slam.localisation.sight import Sight
+from sigmasplat.slam.rules import Asked
 from sigmasplat.types import Matrix
 
 FRONT = 0.03
@@ -23,10 +24,11 @@ class Watch:
     config: MovingConfig = field(default_factory=MovingConfig)
     memory: Memory = field(default_factory=Memory)
 
-    def suspects(self, found: Comparison, known: bool) -> bool:
+    def suspects(self, found: Comparison, known: bool, hurried: Asked) -> bool:
         """Return whether something may be in front of the scene, or may have left its place in it; known: something was
-        in front in the last frame or in the newest keyframe."""
-        return known or found.front >= FRONT or (self.config.find and found.behind >= FRONT)
+        in front in the last frame or in the newest keyframe. If the next frame waits (`hurried`), only what is in front
+        is looked for."""
+        return known or found.front >= FRONT or (self.config.find and found.behind >= FRONT and not hurried())
 
     def in_front(
         self,
