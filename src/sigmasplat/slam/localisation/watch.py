@@ -24,11 +24,13 @@ class Watch:
     config: MovingConfig = field(default_factory=MovingConfig)
     memory: Memory = field(default_factory=Memory)
 
-    def suspects(self, found: Comparison, known: bool, hurried: Asked) -> bool:
-        """Return whether something may be in front of the scene, or may have left its place in it; known: something was
+    def suspects(self, found: Comparison, known: Foreground | None, hurried: Asked) -> bool:
+        """Return whether something may be in front of the scene, or may have left its place in it; known: what was
         in front in the last frame or in the newest keyframe. If the next frame waits (`hurried`), only what is in front
         is looked for."""
-        return known or found.front >= FRONT or (self.config.find and found.behind >= FRONT and not hurried())
+        return (
+            known is not None or found.front >= FRONT or (self.config.find and found.behind >= FRONT and not hurried())
+        )
 
     def in_front(
         self,
