@@ -128,10 +128,7 @@ class Tracker:
     ) -> tuple[PoseFit, Sight] | None:  # fmt: skip
         """Return the fit and the frame without what is in space that was free, and the newest keyframe without what has
         left it; None if there is nothing, or if the images contradict the pose. before: in front in the last frame."""
-        slow, known = (
-            self.watch.slow(seen, se3.inverse(fit.T_camera_world)),
-            (before or self.keyframe_front) is not None,
-        )
+        slow, known = self.watch.slow(seen, se3.inverse(fit.T_camera_world)), before or self.keyframe_front
         if fit.comparison is None or (slow is None and not self.watch.suspects(fit.comparison, known, hurried)):
             return None
         keyframe = self.keyframe
