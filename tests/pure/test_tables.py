@@ -172,7 +172,7 @@ def test_workers_may_have_other_data() -> None:
         (["cgslam-replica", "--data", ".", "--seeds", "0"], "--seeds must be at least 1"),
         (["cgslam-replica", "--data", "x=/data"], "--data names the worker x, which needs --scheduler"),
         (["cgslam-replica", "--data", ".", "--scheduler", "tcp://127.0.0.1:9"], "--scheduler"),
-        (["/no/such.toml", "--data", "."], "cannot read the table"),
+        (["/no/such.toml", "--data", "."], "cannot read /no/such.toml: No such file"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
