@@ -8,7 +8,7 @@ for frame in open_source("path/to/sequence"):
 slam.finish()
 """
 
-from importlib import import_module, metadata
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from sigmasplat import env as env  # must come before torch: it sets how idle OpenMP threads wait
@@ -57,6 +57,8 @@ def __dir__() -> list[str]:
 
 
 def _version() -> str:
+    from importlib import metadata
+
     try:
         return metadata.version("sigmasplat")
     except metadata.PackageNotFoundError:  # a checkout on PYTHONPATH, not installed

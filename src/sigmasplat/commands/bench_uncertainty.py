@@ -1,7 +1,6 @@
 """Score predicted variances at views that the map was not fitted to, and those of poses: sigmasplat bench
 uncertainty."""
 
-import statistics
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -202,6 +201,8 @@ def _table(title: str, of_runs: Sequence[dict[str, Any]]) -> "Table":
 
 def written(values: Sequence[float | None], digits: int) -> str:
     """Write the mean of the known values, ± their standard deviation if there are several."""
+    import statistics
+
     from sigmasplat.report.tables import number
 
     known = [value for value in values if value is not None and value == value]

@@ -83,9 +83,11 @@ def refuse(problems: list[str]) -> None:
 def problems_of(values: Any, prefix: str = "") -> Iterator[str]:
     """Yield a description of each field of a dataclass whose value has another type or is out of range."""
     section: Any = type(values)
-    for name, kind, default in _fields(section):
+    for name, kind, default, (base, range_) in _fields(section):
         value = getattr(values, name)
-        if value is not default and (problem := problem_of(kind, value)):
+        if value is default or (type(value) is base and (range_ is None or (value < 2**63 and value in range_))):
+            continue  # most values, at little cost: every start of a command makes every preset
+        if problem := problem_of(kind, value):
             yield f"{prefix}{name} {problem}"
 
 
@@ -135,10 +137,19 @@ def shown(value: Any) -> str:
 
 def kinds_of(section: Any) -> Mapping[str, Any]:
     """Return the type of each field of a dataclass, with its range."""
-    return {name: kind for name, kind, _ in _fields(section)}
+    return {name: kind for name, kind, *_ in _fields(section)}
 
 
 @cache
-def _fields(section: Any) -> tuple[tuple[str, Any, Any], ...]:
-    """Return name, type and default of each field. The defaults are checked by a test, not again in every object."""
-    return tuple((field.name, field.type, field.default) for field in dataclasses.fields(section))
+def _fields(section: Any) -> tuple[tuple[str, Any, Any, tuple[Any, Range | None]], ...]:
+    """Return name, type, default, and type with range (None: not to be checked quickly) of each field.
+
+    The defaults are checked by a test, not again in every object.
+    """
+    return tuple((f.name, f.type, f.default, _quick(f.type)) for f in dataclasses.fields(section))
+
+
+def _quick(kind: Any) -> tuple[Any, Range | None]:
+    """Return the type and range with which a value is right at once; a number needs a range, which excludes inf."""
+    base, range_ = unpacked(kind)
+    return (base, range_) if base in (bool, str) or range_ is not None else (None, None)

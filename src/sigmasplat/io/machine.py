@@ -1,13 +1,14 @@
-"""Describe the machine and the code version of a run, for run.json and `doctor`."""
+"""Describe the machine and the code version of a run, for run.json and `doctor`.
 
-import hashlib
+Modules of Python that are slow to import are imported at first use: every command imports this module.
+"""
+
 import os
-import platform
-import subprocess
 from collections.abc import Sequence
-from importlib import metadata
 from pathlib import Path
 from typing import Any
+
+import sigmasplat
 
 SOURCES, INSTALLED = (".py", ".cpp", ".h"), (".py", ".h", ".so")
 """Endings of source files, and of installed files: Python, compiled kernels, and the headers that CUDA compiles."""
@@ -15,14 +16,13 @@ SOURCES, INSTALLED = (".py", ".cpp", ".h"), (".py", ".h", ".so")
 
 def package_version() -> str:
     """Return the installed version, or 'unknown' in a checkout that is not installed."""
-    try:
-        return metadata.version("sigmasplat")
-    except metadata.PackageNotFoundError:
-        return "unknown"
+    return str(sigmasplat.__version__)
 
 
 def code_digest(folder: Path, endings: Sequence[str] = SOURCES) -> str:
     """Return a digest of the names and bytes of a folder's files with these endings: equal digests mean equal code."""
+    import hashlib
+
     digest = hashlib.sha256()
     for path in sorted(p for p in folder.rglob("*") if p.suffix in endings):
         digest.update(str(path.relative_to(folder)).encode() + b"\0" + path.read_bytes() + b"\0")
@@ -31,6 +31,8 @@ def code_digest(folder: Path, endings: Sequence[str] = SOURCES) -> str:
 
 def cpu_model() -> str:
     """Return the processor's name from /proc/cpuinfo, else from Python's `platform`."""
+    import platform
+
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
@@ -59,6 +61,8 @@ def _commit_of(checkout: Path) -> str | None:
     """Return the commit of a folder that is itself a checkout; a repository in a parent folder is not ours."""
     if not (checkout / ".git").exists():
         return None
+    import subprocess
+
     command = ["git", "-C", str(checkout), "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
     try:
         answer = subprocess.run(command, capture_output=True, text=True, timeout=5, check=True)
@@ -69,6 +73,8 @@ def _commit_of(checkout: Path) -> str | None:
 
 def describe() -> dict[str, Any]:
     """Return processor, cores, system and Python version."""
+    import platform
+
     return {
         "cpu": cpu_model(),
         "cores": usable_cores(),
