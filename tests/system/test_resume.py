@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import make_dataclass
 from pathlib import Path
 
 import numpy as np
@@ -155,6 +156,15 @@ def test_runs_that_cannot_be_resumed_are_refused_in_one_line(
     (out / "state.safetensors").write_bytes(b"damaged")
     assert exit_code("resume", str(out)) == 2
     assert "is damaged" in capsys.readouterr().err
+
+
+def test_a_state_of_classes_with_other_fields_is_of_another_version(tmp_path: Path) -> None:
+    before = make_dataclass("Facts", [("a", int)])
+    after = make_dataclass("Facts", [("a", int), ("b", int)])
+    write_state(tmp_path / "s", before(1), (before,), {})
+    assert read_state(tmp_path / "s", (before,), {}) == before(1)
+    with pytest.raises(RunError, match="another version"):
+        read_state(tmp_path / "s", (after,), {})
 
 
 def test_a_state_contains_plain_data_only(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ No pickles are used: reading a file can only create numbers, text, and instances
 
 import dataclasses
 import json
+import zlib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from sigmasplat.io.tensors import open_tensors, write_tensors
 INLINE = 64
 """Arrays with at most this many numbers are stored in the text, since there are many poses and each tensor needs a
 header."""
-VERSION = "5"
+FORMAT = "6"
 TEXT = "state"
 """Name of the tensor with the tree as JSON, bytes."""
 _json = json.JSONEncoder().encode
@@ -32,23 +33,36 @@ def write_state(path: Path, tree: Any, classes: Iterable[type], fixed: Mapping[s
     fixed: objects by name that the reader already has; only their names are written. Raises RunError if the file cannot
     be written, TypeError on any other type in the tree.
     """
-    encoder = _Encoder({c.__name__: c for c in classes}, {id(value): name for name, value in fixed.items()})
+    known = {c.__name__: c for c in classes}
+    encoder = _Encoder(known, {id(value): name for name, value in fixed.items()})
     text = encoder.text(tree).encode()
     encoder.tensors[TEXT] = torch.frombuffer(bytearray(text), dtype=torch.uint8)
-    write_tensors(path, encoder.tensors, {"version": VERSION})
+    write_tensors(path, encoder.tensors, {"version": _version(known)})
 
 
 def read_state(path: Path, classes: Iterable[type], fixed: Mapping[str, Any]) -> Any:
     """Read a file of `write_state`. Raises RunError if it is missing, damaged, or of another version."""
     if not path.is_file():
         raise RunError(f"nothing to resume: no {path}")
+    known = {c.__name__: c for c in classes}
     with open_tensors(path, "state") as file:
         facts = file.metadata() or {}
-        if facts.get("version") != VERSION:
+        if facts.get("version") != _version(known):
             raise RunError(f"{path} was written by another version ({facts.get('version')}); run it again")
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         tree = json.loads(tensors[TEXT].numpy().tobytes())
-        return _Decoder(tensors, {c.__name__: c for c in classes}, fixed).decode(tree)
+        return _Decoder(tensors, known, fixed).decode(tree)
+
+
+def _version(classes: Mapping[str, type]) -> str:
+    """Return the version of the format with a checksum of the classes' fields: other code has other fields."""
+    layout = {name: _names(c) for name, c in sorted(classes.items())}
+    return f"{FORMAT}.{zlib.crc32(_json(layout).encode()):08x}"
+
+
+def _names(made: Any) -> list[str]:
+    """Return the names of the fields of a dataclass or a named tuple."""
+    return [f.name for f in dataclasses.fields(made)] if dataclasses.is_dataclass(made) else list(made._fields)
 
 
 class _Encoder:
