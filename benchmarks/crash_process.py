@@ -108,7 +108,7 @@ def run(arguments: Sequence[str], watched: Path, scratch: Path, kill: Kill | Non
         finally:
             os._exit(code)
     _, status = os.waitpid(child, 0)
-    *lines, _ = records.read_text(encoding="utf-8").split("\n")  # a line that a kill left half: its operation never began
+    *lines, _ = records.read_text(encoding="utf-8").split("\n")  # a half line: its operation never began
     operations = [json.loads(line) for line in lines]
     return Ended(os.waitstatus_to_exitcode(status), output.read_text(encoding="utf-8"), operations)
 
