@@ -3,8 +3,10 @@
 import json
 import os
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 # Workers of pytest-xdist share the cores; numpy and torch read this when they are imported.
 if workers := int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", 0)):
@@ -25,6 +27,25 @@ pytest.register_assert_rewrite("benchmark_results", "command_line", "run_process
 
 TINY_SIZE = (32, 24)  # width, height
 TINY_DEPTH_M = 2.0
+
+
+@pytest.fixture(autouse=True, scope="session")
+def views_of_the_room() -> Iterator[None]:
+    """Render each view of the synthetic room once: many runs of this process begin with the same frames."""
+    from sigmasplat.sources import synthetic
+
+    @lru_cache(maxsize=600)
+    def rendered(scene: Any, camera: Any, pose: bytes) -> tuple[np.ndarray, np.ndarray]:
+        return render_scene(scene, camera, np.frombuffer(pose).reshape(4, 4))
+
+    def remembered(scene: Any, camera: Any, T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        color, depth_m = rendered(scene, camera, np.asarray(T_world_camera, np.float64).tobytes())
+        return color.copy(), depth_m.copy()
+
+    render_scene = synthetic.render_scene
+    synthetic.render_scene = remembered
+    yield
+    synthetic.render_scene = render_scene
 
 
 @pytest.fixture

@@ -1,5 +1,6 @@
 """Give every backend test the same two operators, `.project` and `.blend`, with the reference's signatures."""
 
+import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -42,11 +43,15 @@ class Backend:
 
 @pytest.fixture(scope="session")
 def emulator(tmp_path_factory: pytest.TempPathFactory) -> Emulator:
-    """Run the CUDA kernels' text on the CPU; each program is compiled when it is first needed."""
+    """Run the CUDA kernels' text on the CPU; each program is compiled once, when it is first needed."""
     reason = why_not()
     if reason:
         pytest.skip(reason)
-    return Emulator(tmp_path_factory.mktemp("emulated"))
+    shared = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:  # the folder of a worker is in that of the session
+        shared = shared.parent
+    (shared / "emulated").mkdir(exist_ok=True)
+    return Emulator(shared / "emulated")
 
 
 @pytest.fixture

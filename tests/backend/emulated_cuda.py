@@ -1,6 +1,7 @@
 """Run the CUDA backend's kernels on the CPU: the same text compiled as C++ against emulation/emulation.h."""
 
 import ctypes
+import fcntl
 import os
 import platform
 import shutil
@@ -56,19 +57,23 @@ class Emulator:
     def library(self, features: int) -> ctypes.CDLL:
         if features not in self._libraries:
             path = self.folder / f"emulated-{features}.so"
-            library = ctypes.CDLL(str(_built(path, features)))
+            with path.with_suffix(".lock").open("w") as lock:  # workers of pytest-xdist share the folder
+                fcntl.flock(lock, fcntl.LOCK_EX)
+                if not path.exists():
+                    _build(path.with_suffix(".part"), features)
+                    path.with_suffix(".part").rename(path)
+            library = ctypes.CDLL(str(path))
             library.emulate.restype = ctypes.c_char_p
             self._libraries[features] = library
         return self._libraries[features]
 
 
-def _built(path: Path, features: int) -> Path:
+def _build(path: Path, features: int) -> None:
     flags = FLAGS + ["-mfma"] * (platform.machine() == "x86_64")
     includes = [f"-I{folder}" for folder in cubins.include_folders()]
     sources = [f"-DFEATURES={features}", *includes, str(HERE / "kernels.cpp"), "-o", str(path)]
     made = subprocess.run([_compiler(), *flags, *sources], capture_output=True, text=True)
     assert made.returncode == 0, made.stderr
-    return path
 
 
 def _compiler() -> str:

@@ -3,6 +3,7 @@ differences."""
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -69,11 +70,16 @@ def test_rows_pull_and_twist_follow_the_definition(kind: str, variance: bool) ->
     assert_same_vector(got[2], want[2], what="twist")
 
 
-def test_many_splats_on_threads(isa: str) -> None:
+@cache
+def exact_crowd() -> tuple[Tensor, Tensor, Tensor]:
+    """Return what the definition, which is slow, carries for a crowd."""
     s = crowd()
-    params = params_of(s)
-    got = carried(CpuView(s.camera, OPTIONS), params, s)
-    want = carried(exact_view(s.camera, True), params.double(), s)
+    return carried(exact_view(s.camera, True), params_of(s).double(), s)
+
+
+def test_many_splats_on_threads(isa: str) -> None:
+    s, want = crowd(), exact_crowd()
+    got = carried(CpuView(s.camera, OPTIONS), params_of(s), s)
     for name, columns in COLUMNS.items():
         assert_same_vector(got[0][:, columns], want[0][:, columns], 1e-3, f"{isa} {name}")
     assert_same_vector(got[1], want[1], 1e-3, "pull")
@@ -191,24 +197,32 @@ def test_a_fit_without_mean_depth_ignores_what_another_fit_left_on_alpha() -> No
     assert torch.equal(*rows)
 
 
+def stepped(view: View, rows: Tensor, step: CompiledStep | TorchStep) -> tuple[Tensor, Tensor, Tensor, float, float]:
+    """Return gradient, twist, pull, loss and what the shape terms cost of one step with every term."""
+    s = crowd()
+    T = se3.exp(np.array([0, 0, 0, 0, 0.4, 0])) @ s.T_camera_world.numpy()
+    target = seen(s, tuple(view.alpha.shape))
+    if rows.dtype == torch.float64:
+        target.color, target.depth = target.color.double(), target.depth.double()
+    field, pull = GaussianField(rows, steps=1), torch.zeros_like(rows[:, 0])
+    step.forward(field, T, target, WEIGHTS)
+    loss = step.images(target, WEIGHTS)
+    twist, cost = step.splats(field, RATES, WEIGHTS, 0, pull)
+    return field.moment1, torch.as_tensor(np.array(twist)), pull, loss, cost
+
+
+@cache
+def exact_step(n: int) -> tuple[Tensor, Tensor, Tensor, float, float]:
+    """Make it by the definition, which is slow, once for all instruction sets."""
+    view = exact_view(crowd().camera, True)
+    return stepped(view, params_of(crowd())[:n].double(), TorchStep(view))
+
+
 @pytest.mark.parametrize("n", [16, 17, 2003])
 def test_a_step_with_every_term_follows_its_definition(isa: str, n: int) -> None:
     """Rows, twist, pull and what the shape terms cost, with splats out of view."""
-    s = crowd()
-    params = params_of(s)[:n].contiguous()
-    T = se3.exp(np.array([0, 0, 0, 0, 0.4, 0])) @ s.T_camera_world.numpy()
-    results = []
-    for view, rows in ((CpuView(s.camera, OPTIONS), params.clone()), (exact_view(s.camera, True), params.double())):
-        target = seen(s, tuple(view.alpha.shape))
-        if rows.dtype == torch.float64:
-            target.color, target.depth = target.color.double(), target.depth.double()
-        step = CompiledStep(view) if isinstance(view, CpuView) else TorchStep(view)
-        field, pull = GaussianField(rows, steps=1), torch.zeros_like(rows[:, 0])
-        step.forward(field, T, target, WEIGHTS)
-        loss = step.images(target, WEIGHTS)
-        twist, cost = step.splats(field, RATES, WEIGHTS, 0, pull)
-        results.append((field.moment1, torch.as_tensor(twist), pull, loss, cost))
-    got, want = results
+    view, want = CpuView(crowd().camera, OPTIONS), exact_step(n)
+    got = stepped(view, params_of(crowd())[:n].contiguous(), CompiledStep(view))
     for k, what in enumerate(("gradient", "twist", "pull")):
         assert_same_vector(got[k], want[k], 2e-3, f"{isa} {what}")
     assert got[3] == pytest.approx(want[3], rel=1e-4) and got[4] == pytest.approx(want[4], rel=1e-4)

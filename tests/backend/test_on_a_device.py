@@ -170,7 +170,7 @@ def test_a_mapping_iteration_waits_once(stand_in: StandIn, images: int, degree: 
 
 
 QUICK = {
-    "input.width": "48", "mapping.first_iterations": "10", "mapping.iterations": "2", "mapping.every": "2",
+    "input.width": "48", "mapping.first_iterations": "5", "mapping.iterations": "2", "mapping.every": "2",
     "seeding.first_uniform": "200", "seeding.first_gradient": "200", "submaps.frames": "3", "loops.min_interval": "1",
     "loops.min_similarity": "0.0", "loops.similarity_floor": "0.0", "registration.iterations": "2",
     "final.iterations": "3", "render.depth": "center",  # a device has no other
@@ -249,8 +249,9 @@ def test_what_is_written_is_read_as_from_the_host(device: torch.device, tmp_path
 
 
 def test_a_run_is_written_and_evaluated(device: torch.device, tmp_path: Path) -> None:
-    words = [word for name, value in (QUICK | {"backend": "cuda"}).items() for word in ("--set", f"{name}={value}")]
+    settings = QUICK | {"backend": "cuda", "input.width": "32", "input.limit": "4"}
+    words = [word for name, value in settings.items() for word in ("--set", f"{name}={value}")]
     with pytest.raises(SystemExit, match="0"):
-        cli.main(["run", "synthetic:frames=6,width=48,height=36", "--out", str(tmp_path / "run"), *words])
+        cli.main(["run", "synthetic:frames=200,width=32,height=24", "--out", str(tmp_path / "run"), *words])
     written = {path.name for path in (tmp_path / "run").iterdir()}
     assert {"metrics.json", "map.ply", "checkpoint.safetensors"} <= written

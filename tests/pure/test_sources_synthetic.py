@@ -9,7 +9,7 @@ from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
-from sigmasplat.sources import SyntheticRoom, open_source
+from sigmasplat.sources import SyntheticRoom, open_source, synthetic
 from sigmasplat.sources.room.render import build_scene, render_scene
 from sigmasplat.sources.room.sensor import DRIFT_KNOT_FRAMES, drifted_depth, measured_depth, noise_sigma_m
 from sigmasplat.sources.room.shapes import Rays, Shape, cast_rays, image_windows, surface_at
@@ -30,6 +30,12 @@ GOLDEN = [
      [2.7702, 3.1680, 0.0, 2.8647, 3.3803, 0.0, 0.0, 0.9806, 0.0],
      [141, 92, 76, 160, 108, 91, 70, 61, 52]),
 ]  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def rendered_anew(monkeypatch):
+    """Frames made twice are rendered twice here, unlike in other tests (conftest.py)."""
+    monkeypatch.setattr(synthetic, "render_scene", render_scene)
 
 
 def shape(kind, center, half, yaw_rad=0.0):

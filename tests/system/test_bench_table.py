@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -18,7 +19,11 @@ from command_line import exit_code
 from lpips_weights import write_weights
 from sigmasplat.batch import dispatch
 from sigmasplat.batch.definition import Table
+from sigmasplat.batch.local import LocalRoad
+from sigmasplat.batch.make_run import make_run
+from sigmasplat.batch.road import Outcome
 from sigmasplat.batch.scores import run_record
+from sigmasplat.evaluation import reconstruct
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.run.terminal import Screen
 
@@ -63,6 +68,18 @@ def wait_for(condition: Callable[[], bool], log: Path, process: subprocess.Popen
 def frames_logged(out: Path, run: str) -> int:
     log = out / "runs" / run / "log.jsonl"
     return log.read_text().count("\n") if log.exists() else 0
+
+
+@pytest.fixture
+def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make runs without a process of their own, which costs more than a tiny run."""
+
+    def made(road: LocalRoad, jobs: list, out: Path) -> Iterator[Outcome]:
+        for job in jobs:
+            make_run(job, out / job.name, road.data, road.save_every_s)
+            yield Outcome(job)
+
+    monkeypatch.setattr(LocalRoad, "make", made)
 
 
 @pytest.fixture(scope="module")
@@ -157,6 +174,7 @@ EVERY_TABLE = [
 """Tables, a system of each, a layout, where its frames are from, and the scores that its scene must have."""
 
 
+@pytest.mark.usefixtures("in_this_process")
 @pytest.mark.parametrize(
     ("table", "system", "layout", "frames", "scores"),
     EVERY_TABLE,
@@ -174,11 +192,16 @@ def test_every_table_is_made_from_its_layout(
     assert all(ours[score] is not None and ours[score]["mean"] > 0 for score in scores), ours
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_replicas_true_mesh_and_the_weights_of_lpips_fill_their_columns(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The walk turns enough, and is tracked well enough, that its alignment is determined."""
     monkeypatch.chdir(tmp_path)
+    ours, published = reconstruct.reconstruction.score, reconstruct.score_published
+    few = {"points": 10_000}
+    monkeypatch.setattr(reconstruct.reconstruction, "score", partial(ours, **few))
+    monkeypatch.setattr(reconstruct, "score_published", lambda *a, **n: published(*a, **n | few | {"views": 40}))
     write_weights(tmp_path / "data/lpips", "alex")
     data = paper_data.write_replica(tmp_path / "Replica", {"room0": paper_data.room(0, 60)}, surfaces=True)
     better = ["--set", "tracking.method=align", "--set", "mapping.first_iterations=30"]
