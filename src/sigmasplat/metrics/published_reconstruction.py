@@ -90,7 +90,10 @@ def score_published(
 
 def nearest_m(points: Matrix, among: Matrix) -> Matrix:
     """Return the distance [N] of each point to the nearest of `among` [M, 3]; inf if M = 0."""
-    return np.asarray(cKDTree(among).query(points)[0]) if len(among) else np.full(len(points), np.inf)
+    if not len(among):
+        return np.full(len(points), np.inf)
+    # The same distances; for points that are far from a surface, cells without gaps are searched several times faster.
+    return np.asarray(cKDTree(among, compact_nodes=False, balanced_tree=False).query(points)[0])
 
 
 def dense_points(ours: Mesh, theirs: Mesh, seed: int) -> tuple[Matrix, Matrix]:
