@@ -276,8 +276,8 @@ class InputOptions:
         names = {"start": "start_s", "end": "end_s", "hold_out": "hold_every"}
         given = {field.name: getattr(self, field.name) for field in fields(self)}
         given["register_depth"] = None if self.register_depth == "auto" else self.register_depth
-        given["calibration"] = self.calibration and self.calibration.resolve()  # a later eval may run in another folder
-        given["masks"] = self.masks and self.masks.resolve()
+        for name in ("calibration", "masks"):  # a later eval may run in another folder
+            given[name] = given[name] and given[name].absolute()
         return {
             f"input.{names.get(name, name)}": str(value) for name, value in given.items() if value not in (None, False)
         }

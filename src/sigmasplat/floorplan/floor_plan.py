@@ -33,8 +33,9 @@ WALL_LAYERS = 8
 MIN_POINTS = 2
 """A single point in a layer is ignored as noise."""
 MARGIN_CELLS = 4
-MOST_CELLS = 4_000_000
-"""Cells of the largest plan: 100 m × 100 m with cells of 5 cm, which take 0.7 GB."""
+MOST_CELLS, LONGEST_RAY = 4_000_000, 10
+"""Cells of the largest plan: 100 m × 100 m with cells of 5 cm, which take 0.7 GB; and how far a ray is followed, times
+the diagonal of the plan."""
 
 Grid = NDArray[np.float32]
 
@@ -155,9 +156,9 @@ class _Cells:
         flat = np.concatenate([p[:, :2] for p in points])
         low = np.minimum(np.quantile(flat, 0.002, axis=0), path[:, :2].min(0))
         high = np.maximum(np.quantile(flat, 0.998, axis=0), path[:, :2].max(0))
-        first = np.floor(low / cell_m).astype(int) - MARGIN_CELLS
-        count = np.ceil(high / cell_m).astype(int) + MARGIN_CELLS - first
-        if np.prod(count, dtype=np.float64) > MOST_CELLS:
+        first = np.floor(low / cell_m) - MARGIN_CELLS
+        count = np.ceil(high / cell_m) + MARGIN_CELLS - first
+        if not np.prod(count) <= MOST_CELLS:
             size = " × ".join(f"{n * cell_m:.0f}" for n in count)
             raise SigmaSplatError(
                 f"a floor plan of {size} m has too many cells of {cell_m} m (at most {MOST_CELLS:,}); use larger cells"
@@ -174,7 +175,8 @@ class _Cells:
         """Mark the cells between the camera and every third point as passed, up to two cells before the point."""
         rays = points[::3] - eye
         length = np.linalg.norm(rays, axis=1)
-        steps = np.arange(0.0, max(length.max(initial=0.0) - 2 * self.cell_m, 0.0), self.cell_m)
+        farthest = min(length.max(initial=0.0), LONGEST_RAY * float(np.hypot(*self.shape)) * self.cell_m)
+        steps = np.arange(0.0, max(farthest - 2 * self.cell_m, 0.0), self.cell_m)
         for step in steps:
             far = length > step + 2 * self.cell_m
             at = eye + rays[far] * (step / length[far])[:, None]

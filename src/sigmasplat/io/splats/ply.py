@@ -78,7 +78,7 @@ def _by_channel(field: GaussianField) -> NDArray[np.float32]:
     if "harmonics" not in field.attributes:
         return np.empty((len(field), 0), np.float32)
     values = field.attributes["harmonics"].params.detach().cpu().numpy().astype(np.float32)
-    return values.reshape(len(field), -1, 3).swapaxes(1, 2).reshape(values.shape)
+    return values.reshape(len(field), values.shape[1] // 3, 3).swapaxes(1, 2).reshape(values.shape)
 
 
 def read_field(path: Path) -> GaussianField:
