@@ -307,7 +307,8 @@ def test_real_time_calls_functions_on_the_thread_of_the_caller(schedule: Any) ->
     assert closed <= {(loop.query, loop.database) for loop in seen.loops}
     assert seen.corrections[-1].reason == "final map" and threads == {threading.get_ident()}
     moved = [correction for correction in seen.corrections[:-1]]
-    assert (len(moved) > 0) == (len(seen.loops) > 0) and all(c.reason == "loop" for c in moved)
+    assert all(c.reason == "loop" for c in moved) and (seen.loops or not moved)
+    assert moved or schedule is None  # on a busy machine the thread closes its loop in `finish`, with the final map
 
 
 def test_in_real_time_a_function_that_fails_leaves_the_state_valid() -> None:
