@@ -21,32 +21,11 @@ MOST_SPILLED = {11: 16, 16: 24, cubins.ALIGNING: 72}
 where alignment solves for a step, to the one thread that does."""
 
 
-EVERY_KERNEL = (cubins.ALIGNING, cubins.FITTING, 7)
-"""Programs that together have every kernel; those of other feature counts differ in their numbers of registers."""
-
-
-def programs_of(architecture: str) -> tuple[int, ...]:
-    """Return the programs to compile: all for the oldest and the newest architecture, and every kernel for the others.
-
-    `benchmarks/kernels.py --architectures …` compiles all.
-    """
-    ends = cubins.ARCHITECTURES[0], cubins.ARCHITECTURES[-1]
-    return cubins.PROGRAMS if architecture in ends else EVERY_KERNEL
-
-
-def test_every_kernel_is_in_the_programs_for_all_architectures() -> None:
-    names = [
-        {name for f in programs for name in cubins.kernel_names(f)} for programs in (cubins.PROGRAMS, EVERY_KERNEL)
-    ]
-    assert names[0] == names[1]
-
-
 @pytest.mark.parametrize("architecture", cubins.ARCHITECTURES)
 def test_every_kernel_compiles_without_a_warning_and_keeps_to_its_registers(architecture: str) -> None:
-    programs = programs_of(architecture)
     with ThreadPoolExecutor(2) as pool:
-        made = list(pool.map(lambda f: cubins.compiled(f, architecture, kernels.TELL), programs))
-    for features, program in zip(programs, made, strict=True):
+        made = list(pool.map(lambda f: cubins.compiled(f, architecture, kernels.TELL), cubins.PROGRAMS))
+    for features, program in zip(cubins.PROGRAMS, made, strict=True):
         assert kernels.remarks(program.log) == "", f"{features} features: {program.log}"
         used = {usage.kernel: usage for usage in kernels.usages(program.log)}
         for usage in used.values():

@@ -301,6 +301,7 @@ def test_real_time_calls_functions_on_the_thread_of_the_caller(schedule: Any) ->
         rgb, depth = images(i)
         step = system.track(rgb, depth, K, i / 30, depth_scale=1000)
         assert step.covariance is not None and np.isfinite(step.covariance).all()
+    early = len(seen.loops)  # on a busy machine the thread closes its loop in `finish`, with the final map
     system.finish()
     assert [step.index for step in seen.keyframes] == [step.index for step in system.slam.steps if step.is_keyframe]
     closed = {(loop.query, loop.database) for loop in system.loops if loop.accepted}
@@ -308,7 +309,7 @@ def test_real_time_calls_functions_on_the_thread_of_the_caller(schedule: Any) ->
     assert seen.corrections[-1].reason == "final map" and threads == {threading.get_ident()}
     moved = [correction for correction in seen.corrections[:-1]]
     assert all(c.reason == "loop" for c in moved) and (seen.loops or not moved)
-    assert moved or schedule is None  # on a busy machine the thread closes its loop in `finish`, with the final map
+    assert moved or (not early and schedule is None)
 
 
 def test_in_real_time_a_function_that_fails_leaves_the_state_valid() -> None:

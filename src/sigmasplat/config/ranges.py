@@ -83,17 +83,19 @@ def refuse(problems: list[str]) -> None:
 def problems_of(values: Any, prefix: str = "") -> Iterator[str]:
     """Yield a description of each field of a dataclass whose value has another type or is out of range."""
     section: Any = type(values)
-    for name, kind, default, (base, range_) in _fields(section):
+    for name, _, default, base, range_ in _fields(section):
         value = getattr(values, name)
-        if value is default or (type(value) is base and (range_ is None or (value < 2**63 and value in range_))):
-            continue  # most values, at little cost: every start of a command makes every preset
-        if problem := problem_of(kind, value):
+        if value is not default and (problem := _problem(base, range_, value)):
             yield f"{prefix}{name} {problem}"
 
 
 def problem_of(kind: Any, value: Any) -> str | None:
     """Describe why a value does not fit a type with its range, as in "must be at least 1, found 0"; None if it fits."""
-    base, range_ = unpacked(kind)
+    return _problem(*unpacked(kind), value)
+
+
+def _problem(base: Any, range_: Range | None, value: Any) -> str | None:
+    """Describe why a value does not fit a type and a range; None if it fits."""
     if get_origin(base) is Literal:
         choices = get_args(base)
         return None if value in choices else f"must be one of {', '.join(map(str, choices))}, found {shown(value)}"
@@ -141,15 +143,9 @@ def kinds_of(section: Any) -> Mapping[str, Any]:
 
 
 @cache
-def _fields(section: Any) -> tuple[tuple[str, Any, Any, tuple[Any, Range | None]], ...]:
-    """Return name, type, default, and type with range (None: not to be checked quickly) of each field.
+def _fields(section: Any) -> tuple[tuple[str, Any, Any, Any, Range | None], ...]:
+    """Return name, type, default, and the type's base and range of each field.
 
     The defaults are checked by a test, not again in every object.
     """
-    return tuple((f.name, f.type, f.default, _quick(f.type)) for f in dataclasses.fields(section))
-
-
-def _quick(kind: Any) -> tuple[Any, Range | None]:
-    """Return the type and range with which a value is right at once; a number needs a range, which excludes inf."""
-    base, range_ = unpacked(kind)
-    return (base, range_) if base in (bool, str) or range_ is not None else (None, None)
+    return tuple((f.name, f.type, f.default, *unpacked(f.type)) for f in dataclasses.fields(section))

@@ -33,9 +33,10 @@ WALL_LAYERS = 8
 MIN_POINTS = 2
 """A single point in a layer is ignored as noise."""
 MARGIN_CELLS = 4
-MOST_CELLS, LONGEST_RAY = 4_000_000, 10
-"""Cells of the largest plan: 100 m × 100 m with cells of 5 cm, which take 0.7 GB; and how far a ray is followed, times
-the diagonal of the plan."""
+MOST_CELLS = 4_000_000
+"""Cells of the largest plan: 100 m × 100 m with cells of 5 cm, which take 0.7 GB."""
+LONGEST_RAY = 10
+"""How far a ray is followed, in diagonals of the plan."""
 
 Grid = NDArray[np.float32]
 
@@ -158,7 +159,7 @@ class _Cells:
         high = np.maximum(np.quantile(flat, 0.998, axis=0), path[:, :2].max(0))
         first = np.floor(low / cell_m) - MARGIN_CELLS
         count = np.ceil(high / cell_m) + MARGIN_CELLS - first
-        if not np.prod(count) <= MOST_CELLS:
+        if not np.prod(count) <= MOST_CELLS:  # also if it is NaN
             size = " × ".join(f"{n * cell_m:.0f}" for n in count)
             raise SigmaSplatError(
                 f"a floor plan of {size} m has too many cells of {cell_m} m (at most {MOST_CELLS:,}); use larger cells"

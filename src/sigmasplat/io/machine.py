@@ -1,9 +1,10 @@
 """Describe the machine and the code version of a run, for run.json and `doctor`.
 
-Modules of Python that are slow to import are imported at first use: every command imports this module.
+`hashlib` and `platform` are imported at first use: they are slow to import, and every command imports this module.
 """
 
 import os
+import subprocess
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -61,8 +62,6 @@ def _commit_of(checkout: Path) -> str | None:
     """Return the commit of a folder that is itself a checkout; a repository in a parent folder is not ours."""
     if not (checkout / ".git").exists():
         return None
-    import subprocess
-
     command = ["git", "-C", str(checkout), "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
     try:
         answer = subprocess.run(command, capture_output=True, text=True, timeout=5, check=True)

@@ -48,11 +48,11 @@ def read_uncertainty(folder: Path) -> MapUncertainty | None:
     try:
         background = dict(values["background"])
         red, green, blue = background.pop("color")
-        color = {name: _weight(dict(values["color"]), name) for name in COLOR_PARTS}
-        depth = {name: _weight(dict(values["depth"]), name) for name in DEPTH_PARTS}
-        temperature = {name: float(T) for name, T in dict(values.get("temperature", {})).items()}
+        color = {name: _weight(values["color"], name) for name in COLOR_PARTS}
+        depth = {name: _weight(values["depth"], name) for name in DEPTH_PARTS}
+        temperature = {name: float(T) for name, T in values.get("temperature", {}).items()}
         known, probes = Background((red, green, blue), **background), int(values["probes"])
-    except (KeyError, TypeError, ValueError) as problem:
+    except (AttributeError, KeyError, TypeError, ValueError) as problem:
         raise RunError(f"{path} is not the uncertainty of a map: {problem!r}; run it again") from problem
     with open_tensors(folder / TENSORS, "uncertainty") as file:
         found = {name: file.get_tensor(name) for name in STD_TENSORS if name in file.keys()}  # noqa: SIM118

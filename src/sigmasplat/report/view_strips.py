@@ -13,7 +13,7 @@ from sigmasplat.io.runs import RunFolder
 from sigmasplat.metrics.scored_view import ScoredView
 
 QUALITY, EFFORT = 86, 2
-"""Of WebP; a larger effort takes half as long again and saves no space."""
+"""Quality of WebP, and the effort to compress (0 to 6; a larger one takes longer and hardly saves space)."""
 PAGE_WIDTH = 1152
 """Width of the page's text column at twice the resolution of a panel, in pixels."""
 HEADINGS = {"test": "novel views"}

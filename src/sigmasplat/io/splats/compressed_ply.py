@@ -19,7 +19,7 @@ from sigmasplat.io.atomic import replacing
 from sigmasplat.io.binary import open_binary
 from sigmasplat.io.ply_elements import Element, read_header
 from sigmasplat.io.splats.quaternions import Doubles, from_smallest_three, smallest_three
-from sigmasplat.io.splats.values import SplatValues, morton_order, opacities_of, opacity_bytes
+from sigmasplat.io.splats.values import SplatValues, by_channel, morton_order, opacities_of, opacity_bytes
 from sigmasplat.model.field import GaussianField
 
 CHUNK = 256
@@ -47,7 +47,7 @@ def write_field(path: Path, field: GaussianField) -> None:
     which, others = smallest_three(values.quats)
     words[:, 1] = which << 30 | _packed(others * np.sqrt(0.5) + 0.5, ROTATION_BITS)
     words[:, 3] = words[:, 3] << 8 | opacity_bytes(values.opacities)
-    sh = _by_channel(np.clip((values.harmonics / SH_RANGE + 0.5) * 256.0, 0.0, 255.0).astype(np.uint8))
+    sh = by_channel(np.clip((values.harmonics / SH_RANGE + 0.5) * 256.0, 0.0, 255.0).astype(np.uint8))
     header = _header({"chunk": ("float", LIMITS), "vertex": ("uint", WORDS)}, len(values), sh.shape[1])
     with replacing(path) as temporary, temporary.open("wb") as file:
         file.write(header.encode("ascii"))
@@ -120,11 +120,6 @@ def _header(elements: dict[str, tuple[str, list[str]]], count: int, harmonics: i
     for name, (kind, properties) in elements.items():
         lines += [f"element {name} {counts.get(name, count)}", *(f"property {kind} {p}" for p in properties)]
     return "\n".join([*lines, "end_header", ""])
-
-
-def _by_channel(sh: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Reorder columns 3·i + channel to the file's order: all of red, then green, then blue."""
-    return sh.reshape(len(sh), sh.shape[1] // 3, 3).swapaxes(1, 2).reshape(sh.shape)
 
 
 def _harmonics(rest: list[NDArray[np.void]], count: int) -> Doubles:

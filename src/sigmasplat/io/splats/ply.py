@@ -20,7 +20,7 @@ from sigmasplat.errors import SourceError
 from sigmasplat.io.atomic import replacing
 from sigmasplat.io.binary import open_binary
 from sigmasplat.io.ply_elements import read_header
-from sigmasplat.io.splats.values import SH_C0, check_finite, check_values
+from sigmasplat.io.splats.values import SH_C0, by_channel, check_finite, check_values
 from sigmasplat.model.field import ATTRIBUTES, COLUMNS, INITIAL_LOG_VARIANCE, GaussianField, Rows
 from sigmasplat.model.harmonics import DEGREES, count
 from sigmasplat.model.map_uncertainty import SplatStd
@@ -46,7 +46,7 @@ def write_field(path: Path, field: GaussianField, *, plain: bool = False, std: S
     `std` adds its two columns unless `plain`. Raises RunError if the file cannot be written.
     """
     params = field.params.detach().cpu().numpy().astype(np.float32)
-    harmonics = _by_channel(field)
+    harmonics = _harmonics_for_file(field)
     rest = [f"{REST}{i}" for i in range(ATTRIBUTES["harmonics"] if plain else harmonics.shape[1])]
     correlations = field.attributes.get("correlations")
     ours = [] if plain else [*PLY_COLUMNS["log_variances"], *(CORRELATIONS if correlations is not None else [])]
@@ -73,12 +73,11 @@ def write_field(path: Path, field: GaussianField, *, plain: bool = False, std: S
         file.write(rows.tobytes())
 
 
-def _by_channel(field: GaussianField) -> NDArray[np.float32]:
+def _harmonics_for_file(field: GaussianField) -> NDArray[np.float32]:
     """Return a field's harmonics in the file's order [N, 45], or [N, 0]."""
     if "harmonics" not in field.attributes:
         return np.empty((len(field), 0), np.float32)
-    values = field.attributes["harmonics"].params.detach().cpu().numpy().astype(np.float32)
-    return values.reshape(len(field), values.shape[1] // 3, 3).swapaxes(1, 2).reshape(values.shape)
+    return by_channel(field.attributes["harmonics"].params.detach().cpu().numpy().astype(np.float32))
 
 
 def read_field(path: Path) -> GaussianField:
