@@ -160,6 +160,12 @@ def test_a_run_resumes_with_the_same_bytes_after_a_relocalisation(kidnapped: Rec
     assert slam.relocaliser.indexed == whole.relocaliser.indexed
 
 
+def test_nothing_still_is_taken_for_moving_after_a_relocalisation() -> None:
+    slam = followed([*AHEAD, BLACK, BLACK, *BACK[:4]], settings(moving__find="true"))
+    assert "relocalised" in states(slam)
+    assert [step.tracking.get("moving", 0.0) for step in slam.steps] == [0.0] * len(slam.steps)
+
+
 # ---- uncovered where no map is: a new map begins, and joins
 
 JOINING = [*range(10), BLACK, BLACK, *range(2, 6), BLACK, *range(48, 6, -2)]

@@ -97,8 +97,8 @@ class Tracker:
             best = self._retry(field, view, shown, best, expected, hurried)
         self.R_inertial_camera = R_inertial_camera
         self.lost = self._is_lost(best) or self._leaps(best, expected.predicted)
-        if self.lost:
-            self.front = None
+        if self.lost:  # earlier poses do not fit to those that follow
+            self.front, self.watch = None, self.watch.cleared()
         self.doubtful = self.doubtful + 1 if self._contradicted(best) else 0
         best.T_camera_world = se3.orthonormalise(best.T_camera_world)
         if not self.lost:
