@@ -79,8 +79,8 @@ def compared(name: str, words: tuple[str, ...], pairs: int, other: Path) -> dict
     }  # fmt: skip
 
 
-def section(figures: dict[str, Any]) -> Section:
-    """Return the table of the results."""
+def sections(figures: dict[str, Any]) -> list[Section]:
+    """Return the tables of the results."""
     rows = [
         [
             each["command"], str(each["pairs"]), significant(each["other_s"]), significant(each["this_s"]),
@@ -89,7 +89,7 @@ def section(figures: dict[str, Any]) -> Section:
         for each in figures["commands"]
     ]  # fmt: skip
     header = ["command", "pairs", "other, s", "this, s", "ratio", "middle half"]
-    return Section(f"Processor time beside {figures['other']}", header, rows)
+    return [Section(f"Processor time beside {figures['other']}", header, rows)]
 
 
 def main(options: Options) -> int:
@@ -108,7 +108,7 @@ def main(options: Options) -> int:
     other = subprocess.run(git, capture_output=True, text=True, check=True).stdout.strip()
     figures = {"other": other, "commands": found}
     program.keep("startup", figures, options)
-    print(section(figures).markdown())
+    print("\n".join(section.markdown() for section in sections(figures)))
     return 0
 
 

@@ -46,12 +46,13 @@ def read_uncertainty(folder: Path) -> MapUncertainty | None:
         return None
     values = read_json(path)
     try:
-        background = dict(values["background"])
-        red, green, blue = background.pop("color")
+        behind = values["background"]
+        red, green, blue = map(float, behind["color"])
+        known = Background((red, green, blue), float(behind["color_variance"]), float(behind["depth_variance_m2"]))
         color = {name: _weight(values["color"], name) for name in COLOR_PARTS}
         depth = {name: _weight(values["depth"], name) for name in DEPTH_PARTS}
         temperature = {name: float(T) for name, T in values.get("temperature", {}).items()}
-        known, probes = Background((red, green, blue), **background), int(values["probes"])
+        probes = int(values["probes"])
     except (AttributeError, KeyError, TypeError, ValueError) as problem:
         raise RunError(f"{path} is not the uncertainty of a map: {problem!r}; run it again") from problem
     with open_tensors(folder / TENSORS, "uncertainty") as file:

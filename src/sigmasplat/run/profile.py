@@ -25,7 +25,7 @@ def profile(steps: Iterable[Mapping[str, Any]], wall_s: float) -> dict[str, floa
     lines = [step["seconds"] for step in steps]
     total = {stage: sum(line.get(name, 0.0) for line in lines for name in names) for stage, names in STAGES.items()}
     total["align"] = sum(line.get("track", 0.0) - line.get("track_kernels", 0.0) for line in lines)
-    inside = sum(line["total"] for line in lines)
+    inside = sum(line.get("total", 0.0) for line in lines)  # a damaged log may lack it
     total["other"] = max(inside - sum(total.values()), 0.0)
     total["io"] = max(wall_s - inside, 0.0)
     return total
