@@ -15,6 +15,7 @@ from sigmasplat.evaluation.path_scores import score_frame_sets
 from sigmasplat.evaluation.pose_covariance import score_pose_covariance
 from sigmasplat.evaluation.view_scoring import ViewScoring, score_full_resolution, score_test_views
 from sigmasplat.io.frames import RunFrames
+from sigmasplat.io.run_values import frame_seconds
 from sigmasplat.io.runs import TRUTH, RunFolder
 from sigmasplat.io.trajectory import write_trajectory
 from sigmasplat.metrics import views
@@ -253,7 +254,7 @@ def _facts(run: RunFolder, source: Source, log: Log, field: GaussianField) -> di
 
 def _frames_per_s(run: RunFolder, log: Log) -> float | None:
     """Return the end-to-end speed: from wall_s of run.json if it exists, else from the sum of the frames' times."""
-    seconds = run.facts().get("wall_s") or sum(charts.frame_seconds(record) for record in log)
+    seconds = run.facts().get("wall_s") or sum(frame_seconds(record) for record in log)
     return len(log) / seconds if seconds else None
 
 
@@ -265,7 +266,7 @@ def _total_s(run: RunFolder) -> float | None:
 
 def _worst_frame_s(log: Log) -> float | None:
     """Return the longest time of a frame except the first, which creates the map; None if no frame was timed."""
-    return max(map(charts.frame_seconds, log[1:]), default=0.0) or None
+    return max(map(frame_seconds, log[1:]), default=0.0) or None
 
 
 def _draw_plots(run: RunFolder, frames: RunFrames, truth: Trajectory | None) -> dict[str, str]:

@@ -109,6 +109,12 @@ def check_log(records: list[Any], path: Path) -> list[dict[str, Any]]:
     return [Record(check_fields(record, LOG, (), where), where) for record, where in zip(records, places, strict=True)]
 
 
+def frame_seconds(record: Mapping[str, Any]) -> float:
+    """Return the time of one frame: its `total`, or the sum of its stages."""
+    stages: dict[str, float] = record.get("seconds") or {}
+    return float(stages.get("total", sum(stages.values())))
+
+
 def _short(value: Any) -> str:
     if isinstance(value, int) and not isinstance(value, bool) and not math.log10(abs(value) + 1) < 60:
         return "a very large number"

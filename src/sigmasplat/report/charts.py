@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from sigmasplat.drawing.plot import ACCENT, BLUE, FAINT, GREEN, PURPLE, Chart, Curve
 from sigmasplat.io.frames import RunFrames
+from sigmasplat.io.run_values import frame_seconds
 from sigmasplat.model.component import APART, LOST, RELOCALISED, TRACKED
 from sigmasplat.types import Matrix
 
@@ -84,12 +85,6 @@ def _path_charts(
     if submaps.max() > 0:
         found["submaps"] = [submap_chart(estimate, submaps, _known_links(frames, loops))], SUBMAPS_CAPTION
     return found
-
-
-def frame_seconds(record: dict[str, Any]) -> float:
-    """Return the time of one frame: its `total`, or the sum of its stages."""
-    stages: dict[str, float] = record.get("seconds") or {}
-    return float(stages.get("total", sum(stages.values())))
 
 
 def _stages(log: Log) -> list[str]:

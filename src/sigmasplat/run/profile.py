@@ -1,7 +1,9 @@
 """Sum a run's time by stage: kernels, loss, optimiser, alignment, input and the rest."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
+
+from sigmasplat.io.run_values import frame_seconds
 
 STAGES: dict[str, tuple[str, ...]] = {
     "project": ("project",),
@@ -15,7 +17,7 @@ STAGES: dict[str, tuple[str, ...]] = {
 """Stages that the log measures directly, and the counters that make up each."""
 
 
-def profile(steps: Iterable[Mapping[str, Any]], wall_s: float) -> dict[str, float]:
+def profile(steps: Sequence[Mapping[str, Any]], wall_s: float) -> dict[str, float]:
     """Sum the seconds of log lines by stage; all stages together give wall_s.
 
     backward: gradients from pixels to splats; optimiser: gradients from splats to parameters and the Adam step, in one
@@ -25,7 +27,7 @@ def profile(steps: Iterable[Mapping[str, Any]], wall_s: float) -> dict[str, floa
     lines = [step["seconds"] for step in steps]
     total = {stage: sum(line.get(name, 0.0) for line in lines for name in names) for stage, names in STAGES.items()}
     total["align"] = sum(line.get("track", 0.0) - line.get("track_kernels", 0.0) for line in lines)
-    inside = sum(line.get("total", 0.0) for line in lines)  # a damaged log may lack it
+    inside = sum(map(frame_seconds, steps))
     total["other"] = max(inside - sum(total.values()), 0.0)
     total["io"] = max(wall_s - inside, 0.0)
     return total

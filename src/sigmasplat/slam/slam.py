@@ -180,11 +180,11 @@ class Slam(MapWork, ArrayInterface):
         """Continue where the camera was found: in the active submap, or in a new one that is connected to the place."""
         found.state, submap = RELOCALISED, place.where[0]
         found.tracking |= place.values()
-        self.tracker.watch = self.tracker.watch.cleared()
         if submap == len(self.store):
             found.T_submap_camera = place.T_submap_camera
             self.tracker.move_to(self.mapper.field, self.view, place.keyframe, place.T_submap_camera)
         else:
+            self.tracker.watch = self.tracker.watch.cleared()
             found.loops += completed(self.branch_at(place))
             found.T_submap_camera, found.mapped = np.eye(4), True
         self.recovery.found()

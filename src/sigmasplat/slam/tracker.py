@@ -97,7 +97,7 @@ class Tracker:
             best = self._retry(field, view, shown, best, expected, hurried)
         self.R_inertial_camera = R_inertial_camera
         self.lost = self._is_lost(best) or self._leaps(best, expected.predicted)
-        if self.lost:  # earlier poses do not fit to those that follow
+        if self.lost:  # poses of earlier frames do not agree with later ones
             self.front, self.watch = None, self.watch.cleared()
         self.doubtful = self.doubtful + 1 if self._contradicted(best) else 0
         best.T_camera_world = se3.orthonormalise(best.T_camera_world)
