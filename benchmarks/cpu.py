@@ -7,7 +7,10 @@ example: python benchmarks/cpu.py --quick
 """
 
 import multiprocessing
+import os
+import signal
 import sys
+import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
@@ -57,8 +60,20 @@ class Options:
 
 def alone(work: Callable[..., Any], *arguments: Any) -> Any:
     """Run a function in a fresh process and return its result: cold caches, its own peak memory."""
-    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+    spawn = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, spawn, initializer=_end_with, initargs=(os.getpid(),)) as pool:
         return pool.submit(work, *arguments).result()
+
+
+def _end_with(parent: int) -> None:
+    """End this process with SIGTERM when its parent ends, however that happens."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(1.0)
+        signal.raise_signal(signal.SIGTERM)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def supported_isas() -> tuple[str, ...]:

@@ -37,7 +37,8 @@ SUBJECTS = {
     "Real time": ("realtime", "long_live"),
     "Depth noise": ("sensor_models",),
     "Stereo": ("stereo",),
-    "Long runs": ("long_run", "viewer_memory"),
+    "Long runs": ("long_run", "endurance", "viewer_memory"),
+    "Start-up": ("startup",),
     "Killed runs": ("crashes",),
 }
 """Benchmarks by the subject under which their results are listed, in this order; all others follow at the end."""

@@ -17,6 +17,8 @@ from sigmasplat.slam.loop_closure import closer
 from sigmasplat.slam.loop_closure.candidates import SubmapPair
 from sigmasplat.slam.loop_closure.closer import LoopCloser, make_descriptor
 from sigmasplat.slam.loop_closure.descriptors import OrientationGrid
+from sigmasplat.slam.loop_closure.neighbourhood import Neighbourhood
+from sigmasplat.slam.loop_closure.pose_graph import Edge
 from sigmasplat.slam.loop_closure.registration import Registration
 from sigmasplat.types import Slices
 
@@ -159,6 +161,41 @@ def test_components_that_have_joined_share_a_pose_graph(monkeypatch: pytest.Monk
     assert np.array_equal(atlas.anchors[0], np.eye(4))
     assert {loop.query for loop in made.loops if np.isfinite(loop.chi2)} == {7, 8}
     assert abs(atlas.anchors[4][0, 3]) < 0.03
+
+
+def test_in_a_long_run_the_whole_graph_is_solved_if_it_has_grown_or_a_loop_disagrees(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The camera walks 12 m and turns back. Odometry is wrong by 0.5 mm at each step, and at the last by 3 cm."""
+    made, solved, part_of = make_closer(monkeypatch, {}), dict[int, bool](), Neighbourhood.of
+
+    def small_part(nodes: list[int], edges: list[Edge], centre: int | None) -> Neighbourhood:
+        solved[nodes[-1]] = centre is None
+        return part_of(nodes, edges, centre, 4)
+
+    monkeypatch.setattr(Neighbourhood, "of", small_part)
+    monkeypatch.setattr(closer, "MOST_FREE", 4)
+    places = [*range(13), *range(11, -1, -1)]
+    Registered.truth = [se3.exp(np.array([x, 0, 0, 0, 0, 0.0])) for x in places]
+    atlas = Atlas()
+    for k, x in enumerate(places):
+        step = se3.inverse(Registered.truth[k - 1]) @ Registered.truth[k]
+        step[0, 3] += 0.03 if k == 24 else 5e-4
+        if k:
+            made.connect(k - 1, k, step, np.diag([1e4] * 6))
+        atlas.begin_submap(step if k else None)
+        before = np.stack(atlas.anchors)
+        finished(made, atlas, 25.0 * x)
+        if solved.get(k) is False:
+            assert 0 < (np.abs(np.stack(atlas.anchors) - before).max((1, 2)) > 0).sum() <= 4, "only those near it move"
+    assert all(loop.accepted for loop in made.loops)
+    assert [k for k, whole in solved.items() if whole] == [13, 17, 22, 24], "first, 1.25 times, 1.25 times, 3 cm"
+    assert [k for k, whole in solved.items() if not whole] == [14, 15, 16, 18, 19, 20, 21, 23]
+    made.solve_all(atlas)
+    assert solved[24]
+    np.testing.assert_allclose(
+        [T[0, 3] for T in atlas.anchors[13:]], [atlas.anchors[x][0, 3] for x in places[13:]], atol=2e-3
+    )
 
 
 def test_the_descriptor_by_its_name() -> None:

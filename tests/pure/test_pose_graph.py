@@ -13,6 +13,7 @@ from scipy.stats import chi2
 
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.model import se3
+from sigmasplat.slam.loop_closure.neighbourhood import Neighbourhood
 from sigmasplat.slam.loop_closure.pose_graph import Edge, LoopVerdict, PoseGraph, optimise
 
 Array = NDArray[np.float64]
@@ -275,6 +276,32 @@ def test_without_loops_nothing_changes() -> None:
     assert found.verdicts == () and found.iterations == 0 and found.cost_before == found.cost_after > 0
     single = optimise(drifted[5:6], [])
     assert single.T_world_node.tobytes() == drifted[5:6].tobytes() and single.cost_after == 0
+
+
+# A part of a large graph.
+
+
+def test_a_part_moves_only_its_nodes_and_nearly_as_the_whole_graph_does() -> None:
+    truth, drifted, edges = scene(3, nodes=120, true_loops=60, false_loops=0)
+    settled = optimise(drifted, edges).T_world_node
+    error = LOOP_SIGMA * np.random.default_rng(0).normal(size=6)
+    edges.append(measured(truth, 119, 60, error, np.diag((0.5 * LOOP_SIGMA) ** -2.0), True))
+    part, whole = Neighbourhood.of(range(120), edges, 119, 30), optimise(settled, edges).T_world_node
+    found = part.solve(settled, edges)
+    nodes, free = list(part.nodes), list(part.nodes[part.fixed :])
+    assert len(free) == 30 and {119, 60, 118} <= set(free) and 0 not in free
+    assert found.T_world_node[: part.fixed].tobytes() == settled[nodes[: part.fixed]].tobytes()
+    missed, moved = (node_error(T, whole[free]) for T in (found.T_world_node[part.fixed :], settled[free]))
+    assert missed < 0.4 * moved
+    assert found.cost_after < found.cost_before and len(found.verdicts) == sum(edges[row].loop for row in part.edges)
+
+
+def test_a_small_graph_and_one_without_a_centre_are_solved_as_a_whole() -> None:
+    _, drifted, edges = scene(1)
+    whole = optimise(drifted, edges)
+    for part in (Neighbourhood.of(range(50), edges, 49, 50), Neighbourhood.of(range(50), edges, None, 3)):
+        assert part.nodes == tuple(range(50)) and part.fixed == 1 and part.edges == tuple(range(len(edges)))
+        assert part.solve(drifted, edges).T_world_node.tobytes() == whole.T_world_node.tobytes()
 
 
 # What is refused.

@@ -28,7 +28,7 @@ def to_json(value: Any) -> Any:
 
 
 def write_json(path: Path, values: Any) -> None:
-    """Write a file atomically. Raises RunError if it cannot be written."""
+    """Write a file atomically, a list with one line per item. Raises RunError if it cannot be written."""
     write_text(path, _json_text(values))
 
 
@@ -38,6 +38,8 @@ def write_json_on_full_disk(path: Path, values: Any) -> None:
 
 
 def _json_text(values: Any) -> str:
+    if isinstance(values, list) and values:  # may be long, and indenting is slow
+        return "[\n" + ",\n".join(json_line(item).rstrip() for item in values) + "\n]\n"
     return json.dumps(to_json(values), indent=2, allow_nan=False) + "\n"
 
 

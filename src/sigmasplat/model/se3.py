@@ -191,6 +191,16 @@ def is_rigid(T: Matrix, tolerance: float = 1e-3) -> bool:
     )
 
 
+def are_rigid(T: Matrix, tolerance: float = 1e-3) -> NDArray[np.bool_]:
+    """Return which matrices [N, 4, 4] are rigid, as `is_rigid`."""
+    finite = np.asarray(np.isfinite(T).all((1, 2)))
+    known = np.where(finite[:, None, None], T, np.eye(4))
+    R = known[:, :3, :3]
+    orthonormal = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max((1, 2)) < tolerance
+    last_row = np.abs(known[:, 3] - [0, 0, 0, 1]).max(1) < tolerance
+    return np.asarray(finite & orthonormal & (np.linalg.det(R) > 0) & last_row)
+
+
 def is_rotation(R: Matrix, tolerance: float = 1e-3) -> bool:
     """Return whether a 3×3 matrix is a rotation: finite, orthonormal with determinant +1."""
     return bool(

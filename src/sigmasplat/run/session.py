@@ -33,6 +33,8 @@ from sigmasplat.run.signals import interrupt_event
 from sigmasplat.sources.base import Source
 
 RUNS = Path("runs")
+LOOPS_GROWTH = 1.05
+"""loops.json is written when the number of loops has grown by this factor: a long run writes a loop about 20 times."""
 
 
 def new_folder(
@@ -182,6 +184,7 @@ class Session:
     relocalised: int = field(default=0, init=False)
     apart: tuple[int, ...] = field(default=(), init=False)
     submaps: int = field(default=1, init=False)
+    loops_written: int = field(default=0, init=False)
 
     def execute(self) -> Outcome:
         """Process all frames, make the final map, and write trajectory, map, loops and checkpoint.
@@ -265,12 +268,12 @@ class Session:
 
     def _log(self, step: StepResult, arrived_s: float | None) -> None:
         """Append the step to log.jsonl, with the time since the image arrived if it is known; update loops.json if
-        loops were tried, and count the frame."""
+        enough loops were tried since it was written, and count the frame."""
         line = log_line(step)
         if arrived_s is not None:
             line["seconds"]["latency"] = time.perf_counter() - arrived_s
         self.run.log(line)
-        if step.loops:
+        if step.loops and len(self.slam.loops) >= LOOPS_GROWTH * self.loops_written:
             self.later(self._write_loops)
         self.frames += 1
         self.lost += step.lost
@@ -309,7 +312,9 @@ class Session:
             self.run.write_uncertainty(self.slam.uncertainty)
 
     def _write_loops(self) -> None:
-        self.run.write_loops([loop.record() for loop in self.slam.loops])
+        records = [loop.record() for loop in self.slam.loops]
+        self.run.write_loops(records)
+        self.loops_written = len(records)
 
     def _outcome(self, status: str) -> Outcome:
         closed = sum(loop.accepted for loop in self.slam.loops)

@@ -74,6 +74,7 @@ class Slam(MapWork, ArrayInterface):
         progress(0, total)
         completed(self.finish_submap())
         self._connect_components()
+        self.closer.solve_all(self.atlas)
         members = self.atlas.members(0)
         store, anchors = StorePart(self.store, members), [self.atlas.anchors[s] for s in members]
         refining, measuring = (part_of(progress, first, total) for first in (0, steps))

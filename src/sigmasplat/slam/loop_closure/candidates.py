@@ -12,6 +12,8 @@ from sigmasplat.types import Matrix
 
 Descriptors = NDArray[np.float32]
 
+ROUNDING = 1e-6
+"""Larger than any rounding error of a similarity."""
 GATE_LEAST, GATE_MOST = 0.85, 1.20
 """Limits of the factor by which the variance of two submaps changes the similarity of their keyframes."""
 
@@ -110,9 +112,8 @@ def find_candidates(
     """
     threshold = self_similarity(query.descriptors, min_similarity)
     found: list[Candidate] = []
-    for other in database:
-        if abs(other.index - query.index) < max(min_interval, 1):
-            continue
+    least = threshold / (np.where(threshold > 0.0, GATE_MOST, GATE_LEAST) if uncertainty else 1.0)
+    for other in _worth_comparing(query, _apart(query, database, min_interval), least - ROUNDING):
         factor = gate(query.opacity_ratio, other.opacity_ratio) if uncertainty else 1.0
         alike = similarity(query.descriptors, other.descriptors)
         rows, columns = np.nonzero((alike * factor > threshold[:, None]) & (alike > similarity_floor))
@@ -131,38 +132,70 @@ def find_nearby(
     near_rad: float,
     min_interval: int = 2,
     keyframes: int = 2,
+    most: int | None = None,
 ) -> list[SubmapPair]:
-    """List pairs of submaps that show the same place according to the current poses; nearest first.
+    """List pairs of submaps that show the same place according to the current poses; the `most` nearest, nearest first.
 
     An addition to the paper: while drift is small, poses find more revisits than descriptors do. T_world_keyframe:
     poses [K, 4, 4] of each submap, by its index. A pair counts if two keyframes are nearer than near_m and their
     rotations differ by less than near_rad. The nearest `keyframes` of each side, in units of both limits, are to be
     localised.
     """
-    found: list[tuple[float, SubmapPair]] = []
-    ours = T_world_keyframe[query.index]
-    for other in database:
-        if abs(other.index - query.index) < max(min_interval, 1):
-            continue
-        theirs = T_world_keyframe[other.index]
-        apart_m = np.linalg.norm(ours[:, None, :3, 3] - theirs[None, :, :3, 3], axis=-1)
-        cosine = (np.einsum("aij,bij->ab", ours[:, :3, :3], theirs[:, :3, :3]) - 1.0) / 2.0
-        apart_rad = np.arccos(np.clip(cosine, -1.0, 1.0))
-        far = apart_m / near_m + apart_rad / near_rad
-        within = np.where((apart_m < near_m) & (apart_rad < near_rad), far, np.inf)
-        q, d = (int(i) for i in np.unravel_index(int(within.argmin()), far.shape))
-        if np.isfinite(within[q, d]):
-            alike = float(similarity(query.descriptors[q : q + 1], other.descriptors[d : d + 1])[0, 0])
-            best = Candidate(query.index, q, other.index, d, alike, alike)
-            sides = _highest(-far.min(1), keyframes), _highest(-far.min(0), keyframes)
-            found.append((float(within[q, d]), SubmapPair(best, *sides)))
-    return [pair for _, pair in sorted(found, key=lambda f: (f[0], f[1].best.database_submap))]
+    ours, others = T_world_keyframe[query.index], _apart(query, database, min_interval)
+    if not others:
+        return []
+    poses = [T_world_keyframe[other.index] for other in others]
+    first = np.cumsum([0, *map(len, poses)])
+    apart_m, apart_rad = _differences(ours, np.concatenate(poses))
+    far = apart_m / near_m + apart_rad / near_rad
+    within = np.where((apart_m < near_m) & (apart_rad < near_rad), far, np.inf)
+    nearest = np.minimum.reduceat(within.min(0), first[:-1])
+    found = []
+    for row in sorted(np.flatnonzero(np.isfinite(nearest)), key=lambda row: (nearest[row], others[row].index))[:most]:
+        other, ours_theirs = others[row], far[:, first[row] : first[row + 1]]
+        q, d = np.argwhere(within[:, first[row] : first[row + 1]] == nearest[row])[0].tolist()
+        alike = float(similarity(query.descriptors[q : q + 1], other.descriptors[d : d + 1])[0, 0])
+        best = Candidate(query.index, q, other.index, d, alike, alike)
+        sides = _highest(-ours_theirs.min(1), keyframes), _highest(-ours_theirs.min(0), keyframes)
+        found.append(SubmapPair(best, *sides))
+    return found
+
+
+def _apart(query: SubmapDescriptor, database: Sequence[SubmapDescriptor], min_interval: int) -> list[SubmapDescriptor]:
+    """Return the submaps with keyframes, at least `min_interval` apart from the query, without the query itself."""
+    least = max(min_interval, 1)
+    return [other for other in database if abs(other.index - query.index) >= least and len(other.descriptors)]
+
+
+def _worth_comparing(
+    query: SubmapDescriptor, database: Sequence[SubmapDescriptor], threshold: Matrix
+) -> list[SubmapDescriptor]:
+    """Return the submaps with a keyframe whose similarity to one of the query [n] exceeds its threshold [n]: one
+    product of matrices instead of one per submap."""
+    if not database or not len(threshold):
+        return []
+    first = np.cumsum([0, *(len(other.descriptors) for other in database[:-1])])
+    alike = similarity(query.descriptors, np.concatenate([other.descriptors for other in database]))
+    exceeds = np.logical_or.reduceat((alike > threshold[:, None]).any(0), first)
+    return [other for other, worth in zip(database, exceeds, strict=True) if worth]
+
+
+def _differences(a: Matrix, b: Matrix) -> tuple[Matrix, Matrix]:
+    """Return the distances [n, m] (m) and the angles [n, m] (rad) between poses a [n, 4, 4] and b [m, 4, 4]."""
+    apart_m = np.linalg.norm(a[:, None, :3, 3] - b[None, :, :3, 3], axis=-1)
+    cosine = (np.einsum("aij,bij->ab", a[:, :3, :3], b[:, :3, :3]) - 1.0) / 2.0
+    return apart_m, np.arccos(np.clip(cosine, -1.0, 1.0))
 
 
 def pairs_to_register(
-    candidates: Sequence[Candidate], query: SubmapDescriptor, database: Sequence[SubmapDescriptor], keyframes: int = 2
+    candidates: Sequence[Candidate],
+    query: SubmapDescriptor,
+    database: Sequence[SubmapDescriptor],
+    keyframes: int = 2,
+    most: int | None = None,
 ) -> list[SubmapPair]:
-    """Group a query's candidates by submap, best pair first, and choose the keyframes to localise (VarSplat §5).
+    """Group a query's candidates by submap, the `most` best pairs first, and choose the keyframes to localise
+    (VarSplat §5).
 
     candidates: the result of `find_candidates` for the same query and database. Of each side, the `keyframes` most
     similar to any keyframe of the other side are chosen, most similar first.
@@ -172,7 +205,7 @@ def pairs_to_register(
     for candidate in candidates:
         best.setdefault(candidate.database_submap, candidate)
     pairs = []
-    for index, candidate in best.items():
+    for index, candidate in list(best.items())[:most]:
         alike = similarity(query.descriptors, submaps[index].descriptors)
         pairs.append(SubmapPair(candidate, _highest(alike.max(1), keyframes), _highest(alike.max(0), keyframes)))
     return pairs

@@ -25,7 +25,8 @@ from sigmasplat.slam.loop_closure.candidates import (
     pairs_to_register,
 )
 from sigmasplat.slam.loop_closure.descriptors import Descriptor, OrientationGrid
-from sigmasplat.slam.loop_closure.pose_graph import Edge, LoopVerdict, optimise
+from sigmasplat.slam.loop_closure.neighbourhood import MOST_FREE, Neighbourhood
+from sigmasplat.slam.loop_closure.pose_graph import Edge, LoopVerdict, PoseGraph, most_chi2
 from sigmasplat.slam.loop_closure.registration import Registrar, Registration
 from sigmasplat.slam.predicted_submaps import PredictedSubmaps
 from sigmasplat.types import Matrix, Slices, completed
@@ -33,6 +34,9 @@ from sigmasplat.types import Matrix, Slices, completed
 RIGID = np.diag(np.repeat([1e-4, 1e-5], 3) ** -2.0)
 """Information of the edge to a submap of an earlier session: 0.1 mm and 0.0006°. Its map is finished, and poses in its
 world stay valid: a loop that disagrees moves the submaps of the new session."""
+
+GROWTH = 1.25
+"""The whole pose graph is solved when it has grown by this factor."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +93,11 @@ def lacks_weights(config: LoopConfig) -> bool:
 
 @dataclass(eq=False)
 class LoopCloser:
-    """Keeps the descriptors of finished submaps and all edges between them. Only this class moves anchors."""
+    """Keeps the descriptors of finished submaps and all edges between them. Only this class moves anchors.
+
+    solved: the number of submaps when the whole pose graph was last solved. In between, a loop that agrees with the
+    poses moves only the submaps near it in the graph (`Neighbourhood`).
+    """
 
     config: Config
     store: SubmapStore
@@ -98,6 +106,7 @@ class LoopCloser:
     odometry: list[Edge] = field(default_factory=list)
     closed: list[Edge] = field(default_factory=list)
     loops: list[Loop] = field(default_factory=list)
+    solved: int = 0
 
     def __post_init__(self) -> None:
         self.predicted = PredictedSubmaps(self.config, self.store)
@@ -158,8 +167,9 @@ class LoopCloser:
         for pair in pairs:
             yield
             tried.append((yield from self._try(pair, submap, atlas, view)))
-        if any(loop.accepted for loop in tried):
-            self._correct(atlas, atlas.components[submap.index])
+        if new := self.closed[len(self.closed) - sum(loop.accepted for loop in tried) :]:
+            component = atlas.components[submap.index]
+            self._correct(atlas, component, None if self._is_due(atlas, component, new) else submap.index)
         return self.loops[len(self.loops) - len(tried) :]
 
     def _pairs(self, query: SubmapDescriptor, atlas: Atlas) -> list[SubmapPair]:
@@ -169,14 +179,16 @@ class LoopCloser:
         candidates = find_candidates(
             query, database, c.min_similarity, c.min_interval, c.similarity_floor, c.uncertainty
         )
-        keyframes = self.config.registration.keyframes
-        pairs = pairs_to_register(candidates, query, database, keyframes)
+        keyframes, most = self.config.registration.keyframes, c.most or None
+        pairs = pairs_to_register(candidates, query, database, keyframes, most)
         if c.near_m:
             poses = [atlas.T_world_keyframe(index) for index in range(query.index + 1)]
             near_rad, known = np.deg2rad(c.near_deg), {pair.best.database_submap for pair in pairs}
-            near = find_nearby(query, database, poses, c.near_m, near_rad, c.min_interval, keyframes)
+            # Of the nearest 2n, at most n are known already.
+            twice = None if most is None else 2 * most
+            near = find_nearby(query, database, poses, c.near_m, near_rad, c.min_interval, keyframes, twice)
             pairs += [pair for pair in near if pair.best.database_submap not in known]
-        return pairs[: c.most] if c.most else pairs
+        return pairs[:most]
 
     def _try(self, pair: SubmapPair, a: Submap, atlas: Atlas, view: View) -> Slices[Loop]:
         """Register a pair in slices, with `a` as the query, and record the result, accepted or not."""
@@ -190,18 +202,41 @@ class LoopCloser:
             self.closed.append(Edge(a.index, b.index, found.T_a_b, found.information, loop=True))
         return loop
 
-    def _correct(self, atlas: Atlas, component: int) -> None:
-        """Solve the pose graph of a component, move its anchors, and update the verdict on its registered loops."""
+    def solve_all(self, atlas: Atlas) -> None:
+        """Solve the pose graph of each component as a whole; call it once, after the last submap."""
+        for component in sorted(set(atlas.components)):
+            if len(atlas.members(component)) > MOST_FREE:
+                self._correct(atlas, component)
+
+    def _is_due(self, atlas: Atlas, component: int, new: Sequence[Edge]) -> bool:
+        """Return whether the whole graph is to be solved: new loops disagree with the poses, or it has grown enough.
+
+        Its solution takes time in proportion to its size. Because the size grows by a factor in between, the time per
+        submap stays the same.
+        """
+        if len(atlas.members(component)) > GROWTH * self.solved:
+            return True
+        chi2 = PoseGraph(len(atlas.anchors), new).chi2(np.stack(atlas.anchors))
+        return bool((chi2 > most_chi2()).any())
+
+    def _correct(self, atlas: Atlas, component: int, centre: int | None = None) -> None:
+        """Solve the pose graph of a component, move its anchors, and update the verdict on its registered loops.
+
+        centre: a submap; only submaps near it in the graph are moved. Without it the whole graph is solved.
+        """
         members = atlas.members(component)
-        number = {submap: i for i, submap in enumerate(members)}
-        edges = [replace(e, a=number[e.a], b=number[e.b]) for e in (*self.odometry, *self.closed) if e.a in number]
-        solution = optimise(np.stack([atlas.anchors[submap] for submap in members]), edges)
-        for submap, T_world_submap in zip(members, solution.T_world_node, strict=True):
+        registered = [i for i, loop in enumerate(self.loops) if np.isfinite(loop.chi2) or loop.accepted]
+        known = [(e, None) for e in self.odometry] + list(zip(self.closed, registered, strict=True))
+        inside = [(edge, loop) for edge, loop in known if atlas.components[edge.a] == component]
+        edges = [edge for edge, _ in inside]
+        part = Neighbourhood.of(members, edges, centre)
+        solution = part.solve(atlas.anchors, edges)
+        for submap, T_world_submap in zip(part.nodes, solution.T_world_node, strict=True):
             atlas.anchors[submap] = T_world_submap
-        verdicts = iter(solution.verdicts)
-        for i, loop in enumerate(self.loops):
-            if loop.query in number and (np.isfinite(loop.chi2) or loop.accepted):
-                self.loops[i] = judged(loop, next(verdicts))
+        judged_loops = [loop for _, loop in map(inside.__getitem__, part.edges) if loop is not None]
+        for i, verdict in zip(judged_loops, solution.verdicts, strict=True):
+            self.loops[i] = judged(self.loops[i], verdict)
+        self.solved = max(self.solved, len(members)) if centre is None else self.solved
 
 
 def described(best: Candidate, a: Submap, b: Submap, found: Registration, known: Matrix) -> Loop:

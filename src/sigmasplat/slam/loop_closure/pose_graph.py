@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import coo_array, csc_array
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import SuperLU, splu
@@ -65,32 +66,32 @@ class PoseGraphSolution:
 
 
 def optimise(
-    T_world_node: Matrix, edges: Sequence[Edge], confidence: float = 0.99, max_iterations: int = 100
+    T_world_node: Matrix, edges: Sequence[Edge], confidence: float = 0.99, max_iterations: int = 100, fixed: int = 1
 ) -> PoseGraphSolution:
-    """Find the poses [N, 4, 4] that agree best with the edges; node 0 is fixed.
+    """Find the poses [N, 4, 4] that agree best with the edges; the first `fixed` nodes, at least node 0, stay.
 
     A loop is rejected if its χ² exceeds the `confidence` quantile of 6 degrees of freedom; with confidence = 1 every
     loop is accepted (plain least squares). Without loops the poses are returned unchanged. After the verdicts, up to
     `max_iterations` more steps are taken.
 
     Raises SigmaSplatError on poses or edges that are not rigid, edges to nodes that do not exist, information that is
-    not symmetric positive definite, and nodes without a chain of odometry edges to node 0: if their loops are rejected,
-    their poses are undetermined.
+    not symmetric positive definite, and nodes without a chain of odometry edges to a fixed node: if their loops are
+    rejected, their poses are undetermined.
     """
     if not 0.0 < confidence <= 1.0:
         raise SigmaSplatError(f"pose graph: confidence is {confidence}; give a probability above 0 and at most 1")
     poses = np.array(T_world_node, np.float64)
-    _refuse_bad_input(poses, edges)
+    _refuse_bad_input(poses, edges, fixed)
     if not edges:
         return PoseGraphSolution(poses, (), 0, 0.0, 0.0)
-    graph = PoseGraph(len(poses), edges)
+    graph = PoseGraph(len(poses), edges, fixed)
     # Relative to node 0, so that rounding and the steps do not depend on the origin of the world.
     start = se3.inverse(poses[:1]) @ poses
     if not graph.loop.any():
         cost = float(graph.chi2(start).sum())
         return PoseGraphSolution(poses, (), 0, cost, cost)
 
-    chi2_limit = 2.0 * float(gammaincinv(3.0, confidence))
+    chi2_limit = most_chi2(confidence)
     T, weights, graduating = _graduate(graph, start, chi2_limit)
     believed = np.where(graph.loop, weights >= PRUNE_WEIGHT, True)
     T, finishing = _minimise(graph, T, believed.astype(np.float64), max_iterations)
@@ -101,23 +102,29 @@ def optimise(
         if edge.loop
     )
     solved = poses[0] @ T
-    solved[0] = poses[0]
+    solved[:fixed] = poses[:fixed]
     cost_before, cost_after = float(graph.chi2(start)[believed].sum()), float(chi2[believed].sum())
     return PoseGraphSolution(solved, verdicts, graduating + finishing, cost_before, cost_after)
 
 
-class PoseGraph:
-    """The edges as arrays, and the position of their blocks in the normal equations. Node 0 is fixed and has no row."""
+def most_chi2(confidence: float = 0.99) -> float:
+    """Return the χ² of a loop, with 6 degrees of freedom, above which it is rejected."""
+    return 2.0 * float(gammaincinv(3.0, confidence))
 
-    def __init__(self, nodes: int, edges: Sequence[Edge]) -> None:
-        self.nodes = nodes
+
+class PoseGraph:
+    """The edges as arrays, and the position of their blocks in the normal equations. The first `fixed` nodes have no
+    rows."""
+
+    def __init__(self, nodes: int, edges: Sequence[Edge], fixed: int = 1) -> None:
+        self.nodes, self.fixed = nodes, fixed
         self.a = np.array([edge.a for edge in edges], np.intp)
         self.b = np.array([edge.b for edge in edges], np.intp)
         self.loop = np.array([edge.loop for edge in edges], bool)
         self.T_b_a = se3.inverse(np.stack([edge.T_a_b for edge in edges]).astype(np.float64))
         self.information = np.stack([edge.information for edge in edges]).astype(np.float64)
-        rows = np.stack([self.a, self.b, self.a, self.b])[:, :, None, None] - 1
-        columns = np.stack([self.a, self.b, self.b, self.a])[:, :, None, None] - 1
+        rows = np.stack([self.a, self.b, self.a, self.b])[:, :, None, None] - fixed
+        columns = np.stack([self.a, self.b, self.b, self.a])[:, :, None, None] - fixed
         blocks, six = (4, len(edges), 6, 6), np.arange(6)
         self._free = np.broadcast_to((rows >= 0) & (columns >= 0), blocks)
         self._rows = np.broadcast_to(6 * rows + six[:, None], blocks)[self._free]
@@ -144,11 +151,11 @@ class PoseGraph:
         weighted = weights[:, None, None] * (np.swapaxes(J, 1, 2) @ self.information)
         block, pull = weighted @ J, (weighted @ e[:, :, None])[..., 0]
         values = np.stack([block, block, -block, -block])[self._free]
-        size = 6 * (self.nodes - 1)
+        size = 6 * (self.nodes - self.fixed)
         g = np.zeros((self.nodes, 6))
         np.add.at(g, self.b, pull)
         np.add.at(g, self.a, -pull)
-        return coo_array((values, (self._rows, self._columns)), shape=(size, size)).tocsc(), g[1:].ravel()
+        return coo_array((values, (self._rows, self._columns)), shape=(size, size)).tocsc(), g[self.fixed :].ravel()
 
 
 def _graduate(graph: PoseGraph, T: Matrix, chi2_limit: float) -> tuple[Matrix, Matrix, int]:
@@ -182,7 +189,7 @@ def _minimise(graph: PoseGraph, T: Matrix, weights: Matrix, max_iterations: int)
         H.setdiag(H.diagonal() * (1.0 + damping))
         delta = _factorised(H).solve(-g)
         moved = T.copy()
-        moved[1:] = se3.exp_stack(delta.reshape(-1, 6)) @ T[1:]
+        moved[graph.fixed :] = se3.exp_stack(delta.reshape(-1, 6)) @ T[graph.fixed :]
         cost_moved = float(weights @ graph.chi2(moved))
         if cost_moved < cost:
             settled = cost - cost_moved < 1e-10 * cost and damping < 1e-6
@@ -229,24 +236,22 @@ class Sensitivity:
         return np.asarray((G @ np.linalg.inv(self.graph.information) @ np.swapaxes(G, 1, 2)).sum(0))
 
 
-def _refuse_bad_input(poses: Matrix, edges: Sequence[Edge]) -> None:
+def _refuse_bad_input(poses: Matrix, edges: Sequence[Edge], fixed: int) -> None:
     """Raise SigmaSplatError if the input is invalid; its message names the node or the edge."""
     if poses.ndim != 3 or poses.shape[1:] != (4, 4) or not len(poses):
         raise SigmaSplatError(
             f"pose graph: poses have shape {list(poses.shape)}; give [N, 4, 4] with at least one node"
         )
-    for node, T in enumerate(poses):
-        if not se3.is_rigid(T):
-            raise SigmaSplatError(f"pose graph: the pose of node {node} is not a rigid motion; orthonormalise it first")
+    for node in np.flatnonzero(~se3.are_rigid(poses)):
+        raise SigmaSplatError(f"pose graph: the pose of node {node} is not a rigid motion; orthonormalise it first")
     for edge in edges:
-        name = f"pose graph: edge {edge.a} → {edge.b}"
         if edge.a == edge.b or not (0 <= edge.a < len(poses) and 0 <= edge.b < len(poses)):
-            raise SigmaSplatError(f"{name} does not connect two of the {len(poses)} nodes; they are numbered from 0")
-        if not se3.is_rigid(edge.T_a_b):
-            raise SigmaSplatError(f"{name} does not have a rigid motion; orthonormalise it first")
-        if not _is_positive_definite(edge.information):
-            raise SigmaSplatError(f"{name} has an information matrix that is not 6×6 symmetric positive definite")
-    trusted = [(edge.a, edge.b) for edge in edges if not edge.loop]
+            raise SigmaSplatError(
+                f"{_name(edge)} does not connect two of the {len(poses)} nodes; they are numbered from 0"
+            )
+    if edges:
+        _refuse_bad_measurements(edges)
+    trusted = [(edge.a, edge.b) for edge in edges if not edge.loop] + [(0, node) for node in range(1, fixed)]
     a, b = np.array(trusted, np.intp).reshape(-1, 2).T
     _, part = connected_components(coo_array((np.ones(len(a)), (a, b)), shape=(len(poses),) * 2), directed=False)
     loose = np.flatnonzero(part != part[0])
@@ -256,11 +261,29 @@ def _refuse_bad_input(poses: Matrix, edges: Sequence[Edge]) -> None:
         )
 
 
-def _is_positive_definite(information: Matrix) -> bool:
-    """Return whether a matrix is finite, 6×6, symmetric and positive definite, up to rounding."""
-    if information.shape != (6, 6) or not np.isfinite(information).all():
-        return False
-    if np.abs(information - information.T).max() > 1e-9 * np.abs(information).max():
-        return False
-    eigenvalues = np.linalg.eigvalsh(information)
-    return bool(eigenvalues[0] > np.finfo(np.float64).eps * eigenvalues[-1])
+def _refuse_bad_measurements(edges: Sequence[Edge]) -> None:
+    for i in np.flatnonzero(~se3.are_rigid(_stacked([edge.T_a_b for edge in edges], 4))).tolist():
+        raise SigmaSplatError(f"{_name(edges[i])} does not have a rigid motion; orthonormalise it first")
+    for i in np.flatnonzero(~_are_positive_definite(_stacked([edge.information for edge in edges], 6))).tolist():
+        raise SigmaSplatError(
+            f"{_name(edges[i])} has an information matrix that is not 6×6 symmetric positive definite"
+        )
+
+
+def _name(edge: Edge) -> str:
+    return f"pose graph: edge {edge.a} → {edge.b}"
+
+
+def _stacked(matrices: Sequence[Matrix], size: int) -> Matrix:
+    """Return matrices [N, size, size]; NaN in place of those of another shape."""
+    missing = np.full((size, size), np.nan)
+    return np.stack([matrix if matrix.shape == (size, size) else missing for matrix in matrices])
+
+
+def _are_positive_definite(information: Matrix) -> NDArray[np.bool_]:
+    """Return which matrices [N, 6, 6] are finite, symmetric and positive definite, up to rounding."""
+    good = np.asarray(np.isfinite(information).all((1, 2)))
+    known = np.where(good[:, None, None], information, np.eye(6))
+    good &= np.abs(known - np.swapaxes(known, 1, 2)).max((1, 2)) <= 1e-9 * np.abs(known).max((1, 2))
+    eigenvalues = np.linalg.eigvalsh(known)
+    return np.asarray(good & (eigenvalues[:, 0] > np.finfo(np.float64).eps * eigenvalues[:, -1]))
