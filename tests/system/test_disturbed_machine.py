@@ -1,9 +1,10 @@
-"""A busy machine, clocks that jump, a pause of the process and a slow disk do not change a run."""
+"""A busy machine, clocks that jump, a pause of the process and a slow disk do not change a run; frames never wait."""
 
 import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 from unittest import mock
@@ -54,3 +55,19 @@ def test_two_runs_at_once_with_jumping_clocks_and_a_pause_are_those_of_one_with_
             run.communicate()
     assert synced and lines(tmp_path / "alone") == 8
     assert contents(outs[0]) == contents(outs[1]) == contents(tmp_path / "alone")
+
+
+def test_in_real_time_no_frame_waits_for_the_disk(tmp_path: Path) -> None:
+    """While frames arrive, files are synchronised by the mapping thread only: here every one takes 50 ms."""
+    out, sync, waited = tmp_path / "run", os.fsync, list[tuple[str, int]]()
+
+    def slow_sync(file: int) -> None:
+        waited.append((threading.current_thread().name, lines(out)))
+        time.sleep(0.05)
+        sync(file)
+
+    with mock.patch.object(os, "fsync", slow_sync):
+        assert exit_code(*words(out), "--realtime", "--set", "submaps.frames=3") == 0
+    frames = lines(out)
+    assert "mapping" in {thread for thread, _ in waited}
+    assert {thread for thread, logged in waited if 0 < logged < frames} <= {"mapping"}, waited

@@ -72,17 +72,23 @@ def panel_figure(panel: ViewPanel) -> PanelFigure:
     return PanelFigure(panel.title, data_uri(panel.picture(width, height)), panel.caption, colours, panel.ends)
 
 
-def data_uri(picture: Image.Image, lossless: bool = False) -> str:
+def data_uri(picture: Image.Image) -> str:
     """Return a picture as a data: URI, WebP."""
     buffer = io.BytesIO()
-    picture.convert("RGB").save(buffer, "WEBP", quality=QUALITY, lossless=lossless, method=EFFORT)
-    return "data:image/webp;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
+    picture.convert("RGB").save(buffer, "WEBP", quality=QUALITY, method=EFFORT)
+    return _uri("webp", buffer.getvalue())
 
 
 def file_data_uri(path: Path) -> str:
-    """Return a picture file as a lossless data: URI. Raises RunError if it cannot be read."""
+    """Return a PNG file as a data: URI, as it is: compressing it better takes longer than all else on the page.
+
+    Raises RunError if it cannot be read.
+    """
     try:
-        with Image.open(path) as picture:
-            return data_uri(picture, lossless=True)
+        return _uri("png", path.read_bytes())
     except OSError as problem:
         raise RunError(f"cannot read picture {path}: {problem}") from problem
+
+
+def _uri(kind: str, content: bytes) -> str:
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode('ascii')}"
