@@ -296,6 +296,16 @@ def test_a_part_moves_only_its_nodes_and_nearly_as_the_whole_graph_does() -> Non
     assert found.cost_after < found.cost_before and len(found.verdicts) == sum(edges[row].loop for row in part.edges)
 
 
+def test_hundreds_of_solutions_leave_rigid_poses() -> None:
+    """Each one multiplies by the pose of a fixed node and by its inverse: rounding errors must not double each time."""
+    _, drifted, edges = scene(4, nodes=40, true_loops=12, false_loops=0)
+    T = optimise(drifted, edges).T_world_node
+    for k in range(300):
+        part = Neighbourhood.of(range(40), edges, 5 + k % 35, 8)
+        T[list(part.nodes)] = part.solve(T, edges).T_world_node
+    assert all(se3.is_rigid(pose, 1e-12) for pose in T)
+
+
 def test_a_small_graph_and_one_without_a_centre_are_solved_as_a_whole() -> None:
     _, drifted, edges = scene(1)
     whole = optimise(drifted, edges)

@@ -174,10 +174,11 @@ def rotation_angle(R: Matrix) -> float:
 
 
 def orthonormalise(T: Matrix) -> Matrix:
-    """Project the rotation part onto SO(3), so that errors do not accumulate over thousands of products."""
-    u, _, vt = np.linalg.svd(T[:3, :3])
+    """Project the rotation of a pose [..., 4, 4] onto SO(3), so that errors do not accumulate over many products."""
+    u, _, vt = np.linalg.svd(T[..., :3, :3])
+    u[..., :, 2] *= np.linalg.det(u @ vt)[..., None]
     out = T.copy()
-    out[:3, :3] = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    out[..., :3, :3] = u @ vt
     return out
 
 

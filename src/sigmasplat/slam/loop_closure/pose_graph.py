@@ -101,7 +101,7 @@ def optimise(
         for i, edge in enumerate(edges)
         if edge.loop
     )
-    solved = poses[0] @ T
+    solved = se3.orthonormalise(poses[0] @ T)
     solved[:fixed] = poses[:fixed]
     cost_before, cost_after = float(graph.chi2(start)[believed].sum()), float(chi2[believed].sum())
     return PoseGraphSolution(solved, verdicts, graduating + finishing, cost_before, cost_after)
