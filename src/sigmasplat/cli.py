@@ -4,32 +4,24 @@ import os
 import resource
 import sys
 import warnings
-from collections.abc import Callable, Sequence
-from contextlib import suppress
-from typing import TextIO
+from collections.abc import Callable, Sequence, Set
+from contextlib import redirect_stderr, suppress
+from functools import partial, wraps
+from importlib import import_module
+from io import StringIO
+from typing import Any, TextIO
 
 import tyro
 
 import sigmasplat
 from sigmasplat import env
-from sigmasplat.commands.batch import batch
-from sigmasplat.commands.bench import bench
-from sigmasplat.commands.completion import completion
-from sigmasplat.commands.doctor import doctor
-from sigmasplat.commands.download import download
-from sigmasplat.commands.evaluate import evaluate_run
-from sigmasplat.commands.export import export
-from sigmasplat.commands.inspect import inspect
-from sigmasplat.commands.localise import localise
-from sigmasplat.commands.mesh import make_mesh
 from sigmasplat.commands.option_ranges import checked
-from sigmasplat.commands.run import demo, resume, run
-from sigmasplat.commands.view import view
 from sigmasplat.config.text import nearest
 from sigmasplat.errors import ConfigError, SigmaSplatError, is_out_of_memory, out_of_memory
 from sigmasplat.reading.guard import cause
 
 REFUSED, INTERRUPTED, CLOSED = 2, 130, 141
+HELP = {"-h", "--help"}
 LEAST_MEMORY = 1_200_000_000
 """Address space, bytes: a run of tiny images needs that much (1.0 GB was too little with torch 2.13)."""
 DESCRIPTION = """RGB-D SLAM on 3D Gaussian splats, with uncertainty.
@@ -38,22 +30,30 @@ Start with: sigmasplat demo, then: sigmasplat run PATH.
 
 sigmasplat --version    print the version and exit"""
 
-COMMANDS: dict[str, Callable[..., int]] = {
-    "demo": demo,
-    "inspect": inspect,
-    "run": run,
-    "resume": resume,
-    "batch": batch,
-    "localise": localise,
-    "view": view,
-    "eval": evaluate_run,
-    "mesh": make_mesh,
-    "export": export,
-    "download": download,
-    "bench": bench,
-    "doctor": doctor,
-    "completion": completion,
+COMMANDS = {
+    "demo": ("run", "demo"),
+    "inspect": ("inspect", "inspect"),
+    "run": ("run", "run"),
+    "resume": ("run", "resume"),
+    "batch": ("batch", "batch"),
+    "localise": ("localise", "localise"),
+    "view": ("view", "view"),
+    "eval": ("evaluate", "evaluate_run"),
+    "mesh": ("mesh", "make_mesh"),
+    "export": ("export", "export"),
+    "download": ("download", "download"),
+    "bench": ("bench", "bench"),
+    "doctor": ("doctor", "doctor"),
+    "completion": ("completion", "completion"),
 }
+"""Module in `sigmasplat.commands` and function of each command. Only the command that is used is imported."""
+
+
+def command(name: str) -> Callable[..., int]:
+    """Return the function of a command."""
+    module, function = COMMANDS[name]
+    found: Callable[..., int] = getattr(import_module(f"sigmasplat.commands.{module}"), function)
+    return found
 
 
 def _refuse_unknown(command: str) -> None:
@@ -74,14 +74,53 @@ def _refuse_memory_limit() -> None:
 
 def _run_command(arguments: Sequence[str]) -> int:
     """Run the command in the arguments and return its exit code."""
-    code: int = tyro.extras.subcommand_cli_from_dict(
-        {name: checked(command) for name, command in COMMANDS.items()},
+    first = arguments[0]
+    if not HELP.isdisjoint(arguments):
+        return _parsed(arguments, {first} & set(COMMANDS))()
+    if first not in COMMANDS:
+        return _parsed(arguments, {*COMMANDS})()
+    try:
+        with redirect_stderr(StringIO()):
+            call = _parsed(arguments, {first})
+    except SystemExit:  # the arguments are wrong: a complete message suggests options of other commands
+        call = _parsed(arguments, {*COMMANDS})
+    return call()
+
+
+def _parsed(arguments: Sequence[str], known: Set[str]) -> Callable[[], int]:
+    """Return the call that the arguments ask for; known: the commands whose options are parsed.
+
+    Raises SystemExit after it has printed help, or what is wrong with the arguments.
+    """
+    call: Callable[[], int] = tyro.extras.subcommand_cli_from_dict(
+        {name: _postponed(name) if name in known else _without_options(name, not known) for name in COMMANDS},
         prog="sigmasplat",
         description=DESCRIPTION,
         args=arguments,
         config=(tyro.conf.FlagCreatePairsOff,),
     )
-    return code
+    return call
+
+
+def _postponed(name: str) -> Callable[..., Callable[[], int]]:
+    """Return a function with the options of a command that returns its call."""
+    function = command(name)
+
+    @wraps(function)
+    def postponed(*given: Any, **named: Any) -> Callable[[], int]:
+        return partial(checked(function), *given, **named)
+
+    return postponed
+
+
+def _without_options(name: str, described: bool) -> Callable[[], None]:
+    """Return a function that stands for a command whose options are not needed; described: with its description."""
+
+    def stand_in() -> None:
+        """Stand for a command."""
+
+    stand_in.__doc__ = command(name).__doc__ if described else None
+    return stand_in
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

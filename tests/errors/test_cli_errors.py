@@ -148,3 +148,21 @@ def test_mistyped_commands_exit_with_2(arguments: list[str], capsys: pytest.Capt
         cli.main(arguments)
     assert left.value.code == 2
     assert "Traceback" not in capsys.readouterr().err
+
+
+def test_an_option_of_another_command_is_suggested(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        cli.main(["eval", "runs/none", "--limit", "5"])
+    error = " ".join(capsys.readouterr().err.split())
+    assert "--limit" in error and "sigmasplat run --help" in error and "sigmasplat localise --help" in error
+
+
+def test_a_command_does_not_load_the_others() -> None:
+    code = "import sys; from sigmasplat.cli import main\ntry: main(['view', 'none'])\nfinally: print(*sys.modules)"
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=100)
+    parts = [name.split(".") for name in ended.stdout.split()]
+    commands = {
+        name for package, *rest in parts if package == "sigmasplat" and rest[:1] == ["commands"] for name in rest
+    }
+    assert "no run folder none" in ended.stderr and "view" in commands
+    assert not commands & {"run", "bench", "batch", "inspect", "localise"}

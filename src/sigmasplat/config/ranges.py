@@ -53,6 +53,11 @@ WIDTHS_PX = Range(8, 8192, or_zero=True)
 RatioLimit = Annotated[float, Range(1, or_zero=True)]
 
 
+PLAIN = frozenset({bool, int, float, str})
+_VALID: set[tuple[type, str, type, object]] = set()
+"""Values of settings that were valid: presets are made from each other, and most of their values are the same."""
+
+
 class Section:
     """Base class of the sections of `Config`. Checks every value when a section is made, also by `replace`.
 
@@ -85,8 +90,12 @@ def problems_of(values: Any, prefix: str = "") -> Iterator[str]:
     section: Any = type(values)
     for name, _, default, base, range_ in _fields(section):
         value = getattr(values, name)
-        if value is not default and (problem := _problem(base, range_, value)):
+        if value is default or (section, name, kind := type(value), value if kind in PLAIN else None) in _VALID:
+            continue
+        if problem := _problem(base, range_, value):
             yield f"{prefix}{name} {problem}"
+        elif kind in PLAIN:
+            _VALID.add((section, name, kind, value))
 
 
 def problem_of(kind: Any, value: Any) -> str | None:
