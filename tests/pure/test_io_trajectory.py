@@ -65,3 +65,10 @@ def test_missing_empty_and_binary_files(tmp_path: Path) -> None:
         read_trajectory(tmp_path / "image.txt")
     with pytest.raises(RunError, match="cannot write"):
         write_trajectory(tmp_path / "no" / "t.txt", some_path(2))
+
+
+def test_a_pose_beyond_a_million_kilometres_is_refused(tmp_path: Path) -> None:
+    for text in ("1 0 6.4e6 0 0 0 0 1\n2 0 0 -1e10 0 0 0 1\n", "2 0 0 1e308 0 0 0 1\n"):
+        (tmp_path / "t.txt").write_text(text)
+        with pytest.raises(SourceError, match=r"pose at t=2\.0 s is farther than 1e\+09 m"):
+            read_trajectory(tmp_path / "t.txt")

@@ -157,6 +157,12 @@ def test_a_static_camera_and_a_single_frame_can_be_drawn() -> None:
         plot.draw_charts([charts.seconds_chart(np.arange(n), {"total": np.zeros(n)})], plot.LIGHT)
 
 
+def test_vast_values_are_left_out_and_equal_ones_have_an_axis() -> None:
+    for values in ([0.0, 1.0, 1e308, -1e308], [1e20] * 3, [-1e90, 1e90], [np.nan] * 2):
+        seconds = charts.seconds_chart(np.arange(len(values)), {"total": np.array(values)})
+        plot.draw_charts([seconds, *charts.trajectory_charts(np.array([values] * 3).T, None)], plot.LIGHT)
+
+
 def colours_near(image: np.ndarray, colour: tuple[int, int, int]) -> np.ndarray:
     """Return where a picture shows a colour, as (row, column) pairs."""
     return np.argwhere(np.abs(image.astype(int) - colour).sum(-1) < 60)

@@ -17,6 +17,8 @@ NARROW_SIZE = (376, 300)
 """Size of one chart on a page as narrow as a phone."""
 ACCENT, BLUE, GREEN, PURPLE, FAINT = range(5)
 """Indices into `Theme.curves`."""
+MOST = 1e100
+"""Values that are not smaller are not drawn."""
 
 
 @dataclass(frozen=True)
@@ -96,16 +98,20 @@ def nice_ticks(low: float, high: float, wanted: int = 5) -> Matrix:
     return np.asarray(np.arange(np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9) + 1) * step)
 
 
+def _drawable(points: Matrix) -> Matrix:
+    """Return the points [N, 2] that are finite, and so small that differences and squares of them are finite too."""
+    return points[(np.abs(points) < MOST).all(1)]
+
+
 def _limits(chart: Chart, box: Box) -> tuple[Matrix, Matrix]:
     """Return the range of both axes (low [2], high [2]) with a small margin; if `square`, with the same scale."""
-    points = np.concatenate([curve.points for curve in chart.curves])
-    points = points[np.isfinite(points).all(1)]
+    points = _drawable(np.concatenate([curve.points for curve in chart.curves]))
     if not len(points):
         return np.zeros(2), np.ones(2)
     low, high = points.min(0), points.max(0)
     if chart.from_zero:
         low[1] = min(low[1], 0.0)
-    margin = np.maximum(0.06 * (high - low), [1e-3, 1e-3])
+    margin = np.maximum(0.06 * (high - low), np.maximum(1e-3, 1e-9 * np.abs(high)))
     low, high = low - margin * (0.0 if chart.from_zero else 1.0), high + margin
     if chart.y_limits is not None:
         low[1], high[1] = chart.y_limits
@@ -129,7 +135,7 @@ def _draw_chart(draw: ImageDraw.ImageDraw, chart: Chart, theme: Theme, cell: Box
 
     _draw_grid(draw, chart, theme, box, (low, high))
     for curve in chart.curves:
-        _draw_curve(draw, curve, place(curve.points[np.isfinite(curve.points).all(1)]), theme)
+        _draw_curve(draw, curve, place(_drawable(curve.points)), theme)
     font = ImageFont.load_default(13 * s)
     for text, point in chart.labels.items():
         x, y = place(np.array([point]))[0]

@@ -8,12 +8,15 @@ from numpy.typing import NDArray
 from sigmasplat.errors import SourceError
 from sigmasplat.model import se3
 
+MOST_M = 1e9
+"""Larger coordinates are a mistake, and their squares may overflow; geocentric ones are below 1e7 m."""
+
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
     """Poses over time: timestamps_s float64 [N], T_world_camera float64 [N, 4, 4] (camera to world, metres).
 
-    Raises SourceError if a pose is not finite or not rigid.
+    Raises SourceError if a pose is not finite or not rigid, or farther than `MOST_M` from the origin.
     """
 
     timestamps_s: NDArray[np.float64]
@@ -24,12 +27,11 @@ class Trajectory:
             raise SourceError(
                 f"trajectory has {len(self.timestamps_s)} timestamps but poses of shape {self.T_world_camera.shape}"
             )
-        for t, T in zip(self.timestamps_s, self.T_world_camera, strict=True):
-            if not (np.isfinite(t) and se3.is_rigid(T)):
-                raise SourceError(
-                    f"pose at t={t} s is not a finite rigid transform; remove it or correct its rotation "
-                    f"(found {T.tolist()})"
-                )
+        far = np.abs(self.T_world_camera[:, :3, 3]).max(1, initial=0.0) > MOST_M
+        for row in np.flatnonzero(~(np.isfinite(self.timestamps_s) & se3.are_rigid(self.T_world_camera)) | far)[:1]:
+            t, T = self.timestamps_s[row], self.T_world_camera[row]
+            kind = f"farther than {MOST_M:g} m from the origin" if far[row] else "not a finite rigid transform"
+            raise SourceError(f"pose at t={t} s is {kind}; remove it or correct it (found {T.tolist()})")
 
     def __len__(self) -> int:
         return len(self.timestamps_s)

@@ -95,7 +95,7 @@ class CameraClock:
         """Continue where the camera was found, or in a new map."""
         self.recovery.found()
         self.found = snapshot.state
-        self.tracker.velocity = np.eye(4)
+        self.tracker.velocity, self.tracker.watch = np.eye(4), self.tracker.watch.cleared()
         if snapshot.state == APART:
             self.tracker.lost = False
 
