@@ -1,4 +1,4 @@
-"""A busy machine, clocks that jump, a pause of the process and a slow disk do not change a run; frames never wait."""
+"""A busy machine, clocks that jump, a pause of the process and a slow disk do not change a run; no frame waits."""
 
 import os
 import signal

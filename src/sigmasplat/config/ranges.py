@@ -90,12 +90,13 @@ def problems_of(values: Any, prefix: str = "") -> Iterator[str]:
     section: Any = type(values)
     for name, _, default, base, range_ in _fields(section):
         value = getattr(values, name)
-        if value is default or (section, name, kind := type(value), value if kind in PLAIN else None) in _VALID:
+        plain = type(value) in PLAIN
+        if value is default or (plain and (section, name, type(value), value) in _VALID):
             continue
         if problem := _problem(base, range_, value):
             yield f"{prefix}{name} {problem}"
-        elif kind in PLAIN:
-            _VALID.add((section, name, kind, value))
+        elif plain:
+            _VALID.add((section, name, type(value), value))
 
 
 def problem_of(kind: Any, value: Any) -> str | None:

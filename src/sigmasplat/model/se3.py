@@ -184,29 +184,23 @@ def orthonormalise(T: Matrix) -> Matrix:
 
 def is_rigid(T: Matrix, tolerance: float = 1e-3) -> bool:
     """Return whether a 4×4 matrix is rigid: finite, rotation orthonormal with determinant +1, last row 0 0 0 1."""
-    return bool(
-        T.shape == (4, 4)
-        and np.isfinite(T).all()
-        and is_rotation(T[:3, :3], tolerance)
-        and np.abs(T[3] - [0, 0, 0, 1]).max() < tolerance
-    )
+    return T.shape == (4, 4) and bool(are_rigid(T[None], tolerance)[0])
 
 
 def are_rigid(T: Matrix, tolerance: float = 1e-3) -> NDArray[np.bool_]:
     """Return which matrices [N, 4, 4] are rigid, as `is_rigid`."""
     finite = np.asarray(np.isfinite(T).all((1, 2)))
     known = np.where(finite[:, None, None], T, np.eye(4))
-    R = known[:, :3, :3]
-    orthonormal = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max((1, 2)) < tolerance
     last_row = np.abs(known[:, 3] - [0, 0, 0, 1]).max(1) < tolerance
-    return np.asarray(finite & orthonormal & (np.linalg.det(R) > 0) & last_row)
+    return np.asarray(finite & last_row & _are_rotations(known[:, :3, :3], tolerance))
 
 
 def is_rotation(R: Matrix, tolerance: float = 1e-3) -> bool:
     """Return whether a 3×3 matrix is a rotation: finite, orthonormal with determinant +1."""
-    return bool(
-        R.shape == (3, 3)
-        and np.isfinite(R).all()
-        and np.abs(R @ R.T - np.eye(3)).max() < tolerance
-        and np.linalg.det(R) > 0
-    )
+    return R.shape == (3, 3) and bool(np.isfinite(R).all()) and bool(_are_rotations(R[None], tolerance)[0])
+
+
+def _are_rotations(R: Matrix, tolerance: float) -> NDArray[np.bool_]:
+    """Return which finite matrices [N, 3, 3] are orthonormal with determinant +1."""
+    orthonormal = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max((1, 2)) < tolerance
+    return np.asarray(orthonormal & (np.linalg.det(R) > 0))

@@ -28,7 +28,8 @@ class Trajectory:
                 f"trajectory has {len(self.timestamps_s)} timestamps but poses of shape {self.T_world_camera.shape}"
             )
         far = np.abs(self.T_world_camera[:, :3, 3]).max(1, initial=0.0) > MOST_M
-        for row in np.flatnonzero(~(np.isfinite(self.timestamps_s) & se3.are_rigid(self.T_world_camera)) | far)[:1]:
+        valid = np.isfinite(self.timestamps_s) & se3.are_rigid(self.T_world_camera) & ~far
+        for row in np.flatnonzero(~valid)[:1]:
             t, T = self.timestamps_s[row], self.T_world_camera[row]
             kind = f"farther than {MOST_M:g} m from the origin" if far[row] else "not a finite rigid transform"
             raise SourceError(f"pose at t={t} s is {kind}; remove it or correct it (found {T.tolist()})")

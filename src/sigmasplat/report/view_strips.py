@@ -80,10 +80,7 @@ def data_uri(picture: Image.Image) -> str:
 
 
 def file_data_uri(path: Path) -> str:
-    """Return a PNG file as a data: URI, as it is: compressing it better takes longer than all else on the page.
-
-    Raises RunError if it cannot be read.
-    """
+    """Return a PNG file as a data: URI; it is not compressed again. Raises RunError if it cannot be read."""
     try:
         return _uri("png", path.read_bytes())
     except OSError as problem:

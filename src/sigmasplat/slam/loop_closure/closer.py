@@ -211,8 +211,8 @@ class LoopCloser:
     def _is_due(self, atlas: Atlas, component: int, new: Sequence[Edge]) -> bool:
         """Return whether the whole graph is to be solved: new loops disagree with the poses, or it has grown enough.
 
-        Its solution takes time in proportion to its size. Because the size grows by a factor in between, the time per
-        submap stays the same.
+        Its solution takes time in proportion to its size. The size grows by a factor in between, so that on average the
+        time per submap stays the same.
         """
         if len(atlas.members(component)) > GROWTH * self.solved:
             return True
@@ -233,10 +233,11 @@ class LoopCloser:
         solution = part.solve(atlas.anchors, edges)
         for submap, T_world_submap in zip(part.nodes, solution.T_world_node, strict=True):
             atlas.anchors[submap] = T_world_submap
-        judged_loops = [loop for _, loop in map(inside.__getitem__, part.edges) if loop is not None]
-        for i, verdict in zip(judged_loops, solution.verdicts, strict=True):
+        tested = [loop for _, loop in (inside[row] for row in part.edges) if loop is not None]
+        for i, verdict in zip(tested, solution.verdicts, strict=True):
             self.loops[i] = judged(self.loops[i], verdict)
-        self.solved = max(self.solved, len(members)) if centre is None else self.solved
+        if centre is None:
+            self.solved = max(self.solved, len(members))
 
 
 def described(best: Candidate, a: Submap, b: Submap, found: Registration, known: Matrix) -> Loop:

@@ -11,8 +11,7 @@ from sigmasplat.slam.loop_closure.pose_graph import Edge, PoseGraphSolution, opt
 from sigmasplat.types import Matrix
 
 MOST_FREE = 100
-"""Nodes that are solved together at most, unless the whole graph is solved. Its solution takes about as long as the
-registration of one loop."""
+"""A larger graph is solved in parts of this many nodes; a smaller one is always solved as a whole."""
 
 
 @dataclass(frozen=True, eq=False)
