@@ -89,7 +89,7 @@ class SyntheticRoom(Source):
         super().__init__("synthetic", camera)
         if predicted and stereo:
             raise SourceError("synthetic room: depth is either predicted or from stereo; leave out predicted or stereo")
-        self._predicted = predicted
+        self.predicted_depth = predicted
         self._seed, self._noise, self._rooms = seed, noise, rooms
         self._exposure_change, self._drift = exposure_change, drift / 1000
         self._test_views = test_views
@@ -112,7 +112,7 @@ class SyntheticRoom(Source):
         if self._noise:
             rng = np.random.default_rng((self._seed, i, 7))
             color, depth_m = measured_color(color, rng), measured_depth(depth_m, self.camera, rng)
-        if self._predicted:
+        if self.predicted_depth:
             depth_m = predicted_depth(depth_m, i, self._seed, np.random.default_rng((self._seed, i, 12)))
         bytes_, std_m = np.rint(color * 255.0).astype(np.uint8), None
         if self._matcher:
