@@ -1,10 +1,15 @@
 """Predicted depth: its scale, shift and smooth error are found from the map and from other views."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from sigmasplat.config import Config, InputConfig
+from sigmasplat.evaluation.path_scores import arbitrary_scale, in_metres, in_units_of_run
+from sigmasplat.io.runs import RunFolder
 from sigmasplat.metrics.trajectory import align_similarity
+from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.run.scene import config_for, config_of_facts, scene_facts
 from sigmasplat.slam.localisation.depth_fit import DepthFit, pixel_noise, smoothed
 from sigmasplat.slam.slam import Slam
@@ -51,6 +56,21 @@ def test_the_settings_follow_from_the_source_and_from_the_facts_of_the_run() -> 
     assert config_of_facts(scene_facts(source), Config()) == config
     assert not config_for(source, Config(), ["tracking.fit_depth"]).tracking.fit_depth
     assert not config_for(open_source("synthetic:frames=4"), Config()).tracking.fit_depth
+
+
+def test_the_scale_of_a_path_is_found_for_predicted_depth_only(tmp_path: Path) -> None:
+    random, poses = np.random.default_rng(2), np.tile(np.eye(4), (9, 1, 1))
+    poses[:, :3, 3] = random.normal(size=(9, 3))
+    path = Trajectory(np.arange(9.0), poses)
+    truth = in_units_of_run(path, 0.5)  # twice as large
+    run = RunFolder.create(tmp_path / "run", Config(), "room")
+    assert arbitrary_scale(run, path, truth) is None and in_units_of_run(truth, None) is truth
+    run.note(predicted_depth=True)
+    scale = arbitrary_scale(run, path, truth)
+    assert scale == pytest.approx(2.0) and arbitrary_scale(run, path, None) is None
+    np.testing.assert_allclose(in_units_of_run(truth, scale).T_world_camera, poses)
+    metres = in_metres({"ate": {"rmse_m": 0.1, "pairs": 9}, "rpe": None}, scale)
+    assert metres["ate"] == pytest.approx({"rmse_m": 0.2, "pairs": 9}) and metres["rpe"] is None
 
 
 def test_a_path_from_predicted_depth_has_the_shape_of_the_true_one() -> None:
