@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from sigmasplat.commands import options
+from sigmasplat.commands.end_of_run import warn_at_the_end
 from sigmasplat.commands.evaluate import score
 from sigmasplat.commands.options import arg, configured, prepare_torch, source_of
 from sigmasplat.commands.robot_output import (
@@ -230,7 +231,6 @@ def _run_and_score(
     Raises KeyboardInterrupt if Ctrl-C came before the first frame was done.
     """
     from sigmasplat.checks.motion import MotionWatch
-    from sigmasplat.commands.end_of_run import warn_at_the_end
     from sigmasplat.render.cuda import stages as cuda_stages
     from sigmasplat.run.resume import RefinementFile, StateFile
     from sigmasplat.run.session import Session
