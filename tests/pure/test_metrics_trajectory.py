@@ -6,7 +6,7 @@ from hypothesis import given, settings, strategies as st
 from scipy.spatial.transform import Rotation
 
 from sigmasplat.errors import SourceError
-from sigmasplat.metrics.trajectory import align_rigid, associate, ate, pair_poses, rpe
+from sigmasplat.metrics.trajectory import align_rigid, align_similarity, associate, ate, pair_poses, rpe
 from sigmasplat.model.trajectory import Trajectory
 
 Array = np.ndarray
@@ -148,3 +148,12 @@ def test_a_single_pair_has_no_relative_error() -> None:
     one = Trajectory(truth.timestamps_s[:1], truth.T_world_camera[:1])
     assert ate(one, truth).rmse_m == pytest.approx(0.0, abs=1e-12)
     assert rpe(one, truth).pairs == 0 and np.isnan(rpe(one, truth).translation_rmse_m)
+
+
+def test_a_similarity_finds_scale_rotation_and_shift() -> None:
+    points, turn = np.random.default_rng(3).normal(size=(20, 3)), Rotation.from_euler("xyz", [0.3, -0.5, 1.0])
+    scale, T = align_similarity(points, 2.5 * turn.apply(points) + [1.0, 2.0, 3.0])
+    assert scale == pytest.approx(2.5)
+    np.testing.assert_allclose(T[:3, :3], turn.as_matrix(), atol=1e-9)
+    np.testing.assert_allclose(T[:3, 3], [1.0, 2.0, 3.0], atol=1e-9)
+    assert align_similarity(np.ones((4, 3)), points[:4])[0] == 1.0

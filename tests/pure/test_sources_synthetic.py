@@ -322,3 +322,15 @@ def test_options_in_the_path():
     source = open_source("synthetic:frames=7,width=40,height=30,seed=2,noise=1", stride=2)
     assert (len(source), source.camera.width, source.camera.height) == (4, 40, 30)
     assert open_source("synthetic", limit=3).truth().timestamps_s[1] == pytest.approx(1 / 30)
+
+
+def test_predicted_depth_has_a_smooth_error_of_scale_and_noise_at_each_pixel() -> None:
+    room = SyntheticRoom(frames=4, width=80, height=60, predicted=True)
+    depth_m, exact_m = room.frame(2).depth_m, room.exact_depth_of(2)
+    ratio = depth_m[exact_m > 0] / exact_m[exact_m > 0]
+    assert 0.08 < ratio.std() < 0.2 and 0.7 < ratio.mean() < 1.3
+    following = room.frame(3).depth_m[exact_m > 0] / room.exact_depth_of(3)[exact_m > 0]
+    assert abs(following.mean() - ratio.mean()) < 0.01, "the error of scale changes slowly"
+    assert np.array_equal(depth_m, open_source("synthetic:frames=4,width=80,height=60,predicted=1").frame(2).depth_m)
+    with pytest.raises(SourceError, match="predicted or stereo"):
+        SyntheticRoom(predicted=True, stereo=10)

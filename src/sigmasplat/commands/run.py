@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from sigmasplat.commands import options
+from sigmasplat.commands.end_of_run import warn_at_the_end
 from sigmasplat.commands.evaluate import score
 from sigmasplat.commands.options import arg, configured, prepare_torch, source_of
 from sigmasplat.commands.robot_output import (
@@ -25,7 +26,6 @@ from sigmasplat.errors import ConfigError
 from sigmasplat.presets import default_preset
 
 if TYPE_CHECKING:
-    from sigmasplat.checks.motion import MotionWatch
     from sigmasplat.config import Config
     from sigmasplat.io.runs import RunFolder
     from sigmasplat.robots.live import LiveRobot
@@ -261,7 +261,7 @@ def _run_and_score(
         raise KeyboardInterrupt  # the folder has no results, and no state to resume from
     if run_options.profile:
         screen.profile(folder.read_profile())
-    _warn_at_the_end(screen, source, read, folder, motion)
+    warn_at_the_end(screen, source, read, folder, motion)
     if outcome.status == "interrupted":
         _say_interrupted(screen, outcome, folder)
         return INTERRUPTED
@@ -298,46 +298,6 @@ def _progress(
         if system:
             readers = [BetweenFrames(reader, system.between_frames) for reader in readers]
         yield CallbackList(steps, *logs, *readers)
-
-
-def _warn_at_the_end(
-    screen: "Screen", source: "Source", read: "Source", folder: "RunFolder", motion: "MotionWatch"
-) -> None:
-    """Print what was wrong with the frames."""
-    _warn_of_skipped_frames(screen, source)
-    _warn_of_dropped_frames(screen, read)
-    _warn_if_never_recognised(screen, folder)
-    for warning in motion.warnings():
-        screen.warn(warning)
-
-
-def _warn_of_skipped_frames(screen: "Screen", source: "Source") -> None:
-    """Print how many frames are missing from the run, and why."""
-    from sigmasplat.sources.live import LiveSource
-
-    if source.skipped:
-        images = "image" if len(source.skipped) == 1 else "images"
-        screen.warn(f"{len(source.skipped)} {images} skipped (first: {source.skipped[0]})")
-    if isinstance(source, LiveSource) and source.ending:
-        screen.warn(source.ending)
-    if isinstance(source, LiveSource) and source.dropped:
-        screen.say(f"{source.dropped} frames of the camera were dropped because SLAM was slower")
-
-
-def _warn_of_dropped_frames(screen: "Screen", read: "Source") -> None:
-    """Print how many frames were dropped in real time."""
-    if read.arrived_s is not None and read.dropped:
-        screen.warn(f"{read.dropped} frames were dropped because tracking was late")
-
-
-def _warn_if_never_recognised(screen: "Screen", folder: "RunFolder") -> None:
-    """Print a warning if no frame of a run with --onto is connected to the earlier map."""
-    onto = folder.facts().get("onto")
-    if onto and not len(folder.read_trajectory()):
-        screen.warn(
-            f"the recording was never recognised in the map of {onto['run']}; its path and map are in "
-            f"{folder.path / 'components'}"
-        )
 
 
 def _say_interrupted(screen: "Screen", outcome: "Outcome", folder: "RunFolder") -> None:

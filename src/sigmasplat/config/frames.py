@@ -281,6 +281,9 @@ class TrackingConfig(Section, name="tracking"):
     lost_share: NotNegative = 0.2
     """Tracking is lost if the map agrees with less than this share of the sensor's readings (agreement × overlap); with
     `verify`, if reference and frame have less than this share of the reference's readings in common."""
+    fit_depth: bool = False
+    """Whether the depth of each frame is fitted to the map and to other views before it is used, because its scale is
+    arbitrary. `run` sets it for depth that a network predicted."""
     update_stop: NotNegative = 0.0
     """Adam stops when a step is smaller than this (metres and radians); 0 = run every iteration."""
     plateau_stop: NotNegative = 0.0

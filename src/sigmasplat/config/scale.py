@@ -22,6 +22,9 @@ POWERS = {
 }  # fmt: skip
 """The power of a length in each setting. Weights of losses in metres have −1, so that a loss keeps its value."""
 
+PREDICTED_NOISE_PER_M = 0.1
+"""`render.depth_noise_per_m` for predicted depth: about 10 % of the depth in a room."""
+
 
 def for_scene(
     config: Config,
@@ -29,15 +32,20 @@ def for_scene(
     depth_noise_per_m: float | None,
     given: Collection[str] = (),
     sensor: str | None = None,
+    predicted_depth: bool = False,
 ) -> Config:
     """Return the settings for a scene of this size, depth of this noise, and this sensor (None = unknown, the setting
-    stays).
+    stays); predicted_depth: whether a network predicted depth, which is then fitted to the map.
 
     given: names of settings that keep their values, as in ["input.max_depth_m"].
     """
     config = scaled(config, scene_scale, given)
     if sensor is not None and config.input.sensor == AUTO:
         config = config.changed(input={"sensor": sensor})
+    if predicted_depth:
+        depth_noise_per_m = depth_noise_per_m or PREDICTED_NOISE_PER_M
+        if "tracking.fit_depth" not in given:
+            config = config.changed(tracking={"fit_depth": True})
     if depth_noise_per_m is None or "render.depth_noise_per_m" in given:
         return config
     return config.changed(render={"depth_noise_per_m": depth_noise_per_m})

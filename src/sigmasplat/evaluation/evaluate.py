@@ -11,7 +11,7 @@ from sigmasplat.errors import RunError
 from sigmasplat.evaluation import reconstruct
 from sigmasplat.evaluation.frame_states import score_states
 from sigmasplat.evaluation.moving_views import show_moving
-from sigmasplat.evaluation.path_scores import score_frame_sets
+from sigmasplat.evaluation.path_scores import arbitrary_scale, in_metres, in_units_of_run, score_frame_sets
 from sigmasplat.evaluation.pose_covariance import score_pose_covariance
 from sigmasplat.evaluation.view_scoring import ViewScoring, score_full_resolution, score_test_views
 from sigmasplat.io.frames import RunFrames
@@ -69,7 +69,7 @@ def evaluate(
     """
     frames, field = _read_frames(run), run.read_map()
     records, log = frames.log, frames.posed_log()
-    truth = source.truth() if log else None  # without a believed pose nothing can be aligned
+    truth, scale = _truth(run, frames, source) if log else (None, None)  # without a believed pose nothing is aligned
     path_scores, problem = score_path(frames.path, _believed_odometry(run, frames), truth)
     known = None if problem else truth
     chosen = {kind: evenly_spread(views, views_per_kind) for kind, views in _kinds(log).items()}
@@ -79,8 +79,9 @@ def evaluate(
     maps, predictions = _with_prediction(maps, run, frames, config) if standard else (maps, views.PredictionScores())
     aligned = _alignment(frames, known)
     scoring = ViewScoring(source, config.input, maps, chosen, renderer, views_per_kind, aligned, lpips)
-    metrics = _facts(run, source, records, field) | score_states(run, frames, known) | path_scores
-    metrics |= score_frame_sets(run, frames, known) | _score_views(scoring, config.final, predictions, strips, progress)
+    metrics = _facts(run, source, records, field) | score_states(run, frames, known)
+    metrics |= in_metres(path_scores | score_frame_sets(run, frames, known), scale) | {"path_scale": scale}
+    metrics |= _score_views(scoring, config.final, predictions, strips, progress)
     metrics |= {"lpips_network": lpips.net if lpips else None, "reconstruction": None, "reconstruction_published": None}
     metrics["full_resolution"] = score_full_resolution(scoring, config, full_resolution, progress)
     if mesh:
@@ -107,6 +108,13 @@ def _read_frames(run: RunFolder) -> RunFrames:
     if len(path) and not len(frames.rows):
         raise RunError(f"run {run.path}: trajectory.txt and log.jsonl share no timestamps; do they belong to one run?")
     return frames
+
+
+def _truth(run: RunFolder, frames: RunFrames, source: Source) -> tuple[Trajectory | None, float | None]:
+    """Return the true path in the units of the run, and the run's unit in metres if it is arbitrary."""
+    truth = source.truth()
+    scale = arbitrary_scale(run, frames.path, truth)
+    return None if truth is None else in_units_of_run(truth, scale), scale
 
 
 def _alignment(frames: RunFrames, truth: Trajectory | None) -> NDArray[np.float64] | None:

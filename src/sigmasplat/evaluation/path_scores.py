@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from sigmasplat.evaluation.frame_states import final_positions
 from sigmasplat.io.frames import RunFrames
 from sigmasplat.io.runs import RunFolder
-from sigmasplat.metrics.trajectory import absolute_error, associate
+from sigmasplat.metrics.trajectory import absolute_error, align_similarity, associate
 from sigmasplat.model.trajectory import Trajectory
 
 
@@ -28,6 +28,40 @@ def score_frame_sets(run: RunFolder, frames: RunFrames, truth: Trajectory | None
         "ate_keyframes": _error(times_s[keyframes], positions[keyframes], truth),
         "ate_all_frames": _error(times_s, positions, truth),
     }
+
+
+def arbitrary_scale(run: RunFolder, path: Trajectory, truth: Trajectory | None) -> float | None:
+    """Return the factor that brings a path to the scale of the truth, if a network predicted the run's depth; None if
+    the scale is that of a sensor, or cannot be found."""
+    if truth is None or not run.facts().get("predicted_depth"):
+        return None
+    rows, truth_rows = associate(path.timestamps_s, truth.timestamps_s)
+    if not len(rows):
+        return None
+    scale, _ = align_similarity(path.T_world_camera[rows, :3, 3], truth.T_world_camera[truth_rows, :3, 3])
+    return scale if scale > 0 else None
+
+
+def in_units_of_run(truth: Trajectory, scale: float | None) -> Trajectory:
+    """Return the truth in the units of a run whose path times `scale` is in metres."""
+    if scale is None:
+        return truth
+    poses = truth.T_world_camera.copy()
+    poses[:, :3, 3] /= scale
+    return Trajectory(truth.timestamps_s, poses)
+
+
+def in_metres(scores: dict[str, Any], scale: float | None) -> dict[str, Any]:
+    """Return scores of the path, in the units of the run, with all lengths (`…_m`) in metres of the truth."""
+    if scale is None:
+        return scores
+    return {name: _in_metres(found, scale) for name, found in scores.items()}
+
+
+def _in_metres(found: Any, scale: float) -> Any:
+    if not isinstance(found, dict):
+        return found
+    return {key: value * scale if key.endswith("_m") else value for key, value in found.items()}
 
 
 def _error(times_s: NDArray[np.float64], positions: NDArray[np.float64], truth: Trajectory) -> dict[str, Any] | None:

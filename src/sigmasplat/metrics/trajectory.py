@@ -50,6 +50,17 @@ def align_rigid(estimate: Matrix, truth: Matrix) -> Matrix:
     return T
 
 
+def align_similarity(estimate: Matrix, truth: Matrix) -> tuple[float, Matrix]:
+    """Fit the scale c and T [4, 4] that map positions `estimate` [N, 3], times c, to `truth`, by least squares (Umeyama
+    1991, eq. 40–42): for paths whose scale is arbitrary. c is 1 if the estimate does not move."""
+    T = align_rigid(estimate, truth)
+    centred = estimate - estimate.mean(0)
+    square = float((centred**2).sum())
+    c = float(((centred @ T[:3, :3].T) * (truth - truth.mean(0))).sum()) / square if square > 0 else 1.0
+    T[:3, 3] = truth.mean(0) - c * T[:3, :3] @ estimate.mean(0)
+    return c, T
+
+
 def aligned_truth(times_s: Matrix, estimate: Matrix, truth: Trajectory) -> tuple[Rows, Trajectory]:
     """Return the rows of the frames with a true pose, and their true poses in the world of the estimate.
 

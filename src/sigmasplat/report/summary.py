@@ -75,7 +75,12 @@ def _path(metrics: Metrics) -> str:
     error, largest = number(ate["rmse_m"], 1, 100.0), number(ate.get("max_m"), 1, 100.0)
     silent = (metrics.get("failures") or {}).get("silent") or 0
     undeclared = f" {silent} poses are off by more than 10 cm, but were not reported as lost." if silent else ""
-    return f"{tracked} The RMS error of the path is {error} cm; the largest error is {largest} cm.{undeclared}{loops}"
+    factor = metrics.get("path_scale")
+    aligned = f" The scale is arbitrary: the path is aligned with scale factor {number(factor, 2)}." if factor else ""
+    return (
+        f"{tracked} The RMS error of the path is {error} cm; the largest error is {largest} cm."
+        f"{aligned}{undeclared}{loops}"
+    )
 
 
 def _apart_sentence(metrics: Metrics) -> str:

@@ -204,11 +204,12 @@ def _path_rows(metrics: dict[str, Any]) -> list[list[str]]:
     for kind, found in kinds.items():
         if found and found["pairs"] != ate["pairs"]:
             rows.append([f"ATE rmse of {kind} ({found['pairs']} poses), cm", number(found["rmse_m"], 3, 100.0)])
-    without = metrics.get("ate_odometry")
+    factor, without = metrics.get("path_scale"), metrics.get("ate_odometry")
+    alignment = f"aligned with scale factor {number(factor, 3)}" if factor else "rigid alignment"
     if without:
         rows.append(["ATE rmse without loop closure, cm", number(without["rmse_m"], 3, 100.0)])
     return [
-        ["believed frames, rigid alignment", f"{ate['pairs']} poses"],
+        [f"believed frames, {alignment}", f"{ate['pairs']} poses"],
         *rows,
         ["RPE translation, cm per frame", number(rpe["translation_rmse_m"], 3, 100.0)],
         ["RPE rotation, ° per frame", number(rpe["rotation_rmse_deg"], 3)],

@@ -82,7 +82,14 @@ class FinishedMap:
         Settings named in `given` keep their values.
         """
         of_map = ("input.min_depth_m", "input.max_depth_m")  # `config` has the map's already
-        return for_scene(config, noted_scale(self.run.facts()), source.depth_noise_per_m, {*given, *of_map})
+        return for_scene(
+            config,
+            noted_scale(self.run.facts()),
+            source.depth_noise_per_m,
+            {*given, *of_map},
+            None,
+            source.predicted_depth,
+        )
 
     @contextmanager
     def unchanged(self) -> Iterator[None]:

@@ -22,19 +22,22 @@ def open_scene(path: str | Path, config: Config | None = None, given: Collection
 
 def config_for(source: Source, config: Config, given: Collection[str] = ()) -> Config:
     """Return the settings for the scene of a source; those named in `given` keep their values."""
-    return for_scene(config, source.scene_scale, source.depth_noise_per_m, given, source.sensor)
+    return for_scene(config, source.scene_scale, source.depth_noise_per_m, given, source.sensor, source.predicted_depth)
 
 
 def scene_facts(source: Source) -> dict[str, Any]:
-    """Return what run.json keeps of the scene: its size, the noise of depth, and the sensor."""
-    return {
+    """Return what run.json keeps of the scene: its size, the noise of depth, the sensor, and whether a network
+    predicted depth, if so."""
+    facts = {
         "scene_scale": source.scene_scale, "depth_noise_per_m": source.depth_noise_per_m, "sensor": source.sensor
     }  # fmt: skip
+    return facts | ({"predicted_depth": True} if source.predicted_depth else {})
 
 
 def config_of_facts(facts: Mapping[str, Any], config: Config, given: Collection[str] = ()) -> Config:
     """Return the settings that a run with these facts (run.json) used if it was asked for `config`."""
-    return for_scene(config, noted_scale(facts), facts.get("depth_noise_per_m"), given, facts.get("sensor"))
+    noise, predicted = facts.get("depth_noise_per_m"), bool(facts.get("predicted_depth"))
+    return for_scene(config, noted_scale(facts), noise, given, facts.get("sensor"), predicted)
 
 
 def noted_scale(facts: Mapping[str, Any]) -> float:

@@ -13,6 +13,7 @@ from sigmasplat.model.submap import RefinedStore, StorePart
 from sigmasplat.slam.array_interface import ArrayInterface
 from sigmasplat.slam.drift import mean_variance
 from sigmasplat.slam.final import final_map
+from sigmasplat.slam.fitted_depth import fitted_keyframe, fitted_to_map
 from sigmasplat.slam.found import Found
 from sigmasplat.slam.listeners import notifying
 from sigmasplat.slam.localisation.foreground import share_of
@@ -44,8 +45,13 @@ class Slam(MapWork, ArrayInterface):
         """
         self._timer = StepTimer()
         seen = self._observe(frame)
+        if self.steps:
+            seen = fitted_to_map(self.tracker, self.mapper.field, self.view, seen)
         found = self._localise(seen) if self.steps else self._begin(seen)
         if found.mapped:
+            connected = len(self.steps) > 0 and found.state == TRACKED
+            pose = found.T_submap_camera
+            seen = fitted_keyframe(self.tracker, self.mapper.field, self.view, seen, pose, connected)
             seen = seen.without(self.tracker.front, self.view)
             if self.config.mapping.exposure:
                 seen = seen.without_exposure(found.exposure)

@@ -15,6 +15,8 @@ from sigmasplat.model.photo import Photo
 from sigmasplat.model.submap import Picture
 from sigmasplat.slam.drift import Drift
 from sigmasplat.slam.localisation.confidence import Confidence
+from sigmasplat.slam.localisation.depth_fit import DepthFit
+from sigmasplat.slam.localisation.depth_shape import DepthShape, SeenKeyframe
 from sigmasplat.slam.localisation.feature_image import FeatureImage
 from sigmasplat.slam.localisation.foreground import Foreground
 from sigmasplat.slam.localisation.memory import Memory, Seen
@@ -32,10 +34,10 @@ from sigmasplat.slam.step_result import Step
 from sigmasplat.slam.tracker import Tracker
 
 CLASSES: tuple[type, ...] = (
-    Atlas, Camera, Confidence, Detail, Drift, Edge, FeatureImage, Foreground, GaussianField, Hop, Keyframe, Link, Loop,
-    LoopCloser, Mapper, Memory, Photo, Picture, Place, Probe, Probes, Pyramid, Recovery, Reference, Relocaliser, Rows,
-    Seen, Step, SubmapDescriptor, Target, Tracker, Usual,
-    VectorAdam, Watch,
+    Atlas, Camera, Confidence, DepthFit, DepthShape, Detail, Drift, Edge, FeatureImage, Foreground, GaussianField, Hop,
+    Keyframe, Link, Loop, LoopCloser, Mapper, Memory, Photo, Picture, Place, Probe, Probes, Pyramid, Recovery,
+    Reference, Relocaliser, Rows, Seen, SeenKeyframe, Step, SubmapDescriptor, Target, Tracker, Usual, VectorAdam,
+    Watch,
 )  # fmt: skip
 """The classes that a state may contain."""
 

@@ -17,7 +17,8 @@ from sigmasplat.fit.references import Reference, map_reference
 from sigmasplat.model import se3
 from sigmasplat.render.view import View
 from sigmasplat.slam.features import Extractor
-from sigmasplat.slam.localisation.expected import Expected, odometry
+from sigmasplat.slam.localisation.depth_fit import NOTHING_FITTED, DepthFit
+from sigmasplat.slam.localisation.expected import Expected, expect, odometry
 from sigmasplat.slam.localisation.feature_image import FeatureImage, motion_by_features
 from sigmasplat.slam.localisation.foreground import Foreground, objects
 from sigmasplat.slam.localisation.memory import together
@@ -44,7 +45,7 @@ class Tracker:
     R_inertial_camera: that of the last frame; lost: tracking of the last frame failed; doubtful: number of frames in a
     row whose best pose the images contradict (`_contradicted`); front: what was in front of the scene in the last
     frame, None if there was nothing or the frame was lost; keyframe_front: the same for the newest keyframe; watch:
-    what is known of moving things.
+    what is known of moving things; depth: what is known of predicted depth (`tracking.fit_depth`).
     Raises ConfigError on settings that do not fit together.
     """
 
@@ -59,6 +60,7 @@ class Tracker:
     keyframe_front: Foreground | None = None
     front: Foreground | None = None
     watch: Watch = dataclass_field(default_factory=Watch)
+    depth: DepthFit = NOTHING_FITTED
     agreements: list[float] = dataclass_field(default_factory=list)
     first_losses: list[float] = dataclass_field(default_factory=list)
     usual: Usual = dataclass_field(default_factory=Usual)
@@ -86,7 +88,7 @@ class Tracker:
         the later ones are left out. A lost frame gets the best available guess (odometry, else the last pose), and the
         velocity is reset.
         """
-        expected = self._expected(R_inertial_camera)
+        expected = self.expected(R_inertial_camera)
         shown = seen.shown(view)
         best = self._fit(field, view, shown, expected.predicted)
         best, shown = self._uncovered(field, view, seen, shown, expected.predicted, best, hurried)
@@ -189,14 +191,10 @@ class Tracker:
 
     # ---- guesses ----
 
-    def _expected(self, R_inertial_camera: Matrix | None) -> Expected:
-        """Predict the pose by constant velocity; with a gyroscope, its rotation replaces that of the velocity."""
-        motion, turn, last, measured = self.velocity, np.eye(4), self.previous, False
-        if self.R_inertial_camera is not None and R_inertial_camera is not None:
-            motion, measured = motion.copy(), True
-            motion[:3, :3] = turn[:3, :3] = self.R_inertial_camera.T @ R_inertial_camera
-            last = last @ turn
-        return Expected(motion, turn, self.previous @ motion if self.config.motion_model else last, last, measured)
+    def expected(self, R_inertial_camera: Matrix | None) -> Expected:
+        """Return where the camera of the next frame is expected; R_inertial_camera: as in `Frame`."""
+        known = self.R_inertial_camera, R_inertial_camera
+        return expect(self.previous, self.velocity, *known, self.config.motion_model)
 
     def _fit(self, field: Splats, view: View, seen: Sight, guess: Matrix, patience: int = 1) -> PoseFit:
         """Fit from an initial T_world_camera; patience: factor on the number of iterations of gradient descent."""

@@ -26,7 +26,8 @@ class Source(ABC):
     depth_units_per_metre: divisor of whole-number depth, None if depth is stored in metres;
     depth_registered: whether the source itself moved depth to the colour camera; registrable: whether it could do so,
     because the depth camera is known;
-    computed_depth: whether the source computes depth itself, from a stereo pair;
+    computed_depth: whether the source computes depth itself, from a stereo pair; predicted_depth: whether a network
+    predicted depth, so that its scale is arbitrary;
     scene_scale: size of the scene relative to a room, above 1 outdoors; depth_noise_per_m: standard deviation
     of depth, times z²; None if it is unknown (`config.scale.for_scene` uses both);
     sensor: the depth sensor (`config.sensors`), None if it is unknown;
@@ -42,6 +43,7 @@ class Source(ABC):
     depth_registered: bool = False
     registrable: bool = False
     computed_depth: bool = False
+    predicted_depth: bool = False
     scene_scale: float = 1.0
     depth_noise_per_m: float | None = None
     sensor: str | None = None
@@ -153,6 +155,7 @@ class Subset(Source):
         self.depth_units_per_metre = whole.depth_units_per_metre
         self.depth_registered, self.registrable = whole.depth_registered, whole.registrable
         self.computed_depth, self.scene_scale = whole.computed_depth, whole.scene_scale
+        self.predicted_depth = whole.predicted_depth
         self.depth_noise_per_m, self.sensor = whole.depth_noise_per_m, whole.sensor
         self._whole = whole
         self._indices = _within(whole, settings)[:: settings.stride][: settings.limit or None]

@@ -19,7 +19,7 @@ from sigmasplat.sources.opening import Format
 from sigmasplat.sources.room.furnish import furnish_rooms
 from sigmasplat.sources.room.mover import mask_of, mover as moving_ball
 from sigmasplat.sources.room.render import RoomScene, build_scene, render_scene
-from sigmasplat.sources.room.sensor import drifted_depth, measured_color, measured_depth
+from sigmasplat.sources.room.sensor import drifted_depth, measured_color, measured_depth, predicted_depth
 from sigmasplat.sources.room.solid import triangulate
 from sigmasplat.sources.room.walk import camera_path
 from sigmasplat.types import Matrix
@@ -45,7 +45,8 @@ class SyntheticRoom(Source):
     (`room.sensor.drifted_depth`), tenths of a percent of the depth; test_views: number of exact views away from the
     path (`SyntheticRoom.test_views`); stereo: if above 0, depth is computed from a stereo pair with this baseline in cm
     instead of being exact (`right_image`); mover: the share of the image, in percent on average, that a ball covers
-    which moves through the room by itself (`room.mover`); scored views and the true surface show the room without it.
+    which moves through the room by itself (`room.mover`); scored views and the true surface show the room without it;
+    predicted: whether depth is that of an imagined network, with a smooth scale error (`room.sensor.predicted_depth`).
 
     A path with loops to close: frames=720,rooms=2,overrun=20,noise=1,drift=6. A round of 600 frames is a slow pace. The
     way back looks in other directions than the way out, so drift accumulates over a whole round; the last 120 frames
@@ -69,6 +70,7 @@ class SyntheticRoom(Source):
         test_views: int = 0,
         stereo: int = 0,
         mover: int = 0,
+        predicted: bool = False,
     ) -> None:
         """Compute the camera path, no image yet. Raises SourceError unless counts and sizes are ≥ 1, the rest ≥ 0."""
         counts = {"frames": frames, "width": width, "height": height, "loops": loops, "rooms": rooms}
@@ -85,6 +87,9 @@ class SyntheticRoom(Source):
         focal_px = FOCAL_PER_WIDTH * width
         camera = Camera(width, height, focal_px, focal_px, (width - 1) / 2, (height - 1) / 2)
         super().__init__("synthetic", camera)
+        if predicted and stereo:
+            raise SourceError("synthetic room: depth is either predicted or from stereo; leave out predicted or stereo")
+        self.predicted_depth = predicted
         self._seed, self._noise, self._rooms = seed, noise, rooms
         self._exposure_change, self._drift = exposure_change, drift / 1000
         self._test_views = test_views
@@ -107,6 +112,8 @@ class SyntheticRoom(Source):
         if self._noise:
             rng = np.random.default_rng((self._seed, i, 7))
             color, depth_m = measured_color(color, rng), measured_depth(depth_m, self.camera, rng)
+        if self.predicted_depth:
+            depth_m = predicted_depth(depth_m, i, self._seed, np.random.default_rng((self._seed, i, 12)))
         bytes_, std_m = np.rint(color * 255.0).astype(np.uint8), None
         if self._matcher:
             depth_m, std_m = self._matcher.depth_and_std_m(bytes_, self.right_image(i))
@@ -231,7 +238,7 @@ def open_synthetic(text: str) -> SyntheticRoom:
         if key not in _OPTIONS or not value.lstrip("-").isdecimal():
             raise SourceError(f"synthetic room: unknown option {part!r}; give whole numbers for {', '.join(_OPTIONS)}")
         options[key] = int(value)
-    for key in ("noise", "exposure_change"):
+    for key in ("noise", "exposure_change", "predicted"):
         if key in options:
             options[key] = bool(options[key])
     return SyntheticRoom(**options)
@@ -239,7 +246,7 @@ def open_synthetic(text: str) -> SyntheticRoom:
 
 _OPTIONS = (
     "frames", "width", "height", "seed", "noise", "loops", "exposure_change", "rooms", "overrun", "drift", "test_views",
-    "stereo", "mover",
+    "stereo", "mover", "predicted",
 )  # fmt: skip
 
 FORMAT = Format(

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from sigmasplat.config import TrackingConfig
 from sigmasplat.fit.align import align
 from sigmasplat.fit.pyramid import Pyramid
@@ -23,6 +25,22 @@ class Expected:
     predicted: Matrix
     last: Matrix
     measured: bool
+
+
+def expect(
+    previous: Matrix, velocity: Matrix, R_before: Matrix | None, R_now: Matrix | None, motion_model: bool
+) -> Expected:
+    """Predict the pose by constant velocity; with a gyroscope, its rotation replaces that of the velocity.
+
+    previous, velocity [4, 4]: the last pose T_world_camera and motion; R_before, R_now: R_inertial_camera as in
+    `Frame`; motion_model: whether the first guess assumes the velocity.
+    """
+    motion, turn, last, measured = velocity, np.eye(4), previous, False
+    if R_before is not None and R_now is not None:
+        motion, measured = motion.copy(), True
+        motion[:3, :3] = turn[:3, :3] = R_before.T @ R_now
+        last = last @ turn
+    return Expected(motion, turn, previous @ motion if motion_model else last, last, measured)
 
 
 def odometry(last: Pyramid, live: Pyramid, expected: Expected, config: TrackingConfig) -> Matrix | None:

@@ -21,6 +21,7 @@ from sigmasplat.render.backend import make_view
 from sigmasplat.render.view import View
 from sigmasplat.slam.features import Extractor
 from sigmasplat.slam.localisation.denoise import denoised
+from sigmasplat.slam.localisation.depth_fit import smoothed
 from sigmasplat.slam.localisation.feature_image import FeatureImage, LateDetail
 from sigmasplat.slam.localisation.foreground import Foreground
 
@@ -43,7 +44,11 @@ class Sight:
         """Return the frame without depth where something is in front: it is neither mapped nor a reference there."""
         if front is None:
             return self
-        target, live = self._with_depth(np.where(front.hidden, np.float32(0.0), self.target.depth_image.numpy()), view)
+        return self.with_depth(np.where(front.hidden, np.float32(0.0), self.target.depth_image.numpy()), view)
+
+    def with_depth(self, depth_m: NDArray[np.float32], view: View) -> Self:
+        """Return the frame with other depth [H, W], m."""
+        target, live = self._with_depth(depth_m, view)
         image = None if self.image is None else self.image.with_depth(target.depth_image.numpy())
         return replace(self, target=target, live=live, image=image)
 
@@ -103,7 +108,9 @@ def working_frame(frame: Frame, config: Config, camera: Camera | None = None) ->
     if camera is not None and working.camera != camera:
         working = frame.seen_by(camera).prepared(0, i.min_depth_m, i.max_depth_m)
     depth_m, std_m, r = working.depth_m, working.depth_std_m, config.render
-    if i.denoise_depth:
+    if config.tracking.fit_depth:
+        depth_m = smoothed(depth_m)
+    elif i.denoise_depth:
         depth_m = denoised(depth_m, r.depth_noise_per_m, r.scene_scale)
     modelled = std_by_model(depth_m, working.camera, i.sensor)
     return working.with_depth(depth_m, std_m if modelled is None else modelled)

@@ -15,6 +15,7 @@ from sigmasplat.model.component import APART, LOST, RELOCALISED, TRACKED
 from sigmasplat.model.field import GaussianField
 from sigmasplat.render.view import View
 from sigmasplat.slam.drift import Drift
+from sigmasplat.slam.fitted_depth import fitted_keyframe, fitted_to_map
 from sigmasplat.slam.found import Found
 from sigmasplat.slam.localisation.confidence import Confidence
 from sigmasplat.slam.localisation.foreground import share_of
@@ -124,6 +125,7 @@ class CameraClock:
         else:
             with timer.stage("track"), timer.kernels_of(view, "track_kernels"):
                 splats = NOTHING if self.snapshot is None else self.snapshot
+                seen = fitted_to_map(self.tracker, splats, view, seen)
                 fit = self.tracker.track(splats, view, seen, seen.frame.R_inertial_camera, hurried)
             found = Found.of(fit, se3.inverse(fit.T_camera_world), self.tracker.lost)
             self.recovery.count(self.tracker.lost, self.tracker.doubtful > 0, seen)
@@ -151,7 +153,10 @@ class CameraClock:
         certain = not self.tracker.lost and self.recovery.is_steady and self.tracker.is_certain(fit)
         if not certain or not self._is_keyframe(fit, found.T_submap_camera):
             return None
-        alignment, shown = self.tracker.hop(fit, seen.live), seen.without(self.tracker.front, view)
+        alignment = self.tracker.hop(fit, seen.live)
+        splats = NOTHING if self.snapshot is None else self.snapshot
+        refitted = fitted_keyframe(self.tracker, splats, view, seen, found.T_submap_camera, connected=not self.found)
+        shown = refitted.without(self.tracker.front, view)
         self._follow(self.frames, shown, found.T_submap_camera)
         if len(self.waits) >= self.config.realtime.waiting_most:
             self.refused += 1

@@ -11,6 +11,8 @@ Image = NDArray[np.float32]
 JITTER_PX = 0.6
 RANGE_M = (0.35, 7.0)
 COLOR_SIGMA = 0.008
+PREDICTED_SCALE_ERROR, PREDICTED_NOISE = 0.1, 0.1
+"""Standard deviations of predicted depth, shares of the depth: of its smooth error, and at each pixel."""
 DRIFT_KNOT_FRAMES = 300
 """Frames between the random values of the calibration drift; it is a spline between them."""
 
@@ -46,6 +48,14 @@ def drifted_depth(depth_m: Image, i: int, seed: int, deviation: float) -> Image:
     shapes = (one, tilt_u, tilt_v, tilt_u * tilt_v, *(np.sqrt(1.25) * (3.0 * x**2 - 1.0) for x in (u, v)))
     error = sum(_smooth_process(i, (seed, k, 8)) * shape for k, shape in enumerate(shapes)) / np.sqrt(len(shapes))
     return np.asarray(depth_m * (1.0 + deviation * error), np.float32)
+
+
+def predicted_depth(depth_m: Image, i: int, seed: int, rng: np.random.Generator) -> Image:
+    """Return depth [H, W] as a network may predict it for frame i: true depth times a scale error of
+    `PREDICTED_SCALE_ERROR` that changes slowly over image and time, with `PREDICTED_NOISE` at each pixel."""
+    scaled = drifted_depth(depth_m, i, seed, PREDICTED_SCALE_ERROR)
+    factor = 1.0 + PREDICTED_NOISE * rng.standard_normal(scaled.shape, np.float32)
+    return np.where(depth_m > 0, np.maximum(scaled * factor, 0.0), 0.0).astype(np.float32)
 
 
 def _smooth_process(i: int, seed: tuple[int, ...]) -> float:

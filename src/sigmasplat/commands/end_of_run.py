@@ -1,0 +1,51 @@
+"""What `run` says of the frames when the last one is done."""
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from sigmasplat.checks.motion import MotionWatch
+    from sigmasplat.io.runs import RunFolder
+    from sigmasplat.run.terminal import Screen
+    from sigmasplat.sources.base import Source
+
+
+def warn_at_the_end(
+    screen: "Screen", source: "Source", read: "Source", folder: "RunFolder", motion: "MotionWatch"
+) -> None:
+    """Print what was wrong with the frames, and whether the scale of the result is arbitrary."""
+    _warn_of_skipped_frames(screen, source)
+    _warn_of_dropped_frames(screen, read)
+    _warn_if_never_recognised(screen, folder)
+    for warning in motion.warnings():
+        screen.warn(warning)
+    if source.predicted_depth:
+        screen.say("the scale is arbitrary, because a network predicted depth: lengths are not in metres")
+
+
+def _warn_of_skipped_frames(screen: "Screen", source: "Source") -> None:
+    """Print how many frames are missing from the run, and why."""
+    from sigmasplat.sources.live import LiveSource
+
+    if source.skipped:
+        images = "image" if len(source.skipped) == 1 else "images"
+        screen.warn(f"{len(source.skipped)} {images} skipped (first: {source.skipped[0]})")
+    if isinstance(source, LiveSource) and source.ending:
+        screen.warn(source.ending)
+    if isinstance(source, LiveSource) and source.dropped:
+        screen.say(f"{source.dropped} frames of the camera were dropped because SLAM was slower")
+
+
+def _warn_of_dropped_frames(screen: "Screen", read: "Source") -> None:
+    """Print how many frames were dropped in real time."""
+    if read.arrived_s is not None and read.dropped:
+        screen.warn(f"{read.dropped} frames were dropped because tracking was late")
+
+
+def _warn_if_never_recognised(screen: "Screen", folder: "RunFolder") -> None:
+    """Print a warning if no frame of a run with --onto is connected to the earlier map."""
+    onto = folder.facts().get("onto")
+    if onto and not len(folder.read_trajectory()):
+        screen.warn(
+            f"the recording was never recognised in the map of {onto['run']}; its path and map are in "
+            f"{folder.path / 'components'}"
+        )
