@@ -37,6 +37,8 @@ OBJECT_SHARE, MOST_OBJECTS = (0.02, 0.7), 3
 """Share of the image of a thing that stands free, and how many are considered."""
 RING, FREE_AROUND = 3, 0.6
 """Something stands free if at least this share of the pixels at this distance around it is farther."""
+SURROUNDED = 0.75
+"""A hole in depth belongs to what is in front if this share of its edge does."""
 MARGIN_PX = 3
 """The mask is wider than the regions by this much: sensors mix depth and colour at an edge."""
 
@@ -149,9 +151,23 @@ def smooth(depth: Depth) -> Mask:
 
 
 def enlarged(small: Mask, step: int, live_m: Depth) -> tuple[Mask, Mask]:
-    """Return a mask of every `step`-th pixel at the size of the image, and the same with a margin."""
+    """Return a mask of every `step`-th pixel at the size of the image, and the same with a margin and with the holes in
+    depth that it surrounds: what is too near for the sensor has no reading, but hides the scene too."""
     whole = np.repeat(np.repeat(small, step, 0), step, 1)[: live_m.shape[0], : live_m.shape[1]]
-    return whole, np.asarray(maximum_filter(whole, 2 * MARGIN_PX + 1))
+    hidden = np.asarray(maximum_filter(whole, 2 * MARGIN_PX + 1))
+    return whole, hidden | _holes_in(hidden, live_m)
+
+
+def _holes_in(mask: Mask, depth_m: Depth) -> Mask:
+    """Return the connected pixels without a reading whose edge is in the mask, at least a share of `SURROUNDED`."""
+    holes, count = label(depth_m <= 0, np.ones((3, 3)))
+    at_edge = np.where(depth_m > 0, maximum_filter(holes, 3), 0)
+    edges, covered = (
+        np.bincount(at_edge[chosen], minlength=count + 1) for chosen in (at_edge > 0, mask & (at_edge > 0))
+    )
+    own = (edges > 0) & (covered >= SURROUNDED * edges)
+    own[0] = False
+    return np.asarray(own[holes])
 
 
 def _objects(inside: Mask, free: Mask, again: Mask) -> Mask:

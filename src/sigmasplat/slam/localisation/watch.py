@@ -1,14 +1,17 @@
 """Watch for what moves relative to the newest keyframe: what came in front of it, and what has left its place."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 from sigmasplat.config import MovingConfig
 from sigmasplat.fit.compare import Comparison
+from sigmasplat.fit.pose import PoseFit
 from sigmasplat.fit.references import Reference
 from sigmasplat.model import se3
-from sigmasplat.slam.localisation.foreground import Earlier, Foreground, foreground
+from sigmasplat.slam.localisation.foreground import Earlier, Foreground, foreground, objects
 from sigmasplat.slam.localisation.memory import Memory
 from sigmasplat.slam.localisation.sight import Sight
+from sigmasplat.slam.localisation.verdict import agrees_more, differs
 from sigmasplat.slam.rules import Asked
 from sigmasplat.types import Matrix
 
@@ -62,6 +65,18 @@ class Watch:
         live = Earlier(live_m, se3.inverse(keyframe.T_camera_world @ T_world_camera))
         gone = foreground(live, None, depth_m, seen.target.camera, whole_objects=True)
         return keyframe if gone is None else keyframe.without(gone.hidden)
+
+    def suspected(
+        self, keyframe: Reference | None, seen: Sight, fit: PoseFit, contradicted: bool
+    ) -> Iterator[Foreground]:
+        """Yield the things in front that may have drawn a pose: those without which the gray values agree much better
+        at the same pose; if the images contradict it, all."""
+        if keyframe is None or fit.comparison is None or not (contradicted or differs(fit.comparison)):
+            return
+        for thing in objects(seen.target.depth_image.numpy()):
+            rest = seen.live.hiding(thing.hidden)
+            if contradicted or agrees_more(keyframe.compared(rest, fit.T_camera_world), fit.comparison, False):
+                yield thing
 
     def slow(self, seen: Sight, T_world_camera: Matrix) -> Foreground | None:
         """Find what moves too slowly to show against the newest keyframe."""
