@@ -117,7 +117,7 @@ class Tracker:
             return fit, first
         found = self._without_front(field, view, seen, first, predicted, fit, before, hurried)
         if found is None and self.watch.config.find and not hurried():
-            found = self._without_object(field, view, seen, predicted, fit)
+            found = self._without_object(field, view, seen, predicted, fit, before is not None)
         return (fit, first) if found is None else found
 
     def _without_front(
@@ -149,12 +149,13 @@ class Tracker:
         return None
 
     def _without_object(
-        self, field: Splats, view: View, seen: Sight, predicted: Matrix, drawn: PoseFit
+        self, field: Splats, view: View, seen: Sight, predicted: Matrix, drawn: PoseFit, known: bool
     ) -> tuple[PoseFit, Sight] | None:
         """Look for the one thing in front without which the images agree much better: it moves, and has drawn the pose
-        with it. Return the fit and the frame without it; None if there is none."""
+        with it. Return the fit and the frame without it; None if there is none. known: the last frame had something in
+        front."""
         contradicted = self._contradicted(drawn)
-        for front in self.watch.suspected(self.keyframe, seen, drawn, contradicted):
+        for front in self.watch.suspected(self.keyframe, seen, drawn, contradicted, known):
             shown = seen.aside(front, view)
             found = self._fit(field, view, shown, predicted)
             if agrees_more(found.comparison, drawn.comparison, contradicted) and self._stands(found, predicted):

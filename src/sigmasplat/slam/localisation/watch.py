@@ -18,6 +18,9 @@ from sigmasplat.types import Matrix
 FRONT = 0.03
 """What is in front is looked for if at least this share of the compared points is nearer than the reference."""
 
+DRAWN_EVERY = 2
+"""What draws the pose is looked for in every second frame: between keyframes, a wrong pose does not last."""
+
 
 @dataclass(frozen=True, eq=False)
 class Watch:
@@ -67,11 +70,15 @@ class Watch:
         return keyframe if gone is None else keyframe.without(gone.hidden)
 
     def suspected(
-        self, keyframe: Reference | None, seen: Sight, fit: PoseFit, contradicted: bool
+        self, keyframe: Reference | None, seen: Sight, fit: PoseFit, contradicted: bool, known: bool
     ) -> Iterator[Foreground]:
         """Yield the things in front that may have drawn a pose: those without which the gray values agree much better
-        at the same pose; if the images contradict it, all."""
-        if keyframe is None or fit.comparison is None or not (contradicted or differs(fit.comparison)):
+        at the same pose; if the images contradict it, all. Without contradiction, every second frame is looked at, and
+        those after one in which something was in front (`known`)."""
+        if keyframe is None or fit.comparison is None:
+            return
+        looks = (known or self.memory.frames % DRAWN_EVERY == 0) and differs(fit.comparison)
+        if not (contradicted or looks):
             return
         for thing in objects(seen.target.depth_image.numpy()):
             rest = seen.live.hiding(thing.hidden)
