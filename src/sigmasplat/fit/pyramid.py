@@ -4,6 +4,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
+import numpy as np
+
 from sigmasplat.fit.backends import fits_of
 from sigmasplat.fit.interface import DEPTH_STEP_M, ImageKernels, Plane
 from sigmasplat.model.camera import Camera
@@ -57,6 +59,12 @@ class Pyramid:
             depth_weights.append(on_depth)
         own = gray_weights if weight_depth is None else depth_weights
         return replace(self, weight=gray_weights, weight_depth=own)
+
+    def hiding(self, hidden: Any) -> "Pyramid":
+        """Return the same images for comparisons that leave out these pixels [H, W]: the finest level has `HIDDEN_M`
+        there."""
+        finest = np.where(hidden, np.float32(HIDDEN_M), self.kernels.to_host(self.depth[0]))
+        return replace(self, depth=[self.kernels.beside(finest, self.depth[0]), *self.depth[1:]])
 
     @staticmethod
     def of(

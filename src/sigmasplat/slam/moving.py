@@ -10,7 +10,6 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter, minimum_filter
 
 from sigmasplat.config import MovingConfig
 from sigmasplat.fit.target import Keyframe
@@ -18,7 +17,6 @@ from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
 from sigmasplat.slam.localisation.foreground import (
-    AROUND_PX,
     CLEAR_M,
     CLEAR_RELATIVE,
     Depth,
@@ -26,6 +24,7 @@ from sigmasplat.slam.localisation.foreground import (
     Mask,
     foreground,
     projected,
+    range_of,
 )
 from sigmasplat.types import Matrix
 
@@ -33,6 +32,9 @@ COLUMNS_TESTED = 80
 """About so many columns of a keyframe are tested."""
 SUPPORT = 4
 """A splat stays if a surface at its place was seen at least once for this many times that the place was free."""
+
+STRAY = 0.001
+"""Splats are removed if they are at least this share of the map: a few in free space are errors of depth."""
 
 
 def contradicted(own_m: Depth, other_m: Depth, T_other_own: Matrix, camera: Camera) -> Mask | None:
@@ -72,21 +74,29 @@ def _mask(own: Keyframe, other: Keyframe) -> None:
 
 def carve(field: GaussianField, keyframes: Sequence[Keyframe], votes: int) -> None:
     """Remove the splats whose place the newest keyframe and others see to be free, `votes` in all, unless one in
-    `SUPPORT` shows a surface there."""
+    `SUPPORT` shows a surface there. Stray ones stay."""
     points = field.means.double().cpu().numpy()
     free, _ = _seen(points, keyframes[-1])
     rows = np.flatnonzero(free)
-    if len(rows):
-        gone = _is_free(points[rows], keyframes, votes)
-        keep = torch.ones(len(field), dtype=torch.bool)
-        keep[torch.from_numpy(rows[gone])] = False
-        field.keep(keep.to(field.params.device))
+    if len(rows) and not _are_stray(len(rows), field):
+        gone = np.zeros(len(field), np.bool_)
+        gone[rows] = _is_free(points[rows], keyframes, votes)
+        _remove(field, gone)
 
 
 def carve_everywhere(field: GaussianField, keyframes: Iterable[Keyframe], votes: int) -> None:
     """Remove the splats whose place at least `votes` of the keyframes see to be free, as `carve`."""
-    gone = _is_free(field.means.double().numpy(), keyframes, votes)
-    field.keep(torch.from_numpy(~gone))
+    _remove(field, _is_free(field.means.double().numpy(), keyframes, votes))
+
+
+def _are_stray(count: int, field: GaussianField) -> bool:
+    return count < STRAY * len(field)
+
+
+def _remove(field: GaussianField, gone: Mask) -> None:
+    """Remove splats [N] from a map, unless they are stray."""
+    if gone.any() and not _are_stray(int(gone.sum()), field):
+        field.keep(torch.from_numpy(~gone).to(field.params.device))
 
 
 def _is_free(points: Matrix, keyframes: Iterable[Keyframe], votes: int) -> Mask:
@@ -103,8 +113,7 @@ def _seen(points: Matrix, keyframe: Keyframe) -> tuple[NDArray[np.bool_], NDArra
     """Return which points [n, 3] m a keyframe sees through, and at which it shows a surface."""
     camera, depth = keyframe.target.camera, keyframe.target.depth_image.numpy()
     inside, row, column, z = projected(points.T, camera, se3.inverse(keyframe.T_world_camera))
-    near = minimum_filter(np.where(depth > 0, depth, np.float32(np.inf)), AROUND_PX)
+    near, far = range_of(depth)
     limit, read = CLEAR_M + CLEAR_RELATIVE * z, inside & (depth[row, column] > 0)
     free = read & (z + limit < near[row, column])
-    around = maximum_filter(depth, AROUND_PX)[row, column]
-    return free, inside & (z > near[row, column] - limit) & (z < around + limit)
+    return free, inside & (z > near[row, column] - limit) & (z < far[row, column] + limit)

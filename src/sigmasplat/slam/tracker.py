@@ -20,19 +20,17 @@ from sigmasplat.slam.features import Extractor
 from sigmasplat.slam.localisation.depth_fit import NOTHING_FITTED, DepthFit
 from sigmasplat.slam.localisation.expected import Expected, expect, odometry
 from sigmasplat.slam.localisation.feature_image import FeatureImage, motion_by_features
-from sigmasplat.slam.localisation.foreground import Foreground, objects
+from sigmasplat.slam.localisation.foreground import Foreground
 from sigmasplat.slam.localisation.memory import together
 from sigmasplat.slam.localisation.sight import FoundKeyframe, Sight
 from sigmasplat.slam.localisation.tracked_keyframe import Splats, TrackedKeyframe, found_keyframe, mapped_keyframe
-from sigmasplat.slam.localisation.verdict import LEAST_COMMON, Usual, confirmed, score, stands
+from sigmasplat.slam.localisation.verdict import LEAST_COMMON, Usual, agrees_more, confirmed, score, stands
 from sigmasplat.slam.localisation.watch import Watch
 from sigmasplat.slam.rules import Asked, is_lost, jumped, never, unless
 from sigmasplat.types import Matrix
 
 DOUBT = 0.7
 """A pose is doubtful if its agreement × overlap falls below this share of the usual value."""
-AGREES_MORE = 0.05
-"""Something that moves has spoilt a pose if the correlation of the gray values is higher by this without it."""
 WIDE = 0.065
 """A motion between two frames is wide if it moves the image by more than this share of its width: the basin of
 convergence of alignment ends near there."""
@@ -120,8 +118,8 @@ class Tracker:
         if fit.comparison is None or self.lost:
             return fit, first
         found = self._without_front(field, view, seen, first, predicted, fit, before, hurried)
-        if found is None and self.watch.config.find and self._contradicted(fit) and not hurried():
-            found = self._without_object(field, view, seen, predicted, fit.comparison)
+        if found is None and self.watch.config.find and not hurried():
+            found = self._without_object(field, view, seen, predicted, fit, before is not None)
         return (fit, first) if found is None else found
 
     def _without_front(
@@ -153,15 +151,16 @@ class Tracker:
         return None
 
     def _without_object(
-        self, field: Splats, view: View, seen: Sight, predicted: Matrix, contradicted: Comparison
+        self, field: Splats, view: View, seen: Sight, predicted: Matrix, drawn: PoseFit, known: bool
     ) -> tuple[PoseFit, Sight] | None:
-        """Look for the one thing in front without which the images do not contradict the pose: it moves, and has drawn
-        the pose with it. Return the fit and the frame without it; None if there is none."""
-        for front in objects(seen.target.depth_image.numpy()):
+        """Look for the one thing in front without which the images agree much better: it moves, and has drawn the pose
+        with it. Return the fit and the frame without it; None if there is none. known: the last frame had something in
+        front."""
+        contradicted = self._contradicted(drawn)
+        for front in self.watch.suspected(self.keyframe, seen, drawn, contradicted, known):
             shown = seen.aside(front, view)
             found = self._fit(field, view, shown, predicted)
-            agrees = 0.0 if found.comparison is None else found.comparison.correlation
-            if agrees > contradicted.correlation + AGREES_MORE and self._stands(found, predicted):
+            if agrees_more(found.comparison, drawn.comparison, contradicted) and self._stands(found, predicted):
                 self.front = front
                 return found, shown
         return None

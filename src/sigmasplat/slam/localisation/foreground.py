@@ -10,10 +10,11 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import label, maximum_filter, minimum_filter
+from scipy.ndimage import label, maximum_filter
 
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
+from sigmasplat.slam.localisation.windows import largest_around, least_around, widened
 from sigmasplat.types import Matrix
 
 Depth = NDArray[np.float32]
@@ -37,6 +38,8 @@ OBJECT_SHARE, MOST_OBJECTS = (0.02, 0.7), 3
 """Share of the image of a thing that stands free, and how many are considered."""
 RING, FREE_AROUND = 3, 0.6
 """Something stands free if at least this share of the pixels at this distance around it is farther."""
+SURROUNDED = 0.75
+"""A hole in depth belongs to what is in front if this share of its edge does."""
 MARGIN_PX = 3
 """The mask is wider than the regions by this much: sensors mix depth and colour at an edge."""
 
@@ -75,8 +78,7 @@ class Earlier:
 
 def range_of(depth_m: Depth) -> tuple[Depth, Depth]:
     """Return the least (inf without any) and the largest reading (0 without any) in a window around each pixel."""
-    near = minimum_filter(np.where(depth_m > 0, depth_m, np.float32(np.inf)), AROUND_PX)
-    return near, maximum_filter(depth_m, AROUND_PX)
+    return least_around(depth_m, AROUND_PX), largest_around(depth_m, AROUND_PX)
 
 
 @lru_cache(maxsize=8)
@@ -103,7 +105,7 @@ def foreground(
     scene_scale: size of the scene relative to a room.
     """
     depth = live_m[::step, ::step]
-    depth = np.where(depth > 0, depth, maximum_filter(depth, 3))  # fill scattered holes
+    depth = np.where(depth > 0, depth, largest_around(depth, 3))  # fill scattered holes
     free, again, same = _places(scene, before, depth, camera, step, CLEAR_M * scene_scale)
     if np.count_nonzero(free | again) < LEAST_REGION * depth.size:
         return None
@@ -123,7 +125,7 @@ def objects(live_m: Depth) -> list[Foreground]:
     """Return the things that stand free in an image [H, W], m, in front of farther surfaces all around, the largest
     first, at most `MOST_OBJECTS`. What is behind them is not known."""
     depth = live_m[::STEP, ::STEP]
-    depth = np.where(depth > 0, depth, maximum_filter(depth, 3))
+    depth = np.where(depth > 0, depth, largest_around(depth, 3))
     regions, count = label(smooth(depth), np.ones((3, 3)))
     sizes = np.bincount(regions.ravel(), minlength=count + 1) / depth.size
     sizes[0] = 0.0
@@ -133,7 +135,7 @@ def objects(live_m: Depth) -> list[Foreground]:
             break
         inside = regions == region
         far_m = np.median(depth[inside]) * (1 + EDGE_RELATIVE)
-        ring = maximum_filter(inside, 2 * RING + 1) & ~maximum_filter(inside, 2 * RING - 1) & (depth > 0)
+        ring = widened(inside, 2 * RING + 1) & ~widened(inside, 2 * RING - 1) & (depth > 0)
         if sizes[region] > OBJECT_SHARE[1] or not ring.any() or (depth[ring] > far_m).mean() < FREE_AROUND:
             continue
         whole, hidden = enlarged(inside, STEP, live_m)
@@ -144,14 +146,28 @@ def objects(live_m: Depth) -> list[Foreground]:
 
 def smooth(depth: Depth) -> Mask:
     """Return the pixels with a reading that are not on the far side of a depth step."""
-    nearest = minimum_filter(np.where(depth > 0, depth, np.float32(np.inf)), 3)
+    nearest = least_around(depth, 3)
     return np.asarray((depth > 0) & (depth <= (1 + EDGE_RELATIVE) * nearest))
 
 
 def enlarged(small: Mask, step: int, live_m: Depth) -> tuple[Mask, Mask]:
-    """Return a mask of every `step`-th pixel at the size of the image, and the same with a margin."""
+    """Return a mask of every `step`-th pixel at the size of the image, and the same with a margin and with the holes in
+    depth that it surrounds: what is too near for the sensor has no reading, but hides the scene too."""
     whole = np.repeat(np.repeat(small, step, 0), step, 1)[: live_m.shape[0], : live_m.shape[1]]
-    return whole, np.asarray(maximum_filter(whole, 2 * MARGIN_PX + 1))
+    hidden = widened(whole, 2 * MARGIN_PX + 1)
+    return whole, hidden | _holes_in(hidden, live_m)
+
+
+def _holes_in(mask: Mask, depth_m: Depth) -> Mask:
+    """Return the connected pixels without a reading whose edge is in the mask, at least a share of `SURROUNDED`."""
+    holes, count = label(depth_m <= 0, np.ones((3, 3)))
+    at_edge = np.where(depth_m > 0, maximum_filter(holes, 3), 0)
+    edges, covered = (
+        np.bincount(at_edge[chosen], minlength=count + 1) for chosen in (at_edge > 0, mask & (at_edge > 0))
+    )
+    own = (edges > 0) & (covered >= SURROUNDED * edges)
+    own[0] = False
+    return np.asarray(own[holes])
 
 
 def _objects(inside: Mask, free: Mask, again: Mask) -> Mask:
@@ -183,7 +199,7 @@ def _behind(scene: Earlier, camera: Camera) -> Depth:
     found = found[np.argsort(-z[found], kind="stable")]  # the nearest surface is written last
     seen = np.zeros(scene.depth_m.shape, np.float32)
     seen[row[found], column[found]] = z[found]
-    return np.where(seen > 0, seen, maximum_filter(seen, 3))
+    return np.where(seen > 0, seen, largest_around(seen, 3))
 
 
 def _places(

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.ndimage import label, maximum_filter
+from scipy.ndimage import label
 
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
@@ -19,12 +19,13 @@ from sigmasplat.slam.localisation.foreground import (
     seen_again,
     smooth,
 )
+from sigmasplat.slam.localisation.windows import widened
 from sigmasplat.types import Matrix
 
 EVERY = 5
 """Every fifth frame is remembered."""
-AGES, LOOK_EVERY = (3, 6), 2
-"""Every second frame is compared with a remembered one, at these places in turn, counted from the newest one. What was
+AGES, LOOK_EVERY = (3, 6), 4
+"""Every fourth frame is compared with a remembered one, at these places in turn, counted from the newest one. What was
 in front in the last frame is found without it."""
 COLUMNS_TESTED = 80
 """About so many columns of an image are tested."""
@@ -98,7 +99,7 @@ class Memory:
         rests[0] = False
         if not rests.any():
             return front
-        moving = maximum_filter((regions > 0) & ~rests[regions], 3)
+        moving = widened((regions > 0) & ~rests[regions], 3)
         if moving.sum() < LEAST_REGION * moving.size:
             return None
         whole, hidden = enlarged(moving, step, depth_m)

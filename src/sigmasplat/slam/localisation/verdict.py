@@ -49,6 +49,11 @@ STANDS_CORRELATION = 0.7
 correlation: blur and exposure lower the correlation at right poses too."""
 BETTER = 0.1
 """A pose from the whole map replaces a doubtful one if its score is higher by this."""
+DIFFERS, DRAWS = 0.02, 2.5
+"""Something may have drawn the pose if the correlation of the gray values misses 1 by more than this. It has if what is
+missing is smaller by this factor without it: in recordings, the factor of still things was below 2."""
+AGREES_MORE = 0.05
+"""Something has also drawn a doubtful pose if the correlation of the gray values is higher by this without it."""
 
 
 def explained(c: Comparison) -> float:
@@ -79,6 +84,19 @@ def recognised(c: Comparison, matches: int) -> bool:
     """Return whether the map confirms a pose that this number of features has led to."""
     sure = explained(c) >= SURE_EXPLAINED and not c.correlation < SURE_CORRELATION
     return confirmed(c) and (sure or matches >= FEW_MATCHES)
+
+
+def differs(c: Comparison) -> bool:
+    """Return whether the gray values differ so much that something may have drawn the pose."""
+    return 1.0 - c.correlation > DIFFERS
+
+
+def agrees_more(without: Comparison | None, c: Comparison | None, contradicted: bool) -> bool:
+    """Return whether something has drawn a pose, by a comparison without it; contradicted: the pose was doubtful."""
+    if without is None or c is None:
+        return False
+    much = differs(c) and DRAWS * (1.0 - without.correlation) < 1.0 - c.correlation
+    return much or (contradicted and without.correlation > c.correlation + AGREES_MORE)
 
 
 def is_questionable(doubtful: int) -> bool:

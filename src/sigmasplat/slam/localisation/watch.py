@@ -1,19 +1,25 @@
 """Watch for what moves relative to the newest keyframe: what came in front of it, and what has left its place."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 from sigmasplat.config import MovingConfig
 from sigmasplat.fit.compare import Comparison
+from sigmasplat.fit.pose import PoseFit
 from sigmasplat.fit.references import Reference
 from sigmasplat.model import se3
-from sigmasplat.slam.localisation.foreground import Earlier, Foreground, foreground
+from sigmasplat.slam.localisation.foreground import Earlier, Foreground, foreground, objects
 from sigmasplat.slam.localisation.memory import Memory
 from sigmasplat.slam.localisation.sight import Sight
+from sigmasplat.slam.localisation.verdict import agrees_more, differs
 from sigmasplat.slam.rules import Asked
 from sigmasplat.types import Matrix
 
 FRONT = 0.03
 """What is in front is looked for if at least this share of the compared points is nearer than the reference."""
+
+DRAWN_EVERY = 2
+"""What draws the pose is looked for in every second frame: between keyframes, a wrong pose does not last."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +68,22 @@ class Watch:
         live = Earlier(live_m, se3.inverse(keyframe.T_camera_world @ T_world_camera))
         gone = foreground(live, None, depth_m, seen.target.camera, whole_objects=True)
         return keyframe if gone is None else keyframe.without(gone.hidden)
+
+    def suspected(
+        self, keyframe: Reference | None, seen: Sight, fit: PoseFit, contradicted: bool, known: bool
+    ) -> Iterator[Foreground]:
+        """Yield the things in front that may have drawn a pose: those without which the gray values agree much better
+        at the same pose; if the images contradict it, all. Without contradiction, every second frame is looked at, and
+        those after one in which something was in front (`known`)."""
+        if keyframe is None or fit.comparison is None:
+            return
+        looks = (known or self.memory.frames % DRAWN_EVERY == 0) and differs(fit.comparison)
+        if not (contradicted or looks):
+            return
+        for thing in objects(seen.target.depth_image.numpy()):
+            rest = seen.live.hiding(thing.hidden)
+            if contradicted or agrees_more(keyframe.compared(rest, fit.T_camera_world), fit.comparison, False):
+                yield thing
 
     def slow(self, seen: Sight, T_world_camera: Matrix) -> Foreground | None:
         """Find what moves too slowly to show against the newest keyframe."""

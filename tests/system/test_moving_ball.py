@@ -1,0 +1,32 @@
+"""Something that moves does not take the camera with it, from the first frame on."""
+
+import numpy as np
+import pytest
+
+from sigmasplat.config.text import override
+from sigmasplat.model import se3
+from sigmasplat.presets import preset
+from sigmasplat.slam.slam import Slam
+from sigmasplat.sources import SyntheticRoom
+
+pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
+SMALL = {
+    "moving.find": "true", "input.width": "160", "mapping.first_iterations": "20", "mapping.iterations": "6",
+    "final.iterations": "0",
+}  # fmt: skip
+FRAMES = 9
+
+
+@pytest.mark.parametrize("share", [0, 20])
+def test_a_ball_in_view_from_the_first_frame_on_does_not_draw_the_pose(share: int) -> None:
+    room = SyntheticRoom(frames=200, width=160, height=120, noise=1.0, mover=share)
+    slam = Slam(override(preset("sigma"), SMALL))
+    masked = []
+    for i in range(FRAMES):
+        step = slam.step(room.frame(i))
+        masked.append(step.tracking.get("moving", 0.0))
+    truth = room.truth().T_world_camera
+    moved = se3.inverse(truth[0]) @ truth[FRAMES - 1]
+    off_m = np.linalg.norm(step.T_world_camera[:3, 3] - moved[:3, 3])
+    assert off_m < 0.01  # a camera that is drawn by the ball is off by more than 4 cm
+    assert min(masked[1:]) > 0.05 if share else not any(masked)
