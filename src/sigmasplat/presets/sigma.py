@@ -13,7 +13,9 @@ from sigmasplat.presets import varsplat
 SIGMA = varsplat.FAST.changed(
     input={"denoise_depth": True},
     mapping={
-        "iterations": 15,
+        "iterations": 10,  # the final map is as good as with 15; the submaps have 0.5 dB less
+        "lr_pose_translation": 0.0,  # poses stay as tracked: mapping moved keyframes away from the truth
+        "lr_pose_rotation": 0.0,
         "first_divided": True,
         "weight_moment": 0.1,
         "weight_depth": 0.0,
