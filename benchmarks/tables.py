@@ -33,7 +33,7 @@ SUBJECTS = {
     "Consistent maps": ("consistency",),
     "Exported maps": ("export_sizes",),
     "Geometry": ("four_frames", "away_from_path"),
-    "Kernels": ("cpu", "versus", "gpu", "kernels"),
+    "Kernels": ("cpu", "roofline", "versus", "gpu", "kernels"),
     "Real time": ("realtime", "long_live"),
     "Depth noise": ("sensor_models",),
     "Stereo": ("stereo",),
