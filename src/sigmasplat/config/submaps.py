@@ -100,6 +100,9 @@ class RegistrationConfig(Section, name="registration"):
     target: Literal["recorded", "rendered"] = "recorded"
     """Which image of a keyframe is localised in the other submap: the recorded one, or the one that its own submap
     renders at its pose (VarSplat's code for ScanNet)."""
+    to_keyframe: bool = False
+    """Whether a localised keyframe is finally aligned to the recorded image of the other submap's nearest keyframe
+    (ours): the surfaces of a young map are biased; off = its pose relative to the map is used (paper)."""
     exposure: bool = True
     """Whether a factor and an offset of the colour are fitted too, because submaps may differ in exposure."""
     weight_color: Share = 0.95

@@ -24,6 +24,7 @@ SIGMA = varsplat.FAST.changed(
     render={"depth": "ray"},
     tracking={"features": True, "verify": True},
     recovery={"relocalise": True, "new_map_after": 20, "steady_frames": 2},
+    registration={"to_keyframe": True},
     primitives={"uncertain_m2": 0.025, "faded_opacity": 0.07},
     surface={"depth": "map+sensor"},
     uncertainty={"probes": 4},

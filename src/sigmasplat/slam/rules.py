@@ -27,10 +27,15 @@ def is_keyframe(frames_since: int, every: int, overlap: float, overlap_below: fl
 
 
 def has_moved(T_keyframe_camera: NDArray[np.float64], depth_m: float, most_deg: float) -> bool:
-    """Return whether the image has moved by more than an angle since the last keyframe: rotation plus translation
-    divided by the mean depth."""
-    moved_m = float(np.linalg.norm(T_keyframe_camera[:3, 3]))
-    return bool(np.rad2deg(se3.rotation_angle(T_keyframe_camera[:3, :3]) + moved_m / depth_m) > most_deg)
+    """Return whether the image has moved by more than an angle since the last keyframe."""
+    return bool(np.rad2deg(angle_between(np.eye(4), T_keyframe_camera, depth_m)) > most_deg)
+
+
+def angle_between(T_one: NDArray[np.float64], T_other: NDArray[np.float64], depth_m: float) -> float:
+    """Return by how much the image of one camera has moved in the other, rad: rotation plus translation divided by the
+    mean depth; T_one, T_other [4, 4]: poses of the cameras."""
+    moved_m = float(np.linalg.norm(T_other[:3, 3] - T_one[:3, 3]))
+    return se3.rotation_angle(T_one[:3, :3].T @ T_other[:3, :3]) + moved_m / depth_m
 
 
 def is_held_back(index: int, every: int) -> bool:

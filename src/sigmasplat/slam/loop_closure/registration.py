@@ -16,7 +16,8 @@ from sigmasplat.fit.backends import fits_of
 from sigmasplat.fit.compare import Comparison, compare
 from sigmasplat.fit.pose import PoseFit, fit_pose_adam, fit_pose_align
 from sigmasplat.fit.pyramid import Pyramid
-from sigmasplat.fit.references import map_reference, picture_images
+from sigmasplat.fit.references import keyframe_reference, map_reference, picture_images
+from sigmasplat.fit.target import Target
 from sigmasplat.fit.tracking_loss import PoseMaps
 from sigmasplat.model import se3
 from sigmasplat.model.map_uncertainty import Background
@@ -29,6 +30,7 @@ from sigmasplat.slam.localisation.known_map import KnownKeyframe
 from sigmasplat.slam.localisation.verdict import confirmed
 from sigmasplat.slam.loop_closure.candidates import SubmapPair
 from sigmasplat.slam.predicted_submaps import PredictedSubmaps
+from sigmasplat.slam.rules import angle_between
 from sigmasplat.types import Matrix, Slices
 
 HOPELESS = 0.5
@@ -110,7 +112,8 @@ class Registrar:
         self, own: Submap, keyframe: int, other: Submap, alike: Sequence[int], T_own_other: Matrix
     ) -> Slices[Localisation]:
         """Localise a keyframe of `own` in `other`, in slices: align from the expected pose and from those of similar
-        keyframes, then refine the best one by gradient descent on the uncertainty-weighted loss with exposure."""
+        keyframes, then refine the best one: by gradient descent on the uncertainty-weighted loss with exposure, and by
+        alignment to the other submap's nearest keyframe."""
         T_own_camera, other_map = own.T_submap_camera[keyframe], self._map_of(other)
         target, live = picture_images(self.view, self._picture(own, keyframe), own.camera)
         expected = se3.inverse(T_own_camera) @ T_own_other
@@ -122,6 +125,9 @@ class Registrar:
         if fit.alignment is None or score(fit) > HOPELESS * self.config.share_least:
             start, steps = fit.T_camera_world, self.config.iterations
             fit = fit_pose_adam(other_map.params, self.view, target, start, self.tracking, steps)
+            yield
+        if self.config.to_keyframe:
+            fit = self._at_keyframe(other, target, live, fit)
             yield
         A = se3.adjoint(T_own_camera)
         covariance, comparison = self._checked(other_map, live, fit.T_camera_world)
@@ -174,6 +180,24 @@ class Registrar:
             fit = fit_pose_align(reference, live, guess, self.tracking)
             guess = fit.T_camera_world
         return fit
+
+    def _at_keyframe(self, other: Submap, target: Target, live: Pyramid, found: PoseFit) -> PoseFit:
+        """Align a keyframe that was found in a submap to the recorded image of its nearest keyframe there; return the
+        given fit if this one is not valid.
+
+        The map's surfaces are biased while it is young, and all keyframes that are localised in it then agree on a
+        wrong pose. Readings are not.
+        """
+        depth_m = target.depth_image[target.depth_image > 0]
+        if not fits_of(self.view).aligns or not len(depth_m):
+            return found
+        T_other_camera, mean_m = se3.inverse(found.T_camera_world), float(depth_m.double().mean())
+        k = int(np.argmin([angle_between(T, T_other_camera, mean_m) for T in other.T_submap_camera]))
+        _, image = picture_images(self.view, self.store.picture(other.index, k), other.camera)
+        params, T_camera_other = other.field.params.to(self.view.sums.device), se3.inverse(other.T_submap_camera[k])
+        reference = keyframe_reference(params, self.view, image, T_camera_other, self.tracking)
+        fit, c = fit_pose_align(reference, live, found.T_camera_world, self.tracking), self.config
+        return fit if fit.agreement >= c.agreement_least and score(fit) >= c.share_least else found
 
     def _checked(self, other: WeighedMap, live: Pyramid, T_camera_map: Matrix) -> tuple[Matrix, Comparison | None]:
         """Return the covariance [6, 6] of T_camera_map's left twist, estimated by alignment to the map at that pose,
