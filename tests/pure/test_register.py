@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -114,6 +115,26 @@ def test_the_images_that_submaps_render_register_them_without_the_recorded_ones(
     assert found.accepted, found.reason
     metres, degrees = off(found.T_a_b, truth)
     assert metres < 0.01 and degrees < 0.3
+
+
+def test_a_submap_whose_splats_are_too_near_does_not_bias_the_pose_relative_to_its_keyframes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """All surfaces of both maps are 3 % too near, as those of a young map; the recorded images are exact."""
+    seeded = make_splats
+
+    def too_near(target: Target, T: Matrix, *more: Any) -> GaussianField:
+        field = seeded(target, T, *more)
+        camera = torch.tensor(T[:3, 3], dtype=torch.float32)
+        field.params[:, COLUMNS["means"]] = camera + 0.97 * (field.means - camera)
+        return field
+
+    monkeypatch.setitem(globals(), "make_splats", too_near)
+    error = se3.exp(np.array([0.02, -0.01, 0.01, 0.01, 0.01, -0.01]))
+    to_map, truth = registered((0, 5), (3, 8), error)
+    to_keyframe, _ = registered((0, 5), (3, 8), error, config=CONFIG.changed(registration={"to_keyframe": True}))
+    assert to_map.accepted and to_keyframe.accepted
+    assert off(to_keyframe.T_a_b, truth)[0] < 0.3 * off(to_map.T_a_b, truth)[0]
 
 
 def test_what_is_known_before_does_not_matter_where_the_views_are_alike() -> None:
