@@ -37,6 +37,8 @@ SUBJECTS = {
     "Real time": ("realtime", "long_live"),
     "Depth noise": ("sensor_models",),
     "Stereo": ("stereo",),
+    "RGB only": ("predicted",),
+    "Moving things": ("moving",),
     "Long runs": ("long_run", "endurance", "viewer_memory"),
     "Start-up": ("startup",),
     "Killed runs": ("crashes",),

@@ -117,9 +117,10 @@ def tiny() -> Config:
     return override(preset("sigma"), SETTINGS)
 
 
-def test_slam_can_resume_from_every_frame(tmp_path: Path) -> None:
+@pytest.mark.parametrize("fit_depth", [False, True])
+def test_slam_can_resume_from_every_frame(tmp_path: Path, fit_depth: bool) -> None:
     """Also directly after a new submap has started, when it has one keyframe."""
-    source, config = open_source(ROOM, tiny().input), tiny()
+    source, config = open_source(ROOM, tiny().input), tiny().changed(tracking={"fit_depth": fit_depth})
     whole = Slam(config)
     seen = []
     for frame in source:

@@ -2,53 +2,28 @@
 
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
-from sigmasplat.commands import options, picture_options
+from sigmasplat.commands import export_options, options, picture_options
 from sigmasplat.commands.options import prepare_torch, refuse_existing, source_of
-from sigmasplat.config.ranges import Range
 from sigmasplat.exports.formats import FORMATS, ExportSource, choose, listed, refuse_unused
 from sigmasplat.io.lock import output_locked
-
-MaxSplats = Annotated[
-    options.Whole,
-    Range(1),
-    tyro.conf.arg(
-        metavar="N",
-        help="keep at most N splats, those that fill the most pixels of the run's views",
-        help_behavior_hint="(default: all)",
-    ),
-]
-MapAxes = Annotated[
-    Literal["y-up", "z-up", "y-down", "camera"] | None,
-    tyro.conf.arg(
-        metavar="{y-up,z-up,y-down,camera}",
-        help="axes of a map or of points: y-up, z-up and y-down are levelled; camera: those of the run's path; y-up "
-        "and camera only for SPZ, glTF and OpenUSD",
-        help_behavior_hint="(default: y-up for points, SPZ, glTF and OpenUSD, else y-down)",
-    ),
-]
-SpzVersion = Annotated[
-    options.Whole,
-    Range(2, 4),
-    tyro.conf.arg(metavar="{2,3,4}", help="version of SPZ", help_behavior_hint="(default: 3, which most viewers read)"),
-]
 
 
 @dataclass(frozen=True)
 class ExportOptions:
     """Options that only some formats accept, under their names on the command line (`ExportFormat.options`)."""
 
-    sigma_below: options.SigmaBelow = None
-    std_below_m: options.StdBelowM = None
-    opacity_above: options.OpacityAbove = None
-    max_splats: MaxSplats = None
-    axes: MapAxes = None
-    spz_version: SpzVersion = None
-    plain: options.Plain = False
-    pictures: options.Pictures = False
+    sigma_below: export_options.SigmaBelow = None
+    std_below_m: export_options.StdBelowM = None
+    opacity_above: export_options.OpacityAbove = None
+    max_splats: export_options.MaxSplats = None
+    axes: export_options.MapAxes = None
+    spz_version: export_options.SpzVersion = None
+    plain: export_options.Plain = False
+    pictures: export_options.Pictures = False
     voxel_m: options.VoxelM = None
     size: picture_options.FilmSize = 0
     fps: picture_options.FilmRate = 25.0
@@ -70,7 +45,7 @@ ExportOptionsFlat = Annotated[ExportOptions, tyro.conf.arg(name=""), tyro.conf.O
 def export(
     run: options.RunOrMap,
     out: options.OutFile = None,
-    format: options.FormatName = None,
+    format: export_options.FormatName = None,
     overwrite: options.Overwrite = False,
     asked: ExportOptionsFlat = DEFAULT_EXPORT_OPTIONS,
 ) -> int:

@@ -171,42 +171,19 @@ PosesFile = Annotated[
         help_behavior_hint="(default: none)",
     ),
 ]
-RunOrMap = Annotated[Path, tyro.conf.Positional, arg(metavar="RUN", help="run folder or map file")]
-FormatName = Annotated[
-    str | None,
-    arg(metavar="NAME", help="format to write", help_behavior_hint="(default: by the ending of FILE, else ply)"),
-]
-SigmaBelow = Annotated[
-    From0,
+PredictedDepth = Annotated[
+    Path | None,
     arg(
-        metavar="S",
-        help="keep only splats with σ below S, for colours 0 to 1; σ is learned, not calibrated",
-        help_behavior_hint="(default: all)",
-    ),
-]
-StdBelowM = Annotated[
-    From0,
-    arg(
-        metavar="M",
-        help="keep only splats whose surface has a standard deviation of depth below M metres (depth_std_m, "
-        "docs/exports.md); needs a run with uncertainty.json",
-        help_behavior_hint="(default: all)",
-    ),
-]
-OpacityAbove = Annotated[
-    From0,
-    arg(metavar="A", help="keep only splats with opacity above A", help_behavior_hint="(default: all)"),
-]
-Plain = Annotated[
-    bool,
-    arg(
-        help="write PLY with only the 62 columns of 3DGS, without σ², for readers that accept no others",
+        metavar="FOLDER",
+        help="depth that a network predicted, one image per frame: for a video, for colour images, or instead of the "
+        "recorded depth. The scale of the result is arbitrary",
         help_behavior_hint="",
     ),
 ]
-Pictures = Annotated[
-    bool, arg(help="also write the images of the keyframes, and export only keyframes as views", help_behavior_hint="")
+PredictedInverse = Annotated[
+    bool, arg(help="predicted depth is inverse depth, as that of MiDaS or Depth Anything", help_behavior_hint="")
 ]
+RunOrMap = Annotated[Path, tyro.conf.Positional, arg(metavar="RUN", help="run folder or map file")]
 
 
 @dataclass(frozen=True)
@@ -244,6 +221,8 @@ class InputOptions:
             help_behavior_hint="",
         ),
     ] = None
+    predicted_depth: PredictedDepth = None
+    predicted_inverse: PredictedInverse = False
     fx: Annotated[
         From0,
         arg(
@@ -276,7 +255,7 @@ class InputOptions:
         names = {"start": "start_s", "end": "end_s", "hold_out": "hold_every"}
         given = {field.name: getattr(self, field.name) for field in fields(self)}
         given["register_depth"] = None if self.register_depth == "auto" else self.register_depth
-        for name in ("calibration", "masks"):  # a later eval may run in another folder
+        for name in ("calibration", "masks", "predicted_depth"):  # a later eval may run in another folder
             given[name] = given[name] and given[name].absolute()
         return {
             f"input.{names.get(name, name)}": str(value) for name, value in given.items() if value not in (None, False)

@@ -34,6 +34,11 @@ class InputConfig(Section, name="input"):
     masks: str = ""
     """Path of a folder with one image per frame of the recording, in the order of the numbers in their names: pixels
     that are not 0 are ignored in tracking, in the map and in scores; empty = none."""
+    predicted_depth: str = ""
+    """Path of a folder with depth that a network predicted, one image per frame of the recording; it replaces the
+    recorded depth, or is the depth of a video or of colour images. Its scale may be arbitrary; empty = none."""
+    predicted_inverse: bool = False
+    """Whether predicted depth is inverse depth (disparity), as most networks for relative depth give it."""
     fx: NotNegative = 0.0
     """Horizontal focal length of the colour camera in pixels; 0 = as recorded."""
     fy: NotNegative = 0.0

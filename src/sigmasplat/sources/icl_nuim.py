@@ -24,9 +24,9 @@ from sigmasplat.sources.camera.calibration import (
     resolve_calibration,
 )
 from sigmasplat.sources.files.folders import FRAMES_PER_SECOND
+from sigmasplat.sources.files.lists import parse_numbers, read_lines, read_poses
 from sigmasplat.sources.opening import Format
 from sigmasplat.sources.recorded import ImagePair, RecordedSource, first_size
-from sigmasplat.sources.tum import parse_numbers, read_lines, read_poses
 
 LIST_NAMES = ("associations.txt", "association.txt", "associate.txt")
 MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])

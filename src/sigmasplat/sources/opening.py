@@ -61,13 +61,33 @@ def open_source(path: str | Path, settings: InputConfig | None = None, **changes
     ConfigError on an unknown setting.
     """
     chosen = with_changes(settings or InputConfig(), changes)
-    known = format_of(path)
+    source = _with_predicted_depth(path, chosen) if chosen.predicted_depth else _recorded(path, chosen)
     with _guarded(path):
-        source = known.open(str(path), chosen)
-        source.sensor = source.sensor or known.sensor
         source = Masked(source, Path(chosen.masks)) if chosen.masks else source
     part = chosen.stride > 1 or chosen.limit or chosen.start_s or chosen.end_s
     return Subset(source, chosen) if part and not source.live else source
+
+
+def _recorded(path: str | Path, settings: InputConfig) -> Source:
+    """Open a whole sequence with its own depth."""
+    known = format_of(path)
+    with _guarded(path):
+        source = known.open(str(path), settings)
+        source.sensor = source.sensor or known.sensor
+    return source
+
+
+def _with_predicted_depth(path: str | Path, settings: InputConfig) -> Source:
+    """Open a whole sequence with the depth of `input.predicted_depth`: images without depth, or any other sequence."""
+    from sigmasplat.sources.predicted import WithPredictedDepth, lacks_depth, open_color_only
+
+    known = _matching_format(path)
+    with _guarded(path):
+        if lacks_depth(Path(path), known is not None and known.priority >= 0):
+            return open_color_only(Path(path), settings)
+    source = _recorded(path, settings)
+    with _guarded(path):
+        return WithPredictedDepth(source, settings)
 
 
 def _guarded(path: str | Path) -> AbstractContextManager[None]:

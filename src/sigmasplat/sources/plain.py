@@ -7,7 +7,6 @@ groundtruth.txt                                    optional: "t tx ty tz qx qy q
 Names such as 12.033333.png are times in seconds; otherwise frames are 1/30 s apart. Depth is in mm by default.
 """
 
-from itertools import pairwise
 from pathlib import Path
 
 from sigmasplat.config import InputConfig
@@ -20,15 +19,15 @@ from sigmasplat.sources.files.folders import (
     COLOR_FOLDERS,
     DEPTH_ENDINGS,
     DEPTH_FOLDERS,
-    FRAMES_PER_SECOND,
     first_subfolder,
     index_by_number,
     list_images,
     pair_images,
+    times_of_names,
 )
+from sigmasplat.sources.files.lists import read_poses
 from sigmasplat.sources.opening import Format
 from sigmasplat.sources.recorded import ImagePair, RecordedSource, first_size
-from sigmasplat.sources.tum import read_poses
 
 COLOR_NAME, DEPTH_NAME = "color|rgb|images/*", "depth/*"
 
@@ -41,7 +40,7 @@ def open_plain(folder: Path, settings: InputConfig) -> RecordedSource:
         raise problem
     depths = list_images(depth_folder, DEPTH_ENDINGS)
     pairs, skipped = _pairs(folder, colors, depths)
-    times_s = _times_s([color for color, _ in pairs])
+    times_s = times_of_names([color for color, _ in pairs])
     images = [ImagePair(t, *pair) for t, pair in zip(times_s, pairs, strict=True)]
     calibration = resolve_calibration(folder, None, first_size([i.color for i in images]), settings, MM_PER_METRE)
     truth_path = folder / "groundtruth.txt"
@@ -65,18 +64,6 @@ def _pairs(folder: Path, colors: list[Path], depths: list[Path]) -> tuple[list[t
         )
     keys, skipped = pair_images(folder, color_by_number, depth_by_number, COLOR_NAME, DEPTH_NAME)
     return [(color_by_number[n], depth_by_number[n]) for n in keys], skipped
-
-
-def _times_s(paths: list[Path]) -> list[float]:
-    """Return the times in the names if all have a decimal point and increase; else frames are 1/30 s apart."""
-    try:
-        times = [float(path.stem) for path in paths]
-    except ValueError:
-        times = []
-    rising = all(a < b for a, b in pairwise(times))
-    if times and rising and all("." in path.stem for path in paths):
-        return times
-    return [i / FRAMES_PER_SECOND for i in range(len(paths))]
 
 
 FORMAT = Format(

@@ -39,10 +39,10 @@ from sigmasplat.sources.files.folders import (
     list_images,
     pair_images,
 )
+from sigmasplat.sources.files.lists import parse_numbers, read_lines
 from sigmasplat.sources.files.poses import build_trajectory, checked_pose, to_matrix
 from sigmasplat.sources.opening import Format
 from sigmasplat.sources.recorded import ImagePair, RecordedSource, first_size
-from sigmasplat.sources.tum import parse_numbers, read_lines
 
 INTRINSIC_NAMES = ("intrinsic.json", "intrinsics.json", "camera_intrinsic.json", "camera_intrinsics.json")
 

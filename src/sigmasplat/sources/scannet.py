@@ -38,10 +38,10 @@ from sigmasplat.sources.files.folders import (
     list_images,
     pair_images,
 )
+from sigmasplat.sources.files.lists import parse_numbers
 from sigmasplat.sources.files.poses import read_matrix, read_pose_files, to_matrix
 from sigmasplat.sources.opening import Format
 from sigmasplat.sources.recorded import ImagePair, RecordedSource, first_size
-from sigmasplat.sources.tum import parse_numbers
 from sigmasplat.types import Matrix
 
 COLOR_SIZE, DEPTH_SIZE = (1296, 968), (640, 480)

@@ -29,10 +29,11 @@ from sigmasplat.sources.camera.stereo_cameras import StereoCameras, read_stereo_
 from sigmasplat.sources.files.association import associate, no_pairs
 from sigmasplat.sources.files.folders import COLOR_ENDINGS, list_images
 from sigmasplat.sources.files.images import read_color
+from sigmasplat.sources.files.lists import parse_numbers, read_lines, read_poses
 from sigmasplat.sources.files.poses import build_trajectory, checked_pose, rigid_transform, to_matrix
 from sigmasplat.sources.opening import Format
 from sigmasplat.sources.recorded import ImagePair, RecordedSource, Size, first_size
-from sigmasplat.sources.tum import parse_numbers, read_lines, read_list, read_poses
+from sigmasplat.sources.tum import read_list
 from sigmasplat.types import Matrix
 
 KITTI_PAIRS = (("image_2", "image_3"), ("image_0", "image_1"))

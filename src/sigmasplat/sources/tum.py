@@ -6,7 +6,7 @@ gyroscope.txt                           optional: "t wx wy wz", rad/s about the 
 """
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 
@@ -22,7 +22,7 @@ from sigmasplat.model.frame import Frame
 from sigmasplat.model.frame_arrays import UINT16_MAX
 from sigmasplat.model.gyroscope import Gyroscope
 from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.reading.files import exists, read_text
+from sigmasplat.reading.files import exists
 from sigmasplat.sources.base import Source
 from sigmasplat.sources.camera.calibration import (
     TUM_UNITS_PER_METRE,
@@ -31,7 +31,7 @@ from sigmasplat.sources.camera.calibration import (
     resolve_calibration,
 )
 from sigmasplat.sources.files.association import MAX_GAP_S, associate, nearest_gaps_s, no_pairs, refuse_other_units
-from sigmasplat.sources.files.poses import rigid_transform
+from sigmasplat.sources.files.lists import parse_numbers, read_lines, read_poses
 from sigmasplat.sources.opening import Format
 from sigmasplat.sources.recorded import ImagePair, RecordedSource, first_size
 
@@ -143,21 +143,6 @@ def read_list(path: Path) -> tuple[NDArray[np.float64], list[Path]]:
     return np.array(times), paths
 
 
-def read_poses(path: Path) -> Trajectory:
-    """Read "t tx ty tz qx qy qz qw" lines. Raises SourceError naming the line whose pose is not finite or not rigid."""
-    times, poses = [], []
-    for line, words in read_lines(path):
-        if len(words) != 8:
-            raise SourceError(f"{path}:{line}: expected 't tx ty tz qx qy qz qw', found {len(words)} values")
-        t, *values = parse_numbers(path, line, words)
-        times.append(t)
-        x, y, z, qx, qy, qz, qw = values
-        poses.append(rigid_transform(f"{path}:{line}", [x, y, z], [qw, qx, qy, qz]))
-    if not poses:
-        raise SourceError(f"{path}: holds no poses; delete it or add poses")
-    return Trajectory(np.array(times), np.stack(poses))
-
-
 def read_gyroscope(path: Path) -> Gyroscope:
     """Read "t wx wy wz" lines, seconds and rad/s in camera axes. Raises SourceError naming the file, and the line if
     it has other values or no later time than the line before."""
@@ -175,25 +160,6 @@ def read_gyroscope(path: Path) -> Gyroscope:
         return Gyroscope(values[:, 0], values[:, 1:])
     except SourceError as error:
         raise SourceError(f"{path}: {error}") from error
-
-
-def read_lines(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Yield (line number from 1, words) of every line that is not empty or a comment."""
-    for number, line in enumerate(read_text(path).splitlines(), 1):
-        words = line.split("#")[0].replace(",", " ").split()
-        if words:
-            yield number, words
-
-
-def parse_numbers(path: Path, line: int, words: list[str]) -> list[float]:
-    """Read finite numbers. Raises SourceError naming file and line."""
-    try:
-        values = [float(word) for word in words]
-    except ValueError as error:
-        raise SourceError(f"{path}:{line}: expected numbers, found {' '.join(words)!r}") from error
-    if not np.isfinite(values).all():
-        raise SourceError(f"{path}:{line}: not finite: {' '.join(words)!r}; delete the line")
-    return values
 
 
 class TumWriter:

@@ -121,7 +121,7 @@ class CameraClock:
         """Track a frame, and decide whether it becomes a keyframe; hurried: as in `Tracker.track`."""
         number, offer, search = self.frames, None, None
         if number == 0:
-            found, offer = self._begin(seen)
+            found, offer = self._begin(seen, view)
         else:
             with timer.stage("track"), timer.kernels_of(view, "track_kernels"):
                 splats = NOTHING if self.snapshot is None else self.snapshot
@@ -140,10 +140,11 @@ class CameraClock:
         probe = self._probe(number, seen, found)
         return TrackedFrame(number, step, found.T_submap_camera, self.poses, based_on, offer, search, probe)
 
-    def _begin(self, seen: Observation) -> tuple[Found, Offer]:
+    def _begin(self, seen: Observation, view: View) -> tuple[Found, Offer]:
         """Start at the first frame, whose camera is the world until the map says otherwise."""
         refuse_first_without_depth(seen.frame, self.config)
         self.tracker.start(seen, seen.frame.R_inertial_camera)
+        seen = fitted_keyframe(self.tracker, NOTHING, view, seen, np.eye(4), connected=False)
         self._follow(0, seen, np.eye(4))
         self.offered, self.waits = 1, (0,)
         return Found(np.eye(4), TRACKED, mapped=True), Offer(seen.separate())

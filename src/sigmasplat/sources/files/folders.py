@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import TypeVar
 
@@ -34,6 +35,18 @@ def list_images(folder: Path | None, endings: Sequence[str]) -> list[Path]:
 def natural_key(path: Path | str) -> list[tuple[int, str]]:
     """Return a sort key that compares digits in a name as numbers and the rest as text."""
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"([0-9]+)", str(path)) if part]
+
+
+def times_of_names(paths: Sequence[Path]) -> list[float]:
+    """Return the times in the names if all have a decimal point and increase; else frames are 1/30 s apart."""
+    try:
+        times = [float(path.stem) for path in paths]
+    except ValueError:
+        times = []
+    rising = all(a < b for a, b in pairwise(times))
+    if times and rising and all("." in path.stem for path in paths):
+        return times
+    return [i / FRAMES_PER_SECOND for i in range(len(paths))]
 
 
 def index_by_number(paths: Iterable[Path]) -> dict[int, Path]:

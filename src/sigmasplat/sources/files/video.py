@@ -8,12 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.errors import SourceError
+from sigmasplat.sources.files.folders import FRAMES_PER_SECOND
 from sigmasplat.sources.files.optional import import_optional
 
 
 class Video:
     """An open video. Reading forwards is fast. Reading backwards restarts at the first frame, because seeking by frame
     number is not exact in videos with a variable frame rate, as from phones. Safe to use from several threads.
+
+    size: (width, height); count: number of frames that the file states; frames_per_second: as stated, else 30.
     """
 
     def __init__(self, path: Path) -> None:
@@ -26,6 +29,8 @@ class Video:
         )
         self.size = width, height
         self.count = int(self._capture.get(self._cv2.CAP_PROP_FRAME_COUNT))
+        stated = float(self._capture.get(self._cv2.CAP_PROP_FPS))
+        self.frames_per_second = stated if 0.1 < stated < 1000.0 else FRAMES_PER_SECOND
 
     def frame(self, i: int) -> NDArray[np.uint8]:
         """Read frame i as 8-bit RGB [H, W, 3]. Raises SourceError if the video ends before it or is damaged."""

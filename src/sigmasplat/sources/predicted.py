@@ -1,0 +1,127 @@
+"""Sequences whose depth a network predicted: recordings with other depth, and colour images or videos without depth."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sigmasplat.config import InputConfig
+from sigmasplat.errors import SourceError
+from sigmasplat.model.frame import Frame
+from sigmasplat.reading.files import exists
+from sigmasplat.sources.base import Source, Subset
+from sigmasplat.sources.camera.calibration import MM_PER_METRE, resolve_calibration
+from sigmasplat.sources.files.color_only import VIDEO_ENDINGS
+from sigmasplat.sources.files.folders import (
+    COLOR_ENDINGS,
+    COLOR_FOLDERS,
+    DEPTH_FOLDERS,
+    first_subfolder,
+    list_images,
+    times_of_names,
+)
+from sigmasplat.sources.files.images import image_size
+from sigmasplat.sources.files.lists import read_poses
+from sigmasplat.sources.files.predicted import PredictedFolder
+from sigmasplat.sources.files.video import Video
+from sigmasplat.sources.recorded import ImagePair, RecordedSource, Size
+
+Floats = NDArray[np.float32]
+
+
+class WithPredictedDepth(Subset):
+    """Another source with predicted depth instead of its own.
+
+    Raises SourceError if the images do not fit the frames, or the source is a live camera.
+    """
+
+    def __init__(self, whole: Source, settings: InputConfig) -> None:
+        folder = Path(settings.predicted_depth)
+        if whole.live:
+            raise SourceError(f"{folder}: predicted depth is for recordings only; record the camera, then run the file")
+        super().__init__(whole, InputConfig())
+        self._predicted = PredictedFolder(folder, [""] * len(whole), settings.predicted_inverse)
+        self.depth_units_per_metre = None
+        _say_predicted(self)
+
+    def frame(self, i: int) -> Frame:
+        """Read frame i with its predicted depth."""
+        return replace(super().frame(i), depth_m=self.depth_of(i), depth_std_m=None)
+
+    def depth_of(self, i: int) -> Floats:
+        """Read the predicted depth of frame i. Raises SourceError if it cannot be used."""
+        return self._predicted.depth_of(self._checked_index(i), self.camera.width, self.camera.height)
+
+    def depth_std_of(self, i: int) -> Floats | None:
+        """Return None: networks do not say how wrong they are."""
+        return None
+
+
+@dataclass(frozen=True)
+class PredictedPair(ImagePair):
+    """A colour image, or a frame of a video, and its predicted depth."""
+
+    number: int
+    size: Size
+    predicted: PredictedFolder
+    video: Video | None
+
+    def read_color(self) -> NDArray[np.uint8]:
+        """Read 8-bit RGB [H, W, 3]. Raises SourceError naming `color`."""
+        return super().read_color() if self.video is None else self.video.frame(self.number)
+
+    def read_depth(self, units_per_metre: float) -> Floats:
+        """Read the predicted depth [H, W]; its unit does not matter. Raises SourceError naming `depth`."""
+        return self.predicted.depth_of(self.number, *self.size)
+
+    def sizes(self) -> tuple[Size, Size]:
+        """Return (width, height) of colour and of depth, which is resized to it."""
+        return self.size, self.size
+
+
+def lacks_depth(path: Path, recognised: bool) -> bool:
+    """Return whether a path is a video, or a folder of colour images without depth images; recognised: whether a format
+    is sure of it."""
+    if path.suffix.lower() in VIDEO_ENDINGS:
+        return path.is_file()
+    return (
+        not recognised and path.is_dir() and first_subfolder(path, DEPTH_FOLDERS) is None and bool(_color_images(path))
+    )
+
+
+def open_color_only(path: Path, settings: InputConfig) -> RecordedSource:
+    """Open a video or a folder of colour images with predicted depth.
+
+    A folder may contain calibration.json and groundtruth.txt, as a plain folder. Raises SourceError if the images do
+    not fit, or the camera is unknown.
+    """
+    folder, inverse, video = Path(settings.predicted_depth), settings.predicted_inverse, None
+    if path.is_file():
+        video = Video(path)
+        colors, size, names = [path] * video.count, video.size, [""] * video.count
+        times_s = [i / video.frames_per_second for i in range(video.count)]
+    else:
+        colors = _color_images(path)
+        size, names = image_size(colors[0]), [color.stem for color in colors]
+        times_s = times_of_names(colors)
+    predicted = PredictedFolder(folder, names, inverse)
+    images = [
+        PredictedPair(t, color, depth, number, size, predicted, video)
+        for number, (t, color, depth) in enumerate(zip(times_s, colors, predicted.paths, strict=True))
+    ]
+    calibration = resolve_calibration(path, None, size, settings, MM_PER_METRE)
+    truth_path = path / "groundtruth.txt"
+    truth = read_poses(truth_path) if path.is_dir() and exists(truth_path) else None
+    source = RecordedSource(path.resolve().name, images, replace(calibration, depth_camera=None), settings, truth)
+    _say_predicted(source)
+    return source
+
+
+def _color_images(folder: Path) -> list[Path]:
+    return list_images(first_subfolder(folder, COLOR_FOLDERS) or folder, COLOR_ENDINGS)
+
+
+def _say_predicted(source: Source) -> None:
+    source.predicted_depth, source.computed_depth = True, False
+    source.depth_noise_per_m, source.sensor, source.depth_registered = None, None, False
