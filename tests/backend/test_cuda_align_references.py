@@ -22,6 +22,8 @@ from sigmasplat.render.cuda.view import CudaView
 from sigmasplat.render.reference.view import ReferenceView
 from sigmasplat.render.view import View
 from sigmasplat.slam.localisation import memory, watch
+from sigmasplat.slam.localisation.depth_fit import DepthFit
+from sigmasplat.slam.localisation.depth_shape import DepthShape
 from sigmasplat.slam.localisation.sight import Sight
 from sigmasplat.slam.localisation.verdict import Usual
 from sigmasplat.slam.loop_closure.registration import Registrar, WeighedMap
@@ -145,7 +147,7 @@ def test_what_a_tracker_remembers_is_kept_and_read_back(tmp_path: Path) -> None:
     kept = reference("keyframe", view, CONFIGS["V"])
     tracker, classes = (
         Tracker(CONFIGS["V"], keyframe=kept),
-        (Tracker, Reference, Pyramid, Camera, Usual, watch.Watch, memory.Memory),
+        (Tracker, Reference, Pyramid, Camera, Usual, watch.Watch, memory.Memory, DepthFit, DepthShape),
     )
     tracker.start(Sight(seen_from(view, TRUTH), kept.pyramid))
     fixed = {"tracking": CONFIGS["V"], "moving": tracker.watch.config}

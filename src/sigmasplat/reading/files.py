@@ -39,9 +39,9 @@ def open_regular(
         raise error(f"{failed} {path}: {cause(problem)}; check that it exists and may be read") from problem
 
 
-def refuse_special(path: Path, error: type[SigmaSplatError] = SourceError) -> None:
+def refuse_special(path: Path, error: type[SigmaSplatError] = SourceError, most: int | None = None) -> None:
     """Raise `error` as `open_regular` does; call it before a library opens a file, which would wait at a pipe."""
-    with open_regular(path, error):
+    with open_regular(path, error, most):
         pass
 
 

@@ -20,6 +20,9 @@ Message = Any
 Value = TypeVar("Value")
 
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
+METADATA = "metadata.yaml"
+MOST_METADATA_BYTES = 1 << 20
+"""Largest metadata.yaml: it has some hundred bytes for each topic and file, and 1 MB of YAML takes seconds to read."""
 ROS1_MAGIC, MCAP_MAGIC, SQLITE_MAGIC = b"#ROSBAG V2.0", b"\x89MCAP0", b"SQLite format 3\0"
 
 
@@ -49,7 +52,7 @@ class Bag:
         self.path, self._lock = path, threading.Lock()
         for file in sorted(path.iterdir()) if path.is_dir() else [path]:
             if not file.is_dir():
-                refuse_special(file)
+                refuse_special(file, most=MOST_METADATA_BYTES if file.name == METADATA else None)
         self.ros1 = path.is_file() and _magic(path).startswith(ROS1_MAGIC)
         reader = import_optional(
             "rosbags.rosbag1" if self.ros1 else "rosbags.rosbag2", "ros", f"{path}: a ROS bag"
@@ -138,7 +141,7 @@ class Bag:
 def is_bag(path: Path) -> bool:
     """Return whether a path is a ROS bag: a file by its first bytes, a folder by its metadata.yaml."""
     if path.is_dir():
-        metadata = path / "metadata.yaml"
+        metadata = path / METADATA
         if not metadata.is_file():
             return False
         with open_regular(metadata) as file:
