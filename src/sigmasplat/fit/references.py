@@ -47,6 +47,10 @@ class Reference:
         pyramid = replace(made, weight=p.weight, weight_depth=p.weight_depth)
         return Reference(pyramid, self.T_camera_world)
 
+    def moved_by(self, T_new_old: Matrix) -> "Reference":
+        """Return the reference with its pose in other coordinates [4, 4]."""
+        return replace(self, T_camera_world=self.T_camera_world @ se3.inverse(T_new_old))
+
     def compared(self, live: Pyramid, T_camera_world: Matrix) -> Comparison:
         """Compare a live image at its pose T_camera_world [4, 4] with this reference."""
         return compare(self.pyramid, live, T_camera_world @ se3.inverse(self.T_camera_world))

@@ -1,6 +1,5 @@
 """Tracking: predict the pose, fit it to the fixed map, judge the fit, and try other guesses if it is doubtful."""
 
-import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass, field as dataclass_field
 
@@ -26,7 +25,7 @@ from sigmasplat.slam.localisation.sight import FoundKeyframe, Sight
 from sigmasplat.slam.localisation.tracked_keyframe import Splats, TrackedKeyframe, found_keyframe, mapped_keyframe
 from sigmasplat.slam.localisation.verdict import LEAST_COMMON, Usual, agrees_more, confirmed, score, stands
 from sigmasplat.slam.localisation.watch import Watch
-from sigmasplat.slam.rules import Asked, is_lost, jumped, never, unless
+from sigmasplat.slam.rules import Asked, angle_between, is_lost, jumped, never, unless
 from sigmasplat.types import Matrix
 
 DOUBT = 0.7
@@ -89,7 +88,7 @@ class Tracker:
         expected = self.expected(R_inertial_camera)
         shown = seen.shown(view)
         best = self._fit(field, view, shown, expected.predicted)
-        best, shown = self._uncovered(field, view, seen, shown, expected.predicted, best, hurried)
+        best, shown = self._uncovered(field, view, seen, shown, expected, best, hurried)
         if self._is_wide(best, view) or self._doubts(best):
             guesses = unless(hurried, self._other_guesses(shown, expected))
             best = max([best, *(self._fit(field, view, shown, guess) for guess in guesses)], key=self._score)
@@ -107,7 +106,7 @@ class Tracker:
         return best
 
     def _uncovered(
-        self, field: Splats, view: View, seen: Sight, first: Sight, predicted: Matrix, fit: PoseFit, hurried: Asked
+        self, field: Splats, view: View, seen: Sight, first: Sight, expected: Expected, fit: PoseFit, hurried: Asked
     ) -> tuple[PoseFit, Sight]:
         """Find what is in front of the scene, and fit the pose without it; return the fit and the frame without it.
 
@@ -117,26 +116,28 @@ class Tracker:
         before, self.front = self.front, None
         if fit.comparison is None or self.lost:
             return fit, first
-        found = self._without_front(field, view, seen, first, predicted, fit, before, hurried)
+        found = self._without_front(field, view, seen, first, expected, fit, before, hurried)
         if found is None and self.watch.config.find and not hurried():
-            found = self._without_object(field, view, seen, predicted, fit, before is not None)
+            found = self._without_object(field, view, seen, expected.predicted, fit, before is not None)
         return (fit, first) if found is None else found
 
     def _without_front(
-        self, field: Splats, view: View, seen: Sight, first: Sight, predicted: Matrix, fit: PoseFit,
+        self, field: Splats, view: View, seen: Sight, first: Sight, expected: Expected, fit: PoseFit,
         before: Foreground | None, hurried: Asked,
     ) -> tuple[PoseFit, Sight] | None:  # fmt: skip
         """Return the fit and the frame without what is in space that was free, and the newest keyframe without what has
-        left it; None if there is nothing, or if the images contradict the pose. before: in front in the last frame."""
+        left it; None if there is nothing, or if the images contradict the pose. before: in front in the last frame. If
+        the same thing hides most of the newest keyframe, the last image and the map give the pose."""
         slow, known = self.watch.slow(seen, se3.inverse(fit.T_camera_world)), before or self.keyframe_front
         if fit.comparison is None or (slow is None and not self.watch.suspects(fit.comparison, known, hurried)):
             return None
-        keyframe = self.keyframe
+        keyframe, predicted, expected_front = self.keyframe, expected.predicted, None
         for guess in (predicted, se3.inverse(fit.T_camera_world)):
             for _ in range(2):  # a better pose shows better what is in front
                 front = together(
                     self.watch.in_front(keyframe, self.keyframe_front, before, self.previous, seen, guess), slow
                 )
+                expected_front = front if expected_front is None else expected_front
                 self.keyframe = self.watch.without_gone(keyframe, seen, guess)
                 if front is None and self.keyframe is keyframe:
                     break
@@ -148,7 +149,12 @@ class Tracker:
                     self.front = front
                     return found, shown
         self.keyframe = keyframe
-        return None
+        if expected_front is None or hurried():
+            return None
+        shown = seen.aside(expected_front, view)
+        found = self._retry(field, view, shown, fit, expected, hurried)
+        self.front = expected_front if self._stands(found, predicted) else None
+        return None if self.front is None else (found, shown)
 
     def _without_object(
         self, field: Splats, view: View, seen: Sight, predicted: Matrix, drawn: PoseFit, known: bool
@@ -265,9 +271,8 @@ class Tracker:
         """Return whether the frame is so far from the last one that a second guess is worth its time."""
         if self.extractor is None:
             return False
-        motion = se3.inverse(self.previous) @ se3.inverse(fit.T_camera_world)
         depth_m = fit.alignment.depth_m if fit.alignment is not None else 1.0
-        moved = se3.rotation_angle(motion[:3, :3]) + float(np.linalg.norm(motion[:3, 3])) / depth_m
+        moved = angle_between(self.previous, se3.inverse(fit.T_camera_world), depth_m)
         return moved * view.camera.fx > WIDE * view.camera.width
 
     def _score(self, fit: PoseFit) -> float:
@@ -326,9 +331,7 @@ class Tracker:
     def move_by(self, T_new_old: Matrix) -> None:
         """Express the last pose and the reference in other coordinates [4, 4]."""
         self.previous = T_new_old @ self.previous
-        if self.keyframe is not None:
-            T_camera_new = self.keyframe.T_camera_world @ se3.inverse(T_new_old)
-            self.keyframe = dataclasses.replace(self.keyframe, T_camera_world=T_camera_new)
+        self.keyframe = None if self.keyframe is None else self.keyframe.moved_by(T_new_old)
         self.watch = self.watch.moved_by(T_new_old)
 
     def forget(self) -> None:
@@ -337,10 +340,8 @@ class Tracker:
         self.front, self.keyframe_front, self.watch = None, None, self.watch.cleared()
 
     def hop(self, fit: PoseFit, live: Pyramid) -> Alignment | None:
-        """Return the alignment to the newest keyframe that gives the covariance of a fit; None without the kernels.
-
-        For a pose found by gradient descent, it is an alignment to the keyframe's image that takes no step.
-        """
+        """Return the alignment to the newest keyframe that gives the covariance of a fit; None without the kernels. For
+        a pose found by gradient descent, it takes no step."""
         if fit.alignment is not None or self.keyframe is None:
             return fit.alignment
         T_live_keyframe = fit.T_camera_world @ se3.inverse(self.keyframe.T_camera_world)
