@@ -70,7 +70,6 @@ def evaluate(
     frames, field = _read_frames(run), run.read_map()
     records, log = frames.log, frames.posed_log()
     truth, scale = _truth(run, frames, source) if log else (None, None)  # without a believed pose nothing is aligned
-    arbitrary = bool(run.facts().get("predicted_depth"))  # then no score that needs metres has a meaning
     path_scores, problem = score_path(frames.path, _believed_odometry(run, frames), truth)
     known = None if problem else truth
     chosen = {kind: evenly_spread(views, views_per_kind) for kind, views in _kinds(log).items()}
@@ -86,12 +85,12 @@ def evaluate(
     metrics |= {"lpips_network": lpips.net if lpips else None, "reconstruction": None, "reconstruction_published": None}
     metrics["full_resolution"] = score_full_resolution(scoring, config, full_resolution, progress)
     if mesh:
-        surface = None if arbitrary else true_mesh or reconstruct.known_surface(source)
+        surface = None if scale else true_mesh or reconstruct.known_surface(source)  # it is in metres
         how = surface, known, random_views, fill_gaps_m, renderer, progress
         metrics |= reconstruct.fuse_and_score(run, source.camera, *how)
     metrics["pose_covariance"] = score_pose_covariance(run, frames, known)
     metrics["calibration"] = _calibration(run) if standard else None
-    metrics["test_views"] = None if arbitrary else score_test_views(scoring, config.input, strips)
+    metrics["test_views"] = None if scale else score_test_views(scoring, config.input, strips)
     show_moving(strips, source, config.input, run.submaps, records)
     run.write_metrics(metrics)
     plan = report_plan(run, frames.path, source.camera) if standard else None
