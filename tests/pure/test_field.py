@@ -144,3 +144,20 @@ def test_ids_name_splats_for_life() -> None:
     field.append(GaussianField(torch.randn(1, 17)))
     assert field.ids.tolist() == [0, 5, 6], "an id is never given twice"
     assert field.moved(torch.eye(4)).ids.tolist() == [0, 5, 6]
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 5, 8, 11])
+def test_fields_side_by_side_are_those_appended_one_after_another(count: int) -> None:
+    generator = torch.Generator().manual_seed(count)
+    fields = [GaussianField(torch.randn(n % 4, WIDTH, generator=generator)) for n in range(count)]
+    for n, field in enumerate(fields):
+        if n % 3 == 0:
+            field.get_or_create("correlations").params[:] = float(n)
+    one_by_one = GaussianField.empty()
+    for field in fields:
+        one_by_one.append(field)
+    joined = GaussianField.side_by_side(fields)
+    assert torch.equal(joined.params, one_by_one.params) and torch.equal(joined.ids, one_by_one.ids)
+    assert joined.next_id == one_by_one.next_id and joined.attributes.keys() == one_by_one.attributes.keys()
+    for name, attribute in one_by_one.attributes.items():
+        assert torch.equal(joined.attributes[name].params, attribute.params)

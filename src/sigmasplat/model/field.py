@@ -1,5 +1,6 @@
 """Store the Gaussians: one row per splat. Parameters and optimiser state are always edited together."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field as dataclass_field
 
 import torch
@@ -117,6 +118,23 @@ class GaussianField(Rows):
     def empty() -> "GaussianField":
         """Make a field without splats."""
         return GaussianField(torch.zeros(0, WIDTH))
+
+    @staticmethod
+    def side_by_side(fields: Iterable["GaussianField"]) -> "GaussianField":
+        """Return the splats of fields in their order, with new ids, in host memory.
+
+        Results of equal size are joined first, so that time does not grow with the square of the number of fields.
+        """
+        parts = list[GaussianField]()
+        for number, field in enumerate(fields, 1):
+            parts.append(GaussianField.empty())
+            parts[-1].append(field)
+            while number % 2 == 0:
+                parts[-2].append(parts.pop())
+                number //= 2
+        while len(parts) > 1:
+            parts[-2].append(parts.pop())
+        return parts[0] if parts else GaussianField.empty()
 
     @staticmethod
     def from_values(

@@ -1,7 +1,7 @@
 """The final map: merge all submaps, or seed new splats on their surface, and refine over all keyframes (VarSplat
 §7)."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -99,14 +99,17 @@ def _refuse_misfits(store: SubmapStore, anchors: Sequence[Matrix]) -> None:
 def merged(store: SubmapStore, anchors: Sequence[Matrix], config: Config) -> GaussianField:
     """Merge the splats of all submaps in the world (anchors: T_world_submap [4, 4]), without duplicates
     (`survivors`)."""
-    field, owner, variances = GaussianField.empty(), list[NDArray[np.int64]](), list[Tensor]()
-    predicted = PredictedSubmaps(config, store)
-    for index in range(len(store)):
-        part = _in_world(store, anchors, index)
-        owner.append(np.full(len(part), index))
-        is_predicted = config.final.uncertainty and config.final.variance == "predicted"
-        variances.append(_log_variance(predicted.rows(index) if is_predicted else part.params))
-        field.append(part)
+    owner, variances, predicted = list[NDArray[np.int64]](), list[Tensor](), PredictedSubmaps(config, store)
+
+    def parts() -> Iterator[GaussianField]:
+        for index in range(len(store)):
+            part = _in_world(store, anchors, index)
+            owner.append(np.full(len(part), index))
+            is_predicted = config.final.uncertainty and config.final.variance == "predicted"
+            variances.append(_log_variance(predicted.rows(index) if is_predicted else part.params))
+            yield part
+
+    field = GaussianField.side_by_side(parts())
     log_variance = np.asarray(torch.cat(variances).double()) if config.final.uncertainty else None
     keep = survivors(field.means.numpy(), np.concatenate(owner), log_variance, config.final.merge_m)
     field.keep(torch.from_numpy(keep))

@@ -14,11 +14,13 @@ from sigmasplat.model.trajectory import Trajectory
 def merged_field(store: SubmapStore, atlas: Atlas, component: int, active: GaussianField) -> GaussianField:
     """Return the splats of all submaps of a component side by side, in its frame, in host memory; `active` are those of
     the submap that is not finished."""
-    merged = GaussianField.empty()
-    for s in atlas.members(component):
-        field = store.load(s).field if s < len(store) else active.to(torch.device("cpu"))
-        merged.append(field.moved(torch.from_numpy(atlas.anchors[s])))
-    return merged
+    fields = (
+        (store.load(s).field if s < len(store) else active.to(torch.device("cpu"))).moved(
+            torch.from_numpy(atlas.anchors[s])
+        )
+        for s in atlas.members(component)
+    )
+    return GaussianField.side_by_side(fields)
 
 
 def components_apart(
