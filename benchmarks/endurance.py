@@ -136,8 +136,9 @@ def slopes(parts: list[dict[str, float]]) -> dict[str, dict[str, float]]:
     return found
 
 
-def sections(figures: dict[str, Any]) -> list[Section]:
+def sections(measured: dict[str, Any]) -> list[Section]:
     """Return the tables of the results."""
+    figures = measured["figures"]
     parts = [[significant(part[name]) for name in ("frame", *COLUMNS)] for part in figures["parts"]]
     growth = [
         [name, significant(each["median"]), significant(each["per_hour"]), significant(each["per_1000_frames"])]
@@ -161,8 +162,8 @@ def main(options: Options) -> int:
         seconds = 60 * options.minutes
         found: dict[str, Any] = alone(follow, options.source, scratch, options.config(), seconds, options.save_every)
     figures = {"source": options.source, "minutes": options.minutes, **found, "slopes": slopes(found["parts"])}
-    program.keep("endurance", figures, options, [options.seed], not options.quick)
-    print("\n".join(section.markdown() for section in sections(figures)))
+    measured = program.keep("endurance", figures, options, [options.seed], not options.quick)
+    print("\n".join(section.markdown() for section in sections(measured)))
     return 0
 
 
