@@ -8,7 +8,11 @@ from collections.abc import Callable, Sequence, Set
 from contextlib import redirect_stderr, suppress
 from functools import partial, wraps
 from importlib import import_module
+from importlib.abc import InspectLoader
+from importlib.util import find_spec
+from inspect import cleandoc
 from io import StringIO
+from types import CodeType
 from typing import Any, TextIO
 
 import tyro
@@ -119,8 +123,23 @@ def _without_options(name: str, described: bool) -> Callable[[], None]:
     def stand_in() -> None:
         """Stand for a command."""
 
-    stand_in.__doc__ = command(name).__doc__ if described else None
+    stand_in.__doc__ = _description(name) if described else None
     return stand_in
+
+
+def _description(name: str) -> str | None:
+    """Return a command's docstring, without paragraphs that are made at import: `--help` imports no command.
+
+    It is read from the compiled module.
+    """
+    module, function = COMMANDS[name]
+    path = f"sigmasplat.commands.{module}"
+    spec = find_spec(path)
+    compiled = spec.loader.get_code(path) if spec and isinstance(spec.loader, InspectLoader) else None
+    for part in compiled.co_consts if compiled else ():
+        if isinstance(part, CodeType) and part.co_name == function and isinstance(part.co_consts[0], str):
+            return "\n\n".join(p for p in cleandoc(part.co_consts[0]).split("\n\n") if not p.startswith("{"))
+    return None  # python -OO
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

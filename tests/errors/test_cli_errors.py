@@ -112,6 +112,17 @@ def test_help_has_an_example_and_loads_no_torch(arguments: list[str]) -> None:
     assert "example: sigmasplat" in answer.stdout
 
 
+def test_the_overview_describes_each_command_and_imports_none() -> None:
+    code = "import sys, sigmasplat.cli as c\ntry: c.main([])\nfinally: print('LOADED', *sys.modules)"
+    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    overview, loaded = answer.stdout.split("LOADED")
+    assert {f"sigmasplat.commands.{module}" for module, _ in cli.COMMANDS.values()}.isdisjoint(loaded.split())
+    words = " ".join(overview.replace("│", " ").split())
+    for name in cli.COMMANDS:
+        described = " ".join((cli.command(name).__doc__ or "").split("\n\n")[0].split())
+        assert f"{name} {described}" in words
+
+
 @pytest.mark.parametrize(
     "mistyped",
     ["run x --fx 57O", "run x --limit many", "run x --stride 1.5", "run x --seed None", "run x --register-depth None",
