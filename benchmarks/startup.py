@@ -79,8 +79,9 @@ def compared(name: str, words: tuple[str, ...], pairs: int, other: Path) -> dict
     }  # fmt: skip
 
 
-def sections(figures: dict[str, Any]) -> list[Section]:
+def sections(measured: dict[str, Any]) -> list[Section]:
     """Return the tables of the results."""
+    figures = measured["figures"]
     rows = [
         [
             each["command"], str(each["pairs"]), significant(each["other_s"]), significant(each["this_s"]),
@@ -107,8 +108,8 @@ def main(options: Options) -> int:
     git = ["git", "-C", str(options.other), "rev-parse", "--short", "HEAD"]
     other = subprocess.run(git, capture_output=True, text=True, check=True).stdout.strip()
     figures = {"other": other, "commands": found}
-    program.keep("startup", figures, options)
-    print("\n".join(section.markdown() for section in sections(figures)))
+    measured = program.keep("startup", figures, options)
+    print("\n".join(section.markdown() for section in sections(measured)))
     return 0
 
 

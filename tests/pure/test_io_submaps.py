@@ -138,6 +138,12 @@ def test_another_store_of_the_same_folder_has_the_same_submaps(store: DiskStore)
     store.save(*some_submap(0))
     assert len(DiskStore(store.folder)) == 1
     assert_same(DiskStore(store.folder).load(0), some_submap(0)[0])
+    other = DiskStore(store.folder)
+    for count in (2, 3):
+        store.save(*some_submap(count - 1))
+        assert len(other) == len(store) == count, "another process may write"
+    other.truncate(1)
+    assert len(other) == len(store) == 1
 
 
 def test_loaded_submaps_do_not_share_memory(store: DiskStore) -> None:

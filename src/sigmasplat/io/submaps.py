@@ -34,9 +34,15 @@ class DiskStore:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
+        self._count = 0
+        """Number of submaps when they were last counted. Counting lists the folder; looking for two files is enough to
+        see that nothing was added or removed at the end."""
 
     def __len__(self) -> int:
-        return len(self._named(OURS))
+        last, following = self.path(self._count - 1), self.path(self._count)
+        if not self._count or not last.is_file() or following.is_file():
+            self._count = len(self._named(OURS))
+        return self._count
 
     def path(self, index: int) -> Path:
         """Return the path of a submap's file."""

@@ -79,7 +79,7 @@ def opacity_ratio(
 
 def gate(query_ratio: float, database_ratio: float) -> float:
     """Return clamp(r(q) · r(d), 0.85, 1.20) (VarSplat §4)."""
-    return float(np.clip(query_ratio * database_ratio, GATE_LEAST, GATE_MOST))
+    return min(max(query_ratio * database_ratio, GATE_LEAST), GATE_MOST)
 
 
 def self_similarity(descriptors: Descriptors, min_similarity: float = 0.5) -> Matrix:
@@ -102,8 +102,11 @@ def find_candidates(
     min_interval: int = 2,
     similarity_floor: float = 0.0,
     uncertainty: bool = True,
+    most: int | None = None,
 ) -> list[Candidate]:
     """List the keyframe pairs of the query and other submaps that may show the same place (VarSplat §4), best first.
+
+    most: only pairs with the `most` submaps that have the best ones, and with equally good submaps; None = all.
 
     A pair counts if its submaps are at least `min_interval` apart, if similarity × gate exceeds the query keyframe's
     `self_similarity`, and if the similarity without gate exceeds `similarity_floor` (a submap of dissimilar views has a
@@ -112,9 +115,8 @@ def find_candidates(
     """
     threshold = self_similarity(query.descriptors, min_similarity)
     found: list[Candidate] = []
-    least = threshold / (np.where(threshold > 0.0, GATE_MOST, GATE_LEAST) if uncertainty else 1.0)
-    for other in _worth_comparing(query, _apart(query, database, min_interval), least - ROUNDING):
-        factor = gate(query.opacity_ratio, other.opacity_ratio) if uncertainty else 1.0
+    apart, least = _apart(query, database, min_interval), threshold - ROUNDING
+    for other, factor in _worth_comparing(query, apart, least, similarity_floor - ROUNDING, uncertainty, most):
         alike = similarity(query.descriptors, other.descriptors)
         rows, columns = np.nonzero((alike * factor > threshold[:, None]) & (alike > similarity_floor))
         found += [
@@ -168,16 +170,28 @@ def _apart(query: SubmapDescriptor, database: Sequence[SubmapDescriptor], min_in
 
 
 def _worth_comparing(
-    query: SubmapDescriptor, database: Sequence[SubmapDescriptor], threshold: Matrix
-) -> list[SubmapDescriptor]:
-    """Return the submaps with a keyframe whose similarity to one of the query [n] exceeds its threshold [n]: one
-    product of matrices instead of one per submap."""
+    query: SubmapDescriptor,
+    database: Sequence[SubmapDescriptor],
+    threshold: Matrix,
+    floor: float,
+    uncertainty: bool,
+    most: int | None,
+) -> list[tuple[SubmapDescriptor, float]]:
+    """Return the submaps with a keyframe whose gated similarity to one of the query [n] exceeds its threshold [n], and
+    the gate of each; only the `most` best of them. One product of matrices is enough instead of one per submap."""
     if not database or not len(threshold):
         return []
-    first = np.cumsum([0, *(len(other.descriptors) for other in database[:-1])])
+    gates = np.ones(len(database))
+    if uncertainty:
+        gates = np.array([gate(query.opacity_ratio, other.opacity_ratio) for other in database])
+    first = np.cumsum([0, *(len(other.descriptors) for other in database)])
     alike = similarity(query.descriptors, np.concatenate([other.descriptors for other in database]))
-    exceeds = np.logical_or.reduceat((alike > threshold[:, None]).any(0), first)
-    return [other for other, worth in zip(database, exceeds, strict=True) if worth]
+    gated = alike * np.repeat(gates, np.diff(first))
+    gated[(gated <= threshold[:, None]) | (alike <= floor)] = -np.inf
+    best = np.maximum.reduceat(gated.max(0), first[:-1])
+    least = -np.inf if most is None or most >= len(best) else np.partition(best, -most)[-most] - 2.0 * ROUNDING
+    chosen = np.flatnonzero(np.isfinite(best) & (best >= least))
+    return [(database[row], float(gates[row])) for row in chosen.tolist()]
 
 
 def _differences(a: Matrix, b: Matrix) -> tuple[Matrix, Matrix]:

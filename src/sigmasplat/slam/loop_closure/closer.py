@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from math import isfinite
 from typing import Any
 
 import numpy as np
@@ -130,7 +131,7 @@ class LoopCloser:
     @property
     def believed(self) -> list[Edge]:
         """Return the trusted edges and the accepted loops."""
-        registered = [loop for loop in self.loops if np.isfinite(loop.chi2) or loop.accepted]
+        registered = [loop for loop in self.loops if isfinite(loop.chi2) or loop.accepted]
         return self.odometry + [e for e, loop in zip(self.closed, registered, strict=True) if loop.accepted]
 
     def _described(self, submap: Submap, descriptors: Sequence[NDArray[np.float32]]) -> SubmapDescriptor:
@@ -176,10 +177,10 @@ class LoopCloser:
         """Choose the earlier submaps to register with: first similar ones, then those near by the current poses."""
         c = self.config.loops
         database = [d for d in self.descriptors if atlas.components[d.index] == atlas.components[query.index]]
-        candidates = find_candidates(
-            query, database, c.min_similarity, c.min_interval, c.similarity_floor, c.uncertainty
-        )
         keyframes, most = self.config.registration.keyframes, c.most or None
+        candidates = find_candidates(
+            query, database, c.min_similarity, c.min_interval, c.similarity_floor, c.uncertainty, most
+        )
         pairs = pairs_to_register(candidates, query, database, keyframes, most)
         if c.near_m:
             poses = [atlas.T_world_keyframe(index) for index in range(query.index + 1)]
@@ -225,7 +226,7 @@ class LoopCloser:
         centre: a submap; only submaps near it in the graph are moved. Without it the whole graph is solved.
         """
         members = atlas.members(component)
-        registered = [i for i, loop in enumerate(self.loops) if np.isfinite(loop.chi2) or loop.accepted]
+        registered = [i for i, loop in enumerate(self.loops) if isfinite(loop.chi2) or loop.accepted]
         known = [(e, None) for e in self.odometry] + list(zip(self.closed, registered, strict=True))
         inside = [(edge, loop) for edge, loop in known if atlas.components[edge.a] == component]
         edges = [edge for edge, _ in inside]
