@@ -19,6 +19,7 @@ from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.presets import default_preset, preset
 from sigmasplat.render import render
 from sigmasplat.slam.slam import Slam
+from sigmasplat.slam.step_result import Step
 from sigmasplat.sources import SyntheticRoom
 from small_room import SMALL, frames, walk
 
@@ -229,3 +230,21 @@ def test_the_definition_in_torch_runs_the_same_slam(method: str) -> None:
 
 def test_defaults_need_no_settings() -> None:
     assert Slam().config == preset(default_preset())
+
+
+def test_old_steps_keep_what_the_path_needs_and_newer_ones_everything() -> None:
+    slam, count = Slam("sigma"), 2500
+    for index in range(count):
+        lost = index % 7 == 3
+        values = {"agreement": 0.5 + index / count}
+        state = "lost" if lost else "tracked"
+        slam.remember(
+            Step(index, index / 30, np.eye(4), False, lost, values, 9, 1, seconds={"total": 0.1}, state=state)
+        )
+    assert [(s.index, s.timestamp_s, s.lost, s.submap) for s in slam.steps] == [
+        (index, index / 30, index % 7 == 3, 1) for index in range(count)
+    ]
+    whole = [step.index for step in slam.steps if step.tracking and step.seconds]
+    assert whole == list(range(whole[0], count)) and 100 < len(whole) < 2000, (
+        "at least the newest hundred, not half of a long run"
+    )

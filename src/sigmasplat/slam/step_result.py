@@ -3,7 +3,7 @@
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +43,11 @@ class Step:
     component: int = 0
     p_off: float = 0.0
     covariance: NDArray[np.float64] | None = None
+
+    def outline(self) -> "Step":
+        """Return the step without what is only of interest while it is new: values of tracking, loops, seconds, and the
+        covariance. They are most of its memory, and the log has them."""
+        return replace(self, tracking={}, loops=(), seconds={}, covariance=None)
 
 
 def metrics_of(fit: PoseFit) -> dict[str, float]:

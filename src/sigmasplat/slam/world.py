@@ -39,6 +39,8 @@ from sigmasplat.slam.tracker import Tracker
 from sigmasplat.types import Matrix
 
 HOST = torch.device("cpu")
+WHOLE_STEPS = 1000
+"""Number of newest steps that are kept whole."""
 
 
 class World:
@@ -120,6 +122,12 @@ class World:
     def believed(self) -> NDArray[np.bool_]:
         """Return whether the pose of each frame so far is believed [F]: not lost, and connected to the world."""
         return self.atlas.in_world & np.array([not step.lost for step in self.steps], np.bool_)
+
+    def remember(self, step: Step) -> None:
+        """Append a step to `steps`. Those before the newest `WHOLE_STEPS` keep only their outline."""
+        self.steps.append(step)
+        if len(self.steps) > WHOLE_STEPS:
+            self.steps[-WHOLE_STEPS - 1] = self.steps[-WHOLE_STEPS - 1].outline()
 
     def newest_step(self) -> Step | None:
         """Return the result of the newest frame; None before the first one."""
