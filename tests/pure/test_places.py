@@ -204,6 +204,13 @@ def test_a_limit_keeps_the_candidates_of_the_best_submaps() -> None:
     assert limited, "a limit that cuts nothing shows nothing"
 
 
+def test_a_submap_at_the_threshold_takes_no_place_of_a_candidate() -> None:
+    query = SubmapDescriptor(9, at(0, 0, 60, 100))  # its twins must exceed 1, the others cos 40°
+    same, near = SubmapDescriptor(1, at(0)), SubmapDescriptor(2, at(55))
+    for most in (1, 2, None):
+        assert {c.database_submap for c in find_candidates(query, [same, near], most=most)} == {2}
+
+
 def test_a_limit_keeps_equally_good_submaps() -> None:
     query, alike = SubmapDescriptor(9, at(0, 0, 90, 90)), [SubmapDescriptor(i, at(1)) for i in range(4)]
     assert {c.database_submap for c in find_candidates(query, alike, 0.75, most=1)} == {0, 1, 2, 3}

@@ -106,17 +106,20 @@ def find_candidates(
 ) -> list[Candidate]:
     """List the keyframe pairs of the query and other submaps that may show the same place (VarSplat §4), best first.
 
-    most: only pairs with the `most` submaps that have the best ones, and with equally good submaps; None = all.
-
     A pair counts if its submaps are at least `min_interval` apart, if similarity × gate exceeds the query keyframe's
     `self_similarity`, and if the similarity without gate exceeds `similarity_floor` (a submap of dissimilar views has a
     low `self_similarity`). Without `uncertainty` the gate is 1. The order is by gated similarity, then by database
     submap, query keyframe, database keyframe; the order of `database` does not matter.
+
+    most: list the pairs of this many submaps, those with the best pairs, and of submaps that are equally good; None:
+    of all.
     """
     threshold = self_similarity(query.descriptors, min_similarity)
+    others = _apart(query, database, min_interval)
+    gates = [gate(query.opacity_ratio, other.opacity_ratio) if uncertainty else 1.0 for other in others]
     found: list[Candidate] = []
-    apart, least = _apart(query, database, min_interval), threshold - ROUNDING
-    for other, factor in _worth_comparing(query, apart, least, similarity_floor - ROUNDING, uncertainty, most):
+    for row in _worth_comparing(query, others, gates, threshold, similarity_floor, most):
+        other, factor = others[row], gates[row]
         alike = similarity(query.descriptors, other.descriptors)
         rows, columns = np.nonzero((alike * factor > threshold[:, None]) & (alike > similarity_floor))
         found += [
@@ -171,27 +174,29 @@ def _apart(query: SubmapDescriptor, database: Sequence[SubmapDescriptor], min_in
 
 def _worth_comparing(
     query: SubmapDescriptor,
-    database: Sequence[SubmapDescriptor],
+    others: Sequence[SubmapDescriptor],
+    gates: Sequence[float],
     threshold: Matrix,
     floor: float,
-    uncertainty: bool,
     most: int | None,
-) -> list[tuple[SubmapDescriptor, float]]:
-    """Return the submaps with a keyframe whose gated similarity to one of the query [n] exceeds its threshold [n], and
-    the gate of each; only the `most` best of them. One product of matrices is enough instead of one per submap."""
-    if not database or not len(threshold):
+) -> list[int]:
+    """Return the rows of the submaps that may have pairs to list; arguments as in `find_candidates`.
+
+    One product of matrices replaces one per submap. It is rounded differently: a pair whose similarity is within
+    `ROUNDING` of a limit is compared again, and takes no place among the `most` best.
+    """
+    if not others or not len(threshold):
         return []
-    gates = np.ones(len(database))
-    if uncertainty:
-        gates = np.array([gate(query.opacity_ratio, other.opacity_ratio) for other in database])
-    first = np.cumsum([0, *(len(other.descriptors) for other in database)])
-    alike = similarity(query.descriptors, np.concatenate([other.descriptors for other in database]))
-    gated = alike * np.repeat(gates, np.diff(first))
-    gated[(gated <= threshold[:, None]) | (alike <= floor)] = -np.inf
-    best = np.maximum.reduceat(gated.max(0), first[:-1])
-    least = -np.inf if most is None or most >= len(best) else np.partition(best, -most)[-most] - 2.0 * ROUNDING
-    chosen = np.flatnonzero(np.isfinite(best) & (best >= least))
-    return [(database[row], float(gates[row])) for row in chosen.tolist()]
+    counts = [len(other.descriptors) for other in others]
+    first = np.cumsum([0, *counts[:-1]])
+    alike = similarity(query.descriptors, np.concatenate([other.descriptors for other in others]))
+    gated = alike * np.repeat(gates, counts)
+    above = np.minimum(gated - threshold[:, None], alike - floor)
+    possible, certain = (
+        np.maximum.reduceat(np.where(above > limit, gated, -np.inf).max(0), first) for limit in (-ROUNDING, ROUNDING)
+    )
+    least = -np.inf if most is None or most > len(others) else np.partition(certain, -most)[-most] - 2.0 * ROUNDING
+    return [int(row) for row in np.flatnonzero((possible > -np.inf) & (possible >= least))]
 
 
 def _differences(a: Matrix, b: Matrix) -> tuple[Matrix, Matrix]:
