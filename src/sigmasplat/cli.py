@@ -128,9 +128,9 @@ def _without_options(name: str, described: bool) -> Callable[[], None]:
 
 
 def _description(name: str) -> str | None:
-    """Return a command's docstring, without paragraphs that are made at import: `--help` imports no command.
+    """Return a command's docstring, read from the compiled module: `--help` imports no command.
 
-    It is read from the compiled module.
+    A paragraph that the import would fill in, as the list of formats of `export`, is left out.
     """
     module, function = COMMANDS[name]
     path = f"sigmasplat.commands.{module}"

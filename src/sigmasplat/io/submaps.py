@@ -35,12 +35,12 @@ class DiskStore:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._count = 0
-        """Number of submaps when they were last counted. Counting lists the folder; looking for two files is enough to
-        see that nothing was added or removed at the end."""
+        """Number of submaps when they were last counted."""
 
     def __len__(self) -> int:
-        last, following = self.path(self._count - 1), self.path(self._count)
-        if not self._count or not last.is_file() or following.is_file():
+        count = self._count
+        # To count is to list the folder. Two files show whether submaps were added or removed since then.
+        if not count or not self.path(count - 1).is_file() or self.path(count).is_file():
             self._count = len(self._named(OURS))
         return self._count
 

@@ -45,8 +45,8 @@ class Step:
     covariance: NDArray[np.float64] | None = None
 
     def outline(self) -> "Step":
-        """Return the step without what is only of interest while it is new: values of tracking, loops, seconds, and the
-        covariance. They are most of its memory, and the log has them."""
+        """Return the step without the values of tracking, loops, seconds and covariance: they take most of its memory,
+        and nothing reads them later."""
         return replace(self, tracking={}, loops=(), seconds={}, covariance=None)
 
 

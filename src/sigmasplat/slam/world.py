@@ -124,7 +124,7 @@ class World:
         return self.atlas.in_world & np.array([not step.lost for step in self.steps], np.bool_)
 
     def remember(self, step: Step) -> None:
-        """Append a step to `steps`. Those before the newest `WHOLE_STEPS` keep only their outline."""
+        """Append a step to `steps`. Only the newest `WHOLE_STEPS` are kept whole; earlier ones keep their outline."""
         self.steps.append(step)
         if len(self.steps) > WHOLE_STEPS:
             self.steps[-WHOLE_STEPS - 1] = self.steps[-WHOLE_STEPS - 1].outline()

@@ -67,6 +67,11 @@ class Loop:
     chi2: float = float("nan")
     weight: float = float("nan")
 
+    @property
+    def is_edge(self) -> bool:
+        """Return whether the registration succeeded: the loop is an edge of the pose graph, accepted by it or not."""
+        return isfinite(self.chi2) or self.accepted
+
     def record(self) -> dict[str, Any]:
         """Return plain values, T_query_database as 4 rows."""
         return {name: getattr(self, name) for name in self.__dataclass_fields__} | {
@@ -131,7 +136,7 @@ class LoopCloser:
     @property
     def believed(self) -> list[Edge]:
         """Return the trusted edges and the accepted loops."""
-        registered = [loop for loop in self.loops if isfinite(loop.chi2) or loop.accepted]
+        registered = [loop for loop in self.loops if loop.is_edge]
         return self.odometry + [e for e, loop in zip(self.closed, registered, strict=True) if loop.accepted]
 
     def _described(self, submap: Submap, descriptors: Sequence[NDArray[np.float32]]) -> SubmapDescriptor:
@@ -226,7 +231,7 @@ class LoopCloser:
         centre: a submap; only submaps near it in the graph are moved. Without it the whole graph is solved.
         """
         members = atlas.members(component)
-        registered = [i for i, loop in enumerate(self.loops) if isfinite(loop.chi2) or loop.accepted]
+        registered = [i for i, loop in enumerate(self.loops) if loop.is_edge]
         known = [(e, None) for e in self.odometry] + list(zip(self.closed, registered, strict=True))
         inside = [(edge, loop) for edge, loop in known if atlas.components[edge.a] == component]
         edges = [edge for edge, _ in inside]
