@@ -17,7 +17,7 @@ from sigmasplat.slam.loop_closure import closer
 from sigmasplat.slam.loop_closure.candidates import SubmapPair
 from sigmasplat.slam.loop_closure.closer import LoopCloser, make_descriptor
 from sigmasplat.slam.loop_closure.descriptors import OrientationGrid
-from sigmasplat.slam.loop_closure.neighbourhood import Neighbourhood
+from sigmasplat.slam.loop_closure.neighbourhood import Incidence, Neighbourhood
 from sigmasplat.slam.loop_closure.pose_graph import Edge
 from sigmasplat.slam.loop_closure.registration import Registration
 from sigmasplat.types import Slices
@@ -70,12 +70,12 @@ def walked(closer: LoopCloser, alike: bool = True, atlas: Atlas | None = None) -
     return atlas
 
 
-def finished(closer: LoopCloser, atlas: Atlas, degrees: float) -> None:
-    """Finish the last submap, whose two keyframes look into directions of the plane."""
-    s = len(atlas.anchors) - 1
-    atlas.keyframe_poses[-1] = [np.eye(4), np.eye(4)]
+def finished(closer: LoopCloser, atlas: Atlas, degrees: float, T_submap_last: np.ndarray | None = None) -> None:
+    """Finish the last submap, whose two keyframes look into directions of the plane; the last one may be elsewhere."""
+    s, poses = len(atlas.anchors) - 1, [np.eye(4), np.eye(4) if T_submap_last is None else T_submap_last]
+    atlas.keyframe_poses[-1] = poses
     field = GaussianField.from_values(torch.zeros(3, 3), torch.ones(3), torch.zeros(3, 3))
-    submap = Submap(s, field, (2 * s, 2 * s + 1), np.stack([np.eye(4)] * 2), CAMERA)
+    submap = Submap(s, field, (2 * s, 2 * s + 1), np.stack(poses), CAMERA)
     picture = Picture(np.zeros((3, 4, 3), np.uint8), np.ones((3, 4), np.float32))
     closer.store.save(submap, [picture, picture])
     looks = [np.array([np.cos(a), np.sin(a)], np.float32) for a in np.deg2rad([degrees, degrees + 20.0])]
@@ -110,11 +110,26 @@ def test_places_that_do_not_look_alike_are_not_tried(monkeypatch: pytest.MonkeyP
     assert atlas.anchors[3][0, 3] == pytest.approx(3.06)
 
 
+@pytest.mark.parametrize(("ends_at_m", "tried"), [(2.6, True), (2.5, False)])
+def test_a_submap_is_near_where_its_keyframes_are_not_where_it_begins(
+    monkeypatch: pytest.MonkeyPatch, ends_at_m: float, tried: bool
+) -> None:
+    """The first submap ends near the fourth one, which is 3.06 m from where the first one begins."""
+    made, atlas = make_closer(monkeypatch, {}, near_m=0.5, near_deg=30.0, min_interval=3), Atlas()
+    drift = se3.exp(np.array([1.02, 0, 0, 0, 0, 0.0]))
+    for k in range(4):
+        if k:
+            made.connect(k - 1, k, drift, np.diag([1e4] * 6))
+        atlas.begin_submap(drift if k else None)
+        finished(made, atlas, 60.0 * k, None if k else se3.exp(np.array([ends_at_m, 0, 0, 0, 0, 0.0])))
+    assert [(loop.query, loop.database, loop.database_frame) for loop in made.loops] == [(3, 0, 1)] * tried
+
+
 def test_switched_off_nothing_is_tried(monkeypatch: pytest.MonkeyPatch) -> None:
     made = make_closer(monkeypatch, {}, close=False)
     walked(made)
     assert made.loops == []
-    assert len(made.odometry) == 3
+    assert len(made.edges) == 3
 
 
 def test_a_refused_registration_makes_no_edge(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -124,7 +139,7 @@ def test_a_refused_registration_makes_no_edge(monkeypatch: pytest.MonkeyPatch) -
         Registered, "registered", lambda *a: replace(plain(*a), accepted=False, reason="overlap 0.05 is below 0.2")
     )
     atlas = walked(made)
-    assert made.closed == []
+    assert not any(edge.loop for edge in made.edges)
     assert [loop.reason for loop in made.loops] == ["overlap 0.05 is below 0.2"]
     assert np.isnan(made.loops[0].chi2)
     assert atlas.anchors[3][0, 3] == pytest.approx(3.06)
@@ -167,13 +182,19 @@ def test_in_a_long_run_the_whole_graph_is_solved_if_it_has_grown_or_a_loop_disag
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The camera walks 12 m and turns back. Odometry is wrong by 0.5 mm at each step, and at the last by 3 cm."""
-    made, solved, part_of = make_closer(monkeypatch, {}), dict[int, bool](), Neighbourhood.of
+    made, solved = make_closer(monkeypatch, {}), dict[int, bool]()
+    around, whole = Neighbourhood.around, Neighbourhood.whole
 
-    def small_part(nodes: list[int], edges: list[Edge], centre: int | None) -> Neighbourhood:
-        solved[nodes[-1]] = centre is None
-        return part_of(nodes, edges, centre, 4)
+    def small_part(centre: int, graph: Incidence, always_fixed: int) -> Neighbourhood:
+        solved[centre] = False
+        return around(centre, graph, always_fixed, 4)
 
-    monkeypatch.setattr(Neighbourhood, "of", small_part)
+    def all_of(nodes: list[int], edges: list[Edge]) -> Neighbourhood:
+        solved[nodes[-1]] = True
+        return whole(nodes, edges)
+
+    monkeypatch.setattr(Neighbourhood, "around", small_part)
+    monkeypatch.setattr(Neighbourhood, "whole", all_of)
     monkeypatch.setattr(closer, "MOST_FREE", 4)
     places = [*range(13), *range(11, -1, -1)]
     Registered.truth = [se3.exp(np.array([x, 0, 0, 0, 0, 0.0])) for x in places]

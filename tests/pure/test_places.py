@@ -261,10 +261,10 @@ def test_places_that_should_be_near_are_tried_whatever_they_look_like() -> None:
         standing((0.0, 0.0), (0.0, 0.0)),  # the neighbour before
         standing((0.0, 0.0), (9.0, 0.0)),
     ]
-    (pair,) = find_nearby(signatures[3], signatures[:3], poses, 0.5, 30 * DEGREE, 2)
+    (pair,) = find_nearby(signatures[3], signatures[:3], dict(enumerate(poses)), 0.5, 30 * DEGREE, 2)
     assert (pair.best.query_keyframe, pair.best.database_submap, pair.best.database_keyframe) == (0, 0, 1)
     assert pair.best.similarity == pytest.approx(0.0, abs=1e-6)
     assert pair.query_keyframes == (0, 1) and pair.database_keyframes == (1, 0)
-    wider = find_nearby(signatures[3], signatures[:3], poses, 0.8, 30 * DEGREE, 1, keyframes=1)
+    wider = find_nearby(signatures[3], signatures[:3], dict(enumerate(poses)), 0.8, 30 * DEGREE, 1, keyframes=1)
     assert [p.best.database_submap for p in wider] == [2, 0, 1], "the nearest first"
     assert wider[2].database_keyframes == (1,)

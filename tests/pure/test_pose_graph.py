@@ -9,11 +9,13 @@ from hypothesis import given, settings, strategies as st
 from numpy.typing import NDArray
 from scipy.linalg import cholesky
 from scipy.optimize import least_squares
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import shortest_path
 from scipy.stats import chi2
 
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.model import se3
-from sigmasplat.slam.loop_closure.neighbourhood import Neighbourhood
+from sigmasplat.slam.loop_closure.neighbourhood import Incidence, Neighbourhood
 from sigmasplat.slam.loop_closure.pose_graph import Edge, LoopVerdict, PoseGraph, optimise
 
 Array = NDArray[np.float64]
@@ -286,7 +288,7 @@ def test_a_part_moves_only_its_nodes_and_nearly_as_the_whole_graph_does() -> Non
     settled = optimise(drifted, edges).T_world_node
     error = LOOP_SIGMA * np.random.default_rng(0).normal(size=6)
     edges.append(measured(truth, 119, 60, error, np.diag((0.5 * LOOP_SIGMA) ** -2.0), True))
-    part, whole = Neighbourhood.of(range(120), edges, 119, 30), optimise(settled, edges).T_world_node
+    part, whole = Neighbourhood.around(119, Incidence(edges), 0, 30), optimise(settled, edges).T_world_node
     found = part.solve(settled, edges)
     nodes, free = list(part.nodes), list(part.nodes[part.fixed :])
     assert len(free) == 30 and {119, 60, 118} <= set(free) and 0 not in free
@@ -301,17 +303,39 @@ def test_hundreds_of_solutions_leave_rigid_poses() -> None:
     _, drifted, edges = scene(4, nodes=40, true_loops=12, false_loops=0)
     T = optimise(drifted, edges).T_world_node
     for k in range(300):
-        part = Neighbourhood.of(range(40), edges, 5 + k % 35, 8)
+        part = Neighbourhood.around(5 + k % 35, Incidence(edges), 0, 8)
         T[list(part.nodes)] = part.solve(T, edges).T_world_node
     assert all(se3.is_rigid(pose, 1e-12) for pose in T)
 
 
-def test_a_small_graph_and_one_without_a_centre_are_solved_as_a_whole() -> None:
+def test_a_part_of_all_nodes_is_the_whole_graph() -> None:
     _, drifted, edges = scene(1)
     whole = optimise(drifted, edges)
-    for part in (Neighbourhood.of(range(50), edges, 49, 50), Neighbourhood.of(range(50), edges, None, 3)):
+    for part in (Neighbourhood.whole(range(50), edges), Neighbourhood.around(49, Incidence(edges), 0, 50)):
         assert part.nodes == tuple(range(50)) and part.fixed == 1 and part.edges == tuple(range(len(edges)))
         assert part.solve(drifted, edges).T_world_node.tobytes() == whole.T_world_node.tobytes()
+
+
+def test_a_part_of_a_graph_that_grows_is_that_of_the_grown_graph() -> None:
+    """Edges are appended one by one between searches; the part has the fewest edges to the centre, as scipy finds."""
+    _, _, edges = scene(5, nodes=60, true_loops=40, false_loops=0)
+    known: list[Edge] = []
+    graph = Incidence(known)
+    for edge in edges:
+        known.append(edge)
+        found = Neighbourhood.around(0, graph, 0, 9)
+        again = Neighbourhood.around(0, Incidence(list(known)), 0, 9)
+        assert (found.nodes, found.fixed, found.edges) == (again.nodes, again.fixed, again.edges)
+    a, b = np.array([(edge.a, edge.b) for edge in edges]).T
+    steps = shortest_path(coo_array((np.ones(len(a)), (a, b)), shape=(60, 60)).tocsr(), directed=False, unweighted=True)
+    for centre in range(1, 60):
+        part = Neighbourhood.around(centre, graph, 0, 9)
+        free, fixed = set(part.nodes[part.fixed :]), set(part.nodes[: part.fixed])
+        assert len(free) == 9 and centre in free and 0 not in free
+        others = set(range(1, 60)) - free
+        assert max(steps[centre, n] for n in free) <= min(steps[centre, n] for n in others)
+        assert set(part.edges) == {row for row, edge in enumerate(edges) if {edge.a, edge.b} & free}
+        assert fixed == {n for row in part.edges for n in (edges[row].a, edges[row].b)} - free
 
 
 # What is refused.

@@ -18,7 +18,7 @@ KERNELS = ("project", "sort", "blend", "blend_backward", "project_backward")
 """The stages that `View.seconds` counts, in its order."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, slots=True)
 class Step:
     """The result of one frame: pose T_world_camera [4, 4], whether it was mapped, whether tracking was lost, results of
     tracking, the number of splats, the submap, the loops that were tried when the submap before ended, and seconds by

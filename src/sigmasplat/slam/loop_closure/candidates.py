@@ -1,6 +1,6 @@
 """Loop candidates: submaps that may show the same place, and the keyframes to register them by (VarSplat §4)."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,12 +22,14 @@ GATE_LEAST, GATE_MOST = 0.85, 1.20
 class SubmapDescriptor:
     """Descriptors of a finished submap.
 
-    index: its number; descriptors [n, D]: one per keyframe, unit norm; opacity_ratio: r of its splats.
+    index: its number; descriptors [n, D]: one per keyframe, unit norm; opacity_ratio: r of its splats; reach_m: the
+    largest distance of a keyframe from the submap's origin.
     """
 
     index: int
     descriptors: Descriptors
     opacity_ratio: float = 1.0
+    reach_m: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -132,7 +134,7 @@ def find_candidates(
 def find_nearby(
     query: SubmapDescriptor,
     database: Sequence[SubmapDescriptor],
-    T_world_keyframe: Sequence[Matrix],
+    T_world_keyframe: Mapping[int, Matrix],
     near_m: float,
     near_rad: float,
     min_interval: int = 2,
@@ -142,9 +144,9 @@ def find_nearby(
     """List pairs of submaps that show the same place according to the current poses; the `most` nearest, nearest first.
 
     An addition to the paper: while drift is small, poses find more revisits than descriptors do. T_world_keyframe:
-    poses [K, 4, 4] of each submap, by its index. A pair counts if two keyframes are nearer than near_m and their
-    rotations differ by less than near_rad. The nearest `keyframes` of each side, in units of both limits, are to be
-    localised.
+    poses [K, 4, 4] of each of these submaps, by its index. A pair counts if two keyframes are nearer than near_m and
+    their rotations differ by less than near_rad. The nearest `keyframes` of each side, in units of both limits, are to
+    be localised.
     """
     ours, others = T_world_keyframe[query.index], _apart(query, database, min_interval)
     if not others:

@@ -26,7 +26,7 @@ from sigmasplat.slam.loop_closure.candidates import (
     pairs_to_register,
 )
 from sigmasplat.slam.loop_closure.descriptors import Descriptor, OrientationGrid
-from sigmasplat.slam.loop_closure.neighbourhood import MOST_FREE, Neighbourhood
+from sigmasplat.slam.loop_closure.neighbourhood import MOST_FREE, Incidence, Neighbourhood, numbered
 from sigmasplat.slam.loop_closure.pose_graph import Edge, LoopVerdict, PoseGraph, most_chi2
 from sigmasplat.slam.loop_closure.registration import Registrar, Registration
 from sigmasplat.slam.predicted_submaps import PredictedSubmaps
@@ -101,26 +101,32 @@ def lacks_weights(config: LoopConfig) -> bool:
 class LoopCloser:
     """Keeps the descriptors of finished submaps and all edges between them. Only this class moves anchors.
 
-    solved: the number of submaps when the whole pose graph was last solved. In between, a loop that agrees with the
-    poses moves only the submaps near it in the graph (`Neighbourhood`).
+    edges: trusted ones, such as odometry, and registered loops; loop_rows: for each edge its row in `loops`, -1 for a
+    trusted one. solved: the number of submaps when the whole pose graph was last solved. In between, a loop that agrees
+    with the poses moves only the submaps near it in the graph (`Neighbourhood`).
     """
 
     config: Config
     store: SubmapStore
     extractor: Extractor | None = None
     descriptors: list[SubmapDescriptor] = field(default_factory=list)
-    odometry: list[Edge] = field(default_factory=list)
-    closed: list[Edge] = field(default_factory=list)
+    edges: list[Edge] = field(default_factory=list)
+    loop_rows: list[int] = field(default_factory=list)
     loops: list[Loop] = field(default_factory=list)
     solved: int = 0
 
     def __post_init__(self) -> None:
         self.predicted = PredictedSubmaps(self.config, self.store)
+        self.graph = Incidence(self.edges)
 
     def connect(self, a: int, b: int, T_a_b: Matrix, information: Matrix) -> None:
         """Add a trusted edge between two submaps, such as odometry to the next one or a relocalisation: T_a_b [4, 4],
         and the information [6, 6] of its left twist (m, rad)."""
-        self.odometry.append(Edge(a, b, T_a_b, information, loop=False))
+        self._add(Edge(a, b, T_a_b, information, loop=False), -1)
+
+    def _add(self, edge: Edge, loop_row: int) -> None:
+        self.edges.append(edge)
+        self.loop_rows.append(loop_row)
 
     def add_finished(self, submap: Submap, descriptors: Sequence[NDArray[np.float32]], T_first_submap: Matrix) -> None:
         """Add a submap of an earlier session: loops to it are tried, but it stays where it is relative to the first
@@ -136,11 +142,12 @@ class LoopCloser:
     @property
     def believed(self) -> list[Edge]:
         """Return the trusted edges and the accepted loops."""
-        registered = [loop for loop in self.loops if loop.is_edge]
-        return self.odometry + [e for e, loop in zip(self.closed, registered, strict=True) if loop.accepted]
+        known = zip(self.edges, self.loop_rows, strict=True)
+        return [edge for edge, row in known if row < 0 or self.loops[row].accepted]
 
     def _described(self, submap: Submap, descriptors: Sequence[NDArray[np.float32]]) -> SubmapDescriptor:
-        return SubmapDescriptor(submap.index, np.stack(descriptors), self.opacity_ratio(submap))
+        reach_m = float(np.linalg.norm(submap.T_submap_camera[:, :3, 3], axis=1).max())
+        return SubmapDescriptor(submap.index, np.stack(descriptors), self.opacity_ratio(submap), reach_m)
 
     def opacity_ratio(self, submap: Submap) -> float:
         """Return the variance-weighted opacity ratio of a submap (VarSplat §4)."""
@@ -169,11 +176,11 @@ class LoopCloser:
         query = self._described(submap, descriptors)
         pairs = self._pairs(query, atlas)
         self.descriptors.append(query)
-        tried = list[Loop]()
+        tried, known = list[Loop](), len(self.edges)
         for pair in pairs:
             yield
             tried.append((yield from self._try(pair, submap, atlas, view)))
-        if new := self.closed[len(self.closed) - sum(loop.accepted for loop in tried) :]:
+        if new := [edge for edge in self.edges[known:] if edge.loop]:
             component = atlas.components[submap.index]
             self._correct(atlas, component, None if self._is_due(atlas, component, new) else submap.index)
         return self.loops[len(self.loops) - len(tried) :]
@@ -188,13 +195,25 @@ class LoopCloser:
         )
         pairs = pairs_to_register(candidates, query, database, keyframes, most)
         if c.near_m:
-            poses = [atlas.T_world_keyframe(index) for index in range(query.index + 1)]
+            around = self._around(query, database, atlas)
+            poses = {other.index: atlas.T_world_keyframe(other.index) for other in (query, *around)}
             near_rad, known = np.deg2rad(c.near_deg), {pair.best.database_submap for pair in pairs}
             # Of the nearest 2n, at most n are known already.
             twice = None if most is None else 2 * most
-            near = find_nearby(query, database, poses, c.near_m, near_rad, c.min_interval, keyframes, twice)
+            near = find_nearby(query, around, poses, c.near_m, near_rad, c.min_interval, keyframes, twice)
             pairs += [pair for pair in near if pair.best.database_submap not in known]
         return pairs[:most]
+
+    def _around(
+        self, query: SubmapDescriptor, database: Sequence[SubmapDescriptor], atlas: Atlas
+    ) -> list[SubmapDescriptor]:
+        """Return the submaps that may have a keyframe nearer than `near_m` to one of the query's."""
+        if not database:
+            return []
+        centres = np.array([atlas.anchors[other.index][:3, 3] for other in database])
+        apart_m = np.linalg.norm(centres - atlas.anchors[query.index][:3, 3], axis=1)
+        reach_m = query.reach_m + np.array([other.reach_m for other in database])
+        return [database[row] for row in np.flatnonzero(apart_m <= self.config.loops.near_m + reach_m).tolist()]
 
     def _try(self, pair: SubmapPair, a: Submap, atlas: Atlas, view: View) -> Slices[Loop]:
         """Register a pair in slices, with `a` as the query, and record the result, accepted or not."""
@@ -205,7 +224,7 @@ class LoopCloser:
         loop = described(pair.best, a, b, found, known)
         self.loops.append(loop)
         if found.accepted:
-            self.closed.append(Edge(a.index, b.index, found.T_a_b, found.information, loop=True))
+            self._add(Edge(a.index, b.index, found.T_a_b, found.information, loop=True), len(self.loops) - 1)
         return loop
 
     def solve_all(self, atlas: Atlas) -> None:
@@ -222,7 +241,9 @@ class LoopCloser:
         """
         if len(atlas.members(component)) > GROWTH * self.solved:
             return True
-        chi2 = PoseGraph(len(atlas.anchors), new).chi2(np.stack(atlas.anchors))
+        nodes = sorted({end for edge in new for end in (edge.a, edge.b)})
+        poses = np.stack([atlas.anchors[node] for node in nodes])
+        chi2 = PoseGraph(len(nodes), numbered(new, nodes)).chi2(poses)
         return bool((chi2 > most_chi2()).any())
 
     def _correct(self, atlas: Atlas, component: int, centre: int | None = None) -> None:
@@ -231,17 +252,16 @@ class LoopCloser:
         centre: a submap; only submaps near it in the graph are moved. Without it the whole graph is solved.
         """
         members = atlas.members(component)
-        registered = [i for i, loop in enumerate(self.loops) if loop.is_edge]
-        known = [(e, None) for e in self.odometry] + list(zip(self.closed, registered, strict=True))
-        inside = [(edge, loop) for edge, loop in known if atlas.components[edge.a] == component]
-        edges = [edge for edge, _ in inside]
-        part = Neighbourhood.of(members, edges, centre)
-        solution = part.solve(atlas.anchors, edges)
+        if centre is None or len(members) <= MOST_FREE:
+            part = Neighbourhood.whole(members, self.edges)
+        else:
+            part = Neighbourhood.around(centre, self.graph, members[0])
+        solution = part.solve(atlas.anchors, self.edges)
         for submap, T_world_submap in zip(part.nodes, solution.T_world_node, strict=True):
             atlas.anchors[submap] = T_world_submap
-        tested = [loop for _, loop in (inside[row] for row in part.edges) if loop is not None]
-        for i, verdict in zip(tested, solution.verdicts, strict=True):
-            self.loops[i] = judged(self.loops[i], verdict)
+        tested = [row for row in (self.loop_rows[edge] for edge in part.edges) if row >= 0]
+        for row, verdict in zip(tested, solution.verdicts, strict=True):
+            self.loops[row] = judged(self.loops[row], verdict)
         if centre is None:
             self.solved = max(self.solved, len(members))
 

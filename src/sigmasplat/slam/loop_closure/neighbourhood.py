@@ -1,17 +1,38 @@
 """The part of a large pose graph around a node: its nodes move, and their neighbours hold them in place."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import breadth_first_order
 
 from sigmasplat.slam.loop_closure.pose_graph import Edge, PoseGraphSolution, optimise
 from sigmasplat.types import Matrix
 
 MOST_FREE = 100
 """A larger graph is solved in parts of this many nodes; a smaller one is always solved as a whole."""
+
+
+@dataclass(eq=False)
+class Incidence:
+    """Which edges are at each node; kept up to date while edges are appended to a list, so that a part of a large graph
+    is found without reading the whole one."""
+
+    edges: Sequence[Edge]
+    at: dict[int, list[int]] = field(default_factory=dict)
+    known: int = 0
+
+    def rows_at(self, node: int) -> list[int]:
+        """Return the rows of the edges at a node, in the order of the edges."""
+        for row in range(self.known, len(self.edges)):
+            for end in (self.edges[row].a, self.edges[row].b):
+                self.at.setdefault(end, []).append(row)
+        self.known = len(self.edges)
+        return self.at.get(node, [])
+
+    def other_end(self, row: int, node: int) -> int:
+        """Return the end of an edge that is not the node."""
+        edge = self.edges[row]
+        return edge.b if edge.a == node else edge.a
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,31 +45,40 @@ class Neighbourhood:
     edges: tuple[int, ...]
 
     @staticmethod
-    def of(
-        nodes: Sequence[int], edges: Sequence[Edge], centre: int | None = None, most_free: int = MOST_FREE
-    ) -> "Neighbourhood":
+    def whole(nodes: Sequence[int], edges: Sequence[Edge]) -> "Neighbourhood":
+        """Return the whole graph of some nodes, the first of them fixed."""
+        inside = set(nodes)
+        return Neighbourhood(tuple(nodes), 1, tuple(row for row, edge in enumerate(edges) if edge.a in inside))
+
+    @staticmethod
+    def around(centre: int, graph: Incidence, always_fixed: int, most_free: int = MOST_FREE) -> "Neighbourhood":
         """Return the `most_free` nodes that are the fewest edges away from a centre, with their neighbours fixed.
 
-        The result is the whole graph without a centre, or if it is not larger. The first of `nodes` is always fixed.
+        The node `always_fixed` is never free. The time taken depends on the part, not on the whole graph.
         """
-        if centre is None or len(nodes) <= most_free:
-            return Neighbourhood(tuple(nodes), 1, tuple(range(len(edges))))
-        size = max(nodes) + 1
-        a, b = np.array([(edge.a, edge.b) for edge in edges], np.intp).T
-        adjacent = coo_array((np.ones(len(a)), (a, b)), shape=(size, size)).tocsr()
-        order = breadth_first_order(adjacent, centre, directed=False, return_predecessors=False)
-        free, touched = np.zeros(size, bool), np.zeros(size, bool)
-        free[order[order != nodes[0]][:most_free]] = True
-        inside = free[a] | free[b]
-        touched[a[inside]] = touched[b[inside]] = True
-        fixed, moving = np.flatnonzero(touched & ~free), np.flatnonzero(free)
-        numbers = tuple(int(node) for node in (*fixed, *moving))
-        return Neighbourhood(numbers, len(fixed), tuple(int(row) for row in np.flatnonzero(inside)))
+        order, seen = [centre], {centre}
+        for node in order:
+            if len(order) > most_free:  # always_fixed may be one of them
+                break
+            for row in graph.rows_at(node):
+                other = graph.other_end(row, node)
+                if other not in seen:
+                    seen.add(other)
+                    order.append(other)
+        free = sorted([node for node in order if node != always_fixed][:most_free])
+        rows = sorted({row for node in free for row in graph.rows_at(node)})
+        ends = {end for row in rows for end in (graph.edges[row].a, graph.edges[row].b)}
+        fixed = sorted(ends.difference(free))
+        return Neighbourhood((*fixed, *free), len(fixed), tuple(rows))
 
-    def solve(self, T_world_node: Sequence[Matrix], edges: Sequence[Edge]) -> PoseGraphSolution:
+    def solve(self, T_world_node: Mapping[int, Matrix] | Sequence[Matrix], edges: Sequence[Edge]) -> PoseGraphSolution:
         """Solve this part of a graph, given the pose [4, 4] of each node and the edges; the solution has one pose for
         each of `nodes`."""
-        number = {node: i for i, node in enumerate(self.nodes)}
-        rows = [edges[row] for row in self.edges]
-        part = [replace(edge, a=number[edge.a], b=number[edge.b]) for edge in rows]
+        part = numbered([edges[row] for row in self.edges], self.nodes)
         return optimise(np.stack([T_world_node[node] for node in self.nodes]), part, fixed=self.fixed)
+
+
+def numbered(edges: Sequence[Edge], nodes: Sequence[int]) -> list[Edge]:
+    """Return edges with each node replaced by its place in `nodes`."""
+    number = {node: i for i, node in enumerate(nodes)}
+    return [replace(edge, a=number[edge.a], b=number[edge.b]) for edge in edges]
