@@ -22,6 +22,7 @@ from sigmasplat.io.splats import compressed_ply, gltf, ply, sog, splat, spz
 from sigmasplat.model.field import GaussianField
 from sigmasplat.presets.table_files import TABLES
 from sigmasplat.run.resume import StateFile
+from sigmasplat.sources import open_source
 
 Files = dict[str, bytes]
 INPUT, OUT = "INPUT", "OUT"
@@ -125,6 +126,7 @@ def samples(folder: Path) -> Iterator[Sample]:
     yield from _maps(folder)
     yield from _runs(folder)
     yield from _studies(folder)
+    yield from _poses(folder)
 
 
 def _sample(name: str, place: Path, entry: Path, commands: tuple[tuple[str, ...], ...], weight: float = 1.0) -> Sample:
@@ -223,3 +225,25 @@ def _studies(folder: Path) -> Iterator[Sample]:
     run.write_metrics(metrics | {"frames": 3})
     command = ("batch", ROOM, "--out", f"{INPUT}/..", *QUICK)
     yield _sample("batch", folder / "batch", run.path, (command,), 0.3)
+
+
+def _poses(folder: Path) -> Iterator[Sample]:
+    """Make files with the poses of the room's three frames, in the formats whose frames have numbers or times."""
+    path = open_source(ROOM).truth()
+    assert path is not None
+    rows = [[t, *T[:3, 3], 0, 0, 0, 1] for t, T in zip(path.timestamps_s, path.T_world_camera, strict=True)]
+    texts = {"tum": rows, "kitti": path.T_world_camera[:, :3].reshape(-1, 12).tolist()}
+    for name, lines in texts.items():
+        place = folder / f"poses_{name}"
+        layouts.save_text(place / "poses.txt", "".join(" ".join(map(str, line)) + "\n" for line in lines))
+        words = ("run", ROOM, "--poses", INPUT, "--out", OUT, "--no-eval", *QUICK)
+        yield _sample(place.name, place, place / "poses.txt", (words,), 0.5)
+    place, colors = folder / "poses_named", layouts.plain(folder / "poses_named", layouts.sample())
+    names = sorted(color.stem for color in (colors / "color").iterdir())
+    images = "".join(f"{i} 1 0 0 0 {i / 50} 0 0 1 {name}.png\n1 2 -1\n" for i, name in enumerate(names))
+    frames = [{"file_path": f"{name}.png", "transform_matrix": np.eye(4).tolist()} for name in names]
+    layouts.save_text(colors / "images.txt", images)
+    layouts.save_text(colors / "poses.json", json.dumps({"frames": frames}))
+    words = ("run", INPUT, "--out", OUT, "--no-eval", *QUICK, "--poses")
+    commands = tuple((*words, f"{INPUT}/{file}") for file in ("images.txt", "poses.json"))
+    yield _sample("poses_named", place, colors, commands)

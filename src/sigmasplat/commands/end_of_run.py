@@ -8,6 +8,9 @@ if TYPE_CHECKING:
     from sigmasplat.run.terminal import Screen
     from sigmasplat.sources.base import Source
 
+CONTRADICTED_MOST = 0.05
+"""Given poses are reported if the images contradict a larger share of them."""
+
 
 def warn_at_the_end(
     screen: "Screen", source: "Source", read: "Source", folder: "RunFolder", motion: "MotionWatch"
@@ -18,6 +21,8 @@ def warn_at_the_end(
     _warn_if_never_recognised(screen, folder)
     for warning in motion.warnings():
         screen.warn(warning)
+    if folder.config().input.poses:
+        _warn_of_contradicted_poses(screen, folder)
     if source.predicted_depth:
         screen.say("the scale is arbitrary, because a network predicted depth: lengths are not in metres")
 
@@ -48,4 +53,15 @@ def _warn_if_never_recognised(screen: "Screen", folder: "RunFolder") -> None:
         screen.warn(
             f"the recording was never recognised in the map of {onto['run']}; its path and map are in "
             f"{folder.path / 'components'}"
+        )
+
+
+def _warn_of_contradicted_poses(screen: "Screen", folder: "RunFolder") -> None:
+    """Print a warning if many given poses are probably wrong."""
+    frames = folder.read_log()
+    wrong = sum((frame.get("p_off") or 0.0) > 0.5 for frame in frames)
+    if wrong > CONTRADICTED_MOST * len(frames):
+        screen.warn(
+            f"the images contradict the given pose in {wrong} of {len(frames)} frames (p_off above 0.5); are they "
+            "poses of the colour camera, camera to world, x right, y down, z forward?"
         )

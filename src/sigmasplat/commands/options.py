@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from sigmasplat import env
-from sigmasplat.config import Config, InputConfig
+from sigmasplat.config import RECORDED_POSES, Config, InputConfig
 from sigmasplat.config.ranges import Range
 from sigmasplat.config.text import override, split_settings
 from sigmasplat.errors import RunError
@@ -221,6 +221,15 @@ class InputOptions:
             help_behavior_hint="",
         ),
     ] = None
+    poses: Annotated[
+        str | None,
+        arg(
+            metavar="FILE",
+            help="known camera poses, used instead of tracking: TUM or KITTI text, images.txt of COLMAP, "
+            'transforms.json, or a folder of matrices; "recorded" = those of the device, such as ARKit\'s',
+            help_behavior_hint="",
+        ),
+    ] = None
     predicted_depth: PredictedDepth = None
     predicted_inverse: PredictedInverse = False
     fx: Annotated[
@@ -257,6 +266,8 @@ class InputOptions:
         given["register_depth"] = None if self.register_depth == "auto" else self.register_depth
         for name in ("calibration", "masks", "predicted_depth"):  # a later eval may run in another folder
             given[name] = given[name] and given[name].absolute()
+        if self.poses not in (None, RECORDED_POSES):
+            given["poses"] = Path(self.poses).absolute()
         return {
             f"input.{names.get(name, name)}": str(value) for name, value in given.items() if value not in (None, False)
         }

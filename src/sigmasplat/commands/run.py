@@ -180,10 +180,22 @@ def _opened(
         for warning in (depth_warning(source), *time_warnings(times_of(source))):
             if warning:
                 screen.warn(warning)
+    if config.input.poses:
+        _say_of_poses(screen, asked, source, config)
     if source.registrable and not source.depth_registered:
         screen.warn("depth and colour come from different cameras; --register-depth on aligns them (see inspect)")
     _warn_without_weights(screen, config)
     return source, config
+
+
+def _say_of_poses(screen: "Screen", asked: "Config", source: "Source", config: "Config") -> None:
+    """Print the measured unit of given poses, or a warning if it does not seem to be metres."""
+    from sigmasplat.run.pose_scale import scale_warning
+
+    if not asked.input.poses_scale:
+        screen.say(f"{config.input.poses}: poses are multiplied by {config.input.poses_scale:.4g} to be in metres")
+    elif warning := scale_warning(source, config):
+        screen.warn(warning)
 
 
 def _warn_without_weights(screen: "Screen", config: "Config") -> None:

@@ -11,7 +11,7 @@ from typing import Any, Literal
 from sigmasplat.config.densify import DensifyConfig
 from sigmasplat.config.features import FeatureConfig
 from sigmasplat.config.frames import MappingConfig, RenderConfig, SeedConfig, TrackingConfig
-from sigmasplat.config.input import InputConfig
+from sigmasplat.config.input import RECORDED_POSES, InputConfig
 from sigmasplat.config.moving import MovingConfig
 from sigmasplat.config.ranges import Count, Section, kinds_of, problems_of, refuse, shown
 from sigmasplat.config.real_time import RealTimeConfig
@@ -23,9 +23,9 @@ from sigmasplat.errors import ConfigError
 from sigmasplat.reading.structured import read_json
 
 __all__ = [
-    "Config", "DensifyConfig", "FeatureConfig", "FinalConfig", "InputConfig", "LoopConfig", "MappingConfig",
-    "MovingConfig", "RealTimeConfig", "RecoveryConfig", "RegistrationConfig", "RenderConfig", "SeedConfig",
-    "SubmapConfig", "SurfaceConfig", "TrackingConfig", "UncertaintyConfig",
+    "RECORDED_POSES", "Config", "DensifyConfig", "FeatureConfig", "FinalConfig", "InputConfig", "LoopConfig",
+    "MappingConfig", "MovingConfig", "RealTimeConfig", "RecoveryConfig", "RegistrationConfig", "RenderConfig",
+    "SeedConfig", "SubmapConfig", "SurfaceConfig", "TrackingConfig", "UncertaintyConfig",
 ]  # fmt: skip
 
 

@@ -6,6 +6,9 @@ from typing import Annotated, Literal
 from sigmasplat.config.ranges import WIDTHS_PX, Above0, AtLeastOne, Count, NotNegative, Range, Section
 from sigmasplat.config.sensors import sensor_problems
 
+RECORDED_POSES = "recorded"
+"""Value of `input.poses` for the poses that the recording device estimated itself."""
+
 
 @dataclass(frozen=True)
 class InputConfig(Section, name="input"):
@@ -39,6 +42,13 @@ class InputConfig(Section, name="input"):
     recorded depth, or is the depth of a video or of colour images. Its scale may be arbitrary; empty = none."""
     predicted_inverse: bool = False
     """Whether predicted depth is inverse depth (disparity), as most networks for relative depth give it."""
+    poses: str = ""
+    """Path of a file with known camera poses, which are used as they are: TUM text, KITTI text, images.txt of COLMAP,
+    or transforms.json; or of a folder with a matrix per frame; "recorded" = those that the device estimated itself,
+    such as ARKit's. Frames without a pose are left out; empty = poses are estimated."""
+    poses_scale: NotNegative = 1.0
+    """Factor from the unit of `input.poses` to metres; 0 = measured from the images and their depth, for poses of
+    arbitrary scale such as COLMAP's."""
     fx: NotNegative = 0.0
     """Horizontal focal length of the colour camera in pixels; 0 = as recorded."""
     fy: NotNegative = 0.0

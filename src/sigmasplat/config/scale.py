@@ -1,6 +1,7 @@
 """Scale all settings that are lengths to a scene that is larger than a room."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
+from typing import Any
 
 from sigmasplat.config import Config
 from sigmasplat.config.sensors import AUTO
@@ -22,6 +23,13 @@ POWERS = {
 }  # fmt: skip
 """The power of a length in each setting. Weights of losses in metres have −1, so that a loss keeps its value."""
 
+POSES_STAY: Mapping[str, Mapping[str, object]] = {
+    "mapping": {"lr_pose_translation": 0.0, "lr_pose_rotation": 0.0},
+    "final": {"lr_pose_translation": 0.0, "lr_pose_rotation": 0.0},
+    "loops": {"close": False},
+}
+"""Settings for given poses (`input.poses`): nothing moves them."""
+
 PREDICTED_NOISE_PER_M = 0.1
 """`render.depth_noise_per_m` for predicted depth: about 10 % of the depth in a room."""
 
@@ -35,11 +43,14 @@ def for_scene(
     predicted_depth: bool = False,
 ) -> Config:
     """Return the settings for a scene of this size, depth of this noise, and this sensor (None = unknown, the setting
-    stays); predicted_depth: whether a network predicted depth, which is then fitted to the map.
+    stays); predicted_depth: whether a network predicted depth, which is then fitted to the map. Poses that
+    `input.poses` gives stay as they are.
 
     given: names of settings that keep their values, as in ["input.max_depth_m"].
     """
     config = scaled(config, scene_scale, given)
+    if config.input.poses:
+        config = config.changed(**_not_given(POSES_STAY, given))
     if sensor is not None and config.input.sensor == AUTO:
         config = config.changed(input={"sensor": sensor})
     if predicted_depth:
@@ -65,3 +76,11 @@ def scaled(config: Config, factor: float, given: Collection[str] = ()) -> Config
         for section, powers in POWERS.items()
     }
     return config.changed(**sections)
+
+
+def _not_given(changes: Mapping[str, Mapping[str, object]], given: Collection[str]) -> dict[str, dict[str, Any]]:
+    """Return the changes of settings by section, without those that are named in `given`."""
+    return {
+        section: {name: value for name, value in values.items() if f"{section}.{name}" not in given}
+        for section, values in changes.items()
+    }

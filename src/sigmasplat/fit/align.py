@@ -157,7 +157,8 @@ def align(
     Each level takes at most `iterations` Gauss–Newton steps with Huber weights. A level ends when a step is below
     `update_stop` (m, rad), or when the relative change of the cost is below `plateau_stop` (0 = off). If the finest
     level meets neither condition, its best iterate is returned. Undetermined directions keep the guess. weight_color in
-    [0, 1] balances gray against depth, each in units of its Huber width. Raises BackendError without the compiled
+    [0, 1] balances gray against depth, each in units of its Huber width. With 0 iterations the guess stays, and is
+    judged. Raises BackendError without the compiled
     kernels, or if only one image is on a device.
     """
     if reference.kernels is not live.kernels:
@@ -166,12 +167,13 @@ def align(
     pair = Pair(reference, live, weight_color)
     levels = [pair.level(k) for k in range(len(reference.cameras))]
     found = pair.kernels.align(levels, reference.readings, T_live_reference, rules)
+    sums = found.sums if iterations else normal_equations(pair.kernels, levels[0], [T_live_reference])[0].sums
     return Alignment(
         se3.orthonormalise(found.T),
-        agreement=float(found.sums[3] / max(found.sums[2], 1.0)),
-        overlap=float(found.sums[4] / max(found.readings, 1.0)),
+        agreement=float(sums[3] / max(sums[2], 1.0)),
+        overlap=float(sums[4] / max(found.readings, 1.0)),
         degenerate=found.degenerate,
-        cost=float(found.sums[0] / max(found.sums[1], 1.0)),
+        cost=float(sums[0] / max(sums[1], 1.0)),
         steps=found.steps,
         pair=pair,
         depth_m=found.depth_m,

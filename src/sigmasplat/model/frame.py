@@ -2,6 +2,7 @@
 
 import copy
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,16 @@ class Detail:
     camera: Camera
 
 
+class PosePrior(NamedTuple):
+    """What is known of a frame's pose apart from its images: `R_inertial_camera` and `T_given_camera` of `Frame`."""
+
+    R_inertial_camera: Matrix | None = None
+    T_given_camera: Matrix | None = None
+
+
+NO_PRIOR = PosePrior()
+
+
 @dataclass(frozen=True, eq=False)
 class Frame:
     """One image of colour and depth.
@@ -36,10 +47,12 @@ class Frame:
     from the camera's axes to fixed axes, the same for all frames, measured by a gyroscope; None = not measured. Only
     the rotation between two frames is used, so any fixed axes will do; depth_std_m: float32 [H, W], the standard
     deviation of each depth reading, metres, if the sensor knows it; ignored: pixels of the frame as it was read
-    (`ignored_by` resamples them) whose colour is not used either, None = none; they have no depth. The frame keeps
-    read-only views of the arrays and does not copy them: do not write to them later (`frame_from_arrays` copies).
-    Raises SourceError if an array is not float32, on inconsistent shapes, values that are not finite, colour in 0…255,
-    negative depth, a reading whose standard deviation is not above 0, or a matrix that is not a rotation.
+    (`ignored_by` resamples them) whose colour is not used either, None = none; they have no depth; T_given_camera
+    [4, 4]: pose of the camera in fixed axes, metres, which is used as it is; None = the pose is estimated. Only the
+    motion between two frames is used. The frame keeps read-only views of the arrays and does not copy them: do not
+    write to them later (`frame_from_arrays` copies). Raises SourceError if an array is not float32, on inconsistent
+    shapes, values that are not finite, colour in 0…255, negative depth, a reading whose standard deviation is not above
+    0, a matrix that is not a rotation, or a pose that is not rigid.
     """
 
     index: int
@@ -50,6 +63,7 @@ class Frame:
     R_inertial_camera: Matrix | None = None
     depth_std_m: NDArray[np.float32] | None = None
     ignored: NDArray[np.bool_] | None = None
+    T_given_camera: Matrix | None = None
 
     def __post_init__(self) -> None:
         for name, array in (("colour", self.color), ("depth", self.depth_m)):
@@ -71,7 +85,16 @@ class Frame:
             raise SourceError(
                 f"frame {self.index}: R_inertial_camera is not a rotation [3, 3]; give None if it is not measured"
             )
+        if self.T_given_camera is not None and not se3.is_rigid(self.T_given_camera):
+            raise SourceError(
+                f"frame {self.index}: T_given_camera is not a rigid pose [4, 4]; give None if it is to be estimated"
+            )
         self._keep(self.color, self.depth_m, self.depth_std_m)
+
+    @property
+    def prior(self) -> PosePrior:
+        """Return what is known of the pose apart from the images."""
+        return PosePrior(self.R_inertial_camera, self.T_given_camera)
 
     def _keep(
         self, color: NDArray[np.float32], depth_m: NDArray[np.float32], depth_std_m: NDArray[np.float32] | None

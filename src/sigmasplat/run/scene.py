@@ -6,6 +6,7 @@ from typing import Any
 
 from sigmasplat.config import Config
 from sigmasplat.config.scale import for_scene
+from sigmasplat.run.pose_scale import with_measured_scale
 from sigmasplat.sources.base import Source
 from sigmasplat.sources.opening import open_source
 
@@ -13,10 +14,14 @@ from sigmasplat.sources.opening import open_source
 def open_scene(path: str | Path, config: Config | None = None, given: Collection[str] = ()) -> tuple[Source, Config]:
     """Open a sequence; return it with the settings for its scene, which differ from `config` outdoors and for stereo.
 
-    given: names of settings that keep their values, as in ["input.max_depth_m"]. Raises as `open_source`.
+    given: names of settings that keep their values, as in ["input.max_depth_m"]. If `input.poses_scale` is 0, it is
+    measured. Raises as `open_source`.
     """
     config = config or Config()
     source = open_source(path, config.input)
+    if config.input.poses and not config.input.poses_scale:
+        config = with_measured_scale(source, config)
+        source = open_source(path, config.input)
     return source, config_for(source, config, given)
 
 

@@ -22,7 +22,7 @@ def fitted_to_map(tracker: Tracker, field: Splats, view: View, seen: Observation
     frame without `tracking.fit_depth`."""
     if not tracker.config.fit_depth:
         return seen
-    T_world_camera = tracker.expected(seen.frame.R_inertial_camera).predicted
+    T_world_camera = tracker.expected(seen.frame.prior).predicted
     tracker.depth = _fitted(tracker.depth, field, view, seen, T_world_camera)
     return _with_fit(tracker.depth, view, seen)
 

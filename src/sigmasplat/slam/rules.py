@@ -9,10 +9,14 @@ from numpy.typing import NDArray
 from sigmasplat.config import SubmapConfig
 from sigmasplat.fit.pose import PoseFit
 from sigmasplat.model import se3
+from sigmasplat.model.camera import Camera
 
 Item = TypeVar("Item")
 Asked = Callable[[], bool]
 """Asked again and again during long work."""
+WIDE = 0.065
+"""A motion between two frames is wide if it moves the image by more than this share of its width: the basin of
+convergence of alignment ends near there."""
 
 
 def never() -> bool:
@@ -64,6 +68,14 @@ def ends_submap(
         "variance": (variance_sum, c.variance_sum),
     }
     return next((rule for rule, (value, limit) in found.items() if limit and value > limit), "")
+
+
+def is_wide(T_previous: NDArray[np.float64], fit: PoseFit, camera: Camera, has_features: bool) -> bool:
+    """Return whether a frame is so far from the last one, at T_previous [4, 4], that a second guess by features is
+    worth its time."""
+    depth_m = fit.alignment.depth_m if fit.alignment is not None else 1.0
+    moved = angle_between(T_previous, se3.inverse(fit.T_camera_world), depth_m) if has_features else 0.0
+    return moved * camera.fx > WIDE * camera.width
 
 
 def is_lost(fit: PoseFit, least_agreement: float, least_share: float) -> bool:

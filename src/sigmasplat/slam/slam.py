@@ -110,7 +110,7 @@ class Slam(MapWork, ArrayInterface):
         """Start the first submap at the first frame. Its camera is the world, unless there are earlier submaps: then
         it is connected to the place where it is found, or begins a new component."""
         refuse_first_without_depth(seen.frame, self.config)
-        self.tracker.start(seen, seen.frame.R_inertial_camera)
+        self.tracker.start(seen, seen.frame.prior)
         place = self.begin_first(seen)
         if place is None:
             return Found(np.eye(4), TRACKED, mapped=True)
@@ -145,7 +145,7 @@ class Slam(MapWork, ArrayInterface):
     def _track(self, seen: Observation) -> PoseFit:
         """Fit the frame's pose to the active submap."""
         with self._timer.stage("track"), self._timer.kernels_of(self.view, "track_kernels"):
-            return self.tracker.track(self.mapper.field, self.view, seen, seen.frame.R_inertial_camera)
+            return self.tracker.track(self.mapper.field, self.view, seen, seen.frame.prior)
 
     def _is_keyframe(self, overlap: float) -> bool:
         c = self.config.mapping

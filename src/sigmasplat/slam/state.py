@@ -10,7 +10,7 @@ from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.model.atlas import Atlas, Hop, Place
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField, Rows
-from sigmasplat.model.frame import Detail
+from sigmasplat.model.frame import Detail, PosePrior
 from sigmasplat.model.photo import Photo
 from sigmasplat.model.submap import Picture
 from sigmasplat.slam.drift import Drift
@@ -35,9 +35,9 @@ from sigmasplat.slam.tracker import Tracker
 
 CLASSES: tuple[type, ...] = (
     Atlas, Camera, Confidence, DepthFit, DepthShape, Detail, Drift, Edge, FeatureImage, Foreground, GaussianField, Hop,
-    Keyframe, Link, Loop, LoopCloser, Mapper, Memory, Photo, Picture, Place, Probe, Probes, Pyramid, Recovery,
-    Reference, Relocaliser, Rows, Seen, SeenKeyframe, Step, SubmapDescriptor, Target, Tracker, Usual, VectorAdam,
-    Watch,
+    Keyframe, Link, Loop, LoopCloser, Mapper, Memory, Photo, Picture, Place, PosePrior, Probe, Probes, Pyramid,
+    Recovery, Reference, Relocaliser, Rows, Seen, SeenKeyframe, Step, SubmapDescriptor, Target, Tracker, Usual,
+    VectorAdam, Watch,
 )  # fmt: skip
 """The classes that a state may contain."""
 

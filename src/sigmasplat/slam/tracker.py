@@ -1,7 +1,7 @@
 """Tracking: predict the pose, fit it to the fixed map, judge the fit, and try other guesses if it is doubtful."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field as dataclass_field
+from dataclasses import dataclass, field as dataclass_field, replace
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from sigmasplat.fit.pose import PoseFit, fit_pose_adam, fit_pose_align
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference, map_reference
 from sigmasplat.model import se3
+from sigmasplat.model.frame import NO_PRIOR, PosePrior
 from sigmasplat.render.view import View
 from sigmasplat.slam.features import Extractor
 from sigmasplat.slam.localisation.depth_fit import NOTHING_FITTED, DepthFit
@@ -25,21 +26,18 @@ from sigmasplat.slam.localisation.sight import FoundKeyframe, Sight
 from sigmasplat.slam.localisation.tracked_keyframe import Splats, TrackedKeyframe, found_keyframe, mapped_keyframe
 from sigmasplat.slam.localisation.verdict import LEAST_COMMON, Usual, agrees_more, confirmed, score, stands
 from sigmasplat.slam.localisation.watch import Watch
-from sigmasplat.slam.rules import Asked, angle_between, is_lost, jumped, never, unless
+from sigmasplat.slam.rules import Asked, is_lost, is_wide, jumped, never, unless
 from sigmasplat.types import Matrix
 
 DOUBT = 0.7
 """A pose is doubtful if its agreement × overlap falls below this share of the usual value."""
-WIDE = 0.065
-"""A motion between two frames is wide if it moves the image by more than this share of its width: the basin of
-convergence of alignment ends near there."""
 
 
 @dataclass(eq=False)
 class Tracker:
     """Keeps the last pose, the velocity, the last image, the reference keyframe, and statistics of recent fits.
 
-    R_inertial_camera: that of the last frame; lost: tracking of the last frame failed; doubtful: number of frames in a
+    prior: that of the last frame; lost: tracking of the last frame failed; doubtful: number of frames in a
     row whose best pose the images contradict (`_contradicted`); front: what was in front of the scene in the last
     frame, None if there was nothing or the frame was lost; keyframe_front: the same for the newest keyframe; watch:
     what is known of moving things; depth: what is known of predicted depth (`tracking.fit_depth`).
@@ -61,7 +59,7 @@ class Tracker:
     agreements: list[float] = dataclass_field(default_factory=list)
     first_losses: list[float] = dataclass_field(default_factory=list)
     usual: Usual = dataclass_field(default_factory=Usual)
-    R_inertial_camera: Matrix | None = None
+    prior: PosePrior = NO_PRIOR
     lost: bool = False
     doubtful: int = 0
     started: bool = False
@@ -72,38 +70,46 @@ class Tracker:
         if c.uncertainty and c.variance == "predicted" and c.method == "adam":
             raise ConfigError("tracking.variance=predicted needs tracking.method=align; set it, or variance=published")
 
-    def start(self, seen: Sight, R_inertial_camera: Matrix | None = None) -> None:
-        """Fix the gauge: the first camera is the world. R_inertial_camera: as in `Frame`."""
-        self.last_image, self.last_features, self.R_inertial_camera = seen.live, seen.image, R_inertial_camera
+    def start(self, seen: Sight, prior: PosePrior) -> None:
+        """Fix the gauge: the first camera is the world."""
+        self.last_image, self.last_features, self.prior = seen.live, seen.image, prior
 
-    def track(
-        self, field: Splats, view: View, seen: Sight, R_inertial_camera: Matrix | None = None, hurried: Asked = never
-    ) -> PoseFit:
-        """Estimate T_camera_world of a frame; `self.lost` then says whether tracking failed.
+    def track(self, field: Splats, view: View, seen: Sight, prior: PosePrior, hurried: Asked = never) -> PoseFit:
+        """Estimate T_camera_world of a frame; `self.lost` then says whether tracking failed. A given pose is taken as
+        it is, and judged by the images.
 
-        R_inertial_camera: as in `Frame`. hurried: asked before each further guess; if it returns True, that guess and
-        the later ones are left out. A lost frame gets the best available guess (odometry, else the last pose), and the
-        velocity is reset.
+        prior: what is known of the pose apart from the images. hurried: asked before each further guess; if it returns
+        True, that guess and the later ones are left out. A lost frame gets the best available guess (odometry, else the
+        last pose), and the velocity is reset.
         """
-        expected = self.expected(R_inertial_camera)
-        shown = seen.shown(view)
-        best = self._fit(field, view, shown, expected.predicted)
-        best, shown = self._uncovered(field, view, seen, shown, expected, best, hurried)
-        if self._is_wide(best, view) or self._doubts(best):
-            guesses = unless(hurried, self._other_guesses(shown, expected))
-            best = max([best, *(self._fit(field, view, shown, guess) for guess in guesses)], key=self._score)
-        if self._doubts(best):
-            best = self._retry(field, view, shown, best, expected, hurried)
-        self.R_inertial_camera = R_inertial_camera
-        self.lost = self._is_lost(best) or self._leaps(best, expected.predicted)
+        expected, shown = self.expected(prior), seen.shown(view)
+        if expected.given:
+            best = self._fit(field, view, shown, expected.predicted, patience=0)
+            best.T_camera_world = se3.inverse(expected.predicted)
+            self.front, self.lost, self.doubtful = None, False, 0
+        else:
+            best = self._estimated(field, view, seen, shown, expected, hurried)
+            self.lost = self._is_lost(best) or self._leaps(best, expected.predicted)
+            self.doubtful = self.doubtful + 1 if self._contradicted(best) else 0
+        self.prior = prior
         if self.lost:  # poses of earlier frames do not agree with later ones
             self.front, self.watch = None, self.watch.cleared()
-        self.doubtful = self.doubtful + 1 if self._contradicted(best) else 0
         best.T_camera_world = se3.orthonormalise(best.T_camera_world)
         if not self.lost:
             self._notice_rest(seen, se3.inverse(best.T_camera_world))
         self._remember(best, seen.without(self.front, view))
         return best
+
+    def _estimated(
+        self, field: Splats, view: View, seen: Sight, shown: Sight, expected: Expected, hurried: Asked
+    ) -> PoseFit:
+        """Return the best of the fits from all guesses; shown: the frame as it is fitted first."""
+        best = self._fit(field, view, shown, expected.predicted)
+        best, shown = self._uncovered(field, view, seen, shown, expected, best, hurried)
+        if is_wide(self.previous, best, view.camera, self.extractor is not None) or self._doubts(best):
+            guesses = unless(hurried, self._other_guesses(shown, expected))
+            best = max([best, *(self._fit(field, view, shown, guess) for guess in guesses)], key=self._score)
+        return self._retry(field, view, shown, best, expected, hurried) if self._doubts(best) else best
 
     def _uncovered(
         self, field: Splats, view: View, seen: Sight, first: Sight, expected: Expected, fit: PoseFit, hurried: Asked
@@ -196,23 +202,25 @@ class Tracker:
 
     # ---- guesses ----
 
-    def expected(self, R_inertial_camera: Matrix | None) -> Expected:
-        """Return where the camera of the next frame is expected; R_inertial_camera: as in `Frame`."""
-        known = self.R_inertial_camera, R_inertial_camera
-        return expect(self.previous, self.velocity, *known, self.config.motion_model)
+    def expected(self, prior: PosePrior) -> Expected:
+        """Return where the camera of the next frame is expected."""
+        return expect(self.previous, self.velocity, self.prior, prior, self.config.motion_model)
 
     def _fit(self, field: Splats, view: View, seen: Sight, guess: Matrix, patience: int = 1) -> PoseFit:
-        """Fit from an initial T_world_camera; patience: factor on the number of iterations of gradient descent."""
+        """Fit from an initial T_world_camera; patience: factor on the number of iterations of gradient descent; with 0,
+        the pose stays as it is, and is only judged."""
         T_camera_world = se3.inverse(guess)
         if self.config.method == "adam":
             config = self.config if self.started else self.config.without_motion()
             return fit_pose_adam(field.params, view, seen.target, T_camera_world, config, patience * config.iterations)
         if self.config.align_to == "keyframe" and self.keyframe is not None:
-            return self._aligned(self.keyframe, seen.live, T_camera_world)
-        return self._aligned(map_reference(field.params, view, T_camera_world, self.config), seen.live, T_camera_world)
+            return self._aligned(self.keyframe, seen.live, T_camera_world, patience > 0)
+        reference = map_reference(field.params, view, T_camera_world, self.config)
+        return self._aligned(reference, seen.live, T_camera_world, patience > 0)
 
-    def _aligned(self, reference: Reference, live: Pyramid, T_camera_world: Matrix) -> PoseFit:
-        fit = fit_pose_align(reference, live, T_camera_world, self.config)
+    def _aligned(self, reference: Reference, live: Pyramid, T_camera_world: Matrix, moves: bool = True) -> PoseFit:
+        config = self.config if moves else replace(self.config, align_iterations=0)
+        fit = fit_pose_align(reference, live, T_camera_world, config)
         if self.config.verify:
             fit.comparison = self._compared(reference, live, fit.T_camera_world)
         return fit
@@ -266,14 +274,6 @@ class Tracker:
         return None if T_live_last is None else np.asarray(self.previous @ se3.inverse(T_live_last))
 
     # ---- verdicts ----
-
-    def _is_wide(self, fit: PoseFit, view: View) -> bool:
-        """Return whether the frame is so far from the last one that a second guess is worth its time."""
-        if self.extractor is None:
-            return False
-        depth_m = fit.alignment.depth_m if fit.alignment is not None else 1.0
-        moved = angle_between(self.previous, se3.inverse(fit.T_camera_world), depth_m)
-        return moved * view.camera.fx > WIDE * view.camera.width
 
     def _score(self, fit: PoseFit) -> float:
         return fit.agreement * fit.overlap if fit.comparison is None else score(fit.comparison)

@@ -1,7 +1,7 @@
 """Define the interface of an input sequence, the same for every format."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -94,6 +94,15 @@ class Source(ABC):
         length_m = float(np.linalg.norm(np.diff(path.T_world_camera[:, :3, 3], axis=0), axis=1).sum())
         return f"{len(path)} true poses, {length_m:.1f} m long"
 
+    def image_name(self, i: int) -> str:
+        """Return the name of the file of colour image i; "" if images are not files."""
+        return ""
+
+    def device_path(self) -> Trajectory | None:
+        """Return the path of the camera that the recording device estimated itself, such as ARKit's, with timestamps in
+        the clock of the frames; None without one."""
+        return None
+
     def test_views(self) -> "Source | None":
         """Return test views away from the camera path, with poses in `truth`'s world frame; None without them."""
         return None
@@ -158,7 +167,7 @@ class Subset(Source):
         self.predicted_depth = whole.predicted_depth
         self.depth_noise_per_m, self.sensor = whole.depth_noise_per_m, whole.sensor
         self._whole = whole
-        self._indices = _within(whole, settings)[:: settings.stride][: settings.limit or None]
+        self._indices: Sequence[int] = _within(whole, settings)[:: settings.stride][: settings.limit or None]
         if not len(self._indices):
             raise SourceError(
                 f"{whole.name}: no frame between input.start_s={settings.start_s:g} and end_s={settings.end_s:g}; "
@@ -191,6 +200,14 @@ class Subset(Source):
     def truth(self) -> Trajectory | None:
         """Return the ground-truth path of the whole source; it has its own timestamps."""
         return self._whole.truth()
+
+    def image_name(self, i: int) -> str:
+        """Return the name of the file of colour image i."""
+        return self._whole.image_name(self._indices[self._checked_index(i)])
+
+    def device_path(self) -> Trajectory | None:
+        """Return the path that the device of the whole source estimated; it has its own timestamps."""
+        return self._whole.device_path()
 
     def test_views(self) -> Source | None:
         """Return the test views of the whole source."""

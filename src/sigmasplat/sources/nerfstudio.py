@@ -47,7 +47,7 @@ def open_nerfstudio(folder: Path, settings: InputConfig) -> RecordedSource:
     images = [ImagePair(i / FRAMES_PER_SECOND, *_files(folder, frame)) for i, frame in enumerate(frames)]
     calibration = _calibration(path, fields, frames, images, settings)
     truth = build_trajectory((i.timestamp_s, read_pose(path, frame)) for i, frame in zip(images, frames, strict=True))
-    return RecordedSource(folder.resolve().name, images, calibration, settings, truth, skipped)
+    return RecordedSource(folder.resolve().name, images, calibration, settings, truth, skipped, estimated=True)
 
 
 def _files(folder: Path, frame: Fields) -> tuple[Path, Path]:

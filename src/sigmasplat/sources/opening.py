@@ -17,6 +17,7 @@ from sigmasplat.reading.guard import guarded
 from sigmasplat.sources.base import Source, Subset
 from sigmasplat.sources.files.color_only import without_depth
 from sigmasplat.sources.masked import Masked
+from sigmasplat.sources.posed import Posed
 
 PACKED = (".bag", ".mcap", ".db3", ".r3d")
 """Endings of files that may each be a whole sequence. A folder of such files is refused with their names."""
@@ -64,6 +65,7 @@ def open_source(path: str | Path, settings: InputConfig | None = None, **changes
     source = _with_predicted_depth(path, chosen) if chosen.predicted_depth else _recorded(path, chosen)
     with _guarded(path):
         source = Masked(source, Path(chosen.masks)) if chosen.masks else source
+        source = Posed(source, chosen.poses, chosen.poses_scale or 1.0) if chosen.poses else source
     part = chosen.stride > 1 or chosen.limit or chosen.start_s or chosen.end_s
     return Subset(source, chosen) if part and not source.live else source
 

@@ -137,7 +137,7 @@ def open_record3d(path: Path, settings: InputConfig) -> RecordedSource:
     calibration = _calibration(path, path / name, metadata, images, settings)
     skipped = [f"{path / colors[n]}: no depth image {n}" for n in sorted(colors.keys() - depths.keys())]
     truth = _truth(path / name, metadata, numbers, times_s)
-    return RecordedSource(path.resolve().stem, images, calibration, settings, truth, skipped)
+    return RecordedSource(path.resolve().stem, images, calibration, settings, truth, skipped, estimated=True)
 
 
 def _metadata(archive: Archive, name: str) -> dict[str, Any]:

@@ -70,10 +70,12 @@ class RecordedSource(Source):
         test: Source | None = None,
         gyroscope: Gyroscope | None = None,
         surface: Path | None = None,
+        estimated: bool = False,
     ) -> None:
         """Store image pairs in order of time; `truth` is the path of the colour camera; `skipped` lists files left out.
 
-        test: separate test views; gyroscope: in the axes of the colour camera; surface: file of the true surface.
+        test: separate test views; gyroscope: in the axes of the colour camera; surface: file of the true surface;
+        estimated: whether `truth` is an estimate of the recording device.
         Raises SourceError if the first images do not match the calibration, no image has a depth reading, or no image
         was taken while the gyroscope measured.
         """
@@ -85,7 +87,7 @@ class RecordedSource(Source):
         self.registrable, self.sensor = calibration.depth_camera is not None, calibration.sensor
         self.skipped = list(skipped)
         self._images, self._truth, self._test, self._gyroscope = images, truth, test, gyroscope
-        self._surface = surface
+        self._surface, self._estimated = surface, estimated
         self._refuse_sizes_of_first()
         self._refuse_other_clock()
         refuse_without_depth(self)
@@ -118,6 +120,14 @@ class RecordedSource(Source):
     def truth(self) -> Trajectory | None:
         """Return the whole recorded path with its own timestamps."""
         return self._truth
+
+    def image_name(self, i: int) -> str:
+        """Return the name of the file of colour image i."""
+        return self._images[self._checked_index(i)].color.name
+
+    def device_path(self) -> Trajectory | None:
+        """Return the recorded path if the device estimated it."""
+        return self._truth if self._estimated else None
 
     def test_views(self) -> Source | None:
         """Return the separate test views, None without them."""

@@ -92,7 +92,9 @@ def open_stray_scanner(folder: Path, settings: InputConfig) -> RecordedSource:
     calibration = _calibration(folder, rows, video.size, first_size([depths[n] for n in numbers]), settings)
     gyroscope = _gyroscope(folder / "imu.csv", np.array([rows[n]["timestamp"] for n in numbers]))
     truth = _truth(rows, numbers)
-    return RecordedSource(folder.resolve().name, images, calibration, settings, truth, skipped, gyroscope=gyroscope)
+    return RecordedSource(
+        folder.resolve().name, images, calibration, settings, truth, skipped, gyroscope=gyroscope, estimated=True
+    )
 
 
 def with_coarser_depth(calibration: Calibration, depth_size: Size) -> Calibration:

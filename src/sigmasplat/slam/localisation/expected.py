@@ -8,6 +8,7 @@ from sigmasplat.config import TrackingConfig
 from sigmasplat.fit.align import align
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.model import se3
+from sigmasplat.model.frame import PosePrior
 from sigmasplat.types import Matrix
 
 
@@ -17,7 +18,8 @@ class Expected:
 
     motion: T_previous_camera with constant velocity; turn: T_previous_camera without translation; predicted:
     T_world_camera, the first guess; last: T_world_camera, the last pose. If a gyroscope measured the rotation since the
-    last frame (`measured`), this rotation is part of all four.
+    last frame (`measured`), this rotation is part of all four. given: whether `predicted` is the pose itself, because
+    the motion since the last frame is given.
     """
 
     motion: Matrix
@@ -25,16 +27,20 @@ class Expected:
     predicted: Matrix
     last: Matrix
     measured: bool
+    given: bool = False
 
 
-def expect(
-    previous: Matrix, velocity: Matrix, R_before: Matrix | None, R_now: Matrix | None, motion_model: bool
-) -> Expected:
-    """Predict the pose by constant velocity; with a gyroscope, its rotation replaces that of the velocity.
+def expect(previous: Matrix, velocity: Matrix, before: PosePrior, now: PosePrior, motion_model: bool) -> Expected:
+    """Predict the pose by constant velocity; with a gyroscope, its rotation replaces that of the velocity; given poses
+    replace the whole motion.
 
-    previous, velocity [4, 4]: the last pose T_world_camera and motion; R_before, R_now: R_inertial_camera as in
-    `Frame`; motion_model: whether the first guess assumes the velocity.
+    previous, velocity [4, 4]: the last pose T_world_camera and motion; before, now: of the last frame and of this one;
+    motion_model: whether the first guess assumes the velocity.
     """
+    if before.T_given_camera is not None and now.T_given_camera is not None:
+        motion = se3.inverse(before.T_given_camera) @ now.T_given_camera
+        return Expected(motion, np.eye(4), previous @ motion, previous, measured=False, given=True)
+    R_before, R_now = before.R_inertial_camera, now.R_inertial_camera
     motion, turn, last, measured = velocity, np.eye(4), previous, False
     if R_before is not None and R_now is not None:
         motion, measured = motion.copy(), True

@@ -126,7 +126,7 @@ class CameraClock:
             with timer.stage("track"), timer.kernels_of(view, "track_kernels"):
                 splats = NOTHING if self.snapshot is None else self.snapshot
                 seen = fitted_to_map(self.tracker, splats, view, seen)
-                fit = self.tracker.track(splats, view, seen, seen.frame.R_inertial_camera, hurried)
+                fit = self.tracker.track(splats, view, seen, seen.frame.prior, hurried)
             found = Found.of(fit, se3.inverse(fit.T_camera_world), self.tracker.lost)
             self.recovery.count(self.tracker.lost, self.tracker.doubtful > 0, seen)
             held_back = is_held_back(number, self.config.input.hold_every)
@@ -143,7 +143,7 @@ class CameraClock:
     def _begin(self, seen: Observation, view: View) -> tuple[Found, Offer]:
         """Start at the first frame, whose camera is the world until the map says otherwise."""
         refuse_first_without_depth(seen.frame, self.config)
-        self.tracker.start(seen, seen.frame.R_inertial_camera)
+        self.tracker.start(seen, seen.frame.prior)
         seen = fitted_keyframe(self.tracker, NOTHING, view, seen, np.eye(4), connected=False)
         self._follow(0, seen, np.eye(4))
         self.offered, self.waits = 1, (0,)
