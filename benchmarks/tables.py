@@ -38,6 +38,7 @@ SUBJECTS = {
     "Depth noise": ("sensor_models",),
     "Stereo": ("stereo",),
     "RGB only": ("predicted",),
+    "Known poses": ("given_poses",),
     "Moving things": ("moving",),
     "Long runs": ("long_run", "endurance", "viewer_memory"),
     "Start-up": ("startup",),

@@ -7,7 +7,9 @@ from sigmasplat.errors import SigmaSplatError
 from sigmasplat.model import se3
 from sigmasplat.model.atlas import Atlas
 from sigmasplat.model.camera import Camera
+from sigmasplat.model.column import Column
 from sigmasplat.model.field import GaussianField
+from sigmasplat.model.places import Place, Places
 from sigmasplat.model.submap import MemoryStore, Picture, RefinedStore, StorePart, Submap
 
 CAMERA = Camera(4, 3, 4.0, 4.0, 1.5, 1.0)
@@ -188,3 +190,21 @@ def test_a_part_of_a_store_numbers_its_submaps_anew_and_cannot_grow() -> None:
     with pytest.raises(SigmaSplatError, match="part of a store"):
         part.save(piece(2), [picture()])
     assert len(store) == 4
+
+
+def test_places_of_thousands_of_frames_are_kept_as_they_were_appended() -> None:
+    places, rng = Places(), np.random.default_rng(0)
+    poses = rng.normal(size=(3000, 4, 4))
+    early = places.first(0)
+    for i, T in enumerate(poses):
+        places.append(Place(i // 12, i % 12, T))
+        early = places.first(5) if i == 4 else early
+    assert len(places) == 3000 and len(early) == 5
+    np.testing.assert_array_equal(places.T_keyframe_camera, poses)
+    assert places.submap.tolist() == [i // 12 for i in range(3000)] and places[-1].keyframe == 2999 % 12
+    taken = places[7]
+    taken.T_keyframe_camera[:] = 0.0
+    assert np.array_equal(places[7].T_keyframe_camera, poses[7]), "a place is a copy"
+    assert [place.submap for place in early] == [0] * 5 and [p.keyframe for p in places[10:14]] == [10, 11, 0, 1]
+    with pytest.raises(ValueError, match="cannot hold 4"):
+        Column(np.zeros(3), 4)

@@ -187,7 +187,7 @@ def test_a_first_frame_without_usable_depth_is_refused(depth_m: float) -> None:
     slam = Slam(settings())
     with pytest.raises(SourceError, match=r"frame 0 has no depth reading in \[0.1, 8.0\] m to start a map from"):
         slam.step(empty)
-    assert slam.steps == [] and len(slam.field) == 0
+    assert not slam.steps and len(slam.field) == 0
 
 
 @pytest.mark.parametrize("dark", [False, True], ids=["no depth", "nothing at all"])
@@ -238,13 +238,21 @@ def test_old_steps_keep_what_the_path_needs_and_newer_ones_everything() -> None:
         lost = index % 7 == 3
         values = {"agreement": 0.5 + index / count}
         state = "lost" if lost else "tracked"
-        slam.remember(
-            Step(index, index / 30, np.eye(4), False, lost, values, 9, 1, seconds={"total": 0.1}, state=state)
-        )
-    assert [(s.index, s.timestamp_s, s.lost, s.submap) for s in slam.steps] == [
-        (index, index / 30, index % 7 == 3, 1) for index in range(count)
-    ]
+        slam.steps.append(
+            Step(
+                index + 5, index / 30, (1.0 + index) * np.eye(4), index % 9 == 0, lost, values, 10**7 + index,
+                index // 40, seconds={"total": 0.1}, state=state, component=index // 900, p_off=index / count,
+            )
+        )  # fmt: skip
+    for index, step in enumerate(slam.steps):
+        assert (step.index, step.timestamp_s, step.is_keyframe) == (index + 5, index / 30, index % 9 == 0)
+        assert (step.lost, step.state) == (index % 7 == 3, "lost" if index % 7 == 3 else "tracked")
+        assert (step.splats, step.submap, step.component) == (10**7 + index, index // 40, index // 900)
+        assert step.p_off == index / count and np.array_equal(step.T_world_camera, (1.0 + index) * np.eye(4))
+    assert slam.steps[-1].index == count + 4 and [step.index for step in slam.steps[1:6:2]] == [6, 8, 10]
+    with pytest.raises(IndexError):
+        slam.steps[count]
     whole = [step.index for step in slam.steps if step.tracking and step.seconds]
-    assert whole == list(range(whole[0], count)) and 100 < len(whole) < 2000, (
+    assert whole == list(range(whole[0], count + 5)) and 100 < len(whole) < 2000, (
         "at least the newest hundred, not half of a long run"
     )

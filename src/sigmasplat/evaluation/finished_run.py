@@ -70,7 +70,7 @@ class FinishedRun:
         return FinishedRun(
             slam.config, slam.view.camera, slam.field, store, slam.atlas.anchors, slam.atlas.members(0),
             slam.atlas.refined, slam.atlas.exposures, slam.atlas.frame_exposures(), slam.trajectory(),
-            [place.submap for place in slam.atlas.places], slam.atlas.T_submap_camera, slam.believed(),
+            slam.atlas.places.submap.tolist(), slam.atlas.T_submap_camera, slam.believed(),
             [step.index for step in slam.steps], np.array([step.p_off for step in slam.steps]), counts,
             slam.uncertainty, PathCovariance.of(slam.checkpoint()), slam.keyframe_indices,
         )  # fmt: skip

@@ -69,7 +69,7 @@ FACTS: Mapping[str, Test] = {
     "sensor": is_kind(str, type(None)), "predicted_depth": is_kind(bool),
 }  # fmt: skip
 """Values of run.json that commands use."""
-STATE_FIELDS: Mapping[str, Test] = {"index": is_whole, "wall_s": is_number, "submaps": is_whole, "steps": is_kind(list)}
+STATE_FIELDS: Mapping[str, Test] = {"index": is_whole, "wall_s": is_number, "submaps": is_whole}
 """Values of a saved state beside those of `Slam`."""
 
 

@@ -1,5 +1,6 @@
 """All poses: of submaps in the world, of keyframes in submaps, of frames relative to keyframes."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -8,15 +9,8 @@ from numpy.typing import NDArray
 
 from sigmasplat.model import se3
 from sigmasplat.model.exposure import between
+from sigmasplat.model.places import Place, Places
 from sigmasplat.types import Matrix
-
-
-class Place(NamedTuple):
-    """The pose of a frame relative to a keyframe of a submap; both numbers count from 0."""
-
-    submap: int
-    keyframe: int
-    T_keyframe_camera: Matrix
 
 
 class Hop(NamedTuple):
@@ -54,7 +48,7 @@ class Atlas:
     odometry: list[Matrix] = field(default_factory=list)
     keyframe_poses: list[list[Matrix]] = field(default_factory=list)
     hops: list[list[Hop]] = field(default_factory=list)
-    places: list[Place] = field(default_factory=list)
+    places: Places = field(default_factory=Places)
     components: list[int] = field(default_factory=list)
     refined: dict[int, list[Matrix]] = field(default_factory=dict)
     exposures: dict[int, Matrix] = field(default_factory=dict)
@@ -102,7 +96,7 @@ class Atlas:
     @property
     def in_world(self) -> NDArray[np.bool_]:
         """Return which frames are in a submap that is connected to the world, bool [F]."""
-        return np.array([self.components[place.submap] == 0 for place in self.places], bool)
+        return np.asarray(np.array(self.components, np.int64)[self.places.submap] == 0)
 
     def place_frame(self, T_submap_camera: Matrix) -> None:
         """Append a frame, relative to the newest keyframe of the last submap."""
@@ -116,20 +110,26 @@ class Atlas:
     def T_world_camera(self, loops: bool = True) -> Matrix:
         """Return the poses of all frames [F, 4, 4]; without `loops` those of tracking alone."""
         anchors, refined = (self.anchors, self.refined) if loops else (self.odometry, dict[int, list[Matrix]]())
-        keyframes = [refined.get(s, poses) for s, poses in enumerate(self.keyframe_poses)]
-        poses = [anchors[s] @ keyframes[s][k] @ T_keyframe_camera for s, k, T_keyframe_camera in self.places]
-        return np.array(poses).reshape(-1, 4, 4)
+        return self._frames([[anchors[s] @ T for T in refined.get(s, p)] for s, p in enumerate(self.keyframe_poses)])
 
     @property
     def T_submap_camera(self) -> Matrix:
         """Return the poses of all frames in their submaps [F, 4, 4], to which the splats of the submaps were fitted."""
-        return np.array([self.keyframe_poses[s][k] @ T for s, k, T in self.places]).reshape(-1, 4, 4)
+        return self._frames(self.keyframe_poses)
+
+    def _frames(self, keyframe_poses: Sequence[Sequence[Matrix]]) -> Matrix:
+        """Return the poses of all frames [F, 4, 4], given those [4, 4] of the keyframes of each submap."""
+        first = np.cumsum([0, *map(len, keyframe_poses)])
+        poses = np.array([T for of_submap in keyframe_poses for T in of_submap]).reshape(-1, 4, 4)
+        places = self.places.first(len(self.places))  # another thread may append some
+        return np.asarray(poses[first[places.submap] + places.keyframe] @ places.T_keyframe_camera)
 
     def frame_exposures(self) -> Matrix:
         """Return the exposures of all frames [F, 3, 2] relative to the final map, interpolated between keyframes."""
         first = dict[tuple[int, int], int]()
-        for row, (s, k, _) in enumerate(self.places):
-            first.setdefault((s, k), row)
+        places = zip(self.places.submap.tolist(), self.places.keyframe.tolist(), strict=True)
+        for row, place in enumerate(places):
+            first.setdefault(place, row)
         known = [(row, self.exposures[s][k]) for (s, k), row in first.items() if s in self.exposures]
         rows = np.array([row for row, _ in known], np.int64)
         exposures = np.array([exposure for _, exposure in known]).reshape(-1, 3, 2)

@@ -122,8 +122,8 @@ def resume(run: RunFolder, source: Source) -> StartPoint:
     with guarded(run.state, "run it again", RunError, "the state is damaged"):
         tree = read_state(run.state, CLASSES, fixed(slam))
         check_fields(tree, STATE_FIELDS, tuple(STATE_FIELDS), run.state)
-        _truncate(run, frames=len(tree["steps"]), submaps=tree["submaps"])
         restore(slam, tree)
+        _truncate(run, frames=len(slam.steps), submaps=tree["submaps"])
     return StartPoint(slam, tree["index"] + 1, tree["wall_s"])
 
 

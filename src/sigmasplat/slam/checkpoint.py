@@ -39,7 +39,7 @@ def path_errors(atlas: Atlas, keyframes: Sequence[int], edges: Sequence[Edge]) -
         "keyframes": torch.tensor(keyframes, dtype=torch.int64),
         "T_world_submap": torch.from_numpy(np.array(atlas.anchors).reshape(-1, 4, 4)),
         "submap_component": torch.tensor(atlas.components, dtype=torch.int64),
-        "frame_submap": torch.tensor([place.submap for place in atlas.places], dtype=torch.int64),
+        "frame_submap": torch.tensor(atlas.places.submap),
         **({"exposure": torch.from_numpy(atlas.frame_exposures())} if atlas.exposures else {}),
         **recorded(atlas, edges),
     }

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sigmasplat.model.atlas import Atlas
 from sigmasplat.slam.loop_closure.closer import Loop
 from sigmasplat.slam.step_result import Step
+from sigmasplat.slam.steps import Steps
 from sigmasplat.types import Matrix
 
 Arguments = ParamSpec("Arguments")
@@ -37,7 +38,7 @@ class Observed(Protocol):
     """What listeners read of a SLAM system."""
 
     atlas: Atlas
-    steps: list[Step]
+    steps: Steps
     listeners: "Listeners"
 
     @property
@@ -143,7 +144,7 @@ def correction_since(slam: Observed, before: Before) -> Correction | None:
     refined = new.refined.keys() != old.refined.keys()
     if not refined and all(np.array_equal(*pair) for pair in zip(old.anchors, new.anchors, strict=False)):
         return None
-    earlier = new.places[: before.steps]
+    earlier = new.places.first(before.steps)
     T_before, T_now = (replace(atlas, places=earlier).T_world_camera() for atlas in (old, new))
     frames = np.flatnonzero((T_before != T_now).any((1, 2)))
     if not len(frames):

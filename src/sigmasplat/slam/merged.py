@@ -27,7 +27,7 @@ def components_apart(
     store: SubmapStore, atlas: Atlas, active: GaussianField, trajectory: Trajectory, found: NDArray[np.bool_]
 ) -> list[Component]:
     """Return the components that are not connected to the world; trajectory: of all frames, found [F]: not lost."""
-    component_of = np.array([atlas.components[place.submap] for place in atlas.places], np.int64)
+    component_of = np.array(atlas.components, np.int64)[atlas.places.submap]
     return [
         Component(n, merged_field(store, atlas, n, active), trajectory.at(found & (component_of == n)))
         for n in sorted(set(atlas.components) - {0})

@@ -26,6 +26,7 @@ from torch import Tensor
 
 from sigmasplat.model import se3
 from sigmasplat.model.atlas import Atlas
+from sigmasplat.model.places import Places
 from sigmasplat.model.selection import evenly_spread
 from sigmasplat.slam.drift import UNKNOWN
 from sigmasplat.slam.loop_closure.pose_graph import Edge, Sensitivity
@@ -44,8 +45,8 @@ def recorded(atlas: Atlas, edges: Sequence[Edge]) -> dict[str, Tensor]:
     submaps = [s for s, poses in enumerate(atlas.keyframe_poses) for _ in poses]
     hops = [hop for of_submap in atlas.hops for hop in of_submap]
     arrays = {
-        "frame_keyframe": np.array([place.keyframe for place in atlas.places], np.int64),
-        "T_keyframe_camera": np.array([place.T_keyframe_camera for place in atlas.places]).reshape(-1, 4, 4),
+        "frame_keyframe": atlas.places.keyframe,
+        "T_keyframe_camera": atlas.places.T_keyframe_camera,
         "keyframe_submap": np.array(submaps, np.int64),
         "T_submap_keyframe": np.array([T for poses in atlas.keyframe_poses for T in poses]).reshape(-1, 4, 4),
         "hop_T_camera_before": np.array([hop.T_camera_before for hop in hops]).reshape(-1, 4, 4),
@@ -107,7 +108,7 @@ class PathCovariance:
     def of_keyframes(atlas: Atlas, edges: Sequence[Edge], factors: Factors | None = None) -> "PathCovariance":
         """Return the errors of the keyframes alone, without other frames; factors: known ones, so that they need not be
         computed."""
-        read = {name: tensor.numpy() for name, tensor in recorded(replace(atlas, places=[]), edges).items()}
+        read = {name: tensor.numpy() for name, tensor in recorded(replace(atlas, places=Places()), edges).items()}
         none, anchors, components = np.empty(0, np.int64), np.array(atlas.anchors), np.array(atlas.components, np.int64)
         return PathCovariance(
             anchors, components, none, none, read["T_keyframe_camera"], none.astype(bool),

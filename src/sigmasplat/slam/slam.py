@@ -61,7 +61,7 @@ class Slam(MapWork, ArrayInterface):
             self._offer_probe(seen, found)
             completed(self.refining(self.config.mapping.iterations))
         self.atlas.place_frame(found.T_submap_camera)
-        self.remember(self._step_result(seen.frame, found))
+        self.steps.append(self._step_result(seen.frame, found))
         return self.steps[-1]
 
     @notifying

@@ -7,11 +7,13 @@ from sigmasplat.fit.adam import VectorAdam
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference
 from sigmasplat.fit.target import Keyframe, Target
-from sigmasplat.model.atlas import Atlas, Hop, Place
+from sigmasplat.model.atlas import Atlas, Hop
 from sigmasplat.model.camera import Camera
+from sigmasplat.model.column import Column
 from sigmasplat.model.field import GaussianField, Rows
 from sigmasplat.model.frame import Detail, PosePrior
 from sigmasplat.model.photo import Photo
+from sigmasplat.model.places import Places
 from sigmasplat.model.submap import Picture
 from sigmasplat.slam.drift import Drift
 from sigmasplat.slam.localisation.confidence import Confidence
@@ -31,13 +33,14 @@ from sigmasplat.slam.mapper import Mapper
 from sigmasplat.slam.probes import Probe, Probes
 from sigmasplat.slam.slam import Slam
 from sigmasplat.slam.step_result import Step
+from sigmasplat.slam.steps import Steps
 from sigmasplat.slam.tracker import Tracker
 
 CLASSES: tuple[type, ...] = (
-    Atlas, Camera, Confidence, DepthFit, DepthShape, Detail, Drift, Edge, FeatureImage, Foreground, GaussianField, Hop,
-    Keyframe, Link, Loop, LoopCloser, Mapper, Memory, Photo, Picture, Place, PosePrior, Probe, Probes, Pyramid,
-    Recovery, Reference, Relocaliser, Rows, Seen, SeenKeyframe, Step, SubmapDescriptor, Target, Tracker, Usual,
-    VectorAdam, Watch,
+    Atlas, Camera, Column, Confidence, DepthFit, DepthShape, Detail, Drift, Edge, FeatureImage, Foreground,
+    GaussianField, Hop, Keyframe, Link, Loop, LoopCloser, Mapper, Memory, Photo, Picture, Places, PosePrior, Probe,
+    Probes, Pyramid, Recovery, Reference, Relocaliser, Rows, Seen, SeenKeyframe, Step, Steps, SubmapDescriptor,
+    Target, Tracker, Usual, VectorAdam, Watch,
 )  # fmt: skip
 """The classes that a state may contain."""
 

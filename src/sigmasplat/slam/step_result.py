@@ -3,7 +3,7 @@
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,11 +43,6 @@ class Step:
     component: int = 0
     p_off: float = 0.0
     covariance: NDArray[np.float64] | None = None
-
-    def outline(self) -> "Step":
-        """Return the step without the values of tracking, loops, seconds and covariance: they take most of its memory,
-        and nothing reads them later."""
-        return replace(self, tracking={}, loops=(), seconds={}, covariance=None)
 
 
 def metrics_of(fit: PoseFit) -> dict[str, float]:

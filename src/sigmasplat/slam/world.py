@@ -35,12 +35,11 @@ from sigmasplat.slam.newest_covariance import NewestCovariance, PoseErrors
 from sigmasplat.slam.probes import Probes
 from sigmasplat.slam.refinement import SavedRefinement
 from sigmasplat.slam.step_result import Step, StepTimer
+from sigmasplat.slam.steps import Steps
 from sigmasplat.slam.tracker import Tracker
 from sigmasplat.types import Matrix
 
 HOST = torch.device("cpu")
-WHOLE_STEPS = 1000
-"""Number of newest steps that are kept whole."""
 
 
 class World:
@@ -76,7 +75,7 @@ class World:
         self.recovery = Recovery(self.config.recovery)
         self.confidence = Confidence()
         self.relocaliser = Relocaliser(self.config, self.extractor)
-        self.steps: list[Step] = []
+        self.steps = Steps()
         self.keyframe_indices: list[int] = []
         self._view: View | None = None
         self._resample = False
@@ -103,8 +102,7 @@ class World:
 
     def components(self) -> list[Component]:
         """Return the components of the atlas that are not connected to the world."""
-        found = np.array([not step.lost for step in self.steps], np.bool_)
-        return components_apart(self.store, self.atlas, self.mapper.field, self.trajectory(), found)
+        return components_apart(self.store, self.atlas, self.mapper.field, self.trajectory(), ~self.steps.lost)
 
     @property
     def loops(self) -> list[Loop]:
@@ -117,17 +115,11 @@ class World:
         A frame is stored relative to the newest keyframe at its time, and a keyframe relative to its submap. A frame
         therefore moves when mapping moves its keyframe, or a loop moves its submap.
         """
-        return Trajectory(np.array([s.timestamp_s for s in self.steps]), self.atlas.T_world_camera())
+        return Trajectory(self.steps.timestamps_s, self.atlas.T_world_camera())
 
     def believed(self) -> NDArray[np.bool_]:
         """Return whether the pose of each frame so far is believed [F]: not lost, and connected to the world."""
-        return self.atlas.in_world & np.array([not step.lost for step in self.steps], np.bool_)
-
-    def remember(self, step: Step) -> None:
-        """Append a step to `steps`. Only the newest `WHOLE_STEPS` are kept whole; earlier ones keep their outline."""
-        self.steps.append(step)
-        if len(self.steps) > WHOLE_STEPS:
-            self.steps[-WHOLE_STEPS - 1] = self.steps[-WHOLE_STEPS - 1].outline()
+        return self.atlas.in_world & ~self.steps.lost
 
     def newest_step(self) -> Step | None:
         """Return the result of the newest frame; None before the first one."""

@@ -40,7 +40,7 @@ GROWTH = 1.25
 """The whole pose graph is solved when it has grown by this factor."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, slots=True)
 class Loop:
     """A pair of submaps that was tried as a loop, and the result.
 

@@ -29,7 +29,7 @@ STEPS_PER_MU = 10
 so much that thirteen true loops were rejected too (half a metre of drift, 36 submaps)."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, slots=True)
 class Edge:
     """A measurement T_a_b between nodes a and b, and the information [6, 6] (inverse covariance, 1/m² and 1/rad²) of
     its left twist ξ = (ρ, φ): the true motion is exp(ξ) T_a_b. Odometry is trusted, a loop is judged."""

@@ -90,7 +90,7 @@ class MapClock:
         system, number = self.system, self._newest
         T_keyframe_camera = se3.inverse(each.poses[number]) @ each.T_submap_camera
         system.atlas.place_by_keyframe(T_keyframe_camera)
-        system.remember(each.step)
+        system.steps.append(each.step)
         if each.probe is not None:
             last = len(system.mapper.keyframes) - 1
             system.probes.offer(each.number, last, each.number - number, T_keyframe_camera, each.probe)
@@ -137,7 +137,7 @@ class MapClock:
     def _done(self, each: TrackedFrame) -> None:
         """Place a keyframe, which is the newest one."""
         self.system.atlas.place_frame(self.system.atlas.keyframe_poses[-1][-1])
-        self.system.remember(each.step)
+        self.system.steps.append(each.step)
 
     def _add_drift(self, number: int, T_submap_camera: Matrix, hop: Hop) -> None:
         system = self.system

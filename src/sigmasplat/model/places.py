@@ -1,0 +1,65 @@
+"""Where each frame is: the submap, the keyframe, and the pose relative to it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple, overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sigmasplat.model.column import Column
+from sigmasplat.types import Matrix
+
+NUMBERS = 2
+"""Columns before the pose: submap and keyframe, which are exact as floating-point numbers."""
+
+
+class Place(NamedTuple):
+    """The pose of a frame relative to a keyframe of a submap; both numbers count from 0."""
+
+    submap: int
+    keyframe: int
+    T_keyframe_camera: Matrix
+
+
+@dataclass(eq=False)
+class Places(Sequence[Place]):
+    """The places of all frames. rows [F, 18]: submap, keyframe, and T_keyframe_camera [4, 4] by rows."""
+
+    rows: Column = field(default_factory=lambda: Column.of(np.float64, NUMBERS + 16))
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    @overload
+    def __getitem__(self, i: int) -> Place: ...
+    @overload
+    def __getitem__(self, i: slice) -> list[Place]: ...
+    def __getitem__(self, i: int | slice) -> Place | list[Place]:
+        if isinstance(i, slice):
+            return [self[k] for k in range(len(self))[i]]
+        row = self.rows.used[i]
+        return Place(int(row[0]), int(row[1]), row[NUMBERS:].reshape(4, 4).copy())
+
+    @property
+    def submap(self) -> NDArray[np.int64]:
+        """Return the submap of each frame [F]."""
+        return self.rows.used[:, 0].astype(np.int64)
+
+    @property
+    def keyframe(self) -> NDArray[np.int64]:
+        """Return the keyframe of each frame in its submap [F]."""
+        return self.rows.used[:, 1].astype(np.int64)
+
+    @property
+    def T_keyframe_camera(self) -> Matrix:
+        """Return the pose of each frame relative to its keyframe [F, 4, 4]."""
+        return self.rows.used[:, NUMBERS:].reshape(-1, 4, 4).copy()
+
+    def append(self, place: Place) -> None:
+        """Append the place of the next frame."""
+        self.rows.append([place.submap, place.keyframe, *place.T_keyframe_camera.ravel()])
+
+    def first(self, count: int) -> "Places":
+        """Return the places of the first frames, in the same memory."""
+        return Places(self.rows.first(count))
