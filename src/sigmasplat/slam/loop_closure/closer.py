@@ -38,6 +38,10 @@ world stay valid: a loop that disagrees moves the submaps of the new session."""
 
 GROWTH = 1.25
 """The whole pose graph is solved when it has grown by this factor."""
+WIDER = 3
+"""Factor from one part of the pose graph to the next larger one, while a new loop disagrees."""
+SAME_CHI2 = 0.9
+"""A larger part of the pose graph does not help a rejected loop if its χ² stays above this share."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -180,9 +184,8 @@ class LoopCloser:
         for pair in pairs:
             yield
             tried.append((yield from self._try(pair, submap, atlas, view)))
-        if new := [edge for edge in self.edges[known:] if edge.loop]:
-            component = atlas.components[submap.index]
-            self._correct(atlas, component, None if self._is_due(atlas, component, new) else submap.index)
+        if any(edge.loop for edge in self.edges[known:]):
+            self._correct_at(atlas, submap.index, known)
         return self.loops[len(self.loops) - len(tried) :]
 
     def _pairs(self, query: SubmapDescriptor, atlas: Atlas) -> list[SubmapPair]:
@@ -233,37 +236,57 @@ class LoopCloser:
             if len(atlas.members(component)) > MOST_FREE:
                 self._correct(atlas, component)
 
-    def _is_due(self, atlas: Atlas, component: int, new: Sequence[Edge]) -> bool:
-        """Return whether the whole graph is to be solved: new loops disagree with the poses, or it has grown enough.
+    def _correct_at(self, atlas: Atlas, submap: int, first: int) -> None:
+        """Solve the pose graph as far as the new edges of a submap, from row `first` on, require it.
 
-        Its solution takes time in proportion to its size. The size grows by a factor in between, so that on average the
-        time per submap stays the same.
+        The solution of the whole graph takes time in proportion to its size, or more. The size grows by a factor in
+        between, so that on average the time per submap grows little. In between, loops that agree with the poses move
+        only the submaps near them. If one disagrees, larger parts are solved until all agree, or until a larger part
+        no longer changes their χ².
         """
+        component = atlas.components[submap]
         if len(atlas.members(component)) > GROWTH * self.solved:
-            return True
-        nodes = sorted({end for edge in new for end in (edge.a, edge.b)})
-        poses = np.stack([atlas.anchors[node] for node in nodes])
-        chi2 = PoseGraph(len(nodes), numbered(new, nodes)).chi2(poses)
-        return bool((chi2 > most_chi2()).any())
+            self._correct(atlas, component)
+            return
+        new = [row for row in range(first, len(self.edges)) if self.edges[row].loop]
+        wrong, size = self._wrong(atlas, new), MOST_FREE
+        size = WIDER * size if wrong else size
+        while True:
+            whole = self._correct(atlas, component, submap, size)
+            before, wrong = wrong, self._wrong(atlas, new)
+            if not wrong or whole or (size > WIDER * MOST_FREE and wrong > SAME_CHI2 * before):
+                return
+            size *= WIDER
 
-    def _correct(self, atlas: Atlas, component: int, centre: int | None = None) -> None:
-        """Solve the pose graph of a component, move its anchors, and update the verdict on its registered loops.
+    def _wrong(self, atlas: Atlas, rows: Sequence[int]) -> float:
+        """Return the sum of χ² of those edges that disagree with the poses; 0 if all agree."""
+        edges = [self.edges[row] for row in rows]
+        nodes = sorted({end for edge in edges for end in (edge.a, edge.b)})
+        chi2 = PoseGraph(len(nodes), numbered(edges, nodes)).chi2(np.stack([atlas.anchors[node] for node in nodes]))
+        return float(chi2[chi2 > most_chi2()].sum())
 
-        centre: a submap; only submaps near it in the graph are moved. Without it the whole graph is solved.
+    def _correct(self, atlas: Atlas, component: int, centre: int | None = None, most_free: int = MOST_FREE) -> bool:
+        """Solve the pose graph of a component, move its anchors, and update the verdict on its registered loops; return
+        whether the whole graph was solved.
+
+        centre: a submap; only the `most_free` submaps nearest to it in the graph are moved. Without it, or if there are
+        not more, the whole graph is solved.
         """
         members = atlas.members(component)
-        if centre is None or len(members) <= MOST_FREE:
+        whole = centre is None or len(members) <= most_free
+        if centre is None or whole:
             part = Neighbourhood.whole(members, self.edges)
         else:
-            part = Neighbourhood.around(centre, self.graph, members[0])
+            part = Neighbourhood.around(centre, self.graph, members[0], most_free)
         solution = part.solve(atlas.anchors, self.edges)
         for submap, T_world_submap in zip(part.nodes, solution.T_world_node, strict=True):
             atlas.anchors[submap] = T_world_submap
         tested = [row for row in (self.loop_rows[edge] for edge in part.edges) if row >= 0]
         for row, verdict in zip(tested, solution.verdicts, strict=True):
             self.loops[row] = judged(self.loops[row], verdict)
-        if centre is None:
+        if whole:
             self.solved = max(self.solved, len(members))
+        return whole
 
 
 def described(best: Candidate, a: Submap, b: Submap, found: Registration, known: Matrix) -> Loop:
