@@ -16,6 +16,7 @@ from sigmasplat.fit.references import Reference, keyframe_reference, live_image,
 from sigmasplat.io.state import read_state, write_state
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
+from sigmasplat.model.frame import PosePrior
 from sigmasplat.presets import default_preset, preset
 from sigmasplat.render.cpu.view import CpuView
 from sigmasplat.render.cuda.view import CudaView
@@ -147,7 +148,7 @@ def test_what_a_tracker_remembers_is_kept_and_read_back(tmp_path: Path) -> None:
     kept = reference("keyframe", view, CONFIGS["V"])
     tracker, classes = (
         Tracker(CONFIGS["V"], keyframe=kept),
-        (Tracker, Reference, Pyramid, Camera, Usual, watch.Watch, memory.Memory, DepthFit, DepthShape),
+        (Tracker, PosePrior, Reference, Pyramid, Camera, Usual, watch.Watch, memory.Memory, DepthFit, DepthShape),
     )
     tracker.start(Sight(seen_from(view, TRUTH), kept.pyramid))
     fixed = {"tracking": CONFIGS["V"], "moving": tracker.watch.config}

@@ -10,9 +10,10 @@ from sigmasplat.fit.exposure import fit_exposure
 from sigmasplat.fit.target import Target
 from sigmasplat.metrics.image import psnr
 from sigmasplat.metrics.views import scored_view
-from sigmasplat.model.atlas import Atlas, Place
+from sigmasplat.model.atlas import Atlas
 from sigmasplat.model.exposure import NEUTRAL, between, centred, exposed, unexposed
 from sigmasplat.model.frame import Frame
+from sigmasplat.model.places import Place, Places
 from sigmasplat.model.submap import MemoryStore, Picture, RefinedStore, Submap
 from sigmasplat.render import render
 from sigmasplat.render.reference.view import ReferenceView
@@ -135,7 +136,8 @@ def test_the_final_maps_store_has_images_in_its_exposure() -> None:
 
 def test_frames_get_the_exposure_between_their_keyframes() -> None:
     """Keyframes are the rows 0, 3 and 5; the submap of row 5 is not in the final map."""
-    atlas = Atlas(places=[Place(s, k, np.eye(4)) for s, k in ((0, 0), (0, 0), (0, 0), (0, 1), (0, 1), (1, 0))])
+    known = ((0, 0), (0, 0), (0, 0), (0, 1), (0, 1), (1, 0))
+    atlas = Atlas(places=Places.of(Place(s, k, np.eye(4)) for s, k in known))
     atlas.exposures = {0: EXPOSURES[:2]}
     found = atlas.frame_exposures()
     np.testing.assert_allclose(found[[0, 3, 4, 5]], EXPOSURES[[0, 1, 1, 1]])

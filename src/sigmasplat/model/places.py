@@ -1,6 +1,6 @@
 """Where each frame is: the submap, the keyframe, and the pose relative to it."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple, overload
 
@@ -27,6 +27,14 @@ class Places(Sequence[Place]):
     """The places of all frames. rows [F, 18]: submap, keyframe, and T_keyframe_camera [4, 4] by rows."""
 
     rows: Column = field(default_factory=lambda: Column.of(np.float64, NUMBERS + 16))
+
+    @staticmethod
+    def of(known: Iterable[Place]) -> "Places":
+        """Return places in their order."""
+        places = Places()
+        for place in known:
+            places.append(place)
+        return places
 
     def __len__(self) -> int:
         return len(self.rows)

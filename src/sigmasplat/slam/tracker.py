@@ -70,11 +70,13 @@ class Tracker:
         if c.uncertainty and c.variance == "predicted" and c.method == "adam":
             raise ConfigError("tracking.variance=predicted needs tracking.method=align; set it, or variance=published")
 
-    def start(self, seen: Sight, prior: PosePrior) -> None:
+    def start(self, seen: Sight, prior: PosePrior = NO_PRIOR) -> None:
         """Fix the gauge: the first camera is the world."""
         self.last_image, self.last_features, self.prior = seen.live, seen.image, prior
 
-    def track(self, field: Splats, view: View, seen: Sight, prior: PosePrior, hurried: Asked = never) -> PoseFit:
+    def track(
+        self, field: Splats, view: View, seen: Sight, prior: PosePrior = NO_PRIOR, hurried: Asked = never
+    ) -> PoseFit:
         """Estimate T_camera_world of a frame; `self.lost` then says whether tracking failed. A given pose is taken as
         it is, and judged by the images.
 
