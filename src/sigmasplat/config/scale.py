@@ -68,14 +68,10 @@ def scaled(config: Config, factor: float, given: Collection[str] = ()) -> Config
     if factor == 1.0:
         return config
     sections = {
-        section: {
-            name: getattr(getattr(config, section), name) * factor**power
-            for name, power in powers.items()
-            if f"{section}.{name}" not in given
-        }
+        section: {name: getattr(getattr(config, section), name) * factor**power for name, power in powers.items()}
         for section, powers in POWERS.items()
     }
-    return config.changed(**sections)
+    return config.changed(**_not_given(sections, given))
 
 
 def _not_given(changes: Mapping[str, Mapping[str, object]], given: Collection[str]) -> dict[str, dict[str, Any]]:

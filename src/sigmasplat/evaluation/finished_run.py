@@ -64,14 +64,14 @@ class FinishedRun:
             store = MemoryStore()
             store.save(*slam.mapper.finished(0))
         counts = {
-            "frames": len(slam.steps), "lost": sum(step.lost for step in slam.steps),
+            "frames": len(slam.steps), "lost": int(slam.steps.lost.sum()),
             "keyframes": len(slam.keyframe_indices), "submaps": len(store), "splats": len(slam.field),
         }  # fmt: skip
         return FinishedRun(
             slam.config, slam.view.camera, slam.field, store, slam.atlas.anchors, slam.atlas.members(0),
             slam.atlas.refined, slam.atlas.exposures, slam.atlas.frame_exposures(), slam.trajectory(),
             slam.atlas.places.submap.tolist(), slam.atlas.T_submap_camera, slam.believed(),
-            [step.index for step in slam.steps], np.array([step.p_off for step in slam.steps]), counts,
+            slam.steps.source_index.tolist(), slam.steps.p_off, counts,
             slam.uncertainty, PathCovariance.of(slam.checkpoint()), slam.keyframe_indices,
         )  # fmt: skip
 

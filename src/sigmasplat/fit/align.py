@@ -158,8 +158,7 @@ def align(
     `update_stop` (m, rad), or when the relative change of the cost is below `plateau_stop` (0 = off). If the finest
     level meets neither condition, its best iterate is returned. Undetermined directions keep the guess. weight_color in
     [0, 1] balances gray against depth, each in units of its Huber width. With 0 iterations the guess stays, and is
-    judged. Raises BackendError without the compiled
-    kernels, or if only one image is on a device.
+    judged. Raises BackendError without the compiled kernels, or if only one image is on a device.
     """
     if reference.kernels is not live.kernels:
         raise BackendError("the two images to align are on different devices; make both for the same view")

@@ -25,12 +25,11 @@ TOLERANCE = 0.1
 
 @dataclass(frozen=True)
 class PoseScale:
-    """factor: from the unit of given poses to metres, the median of `motions` measured motions; spread: median relative
+    """factor: from the unit of given poses to metres, the median of some measured motions; spread: median relative
     difference of these from it."""
 
     factor: float
     spread: float
-    motions: int
 
 
 def with_measured_scale(source: Source, config: Config) -> Config:
@@ -64,19 +63,21 @@ def measured_scale(source: Source, config: Config) -> PoseScale | None:
     if len(ratios) < FEWEST:
         return None
     factor = float(np.median(ratios))
-    return PoseScale(factor, float(np.median(np.abs(np.array(ratios) / factor - 1.0))), len(ratios))
+    return PoseScale(factor, float(np.median(np.abs(np.array(ratios) / factor - 1.0))))
 
 
 def _ratio_at(first: int, source: Source, config: Config, extractor: Extractor) -> float | None:
     """Return the length in metres of the longest motion from a frame that can be measured, divided by its given length;
     None if there is none."""
     begin, room = _seen(source, first, config), source.scene_scale
+    if begin is None:
+        return None
     for step in STEPS:
-        later = _seen(source, first + step, config) if begin is not None and first + step < len(source) else None
-        T_later_begin = None if begin is None or later is None else motion_by_features(begin[0], later[0], extractor)
-        if begin is None or later is None or T_later_begin is None:
+        later = _seen(source, first + step, config) if first + step < len(source) else None
+        T_later_begin = None if later is None else motion_by_features(begin[0], later[0], extractor)
+        if later is None or T_later_begin is None:
             continue
-        length_m = float(np.linalg.norm(se3.inverse(T_later_begin)[:3, 3]))
+        length_m = float(np.linalg.norm(T_later_begin[:3, 3]))
         given = float(np.linalg.norm((se3.inverse(begin[1]) @ later[1])[:3, 3]))
         if LEAST_M * room < length_m < MOST_M * room and given > 0:
             return length_m / given

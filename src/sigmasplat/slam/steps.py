@@ -62,6 +62,26 @@ class Steps(Sequence[Step]):
         """Return whether each frame was lost [F]."""
         return np.asarray(self.rows.used[:, 3] != 0)
 
+    @property
+    def source_index(self) -> NDArray[np.int64]:
+        """Return the index of each frame in its source [F]."""
+        return self.rows.used[:, 0].astype(np.int64)
+
+    @property
+    def submap(self) -> NDArray[np.int64]:
+        """Return the submap of each frame [F]."""
+        return self.rows.used[:, 5].astype(np.int64)
+
+    @property
+    def states(self) -> list[str]:
+        """Return the state of each frame."""
+        return [STATES[number] for number in self.rows.used[:, 6].astype(np.int64).tolist()]
+
+    @property
+    def p_off(self) -> NDArray[np.float64]:
+        """Return the probability that each pose is off [F]."""
+        return self.rows.used[:, 8].copy()
+
     def _step(self, i: int) -> Step:
         if (step := self.whole.get(i)) is not None:
             return step

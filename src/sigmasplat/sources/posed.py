@@ -12,7 +12,7 @@ from sigmasplat.model.frame import Frame
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.sources.base import Source, Subset
 from sigmasplat.sources.files.association import MAX_GAP_S, associate
-from sigmasplat.sources.files.given_poses import ByName, ByNumber, GivenPoses, read_given_poses
+from sigmasplat.sources.files.given_poses import ByName, ByNumber, read_given_poses
 from sigmasplat.types import Matrix
 
 
@@ -20,8 +20,8 @@ class Posed(Subset):
     """Another source with a pose for each frame; frames without one are left out.
 
     given: the path of the poses, or "recorded" for those that the device estimated itself; scale: factor from their
-    unit to metres. Raises SourceError if the
-    poses do not fit the frames, the source is a live camera, or its depth is predicted, which has no scale.
+    unit to metres. Raises SourceError if the poses do not fit the frames, the source is a live camera, or its depth is
+    predicted, which has no scale.
     """
 
     def __init__(self, whole: Source, given: str, scale: float = 1.0) -> None:
@@ -51,23 +51,22 @@ def _scaled(T: Matrix, scale: float) -> Matrix:
 
 def _poses_of(whole: Source, given: str) -> list[Matrix | None]:
     """Return T_world_camera [4, 4] of each frame, None without one. Raises SourceError if no frame has one."""
-    if given == RECORDED_POSES:
-        path = whole.device_path()
-        if path is None:
-            raise SourceError(
-                f"{whole.name}: the recording has no poses that its device estimated; give a file of poses, or leave "
-                "out input.poses: then poses are estimated"
-            )
-        return _by_time(whole, given, path)
-    return _matched(whole, given, read_given_poses(Path(given)))
-
-
-def _matched(whole: Source, given: str, poses: GivenPoses) -> list[Matrix | None]:
+    poses = _recorded(whole) if given == RECORDED_POSES else read_given_poses(Path(given))
     if isinstance(poses, Trajectory):
         return _by_time(whole, given, poses)
     if isinstance(poses, ByNumber):
         return _by_number(whole, given, poses.poses)
     return _by_name(whole, given, poses)
+
+
+def _recorded(whole: Source) -> Trajectory:
+    path = whole.device_path()
+    if path is None:
+        raise SourceError(
+            f"{whole.name}: the recording has no poses that its device estimated; give a file of poses, or leave "
+            "out input.poses: then poses are estimated"
+        )
+    return path
 
 
 def _by_time(whole: Source, given: str, path: Trajectory) -> list[Matrix | None]:

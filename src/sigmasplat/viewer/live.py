@@ -3,8 +3,6 @@
 import time
 from collections.abc import Callable, Sequence
 
-import numpy as np
-
 from sigmasplat.drawing.colormap import Rgb
 from sigmasplat.model.component import LOST, outside_world, states_at_end, submaps_outside
 from sigmasplat.run.protocols import LoopResult, StepResult
@@ -54,9 +52,9 @@ class LiveView:
     def snapshot(self, finished: bool = False) -> Snapshot:
         """Copy the current state of the system; include the final map if it is finished."""
         slam = self.slam
-        lost = np.array([step.lost for step in slam.steps], np.bool_)
-        submaps = np.array([step.submap for step in slam.steps], np.int64)
-        states = states_at_end([LOST if step.lost else step.state for step in slam.steps], slam.believed())
+        lost, submaps = slam.steps.lost, slam.steps.submap
+        known = [LOST if is_lost else state for is_lost, state in zip(lost, slam.steps.states, strict=True)]
+        states = states_at_end(known, slam.believed())
         outside = submaps_outside(states, submaps)
         poses, keyframes = slam.atlas.T_world_camera(), tuple(slam.keyframe_indices)
         path = CameraPath(poses, lost, submaps, keyframes, outside_world(states))

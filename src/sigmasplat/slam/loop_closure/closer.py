@@ -249,8 +249,8 @@ class LoopCloser:
             self._correct(atlas, component)
             return
         new = [row for row in range(first, len(self.edges)) if self.edges[row].loop]
-        wrong, size = self._wrong(atlas, new), MOST_FREE
-        size = WIDER * size if wrong else size
+        wrong = self._wrong(atlas, new)
+        size = WIDER * MOST_FREE if wrong else MOST_FREE
         while True:
             whole = self._correct(atlas, component, submap, size)
             before, wrong = wrong, self._wrong(atlas, new)

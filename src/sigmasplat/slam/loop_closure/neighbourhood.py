@@ -1,6 +1,6 @@
 """The part of a large pose graph around a node: its nodes move, and their neighbours hold them in place."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -71,7 +71,7 @@ class Neighbourhood:
         fixed = sorted(ends.difference(free))
         return Neighbourhood((*fixed, *free), len(fixed), tuple(rows))
 
-    def solve(self, T_world_node: Mapping[int, Matrix] | Sequence[Matrix], edges: Sequence[Edge]) -> PoseGraphSolution:
+    def solve(self, T_world_node: Sequence[Matrix], edges: Sequence[Edge]) -> PoseGraphSolution:
         """Solve this part of a graph, given the pose [4, 4] of each node and the edges; the solution has one pose for
         each of `nodes`."""
         part = numbered([edges[row] for row in self.edges], self.nodes)

@@ -25,7 +25,7 @@ from sigmasplat.sources.files.transforms import read_frames, read_pose
 from sigmasplat.types import Matrix
 
 TUM_WORDS, COLMAP_WORDS, MATRIX_WORDS = 8, 10, (12, 16)
-HAND_OUT = "give TUM or KITTI text, images.txt of COLMAP, transforms.json, or a folder with one matrix per frame"
+FORMATS = "give TUM or KITTI text, images.txt of COLMAP, transforms.json, or a folder with one matrix per frame"
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +49,7 @@ def read_given_poses(path: Path) -> GivenPoses:
     """Read poses T_world_camera [4, 4] from a file or a folder. Raises SourceError that names the place and the remedy
     if it does not exist, has another format, or a pose is not rigid."""
     if not exists(path):
-        raise SourceError(f"no such file or folder: {path}; {HAND_OUT}")
+        raise SourceError(f"no such file or folder: {path}; {FORMATS}")
     if path.is_dir():
         return _folder(path)
     if path.suffix.lower() == ".json":
@@ -63,7 +63,7 @@ def read_given_poses(path: Path) -> GivenPoses:
     if len(words) >= COLMAP_WORDS and not _is_number(words[COLMAP_WORDS - 1]):
         return _colmap(path)
     found = f"a line of {len(words)} values" if words else "no poses"
-    raise SourceError(f"{path}: poses of an unknown format ({found}); {HAND_OUT}")
+    raise SourceError(f"{path}: poses of an unknown format ({found}); {FORMATS}")
 
 
 def _matrix(path: Path, line: int, words: list[str]) -> Matrix | None:
@@ -78,7 +78,7 @@ def _matrix(path: Path, line: int, words: list[str]) -> Matrix | None:
 def _folder(folder: Path) -> ByNumber:
     paths = list_images(folder, (".txt",))
     if not paths:
-        raise SourceError(f"{folder}: holds no .txt files with matrices; {HAND_OUT}")
+        raise SourceError(f"{folder}: holds no .txt files with matrices; {FORMATS}")
     return ByNumber([checked_pose(str(path), read_matrix(path)) for path in paths])
 
 
@@ -100,7 +100,7 @@ def _transforms(path: Path) -> ByName:
     }
     poses = {name: T for name, T in found.items() if T is not None}
     if not poses:
-        raise SourceError(f'{path}: no frame has a "transform_matrix"; {HAND_OUT}')
+        raise SourceError(f'{path}: no frame has a "transform_matrix"; {FORMATS}')
     return ByName(poses)
 
 
