@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 from sigmasplat.commands import options
 from sigmasplat.commands.end_of_run import warn_at_the_end
 from sigmasplat.commands.evaluate import score
+from sigmasplat.commands.input_options import DEFAULT_INPUT_OPTIONS, InputOptions, InputOptionsFlat
 from sigmasplat.commands.options import arg, configured, prepare_torch, source_of
 from sigmasplat.commands.robot_output import (
     DEFAULT_ROBOT_OPTIONS,
@@ -64,7 +65,7 @@ def demo(
     example: sigmasplat demo --frames 40
     """
     whole_walk = max(frames, DEMO_FRAMES)  # a short demo is the start of this walk, at the same pace
-    limit = options.InputOptions(limit=frames)
+    limit = InputOptions(limit=frames)
     return run(f"synthetic:frames={whole_walk}", preset, settings, out, overwrite=True, input_options=limit, seed=seed)
 
 
@@ -74,7 +75,7 @@ def run(
     settings: options.Settings = (),
     out: options.OutFolder = None,
     overwrite: options.Overwrite = False,
-    input_options: options.InputOptionsFlat = options.DEFAULT_INPUT_OPTIONS,
+    input_options: InputOptionsFlat = DEFAULT_INPUT_OPTIONS,
     seed: options.Seed = None,
     record: options.Record = None,
     run_options: options.RunOptionsFlat = options.DEFAULT_RUN_OPTIONS,
