@@ -21,6 +21,14 @@ PredictedDepth = Annotated[
         help_behavior_hint="",
     ),
 ]
+DepthModel = Annotated[
+    Path | None,
+    arg(
+        metavar="FILE.onnx",
+        help="network that predicts depth from each colour image, used like --predicted-depth",
+        help_behavior_hint="",
+    ),
+]
 PredictedInverse = Annotated[
     bool, arg(help="predicted depth is inverse depth, as that of MiDaS or Depth Anything", help_behavior_hint="")
 ]
@@ -71,6 +79,7 @@ class InputOptions:
         ),
     ] = None
     predicted_depth: PredictedDepth = None
+    depth_model: DepthModel = None
     predicted_inverse: PredictedInverse = False
     fx: Annotated[
         From0,
@@ -104,7 +113,12 @@ class InputOptions:
         names = {"start": "start_s", "end": "end_s", "hold_out": "hold_every"}
         given = {field.name: getattr(self, field.name) for field in fields(self)}
         given["register_depth"] = None if self.register_depth == "auto" else self.register_depth
-        for name in ("calibration", "masks", "predicted_depth"):  # a later eval may run in another folder
+        for name in (
+            "calibration",
+            "masks",
+            "predicted_depth",
+            "depth_model",
+        ):  # a later eval may run in another folder
             given[name] = given[name] and given[name].absolute()
         if self.poses not in (None, RECORDED_POSES):
             given["poses"] = Path(self.poses).absolute()

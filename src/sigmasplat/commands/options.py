@@ -195,14 +195,18 @@ def working_images(config: Config) -> dict[str, str]:
 
 
 def source_of(folder: "RunFolder", moved_to: str | None) -> "Source":
-    """Open the sequence of a run. Raises RunError if the run does not contain its path."""
+    """Open the sequence of a run. Raises RunError if the run does not contain its path, or if depth is predicted by
+    another network than in the run."""
+    from sigmasplat.run.same_conditions import refuse_other_model
     from sigmasplat.sources import open_source
 
     facts = folder.facts()
     path = moved_to or facts.get("source_path")
     if not path:
         raise RunError(f"run {folder.path} does not contain the path of its sequence; give --source PATH")
-    return open_source(path, folder.config().input)
+    source = open_source(path, folder.config().input)
+    refuse_other_model(folder, source)
+    return source
 
 
 def refuse_existing(target: Path | None, overwrite: bool) -> None:

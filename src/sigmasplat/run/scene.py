@@ -31,12 +31,13 @@ def config_for(source: Source, config: Config, given: Collection[str] = ()) -> C
 
 
 def scene_facts(source: Source) -> dict[str, Any]:
-    """Return what run.json keeps of the scene: its size, the noise of depth, the sensor, and whether a network
-    predicted depth, if so."""
-    facts = {
+    """Return what run.json keeps of the scene: its size, the noise of depth, the sensor, and if a network
+    predicted depth this fact, and the file of the network if it is known."""
+    facts: dict[str, Any] = {
         "scene_scale": source.scene_scale, "depth_noise_per_m": source.depth_noise_per_m, "sensor": source.sensor
     }  # fmt: skip
-    return facts | ({"predicted_depth": True} if source.predicted_depth else {})
+    facts |= {"predicted_depth": True} if source.predicted_depth else {}
+    return facts | ({"depth_model": dict(source.depth_model)} if source.depth_model else {})
 
 
 def config_of_facts(facts: Mapping[str, Any], config: Config, given: Collection[str] = ()) -> Config:

@@ -62,7 +62,8 @@ def open_source(path: str | Path, settings: InputConfig | None = None, **changes
     ConfigError on an unknown setting.
     """
     chosen = with_changes(settings or InputConfig(), changes)
-    source = _with_predicted_depth(path, chosen) if chosen.predicted_depth else _recorded(path, chosen)
+    predicted = chosen.predicted_depth or chosen.depth_model
+    source = _with_predicted_depth(path, chosen) if predicted else _recorded(path, chosen)
     with _guarded(path):
         source = Masked(source, Path(chosen.masks)) if chosen.masks else source
         source = Posed(source, chosen.poses, chosen.poses_scale or 1.0) if chosen.poses else source
@@ -80,7 +81,7 @@ def _recorded(path: str | Path, settings: InputConfig) -> Source:
 
 
 def _with_predicted_depth(path: str | Path, settings: InputConfig) -> Source:
-    """Open a whole sequence with the depth of `input.predicted_depth`: images without depth, or any other sequence."""
+    """Open a whole sequence with predicted depth: images without depth, or any other sequence."""
     from sigmasplat.sources.predicted import WithPredictedDepth, lacks_depth, open_color_only
 
     known = _matching_format(path)
