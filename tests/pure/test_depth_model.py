@@ -165,6 +165,7 @@ def external(path: Path) -> None:
         (lambda path: path.write_bytes(b""), "not a usable ONNX file"),
         (lambda path: path.write_bytes(b"<!DOCTYPE html>" * 40), "not a usable ONNX file"),
         (lambda path: cut(path, 60), "not a usable ONNX file"),
+        (lambda path: path.write_bytes(path.read_bytes().replace(b"image", b"im\xb7ge")), "not a usable ONNX file"),
         (external, "its weights are in a second file.*; save it as one file"),
         (lambda path: weighted(path, inputs=["image", "K"]), r"has 2 inputs \(image, K\)"),
         (lambda path: weighted(path, (4, 3, "h", "w")), "of shape 4×3×h×w; export it for one colour image"),
@@ -183,13 +184,16 @@ def external(path: Path) -> None:
         (lambda path: weighted(path, bias=-100.0), "no value above 0"),
     ],
 )  # fmt: skip
-def test_what_is_no_network_for_depth_is_refused_in_one_line(tmp_path: Path, change: Any, message: str) -> None:
+def test_what_is_no_network_for_depth_is_refused_in_one_line(
+    tmp_path: Path, change: Any, message: str, capfd: pytest.CaptureFixture[str]
+) -> None:
     path = tmp_path / "n.onnx"
     weighted(path)
     change(path)
     with pytest.raises(SourceError, match=message) as found:
         open_source(ROOM, depth_model=str(path), depth_model_colors="unit", depth_model_size=28)
     assert "\n" not in str(found.value) and len(str(found.value)) < 500
+    assert capfd.readouterr() == ("", ""), "onnxruntime prints nothing"
 
 
 def test_a_frame_for_which_the_network_fails_is_skipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -124,10 +124,10 @@ class DepthModel:
         self.path, self.name, self.sha256 = path, path.name, hashlib.sha256(data).hexdigest()
         self._colors, self._side = settings.depth_model_colors, settings.depth_model_size
         with self._guarded("not a usable ONNX file", "export or download it again"):
-            # From bytes: onnxruntime then reads no second file, and what runs is what was hashed.
-            self._session = runtime.InferenceSession(
-                data, _options(runtime, settings.depth_model_threads), providers=["CPUExecutionProvider"]
-            )
+            # From bytes: onnxruntime then reads no second file, and what runs is what was hashed. Its fallback only
+            # prints and tries the same again.
+            options, cpu = _options(runtime, settings.depth_model_threads), ["CPUExecutionProvider"]
+            self._session = runtime.InferenceSession(data, options, providers=cpu, enable_fallback=False)
         self._input = ImageInput.of(path, self._session.get_inputs())
         self._output = _chosen_output(path, self._session.get_outputs(), settings.depth_model_output)
         self._size_of: dict[tuple[int, ...], Size] = {}
