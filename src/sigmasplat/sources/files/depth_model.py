@@ -2,7 +2,7 @@
 
 import hashlib
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +15,7 @@ from PIL import Image
 from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.reading.files import read_bytes
-from sigmasplat.reading.guard import cause
+from sigmasplat.reading.guard import MOST_CHARACTERS, cause
 from sigmasplat.reading.pictures import check_pixels
 from sigmasplat.sources.files.optional import import_optional
 
@@ -38,6 +38,24 @@ QUIET = 4
 LEAST_PX = 8
 """Shortest side of an image of depth."""
 PREFIX = re.compile(r"^\[ONNXRuntimeError\] : \d+ : \w+ : ")
+
+
+class Tensor(NamedTuple):
+    """An input or output of a network: name, type as onnxruntime writes it, sizes of its axes (other than a number:
+    any)."""
+
+    name: str
+    type: str
+    shape: tuple[Any, ...]
+
+    @classmethod
+    def all_of(cls, described: Iterable[Any]) -> "list[Tensor]":
+        """Copy what onnxruntime describes."""
+        return [cls(str(each.name), str(each.type), tuple(each.shape)) for each in described]
+
+    def __str__(self) -> str:
+        """Return type and shape in one short line."""
+        return _listed([f"{self.type} of shape {'×'.join(map(str, self.shape)) or 'unknown'}"])
 
 
 class Step(NamedTuple):
@@ -64,11 +82,11 @@ class ImageInput:
     width: int | None
 
     @classmethod
-    def of(cls, path: Path, inputs: Sequence[Any]) -> "ImageInput":
-        """Read the description that onnxruntime gives. Raises SourceError unless it is one colour image."""
+    def of(cls, path: Path, inputs: Sequence[Tensor]) -> "ImageInput":
+        """Choose how to give an image to these inputs. Raises SourceError unless there is one, for a colour image."""
         if len(inputs) != 1:
-            names = ", ".join(str(each.name) for each in inputs) or "none"
-            raise SourceError(f"{path}: the network has {len(inputs)} inputs ({names}); export it with the image alone")
+            found = f"{len(inputs)} inputs ({_listed(each.name for each in inputs)})"
+            raise SourceError(f"{path}: the network has {found}; export it with the image alone")
         (only,) = inputs
         shape = [size if isinstance(size, int) and size > 0 else None for size in only.shape]
         numbers, batch = NUMBERS.get(only.type), len(shape) == 4
@@ -77,7 +95,7 @@ class ImageInput:
         height, width = (*middle, last) if channels_first else (first, *middle)
         if numbers is None or not (channels_first or last == CHANNELS) or (batch and shape[0] not in (1, None)):
             raise SourceError(
-                f"{path}: the input of the network is {_described(only)}; export it for one colour image: "
+                f"{path}: the input of the network is {only}; export it for one colour image: "
                 "1×3×H×W or 1×H×W×3, float32, float16 or uint8"
             )
         check_pixels(path, (width or 1, height or 1))
@@ -128,8 +146,9 @@ class DepthModel:
             # prints and tries the same again.
             options, cpu = _options(runtime, settings.depth_model_threads), ["CPUExecutionProvider"]
             self._session = runtime.InferenceSession(data, options, providers=cpu, enable_fallback=False)
-        self._input = ImageInput.of(path, self._session.get_inputs())
-        self._output = _chosen_output(path, self._session.get_outputs(), settings.depth_model_output)
+            inputs, outputs = map(Tensor.all_of, (self._session.get_inputs(), self._session.get_outputs()))
+        self._input = ImageInput.of(path, inputs)
+        self._output = _chosen_output(path, outputs, settings.depth_model_output)
         self._size_of: dict[tuple[int, ...], Size] = {}
 
     def predict(self, color: Floats) -> Floats:
@@ -162,13 +181,12 @@ class DepthModel:
         check_pixels(self.path, size[::-1])
         tensor = self._input.tensor(color, size, self._colors)
         with self._guarded(f"the network fails for {size[1]}×{size[0]} pixels", "is it for colour images of any size?"):
-            (output,) = self._session.run([self._output], {self._input.name: tensor})
-        values = np.asarray(output)
+            values = np.asarray(self._session.run([self._output], {self._input.name: tensor})[0])
         shape = tuple(side for side in values.shape if side != 1)
         if len(shape) != 2 or min(shape) < LEAST_PX or values.dtype.kind not in "uif":
             raise SourceError(
-                f"{self.path}: output {self._output!r} is {values.dtype} {values.shape}, not depth; give the network's "
-                "output of one number for each pixel as input.depth_model_output"
+                f"{self.path}: output {_listed([self._output])} is {values.dtype} {values.shape}, not depth; give the "
+                "network's output of one number for each pixel as input.depth_model_output"
             )
         check_pixels(self.path, shape[::-1])
         return values.reshape(shape).astype(np.float32)
@@ -196,16 +214,22 @@ def _options(runtime: Any, threads: int) -> Any:
     return options
 
 
-def _chosen_output(path: Path, outputs: Sequence[Any], wanted: str) -> str:
+def _chosen_output(path: Path, outputs: Sequence[Tensor], wanted: str) -> str:
     """Return the name of the output with depth. Raises SourceError if it is unknown."""
-    names = [str(each.name) for each in outputs]
+    names = [each.name for each in outputs]
     found = [name for name in names if name == wanted] if wanted else names
     if len(found) > 1:
         found = [name for name in names if "depth" in name.lower()]
     if len(found) == 1:
         return found[0]
     why = f"no output {wanted!r}" if wanted else "it is not clear which output is depth"
-    raise SourceError(f"{path}: {why}; give one of {', '.join(names) or 'none'} as input.depth_model_output")
+    raise SourceError(f"{path}: {why}; give one of {_listed(names)} as input.depth_model_output")
+
+
+def _listed(names: Iterable[str]) -> str:
+    """Return names of an unknown file in one short line."""
+    text = "".join(c if c.isprintable() else "?" for c in ", ".join(names)) or "none"
+    return text if len(text) <= MOST_CHARACTERS else f"{text[:MOST_CHARACTERS]} …"
 
 
 def _resized(color: Floats, height: int, width: int) -> Floats:
@@ -215,8 +239,3 @@ def _resized(color: Floats, height: int, width: int) -> Floats:
     planes = (Image.fromarray(np.ascontiguousarray(color[..., c])) for c in range(CHANNELS))
     resized = [np.asarray(plane.resize((width, height), Image.Resampling.BICUBIC)) for plane in planes]
     return np.asarray(np.clip(np.stack(resized, -1), 0.0, 1.0), np.float32)
-
-
-def _described(tensor: Any) -> str:
-    sizes = "×".join(str(size) for size in tensor.shape)
-    return f"{tensor.type} of shape {sizes or 'unknown'}"[:80]
