@@ -42,6 +42,9 @@ class InputConfig(Section, name="input"):
     recorded depth, or is the depth of a video or of colour images. Its scale may be arbitrary; empty = none."""
     predicted_inverse: bool = False
     """Whether predicted depth is inverse depth (disparity), as most networks for relative depth give it."""
+    predicted_scale: NotNegative = 0.0
+    """Factor from predicted depth to metres, used with `input.poses` only; 0 = measured from the poses and the images,
+    unless `input.poses_scale` is 0."""
     depth_model: str = ""
     """Path of an ONNX file with a network that predicts depth from colour. Its depth is used as that of
     `input.predicted_depth`; empty = none."""
@@ -103,6 +106,11 @@ class InputConfig(Section, name="input"):
     grazing, most). auto = that of the sensor if the source knows it, otherwise generic. `inspect` measures one."""
     denoise_depth: bool = False
     """Whether depth images that are noisier than those of a structured-light sensor are smoothed."""
+
+    @property
+    def poses_scale_depth(self) -> bool:
+        """Return whether known poses give predicted depth its scale."""
+        return bool(self.poses and self.predicted_scale)
 
     def problems(self) -> list[str]:
         """Describe each invalid value, and limits that exclude every frame or every depth reading."""

@@ -6,7 +6,7 @@ from typing import Any
 
 from sigmasplat.config import Config
 from sigmasplat.config.scale import for_scene
-from sigmasplat.run.pose_scale import with_measured_scale
+from sigmasplat.run.pose_scale import with_measured_scale, with_scaled_depth
 from sigmasplat.sources.base import Source
 from sigmasplat.sources.opening import open_source
 
@@ -14,13 +14,16 @@ from sigmasplat.sources.opening import open_source
 def open_scene(path: str | Path, config: Config | None = None, given: Collection[str] = ()) -> tuple[Source, Config]:
     """Open a sequence; return it with the settings for its scene, which differ from `config` outdoors and for stereo.
 
-    given: names of settings that keep their values, as in ["input.max_depth_m"]. If `input.poses_scale` is 0, it is
-    measured. Raises as `open_source`.
+    given: names of settings that keep their values, as in ["input.max_depth_m"]. With known poses, an
+    `input.poses_scale` of 0 is measured, or the scale of predicted depth. Raises as `open_source`.
     """
     config = config or Config()
-    source = open_source(path, config.input)
-    if config.input.poses and not config.input.poses_scale:
+    source, asked = open_source(path, config.input), config.input
+    if asked.poses and not asked.poses_scale:
         config = with_measured_scale(source, config)
+    elif asked.poses and source.predicted_depth and not asked.predicted_scale:
+        config = with_scaled_depth(source, config)
+    if config.input != asked:
         source = open_source(path, config.input)
     return source, config_for(source, config, given)
 

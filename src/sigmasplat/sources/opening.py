@@ -66,7 +66,8 @@ def open_source(path: str | Path, settings: InputConfig | None = None, **changes
     source = _with_predicted_depth(path, chosen) if predicted else _recorded(path, chosen)
     with _guarded(path):
         source = Masked(source, Path(chosen.masks)) if chosen.masks else source
-        source = Posed(source, chosen.poses, chosen.poses_scale or 1.0) if chosen.poses else source
+        scales = chosen.poses_scale or 1.0, chosen.predicted_scale or 1.0
+        source = Posed(source, chosen.poses, *scales) if chosen.poses else source
     part = chosen.stride > 1 or chosen.limit or chosen.start_s or chosen.end_s
     return Subset(source, chosen) if part and not source.live else source
 
