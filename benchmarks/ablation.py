@@ -19,6 +19,7 @@ from tables import Section
 
 from sigmasplat.commands import options as described
 from sigmasplat.commands.bench import DEFAULT_PRESET, Ablation
+from sigmasplat.commands.input_options import Limit
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.evaluation.ablation import COMPARED, NAMES, WITHOUT_VARIANCE
 from sigmasplat.evaluation.paired_comparison import FIGURES, columns, paired_differences, passed_by_chance, rows
@@ -39,7 +40,7 @@ class Options:
     settings: described.Settings = ()
     seeds: described.Seeds = 3
     tau: described.Tau = 10.0
-    limit: described.Limit = None
+    limit: Limit = None
     reference: Annotated[bool, arg(help="leave out the runs without variance", help_behavior_hint="")] = True
     name: Annotated[str, arg(help="name of the results; use another name with other --set")] = "ablation"
     runs: Annotated[Path, arg(help="folder of finished runs")] = RUNS

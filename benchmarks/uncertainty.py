@@ -28,6 +28,7 @@ from sigmasplat.commands.bench_uncertainty import (
     pose_rows,
     written,
 )
+from sigmasplat.commands.input_options import Limit
 from sigmasplat.errors import SigmaSplatError
 
 arg = tyro.conf.arg
@@ -58,7 +59,7 @@ class Options:
     preset: described.PresetName = DEFAULT_PRESET
     settings: described.Settings = ()
     seeds: described.Runs = 3
-    limit: described.Limit = None
+    limit: Limit = None
     hold_every: described.HoldEvery = 8
     views: described.MostViews = 24
     name: Annotated[str, arg(help="name of the results; use another name with other --set")] = "uncertainty"

@@ -24,6 +24,7 @@ from tables import Section, significant
 from uncertainty import SOURCES, located
 
 from sigmasplat.commands import options as described
+from sigmasplat.commands.input_options import Limit
 from sigmasplat.commands.options import prepare_torch
 from sigmasplat.config.text import full_path
 from sigmasplat.evaluation.finished_run import FinishedRun, run_slam
@@ -65,7 +66,7 @@ class Options:
 
     sources: Annotated[tuple[str, ...], arg(help="sequences: names in the data folder, or paths")] = TAUGHT_BY
     settings: described.Settings = ("input.width=240",)
-    limit: described.Limit = 100
+    limit: Limit = 100
     hold_every: described.HoldEvery = 8
     views: described.MostViews = 24
     name: Annotated[str, arg(help="name of the results")] = "uncertainty-weights"

@@ -16,7 +16,8 @@ from bag_recordings import Recorder, aligned
 from command_line import exit_code
 from room_run import made_run
 from sigmasplat.batch.job import Job
-from sigmasplat.commands.options import DEFAULT_INPUT_OPTIONS, configured
+from sigmasplat.commands.input_options import DEFAULT_INPUT_OPTIONS
+from sigmasplat.commands.options import configured
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.io.splats import compressed_ply, gltf, ply, sog, splat, spz
 from sigmasplat.model.field import GaussianField

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from sigmasplat import cli
-from sigmasplat.commands.options import InputOptions
+from sigmasplat.commands.input_options import InputOptions
 
 
 def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:

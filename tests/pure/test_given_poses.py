@@ -16,10 +16,12 @@ from sigmasplat.config.scale import for_scene
 from sigmasplat.errors import SourceError
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.model import se3
+from sigmasplat.model.camera import Camera
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.presets import preset
-from sigmasplat.run.pose_scale import measured_scale, scale_warning
+from sigmasplat.run.pose_scale import measured_scale, scale_warning, triangulated
 from sigmasplat.run.scene import open_scene
+from sigmasplat.slam.features import Features
 from sigmasplat.sources import open_source
 from sigmasplat.sources.base import Source
 from sigmasplat.sources.files.poses import FLIP_YZ
@@ -184,10 +186,62 @@ def test_poses_that_do_not_fit_are_refused_in_one_line(
     assert len(capsys.readouterr().err.strip().splitlines()) == 1 and not (tmp_path / "run").exists()
 
 
-def test_poses_and_predicted_depth_exclude_each_other(tmp_path: Path) -> None:
-    file = tum(tmp_path / "poses.txt", true_path())
-    with pytest.raises(SourceError, match="poses cannot be used with predicted depth, whose scale is arbitrary"):
-        open_source(f"{ROOM},predicted=1", poses=str(file))
+def test_poses_give_predicted_depth_its_scale_or_take_it_from_there(tmp_path: Path) -> None:
+    room = "synthetic:frames=40,width=240,height=180,predicted=1"
+    path, predicted = true_path(room), open_source(room).frame(3).depth_m
+    half = path.T_world_camera.copy()
+    half[:, :3, 3] *= 0.5
+    file = str(tum(tmp_path / "half.txt", Trajectory(path.timestamps_s, half)))
+    config = preset("sigma").changed(input={"poses": file})
+    source, found = open_scene(room, config)
+    assert found.input.predicted_scale == pytest.approx(0.5, rel=0.1) and found.input.poses_scale == 1.0
+    for depth in (source.frame(3).depth_m, source.depth_of(3)):
+        np.testing.assert_allclose(depth, predicted * found.input.predicted_scale, rtol=1e-6)
+    np.testing.assert_allclose(given(source)[:, :3, 3], motions(list(half))[:, :3, 3], atol=1e-9)
+    assert found.input.poses_scale_depth and found.tracking.fit_depth
+
+    source, found = open_scene(room, config.changed(input={"poses_scale": 0.0}))
+    assert found.input.poses_scale == pytest.approx(2.0, rel=0.1) and not found.input.poses_scale_depth
+    np.testing.assert_array_equal(source.frame(3).depth_m, predicted)
+    chosen = config.changed(input={"predicted_scale": 0.7})
+    assert open_scene(room, chosen)[1].input == chosen.input
+
+    still = tum(tmp_path / "still.txt", Trajectory(path.timestamps_s, np.tile(np.eye(4), (40, 1, 1))))
+    with pytest.raises(SourceError, match=r"do not show the scale of predicted depth .*; give this factor"):
+        open_scene(room, config.changed(input={"poses": str(still), "limit": 2}))
+
+
+def test_given_motions_show_the_depth_of_features_and_which_matches_are_wrong() -> None:
+    camera, rng = Camera(320, 240, 300.0, 300.0, 160.0, 120.0), np.random.default_rng(0)
+    points = rng.uniform([-1.0, -0.8, 2.0], [1.0, 0.8, 4.0], (50, 3))
+    T = se3.exp(np.array([0.3, 0.05, 0.1, 0.02, -0.04, 0.03]))
+
+    def seen(x: np.ndarray) -> Features:
+        pixels = x[:, :2] / x[:, 2:] * 300.0 + [160.0, 120.0]
+        return Features(pixels, np.ones(len(x)), np.zeros((len(x), 1)), camera)
+
+    first, second = seen(points), seen(points @ T[:3, :3].T + T[:3, 3])
+    np.testing.assert_allclose(triangulated(first, second, T), points[:, 2], rtol=1e-9)
+    second.points[:5, 1] += 20.0
+    assert (triangulated(first, second, T)[:5] == 0).all()
+    assert (triangulated(first, first, np.eye(4)) == 0).all(), "no parallax"
+
+
+def test_a_run_with_poses_and_predicted_depth_has_the_scale_of_the_poses(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    room = "synthetic:frames=40,width=240,height=180,predicted=1"
+    file = str(tum(tmp_path / "poses.txt", true_path(room)))
+    quick = ["input.width=80", "mapping.first_iterations=5", "mapping.iterations=2", "final.iterations=2"]
+    settings = [word for setting in quick for word in ("--set", setting)]
+    words = ["--poses", file, "--limit", "30", "--out", str(tmp_path / "run"), *settings]
+    assert exit_code("run", room, *words) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "predicted depth is multiplied by" in said and "scale is arbitrary" not in said
+    run = RunFolder(tmp_path / "run")
+    assert run.facts()["predicted_depth"] and run.config().input.predicted_scale == pytest.approx(1.0, rel=0.1)
+    metrics = run.read_metrics()
+    assert metrics["path_scale"] is None and metrics["ate"]["rmse_m"] < 1e-6
 
 
 def test_nothing_moves_given_poses_unless_it_is_asked() -> None:

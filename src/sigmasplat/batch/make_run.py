@@ -17,16 +17,17 @@ import torch
 
 from sigmasplat import env
 from sigmasplat.batch.job import Job
+from sigmasplat.config import Config
 from sigmasplat.errors import SigmaSplatError, is_out_of_memory, out_of_memory
 from sigmasplat.evaluation.evaluate import evaluate
 from sigmasplat.io.lock import locked
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.metrics.lpips import find_lpips
 from sigmasplat.run.resume import RefinementFile, StartPoint, StateFile, resume
-from sigmasplat.run.scene import config_for
+from sigmasplat.run.same_conditions import refuse_other_model
+from sigmasplat.run.scene import open_scene
 from sigmasplat.run.session import Session, new_folder
 from sigmasplat.slam.slam import Slam
-from sigmasplat.sources import open_source
 from sigmasplat.sources.base import Source
 
 REFUSED, INTERRUPTED = 2, 130
@@ -42,18 +43,20 @@ def make_run(job: Job, folder: Path, data: str | None, save_every_s: float) -> N
             if job.finished_in(folder):
                 return
             path = job.sequence(data)
-            source = open_source(path, job.config.input)
-            _make_and_score(job, RunFolder(folder), source, path, save_every_s)
+            source, config = open_scene(path, job.config, job.given)
+            _make_and_score(job, RunFolder(folder), source, config, path, save_every_s)
     except BaseException:
         with suppress(OSError):  # the lock has created the folder
             folder.rmdir()
         raise
 
 
-def _make_and_score(job: Job, run: RunFolder, source: Source, path: str, save_every_s: float) -> None:
+def _make_and_score(
+    job: Job, run: RunFolder, source: Source, config: Config, path: str, save_every_s: float
+) -> None:  # fmt: skip
     """Make or resume the run unless it is complete, then score it."""
     if not (job.started_in(run.path) and run.facts().get("status") == "complete"):
-        run, start = _started(job, run.path, source, path)
+        run, start = _started(job, run.path, source, config, path)
         state = StateFile(start.slam, run, save_every_s)
         start.slam.saved_refinement = RefinementFile(start.slam, run, save_every_s)
         outcome = Session(
@@ -61,13 +64,14 @@ def _make_and_score(job: Job, run: RunFolder, source: Source, path: str, save_ev
         ).execute()
         if outcome.status == "interrupted":
             raise KeyboardInterrupt
+    refuse_other_model(run, source)
     started_s = time.perf_counter()
     lpips, _ = find_lpips(env.LPIPS_FOLDER)
     evaluate(run, source, mesh=job.mesh, lpips=lpips)
     run.note(batch=job.facts() | {"scored": True, "scoring_s": time.perf_counter() - started_s})
 
 
-def _started(job: Job, folder: Path, source: Source, path: str) -> tuple[RunFolder, StartPoint]:
+def _started(job: Job, folder: Path, source: Source, config: Config, path: str) -> tuple[RunFolder, StartPoint]:
     """Resume the run in a folder if it is one of this job and has a state, else begin it."""
     if job.started_in(folder) and RunFolder(folder).state.is_file():
         with suppress(SigmaSplatError):  # a damaged state costs time, not the table
@@ -75,7 +79,6 @@ def _started(job: Job, folder: Path, source: Source, path: str) -> tuple[RunFold
             start = resume(run, source)
             run.note(status="running", source_path=path)
             return run, start
-    config = config_for(source, job.config, job.given)
     run = new_folder(folder, config, source, overwrite=True, source_path=path, batch=job.facts())
     return run, StartPoint(Slam(config, run.submaps))
 

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sigmasplat.commands import batch_options, options
+from sigmasplat.commands.input_options import DEFAULT_INPUT_OPTIONS, InputOptionsFlat
 from sigmasplat.config.text import full_path
 from sigmasplat.errors import ConfigError, SourceError
 from sigmasplat.presets import default_preset
@@ -23,7 +24,7 @@ def batch(
     preset: options.PresetName = DEFAULT_PRESET,
     settings: options.Settings = (),
     seed: options.Seed = None,
-    input_options: options.InputOptionsFlat = options.DEFAULT_INPUT_OPTIONS,
+    input_options: InputOptionsFlat = DEFAULT_INPUT_OPTIONS,
     data: batch_options.DataFolders = (),
     mesh: options.WithMesh = False,
     out: batch_options.BatchFolder = None,

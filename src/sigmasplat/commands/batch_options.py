@@ -5,7 +5,8 @@ from typing import Annotated
 
 import tyro
 
-from sigmasplat.commands.options import From1, arg
+from sigmasplat.commands.option_ranges import From1
+from sigmasplat.commands.options import arg
 
 DataFolders = Annotated[
     tuple[str, ...],

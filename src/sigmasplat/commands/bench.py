@@ -11,6 +11,7 @@ import tyro
 from sigmasplat.commands import options
 from sigmasplat.commands.bench_table import PaperTable
 from sigmasplat.commands.bench_uncertainty import Uncertainty
+from sigmasplat.commands.input_options import Limit
 from sigmasplat.commands.options import prepare_torch
 from sigmasplat.config.text import split_settings
 from sigmasplat.errors import ConfigError
@@ -42,7 +43,7 @@ class Ablation:
     settings: options.Settings = ()
     seeds: options.Seeds = 3
     tau: options.Tau = 10.0
-    limit: options.Limit = None
+    limit: Limit = None
     without_variance: options.WithoutVariance = False
     out: options.AblationFile = Path("ablation.json")
     overwrite: options.DropRuns = False

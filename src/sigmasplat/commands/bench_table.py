@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sigmasplat.commands import batch_options, options
+from sigmasplat.commands.input_options import Limit
 from sigmasplat.config.text import split_settings
 from sigmasplat.errors import ConfigError, SourceError
 from sigmasplat.presets.table_files import list_tables, read_table
@@ -33,7 +34,7 @@ class PaperTable:
     systems: batch_options.TableSystems = ()
     seeds: options.Runs = 3
     settings: options.Settings = ()
-    limit: options.Limit = None
+    limit: Limit = None
     out: batch_options.BatchFolder = None
     overwrite: batch_options.ReplaceRuns = False
     jobs: batch_options.Jobs = 1

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sigmasplat.commands import options
+from sigmasplat.commands.input_options import Limit
 from sigmasplat.commands.options import prepare_torch
 from sigmasplat.config.text import split_settings
 from sigmasplat.errors import ConfigError
@@ -42,7 +43,7 @@ class Uncertainty:
     preset: options.PresetName = DEFAULT_PRESET
     settings: options.Settings = ()
     seeds: options.Runs = 1
-    limit: options.Limit = None
+    limit: Limit = None
     hold_every: options.HoldEvery = 8
     views: options.MostViews = 24
     out: options.StudyFolder = Path("uncertainty")

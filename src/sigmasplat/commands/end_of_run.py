@@ -21,9 +21,10 @@ def warn_at_the_end(
     _warn_if_never_recognised(screen, folder)
     for warning in motion.warnings():
         screen.warn(warning)
-    if folder.config().input.poses:
+    chosen = folder.config().input
+    if chosen.poses:
         _warn_of_contradicted_poses(screen, folder)
-    if source.predicted_depth:
+    if source.predicted_depth and not chosen.poses_scale_depth:
         screen.say("the scale is arbitrary, because a network predicted depth: lengths are not in metres")
 
 

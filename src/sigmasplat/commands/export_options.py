@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from sigmasplat.commands.options import From0, Whole
+from sigmasplat.commands.option_ranges import From0, Whole
 from sigmasplat.config.ranges import Range
 
 arg = tyro.conf.arg

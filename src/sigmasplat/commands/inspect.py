@@ -6,6 +6,7 @@ from typing import Annotated
 import tyro
 
 from sigmasplat.commands import options
+from sigmasplat.commands.input_options import DEFAULT_INPUT_OPTIONS, InputOptionsFlat
 from sigmasplat.commands.options import configured
 from sigmasplat.presets import default_preset
 
@@ -24,7 +25,7 @@ JsonFile = Annotated[
 
 def inspect(
     path: options.SourcePath,
-    input_options: options.InputOptionsFlat = options.DEFAULT_INPUT_OPTIONS,
+    input_options: InputOptionsFlat = DEFAULT_INPUT_OPTIONS,
     settings: options.Settings = (),
     out: SheetFile = None,
     json: JsonFile = None,

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sigmasplat.commands import options
+from sigmasplat.commands.input_options import DEFAULT_INPUT_OPTIONS, InputOptions, InputOptionsFlat
 from sigmasplat.commands.options import prepare_torch, refuse_existing, working_images
 from sigmasplat.config.scale import for_scene
 from sigmasplat.config.text import override, split_settings
@@ -29,7 +30,7 @@ def localise(
     run: options.InRun,
     out: options.PosesFile = None,
     overwrite: options.Overwrite = False,
-    input_options: options.InputOptionsFlat = options.DEFAULT_INPUT_OPTIONS,
+    input_options: InputOptionsFlat = DEFAULT_INPUT_OPTIONS,
     settings: options.Settings = (),
 ) -> int:
     """Find the images of a recording in the map of a finished run: pose, uncertainty, and a verdict for each image.
@@ -67,7 +68,7 @@ def localise(
     return OK if count else NONE_FOUND
 
 
-def search_settings(config: "Config", settings: Sequence[str], input_options: options.InputOptions) -> "Config":
+def search_settings(config: "Config", settings: Sequence[str], input_options: InputOptions) -> "Config":
     """Return a run's settings for another recording: frames and calibration are not those of the run."""
     return override(config, working_images(config) | input_options.settings() | split_settings(settings))
 

@@ -1,4 +1,4 @@
-"""Check the numbers of a command's options against the ranges that their types declare, before the command starts."""
+"""Define numbers as options, and check them against the ranges that their types declare, before a command starts."""
 
 import dataclasses
 import functools
@@ -6,7 +6,26 @@ from collections.abc import Callable, Iterator
 from inspect import signature
 from typing import Annotated, Any, get_args, get_origin
 
-from sigmasplat.config.ranges import out_of_range, refuse, unpacked
+import tyro
+
+from sigmasplat.config.ranges import Range, out_of_range, refuse, unpacked
+
+
+def _number(read: Callable[[str], float]) -> tyro.constructors.PrimitiveConstructorSpec[float | None]:
+    """Describe an optional number: None if it is not given; a given text is always read as a number, never as None."""
+    return tyro.constructors.PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="NUMBER",
+        instance_from_str=lambda given: read(given[0]),
+        is_instance=lambda value: value is None or isinstance(value, int | float),
+        str_from_instance=lambda value: [str(value)],
+    )
+
+
+Whole = Annotated[int | None, _number(int)]
+Number = Annotated[float | None, _number(float)]
+From0 = Annotated[Number, Range(0)]
+From1 = Annotated[int, Range(1)]
 
 
 def checked(command: Callable[..., int]) -> Callable[..., int]:

@@ -1,14 +1,16 @@
 """Define the options of the command line (type, placeholder, one line of help) and convert them to values."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
 from sigmasplat import env
-from sigmasplat.config import RECORDED_POSES, Config, InputConfig
+from sigmasplat.commands.input_options import DEFAULT_INPUT_OPTIONS, InputOptions
+from sigmasplat.commands.option_ranges import From0, From1, Whole
+from sigmasplat.config import Config, InputConfig
 from sigmasplat.config.ranges import Range
 from sigmasplat.config.text import override, split_settings
 from sigmasplat.errors import RunError
@@ -21,22 +23,6 @@ if TYPE_CHECKING:
 
 arg = tyro.conf.arg
 
-
-def _number(read: Callable[[str], float]) -> tyro.constructors.PrimitiveConstructorSpec[float | None]:
-    """Describe an optional number: None if it is not given; a given text is always read as a number, never as None."""
-    return tyro.constructors.PrimitiveConstructorSpec(
-        nargs=1,
-        metavar="NUMBER",
-        instance_from_str=lambda given: read(given[0]),
-        is_instance=lambda value: value is None or isinstance(value, int | float),
-        str_from_instance=lambda value: [str(value)],
-    )
-
-
-Whole = Annotated[int | None, _number(int)]
-Number = Annotated[float | None, _number(float)]
-From0 = Annotated[Number, Range(0)]
-From1 = Annotated[int, Range(1)]
 PresetName = Annotated[str, arg(metavar="NAME", help=f"preset of settings to start from: {', '.join(families())}")]
 Shell = Annotated[
     Literal["bash", "zsh"], tyro.conf.Positional, arg(metavar="{bash,zsh}", help="the shell that you use")
@@ -87,7 +73,6 @@ Keep = Annotated[
     arg(metavar="DIR", help="keep the run folders in DIR", help_behavior_hint="(default: they are removed)"),
 ]
 Overwrite = Annotated[bool, arg(help="replace an earlier result", help_behavior_hint="")]
-Limit = Annotated[Whole, Range(1), arg(metavar="N", help="use at most N frames", help_behavior_hint="(default: all)")]
 Profile = Annotated[bool, arg(help="print the time spent in each stage", help_behavior_hint="")]
 SaveEvery = Annotated[
     float, Range(0), arg(metavar="S", help="save the state for `resume` every S seconds; 0 = at the end only")
@@ -171,110 +156,7 @@ PosesFile = Annotated[
         help_behavior_hint="(default: none)",
     ),
 ]
-PredictedDepth = Annotated[
-    Path | None,
-    arg(
-        metavar="FOLDER",
-        help="depth that a network predicted, one image per frame: for a video, for colour images, or instead of the "
-        "recorded depth. The scale of the result is arbitrary",
-        help_behavior_hint="",
-    ),
-]
-PredictedInverse = Annotated[
-    bool, arg(help="predicted depth is inverse depth, as that of MiDaS or Depth Anything", help_behavior_hint="")
-]
 RunOrMap = Annotated[Path, tyro.conf.Positional, arg(metavar="RUN", help="run folder or map file")]
-
-
-@dataclass(frozen=True)
-class InputOptions:
-    """Options that select and calibrate the input: short forms of the settings input.* of --set."""
-
-    limit: Limit = None
-    stride: Annotated[Whole, Range(1), arg(metavar="N", help="use every N-th frame", help_behavior_hint="")] = None
-    start: Annotated[From0, arg(metavar="S", help="start S seconds after the first frame", help_behavior_hint="")] = (
-        None
-    )
-    end: Annotated[From0, arg(metavar="S", help="stop S seconds after the first frame", help_behavior_hint="")] = None
-    hold_out: Annotated[
-        Whole,
-        Range(2, or_zero=True),
-        arg(
-            metavar="N",
-            help="hold back every N-th frame: it is tracked but not mapped, so that it can test the map",
-            help_behavior_hint="",
-        ),
-    ] = None
-    strict: Annotated[bool, arg(help="stop at an unreadable image instead of skipping it", help_behavior_hint="")] = (
-        False
-    )
-    calibration: Annotated[
-        Path | None,
-        arg(metavar="FILE", help="calibration.json to use instead of the recorded calibration", help_behavior_hint=""),
-    ] = None
-    masks: Annotated[
-        Path | None,
-        arg(
-            metavar="FOLDER",
-            help="ignore pixels: one image per frame of the recording, not 0 = ignored, such as people found by a "
-            "segmenter",
-            help_behavior_hint="",
-        ),
-    ] = None
-    poses: Annotated[
-        str | None,
-        arg(
-            metavar="FILE",
-            help="known camera poses, used instead of tracking: TUM or KITTI text, images.txt of COLMAP, "
-            'transforms.json, or a folder of matrices; "recorded" = those of the device, such as ARKit\'s',
-            help_behavior_hint="",
-        ),
-    ] = None
-    predicted_depth: PredictedDepth = None
-    predicted_inverse: PredictedInverse = False
-    fx: Annotated[
-        From0,
-        arg(
-            metavar="PX",
-            help="horizontal focal length in pixels; also the vertical one unless --fy is given",
-            help_behavior_hint="",
-        ),
-    ] = None
-    fy: Annotated[From0, arg(metavar="PX", help="vertical focal length in pixels", help_behavior_hint="")] = None
-    cx: Annotated[From0, arg(metavar="PX", help="column of the principal point in pixels", help_behavior_hint="")] = (
-        None
-    )
-    cy: Annotated[From0, arg(metavar="PX", help="row of the principal point in pixels", help_behavior_hint="")] = None
-    depth_scale: Annotated[
-        From0, arg(metavar="UNITS", help="units of the depth images per metre", help_behavior_hint="")
-    ] = None
-    color_topic: Annotated[
-        str | None, arg(metavar="NAME", help="ROS bag: topic of the colour images", help_behavior_hint="")
-    ] = None
-    depth_topic: Annotated[
-        str | None, arg(metavar="NAME", help="ROS bag: topic of the depth images", help_behavior_hint="")
-    ] = None
-    register_depth: Annotated[
-        Literal["auto", "on", "off"],
-        arg(help="register depth to the colour camera; auto: if the recording has a separate depth camera"),
-    ] = "auto"
-
-    def settings(self) -> dict[str, str]:
-        """Return the given options by the names of their settings."""
-        names = {"start": "start_s", "end": "end_s", "hold_out": "hold_every"}
-        given = {field.name: getattr(self, field.name) for field in fields(self)}
-        given["register_depth"] = None if self.register_depth == "auto" else self.register_depth
-        for name in ("calibration", "masks", "predicted_depth"):  # a later eval may run in another folder
-            given[name] = given[name] and given[name].absolute()
-        if self.poses not in (None, RECORDED_POSES):
-            given["poses"] = Path(self.poses).absolute()
-        return {
-            f"input.{names.get(name, name)}": str(value) for name, value in given.items() if value not in (None, False)
-        }
-
-
-DEFAULT_INPUT_OPTIONS = InputOptions()
-InputOptionsFlat = Annotated[InputOptions, arg(name=""), tyro.conf.OmitArgPrefixes]
 
 
 @dataclass(frozen=True)
@@ -313,14 +195,18 @@ def working_images(config: Config) -> dict[str, str]:
 
 
 def source_of(folder: "RunFolder", moved_to: str | None) -> "Source":
-    """Open the sequence of a run. Raises RunError if the run does not contain its path."""
+    """Open the sequence of a run. Raises RunError if the run does not contain its path, or if depth is predicted by
+    another network than in the run."""
+    from sigmasplat.run.same_conditions import refuse_other_model
     from sigmasplat.sources import open_source
 
     facts = folder.facts()
     path = moved_to or facts.get("source_path")
     if not path:
         raise RunError(f"run {folder.path} does not contain the path of its sequence; give --source PATH")
-    return open_source(path, folder.config().input)
+    source = open_source(path, folder.config().input)
+    refuse_other_model(folder, source)
+    return source
 
 
 def refuse_existing(target: Path | None, overwrite: bool) -> None:

@@ -2,7 +2,8 @@
 
 from typing import Annotated, Literal
 
-from sigmasplat.commands.options import Number, arg
+from sigmasplat.commands.option_ranges import Number
+from sigmasplat.commands.options import arg
 from sigmasplat.config.ranges import Range
 
 CellM = Annotated[float, Range(0.001, 1), arg(metavar="M", help="cell size of the floor plan in metres")]

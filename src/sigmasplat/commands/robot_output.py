@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from sigmasplat.commands import options
+from sigmasplat.commands.option_ranges import Whole
 from sigmasplat.config.ranges import Range
 from sigmasplat.viewer.server import is_loopback
 
@@ -28,7 +28,7 @@ Bag = Annotated[
     ),
 ]
 Stream = Annotated[
-    options.Whole,
+    Whole,
     Range(0, 65535),
     tyro.conf.arg(
         metavar="PORT",

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 from sigmasplat.commands import options
 from sigmasplat.commands.end_of_run import warn_at_the_end
 from sigmasplat.commands.evaluate import score
+from sigmasplat.commands.input_options import DEFAULT_INPUT_OPTIONS, InputOptions, InputOptionsFlat
 from sigmasplat.commands.options import arg, configured, prepare_torch, source_of
 from sigmasplat.commands.robot_output import (
     DEFAULT_ROBOT_OPTIONS,
@@ -64,7 +65,7 @@ def demo(
     example: sigmasplat demo --frames 40
     """
     whole_walk = max(frames, DEMO_FRAMES)  # a short demo is the start of this walk, at the same pace
-    limit = options.InputOptions(limit=frames)
+    limit = InputOptions(limit=frames)
     return run(f"synthetic:frames={whole_walk}", preset, settings, out, overwrite=True, input_options=limit, seed=seed)
 
 
@@ -74,7 +75,7 @@ def run(
     settings: options.Settings = (),
     out: options.OutFolder = None,
     overwrite: options.Overwrite = False,
-    input_options: options.InputOptionsFlat = options.DEFAULT_INPUT_OPTIONS,
+    input_options: InputOptionsFlat = DEFAULT_INPUT_OPTIONS,
     seed: options.Seed = None,
     record: options.Record = None,
     run_options: options.RunOptionsFlat = options.DEFAULT_RUN_OPTIONS,
@@ -181,19 +182,24 @@ def _opened(
             if warning:
                 screen.warn(warning)
     if config.input.poses:
-        _say_of_poses(screen, asked, source, config)
+        _say_of_scale(screen, asked, source, config)
     if source.registrable and not source.depth_registered:
         screen.warn("depth and colour come from different cameras; --register-depth on aligns them (see inspect)")
     _warn_without_weights(screen, config)
     return source, config
 
 
-def _say_of_poses(screen: "Screen", asked: "Config", source: "Source", config: "Config") -> None:
-    """Print the measured unit of given poses, or a warning if it does not seem to be metres."""
+def _say_of_scale(screen: "Screen", asked: "Config", source: "Source", config: "Config") -> None:
+    """Print the measured unit of given poses, or that of predicted depth in theirs, or a warning if poses do not seem
+    to be in metres."""
     from sigmasplat.run.pose_scale import scale_warning
 
+    poses, factor = config.input.poses, config.input.poses_scale
     if not asked.input.poses_scale:
-        screen.say(f"{config.input.poses}: poses are multiplied by {config.input.poses_scale:.4g} to be in metres")
+        unit = "to have the scale of the predicted depth" if source.predicted_depth else "to be in metres"
+        screen.say(f"{poses}: poses are multiplied by {factor:.4g} {unit}")
+    elif config.input.poses_scale_depth and not asked.input.predicted_scale:
+        screen.say(f"{poses}: predicted depth is multiplied by {config.input.predicted_scale:.4g} to have their scale")
     elif warning := scale_warning(source, config):
         screen.warn(warning)
 

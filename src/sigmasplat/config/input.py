@@ -42,6 +42,24 @@ class InputConfig(Section, name="input"):
     recorded depth, or is the depth of a video or of colour images. Its scale may be arbitrary; empty = none."""
     predicted_inverse: bool = False
     """Whether predicted depth is inverse depth (disparity), as most networks for relative depth give it."""
+    predicted_scale: NotNegative = 0.0
+    """Factor from predicted depth to metres, used with `input.poses` only; 0 = measured from the poses and the images,
+    unless `input.poses_scale` is 0."""
+    depth_model: str = ""
+    """Path of an ONNX file with a network that predicts depth from colour. Its depth is used as that of
+    `input.predicted_depth`; empty = none."""
+    depth_model_colors: Literal["imagenet", "half", "unit", "bytes"] = "imagenet"
+    """Numbers that the network expects: imagenet = colour in [0, 1] minus ImageNet's mean, over its standard deviation
+    (MiDaS v2.1, Depth Anything); half = colour in [−1, 1] (DPT, ZoeDepth, Depth Pro); unit = colour in [0, 1];
+    bytes = colour in [0, 255]. A network that takes 8-bit numbers gets bytes."""
+    depth_model_size: Annotated[int, Range(14, 4096, or_zero=True)] = 0
+    """Shorter side of the images in pixels, for networks that take any size; sides are rounded to multiples of 14 or
+    32. 0 = 518 if multiples of 14 work, otherwise 384."""
+    depth_model_output: str = ""
+    """Name of the network's output that is depth; empty = the only one, or the only one with "depth" in its name."""
+    depth_model_threads: Annotated[int, Range(1, 256)] = 1
+    """Number of threads of the network. It may change the last bits of its depth. One thread predicts while another one
+    tracks the frame before."""
     poses: str = ""
     """Path of a file with known camera poses, which are used as they are: TUM text, KITTI text, images.txt of COLMAP,
     or transforms.json; or of a folder with a matrix per frame; "recorded" = those that the device estimated itself,
@@ -89,12 +107,19 @@ class InputConfig(Section, name="input"):
     denoise_depth: bool = False
     """Whether depth images that are noisier than those of a structured-light sensor are smoothed."""
 
+    @property
+    def poses_scale_depth(self) -> bool:
+        """Return whether known poses give predicted depth its scale."""
+        return bool(self.poses and self.predicted_scale)
+
     def problems(self) -> list[str]:
         """Describe each invalid value, and limits that exclude every frame or every depth reading."""
         if found := super().problems():
             return found
         if self.end_s and self.end_s <= self.start_s:
             found.append(f"input.end_s must be after input.start_s, found {self.start_s:g} to {self.end_s:g} s")
+        if self.predicted_depth and self.depth_model:
+            found.append("input.predicted_depth and input.depth_model exclude each other; give one of them")
         found += sensor_problems(self.sensor)
         if self.max_depth_m <= self.min_depth_m:
             found.append(

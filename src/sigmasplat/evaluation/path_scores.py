@@ -32,8 +32,8 @@ def score_frame_sets(run: RunFolder, frames: RunFrames, truth: Trajectory | None
 
 def arbitrary_scale(run: RunFolder, path: Trajectory, truth: Trajectory | None) -> float | None:
     """Return the factor that brings a path to the scale of the truth, if a network predicted the run's depth; None if
-    the scale is that of a sensor, or cannot be found."""
-    if truth is None or not run.facts().get("predicted_depth"):
+    the scale is that of a sensor or of given poses, or cannot be found."""
+    if truth is None or not run.facts().get("predicted_depth") or run.config().input.poses_scale_depth:
         return None
     rows, truth_rows = associate(path.timestamps_s, truth.timestamps_s)
     if not len(rows):

@@ -66,7 +66,7 @@ FACTS: Mapping[str, Test] = {
     "wall_s": _number_or_null, "finish_s": _number_or_null, "final_steps": _number_or_null, "machine": is_kind(dict),
     "onto": is_kind(dict), "camera": is_kind(dict), "source_frames": is_whole, "depth_units_per_metre": _number_or_null,
     "isa": is_kind(str, type(None)), "scene_scale": _number_or_null, "depth_noise_per_m": _number_or_null,
-    "sensor": is_kind(str, type(None)), "predicted_depth": is_kind(bool),
+    "sensor": is_kind(str, type(None)), "predicted_depth": is_kind(bool), "depth_model": is_kind(dict),
 }  # fmt: skip
 """Values of run.json that commands use."""
 STATE_FIELDS: Mapping[str, Test] = {"index": is_whole, "wall_s": is_number, "submaps": is_whole}

@@ -1,5 +1,10 @@
-"""Measure the unit of given poses: the images and their depth show the same motions in metres."""
+"""Measure the unit of given poses: the images and their depth show the same motions in metres.
 
+The depth that a network predicts is too inexact to measure motions, and its scale is arbitrary. The given motions then
+show the depth of features in the unit of the poses (triangulation), and so the scale of predicted depth.
+"""
+
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,7 +12,8 @@ import numpy as np
 from sigmasplat.config import Config
 from sigmasplat.errors import SourceError
 from sigmasplat.model import se3
-from sigmasplat.slam.features import Extractor, make_extractor
+from sigmasplat.slam.features import Extractor, Features, make_extractor
+from sigmasplat.slam.localisation.depth_shape import depth_at
 from sigmasplat.slam.localisation.feature_image import FeatureImage, LateDetail, motion_by_features
 from sigmasplat.sources.base import Source
 from sigmasplat.types import Matrix
@@ -19,8 +25,14 @@ LEAST_M, MOST_M = 0.05, 0.6
 """A motion is compared if the images show this length, for a room; features measure longer ones less well."""
 FEWEST = 3
 """A scale is measured from at least this many motions."""
+LEAST_MATCHES, LEAST_PARALLAX_DEG, MOST_OFF_PX = 20, 1.5, 2.0
+"""Features are triangulated if at least this many are seen from directions that differ by this angle, and at most this
+far from where the given motion can show them."""
 TOLERANCE = 0.1
 """Poses whose measured scale differs from 1 by less than this are taken to be in metres."""
+
+
+RatioAt = Callable[[int, Source, Config, Extractor], float | None]
 
 
 @dataclass(frozen=True)
@@ -33,7 +45,10 @@ class PoseScale:
 
 
 def with_measured_scale(source: Source, config: Config) -> Config:
-    """Return the settings with `input.poses_scale` as the images show it. Raises SourceError if they do not show it."""
+    """Return the settings with `input.poses_scale` as the images show it: metres, or the scale of predicted depth.
+    Raises SourceError if they do not show it."""
+    if source.predicted_depth:
+        return config.changed(input={"poses_scale": 1.0 / _scale_of_depth(source, config)})
     measured = measured_scale(source, config)
     if measured is None:
         raise SourceError(
@@ -41,6 +56,22 @@ def with_measured_scale(source: Source, config: Config) -> Config:
             "input.poses_scale, 1 for metres"
         )
     return config.changed(input={"poses_scale": measured.factor})
+
+
+def with_scaled_depth(source: Source, config: Config) -> Config:
+    """Return the settings with `input.predicted_scale`, the factor from predicted depth to the unit of given poses.
+    Raises SourceError if the images do not show it."""
+    return config.changed(input={"predicted_scale": _scale_of_depth(source, config)})
+
+
+def _scale_of_depth(source: Source, config: Config) -> float:
+    measured = measured_depth_scale(source, config)
+    if measured is None:
+        raise SourceError(
+            f"{config.input.poses}: the images do not show the scale of predicted depth in the unit of the poses; give "
+            "this factor as input.predicted_scale"
+        )
+    return measured.factor
 
 
 def scale_warning(source: Source, config: Config) -> str | None:
@@ -56,9 +87,19 @@ def scale_warning(source: Source, config: Config) -> str | None:
 
 def measured_scale(source: Source, config: Config) -> PoseScale | None:
     """Compare given motions with those that features and depth show; None if too few can be compared."""
+    return _measured(source, config, _ratio_at)
+
+
+def measured_depth_scale(source: Source, config: Config) -> PoseScale | None:
+    """Compare predicted depth with that which features and given motions show; None if too few can be compared. The
+    factor is from predicted depth to the unit of the poses."""
+    return _measured(source, config, _depth_ratio_at)
+
+
+def _measured(source: Source, config: Config, ratio_at: RatioAt) -> PoseScale | None:
     extractor, ratios = make_extractor(config.features), list[float]()
     for first in np.unique(np.linspace(0, len(source) - 1, PLACES, endpoint=False).astype(int)).tolist():
-        ratio = _ratio_at(first, source, config, extractor)
+        ratio = ratio_at(first, source, config, extractor)
         ratios += [] if ratio is None else [ratio]
     if len(ratios) < FEWEST:
         return None
@@ -82,6 +123,49 @@ def _ratio_at(first: int, source: Source, config: Config, extractor: Extractor) 
         if LEAST_M * room < length_m < MOST_M * room and given > 0:
             return length_m / given
     return None
+
+
+def _depth_ratio_at(first: int, source: Source, config: Config, extractor: Extractor) -> float | None:
+    """Return the depth of features of a frame in the unit of the given poses, divided by their predicted depth, the
+    median over the longest motion from it that shows enough of them; None if there is none."""
+    begin = _seen(source, first, config)
+    if begin is None:
+        return None
+    features, z = begin[0].features(extractor), depth_at(begin[0], extractor)
+    for step in STEPS:
+        later = _seen(source, first + step, config) if first + step < len(source) else None
+        pairs = extractor.match(features, later[0].features(extractor)) if later else np.zeros((0, 2), np.intp)
+        if later is None or len(pairs) < LEAST_MATCHES:
+            continue
+        a, b = pairs.T
+        T_later_begin = se3.inverse(later[1]) @ begin[1]
+        shown = triangulated(features.take(a), later[0].features(extractor).take(b), T_later_begin)
+        known = (shown > 0) & (z[a] > 0)
+        if known.sum() >= LEAST_MATCHES:
+            return float(np.median(shown[known] / z[a][known]))
+    return None
+
+
+def triangulated(first: Features, second: Features, T_second_first: Matrix) -> Matrix:
+    """Return the depth [M] of matched features of two views in the first one, in the unit of the motion [4, 4] between
+    them; 0 if directions differ too little, or the motion cannot show both."""
+    R, t, camera = T_second_first[:3, :3], T_second_first[:3, 3], second.camera
+    turned, seen = _rays(first) @ R.T, _rays(second)
+    across, offset = np.cross(seen, turned), np.cross(seen, t)  # seen × (z · turned + t) = 0
+    square = np.maximum((across**2).sum(1), 1e-18)
+    z = -(across * offset).sum(1) / square
+    parallax = np.sqrt(square) / (np.linalg.norm(seen, axis=1) * np.linalg.norm(turned, axis=1))
+    moved = z[:, None] * turned + t
+    ahead = (z > 0) & (moved[:, 2] > 0)
+    off = moved[:, :2] / np.where(ahead, moved[:, 2], 1.0)[:, None] - seen[:, :2]
+    off_px = np.hypot(camera.fx * off[:, 0], camera.fy * off[:, 1])
+    return np.where(ahead & (parallax > np.sin(np.deg2rad(LEAST_PARALLAX_DEG))) & (off_px < MOST_OFF_PX), z, 0.0)
+
+
+def _rays(features: Features) -> Matrix:
+    """Return the direction [M, 3] of each feature, with z = 1."""
+    (u, v), c = features.points.T.astype(np.float64), features.camera
+    return np.stack([(u - c.cx) / c.fx, (v - c.cy) / c.fy, np.ones(len(u))], 1)
 
 
 def _seen(source: Source, i: int, config: Config) -> tuple[FeatureImage, Matrix] | None:

@@ -6,7 +6,7 @@ from typing import Any
 
 from sigmasplat.config import Config
 from sigmasplat.config.scale import for_scene
-from sigmasplat.run.pose_scale import with_measured_scale
+from sigmasplat.run.pose_scale import with_measured_scale, with_scaled_depth
 from sigmasplat.sources.base import Source
 from sigmasplat.sources.opening import open_source
 
@@ -14,13 +14,16 @@ from sigmasplat.sources.opening import open_source
 def open_scene(path: str | Path, config: Config | None = None, given: Collection[str] = ()) -> tuple[Source, Config]:
     """Open a sequence; return it with the settings for its scene, which differ from `config` outdoors and for stereo.
 
-    given: names of settings that keep their values, as in ["input.max_depth_m"]. If `input.poses_scale` is 0, it is
-    measured. Raises as `open_source`.
+    given: names of settings that keep their values, as in ["input.max_depth_m"]. With known poses, an
+    `input.poses_scale` of 0 is measured, or the scale of predicted depth. Raises as `open_source`.
     """
     config = config or Config()
-    source = open_source(path, config.input)
-    if config.input.poses and not config.input.poses_scale:
+    source, asked = open_source(path, config.input), config.input
+    if asked.poses and not asked.poses_scale:
         config = with_measured_scale(source, config)
+    elif asked.poses and source.predicted_depth and not asked.predicted_scale:
+        config = with_scaled_depth(source, config)
+    if config.input != asked:
         source = open_source(path, config.input)
     return source, config_for(source, config, given)
 
@@ -31,12 +34,13 @@ def config_for(source: Source, config: Config, given: Collection[str] = ()) -> C
 
 
 def scene_facts(source: Source) -> dict[str, Any]:
-    """Return what run.json keeps of the scene: its size, the noise of depth, the sensor, and whether a network
-    predicted depth, if so."""
-    facts = {
+    """Return what run.json keeps of the scene: its size, the noise of depth, the sensor, and if a network
+    predicted depth this fact, and the file of the network if it is known."""
+    facts: dict[str, Any] = {
         "scene_scale": source.scene_scale, "depth_noise_per_m": source.depth_noise_per_m, "sensor": source.sensor
     }  # fmt: skip
-    return facts | ({"predicted_depth": True} if source.predicted_depth else {})
+    facts |= {"predicted_depth": True} if source.predicted_depth else {}
+    return facts | ({"depth_model": dict(source.depth_model)} if source.depth_model else {})
 
 
 def config_of_facts(facts: Mapping[str, Any], config: Config, given: Collection[str] = ()) -> Config:

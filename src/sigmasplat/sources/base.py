@@ -1,7 +1,7 @@
 """Define the interface of an input sequence, the same for every format."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -27,7 +27,8 @@ class Source(ABC):
     depth_registered: whether the source itself moved depth to the colour camera; registrable: whether it could do so,
     because the depth camera is known;
     computed_depth: whether the source computes depth itself, from a stereo pair; predicted_depth: whether a network
-    predicted depth, so that its scale is arbitrary;
+    predicted depth, so that its scale is arbitrary; depth_model: name and SHA-256 of the file with that network, None
+    if depth comes from elsewhere;
     scene_scale: size of the scene relative to a room, above 1 outdoors; depth_noise_per_m: standard deviation
     of depth, times z²; None if it is unknown (`config.scale.for_scene` uses both);
     sensor: the depth sensor (`config.sensors`), None if it is unknown;
@@ -44,6 +45,7 @@ class Source(ABC):
     registrable: bool = False
     computed_depth: bool = False
     predicted_depth: bool = False
+    depth_model: Mapping[str, str] | None = None
     scene_scale: float = 1.0
     depth_noise_per_m: float | None = None
     sensor: str | None = None
@@ -164,7 +166,7 @@ class Subset(Source):
         self.depth_units_per_metre = whole.depth_units_per_metre
         self.depth_registered, self.registrable = whole.depth_registered, whole.registrable
         self.computed_depth, self.scene_scale = whole.computed_depth, whole.scene_scale
-        self.predicted_depth = whole.predicted_depth
+        self.predicted_depth, self.depth_model = whole.predicted_depth, whole.depth_model
         self.depth_noise_per_m, self.sensor = whole.depth_noise_per_m, whole.sensor
         self._whole = whole
         self._indices: Sequence[int] = _within(whole, settings)[:: settings.stride][: settings.limit or None]

@@ -62,10 +62,12 @@ def open_source(path: str | Path, settings: InputConfig | None = None, **changes
     ConfigError on an unknown setting.
     """
     chosen = with_changes(settings or InputConfig(), changes)
-    source = _with_predicted_depth(path, chosen) if chosen.predicted_depth else _recorded(path, chosen)
+    predicted = chosen.predicted_depth or chosen.depth_model
+    source = _with_predicted_depth(path, chosen) if predicted else _recorded(path, chosen)
     with _guarded(path):
         source = Masked(source, Path(chosen.masks)) if chosen.masks else source
-        source = Posed(source, chosen.poses, chosen.poses_scale or 1.0) if chosen.poses else source
+        scales = chosen.poses_scale or 1.0, chosen.predicted_scale or 1.0
+        source = Posed(source, chosen.poses, *scales) if chosen.poses else source
     part = chosen.stride > 1 or chosen.limit or chosen.start_s or chosen.end_s
     return Subset(source, chosen) if part and not source.live else source
 
@@ -80,7 +82,7 @@ def _recorded(path: str | Path, settings: InputConfig) -> Source:
 
 
 def _with_predicted_depth(path: str | Path, settings: InputConfig) -> Source:
-    """Open a whole sequence with the depth of `input.predicted_depth`: images without depth, or any other sequence."""
+    """Open a whole sequence with predicted depth: images without depth, or any other sequence."""
     from sigmasplat.sources.predicted import WithPredictedDepth, lacks_depth, open_color_only
 
     known = _matching_format(path)

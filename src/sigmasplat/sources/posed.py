@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sigmasplat.config import RECORDED_POSES, InputConfig
 from sigmasplat.errors import SourceError
@@ -20,26 +21,29 @@ class Posed(Subset):
     """Another source with a pose for each frame; frames without one are left out.
 
     given: the path of the poses, or "recorded" for those that the device estimated itself; scale: factor from their
-    unit to metres. Raises SourceError if the poses do not fit the frames, the source is a live camera, or its depth is
-    predicted, which has no scale.
+    unit to metres; depth_scale: factor from predicted depth, whose scale is arbitrary, to metres. Raises SourceError if
+    the poses do not fit the frames, or the source is a live camera.
     """
 
-    def __init__(self, whole: Source, given: str, scale: float = 1.0) -> None:
+    def __init__(self, whole: Source, given: str, scale: float = 1.0, depth_scale: float = 1.0) -> None:
         if whole.live:
             raise SourceError(f"{given}: poses are for recordings only; record the camera, then run the recording")
-        if whole.predicted_depth:
-            raise SourceError(
-                f"{given}: poses cannot be used with predicted depth, whose scale is arbitrary; leave out one of them"
-            )
         super().__init__(whole, InputConfig())
         found = _poses_of(whole, given)
+        self._depth_scale = np.float32(depth_scale if whole.predicted_depth else 1.0)
         self._poses = [_scaled(T, scale) for T in found if T is not None]
         self._indices = [i for i, T in enumerate(found) if T is not None]
         self.skipped += [f"{whole.name}, frame {i}: no pose in {given}" for i, T in enumerate(found) if T is None]
 
     def frame(self, i: int) -> Frame:
-        """Read frame i with its pose."""
-        return replace(super().frame(i), T_given_camera=self._poses[i])
+        """Read frame i with its pose, and predicted depth in the unit of the poses."""
+        frame = super().frame(i)
+        depth_m = frame.depth_m if self._depth_scale == 1.0 else frame.depth_m * self._depth_scale
+        return replace(frame, depth_m=depth_m, T_given_camera=self._poses[i])
+
+    def depth_of(self, i: int) -> NDArray[np.float32]:
+        """Read the depth of frame i, in the unit of the poses if it is predicted."""
+        return super().depth_of(i) * self._depth_scale
 
 
 def _scaled(T: Matrix, scale: float) -> Matrix:

@@ -78,9 +78,9 @@ class DepthShape:
         found = replace(self, information=KEPT * self.information + (1.0 - KEPT) * prior)
         T_new_last = se3.inverse(T_last_new)
         views = [SeenKeyframe(seen.image, T_new_last @ seen.T_newest_camera) for seen in self.views]
-        new, z = image.features(extractor), _depth_at(image, extractor)
+        new, z = image.features(extractor), depth_at(image, extractor)
         for seen in views:
-            old, old_z = seen.image.features(extractor), _depth_at(seen.image, extractor)
+            old, old_z = seen.image.features(extractor), depth_at(seen.image, extractor)
             pairs = extractor.match(old, new)
             if len(pairs) < LEAST_MATCHES:
                 continue
@@ -152,7 +152,7 @@ def _polynomials(u: Matrix, v: Matrix) -> Matrix:
     return np.stack([u, v, u * v, u * u - 1.0 / 3.0, v * v - 1.0 / 3.0])
 
 
-def _depth_at(image: FeatureImage, extractor: Extractor) -> Matrix:
+def depth_at(image: FeatureImage, extractor: Extractor) -> Matrix:
     """Return the predicted depth at each feature [N], of the nearest pixel; 0 = none."""
     features, camera = image.features(extractor), image.camera
     c = features.camera

@@ -1,0 +1,131 @@
+"""Define the options that select and calibrate the input, the same for all commands that open a sequence."""
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from sigmasplat.commands.option_ranges import From0, Whole
+from sigmasplat.config import RECORDED_POSES
+from sigmasplat.config.ranges import Range
+
+arg = tyro.conf.arg
+Limit = Annotated[Whole, Range(1), arg(metavar="N", help="use at most N frames", help_behavior_hint="(default: all)")]
+PredictedDepth = Annotated[
+    Path | None,
+    arg(
+        metavar="FOLDER",
+        help="depth that a network predicted, one image per frame: for a video, for colour images, or instead of the "
+        "recorded depth. The scale of the result is arbitrary",
+        help_behavior_hint="",
+    ),
+]
+DepthModel = Annotated[
+    Path | None,
+    arg(
+        metavar="FILE.onnx",
+        help="network that predicts depth from each colour image, used like --predicted-depth",
+        help_behavior_hint="",
+    ),
+]
+PredictedInverse = Annotated[
+    bool, arg(help="predicted depth is inverse depth, as that of MiDaS or Depth Anything", help_behavior_hint="")
+]
+
+
+@dataclass(frozen=True)
+class InputOptions:
+    """Options that select and calibrate the input: short forms of the settings input.* of --set."""
+
+    limit: Limit = None
+    stride: Annotated[Whole, Range(1), arg(metavar="N", help="use every N-th frame", help_behavior_hint="")] = None
+    start: Annotated[From0, arg(metavar="S", help="start S seconds after the first frame", help_behavior_hint="")] = (
+        None
+    )
+    end: Annotated[From0, arg(metavar="S", help="stop S seconds after the first frame", help_behavior_hint="")] = None
+    hold_out: Annotated[
+        Whole,
+        Range(2, or_zero=True),
+        arg(
+            metavar="N",
+            help="hold back every N-th frame: it is tracked but not mapped, so that it can test the map",
+            help_behavior_hint="",
+        ),
+    ] = None
+    strict: Annotated[bool, arg(help="stop at an unreadable image instead of skipping it", help_behavior_hint="")] = (
+        False
+    )
+    calibration: Annotated[
+        Path | None,
+        arg(metavar="FILE", help="calibration.json to use instead of the recorded calibration", help_behavior_hint=""),
+    ] = None
+    masks: Annotated[
+        Path | None,
+        arg(
+            metavar="FOLDER",
+            help="ignore pixels: one image per frame of the recording, not 0 = ignored, such as people found by a "
+            "segmenter",
+            help_behavior_hint="",
+        ),
+    ] = None
+    poses: Annotated[
+        str | None,
+        arg(
+            metavar="FILE",
+            help="known camera poses, used instead of tracking: TUM or KITTI text, images.txt of COLMAP, "
+            'transforms.json, or a folder of matrices; "recorded" = those of the device, such as ARKit\'s',
+            help_behavior_hint="",
+        ),
+    ] = None
+    predicted_depth: PredictedDepth = None
+    depth_model: DepthModel = None
+    predicted_inverse: PredictedInverse = False
+    fx: Annotated[
+        From0,
+        arg(
+            metavar="PX",
+            help="horizontal focal length in pixels; also the vertical one unless --fy is given",
+            help_behavior_hint="",
+        ),
+    ] = None
+    fy: Annotated[From0, arg(metavar="PX", help="vertical focal length in pixels", help_behavior_hint="")] = None
+    cx: Annotated[From0, arg(metavar="PX", help="column of the principal point in pixels", help_behavior_hint="")] = (
+        None
+    )
+    cy: Annotated[From0, arg(metavar="PX", help="row of the principal point in pixels", help_behavior_hint="")] = None
+    depth_scale: Annotated[
+        From0, arg(metavar="UNITS", help="units of the depth images per metre", help_behavior_hint="")
+    ] = None
+    color_topic: Annotated[
+        str | None, arg(metavar="NAME", help="ROS bag: topic of the colour images", help_behavior_hint="")
+    ] = None
+    depth_topic: Annotated[
+        str | None, arg(metavar="NAME", help="ROS bag: topic of the depth images", help_behavior_hint="")
+    ] = None
+    register_depth: Annotated[
+        Literal["auto", "on", "off"],
+        arg(help="register depth to the colour camera; auto: if the recording has a separate depth camera"),
+    ] = "auto"
+
+    def settings(self) -> dict[str, str]:
+        """Return the given options by the names of their settings."""
+        names = {"start": "start_s", "end": "end_s", "hold_out": "hold_every"}
+        given = {field.name: getattr(self, field.name) for field in fields(self)}
+        given["register_depth"] = None if self.register_depth == "auto" else self.register_depth
+        for name in (
+            "calibration",
+            "masks",
+            "predicted_depth",
+            "depth_model",
+        ):  # a later eval may run in another folder
+            given[name] = given[name] and given[name].absolute()
+        if self.poses not in (None, RECORDED_POSES):
+            given["poses"] = Path(self.poses).absolute()
+        return {
+            f"input.{names.get(name, name)}": str(value) for name, value in given.items() if value not in (None, False)
+        }
+
+
+DEFAULT_INPUT_OPTIONS = InputOptions()
+InputOptionsFlat = Annotated[InputOptions, arg(name=""), tyro.conf.OmitArgPrefixes]
