@@ -137,6 +137,16 @@ def test_a_submap_whose_splats_are_too_near_does_not_bias_the_pose_relative_to_i
     assert off(to_keyframe.T_a_b, truth)[0] < 0.3 * off(to_map.T_a_b, truth)[0]
 
 
+def test_a_pose_relative_to_a_keyframe_needs_no_descent() -> None:
+    error = se3.exp(np.array([0.02, -0.01, 0.01, 0.01, 0.01, -0.01]))
+    found = [
+        registered((0, 5), (3, 8), error, config=CONFIG.changed(registration={"to_keyframe": True, "iterations": n}))[0]
+        for n in (0, 50)
+    ]
+    assert all(each.accepted and each.localised == 4 for each in found)
+    assert np.array_equal(found[0].T_a_b, found[1].T_a_b)
+
+
 def test_what_is_known_before_does_not_matter_where_the_views_are_alike() -> None:
     found, truth = registered((0, 5), (2, 6), se3.exp(np.array([3.0, 1.0, 0.0, 0.0, 0.0, 2.0])))
     assert found.accepted, found.reason

@@ -85,6 +85,12 @@ def test_few_frames_do_not_define_what_is_usual() -> None:
     assert not usual(worse, 10).doubts(worse)
 
 
+def test_a_camera_that_turns_from_the_start_is_not_doubted() -> None:
+    turned = replace(GOOD, common=0.65)
+    assert not Usual().doubts(turned) and not usual(GOOD, 3).doubts(turned)
+    assert Usual().doubts(replace(turned, correlation=0.75))
+
+
 def test_what_is_usual_follows_the_latest_frames() -> None:
     worse = replace(GOOD, common=0.4)
     history = usual(GOOD, 3 * RECENT)

@@ -19,6 +19,7 @@ from sigmasplat.config.text import override
 from sigmasplat.errors import RunError
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.io.state import read_state, write_state
+from sigmasplat.io.submaps import DiskStore
 from sigmasplat.presets import preset
 from sigmasplat.run.resume import REFINEMENT_CLASSES
 from sigmasplat.slam.slam import Slam
@@ -179,3 +180,36 @@ def test_a_state_contains_plain_data_only(tmp_path: Path) -> None:
     assert np.shares_memory(*back["b"]), "shared arrays stay shared"
     with pytest.raises(RunError, match="nothing to resume"):
         read_state(tmp_path / "none", (), {})
+
+
+def test_a_search_for_loops_that_is_divided_over_frames_resumes_and_finds_what_a_whole_one_finds(
+    tmp_path: Path,
+) -> None:
+    """Every frame that is not a keyframe makes one slice; the state is saved where some slices are made."""
+    loops = {"slices_per_frame": 2, "near_m": 10.0, "near_deg": 180.0}
+    config = tiny().changed(input={"limit": 36}, submaps={"frames": 6}, loops=loops, final={"iterations": 0})
+    frames = list(open_source(ROOM, config.input))
+    slam, whole = Slam(config, DiskStore(tmp_path / "slam")), Slam(config.changed(loops={"slices_per_frame": 0}))
+    saved, reported = tmp_path / "saved.st", list[int]()
+    for frame in frames:
+        at_once, step = whole.step(frame), slam.step(frame)
+        assert at_once.is_keyframe or not at_once.loops
+        reported += [step.index] * len(step.loops)
+        owed = slam.closer.owed
+        if not saved.exists() and owed is not None and owed.slices > 2:
+            write_state(saved, state_of(slam), CLASSES, fixed(slam))
+    assert len(reported) > 1
+    resumed = Slam(config, DiskStore(tmp_path / "slam"))
+    resumed.prepare(slam.view.camera)
+    tree = read_state(saved, CLASSES, fixed(resumed))
+    resumed.store.truncate(tree["submaps"])
+    restore(resumed, tree)
+    assert resumed.closer.owed is not None and len(resumed.steps) < reported[0]
+    for frame in frames[len(resumed.steps) :]:
+        resumed.step(frame)
+    assert np.array_equal(resumed.trajectory().T_world_camera, slam.trajectory().T_world_camera)
+    assert [loop.record() for loop in resumed.loops] == [loop.record() for loop in slam.loops]
+    for each in (resumed, whole):
+        each.finish()
+    tried = [[(loop.query, loop.database, loop.accepted) for loop in each.loops] for each in (resumed, whole)]
+    assert tried[0] == tried[1] and any(accepted for *_, accepted in tried[0])

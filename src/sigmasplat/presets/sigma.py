@@ -25,6 +25,7 @@ SIGMA = varsplat.FAST.changed(
     tracking={"features": True, "verify": True},
     recovery={"relocalise": True, "new_map_after": 20, "steady_frames": 2},
     registration={"to_keyframe": True},
+    loops={"slices_per_frame": 2},
     primitives={"uncertain_m2": 0.025, "faded_opacity": 0.07},
     surface={"depth": "map+sensor"},
     uncertainty={"probes": 4},

@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 from sigmasplat.fit.pose import PoseFit
 from sigmasplat.model.component import LOST, TRACKED
 from sigmasplat.model.hops import UNKNOWN_HOP, Hop
-from sigmasplat.slam.loop_closure.closer import Loop
 from sigmasplat.slam.step_result import metrics_of
 from sigmasplat.types import Matrix
 
@@ -13,15 +12,13 @@ from sigmasplat.types import Matrix
 @dataclass(eq=False)
 class Found:
     """Where a frame is: T_submap_camera [4, 4] in the active submap, its state, values of tracking, whether it is to be
-    mapped, the hop to it from the last keyframe, the loops that were tried meanwhile, and its exposure (a, b) relative
-    to the map."""
+    mapped, the hop to it from the last keyframe, and its exposure (a, b) relative to the map."""
 
     T_submap_camera: Matrix
     state: str = TRACKED
     tracking: dict[str, float] = field(default_factory=dict)
     mapped: bool = False
     hop: Hop = UNKNOWN_HOP
-    loops: list[Loop] = field(default_factory=list)
     exposure: tuple[float, float] = (0.0, 0.0)
 
     @staticmethod

@@ -18,7 +18,7 @@ from sigmasplat.slam.localisation.known_map import KnownMap
 from sigmasplat.slam.localisation.recovery import Link, usable
 from sigmasplat.slam.localisation.relocaliser import INDEX_AT_MOST, Relocation, sight_of
 from sigmasplat.slam.localisation.sight import Observation, Sight
-from sigmasplat.slam.loop_closure.closer import Loop
+from sigmasplat.slam.loop_closure.closer import OwedSearch
 from sigmasplat.slam.mapper import Mapper
 from sigmasplat.slam.rules import ends_submap, never
 from sigmasplat.slam.world import World
@@ -97,26 +97,22 @@ class MapWork(World):
         since, moved_m = index - self.mapper.keyframes[0].index, self.drift.position_m(T_submap_camera)
         return bool(ends_submap(T_submap_camera, since, moved_m, self.config.submaps, self.drift.variance_sum))
 
-    def cut(self, T_submap_camera: Matrix) -> Slices[list[Loop]]:
-        """Finish the active submap and start the next one at its newest keyframe, in slices; return the loops tried."""
+    def cut(self, T_submap_camera: Matrix) -> Slices[None]:
+        """Finish the active submap and start the next one at its newest keyframe, in slices."""
         return self.branch(len(self.store), T_submap_camera, self.drift.information, self.mapper.field)
 
-    def branch(
-        self, parent: int, T_parent_camera: Matrix, information: Matrix, field: GaussianField
-    ) -> Slices[list[Loop]]:
-        """Finish the active submap and start the next one at the camera, connected to a parent submap, in slices;
-        return the loops tried.
+    def branch(self, parent: int, T_parent_camera: Matrix, information: Matrix, field: GaussianField) -> Slices[None]:
+        """Finish the active submap and start the next one at the camera, connected to a parent submap, in slices.
 
         information [6, 6]: of T_parent_camera's left twist; field: the parent's splats, which the new submap may
         inherit.
         """
         with self._timer.stage("cut"):
-            loops = yield from self.finish_submap()
+            yield from self.finish_submap()
             self.begin_at(parent, T_parent_camera, information, field)
-            return loops
 
-    def branch_at(self, place: Relocation) -> Slices[list[Loop]]:
-        """Finish the active submap and start the next one where the camera was found, in slices; return the loops."""
+    def branch_at(self, place: Relocation) -> Slices[None]:
+        """Finish the active submap and start the next one where the camera was found, in slices."""
         return self.branch(place.where[0], place.T_submap_camera, place.information, self._splats_of(place))
 
     def begin_at(self, parent: int, T_parent_camera: Matrix, information: Matrix, field: GaussianField) -> None:
@@ -137,22 +133,23 @@ class MapWork(World):
             self.begin_at(place.where[0], place.T_submap_camera, place.information, self._splats_of(place))
         return place
 
-    def begin_apart(self) -> Slices[list[Loop]]:
-        """Finish the active submap and begin a component at the camera, in slices; return the loops tried."""
-        loops = yield from self.finish_submap()
+    def begin_apart(self) -> Slices[None]:
+        """Finish the active submap and begin a component at the camera, in slices."""
+        yield from self.finish_submap()
         self._begin_component()
         self.mapper = Mapper(self.config, self.random)
         self.drift = Drift(scene_scale=self.config.render.scene_scale)
-        return loops
 
     def _begin_component(self) -> None:
         """Begin a map at the camera, which is its origin."""
         self.atlas.begin_submap()
         self.confidence.begun(None, 0.0)
 
-    def finish_submap(self) -> Slices[list[Loop]]:
-        """Move the active submap to the store and look for its loops, which may move anchors, in slices."""
+    def finish_submap(self) -> Slices[None]:
+        """Move the active submap to the store, in slices, and look for its loops, or leave that to the next frames
+        (`loops.slices_per_frame`)."""
         yield from self.refining(self.mapper.owed)
+        yield from self.closing()
         submap, pictures = self.mapper.finished(len(self.store))
         submap, probes = self.probes.of(submap)
         yield
@@ -161,9 +158,28 @@ class MapWork(World):
         descriptors = [keyframe.descriptor for keyframe in self.mapper.keyframes]
         known = [descriptor for descriptor in descriptors if descriptor is not None]
         yield
-        loops = yield from self.closer.closing(submap, known, self.atlas, self.view)
-        self.confidence.closed(loops, self.config.render.scene_scale)
-        return loops
+        self.closer.owed = OwedSearch(submap.index, known)
+        if not self.config.loops.slices_per_frame:
+            yield from self.closing()
+
+    def closing(self, at_most: int | None = None) -> Slices[None]:
+        """Look for the loops of the submap that was finished last, as far as this is owed, in at most so many slices;
+        at the end anchors may move."""
+        while (owed := self.closer.owed) is not None and (at_most is None or at_most > 0):
+            if self._search is None:
+                submap = self.store.load(owed.submap)
+                self._search = self.closer.closing(submap, owed.descriptors, self.atlas, self.view)
+                for _ in range(owed.slices):  # after a resume: what was done before
+                    next(self._search)
+            try:
+                next(self._search)
+            except StopIteration as end:
+                self.confidence.closed(end.value, self.config.render.scene_scale)
+                self.closer.owed = self._search = None
+                return
+            owed.slices += 1
+            at_most = None if at_most is None else at_most - 1
+            yield
 
     # ---- search and join ----
 
@@ -213,6 +229,7 @@ class MapWork(World):
             return
         link = Link(place.where[0], submap, place.T_submap_camera @ se3.inverse(T_submap_camera), place.information)
         if self.recovery.confirms(link, self.atlas, self.config.render.scene_scale):
+            yield from self.closing()
             kept, moved = sorted((link.a, link.b), key=self.atlas.components.__getitem__)
             members = self.atlas.members(self.atlas.components[moved])
             self.confidence.joined(members, moved, kept, std_of(link.information))

@@ -1,6 +1,6 @@
 """SLAM: track every frame, map keyframes, cut submaps, close loops. `Slam.step` follows the papers' overviews."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from sigmasplat.slam.localisation.recovery import usable
 from sigmasplat.slam.localisation.relocaliser import Relocation
 from sigmasplat.slam.localisation.sight import Observation, refuse_first_without_depth, working_frame
 from sigmasplat.slam.localisation.verdict import is_better, is_questionable
+from sigmasplat.slam.loop_closure.closer import Loop
 from sigmasplat.slam.mapping import MapWork
 from sigmasplat.slam.rules import is_held_back, is_keyframe
 from sigmasplat.slam.step_result import Step, StepTimer
@@ -43,7 +44,7 @@ class Slam(MapWork, ArrayInterface):
 
         Raises SourceError if the first frame has no depth or a later one comes from another camera.
         """
-        self._timer = StepTimer()
+        self._timer, loops_before = StepTimer(), len(self.closer.loops)
         seen = self._observe(frame)
         if self.steps:
             seen = fitted_to_map(self.tracker, self.mapper.field, self.view, seen)
@@ -60,8 +61,9 @@ class Slam(MapWork, ArrayInterface):
         else:
             self._offer_probe(seen, found)
             completed(self.refining(self.config.mapping.iterations))
+            self._look_for_loops()
         self.atlas.place_frame(found.T_submap_camera)
-        self.steps.append(self._step_result(seen.frame, found))
+        self.steps.append(self._step_result(seen.frame, found, self.closer.loops[loops_before:]))
         return self.steps[-1]
 
     @notifying
@@ -79,6 +81,7 @@ class Slam(MapWork, ArrayInterface):
         total = max(1, steps + measures * sum(map(len, self.atlas.keyframe_poses)))
         progress(0, total)
         completed(self.finish_submap())
+        completed(self.closing())
         self._connect_components()
         self.closer.solve_all(self.atlas)
         members = self.atlas.members(0)
@@ -155,8 +158,13 @@ class Slam(MapWork, ArrayInterface):
         """Map a keyframe, and cut the submap if a rule ends it here."""
         found.T_submap_camera = self._mapped(seen, found.T_submap_camera, found.hop)
         if self.submap_ends(len(self.steps), found.T_submap_camera):
-            found.loops += completed(self.cut(found.T_submap_camera))
+            completed(self.cut(found.T_submap_camera))
             found.T_submap_camera = self._mapped(seen, np.eye(4))  # the next submap begins with the same keyframe
+
+    def _look_for_loops(self) -> None:
+        """Continue the search for loops that is owed, by as much as a frame does."""
+        with self._timer.stage("loops"):
+            completed(self.closing(self.config.loops.slices_per_frame))
 
     def _mapped(self, seen: Observation, T_submap_camera: Matrix, hop: Hop = UNKNOWN_HOP) -> Matrix:
         """Map a keyframe, and track the next frames relative to it; return its pose."""
@@ -192,18 +200,18 @@ class Slam(MapWork, ArrayInterface):
             self.tracker.move_to(self.mapper.field, self.view, place.keyframe, place.T_submap_camera)
         else:
             self.tracker.watch = self.tracker.watch.cleared()
-            found.loops += completed(self.branch_at(place))
+            completed(self.branch_at(place))
             found.T_submap_camera, found.mapped = np.eye(4), True
         self.recovery.found()
 
     def _begin_apart(self, seen: Observation, found: Found) -> None:
         """Begin a new map at the camera, whose place in the world is not known yet."""
-        found.loops += completed(self.begin_apart())
+        completed(self.begin_apart())
         self.tracker.forget()
         self.recovery.found()
         found.T_submap_camera, found.state, found.mapped = np.eye(4), APART, True
 
-    def _step_result(self, frame: Frame, found: Found) -> Step:
+    def _step_result(self, frame: Frame, found: Found, loops: Sequence[Loop]) -> Step:
         component, in_submap_m = self.atlas.components[-1], self.drift.position_m(found.T_submap_camera)
         state = APART if component and found.state != LOST else found.state
         found.tracking |= {
@@ -214,5 +222,5 @@ class Slam(MapWork, ArrayInterface):
         return Step(
             frame.index, frame.timestamp_s, self.atlas.anchors[-1] @ found.T_submap_camera, found.mapped,
             state == LOST, found.tracking, len(self.mapper.field), len(self.atlas.anchors) - 1,
-            tuple(found.loops), self._timer.stop(self.view), state, component, p_off,
+            tuple(loops), self._timer.stop(self.view), state, component, p_off,
         )  # fmt: skip

@@ -28,7 +28,7 @@ from sigmasplat.slam.localisation.relocaliser import Relocaliser
 from sigmasplat.slam.localisation.verdict import Usual
 from sigmasplat.slam.localisation.watch import Watch
 from sigmasplat.slam.loop_closure.candidates import SubmapDescriptor
-from sigmasplat.slam.loop_closure.closer import Loop, LoopCloser
+from sigmasplat.slam.loop_closure.closer import Loop, LoopCloser, OwedSearch
 from sigmasplat.slam.loop_closure.pose_graph import Edge
 from sigmasplat.slam.mapper import Mapper
 from sigmasplat.slam.probes import Probe, Probes
@@ -39,9 +39,9 @@ from sigmasplat.slam.tracker import Tracker
 
 CLASSES: tuple[type, ...] = (
     Atlas, Camera, Column, Confidence, DepthFit, DepthShape, Detail, Drift, Edge, FeatureImage, Foreground,
-    GaussianField, Keyframe, Link, Loop, LoopCloser, Mapper, Memory, Photo, Picture, Places, PosePrior, Probe,
-    Probes, Pyramid, Recovery, Reference, Relocaliser, Rows, Seen, SeenKeyframe, Step, Steps, SubmapDescriptor,
-    Target, TrackedHops, Tracker, Usual, VectorAdam, Watch,
+    GaussianField, Keyframe, Link, Loop, LoopCloser, Mapper, Memory, OwedSearch, Photo, Picture, Places,
+    PosePrior, Probe, Probes, Pyramid, Recovery, Reference, Relocaliser, Rows, Seen, SeenKeyframe, Step, Steps,
+    SubmapDescriptor, Target, TrackedHops, Tracker, Usual, VectorAdam, Watch,
 )  # fmt: skip
 """The classes that a state may contain."""
 

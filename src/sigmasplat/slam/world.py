@@ -37,7 +37,7 @@ from sigmasplat.slam.refinement import SavedRefinement
 from sigmasplat.slam.step_result import Step, StepTimer
 from sigmasplat.slam.steps import Steps
 from sigmasplat.slam.tracker import Tracker
-from sigmasplat.types import Matrix
+from sigmasplat.types import Matrix, Slices
 
 HOST = torch.device("cpu")
 
@@ -87,6 +87,7 @@ class World:
         self.uncertainty: MapUncertainty | None = None
         """How sure the final map is; None before `finish`, or without probe views (`uncertainty.probes`)."""
         self._timer = StepTimer()
+        self._search: Slices[list[Loop]] | None = None
         self.listeners = Listeners()
         self._newest_covariance = NewestCovariance()
 
@@ -187,7 +188,8 @@ class World:
         return self._timer
 
     def settle(self) -> None:
-        """Finish the work on all frames so far. Nothing is left to do: `step` does all work on its frame."""
+        """Finish the work on all frames so far. Nothing is left to do: `step` does all work on its frame, and the next
+        frames, or `finish`, do what it owes."""
 
     @property
     def cuts(self) -> bool:

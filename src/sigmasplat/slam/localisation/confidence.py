@@ -38,14 +38,16 @@ world is not known."""
 
 @dataclass(eq=False)
 class Confidence:
-    """spread_m: standard deviation of each submap's position in its component; since_lost: number of frames since the
-    last one that was lost or relocalised."""
+    """spread_m: standard deviation of each submap's position in its component; parents: the submap that each began at,
+    None: it began a component; since_lost: number of frames since the last one that was lost or relocalised."""
 
     spread_m: list[float] = field(default_factory=list)
+    parents: list[int | None] = field(default_factory=list)
     since_lost: int = NEVER_LOST
 
     def begun(self, parent: int | None, position_m: float) -> None:
         """Add a submap: at position_m (standard deviation, m) from its parent, or the first of a component."""
+        self.parents.append(parent)
         self.spread_m.append(0.0 if parent is None else math.hypot(self.spread_m[parent], position_m))
 
     def joined(self, members: Sequence[int], submap: int, kept: int, link_m: float) -> None:
@@ -56,11 +58,14 @@ class Confidence:
             self.spread_m[s] = math.hypot(path_m, self.spread_m[s])
 
     def closed(self, loops: Sequence[Loop], scene_scale: float = 1.0) -> None:
-        """Take the loops of a finished submap into account; scene_scale: size of the scene relative to a room."""
+        """Take the loops of a finished submap into account, also for the submaps that began at it before its loops were
+        known; scene_scale: size of the scene relative to a room."""
         for loop in loops:
             if loop.accepted:
                 ours, theirs = loop.query, math.hypot(self.spread_m[loop.database], LOOP_STD_M * scene_scale)
-                self.spread_m[ours] = min(self.spread_m[ours], theirs)
+                lower = max(0.0, self.spread_m[ours] ** 2 - theirs**2)
+                for s in (ours, *(s for s, parent in enumerate(self.parents) if parent == ours)):
+                    self.spread_m[s] = math.sqrt(max(0.0, self.spread_m[s] ** 2 - lower))
 
     def position_std_m(self, in_submap_m: float) -> float:
         """Return the standard deviation of the camera's position in its component, given that in its submap, metres."""

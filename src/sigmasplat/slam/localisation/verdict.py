@@ -40,8 +40,9 @@ view, the images agree as well at every pose along it."""
 LEAP_M, LEAP_HOPS = 0.3, 3.0
 """Lost: the pose is farther from the predicted one than this distance and this many usual hops between frames. Flat
 walls fit each other across a room."""
-DOUBT_SCORE = 0.7
-"""Doubtful: the score falls below this share of the usual one."""
+DOUBT_SCORE, FIRST_SCORE = 0.7, 0.8
+"""Doubtful: the score falls below this share of the usual one, which is the second value while it is not known. A frame
+and its keyframe share four fifths of their surface, or less: with 1, the fifth frame of a turn was doubtful."""
 PATIENCE = 3
 """Number of doubtful frames in a row after which the whole map is searched."""
 STANDS_CORRELATION = 0.7
@@ -156,7 +157,8 @@ class Usual:
 
     def doubts(self, c: Comparison) -> bool:
         """Return whether a pose is clearly worse than usual."""
-        worse = c.close < DOUBT_CLOSE * _median(self.closes, 1.0) or score(c) < DOUBT_SCORE * _median(self.scores, 1.0)
+        usual_score = _median(self.scores, FIRST_SCORE)
+        worse = c.close < DOUBT_CLOSE * _median(self.closes, 1.0) or score(c) < DOUBT_SCORE * usual_score
         return worse or self.contradicts(c)
 
     def contradicts(self, c: Comparison) -> bool:

@@ -102,12 +102,23 @@ def lacks_weights(config: LoopConfig) -> bool:
 
 
 @dataclass(eq=False)
+class OwedSearch:
+    """The search for the loops of a finished submap that is not complete: the submap, the descriptors [D] of its
+    keyframes, and the slices of `LoopCloser.closing` that are done."""
+
+    submap: int
+    descriptors: list[NDArray[np.float32]]
+    slices: int = 0
+
+
+@dataclass(eq=False)
 class LoopCloser:
     """Keeps the descriptors of finished submaps and all edges between them. Only this class moves anchors.
 
     edges: trusted ones, such as odometry, and registered loops; loop_rows: for each edge its row in `loops`, -1 for a
     trusted one. solved: the number of submaps when the whole pose graph was last solved. In between, and in a graph
     that is larger than the largest part, loops move only the submaps near them in the graph (`Neighbourhood`).
+    owed: the search that is under way.
     """
 
     config: Config
@@ -118,6 +129,7 @@ class LoopCloser:
     loop_rows: list[int] = field(default_factory=list)
     loops: list[Loop] = field(default_factory=list)
     solved: int = 0
+    owed: OwedSearch | None = None
 
     def __post_init__(self) -> None:
         self.predicted = PredictedSubmaps(self.config, self.store)
@@ -174,17 +186,25 @@ class LoopCloser:
     def closing(
         self, submap: Submap, descriptors: Sequence[NDArray[np.float32]], atlas: Atlas, view: View
     ) -> Slices[list[Loop]]:
-        """Look for loops as `submap_finished` does, in slices of one alignment."""
+        """Look for loops as `submap_finished` does, in slices of one alignment.
+
+        Nothing changes before the last slice: a search that was begun can be made again from its first slice, as long
+        as the anchors stay.
+        """
         if not self.config.loops.close or not descriptors:
             return []
         query = self._described(submap, descriptors)
-        pairs = self._pairs(query, atlas)
-        self.descriptors.append(query)
-        tried, known = list[Loop](), len(self.edges)
-        for pair in pairs:
+        tried = list[tuple[Loop, Edge | None]]()
+        for pair in self._pairs(query, atlas):
             yield
             tried.append((yield from self._try(pair, submap, atlas, view)))
-        if any(edge.loop for edge in self.edges[known:]):
+        self.descriptors.append(query)
+        known = len(self.edges)
+        for loop, edge in tried:
+            self.loops.append(loop)
+            if edge is not None:
+                self._add(edge, len(self.loops) - 1)
+        if len(self.edges) > known:
             self._correct_at(atlas, submap.index, known)
         return self.loops[len(self.loops) - len(tried) :]
 
@@ -218,17 +238,14 @@ class LoopCloser:
         reach_m = query.reach_m + np.array([other.reach_m for other in database])
         return [database[row] for row in np.flatnonzero(apart_m <= self.config.loops.near_m + reach_m).tolist()]
 
-    def _try(self, pair: SubmapPair, a: Submap, atlas: Atlas, view: View) -> Slices[Loop]:
-        """Register a pair in slices, with `a` as the query, and record the result, accepted or not."""
+    def _try(self, pair: SubmapPair, a: Submap, atlas: Atlas, view: View) -> Slices[tuple[Loop, Edge | None]]:
+        """Register a pair in slices, with `a` as the query; return the result, and its edge if it was accepted."""
         b = self.store.load(pair.best.database_submap)
         known = se3.inverse(atlas.anchors[a.index]) @ atlas.anchors[b.index]
         registrar = Registrar(self.config, self.store, view, self.extractor, self.predicted)
         found = yield from registrar.register(pair, a, b, known)
-        loop = described(pair.best, a, b, found, known)
-        self.loops.append(loop)
-        if found.accepted:
-            self._add(Edge(a.index, b.index, found.T_a_b, found.information, loop=True), len(self.loops) - 1)
-        return loop
+        edge = Edge(a.index, b.index, found.T_a_b, found.information, loop=True) if found.accepted else None
+        return described(pair.best, a, b, found, known), edge
 
     def solve_all(self, atlas: Atlas) -> None:
         """Solve the pose graph of each component as a whole; call it once, after the last submap."""

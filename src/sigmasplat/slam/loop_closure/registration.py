@@ -111,28 +111,40 @@ class Registrar:
     def _localise(
         self, own: Submap, keyframe: int, other: Submap, alike: Sequence[int], T_own_other: Matrix
     ) -> Slices[Localisation]:
-        """Localise a keyframe of `own` in `other`, in slices: align from the expected pose and from those of similar
-        keyframes, then refine the best one: by gradient descent on the uncertainty-weighted loss with exposure, and by
-        alignment to the other submap's nearest keyframe."""
+        """Localise a keyframe of `own` in `other`, in slices: align from the expected pose, and from those of similar
+        keyframes and by features if that explains too little; then refine the best pose."""
         T_own_camera, other_map = own.T_submap_camera[keyframe], self._map_of(other)
         target, live = picture_images(self.view, self._picture(own, keyframe), own.camera)
         expected = se3.inverse(T_own_camera) @ T_own_other
-        guesses = [expected, *(se3.inverse(other.T_submap_camera[k]) for k in alike)]
-        fit = max((yield from self._all_aligned(other_map, live, guesses)), key=score)
-        if score(fit) < DOUBTFUL:
-            by_features = self._by_features(own, keyframe, other, alike)
-            fit = max((fit, *(yield from self._all_aligned(other_map, live, by_features))), key=score)
-        if fit.alignment is None or score(fit) > HOPELESS * self.config.share_least:
-            start, steps = fit.T_camera_world, self.config.iterations
-            fit = fit_pose_adam(other_map.params, self.view, target, start, self.tracking, steps)
-            yield
-        if self.config.to_keyframe:
-            fit = self._at_keyframe(other, target, live, fit)
-            yield
+        similar = (se3.inverse(other.T_submap_camera[k]) for k in alike)
+        fits = list[PoseFit]()
+        for guesses in ([expected], similar, self._by_features(own, keyframe, other, alike)):
+            fits += yield from self._all_aligned(other_map, live, guesses)
+            fit = max(fits, key=score)
+            if score(fit) >= DOUBTFUL:
+                break
+        fit = yield from self._refined(other, other_map, target, live, fit)
         A = se3.adjoint(T_own_camera)
         covariance, comparison = self._checked(other_map, live, fit.T_camera_world)
         T_own_other = T_own_camera @ fit.T_camera_world
         return Localisation(T_own_other, fit.loss, A @ covariance @ A.T, fit.agreement, fit.overlap, comparison)
+
+    def _refined(
+        self, other: Submap, other_map: WeighedMap, target: Target, live: Pyramid, found: PoseFit
+    ) -> Slices[PoseFit]:
+        """Refine a keyframe's pose in a submap, in slices: by alignment to the submap's nearest keyframe if that is
+        wanted and gives a valid pose, else by gradient descent on the uncertainty-weighted loss with exposure. Descent
+        takes ten times as long, and its result is only the guess of that alignment."""
+        at_keyframe = self._at_keyframe(other, target, live, found)
+        yield
+        if at_keyframe is not None:
+            return at_keyframe
+        if found.alignment is not None and score(found) <= HOPELESS * self.config.share_least:
+            return found
+        start, steps = found.T_camera_world, self.config.iterations
+        found = fit_pose_adam(other_map.params, self.view, target, start, self.tracking, steps)
+        yield
+        return self._at_keyframe(other, target, live, found) or found
 
     def _picture(self, own: Submap, keyframe: int) -> Picture:
         """Return a keyframe's recorded image, or the one that its own submap renders at its pose."""
@@ -181,23 +193,23 @@ class Registrar:
             guess = fit.T_camera_world
         return fit
 
-    def _at_keyframe(self, other: Submap, target: Target, live: Pyramid, found: PoseFit) -> PoseFit:
-        """Align a keyframe that was found in a submap to the recorded image of its nearest keyframe there; return the
-        given fit if this one is not valid.
+    def _at_keyframe(self, other: Submap, target: Target, live: Pyramid, found: PoseFit) -> PoseFit | None:
+        """Align a keyframe that was found in a submap to the recorded image of its nearest keyframe there; return None
+        if this is not wanted (`registration.to_keyframe`) or the result is not valid.
 
         The map's surfaces are biased while it is young, and all keyframes that are localised in it then agree on a
         wrong pose. Readings are not.
         """
-        depth_m = target.depth_image[target.depth_image > 0]
-        if not fits_of(self.view).aligns or not len(depth_m):
-            return found
+        c, depth_m = self.config, target.depth_image[target.depth_image > 0]
+        if not c.to_keyframe or not fits_of(self.view).aligns or not len(depth_m):
+            return None
         T_other_camera, mean_m = se3.inverse(found.T_camera_world), float(depth_m.double().mean())
         k = int(np.argmin([angle_between(T, T_other_camera, mean_m) for T in other.T_submap_camera]))
         _, image = picture_images(self.view, self.store.picture(other.index, k), other.camera)
         params, T_camera_other = other.field.params.to(self.view.sums.device), se3.inverse(other.T_submap_camera[k])
         reference = keyframe_reference(params, self.view, image, T_camera_other, self.tracking)
-        fit, c = fit_pose_align(reference, live, found.T_camera_world, self.tracking), self.config
-        return fit if fit.agreement >= c.agreement_least and score(fit) >= c.share_least else found
+        fit = fit_pose_align(reference, live, found.T_camera_world, self.tracking)
+        return fit if fit.agreement >= c.agreement_least and score(fit) >= c.share_least else None
 
     def _checked(self, other: WeighedMap, live: Pyramid, T_camera_map: Matrix) -> tuple[Matrix, Comparison | None]:
         """Return the covariance [6, 6] of T_camera_map's left twist, estimated by alignment to the map at that pose,

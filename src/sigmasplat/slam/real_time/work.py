@@ -84,6 +84,7 @@ class MapClock:
         if each.search is not None:
             yield from self._search(each, each.search)
         yield from self.system.refining(self.system.config.mapping.iterations, self._keyframe_waits)
+        yield from self.system.closing(self.system.config.loops.slices_per_frame)
 
     def _place(self, each: TrackedFrame) -> None:
         """Place a frame relative to the newest keyframe."""
