@@ -13,9 +13,10 @@ from sigmasplat.config import Config
 from sigmasplat.errors import RunError, SigmaSplatError
 from sigmasplat.floorplan.floor_plan import floor_plan
 from sigmasplat.io.runs import RunFolder
-from sigmasplat.model.atlas import UNKNOWN_HOP, Atlas
+from sigmasplat.model.atlas import Atlas
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
+from sigmasplat.model.hops import UNKNOWN_HOP, TrackedHops
 from sigmasplat.model.places import Place, Places
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.slam.checkpoint import checkpoint_of
@@ -45,7 +46,7 @@ def run(tmp_path: Path) -> RunFolder:
     """Return a run with the path of three frames in two submaps, the errors of the path, and no map."""
     T = np.eye(4)
     places = Places.of([Place(0, 0, T), Place(0, 1, T), Place(1, 0, T)])
-    hops = [[UNKNOWN_HOP] * 2, [UNKNOWN_HOP]]
+    hops = TrackedHops.of((submap, UNKNOWN_HOP) for submap in (0, 0, 1))
     atlas = Atlas([T] * 2, [T] * 2, [[T] * 2, [T]], hops, places, [0, 0])
     edges = [Edge(0, 1, T, np.eye(6), loop=True)]
     run = RunFolder.create(tmp_path / "run", Config(), "room")

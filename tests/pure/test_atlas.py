@@ -9,6 +9,7 @@ from sigmasplat.model.atlas import Atlas
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.column import Column
 from sigmasplat.model.field import GaussianField
+from sigmasplat.model.hops import UNKNOWN_HOP, Hop
 from sigmasplat.model.places import Place, Places
 from sigmasplat.model.submap import MemoryStore, Picture, RefinedStore, StorePart, Submap
 
@@ -54,6 +55,26 @@ def test_a_frame_follows_its_keyframe() -> None:
     moved = motion(5)
     atlas.keyframe_poses[1][1] = moved @ atlas.keyframe_poses[1][1]
     assert np.allclose(atlas.T_world_camera()[3], atlas.anchors[1] @ moved @ se3.inverse(atlas.anchors[1]) @ world[3])
+
+
+def test_hops_to_keyframes_are_read_as_they_were_set() -> None:
+    """Their number grows past the space that is first reserved; an earlier session's keyframes have none."""
+    atlas, rng, known = Atlas(), np.random.default_rng(0), list[Hop]()
+    atlas.add_finished(np.eye(4), [np.eye(4)] * 2)
+    for submap in range(1, 41):
+        atlas.begin_submap(motion(submap))
+        for k in range(3):
+            hop = Hop(motion(100 * submap + k), rng.normal(size=(6, 6)), rng.normal(size=6)) if k else UNKNOWN_HOP
+            atlas.set_keyframes([np.eye(4)] * (k + 1), hop)
+            known.append(hop)
+    hops = atlas.hops
+    assert len(hops) == 122 and [k for k in range(8) if hops.begins_submap(k)] == [0, 2, 5]
+    for found, set_before in zip(hops[2:], known, strict=True):
+        assert all(np.array_equal(a, b, equal_nan=True) for a, b in zip(found, set_before, strict=True))
+    np.testing.assert_array_equal(hops.covariance[-1], known[-1].covariance)
+    np.testing.assert_array_equal(hops.T_camera_before[3], known[1].T_camera_before)
+    np.testing.assert_array_equal(hops.bias[-3:], [hop.bias for hop in known[-3:]])
+    assert np.isnan(hops[0].covariance).all() and np.isnan(hops.covariance[1]).all()
 
 
 def test_frames_follow_the_refined_poses_of_their_keyframes() -> None:

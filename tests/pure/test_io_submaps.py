@@ -1,6 +1,8 @@
 """Submaps on disk: they are read back bit for bit and in parts, and damage is reported in one line."""
 
+import gc
 import json
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
@@ -131,6 +133,26 @@ def test_probe_views_are_read_back_from_both_stores(store: DiskStore) -> None:
             assert np.array_equal(where.probe(0, k).depth_m, probe.depth_m)
         with pytest.raises(SigmaSplatError, match="probe views"):
             where.save(replace(submap, index=1), pictures, probes[:1])
+
+
+def test_memory_does_not_grow_with_the_number_of_submaps_written_and_read(store: DiskStore) -> None:
+    """Every submap has another number of splats: one type per size would be kept."""
+
+    def traced(first: int, last: int) -> int:
+        tracemalloc.start()
+        for index in range(first, last):
+            submap, pictures = some_submap(index)
+            store.save(replace(submap, field=GaussianField(torch.zeros(100 + index, 17))), pictures)
+            for k in range(3):
+                store.picture(index, k)
+            assert len(store.load(index).field) == 100 + index
+        gc.collect()
+        kept, _ = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        return kept
+
+    traced(0, 20)
+    assert traced(20, 120) < 100 * 1000, "bytes per submap; one type takes 5000"
 
 
 def test_another_store_of_the_same_folder_has_the_same_submaps(store: DiskStore) -> None:

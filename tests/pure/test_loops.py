@@ -230,10 +230,10 @@ def test_in_a_long_run_the_whole_graph_is_solved_if_it_has_grown(monkeypatch: py
     )
 
 
-def test_a_loop_that_still_disagrees_moves_ever_more_submaps_until_this_changes_nothing(
+def test_a_loop_that_still_disagrees_moves_ever_more_submaps_up_to_the_largest_part(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A false loop is rejected by every part of the graph: two of them are enough."""
+    """A false loop is rejected by every part of the graph: the largest one is the last."""
     lie = {(24, 0): se3.exp(np.array([4.0, 0, 0, 0, 0, 0.0]))}
     made, parts = make_closer(monkeypatch, lie), solved_parts(monkeypatch, 2)
     Registered.truth = [se3.exp(np.array([x, 0, 0, 0, 0, 0.0])) for x in [*range(13), *range(11, -1, -1)]]
@@ -245,8 +245,12 @@ def test_a_loop_that_still_disagrees_moves_ever_more_submaps_until_this_changes_
         atlas.begin_submap(step)
         finished(made, atlas, 25.0 * Registered.truth[k][0, 3])
     assert parts[24] == [6, 18], "not the whole graph of 25"
+    assert not any(None in sizes for k, sizes in parts.items() if k >= 18), "larger than the largest part of 18"
+    assert any(None in sizes for k, sizes in parts.items() if k < 18)
     assert [(loop.query, loop.database) for loop in made.loops if not loop.accepted] == [(24, 0)]
     np.testing.assert_allclose(np.stack(atlas.anchors), np.stack(Registered.truth), atol=1e-6)
+    made.solve_all(atlas)
+    assert parts[24] == [6, 18, None], "the end solves the whole graph"
 
 
 def test_the_descriptor_by_its_name() -> None:

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from sigmasplat.fit.align import BIAS_PX
 from sigmasplat.model import se3
-from sigmasplat.model.atlas import UNKNOWN_HOP, Atlas, Hop
+from sigmasplat.model.atlas import Atlas
+from sigmasplat.model.hops import UNKNOWN_HOP, Hop, TrackedHops
 from sigmasplat.slam.loop_closure.pose_graph import Edge, PoseGraph, Sensitivity, optimise
 from sigmasplat.slam.path_covariance import PathCovariance, recorded
 
@@ -75,12 +76,14 @@ class Loopy:
         return world_of(optimise(np.stack(start), edges, confidence=1.0).T_world_node, keyframes), edges
 
     def covariance(self, loop: Edge | None, hops: bool = True) -> PathCovariance:
-        atlas, edges = self.solved({}, loop)
+        (atlas, edges), tracked = self.solved({}, loop), TrackedHops()
         for s in range(SUBMAPS):
             known = [
                 Hop(T, C, self.bias) for T, C in zip(self.steps[s], self.covariances[s], strict=True)
             ] if hops else [UNKNOWN_HOP] * KEYFRAMES  # fmt: skip
-            atlas.hops[s] = [UNKNOWN_HOP, *known]
+            for hop in (UNKNOWN_HOP, *known):
+                tracked.append(s, hop)
+        atlas.hops = tracked
         found = PathCovariance.of(checkpoint(atlas, edges))
         assert found is not None
         return found

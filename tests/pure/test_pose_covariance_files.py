@@ -15,7 +15,8 @@ from sigmasplat.io.runs import RunFolder
 from sigmasplat.io.trajectory import write_trajectory
 from sigmasplat.metrics.pose_covariance import score_covariances
 from sigmasplat.model import se3
-from sigmasplat.model.atlas import Atlas, Hop
+from sigmasplat.model.atlas import Atlas
+from sigmasplat.model.hops import Hop
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.slam.path_covariance import PathCovariance, recorded
 

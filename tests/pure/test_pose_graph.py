@@ -15,6 +15,7 @@ from scipy.stats import chi2
 
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.model import se3
+from sigmasplat.slam.loop_closure import normal_equations, pose_graph
 from sigmasplat.slam.loop_closure.neighbourhood import Incidence, Neighbourhood
 from sigmasplat.slam.loop_closure.pose_graph import Edge, LoopVerdict, PoseGraph, optimise
 
@@ -134,6 +135,37 @@ def test_a_loop_is_believed_up_to_the_quantile_of_chi_squared() -> None:
         assert verdict.chi2 == pytest.approx(r2, rel=1e-5)
         assert verdict.weight == pytest.approx((limit / (r2 + limit)) ** 2, rel=1e-5)
         assert (verdict.weight > 0.25) is inside
+
+
+# Large graphs are solved in another way, to the same solution.
+
+
+@pytest.mark.parametrize(("true_loops", "false_loops", "factorises"), [(3, 0, True), (3, 2, True), (600, 20, False)])
+def test_a_large_graph_has_the_solution_that_factorisations_find(
+    monkeypatch: pytest.MonkeyPatch, true_loops: int, false_loops: int, factorises: bool
+) -> None:
+    """A long chain needs a factorisation; in a graph with many loops none is made."""
+    _, drifted, edges = scene(3, 150, true_loops, false_loops)
+    made, counted = list[int](), normal_equations.factorised
+    monkeypatch.setattr(normal_equations, "factorised", lambda H: (made.append(1), counted(H))[1])
+    found, factorisations = optimise(drifted, edges), len(made)
+    monkeypatch.setattr(pose_graph, "LARGE", len(drifted))
+    known = optimise(drifted, edges)
+    assert (factorisations > 0) is factorises and factorisations < (len(made) - factorisations) / 4
+    assert [v.accepted for v in found.verdicts] == [v.accepted for v in known.verdicts]
+    np.testing.assert_allclose(found.T_world_node, known.T_world_node, atol=1e-6)
+    assert found.cost_after == pytest.approx(known.cost_after, rel=1e-8)
+
+
+def test_loops_that_were_rejected_before_are_judged_again_in_fewer_steps() -> None:
+    """Two stay rejected. One is given as rejected although it is true: it is accepted."""
+    _, drifted, edges = scene(1, 60, 5, 2)
+    first = optimise(drifted, edges)
+    rejected = [False] * (len(edges) - 3) + [True] * 3
+    again = optimise(first.T_world_node, edges, rejected=rejected)
+    assert [v.accepted for v in again.verdicts] == [True] * 5 + [False] * 2
+    np.testing.assert_allclose(again.T_world_node, first.T_world_node, atol=1e-6)
+    assert again.iterations < optimise(first.T_world_node, edges).iterations / 2
 
 
 # The minimum is the minimum.

@@ -17,9 +17,10 @@ from room_run import FRAMES, LOST, PATH, made_run, picture
 from ros_reading import covariance, decoded, image, links, matrix, points, pose, read_bag, seconds
 from sigmasplat.floorplan.floor_plan import FREE, OBJECT, UNOBSERVED, WALL, FloorPlan
 from sigmasplat.model import se3
-from sigmasplat.model.atlas import UNKNOWN_HOP, Atlas, Hop
+from sigmasplat.model.atlas import Atlas
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.component import LOST as LOST_STATE, RELOCALISED, TRACKED
+from sigmasplat.model.hops import UNKNOWN_HOP, Hop
 from sigmasplat.robots.frames import T_LINK_OPTICAL, levelled_map, link_pose, ros_covariance
 from sigmasplat.robots.map_messages import grids
 from sigmasplat.robots.odometry import LiveOdometry, has_motion, odometry_poses

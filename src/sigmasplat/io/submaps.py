@@ -82,29 +82,30 @@ class DiskStore:
     def load(self, index: int) -> Submap:
         """Read a submap without its images. Raises RunError if it is missing or damaged."""
         with self._opened(index) as file:
-            attributes = {n: Rows(file.get_tensor(f"extra.{n}")) for n in ATTRIBUTES if f"extra.{n}" in file.keys()}  # noqa: SIM118
+            kept = [name for name in ATTRIBUTES if f"extra.{name}" in file.keys()]  # noqa: SIM118
+            attributes = {name: Rows(torch.from_numpy(file.get_tensor(f"extra.{name}"))) for name in kept}
             submap = Submap(
                 index,
-                GaussianField(file.get_tensor("params"), attributes=attributes),
+                GaussianField(torch.from_numpy(file.get_tensor("params")), attributes=attributes),
                 tuple(file.get_tensor("frames").tolist()),
-                file.get_tensor("T_submap_camera").numpy(),
+                file.get_tensor("T_submap_camera"),
                 Camera(**json.loads(file.metadata()["camera"])),
             )
             if "probe_frames" not in file.keys():  # noqa: SIM118
                 return submap
-            frames, poses = file.get_tensor("probe_frames").tolist(), file.get_tensor("T_submap_probe").numpy()
+            frames, poses = file.get_tensor("probe_frames").tolist(), file.get_tensor("T_submap_probe")
             return replace(submap, probe_frames=tuple(frames), T_submap_probe=poses)
 
     def picture(self, index: int, keyframe: int) -> Picture:
         """Read the images of one keyframe. Raises RunError if the submap is missing or damaged."""
         with self._opened(index) as file:
-            color, depth_m = (file.get_slice(name)[keyframe].numpy() for name in ("colors", "depths_m"))
+            color, depth_m = (file.get_slice(name)[keyframe] for name in ("colors", "depths_m"))
             return Picture(color, depth_m, _detail(file, keyframe), _photo(file, keyframe))
 
     def probe(self, index: int, probe: int) -> Picture:
         """Read the images of one probe view. Raises RunError if the submap is missing or damaged."""
         with self._opened(index) as file:
-            color, depth_m = (file.get_slice(name)[probe].numpy() for name in ("probe_colors", "probe_depths_m"))
+            color, depth_m = (file.get_slice(name)[probe] for name in ("probe_colors", "probe_depths_m"))
             return Picture(color, depth_m)
 
     def truncate(self, count: int) -> None:
@@ -129,7 +130,7 @@ class DiskStore:
         path = self.path(index)
         if not path.is_file():
             raise RunError(f"no submap {index} in {self.folder}: {path.name} is missing; run it again")
-        with open_tensors(path, "submap") as file:
+        with open_tensors(path, "submap", arrays=True) as file:
             yield file
 
 
@@ -138,7 +139,7 @@ def _detail(file: Any, keyframe: int) -> Detail | None:
     if "details" not in file.keys():  # noqa: SIM118
         return None
     camera = Camera(**json.loads(file.metadata()["detail_camera"]))
-    return Detail(file.get_slice("details")[keyframe].numpy(), camera)
+    return Detail(file.get_slice("details")[keyframe], camera)
 
 
 def _photo(file: Any, keyframe: int) -> Photo | None:
@@ -147,4 +148,4 @@ def _photo(file: Any, keyframe: int) -> Photo | None:
         return None
     ends = [0, *file.get_tensor("photo_ends").tolist()]
     camera = Camera(**json.loads(file.metadata()["photo_camera"]))
-    return Photo(file.get_slice("photos")[ends[keyframe] : ends[keyframe + 1]].numpy(), camera)
+    return Photo(file.get_slice("photos")[ends[keyframe] : ends[keyframe + 1]], camera)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.numpy import save_file
 from torch import Tensor
 
 from sigmasplat.errors import RunError
@@ -23,7 +23,9 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], text: dict[str, str
     """Write a file atomically. Raises RunError if it cannot be written."""
     with replacing(path) as temporary:
         try:
-            save_file(_without_shared_memory(tensors), temporary, text)
+            # safetensors.torch would keep some kB for each new size of a tensor: numpy.ctypeslib makes a type for it.
+            arrays = {name: tensor.detach().cpu().contiguous().numpy() for name, tensor in tensors.items()}
+            save_file(arrays, temporary, text)
             if tensors and len(text) > 1:
                 _sort_metadata(temporary)
         except SafetensorError as problem:  # also raised if the disk is full
@@ -32,14 +34,16 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], text: dict[str, str
 
 
 @contextmanager
-def open_tensors(path: Path, what: str) -> Iterator[Any]:
+def open_tensors(path: Path, what: str, arrays: bool = False) -> Iterator[Any]:
     """Open a file to read tensors or parts of them (`safe_open`); error messages call it `what`.
 
-    Raises RunError if it is damaged, or if the block does not find a tensor or cannot use it.
+    arrays: it yields NumPy arrays instead of tensors. Files that are read again and again need them: with tensors,
+    safetensors keeps some bytes for each one. Raises RunError if the file is damaged, or if the block does not find a
+    tensor or cannot use it.
     """
     try:
         refuse_special(path, RunError)
-        with safe_open(path, "pt") as file:
+        with safe_open(path, "np" if arrays else "pt") as file:
             yield file
     except ERRORS as problem:
         raise RunError(f"{what} {path} is damaged: {cause(problem)}") from problem
@@ -55,18 +59,6 @@ def _sort_metadata(path: Path) -> None:
         if len(text) <= size:  # the header is padded with spaces
             file.seek(8)
             file.write(text.ljust(size))
-
-
-def _without_shared_memory(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Copy tensors that share memory with another one, which safetensors refuses; others are not copied."""
-    out: dict[str, Tensor] = {}
-    taken: set[int] = set()
-    for name, tensor in tensors.items():
-        own = tensor.detach().cpu().contiguous()
-        memory = own.untyped_storage().data_ptr()
-        out[name] = own.clone() if memory in taken else own
-        taken.add(memory)
-    return out
 
 
 def _umask() -> int:

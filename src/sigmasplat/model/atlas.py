@@ -2,30 +2,15 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.model import se3
 from sigmasplat.model.exposure import between
+from sigmasplat.model.hops import UNKNOWN_HOP, Hop, TrackedHops
 from sigmasplat.model.places import Place, Places
 from sigmasplat.types import Matrix
-
-
-class Hop(NamedTuple):
-    """The motion T_camera_before [4, 4] from the keyframe before to a keyframe, as tracking found it.
-
-    covariance [6, 6]: of its left twist (ρ, φ), m and rad; nan if it is not known, as for the first keyframe of a
-    submap. bias [6]: standard deviation of the error that is the same in all hops.
-    """
-
-    T_camera_before: Matrix
-    covariance: Matrix
-    bias: Matrix
-
-
-UNKNOWN_HOP = Hop(np.eye(4), np.full((6, 6), np.nan), np.zeros(6))
 
 
 @dataclass(eq=False)
@@ -35,8 +20,7 @@ class Atlas:
     anchors: T_world_submap of each submap, the first one the identity; closing a loop changes only these.
     odometry: the same poses from tracking alone; no loop changes them.
     keyframe_poses: T_submap_camera of each submap's keyframes; those of the last submap change while it is mapped.
-    hops: how tracking found each keyframe from the keyframe before it in the submap.
-    places: one per frame.
+    hops: one per keyframe: how tracking found it from the keyframe before it in the submap. places: one per frame.
     refined: T_submap_camera of the keyframes of each submap in the final map, after its refinement has moved them; the
     world poses of keyframes and of their frames then come from these.
     exposures: those of the same keyframes [K, 3, 2] relative to the final map (`model.exposure`).
@@ -47,7 +31,7 @@ class Atlas:
     anchors: list[Matrix] = field(default_factory=list)
     odometry: list[Matrix] = field(default_factory=list)
     keyframe_poses: list[list[Matrix]] = field(default_factory=list)
-    hops: list[list[Hop]] = field(default_factory=list)
+    hops: TrackedHops = field(default_factory=TrackedHops)
     places: Places = field(default_factory=Places)
     components: list[int] = field(default_factory=list)
     refined: dict[int, list[Matrix]] = field(default_factory=dict)
@@ -62,7 +46,6 @@ class Atlas:
         begun = max(self.components, default=-1) + 1
         self.components.append(begun if T_parent_submap is None else self.components[parent])
         self.keyframe_poses.append([])
-        self.hops.append([])
 
     def add_finished(self, T_world_submap: Matrix, keyframe_poses: list[Matrix]) -> None:
         """Append a submap of an earlier session to the world, with T_submap_camera [4, 4] of its keyframes."""
@@ -70,12 +53,13 @@ class Atlas:
         self.odometry.append(T_world_submap)
         self.components.append(0)
         self.keyframe_poses.append(keyframe_poses)
-        self.hops.append([UNKNOWN_HOP] * len(keyframe_poses))
+        for _ in keyframe_poses:
+            self.hops.append(len(self.anchors) - 1, UNKNOWN_HOP)
 
     def set_keyframes(self, keyframe_poses: list[Matrix], hop: Hop) -> None:
         """Set T_submap_camera [4, 4] of the last submap's keyframes, with a new one at the end, and the hop to it."""
         self.keyframe_poses[-1] = keyframe_poses
-        self.hops[-1].append(hop)
+        self.hops.append(len(self.anchors) - 1, hop)
 
     def join(self, a: int, b: int, T_a_b: Matrix) -> None:
         """Join the components of two submaps, given T_a_b [4, 4]: the one with the higher number moves to the other."""

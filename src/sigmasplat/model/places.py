@@ -1,13 +1,13 @@
 """Where each frame is: the submap, the keyframe, and the pose relative to it."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import NamedTuple, overload
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.model.column import Column
+from sigmasplat.model.column import Column, Records
 from sigmasplat.types import Matrix
 
 NUMBERS = 2
@@ -23,7 +23,7 @@ class Place(NamedTuple):
 
 
 @dataclass(eq=False)
-class Places(Sequence[Place]):
+class Places(Records[Place]):
     """The places of all frames. rows [F, 18]: submap, keyframe, and T_keyframe_camera [4, 4] by rows."""
 
     rows: Column = field(default_factory=lambda: Column.of(np.float64, NUMBERS + 16))
@@ -35,19 +35,6 @@ class Places(Sequence[Place]):
         for place in known:
             places.append(place)
         return places
-
-    def __len__(self) -> int:
-        return len(self.rows)
-
-    @overload
-    def __getitem__(self, i: int) -> Place: ...
-    @overload
-    def __getitem__(self, i: slice) -> list[Place]: ...
-    def __getitem__(self, i: int | slice) -> Place | list[Place]:
-        if isinstance(i, slice):
-            return [self[k] for k in range(len(self))[i]]
-        row = self.rows.used[i]
-        return Place(int(row[0]), int(row[1]), row[NUMBERS:].reshape(4, 4).copy())
 
     @property
     def submap(self) -> NDArray[np.int64]:
@@ -71,3 +58,7 @@ class Places(Sequence[Place]):
     def first(self, count: int) -> "Places":
         """Return the places of the first frames, in the same memory."""
         return Places(self.rows.first(count))
+
+    def _record(self, i: int) -> Place:
+        row = self.rows.used[i]
+        return Place(int(row[0]), int(row[1]), row[NUMBERS:].reshape(4, 4).copy())

@@ -61,7 +61,7 @@ class LiveOdometry:
         self._last_hop: Matrix | None = None
         self._known = True
         self._last: int | None = None
-        self._counted: tuple[int, int] | None = None
+        self._counted: int | None = None
 
     def step(self, moved: bool, lost: bool, is_keyframe: bool) -> Matrix:
         """Add the motion to the newest frame of the atlas; return T_odom_camera.
@@ -70,7 +70,7 @@ class LiveOdometry:
         """
         newest = len(self.atlas.places) - 1
         if self._counted is None:
-            self._counted, self._last = self._hops(), newest
+            self._counted, self._last = len(self.atlas.hops), newest
             return self.T_odom_camera
         if not lost:
             motion = self._motion() if moved else None
@@ -95,15 +95,12 @@ class LiveOdometry:
         T = [atlas.odometry[s] @ atlas.keyframe_poses[s][k] @ T_keyframe for s, k, T_keyframe in (before, now)]
         return np.asarray(se3.inverse(T[0]) @ T[1])
 
-    def _hops(self) -> tuple[int, int]:
-        return len(self.atlas.hops), len(self.atlas.hops[-1])
-
     def _add_new_hops(self) -> None:
         """Add the errors of the hops to keyframes that are new since the last step."""
         assert self._counted is not None
-        submaps, count = self._counted
-        new = [*self.atlas.hops[submaps - 1][count:], *(h for hops in self.atlas.hops[submaps:] for h in hops[1:])]
-        self._counted = self._hops()
+        hops, first = self.atlas.hops, self._counted
+        self._counted = len(hops)
+        new = [hops[k] for k in range(first, self._counted) if not hops.begins_submap(k)]
         A = -se3.adjoint(self.T_odom_camera)
         for hop in new:
             self._known &= bool(np.isfinite(hop.covariance).all())

@@ -3,8 +3,8 @@
 from dataclasses import dataclass, field
 
 from sigmasplat.fit.pose import PoseFit
-from sigmasplat.model.atlas import UNKNOWN_HOP, Hop
 from sigmasplat.model.component import LOST, TRACKED
+from sigmasplat.model.hops import UNKNOWN_HOP, Hop
 from sigmasplat.slam.step_result import metrics_of
 from sigmasplat.types import Matrix
 

@@ -10,8 +10,8 @@ import numpy as np
 from sigmasplat.fit.align import Alignment
 from sigmasplat.fit.target import Keyframe
 from sigmasplat.model import se3
-from sigmasplat.model.atlas import UNKNOWN_HOP, Hop
 from sigmasplat.model.field import GaussianField
+from sigmasplat.model.hops import UNKNOWN_HOP, Hop
 from sigmasplat.slam.drift import Drift
 from sigmasplat.slam.localisation.confidence import std_of
 from sigmasplat.slam.localisation.known_map import KnownMap

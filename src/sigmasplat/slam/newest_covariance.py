@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from sigmasplat.model import se3
-from sigmasplat.model.atlas import Atlas, Hop
+from sigmasplat.model.atlas import Atlas
+from sigmasplat.model.hops import Hop
 from sigmasplat.slam.drift import hop_errors
 from sigmasplat.slam.loop_closure.closer import LoopCloser
 from sigmasplat.slam.path_covariance import Factors, PathCovariance
@@ -64,6 +65,6 @@ def newest_hop(atlas: Atlas) -> Matrix:
 
     It stands for that of a frame from its keyframe, which is tracked in the same way.
     """
-    known = (hop for hops in reversed(atlas.hops) for hop in reversed(hops) if np.isfinite(hop.covariance).all())
+    known = (hop for hop in reversed(atlas.hops) if np.isfinite(hop.covariance).all())
     hop: Hop | None = next(known, None)
     return FIRST_HOP if hop is None else np.asarray(hop.covariance + np.diag(hop.bias**2))

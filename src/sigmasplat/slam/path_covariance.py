@@ -43,15 +43,14 @@ LOOPS_MOST = 40
 def recorded(atlas: Atlas, edges: Sequence[Edge]) -> dict[str, Tensor]:
     """Return what a checkpoint keeps of the errors of a path; edges: the trusted ones and the accepted loops."""
     submaps = [s for s, poses in enumerate(atlas.keyframe_poses) for _ in poses]
-    hops = [hop for of_submap in atlas.hops for hop in of_submap]
     arrays = {
         "frame_keyframe": atlas.places.keyframe,
         "T_keyframe_camera": atlas.places.T_keyframe_camera,
         "keyframe_submap": np.array(submaps, np.int64),
         "T_submap_keyframe": np.array([T for poses in atlas.keyframe_poses for T in poses]).reshape(-1, 4, 4),
-        "hop_T_camera_before": np.array([hop.T_camera_before for hop in hops]).reshape(-1, 4, 4),
-        "hop_covariance": np.array([hop.covariance for hop in hops]).reshape(-1, 6, 6),
-        "hop_bias": np.array([hop.bias for hop in hops]).reshape(-1, 6),
+        "hop_T_camera_before": atlas.hops.T_camera_before,
+        "hop_covariance": atlas.hops.covariance,
+        "hop_bias": atlas.hops.bias,
         "edge_submaps": np.array([(edge.a, edge.b) for edge in edges], np.int64).reshape(-1, 2),
         "edge_T_a_b": np.array([edge.T_a_b for edge in edges]).reshape(-1, 4, 4),
         "edge_information": np.array([edge.information for edge in edges]).reshape(-1, 6, 6),
@@ -62,7 +61,7 @@ def recorded(atlas: Atlas, edges: Sequence[Edge]) -> dict[str, Tensor]:
 
 @dataclass(frozen=True, eq=False)
 class Hops:
-    """The motion to each of K keyframes from the one before it in its submap, as tracking found it (`model.atlas.Hop`):
+    """The motion to each of K keyframes from the one before it in its submap, as tracking found it (`model.hops.Hop`):
     T_camera_before [K, 4, 4], covariance [K, 6, 6], bias [K, 6]."""
 
     T_camera_before: Matrix

@@ -6,9 +6,9 @@ import numpy as np
 
 from sigmasplat.fit.pose import PoseFit
 from sigmasplat.model import se3
-from sigmasplat.model.atlas import UNKNOWN_HOP, Hop
 from sigmasplat.model.component import APART, LOST, RELOCALISED, TRACKED
 from sigmasplat.model.frame import Frame
+from sigmasplat.model.hops import UNKNOWN_HOP, Hop
 from sigmasplat.model.submap import RefinedStore, StorePart
 from sigmasplat.slam.array_interface import ArrayInterface
 from sigmasplat.slam.drift import mean_variance

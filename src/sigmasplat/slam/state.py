@@ -7,11 +7,12 @@ from sigmasplat.fit.adam import VectorAdam
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference
 from sigmasplat.fit.target import Keyframe, Target
-from sigmasplat.model.atlas import Atlas, Hop
+from sigmasplat.model.atlas import Atlas
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.column import Column
 from sigmasplat.model.field import GaussianField, Rows
 from sigmasplat.model.frame import Detail, PosePrior
+from sigmasplat.model.hops import TrackedHops
 from sigmasplat.model.photo import Photo
 from sigmasplat.model.places import Places
 from sigmasplat.model.submap import Picture
@@ -38,9 +39,9 @@ from sigmasplat.slam.tracker import Tracker
 
 CLASSES: tuple[type, ...] = (
     Atlas, Camera, Column, Confidence, DepthFit, DepthShape, Detail, Drift, Edge, FeatureImage, Foreground,
-    GaussianField, Hop, Keyframe, Link, Loop, LoopCloser, Mapper, Memory, OwedSearch, Photo, Picture, Places,
+    GaussianField, Keyframe, Link, Loop, LoopCloser, Mapper, Memory, OwedSearch, Photo, Picture, Places,
     PosePrior, Probe, Probes, Pyramid, Recovery, Reference, Relocaliser, Rows, Seen, SeenKeyframe, Step, Steps,
-    SubmapDescriptor, Target, Tracker, Usual, VectorAdam, Watch,
+    SubmapDescriptor, Target, TrackedHops, Tracker, Usual, VectorAdam, Watch,
 )  # fmt: skip
 """The classes that a state may contain."""
 

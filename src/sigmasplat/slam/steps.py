@@ -1,13 +1,11 @@
 """The results of all frames: the newest ones whole, of earlier ones what is read later."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import overload
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.model.column import Column
+from sigmasplat.model.column import Column, Records
 from sigmasplat.model.component import APART, LOST, RELOCALISED, TRACKED
 from sigmasplat.slam.step_result import Step
 
@@ -19,7 +17,7 @@ NUMBERS = 9
 
 
 @dataclass(eq=False)
-class Steps(Sequence[Step]):
+class Steps(Records[Step]):
     """The steps of all frames. Only the newest `WHOLE_STEPS` are kept whole; of earlier ones the values of tracking,
     loops, seconds and the covariance are dropped: they take most of the memory, and nothing reads them later.
 
@@ -29,17 +27,6 @@ class Steps(Sequence[Step]):
 
     rows: Column = field(default_factory=lambda: Column.of(np.float64, NUMBERS + 16))
     whole: dict[int, Step] = field(default_factory=dict)
-
-    def __len__(self) -> int:
-        return len(self.rows)
-
-    @overload
-    def __getitem__(self, i: int) -> Step: ...
-    @overload
-    def __getitem__(self, i: slice) -> list[Step]: ...
-    def __getitem__(self, i: int | slice) -> Step | list[Step]:
-        known = range(len(self))
-        return [self._step(k) for k in known[i]] if isinstance(i, slice) else self._step(known[i])
 
     def append(self, step: Step) -> None:
         """Append the result of the next frame."""
@@ -82,7 +69,7 @@ class Steps(Sequence[Step]):
         """Return the probability that each pose is off [F]."""
         return self.rows.used[:, 8].copy()
 
-    def _step(self, i: int) -> Step:
+    def _record(self, i: int) -> Step:
         if (step := self.whole.get(i)) is not None:
             return step
         index, timestamp_s, is_keyframe, lost, splats, submap, state, component, p_off = self.rows.used[i, :NUMBERS]

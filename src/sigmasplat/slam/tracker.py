@@ -24,7 +24,7 @@ from sigmasplat.slam.localisation.foreground import Foreground
 from sigmasplat.slam.localisation.memory import together
 from sigmasplat.slam.localisation.sight import FoundKeyframe, Sight
 from sigmasplat.slam.localisation.tracked_keyframe import Splats, TrackedKeyframe, found_keyframe, mapped_keyframe
-from sigmasplat.slam.localisation.verdict import LEAST_COMMON, Usual, agrees_more, confirmed, score, stands
+from sigmasplat.slam.localisation.verdict import LEAST_COMMON, RECENT, Usual, agrees_more, confirmed, score, stands
 from sigmasplat.slam.localisation.watch import Watch
 from sigmasplat.slam.rules import Asked, is_lost, is_wide, jumped, never, unless
 from sigmasplat.types import Matrix
@@ -195,8 +195,8 @@ class Tracker:
             self.velocity = np.eye(4)
         else:
             self.velocity = se3.inverse(self.previous) @ T_world_camera
-            self.agreements.append(fit.agreement * fit.overlap)
-            self.first_losses.append(fit.first_loss)
+            self.agreements = [*self.agreements, fit.agreement * fit.overlap][-RECENT:]
+            self.first_losses = [*self.first_losses, fit.first_loss][-RECENT:]
             if fit.comparison is not None:
                 self.usual.add(fit.comparison, float(np.linalg.norm(self.velocity[:3, 3])))
         self.previous = T_world_camera
@@ -298,7 +298,7 @@ class Tracker:
     def _doubts(self, fit: PoseFit) -> bool:
         if fit.comparison is not None:
             return self.usual.doubts(fit.comparison)
-        usual = float(np.median(self.agreements[-50:])) if self.agreements else 1.0
+        usual = float(np.median(self.agreements)) if self.agreements else 1.0
         worse = fit.agreement * fit.overlap < DOUBT * usual
         return worse or jumped(fit.first_loss, self.first_losses, self.config.reinit_factor)
 

@@ -12,8 +12,8 @@ from sigmasplat.types import Matrix
 
 Descriptors = NDArray[np.float32]
 
-ROUNDING = 1e-6
-"""Larger than any rounding error of a similarity."""
+ROUNDING = float(np.finfo(np.float32).eps)
+"""Times the length of a descriptor, this is larger than any rounding error of a similarity in single precision."""
 GATE_LEAST, GATE_MOST = 0.85, 1.20
 """Limits of the factor by which the variance of two submaps changes the similarity of their keyframes."""
 
@@ -79,9 +79,9 @@ def opacity_ratio(
     return float(variance_weights(log_variances, tau, weight_max) @ opaque) / total if total > 0.0 else 1.0
 
 
-def gate(query_ratio: float, database_ratio: float) -> float:
-    """Return clamp(r(q) · r(d), 0.85, 1.20) (VarSplat §4)."""
-    return min(max(query_ratio * database_ratio, GATE_LEAST), GATE_MOST)
+def gate(query_ratio: float, database_ratio: float | Matrix) -> Matrix:
+    """Return clamp(r(q) · r(d), 0.85, 1.20) of each database ratio [n] (VarSplat §4)."""
+    return np.asarray(np.clip(query_ratio * database_ratio, GATE_LEAST, GATE_MOST))
 
 
 def self_similarity(descriptors: Descriptors, min_similarity: float = 0.5) -> Matrix:
@@ -118,7 +118,8 @@ def find_candidates(
     """
     threshold = self_similarity(query.descriptors, min_similarity)
     others = _apart(query, database, min_interval)
-    gates = [gate(query.opacity_ratio, other.opacity_ratio) if uncertainty else 1.0 for other in others]
+    ratios = np.array([other.opacity_ratio for other in others])
+    gates = gate(query.opacity_ratio, ratios) if uncertainty else np.ones(len(others))
     found: list[Candidate] = []
     for row in _worth_comparing(query, others, gates, threshold, similarity_floor, most):
         other, factor = others[row], gates[row]
@@ -177,27 +178,28 @@ def _apart(query: SubmapDescriptor, database: Sequence[SubmapDescriptor], min_in
 def _worth_comparing(
     query: SubmapDescriptor,
     others: Sequence[SubmapDescriptor],
-    gates: Sequence[float],
+    gates: Matrix,
     threshold: Matrix,
     floor: float,
     most: int | None,
 ) -> list[int]:
     """Return the rows of the submaps that may have pairs to list; arguments as in `find_candidates`.
 
-    One product of matrices replaces one per submap. It is rounded differently: a pair whose similarity is within
-    `ROUNDING` of a limit is compared again, and takes no place among the `most` best.
+    One product of matrices in single precision replaces one per submap. It is rounded differently: a pair whose
+    similarity is so near a limit is compared again, and takes no place among the `most` best.
     """
     if not others or not len(threshold):
         return []
     counts = [len(other.descriptors) for other in others]
     first = np.cumsum([0, *counts[:-1]])
-    alike = similarity(query.descriptors, np.concatenate([other.descriptors for other in others]))
+    alike = query.descriptors @ np.concatenate([other.descriptors for other in others]).T
+    rounding = ROUNDING * query.descriptors.shape[1]
     gated = alike * np.repeat(gates, counts)
     above = np.minimum(gated - threshold[:, None], alike - floor)
     possible, certain = (
-        np.maximum.reduceat(np.where(above > limit, gated, -np.inf).max(0), first) for limit in (-ROUNDING, ROUNDING)
+        np.maximum.reduceat(np.where(above > limit, gated, -np.inf).max(0), first) for limit in (-rounding, rounding)
     )
-    least = -np.inf if most is None or most > len(others) else np.partition(certain, -most)[-most] - 2.0 * ROUNDING
+    least = -np.inf if most is None or most > len(others) else np.partition(certain, -most)[-most] - 2.0 * rounding
     return [int(row) for row in np.flatnonzero((possible > -np.inf) & (possible >= least))]
 
 

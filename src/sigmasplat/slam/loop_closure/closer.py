@@ -37,11 +37,11 @@ RIGID = np.diag(np.repeat([1e-4, 1e-5], 3) ** -2.0)
 world stay valid: a loop that disagrees moves the submaps of the new session."""
 
 GROWTH = 1.25
-"""The whole pose graph is solved when it has grown by this factor."""
+"""A pose graph that is not larger than the largest part is solved as a whole when it has grown by this factor."""
 WIDER = 3
 """Factor from one part of the pose graph to the next larger one, while a new loop disagrees."""
-SAME_CHI2 = 0.9
-"""A larger part of the pose graph does not help a rejected loop if its χ² stays above this share."""
+WIDEST = WIDER**2
+"""Factor from the smallest part to the largest one: it bounds the time of a cut, however long the run is."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -116,8 +116,9 @@ class LoopCloser:
     """Keeps the descriptors of finished submaps and all edges between them. Only this class moves anchors.
 
     edges: trusted ones, such as odometry, and registered loops; loop_rows: for each edge its row in `loops`, -1 for a
-    trusted one. solved: the number of submaps when the whole pose graph was last solved. In between, a loop that agrees
-    with the poses moves only the submaps near it in the graph (`Neighbourhood`). owed: the search that is under way.
+    trusted one. solved: the number of submaps when the whole pose graph was last solved. In between, and in a graph
+    that is larger than the largest part, loops move only the submaps near them in the graph (`Neighbourhood`).
+    owed: the search that is under way.
     """
 
     config: Config
@@ -255,31 +256,30 @@ class LoopCloser:
     def _correct_at(self, atlas: Atlas, submap: int, first: int) -> None:
         """Solve the pose graph as far as the new edges of a submap, from row `first` on, require it.
 
-        The solution of the whole graph takes time in proportion to its size, or more. The size grows by a factor in
-        between, so that on average the time per submap grows little. In between, loops that agree with the poses move
-        only the submaps near them. If one disagrees, larger parts are solved until all agree, or until a larger part
-        no longer changes their χ².
+        Loops that agree with the poses move only the submaps near them. If one disagrees, larger parts are solved until
+        all agree, or up to the largest part. A larger graph is solved as a whole only at the end (`solve_all`). Each
+        part starts at the solutions of earlier ones.
         """
         component = atlas.components[submap]
-        if len(atlas.members(component)) > GROWTH * self.solved:
+        largest, members = WIDEST * MOST_FREE, len(atlas.members(component))
+        if GROWTH * self.solved < members <= largest:
             self._correct(atlas, component)
             return
         new = [row for row in range(first, len(self.edges)) if self.edges[row].loop]
-        wrong = self._wrong(atlas, new)
-        size = WIDER * MOST_FREE if wrong else MOST_FREE
-        while True:
-            whole = self._correct(atlas, component, submap, size)
-            before, wrong = wrong, self._wrong(atlas, new)
-            if not wrong or whole or (size > WIDER * MOST_FREE and wrong > SAME_CHI2 * before):
-                return
+        size = WIDER * MOST_FREE if self._wrong(atlas, new) else MOST_FREE
+        while not self._correct(atlas, component, submap, size) and size < largest and self._wrong(atlas, new):
             size *= WIDER
 
-    def _wrong(self, atlas: Atlas, rows: Sequence[int]) -> float:
-        """Return the sum of χ² of those edges that disagree with the poses; 0 if all agree."""
+    def _wrong(self, atlas: Atlas, rows: Sequence[int]) -> bool:
+        """Return whether any of these edges disagrees with the poses."""
         edges = [self.edges[row] for row in rows]
         nodes = sorted({end for edge in edges for end in (edge.a, edge.b)})
         chi2 = PoseGraph(len(nodes), numbered(edges, nodes)).chi2(np.stack([atlas.anchors[node] for node in nodes]))
-        return float(chi2[chi2 > most_chi2()].sum())
+        return bool((chi2 > most_chi2()).any())
+
+    def _is_rejected(self, loop_row: int) -> bool:
+        """Return whether a pose graph that was solved before has rejected the loop of an edge."""
+        return loop_row >= 0 and isfinite(self.loops[loop_row].chi2) and not self.loops[loop_row].accepted
 
     def _correct(self, atlas: Atlas, component: int, centre: int | None = None, most_free: int = MOST_FREE) -> bool:
         """Solve the pose graph of a component, move its anchors, and update the verdict on its registered loops; return
@@ -294,7 +294,9 @@ class LoopCloser:
             part = Neighbourhood.whole(members, self.edges)
         else:
             part = Neighbourhood.around(centre, self.graph, members[0], most_free)
-        solution = part.solve(atlas.anchors, self.edges)
+        small = len(members) <= MOST_FREE
+        rejected = [] if small else [self._is_rejected(self.loop_rows[edge]) for edge in part.edges]
+        solution = part.solve(atlas.anchors, self.edges, rejected)
         for submap, T_world_submap in zip(part.nodes, solution.T_world_node, strict=True):
             atlas.anchors[submap] = T_world_submap
         tested = [row for row in (self.loop_rows[edge] for edge in part.edges) if row >= 0]

@@ -71,11 +71,14 @@ class Neighbourhood:
         fixed = sorted(ends.difference(free))
         return Neighbourhood((*fixed, *free), len(fixed), tuple(rows))
 
-    def solve(self, T_world_node: Sequence[Matrix], edges: Sequence[Edge]) -> PoseGraphSolution:
+    def solve(
+        self, T_world_node: Sequence[Matrix], edges: Sequence[Edge], rejected: Sequence[bool] = ()
+    ) -> PoseGraphSolution:
         """Solve this part of a graph, given the pose [4, 4] of each node and the edges; the solution has one pose for
-        each of `nodes`."""
+        each of `nodes`. rejected: for each of this part's edges, as in `optimise`."""
         part = numbered([edges[row] for row in self.edges], self.nodes)
-        return optimise(np.stack([T_world_node[node] for node in self.nodes]), part, fixed=self.fixed)
+        poses = np.stack([T_world_node[node] for node in self.nodes])
+        return optimise(poses, part, fixed=self.fixed, rejected=rejected)
 
 
 def numbered(edges: Sequence[Edge], nodes: Sequence[int]) -> list[Edge]:

@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csc_array
 from scipy.sparse.csgraph import connected_components
-from scipy.sparse.linalg import SuperLU, splu
 from scipy.special import gammaincinv
 
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.model import se3
+from sigmasplat.slam.loop_closure.normal_equations import Solver, factorised
 from sigmasplat.types import Matrix
 
 PRUNE_WEIGHT = 0.25
@@ -27,6 +27,12 @@ GRADUATION = 1.4
 STEPS_PER_MU = 10
 """Enough steps to converge. With only two steps, one loop that was wrong by half a turn distorted the first solutions
 so much that thirteen true loops were rejected too (half a metre of drift, 36 submaps)."""
+LARGE = 100
+"""A graph with more free nodes than this is solved iteratively."""
+SETTLED = 1e-10
+"""A solution is found when a step lowers the cost by less than this share."""
+ROUGHLY = 1e-3
+"""The same before the last μ in a large graph: these solutions only lead to the next one."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -66,13 +72,21 @@ class PoseGraphSolution:
 
 
 def optimise(
-    T_world_node: Matrix, edges: Sequence[Edge], confidence: float = 0.99, max_iterations: int = 100, fixed: int = 1
+    T_world_node: Matrix,
+    edges: Sequence[Edge],
+    confidence: float = 0.99,
+    max_iterations: int = 100,
+    fixed: int = 1,
+    rejected: Sequence[bool] = (),
 ) -> PoseGraphSolution:
     """Find the poses [N, 4, 4] that agree best with the edges; the first `fixed` nodes, at least node 0, stay.
 
     A loop is rejected if its χ² exceeds the `confidence` quantile of 6 degrees of freedom; with confidence = 1 every
     loop is accepted (plain least squares). Without loops the poses are returned unchanged. After the verdicts, up to
     `max_iterations` more steps are taken.
+
+    rejected [E]: loops that an earlier solution has rejected; by default none. They are judged again, but do not
+    prolong the solution: it starts as if they were not there.
 
     Raises SigmaSplatError on poses or edges that are not rigid, edges to nodes that do not exist, information that is
     not symmetric positive definite, and nodes without a chain of odometry edges to a fixed node: if their loops are
@@ -92,7 +106,8 @@ def optimise(
         return PoseGraphSolution(poses, (), 0, cost, cost)
 
     chi2_limit = most_chi2(confidence)
-    T, weights, graduating = _graduate(graph, start, chi2_limit)
+    judged_first = graph.loop & ~np.array(rejected, bool) if len(rejected) else graph.loop
+    T, weights, graduating = _graduate(graph, start, chi2_limit, judged_first)
     believed = np.where(graph.loop, weights >= PRUNE_WEIGHT, True)
     T, finishing = _minimise(graph, T, believed.astype(np.float64), max_iterations)
     chi2 = graph.chi2(T)
@@ -118,6 +133,8 @@ class PoseGraph:
 
     def __init__(self, nodes: int, edges: Sequence[Edge], fixed: int = 1) -> None:
         self.nodes, self.fixed = nodes, fixed
+        self.is_large = nodes - fixed > LARGE
+        self.solver = Solver(self.is_large)
         self.a = np.array([edge.a for edge in edges], np.intp)
         self.b = np.array([edge.b for edge in edges], np.intp)
         self.loop = np.array([edge.loop for edge in edges], bool)
@@ -158,41 +175,46 @@ class PoseGraph:
         return coo_array((values, (self._rows, self._columns)), shape=(size, size)).tocsc(), g[self.fixed :].ravel()
 
 
-def _graduate(graph: PoseGraph, T: Matrix, chi2_limit: float) -> tuple[Matrix, Matrix, int]:
+def _graduate(
+    graph: PoseGraph, T: Matrix, chi2_limit: float, judged_first: NDArray[np.bool_]
+) -> tuple[Matrix, Matrix, int]:
     """Solve for decreasing μ: return poses, weights [E] of the Geman–McClure loss with c² = chi2_limit, and steps
     taken.
 
-    w = (μc² / (r² + μc²))², μ from 2 max r² / c² down to 1 (Yang et al. 2020, eq. 12 and remark 5). The first r² is
-    that of the given poses. It is not that of a solution with equal weights, because false loops distort such a
-    solution most.
+    w = (μc² / (r² + μc²))², μ from 2 max r² / c² down to 1 (Yang et al. 2020, eq. 12 and remark 5). The first r²
+    is that of the loops `judged_first` [E] at the given poses. It is not that of a solution with equal weights, because
+    false loops distort such a solution most.
     """
     chi2, steps = graph.chi2(T), 0
-    mu = max(2.0 * float(chi2[graph.loop].max()) / chi2_limit, 1.0)
+    mu = max(2.0 * float(chi2[judged_first].max(initial=0.0)) / chi2_limit, 1.0)
+    enough = ROUGHLY if graph.is_large else SETTLED
     while True:
         weights = np.where(graph.loop, 1.0 / (1.0 + chi2 / (mu * chi2_limit)) ** 2, 1.0)
-        T, taken = _minimise(graph, T, weights, STEPS_PER_MU)
+        T, taken = _minimise(graph, T, weights, STEPS_PER_MU, SETTLED if mu == 1.0 else enough)
         chi2, steps = graph.chi2(T), steps + taken
         if mu == 1.0:
             return T, 1.0 / (1.0 + chi2 / chi2_limit) ** 2, steps
         mu = max(mu / GRADUATION, 1.0)
 
 
-def _minimise(graph: PoseGraph, T: Matrix, weights: Matrix, max_iterations: int) -> tuple[Matrix, int]:
+def _minimise(
+    graph: PoseGraph, T: Matrix, weights: Matrix, max_iterations: int, enough: float = SETTLED
+) -> tuple[Matrix, int]:
     """Minimise Σ w eᵀΩe by Levenberg–Marquardt from poses T; return the poses and the number of steps tried.
 
-    Damping is proportional to H's diagonal and starts very small, because the smallest eigenvalues of a chain are about
-    N² times smaller than the diagonal.
+    enough: a step that lowers the cost by less than this share is the last one. Damping is proportional to H's diagonal
+    and starts very small, because the smallest eigenvalues of a chain are about N² times smaller than the diagonal.
     """
     cost, damping = float(weights @ graph.chi2(T)), 1e-9
     for step in range(1, max_iterations + 1):
         H, g = graph.normal_equations(T, weights)
         H.setdiag(H.diagonal() * (1.0 + damping))
-        delta = _factorised(H).solve(-g)
+        delta = graph.solver.solve(H, -g)
         moved = T.copy()
         moved[graph.fixed :] = se3.exp_stack(delta.reshape(-1, 6)) @ T[graph.fixed :]
         cost_moved = float(weights @ graph.chi2(moved))
         if cost_moved < cost:
-            settled = cost - cost_moved < 1e-10 * cost and damping < 1e-6
+            settled = cost - cost_moved < enough * cost and damping < 1e-6
             T, cost, damping = moved, cost_moved, damping / 10.0
         else:
             settled = bool(np.abs(delta).max() < 1e-9) or damping > 1e6
@@ -200,10 +222,6 @@ def _minimise(graph: PoseGraph, T: Matrix, weights: Matrix, max_iterations: int)
         if settled:
             return T, step
     return T, max_iterations
-
-
-def _factorised(H: csc_array) -> SuperLU:
-    return splu(H, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
 
 class Sensitivity:
@@ -218,7 +236,7 @@ class Sensitivity:
         self.graph = graph = PoseGraph(len(T_world_node), edges)
         e = graph.residuals(T_world_node)
         H, _ = graph.normal_equations(T_world_node, np.ones(len(edges)))
-        self._solver = _factorised(H)
+        self._solver = factorised(H)
         self._pull = np.swapaxes(graph.jacobians(T_world_node, e), 1, 2) @ graph.information
 
     def of(self, node: int) -> Matrix:

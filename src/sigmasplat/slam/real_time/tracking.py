@@ -62,10 +62,7 @@ class CameraClock:
 
     def copied(self) -> "CameraClock":
         """Return a copy that later frames do not change."""
-        tracker = replace(
-            self.tracker, agreements=self.tracker.agreements[:], first_losses=self.tracker.first_losses[:],
-            usual=copy.deepcopy(self.tracker.usual),
-        )  # fmt: skip
+        tracker = replace(self.tracker, usual=copy.deepcopy(self.tracker.usual))
         return replace(self, tracker=tracker, recovery=copy.copy(self.recovery), confidence=copy.copy(self.confidence))
 
     # ---- a new snapshot ----

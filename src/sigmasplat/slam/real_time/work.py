@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from sigmasplat.model import se3
-from sigmasplat.model.atlas import UNKNOWN_HOP, Hop
 from sigmasplat.model.component import APART, RELOCALISED
+from sigmasplat.model.hops import UNKNOWN_HOP, Hop
 from sigmasplat.slam.drift import mean_variance
 from sigmasplat.slam.listeners import Before, correction_since
 from sigmasplat.slam.localisation.relocaliser import Relocation
