@@ -112,9 +112,9 @@ class MappingConfig(Section, name="mapping"):
     """Optimisation steps for the first keyframe of a map. Until about 150 steps, a new map renders surfaces too
     close."""
     first_divided: bool = False
-    """Whether the steps of the first keyframe are divided: `iterations` of them at once, and as many at each of the
-    next frames that are not mapped, until `first_iterations` are made. The first frame then takes no longer than
-    others."""
+    """Whether the steps of the first keyframe are divided: `iterations` of them at once, and as many, or a fifteenth of
+    `first_iterations` if this is more, at each of the next frames that are not mapped, until `first_iterations` are
+    made. The first frame then takes no longer than others."""
     newest_probability: Share = 0.4
     """Probability that a step uses the newest keyframe; the other steps use older ones, drawn uniformly."""
     weight_l1: NotNegative = 0.8
@@ -194,6 +194,11 @@ class MappingConfig(Section, name="mapping"):
     """Whether the losses of depth weigh each reading by 1/σ (`input.sensor`), with a mean of 1 over the image."""
     frames_per_step: Count = 1
     """Each step minimises the mean loss of this many keyframes of the window; 0 = of all of them (CG-SLAM)."""
+
+    @property
+    def first_per_frame(self) -> int:
+        """Return how many steps of the first keyframe a later frame makes (`first_divided`)."""
+        return max(self.iterations, self.first_iterations // 15)
 
 
 @dataclass(frozen=True)
