@@ -30,11 +30,11 @@ SIGMA = varsplat.FAST.changed(
     surface={"depth": "map+sensor"},
     uncertainty={"probes": 4},
     final={
-        "iterations": 1200,
+        "iterations": 1000,
         "merge_m": 0.05,  # 40 % fewer splats than with 0.02, and no seams between neighbouring voxels
         "exposure": True,
         "order": "epochs",
-        "lr_factor": 8.0,  # the rates of mapping are too small for 1200 steps: shapes hardly change
+        "lr_factor": 8.0,  # the rates of mapping are too small for 1000 steps: shapes hardly change
         "beta2": 0.99,  # each keyframe has about a dozen steps: 0.999 remembers gradients of the merged map
         "lr_decay": 0.05,
         "lr_pose_translation": 3e-4,
