@@ -18,7 +18,7 @@ def test_the_first_frame_counts_for_the_rate_but_not_as_the_longest() -> None:
 
 def test_a_run_without_a_final_map_has_no_ratio_of_it() -> None:
     now, before = ([pace.figures_of([1.0, s, s], {"wall_s": s, "finish_s": None})] * 2 for s in (0.1, 0.2))
-    table = laid_out("pace", {"sequences": [{"sequence": "room", "runs": {"now": now, "before": before}}]})["room: pace"]
-    rows = {row[0]: row for row in table.rows}
+    figures = {"sequences": [{"sequence": "room", "runs": {"now": now, "before": before}}]}
+    rows = {row[0]: row for row in laid_out("pace", figures)["room: pace"].rows}
     assert rows["frames/s"][3] == "2.00" and rows["frames/s"][4] == "2.00, 2.00"
     assert rows["longest frame, ms"][3] == "0.500" and rows["final map, s"][4] == "nan, nan"

@@ -312,6 +312,24 @@ def test_real_time_calls_functions_on_the_thread_of_the_caller(schedule: Any) ->
     assert moved or (not early and schedule is None)
 
 
+def test_loops_that_close_after_the_last_keyframe_are_reported_in_real_time() -> None:
+    system = RealTime(Slam(settings=LOOPS | {"realtime.keyframe_deg": "0"}), AtOnce())
+    seen, closed = Recorder(system), False
+    for i in range(60):
+        before = len(system.slam.loops)
+        rgb, depth = images(i)
+        step = system.track(rgb, depth, K, i / 30, depth_scale=1000)
+        newest = system.slam.loops[before:]
+        if closed := not step.is_keyframe and any(loop.accepted for loop in newest):
+            break
+    assert closed and newest[-1].query not in {loop.query for loop in seen.loops}
+    system.settle()
+    assert {(loop.query, loop.database) for loop in newest if loop.accepted} <= {
+        (loop.query, loop.database) for loop in seen.loops
+    }
+    assert not seen.corrections or seen.corrections[-1].reason == "loop"
+
+
 def test_in_real_time_a_function_that_fails_leaves_the_state_valid() -> None:
     system = RealTime(Slam(settings=SETTINGS), AtOnce())
 

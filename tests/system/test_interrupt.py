@@ -43,7 +43,8 @@ def test_ctrl_c_leaves_a_usable_run(tmp_path: Path, capsys: pytest.CaptureFixtur
 def test_ctrl_c_with_submaps_keeps_them_and_writes_their_map(tmp_path: Path) -> None:
     out = tmp_path / "run"
     with running(out, "submaps.frames=8", "loops.min_interval=1") as process:
-        wait_for(process, lambda: len(RunFolder(out).submaps) >= 2)
+        log_file = out / "log.jsonl"
+        wait_for(process, lambda: len(RunFolder(out).submaps) >= 2 and '"loops": [' in log_file.read_text())
         process.send_signal(signal.SIGINT)
         said, errors = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 130, errors

@@ -11,11 +11,12 @@ from sigmasplat.model import se3
 from sigmasplat.model.component import APART, RELOCALISED
 from sigmasplat.model.hops import UNKNOWN_HOP, Hop
 from sigmasplat.slam.drift import mean_variance
-from sigmasplat.slam.listeners import Before, correction_since
+from sigmasplat.slam.listeners import Before, Correction, correction_since
 from sigmasplat.slam.localisation.relocaliser import Relocation
 from sigmasplat.slam.localisation.sight import Observation
 from sigmasplat.slam.localisation.tracked_keyframe import TrackedKeyframe, found_keyframe, mapped_keyframe
 from sigmasplat.slam.localisation.verdict import is_better
+from sigmasplat.slam.loop_closure.closer import Loop
 from sigmasplat.slam.mapping import MapWork
 from sigmasplat.slam.newest_covariance import NO_ERRORS
 from sigmasplat.slam.real_time.messages import Offer, Search, Snapshot, Task, TrackedFrame
@@ -207,6 +208,12 @@ class MapClock:
         self._publish(number, self._reference(seen, T, None), {number: T}, state)
 
     # ---- snapshots ----
+
+    def unreported(self) -> tuple[list[Loop], Correction | None]:
+        """Return all loops tried, and the correction since the last snapshot; call it when no work is left."""
+        correction = correction_since(self.system, self._before) if self.system.listeners.correction else None
+        self._before = Before.of(self.system)
+        return self.system.loops, correction
 
     def _publish(self, number: int, keyframe: TrackedKeyframe, poses: dict[int, Matrix], state: str) -> None:
         """Hand a snapshot of the active map to tracking."""
