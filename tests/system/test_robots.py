@@ -44,8 +44,10 @@ SETTINGS = {
     "submaps.distance_m": "0", "submaps.angle_deg": "0", "submaps.uncertainty_m": "0", "submaps.frames": "10",
     "loops.min_interval": "1", "loops.min_similarity": "0.3",
     "mapping.lr_pose_translation": "2e-4", "mapping.lr_pose_rotation": "1e-4", "registration.to_keyframe": "false",
+    "loops.slices_per_frame": "0",
 }  # fmt: skip
-"""Mapping moves the keyframes of this short walk, so that the loop has something to correct."""
+"""Mapping moves the keyframes of this short walk, so that the loop has something to correct. The walk is too short for
+a search for loops that is divided over its frames."""
 FRAMES = 26
 MESSAGES = RosMessages()
 ROOM = "synthetic:frames=60,width=64,height=48"
