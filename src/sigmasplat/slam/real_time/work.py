@@ -211,17 +211,19 @@ class MapClock:
 
     def unreported(self) -> tuple[list[Loop], Correction | None]:
         """Return all loops tried, and the correction since the last snapshot; call it when no work is left."""
-        correction = correction_since(self.system, self._before) if self.system.listeners.correction else None
-        self._before = Before.of(self.system)
-        return self.system.loops, correction
+        return self.system.loops, self._correction()
+
+    def _correction(self) -> Correction | None:
+        """Return the correction since the last call, if a function wants it."""
+        before, self._before = self._before, Before.of(self.system)
+        return correction_since(self.system, before) if self.system.listeners.correction else None
 
     def _publish(self, number: int, keyframe: TrackedKeyframe, poses: dict[int, Matrix], state: str) -> None:
         """Hand a snapshot of the active map to tracking."""
         system, seconds = self.system, self._timer.stop(self.system.view)["total"]
         if state:
             self._found = number
-        correction = correction_since(system, self._before) if system.listeners.correction else None
-        self._before = Before.of(system)
+        correction = self._correction()
         errors = system.pose_errors() if self.with_errors else NO_ERRORS
         self._hand_over(
             Snapshot(
