@@ -15,6 +15,12 @@ Slices = Generator[None, None, Result]
 """A long task in slices: it yields after each slice, and returns its result after the last one."""
 
 
+def long_slice() -> Slices[None]:
+    """End a slice that takes as long as several others: it counts as three."""
+    for _ in range(3):
+        yield
+
+
 def completed(slices: Slices[Result]) -> Result:
     """Run all slices of a task and return its result."""
     while True:

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -12,13 +12,16 @@ from numpy.typing import NDArray
 from sigmasplat.config import Config, RegistrationConfig, RenderConfig, SeedConfig, TrackingConfig
 from sigmasplat.fit.target import Target
 from sigmasplat.model import se3
+from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import COLUMNS, GaussianField
 from sigmasplat.model.submap import MemoryStore, Submap
 from sigmasplat.render.backend import make_view
 from sigmasplat.slam.drift import floor
+from sigmasplat.slam.features import Extractor, Features, make_extractor
 from sigmasplat.slam.loop_closure import registration
 from sigmasplat.slam.loop_closure.candidates import Candidate, SubmapPair
 from sigmasplat.slam.loop_closure.closer import LoopCloser
+from sigmasplat.slam.loop_closure.feature_guesses import FeatureGuesses
 from sigmasplat.slam.loop_closure.registration import Localisation, Registrar, Registration
 from sigmasplat.slam.seeding import make_splats
 from sigmasplat.types import completed
@@ -151,6 +154,39 @@ def test_what_is_known_before_does_not_matter_where_the_views_are_alike() -> Non
     found, truth = registered((0, 5), (2, 6), se3.exp(np.array([3.0, 1.0, 0.0, 0.0, 0.0, 2.0])))
     assert found.accepted, found.reason
     assert off(found.T_a_b, truth)[0] < 0.02
+
+
+class Counting:
+    """An extractor that counts in how many images it looks for features."""
+
+    def __init__(self) -> None:
+        self.inner, self.images = make_extractor(CONFIG.features), 0
+        self.config = self.inner.config
+
+    def find(self, gray: NDArray[np.uint8], camera: Camera) -> Features:
+        self.images += 1
+        return self.inner.find(gray, camera)
+
+    def match(self, a: Features, b: Features) -> NDArray[np.int64]:
+        return self.inner.match(a, b)
+
+
+def test_features_guess_the_pose_and_are_found_once_per_image_in_slices_of_their_own() -> None:
+    store, counting = MemoryStore(), Counting()
+    ours, theirs = piece(store, range(0, 12, 6)), piece(store, range(3, 15, 6))
+    truth = walk().truth().T_world_camera
+    guesses = FeatureGuesses(store, cast(Extractor, counting), seed=0)
+    for k, frame in enumerate(ours.frames):
+        for _ in (slices := guesses.of(ours, k, theirs, (0, 1))):
+            before = counting.images
+            next(slices, None)
+            assert counting.images <= before + 1, "one image in a slice"
+        for found in completed(guesses.of(ours, k, theirs, (0, 1))):
+            apart_m, turned_deg = off(found, se3.inverse(truth[frame]) @ truth[theirs.frames[0]])
+            assert apart_m < 0.02 and turned_deg < 1.0
+    assert len(completed(guesses.of(ours, 0, theirs, (0, 1)))) == 2
+    assert counting.images == 4
+    assert completed(FeatureGuesses(store, None, seed=0).of(ours, 0, theirs, (0, 1))) == []
 
 
 def test_submaps_of_different_places_are_refused_and_left_where_they_are() -> None:

@@ -69,9 +69,9 @@ class LoopConfig(Section, name="loops"):
     most: Count = 4
     """Maximum number of pairs registered per finished submap, the most similar first; 0 = no limit."""
     slices_per_frame: Count = 0
-    """Each frame that is not a keyframe continues the search for the loops of the last finished submap by this many
-    slices, each of one alignment, so that no frame takes long; 0 = the frame that ends the submap makes the whole
-    search."""
+    """Each frame that is not a keyframe continues the search for the loops of finished submaps by this many slices for
+    each submap that waits, so that no frame takes long. A slice is one alignment. 0 = the frame that ends the submap
+    makes the whole search."""
     uncertainty: bool = True
     """Whether similarity is multiplied by a gate from the variance-weighted opacity ratio; off = LoopSplat."""
     variance: Literal["published", "predicted"] = "published"

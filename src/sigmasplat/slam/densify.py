@@ -38,7 +38,9 @@ def multiply(field: GaussianField, chosen: Tensor, config: DensifyConfig, random
     Split splats are removed and the rows after them move up; new splats are appended. Each chosen splat enlarges the
     field by at most one.
     """
-    large = chosen & (field.scales.amax(1) > config.split_scale_m)
+    if not chosen.any():
+        return chosen
+    large = chosen & (_widest(field) > config.split_scale_m)
     twins = _copies(field, chosen & ~large & config.clone)
     split(field, large, random)
     field.append(twins)
@@ -74,7 +76,7 @@ def too_large(
     """
     if not (most_scale_m > 0 or most_radius_px > 0):
         return torch.zeros(len(field), dtype=torch.bool, device=field.params.device)
-    widest, T = field.scales.amax(1), torch.from_numpy(T_camera_world).to(field.params)
+    widest, T = _widest(field), torch.from_numpy(T_camera_world).to(field.params)
     large = (widest > most_scale_m) & (most_scale_m > 0)
     if most_radius_px > 0:
         x, y, z = (sum((field.means[:, k] * T[i, k] for k in range(3)), T[i, 3]) for i in range(3))
@@ -82,6 +84,12 @@ def too_large(
         inside = (u >= -0.5) & (u <= camera.width - 0.5) & (v >= -0.5) & (v <= camera.height - 0.5)
         large |= (z > 0) & inside & (RADIUS_SIGMAS * widest * camera.fx / z > most_radius_px)
     return large
+
+
+def _widest(field: GaussianField) -> Tensor:
+    """Return the largest standard deviation of each splat [N], metres; by columns, which is faster than over rows."""
+    first, second, third = field.params[:, SCALES].unbind(1)
+    return torch.maximum(torch.maximum(first, second), third).exp()
 
 
 def _copies(field: GaussianField, rows: Tensor) -> GaussianField:

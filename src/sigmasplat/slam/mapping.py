@@ -4,6 +4,7 @@ Both clocks do this work: `Slam.step` between two frames, `RealTime` beside them
 """
 
 from collections.abc import Callable, Sequence
+from math import inf
 
 import numpy as np
 
@@ -149,7 +150,6 @@ class MapWork(World):
         """Move the active submap to the store, in slices, and look for its loops, or leave that to the next frames
         (`loops.slices_per_frame`)."""
         yield from self.refining(self.mapper.owed)
-        yield from self.closing()
         submap, pictures = self.mapper.finished(len(self.store))
         submap, probes = self.probes.of(submap)
         yield
@@ -158,14 +158,16 @@ class MapWork(World):
         descriptors = [keyframe.descriptor for keyframe in self.mapper.keyframes]
         known = [descriptor for descriptor in descriptors if descriptor is not None]
         yield
-        self.closer.owed = OwedSearch(submap.index, known)
+        self.closer.owed.append(OwedSearch(submap.index, known))
         if not self.config.loops.slices_per_frame:
             yield from self.closing()
 
     def closing(self, at_most: int | None = None) -> Slices[None]:
-        """Look for the loops of the submap that was finished last, as far as this is owed, in at most so many slices;
-        at the end anchors may move."""
-        while (owed := self.closer.owed) is not None and (at_most is None or at_most > 0):
+        """Look for the loops of finished submaps, as far as this is owed, one submap after the other; at most so many
+        slices are made for each search that is owed. At the end of a search anchors may move."""
+        left = inf if at_most is None else at_most * len(self.closer.owed)
+        while self.closer.owed and left > 0:
+            owed = self.closer.owed[0]
             if self._search is None:
                 submap = self.store.load(owed.submap)
                 self._search = self.closer.closing(submap, owed.descriptors, self.atlas, self.view)
@@ -175,10 +177,11 @@ class MapWork(World):
                 next(self._search)
             except StopIteration as end:
                 self.confidence.closed(end.value, self.config.render.scene_scale)
-                self.closer.owed = self._search = None
-                return
+                self.closer.owed.pop(0)
+                self._search = None
+                continue
             owed.slices += 1
-            at_most = None if at_most is None else at_most - 1
+            left -= 1
             yield
 
     # ---- search and join ----

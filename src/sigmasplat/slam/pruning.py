@@ -31,7 +31,7 @@ def splat_uncertainty(
         T_camera_world = se3.inverse(keyframe.T_world_camera)
         view.forward(field.params, T_camera_world, layers=True)
         rows, weights, readings = (x.to(field.params.device) for x in _owned(view, keyframe, owner))
-        off = readings - depths(field.means[rows].double(), T_camera_world)
+        off = readings - depths(field.means.double(), T_camera_world)[rows]
         # On a device that sums in parallel, torch sorts the indices first, so that the sums are the same every time.
         spread += torch.zeros_like(spread).index_put_((rows,), weights * (off * off), accumulate=True)
         count.index_put_((rows,), torch.ones_like(rows), accumulate=True)

@@ -118,7 +118,7 @@ class LoopCloser:
     edges: trusted ones, such as odometry, and registered loops; loop_rows: for each edge its row in `loops`, -1 for a
     trusted one. solved: the number of submaps when the whole pose graph was last solved. In between, and in a graph
     that is larger than the largest part, loops move only the submaps near them in the graph (`Neighbourhood`).
-    owed: the search that is under way.
+    owed: the searches that are not complete, the oldest first.
     """
 
     config: Config
@@ -129,7 +129,7 @@ class LoopCloser:
     loop_rows: list[int] = field(default_factory=list)
     loops: list[Loop] = field(default_factory=list)
     solved: int = 0
-    owed: OwedSearch | None = None
+    owed: list[OwedSearch] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.predicted = PredictedSubmaps(self.config, self.store)

@@ -1,7 +1,7 @@
 """Register two submaps: keyframes of each are localised in the other, and the results must agree (VarSplat §5)."""
 
 import dataclasses
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -25,13 +25,12 @@ from sigmasplat.model.submap import Picture, Submap, SubmapStore
 from sigmasplat.render.view import View
 from sigmasplat.slam.drift import floor, symmetric
 from sigmasplat.slam.features import Extractor
-from sigmasplat.slam.localisation.feature_image import pose_by_features
-from sigmasplat.slam.localisation.known_map import KnownKeyframe
 from sigmasplat.slam.localisation.verdict import confirmed
 from sigmasplat.slam.loop_closure.candidates import SubmapPair
+from sigmasplat.slam.loop_closure.feature_guesses import FeatureGuesses
 from sigmasplat.slam.predicted_submaps import PredictedSubmaps
 from sigmasplat.slam.rules import angle_between
-from sigmasplat.types import Matrix, Slices
+from sigmasplat.types import Matrix, Slices, long_slice
 
 HOPELESS = 0.5
 """If alignment explains less than this share of `share_least`, the keyframe is not refined further."""
@@ -92,9 +91,9 @@ class Registrar:
         extractor: Extractor | None = None,
         predicted: PredictedSubmaps | None = None,
     ) -> None:
-        self.config, self.store, self.view, self.extractor = config.registration, store, view, extractor
+        self.config, self.store, self.view, self.verify = config.registration, store, view, config.tracking.verify
         self.predicted = predicted or PredictedSubmaps(config, store)
-        self.verify, self.seed = config.tracking.verify, config.seed
+        self.by_features = FeatureGuesses(store, extractor, config.seed)
         self.tracking = tracking_of(config.registration, config.tracking)
 
     def register(self, pair: SubmapPair, a: Submap, b: Submap, T_a_b: Matrix) -> Slices[Registration]:
@@ -116,14 +115,13 @@ class Registrar:
         T_own_camera, other_map = own.T_submap_camera[keyframe], self._map_of(other)
         target, live = picture_images(self.view, self._picture(own, keyframe), own.camera)
         expected = se3.inverse(T_own_camera) @ T_own_other
-        similar = (se3.inverse(other.T_submap_camera[k]) for k in alike)
-        fits = list[PoseFit]()
-        for guesses in ([expected], similar, self._by_features(own, keyframe, other, alike)):
-            fits += yield from self._all_aligned(other_map, live, guesses)
-            fit = max(fits, key=score)
-            if score(fit) >= DOUBTFUL:
-                break
-        fit = yield from self._refined(other, other_map, target, live, fit)
+        fits = yield from self._all_aligned(other_map, live, [expected])
+        if score(fits[0]) < DOUBTFUL:
+            fits += yield from self._all_aligned(other_map, live, map(se3.inverse, other.T_submap_camera[[*alike]]))
+        if max(map(score, fits)) < DOUBTFUL:
+            by_features = yield from self.by_features.of(own, keyframe, other, alike)
+            fits += yield from self._all_aligned(other_map, live, by_features)
+        fit = yield from self._refined(other, other_map, target, live, max(fits, key=score))
         A = se3.adjoint(T_own_camera)
         covariance, comparison = self._checked(other_map, live, fit.T_camera_world)
         T_own_other = T_own_camera @ fit.T_camera_world
@@ -143,7 +141,7 @@ class Registrar:
             return found
         start, steps = found.T_camera_world, self.config.iterations
         found = fit_pose_adam(other_map.params, self.view, target, start, self.tracking, steps)
-        yield
+        yield from long_slice()
         return self._at_keyframe(other, target, live, found) or found
 
     def _picture(self, own: Submap, keyframe: int) -> Picture:
@@ -153,20 +151,6 @@ class Registrar:
         T_camera_own = se3.inverse(own.T_submap_camera[keyframe])
         self.view.forward(own.field.params.to(self.view.sums.device), T_camera_own)
         return rendered_picture(PoseMaps.of(self.view))
-
-    def _by_features(self, own: Submap, keyframe: int, other: Submap, alike: Sequence[int]) -> Iterator[Matrix]:
-        """Yield T_camera_other by features of the similar keyframes of the other submap, where they give a pose."""
-        if self.extractor is None:
-            return
-        image = self._known(own, keyframe).image(own.camera)
-        for k in alike:
-            landmarks = self._known(other, k).image(other.camera).landmarks(self.extractor)
-            found = pose_by_features(landmarks, image, self.extractor, self.seed)
-            if found is not None:
-                yield found.T_live_reference @ se3.inverse(other.T_submap_camera[k])
-
-    def _known(self, submap: Submap, keyframe: int) -> KnownKeyframe:
-        return KnownKeyframe(self.store.picture(submap.index, keyframe), submap.T_submap_camera[keyframe])
 
     def _map_of(self, submap: Submap) -> WeighedMap:
         """Return a submap as the weights read it: with V as published, or with the predicted variance."""
