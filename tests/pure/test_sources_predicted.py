@@ -119,6 +119,19 @@ def test_what_does_not_fit_is_refused_in_one_line(tmp_path: Path, change, messag
     assert "\n" not in str(found.value)
 
 
+def test_inspect_checks_images_with_predicted_depth_and_takes_no_unit_from_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    depths = images(tmp_path / "rgb", NAMES)
+    folder = predicted(tmp_path / "depth", NAMES, depths)
+    words = ("inspect", str(tmp_path / "rgb"), "--predicted-depth", folder, "--set", f"input.fx={FX}")
+    assert exit_code(*words, "--out", str(tmp_path / "sheet.png")) in (0, 1)
+    shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert "colour only, with predicted depth" in shown and f"{FRAMES}, " in shown
+    assert "arbitrary: a network predicted depth" in shown and "not measured: depth is predicted" in shown
+    assert "input.sensor=" not in shown and (tmp_path / "sheet.png").stat().st_size > 0
+
+
 def test_no_such_folder(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="no such folder"):
         open_source(ROOM, predicted_depth=str(tmp_path / "none"))

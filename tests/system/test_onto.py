@@ -14,8 +14,10 @@ from command_line import exit_code
 from recorded_room import OPTIONS, mirrored, write_images
 from sigmasplat.exports.run_reader import RunReader
 from sigmasplat.io.runs import RunFolder
+from sigmasplat.io.trajectory import write_trajectory
 from sigmasplat.model import se3
 from sigmasplat.model.submap import MemoryStore
+from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.run.finished_map import FinishedMap
 from sigmasplat.slam.continuation import continued, take_over
 from sigmasplat.sources import SyntheticRoom, open_source
@@ -57,6 +59,17 @@ def test_the_second_part_has_poses_in_the_first_world(place: Path) -> None:
     assert float(np.sqrt(np.mean(errors_m**2))) < 0.05
     report = (place / "second" / "report.html").read_text()
     assert "continues the map of" in report
+
+
+def test_the_measured_unit_of_given_poses_is_kept(place: Path, tmp_path: Path) -> None:
+    truth = open_source(WALK).truth()
+    assert truth is not None
+    halved = truth.T_world_camera.copy()
+    halved[:, :3, 3] *= 0.5
+    write_trajectory(tmp_path / "poses.txt", Trajectory(truth.timestamps_s, halved))
+    words = ("--poses", str(tmp_path / "poses.txt"), "--set", "input.poses_scale=0", "--onto", str(place / "first"))
+    assert exit_code("run", WALK, *SECOND, *words, "--out", str(tmp_path / "third"), "--no-eval", *SHORT) == 0
+    assert RunFolder(tmp_path / "third").config().input.poses_scale == pytest.approx(2.0, rel=0.1)
 
 
 def test_the_new_run_contains_the_old_submaps(place: Path) -> None:

@@ -10,7 +10,7 @@ from PIL import Image
 
 from sigmasplat.checks.motion import Motion, motion_warnings
 from sigmasplat.checks.registration import EdgeAgreement, edge_agreement, overlay
-from sigmasplat.checks.sensor_noise import measure_noise
+from sigmasplat.checks.sensor_noise import SensorNoise, measure_noise
 from sigmasplat.checks.timing import time_warnings, times_of
 from sigmasplat.config import InputConfig
 from sigmasplat.config.sensors import AUTO
@@ -22,7 +22,7 @@ from sigmasplat.sources import open_source
 from sigmasplat.sources.base import Source
 from sigmasplat.sources.camera.calibration import CameraUnknown, unlikely_camera
 from sigmasplat.sources.camera.depth_units import depth_warning
-from sigmasplat.sources.opening import format_of
+from sigmasplat.sources.opening import format_name
 
 SAMPLES = 16
 SHOWN = 6
@@ -57,12 +57,13 @@ class Inspection:
 
 def inspect_source(path: str | Path, settings: InputConfig, samples: int = SAMPLES) -> Inspection:
     """Open a recording and inspect `samples` frames, evenly spaced. Raises SourceError if it cannot be opened."""
-    format_, (source, guessed) = format_of(path), _opened(path, settings)
+    name, (source, guessed) = format_name(path, settings), _opened(path, settings)
     frames = _sampled(source, samples)
     if not frames:
         raise SourceError(f"{source.name}: none of {samples} sampled frames can be read; check the image files")
     agreement = None if source.computed_depth else edge_agreement(frames)  # stereo depth has the left image's pixels
-    noise, sensor = measure_noise(frames), (source.sensor or AUTO) if settings.sensor == AUTO else settings.sensor
+    noise = None if source.predicted_depth else measure_noise(frames)
+    sensor = (source.sensor or AUTO) if settings.sensor == AUTO else settings.sensor
     times_s = times_of(source)
     first = max(0, (len(source) - CONSECUTIVE) // 2)
     warnings = [
@@ -76,15 +77,15 @@ def inspect_source(path: str | Path, settings: InputConfig, samples: int = SAMPL
         *motion_warnings(Motion.of(_consecutive(source, first)), first),
     ]
     rows = [
-        ("format", format_.name),
+        ("format", name),
         *_size_rows(source, frames[0]),
         *_depth_rows(source, frames, settings),
-        ("depth noise", "unknown: too few flat surfaces" if noise is None else noise.row(sensor)),
+        ("depth noise", _noise_row(source, noise, sensor)),
         ("colour–depth alignment", "unknown: no outlines in depth" if agreement is None else agreement.sentence()),
         ("poses", source.described_truth() or "none: the error of the path cannot be measured"),
         *_gyroscope_rows(frames),
         ("skipped", f"{len(source.skipped)} files (first: {source.skipped[0]})" if source.skipped else "nothing"),
-        ("suggested preset", _suggested(format_.name)),
+        ("suggested preset", _suggested(name)),
     ]
     record = None if noise is None else noise.record(sensor)
     return Inspection(source.name, rows, warnings, _sheet(frames), agreement, record)
@@ -143,7 +144,7 @@ def _size_rows(source: Source, first: Frame) -> list[tuple[str, str]]:
 
 
 def _depth_rows(source: Source, frames: list[Frame], settings: InputConfig) -> list[tuple[str, str]]:
-    units = source.depth_units_per_metre
+    unit = f"{source.depth_units_per_metre:g} per metre" if source.depth_units_per_metre else "metres"
     readings = np.concatenate([frame.depth_m[frame.depth_m > 0] for frame in frames])
     if not len(readings):
         return [("depth", "no depth reading in the sampled frames")]
@@ -151,12 +152,19 @@ def _depth_rows(source: Source, frames: list[Frame], settings: InputConfig) -> l
     scale = source.scene_scale
     used = ((readings >= settings.min_depth_m * scale) & (readings <= settings.max_depth_m * scale)).mean()
     return [
-        ("depth unit", f"{units:g} per metre" if units else "metres"),
+        ("depth unit", "arbitrary: a network predicted depth" if source.predicted_depth else unit),
         ("depth", f"{low:.2f} to {high:.2f} m, median {middle:.2f} m; {used:.0%} within the limits of the run"),
         ("without depth", f"{_holes(frames):.0%} of the pixels"),
         ("depth camera", _depth_camera(source, settings)),
         *_scale_question(middle, settings),
     ]
+
+
+def _noise_row(source: Source, noise: SensorNoise | None, sensor: str) -> str:
+    """Describe the noise of depth, if it was measured."""
+    if noise is not None:
+        return noise.row(sensor)
+    return "not measured: depth is predicted" if source.predicted_depth else "unknown: too few flat surfaces"
 
 
 def _gyroscope_rows(frames: list[Frame]) -> list[tuple[str, str]]:

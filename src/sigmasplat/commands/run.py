@@ -168,7 +168,8 @@ def _opened(
     asked = config
     source, config = open_scene(path, asked, given)
     if earlier:
-        config = earlier.config_for(source, asked, given)
+        scales = {name: getattr(config.input, name) for name in ("poses_scale", "predicted_scale")}
+        config = earlier.config_for(source, asked.changed(input=scales), given)
     elif source.scene_scale != 1.0:
         screen.say(f"{source.name}: settings in metres are multiplied by {source.scene_scale:g}, the scene's scale")
     if isinstance(source, LiveSource):

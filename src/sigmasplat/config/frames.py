@@ -5,6 +5,9 @@ from typing import Annotated, Literal
 
 from sigmasplat.config.ranges import Above0, AtLeastOne, Count, NotNegative, Range, Section, Share, WeightBound
 
+FIRST_FRAMES = 15
+"""The steps of the first keyframe that are divided over later frames are made in about this many of them."""
+
 
 @dataclass(frozen=True)
 class RenderConfig(Section, name="render"):
@@ -198,7 +201,7 @@ class MappingConfig(Section, name="mapping"):
     @property
     def first_per_frame(self) -> int:
         """Return how many steps of the first keyframe a later frame makes (`first_divided`)."""
-        return max(self.iterations, self.first_iterations // 15)
+        return max(self.iterations, self.first_iterations // FIRST_FRAMES)
 
 
 @dataclass(frozen=True)

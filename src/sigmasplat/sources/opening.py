@@ -72,6 +72,14 @@ def open_source(path: str | Path, settings: InputConfig | None = None, **changes
     return Subset(source, chosen) if part and not source.live else source
 
 
+def format_name(path: str | Path, settings: InputConfig) -> str:
+    """Return the name of the format that `open_source` reads. Raises SourceError if none recognises the path."""
+    if not (settings.predicted_depth or settings.depth_model):
+        return format_of(path).name
+    known = _matching_format(path)
+    return f"{known.name if known and known.priority >= 0 else 'colour only'}, with predicted depth"
+
+
 def _recorded(path: str | Path, settings: InputConfig) -> Source:
     """Open a whole sequence with its own depth."""
     known = format_of(path)
