@@ -42,12 +42,12 @@ LOOPS_MOST = 40
 
 def recorded(atlas: Atlas, edges: Sequence[Edge]) -> dict[str, Tensor]:
     """Return what a checkpoint keeps of the errors of a path; edges: the trusted ones and the accepted loops."""
-    submaps = [s for s, poses in enumerate(atlas.keyframe_poses) for _ in poses]
+    counts = atlas.keyframe_poses.counts
     arrays = {
         "frame_keyframe": atlas.places.keyframe,
         "T_keyframe_camera": atlas.places.T_keyframe_camera,
-        "keyframe_submap": np.array(submaps, np.int64),
-        "T_submap_keyframe": np.array([T for poses in atlas.keyframe_poses for T in poses]).reshape(-1, 4, 4),
+        "keyframe_submap": np.repeat(np.arange(len(counts)), counts),
+        "T_submap_keyframe": atlas.keyframe_poses.stacked(),
         "hop_T_camera_before": atlas.hops.T_camera_before,
         "hop_covariance": atlas.hops.covariance,
         "hop_bias": atlas.hops.bias,
