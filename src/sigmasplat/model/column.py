@@ -15,7 +15,7 @@ Record = TypeVar("Record")
 GROWTH = 1.25
 """Factor by which the space grows when it is full."""
 FEWEST = 64
-LEAST_ON_DISK = 2**20
+LEAST_ON_DISK = 2**18
 """A column with fewer bytes stays in RAM."""
 
 
