@@ -52,7 +52,7 @@ class NewestCovariance:
         state = counts.tobytes() + (atlas.anchors[-1] @ atlas.keyframe_poses.last[-1]).tobytes()
         if state != self._state:
             edges = closer.believed
-            loops = sum(edge.loop for edge in edges)
+            loops = int(edges.is_loop.sum())
             known = self._factors if loops == self._loops else None
             path = PathCovariance.of_keyframes(atlas, edges, known)
             self._errors = PoseErrors(path.of_keyframe(submap, keyframe), newest_hop(atlas))

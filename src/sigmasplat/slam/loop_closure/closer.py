@@ -112,12 +112,12 @@ class LoopCloser:
             self.connect(0, submap.index, T_first_submap, RIGID)
 
     @property
-    def believed(self) -> list[Edge]:
+    def believed(self) -> Edges:
         """Return the trusted edges and the accepted loops."""
         rows = self.edges.loop_rows(range(len(self.edges)))
         believed = rows < 0
         believed[~believed] = self.loops.accepted[rows[~believed]]
-        return [self.edges[i] for i in np.flatnonzero(believed).tolist()]
+        return self.edges.taken(believed)
 
     def _described(self, submap: Submap, descriptors: Sequence[NDArray[np.float32]]) -> SubmapDescriptor:
         reach_m = float(np.linalg.norm(submap.T_submap_camera[:, :3, 3], axis=1).max())
