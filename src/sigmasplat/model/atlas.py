@@ -81,9 +81,8 @@ class Atlas:
 
     @property
     def columns(self) -> tuple[Column, ...]:
-        """Return what grows with the number of frames or submaps."""
-        of_keyframes = self.keyframe_poses.rows, self.keyframe_poses.ends, self.hops.rows
-        return self.anchors.rows, self.odometry.rows, *of_keyframes, self.places.rows
+        """Return what grows with every frame or keyframe."""
+        return self.keyframe_poses.rows, self.hops.rows, self.places.rows
 
     @property
     def in_world(self) -> NDArray[np.bool_]:

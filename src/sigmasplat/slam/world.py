@@ -11,6 +11,7 @@ from sigmasplat.config import Config
 from sigmasplat.errors import SourceError
 from sigmasplat.model.atlas import Atlas
 from sigmasplat.model.camera import Camera
+from sigmasplat.model.column import Column
 from sigmasplat.model.component import LOST, Component
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
@@ -116,13 +117,17 @@ class World:
         """Let what grows with every frame move from RAM to the folder of the store, if it has one: a file without a
         name, which is gone when the process ends."""
         folder = self.store.folder if isinstance(self.store, OnDisk) else None
-        for column in (*self.atlas.columns, self.steps.rows, *self.closer.columns):
+        for column in self._columns:
             column.folder = folder
 
     def release(self) -> None:
         """Give the RAM of what is on disk back to the system, after the whole history was read."""
-        for column in (*self.atlas.columns, self.steps.rows, *self.closer.columns):
+        for column in self._columns:
             column.release()
+
+    @property
+    def _columns(self) -> tuple[Column, ...]:
+        return *self.atlas.columns, self.steps.rows, *self.closer.columns
 
     def trajectory(self) -> Trajectory:
         """Return the poses of all frames so far, including lost ones (the log marks them).

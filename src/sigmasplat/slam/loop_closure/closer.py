@@ -169,8 +169,8 @@ class LoopCloser:
 
     @property
     def columns(self) -> tuple[Column, ...]:
-        """Return what grows with the number of submaps."""
-        return self.descriptors.rows, self.edges.rows, self.loops.rows, self.loops.verdicts
+        """Return what grows most with the number of submaps."""
+        return self.descriptors.rows, self.edges.rows, self.loops.rows
 
     def release(self) -> None:
         """Give RAM back to the system, after the whole history was read."""
