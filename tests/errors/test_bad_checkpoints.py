@@ -16,7 +16,7 @@ from sigmasplat.io.runs import RunFolder
 from sigmasplat.model.atlas import Atlas
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
-from sigmasplat.model.hops import UNKNOWN_HOP, TrackedHops
+from sigmasplat.model.hops import UNKNOWN_HOP
 from sigmasplat.model.places import Place, Places
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.slam.checkpoint import checkpoint_of
@@ -46,8 +46,11 @@ def run(tmp_path: Path) -> RunFolder:
     """Return a run with the path of three frames in two submaps, the errors of the path, and no map."""
     T = np.eye(4)
     places = Places.of([Place(0, 0, T), Place(0, 1, T), Place(1, 0, T)])
-    hops = TrackedHops.of((submap, UNKNOWN_HOP) for submap in (0, 0, 1))
-    atlas = Atlas([T] * 2, [T] * 2, [[T] * 2, [T]], hops, places, [0, 0])
+    atlas = Atlas(places=places)
+    for submap, keyframes in enumerate((2, 1)):
+        atlas.begin_submap(T if submap else None)
+        for k in range(keyframes):
+            atlas.set_keyframes([T] * (k + 1), UNKNOWN_HOP)
     edges = [Edge(0, 1, T, np.eye(6), loop=True)]
     run = RunFolder.create(tmp_path / "run", Config(), "room")
     trajectory = Trajectory(np.arange(3.0), np.tile(np.eye(4), (3, 1, 1)))

@@ -8,7 +8,7 @@ import pytest
 
 from sigmasplat.model.component import APART, LOST, RELOCALISED, TRACKED
 from sigmasplat.slam.localisation.confidence import Confidence, std_of
-from sigmasplat.slam.loop_closure.closer import Loop
+from sigmasplat.slam.loop_closure.loops import Loop
 
 CLEAN: dict[str, float] = {
     "common": 0.9, "close": 0.98, "front": 0.01, "behind": 0.01, "residual": 0.3, "correlation": 0.97, "points": 3000.0,

@@ -73,7 +73,7 @@ def walked(closer: LoopCloser, alike: bool = True, atlas: Atlas | None = None) -
 def finished(closer: LoopCloser, atlas: Atlas, degrees: float, T_submap_last: np.ndarray | None = None) -> None:
     """Finish the last submap, whose two keyframes look into directions of the plane; the last one may be elsewhere."""
     s, poses = len(atlas.anchors) - 1, [np.eye(4), np.eye(4) if T_submap_last is None else T_submap_last]
-    atlas.keyframe_poses[-1] = poses
+    atlas.keyframe_poses.newest = poses
     field = GaussianField.from_values(torch.zeros(3, 3), torch.ones(3), torch.zeros(3, 3))
     submap = Submap(s, field, (2 * s, 2 * s + 1), np.stack(poses), CAMERA)
     picture = Picture(np.zeros((3, 4, 3), np.uint8), np.ones((3, 4), np.float32))
@@ -106,7 +106,7 @@ def test_a_gross_lie_is_registered_refused_by_the_graph_and_moves_nothing(monkey
 def test_places_that_do_not_look_alike_are_not_tried(monkeypatch: pytest.MonkeyPatch) -> None:
     made = make_closer(monkeypatch, {}, similarity_floor=0.5)
     atlas = walked(made, alike=False)
-    assert made.loops == []
+    assert not made.loops
     assert atlas.anchors[3][0, 3] == pytest.approx(3.06)
 
 
@@ -128,7 +128,7 @@ def test_a_submap_is_near_where_its_keyframes_are_not_where_it_begins(
 def test_switched_off_nothing_is_tried(monkeypatch: pytest.MonkeyPatch) -> None:
     made = make_closer(monkeypatch, {}, close=False)
     walked(made)
-    assert made.loops == []
+    assert not made.loops
     assert len(made.edges) == 3
 
 

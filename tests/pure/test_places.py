@@ -8,7 +8,6 @@ import pytest
 from sigmasplat.model import se3
 from sigmasplat.slam.loop_closure.candidates import (
     Candidate,
-    SubmapDescriptor,
     find_candidates,
     find_nearby,
     gate,
@@ -17,6 +16,7 @@ from sigmasplat.slam.loop_closure.candidates import (
     self_similarity,
     variance_weights,
 )
+from sigmasplat.slam.loop_closure.described_submaps import SubmapDescriptor
 
 DEGREE = np.pi / 180
 

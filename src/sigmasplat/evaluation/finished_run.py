@@ -68,7 +68,7 @@ class FinishedRun:
             "keyframes": len(slam.keyframe_indices), "submaps": len(store), "splats": len(slam.field),
         }  # fmt: skip
         return FinishedRun(
-            slam.config, slam.view.camera, slam.field, store, slam.atlas.anchors, slam.atlas.members(0),
+            slam.config, slam.view.camera, slam.field, store, list(slam.atlas.anchors), slam.atlas.members(0),
             slam.atlas.refined, slam.atlas.exposures, slam.atlas.frame_exposures(), slam.trajectory(),
             slam.atlas.places.submap.tolist(), slam.atlas.T_submap_camera, slam.believed(),
             slam.steps.source_index.tolist(), slam.steps.p_off, counts,

@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 from torch import Tensor
 
 from sigmasplat.errors import RunError
-from sigmasplat.io.atomic import write_text, write_text_on_full_disk
+from sigmasplat.io.atomic import replacing, write_text, write_text_on_full_disk
 from sigmasplat.reading import files, structured
 from sigmasplat.reading.structured import MOST_OWN_JSON_BYTES, parse_json
 
@@ -28,8 +29,23 @@ def to_json(value: Any) -> Any:
 
 
 def write_json(path: Path, values: Any) -> None:
-    """Write a file atomically, a list with one line per item. Raises RunError if it cannot be written."""
-    write_text(path, _json_text(values))
+    """Write a file atomically, a list with one line per item. Raises RunError if it cannot be written.
+
+    An iterator is written as a list, without ever being in memory as a whole.
+    """
+    if isinstance(values, list | Iterator):
+        _write_items(path, values)  # may be many, and indenting is slow
+    else:
+        write_text(path, _json_text(values))
+
+
+def _write_items(path: Path, items: Iterable[Any]) -> None:
+    with replacing(path) as temporary, temporary.open("w", encoding="utf-8") as file:
+        before = "[\n"
+        for item in items:
+            file.write(before + json_line(item).rstrip())
+            before = ",\n"
+        file.write("[]\n" if before == "[\n" else "\n]\n")
 
 
 def write_json_on_full_disk(path: Path, values: Any) -> None:
@@ -38,8 +54,6 @@ def write_json_on_full_disk(path: Path, values: Any) -> None:
 
 
 def _json_text(values: Any) -> str:
-    if isinstance(values, list) and values:  # may be long, and indenting is slow
-        return "[\n" + ",\n".join(json_line(item).rstrip() for item in values) + "\n]\n"
     return json.dumps(to_json(values), indent=2, allow_nan=False) + "\n"
 
 

@@ -1,7 +1,7 @@
 """Write and read the folder of a run, which is valid at any time."""
 
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -202,9 +202,9 @@ class RunFolder:
         Raises RunError if it is missing, or another line is damaged or has a wrong value."""
         return check_log(read_lines(path := self._existing("log.jsonl")), path)
 
-    def write_loops(self, records: list[dict[str, Any]]) -> None:
+    def write_loops(self, records: Iterable[dict[str, Any]]) -> None:
         """Write loops.json: all tried pairs of submaps with their latest results."""
-        write_json(self.path / "loops.json", records)
+        write_json(self.path / "loops.json", iter(records))
 
     def read_loops(self) -> list[dict[str, Any]]:
         """Read loops.json; the list is empty if there is no such file. Raises RunError if it is damaged."""

@@ -17,6 +17,7 @@ from torch import Tensor
 from sigmasplat.errors import RunError
 from sigmasplat.io.state_types import wrong_field
 from sigmasplat.io.tensors import open_tensors, write_tensors
+from sigmasplat.model.column import Column
 
 INLINE = 64
 """Arrays with at most this many numbers are stored in the text, since there are many poses and each tensor needs a
@@ -93,6 +94,8 @@ class _Encoder:
         if isinstance(value, dict):
             pairs = ", ".join(f"[{self.text(key)}, {self.text(item)}]" for key, item in value.items())
             return f'{{"dict": [{pairs}]}}'
+        if isinstance(value, Column):
+            return self._column(value)
         name = type(value).__name__
         if self.classes.get(name) is type(value):
             fields = ", ".join(f"{_json(n)}: {self.text(v)}" for n, v in _fields(value).items())
@@ -103,6 +106,16 @@ class _Encoder:
 
     def _list(self, values: Iterable[Any]) -> str:
         return f"[{', '.join(map(self.text, values))}]"
+
+    def _column(self, column: Column) -> str:
+        """Return a column, whose values are not copied: most of a long state is in columns."""
+        if column.used.size > INLINE:
+            values: Any = {"array": str(len(self.tensors))}
+            self.tensors[values["array"]] = torch.from_numpy(column.used)
+        else:
+            values = self._array(column.used)
+        fields = f'{{"values": {_json(values)}, "count": {len(column)}}}'
+        return f'{{"object": "Column", "fields": {fields}}}'
 
     def _array(self, value: Tensor | np.ndarray[Any, Any]) -> Any:
         kind = "tensor" if isinstance(value, Tensor) else "array"

@@ -1,15 +1,17 @@
 """All poses: of submaps in the world, of keyframes in submaps, of frames relative to keyframes."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.model import se3
+from sigmasplat.model.column import Column
 from sigmasplat.model.exposure import between
 from sigmasplat.model.hops import UNKNOWN_HOP, Hop, TrackedHops
 from sigmasplat.model.places import Place, Places
+from sigmasplat.model.poses import KeyframePoses, Poses
 from sigmasplat.types import Matrix
 
 
@@ -28,9 +30,9 @@ class Atlas:
     world for component 0, else the first camera of the component. A component joins another when a place is recognised.
     """
 
-    anchors: list[Matrix] = field(default_factory=list)
-    odometry: list[Matrix] = field(default_factory=list)
-    keyframe_poses: list[list[Matrix]] = field(default_factory=list)
+    anchors: Poses = field(default_factory=Poses)
+    odometry: Poses = field(default_factory=Poses)
+    keyframe_poses: KeyframePoses = field(default_factory=KeyframePoses)
     hops: TrackedHops = field(default_factory=TrackedHops)
     places: Places = field(default_factory=Places)
     components: list[int] = field(default_factory=list)
@@ -45,20 +47,20 @@ class Atlas:
             chain.append(new)
         begun = max(self.components, default=-1) + 1
         self.components.append(begun if T_parent_submap is None else self.components[parent])
-        self.keyframe_poses.append([])
+        self.keyframe_poses.begin([])
 
     def add_finished(self, T_world_submap: Matrix, keyframe_poses: list[Matrix]) -> None:
         """Append a submap of an earlier session to the world, with T_submap_camera [4, 4] of its keyframes."""
         self.anchors.append(T_world_submap)
         self.odometry.append(T_world_submap)
         self.components.append(0)
-        self.keyframe_poses.append(keyframe_poses)
+        self.keyframe_poses.begin(keyframe_poses)
         for _ in keyframe_poses:
             self.hops.append(len(self.anchors) - 1, UNKNOWN_HOP)
 
     def set_keyframes(self, keyframe_poses: list[Matrix], hop: Hop) -> None:
         """Set T_submap_camera [4, 4] of the last submap's keyframes, with a new one at the end, and the hop to it."""
-        self.keyframe_poses[-1] = keyframe_poses
+        self.keyframe_poses.newest = keyframe_poses
         self.hops.append(len(self.anchors) - 1, hop)
 
     def join(self, a: int, b: int, T_a_b: Matrix) -> None:
@@ -78,35 +80,58 @@ class Atlas:
         return [s for s, number in enumerate(self.components) if number == component]
 
     @property
+    def columns(self) -> tuple[Column, ...]:
+        """Return what grows with every frame or keyframe."""
+        return self.keyframe_poses.rows, self.hops.rows, self.places.rows
+
+    @property
     def in_world(self) -> NDArray[np.bool_]:
         """Return which frames are in a submap that is connected to the world, bool [F]."""
         return np.asarray(np.array(self.components, np.int64)[self.places.submap] == 0)
 
     def place_frame(self, T_submap_camera: Matrix) -> None:
         """Append a frame, relative to the newest keyframe of the last submap."""
-        self.place_by_keyframe(se3.inverse(self.keyframe_poses[-1][-1]) @ T_submap_camera)
+        self.place_by_keyframe(se3.inverse(self.keyframe_poses.last[-1]) @ T_submap_camera)
 
     def place_by_keyframe(self, T_keyframe_camera: Matrix) -> None:
         """Append a frame at its pose [4, 4] relative to the newest keyframe of the last submap."""
-        place = Place(len(self.anchors) - 1, len(self.keyframe_poses[-1]) - 1, se3.orthonormalise(T_keyframe_camera))
+        place = Place(len(self.anchors) - 1, len(self.keyframe_poses.last) - 1, se3.orthonormalise(T_keyframe_camera))
         self.places.append(place)
 
     def T_world_camera(self, loops: bool = True) -> Matrix:
         """Return the poses of all frames [F, 4, 4]; without `loops` those of tracking alone."""
-        anchors, refined = (self.anchors, self.refined) if loops else (self.odometry, dict[int, list[Matrix]]())
-        return self._frames([[anchors[s] @ T for T in refined.get(s, p)] for s, p in enumerate(self.keyframe_poses)])
+        if not loops:
+            return self._frames(self._in_world(self.odometry, {}))
+        return self._frames(self._in_world(self.anchors, self.refined))
 
     @property
     def T_submap_camera(self) -> Matrix:
         """Return the poses of all frames in their submaps [F, 4, 4], to which the splats of the submaps were fitted."""
-        return self._frames(self.keyframe_poses)
+        return self._frames(self.keyframe_poses.stacked())
 
-    def _frames(self, keyframe_poses: Sequence[Sequence[Matrix]]) -> Matrix:
-        """Return the poses of all frames [F, 4, 4], given those [4, 4] of the keyframes of each submap."""
-        first = np.cumsum([0, *map(len, keyframe_poses)])
-        poses = np.array([T for of_submap in keyframe_poses for T in of_submap]).reshape(-1, 4, 4)
+    @property
+    def T_world_keyframes(self) -> Matrix:
+        """Return the poses of all keyframes [K, 4, 4], submap by submap."""
+        return self._in_world(self.anchors, self.refined)
+
+    def T_world_keyframes_of(self, submaps: Sequence[int]) -> dict[int, Matrix]:
+        """Return the poses of the keyframes [K, 4, 4] of some submaps, by submap."""
+        poses, ends = self.T_world_keyframes, np.cumsum([0, *self.keyframe_poses.counts]).tolist()
+        return {submap: poses[ends[submap] : ends[submap + 1]] for submap in submaps}
+
+    def _in_world(self, anchors: Poses, refined: Mapping[int, Sequence[Matrix]]) -> Matrix:
+        """Return the poses of all keyframes [K, 4, 4] in the world; refined: as the attribute."""
+        poses, counts = self.keyframe_poses.stacked(), self.keyframe_poses.counts
+        first = np.cumsum(counts) - counts
+        for submap, moved in refined.items():
+            poses[first[submap] : first[submap] + len(moved)] = moved
+        return np.asarray(np.repeat(np.array(anchors), counts, axis=0) @ poses)
+
+    def _frames(self, keyframe_poses: Matrix) -> Matrix:
+        """Return the poses of all frames [F, 4, 4], given those [K, 4, 4] of the keyframes."""
+        first = np.cumsum([0, *self.keyframe_poses.counts])
         places = self.places.first(len(self.places))  # another thread may append some
-        return np.asarray(poses[first[places.submap] + places.keyframe] @ places.T_keyframe_camera)
+        return np.asarray(keyframe_poses[first[places.submap] + places.keyframe] @ places.T_keyframe_camera)
 
     def frame_exposures(self) -> Matrix:
         """Return the exposures of all frames [F, 3, 2] relative to the final map, interpolated between keyframes."""

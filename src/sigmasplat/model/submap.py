@@ -2,7 +2,8 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field as dataclass_field, replace
-from typing import Protocol
+from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,6 +79,13 @@ class SubmapStore(Protocol):
     def probe(self, index: int, probe: int) -> Picture:
         """Return the images of one probe view of a submap."""
         ...
+
+
+@runtime_checkable
+class OnDisk(Protocol):
+    """A store in a folder, which may not exist before the first submap."""
+
+    folder: Path
 
 
 @dataclass(eq=False)

@@ -55,6 +55,7 @@ class StateFile:
         started_s, tree = time.perf_counter(), state_of(self.slam) | {"index": index, "wall_s": wall_s}
         self.run.sync_log()  # the state needs these lines, also after a power failure
         write_state(self.run.state, tree, CLASSES, fixed(self.slam))
+        self.slam.release()
         self.last_s = time.perf_counter()
         self.took_s = self.last_s - started_s
 

@@ -312,9 +312,9 @@ class Session:
             self.run.write_uncertainty(self.slam.uncertainty)
 
     def _write_loops(self) -> None:
-        records = [loop.record() for loop in self.slam.loops]
-        self.run.write_loops(records)
-        self.loops_written = len(records)
+        loops = self.slam.loops
+        self.loops_written = len(loops)
+        self.run.write_loops(loop.record() for loop in loops)
 
     def _outcome(self, status: str) -> Outcome:
         closed = sum(loop.accepted for loop in self.slam.loops)

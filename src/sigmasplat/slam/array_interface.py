@@ -10,7 +10,7 @@ from sigmasplat.model.camera import Camera
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.frame_arrays import Array, ColorOrder, frame_from_arrays
 from sigmasplat.slam.listeners import Correction, Listeners
-from sigmasplat.slam.loop_closure.closer import Loop
+from sigmasplat.slam.loop_closure.loops import Loop
 from sigmasplat.slam.step_result import Step
 from sigmasplat.types import Matrix
 

@@ -25,9 +25,7 @@ def checkpoint_of(
         "timestamps_s": torch.from_numpy(path.timestamps_s),
         "T_world_camera": torch.from_numpy(path.T_world_camera),
         "T_world_camera_odometry": torch.from_numpy(atlas.T_world_camera(loops=False)),
-        "T_world_keyframe": torch.from_numpy(
-            np.concatenate([np.empty((0, 4, 4)), *map(atlas.T_world_keyframe, range(len(atlas.anchors)))])
-        ),
+        "T_world_keyframe": torch.from_numpy(atlas.T_world_keyframes),
         "T_submap_camera": torch.from_numpy(atlas.T_submap_camera),
         **path_errors(atlas, keyframes, edges),
     }
@@ -37,7 +35,7 @@ def path_errors(atlas: Atlas, keyframes: Sequence[int], edges: Sequence[Edge]) -
     """Return the part of a checkpoint that `PathCovariance.of` reads; arguments as for `checkpoint_of`."""
     return {
         "keyframes": torch.tensor(keyframes, dtype=torch.int64),
-        "T_world_submap": torch.from_numpy(np.array(atlas.anchors).reshape(-1, 4, 4)),
+        "T_world_submap": torch.from_numpy(np.array(atlas.anchors)),
         "submap_component": torch.tensor(atlas.components, dtype=torch.int64),
         "frame_submap": torch.tensor(atlas.places.submap),
         **({"exposure": torch.from_numpy(atlas.frame_exposures())} if atlas.exposures else {}),

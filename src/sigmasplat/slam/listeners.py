@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.model.atlas import Atlas
-from sigmasplat.slam.loop_closure.closer import Loop
+from sigmasplat.slam.loop_closure.loops import Loop, Loops
 from sigmasplat.slam.step_result import Step
 from sigmasplat.slam.steps import Steps
 from sigmasplat.types import Matrix
@@ -42,7 +42,7 @@ class Observed(Protocol):
     listeners: "Listeners"
 
     @property
-    def loops(self) -> list[Loop]: ...
+    def loops(self) -> Loops: ...
 
 
 System = TypeVar("System", bound=Observed)
@@ -50,22 +50,21 @@ System = TypeVar("System", bound=Observed)
 
 @dataclass(frozen=True, eq=False)
 class Before:
-    """The state before a step, as far as listeners need it. closed: the pairs of submaps of the closed loops."""
+    """The state before a step, as far as listeners need it. closed [L]: which pairs of submaps were closed loops."""
 
     atlas: Atlas
     steps: int
-    closed: frozenset[tuple[int, int]]
+    closed: NDArray[np.bool_]
 
     @staticmethod
     def of(slam: Observed) -> "Before":
         """Copy what a step may change."""
         a = slam.atlas
-        keyframe_poses = [*a.keyframe_poses[:-1], *map(list, a.keyframe_poses[-1:])]  # only the last ones can change
         kept = replace(
-            a, anchors=list(a.anchors), components=list(a.components), refined=dict(a.refined),
-            keyframe_poses=keyframe_poses,
+            a, anchors=a.anchors.copied(), components=list(a.components), refined=dict(a.refined),
+            keyframe_poses=a.keyframe_poses.copied(),
         )  # fmt: skip
-        return Before(kept, len(slam.steps), frozenset(_pair(loop) for loop in slam.loops if loop.accepted))
+        return Before(kept, len(slam.steps), slam.loops.accepted)
 
 
 @dataclass(eq=False)
@@ -81,7 +80,7 @@ class Listeners:
 
     def notify(self, slam: Observed, before: Before) -> None:
         """Call the functions for what happened since `before`."""
-        closed = [loop for loop in slam.loops if loop.accepted and _pair(loop) not in before.closed]
+        closed = slam.loops.newly_closed(before.closed)
         correction = correction_since(slam, before) if self.correction else None
         corrections = [] if correction is None else [correction]
         self.call([step for step in slam.steps[before.steps :] if step.is_keyframe], closed, corrections)
@@ -98,16 +97,16 @@ class Listeners:
 class Events:
     """Collects what the work on the map reports, until the caller's functions can be called."""
 
-    def __init__(self, loops: Sequence[Loop]) -> None:
-        self._closed = {_pair(loop) for loop in loops if loop.accepted}
+    def __init__(self, loops: Loops) -> None:
+        self._closed = loops.accepted
         self._new: list[Loop] = []
         self._corrections: list[Correction] = []
 
-    def add(self, loops: Sequence[Loop], correction: Correction | None) -> None:
+    def add(self, loops: Loops, correction: Correction | None) -> None:
         """Add what a snapshot contains; loops: all pairs tried so far."""
-        new = [loop for loop in loops if loop.accepted and _pair(loop) not in self._closed]
-        self._new += new
-        self._closed |= {_pair(loop) for loop in new}
+        self._new += loops.newly_closed(self._closed)
+        before, self._closed = self._closed, loops.accepted
+        self._closed[: len(before)] |= before
         if correction is not None:
             self._corrections.append(correction)
 
@@ -142,7 +141,7 @@ def correction_since(slam: Observed, before: Before) -> Correction | None:
     """
     old, new = before.atlas, slam.atlas
     refined = new.refined.keys() != old.refined.keys()
-    if not refined and all(np.array_equal(*pair) for pair in zip(old.anchors, new.anchors, strict=False)):
+    if not refined and np.array_equal(np.array(old.anchors), np.array(new.anchors)[: len(old.anchors)]):
         return None
     earlier = new.places.first(before.steps)
     T_before, T_now = (replace(atlas, places=earlier).T_world_camera() for atlas in (old, new))
@@ -164,7 +163,3 @@ def _called(functions: Sequence[Callable[[Event], object]], events: Sequence[Eve
             except Exception as problem:
                 problems.append(problem)
     return problems
-
-
-def _pair(loop: Loop) -> tuple[int, int]:
-    return loop.query, loop.database

@@ -77,11 +77,11 @@ class MapWork(World):
         if self.keyframe_indices[-1:] != [index]:  # a keyframe that two submaps share is counted once
             self.keyframe_indices.append(index)
         self.atlas.set_keyframes([keyframe.T_world_camera for keyframe in self.mapper.keyframes], hop)
-        return self.atlas.keyframe_poses[-1][-1]
+        return self.atlas.keyframe_poses.last[-1]
 
     def hop_to(self, T_camera_submap: Matrix, alignment: Alignment | None) -> Hop:
         """Return the motion from the newest keyframe to a new one, with its errors; alignment: of the new one to it."""
-        T_camera_before = T_camera_submap @ self.atlas.keyframe_poses[-1][-1]
+        T_camera_before = T_camera_submap @ self.atlas.keyframe_poses.last[-1]
         if alignment is None:
             return UNKNOWN_HOP._replace(T_camera_before=T_camera_before)
         return Hop(T_camera_before, alignment.covariance, alignment.bias)

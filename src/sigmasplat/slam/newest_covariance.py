@@ -47,12 +47,12 @@ class NewestCovariance:
 
     def errors(self, atlas: Atlas, closer: LoopCloser) -> PoseErrors:
         """Return the errors for poses relative to the newest keyframe."""
-        submap, keyframe = len(atlas.keyframe_poses) - 1, len(atlas.keyframe_poses[-1]) - 1
-        counts = np.array([submap, keyframe, sum(map(len, atlas.keyframe_poses)), *atlas.components])
-        state = counts.tobytes() + (atlas.anchors[-1] @ atlas.keyframe_poses[-1][-1]).tobytes()
+        submap, keyframe = len(atlas.keyframe_poses) - 1, len(atlas.keyframe_poses.last) - 1
+        counts = np.array([submap, keyframe, atlas.keyframe_poses.total, *atlas.components])
+        state = counts.tobytes() + (atlas.anchors[-1] @ atlas.keyframe_poses.last[-1]).tobytes()
         if state != self._state:
             edges = closer.believed
-            loops = sum(edge.loop for edge in edges)
+            loops = int(edges.is_loop.sum())
             known = self._factors if loops == self._loops else None
             path = PathCovariance.of_keyframes(atlas, edges, known)
             self._errors = PoseErrors(path.of_keyframe(submap, keyframe), newest_hop(atlas))

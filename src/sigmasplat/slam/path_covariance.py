@@ -29,6 +29,7 @@ from sigmasplat.model.atlas import Atlas
 from sigmasplat.model.places import Places
 from sigmasplat.model.selection import evenly_spread
 from sigmasplat.slam.drift import UNKNOWN
+from sigmasplat.slam.loop_closure.edges import Edges
 from sigmasplat.slam.loop_closure.pose_graph import Edge, Sensitivity
 from sigmasplat.slam.variance_factors import variance_factors
 from sigmasplat.types import Matrix
@@ -42,19 +43,19 @@ LOOPS_MOST = 40
 
 def recorded(atlas: Atlas, edges: Sequence[Edge]) -> dict[str, Tensor]:
     """Return what a checkpoint keeps of the errors of a path; edges: the trusted ones and the accepted loops."""
-    submaps = [s for s, poses in enumerate(atlas.keyframe_poses) for _ in poses]
+    counts, known = atlas.keyframe_poses.counts, Edges.of(edges)
     arrays = {
         "frame_keyframe": atlas.places.keyframe,
         "T_keyframe_camera": atlas.places.T_keyframe_camera,
-        "keyframe_submap": np.array(submaps, np.int64),
-        "T_submap_keyframe": np.array([T for poses in atlas.keyframe_poses for T in poses]).reshape(-1, 4, 4),
+        "keyframe_submap": np.repeat(np.arange(len(counts)), counts),
+        "T_submap_keyframe": atlas.keyframe_poses.stacked(),
         "hop_T_camera_before": atlas.hops.T_camera_before,
         "hop_covariance": atlas.hops.covariance,
         "hop_bias": atlas.hops.bias,
-        "edge_submaps": np.array([(edge.a, edge.b) for edge in edges], np.int64).reshape(-1, 2),
-        "edge_T_a_b": np.array([edge.T_a_b for edge in edges]).reshape(-1, 4, 4),
-        "edge_information": np.array([edge.information for edge in edges]).reshape(-1, 6, 6),
-        "edge_is_loop": np.array([edge.loop for edge in edges], bool),
+        "edge_submaps": known.ends,
+        "edge_T_a_b": known.T_a_b,
+        "edge_information": known.information,
+        "edge_is_loop": known.is_loop,
     }
     return {name: torch.from_numpy(array) for name, array in arrays.items()}
 

@@ -21,7 +21,7 @@ from sigmasplat.slam.localisation.recovery import usable
 from sigmasplat.slam.localisation.relocaliser import Relocation
 from sigmasplat.slam.localisation.sight import Observation, refuse_first_without_depth, working_frame
 from sigmasplat.slam.localisation.verdict import is_better, is_questionable
-from sigmasplat.slam.loop_closure.closer import Loop
+from sigmasplat.slam.loop_closure.loops import Loop
 from sigmasplat.slam.mapping import MapWork
 from sigmasplat.slam.rules import is_held_back, is_keyframe
 from sigmasplat.slam.step_result import Step, StepTimer
@@ -78,7 +78,7 @@ class Slam(MapWork, ArrayInterface):
         if not self.steps or not (len(self.store) or self.cuts or self.config.final.iterations):
             return
         steps, measures = self._refinement_steps(), self.config.uncertainty.probes > 0
-        total = max(1, steps + measures * sum(map(len, self.atlas.keyframe_poses)))
+        total = max(1, steps + measures * self.atlas.keyframe_poses.total)
         progress(0, total)
         completed(self.finish_submap())
         completed(self.closing())

@@ -15,6 +15,7 @@ from sigmasplat.model.frame import Detail, PosePrior
 from sigmasplat.model.hops import TrackedHops
 from sigmasplat.model.photo import Photo
 from sigmasplat.model.places import Places
+from sigmasplat.model.poses import KeyframePoses, Poses
 from sigmasplat.model.submap import Picture
 from sigmasplat.slam.drift import Drift
 from sigmasplat.slam.localisation.confidence import Confidence
@@ -27,9 +28,10 @@ from sigmasplat.slam.localisation.recovery import Link, Recovery
 from sigmasplat.slam.localisation.relocaliser import Relocaliser
 from sigmasplat.slam.localisation.verdict import Usual
 from sigmasplat.slam.localisation.watch import Watch
-from sigmasplat.slam.loop_closure.candidates import SubmapDescriptor
-from sigmasplat.slam.loop_closure.closer import Loop, LoopCloser, OwedSearch
-from sigmasplat.slam.loop_closure.pose_graph import Edge
+from sigmasplat.slam.loop_closure.closer import LoopCloser, OwedSearch
+from sigmasplat.slam.loop_closure.described_submaps import DescribedSubmaps
+from sigmasplat.slam.loop_closure.edges import Edges
+from sigmasplat.slam.loop_closure.loops import Loop, Loops
 from sigmasplat.slam.mapper import Mapper
 from sigmasplat.slam.probes import Probe, Probes
 from sigmasplat.slam.slam import Slam
@@ -38,10 +40,10 @@ from sigmasplat.slam.steps import Steps
 from sigmasplat.slam.tracker import Tracker
 
 CLASSES: tuple[type, ...] = (
-    Atlas, Camera, Column, Confidence, DepthFit, DepthShape, Detail, Drift, Edge, FeatureImage, Foreground,
-    GaussianField, Keyframe, Link, Loop, LoopCloser, Mapper, Memory, OwedSearch, Photo, Picture, Places,
-    PosePrior, Probe, Probes, Pyramid, Recovery, Reference, Relocaliser, Rows, Seen, SeenKeyframe, Step, Steps,
-    SubmapDescriptor, Target, TrackedHops, Tracker, Usual, VectorAdam, Watch,
+    Atlas, Camera, Column, Confidence, DepthFit, DepthShape, DescribedSubmaps, Detail, Drift, Edges, FeatureImage,
+    Foreground, GaussianField, Keyframe, KeyframePoses, Link, Loop, LoopCloser, Loops, Mapper, Memory, OwedSearch,
+    Photo, Picture, Places, PosePrior, Poses, Probe, Probes, Pyramid, Recovery, Reference, Relocaliser, Rows, Seen,
+    SeenKeyframe, Step, Steps, Target, TrackedHops, Tracker, Usual, VectorAdam, Watch,
 )  # fmt: skip
 """The classes that a state may contain."""
 
@@ -80,3 +82,4 @@ def restore(slam: Slam, state: dict[str, Any]) -> None:
     slam.random.bit_generator.state = state["numbers"]
     for name in REMEMBERED:
         setattr(slam, name, state[name])
+    slam.keep_on_disk()

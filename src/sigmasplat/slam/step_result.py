@@ -12,7 +12,7 @@ from sigmasplat.fit.pose import PoseFit
 from sigmasplat.model.component import TRACKED
 from sigmasplat.model.stopwatch import Stopwatch
 from sigmasplat.render.view import View
-from sigmasplat.slam.loop_closure.closer import Loop
+from sigmasplat.slam.loop_closure.loops import Loop
 
 KERNELS = ("project", "sort", "blend", "blend_backward", "project_backward")
 """The stages that `View.seconds` counts, in its order."""

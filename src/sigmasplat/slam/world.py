@@ -11,11 +11,12 @@ from sigmasplat.config import Config
 from sigmasplat.errors import SourceError
 from sigmasplat.model.atlas import Atlas
 from sigmasplat.model.camera import Camera
+from sigmasplat.model.column import Column
 from sigmasplat.model.component import LOST, Component
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.map_uncertainty import MapUncertainty
-from sigmasplat.model.submap import MemoryStore, SubmapStore
+from sigmasplat.model.submap import MemoryStore, OnDisk, SubmapStore
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.presets import configured
 from sigmasplat.render.view import View
@@ -28,7 +29,8 @@ from sigmasplat.slam.localisation.recovery import Recovery
 from sigmasplat.slam.localisation.relocaliser import Relocaliser
 from sigmasplat.slam.localisation.sight import Observation, observe, view_of, working_frame
 from sigmasplat.slam.localisation.watch import Watch
-from sigmasplat.slam.loop_closure.closer import Loop, LoopCloser, make_descriptor
+from sigmasplat.slam.loop_closure.closer import LoopCloser, make_descriptor
+from sigmasplat.slam.loop_closure.loops import Loop, Loops
 from sigmasplat.slam.mapper import Mapper
 from sigmasplat.slam.merged import components_apart, merged_field
 from sigmasplat.slam.newest_covariance import NewestCovariance, PoseErrors
@@ -90,6 +92,7 @@ class World:
         self._search: Slices[list[Loop]] | None = None
         self.listeners = Listeners()
         self._newest_covariance = NewestCovariance()
+        self.keep_on_disk()
 
     @property
     def field(self) -> GaussianField:
@@ -106,9 +109,25 @@ class World:
         return components_apart(self.store, self.atlas, self.mapper.field, self.trajectory(), ~self.steps.lost)
 
     @property
-    def loops(self) -> list[Loop]:
-        """Return every pair of submaps that was tried as a loop, with the latest verdict."""
-        return list(self.closer.loops)
+    def loops(self) -> Loops:
+        """Return every pair of submaps that was tried as a loop, with the latest verdict. It grows with the map."""
+        return self.closer.loops
+
+    def keep_on_disk(self) -> None:
+        """Let what grows with every frame move from RAM to the folder of the store, if it has one: a file without a
+        name, which is gone when the process ends."""
+        folder = self.store.folder if isinstance(self.store, OnDisk) else None
+        for column in self._columns:
+            column.folder = folder
+
+    def release(self) -> None:
+        """Give the RAM of what is on disk back to the system, after the whole history was read."""
+        for column in self._columns:
+            column.release()
+
+    @property
+    def _columns(self) -> tuple[Column, ...]:
+        return *self.atlas.columns, self.steps.rows, *self.closer.columns
 
     def trajectory(self) -> Trajectory:
         """Return the poses of all frames so far, including lost ones (the log marks them).
@@ -141,7 +160,7 @@ class World:
         if newest.state == LOST:
             return None
         T_world_camera = (
-            self.atlas.anchors[-1] @ self.atlas.keyframe_poses[-1][-1] @ self.atlas.places[-1].T_keyframe_camera
+            self.atlas.anchors[-1] @ self.atlas.keyframe_poses.last[-1] @ self.atlas.places[-1].T_keyframe_camera
         )
         return self.pose_errors().of(T_world_camera, int(not newest.is_keyframe))
 

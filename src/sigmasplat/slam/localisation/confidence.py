@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sigmasplat.model.component import APART, LOST, RELOCALISED
-from sigmasplat.slam.loop_closure.closer import Loop
+from sigmasplat.slam.loop_closure.loops import Loop
 from sigmasplat.types import Matrix
 
 LOOP_STD_M = 0.01

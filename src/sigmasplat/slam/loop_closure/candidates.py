@@ -7,29 +7,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp, softmax
 
+from sigmasplat.slam.loop_closure.described_submaps import DescribedSubmaps, Descriptors, SubmapDescriptor
 from sigmasplat.slam.loop_closure.descriptors import similarity
 from sigmasplat.types import Matrix
-
-Descriptors = NDArray[np.float32]
 
 ROUNDING = float(np.finfo(np.float32).eps)
 """Times the length of a descriptor, this is larger than any rounding error of a similarity in single precision."""
 GATE_LEAST, GATE_MOST = 0.85, 1.20
 """Limits of the factor by which the variance of two submaps changes the similarity of their keyframes."""
-
-
-@dataclass(frozen=True, eq=False)
-class SubmapDescriptor:
-    """Descriptors of a finished submap.
-
-    index: its number; descriptors [n, D]: one per keyframe, unit norm; opacity_ratio: r of its splats; reach_m: the
-    largest distance of a keyframe from the submap's origin.
-    """
-
-    index: int
-    descriptors: Descriptors
-    opacity_ratio: float = 1.0
-    reach_m: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -105,6 +90,7 @@ def find_candidates(
     similarity_floor: float = 0.0,
     uncertainty: bool = True,
     most: int | None = None,
+    among: NDArray[np.bool_] | None = None,
 ) -> list[Candidate]:
     """List the keyframe pairs of the query and other submaps that may show the same place (VarSplat §4), best first.
 
@@ -114,15 +100,14 @@ def find_candidates(
     submap, query keyframe, database keyframe; the order of `database` does not matter.
 
     most: list the pairs of this many submaps, those with the best pairs, and of submaps that are equally good; None:
-    of all.
+    of all. among [S]: which submaps of the database are compared; None: all.
     """
-    threshold = self_similarity(query.descriptors, min_similarity)
-    others = _apart(query, database, min_interval)
-    ratios = np.array([other.opacity_ratio for other in others])
-    gates = gate(query.opacity_ratio, ratios) if uncertainty else np.ones(len(others))
+    threshold, known = self_similarity(query.descriptors, min_similarity), DescribedSubmaps.of(database)
+    wanted = _apart(query, known, min_interval) & (True if among is None else among)
+    gates = gate(query.opacity_ratio, known.opacity_ratio) if uncertainty else np.ones(len(known))
     found: list[Candidate] = []
-    for row in _worth_comparing(query, others, gates, threshold, similarity_floor, most):
-        other, factor = others[row], gates[row]
+    for row in _worth_comparing(query, known, wanted, gates, threshold, similarity_floor, most):
+        other, factor = known[row], gates[row]
         alike = similarity(query.descriptors, other.descriptors)
         rows, columns = np.nonzero((alike * factor > threshold[:, None]) & (alike > similarity_floor))
         found += [
@@ -141,26 +126,29 @@ def find_nearby(
     min_interval: int = 2,
     keyframes: int = 2,
     most: int | None = None,
+    among: NDArray[np.bool_] | None = None,
 ) -> list[SubmapPair]:
     """List pairs of submaps that show the same place according to the current poses; the `most` nearest, nearest first.
 
     An addition to the paper: while drift is small, poses find more revisits than descriptors do. T_world_keyframe:
-    poses [K, 4, 4] of each of these submaps, by its index. A pair counts if two keyframes are nearer than near_m and
-    their rotations differ by less than near_rad. The nearest `keyframes` of each side, in units of both limits, are to
-    be localised.
+    poses [K, 4, 4] of each of these submaps, by its index; among: as in `find_candidates`. A pair counts if two
+    keyframes are nearer than near_m and their rotations differ by less than near_rad. The nearest `keyframes` of each
+    side, in units of both limits, are to be localised.
     """
-    ours, others = T_world_keyframe[query.index], _apart(query, database, min_interval)
-    if not others:
+    known = DescribedSubmaps.of(database)
+    wanted = _apart(query, known, min_interval) & (True if among is None else among)
+    if not wanted.any():
         return []
-    poses = [T_world_keyframe[other.index] for other in others]
+    ours, others = T_world_keyframe[query.index], known.numbers[wanted]
+    poses = [T_world_keyframe[index] for index in others.tolist()]
     first = np.cumsum([0, *map(len, poses)])
     apart_m, apart_rad = _differences(ours, np.concatenate(poses))
     far = apart_m / near_m + apart_rad / near_rad
     within = np.where((apart_m < near_m) & (apart_rad < near_rad), far, np.inf)
     nearest = np.minimum.reduceat(within.min(0), first[:-1])
-    found = []
-    for row in sorted(np.flatnonzero(np.isfinite(nearest)), key=lambda row: (nearest[row], others[row].index))[:most]:
-        other, ours_theirs = others[row], far[:, first[row] : first[row + 1]]
+    found, rows = [], np.flatnonzero(wanted)
+    for row in sorted(np.flatnonzero(np.isfinite(nearest)), key=lambda row: (nearest[row], others[row]))[:most]:
+        other, ours_theirs = known[int(rows[row])], far[:, first[row] : first[row + 1]]
         q, d = np.argwhere(within[:, first[row] : first[row + 1]] == nearest[row])[0].tolist()
         alike = float(similarity(query.descriptors[q : q + 1], other.descriptors[d : d + 1])[0, 0])
         best = Candidate(query.index, q, other.index, d, alike, alike)
@@ -169,38 +157,41 @@ def find_nearby(
     return found
 
 
-def _apart(query: SubmapDescriptor, database: Sequence[SubmapDescriptor], min_interval: int) -> list[SubmapDescriptor]:
-    """Return the submaps with keyframes, at least `min_interval` apart from the query, without the query itself."""
-    least = max(min_interval, 1)
-    return [other for other in database if abs(other.index - query.index) >= least and len(other.descriptors)]
+def _apart(query: SubmapDescriptor, known: DescribedSubmaps, min_interval: int) -> NDArray[np.bool_]:
+    """Return which submaps [S] have keyframes and are at least `min_interval` apart from the query, without the query
+    itself."""
+    return np.asarray((np.abs(known.numbers - query.index) >= max(min_interval, 1)) & (known.counts > 0))
 
 
 def _worth_comparing(
     query: SubmapDescriptor,
-    others: Sequence[SubmapDescriptor],
+    known: DescribedSubmaps,
+    wanted: NDArray[np.bool_],
     gates: Matrix,
     threshold: Matrix,
     floor: float,
     most: int | None,
 ) -> list[int]:
-    """Return the rows of the submaps that may have pairs to list; arguments as in `find_candidates`.
+    """Return the rows of the wanted submaps that may have pairs to list; arguments as in `find_candidates`.
 
     One product of matrices in single precision replaces one per submap. It is rounded differently: a pair whose
     similarity is so near a limit is compared again, and takes no place among the `most` best.
     """
-    if not others or not len(threshold):
+    if not wanted.any() or not len(threshold):
         return []
-    counts = [len(other.descriptors) for other in others]
-    first = np.cumsum([0, *counts[:-1]])
-    alike = query.descriptors @ np.concatenate([other.descriptors for other in others]).T
+    counts = known.counts
+    some = np.flatnonzero(counts)
+    alike = query.descriptors @ known.rows.used.T
     rounding = ROUNDING * query.descriptors.shape[1]
     gated = alike * np.repeat(gates, counts)
     above = np.minimum(gated - threshold[:, None], alike - floor)
     possible, certain = (
-        np.maximum.reduceat(np.where(above > limit, gated, -np.inf).max(0), first) for limit in (-rounding, rounding)
+        np.maximum.reduceat(np.where(above > limit, gated, -np.inf).max(0), (np.cumsum(counts) - counts)[some])
+        for limit in (-rounding, rounding)
     )
-    least = -np.inf if most is None or most > len(others) else np.partition(certain, -most)[-most] - 2.0 * rounding
-    return [int(row) for row in np.flatnonzero((possible > -np.inf) & (possible >= least))]
+    possible, certain, rows = possible[wanted[some]], certain[wanted[some]], some[wanted[some]]
+    least = -np.inf if most is None or most > len(rows) else np.partition(certain, -most)[-most] - 2.0 * rounding
+    return [int(row) for row in rows[(possible > -np.inf) & (possible >= least)]]
 
 
 def _differences(a: Matrix, b: Matrix) -> tuple[Matrix, Matrix]:
@@ -223,13 +214,13 @@ def pairs_to_register(
     candidates: the result of `find_candidates` for the same query and database. Of each side, the `keyframes` most
     similar to any keyframe of the other side are chosen, most similar first.
     """
-    submaps = {submap.index: submap for submap in database}
+    known = DescribedSubmaps.of(database)
     best: dict[int, Candidate] = {}
     for candidate in candidates:
         best.setdefault(candidate.database_submap, candidate)
     pairs = []
     for index, candidate in list(best.items())[:most]:
-        alike = similarity(query.descriptors, submaps[index].descriptors)
+        alike = similarity(query.descriptors, known[int(np.flatnonzero(known.numbers == index)[0])].descriptors)
         pairs.append(SubmapPair(candidate, _highest(alike.max(1), keyframes), _highest(alike.max(0), keyframes)))
     return pairs
 

@@ -1,9 +1,7 @@
 """Close loops: find candidate submaps, register them, solve the pose graph, and move the anchors."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from math import isfinite
-from typing import Any
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,23 +10,25 @@ from sigmasplat.config import Config, LoopConfig
 from sigmasplat.errors import ConfigError
 from sigmasplat.model import se3
 from sigmasplat.model.atlas import Atlas
+from sigmasplat.model.column import Column
 from sigmasplat.model.field import COLUMNS
 from sigmasplat.model.submap import Submap, SubmapStore
 from sigmasplat.render.view import View
 from sigmasplat.slam.features import Extractor
 from sigmasplat.slam.loop_closure.candidates import (
-    Candidate,
-    SubmapDescriptor,
     SubmapPair,
     find_candidates,
     find_nearby,
     opacity_ratio,
     pairs_to_register,
 )
+from sigmasplat.slam.loop_closure.described_submaps import DescribedSubmaps, SubmapDescriptor
 from sigmasplat.slam.loop_closure.descriptors import Descriptor, OrientationGrid
+from sigmasplat.slam.loop_closure.edges import Edges
+from sigmasplat.slam.loop_closure.loops import Loop, Loops, described
 from sigmasplat.slam.loop_closure.neighbourhood import MOST_FREE, Incidence, Neighbourhood, numbered
-from sigmasplat.slam.loop_closure.pose_graph import Edge, LoopVerdict, PoseGraph, most_chi2
-from sigmasplat.slam.loop_closure.registration import Registrar, Registration
+from sigmasplat.slam.loop_closure.pose_graph import Edge, PoseGraph, most_chi2
+from sigmasplat.slam.loop_closure.registration import Registrar
 from sigmasplat.slam.predicted_submaps import PredictedSubmaps
 from sigmasplat.types import Matrix, Slices, completed
 
@@ -42,45 +42,6 @@ WIDER = 3
 """Factor from one part of the pose graph to the next larger one, while a new loop disagrees."""
 WIDEST = WIDER**2
 """Factor from the smallest part to the largest one: it bounds the time of a cut, however long the run is."""
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Loop:
-    """A pair of submaps that was tried as a loop, and the result.
-
-    query, database: submaps; query_frame, database_frame: the frames of their most similar keyframes; similarity,
-    gated: of these keyframes (VarSplat §4); residual, overlap, localised: of the registration; translation_m,
-    rotation_deg: the difference between T_query_database [4, 4] and the poses before; chi2, weight: verdict of the pose
-    graph; accepted: whether the loop is used.
-    """
-
-    query: int
-    database: int
-    query_frame: int
-    database_frame: int
-    similarity: float
-    gated: float
-    accepted: bool
-    reason: str
-    residual: float
-    overlap: float
-    localised: int
-    translation_m: float
-    rotation_deg: float
-    T_query_database: Matrix
-    chi2: float = float("nan")
-    weight: float = float("nan")
-
-    @property
-    def is_edge(self) -> bool:
-        """Return whether the registration succeeded: the loop is an edge of the pose graph, accepted by it or not."""
-        return isfinite(self.chi2) or self.accepted
-
-    def record(self) -> dict[str, Any]:
-        """Return plain values, T_query_database as 4 rows."""
-        return {name: getattr(self, name) for name in self.__dataclass_fields__} | {
-            "T_query_database": self.T_query_database.tolist()
-        }
 
 
 def make_descriptor(config: LoopConfig) -> Descriptor:
@@ -115,8 +76,8 @@ class OwedSearch:
 class LoopCloser:
     """Keeps the descriptors of finished submaps and all edges between them. Only this class moves anchors.
 
-    edges: trusted ones, such as odometry, and registered loops; loop_rows: for each edge its row in `loops`, -1 for a
-    trusted one. solved: the number of submaps when the whole pose graph was last solved. In between, and in a graph
+    edges: trusted ones, such as odometry, and registered loops, each with its row in `loops`, -1 for a trusted one.
+    solved: the number of submaps when the whole pose graph was last solved. In between, and in a graph
     that is larger than the largest part, loops move only the submaps near them in the graph (`Neighbourhood`).
     owed: the searches that are not complete, the oldest first.
     """
@@ -124,10 +85,9 @@ class LoopCloser:
     config: Config
     store: SubmapStore
     extractor: Extractor | None = None
-    descriptors: list[SubmapDescriptor] = field(default_factory=list)
-    edges: list[Edge] = field(default_factory=list)
-    loop_rows: list[int] = field(default_factory=list)
-    loops: list[Loop] = field(default_factory=list)
+    descriptors: DescribedSubmaps = field(default_factory=DescribedSubmaps)
+    edges: Edges = field(default_factory=Edges)
+    loops: Loops = field(default_factory=Loops)
     solved: int = 0
     owed: list[OwedSearch] = field(default_factory=list)
 
@@ -138,11 +98,7 @@ class LoopCloser:
     def connect(self, a: int, b: int, T_a_b: Matrix, information: Matrix) -> None:
         """Add a trusted edge between two submaps, such as odometry to the next one or a relocalisation: T_a_b [4, 4],
         and the information [6, 6] of its left twist (m, rad)."""
-        self._add(Edge(a, b, T_a_b, information, loop=False), -1)
-
-    def _add(self, edge: Edge, loop_row: int) -> None:
-        self.edges.append(edge)
-        self.loop_rows.append(loop_row)
+        self.edges.append(Edge(a, b, T_a_b, information, loop=False))
 
     def add_finished(self, submap: Submap, descriptors: Sequence[NDArray[np.float32]], T_first_submap: Matrix) -> None:
         """Add a submap of an earlier session: loops to it are tried, but it stays where it is relative to the first
@@ -156,10 +112,12 @@ class LoopCloser:
             self.connect(0, submap.index, T_first_submap, RIGID)
 
     @property
-    def believed(self) -> list[Edge]:
+    def believed(self) -> Edges:
         """Return the trusted edges and the accepted loops."""
-        known = zip(self.edges, self.loop_rows, strict=True)
-        return [edge for edge, row in known if row < 0 or self.loops[row].accepted]
+        rows = self.edges.loop_rows(range(len(self.edges)))
+        believed = rows < 0
+        believed[~believed] = self.loops.accepted[rows[~believed]]
+        return self.edges.taken(believed)
 
     def _described(self, submap: Submap, descriptors: Sequence[NDArray[np.float32]]) -> SubmapDescriptor:
         reach_m = float(np.linalg.norm(submap.T_submap_camera[:, :3, 3], axis=1).max())
@@ -203,40 +161,47 @@ class LoopCloser:
         for loop, edge in tried:
             self.loops.append(loop)
             if edge is not None:
-                self._add(edge, len(self.loops) - 1)
+                self.edges.append(edge, len(self.loops) - 1)
         if len(self.edges) > known:
             self._correct_at(atlas, submap.index, known)
+        self.release()
         return self.loops[len(self.loops) - len(tried) :]
+
+    @property
+    def columns(self) -> tuple[Column, ...]:
+        """Return what grows most with the number of submaps."""
+        return self.descriptors.rows, self.edges.rows, self.loops.rows
+
+    def release(self) -> None:
+        """Give RAM back to the system, after the whole history was read."""
+        for column in self.columns:
+            column.release()
 
     def _pairs(self, query: SubmapDescriptor, atlas: Atlas) -> list[SubmapPair]:
         """Choose the earlier submaps to register with: first similar ones, then those near by the current poses."""
         c = self.config.loops
-        database = [d for d in self.descriptors if atlas.components[d.index] == atlas.components[query.index]]
+        database, components = self.descriptors, np.array(atlas.components, np.int64)
+        connected = components[database.numbers] == components[query.index]
         keyframes, most = self.config.registration.keyframes, c.most or None
         candidates = find_candidates(
-            query, database, c.min_similarity, c.min_interval, c.similarity_floor, c.uncertainty, most
+            query, database, c.min_similarity, c.min_interval, c.similarity_floor, c.uncertainty, most, connected
         )
         pairs = pairs_to_register(candidates, query, database, keyframes, most)
         if c.near_m:
-            around = self._around(query, database, atlas)
-            poses = {other.index: atlas.T_world_keyframe(other.index) for other in (query, *around)}
+            around = connected & self._around(query, atlas)
+            poses = atlas.T_world_keyframes_of([query.index, *database.numbers[around].tolist()])
             near_rad, known = np.deg2rad(c.near_deg), {pair.best.database_submap for pair in pairs}
             # Of the nearest 2n, at most n are known already.
             twice = None if most is None else 2 * most
-            near = find_nearby(query, around, poses, c.near_m, near_rad, c.min_interval, keyframes, twice)
+            near = find_nearby(query, database, poses, c.near_m, near_rad, c.min_interval, keyframes, twice, around)
             pairs += [pair for pair in near if pair.best.database_submap not in known]
         return pairs[:most]
 
-    def _around(
-        self, query: SubmapDescriptor, database: Sequence[SubmapDescriptor], atlas: Atlas
-    ) -> list[SubmapDescriptor]:
-        """Return the submaps that may have a keyframe nearer than `near_m` to one of the query's."""
-        if not database:
-            return []
-        centres = np.array([atlas.anchors[other.index][:3, 3] for other in database])
-        apart_m = np.linalg.norm(centres - atlas.anchors[query.index][:3, 3], axis=1)
-        reach_m = query.reach_m + np.array([other.reach_m for other in database])
-        return [database[row] for row in np.flatnonzero(apart_m <= self.config.loops.near_m + reach_m).tolist()]
+    def _around(self, query: SubmapDescriptor, atlas: Atlas) -> NDArray[np.bool_]:
+        """Return which described submaps [n] may have a keyframe nearer than `near_m` to one of the query's."""
+        known, anchors = self.descriptors, np.array(atlas.anchors)
+        apart_m = np.linalg.norm(anchors[known.numbers][:, :3, 3] - anchors[query.index][:3, 3], axis=1)
+        return np.asarray(apart_m <= self.config.loops.near_m + query.reach_m + known.reach_m)
 
     def _try(self, pair: SubmapPair, a: Submap, atlas: Atlas, view: View) -> Slices[tuple[Loop, Edge | None]]:
         """Register a pair in slices, with `a` as the query; return the result, and its edge if it was accepted."""
@@ -277,10 +242,6 @@ class LoopCloser:
         chi2 = PoseGraph(len(nodes), numbered(edges, nodes)).chi2(np.stack([atlas.anchors[node] for node in nodes]))
         return bool((chi2 > most_chi2()).any())
 
-    def _is_rejected(self, loop_row: int) -> bool:
-        """Return whether a pose graph that was solved before has rejected the loop of an edge."""
-        return loop_row >= 0 and isfinite(self.loops[loop_row].chi2) and not self.loops[loop_row].accepted
-
     def _correct(self, atlas: Atlas, component: int, centre: int | None = None, most_free: int = MOST_FREE) -> bool:
         """Solve the pose graph of a component, move its anchors, and update the verdict on its registered loops; return
         whether the whole graph was solved.
@@ -295,31 +256,14 @@ class LoopCloser:
         else:
             part = Neighbourhood.around(centre, self.graph, members[0], most_free)
         small = len(members) <= MOST_FREE
-        rejected = [] if small else [self._is_rejected(self.loop_rows[edge]) for edge in part.edges]
+        loop_rows = self.edges.loop_rows(part.edges).tolist()
+        rejected = [] if small else [row >= 0 and self.loops.is_rejected(row) for row in loop_rows]
         solution = part.solve(atlas.anchors, self.edges, rejected)
         for submap, T_world_submap in zip(part.nodes, solution.T_world_node, strict=True):
             atlas.anchors[submap] = T_world_submap
-        tested = [row for row in (self.loop_rows[edge] for edge in part.edges) if row >= 0]
+        tested = [row for row in loop_rows if row >= 0]
         for row, verdict in zip(tested, solution.verdicts, strict=True):
-            self.loops[row] = judged(self.loops[row], verdict)
+            self.loops.judge(row, verdict)
         if whole:
             self.solved = max(self.solved, len(members))
         return whole
-
-
-def described(best: Candidate, a: Submap, b: Submap, found: Registration, known: Matrix) -> Loop:
-    """Return the loop record of a registration of submaps a and b; best: their most similar keyframes; known: T_a_b
-    [4, 4] before it."""
-    seen_from = b.T_submap_camera[best.database_keyframe]
-    moved = se3.inverse(known @ seen_from) @ found.T_a_b @ seen_from
-    return Loop(
-        a.index, b.index, a.frames[best.query_keyframe], b.frames[best.database_keyframe], best.similarity,
-        best.gated, found.accepted, found.reason, found.residual, found.overlap, found.localised,
-        float(np.linalg.norm(moved[:3, 3])), float(np.rad2deg(se3.rotation_angle(moved[:3, :3]))), found.T_a_b,
-    )  # fmt: skip
-
-
-def judged(loop: Loop, verdict: LoopVerdict) -> Loop:
-    """Return a registered loop with the pose graph's verdict on it."""
-    reason = "accepted" if verdict.accepted else f"the pose graph disagrees (χ² {verdict.chi2:.0f})"
-    return replace(loop, accepted=verdict.accepted, reason=reason, chi2=verdict.chi2, weight=verdict.weight)

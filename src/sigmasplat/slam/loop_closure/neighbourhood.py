@@ -1,5 +1,6 @@
 """The part of a large pose graph around a node: its nodes move, and their neighbours hold them in place."""
 
+from array import array
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -18,21 +19,27 @@ class Incidence:
     is found without reading the whole one."""
 
     edges: Sequence[Edge]
-    at: dict[int, list[int]] = field(default_factory=dict)
-    known: int = 0
+    at: dict[int, "array[int]"] = field(default_factory=dict)
+    ends: "array[int]" = field(default_factory=lambda: array("i"))
+    """Both ends of each edge that was read."""
 
     def rows_at(self, node: int) -> list[int]:
         """Return the rows of the edges at a node, in the order of the edges."""
-        for row in range(self.known, len(self.edges)):
-            for end in (self.edges[row].a, self.edges[row].b):
-                self.at.setdefault(end, []).append(row)
-        self.known = len(self.edges)
-        return self.at.get(node, [])
+        for row in range(len(self.ends) // 2, len(self.edges)):
+            edge = self.edges[row]
+            for end in (edge.a, edge.b):
+                self.at.setdefault(end, array("i")).append(row)
+                self.ends.append(end)
+        return list(self.at.get(node, ()))
+
+    def ends_of(self, row: int) -> tuple[int, int]:
+        """Return both ends of an edge that `rows_at` has returned."""
+        return self.ends[2 * row], self.ends[2 * row + 1]
 
     def other_end(self, row: int, node: int) -> int:
         """Return the end of an edge that is not the node."""
-        edge = self.edges[row]
-        return edge.b if edge.a == node else edge.a
+        a, b = self.ends_of(row)
+        return b if a == node else a
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +74,7 @@ class Neighbourhood:
                     order.append(other)
         free = sorted([node for node in order if node != always_fixed][:most_free])
         rows = sorted({row for node in free for row in graph.rows_at(node)})
-        ends = {end for row in rows for end in (graph.edges[row].a, graph.edges[row].b)}
+        ends = {end for row in rows for end in graph.ends_of(row)}
         fixed = sorted(ends.difference(free))
         return Neighbourhood((*fixed, *free), len(fixed), tuple(rows))
 

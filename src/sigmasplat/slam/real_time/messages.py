@@ -16,7 +16,7 @@ from sigmasplat.slam.listeners import Correction
 from sigmasplat.slam.localisation.foreground import Foreground
 from sigmasplat.slam.localisation.sight import Observation
 from sigmasplat.slam.localisation.tracked_keyframe import TrackedKeyframe
-from sigmasplat.slam.loop_closure.closer import Loop
+from sigmasplat.slam.loop_closure.loops import Loops
 from sigmasplat.slam.newest_covariance import NO_ERRORS, PoseErrors
 from sigmasplat.slam.step_result import Step
 from sigmasplat.types import Matrix
@@ -48,7 +48,7 @@ class Snapshot:
     T_world_submap: Matrix
     drift: Drift
     spread_m: float
-    loops: tuple[Loop, ...] = ()
+    loops: Loops = field(default_factory=Loops)
     searched: int = -1
     seconds: float = 0.0
     errors: PoseErrors = NO_ERRORS

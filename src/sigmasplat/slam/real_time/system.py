@@ -21,7 +21,7 @@ from sigmasplat.slam.listeners import Events
 from sigmasplat.slam.localisation.recovery import Recovery
 from sigmasplat.slam.localisation.sight import view_of, working_frame
 from sigmasplat.slam.localisation.watch import Watch
-from sigmasplat.slam.loop_closure.closer import Loop
+from sigmasplat.slam.loop_closure.loops import Loops
 from sigmasplat.slam.real_time.messages import Snapshot, Task
 from sigmasplat.slam.real_time.schedule import MappingThread, Schedule
 from sigmasplat.slam.real_time.tracking import CameraClock
@@ -188,10 +188,10 @@ class RealTime(ArrayInterface):
         self.slam.finish(progress)
 
     @property
-    def loops(self) -> list[Loop]:
+    def loops(self) -> Loops:
         """Return every pair of submaps that was tried as a loop, as of the newest snapshot while frames arrive."""
         if self._runs:
-            return [] if self._camera.snapshot is None else list(self._camera.snapshot.loops)
+            return Loops() if self._camera.snapshot is None else self._camera.snapshot.loops
         return self.slam.loops
 
     @property

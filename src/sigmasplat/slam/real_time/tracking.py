@@ -203,7 +203,7 @@ class CameraClock:
         if found.state == TRACKED and self.found:
             found.state, self.found = (RELOCALISED if self.found == RELOCALISED else TRACKED), ""
         state = APART if component and found.state != LOST else found.state
-        loops = () if s is None else s.loops[self.loops :]
+        loops = () if s is None else tuple(s.loops[self.loops :])
         self.loops += len(loops)
         in_submap_m = drift.position_m(found.T_submap_camera)
         found.tracking |= {

@@ -16,7 +16,7 @@ from sigmasplat.slam.localisation.relocaliser import Relocation
 from sigmasplat.slam.localisation.sight import Observation
 from sigmasplat.slam.localisation.tracked_keyframe import TrackedKeyframe, found_keyframe, mapped_keyframe
 from sigmasplat.slam.localisation.verdict import is_better
-from sigmasplat.slam.loop_closure.closer import Loop
+from sigmasplat.slam.loop_closure.loops import Loops
 from sigmasplat.slam.mapping import MapWork
 from sigmasplat.slam.newest_covariance import NO_ERRORS
 from sigmasplat.slam.real_time.messages import Offer, Search, Snapshot, Task, TrackedFrame
@@ -104,7 +104,7 @@ class MapClock:
 
     def _pose(self, each: TrackedFrame) -> Matrix:
         """Return a frame's pose in the active submap, whose keyframes mapping may have moved since it was tracked."""
-        known, T_submap_keyframe = each.poses[self._newest], self.system.atlas.keyframe_poses[-1][-1]
+        known, T_submap_keyframe = each.poses[self._newest], self.system.atlas.keyframe_poses.last[-1]
         if np.array_equal(known, T_submap_keyframe):
             return each.T_submap_camera
         return T_submap_keyframe @ se3.inverse(known) @ each.T_submap_camera
@@ -138,7 +138,7 @@ class MapClock:
 
     def _done(self, each: TrackedFrame) -> None:
         """Place a keyframe, which is the newest one."""
-        self.system.atlas.place_frame(self.system.atlas.keyframe_poses[-1][-1])
+        self.system.atlas.place_frame(self.system.atlas.keyframe_poses.last[-1])
         self.system.steps.append(each.step)
 
     def _add_drift(self, number: int, T_submap_camera: Matrix, hop: Hop) -> None:
@@ -183,7 +183,7 @@ class MapClock:
             yield from system.begin_apart()
             yield from self._map_found(number, search.seen, APART)
         elif self.last is not None:
-            last = replace(self.last, state="", searched=number, loops=tuple(system.loops), seconds=0.0)
+            last = replace(self.last, state="", searched=number, loops=system.loops.copied(), seconds=0.0)
             self._hand_over(replace(last, correction=None))
 
     def _has_recovered(self, search: Search) -> bool:
@@ -196,7 +196,7 @@ class MapClock:
         if place.where[0] == len(system.store):
             c, params = system.config.tracking, system.mapper.field.params
             keyframe = self._described(found_keyframe(params, system.view, place.keyframe, c))
-            newest = {self._newest: system.atlas.keyframe_poses[-1][-1]}
+            newest = {self._newest: system.atlas.keyframe_poses.last[-1]}
             self._publish(number, keyframe, newest | {number: place.T_submap_camera}, RELOCALISED)
             return
         yield from system.branch_at(place)
@@ -209,7 +209,7 @@ class MapClock:
 
     # ---- snapshots ----
 
-    def unreported(self) -> tuple[list[Loop], Correction | None]:
+    def unreported(self) -> tuple[Loops, Correction | None]:
         """Return all loops tried, and the correction since the last snapshot; call it when no work is left."""
         return self.system.loops, self._correction()
 
@@ -228,8 +228,8 @@ class MapClock:
         self._hand_over(
             Snapshot(
                 number, self._newest, poses, state, system.mapper.field.params.clone(), keyframe,
-                len(system.atlas.anchors) - 1, system.atlas.components[-1], system.atlas.anchors[-1].copy(),
-                replace(system.drift), system.confidence.spread_m[-1], tuple(system.loops), number, seconds, errors,
+                len(system.atlas.anchors) - 1, system.atlas.components[-1], system.atlas.anchors[-1],
+                replace(system.drift), system.confidence.spread_m[-1], system.loops.copied(), number, seconds, errors,
                 correction,
             )
         )  # fmt: skip

@@ -1,0 +1,76 @@
+"""All edges of the pose graphs, in a column."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sigmasplat.model.column import Column, Records
+from sigmasplat.slam.loop_closure.pose_graph import Edge
+from sigmasplat.types import Matrix
+
+NUMBERS = 3
+"""Columns before the motion, see `Edges.rows`."""
+
+
+@dataclass(eq=False)
+class Edges(Records[Edge]):
+    """Edges in their order. An edge is made when it is read.
+
+    rows [E, 55]: a, b, row of the loop that the edge is, −1 for a trusted edge, T_a_b and information by rows.
+    """
+
+    rows: Column = field(default_factory=lambda: Column.of(np.float64, NUMBERS + 16 + 36))
+
+    @staticmethod
+    def of(known: Iterable[Edge]) -> "Edges":
+        """Return edges in their order; each loop has row 0."""
+        if isinstance(known, Edges):
+            return known
+        edges = Edges()
+        for edge in known:
+            edges.append(edge, 0 if edge.loop else -1)
+        return edges
+
+    def append(self, edge: Edge, loop_row: int = -1) -> None:
+        """Append an edge; loop_row: of a loop, its row among all pairs that were tried."""
+        self.rows.append([edge.a, edge.b, loop_row, *edge.T_a_b.ravel(), *edge.information.ravel()])
+
+    def __iter__(self) -> Iterator[Edge]:
+        return (self._record(i) for i in range(len(self)))
+
+    @property
+    def ends(self) -> NDArray[np.int64]:
+        """Return a and b of each edge [E, 2]."""
+        return np.asarray(self.rows.used[:, :2].astype(np.int64))
+
+    @property
+    def T_a_b(self) -> Matrix:
+        """Return the motion of each edge [E, 4, 4]."""
+        return self.rows.used[:, NUMBERS : NUMBERS + 16].reshape(-1, 4, 4).copy()
+
+    @property
+    def information(self) -> Matrix:
+        """Return the information of each edge [E, 6, 6]."""
+        return self.rows.used[:, NUMBERS + 16 :].reshape(-1, 6, 6).copy()
+
+    @property
+    def is_loop(self) -> NDArray[np.bool_]:
+        """Return which edges are loops [E]."""
+        return np.asarray(self.rows.used[:, 2] >= 0)
+
+    def taken(self, chosen: NDArray[np.bool_]) -> "Edges":
+        """Return a copy of some edges."""
+        rows = self.rows.used[chosen]
+        return Edges(Column(rows, len(rows)))
+
+    def loop_rows(self, edges: Sequence[int]) -> NDArray[np.int64]:
+        """Return the row of the loop that each of some edges is [n], −1 for a trusted edge."""
+        return np.asarray(self.rows.used[np.array(edges, np.intp), 2].astype(np.int64))
+
+    def _record(self, i: int) -> Edge:
+        row = self.rows.used[i].copy()
+        a, b, loop_row = (int(number) for number in row[:NUMBERS].tolist())
+        T, information = row[NUMBERS : NUMBERS + 16].reshape(4, 4), row[NUMBERS + 16 :].reshape(6, 6)
+        return Edge(a, b, T, information, loop_row >= 0)
