@@ -30,7 +30,10 @@ class DiskMemory:
         would end the process.
         """
         steps = -(-max(size, self.size + self.size // 8) // STEP_BYTES)
-        os.posix_fallocate(self._file.fileno(), 0, steps * STEP_BYTES)
+        reserve = getattr(os, "posix_fallocate", None)
+        if reserve is None:
+            raise OSError("this system cannot reserve space in a file")
+        reserve(self._file.fileno(), 0, steps * STEP_BYTES)
         self.size = steps * STEP_BYTES
         self._map = mmap.mmap(self._file.fileno(), self.size)
         return self._map
