@@ -123,6 +123,14 @@ def test_a_keyframe_is_a_matter_of_motion() -> None:
     assert [system.step(frame).is_keyframe for frame in still] == [True] + [False] * 14
 
 
+def test_a_fast_camera_makes_no_more_keyframes_than_in_a_recording() -> None:
+    """Each keyframe adds an error to the path."""
+    system = RealTime(
+        Slam(config(realtime__keyframe_deg="0.5", mapping__every="4", mapping__overlap_below="0")), AtOnce()
+    )
+    assert [step.index for step in map(system.step, frames(14)) if step.is_keyframe] == [0, 4, 8, 12]
+
+
 def test_too_many_waiting_keyframes_are_refused_and_counted() -> None:
     class Never(AtOnce):
         def wake(self) -> None:
@@ -131,7 +139,8 @@ def test_too_many_waiting_keyframes_are_refused_and_counted() -> None:
         def settle(self) -> None:
             AtOnce.wake(self)
 
-    system = RealTime(Slam(config(realtime__keyframe_deg="0.5", realtime__waiting_most="3")), Never())
+    often = config(realtime__keyframe_deg="0.5", realtime__waiting_most="3", mapping__every="1")
+    system = RealTime(Slam(often), Never())
     steps = [system.step(frame) for frame in frames(20)]
     assert sum(step.is_keyframe for step in steps) == 3 and system.keyframes_refused > 5
     assert max(step.tracking["waiting"] for step in steps) == 3

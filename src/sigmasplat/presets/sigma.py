@@ -7,9 +7,8 @@ from sigmasplat.presets import varsplat
 # contradict depth readings. Fading and removing keep the map usable when the camera moves fast. Two parts are not used.
 # The window: a map with loops to close must keep older parts. The median-depth loss: it brings nothing in addition to
 # U, and costs an eighth of the speed. There are fewer iterations, to compensate for the cost of U.
-# Depth is ours: the mean depth of the splats along the ray, D̂/A, is fitted to the sensor. Seeds as discs
-# (`seeding.thickness`) are not used: they make the path of the noisy synthetic room worse. The refinement of the final
-# map is ours, too (docs/final-map.md).
+# Depth is ours: the mean depth of the splats along the ray, D̂/A, is fitted to the sensor. Seeds are discs on the
+# surface. The refinement of the final map is ours, too (docs/final-map.md).
 SIGMA = varsplat.FAST.changed(
     input={"denoise_depth": True},
     mapping={
@@ -22,6 +21,7 @@ SIGMA = varsplat.FAST.changed(
         "weight_mean_depth": 2.0,
     },
     render={"depth": "ray"},
+    seeding={"thickness": 0.1},  # the depth of a disc seen at an angle is right, and the path a little better
     tracking={"features": True, "verify": True},
     recovery={"relocalise": True, "new_map_after": 20, "steady_frames": 2},
     registration={"to_keyframe": True, "iterations": 20},  # descent is left for pairs that hardly match

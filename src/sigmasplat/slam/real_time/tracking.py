@@ -174,7 +174,7 @@ class CameraClock:
         if not most_deg or reference is None:
             return is_keyframe(since, c.every, fit.overlap, c.overlap_below)
         depth_m = 1.0 if fit.alignment is None else fit.alignment.depth_m
-        moved = has_moved(reference.T_camera_world @ T_submap_camera, depth_m, most_deg)
+        moved = since >= c.every and has_moved(reference.T_camera_world @ T_submap_camera, depth_m, most_deg)
         return moved or fit.overlap < c.overlap_below
 
     def _search(self, fit: PoseFit, seen: Observation, offer: Offer | None) -> Search | None:
