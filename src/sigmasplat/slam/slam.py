@@ -130,7 +130,7 @@ class Slam(MapWork, ArrayInterface):
                 self.drift.variance_sum += mean_variance(self.mapper.field, self.view, fit.T_camera_world)
                 found.tracking["variance_sum"] = self.drift.variance_sum
             certain = self.recovery.is_steady and self.tracker.is_certain(fit)
-            found.mapped = certain and not held_back and self._is_keyframe(fit.overlap)
+            found.mapped = certain and not held_back and (self._is_keyframe(fit.overlap) or self.tracker.needs_keyframe(fit))
             if found.mapped:
                 found.hop = self.hop_to(fit.T_camera_world, self.tracker.hop(fit, seen.live))
                 if self.cuts:

@@ -151,6 +151,7 @@ class Tracker:
                     break
                 shown = first if front is None else seen.aside(front, view)
                 found = self._fit(field, view, shown, guess)
+                found = self.watch.fitted_to_all(self.keyframe, shown.live, found, self.config)
                 guess = se3.inverse(found.T_camera_world)
             else:
                 if self._stands(found, predicted):
@@ -170,8 +171,8 @@ class Tracker:
         """Look for the one thing in front without which the images agree much better: it moves, and has drawn the pose
         with it. Return the fit and the frame without it; None if there is none. known: the last frame had something in
         front."""
-        contradicted = self._contradicted(drawn)
-        for front in self.watch.suspected(self.keyframe, seen, drawn, contradicted, known):
+        contradicted, drops = self._contradicted(drawn), self.usual.agrees_less(drawn.comparison)
+        for front in self.watch.suspected(self.keyframe, seen, drawn, contradicted, known, drops):
             shown = seen.aside(front, view)
             found = self._fit(field, view, shown, predicted)
             if agrees_more(found.comparison, drawn.comparison, contradicted) and self._stands(found, predicted):
@@ -319,9 +320,14 @@ class Tracker:
         self.previous, self.lost = T_world_camera, False
         self.follow(mapped_keyframe(field.params, view, seen, T_world_camera, self.config, self.front))
 
+    def needs_keyframe(self, fit: PoseFit) -> bool:
+        """Return whether what is in front hides so much that a frame is to be the next keyframe."""
+        return self.watch.renews(fit.comparison, self.front)
+
     def follow(self, keyframe: TrackedKeyframe) -> None:
         """Use a keyframe as the reference of the next frames."""
-        self.keyframe = self.keyframe if keyframe.reference is None else keyframe.reference
+        if keyframe.reference is not None:
+            self.watch, self.keyframe = self.watch.followed(self.keyframe, keyframe.reference), keyframe.reference
         self.keyframe_features, self.keyframe_front = keyframe.image, keyframe.front
 
     def move_to(self, field: Splats, view: View, keyframe: FoundKeyframe, T_world_camera: Matrix) -> None:
