@@ -87,8 +87,8 @@ class Watch:
     ) -> Iterator[Foreground]:
         """Yield the things in front that may have drawn a pose: those without which the gray values agree much better
         at the same pose; if the images contradict it, all. Without contradiction, every second frame is looked at, and
-        those after one in which something was in front (`known`). If the gray values agree much less than usual (`drops`),
-        all things are yielded in every frame: at a pose that was drawn far, nothing agrees."""
+        those after one in which something was in front (`known`). If the gray values agree much less than usual
+        (`drops`), all are yielded in every frame: at a pose that was drawn far, nothing agrees."""
         if keyframe is None or fit.comparison is None:
             return
         looks = (known or drops or self.memory.frames % DRAWN_EVERY == 0) and differs(fit.comparison)
@@ -115,8 +115,10 @@ class Watch:
         return replace(fit, T_camera_world=T_camera_world, comparison=keyframe.compared(live, T_camera_world))
 
     def renews(self, found: Comparison | None, front: Foreground | None) -> bool:
-        """Return whether a frame with something in front shares so little with the newest keyframe that it becomes one."""
-        return self.config.find and front is not None and found is not None and min(found.common, found.covered) < RENEWED
+        """Return whether a frame with something in front becomes a keyframe: it shares too little with the newest."""
+        if not self.config.find or front is None or found is None:
+            return False
+        return min(found.common, found.covered) < RENEWED
 
     def followed(self, keyframe: Reference | None, newest: Reference) -> "Watch":
         """Return the watch when a keyframe is no longer the newest one; at a cut, the newest one is the same again."""
