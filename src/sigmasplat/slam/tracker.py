@@ -313,7 +313,7 @@ class Tracker:
 
     def keep_keyframe(self, field: Splats, view: View, seen: Sight, T_world_camera: Matrix) -> None:
         """Use a keyframe that was just mapped: its refined pose, and its image as the reference of the next frames."""
-        self.watch = self.watch.moved_by(T_world_camera @ se3.inverse(self.previous))
+        self.move_by(T_world_camera @ se3.inverse(self.previous))  # at a cut, the coordinates change
         self.previous, self.lost = T_world_camera, False
         self.follow(mapped_keyframe(field.params, view, seen, T_world_camera, self.config, self.front))
 
