@@ -205,9 +205,8 @@ def sections(measured: dict[str, Any]) -> list[Section]:
     note = (
         "IoU: of the masks of all frames in which the ball moves. Too near: pixels of held-out views at which the "
         "final map is at least 5 cm + 5 % nearer than the still room. Left: summed opacity of splats up to 5 cm from "
-        "the ball, at any place of its path, and more than 6 cm from the room's own surface; in the still room, near the "
-        "path of the ball of 30 %. Time: processor seconds "
-        "of all frames, without the final map."
+        "the ball, at any place of its path, and more than 6 cm from the room's own surface (share 0: of the ball of "
+        "30 %). Time: processor seconds of all frames, without the final map."
     )
     head = ("share, %", "seed", "search", "ATE, cm", "lost frames", "IoU", "wrongly masked, %", "too near, %", "left")
     found = [Section("Moving ball", (*head, "PSNR, dB", "time, s"), rooms, note)]
