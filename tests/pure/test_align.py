@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from align_oracle import CAMERA, HUGE, MISSING, Pair, missing, oracle, pair
-from sigmasplat.fit.align import align
+from sigmasplat.fit.align import align, align_to_all
 from sigmasplat.fit.gray import gray_of
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.model import se3
@@ -52,6 +52,29 @@ def test_a_known_motion_is_found_from_standing_still() -> None:
         assert_same_pose(found.T_live_reference, true, *((2e-3, 0.1) if size[0] > 100 else (4e-3, 0.15)))
         assert found.agreement > 0.9 and 0.7 < found.overlap <= 1.0
         assert se3.is_rigid(found.T_live_reference, 1e-9)
+
+
+def test_references_that_each_show_little_find_the_motion_together() -> None:
+    frames, true = (8, 10), [motion(i, 12) for i in (8, 10)]
+    shown = [np.zeros((120, 160), np.bool_) for _ in frames]
+    shown[0][70:110, 10:50], shown[1][10:50, 110:150] = True, True
+    parts = [
+        Pyramid.of(seen(i).gray[0], np.where(own, seen(i).depth[0], np.float32(0.0)), seen(i).cameras[0])
+        for i, own in zip(frames, shown, strict=True)
+    ]
+    aside = se3.exp(np.array([0.01, -0.008, 0.006, 0.004, 0.003, -0.004]))
+    moved = align_to_all(parts, seen(12), [aside @ T for T in true], 20)
+    off_m = np.linalg.norm((moved @ aside)[:3, 3])
+    alone_m = [
+        np.linalg.norm((align_to_all([part], seen(12), [aside @ T], 20) @ aside)[:3, 3])
+        for part, T in zip(parts, true, strict=True)
+    ]
+    assert off_m < 3e-3 < min(alone_m)
+
+
+def test_without_common_pixels_the_guess_stays() -> None:
+    nothing = Pyramid.of(seen(10).gray[0], np.zeros_like(seen(10).depth[0]), seen(10).cameras[0])
+    assert np.array_equal(align_to_all([nothing, nothing], seen(12), [np.eye(4)] * 2), np.eye(4))
 
 
 def test_either_kind_of_residual_finds_the_motion() -> None:

@@ -14,6 +14,7 @@ from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
+from sigmasplat.slam.localisation.foreground import Foreground
 from sigmasplat.slam.localisation.memory import Memory
 from sigmasplat.slam.moving import carve, mask_keyframes
 from sigmasplat.sources import SyntheticRoom, open_source
@@ -71,6 +72,18 @@ def test_slow_motion_shows_against_older_frames_and_rest_ends_it() -> None:
         found.append(front is not None)
         memory = memory.after(depth_m, front, np.eye(4), FRAMES)
     assert all(found[16:40:4]) and not any(found[75:])
+
+
+def test_what_comes_back_to_an_earlier_place_is_not_at_rest() -> None:
+    memory, left = Memory(), [60] * 11 + [110] * 10 + [60] * 20
+    moved, found = with_box(60) == BOX_M, None
+    for n, column in enumerate(left):
+        depth_m = with_box(column)
+        front = Foreground(depth_m == BOX_M, np.where(depth_m == BOX_M, depth_m, 0), np.full_like(depth_m, WALL_M))
+        found = memory.still_moving(front, depth_m, np.eye(4), CAMERA, FRAMES)
+        assert found is not None, f"frame {n} is taken for at rest"
+        memory = memory.after(depth_m, found, np.eye(4), FRAMES)
+    assert found is not None and found.hidden[moved].all()
 
 
 @pytest.mark.parametrize(("floating", "left"), [(1, 2001), (20, 2000)])

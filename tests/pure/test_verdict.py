@@ -149,3 +149,11 @@ def test_few_matches_need_surfaces_that_agree_better() -> None:
     assert not recognised(replace(GOOD, correlation=0.84), 12)
     for wrong in (THROUGH, OBJECT, NOTHING):
         assert not recognised(wrong, 500)
+
+
+def test_gray_values_that_agree_much_less_than_usual_show_that_the_pose_may_be_drawn() -> None:
+    history = usual(replace(GOOD, correlation=0.98))
+    assert history.agrees_less(replace(GOOD, correlation=0.89))  # not yet doubtful
+    assert not history.doubts(replace(GOOD, correlation=0.89))
+    assert not history.agrees_less(replace(GOOD, correlation=0.96))
+    assert not history.agrees_less(None) and not history.agrees_less(FLAT)

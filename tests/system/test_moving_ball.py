@@ -30,3 +30,16 @@ def test_a_ball_in_view_from_the_first_frame_on_does_not_draw_the_pose(share: in
     off_m = np.linalg.norm(step.T_world_camera[:3, 3] - moved[:3, 3])
     assert off_m < 0.01  # a camera that is drawn by the ball is off by more than 4 cm
     assert min(masked[1:]) > 0.05 if share else not any(masked)
+
+
+def test_a_ball_that_hides_most_of_the_image_does_not_draw_the_pose() -> None:
+    room, first, last = SyntheticRoom(200, 160, 120, seed=1, noise=True, exposure_change=False, mover=30), 36, 52
+    slam = Slam(override(preset("sigma"), SMALL))
+    steps = [slam.step(room.frame(i)) for i in range(first, last)]
+    truth = room.truth().T_world_camera
+    off_m = [
+        np.linalg.norm(step.T_world_camera[:3, 3] - (se3.inverse(truth[first]) @ truth[i])[:3, 3])
+        for step, i in zip(steps, range(first, last), strict=True)
+    ]
+    assert not any(step.lost for step in steps)
+    assert max(off_m) < 0.02, f"{100 * max(off_m):.1f} cm"  # with the newest keyframe alone it is 5 cm

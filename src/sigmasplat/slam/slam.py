@@ -130,7 +130,7 @@ class Slam(MapWork, ArrayInterface):
                 self.drift.variance_sum += mean_variance(self.mapper.field, self.view, fit.T_camera_world)
                 found.tracking["variance_sum"] = self.drift.variance_sum
             certain = self.recovery.is_steady and self.tracker.is_certain(fit)
-            found.mapped = certain and not held_back and self._is_keyframe(fit.overlap)
+            found.mapped = certain and not held_back and self._is_keyframe(fit)
             if found.mapped:
                 found.hop = self.hop_to(fit.T_camera_world, self.tracker.hop(fit, seen.live))
                 if self.cuts:
@@ -150,9 +150,10 @@ class Slam(MapWork, ArrayInterface):
         with self._timer.stage("track"), self._timer.kernels_of(self.view, "track_kernels"):
             return self.tracker.track(self.mapper.field, self.view, seen, seen.frame.prior)
 
-    def _is_keyframe(self, overlap: float) -> bool:
-        c = self.config.mapping
-        return is_keyframe(len(self.steps) - self.mapper.keyframes[-1].index, c.every, overlap, c.overlap_below)
+    def _is_keyframe(self, fit: PoseFit) -> bool:
+        c, since = self.config.mapping, len(self.steps) - self.mapper.keyframes[-1].index
+        renews = self.tracker.watch.renews(fit.comparison, self.tracker.front)
+        return renews or is_keyframe(since, c.every, fit.overlap, c.overlap_below)
 
     def _map(self, seen: Observation, found: Found) -> None:
         """Map a keyframe, and cut the submap if a rule ends it here."""

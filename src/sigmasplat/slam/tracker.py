@@ -133,9 +133,9 @@ class Tracker:
         self, field: Splats, view: View, seen: Sight, first: Sight, expected: Expected, fit: PoseFit,
         before: Foreground | None, hurried: Asked,
     ) -> tuple[PoseFit, Sight] | None:  # fmt: skip
-        """Return the fit and the frame without what is in space that was free, and the newest keyframe without what has
-        left it; None if there is nothing, or if the images contradict the pose. before: in front in the last frame. If
-        the same thing hides most of the newest keyframe, the last image and the map give the pose."""
+        """Return the fit and the frame without what is in space that was free; None without, or if the images
+        contradict the pose. before: in front in the last frame. The newest keyframe loses what has left it. If the same
+        thing hides most of it, the last image and the map give the pose."""
         slow, known = self.watch.slow(seen, se3.inverse(fit.T_camera_world)), before or self.keyframe_front
         if fit.comparison is None or (slow is None and not self.watch.suspects(fit.comparison, known, hurried)):
             return None
@@ -151,6 +151,7 @@ class Tracker:
                     break
                 shown = first if front is None else seen.aside(front, view)
                 found = self._fit(field, view, shown, guess)
+                found = self.watch.fitted_to_all(self.keyframe, shown.live, found, self.config)
                 guess = se3.inverse(found.T_camera_world)
             else:
                 if self._stands(found, predicted):
@@ -170,8 +171,8 @@ class Tracker:
         """Look for the one thing in front without which the images agree much better: it moves, and has drawn the pose
         with it. Return the fit and the frame without it; None if there is none. known: the last frame had something in
         front."""
-        contradicted = self._contradicted(drawn)
-        for front in self.watch.suspected(self.keyframe, seen, drawn, contradicted, known):
+        contradicted, drops = self._contradicted(drawn), self.usual.agrees_less(drawn.comparison)
+        for front in self.watch.suspected(self.keyframe, seen, drawn, contradicted, known, drops):
             shown = seen.aside(front, view)
             found = self._fit(field, view, shown, predicted)
             if agrees_more(found.comparison, drawn.comparison, contradicted) and self._stands(found, predicted):
@@ -211,13 +212,12 @@ class Tracker:
     def _fit(self, field: Splats, view: View, seen: Sight, guess: Matrix, patience: int = 1) -> PoseFit:
         """Fit from an initial T_world_camera; patience: factor on the number of iterations of gradient descent; with 0,
         the pose stays as it is, and is only judged."""
-        T_camera_world = se3.inverse(guess)
-        if self.config.method == "adam":
-            config = self.config if self.started else self.config.without_motion()
+        T_camera_world, c = se3.inverse(guess), self.config
+        if c.method == "adam":
+            config = c if self.started else c.without_motion()
             return fit_pose_adam(field.params, view, seen.target, T_camera_world, config, patience * config.iterations)
-        if self.config.align_to == "keyframe" and self.keyframe is not None:
-            return self._aligned(self.keyframe, seen.live, T_camera_world, patience > 0)
-        reference = map_reference(field.params, view, T_camera_world, self.config)
+        reference = self.keyframe if c.align_to == "keyframe" else None
+        reference = reference or map_reference(field.params, view, T_camera_world, c)
         return self._aligned(reference, seen.live, T_camera_world, patience > 0)
 
     def _aligned(self, reference: Reference, live: Pyramid, T_camera_world: Matrix, moves: bool = True) -> PoseFit:
@@ -272,8 +272,8 @@ class Tracker:
         """Align the last image to this one and return T_world_camera; None if this fails too."""
         if self.last_image is None or (self.config.method == "adam" and not fits_of(view).aligns):
             return None  # alignment needs the compiled kernels
-        T_live_last = odometry(self.last_image, live, expected, self.config)
-        return None if T_live_last is None else np.asarray(self.previous @ se3.inverse(T_live_last))
+        found = odometry(self.last_image, live, expected, self.config)
+        return None if found is None else np.asarray(self.previous @ se3.inverse(found))
 
     # ---- verdicts ----
 
@@ -281,12 +281,11 @@ class Tracker:
         return fit.agreement * fit.overlap if fit.comparison is None else score(fit.comparison)
 
     def _is_lost(self, fit: PoseFit) -> bool:
-        c = self.config
         if fit.comparison is None:
-            return is_lost(fit, c.lost_agreement, c.lost_share)
+            return is_lost(fit, self.config.lost_agreement, self.config.lost_share)
         if self.lost:  # after a lost frame the path of the camera does not support a pose
             return not confirmed(fit.comparison)
-        return self.usual.is_lost(fit.comparison, c.lost_share)
+        return self.usual.is_lost(fit.comparison, self.config.lost_share)
 
     def _leaps(self, fit: PoseFit, predicted: Matrix) -> bool:
         """Return whether a verified pose is so far from the predicted one that the camera cannot have moved there."""
@@ -298,8 +297,7 @@ class Tracker:
     def _doubts(self, fit: PoseFit) -> bool:
         if fit.comparison is not None:
             return self.usual.doubts(fit.comparison)
-        usual = float(np.median(self.agreements)) if self.agreements else 1.0
-        worse = fit.agreement * fit.overlap < DOUBT * usual
+        worse = fit.agreement * fit.overlap < DOUBT * (float(np.median(self.agreements)) if self.agreements else 1.0)
         return worse or jumped(fit.first_loss, self.first_losses, self.config.reinit_factor)
 
     def _contradicted(self, fit: PoseFit) -> bool:
@@ -315,13 +313,15 @@ class Tracker:
 
     def keep_keyframe(self, field: Splats, view: View, seen: Sight, T_world_camera: Matrix) -> None:
         """Use a keyframe that was just mapped: its refined pose, and its image as the reference of the next frames."""
-        self.watch = self.watch.moved_by(T_world_camera @ se3.inverse(self.previous))
+        self.move_by(T_world_camera @ se3.inverse(self.previous))  # at a cut, the coordinates change
         self.previous, self.lost = T_world_camera, False
         self.follow(mapped_keyframe(field.params, view, seen, T_world_camera, self.config, self.front))
 
     def follow(self, keyframe: TrackedKeyframe) -> None:
         """Use a keyframe as the reference of the next frames."""
-        self.keyframe = self.keyframe if keyframe.reference is None else keyframe.reference
+        if keyframe.reference is not None:
+            self.watch = self.watch.followed(self.keyframe, keyframe.reference)
+            self.keyframe = keyframe.reference
         self.keyframe_features, self.keyframe_front = keyframe.image, keyframe.front
 
     def move_to(self, field: Splats, view: View, keyframe: FoundKeyframe, T_world_camera: Matrix) -> None:

@@ -115,7 +115,7 @@ def foreground(
         moved |= _objects(inside, free, again)
     if not moved.any():
         return None
-    whole, hidden = enlarged(moved, step, live_m)
+    whole, hidden = enlarged(moved, step, live_m, whole_objects)
     return Foreground(
         hidden, np.where(whole, live_m, np.float32(0.0)), np.where(hidden, _behind(scene, camera), live_m)
     )
@@ -150,22 +150,35 @@ def smooth(depth: Depth) -> Mask:
     return np.asarray((depth > 0) & (depth <= (1 + EDGE_RELATIVE) * nearest))
 
 
-def enlarged(small: Mask, step: int, live_m: Depth) -> tuple[Mask, Mask]:
+def enlarged(small: Mask, step: int, live_m: Depth, whole_objects: bool = True) -> tuple[Mask, Mask]:
     """Return a mask of every `step`-th pixel at the size of the image, and the same with a margin and with the holes in
-    depth that it surrounds: what is too near for the sensor has no reading, but hides the scene too."""
+    depth that it surrounds: what is too near for the sensor has no reading, but hides the scene too. whole_objects:
+    what is as far as the edge of such a hole belongs to the same thing."""
     whole = np.repeat(np.repeat(small, step, 0), step, 1)[: live_m.shape[0], : live_m.shape[1]]
     hidden = widened(whole, 2 * MARGIN_PX + 1)
-    return whole, hidden | _holes_in(hidden, live_m)
+    return whole, hidden | _holes_in(hidden, whole if whole_objects else None, live_m)
 
 
-def _holes_in(mask: Mask, depth_m: Depth) -> Mask:
-    """Return the connected pixels without a reading whose edge is in the mask, at least a share of `SURROUNDED`."""
-    holes, count = label(depth_m <= 0, np.ones((3, 3)))
+def _holes_in(mask: Mask, thing: Mask | None, depth_m: Depth) -> Mask:
+    """Return the connected pixels without a reading whose edge is in the mask, at least a share of `SURROUNDED`.
+
+    With `thing`, its own pixels, half of the edge is enough if the rest is as far as the thing at this hole: a rim
+    between two holes is too thin to be a region. Then lines without readings, as at outlines, join no holes.
+    """
+    unread = depth_m <= 0
+    holes, count = label(unread if thing is None else ~widened(~unread, 3), np.ones((3, 3)))
+    holes = holes if thing is None else np.where(unread, maximum_filter(holes, 3), 0)
     at_edge = np.where(depth_m > 0, maximum_filter(holes, 3), 0)
-    edges, covered = (
-        np.bincount(at_edge[chosen], minlength=count + 1) for chosen in (at_edge > 0, mask & (at_edge > 0))
-    )
+    edge = at_edge > 0
+    edges, covered = (np.bincount(at_edge[chosen], minlength=count + 1) for chosen in (edge, mask & edge))
     own = (edges > 0) & (covered >= SURROUNDED * edges)
+    if thing is not None:
+        near, far = np.full(count + 1, np.inf), np.zeros(count + 1)
+        np.minimum.at(near, at_edge[thing & edge], depth_m[thing & edge])
+        np.maximum.at(far, at_edge[thing & edge], depth_m[thing & edge])
+        reach = 1 + EDGE_RELATIVE
+        alike = edge & (mask | ((depth_m * reach >= near[at_edge]) & (depth_m <= far[at_edge] * reach)))
+        own |= (2 * covered >= edges) & (np.bincount(at_edge[alike], minlength=count + 1) >= SURROUNDED * edges)
     own[0] = False
     return np.asarray(own[holes])
 

@@ -61,7 +61,7 @@ class Memory:
         if self.frames % EVERY:
             return replace(self, frames=self.frames + 1)
         scene_m = depth_m if front is None else np.where(front.hidden, front.scene_m, depth_m)
-        kept = max(AGES[-1], most_frames // EVERY)
+        kept = max(AGES[-1], most_frames // EVERY + 1)
         seen = (*self.seen, Seen(self.frames, depth_m, scene_m, T_world_camera))[-kept:]
         return Memory(self.frames + 1, seen)
 
@@ -86,16 +86,20 @@ class Memory:
         self, front: Foreground, depth_m: Depth, T_world_camera: Matrix, camera: Camera, frames: int
     ) -> Foreground | None:
         """Return what is in front without the things that have stayed in place for this number of frames (0 = any)."""
-        before = [earlier for earlier in self.seen if self.frames - earlier.number >= frames - EVERY]
+        before = [k for k, earlier in enumerate(self.seen) if self.frames - earlier.number >= frames]
         if not frames or not before:
             return front
-        step, earlier = _step(camera), before[-1]
+        step = _step(camera)
         depth = np.where(front.depth_m > 0, depth_m, np.float32(0.0))[::step, ::step]
         regions, count = label(smooth(depth), np.ones((3, 3)))
-        scene = Earlier(earlier.depth_m, se3.inverse(earlier.T_world_camera) @ T_world_camera)
-        known, same = seen_again(scene, depth, camera, step)
-        sizes, of_known, of_same = (np.bincount(regions[m], minlength=count + 1) for m in (regions > 0, known, same))
-        rests = (of_same >= AT_REST * of_known) & (of_known >= KNOWN * sizes)
+        rests = np.ones(count + 1, np.bool_)
+        for earlier in self.seen[before[-1] :]:  # what comes back to an earlier place has not rested there
+            scene = Earlier(earlier.depth_m, se3.inverse(earlier.T_world_camera) @ T_world_camera)
+            known, same = seen_again(scene, depth, camera, step)
+            sizes, of_known, of_same = (
+                np.bincount(regions[m], minlength=count + 1) for m in (regions > 0, known, same)
+            )
+            rests &= (of_same >= AT_REST * of_known) & (of_known >= KNOWN * sizes)
         rests[0] = False
         if not rests.any():
             return front

@@ -161,6 +161,10 @@ class Usual:
         worse = c.close < DOUBT_CLOSE * _median(self.closes, 1.0) or score(c) < DOUBT_SCORE * usual_score
         return worse or self.contradicts(c)
 
+    def agrees_less(self, c: Comparison | None) -> bool:
+        """Return whether the gray values agree so much less than usual that something may have drawn the pose far."""
+        return c is not None and 1.0 - c.correlation > DRAWS * max(1.0 - _median(self.correlations, 0.9), DIFFERS)
+
     def contradicts(self, c: Comparison) -> bool:
         """Return whether what both images show differs clearly more than usual, however much they share."""
         return (

@@ -3,9 +3,13 @@
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
-from sigmasplat.config import MovingConfig
-from sigmasplat.fit.compare import Comparison
+import numpy as np
+
+from sigmasplat.config import MovingConfig, TrackingConfig
+from sigmasplat.fit.align import align_to_all
+from sigmasplat.fit.compare import STEP, Comparison
 from sigmasplat.fit.pose import PoseFit
+from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference
 from sigmasplat.model import se3
 from sigmasplat.slam.localisation.foreground import Earlier, Foreground, foreground, objects
@@ -18,17 +22,26 @@ from sigmasplat.types import Matrix
 FRONT = 0.03
 """What is in front is looked for if at least this share of the compared points is nearer than the reference."""
 
+EARLIER, ENOUGH = 3, 0.4
+"""If the newest keyframe and a frame with something in front share less than this share of the image, the pose is also
+fitted to so many earlier keyframes."""
+RENEWED = 0.7
+"""A frame with something in front becomes a keyframe if it shares less than this with the newest one."""
+SAME_POSE = 1e-6
+"""Two keyframes whose poses differ by less than this are the same frame."""
+
 DRAWN_EVERY = 2
 """What draws the pose is looked for in every second frame: between keyframes, a wrong pose does not last."""
 
 
 @dataclass(frozen=True, eq=False)
 class Watch:
-    """What is known of moving things between two frames: what recent frames saw. Without `config.find` nothing is
-    remembered."""
+    """What is known of moving things between two frames: what recent frames saw, and the keyframes before the newest
+    one, the newest last. Without `config.find` nothing is remembered."""
 
     config: MovingConfig = field(default_factory=MovingConfig)
     memory: Memory = field(default_factory=Memory)
+    earlier: tuple[Reference, ...] = ()
 
     def suspects(self, found: Comparison, known: Foreground | None, hurried: Asked) -> bool:
         """Return whether something may be in front of the scene, or may have left its place in it; known: what was
@@ -70,20 +83,49 @@ class Watch:
         return keyframe if gone is None else keyframe.without(gone.hidden)
 
     def suspected(
-        self, keyframe: Reference | None, seen: Sight, fit: PoseFit, contradicted: bool, known: bool
+        self, keyframe: Reference | None, seen: Sight, fit: PoseFit, contradicted: bool, known: bool, drops: bool
     ) -> Iterator[Foreground]:
         """Yield the things in front that may have drawn a pose: those without which the gray values agree much better
         at the same pose; if the images contradict it, all. Without contradiction, every second frame is looked at, and
-        those after one in which something was in front (`known`)."""
+        those after one in which something was in front (`known`). If the gray values agree much less than usual
+        (`drops`), all are yielded in every frame: at a pose that was drawn far, nothing agrees."""
         if keyframe is None or fit.comparison is None:
             return
-        looks = (known or self.memory.frames % DRAWN_EVERY == 0) and differs(fit.comparison)
+        looks = (known or drops or self.memory.frames % DRAWN_EVERY == 0) and differs(fit.comparison)
         if not (contradicted or looks):
             return
         for thing in objects(seen.target.depth_image.numpy()):
             rest = seen.live.hiding(thing.hidden)
-            if contradicted or agrees_more(keyframe.compared(rest, fit.T_camera_world), fit.comparison, False):
+            if contradicted or drops or agrees_more(keyframe.compared(rest, fit.T_camera_world), fit.comparison, False):
                 yield thing
+
+    def fitted_to_all(self, keyframe: Reference | None, live: Pyramid, fit: PoseFit, config: TrackingConfig) -> PoseFit:
+        """Return the fit of a frame without what is in front; if the newest keyframe shows little of the rest, fitted
+        to earlier keyframes too."""
+        c = fit.comparison
+        if keyframe is None or c is None or not self.earlier or c.points >= ENOUGH * _compared_points(live):
+            return fit
+        references = [keyframe, *self.earlier]
+        guesses = [fit.T_camera_world @ se3.inverse(reference.T_camera_world) for reference in references]
+        moved = align_to_all(
+            [reference.pyramid for reference in references], live, guesses, config.align_iterations,
+            config.align_weight_color, config.align_stop,
+        )  # fmt: skip
+        T_camera_world = moved @ fit.T_camera_world
+        return replace(fit, T_camera_world=T_camera_world, comparison=keyframe.compared(live, T_camera_world))
+
+    def renews(self, found: Comparison | None, front: Foreground | None) -> bool:
+        """Return whether a frame with something in front becomes a keyframe: it shares too little with the newest."""
+        if not self.config.find or front is None or found is None:
+            return False
+        return min(found.common, found.covered) < RENEWED
+
+    def followed(self, keyframe: Reference | None, newest: Reference) -> "Watch":
+        """Return the watch when a keyframe is no longer the newest one; at a cut, the newest one is the same again."""
+        same = keyframe is None or np.allclose(keyframe.T_camera_world, newest.T_camera_world, atol=SAME_POSE)
+        if keyframe is None or same or not self.config.find:
+            return self
+        return replace(self, earlier=(*self.earlier, keyframe)[-EARLIER:])
 
     def slow(self, seen: Sight, T_world_camera: Matrix) -> Foreground | None:
         """Find what moves too slowly to show against the newest keyframe."""
@@ -108,8 +150,15 @@ class Watch:
 
     def moved_by(self, T_new_old: Matrix) -> "Watch":
         """Return the same in other coordinates [4, 4]."""
-        return replace(self, memory=self.memory.moved_by(T_new_old))
+        earlier = tuple(reference.moved_by(T_new_old) for reference in self.earlier)
+        return replace(self, memory=self.memory.moved_by(T_new_old), earlier=earlier)
 
     def cleared(self) -> "Watch":
         """Return the watch with nothing remembered."""
         return Watch(self.config)
+
+
+def _compared_points(live: Pyramid) -> int:
+    """Return how many pixels of an image a comparison looks at."""
+    camera = live.cameras[0]
+    return -(-camera.width // STEP) * -(-camera.height // STEP)

@@ -171,6 +171,8 @@ class CameraClock:
     def _is_keyframe(self, fit: PoseFit, T_submap_camera: Matrix) -> bool:
         c, since, most_deg = self.config.mapping, self.frames - self.newest, self.config.realtime.keyframe_deg
         reference = self.tracker.keyframe
+        if self.tracker.watch.renews(fit.comparison, self.tracker.front):
+            return True
         if not most_deg or reference is None:
             return is_keyframe(since, c.every, fit.overlap, c.overlap_below)
         depth_m = 1.0 if fit.alignment is None else fit.alignment.depth_m
