@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.errors import ConfigError
+from sigmasplat.errors import ConfigError, RunError
 from sigmasplat.io.atomic import replacing
 from sigmasplat.io.binary import open_binary
 from sigmasplat.io.splats.quaternions import Doubles, from_smallest_three, smallest_three, unit
@@ -36,13 +36,13 @@ MAGNITUDES = (1 << 9) - 1
 def write_field(path: Path, field: GaussianField, *, version: int = DEFAULT_VERSION) -> None:
     """Write the splats atomically as SPZ of version 2, 3 or 4.
 
-    Raises ConfigError on another version, RunError if the file cannot be written.
+    Raises ConfigError on another version, RunError if the file cannot be written or a position is too large.
     """
     if version not in VERSIONS:
         raise ConfigError(f"SPZ has versions 2, 3 and 4, found {version}")
     values = SplatValues.of(field).turned_about_x()
     values = values.ordered(morton_order(values.means))
-    bits = _fractional_bits(values.means)
+    bits = _fractional_bits(path, values.means)
     colors = (values.colors - 0.5) / SH_C0 * COLOR_SCALE + 0.5
     streams = [
         np.round(values.means * 2.0**bits).astype("<i4")[..., None].view("u1")[..., :3].tobytes(),
@@ -79,11 +79,18 @@ def read_field(path: Path) -> GaussianField:
     return values.turned_about_x().field(path)
 
 
-def _fractional_bits(means: Doubles) -> int:
-    """Return the number of fractional bits of the 24-bit positions: fewer than the default if positions are large."""
+def _fractional_bits(path: Path, means: Doubles) -> int:
+    """Return the number of fractional bits of the 24-bit positions: fewer than the default if positions are large.
+    Raises RunError if even none are too many."""
     farthest = float(np.abs(means).max(initial=0.0))
-    fitting = int(np.floor(np.log2(LARGEST_FIXED / farthest))) if farthest else FRACTIONAL_BITS
-    return max(0, min(FRACTIONAL_BITS, fitting))
+    if not farthest <= LARGEST_FIXED:
+        raise RunError(
+            f"{path} cannot be written: a splat is {farthest:.3g} m from the origin, SPZ holds at most "
+            f"{LARGEST_FIXED / 1000:.0f} km; the map is damaged, make it again"
+        )
+    if farthest * 2.0**FRACTIONAL_BITS <= LARGEST_FIXED:
+        return FRACTIONAL_BITS
+    return max(0, int(np.floor(np.log2(LARGEST_FIXED / farthest))))
 
 
 def _bytes(values: Doubles) -> bytes:
