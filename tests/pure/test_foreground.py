@@ -122,3 +122,28 @@ def test_what_is_too_near_for_the_sensor_is_hidden_with_the_object_around_it(row
     covered[5:15, 5:15] = 0.0  # a hole in the wall is not the object's
     front = found(wall(), covered)
     assert front is not None and front.hidden[30:120, 40:120].all() and not front.hidden[5:15, 5:15].any()
+
+
+def near_hole() -> Depth:
+    """Return the depth of a box whose middle is too near for the sensor."""
+    depth_m = with_box(wall())
+    depth_m[50:80, 62:98] = 0.0
+    return depth_m
+
+
+def test_a_hole_in_a_thing_belongs_to_it_although_an_outline_joins_it_to_others() -> None:
+    depth_m = near_hole()
+    depth_m[60:62, :62] = depth_m[20:100, 20:22] = depth_m[20:22, 20:150] = 0.0  # outlines have no readings
+    front = foreground(Earlier(wall(), np.eye(4)), None, depth_m, CAMERA, whole_objects=True)
+    assert front is not None and front.hidden[50:80, 62:98].all()
+    assert not front.hidden[20:36, 20:150].any()
+
+
+def test_a_thin_rim_of_a_hole_that_is_as_far_as_the_thing_belongs_to_it() -> None:
+    depth_m = near_hole()
+    depth_m[50:80, 62:106] = 0.0
+    depth_m[50:80, 109:] = 0.0  # the rim lies between two holes: its place is not known
+    scene_m = wall()
+    scene_m[:, 105:] = 0.0
+    front = foreground(Earlier(scene_m, np.eye(4)), None, depth_m, CAMERA, whole_objects=True)
+    assert front is not None and front.hidden[50:80, 64:100].all() and not front.hidden[50:80, 125:].any()
