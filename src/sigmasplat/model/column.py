@@ -1,7 +1,7 @@
 """Values of all frames or keyframes in one array: a list of objects takes several times the memory."""
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Generic, TypeVar, overload
@@ -106,6 +106,9 @@ class Records(Sequence[Record], Generic[Record]):
 
     def __len__(self) -> int:
         return len(self.rows)
+
+    def __iter__(self) -> Iterator[Record]:
+        return (self._record(i) for i in range(len(self)))
 
     @overload
     def __getitem__(self, i: int) -> Record: ...

@@ -1,6 +1,6 @@
 """Poses of all submaps, and of the keyframes in them, in columns."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, overload
 
@@ -23,9 +23,6 @@ class Poses(Records[Matrix]):
 
     def __setitem__(self, i: int, pose: Matrix) -> None:
         self.rows.used[range(len(self))[i]] = pose
-
-    def __iter__(self) -> Iterator[Matrix]:
-        return (self._record(i) for i in range(len(self)))
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         return np.array(self.rows.used, dtype)

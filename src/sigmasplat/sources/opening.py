@@ -76,8 +76,8 @@ def format_name(path: str | Path, settings: InputConfig) -> str:
     """Return the name of the format that `open_source` reads. Raises SourceError if none recognises the path."""
     if not (settings.predicted_depth or settings.depth_model):
         return format_of(path).name
-    known = _matching_format(path)
-    return f"{known.name if known and known.priority >= 0 else 'colour only'}, with predicted depth"
+    known = _sure_format(path)
+    return f"{known.name if known else 'colour only'}, with predicted depth"
 
 
 def _recorded(path: str | Path, settings: InputConfig) -> Source:
@@ -93,9 +93,9 @@ def _with_predicted_depth(path: str | Path, settings: InputConfig) -> Source:
     """Open a whole sequence with predicted depth: images without depth, or any other sequence."""
     from sigmasplat.sources.predicted import WithPredictedDepth, lacks_depth, open_color_only
 
-    known = _matching_format(path)
+    known = _sure_format(path)
     with _guarded(path):
-        if lacks_depth(Path(path), known is not None and known.priority >= 0):
+        if lacks_depth(Path(path), known is not None):
             return open_color_only(Path(path), settings)
     source = _recorded(path, settings)
     with _guarded(path):
@@ -118,6 +118,12 @@ def format_of(path: str | Path) -> Format:
 def _matching_format(path: str | Path) -> Format | None:
     with _guarded(path):
         return next((known for known in formats() if known.recognises(str(path))), None)
+
+
+def _sure_format(path: str | Path) -> Format | None:
+    """Return the format that recognises the path, None if it only guesses, or there is none."""
+    known = _matching_format(path)
+    return known if known is not None and known.priority >= 0 else None
 
 
 def with_changes(settings: InputConfig, changes: Mapping[str, Any]) -> InputConfig:

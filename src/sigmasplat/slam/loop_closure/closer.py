@@ -152,10 +152,11 @@ class LoopCloser:
         if not self.config.loops.close or not descriptors:
             return []
         query = self._described(submap, descriptors)
+        registrar = Registrar(self.config, self.store, view, self.extractor, self.predicted)
         tried = list[tuple[Loop, Edge | None]]()
         for pair in self._pairs(query, atlas):
             yield
-            tried.append((yield from self._try(pair, submap, atlas, view)))
+            tried.append((yield from self._try(pair, submap, atlas, registrar)))
         self.descriptors.append(query)
         known = len(self.edges)
         for loop, edge in tried:
@@ -203,11 +204,10 @@ class LoopCloser:
         apart_m = np.linalg.norm(anchors[known.numbers][:, :3, 3] - anchors[query.index][:3, 3], axis=1)
         return np.asarray(apart_m <= self.config.loops.near_m + query.reach_m + known.reach_m)
 
-    def _try(self, pair: SubmapPair, a: Submap, atlas: Atlas, view: View) -> Slices[tuple[Loop, Edge | None]]:
+    def _try(self, pair: SubmapPair, a: Submap, atlas: Atlas, registrar: Registrar) -> Slices[tuple[Loop, Edge | None]]:
         """Register a pair in slices, with `a` as the query; return the result, and its edge if it was accepted."""
         b = self.store.load(pair.best.database_submap)
         known = se3.inverse(atlas.anchors[a.index]) @ atlas.anchors[b.index]
-        registrar = Registrar(self.config, self.store, view, self.extractor, self.predicted)
         found = yield from registrar.register(pair, a, b, known)
         edge = Edge(a.index, b.index, found.T_a_b, found.information, loop=True) if found.accepted else None
         return described(pair.best, a, b, found, known), edge

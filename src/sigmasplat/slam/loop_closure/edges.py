@@ -1,6 +1,6 @@
 """All edges of the pose graphs, in a column."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -36,9 +36,6 @@ class Edges(Records[Edge]):
     def append(self, edge: Edge, loop_row: int = -1) -> None:
         """Append an edge; loop_row: of a loop, its row among all pairs that were tried."""
         self.rows.append([edge.a, edge.b, loop_row, *edge.T_a_b.ravel(), *edge.information.ravel()])
-
-    def __iter__(self) -> Iterator[Edge]:
-        return (self._record(i) for i in range(len(self)))
 
     @property
     def ends(self) -> NDArray[np.int64]:

@@ -1,6 +1,5 @@
 """All pairs of submaps that were tried as loops, in columns."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from math import isfinite
 from typing import Any
@@ -93,9 +92,6 @@ class Loops(Records[Loop]):
         if number == len(self.reasons):
             self.reasons.append(loop.reason)
         return loop.accepted, number, loop.chi2, loop.weight
-
-    def __iter__(self) -> Iterator[Loop]:
-        return (self._record(i) for i in range(len(self)))
 
     @property
     def accepted(self) -> NDArray[np.bool_]:
