@@ -20,10 +20,17 @@ from sigmasplat.errors import RunError
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.io.state import read_state, write_state
 from sigmasplat.io.submaps import DiskStore
+from sigmasplat.model.column import Column
+from sigmasplat.model.hops import TrackedHops
+from sigmasplat.model.places import Places
+from sigmasplat.model.poses import KeyframePoses, Poses
 from sigmasplat.presets import preset
 from sigmasplat.run.resume import REFINEMENT_CLASSES
+from sigmasplat.slam.loop_closure.edges import Edges
+from sigmasplat.slam.loop_closure.loops import Loops
 from sigmasplat.slam.slam import Slam
 from sigmasplat.slam.state import CLASSES, fixed, restore, state_of
+from sigmasplat.slam.steps import Steps
 from sigmasplat.sources import open_source
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
@@ -180,6 +187,22 @@ def test_a_state_contains_plain_data_only(tmp_path: Path) -> None:
     assert np.shares_memory(*back["b"]), "shared arrays stay shared"
     with pytest.raises(RunError, match="nothing to resume"):
         read_state(tmp_path / "none", (), {})
+
+
+@pytest.mark.parametrize("owner", [Edges, KeyframePoses, Loops, Places, Poses, Steps, TrackedHops])
+def test_a_state_with_a_pose_that_is_not_finite_is_refused(owner: type, tmp_path: Path) -> None:
+    empty = owner()
+    shape, dtype = empty.rows.values.shape[1:], empty.rows.values.dtype
+    classes = (owner, Column)
+    for rows in (np.zeros((3, *shape), dtype), np.full((3, *shape), np.inf, dtype)):
+        empty.rows.count = 0
+        empty.rows.extend(rows)
+        write_state(tmp_path / "s", empty, classes, {})
+        if np.isfinite(rows).all():
+            assert np.array_equal(read_state(tmp_path / "s", classes, {}).rows.used, rows)
+        else:
+            with pytest.raises(RunError, match=f"is damaged: {owner.__name__}.rows has nan or inf"):
+                read_state(tmp_path / "s", classes, {})
 
 
 @pytest.mark.parametrize("slices, waiting", [(2, 1), (1, 2)])

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from sigmasplat.model.column import Column
+
 PLAIN = (bool, int, str, list, tuple, dict, set, np.ndarray, torch.Tensor)
 
 
@@ -30,7 +32,11 @@ def wrong_field(owner: type, values: dict[str, Any]) -> str | None:
         kinds = allowed.get(name)
         if kinds and not isinstance(value, kinds):
             return f"{owner.__name__}.{name} is {type(value).__name__}"
-        if (name.startswith("T_") or name == "params") and not is_finite(value):
+        if isinstance(value, Column) and name == "rows" and hasattr(owner, "POSE_COLUMNS"):
+            numbers: Any = value.used[:, owner.POSE_COLUMNS]
+        else:
+            numbers = value if name.startswith("T_") or name == "params" else None
+        if not is_finite(numbers):
             return f"{owner.__name__}.{name} has nan or inf"
     return None
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -29,6 +29,9 @@ UNKNOWN_HOP = Hop(np.eye(4), np.full((6, 6), np.nan), np.zeros(6))
 class TrackedHops(Records[Hop]):
     """The hops to all keyframes, submap by submap. rows [K, 59]: submap, then T_camera_before, covariance and bias by
     rows."""
+
+    POSE_COLUMNS: ClassVar[slice] = slice(1, 17)
+    """The columns of `rows` that hold a pose."""
 
     rows: Column = field(default_factory=lambda: Column.of(np.float64, 1 + 16 + 36 + 6))
 

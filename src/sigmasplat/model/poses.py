@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, overload
+from typing import Any, ClassVar, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,8 @@ def _of_poses() -> Column:
 @dataclass(eq=False)
 class Poses(Records[Matrix]):
     """A list of poses [4, 4]; those that are read are copies. rows [N, 4, 4]."""
+
+    POSE_COLUMNS: ClassVar[slice] = slice(None)
 
     rows: Column = field(default_factory=_of_poses)
 
@@ -47,6 +49,8 @@ class KeyframePoses(Sequence[Sequence[Matrix]]):
     rows [K, 4, 4]: those of all submaps but the last; ends [S - 1]: number of keyframes up to the end of each of these
     submaps; newest: those of the last submap, None before the first one.
     """
+
+    POSE_COLUMNS: ClassVar[slice] = slice(None)
 
     rows: Column = field(default_factory=_of_poses)
     ends: Column = field(default_factory=lambda: Column.of(np.int64))

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,9 @@ class Edges(Records[Edge]):
 
     rows [E, 55]: a, b, row of the loop that the edge is, −1 for a trusted edge, T_a_b and information by rows.
     """
+
+    POSE_COLUMNS: ClassVar[slice] = slice(NUMBERS, NUMBERS + 16)
+    """The columns of `rows` that hold a pose."""
 
     rows: Column = field(default_factory=lambda: Column.of(np.float64, NUMBERS + 16 + 36))
 
