@@ -49,9 +49,10 @@ class Options:
 
 def processor_s(checkout: Path, words: tuple[str, ...]) -> float:
     """Return the user and system time of a Python process that imports from a checkout."""
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
     path = {"PYTHONPATH": str(checkout / "src"), "SIGMASPLAT_THREADS": "1", "OMP_NUM_THREADS": "1"}
     child = subprocess.Popen(
-        [sys.executable, *words], env=os.environ | path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        [sys.executable, *words], env=environment | path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     )
     _, status, used = os.wait4(child.pid, 0)
     if child.returncode is None:
