@@ -1,7 +1,7 @@
 """Provide the presets by name. A preset is a set of values; each system has its own module."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 from sigmasplat.config import Config
 from sigmasplat.config.text import nearest, override
@@ -9,7 +9,10 @@ from sigmasplat.errors import ConfigError
 from sigmasplat.presets import cgslam, cgslam_released, sigma, varsplat, varsplat_released
 
 SYSTEMS = (varsplat.PRESETS, varsplat_released.PRESETS, cgslam.PRESETS, cgslam_released.PRESETS, sigma.PRESETS)
-PRESETS = {name: dataclasses.replace(config, name=name) for presets in SYSTEMS for name, config in presets.items()}
+PRESETS: dict[str, Config | Callable[[], Config]] = {
+    name: config for presets in SYSTEMS for name, config in presets.items()
+}
+"""The settings of each preset, or a function that makes them: most of the many scenes are never used."""
 
 
 def default_preset() -> str:
@@ -34,7 +37,8 @@ def preset(name: str) -> Config:
     """Return the settings of a preset. Raises ConfigError on an unknown name, with similar names or all names."""
     if name not in PRESETS:
         raise ConfigError(f"no preset {name!r}{_similar(name) or _all(name)}")
-    return PRESETS[name]
+    config = PRESETS[name]
+    return dataclasses.replace(config if isinstance(config, Config) else config(), name=name)
 
 
 def configured(config: Config | str | None, settings: Mapping[str, object] | None = None) -> Config:

@@ -6,6 +6,7 @@ used, with a warning. Uncertain splats are not pruned, the splat at the median d
 and the second frame has its own number of iterations. Bugs of the code are not reproduced.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 from sigmasplat.config import Config
@@ -71,4 +72,6 @@ def _released(scene: ReleasedScene, **rates: float) -> Config:
     return sized(config, s.extent, **rates)
 
 
-PRESETS = {f"cgslam-released-{name}": _released(scene, **OTHER_RATES.get(name, {})) for name, scene in SCENES.items()}
+PRESETS = {
+    f"cgslam-released-{name}": partial(_released, scene, **OTHER_RATES.get(name, {})) for name, scene in SCENES.items()
+}

@@ -6,6 +6,7 @@ arguments are given by position, so w_max is used as tau). Its mistakes in the
 input are not reproduced, such as the calibration of another camera for fr3. Deviations: docs/varsplat.md.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 from sigmasplat.config import Config
@@ -90,4 +91,4 @@ def _scene(scene: ReleasedScene) -> Config:
     )
 
 
-PRESETS = {f"varsplat-released-{name}": _scene(scene) for name, scene in SCENES.items()}
+PRESETS = {f"varsplat-released-{name}": partial(_scene, scene) for name, scene in SCENES.items()}
