@@ -100,18 +100,19 @@ class Recorder:
         return self.make("geometry_msgs/msg/PoseStamped", header=self.header(time_s, "world"), pose=pose)
 
     def imu(
-        self, topic: str, time_s: float, rates: np.ndarray, frame: str, late_s: float = 0.0, unknown: bool = False
-    ) -> None:
-        """Add a sensor_msgs/Imu; unknown: it has no angular velocity."""
+        self, topic: str, time_s: float, rates: np.ndarray, frame: str, late_s: float = 0.0, unknown: bool = False,
+        force: np.ndarray | None = None,
+    ) -> None:  # fmt: skip
+        """Add a sensor_msgs/Imu; unknown: it has no angular velocity; force: specific force, m/s², None = without."""
         vectors = [self.make("geometry_msgs/msg/Vector3", x=float(v[0]), y=float(v[1]), z=float(v[2]))
-                   for v in (rates, np.array([0.0, 0.0, 9.81]))]  # fmt: skip
+                   for v in (rates, np.zeros(3) if force is None else force)]  # fmt: skip
         known, none = np.zeros(9), np.array([-1.0, *np.zeros(8)])
         message = self.make(
             "sensor_msgs/msg/Imu", header=self.header(time_s, frame),
             orientation=self.make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
             orientation_covariance=none, angular_velocity=vectors[0],
             angular_velocity_covariance=none if unknown else known, linear_acceleration=vectors[1],
-            linear_acceleration_covariance=known,
+            linear_acceleration_covariance=none if force is None else known,
         )  # fmt: skip
         self.add(topic, time_s + late_s, message)
 

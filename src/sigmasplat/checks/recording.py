@@ -83,7 +83,7 @@ def inspect_source(path: str | Path, settings: InputConfig, samples: int = SAMPL
         ("depth noise", _noise_row(source, noise, sensor)),
         ("colour–depth alignment", "unknown: no outlines in depth" if agreement is None else agreement.sentence()),
         ("poses", source.described_truth() or "none: the error of the path cannot be measured"),
-        *_gyroscope_rows(frames),
+        *_imu_rows(frames),
         ("skipped", f"{len(source.skipped)} files (first: {source.skipped[0]})" if source.skipped else "nothing"),
         ("suggested preset", _suggested(name)),
     ]
@@ -167,10 +167,13 @@ def _noise_row(source: Source, noise: SensorNoise | None, sensor: str) -> str:
     return "not measured: depth is predicted" if source.predicted_depth else "unknown: too few flat surfaces"
 
 
-def _gyroscope_rows(frames: list[Frame]) -> list[tuple[str, str]]:
-    """Return how many of the sampled frames have a rotation measured by a gyroscope, no row if none has."""
-    measured = sum(frame.R_inertial_camera is not None for frame in frames)
-    return [("gyroscope", f"measured {measured} of {len(frames)} sampled frames")] if measured else []
+def _imu_rows(frames: list[Frame]) -> list[tuple[str, str]]:
+    """Return how many of the sampled frames have values of a gyroscope and of an accelerometer, no row if none has."""
+    measured = {
+        "gyroscope": sum(frame.R_inertial_camera is not None for frame in frames),
+        "accelerometer": sum(frame.specific_force_m_s2 is not None for frame in frames),
+    }
+    return [(name, f"measured {n} of {len(frames)} sampled frames") for name, n in measured.items() if n]
 
 
 def _depth_camera(source: Source, settings: InputConfig) -> str:

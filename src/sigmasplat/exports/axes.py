@@ -57,20 +57,23 @@ def levelled(reader: RunReader) -> Matrix:
     """Return R_floor_world [3, 3] of a run: x right, y ahead along the walls, z up.
 
     The vertical direction comes from the floor and the walls of the map, rendered along the path, and is the same in
-    every export and in the floor plan. If no surface is visible, it is the mean vertical direction of the cameras.
+    every export and in the floor plan. They are looked for near the direction that an accelerometer measured, or else
+    near the mean vertical direction of the cameras, which is used alone if no surface is visible.
     Raises RunError if the run has no map or no path.
     """
     field, path, config = reader.run.read_map(), reader.believed_path(), reader.config
+    up_world = reader.run.up_world()
     samples = sample_surfaces(field, path, reader.camera, FieldRenderer(config.render, config.backend))
     try:
-        return floor_frame(list(samples))[:3, :3]
+        return floor_frame(list(samples), up_world)[:3, :3]
     except SigmaSplatError:
-        return level_cameras(path)
+        return level_cameras(path, up_world)
 
 
-def level_cameras(path: Trajectory) -> Matrix:
-    """Return R_floor_world [3, 3] from the cameras alone: z is their mean vertical direction, y is level and ahead."""
-    up = -path.T_world_camera[:, :3, 1].sum(0)
+def level_cameras(path: Trajectory, up_world: Matrix | None = None) -> Matrix:
+    """Return R_floor_world [3, 3] without a map: z is the measured up direction `up_world` [3], or else the mean
+    vertical direction of the cameras; y is level and ahead."""
+    up = -path.T_world_camera[:, :3, 1].sum(0) if up_world is None else up_world
     first = path.T_world_camera[0, :3]
     up = -first[:, 1] if np.linalg.norm(up) < 1e-9 else up / np.linalg.norm(up)
     right = np.cross(first[:, 2], up)

@@ -189,5 +189,5 @@ def _floor(reader: RunReader, progress: Progress) -> tuple[FloorPlan | None, Mat
         plan = run_floor_plan(reader.run, path, reader.camera, progress=progress)
         return plan, plan.T_floor_world
     T = np.eye(4)
-    T[:3, :3] = level_cameras(path)
+    T[:3, :3] = level_cameras(path, reader.run.up_world())
     return None, T

@@ -91,7 +91,7 @@ def export_video(
     field, camera = reader.run.read_map(), film_camera(reader.camera, options.width_px)
     count = options.images(float(path.timestamps_s[-1] - path.timestamps_s[0]))
     if options.path == "orbit":
-        field, poses = orbit_view(field, path, camera, count, renderer)
+        field, poses = orbit_view(field, path, camera, count, renderer, reader.run.up_world())
     else:
         poses = smooth_path(path, count)
     show = partial(_show, renderer, field, camera)
@@ -108,11 +108,17 @@ def film_camera(camera: Camera, width_px: int) -> Camera:
 
 
 def orbit_view(
-    field: GaussianField, path: Trajectory, camera: Camera, images: int, renderer: SurfaceRenderer
+    field: GaussianField,
+    path: Trajectory,
+    camera: Camera,
+    images: int,
+    renderer: SurfaceRenderer,
+    up_world: Matrix | None = None,
 ) -> tuple[GaussianField, Matrix]:
-    """Return the map without its ceiling, and poses [images, 4, 4] on a circle above it from which it is visible."""
+    """Return the map without its ceiling, and poses [images, 4, 4] on a circle above it from which it is visible;
+    up_world: as in `floor_frame`."""
     samples = list(sample_surfaces(field, path, camera, renderer, SURFACE_VIEWS))
-    T = floor_frame(samples)
+    T = floor_frame(samples, up_world)
     points = np.concatenate([sample.points for sample in samples]) @ T[:3, :3].T + T[:3, 3]
     low, high = np.quantile(points, [0.02, 0.98], axis=0)
     ceiling_m = float(np.median(path.T_world_camera[:, :3, 3] @ T[2, :3] + T[2, 3])) + CEILING_M

@@ -104,18 +104,19 @@ def floor_plan(
     cell_m: float = CELL_M,
     renderer: SurfaceRenderer = render,
     predictor: SurfacePredictor | None = None,
+    up_world: Matrix | None = None,
     progress: Progress = no_progress,
 ) -> FloorPlan:
     """Make the floor plan of a map from poses along its path; `camera` gives the field of view.
 
-    predictor: predicts the errors of the map, if they are known (`render.predictive.predict`). Calls
-    `progress(poses done, total)`. Raises ConfigError unless 1 mm ≤ cell_m ≤ 1 m; SigmaSplatError if no surface is
+    predictor: predicts the errors of the map, if they are known (`render.predictive.predict`). up_world:
+    as in `floor_frame`. Calls `progress(poses done, total)`. Raises ConfigError unless 1 mm ≤ cell_m ≤ 1 m; SigmaSplatError if no surface is
     visible, or the plan has more than `MOST_CELLS`.
     """
     if not 0.001 <= cell_m <= 1.0:
         raise ConfigError(f"a cell of the floor plan must be 0.001 to 1 m wide, found {cell_m}")
     samples = list(sample_surfaces(field, trajectory, camera, renderer, progress=progress, predictor=predictor))
-    T_floor_world = floor_frame(samples)
+    T_floor_world = floor_frame(samples, up_world)
     to_floor = partial(_transformed, T_floor_world)
     path = to_floor(trajectory.T_world_camera[:, :3, 3])
     grid = _Cells.around([to_floor(sample.points) for sample in samples], path, cell_m)

@@ -10,6 +10,8 @@ from sigmasplat.types import Matrix
 
 MAX_TILT_COS = np.cos(np.deg2rad(40.0))
 """Cameras are assumed upright within 40°."""
+MEASURED_COS = np.cos(np.deg2rad(6.0))
+"""A direction from an accelerometer is right within 6°, also if the camera gained 1 m/s in one second."""
 PARALLEL_COS = np.cos(np.deg2rad(8.0))
 CANDIDATES = 400
 MIN_LEVEL_SHARE = 0.02
@@ -21,15 +23,19 @@ MAX_POINTS = 16_000
 """Samples are reduced to about this many points."""
 
 
-def floor_frame(samples: Sequence[SurfaceSample]) -> Matrix:
+def floor_frame(samples: Sequence[SurfaceSample], up_world: Matrix | None = None) -> Matrix:
     """Return T_floor_world: z up, floor at z = 0, origin below the first camera, x and y along the walls.
 
-    y is the direction along the walls that is nearest to the viewing direction of the first camera. Raises
+    up_world [3]: unit vector that points up, if an accelerometer measured it; the floor and the walls make it exact. y
+    is the direction along the walls that is nearest to the viewing direction of the first camera. Raises
     SigmaSplatError if no surface is visible.
     """
     points, normals, area = _subsampled(samples)
     poses = np.stack([sample.T_world_camera for sample in samples])
-    up = up_direction(normals, area, poses)
+    if up_world is None:
+        up = up_direction(normals, area, _unit(-poses[:, :3, 1].sum(0), -poses[0, :3, 1]))
+    else:
+        up = up_direction(normals, area, up_world, MEASURED_COS)
     height_m = floor_height(points @ up, normals @ up, area, float((poses[:, :3, 3] @ up).min()))
     ahead = _horizontal(poses[0], up)
     ahead = along_walls(normals, area, up, ahead)
@@ -51,17 +57,16 @@ def _subsampled(samples: Sequence[SurfaceSample]) -> tuple[Matrix, Matrix, Matri
     return points, normals, area
 
 
-def up_direction(normals: Matrix, area: Matrix, poses: Matrix) -> Matrix:
-    """Return the unit vector that points up.
+def up_direction(normals: Matrix, area: Matrix, about_up: Matrix, within_cos: float = MAX_TILT_COS) -> Matrix:
+    """Return the unit vector that points up, near `about_up` [3].
 
-    Candidates are normals within 40° of the mean up direction of the cameras. The best one has the most area whose
-    normals are parallel (weight 1) or perpendicular (weight ½) to it. With too few level surfaces the result is
-    perpendicular to the walls. Without walls it is the mean up direction of the cameras.
+    Candidates are normals whose angle to `about_up` has at least the cosine `within_cos`. The best one has the most
+    area whose normals are parallel (weight 1) or perpendicular (weight ½) to it. With too few level surfaces the result
+    is perpendicular to the walls. Without walls it is `about_up`.
     """
-    camera_up = _unit(-poses[:, :3, 1].sum(0), -poses[0, :3, 1])
-    level = np.abs(normals @ camera_up) > MAX_TILT_COS
+    level = np.abs(normals @ about_up) > within_cos
     if area[level].sum() < MIN_LEVEL_SHARE * area.sum():
-        return _across_walls(normals, area, camera_up)
+        return _across_walls(normals, area, about_up, within_cos)
     rows = np.flatnonzero(level)
     candidates = normals[rows[np.linspace(0, len(rows) - 1, min(CANDIDATES, len(rows))).astype(int)]]
     cosines = np.abs(candidates @ normals.T)
@@ -71,17 +76,17 @@ def up_direction(normals: Matrix, area: Matrix, poses: Matrix) -> Matrix:
         cosine = normals @ up
         agree = np.abs(cosine) > PARALLEL_COS
         up = _unit((np.sign(cosine) * area)[agree] @ normals[agree], up)
-    return np.asarray(up * np.sign(up @ camera_up))
+    return np.asarray(up * np.sign(up @ about_up))
 
 
-def _across_walls(normals: Matrix, area: Matrix, camera_up: Matrix) -> Matrix:
-    """Return the direction perpendicular to the walls if there are walls in two directions, else `camera_up`."""
-    walls = np.abs(normals @ camera_up) < np.sqrt(1.0 - MAX_TILT_COS**2)
+def _across_walls(normals: Matrix, area: Matrix, about_up: Matrix, within_cos: float) -> Matrix:
+    """Return the direction perpendicular to the walls if there are walls in two directions, else `about_up`."""
+    walls = np.abs(normals @ about_up) < np.sqrt(1.0 - within_cos**2)
     values, vectors = np.linalg.eigh((normals[walls] * area[walls, None]).T @ normals[walls])
     if not walls.any() or values[0] > 0.2 * values[1]:
-        return camera_up
-    up = vectors[:, 0] * np.sign(vectors[:, 0] @ camera_up)
-    return up if up @ camera_up > MAX_TILT_COS else camera_up
+        return about_up
+    up = vectors[:, 0] * np.sign(vectors[:, 0] @ about_up)
+    return up if up @ about_up > within_cos else about_up
 
 
 def floor_height(heights_m: Matrix, cosines: Matrix, area: Matrix, camera_m: float) -> float:

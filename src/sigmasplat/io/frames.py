@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sigmasplat.model.accelerometer import up_of_path
 from sigmasplat.model.component import LOST, TRACKED, outside_world, states_at_end, submaps_outside
 from sigmasplat.model.trajectory import Trajectory
 
@@ -68,6 +69,13 @@ class RunFrames:
     def p_off(self) -> NDArray[np.float64]:
         """Return the logged probability [F] that each pose is off by more than 5 cm; nan if it is not known."""
         return np.array([np.nan if r.get("p_off") is None else r["p_off"] for r in self.log], np.float64)
+
+    def measured_up(self) -> NDArray[np.float64] | None:
+        """Return the unit vector [3] that points up in the world, from the forces that an accelerometer measured on the
+        believed frames; None if it did not."""
+        forces = [self.log[row].get("specific_force_m_s2") for row in self.rows]
+        known = [i for i, force in enumerate(forces) if force is not None]
+        return up_of_path(self.path.T_world_camera[known], np.array([forces[i] for i in known]).reshape(-1, 3))
 
     def posed_log(self) -> Log:
         """Return the records of the believed frames, each with `T_world_camera` [4, 4], its `state` at the end, and

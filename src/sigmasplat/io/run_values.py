@@ -37,6 +37,14 @@ def _pose(value: Any) -> bool:
     return rows and all(is_number(item) for row in value for item in row)
 
 
+def _vector(value: Any) -> bool:
+    return isinstance(value, list) and len(value) == 3 and all(is_number(item) for item in value)
+
+
+def _direction(value: Any) -> bool:
+    return _vector(value) and math.hypot(*value) > 0.0
+
+
 def _seconds(value: Any) -> bool:
     return isinstance(value, dict) and all(is_number(item) for item in value.values())
 
@@ -58,7 +66,7 @@ LOG: Mapping[str, Test] = {
     "index": lambda value: is_whole(value) and value >= 0, "timestamp_s": is_number, "is_keyframe": is_kind(bool),
     "lost": is_kind(bool), "state": lambda value: value in (TRACKED, RELOCALISED, LOST, APART), "component": is_whole,
     "p_off": _number_or_null, "splats": is_whole, "submap": is_whole, "tracking": are_numbers, "seconds": _seconds,
-    "T_world_camera": _pose, "loops": _records,
+    "T_world_camera": _pose, "loops": _records, "specific_force_m_s2": _vector,
 }  # fmt: skip
 """Values of a line of log.jsonl."""
 FACTS: Mapping[str, Test] = {
@@ -67,6 +75,7 @@ FACTS: Mapping[str, Test] = {
     "onto": is_kind(dict), "camera": is_kind(dict), "source_frames": is_whole, "depth_units_per_metre": _number_or_null,
     "isa": is_kind(str, type(None)), "scene_scale": _number_or_null, "depth_noise_per_m": _number_or_null,
     "sensor": is_kind(str, type(None)), "predicted_depth": is_kind(bool), "depth_model": is_kind(dict),
+    "up_world": _direction,
 }  # fmt: skip
 """Values of run.json that commands use."""
 STATE_FIELDS: Mapping[str, Test] = {"index": is_whole, "wall_s": is_number, "submaps": is_whole}

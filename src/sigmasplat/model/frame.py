@@ -49,10 +49,11 @@ class Frame:
     deviation of each depth reading, metres, if the sensor knows it; ignored: pixels of the frame as it was read
     (`ignored_by` resamples them) whose colour is not used either, None = none; they have no depth; T_given_camera
     [4, 4]: pose of the camera in fixed axes, metres, which is used as it is; None = the pose is estimated. Only the
-    motion between two frames is used. The frame keeps read-only views of the arrays and does not copy them: do not
+    motion between two frames is used; specific_force_m_s2 [3]: measured by an accelerometer along the camera's axes, 9.81
+    upwards at rest, from which a run finds the vertical direction; None = not measured. The frame keeps read-only views of the arrays and does not copy them: do not
     write to them later (`frame_from_arrays` copies). Raises SourceError if an array is not float32, on inconsistent
     shapes, values that are not finite, colour in 0…255, negative depth, a reading whose standard deviation is not above
-    0, a matrix that is not a rotation, or a pose that is not rigid.
+    0, a matrix that is not a rotation, a pose that is not rigid, or a force that is not three finite numbers.
     """
 
     index: int
@@ -64,6 +65,7 @@ class Frame:
     depth_std_m: NDArray[np.float32] | None = None
     ignored: NDArray[np.bool_] | None = None
     T_given_camera: Matrix | None = None
+    specific_force_m_s2: NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
         for name, array in (("colour", self.color), ("depth", self.depth_m)):
@@ -88,6 +90,11 @@ class Frame:
         if self.T_given_camera is not None and not se3.is_rigid(self.T_given_camera):
             raise SourceError(
                 f"frame {self.index}: T_given_camera is not a rigid pose [4, 4]; give None if it is to be estimated"
+            )
+        force = self.specific_force_m_s2
+        if force is not None and not (np.shape(force) == (3,) and np.isfinite(force).all()):
+            raise SourceError(
+                f"frame {self.index}: specific_force_m_s2 is not three finite numbers; give None if it is not measured"
             )
         self._keep(self.color, self.depth_m, self.depth_std_m)
 

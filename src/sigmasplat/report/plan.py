@@ -27,4 +27,7 @@ def run_floor_plan(
     predictor = None
     if known is not None:
         predictor = partial(predict, field, known, options=config.render, backend=config.backend)
-    return floor_plan(field, path, camera, cell_m=cell_m, renderer=renderer, predictor=predictor, progress=progress)
+    return floor_plan(
+        field, path, camera, cell_m=cell_m, renderer=renderer, predictor=predictor, up_world=run.up_world(),
+        progress=progress,
+    )  # fmt: skip

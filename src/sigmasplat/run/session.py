@@ -15,6 +15,7 @@ from typing import Any
 
 from sigmasplat.config import Config
 from sigmasplat.errors import RunError
+from sigmasplat.io.frames import RunFrames
 from sigmasplat.io.lock import LOCK, locked, no_warning
 from sigmasplat.io.runs import ALL_POSES, RunFolder
 from sigmasplat.model.component import RELOCALISED
@@ -251,7 +252,7 @@ class Session:
             for frame in self.source.frames_from(self.first_index):
                 self.watch(frame)
                 step = self.slam.step(frame)
-                self._log(step, self.source.arrived_s)
+                self._log(step, frame, self.source.arrived_s)
                 self.wall_s = earlier_s + time.perf_counter() - started_s
                 self.callback(step)
                 self.checkpointer.after_frame(frame.index, self.wall_s)
@@ -266,10 +267,12 @@ class Session:
             interrupt.clear()  # this Ctrl-C has ended the live frames; the next one interrupts the final map
         return not interrupt.is_set()
 
-    def _log(self, step: StepResult, arrived_s: float | None) -> None:
-        """Append the step to log.jsonl, with the time since the image arrived if it is known; update loops.json if
-        enough loops were tried since it was written, and count the frame."""
+    def _log(self, step: StepResult, frame: Frame, arrived_s: float | None) -> None:
+        """Append the step to log.jsonl, with the force on the camera and the time since the image arrived if they are
+        known; update loops.json if enough loops were tried since it was written, and count the frame."""
         line = log_line(step)
+        if frame.specific_force_m_s2 is not None:
+            line["specific_force_m_s2"] = frame.specific_force_m_s2
         if arrived_s is not None:
             line["seconds"]["latency"] = time.perf_counter() - arrived_s
         self.run.log(line)
@@ -300,12 +303,16 @@ class Session:
         self.run.sync_log()
         path, components = self.slam.trajectory(), self.slam.components()
         self.apart = tuple(len(component.trajectory) for component in components)
-        self.run.write_trajectory(path.at(self.slam.believed()))
+        believed = path.at(self.slam.believed())
+        self.run.write_trajectory(believed)
         if self.all_poses or (self.run.path / ALL_POSES).exists():
             self.run.write_all_poses(path)
         self._write_loops()
         self.run.write_checkpoint(self.slam.checkpoint(), {"frames": str(self.frames)})
-        self.run.write_profile(profile(self.run.read_log(), self.wall_s))
+        log = self.run.read_log()
+        self.run.write_profile(profile(log, self.wall_s))
+        if (up := RunFrames.of(log, believed).measured_up()) is not None:
+            self.run.note(up_world=up.tolist())
         self.run.write_components(components)
         self.run.write_map(self.slam.field)
         if self.slam.uncertainty is not None:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
+from sigmasplat.model.accelerometer import Accelerometer
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.frame_arrays import color_from_bytes
 from sigmasplat.model.gyroscope import Gyroscope
@@ -69,12 +70,13 @@ class RecordedSource(Source):
         skipped: Sequence[str] = (),
         test: Source | None = None,
         gyroscope: Gyroscope | None = None,
+        accelerometer: Accelerometer | None = None,
         surface: Path | None = None,
         estimated: bool = False,
     ) -> None:
         """Store image pairs in order of time; `truth` is the path of the colour camera; `skipped` lists files left out.
 
-        test: separate test views; gyroscope: in the axes of the colour camera; surface: file of the true surface;
+        test: separate test views; gyroscope, accelerometer: in the axes of the colour camera; surface: file of the true surface;
         estimated: whether `truth` is an estimate of the recording device.
         Raises SourceError if the first images do not match the calibration, no image has a depth reading, or no image
         was taken while the gyroscope measured.
@@ -86,7 +88,8 @@ class RecordedSource(Source):
         self.depth_registered = self._rectified.moves_depth
         self.registrable, self.sensor = calibration.depth_camera is not None, calibration.sensor
         self.skipped = list(skipped)
-        self._images, self._truth, self._test, self._gyroscope = images, truth, test, gyroscope
+        self._images, self._truth, self._test = images, truth, test
+        self._gyroscope, self._accelerometer = gyroscope, accelerometer
         self._surface, self._estimated = surface, estimated
         self._refuse_sizes_of_first()
         self._refuse_other_clock()
@@ -108,7 +111,10 @@ class RecordedSource(Source):
         color, depth_m = self._rectified(color, depth_m)
         color = resized_color(color, self.camera.width, self.camera.height)
         R_inertial_camera = None if self._gyroscope is None else self._gyroscope.R_inertial_camera(files.timestamp_s)
-        return Frame(i, files.timestamp_s, color, depth_m, self.camera, R_inertial_camera, std_m)
+        force = None if self._accelerometer is None else self._accelerometer.at(files.timestamp_s)
+        return Frame(
+            i, files.timestamp_s, color, depth_m, self.camera, R_inertial_camera, std_m, specific_force_m_s2=force
+        )
 
     def depth_of(self, i: int) -> NDArray[np.float32]:
         """Read the depth of frame i as `frame` does, without reading colour."""

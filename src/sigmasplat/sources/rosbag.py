@@ -17,8 +17,8 @@ from sigmasplat.sources.opening import Format
 from sigmasplat.sources.recorded import ImagePair, RecordedSource, Size
 from sigmasplat.sources.ros.bag import Bag, Entry, is_bag
 from sigmasplat.sources.ros.cameras import read_bag_calibration
-from sigmasplat.sources.ros.gyroscope import read_bag_gyroscope
 from sigmasplat.sources.ros.images import decode_color_message, decode_depth_message, message_size
+from sigmasplat.sources.ros.imu import read_bag_imu
 from sigmasplat.sources.ros.topics import color_topic, depth_topic
 from sigmasplat.sources.ros.truth import read_truth
 from sigmasplat.sources.stereo_bag import open_stereo_bag, stereo_topics
@@ -74,10 +74,11 @@ def open_bag(path: Path, settings: InputConfig) -> RecordedSource:
         BagImagePair(float(color_s[i]), colors[i], depths[j], bag, topics, (entries[0][i], entries[1][j]))
         for i, j in pairs
     ]
-    gyroscope = read_bag_gyroscope(bag, color, color_s)
+    imu = read_bag_imu(bag, color, color_s)
     alone = sorted(set(range(len(entries[0]))) - set(pairs[:, 0].tolist()))
     skipped = [f"{colors[i]}: no depth within {MAX_GAP_S:g} s" for i in alone]
-    return RecordedSource(path.resolve().stem, images, calibration, settings, truth, skipped, gyroscope=gyroscope)
+    name = path.resolve().stem
+    return RecordedSource(name, images, calibration, settings, truth, skipped, **imu._asdict())
 
 
 def _paired(entries: tuple[Sequence[Entry], Sequence[Entry]]) -> tuple[NDArray[np.intp], bool]:

@@ -3,7 +3,8 @@
 rgb.mp4                       depth/000000.png    16-bit millimetres, fewer pixels, same camera
 camera_matrix.csv   3×3       confidence/000000.png   0, 1 or 2: readings with 0 are ignored
 odometry.csv        timestamp, frame, x, y, z, qx, qy, qz, qw [, fx, fy, cx, cy]
-imu.csv             timestamp, a_x, a_y, a_z, alpha_x, alpha_y, alpha_z: alpha is the angular velocity, rad/s; optional
+imu.csv             timestamp, a_x, a_y, a_z, alpha_x, alpha_y, alpha_z; optional
+                    alpha: angular velocity, rad/s; a: of CMAccelerometerData in g, −1 upwards at rest
 
 The app converts ARKit's camera axes to ours before it writes a pose (OdometryEncoder.swift). Frame, depth and pose
 share one number. The clock of imu.csv is that of the frames, and its axes are those of the phone (IMUEncoder.swift,
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.model import se3
+from sigmasplat.model.accelerometer import GRAVITY_M_S2, Accelerometer, accelerometer_from_samples
 from sigmasplat.model.gyroscope import Gyroscope, gyroscope_from_samples
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.reading.files import read_text
@@ -31,7 +33,7 @@ from sigmasplat.sources.opening import Format
 from sigmasplat.sources.recorded import ImagePair, RecordedSource, Size, first_size
 
 POSE = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")
-ANGULAR = ("alpha_x", "alpha_y", "alpha_z")
+ANGULAR, LINEAR = ("alpha_x", "alpha_y", "alpha_z"), ("a_x", "a_y", "a_z")
 R_CAMERA_PHONE = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 """To the camera's axes from those of the phone. Held upright, the phone has x right, y up and z towards the user. The
 image's x points from the top of the phone to its bottom (ARKit's camera axes, with y and z reversed)."""
@@ -90,11 +92,11 @@ def open_stray_scanner(folder: Path, settings: InputConfig) -> RecordedSource:
     kept = set(numbers)
     skipped = [f"{depths[n]}: no frame {n} in rgb.mp4 or odometry.csv" for n in sorted(depths) if n not in kept]
     calibration = _calibration(folder, rows, video.size, first_size([depths[n] for n in numbers]), settings)
-    gyroscope = _gyroscope(folder / "imu.csv", np.array([rows[n]["timestamp"] for n in numbers]))
-    truth = _truth(rows, numbers)
+    truth, imu = _truth(rows, numbers), folder / "imu.csv"
     return RecordedSource(
-        folder.resolve().name, images, calibration, settings, truth, skipped, gyroscope=gyroscope, estimated=True
-    )
+        folder.resolve().name, images, calibration, settings, truth, skipped, estimated=True,
+        gyroscope=_gyroscope(imu, np.array([rows[n]["timestamp"] for n in numbers])), accelerometer=_accelerometer(imu),
+    )  # fmt: skip
 
 
 def with_coarser_depth(calibration: Calibration, depth_size: Size) -> Calibration:
@@ -173,23 +175,33 @@ def _truth(rows: Rows, numbers: list[int]) -> Trajectory | None:
 
 
 def _gyroscope(path: Path, frame_times_s: NDArray[np.float64]) -> Gyroscope | None:
-    """Read the angular velocities; None if they are missing, unusable, or of another time than the frames.
+    """Read the angular velocities; None if they are missing, unusable, or of another time than the frames."""
+    times_s, rates = _samples(path, ANGULAR)
+    gyroscope = gyroscope_from_samples(times_s, rates)
+    return gyroscope if gyroscope is not None and gyroscope.measured_any(frame_times_s) else None
+
+
+def _accelerometer(path: Path) -> Accelerometer | None:
+    """Read the specific forces; None if they are missing, or without gravity. Apple's sign is that of gravity."""
+    times_s, accelerations_g = _samples(path, LINEAR)
+    return accelerometer_from_samples(times_s, -GRAVITY_M_S2 * accelerations_g)
+
+
+def _samples(path: Path, names: tuple[str, ...]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Read times [M] and three columns [M, 3] of imu.csv, turned to the camera's axes; none if they are missing.
 
     Lines that cannot be read are left out: the app may be stopped while it writes one.
     """
-    if not path.is_file():
-        return None
-    lines = csv_rows(path, errors="replace")
-    _, names = next(lines, (0, []))
-    if not {"timestamp", *ANGULAR} <= set(names):
-        return None
-    columns, samples = [names.index(name) for name in ("timestamp", *ANGULAR)], []
-    for _, line in lines:
-        with suppress(ValueError, IndexError):
-            samples.append([float(line[column]) for column in columns])
+    lines = csv_rows(path, errors="replace") if path.is_file() else iter(())
+    _, header = next(lines, (0, []))
+    samples = []
+    if {"timestamp", *names} <= set(header):
+        columns = [header.index(name) for name in ("timestamp", *names)]
+        for _, line in lines:
+            with suppress(ValueError, IndexError):
+                samples.append([float(line[column]) for column in columns])
     values = np.array(samples).reshape(-1, 4)
-    gyroscope = gyroscope_from_samples(values[:, 0], values[:, 1:] @ R_CAMERA_PHONE.T)
-    return gyroscope if gyroscope is not None and gyroscope.measured_any(frame_times_s) else None
+    return values[:, 0], values[:, 1:] @ R_CAMERA_PHONE.T
 
 
 def _recognises(path: str) -> bool:
