@@ -17,14 +17,14 @@ from sigmasplat.io.frames import RunFrames
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.model import se3
 from sigmasplat.model.accelerometer import Accelerometer, accelerometer_from_samples, up_of_path
+from sigmasplat.model.camera import Camera
+from sigmasplat.model.frame import Frame
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.presets import preset
 from sigmasplat.sources import open_source
 from sigmasplat.sources.base import Source
-WORLD = se3.exp(np.array([3.0, -2.0, 1.0, 1.9, 0.4, -0.3]))
-from sigmasplat.model.frame import Frame
-from sigmasplat.model.camera import Camera
 
+WORLD = se3.exp(np.array([3.0, -2.0, 1.0, 1.9, 0.4, -0.3]))
 UP = np.array([0.2, -0.9, 0.4]) / np.linalg.norm([0.2, -0.9, 0.4])
 """Up in a world whose first camera was tilted."""
 T_COLOR_IMU = se3.exp(np.array([0.02, -0.01, 0.005, 1.2, -0.7, 2.0]))

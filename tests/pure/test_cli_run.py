@@ -7,7 +7,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -585,3 +585,24 @@ def test_a_session_runs_without_a_terminal(corridor: Corridor) -> None:
     outcome = Session(MadeUpSlam(Config()), corridor, folder).execute()
     assert (outcome.status, outcome.frames, outcome.lost) == ("complete", 6, 0)
     assert outcome.wall_s > 0
+
+
+@pytest.mark.parametrize("measured", [True, False])
+def test_a_run_writes_the_vertical_direction_that_an_accelerometer_measured(
+    corridor: Corridor, monkeypatch: pytest.MonkeyPatch, measured: bool
+) -> None:
+    plain = Corridor.frame
+
+    def frame(self: Corridor, i: int) -> Frame:
+        force = np.array([9.81, 0.3 * (-1) ** i, 0.0]) if measured else None
+        return replace(plain(self, i), specific_force_m_s2=force)
+
+    monkeypatch.setattr(Corridor, "__len__", lambda self: 12)
+    monkeypatch.setattr(Corridor, "frame", frame)
+    run = RunFolder.create(Path("sideways"), Config(), "corridor")
+    Session(MadeUpSlam(Config()), corridor, run).execute()
+    if measured:
+        assert run.up_world() == pytest.approx([1.0, 0.0, 0.0])
+        assert run.read_log()[1]["specific_force_m_s2"] == pytest.approx([9.81, -0.3, 0.0])
+    else:
+        assert run.up_world() is None and "specific_force_m_s2" not in run.read_log()[0]

@@ -76,8 +76,8 @@ class RecordedSource(Source):
     ) -> None:
         """Store image pairs in order of time; `truth` is the path of the colour camera; `skipped` lists files left out.
 
-        test: separate test views; gyroscope, accelerometer: in the axes of the colour camera; surface: file of the true surface;
-        estimated: whether `truth` is an estimate of the recording device.
+        test: separate test views; gyroscope, accelerometer: in the axes of the colour camera; surface: file of the true
+        surface; estimated: whether `truth` is an estimate of the recording device.
         Raises SourceError if the first images do not match the calibration, no image has a depth reading, or no image
         was taken while the gyroscope measured.
         """
