@@ -82,16 +82,21 @@ def _refuse_memory_limit() -> None:
 def _run_command(arguments: Sequence[str]) -> int:
     """Run the command in the arguments and return its exit code."""
     first = arguments[0]
-    if not HELP.isdisjoint(arguments):
-        return _parsed(arguments, {first} & set(COMMANDS))()
     if first not in COMMANDS:
-        return _parsed(arguments, {*COMMANDS})()
+        return _parsed(arguments, set() if not HELP.isdisjoint(arguments) else {*COMMANDS})()
+    if not HELP.isdisjoint(arguments):
+        return _parsed_alone(first, arguments[1:])()
     try:
         with redirect_stderr(StringIO()):
-            call = _parsed(arguments, {first})
+            call = _parsed_alone(first, arguments[1:])
     except SystemExit:  # the arguments are wrong: a complete message suggests options of other commands
         call = _parsed(arguments, {*COMMANDS})
     return call()
+
+
+def _parsed_alone(name: str, arguments: Sequence[str]) -> Callable[[], int]:
+    """Return the call of a command; the others are not parsed, which takes time. Raises SystemExit as `_parsed`."""
+    return tyro.cli(_postponed(name), prog=f"sigmasplat {name}", args=arguments, config=(tyro.conf.FlagCreatePairsOff,))
 
 
 def _parsed(arguments: Sequence[str], known: Set[str]) -> Callable[[], int]:
