@@ -13,7 +13,7 @@ from sigmasplat.errors import RunError, SourceError
 from sigmasplat.exports.axes import level_cameras
 from sigmasplat.floorplan.ground import floor_frame
 from sigmasplat.floorplan.surface_samples import sample_surfaces
-from sigmasplat.io.frames import RunFrames
+from sigmasplat.io.frames import RunFrames, noted_up
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.model import se3
 from sigmasplat.model.accelerometer import Accelerometer, accelerometer_from_samples, up_of_path
@@ -98,14 +98,14 @@ def test_a_run_knows_up_by_the_forces_on_its_believed_frames(tmp_path: Path) -> 
     up = frames.measured_up()
     assert up is not None and np.rad2deg(np.arccos(up @ UP)) < 1.5
     run = RunFolder.create(tmp_path / "run", preset("sigma"), "x")
-    assert run.up_world() is None
+    assert noted_up(run.facts()) is None
     run.note(up_world=up.tolist())
-    np.testing.assert_allclose(run.up_world(), up)
+    np.testing.assert_allclose(noted_up(run.facts()), up)
     for wrong in ([0, 0, 0], [1, 2], "up", [1, None, 2]):
         text = (run.path / "run.json").read_text()
         run.note(up_world=wrong)
         with pytest.raises(RunError, match="up_world"):
-            run.up_world()
+            noted_up(run.facts())
         (run.path / "run.json").write_text(text)
 
 

@@ -22,6 +22,7 @@ from lpips_weights import write_weights
 from sigmasplat import cli
 from sigmasplat.config import Config
 from sigmasplat.errors import SigmaSplatError, SourceError
+from sigmasplat.io.frames import noted_up
 from sigmasplat.io.mesh import write_mesh
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.io.splats.ply import read_field
@@ -602,7 +603,7 @@ def test_a_run_writes_the_vertical_direction_that_an_accelerometer_measured(
     run = RunFolder.create(Path("sideways"), Config(), "corridor")
     Session(MadeUpSlam(Config()), corridor, run).execute()
     if measured:
-        assert run.up_world() == pytest.approx([1.0, 0.0, 0.0])
+        assert noted_up(run.facts()) == pytest.approx([1.0, 0.0, 0.0])
         assert run.read_log()[1]["specific_force_m_s2"] == pytest.approx([9.81, -0.3, 0.0])
     else:
-        assert run.up_world() is None and "specific_force_m_s2" not in run.read_log()[0]
+        assert noted_up(run.facts()) is None and "specific_force_m_s2" not in run.read_log()[0]

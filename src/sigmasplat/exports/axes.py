@@ -25,6 +25,7 @@ from sigmasplat.errors import SigmaSplatError
 from sigmasplat.exports.run_reader import RunReader
 from sigmasplat.floorplan.ground import floor_frame
 from sigmasplat.floorplan.surface_samples import sample_surfaces
+from sigmasplat.io.frames import noted_up
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.render import FieldRenderer
 from sigmasplat.types import Matrix
@@ -62,7 +63,7 @@ def levelled(reader: RunReader) -> Matrix:
     Raises RunError if the run has no map or no path.
     """
     field, path, config = reader.run.read_map(), reader.believed_path(), reader.config
-    up_world = reader.run.up_world()
+    up_world = noted_up(reader.run.facts())
     samples = sample_surfaces(field, path, reader.camera, FieldRenderer(config.render, config.backend))
     try:
         return floor_frame(list(samples), up_world)[:3, :3]

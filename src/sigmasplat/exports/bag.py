@@ -15,6 +15,7 @@ from sigmasplat.errors import RunError, SigmaSplatError
 from sigmasplat.exports.axes import level_cameras
 from sigmasplat.exports.run_reader import RunReader
 from sigmasplat.floorplan.floor_plan import FloorPlan
+from sigmasplat.io.frames import noted_up
 from sigmasplat.model.component import LOST
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.report.plan import run_floor_plan
@@ -189,5 +190,5 @@ def _floor(reader: RunReader, progress: Progress) -> tuple[FloorPlan | None, Mat
         plan = run_floor_plan(reader.run, path, reader.camera, progress=progress)
         return plan, plan.T_floor_world
     T = np.eye(4)
-    T[:3, :3] = level_cameras(path, reader.run.up_world())
+    T[:3, :3] = level_cameras(path, noted_up(reader.run.facts()))
     return None, T

@@ -21,6 +21,7 @@ from sigmasplat.exports.run_reader import RunReader
 from sigmasplat.floorplan.ground import floor_frame
 from sigmasplat.floorplan.surface_samples import SurfaceRenderer, sample_surfaces
 from sigmasplat.io.atomic import replacing
+from sigmasplat.io.frames import noted_up
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.camera_path import orbit, smooth_path
@@ -91,7 +92,7 @@ def export_video(
     field, camera = reader.run.read_map(), film_camera(reader.camera, options.width_px)
     count = options.images(float(path.timestamps_s[-1] - path.timestamps_s[0]))
     if options.path == "orbit":
-        field, poses = orbit_view(field, path, camera, count, renderer, reader.run.up_world())
+        field, poses = orbit_view(field, path, camera, count, renderer, noted_up(reader.run.facts()))
     else:
         poses = smooth_path(path, count)
     show = partial(_show, renderer, field, camera)

@@ -1,5 +1,6 @@
 """Combine the log and the path of a run: the state of each frame at the end of the run, and its pose if believed."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -92,6 +93,13 @@ class RunFrames:
     def submaps_outside(self) -> frozenset[int]:
         """Return the submaps that are not connected to the world."""
         return submaps_outside(np.array(self.states), np.array([r.get("submap", 0) for r in self.log], np.int64))
+
+
+def noted_up(facts: Mapping[str, Any]) -> NDArray[np.float64] | None:
+    """Return the unit vector [3] that points up in a run's world from its facts (run.json), None if an accelerometer
+    did not measure it."""
+    up = facts.get("up_world")
+    return None if up is None else np.array(up) / np.linalg.norm(up)
 
 
 def _is_lost(record: dict[str, Any]) -> bool:

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
@@ -174,11 +172,6 @@ class RunFolder:
     def facts(self) -> dict[str, Any]:
         """Read run.json: source, version, machine, status and facts of `note`. Raises RunError if it is damaged."""
         return check_fields(self._read_values("run.json"), FACTS, (), self.path / "run.json")
-
-    def up_world(self) -> NDArray[np.float64] | None:
-        """Return the unit vector [3] that points up in the run's world, if an accelerometer measured it, else None."""
-        up = self.facts().get("up_world")
-        return None if up is None else np.array(up) / np.linalg.norm(up)
 
     def note(self, **facts: Any) -> None:
         """Add or change facts in run.json, for instance status="complete" or "interrupted", wall_s=…"""

@@ -3,6 +3,7 @@
 from functools import partial
 
 from sigmasplat.floorplan.floor_plan import CELL_M, FloorPlan, floor_plan
+from sigmasplat.io.frames import noted_up
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.trajectory import Trajectory
@@ -28,6 +29,6 @@ def run_floor_plan(
     if known is not None:
         predictor = partial(predict, field, known, options=config.render, backend=config.backend)
     return floor_plan(
-        field, path, camera, cell_m=cell_m, renderer=renderer, predictor=predictor, up_world=run.up_world(),
+        field, path, camera, cell_m=cell_m, renderer=renderer, predictor=predictor, up_world=noted_up(run.facts()),
         progress=progress,
     )  # fmt: skip
