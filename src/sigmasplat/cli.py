@@ -5,7 +5,7 @@ import os
 import resource
 import sys
 import warnings
-from collections.abc import Callable, Sequence, Set
+from collections.abc import Callable, Sequence
 from contextlib import redirect_stderr, suppress
 from functools import partial, wraps
 from importlib import import_module
@@ -81,16 +81,16 @@ def _refuse_memory_limit() -> None:
 
 def _run_command(arguments: Sequence[str]) -> int:
     """Run the command in the arguments and return its exit code."""
-    first = arguments[0]
+    first, wants_help = arguments[0], not HELP.isdisjoint(arguments)
     if first not in COMMANDS:
-        return _parsed(arguments, set() if not HELP.isdisjoint(arguments) else {*COMMANDS})()
-    if not HELP.isdisjoint(arguments):
+        return _parsed(arguments, with_options=not wants_help)()
+    if wants_help:
         return _parsed_alone(first, arguments[1:])()
     try:
         with redirect_stderr(StringIO()):
             call = _parsed_alone(first, arguments[1:])
     except SystemExit:  # the arguments are wrong: a complete message suggests options of other commands
-        call = _parsed(arguments, {*COMMANDS})
+        call = _parsed(arguments, with_options=True)
     return call()
 
 
@@ -99,13 +99,13 @@ def _parsed_alone(name: str, arguments: Sequence[str]) -> Callable[[], int]:
     return tyro.cli(_postponed(name), prog=f"sigmasplat {name}", args=arguments, config=(tyro.conf.FlagCreatePairsOff,))
 
 
-def _parsed(arguments: Sequence[str], known: Set[str]) -> Callable[[], int]:
-    """Return the call that the arguments ask for; known: the commands whose options are parsed.
+def _parsed(arguments: Sequence[str], with_options: bool) -> Callable[[], int]:
+    """Return the call that the arguments ask for; with_options: parse the options of all commands, or none.
 
     Raises SystemExit after it has printed help, or what is wrong with the arguments.
     """
     call: Callable[[], int] = tyro.extras.subcommand_cli_from_dict(
-        {name: _postponed(name) if name in known else _without_options(name, not known) for name in COMMANDS},
+        {name: _postponed(name) if with_options else _without_options(name) for name in COMMANDS},
         prog="sigmasplat",
         description=DESCRIPTION,
         args=arguments,
@@ -125,13 +125,13 @@ def _postponed(name: str) -> Callable[..., Callable[[], int]]:
     return postponed
 
 
-def _without_options(name: str, described: bool) -> Callable[[], None]:
-    """Return a function that stands for a command whose options are not needed; described: with its description."""
+def _without_options(name: str) -> Callable[[], None]:
+    """Return a function that stands for a command in the list of commands."""
 
     def stand_in() -> None:
         """Stand for a command."""
 
-    stand_in.__doc__ = _description(name) if described else None
+    stand_in.__doc__ = _description(name)
     return stand_in
 
 

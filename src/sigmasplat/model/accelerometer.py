@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from sigmasplat.model.sensor_samples import in_time_order
 from sigmasplat.types import Matrix
 
 GRAVITY_M_S2 = 9.81
@@ -40,13 +41,9 @@ class Accelerometer:
 def accelerometer_from_samples(
     times_s: NDArray[np.float64], specific_force_m_s2: NDArray[np.float64]
 ) -> Accelerometer | None:
-    """Make an accelerometer of recorded samples [M] and [M, 3]; None if they do not measure gravity.
-
-    Samples are sorted by time. Samples of repeated times, and values that are not finite, are left out.
-    """
-    finite = np.isfinite(times_s) & np.isfinite(specific_force_m_s2).all(1)
-    times, first = np.unique(times_s[finite], return_index=True)
-    forces = specific_force_m_s2[finite][first]
+    """Make an accelerometer of recorded samples [M] and [M, 3] (`in_time_order`); None if they do not measure
+    gravity."""
+    times, forces = in_time_order(times_s, specific_force_m_s2)
     if not len(times) or not _is_gravity(float(np.median(np.linalg.norm(forces, axis=1)))):
         return None
     return Accelerometer(times, forces)

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from sigmasplat.errors import SourceError
+from sigmasplat.model.sensor_samples import in_time_order
 from sigmasplat.types import Matrix
 
 MAX_RAD_S = 40.0
@@ -72,13 +73,9 @@ class Gyroscope:
 def gyroscope_from_samples(
     times_s: NDArray[np.float64], angular_velocity_rad_s: NDArray[np.float64]
 ) -> Gyroscope | None:
-    """Make a gyroscope of recorded samples [M] and [M, 3], without its bias (`still_bias`); None if they are unusable.
-
-    Samples are sorted by time. Samples of repeated times, and values that are not finite, are left out.
-    """
-    finite = np.isfinite(times_s) & np.isfinite(angular_velocity_rad_s).all(1)
-    times, first = np.unique(times_s[finite], return_index=True)
-    rates = angular_velocity_rad_s[finite][first]
+    """Make a gyroscope of recorded samples [M] and [M, 3] (`in_time_order`), without its bias (`still_bias`); None if
+    they are unusable."""
+    times, rates = in_time_order(times_s, angular_velocity_rad_s)
     if len(times) < 2 or not rates.any() or np.abs(rates).max() > MAX_RAD_S:
         return None
     return Gyroscope(times, rates - still_bias(times, rates))

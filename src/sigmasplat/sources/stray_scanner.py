@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.model import se3
-from sigmasplat.model.accelerometer import GRAVITY_M_S2, Accelerometer, accelerometer_from_samples
-from sigmasplat.model.gyroscope import Gyroscope, gyroscope_from_samples
+from sigmasplat.model.accelerometer import GRAVITY_M_S2, accelerometer_from_samples
+from sigmasplat.model.gyroscope import gyroscope_from_samples
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.reading.files import read_text
 from sigmasplat.reading.structured import csv_rows
@@ -92,10 +92,13 @@ def open_stray_scanner(folder: Path, settings: InputConfig) -> RecordedSource:
     kept = set(numbers)
     skipped = [f"{depths[n]}: no frame {n} in rgb.mp4 or odometry.csv" for n in sorted(depths) if n not in kept]
     calibration = _calibration(folder, rows, video.size, first_size([depths[n] for n in numbers]), settings)
-    truth, imu = _truth(rows, numbers), folder / "imu.csv"
+    truth, (moved_s, rates, forces) = _truth(rows, numbers), _imu(folder / "imu.csv")
+    gyroscope = gyroscope_from_samples(moved_s, rates)
+    if gyroscope and not gyroscope.measured_any(np.array([rows[n]["timestamp"] for n in numbers])):
+        gyroscope = None
     return RecordedSource(
         folder.resolve().name, images, calibration, settings, truth, skipped, estimated=True,
-        gyroscope=_gyroscope(imu, np.array([rows[n]["timestamp"] for n in numbers])), accelerometer=_accelerometer(imu),
+        gyroscope=gyroscope, accelerometer=accelerometer_from_samples(moved_s, forces),
     )  # fmt: skip
 
 
@@ -174,34 +177,24 @@ def _truth(rows: Rows, numbers: list[int]) -> Trajectory | None:
     return Trajectory(np.array([rows[n]["timestamp"] for n in numbers]), poses)
 
 
-def _gyroscope(path: Path, frame_times_s: NDArray[np.float64]) -> Gyroscope | None:
-    """Read the angular velocities; None if they are missing, unusable, or of another time than the frames."""
-    times_s, rates = _samples(path, ANGULAR)
-    gyroscope = gyroscope_from_samples(times_s, rates)
-    return gyroscope if gyroscope is not None and gyroscope.measured_any(frame_times_s) else None
-
-
-def _accelerometer(path: Path) -> Accelerometer | None:
-    """Read the specific forces; None if they are missing, or without gravity. Apple's sign is that of gravity."""
-    times_s, accelerations_g = _samples(path, LINEAR)
-    return accelerometer_from_samples(times_s, -GRAVITY_M_S2 * accelerations_g)
-
-
-def _samples(path: Path, names: tuple[str, ...]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Read times [M] and three columns [M, 3] of imu.csv, turned to the camera's axes; none if they are missing.
-
-    Lines that cannot be read are left out: the app may be stopped while it writes one.
-    """
+def _imu(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Read times [M], angular velocities and specific forces [M, 3] along the camera's axes; Apple's sign is that of
+    gravity. What is missing or cannot be read is nan: the app may be stopped while it writes a line."""
     lines = csv_rows(path, errors="replace") if path.is_file() else iter(())
     _, header = next(lines, (0, []))
     samples = []
-    if {"timestamp", *names} <= set(header):
-        columns = [header.index(name) for name in ("timestamp", *names)]
-        for _, line in lines:
-            with suppress(ValueError, IndexError):
-                samples.append([float(line[column]) for column in columns])
-    values = np.array(samples).reshape(-1, 4)
-    return values[:, 0], values[:, 1:] @ R_CAMERA_PHONE.T
+    for _, line in lines:
+        words = dict(zip(header, line, strict=False))
+        samples.append([_number(words.get(name)) for name in ("timestamp", *ANGULAR, *LINEAR)])
+    values = np.array(samples).reshape(-1, 7)
+    rates, forces = values[:, 1:4], -GRAVITY_M_S2 * values[:, 4:]
+    return values[:, 0], rates @ R_CAMERA_PHONE.T, forces @ R_CAMERA_PHONE.T
+
+
+def _number(word: str | None) -> float:
+    with suppress(ValueError):
+        return np.nan if word is None else float(word)
+    return np.nan
 
 
 def _recognises(path: str) -> bool:
