@@ -5,8 +5,8 @@ import os
 import resource
 import sys
 import warnings
-from collections.abc import Callable, Sequence
-from contextlib import redirect_stderr, suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, redirect_stderr, suppress
 from functools import partial, wraps
 from importlib import import_module
 from importlib.abc import InspectLoader
@@ -16,12 +16,8 @@ from io import StringIO
 from types import CodeType
 from typing import Any, TextIO
 
-import tyro
-
 import sigmasplat
 from sigmasplat import env
-from sigmasplat.commands.option_ranges import checked
-from sigmasplat.config.text import nearest
 from sigmasplat.errors import ConfigError, SigmaSplatError, is_out_of_memory, out_of_memory
 from sigmasplat.reading.guard import cause
 
@@ -66,6 +62,8 @@ def command(name: str) -> Callable[..., int]:
 def _refuse_unknown(command: str) -> None:
     """Raise ConfigError unless the word is a command or an option."""
     if command not in COMMANDS and not command.startswith("-"):
+        from sigmasplat.config.text import nearest
+
         raise ConfigError(f"no command '{command}'{nearest(command, COMMANDS)}; the commands are {', '.join(COMMANDS)}")
 
 
@@ -79,23 +77,24 @@ def _refuse_memory_limit() -> None:
         )
 
 
-def _run_command(arguments: Sequence[str]) -> int:
-    """Run the command in the arguments and return its exit code."""
+def _call_of(arguments: Sequence[str]) -> Callable[[], int]:
+    """Return the call of the command in the arguments. Raises SystemExit after help, or if the arguments are wrong."""
     first, wants_help = arguments[0], not HELP.isdisjoint(arguments)
     if first not in COMMANDS:
-        return _parsed(arguments, with_options=not wants_help)()
+        return _parsed(arguments, with_options=not wants_help)
     if wants_help:
-        return _parsed_alone(first, arguments[1:])()
+        return _parsed_alone(first, arguments[1:])
     try:
         with redirect_stderr(StringIO()):
-            call = _parsed_alone(first, arguments[1:])
+            return _parsed_alone(first, arguments[1:])
     except SystemExit:  # the arguments are wrong: a complete message suggests options of other commands
-        call = _parsed(arguments, with_options=True)
-    return call()
+        return _parsed(arguments, with_options=True)
 
 
 def _parsed_alone(name: str, arguments: Sequence[str]) -> Callable[[], int]:
     """Return the call of a command; the others are not parsed, which takes time. Raises SystemExit as `_parsed`."""
+    import tyro
+
     return tyro.cli(_postponed(name), prog=f"sigmasplat {name}", args=arguments, config=(tyro.conf.FlagCreatePairsOff,))
 
 
@@ -104,6 +103,8 @@ def _parsed(arguments: Sequence[str], with_options: bool) -> Callable[[], int]:
 
     Raises SystemExit after it has printed help, or what is wrong with the arguments.
     """
+    import tyro
+
     call: Callable[[], int] = tyro.extras.subcommand_cli_from_dict(
         {name: _postponed(name) if with_options else _without_options(name) for name in COMMANDS},
         prog="sigmasplat",
@@ -116,6 +117,8 @@ def _parsed(arguments: Sequence[str], with_options: bool) -> Callable[[], int]:
 
 def _postponed(name: str) -> Callable[..., Callable[[], int]]:
     """Return a function with the options of a command that returns its call."""
+    from sigmasplat.commands.option_ranges import checked
+
     function = command(name)
 
     @wraps(function)
@@ -153,7 +156,6 @@ def _description(name: str) -> str | None:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run a command and exit: 0 done, 1 problems found (doctor, inspect), no image found (localise) or a run failed
     (batch, bench table), 2 refused with one line, 130 interrupted, 141 standard output was closed (as by `| head`)."""
-    gc.set_threshold(COLLECTED_AFTER)
     given = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
     if given == ["--version"]:
         print(f"sigmasplat {sigmasplat.__version__}")
@@ -164,7 +166,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         _refuse_unknown(given[0])
         _refuse_memory_limit()
         _refuse_nul(given)
-        code = _run_command(given)
+        with _without_collection():
+            call = _call_of(given)
+        code = call()
         sys.stdout.flush()
     except SigmaSplatError as problem:
         code = _refused(str(problem))
@@ -183,6 +187,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
         else:
             raise
     sys.exit(code)
+
+
+@contextmanager
+def _without_collection() -> Iterator[None]:
+    """Never look for cycles of unused objects among what is loaded for the options: it stays in use until the exit."""
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.freeze()
+        gc.set_threshold(COLLECTED_AFTER)
+        gc.enable()
 
 
 def _refuse_nul(given: Sequence[str]) -> None:

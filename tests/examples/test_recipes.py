@@ -52,7 +52,7 @@ def test_a_preset_is_values_and_a_setting_is_a_field(package: Path, run: Callabl
         'PRESETS = {"robot": override(SIGMA, {"input.width": "480", "tracking.patience_s": "0.5"})}\n',
         encoding="utf-8",
     )
-    replace(presets / "__init__.py", "sigma, varsplat", "mine, sigma, varsplat")
+    replace(presets / "__init__.py", "cgslam_released, sigma", "cgslam_released, mine, sigma")
     replace(presets / "__init__.py", "sigma.PRESETS)", "sigma.PRESETS, mine.PRESETS)")
     replace(presets / "varsplat.py", '"fast": FAST}', '"fast": FAST, "office": TUM}')
     frames = package / "config" / "frames.py"

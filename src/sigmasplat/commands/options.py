@@ -14,7 +14,7 @@ from sigmasplat.config import Config, InputConfig
 from sigmasplat.config.ranges import Range
 from sigmasplat.config.text import override, split_settings
 from sigmasplat.errors import RunError
-from sigmasplat.presets import families, preset as preset_of
+from sigmasplat.presets import FAMILIES, preset as preset_of
 from sigmasplat.viewer.server import HOST, PORT
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 arg = tyro.conf.arg
 
-PresetName = Annotated[str, arg(metavar="NAME", help=f"preset of settings to start from: {', '.join(families())}")]
+PresetName = Annotated[str, arg(metavar="NAME", help=f"preset of settings to start from: {', '.join(FAMILIES)}")]
 Shell = Annotated[
     Literal["bash", "zsh"], tyro.conf.Positional, arg(metavar="{bash,zsh}", help="the shell that you use")
 ]

@@ -2,17 +2,26 @@
 
 import dataclasses
 from collections.abc import Callable, Mapping
+from functools import cache
 
 from sigmasplat.config import Config
 from sigmasplat.config.text import nearest, override
 from sigmasplat.errors import ConfigError
-from sigmasplat.presets import cgslam, cgslam_released, sigma, varsplat, varsplat_released
 
-SYSTEMS = (varsplat.PRESETS, varsplat_released.PRESETS, cgslam.PRESETS, cgslam_released.PRESETS, sigma.PRESETS)
-PRESETS: dict[str, Config | Callable[[], Config]] = {
-    name: config for presets in SYSTEMS for name, config in presets.items()
-}
-"""The settings of each preset, or a function that makes them: most of the many scenes are never used."""
+FAMILIES = ("sigma", "cgslam-*", "loopsplat-*", "varsplat-*")
+"""The names of all presets in short, the default first: a name, or a pattern for several names."""
+
+
+@cache
+def _presets() -> dict[str, Config | Callable[[], Config]]:
+    """Return the settings of each preset, or a function that makes them: most of the many scenes are never used.
+
+    The modules are imported when the first preset is asked for: the help of a command needs none.
+    """
+    from sigmasplat.presets import cgslam, cgslam_released, sigma, varsplat, varsplat_released
+
+    systems = (varsplat.PRESETS, varsplat_released.PRESETS, cgslam.PRESETS, cgslam_released.PRESETS, sigma.PRESETS)
+    return {name: config for presets in systems for name, config in presets.items()}
 
 
 def default_preset() -> str:
@@ -22,22 +31,14 @@ def default_preset() -> str:
 
 def list_presets() -> list[str]:
     """List the names of all presets."""
-    return sorted(PRESETS)
-
-
-def families() -> list[str]:
-    """List the families of presets, the default first: a name, or a pattern such as varsplat-* for several names."""
-    groups: dict[str, list[str]] = {}
-    for name in [default_preset(), *list_presets()]:
-        groups.setdefault(name.partition("-")[0], []).append(name)
-    return [first if set(names) == {first} else f"{first}-*" for first, names in groups.items()]
+    return sorted(_presets())
 
 
 def preset(name: str) -> Config:
     """Return the settings of a preset. Raises ConfigError on an unknown name, with similar names or all names."""
-    if name not in PRESETS:
+    if name not in _presets():
         raise ConfigError(f"no preset {name!r}{_similar(name) or _all(name)}")
-    config = PRESETS[name]
+    config = _presets()[name]
     return dataclasses.replace(config if isinstance(config, Config) else config(), name=name)
 
 
@@ -56,9 +57,9 @@ def configured(config: Config | str | None, settings: Mapping[str, object] | Non
 def _similar(name: str) -> str:
     """Return text with the presets that begin or end with a name, "" if there are none."""
     similar = [known for known in list_presets() if known.endswith(f"-{name}") or known.startswith(f"{name}-")]
-    return f"; known: {', '.join(similar)} (and {len(PRESETS) - len(similar)} others)" if similar else ""
+    return f"; known: {', '.join(similar)} (and {len(_presets()) - len(similar)} others)" if similar else ""
 
 
 def _all(name: str) -> str:
     """Return text with the preset closest to a name, and all presets."""
-    return f"{nearest(name, PRESETS)}; known: {', '.join(list_presets())}"
+    return f"{nearest(name, _presets())}; known: {', '.join(list_presets())}"
