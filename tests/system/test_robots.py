@@ -5,7 +5,7 @@ import resource
 import socket
 import struct
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import cache
@@ -15,17 +15,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from command_line import exit_code
 from ros_reading import covariance, decoded, image, links, points, pose, read_bag, seconds
 from sigmasplat.config import Config
 from sigmasplat.config.text import override
 from sigmasplat.io.runs import RunFolder
+from sigmasplat.model.camera import Camera
 from sigmasplat.model.frame import Frame
 from sigmasplat.presets import default_preset, preset
 from sigmasplat.slam.slam import Slam
 from sigmasplat.sources import open_source
-from small_room import frame_at
+from small_room import frame_at, walk
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 pytest.importorskip("rosbags", reason="rosbags is not installed (extra `ros`)")
@@ -65,11 +67,13 @@ def settings() -> Config:
     return override(preset(default_preset()), SETTINGS)
 
 
-def followed(sinks: list[Sink], warnings: list[str] | None = None) -> tuple[Slam, list[Outlet]]:
+def followed(
+    sinks: list[Sink], warnings: list[str] | None = None, frames: Sequence[Frame] | None = None
+) -> tuple[Slam, list[Outlet]]:
     """Run with these sinks."""
     slam, outlets = Slam(settings()), [Outlet(sink, MESSAGES) for sink in sinks]
     robot = LiveRobot(slam, outlets, [].append if warnings is None else warnings.append, "all")
-    for frame in there_and_back():
+    for frame in there_and_back() if frames is None else frames:
         robot.watch(frame)
         robot(slam.step(frame))
     before = len(slam.loops)
@@ -77,6 +81,25 @@ def followed(sinks: list[Sink], warnings: list[str] | None = None) -> tuple[Slam
     robot.last_loops(slam.loops[before:])
     robot.close()
     return slam, outlets
+
+
+def turned_by_90_degrees(frames: Sequence[Frame], measured: bool) -> tuple[list[Frame], np.ndarray]:
+    """Return the frames of a camera held sideways, with the force on it (3° off) if it is measured, and the vertical
+    direction in the world."""
+    poses, R = walk().truth().T_world_camera, np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
+    R_error = Rotation.from_euler("y", 3, degrees=True).as_matrix()
+    turned = []
+    for n, frame in enumerate(frames):
+        c = frame.camera
+        up = R @ poses[min(n, FRAMES - 1 - n)][2, :3]
+        turned.append(
+            replace(
+                frame, color=np.rot90(frame.color).copy(), depth_m=np.rot90(frame.depth_m).copy(),
+                camera=Camera(c.height, c.width, c.fy, c.fx, c.cy, c.width - 1 - c.cx),
+                specific_force_m_s2=9.81 * R_error @ up if measured else None,
+            )
+        )  # fmt: skip
+    return turned, R @ poses[0][2, :3]
 
 
 def contents(slam: Slam) -> dict[str, bytes]:
@@ -172,6 +195,16 @@ def test_the_final_map_is_given_as_points_and_as_a_grid(recorded: tuple[Slam, Pa
     assert set(np.unique(grid.data)) <= {-1, 0, 100} and (grid.data == 0).any() and (grid.data == 100).any()
     up = static["map", "floor"][:3, 2]
     assert up[2] > 0.7, "z of the floor is nearly that of the map, whose first camera was nearly level"
+
+
+@pytest.mark.parametrize("measured", [True, False])
+def test_the_accelerometer_levels_the_floor_of_a_camera_held_sideways(tmp_path: Path, measured: bool) -> None:
+    frames, up_world = turned_by_90_degrees(there_and_back(), measured)
+    followed([BagSink(tmp_path / "bag")], frames=frames)
+    static = links(read_bag(tmp_path / "bag")["/tf_static"][-1])
+    T_floor_world = np.linalg.inv(static["map", "floor"]) @ static["map", "sigmasplat_world"]
+    off_deg = np.rad2deg(np.arccos(T_floor_world[2, :3] @ up_world))
+    assert off_deg < 1.5 if measured else off_deg > 60.0, "without it, the images alone mislead"
 
 
 def test_our_own_source_reads_the_same_frames(tmp_path: Path) -> None:

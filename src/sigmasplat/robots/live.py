@@ -1,17 +1,22 @@
 """Give a run that goes on to outlets: transforms, odometry, loops, images, and the map as points and as a grid."""
 
+from array import array
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property, partial
 from typing import Literal
 
+import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.floorplan.floor_plan import FloorPlan, floor_plan
 from sigmasplat.model import se3
+from sigmasplat.model.accelerometer import up_of_path
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.submap import SubmapStore
+from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.render import FieldRenderer
 from sigmasplat.render.predictive import predict
 from sigmasplat.robots.frames import (
@@ -74,19 +79,21 @@ class LiveRobot:
     ) -> None:
         self.slam, self.outlets, self.warn, self.images = slam, outlets, warn, images
         self.odometry = LiveOdometry(slam.atlas)
-        self._frames = dict[int, Frame]()
+        self._frames, self._forces = dict[int, Frame](), _Forces()
         self._submaps = list[_SubmapPoints]()
         self._stamp_ns = -1
         self._failed = set[str]()
 
     def watch(self, frame: Frame) -> None:
-        """Keep a frame until its step, if its images may be wanted."""
+        """Keep until a frame's step the force on it, and its images if they may be wanted."""
+        self._forces.watch(frame)
         if self.images != "none":
             self._frames[frame.index] = frame
 
     def __call__(self, step: StepResult) -> None:
         """Give the messages of a step to the outlets."""
         self._now(step.timestamp_s)
+        self._forces.step(step.index, len(self.slam.steps) - 1)
         self._offer_images(step)
         moved = has_motion(step.state, step.tracking)
         T_odom_camera = self.odometry.step(moved, step.lost, step.is_keyframe)
@@ -181,14 +188,17 @@ class LiveRobot:
 
     def _floor_plan(self) -> FloorPlan | None:
         """Return the floor plan of the final map; None if no surface is visible."""
-        slam, config = self.slam, self.slam.config
-        path, field, known = slam.trajectory().at(slam.believed()), slam.field, slam.uncertainty
+        slam, config, field, known = self.slam, self.slam.config, self.slam.field, self.slam.uncertainty
+        whole, believed = slam.trajectory(), slam.believed()
+        path, up_world = whole.at(believed), self._forces.up_of(whole, believed)
         predictor = None
         if known is not None:
             predictor = partial(predict, field, known, options=config.render, backend=config.backend)
         renderer, camera = FieldRenderer(config.render, config.backend), slam.view.camera
         try:
-            return floor_plan(field, path, camera, renderer=renderer, predictor=predictor) if len(path) else None
+            if not len(path):
+                return None
+            return floor_plan(field, path, camera, renderer=renderer, predictor=predictor, up_world=up_world)
         except SigmaSplatError:
             return None
 
@@ -227,6 +237,34 @@ def _loop(stamp_ns: int, errors: Mapping[str, Tensor], row: int, messages: RosMe
     T_map_link = link_pose(T_MAP_WORLD @ path.T_world_camera[row])
     covariance = ros_covariance(path.of_frame(row), T_MAP_WORLD, T_map_link)
     return [messages.pose(LOOP, stamp_ns, MAP, T_map_link, covariance)]
+
+
+class _Forces:
+    """The forces that an accelerometer measures on the frames, if there is one."""
+
+    def __init__(self) -> None:
+        self._waiting = dict[int, NDArray[np.float64]]()
+        self._rows, self._forces_m_s2 = array("q"), array("d")
+
+    def watch(self, frame: Frame) -> None:
+        """Keep the force on a frame until its step; frames that real time drops have none."""
+        if frame.specific_force_m_s2 is not None:
+            self._waiting[frame.index] = frame.specific_force_m_s2
+
+    def step(self, index: int, row: int) -> None:
+        """Note the force on the frame with this index, which is the step `row`."""
+        for waiting in [i for i in list(self._waiting) if i <= index]:  # a copy: `watch` may run on another thread
+            force = self._waiting.pop(waiting)
+            if waiting == index:
+                self._rows.append(row)
+                self._forces_m_s2.extend(force)
+
+    def up_of(self, path: Trajectory, believed: NDArray[np.bool_]) -> NDArray[np.float64] | None:
+        """Return the unit vector [3] that points up in the world, from the believed poses of a path; None if it was not
+        measured."""
+        rows, forces = np.array(self._rows, np.intp), np.array(self._forces_m_s2).reshape(-1, 3)
+        use = believed[rows]
+        return up_of_path(path.T_world_camera[rows[use]], forces[use])
 
 
 class _SubmapPoints:
