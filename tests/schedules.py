@@ -39,3 +39,18 @@ class Drawn(AtOnce):
 
     def settle(self) -> None:
         AtOnce.wake(self)
+
+
+class Late(AtOnce):
+    """At most a number of slices is done after each frame."""
+
+    def __init__(self, slices: int) -> None:
+        self.slices = slices
+
+    def wake(self) -> None:
+        for _ in range(self.slices):
+            if not next(self.work, False):
+                return
+
+    def settle(self) -> None:
+        AtOnce.wake(self)

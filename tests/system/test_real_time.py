@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from command_line import exit_code
-from schedules import AtOnce, Drawn
+from schedules import AtOnce, Drawn, Late
 from sigmasplat.config import Config
 from sigmasplat.config.text import override
 from sigmasplat.errors import RunError
@@ -129,6 +129,35 @@ def test_a_fast_camera_makes_no_more_keyframes_than_in_a_recording() -> None:
         Slam(config(realtime__keyframe_deg="0.5", mapping__every="4", mapping__overlap_below="0")), AtOnce()
     )
     assert [step.index for step in map(system.step, frames(14)) if step.is_keyframe] == [0, 4, 8, 12]
+
+
+def test_the_first_map_is_left_unfinished_at_a_cut_if_a_keyframe_waits() -> None:
+    """Otherwise all later keyframes wait for it, and none of them is fitted."""
+    often = config(mapping__first_iterations="400", mapping__every="4", realtime__keyframe_deg="0.5")
+    system = RealTime(Slam(often), Late(slices=6))
+    steps = [system.step(frame) for frame in frames(50)]
+    assert max(step.tracking.get("waiting", 0) for step in steps) <= 3
+    system.settle()
+    assert len(system.slam.atlas.anchors) > 2
+
+
+def test_a_keyframe_is_aligned_again_when_the_weights_of_the_one_before_it_are_known() -> None:
+    """Else the path would be that of an alignment without weights."""
+    same = config(
+        mapping__every="4", realtime__keyframe_deg="0", realtime__spare_iterations="0", submaps__frames="1000"
+    )
+    usual, late = Slam(same), RealTime(Slam(same), Late(slices=3))
+    for frame in frames(FRAMES):
+        usual.step(frame)
+        late.step(frame)
+    late.settle()
+    assert usual.keyframe_indices == late.slam.keyframe_indices
+    assert any(step.tracking["waiting"] > 1 for step in late.slam.steps if step.is_keyframe)
+    apart = (
+        late.trajectory().T_world_camera[usual.keyframe_indices]
+        - usual.trajectory().T_world_camera[usual.keyframe_indices]
+    )
+    assert np.linalg.norm(apart[:, :3, 3], axis=1).max() < 1e-4, "without it 2.4e-4"
 
 
 def test_too_many_waiting_keyframes_are_refused_and_counted() -> None:

@@ -98,18 +98,26 @@ class MapWork(World):
         since, moved_m = index - self.mapper.keyframes[0].index, self.drift.position_m(T_submap_camera)
         return bool(ends_submap(T_submap_camera, since, moved_m, self.config.submaps, self.drift.variance_sum))
 
-    def cut(self, T_submap_camera: Matrix) -> Slices[None]:
-        """Finish the active submap and start the next one at its newest keyframe, in slices."""
-        return self.branch(len(self.store), T_submap_camera, self.drift.information, self.mapper.field)
+    def cut(self, T_submap_camera: Matrix, hurried: Callable[[], bool] = never) -> Slices[None]:
+        """Finish the active submap (`finish_submap`) and start the next one at its newest keyframe, in slices."""
+        return self.branch(len(self.store), T_submap_camera, self.drift.information, self.mapper.field, hurried)
 
-    def branch(self, parent: int, T_parent_camera: Matrix, information: Matrix, field: GaussianField) -> Slices[None]:
-        """Finish the active submap and start the next one at the camera, connected to a parent submap, in slices.
+    def branch(
+        self,
+        parent: int,
+        T_parent_camera: Matrix,
+        information: Matrix,
+        field: GaussianField,
+        hurried: Callable[[], bool] = never,
+    ) -> Slices[None]:
+        """Finish the active submap (`finish_submap`) and start the next one at the camera, connected to a parent
+        submap, in slices.
 
         information [6, 6]: of T_parent_camera's left twist; field: the parent's splats, which the new submap may
         inherit.
         """
         with self._timer.stage("cut"):
-            yield from self.finish_submap()
+            yield from self.finish_submap(hurried)
             self.begin_at(parent, T_parent_camera, information, field)
 
     def branch_at(self, place: Relocation) -> Slices[None]:
@@ -146,10 +154,11 @@ class MapWork(World):
         self.atlas.begin_submap()
         self.confidence.begun(None, 0.0)
 
-    def finish_submap(self) -> Slices[None]:
+    def finish_submap(self, hurried: Callable[[], bool] = never) -> Slices[None]:
         """Move the active submap to the store, in slices, and look for its loops, or leave that to the next frames
-        (`loops.slices_per_frame`)."""
-        yield from self.refining(self.mapper.owed)
+        (`loops.slices_per_frame`). Steps of its first keyframe that are still owed are made before, unless `hurried`
+        returns True."""
+        yield from self.refining(self.mapper.owed, hurried)
         submap, pictures = self.mapper.finished(len(self.store))
         submap, probes = self.probes.of(submap)
         yield

@@ -7,6 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from sigmasplat.fit.align import Alignment
+from sigmasplat.fit.pose import fit_pose_align
 from sigmasplat.model import se3
 from sigmasplat.model.component import APART, RELOCALISED
 from sigmasplat.model.hops import UNKNOWN_HOP, Hop
@@ -23,6 +25,9 @@ from sigmasplat.slam.real_time.messages import Offer, Search, Snapshot, Task, Tr
 from sigmasplat.slam.step_result import StepTimer
 from sigmasplat.types import Matrix
 
+AS_GOOD = 0.99
+"""An alignment replaces another one if its agreement × overlap is at least this share of the other's."""
+
 
 class MapClock:
     """Does the work that tracking hands over, in the order of the frames. It owns the map, the atlas and the store.
@@ -38,6 +43,7 @@ class MapClock:
         self._before = Before.of(system)
         self._pending: deque[TrackedFrame | Task] = deque()
         self._spare = 0
+        self._undescribed: TrackedKeyframe | None = None
         self._found = -1
         self._timer = StepTimer()
 
@@ -109,6 +115,19 @@ class MapClock:
             return each.T_submap_camera
         return T_submap_keyframe @ se3.inverse(known) @ each.T_submap_camera
 
+    def _realigned(self, each: TrackedFrame, offer: Offer) -> tuple[Matrix, Alignment | None]:
+        """Return a keyframe's pose and its alignment to the keyframe before it; if that one was not mapped yet when the
+        frame was tracked, they are found again, with the weights of its pixels. Such errors would add up."""
+        T, last, first = self._pose(each), self.last, offer.alignment
+        known = last is not None and each.based_on < self._newest == last.newest
+        reference = last.keyframe.reference if known and last is not None else None
+        if first is None or reference is None or offer.seen.frame.T_given_camera is not None:
+            return T, first
+        fit = fit_pose_align(reference, offer.seen.live, se3.inverse(T), self.system.config.tracking)
+        if fit.alignment is None or fit.agreement * fit.overlap < AS_GOOD * first.agreement * first.overlap:
+            return T, first
+        return se3.orthonormalise(se3.inverse(fit.T_camera_world)), fit.alignment
+
     def _map(self, each: TrackedFrame, offer: Offer) -> Iterator[None]:
         """Map a keyframe. If another one waits, it is added to the map, and the fit is left to the newest one."""
         system, number = self.system, each.number
@@ -120,8 +139,8 @@ class MapClock:
             place = system.begin_first(seen)
             state, T, hop = ("" if place is None else RELOCALISED), np.eye(4), UNKNOWN_HOP
         else:
-            state, T = "", self._pose(each)
-            hop = system.hop_to(se3.inverse(T), offer.alignment)
+            state, (T, alignment) = "", self._realigned(each, offer)
+            hop = system.hop_to(se3.inverse(T), alignment)
             self._add_drift(number, T, hop)
         if not first and self._keyframe_waits():
             system.add_keyframe(seen, number, T, hop)
@@ -129,7 +148,7 @@ class MapClock:
             return
         T = yield from system.map_keyframe(seen, number, T, hop, self._keyframe_waits)
         if system.submap_ends(number, T):
-            yield from system.cut(T)
+            yield from system.cut(T, self._keyframe_waits)
             T = yield from system.map_keyframe(seen, number, np.eye(4), hurried=self._keyframe_waits)
         yield from system.seek_component(seen, T)
         self._done(each)
@@ -152,8 +171,8 @@ class MapClock:
     def _reference(self, seen: Observation, T_submap_camera: Matrix, offer: Offer | None) -> TrackedKeyframe:
         system, front = self.system, None if offer is None else offer.front
         c = system.config.tracking
-        kept = mapped_keyframe(system.mapper.field.params, system.view, seen, T_submap_camera, c, front)
-        return self._described(kept)
+        self._undescribed = mapped_keyframe(system.mapper.field.params, system.view, seen, T_submap_camera, c, front)
+        return self._undescribed
 
     def _described(self, keyframe: TrackedKeyframe) -> TrackedKeyframe:
         """Find the features of a keyframe, so that tracking does not have to."""
@@ -163,7 +182,12 @@ class MapClock:
         return keyframe
 
     def _spare_work(self) -> Iterator[None]:
-        """Fit the map further while no keyframe waits."""
+        """Find the features of the newest keyframe, which take longer than its fit, and fit the map further, while no
+        keyframe waits."""
+        if self._undescribed is not None:
+            keyframe, self._undescribed = self._undescribed, None
+            self._described(keyframe)
+            yield
         if self._spare and self.system.mapper.keyframes:
             steps, self._spare = self._spare, 0
             yield from self.system.mapper.refining(self.system.view, steps, self._keyframe_waits)
