@@ -16,7 +16,7 @@ class AtOnce:
             pass
 
     def settle(self) -> None:
-        self.wake()
+        AtOnce.wake(self)
 
     def stop(self) -> None:
         pass
@@ -37,9 +37,6 @@ class Drawn(AtOnce):
                 if not next(self.work, False):
                     return
 
-    def settle(self) -> None:
-        AtOnce.wake(self)
-
 
 class Late(AtOnce):
     """At most a number of slices is done after each frame."""
@@ -51,6 +48,3 @@ class Late(AtOnce):
         for _ in range(self.slices):
             if not next(self.work, False):
                 return
-
-    def settle(self) -> None:
-        AtOnce.wake(self)

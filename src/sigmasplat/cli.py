@@ -93,7 +93,7 @@ def _call_of(arguments: Sequence[str]) -> Callable[[], int]:
 
 def _parsed_alone(name: str, arguments: Sequence[str]) -> Callable[[], int]:
     """Return the call of a command; the others are not parsed, which takes time. Raises SystemExit as `_parsed`."""
-    import tyro
+    import tyro  # not at the top: `--version` and a wrong command do not need it
 
     return tyro.cli(_postponed(name), prog=f"sigmasplat {name}", args=arguments, config=(tyro.conf.FlagCreatePairsOff,))
 

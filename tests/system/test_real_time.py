@@ -165,9 +165,6 @@ def test_too_many_waiting_keyframes_are_refused_and_counted() -> None:
         def wake(self) -> None:
             pass
 
-        def settle(self) -> None:
-            AtOnce.wake(self)
-
     often = config(realtime__keyframe_deg="0.5", realtime__waiting_most="3", mapping__every="1")
     system = RealTime(Slam(often), Never())
     steps = [system.step(frame) for frame in frames(20)]

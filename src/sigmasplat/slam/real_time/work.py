@@ -118,10 +118,11 @@ class MapClock:
     def _realigned(self, each: TrackedFrame, offer: Offer) -> tuple[Matrix, Alignment | None]:
         """Return a keyframe's pose and its alignment to the keyframe before it; if that one was not mapped yet when the
         frame was tracked, they are found again, with the weights of its pixels. Such errors would add up."""
-        T, last, first = self._pose(each), self.last, offer.alignment
-        known = last is not None and each.based_on < self._newest == last.newest
-        reference = last.keyframe.reference if known and last is not None else None
-        if first is None or reference is None or offer.seen.frame.T_given_camera is not None:
+        T, first, last = self._pose(each), offer.alignment, self.last
+        if first is None or last is None or offer.seen.frame.T_given_camera is not None:
+            return T, first
+        reference, with_weights = last.keyframe.reference, each.based_on >= self._newest
+        if with_weights or last.newest != self._newest or reference is None:
             return T, first
         fit = fit_pose_align(reference, offer.seen.live, se3.inverse(T), self.system.config.tracking)
         if fit.alignment is None or fit.agreement * fit.overlap < AS_GOOD * first.agreement * first.overlap:
