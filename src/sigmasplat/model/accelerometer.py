@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.model.sensor_samples import in_time_order
+from sigmasplat.model.sensor_samples import RecentSamples, in_time_order
 from sigmasplat.types import Matrix
 
 GRAVITY_M_S2 = 9.81
@@ -47,6 +47,23 @@ def accelerometer_from_samples(
     if not len(times) or not _is_gravity(float(np.median(np.linalg.norm(forces, axis=1)))):
         return None
     return Accelerometer(times, forces)
+
+
+class RunningAccelerometer:
+    """An accelerometer that measures now, along the axes of the camera, by the clock of the frames."""
+
+    def __init__(self) -> None:
+        self._recent = RecentSamples()
+
+    def add(self, times_s: NDArray[np.float64], specific_force_m_s2: NDArray[np.float64]) -> None:
+        """Add the samples [N] and [N, 3] that arrived since the last call."""
+        self._recent.add(times_s, specific_force_m_s2)
+
+    def at(self, time_s: float) -> NDArray[np.float64] | None:
+        """Return the mean specific force [3] around a time, m/s², of the samples so far; None if nothing was measured
+        then, or if the recent samples do not measure gravity."""
+        found = accelerometer_from_samples(self._recent.times_s, self._recent.values)
+        return None if found is None else found.at(time_s)
 
 
 def _is_gravity(length_m_s2: float) -> bool:

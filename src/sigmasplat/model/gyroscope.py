@@ -88,9 +88,15 @@ def still_bias(times_s: NDArray[np.float64], angular_velocity_rad_s: NDArray[np.
     """
     seconds = np.floor(times_s - times_s[0]).astype(np.int64)
     starts = np.flatnonzero(np.diff(seconds, prepend=-1))
-    still = []
-    for rates in np.split(angular_velocity_rad_s, starts[1:]):
-        enough = len(rates) >= STILL_SAMPLES
-        if enough and rates.std(0).max() < STILL_NOISE_RAD_S and np.linalg.norm(rates.mean(0)) < MAX_BIAS_RAD_S:
-            still.append(rates.mean(0))
+    means = [still_mean(rates) for rates in np.split(angular_velocity_rad_s, starts[1:])]
+    still = [mean for mean in means if mean is not None]
     return np.median(still, axis=0) if still else np.zeros(3)
+
+
+def still_mean(angular_velocity_rad_s: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """Return the mean [3] of the samples [M, 3] of one second, rad/s; None if the gyroscope was not still."""
+    rates = angular_velocity_rad_s
+    if len(rates) < STILL_SAMPLES or rates.std(0).max() >= STILL_NOISE_RAD_S:
+        return None
+    mean: NDArray[np.float64] = rates.mean(0)
+    return mean if np.linalg.norm(mean) < MAX_BIAS_RAD_S else None
