@@ -3,7 +3,8 @@
 "realsense" or "realsense:width=848,height=480,fps=30,serial=012345678901". Intrinsics, lens distortion and depth unit
 come from the device. The SDK moves depth to the colour camera's pixels, but keeps the distances along the axis of the
 depth camera, which differ by some millimetres. With input.register_depth=on depth is registered exactly, but slower.
-With "realsense:stereo=1" the projector is off, and depth is computed here from the two infrared images.
+With "realsense:stereo=1" the projector is off, and depth is computed here from the two infrared images. Cameras with a
+motion module deliver gyroscope and accelerometer too (`sources.realsense_imu`), without it with "realsense:imu=0".
 """
 
 import weakref
@@ -28,10 +29,13 @@ from sigmasplat.sources.camera.stereo_cameras import StereoCameras
 from sigmasplat.sources.files.optional import import_optional
 from sigmasplat.sources.live import LiveSource
 from sigmasplat.sources.opening import Format
+from sigmasplat.sources.realsense_imu import NOT_MEASURED, MotionModule, open_motion_module
+from sigmasplat.types import Matrix
 
 Images = tuple[NDArray[np.float32], NDArray[np.float32]]
 """Colour [H, W, 3] and depth in metres [H, W]."""
 OPTIONS = {"width": 640, "height": 480, "fps": 30}
+SWITCHES = {"stereo": 0, "imu": 1}
 TIMEOUT_MS = 5000
 WARM_UP_FRAMES = 15
 """Number of first frames to skip, until the exposure is stable."""
@@ -40,13 +44,18 @@ WARM_UP_FRAMES = 15
 class RealSense(LiveSource):
     """A RealSense camera that is running."""
 
-    def __init__(self, pipeline: Any, images: "DepthImages | InfraredImages", settings: InputConfig) -> None:
-        """images: turns what the SDK delivers into colour and depth."""
+    def __init__(
+        self, sdk: Any, pipeline: Any, device: Any, images: "DepthImages | InfraredImages", settings: InputConfig,
+        imu: bool,
+    ) -> None:  # fmt: skip
+        """images: turns what the SDK delivers into colour and depth; imu: whether to read the motion module, if the
+        device has one."""
         super().__init__("realsense", images.camera, settings)
         self.depth_units_per_metre = images.depth_units_per_metre
         self.computed_depth, self.depth_noise_per_m = images.computed, images.noise_per_m
         self._images, self._pipeline = images, pipeline
-        self._stop = weakref.finalize(self, pipeline.stop)
+        self._motion = open_motion_module(sdk, device, images.R_camera_sensor, self.notes) if imu else None
+        self._stop = weakref.finalize(self, _stop, pipeline, self._motion)
 
     def captured(self) -> Iterator[Frame]:
         """Yield the newest frame repeatedly. Raises SourceError if no frame arrives at all."""
@@ -62,7 +71,10 @@ class RealSense(LiveSource):
                 self.dropped += max(number - last - 1, 0) if last is not None else 0
                 last = number
                 rgb, depth_m = self._images.read(first, second)
-                yield Frame(index, float(first.get_timestamp()) / 1000.0, rgb, depth_m, self.camera)
+                time_s, motion = float(first.get_timestamp()) / 1000.0, NOT_MEASURED
+                if self._motion is not None:
+                    motion = self._motion.at(time_s, first.get_frame_timestamp_domain())
+                yield Frame(index, time_s, rgb, depth_m, self.camera, **motion._asdict())
                 index += 1
         finally:
             self._stop()
@@ -75,6 +87,7 @@ class RealSense(LiveSource):
                 frames = self._pipeline.wait_for_frames(TIMEOUT_MS)
             except RuntimeError as error:
                 problem = f"{self.name}: no frame for {TIMEOUT_MS / 1000:g} s ({error}); is the camera plugged in?"
+                problem += " If so, try realsense:imu=0" if self._motion is not None else ""
                 if count <= WARM_UP_FRAMES:
                     raise SourceError(problem) from error
                 self.ending = problem
@@ -106,7 +119,11 @@ class DepthImages:
         self._rectified = Rectification("realsense", calibration, settings)
         self.camera = self._rectified.camera
         self.depth_units_per_metre: float | None = calibration.depth_units_per_metre
-        self._align = sdk.align(sdk.stream.color)
+        self._align, self._color = sdk.align(sdk.stream.color), color
+
+    def R_camera_sensor(self, sensor: Any) -> Matrix:
+        """Return the rotation [3, 3] from the axes of another stream's profile to those of the images."""
+        return _transform(sensor.get_extrinsics_to(self._color))[:3, :3]
 
     def pair(self, frames: Any) -> tuple[Any, Any]:
         """Return colour and depth of a set of frames."""
@@ -131,7 +148,7 @@ class InfraredImages:
         left, right = (profile.get_stream(sdk.stream.infrared, side).as_video_stream_profile() for side in (1, 2))
         (camera, lens), (other, other_lens) = (_optics(sdk, stream.get_intrinsics()) for stream in (left, right))
         cameras = StereoCameras(camera, other, _transform(left.get_extrinsics_to(right)), lens, other_lens)
-        self._rectification = StereoRectification.of(cameras)
+        self._rectification, self._left = StereoRectification.of(cameras), left
         self.camera = self._rectification.camera
         self._matcher = StereoMatcher(self.camera, self._rectification.baseline_m, settings)
         self.depth_units_per_metre: float | None = None
@@ -139,6 +156,11 @@ class InfraredImages:
         sensor = profile.get_device().first_depth_sensor()
         if sensor.supports(sdk.option.emitter_enabled):
             sensor.set_option(sdk.option.emitter_enabled, 0)
+
+    def R_camera_sensor(self, sensor: Any) -> Matrix:
+        """Return the rotation [3, 3] from the axes of another stream's profile to those of the rectified left image."""
+        R_left_sensor = _transform(sensor.get_extrinsics_to(self._left))[:3, :3]
+        return self._rectification.T_left_rectified[:3, :3].T @ R_left_sensor
 
     def pair(self, frames: Any) -> tuple[Any, Any]:
         """Return the left and the right image of a set of frames."""
@@ -175,18 +197,29 @@ def open_realsense(text: str, settings: InputConfig) -> RealSense:
         ) from error
     try:
         images = (InfraredImages if options["stereo"] else DepthImages)(sdk, profile, settings)
-        return RealSense(pipeline, images, settings)
+        return RealSense(sdk, pipeline, profile.get_device(), images, settings, bool(options["imu"]))
     except BaseException:
         pipeline.stop()
         raise
 
 
+def _stop(pipeline: Any, motion: MotionModule | None) -> None:
+    """Stop the camera."""
+    try:
+        if motion is not None:
+            motion.stop()
+    finally:
+        pipeline.stop()
+
+
 def _parsed(text: str) -> dict[str, Any]:
     """Read the options after the colon. Raises SourceError on an unknown option."""
-    options: dict[str, Any] = {**OPTIONS, "stereo": 0, "serial": ""}
+    options: dict[str, Any] = {**OPTIONS, **SWITCHES, "serial": ""}
     for part in filter(None, text.partition(":")[2].split(",")):
         key, _, value = (word.strip() for word in part.partition("="))
-        wrong = (key in OPTIONS and not (value.isdecimal() and int(value))) or (key == "stereo" and value not in "01")
+        wrong = (key in OPTIONS and not (value.isdecimal() and int(value))) or (
+            key in SWITCHES and value not in ("0", "1")
+        )
         if key not in options or not value or wrong:
             raise SourceError(f"realsense: unknown option {part!r}; the options are {', '.join(options)}")
         options[key] = value if key == "serial" else int(value)
