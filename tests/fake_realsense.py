@@ -18,6 +18,8 @@ from sigmasplat.sources import SyntheticRoom
 stream = Enum("stream", "depth color infrared gyro accel")
 format_ = Enum("format", "z16 rgb8 y8 motion_xyz32f combined_motion")
 clock = Enum("timestamp_domain", "hardware_clock system_time global_time")
+EARLIER_S = {clock.hardware_clock: 5000.0, clock.system_time: 0.0, clock.global_time: 0.0}
+"""By how much the times of each clock are smaller."""
 option = Enum("option", "emitter_enabled")
 distortion = Enum(
     "distortion", "none brown_conrady inverse_brown_conrady modified_brown_conrady kannala_brandt4 ftheta"
@@ -210,7 +212,7 @@ class MotionSensor:
         x, y, z = self.R_imu_turned @ value if np.isfinite(value).all() else value
         sample = SimpleNamespace(
             get_motion_data=lambda: SimpleNamespace(x=x, y=y, z=z), get_profile=lambda: profile,
-            get_timestamp=lambda: 1000.0 * (time_s + self.ahead_s),
+            get_timestamp=lambda: 1000.0 * (time_s + self.ahead_s - EARLIER_S[self.clock(time_s)]),
             get_frame_timestamp_domain=lambda: self.clock(time_s),
         )  # fmt: skip
         if self.callback:
@@ -260,8 +262,9 @@ class _Frames:
         return self._frame(np.asarray(image, np.uint8)[..., 1])
 
     def _frame(self, data: np.ndarray) -> Any:
-        milliseconds = 1000.0 * self.number / 30.0
+        kind = self.device.clock(self.number)
+        milliseconds = 1000.0 * (self.number / 30.0 - EARLIER_S[kind])
         return SimpleNamespace(
             get_data=lambda: data, get_timestamp=lambda: milliseconds, get_frame_number=lambda: self.number,
-            get_frame_timestamp_domain=lambda: self.device.clock(self.number),
+            get_frame_timestamp_domain=lambda: kind,
         )  # fmt: skip

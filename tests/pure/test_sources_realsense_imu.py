@@ -31,6 +31,7 @@ PATIENT_FRAMES = WARM_UP_FRAMES + int(PATIENCE_S * 30)
 @pytest.fixture
 def device(monkeypatch: pytest.MonkeyPatch) -> Device:
     made = Device()
+    made.room = SyntheticRoom(frames=8, width=80, height=60, noise=False)
     monkeypatch.setitem(sys.modules, "pyrealsense2", made.module())
     return made
 
@@ -164,14 +165,20 @@ def test_samples_of_another_clock_are_not_used(device: Device) -> None:
     assert "their clock (hardware_clock) is not that of the images (system_time)" in source.notes[0]
 
 
-def test_the_clock_may_change_in_the_first_frames(device: Device) -> None:
-    """The SDK converts times only when it knows how; the first ones are those of the device."""
+@pytest.mark.parametrize("later_s", [-0.01, 0.15])
+def test_the_clock_may_change_in_the_first_frames(device: Device, later_s: float) -> None:
+    """The SDK converts times only when it knows how; the first ones are those of the device. Images and samples do not
+    change together."""
     after_s = (WARM_UP_FRAMES + 4.5) / 30
-    equipped(device).clock = lambda time_s: clock.hardware_clock if time_s < after_s - 0.01 else clock.global_time
+    sampled_s = after_s + later_s
+    equipped(device).clock = lambda time_s: clock.hardware_clock if time_s < sampled_s else clock.global_time
     device.clock = lambda number: clock.hardware_clock if number / 30 < after_s else clock.global_time
     source = opened(limit=PATIENT_FRAMES + 20)
     frames = list(source)
-    check_turns(frames[8:], VELOCITY)
+    check_turns(frames[:3], VELOCITY)
+    check_turns(frames[12:], VELOCITY)
+    unknown = [frame.R_inertial_camera is None for frame in frames]
+    assert any(unknown[4:6]) and sum(unknown) == sum(unknown[4:12])
     assert source.notes == []
 
 
