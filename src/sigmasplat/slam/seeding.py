@@ -136,13 +136,15 @@ def discs(target: Target, pixels: Mask) -> tuple[NDArray[np.float64], NDArray[np
     by the stretch 1 / cos of the viewing angle, at most `STRETCH_MOST`; the stretch is 0, and the axes are those of the
     camera, where a neighbour has no reading or shows another surface.
     """
-    depth, rays = target.depth_image.numpy().astype(np.float64), target.camera.rays()
-    points = np.pad(rays * depth[..., None], ((1, 1), (1, 1), (0, 0)))
-    right, below = points[1:-1, 2:] - points[1:-1, :-2], points[2:, 1:-1] - points[:-2, 1:-1]
-    around = np.pad(depth, 1)
-    neighbours = np.stack([around[1:-1, 2:], around[1:-1, :-2], around[2:, 1:-1], around[:-2, 1:-1]])
-    known: Mask = np.all((np.abs(neighbours - depth) < SAME_SURFACE * depth) & (neighbours > 0), axis=0)
-    normal = np.cross(right, below)[pixels]
+    rays, (v, u) = target.camera.rays(), np.nonzero(pixels)
+    depth = target.depth_image.numpy().astype(np.float64)
+    around = np.pad(depth, 1)  # outside the image there is no reading
+    beside = [(v + row, u + column) for row, column in ((0, 1), (0, -1), (1, 0), (-1, 0))]
+    neighbours = np.stack([around[row + 1, column + 1] for row, column in beside])
+    known: Mask = np.all((np.abs(neighbours - depth[pixels]) < SAME_SURFACE * depth[pixels]) & (neighbours > 0), axis=0)
+    inside = [(row.clip(0, depth.shape[0] - 1), column.clip(0, depth.shape[1] - 1)) for row, column in beside]
+    right, left, below, above = (rays[at] * z[:, None] for at, z in zip(inside, neighbours, strict=True))
+    normal = np.cross(right - left, below - above)
     view = rays[pixels] / np.linalg.norm(rays[pixels], axis=1, keepdims=True)
     length = np.linalg.norm(normal, axis=1)
     normal /= np.maximum(length, 1e-12)[:, None]
@@ -153,7 +155,7 @@ def discs(target: Target, pixels: Mask) -> tuple[NDArray[np.float64], NDArray[np
     away = np.where(off[:, None] > 1e-3, away / np.maximum(off, 1e-12)[:, None], frontal)
     away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
     axes = np.stack([away, np.cross(normal, away), normal], 2)
-    disc = known[pixels] & (length > 0)
+    disc = known & (length > 0)
     stretch = np.where(disc, np.minimum(1.0 / np.maximum(np.abs(cosine), 1e-6), STRETCH_MOST), 0.0)
     return np.where(disc[:, None, None], axes, np.eye(3)), stretch
 

@@ -16,7 +16,7 @@ from sigmasplat.fit.backends import fits_of
 from sigmasplat.fit.compare import Comparison, compare
 from sigmasplat.fit.pose import PoseFit, fit_pose_adam, fit_pose_align
 from sigmasplat.fit.pyramid import Pyramid
-from sigmasplat.fit.references import keyframe_reference, map_reference, picture_images
+from sigmasplat.fit.references import Reference, keyframe_reference, map_reference, picture_images
 from sigmasplat.fit.target import Target
 from sigmasplat.fit.tracking_loss import PoseMaps
 from sigmasplat.model import se3
@@ -81,7 +81,8 @@ class Registration:
 
 class Registrar:
     """Registers submaps of one store; all of them share the camera of the view. With an extractor, features give
-    another guess where alignment from the known poses fits poorly, such as between wide angles."""
+    another guess where alignment from the known poses fits poorly, such as between wide angles. It remembers images of
+    keyframes: make one for each search."""
 
     def __init__(
         self,
@@ -95,6 +96,8 @@ class Registrar:
         self.predicted = predicted or PredictedSubmaps(config, store)
         self.by_features = FeatureGuesses(store, extractor, config.seed)
         self.tracking = tracking_of(config.registration, config.tracking)
+        self._images: dict[tuple[int, int], tuple[Target, Pyramid]] = {}
+        self._references: dict[tuple[int, int], Reference] = {}
 
     def register(self, pair: SubmapPair, a: Submap, b: Submap, T_a_b: Matrix) -> Slices[Registration]:
         """Register the submaps a (query) and b (database) of a pair, in slices of one alignment; T_a_b [4, 4] is the
@@ -113,7 +116,7 @@ class Registrar:
         """Localise a keyframe of `own` in `other`, in slices: align from the expected pose, and from those of similar
         keyframes and by features if that explains too little; then refine the best pose."""
         T_own_camera, other_map = own.T_submap_camera[keyframe], self._map_of(other)
-        target, live = picture_images(self.view, self._picture(own, keyframe), own.camera)
+        target, live = self._images_of(own, keyframe)
         expected = se3.inverse(T_own_camera) @ T_own_other
         fits = yield from self._all_aligned(other_map, live, [expected])
         if score(fits[0]) < DOUBTFUL:
@@ -144,13 +147,19 @@ class Registrar:
         yield from long_slice()
         return self._at_keyframe(other, target, live, found) or found
 
-    def _picture(self, own: Submap, keyframe: int) -> Picture:
+    def _images_of(self, own: Submap, keyframe: int) -> tuple[Target, Pyramid]:
         """Return a keyframe's recorded image, or the one that its own submap renders at its pose."""
         if self.config.target == "recorded":
-            return self.store.picture(own.index, keyframe)
+            return self._recorded(own, keyframe)
         T_camera_own = se3.inverse(own.T_submap_camera[keyframe])
         self.view.forward(own.field.params.to(self.view.sums.device), T_camera_own)
-        return rendered_picture(PoseMaps.of(self.view))
+        return picture_images(self.view, rendered_picture(PoseMaps.of(self.view)), own.camera)
+
+    def _recorded(self, submap: Submap, keyframe: int) -> tuple[Target, Pyramid]:
+        where = submap.index, keyframe
+        if where not in self._images:
+            self._images[where] = picture_images(self.view, self.store.picture(*where), submap.camera)
+        return self._images[where]
 
     def _map_of(self, submap: Submap) -> WeighedMap:
         """Return a submap as the weights read it: with V as published, or with the predicted variance."""
@@ -189,11 +198,18 @@ class Registrar:
             return None
         T_other_camera, mean_m = se3.inverse(found.T_camera_world), float(depth_m.double().mean())
         k = int(np.argmin([angle_between(T, T_other_camera, mean_m) for T in other.T_submap_camera]))
-        _, image = picture_images(self.view, self.store.picture(other.index, k), other.camera)
-        params, T_camera_other = other.field.params.to(self.view.sums.device), se3.inverse(other.T_submap_camera[k])
-        reference = keyframe_reference(params, self.view, image, T_camera_other, self.tracking)
-        fit = fit_pose_align(reference, live, found.T_camera_world, self.tracking)
+        fit = fit_pose_align(self._reference_at(other, k), live, found.T_camera_world, self.tracking)
         return fit if fit.agreement >= c.agreement_least and score(fit) >= c.share_least else None
+
+    def _reference_at(self, submap: Submap, keyframe: int) -> Reference:
+        """Return the recorded image of a keyframe, weighted by its submap, as a reference."""
+        where = submap.index, keyframe
+        if where not in self._references:
+            params = submap.field.params.to(self.view.sums.device)
+            _, image = self._recorded(submap, keyframe)
+            T_camera_submap = se3.inverse(submap.T_submap_camera[keyframe])
+            self._references[where] = keyframe_reference(params, self.view, image, T_camera_submap, self.tracking)
+        return self._references[where]
 
     def _checked(self, other: WeighedMap, live: Pyramid, T_camera_map: Matrix) -> tuple[Matrix, Comparison | None]:
         """Return the covariance [6, 6] of T_camera_map's left twist, estimated by alignment to the map at that pose,
