@@ -91,7 +91,7 @@ class RegistrationConfig(Section, name="registration"):
     keyframes: AtLeastOne = 2
     """Number of keyframes of each submap that are localised in the other one."""
     iterations: Count = 100
-    """Maximum number of Adam steps per keyframe, after alignment; each step is a render."""
+    """Maximum number of Adam steps per keyframe, after alignment; each step is a render. 0 = only alignment."""
     lr_rotation: NotNegative = 1.5e-2
     """Learning rate of rotation in registration, as `tracking.lr_rotation`."""
     lr_translation: NotNegative = 5e-3

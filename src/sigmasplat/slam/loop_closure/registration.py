@@ -134,15 +134,16 @@ class Registrar:
         self, other: Submap, other_map: WeighedMap, target: Target, live: Pyramid, found: PoseFit
     ) -> Slices[PoseFit]:
         """Refine a keyframe's pose in a submap, in slices: by alignment to the submap's nearest keyframe if that is
-        wanted and gives a valid pose, else by gradient descent on the uncertainty-weighted loss with exposure. Descent
-        takes ten times as long, and its result is only the guess of that alignment."""
+        wanted and gives a valid pose, else by `registration.iterations` of gradient descent on the uncertainty-weighted
+        loss with exposure. Descent takes ten times as long, and its result is only the guess of that alignment."""
         at_keyframe = self._at_keyframe(other, target, live, found)
         yield
         if at_keyframe is not None:
             return at_keyframe
-        if found.alignment is not None and score(found) <= HOPELESS * self.config.share_least:
+        steps, hopeless = self.config.iterations, score(found) <= HOPELESS * self.config.share_least
+        if found.alignment is not None and (hopeless or not steps):
             return found
-        start, steps = found.T_camera_world, self.config.iterations
+        start = found.T_camera_world
         found = fit_pose_adam(other_map.params, self.view, target, start, self.tracking, steps)
         yield from long_slice()
         return self._at_keyframe(other, target, live, found) or found
