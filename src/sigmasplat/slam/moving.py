@@ -23,8 +23,9 @@ from sigmasplat.slam.localisation.foreground import (
     Earlier,
     Mask,
     foreground,
+    near_of,
+    on_image,
     projected,
-    range_of,
 )
 from sigmasplat.types import Matrix
 
@@ -75,12 +76,11 @@ def _mask(own: Keyframe, other: Keyframe) -> None:
 def carve(field: GaussianField, keyframes: Sequence[Keyframe], votes: int) -> None:
     """Remove the splats whose place the newest keyframe and others see to be free, `votes` in all, unless one in
     `SUPPORT` shows a surface there. Stray ones stay."""
-    points = field.means.double().cpu().numpy()
-    free, _ = _seen(points, keyframes[-1])
-    rows = np.flatnonzero(free)
+    means = field.means.cpu().numpy()
+    rows = np.flatnonzero(_sees_through(means, keyframes[-1]))
     if len(rows) and not _are_stray(len(rows), field):
         gone = np.zeros(len(field), np.bool_)
-        gone[rows] = _is_free(points[rows], keyframes, votes)
+        gone[rows] = _is_free(means[rows].astype(np.float64), keyframes, votes)
         _remove(field, gone)
 
 
@@ -109,11 +109,24 @@ def _is_free(points: Matrix, keyframes: Iterable[Keyframe], votes: int) -> Mask:
     return np.asarray((through >= votes) & (through > SUPPORT * there))
 
 
+def _sees_through(means_m: NDArray[np.float32], keyframe: Keyframe) -> Mask:
+    """Return which splats with means [n, 3] m a keyframe sees through: in float32, for all splats of a map."""
+    camera, depth = keyframe.target.camera, keyframe.target.depth_image.numpy()
+    means = np.ascontiguousarray(means_m.T)
+    rows = se3.inverse(keyframe.T_world_camera).astype(np.float32)[:3]
+    # The sums are explicit: those of a library's matrix product depend on how the memory is aligned.
+    x, y, z = (r[0] * means[0] + r[1] * means[1] + r[2] * means[2] + r[3] for r in rows)
+    inside, row, column = on_image(x, y, z, camera)
+    at, near = row * camera.width + column, near_of(depth)
+    free = z * np.float32(1 + CLEAR_RELATIVE) + np.float32(CLEAR_M) < np.take(near, at)
+    return np.asarray(free & inside & (np.take(depth, at) > 0))
+
+
 def _seen(points: Matrix, keyframe: Keyframe) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return which points [n, 3] m a keyframe sees through, and at which it shows a surface."""
     camera, depth = keyframe.target.camera, keyframe.target.depth_image.numpy()
     inside, row, column, z = projected(points.T, camera, se3.inverse(keyframe.T_world_camera))
-    near, far = range_of(depth)
+    near, far = Earlier(depth, np.eye(4)).range_m
     limit, read = CLEAR_M + CLEAR_RELATIVE * z, inside & (depth[row, column] > 0)
     free = read & (z + limit < near[row, column])
     return free, inside & (z > near[row, column] - limit) & (z < far[row, column] + limit)

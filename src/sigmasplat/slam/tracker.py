@@ -18,13 +18,14 @@ from sigmasplat.model.frame import NO_PRIOR, PosePrior
 from sigmasplat.render.view import View
 from sigmasplat.slam.features import Extractor
 from sigmasplat.slam.localisation.depth_fit import NOTHING_FITTED, DepthFit
+from sigmasplat.slam.localisation.drawn import has_drawn
 from sigmasplat.slam.localisation.expected import Expected, expect, odometry
 from sigmasplat.slam.localisation.feature_image import FeatureImage, motion_by_features
 from sigmasplat.slam.localisation.foreground import Foreground
 from sigmasplat.slam.localisation.memory import together
 from sigmasplat.slam.localisation.sight import FoundKeyframe, Sight
 from sigmasplat.slam.localisation.tracked_keyframe import Splats, TrackedKeyframe, found_keyframe, mapped_keyframe
-from sigmasplat.slam.localisation.verdict import LEAST_COMMON, RECENT, Usual, agrees_more, confirmed, score, stands
+from sigmasplat.slam.localisation.verdict import LEAST_COMMON, RECENT, Usual, confirmed, score, stands
 from sigmasplat.slam.localisation.watch import Watch
 from sigmasplat.slam.rules import Asked, is_lost, is_wide, jumped, never, unless
 from sigmasplat.types import Matrix
@@ -168,14 +169,13 @@ class Tracker:
     def _without_object(
         self, field: Splats, view: View, seen: Sight, predicted: Matrix, drawn: PoseFit, known: bool
     ) -> tuple[PoseFit, Sight] | None:
-        """Look for the one thing in front without which the images agree much better: it moves, and has drawn the pose
-        with it. Return the fit and the frame without it; None if there is none. known: the last frame had something in
-        front."""
+        """Look for the thing that moves and has drawn the pose with it. Return the fit and the frame without it; None
+        if there is none. known: the last frame had something in front."""
         contradicted, drops = self._contradicted(drawn), self.usual.agrees_less(drawn.comparison)
         for front in self.watch.suspected(self.keyframe, seen, drawn, contradicted, known, drops):
             shown = seen.aside(front, view)
             found = self._fit(field, view, shown, predicted)
-            if agrees_more(found.comparison, drawn.comparison, contradicted) and self._stands(found, predicted):
+            if self._stands(found, predicted) and has_drawn(front, self.keyframe, seen, drawn, found, contradicted):
                 self.front = front
                 return found, shown
         return None

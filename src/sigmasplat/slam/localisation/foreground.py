@@ -10,15 +10,16 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import label, maximum_filter
+from scipy.ndimage import label
 
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
-from sigmasplat.slam.localisation.windows import largest_around, least_around, widened
+from sigmasplat.slam.localisation.windows import largest_around, largest_label, least_around, widened
 from sigmasplat.types import Matrix
 
 Depth = NDArray[np.float32]
 Mask = NDArray[np.bool_]
+Floats = NDArray[np.floating]
 
 STEP = 2
 """Every second row and column of the live image is tested, unless another step is given."""
@@ -34,10 +35,6 @@ WHOLE_SHARE = 0.05
 """The least share of a region that is an object by itself: an object that moves slowly covers most of its old place."""
 SAME_THING = 0.6
 """A region is what was in front in the last image if at least this share of it is there."""
-OBJECT_SHARE, MOST_OBJECTS = (0.02, 0.7), 3
-"""Share of the image of a thing that stands free, and how many are considered."""
-RING, FREE_AROUND = 3, 0.6
-"""Something stands free if at least this share of the pixels at this distance around it is farther."""
 SURROUNDED = 0.75
 """A hole in depth belongs to what is in front if this share of its edge does."""
 MARGIN_PX = 3
@@ -68,23 +65,40 @@ class Earlier:
 
     depth_m: Depth
     T_earlier_live: Matrix
-    known_range: tuple[Depth, Depth] | None = None
+    known_near_m: Depth | None = None
+
+    @property
+    def near_m(self) -> Depth:
+        """Return the least reading around each pixel (`near_of`)."""
+        return near_of(self.depth_m) if self.known_near_m is None else self.known_near_m
 
     @property
     def range_m(self) -> tuple[Depth, Depth]:
-        """Return the least and the largest reading around each pixel (`range_of`)."""
-        return range_of(self.depth_m) if self.known_range is None else self.known_range
+        """Return the least (inf without any) and the largest reading (0 without any) in a window around each pixel."""
+        return self.near_m, largest_around(self.depth_m, AROUND_PX)
 
 
-def range_of(depth_m: Depth) -> tuple[Depth, Depth]:
-    """Return the least (inf without any) and the largest reading (0 without any) in a window around each pixel."""
-    return least_around(depth_m, AROUND_PX), largest_around(depth_m, AROUND_PX)
+def near_of(depth_m: Depth) -> Depth:
+    """Return the least reading in a window around each pixel [H, W], m, inf without any."""
+    return least_around(depth_m, AROUND_PX)
 
 
 @lru_cache(maxsize=8)
 def coarse_rays(camera: Camera, step: int) -> Matrix:
     """Return the rays of every `step`-th row and column of a camera [h, w, 3], float64."""
     return camera.rays()[::step, ::step].astype(np.float64)
+
+
+@lru_cache(maxsize=8)
+def _columns_of_rays(camera: Camera, step: int) -> Matrix:
+    """Return the same rays as columns [3, h · w]."""
+    return np.ascontiguousarray(coarse_rays(camera, step).reshape(-1, 3).T)
+
+
+def thinned(live_m: Depth, step: int) -> Depth:
+    """Return every `step`-th row and column of depth [H, W], m, without its scattered holes."""
+    depth = live_m[::step, ::step]
+    return np.where(depth > 0, depth, largest_around(depth, 3))
 
 
 def foreground(
@@ -104,9 +118,10 @@ def foreground(
     moved by less than its size covers its own earlier place. step: of the rows and columns that are tested.
     scene_scale: size of the scene relative to a room.
     """
-    depth = live_m[::step, ::step]
-    depth = np.where(depth > 0, depth, largest_around(depth, 3))  # fill scattered holes
-    free, again, same = _places(scene, before, depth, camera, step, CLEAR_M * scene_scale)
+    depth, clear_m = thinned(live_m, step), CLEAR_M * scene_scale
+    if before is None and _count_free(scene, depth, camera, step, clear_m) < LEAST_REGION * depth.size:
+        return None
+    free, again, same = _places(scene, before, depth, camera, step, clear_m)
     if np.count_nonzero(free | again) < LEAST_REGION * depth.size:
         return None
     inside = smooth(depth)
@@ -121,29 +136,6 @@ def foreground(
     )
 
 
-def objects(live_m: Depth) -> list[Foreground]:
-    """Return the things that stand free in an image [H, W], m, in front of farther surfaces all around, the largest
-    first, at most `MOST_OBJECTS`. What is behind them is not known."""
-    depth = live_m[::STEP, ::STEP]
-    depth = np.where(depth > 0, depth, largest_around(depth, 3))
-    regions, count = label(smooth(depth), np.ones((3, 3)))
-    sizes = np.bincount(regions.ravel(), minlength=count + 1) / depth.size
-    sizes[0] = 0.0
-    found = list[Foreground]()
-    for region in np.argsort(-sizes, kind="stable"):
-        if sizes[region] < OBJECT_SHARE[0] or len(found) == MOST_OBJECTS:
-            break
-        inside = regions == region
-        far_m = np.median(depth[inside]) * (1 + EDGE_RELATIVE)
-        ring = widened(inside, 2 * RING + 1) & ~widened(inside, 2 * RING - 1) & (depth > 0)
-        if sizes[region] > OBJECT_SHARE[1] or not ring.any() or (depth[ring] > far_m).mean() < FREE_AROUND:
-            continue
-        whole, hidden = enlarged(inside, STEP, live_m)
-        depths = np.where(whole, live_m, np.float32(0.0)), np.where(hidden, np.float32(0.0), live_m)
-        found.append(Foreground(hidden, *depths))
-    return found
-
-
 def smooth(depth: Depth) -> Mask:
     """Return the pixels with a reading that are not on the far side of a depth step."""
     nearest = least_around(depth, 3)
@@ -154,9 +146,14 @@ def enlarged(small: Mask, step: int, live_m: Depth, whole_objects: bool = True) 
     """Return a mask of every `step`-th pixel at the size of the image, and the same with a margin and with the holes in
     depth that it surrounds: what is too near for the sensor has no reading, but hides the scene too. whole_objects:
     what is as far as the edge of such a hole belongs to the same thing."""
-    whole = np.repeat(np.repeat(small, step, 0), step, 1)[: live_m.shape[0], : live_m.shape[1]]
-    hidden = widened(whole, 2 * MARGIN_PX + 1)
+    whole, hidden = with_margin(small, step, live_m)
     return whole, hidden | _holes_in(hidden, whole if whole_objects else None, live_m)
+
+
+def with_margin(small: Mask, step: int, live_m: Depth) -> tuple[Mask, Mask]:
+    """Return a mask of every `step`-th pixel at the size of the image, and the same with a margin."""
+    whole = np.repeat(np.repeat(small, step, 0), step, 1)[: live_m.shape[0], : live_m.shape[1]]
+    return whole, widened(whole, 2 * MARGIN_PX + 1)
 
 
 def _holes_in(mask: Mask, thing: Mask | None, depth_m: Depth) -> Mask:
@@ -167,8 +164,8 @@ def _holes_in(mask: Mask, thing: Mask | None, depth_m: Depth) -> Mask:
     """
     unread = depth_m <= 0
     holes, count = label(unread if thing is None else ~widened(~unread, 3), np.ones((3, 3)))
-    holes = holes if thing is None else np.where(unread, maximum_filter(holes, 3), 0)
-    at_edge = np.where(depth_m > 0, maximum_filter(holes, 3), 0)
+    holes = holes if thing is None else np.where(unread, largest_label(holes), 0)
+    at_edge = np.where(depth_m > 0, largest_label(holes), 0)
     edge = at_edge > 0
     edges, covered = (np.bincount(at_edge[chosen], minlength=count + 1) for chosen in (edge, mask & edge))
     own = (edges > 0) & (covered >= SURROUNDED * edges)
@@ -215,6 +212,16 @@ def _behind(scene: Earlier, camera: Camera) -> Depth:
     return np.where(seen > 0, seen, largest_around(seen, 3))
 
 
+def _count_free(scene: Earlier, depth: Depth, camera: Camera, step: int, clear_m: float) -> int:
+    """Return how many pixels of every `step`-th row and column are in places that were free, as `_places` does, but
+    without telling which: in a still scene, these are too few, and nothing else is needed."""
+    depths = depth.reshape(-1)
+    inside, row, column, z = projected(_columns_of_rays(camera, step) * depths, camera, scene.T_earlier_live)
+    near = np.take(scene.near_m, row * camera.width + column)  # inf without a reading
+    free = (z * (1 + CLEAR_RELATIVE) + clear_m < near) & inside & (depths > 0) & (near < np.inf)
+    return int(np.count_nonzero(free))
+
+
 def _places(
     scene: Earlier, before: Earlier | None, depth: Depth, camera: Camera, step: int, clear_m: float
 ) -> tuple[Mask, Mask, Mask]:
@@ -227,7 +234,7 @@ def _places(
     known, limit = inside & (far[row, column] > 0), clear_m + CLEAR_RELATIVE * z
     places = np.zeros((3, *depth.shape), bool)
     free, again, same = places
-    free[v, u] = known & (z < near[row, column] - limit)
+    free[v, u] = known & (z * (1 + CLEAR_RELATIVE) + clear_m < near[row, column])
     if before is not None:
         in_last, at_row, at_column, z_last = projected(points, camera, before.T_earlier_live)
         front = before.depth_m[at_row, at_column]
@@ -254,7 +261,13 @@ def projected(
 ) -> tuple[Mask, NDArray[np.intp], NDArray[np.intp], Matrix]:
     """Project live points [3, n] into an earlier image: whether they are inside, row, column (0 outside), depth."""
     x, y, z = T_earlier_live[:3, :3] @ points + T_earlier_live[:3, 3:]
+    return *on_image(x, y, z, camera), z
+
+
+def on_image(x: Floats, y: Floats, z: Floats, camera: Camera) -> tuple[Mask, NDArray[np.intp], NDArray[np.intp]]:
+    """Return whether points x, y, z [n] m in a camera's frame are in its image; their row and column (0 outside)."""
     ahead = np.maximum(z, 1e-3)
     column, row = np.rint(camera.fx * x / ahead + camera.cx), np.rint(camera.fy * y / ahead + camera.cy)
     inside = (z > 0.05) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
-    return inside, *(np.where(inside, pixel, 0).astype(np.intp) for pixel in (row, column)), z
+    row, column = (np.where(inside, pixel, 0) for pixel in (row, column))
+    return np.asarray(inside), row.astype(np.intp), column.astype(np.intp)

@@ -15,7 +15,7 @@ from sigmasplat.slam.localisation.foreground import (
     Foreground,
     enlarged,
     foreground,
-    range_of,
+    near_of,
     seen_again,
     smooth,
 )
@@ -44,9 +44,9 @@ class Seen:
     T_world_camera: Matrix
 
     @cached_property
-    def scene_range_m(self) -> tuple[Depth, Depth]:
-        """Return the range of depth with what is behind moving things, around each pixel (`range_of`)."""
-        return range_of(self.scene_m)
+    def scene_near_m(self) -> Depth:
+        """Return the least depth with what is behind moving things, around each pixel (`near_of`)."""
+        return near_of(self.scene_m)
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +79,7 @@ class Memory:
         if most_frames and self.frames - earlier.number > most_frames:
             return None
         T_earlier_live = se3.inverse(earlier.T_world_camera) @ T_world_camera
-        scene = Earlier(earlier.scene_m, T_earlier_live, earlier.scene_range_m)
+        scene = Earlier(earlier.scene_m, T_earlier_live, earlier.scene_near_m)
         return foreground(scene, None, depth_m, camera, whole_objects=True, step=_step(camera))
 
     def still_moving(

@@ -12,10 +12,11 @@ from sigmasplat.fit.pose import PoseFit
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference
 from sigmasplat.model import se3
-from sigmasplat.slam.localisation.foreground import Earlier, Foreground, foreground, objects
+from sigmasplat.slam.localisation.drawn import suspected
+from sigmasplat.slam.localisation.foreground import Earlier, Foreground, foreground
 from sigmasplat.slam.localisation.memory import Memory
 from sigmasplat.slam.localisation.sight import Sight
-from sigmasplat.slam.localisation.verdict import agrees_more, differs
+from sigmasplat.slam.localisation.verdict import differs
 from sigmasplat.slam.rules import Asked
 from sigmasplat.types import Matrix
 
@@ -85,8 +86,8 @@ class Watch:
     def suspected(
         self, keyframe: Reference | None, seen: Sight, fit: PoseFit, contradicted: bool, known: bool, drops: bool
     ) -> Iterator[Foreground]:
-        """Yield the things in front that may have drawn a pose: those without which the gray values agree much better
-        at the same pose; if the images contradict it, all. Without contradiction, every second frame is looked at, and
+        """Yield the things in front that may have drawn a pose: those without which the gray values agree better at
+        the same pose; if the images contradict it, all. Without contradiction, every second frame is looked at, and
         those after one in which something was in front (`known`). If the gray values agree much less than usual
         (`drops`), all are yielded in every frame: at a pose that was drawn far, nothing agrees."""
         if keyframe is None or fit.comparison is None:
@@ -94,10 +95,7 @@ class Watch:
         looks = (known or drops or self.memory.frames % DRAWN_EVERY == 0) and differs(fit.comparison)
         if not (contradicted or looks):
             return
-        for thing in objects(seen.target.depth_image.numpy()):
-            rest = seen.live.hiding(thing.hidden)
-            if contradicted or drops or agrees_more(keyframe.compared(rest, fit.T_camera_world), fit.comparison, False):
-                yield thing
+        yield from suspected(keyframe, seen, fit, contradicted or drops)
 
     def fitted_to_all(self, keyframe: Reference | None, live: Pyramid, fit: PoseFit, config: TrackingConfig) -> PoseFit:
         """Return the fit of a frame without what is in front; if the newest keyframe shows little of the rest, fitted

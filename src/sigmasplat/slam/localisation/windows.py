@@ -24,5 +24,10 @@ def widened(mask: NDArray[np.bool_], size: int) -> NDArray[np.bool_]:
     return np.asarray(opencv().dilate(np.ascontiguousarray(mask).view(np.uint8), _window(size)).view(np.bool_))
 
 
+def largest_label(labels: NDArray[np.integer]) -> NDArray[np.intp]:
+    """Return the largest label in a window of 3 pixels around each pixel [H, W]; labels are at most 2²⁴."""
+    return np.asarray(opencv().dilate(labels.astype(np.float32), _window(3)), np.intp)
+
+
 def _window(size: int) -> NDArray[np.uint8]:
     return np.ones((size, size), np.uint8)

@@ -1,0 +1,98 @@
+"""Find the thing that has drawn a pose: it moves, and the images agree much better without it."""
+
+from collections.abc import Iterator
+
+import numpy as np
+from scipy.ndimage import label
+
+from sigmasplat.fit.pose import PoseFit
+from sigmasplat.fit.references import Reference
+from sigmasplat.model import se3
+from sigmasplat.model.camera import Camera
+from sigmasplat.slam.localisation.foreground import (
+    EDGE_RELATIVE,
+    STEP,
+    Depth,
+    Foreground,
+    Mask,
+    coarse_rays,
+    enlarged,
+    smooth,
+    thinned,
+    with_margin,
+)
+from sigmasplat.slam.localisation.sight import Sight
+from sigmasplat.slam.localisation.verdict import agrees_more, disagrees, may_draw
+from sigmasplat.slam.localisation.windows import widened
+from sigmasplat.types import Matrix
+
+OBJECT_SHARE, MOST_OBJECTS = (0.02, 0.7), 3
+"""Share of the image of a thing that stands free, and how many are considered."""
+RING, FREE_AROUND = 3, 0.6
+"""Something stands free if at least this share of the pixels at this distance around it is farther."""
+SHIFTED = 1e-3
+"""A thing has drawn the pose only if the pose without it shows the thing elsewhere: by at least this share of the
+width of the image. What has another brightness than before, and stays in place, changes the pose less."""
+SHIFT_STEP = 4
+"""Every fourth row and column of a thing is used to find this shift."""
+
+
+def suspected(keyframe: Reference, seen: Sight, fit: PoseFit, every: bool) -> Iterator[Foreground]:
+    """Yield the things in front that may have drawn a pose: those without which the gray values agree better at the
+    same pose; with `every`, all that stand free."""
+    live_m = seen.target.depth_image.numpy()
+    for inside in free_standing(thinned(live_m, STEP)):
+        rest = None if every else seen.live.hiding(with_margin(inside, STEP, live_m)[1])
+        if rest is None or may_draw(keyframe.compared(rest, fit.T_camera_world), fit.comparison):
+            yield _front(inside, live_m)
+
+
+def _front(inside: Mask, live_m: Depth) -> Foreground:
+    """Return a thing that stands free; what is behind it is not known."""
+    whole, hidden = enlarged(inside, STEP, live_m)
+    return Foreground(hidden, np.where(whole, live_m, np.float32(0.0)), np.where(hidden, np.float32(0.0), live_m))
+
+
+def free_standing(depth: Depth) -> Iterator[Mask]:
+    """Yield the things that stand free in `thinned` depth [h, w], m, in front of farther surfaces all around, as masks
+    [h, w]: the largest first, at most `MOST_OBJECTS`."""
+    regions, count = label(smooth(depth), np.ones((3, 3)))
+    sizes, found = np.bincount(regions.ravel(), minlength=count + 1) / depth.size, 0
+    sizes[0] = 0.0
+    for region in np.argsort(-sizes, kind="stable"):
+        if sizes[region] < OBJECT_SHARE[0] or found == MOST_OBJECTS:
+            break
+        if sizes[region] > OBJECT_SHARE[1]:
+            continue
+        inside = regions == region
+        far_m = np.median(depth[inside]) * (1 + EDGE_RELATIVE)
+        ring = widened(inside, 2 * RING + 1) & ~widened(inside, 2 * RING - 1) & (depth > 0)
+        if ring.any() and (depth[ring] > far_m).mean() >= FREE_AROUND:
+            found += 1
+            yield inside
+
+
+def has_drawn(
+    thing: Foreground, keyframe: Reference | None, seen: Sight, drawn: PoseFit, found: PoseFit, contradicted: bool
+) -> bool:
+    """Return whether a thing has drawn a pose, by the pose that was fitted without it: the rest agrees much more there,
+    the thing does not agree with the rest, and it is shown elsewhere than at the drawn pose. contradicted: the images
+    contradict the drawn pose."""
+    if keyframe is None or not agrees_more(found.comparison, drawn.comparison, contradicted):
+        return False
+    whole = keyframe.compared(seen.live, found.T_camera_world)
+    T_drawn_found = drawn.T_camera_world @ se3.inverse(found.T_camera_world)
+    camera = seen.target.camera
+    return disagrees(whole, found.comparison) and shift_px(thing, camera, T_drawn_found) >= SHIFTED * camera.width
+
+
+def shift_px(thing: Foreground, camera: Camera, T_b_a: Matrix) -> float:
+    """Return by how many pixels a thing that camera a sees is shifted in camera b [4, 4]: the median of its pixels."""
+    depth = thing.depth_m[::SHIFT_STEP, ::SHIFT_STEP]
+    v, u = np.nonzero(depth > 0)
+    if not len(u):
+        return 0.0
+    rays = coarse_rays(camera, SHIFT_STEP)[v, u].T
+    x, y, z = T_b_a[:3, :3] @ (rays * depth[v, u]) + T_b_a[:3, 3:]
+    ahead = np.maximum(z, 1e-3)
+    return float(np.median(np.hypot(camera.fx * (x / ahead - rays[0]), camera.fy * (y / ahead - rays[1]))))

@@ -1,0 +1,102 @@
+"""The thing that has drawn a pose is told apart from still things that look different, and from poor fits."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from sigmasplat.fit.pose import PoseFit
+from sigmasplat.fit.pyramid import Pyramid
+from sigmasplat.fit.references import Reference
+from sigmasplat.fit.target import Target
+from sigmasplat.model import se3
+from sigmasplat.model.camera import Camera
+from sigmasplat.model.frame import Frame
+from sigmasplat.slam.localisation.drawn import free_standing, has_drawn, shift_px, suspected
+from sigmasplat.slam.localisation.foreground import Foreground, thinned
+from sigmasplat.slam.localisation.sight import Sight
+
+pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
+CAMERA = Camera(160, 120, 140.0, 140.0, 79.5, 59.5)
+WALL_M, BOX_M, HALF_M = 3.0, 1.0, 0.16
+MOVED_M, BETWEEN_M = 0.06, 0.035
+"""The camera moves to the right by the first distance; a pose that a box has drawn is at the second one."""
+
+
+def stripes(x: NDArray[np.float64], y: NDArray[np.float64], length_m: float) -> NDArray[np.float64]:
+    return 0.5 + 0.2 * np.sin(2 * np.pi * x / length_m) + 0.2 * np.sin(2 * np.pi * (y + 0.3 * x) / length_m)
+
+
+def sight(camera_m: float, box_m: float, paint_m: float = 0.0) -> Sight:
+    """Return a frame of a striped wall with a striped box in front of it: x of camera and box; the stripes of the box
+    are shifted on it by paint_m."""
+    rays = CAMERA.rays().astype(np.float64)
+    on_box = camera_m + BOX_M * rays[..., 0] - box_m, BOX_M * rays[..., 1]
+    box = (np.abs(on_box[0]) < HALF_M) & (np.abs(on_box[1]) < HALF_M)
+    wall = stripes(camera_m + WALL_M * rays[..., 0], WALL_M * rays[..., 1], 0.5)
+    gray = np.where(box, stripes(on_box[0] - paint_m, on_box[1], 0.2), wall).astype(np.float32)
+    depth_m = np.where(box, BOX_M, WALL_M).astype(np.float32)
+    color = np.repeat(gray[..., None], 3, -1)
+    target = Target.of(Frame(0, 0.0, color, depth_m, CAMERA), depth_m.shape)
+    return Sight(target, Pyramid.of(gray, depth_m, CAMERA))
+
+
+def pose(camera_m: float) -> NDArray[np.float64]:
+    """Return T_camera_world."""
+    return se3.exp(np.array([-camera_m, 0, 0, 0, 0, 0]))
+
+
+def fitted(seen: Sight, camera_m: float, without: Foreground | None = None) -> PoseFit:
+    """Return the fit of a frame at a pose, relative to a keyframe that shows the box at x = 0."""
+    live = seen.live if without is None else seen.live.hiding(without.hidden)
+    fit = PoseFit(pose(camera_m), 0.0, 0.0, 0, 1.0, 1.0)
+    return replace(fit, comparison=keyframe().compared(live, fit.T_camera_world))
+
+
+def keyframe() -> Reference:
+    return Reference(sight(0.0, 0.0).live, np.eye(4))
+
+
+def box_of(seen: Sight) -> Foreground:
+    (found,) = suspected(keyframe(), seen, fitted(seen, BETWEEN_M), every=True)
+    return found
+
+
+def judged(seen: Sight, drawn_m: float) -> bool:
+    """Return whether the box has drawn a pose, if the pose without it is right."""
+    box = box_of(seen)
+    return has_drawn(box, keyframe(), seen, fitted(seen, drawn_m), fitted(seen, MOVED_M, box), contradicted=False)
+
+
+def test_a_box_that_moves_with_the_camera_has_drawn_the_pose() -> None:
+    assert judged(sight(MOVED_M, MOVED_M), BETWEEN_M)
+
+
+def test_a_pose_between_two_motions_raises_suspicion_although_the_rest_does_not_agree_there() -> None:
+    seen = sight(MOVED_M, MOVED_M)
+    found = list(suspected(keyframe(), seen, fitted(seen, BETWEEN_M), every=False))
+    assert len(found) == 1 and found[0].hidden[45:75, 65:95].all() and found[0].hidden.mean() < 0.2
+    assert not list(suspected(keyframe(), sight(MOVED_M, 0.0), fitted(sight(MOVED_M, 0.0), MOVED_M), every=False))
+
+
+def test_a_box_that_looks_different_at_its_place_has_not_drawn_the_pose() -> None:
+    assert not judged(sight(MOVED_M, 0.0, paint_m=0.05), MOVED_M)
+
+
+def test_a_still_box_has_not_drawn_a_pose_that_fits_badly() -> None:
+    assert not judged(sight(MOVED_M, 0.0), BETWEEN_M)
+
+
+def test_the_shift_of_a_thing_is_that_of_its_own_depth() -> None:
+    box = box_of(sight(0.0, 0.0))
+    assert shift_px(box, CAMERA, pose(MOVED_M)) == pytest.approx(CAMERA.fx * MOVED_M / BOX_M, rel=1e-4)
+    assert shift_px(box, CAMERA, np.eye(4)) == 0.0
+
+
+def test_what_another_thing_hides_in_part_does_not_stand_free() -> None:
+    depth_m = np.full((CAMERA.height, CAMERA.width), WALL_M, np.float32)
+    depth_m[40:80, 60:100] = BOX_M
+    assert len(list(free_standing(thinned(depth_m, 2)))) == 1
+    depth_m[30:90, 20:60] = depth_m[20:40, 40:110] = depth_m[80:100, 40:110] = BOX_M / 2
+    assert not any(inside[25:35, 35:45].any() for inside in free_standing(thinned(depth_m, 2)))
