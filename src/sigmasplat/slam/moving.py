@@ -25,7 +25,6 @@ from sigmasplat.slam.localisation.foreground import (
     foreground,
     near_of,
     on_image,
-    projected,
 )
 from sigmasplat.types import Matrix
 
@@ -80,13 +79,13 @@ def carve(field: GaussianField, keyframes: Sequence[Keyframe], votes: int) -> No
     rows = np.flatnonzero(_sees_through(means, keyframes[-1]))
     if len(rows) and not _are_stray(len(rows), field):
         gone = np.zeros(len(field), np.bool_)
-        gone[rows] = _is_free(means[rows].astype(np.float64), keyframes, votes)
+        gone[rows] = _is_free(means[rows], keyframes, votes)
         _remove(field, gone)
 
 
 def carve_everywhere(field: GaussianField, keyframes: Iterable[Keyframe], votes: int) -> None:
     """Remove the splats whose place at least `votes` of the keyframes see to be free, as `carve`."""
-    _remove(field, _is_free(field.means.double().numpy(), keyframes, votes))
+    _remove(field, _is_free(field.means.numpy(), keyframes, votes))
 
 
 def _are_stray(count: int, field: GaussianField) -> bool:
@@ -99,34 +98,42 @@ def _remove(field: GaussianField, gone: Mask) -> None:
         field.keep(torch.from_numpy(~gone).to(field.params.device))
 
 
-def _is_free(points: Matrix, keyframes: Iterable[Keyframe], votes: int) -> Mask:
-    """Return which points [n, 3] m are in free space."""
-    through, there = np.zeros(len(points), np.int64), np.zeros(len(points), np.int64)
+def _is_free(means_m: NDArray[np.float32], keyframes: Iterable[Keyframe], votes: int) -> Mask:
+    """Return which splats with means [n, 3] m are in free space."""
+    through, there = np.zeros(len(means_m), np.int64), np.zeros(len(means_m), np.int64)
     for keyframe in keyframes:
-        free, surface = _seen(points, keyframe)
+        free, surface = _seen(means_m, keyframe)
         through += free
         there += surface
     return np.asarray((through >= votes) & (through > SUPPORT * there))
 
 
 def _sees_through(means_m: NDArray[np.float32], keyframe: Keyframe) -> Mask:
-    """Return which splats with means [n, 3] m a keyframe sees through: in float32, for all splats of a map."""
-    camera, depth = keyframe.target.camera, keyframe.target.depth_image.numpy()
-    means = np.ascontiguousarray(means_m.T)
-    rows = se3.inverse(keyframe.T_world_camera).astype(np.float32)[:3]
+    """Return which splats with means [n, 3] m a keyframe sees through."""
+    depth, z, inside, at = _on_keyframe(means_m, keyframe)
+    return np.asarray(inside & (np.take(depth, at) > 0) & (z + _limit_m(z) < np.take(near_of(depth), at)))
+
+
+def _seen(means_m: NDArray[np.float32], keyframe: Keyframe) -> tuple[Mask, Mask]:
+    """Return which splats with means [n, 3] m a keyframe sees through, and at which it shows a surface."""
+    depth, z, inside, at = _on_keyframe(means_m, keyframe)
+    limit, (near, far) = _limit_m(z), (np.take(plane, at) for plane in Earlier(depth, np.eye(4)).range_m)
+    free = inside & (np.take(depth, at) > 0) & (z + limit < near)
+    return free, inside & (z > near - limit) & (z < far + limit)
+
+
+def _limit_m(z: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.asarray(np.float32(CLEAR_M) + np.float32(CLEAR_RELATIVE) * z)
+
+
+def _on_keyframe(
+    means_m: NDArray[np.float32], keyframe: Keyframe
+) -> tuple[Depth, NDArray[np.float32], Mask, NDArray[np.intp]]:
+    """Return the depth of a keyframe [H, W], and of splats with means [n, 3] m: depth in its camera, whether they are
+    in its image, and the number of their pixel."""
+    camera, depth = keyframe.target.camera, np.ascontiguousarray(keyframe.target.depth_image.numpy())
+    means, rows = np.ascontiguousarray(means_m.T), se3.inverse(keyframe.T_world_camera).astype(np.float32)[:3]
     # The sums are explicit: those of a library's matrix product depend on how the memory is aligned.
     x, y, z = (r[0] * means[0] + r[1] * means[1] + r[2] * means[2] + r[3] for r in rows)
     inside, row, column = on_image(x, y, z, camera)
-    at, near = row * camera.width + column, near_of(depth)
-    free = z * np.float32(1 + CLEAR_RELATIVE) + np.float32(CLEAR_M) < np.take(near, at)
-    return np.asarray(free & inside & (np.take(depth, at) > 0))
-
-
-def _seen(points: Matrix, keyframe: Keyframe) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return which points [n, 3] m a keyframe sees through, and at which it shows a surface."""
-    camera, depth = keyframe.target.camera, keyframe.target.depth_image.numpy()
-    inside, row, column, z = projected(points.T, camera, se3.inverse(keyframe.T_world_camera))
-    near, far = Earlier(depth, np.eye(4)).range_m
-    limit, read = CLEAR_M + CLEAR_RELATIVE * z, inside & (depth[row, column] > 0)
-    free = read & (z + limit < near[row, column])
-    return free, inside & (z > near[row, column] - limit) & (z < far[row, column] + limit)
+    return depth, z, inside, row * camera.width + column
