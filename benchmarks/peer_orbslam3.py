@@ -1,7 +1,8 @@
 """Run ORB-SLAM3 (RGB-D) on prepared frames, for peers.py; needs numpy, opencv and pyorbslam3 only, not sigmasplat.
 
-usage: python peer_orbslam3.py FOLDER VOCABULARY: reads FOLDER/color.npy, depth.npy, times.npy and camera.json, writes
-FOLDER/poses.npy (float64 [N, 4, 4], camera to world, metres; NaN for a frame without a pose) and version.txt.
+usage: python peer_orbslam3.py FOLDER VOCABULARY [camera]: reads FOLDER/color.npy, depth.npy, times.npy and camera.json,
+writes FOLDER/poses.npy (float64 [N, 4, 4], camera to world, metres; NaN for a frame without a pose), version.txt, and
+the times of peer_clock.py. Frames come half a second apart; with `camera`, at their own times, and none is dropped.
 If tracking is lost, ORB-SLAM3 starts a new map with a new origin: only the map of most frames is kept.
 VOCABULARY is ORB-SLAM3's ORBvoc.txt. If the file does not exist, it is made from the frames of the folder.
 """
@@ -16,6 +17,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pyorbslam3
+from peer_clock import Clock
 
 BRANCHES, LEVELS, ROUNDS = 10, 6, 8
 """Numbers of branches and levels, as in the published vocabulary, and rounds of k-majority clustering."""
@@ -115,7 +117,7 @@ def read_poses(path: Path, times: Any) -> Any:
     return poses
 
 
-def main(folder: Path, vocabulary: Path) -> None:
+def main(folder: Path, vocabulary: Path, at_camera_times: bool) -> None:
     """Run ORB-SLAM3 on the frames of a folder and write its poses there."""
     color, depth = (np.load(folder / f"{name}.npy", mmap_mode="r") for name in ("color", "depth"))
     times, camera = np.load(folder / "times.npy"), json.loads((folder / "camera.json").read_text())
@@ -124,14 +126,19 @@ def main(folder: Path, vocabulary: Path) -> None:
     settings, path = folder / "orbslam3.yaml", folder / "orbslam3.txt"
     settings.write_text(SETTINGS.format(**camera))
     slam = pyorbslam3.Slam(vocabulary, settings, pyorbslam3.Sensor.RGBD)
-    maps, newest = [], -1
+    maps, newest, arrivals_s = [], -1, np.append(times[1:], times[-1]) - times[0]
+    clock, first = Clock(), time.monotonic()
     for i, t in enumerate(times):
         start = time.monotonic()
-        found = slam.track_rgbd(np.ascontiguousarray(color[i]), np.ascontiguousarray(depth[i]), float(t))
+        seen = np.array(color[i]), np.array(depth[i])  # read from the files before the call
+        with clock.call():
+            found = slam.track_rgbd(*seen, float(t))
         if found.pose_valid and np.array_equal(found.pose_wc, np.eye(4)):
             newest += 1  # every map starts at the identity
         maps.append(newest if found.pose_valid else -1)
-        time.sleep(max(0.0, SECONDS_PER_FRAME - (time.monotonic() - start)))
+        next_frame = first + arrivals_s[i] if at_camera_times else start + SECONDS_PER_FRAME
+        clock.wait(next_frame - time.monotonic())
+    clock.write(folder)
     slam.shutdown()
     slam.save_trajectory_tum(str(path))
     poses = read_poses(path, times)
@@ -142,4 +149,4 @@ def main(folder: Path, vocabulary: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), Path(sys.argv[2]))
+    main(Path(sys.argv[1]), Path(sys.argv[2]), "camera" in sys.argv[3:])

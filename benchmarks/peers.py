@@ -22,6 +22,7 @@ import tables
 import tyro
 from accuracy_tables import spread
 from numpy.typing import NDArray
+from peer_clock import SECONDS, TOTALS
 from tables import Section
 
 from sigmasplat.errors import ConfigError, SigmaSplatError, SourceError
@@ -48,6 +49,7 @@ class Peer:
     name: str
     package: str
     method: str = ""
+    more: tuple[str, ...] = ()
 
 
 PEERS = (
@@ -166,8 +168,8 @@ def run_ours(options: Options) -> list[Result]:
 
 def run_peer(peer: Peer, name: str, path: str, frames: Path, options: Options, python: Path) -> Result:
     """Run one system on the frames in a folder and score its path; if it fails, the result has a `problem`."""
-    words = [peer.method or str(options.vocabulary or frames / "vocabulary.txt")]
-    for old in ("poses.npy", "version.txt"):
+    words = [peer.method or str(options.vocabulary or frames / "vocabulary.txt"), *peer.more]
+    for old in ("poses.npy", "version.txt", SECONDS, TOTALS):
         (frames / old).unlink(missing_ok=True)
     command = [str(python), str(FOLDER / f"peer_{peer.package}.py"), str(frames), *words]
     problem, _ = accuracy.call(command, frames / "output.txt")

@@ -11,7 +11,9 @@ example: python benchmarks/realtime.py --sources livingroom --seeds 0
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import compress
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -75,8 +77,8 @@ def made(source: str, seed: int, options: Options, out: Path, *more: str) -> Run
 def figures_of(run: RunFolder) -> dict[str, Any]:
     """Return the figures of one run."""
     log, metrics = run.read_log(), run.read_metrics()
-    late = [line for line in log if line["timestamp_s"] - log[0]["timestamp_s"] > FIRST_S]
-    latencies_ms = [1000 * line["seconds"]["latency"] for line in late if "latency" in line["seconds"]]
+    late = settled([line["timestamp_s"] for line in log])
+    latencies_ms = [1000 * line["seconds"]["latency"] for line in compress(log, late) if "latency" in line["seconds"]]
     return {
         "frames": len(log),
         "lost": sum(line["lost"] for line in log),
@@ -86,6 +88,11 @@ def figures_of(run: RunFolder) -> dict[str, Any]:
         "psnr_db": metrics["training"]["psnr_db"],
         "latency_ms": latency(latencies_ms) if latencies_ms else None,
     }
+
+
+def settled(times_s: Sequence[float]) -> list[bool]:
+    """Return which frames, by their times, count: those after the first second."""
+    return [time_s - times_s[0] > FIRST_S for time_s in times_s]
 
 
 def latency(values_ms: list[float]) -> dict[str, float]:

@@ -23,7 +23,7 @@ import tyro
 
 SUBJECTS = {
     "Whole runs": ("accuracy", "pace", "systems", "map_quality", "every_preset", "paper_presets"),
-    "Other systems": ("peers", "mesh_quality"),
+    "Other systems": ("peers", "peer_pace", "mesh_quality"),
     "Claims of the papers": ("claims",),
     "Effect of σ²": ("ablation", "weights", "color_covariance"),
     "Uncertainty": ("uncertainty", "uncertainty_weights", "pose_covariance"),
