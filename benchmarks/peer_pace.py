@@ -221,9 +221,9 @@ NOTE = (
     "files of the recording too, the others read decoded images. Tracking alone: the stages `prepare` and `track` of "
     "the same run. Cores: processor time by wall time, from the second frame on. SigmaSplat works at 320 pixels width, "
     "the others at full size. Final map: time after the last frame. ‡ At the times of the frames: it waits for them, "
-    "so that frames/s are the camera's if it keeps up. Half a second per frame: the threads of ORB-SLAM3 that map keep "
-    "up, which they do not if frames come as fast as the calls end; so there are no frames/s. † Not measured by "
-    "this command: the issue that asks for this comparison gives it for RTAB-Map-like systems on these frames, "
+    "so that frames/s are the camera's if it keeps up. Half a second per frame, as in `peers.py`: the threads of "
+    "ORB-SLAM3 that map have time to keep up; frames/s would be those of the waiting. † Not measured by this command: "
+    "the issue that asks for this comparison gives it for RTAB-Map-like systems on these frames, "
     "measured earlier by the project's founders on one core."
 )
 
@@ -267,7 +267,10 @@ def main(options: Options) -> int:
     """Measure, write the results and print the tables; return 2 if a system fails."""
     if options.quick:
         options = replace(options, limit=options.limit or QUICK_FRAMES, rounds=1)
-    return program.run("peer_pace", options, measure, write=not options.quick, refused=(SigmaSplatError, OSError))
+    given = {name: bool(python) for name, python in pythons_of(options).items()}
+    given["vocabulary"] = bool(options.vocabulary)
+    refused = (SigmaSplatError, OSError)
+    return program.run("peer_pace", options, measure, write=not options.quick, refused=refused, **given)
 
 
 if __name__ == "__main__":

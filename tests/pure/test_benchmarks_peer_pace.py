@@ -103,6 +103,18 @@ def test_other_systems_that_fail_give_one_line(
     assert not (tmp_path / "out").exists()
 
 
+def test_results_are_written_without_the_paths_of_other_systems(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(peer_pace, "measure", lambda options: {"runs": [], "quoted": []})
+    assert peer_pace.main(peer_pace.Options((ROOM,), open3d=tmp_path / "python", quick=True, out=tmp_path)) == 0
+    assert not list(tmp_path.iterdir())
+    assert peer_pace.main(peer_pace.Options((ROOM,), open3d=tmp_path / "python", out=tmp_path)) == 0
+    (written,) = tmp_path.glob("peer-pace-*.json")
+    config = json.loads(written.read_text())["config"]
+    assert (config["open3d"], config["orbslam3"], config["vocabulary"]) == (True, False, False)
+
+
 def test_one_frame_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert peer_pace.main(peer_pace.Options((ROOM,), limit=1, out=tmp_path)) == 2
     assert capsys.readouterr().err == "peer_pace.py: --limit 1: at least two frames are needed\n"
