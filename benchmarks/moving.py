@@ -209,7 +209,7 @@ def sections(measured: dict[str, Any]) -> list[Section]:
         "30 %). Time: processor seconds of all frames, without the final map."
     )
     head = ("share, %", "seed", "search", "ATE, cm", "lost frames", "IoU", "wrongly masked, %", "too near, %", "left")
-    found = [Section("Moving ball", (*head, "PSNR, dB", "time, s"), rooms, note)]
+    found = [Section("Moving ball", (*head, "PSNR, dB", "time, s"), rooms, note)] if rooms else []
     head = ("recording", "seed", "search", "ATE, cm", "lost frames", "masked, %", "PSNR, dB", "splats", "time, s")
     return found + ([Section("Nothing moves", head, still)] if still else [])
 
