@@ -29,7 +29,7 @@ import realtime
 import record
 import tyro
 from peer_clock import SECONDS, TOTALS
-from peers import Peer, Result
+from peers import OtherSystems, Peer, Result, pythons_of
 from tables import Section, significant
 
 from sigmasplat.errors import ConfigError, SigmaSplatError
@@ -61,21 +61,11 @@ FIGURES = ("median_ms", "p99_ms", "frames_per_s", "cores", "processor_ms", "with
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(OtherSystems):
     """Measure the time per frame of SigmaSplat and of other RGB-D systems on the same frames."""
 
     sequences: Annotated[tuple[str, ...], arg(help="names in the data folder, or paths")] = ("redkitchen", "livingroom")
     rounds: Annotated[int, arg(help="runs of each system, by turns")] = 1
-    open3d: Annotated[Path | None, arg(help="a Python with open3d", help_behavior_hint="(default: left out)")] = None
-    orbslam3: Annotated[
-        Path | None,
-        arg(help="a Python with pyorbslam3 and opencv-python-headless", help_behavior_hint="(default: left out)"),
-    ] = None
-    vocabulary: Annotated[
-        Path | None,
-        arg(help="ORB-SLAM3's ORBvoc.txt", help_behavior_hint="(default: one is trained on each sequence)"),
-    ] = None
-    limit: Annotated[int | None, arg(help="frames at most", help_behavior_hint="(default: all)")] = None
     quick: Annotated[bool, arg(help=f"{QUICK_FRAMES} frames, once; no results written", help_behavior_hint="")] = False
     name: Annotated[str, arg(help="name of the results")] = "peer-pace"
     out: Annotated[Path, arg(help="folder of the results")] = record.RESULTS
@@ -152,7 +142,7 @@ def ours_of(log: list[Any], facts: Result, wall_s: float, used_s: float, found: 
 
 def run_peer(peer: Peer, path: str, options: Options, frames: Path, python: Path) -> Result:
     """Run another system on the frames in a folder. Raises SigmaSplatError if it fails."""
-    result = peers.run_peer(peer, Path(path).name, path, frames, options, python)  # type: ignore[arg-type]
+    result = peers.run_peer(peer, Path(path).name, path, frames, options, python)
     if result["problem"] is not None:
         raise SigmaSplatError(f"{peer.name}: {result['problem']}")
     times_s, calls_s = (np.load(frames / name).tolist() for name in ("times.npy", SECONDS))
@@ -175,11 +165,6 @@ def peer_figures(peer: Peer, times_s: Sequence[float], calls_s: Sequence[float],
 
 
 # ---- all ----
-
-
-def pythons_of(options: Options) -> dict[str, Path | None]:
-    """Return the Python of each package of other systems; None if these systems are left out."""
-    return {"open3d": options.open3d, "orbslam3": options.orbslam3}
 
 
 def systems_of(path: str, options: Options, scratch: Path) -> Iterator[Result]:

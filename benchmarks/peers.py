@@ -78,13 +78,10 @@ PROPERTIES = {
 """Kind of map, and whether loops are closed."""
 
 
-@dataclass(frozen=True)
-class Options:
-    """Run SigmaSplat and other RGB-D systems on the same frames and score every path with the same evaluation."""
+@dataclass(frozen=True, kw_only=True)
+class OtherSystems:
+    """The options of programs that run other systems: where these are, and how many frames they get."""
 
-    sources: Annotated[tuple[str, ...], arg(help="names in the data folder, or paths")] = SOURCES
-    systems: Annotated[tuple[str, ...], arg(help="the other systems")] = tuple(p.method or p.package for p in PEERS)
-    seeds: Annotated[tuple[int, ...], arg(help="starts of SigmaSplat's random numbers, a run each")] = (0,)
     open3d: Annotated[Path | None, arg(help="a Python with open3d", help_behavior_hint="(default: left out)")] = None
     orbslam3: Annotated[
         Path | None,
@@ -94,12 +91,21 @@ class Options:
         Path | None,
         arg(help="ORB-SLAM3's ORBvoc.txt", help_behavior_hint="(default: one is trained on each sequence)"),
     ] = None
+    limit: Annotated[int | None, arg(help="frames at most", help_behavior_hint="(default: all)")] = None
+
+
+@dataclass(frozen=True)
+class Options(OtherSystems):
+    """Run SigmaSplat and other RGB-D systems on the same frames and score every path with the same evaluation."""
+
+    sources: Annotated[tuple[str, ...], arg(help="names in the data folder, or paths")] = SOURCES
+    systems: Annotated[tuple[str, ...], arg(help="the other systems")] = tuple(p.method or p.package for p in PEERS)
+    seeds: Annotated[tuple[int, ...], arg(help="starts of SigmaSplat's random numbers, a run each")] = (0,)
     paths: Annotated[
         tuple[str, ...],
         arg(help="SYSTEM=SEQUENCE=FILE: also score a TUM text file that another system has written", metavar="PATHS"),
     ] = ()
     keep: Annotated[bool, arg(help="keep the rows of other systems in the earlier results")] = False
-    limit: Annotated[int | None, arg(help="frames at most", help_behavior_hint="(default: all)")] = None
     name: Annotated[str, arg(help="name of the results")] = "peers"
     fresh: Annotated[bool, arg(help="run also what has been run before")] = False
     runs: Annotated[Path, arg(help="folder of the run folders")] = accuracy.RUNS
@@ -166,7 +172,12 @@ def run_ours(options: Options) -> list[Result]:
     return made
 
 
-def run_peer(peer: Peer, name: str, path: str, frames: Path, options: Options, python: Path) -> Result:
+def pythons_of(options: OtherSystems) -> dict[str, Path | None]:
+    """Return the Python of each package of other systems; None if these systems are left out."""
+    return {"open3d": options.open3d, "orbslam3": options.orbslam3}
+
+
+def run_peer(peer: Peer, name: str, path: str, frames: Path, options: OtherSystems, python: Path) -> Result:
     """Run one system on the frames in a folder and score its path; if it fails, the result has a `problem`."""
     words = [peer.method or str(options.vocabulary or frames / "vocabulary.txt"), *peer.more]
     for old in ("poses.npy", "version.txt", SECONDS, TOTALS):
@@ -196,7 +207,7 @@ def finished(peer: Peer, path: str, options: Options) -> tuple[Path, Result, Res
 
 def run_peers(options: Options) -> list[Result]:
     """Run the other systems for which a Python is given, sequence by sequence."""
-    pythons = {"open3d": options.open3d, "orbslam3": options.orbslam3}
+    pythons = pythons_of(options)
     wanted = [peer for peer in PEERS if (peer.method or peer.package) in options.systems]
     chosen = [(peer, python) for peer in wanted if (python := pythons[peer.package])]
     made = []

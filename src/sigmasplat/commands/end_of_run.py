@@ -39,8 +39,8 @@ def _warn_of_skipped_frames(screen: "Screen", source: "Source") -> None:
         for note in (*source.notes, source.ending):
             if note:
                 screen.warn(note)
-    if isinstance(source, LiveSource) and source.dropped:
-        screen.say(f"{source.dropped} frames of the camera were dropped because SLAM was slower")
+        if source.dropped:
+            screen.say(f"{source.dropped} frames of the camera were dropped because SLAM was slower")
 
 
 def _warn_of_dropped_frames(screen: "Screen", read: "Source") -> None:

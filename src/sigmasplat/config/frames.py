@@ -112,8 +112,8 @@ class MappingConfig(Section, name="mapping"):
     iterations: Count = 100
     """Optimisation steps per keyframe: the first setting to change to trade speed for quality."""
     first_iterations: Count = 100
-    """Optimisation steps for the first keyframe of a map. Until about 150 steps, a new map renders surfaces too
-    close."""
+    """Optimisation steps for the first keyframe of a map. Until about 150 steps, a new map renders surfaces too close,
+    with `weight_mean_depth` until about 75."""
     first_divided: bool = False
     """Whether the steps of the first keyframe are divided: `iterations` of them at once, and as many, or a fifteenth of
     `first_iterations` if this is more, at each of the next frames that are not mapped, until `first_iterations` are
