@@ -161,3 +161,23 @@ def test_fields_side_by_side_are_those_appended_one_after_another(count: int) ->
     assert joined.next_id == one_by_one.next_id and joined.attributes.keys() == one_by_one.attributes.keys()
     for name, attribute in one_by_one.attributes.items():
         assert torch.equal(joined.attributes[name].params, attribute.params)
+
+
+@pytest.mark.parametrize("chosen", [[0, 3], [0, 1, 2, 3, 4], []])
+def test_a_part_of_a_field_keeps_ids_and_optimiser_and_shares_nothing(chosen: list[int]) -> None:
+    whole = GaussianField(torch.arange(5.0)[:, None] + torch.zeros(5, WIDTH), steps=7)
+    whole.keep(torch.tensor([4, 3, 2, 1, 0]))
+    whole.moment1 += 1.0
+    whole.get_or_create("harmonics").params += whole.params[:, :1]
+    before = whole.copy_to(whole.params.device)
+    rows = torch.zeros(5, dtype=torch.bool)
+    rows[chosen] = True
+    part = whole.part(rows)
+    assert part.ids.tolist() == [4 - row for row in chosen] and (part.steps, part.next_id) == (7, 5)
+    for name in ("params", "moment1", "moment2", "last_step"):
+        assert torch.equal(getattr(part, name), getattr(whole, name)[rows])
+    assert torch.equal(part.attributes["harmonics"].params, whole.attributes["harmonics"].params[rows])
+    part.params += 1.0
+    part.attributes["harmonics"].params += 1.0
+    assert torch.equal(whole.params, before.params) and len(whole) == 5
+    assert torch.equal(whole.attributes["harmonics"].params, before.attributes["harmonics"].params)

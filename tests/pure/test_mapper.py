@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from sigmasplat.config import Config, MappingConfig, RenderConfig, SeedConfig
-from sigmasplat.fit.target import Target
+from sigmasplat.config import Config, DensifyConfig, MappingConfig, RenderConfig, SeedConfig
+from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import COLUMNS
 from sigmasplat.model.frame import Frame
 from sigmasplat.render.reference.view import ReferenceView
 from sigmasplat.slam.mapper import Mapper
+from sigmasplat.slam.rules import never
 from sigmasplat.types import completed
 
 CAMERA = Camera(16, 12, 15.0, 15.0, 7.5, 5.5)
@@ -65,16 +66,61 @@ def test_what_the_map_explains_is_not_seeded_again() -> None:
     assert float(new[:, 2].max()) < 1.1 and float(new[:, 0].max()) < 0.0, "the object, and nothing else"
 
 
-def test_the_steps_of_the_first_keyframe_are_divided_where_asked() -> None:
-    made = mapper(mapping=replace(NO_FIT, iterations=2, first_iterations=7, first_divided=True))
-    assert len(made.map(view(), 0, target(), np.eye(4)).losses) == 2
-    taken = list[int]()
-    while made.owed:
-        completed(made.refining(view(), min(2, made.owed), lambda: False))
-        taken.append(made.field.steps)
-    assert taken == [4, 6, 7]
-    assert len(made.map(view(), 1, target(), np.eye(4)).losses) == 2
-    assert not made.owed  # only the first keyframe of a map has more steps
+DIVIDED = replace(NO_FIT, every=5, iterations=8, first_iterations=21, divided=True)
+
+
+def keyframe(index: int) -> Keyframe:
+    return Keyframe(index, target(), np.eye(4))
+
+
+def test_half_of_the_steps_of_a_keyframe_are_divided_over_the_next_frames_where_asked() -> None:
+    made, taken = mapper(mapping=DIVIDED), list[int]()
+
+    def frames(count: int) -> None:
+        for _ in range(count):
+            before = made.field.steps
+            completed(made.refining(view(), made.due, never))
+            taken.append(made.field.steps - before)
+
+    assert len(completed(made.mapping(view(), keyframe(0))).losses) == 4
+    frames(4)
+    assert taken == [8, 8, 1, 0]  # the second half of 8 steps, and the other 13 that only the first keyframe has
+    for index in (1, 2):
+        taken.clear()
+        assert len(completed(made.mapping(view(), keyframe(index))).losses) == 4
+        frames(5)
+        assert taken == [1, 1, 1, 1, 0]
+    assert made.field.steps == 21 + 2 * 8
+
+
+def test_a_keyframe_that_comes_early_finds_the_steps_of_the_one_before_made() -> None:
+    made = mapper(mapping=replace(DIVIDED, first_iterations=8))
+    completed(made.mapping(view(), keyframe(0)))
+    completed(made.refining(view(), made.due, never))
+    completed(made.mapping(view(), keyframe(1)))
+    assert (made.field.steps, made.owed) == (8 + 4, 4)
+    assert len(made.map(view(), 2, target(), np.eye(4)).losses) == 8 and made.field.steps == 8 + 8 + 8
+
+
+def test_splats_that_contradict_readings_are_removed_when_the_last_step_is_made() -> None:
+    """A wall that is seen at 1 m is an error if all readings say 2 m. It is faded at once and goes after the last step,
+    whether the steps are divided or not; what owns no pixel stays."""
+    seeding = replace(EVERY_PIXEL, opacity=0.95)
+    uncertain = DensifyConfig(uncertain_m2=0.025, faded_opacity=0.05)
+    fit = replace(NO_FIT, iterations=2, every=5, prune_opacity=0.01, lr_means=0.0, lr_opacity_logits=0.0)
+    counts = list[int]()
+    for divided in (False, True):
+        config = Config(seeding=seeding, mapping=replace(fit, divided=divided), primitives=uncertain)
+        made = Mapper(config, np.random.default_rng(0))
+        made.map(view(), 0, target(object_columns=16), np.eye(4))
+        near = len(made.field)
+        completed(made.mapping(view(), keyframe(1)))
+        if divided:
+            assert int((made.field.means[:, 2] < 1.5).sum()) == near
+            completed(made.refining(view(), made.owed, never))
+        counts.append(int((made.field.means[:, 2] < 1.5).sum()))
+        assert near == PIXELS and made.half is None
+    assert counts[0] == counts[1] < PIXELS / 4
 
 
 def test_faded_splats_are_pruned() -> None:

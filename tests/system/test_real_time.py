@@ -48,8 +48,8 @@ def error_m(system: RealTime) -> float:
     return float(ate(path, truth).rmse_m)
 
 
-FITTED = {"tracking__fit_depth": "true", "mapping__first_divided": "false"}
-"""Depth is fitted to the map, and a snapshot of the map does not contain the steps that the first keyframe owes."""
+FITTED = {"tracking__fit_depth": "true", "mapping__divided": "false"}
+"""Depth is fitted to the map, and a snapshot of the map does not contain the steps that keyframes are owed."""
 
 
 @pytest.mark.parametrize("more", [{}, FITTED], ids=["measured", "predicted"])

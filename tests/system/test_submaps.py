@@ -201,6 +201,24 @@ def test_a_successor_inherits_the_splats_in_view_unless_inherit_is_off() -> None
     assert len(slam.mapper.successor(slam.view, T_submap_camera).field) == 0
 
 
+@pytest.mark.parametrize("inherit", [True, False])
+def test_a_successor_that_inherits_splats_makes_the_second_half_of_the_steps(inherit: bool) -> None:
+    """No step is made twice or left out at a cut; without inheritance the first submap makes all of them."""
+    every = {"submaps__inherit": str(inherit).lower(), "mapping__first_iterations": "10", "loops__close": "false"}
+    slam, steps = Slam(settings(**every)), list[int]()
+    for frame in there_and_back()[:14]:
+        step = slam.step(frame)
+        steps.append(slam.mapper.field.steps)
+        if step.submap and step.is_keyframe:
+            assert slam.mapper.owed == 5
+    assert slam.mapper.owed == 0
+    cut = 10
+    if inherit:  # two keyframes of the first submap with 10 steps, and half of the third
+        assert steps[cut - 1 : cut + 4] == [20, 25, 27, 29, 30]
+    else:  # a new map with its own 10 steps
+        assert steps[cut - 1 : cut + 4] == [20, 5, 7, 9, 10]
+
+
 @pytest.mark.parametrize(
     ("steps", "expected"), [("0", [(0, 1), (1, 1)]), ("2", [(0, 2), (0, 2), (1, 2), (2, 2), (2, 2)])]
 )

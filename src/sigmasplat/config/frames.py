@@ -1,6 +1,7 @@
 """Settings of the work per frame: rendering, seeding, mapping, tracking."""
 
 from dataclasses import dataclass, replace
+from math import ceil
 from typing import Annotated, Literal
 
 from sigmasplat.config.ranges import Above0, AtLeastOne, Count, NotNegative, Range, Section, Share, WeightBound
@@ -114,10 +115,11 @@ class MappingConfig(Section, name="mapping"):
     first_iterations: Count = 100
     """Optimisation steps for the first keyframe of a map. Until about 150 steps, a new map renders surfaces too close,
     with `weight_mean_depth` until about 75."""
-    first_divided: bool = False
-    """Whether the steps of the first keyframe are divided: `iterations` of them at once, and as many, or a fifteenth of
-    `first_iterations` if this is more, at each of the next frames that are not mapped, until `first_iterations` are
-    made. The first frame then takes no longer than others."""
+    divided: bool = False
+    """Whether the steps of a keyframe are divided: the first half at once, the second half at the frames before the
+    next keyframe, so that no frame takes much longer than others. The second half does not move poses. The first
+    keyframe of a map has `iterations` of its steps in this way. The frames after them make as many each, or a
+    fifteenth of `first_iterations` if this is more, until `first_iterations` are made."""
     newest_probability: Share = 0.4
     """Probability that a step uses the newest keyframe; the other steps use older ones, drawn uniformly."""
     weight_l1: NotNegative = 0.8
@@ -200,8 +202,14 @@ class MappingConfig(Section, name="mapping"):
 
     @property
     def first_per_frame(self) -> int:
-        """Return how many steps of the first keyframe a later frame makes (`first_divided`)."""
+        """Return how many steps of the first keyframe a later frame makes (`divided`)."""
         return max(self.iterations, self.first_iterations // FIRST_FRAMES)
+
+    @property
+    def half_per_frame(self) -> int:
+        """Return how many steps of the second half of a keyframe a later frame makes (`divided`), so that they are
+        made before the next keyframe."""
+        return ceil((self.iterations - self.iterations // 2) / max(self.every - 1, 1))
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Store the Gaussians: one row per splat. Parameters and optimiser state are always edited together."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field as dataclass_field
+from dataclasses import dataclass, field as dataclass_field, replace
 
 import torch
 from torch import Tensor
@@ -237,6 +237,12 @@ class GaussianField(Rows):
         for part in (self, *self.attributes.values()):
             part.choose(rows)
         self.ids = self.ids[rows]
+
+    def part(self, rows: Tensor) -> "GaussianField":
+        """Return copies of the splats selected by a bool mask [N], with their ids and optimiser state."""
+        kept = replace(self, attributes={name: replace(attribute) for name, attribute in self.attributes.items()})
+        kept.keep(rows)
+        return kept if len(kept) < len(self) else self.copy_to(self.params.device)
 
     def moved(self, T_new_old: Tensor) -> "GaussianField":
         """Return the field moved by a rigid 4×4 transform: positions and rotations change, shapes and colours do not.

@@ -3,6 +3,7 @@
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field as dataclass_field
+from itertools import repeat
 
 import numpy as np
 import torch
@@ -24,7 +25,7 @@ from sigmasplat.render.view import View
 from sigmasplat.slam.densify import densify_mask, multiply, split, too_large
 from sigmasplat.slam.moving import carve, mask_keyframes
 from sigmasplat.slam.pruning import fade, splat_depth_residuals, splat_uncertainty, still_uncertain
-from sigmasplat.slam.rules import draw_keyframes
+from sigmasplat.slam.rules import draw_keyframes, never
 from sigmasplat.slam.seeding import first_pixels, later_pixels, make_splats, sureness, thin_out
 from sigmasplat.slam.window import choose_window, dominating
 from sigmasplat.types import Slices, completed
@@ -35,18 +36,43 @@ LEAST_SHARE = 1 / 3
 """Share of a keyframe's iterations that are made even if another keyframe waits."""
 
 
+@dataclass
+class SecondHalf:
+    """The second half of a keyframe's steps, as far as it is still to be made.
+
+    frozen_below: splats with ids below it keep their colours; faded: ids of the splats that are judged after it.
+    """
+
+    steps: int
+    frozen_below: int
+    faded: Tensor
+
+
 @dataclass(eq=False)
 class Mapper:
     """Owns the field and the keyframes of the active submap. Poses are in the submap's frame.
 
-    owed: the steps of the first keyframe that are still to be made (`mapping.first_divided`).
+    first_owed: the steps of the first keyframe that are still to be made (`mapping.divided`).
+    half: what is still to be made of the newest keyframe's second half (`mapping.divided`).
     """
 
     config: Config
     random: np.random.Generator
     field: GaussianField = dataclass_field(default_factory=GaussianField.empty)
     keyframes: list[Keyframe] = dataclass_field(default_factory=list)
-    owed: int = 0
+    first_owed: int = 0
+    half: SecondHalf | None = None
+
+    @property
+    def owed(self) -> int:
+        """Return how many steps are still to be made."""
+        return self.first_owed + (self.half.steps if self.half else 0)
+
+    @property
+    def due(self) -> int:
+        """Return how many of these steps the next frame makes, if it is not mapped."""
+        c = self.config.mapping
+        return min(self.owed, c.first_per_frame if self.first_owed else c.half_per_frame)
 
     def map(
         self,
@@ -62,24 +88,27 @@ class Mapper:
 
         The first keyframe of a submap that inherits splats is already mapped; it is only added to the list.
         """
-        return completed(
-            self.mapping(
-                view, Keyframe(index, target, T_world_camera, descriptor=descriptor, detail=detail, photo=photo)
-            )
-        )
+        keyframe = Keyframe(index, target, T_world_camera, descriptor=descriptor, detail=detail, photo=photo)
+        fit = completed(self.mapping(view, keyframe))
+        fit.join(completed(self._left_of_half(view, never)))
+        return fit
 
-    def mapping(self, view: View, newest: Keyframe, hurried: Callable[[], bool] = lambda: False) -> Slices[FieldFit]:
-        """Map a keyframe as `map` does, in slices of one iteration.
+    def mapping(self, view: View, newest: Keyframe, hurried: Callable[[], bool] = never) -> Slices[FieldFit]:
+        """Map a keyframe as `map` does, in slices of one iteration. With `mapping.divided` the second half of the
+        iterations is left to `refining`, and what `refining` has not made is made before the next keyframe.
 
         hurried: asked before each iteration; if it returns True, the rest of a part's iterations is left out after
         `LEAST_SHARE` of them.
         """
         self.field = self.field.to(view.sums.device)  # the active field stays on the view's device
-        c, first_new, begun = self.config.mapping, self.field.next_id, len(self.field) > 0
-        self._append(newest)
-        if begun and len(self.keyframes) == 1:
+        c, begun = self.config.mapping, len(self.field) > 0
+        if begun and not self.keyframes:
+            self._append(newest)
             self._note_visible(view)
             return FieldFit()
+        yield from self._left_of_half(view, hurried)
+        first_new = self.field.next_id
+        self._append(newest)
         self._leave_out_moving()
         self._seed(view, newest.target, newest.T_world_camera)
         yield
@@ -87,9 +116,9 @@ class Mapper:
             self.field.forget()
         steps = c.iterations if begun else c.first_iterations
         rates = iter([Rates.of(c)] * steps if begun else Rates.falling(c, steps))
-        if c.first_divided and not begun:
+        if c.divided and not begun:
             steps = min(c.iterations, steps)
-            self.owed = c.first_iterations - steps
+            self.first_owed = c.first_iterations - steps
         window = self._window(view)
         stats = DensifyStats.of(self.keyframes[-1], len(self.field), self.field.params.device)
         self._choose_movable(c.poses_from == "start")
@@ -98,13 +127,40 @@ class Mapper:
         self._densify(view, stats)
         self._prune(view)
         yield
-        faded = self._fade_uncertain(view, window)
+        self.half = SecondHalf(
+            steps - steps // 2, self._frozen_below(first_new, "end"), self._fade_uncertain(view, window)
+        )
         yield
-        self._choose_movable(True)
-        frozen_below = self._frozen_below(first_new, "end")
-        fit.join((yield from self._fit(view, window, steps - steps // 2, rates, frozen_below, None, hurried)))
-        self._prune(view, self._still_uncertain(view, window, faded))
+        if not c.divided:
+            self._choose_movable(True)
+            fit.join((yield from self._second_half(view, window, self.half, rates, hurried)))
         return fit
+
+    def _second_half(
+        self,
+        view: View,
+        window: list[Keyframe],
+        half: SecondHalf,
+        rates: Iterator[Rates],
+        hurried: Callable[[], bool],
+        at_most: int | None = None,
+    ) -> Slices[FieldFit]:
+        """Make the steps of the second half that are left, or some of them; after the last one, prune."""
+        steps, share = (half.steps, LEAST_SHARE) if at_most is None else (min(at_most, half.steps), 0.0)
+        fit = yield from self._fit(view, window, steps, rates, half.frozen_below, None, hurried, share)
+        half.steps -= len(fit.losses)
+        if at_most is None or not half.steps:
+            self._prune(view, self._still_uncertain(view, window, half.faded))
+            self.half = None
+        return fit
+
+    def _left_of_half(self, view: View, hurried: Callable[[], bool], at_most: int | None = None) -> Slices[FieldFit]:
+        """Make steps that are left of the second half, if there is one; the keyframes keep their poses."""
+        if self.half is None:
+            return FieldFit()
+        self._choose_movable(False)
+        rates = repeat(Rates.of(self.config.mapping))
+        return (yield from self._second_half(view, self._window(view), self.half, rates, hurried, at_most))
 
     def add(self, view: View, keyframe: Keyframe) -> None:
         """Add a keyframe and seed splats at it, without fitting them. The submap must have a keyframe."""
@@ -116,10 +172,13 @@ class Mapper:
     def refining(self, view: View, steps: int, hurried: Callable[[], bool]) -> Slices[None]:
         """Fit the map to its keyframes for more steps, in slices of one, until `hurried` returns True; the keyframes
         keep their poses. Steps that are owed count as made."""
+        steps -= len((yield from self._left_of_half(view, hurried, steps)).losses)
+        if not steps:
+            return
         self._choose_movable(False)
-        rates = iter([Rates.of(self.config.mapping)] * steps)
+        rates = repeat(Rates.of(self.config.mapping))
         for _ in self._fit(view, self._window(view), steps, rates, 0, None, hurried, least_share=0.0):
-            self.owed = max(self.owed - 1, 0)
+            self.first_owed = max(self.first_owed - 1, 0)
             yield
 
     def _append(self, keyframe: Keyframe) -> None:
@@ -203,8 +262,8 @@ class Mapper:
         if self.config.submaps.inherit:
             T_new_old = se3.inverse(T_submap_camera)
             view.forward(self.field.params, T_new_old)
-            field = self.field.moved(torch.from_numpy(T_new_old))
-            field.keep(view.visible(len(field)).to(field.params.device))
+            seen = view.visible(len(self.field)).to(self.field.params.device)
+            field = self.field.part(seen).moved(torch.from_numpy(T_new_old))
         return Mapper(self.config, self.random, field)
 
     def _seed(self, view: View, target: Target, T_world_camera: NDArray[np.float64]) -> None:

@@ -57,11 +57,12 @@ class MapWork(World):
         self.mapper.add(self.view, self._keyframe(seen, index, T_submap_camera))
         return self._placed(index, hop)
 
-    def refining(self, at_most: int, hurried: Callable[[], bool] = never) -> Slices[None]:
-        """Make steps of the active submap's first keyframe that are owed, in slices, until `hurried` returns True."""
-        if self.mapper.owed:
+    def refining(self, steps: int, hurried: Callable[[], bool] = never) -> Slices[None]:
+        """Make so many of the steps that the active submap's keyframes are owed, in slices, until `hurried` returns
+        True."""
+        if steps:
             with self._timer.stage("map"):
-                yield from self.mapper.refining(self.view, min(at_most, self.mapper.owed), hurried)
+                yield from self.mapper.refining(self.view, steps, hurried)
 
     def _keyframe(self, seen: Observation, index: int, T_submap_camera: Matrix) -> Keyframe:
         frame = seen.frame
@@ -99,8 +100,13 @@ class MapWork(World):
         return bool(ends_submap(T_submap_camera, since, moved_m, self.config.submaps, self.drift.variance_sum))
 
     def cut(self, T_submap_camera: Matrix, hurried: Callable[[], bool] = never) -> Slices[None]:
-        """Finish the active submap (`finish_submap`) and start the next one at its newest keyframe, in slices."""
-        return self.branch(len(self.store), T_submap_camera, self.drift.information, self.mapper.field, hurried)
+        """Finish the active submap (`finish_submap`) and start the next one at its newest keyframe, in slices. The next
+        one inherits what is left of this keyframe's steps, if it inherits splats."""
+        inherited = None
+        if self.config.submaps.inherit:
+            inherited, self.mapper.half = self.mapper.half, None
+        yield from self.branch(len(self.store), T_submap_camera, self.drift.information, self.mapper.field, hurried)
+        self.mapper.half = inherited
 
     def branch(
         self,
@@ -156,8 +162,7 @@ class MapWork(World):
 
     def finish_submap(self, hurried: Callable[[], bool] = never) -> Slices[None]:
         """Move the active submap to the store, in slices, and look for its loops, or leave that to the next frames
-        (`loops.slices_per_frame`). Steps of its first keyframe that are still owed are made before, unless `hurried`
-        returns True."""
+        (`loops.slices_per_frame`). Steps that are still owed are made before, unless `hurried` returns True."""
         yield from self.refining(self.mapper.owed, hurried)
         submap, pictures = self.mapper.finished(len(self.store))
         submap, probes = self.probes.of(submap)

@@ -60,7 +60,7 @@ class Slam(MapWork, ArrayInterface):
             completed(self.seek_component(seen, found.T_submap_camera))
         else:
             self._offer_probe(seen, found)
-            completed(self.refining(self.config.mapping.first_per_frame))
+            completed(self.refining(self.mapper.due))
             self._look_for_loops()
         self.atlas.place_frame(found.T_submap_camera)
         self.steps.append(self._step_result(seen.frame, found, self.closer.loops[loops_before:]))

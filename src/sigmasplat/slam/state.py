@@ -32,7 +32,7 @@ from sigmasplat.slam.loop_closure.closer import LoopCloser, OwedSearch
 from sigmasplat.slam.loop_closure.described_submaps import DescribedSubmaps
 from sigmasplat.slam.loop_closure.edges import Edges
 from sigmasplat.slam.loop_closure.loops import Loop, Loops
-from sigmasplat.slam.mapper import Mapper
+from sigmasplat.slam.mapper import Mapper, SecondHalf
 from sigmasplat.slam.probes import Probe, Probes
 from sigmasplat.slam.slam import Slam
 from sigmasplat.slam.step_result import Step
@@ -42,8 +42,8 @@ from sigmasplat.slam.tracker import Tracker
 CLASSES: tuple[type, ...] = (
     Atlas, Camera, Column, Confidence, DepthFit, DepthShape, DescribedSubmaps, Detail, Drift, Edges, FeatureImage,
     Foreground, GaussianField, Keyframe, KeyframePoses, Link, Loop, LoopCloser, Loops, Mapper, Memory, OwedSearch,
-    Photo, Picture, Places, PosePrior, Poses, Probe, Probes, Pyramid, Recovery, Reference, Relocaliser, Rows, Seen,
-    SeenKeyframe, Step, Steps, Target, TrackedHops, Tracker, Usual, VectorAdam, Watch,
+    Photo, Picture, Places, PosePrior, Poses, Probe, Probes, Pyramid, Recovery, Reference, Relocaliser, Rows,
+    SecondHalf, Seen, SeenKeyframe, Step, Steps, Target, TrackedHops, Tracker, Usual, VectorAdam, Watch,
 )  # fmt: skip
 """The classes that a state may contain."""
 

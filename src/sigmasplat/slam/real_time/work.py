@@ -90,7 +90,7 @@ class MapClock:
         self._place(each)
         if each.search is not None:
             yield from self._search(each, each.search)
-        yield from self.system.refining(self.system.config.mapping.first_per_frame, self._keyframe_waits)
+        yield from self.system.refining(self.system.mapper.due, self._keyframe_waits)
         yield from self.system.closing(self.system.config.loops.slices_per_frame)
 
     def _place(self, each: TrackedFrame) -> None:
