@@ -1,10 +1,14 @@
 """Submaps on disk: they are read back bit for bit and in parts, and damage is reported in one line."""
 
+import errno
 import gc
 import json
+import os
+import threading
 import tracemalloc
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,8 +22,11 @@ from sigmasplat.io.tensors import open_tensors, write_tensors
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import ATTRIBUTES, GaussianField, Rows
-from sigmasplat.model.frame import Detail
+from sigmasplat.model.frame import Detail, Frame
 from sigmasplat.model.submap import MemoryStore, Picture, Submap, SubmapStore
+from sigmasplat.slam.slam import Slam
+from sigmasplat.slam.state import state_of
+from sigmasplat.types import completed
 
 CAMERA = Camera(8, 6, 7.25, 7.5, 3.5 + 1 / 3, 2.5)
 
@@ -349,3 +356,63 @@ def test_tensors_and_text_are_read_back_whatever_the_text(tmp_path: Path) -> Non
     assert len(made) == 1
     with open_tensors(tmp_path / "a", "file") as file:
         assert file.metadata() == text and file.get_tensor("x").tolist() == [0.0, 1.0, 2.0]
+
+
+class SlowDisk:
+    """Files of tensors are written when `release` is called."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.free, real = threading.Event(), tensors.save_file
+
+        def late(*arguments: Any) -> None:
+            assert self.free.wait(30)
+            real(*arguments)
+
+        monkeypatch.setattr(tensors, "save_file", late)
+
+
+def test_in_the_background_a_submap_counts_at_once_and_reading_waits_for_it(
+    store: DiskStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    disk, background = SlowDisk(monkeypatch), store.in_background()
+    submap, pictures = some_submap(0)
+    background.save(submap, pictures)
+    assert len(background) == 1 and len(store) == 0
+    threading.Timer(0.1, disk.free.set).start()
+    assert_same(background.load(0), submap)
+    assert len(store) == 1 and np.array_equal(store.picture(0, 1).color, pictures[1].color)
+    background.save(*some_submap(1))
+    background.settle()
+    assert len(store) == len(background) == 2
+    background.truncate(1)
+    assert len(store) == len(background) == 1
+
+
+def test_a_full_disk_in_the_background_is_reported_by_whatever_comes_next(
+    store: DiskStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(_tensors: object, path: Path, _text: object) -> None:
+        path.write_text("half")
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    background = store.in_background()
+    background.save(*some_submap(0))
+    background.settle()
+    monkeypatch.setattr(tensors, "save_file", full)
+    background.save(*some_submap(1))
+    for next_one in (background.settle, lambda: background.load(0), lambda: background.save(*some_submap(2))):
+        with pytest.raises(RunError, match=r"cannot write .*submap-00001.*No space left") as caught:
+            next_one()
+        assert "\n" not in str(caught.value)
+    assert [path.name for path in store.folder.iterdir()] == ["submap-00000.safetensors"]
+
+
+def test_a_state_waits_for_its_submaps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = DiskStore(tmp_path)
+    slam = Slam("sigma", store.in_background())
+    disk = SlowDisk(monkeypatch)
+    camera = Camera(32, 24, 30.0, 30.0, 15.5, 11.5)
+    slam.step(Frame(0, 0.0, np.full((24, 32, 3), 0.5, np.float32), np.full((24, 32), 2.0, np.float32), camera))
+    completed(slam.finish_submap())
+    threading.Timer(0.1, disk.free.set).start()
+    assert len(store) == 0 and state_of(slam)["submaps"] == 1 and len(store) == 1

@@ -80,7 +80,7 @@ def _started(job: Job, folder: Path, source: Source, config: Config, path: str) 
             run.note(status="running", source_path=path)
             return run, start
     run = new_folder(folder, config, source, overwrite=True, source_path=path, batch=job.facts())
-    return run, StartPoint(Slam(config, run.submaps))
+    return run, StartPoint(Slam(config, run.submaps.in_background()))
 
 
 def _end_with_parent() -> None:

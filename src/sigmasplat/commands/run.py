@@ -113,7 +113,9 @@ def run(
     ):
         _announce(screen, config.name, source, folder, record)
         prepare_torch()
-        slam = continue_map(earlier, config, source, folder) if earlier else Slam(config, folder.submaps)
+        slam = (
+            continue_map(earlier, config, source, folder) if earlier else Slam(config, folder.submaps.in_background())
+        )
         at_once = realtime or (source.live and config.realtime.live)
         return _run_and_score(screen, StartPoint(slam), source, folder, run_options, viewer, robot_options, at_once)
 

@@ -3,6 +3,7 @@
 import json
 import re
 from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -30,26 +31,39 @@ class DiskStore:
 
     The folder is created with the first submap. Images are read one at a time, so that memory does not grow with their
     number. Adam's state is not stored, because a finished submap is not optimised.
+
+    in_background: see the method of that name.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, in_background: bool = False) -> None:
         self.folder = folder
         self._count = 0
         """Number of submaps when they were last counted."""
+        self._writer = ThreadPoolExecutor(1, "submaps") if in_background else None
+        self._written: Future[None] | None = None
 
     def __len__(self) -> int:
-        count = self._count
+        count, written = self._count, self._written
+        if written is not None and not (written.done() and written.exception() is None):
+            return count
         # To count is to list the folder. Two files show whether submaps were added or removed since then.
         if not count or not self.path(count - 1).is_file() or self.path(count).is_file():
             self._count = len(self._named(OURS))
         return self._count
+
+    def in_background(self) -> "DiskStore":
+        """Return the store of this folder for a run that adds submaps: `save` does not wait until the file is on the
+        disk. What reads that store waits for it; call `settle` before the folder is read otherwise."""
+        return DiskStore(self.folder, in_background=True)
 
     def path(self, index: int) -> Path:
         """Return the path of a submap's file."""
         return self.folder / f"submap-{index:05d}.safetensors"
 
     def save(self, submap: Submap, pictures: list[Picture], probes: Sequence[Picture] = ()) -> None:
-        """Write a submap. Raises SigmaSplatError if it is inconsistent, RunError if it cannot be written."""
+        """Write a submap. Raises SigmaSplatError if it is inconsistent, RunError if it or the one before cannot be
+        written."""
+        self.settle()
         refuse_misfit(submap, pictures, len(self), probes)
         tensors = {
             "params": submap.field.params,
@@ -77,7 +91,16 @@ class DiskStore:
             tensors["photos"] = torch.from_numpy(np.concatenate([photo.jpeg for photo in photos]))
             tensors["photo_ends"] = torch.tensor([len(photo.jpeg) for photo in photos]).cumsum(0)
             text["photo_camera"] = json.dumps(asdict(photos[0].camera))
-        write_tensors(self.path(submap.index), tensors, text)
+        if self._writer is None:
+            write_tensors(self.path(submap.index), tensors, text)
+        else:
+            self._written = self._writer.submit(write_tensors, self.path(submap.index), tensors, text)
+            self._count = submap.index + 1
+
+    def settle(self) -> None:
+        """Wait until what was saved is on the disk. Raises RunError if it cannot be written."""
+        if self._written is not None:
+            self._written.result()
 
     def load(self, index: int) -> Submap:
         """Read a submap without its images. Raises RunError if it is missing or damaged."""
@@ -110,11 +133,13 @@ class DiskStore:
 
     def truncate(self, count: int) -> None:
         """Remove all submaps except the first `count`, and incomplete files."""
+        self.settle()
         for path in [self.path(index) for index in range(count, len(self))] + self._named(UNFINISHED):
             path.unlink(missing_ok=True)
 
     def clear(self) -> None:
         """Remove all submaps and incomplete files, and the folder if it is then empty; other files are kept."""
+        self.settle()
         for path in self._named(OURS) + self._named(UNFINISHED):
             path.unlink()
         if self.folder.is_dir() and not any(self.folder.iterdir()):
@@ -127,6 +152,7 @@ class DiskStore:
 
     @contextmanager
     def _opened(self, index: int) -> Iterator[Any]:
+        self.settle()
         path = self.path(index)
         if not path.is_file():
             raise RunError(f"no submap {index} in {self.folder}: {path.name} is missing; run it again")

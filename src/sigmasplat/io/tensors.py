@@ -1,7 +1,6 @@
 """Write and read named tensors with text metadata (safetensors), completely or not at all."""
 
 import json
-import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,6 +21,9 @@ ERRORS: tuple[type[Exception], ...] = (SafetensorError, *DAMAGED)
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], text: dict[str, str]) -> None:
     """Write a file atomically. Raises RunError if it cannot be written."""
     with replacing(path) as temporary:
+        temporary.unlink(missing_ok=True)
+        temporary.touch()  # safetensors makes the file readable only for its owner; this one has the usual permissions
+        permissions = temporary.stat().st_mode
         try:
             # safetensors.torch would keep some kB for each new size of a tensor: numpy.ctypeslib makes a type for it.
             arrays = {name: tensor.detach().cpu().contiguous().numpy() for name, tensor in tensors.items()}
@@ -30,7 +32,7 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], text: dict[str, str
                 _sort_metadata(temporary)
         except SafetensorError as problem:  # also raised if the disk is full
             raise RunError(f"cannot write {path}: {problem}; choose a writable place") from problem
-        temporary.chmod(0o666 & ~_umask())  # safetensors makes the file readable only for its owner
+        temporary.chmod(permissions)
 
 
 @contextmanager
@@ -59,9 +61,3 @@ def _sort_metadata(path: Path) -> None:
         if len(text) <= size:  # the header is padded with spaces
             file.seek(8)
             file.write(text.ljust(size))
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask

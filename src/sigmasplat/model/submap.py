@@ -87,6 +87,9 @@ class OnDisk(Protocol):
 
     folder: Path
 
+    def settle(self) -> None:
+        """Wait until what was saved is on the disk."""
+
 
 @dataclass(eq=False)
 class MemoryStore:

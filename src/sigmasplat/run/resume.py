@@ -116,7 +116,7 @@ def resume(run: RunFolder, source: Source) -> StartPoint:
     refuse_other_sequence(run, source)
     run.remove_leftovers()
     config = run.config()
-    slam = Slam(config, run.submaps)
+    slam = Slam(config, run.submaps.in_background())
     camera = source.camera.prepared(config.input.width, config.input.crop_px)
     onto = "onto" in run.facts() and len(run.submaps)
     slam.prepare(run.submaps.load(0).camera if onto else camera, resample=bool(onto))

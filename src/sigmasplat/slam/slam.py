@@ -81,6 +81,7 @@ class Slam(MapWork, ArrayInterface):
         total = max(1, steps + measures * self.atlas.keyframe_poses.total)
         progress(0, total)
         completed(self.finish_submap())
+        self.settle()
         completed(self.closing())
         self._connect_components()
         self.closer.solve_all(self.atlas)

@@ -65,7 +65,9 @@ def fixed(slam: Slam) -> dict[str, Any]:
 
 
 def state_of(slam: Slam) -> dict[str, Any]:
-    """Return the state; write it before the next step. At least one frame must have been processed."""
+    """Return the state, when its submaps are on the disk; write it before the next step. At least one frame must have
+    been processed."""
+    slam.settle()
     remembered = {name: getattr(slam, name) for name in REMEMBERED}
     return {"numbers": slam.random.bit_generator.state, "submaps": len(slam.store)} | remembered
 

@@ -207,8 +207,10 @@ class World:
         return self._timer
 
     def settle(self) -> None:
-        """Finish the work on all frames so far. Nothing is left to do: `step` does all work on its frame, and the next
-        frames, or `finish`, do what it owes."""
+        """Wait until finished submaps are on the disk. `step` does all other work on its frame, and the next frames, or
+        `finish`, do what it owes. Raises RunError if a submap cannot be written."""
+        if isinstance(self.store, OnDisk):
+            self.store.settle()
 
     @property
     def cuts(self) -> bool:

@@ -169,6 +169,7 @@ class RealTime(ArrayInterface):
             set_kernel_threads(self._threads)
             self._adopt()
             self._give_back(self._camera.copied())
+        self.slam.settle()
         self._events.add(*self._map.unreported())  # the last frames may have closed loops
         self._events.tell(self.listeners)
 
