@@ -170,3 +170,10 @@ def test_a_keyframe_forgets_adams_moments_where_asked() -> None:
         assert made.field.steps == 3 and bool(made.field.moment2.any())
         made.map(view(), 1, target(), np.eye(4))
         assert bool(made.field.moment2.any()) == (not fresh) and made.field.steps == (0 if fresh else 3)
+
+
+def test_a_keyframe_whose_pose_mapping_moves_is_not_divided() -> None:
+    """Frames are tracked from its pose at once, so it must be final."""
+    made = mapper(mapping=replace(DIVIDED, first_iterations=0, iterations=4, lr_pose_translation=1e-3))
+    completed(made.mapping(view(), keyframe(0)))
+    assert len(completed(made.mapping(view(), keyframe(1))).losses) == 4 and made.owed == 0

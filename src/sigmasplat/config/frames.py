@@ -117,9 +117,10 @@ class MappingConfig(Section, name="mapping"):
     with `weight_mean_depth` until about 75."""
     divided: bool = False
     """Whether the steps of a keyframe are divided: the first half at once, the second half at the frames before the
-    next keyframe, so that no frame takes much longer than others. The second half does not move poses. The first
-    keyframe of a map has `iterations` of its steps in this way. The frames after them make as many each, or a
-    fifteenth of `first_iterations` if this is more, until `first_iterations` are made."""
+    next keyframe, so that no frame takes much longer than others. If mapping moves poses (`lr_pose_*`), all are made at
+    once: the next frames are tracked from these poses. The first keyframe of a map begins with `iterations` steps.
+    The frames after them make as many each, or a fifteenth of `first_iterations` if this is more, until
+    `first_iterations` are made."""
     newest_probability: Share = 0.4
     """Probability that a step uses the newest keyframe; the other steps use older ones, drawn uniformly."""
     weight_l1: NotNegative = 0.8
@@ -204,6 +205,11 @@ class MappingConfig(Section, name="mapping"):
     def first_per_frame(self) -> int:
         """Return how many steps of the first keyframe a later frame makes (`divided`)."""
         return max(self.iterations, self.first_iterations // FIRST_FRAMES)
+
+    @property
+    def in_halves(self) -> bool:
+        """Return whether the second half of a keyframe's steps is left to the next frames (`divided`)."""
+        return self.divided and not (self.lr_pose_translation or self.lr_pose_rotation)
 
     @property
     def half_per_frame(self) -> int:

@@ -94,8 +94,8 @@ class Mapper:
         return fit
 
     def mapping(self, view: View, newest: Keyframe, hurried: Callable[[], bool] = never) -> Slices[FieldFit]:
-        """Map a keyframe as `map` does, in slices of one iteration. With `mapping.divided` the second half of the
-        iterations is left to `refining`, and what `refining` has not made is made before the next keyframe.
+        """Map a keyframe as `map` does, in slices of one iteration. With `mapping.in_halves` the second half of
+        the iterations is left to `refining`, and what `refining` has not made is made before the next keyframe.
 
         hurried: asked before each iteration; if it returns True, the rest of a part's iterations is left out after
         `LEAST_SHARE` of them.
@@ -131,7 +131,7 @@ class Mapper:
             steps - steps // 2, self._frozen_below(first_new, "end"), self._fade_uncertain(view, window)
         )
         yield
-        if not c.divided:
+        if not c.in_halves:
             self._choose_movable(True)
             fit.join((yield from self._second_half(view, window, self.half, rates, hurried)))
         return fit
@@ -155,10 +155,9 @@ class Mapper:
         return fit
 
     def _left_of_half(self, view: View, hurried: Callable[[], bool], at_most: int | None = None) -> Slices[FieldFit]:
-        """Make steps that are left of the second half, if there is one; the keyframes keep their poses."""
+        """Make steps that are left of the second half, if there is one."""
         if self.half is None:
             return FieldFit()
-        self._choose_movable(False)
         rates = repeat(Rates.of(self.config.mapping))
         return (yield from self._second_half(view, self._window(view), self.half, rates, hurried, at_most))
 
