@@ -8,7 +8,6 @@ example: python benchmarks/pace.py --before ../before/.venv/bin/sigmasplat --seq
 """
 
 import json
-import os
 import shlex
 import subprocess
 import sys
@@ -60,8 +59,7 @@ def measured_run(code: str, sequence: str, options: Options, folder: Path) -> di
     words += ["--no-eval", *(["--limit", str(options.limit)] if options.limit else [])]
     words += [word for setting in options.settings for word in ("--set", setting)]
     print(shlex.join(words), file=sys.stderr, flush=True)
-    hidden = () if code == "now" else ("PYTHONPATH",)  # with it, the other program could run this checkout's code
-    environment = {name: value for name, value in os.environ.items() if name not in hidden}
+    environment = program.environment_of(other=code != "now")
     ended = subprocess.run(words, capture_output=True, text=True, env=environment)
     if ended.returncode:
         raise ValueError(f"{code}: {sequence}: {(ended.stderr.strip().splitlines() or ['no message'])[-1]}")

@@ -1,5 +1,6 @@
 """Start a benchmark: parse its options, measure, write the results, print their tables."""
 
+import os
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
@@ -19,6 +20,12 @@ NOT_RECORDED = ("runs", "out", "fresh", "quick", "scratch", "other", "collect", 
 def start(main: Callable[[Options], int], options: type[Options], description: str | None = None) -> NoReturn:
     """Parse the command line, run `main`, exit with its code."""
     sys.exit(main(tyro.cli(options, description=description, config=(tyro.conf.FlagCreatePairsOff,))))
+
+
+def environment_of(other: bool) -> dict[str, str]:
+    """Return the environment of a command of this checkout, or of another one, which must not find modules of this
+    one."""
+    return {name: value for name, value in os.environ.items() if not (other and name == "PYTHONPATH")}
 
 
 def refuse(benchmark: str, problem: Exception) -> int:

@@ -9,7 +9,6 @@ example: python benchmarks/robustness.py --sequences livingroom --disturbances b
 """
 
 import json
-import os
 import shlex
 import shutil
 import subprocess
@@ -159,10 +158,8 @@ def perform(job: Job, from_: Original, folder: Path, keep: Path | None = None) -
 
 
 def call(words: Sequence[str], other: bool) -> str | None:
-    """Run a command with one thread; return its last line if it failed. Another checkout finds its own modules only."""
-    environment = os.environ | {"SIGMASPLAT_THREADS": "1", "OMP_NUM_THREADS": "1"}
-    if other:
-        environment.pop("PYTHONPATH", None)
+    """Run a command of this or another checkout with one thread; return its last line if it failed."""
+    environment = program.environment_of(other) | {"SIGMASPLAT_THREADS": "1", "OMP_NUM_THREADS": "1"}
     try:
         ended = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=TIMEOUT_S)
     except (OSError, subprocess.TimeoutExpired) as problem:

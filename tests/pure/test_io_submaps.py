@@ -359,7 +359,7 @@ def test_tensors_and_text_are_read_back_whatever_the_text(tmp_path: Path) -> Non
 
 
 class SlowDisk:
-    """Files of tensors are written when `release` is called."""
+    """Files of tensors are not written before `free` is set."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.free, real = threading.Event(), tensors.save_file

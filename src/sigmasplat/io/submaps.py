@@ -32,7 +32,7 @@ class DiskStore:
     The folder is created with the first submap. Images are read one at a time, so that memory does not grow with their
     number. Adam's state is not stored, because a finished submap is not optimised.
 
-    in_background: see the method of that name.
+    in_background: whether a thread writes the files (`DiskStore.in_background`).
     """
 
     def __init__(self, folder: Path, in_background: bool = False) -> None:
@@ -45,7 +45,7 @@ class DiskStore:
     def __len__(self) -> int:
         count, written = self._count, self._written
         if written is not None and not (written.done() and written.exception() is None):
-            return count
+            return count  # the newest file is not there yet, or could not be written
         # To count is to list the folder. Two files show whether submaps were added or removed since then.
         if not count or not self.path(count - 1).is_file() or self.path(count).is_file():
             self._count = len(self._named(OURS))

@@ -21,8 +21,9 @@ ERRORS: tuple[type[Exception], ...] = (SafetensorError, *DAMAGED)
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], text: dict[str, str]) -> None:
     """Write a file atomically. Raises RunError if it cannot be written."""
     with replacing(path) as temporary:
+        # safetensors makes a file that only its owner can read; a new file of ours has the usual permissions.
         temporary.unlink(missing_ok=True)
-        temporary.touch()  # safetensors makes the file readable only for its owner; this one has the usual permissions
+        temporary.touch()
         permissions = temporary.stat().st_mode
         try:
             # safetensors.torch would keep some kB for each new size of a tensor: numpy.ctypeslib makes a type for it.

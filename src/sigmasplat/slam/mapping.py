@@ -58,7 +58,7 @@ class MapWork(World):
         return self._placed(index, hop)
 
     def refining(self, steps: int, hurried: Callable[[], bool] = never) -> Slices[None]:
-        """Make so many of the steps that the active submap's keyframes are owed, in slices, until `hurried` returns
+        """Make this many of the steps that the active submap's keyframes are owed, in slices, until `hurried` returns
         True."""
         if steps:
             with self._timer.stage("map"):
@@ -100,8 +100,8 @@ class MapWork(World):
         return bool(ends_submap(T_submap_camera, since, moved_m, self.config.submaps, self.drift.variance_sum))
 
     def cut(self, T_submap_camera: Matrix, hurried: Callable[[], bool] = never) -> Slices[None]:
-        """Finish the active submap (`finish_submap`) and start the next one at its newest keyframe, in slices. The next
-        one inherits what is left of this keyframe's steps, if it inherits splats."""
+        """Finish the active submap (`finish_submap`) and start the next one at its newest keyframe, in slices. A next
+        submap that inherits splats also makes the steps that this keyframe is still owed."""
         inherited = None
         if self.config.submaps.inherit:
             inherited, self.mapper.half = self.mapper.half, None
