@@ -14,7 +14,7 @@ from sigmasplat.fit.target import Target
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import COLUMNS, GaussianField
-from sigmasplat.model.submap import MemoryStore, Submap
+from sigmasplat.model.submap import MemoryStore, Picture, Submap
 from sigmasplat.render.backend import make_view
 from sigmasplat.slam.drift import floor
 from sigmasplat.slam.features import Extractor, Features, make_extractor
@@ -54,16 +54,32 @@ def piece(store: MemoryStore, frames: Sequence[int], brighter: float = 1.0) -> S
 
 
 def registered(
-    a: Sequence[int], b: Sequence[int], error: Matrix, brighter: float = 1.0, config: Config = CONFIG
+    a: Sequence[int],
+    b: Sequence[int],
+    error: Matrix,
+    brighter: float = 1.0,
+    config: Config = CONFIG,
+    unread: tuple[slice, slice] | None = None,
 ) -> tuple[Registration, Matrix]:
-    """Register submaps of frames a and b, told a T_a_b that is wrong by `error`; return the verdict and the truth."""
+    """Register submaps of frames a and b, told a T_a_b that is wrong by `error`; return the verdict and the truth.
+
+    unread: columns without readings in the recorded images of each submap; its map has all splats.
+    """
     store = MemoryStore()
     ours, theirs = piece(store, a), piece(store, b, brighter)
+    for pictures, columns in zip(store.pictures, unread or (), strict=False):
+        pictures[:] = [_without_readings(picture, columns) for picture in pictures]
     truth = walk().truth().T_world_camera
     T_a_b = se3.inverse(truth[a[0]]) @ truth[b[0]]
     pair = SubmapPair(Candidate(0, 0, 1, 0, 1.0, 1.0), (0, 1), (0, 1))
     view = make_view("cpu", walk().camera, RenderConfig())
     return completed(Registrar(config, store, view).register(pair, ours, theirs, error @ T_a_b)), T_a_b
+
+
+def _without_readings(picture: Picture, columns: slice) -> Picture:
+    depth_m = picture.depth_m.copy()
+    depth_m[:, columns] = 0.0
+    return replace(picture, depth_m=depth_m)
 
 
 def off(found: Matrix, truth: Matrix) -> tuple[float, float]:
@@ -118,6 +134,19 @@ def test_the_images_that_submaps_render_register_them_without_the_recorded_ones(
     assert found.accepted, found.reason
     metres, degrees = off(found.T_a_b, truth)
     assert metres < 0.01 and degrees < 0.3
+
+
+def test_a_loop_that_maps_show_but_no_recorded_image_is_refused() -> None:
+    """The images of one submap have readings on the left, those of the other one on the right."""
+    error = se3.exp(np.array([0.02, -0.01, 0.01, 0.01, 0.01, -0.01]))
+    to_keyframe = CONFIG.changed(registration={"to_keyframe": True})
+    halves = slice(0, 75), slice(85, 160)
+    by_maps, _ = registered((0, 5), (3, 8), error, unread=halves)
+    by_images, truth = registered((0, 5), (3, 8), error, config=to_keyframe, unread=halves)
+    assert by_maps.accepted
+    assert not by_images.accepted and "no image does" in by_images.reason
+    whole, truth = registered((0, 5), (3, 8), error, config=to_keyframe, unread=(slice(0, 75), slice(0, 75)))
+    assert whole.accepted and off(whole.T_a_b, truth)[0] < 0.005
 
 
 def test_a_submap_whose_splats_are_too_near_does_not_bias_the_pose_relative_to_its_keyframes(

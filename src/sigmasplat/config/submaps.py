@@ -106,7 +106,8 @@ class RegistrationConfig(Section, name="registration"):
     renders at its pose (VarSplat's code for ScanNet)."""
     to_keyframe: bool = False
     """Whether a localised keyframe is finally aligned to the recorded image of the other submap's nearest keyframe
-    (ours): the surfaces of a young map are biased; off = its pose relative to the map is used (paper)."""
+    (ours): the surfaces of a young map are biased. A loop that only the maps show is rejected. off = the pose relative
+    to the map is used (paper)."""
     exposure: bool = True
     """Whether a factor and an offset of the colour are fitted too, because submaps may differ in exposure."""
     weight_color: Share = 0.95

@@ -45,7 +45,8 @@ OPAQUE = 0.95
 class Localisation:
     """A keyframe's pose in the other submap, expressed as T_a_b [4, 4] between the submaps; residual: the final loss;
     covariance [6, 6] of T_a_b's left twist (m, rad); agreement and overlap as in `PoseFit`; comparison: with the other
-    map rendered at the pose, None if it was not made."""
+    map rendered at the pose, None if it was not made; at_keyframe: whether a recorded image of the other submap gave
+    the pose, not its map."""
 
     T_a_b: Matrix
     residual: float
@@ -53,6 +54,7 @@ class Localisation:
     agreement: float
     overlap: float
     comparison: Comparison | None = None
+    at_keyframe: bool = False
 
 
 class WeighedMap(NamedTuple):
@@ -124,29 +126,32 @@ class Registrar:
         if max(map(score, fits)) < DOUBTFUL:
             by_features = yield from self.by_features.of(own, keyframe, other, alike)
             fits += yield from self._all_aligned(other_map, live, by_features)
-        fit = yield from self._refined(other, other_map, target, live, max(fits, key=score))
+        fit, at_keyframe = yield from self._refined(other, other_map, target, live, max(fits, key=score))
         A = se3.adjoint(T_own_camera)
         covariance, comparison = self._checked(other_map, live, fit.T_camera_world)
-        T_own_other = T_own_camera @ fit.T_camera_world
-        return Localisation(T_own_other, fit.loss, A @ covariance @ A.T, fit.agreement, fit.overlap, comparison)
+        T_own_other, covariance = T_own_camera @ fit.T_camera_world, A @ covariance @ A.T
+        return Localisation(T_own_other, fit.loss, covariance, fit.agreement, fit.overlap, comparison, at_keyframe)
 
     def _refined(
         self, other: Submap, other_map: WeighedMap, target: Target, live: Pyramid, found: PoseFit
-    ) -> Slices[PoseFit]:
+    ) -> Slices[tuple[PoseFit, bool]]:
         """Refine a keyframe's pose in a submap, in slices: by alignment to the submap's nearest keyframe if that is
         wanted and gives a valid pose, else by `registration.iterations` of gradient descent on the uncertainty-weighted
-        loss with exposure. Descent takes ten times as long, and its result is only the guess of that alignment."""
+        loss with exposure. Descent takes ten times as long, and its result is only the guess of that alignment.
+
+        Returns the pose, and whether the submap's keyframe gave it."""
         at_keyframe = self._at_keyframe(other, target, live, found)
         yield
         if at_keyframe is not None:
-            return at_keyframe
+            return at_keyframe, True
         steps, hopeless = self.config.iterations, score(found) <= HOPELESS * self.config.share_least
         if found.alignment is not None and (hopeless or not steps):
-            return found
+            return found, False
         start = found.T_camera_world
         found = fit_pose_adam(other_map.params, self.view, target, start, self.tracking, steps)
         yield from long_slice()
-        return self._at_keyframe(other, target, live, found) or found
+        at_keyframe = self._at_keyframe(other, target, live, found)
+        return at_keyframe or found, at_keyframe is not None
 
     def _images_of(self, own: Submap, keyframe: int) -> tuple[Target, Pyramid]:
         """Return a keyframe's recorded image, or the one that its own submap renders at its pose."""
@@ -235,6 +240,10 @@ class Registrar:
         agreed = consensus(good, centre_b, c.spread_m, np.deg2rad(c.spread_deg))
         if len(agreed) < 2:
             return refused(T_a_b, good, len(agreed), f"the poses of {len(good)} keyframes disagree")
+        if c.to_keyframe and fits_of(self.view).aligns and not any(f.at_keyframe for f in agreed):
+            return refused(
+                T_a_b, agreed, len(agreed), f"only maps agree with {len(agreed)} keyframes, no image does"
+            )
         mean = combined(agreed)
         overlap = shared(a, b, mean, c.overlap_m)
         if overlap < c.overlap_least:
