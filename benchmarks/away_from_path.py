@@ -90,7 +90,9 @@ def finished_run(options: Options, code: str, command: list[str], seed: int) -> 
     if options.fresh or not facts.is_file() or json.loads(facts.read_text())["status"] != "complete":
         words = [*command, "run", ROOM.format(seed=seed), "--seed", str(seed), "--out", str(folder), "--overwrite"]
         words += [word for setting in options.settings for word in ("--set", setting)]
-        subprocess.run([*words, *(["--limit", str(options.limit)] if options.limit else [])], check=True)
+        environment = program.environment_of(other=code == "before")
+        words += ["--limit", str(options.limit)] if options.limit else []
+        subprocess.run(words, check=True, env=environment)
     return RunFolder.open(folder)
 
 

@@ -4,7 +4,7 @@ Sequences × seeds; each run is a process that scores itself, on views that are 
 sigmasplat of another checkout, which is measured beside this one. Finished runs are read, not repeated, unless --fresh.
 Writes benchmarks/results/<name>-<machine>.json and prints tables.
 
-example: python benchmarks/map_quality.py --before 'env -u PYTHONPATH ../before/.venv/bin/sigmasplat' --seeds 0
+example: python benchmarks/map_quality.py --before ../before/.venv/bin/sigmasplat --seeds 0
 """
 
 import json
@@ -111,7 +111,7 @@ def measured_run(job: Job, options: Options) -> dict[str, Any]:
     folder.mkdir(parents=True)
     figures: dict[str, Any] = {"sequence": Path(job.sequence).name, "seed": job.seed, "code": job.code}
     print(shlex.join(words), file=sys.stderr)
-    exit_code, peak = call(words, folder / "output.txt")
+    exit_code, peak = call(words, folder / "output.txt", other=job.code != "now")
     if exit_code:
         return figures | {"problem": (folder / "output.txt").read_text()[-500:]}
     figures |= figures_of(RunFolder(folder / "run")) | {"peak_rss_bytes": peak}
@@ -120,10 +120,12 @@ def measured_run(job: Job, options: Options) -> dict[str, Any]:
     return figures
 
 
-def call(words: Sequence[str], output: Path) -> tuple[int, int]:
-    """Run a command and write what it prints; return its exit code and its peak memory in bytes."""
+def call(words: Sequence[str], output: Path, other: bool = False) -> tuple[int, int]:
+    """Run a command, of another checkout or of this one, and write what it prints; return its exit code and its peak
+    memory in bytes."""
     with output.open("w") as file:
-        process = subprocess.Popen(words, stdout=file, stderr=subprocess.STDOUT)
+        environment = program.environment_of(other)
+        process = subprocess.Popen(words, stdout=file, stderr=subprocess.STDOUT, env=environment)
         _, status, usage = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)
     return process.returncode, 1024 * usage.ru_maxrss
