@@ -241,9 +241,7 @@ class Registrar:
         if len(agreed) < 2:
             return refused(T_a_b, good, len(agreed), f"the poses of {len(good)} keyframes disagree")
         if c.to_keyframe and fits_of(self.view).aligns and not any(f.at_keyframe for f in agreed):
-            return refused(
-                T_a_b, agreed, len(agreed), f"only maps agree with {len(agreed)} keyframes, no image does"
-            )
+            return refused(T_a_b, agreed, len(agreed), f"only maps agree with {len(agreed)} keyframes, no image does")
         mean = combined(agreed)
         overlap = shared(a, b, mean, c.overlap_m)
         if overlap < c.overlap_least:
