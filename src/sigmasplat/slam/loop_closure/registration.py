@@ -45,8 +45,7 @@ OPAQUE = 0.95
 class Localisation:
     """A keyframe's pose in the other submap, expressed as T_a_b [4, 4] between the submaps; residual: the final loss;
     covariance [6, 6] of T_a_b's left twist (m, rad); agreement and overlap as in `PoseFit`; comparison: with the other
-    map rendered at the pose, None if it was not made; at_keyframe: whether a recorded image of the other submap gave
-    the pose, not its map."""
+    map rendered at the pose, if it was made; at_keyframe: whether the other submap's recorded image gave the pose."""
 
     T_a_b: Matrix
     residual: float
@@ -137,9 +136,8 @@ class Registrar:
     ) -> Slices[tuple[PoseFit, bool]]:
         """Refine a keyframe's pose in a submap, in slices: by alignment to the submap's nearest keyframe if that is
         wanted and gives a valid pose, else by `registration.iterations` of gradient descent on the uncertainty-weighted
-        loss with exposure. Descent takes ten times as long, and its result is only the guess of that alignment.
-
-        Returns the pose, and whether the submap's keyframe gave it."""
+        loss with exposure, which takes ten times as long and is only the guess of that alignment. Return the pose, and
+        whether the submap's keyframe gave it."""
         at_keyframe = self._at_keyframe(other, target, live, found)
         yield
         if at_keyframe is not None:
@@ -147,8 +145,7 @@ class Registrar:
         steps, hopeless = self.config.iterations, score(found) <= HOPELESS * self.config.share_least
         if found.alignment is not None and (hopeless or not steps):
             return found, False
-        start = found.T_camera_world
-        found = fit_pose_adam(other_map.params, self.view, target, start, self.tracking, steps)
+        found = fit_pose_adam(other_map.params, self.view, target, found.T_camera_world, self.tracking, steps)
         yield from long_slice()
         at_keyframe = self._at_keyframe(other, target, live, found)
         return at_keyframe or found, at_keyframe is not None
@@ -297,11 +294,8 @@ def differs(one: Matrix, other: Matrix, point_b: Matrix) -> tuple[float, float]:
 
 def consensus(found: Sequence[Localisation], point_b: Matrix, spread_m: float, spread_rad: float) -> list[Localisation]:
     """Return the largest group of localisations that agree with one of them; between equal groups, the one with the
-    lower residual.
-
-    Two agree if they map point_b [3] (m, in b) within `spread_m` of each other and their rotations differ by at most
-    `spread_rad`.
-    """
+    lower residual. Two agree if they map point_b [3] (m, in b) within `spread_m` of each other and their rotations
+    differ by at most `spread_rad`."""
     best: list[Localisation] = []
     for centre in sorted(found, key=lambda f: f.residual):
         apart = [differs(centre.T_a_b, f.T_a_b, point_b) for f in found]
