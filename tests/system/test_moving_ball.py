@@ -3,11 +3,9 @@
 import numpy as np
 import pytest
 
-from schedules import AtOnce
 from sigmasplat.config.text import override
 from sigmasplat.model import se3
 from sigmasplat.presets import preset
-from sigmasplat.slam.real_time.system import RealTime
 from sigmasplat.slam.slam import Slam
 from sigmasplat.sources import SyntheticRoom
 
@@ -37,22 +35,6 @@ def test_a_ball_in_view_from_the_first_frame_on_does_not_draw_the_pose(
     off_m = np.linalg.norm(step.T_world_camera[:3, 3] - moved[:3, 3])
     assert off_m < 0.01  # a camera that is drawn by the ball is off by more than 4 cm
     assert min(masked[found_from:]) > 0.05 if share else not any(masked)
-
-
-def test_a_late_frame_in_real_time_still_leaves_out_what_is_known_to_move() -> None:
-    room = SyntheticRoom(200, 160, 120, seed=0, noise=True, exposure_change=True, mover=20)
-    late = list[int]()
-    system = RealTime(Slam(override(preset("sigma"), SMALL)), AtOnce(), hurried=lambda: bool(late))
-    masked = []
-    for i in range(FRAMES):
-        if i == 5:
-            late.append(i)
-        step = system.step(room.frame(i))
-        masked.append(step.tracking.get("moving", 0.0))
-    truth = room.truth().T_world_camera
-    moved = se3.inverse(truth[0]) @ truth[FRAMES - 1]
-    assert np.linalg.norm(step.T_world_camera[:3, 3] - moved[:3, 3]) < 0.01
-    assert min(masked[1:]) > 0.05
 
 
 def test_a_ball_that_hides_most_of_the_image_does_not_draw_the_pose() -> None:
