@@ -118,10 +118,14 @@ def finished(job: Job, runs: Path) -> dict[str, Any] | None:
     return result if result and result["problem"] is None else None
 
 
-def call(command: Sequence[str], output: Path) -> tuple[str | None, float]:
-    """Run a command with its output in a file; return its last line if it failed, and its peak memory, MiB."""
+def call(command: Sequence[str], output: Path, other: bool = False) -> tuple[str | None, float]:
+    """Run a command with its output in a file; return its last line if it failed, and its peak memory, MiB.
+
+    other: whether it is that of another checkout (`program.environment_of`).
+    """
+    environment = program.environment_of(other)
     with output.open("w") as log:
-        process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
+        process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, env=environment)
         _, status, usage = os.wait4(process.pid, 0)  # wait4: the peak memory of this child alone
         process.returncode = os.waitstatus_to_exitcode(status)
     return _last_line(output) if process.returncode else None, usage.ru_maxrss / 1024

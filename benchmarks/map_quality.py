@@ -8,10 +8,8 @@ example: python benchmarks/map_quality.py --before ../before/.venv/bin/sigmaspla
 """
 
 import json
-import os
 import shlex
 import shutil
-import subprocess
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -111,24 +109,13 @@ def measured_run(job: Job, options: Options) -> dict[str, Any]:
     folder.mkdir(parents=True)
     figures: dict[str, Any] = {"sequence": Path(job.sequence).name, "seed": job.seed, "code": job.code}
     print(shlex.join(words), file=sys.stderr)
-    exit_code, peak = call(words, folder / "output.txt", other=job.code != "now")
-    if exit_code:
+    problem, peak_mib = accuracy.call(words, folder / "output.txt", other=job.code != "now")
+    if problem is not None:
         return figures | {"problem": (folder / "output.txt").read_text()[-500:]}
-    figures |= figures_of(RunFolder(folder / "run")) | {"peak_rss_bytes": peak}
+    figures |= figures_of(RunFolder(folder / "run")) | {"peak_rss_bytes": int(peak_mib * 1024**2)}
     kept.write_text(json.dumps({"made_by": made_by, "figures": figures}, indent=1))
     shutil.rmtree(folder / "run" / "submaps", ignore_errors=True)
     return figures
-
-
-def call(words: Sequence[str], output: Path, other: bool = False) -> tuple[int, int]:
-    """Run a command, of another checkout or of this one, and write what it prints; return its exit code and its peak
-    memory in bytes."""
-    with output.open("w") as file:
-        environment = program.environment_of(other)
-        process = subprocess.Popen(words, stdout=file, stderr=subprocess.STDOUT, env=environment)
-        _, status, usage = os.wait4(process.pid, 0)
-    process.returncode = os.waitstatus_to_exitcode(status)
-    return process.returncode, 1024 * usage.ru_maxrss
 
 
 def figures_of(run: RunFolder) -> dict[str, Any]:

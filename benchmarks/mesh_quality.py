@@ -81,21 +81,21 @@ class Reference:
     exact: bool
 
 
-def program(words: list[str], log: Path) -> None:
-    """Run a command. Raises SigmaSplatError with its last line if it fails."""
-    problem, _ = accuracy.call(words, log)
+def program(words: list[str], log: Path, other: bool = False) -> None:
+    """Run a command, with `other` that of another checkout. Raises SigmaSplatError with its last line if it fails."""
+    problem, _ = accuracy.call(words, log, other)
     if problem is not None:
         raise SigmaSplatError(f"{' '.join(words[:4])} … failed: {problem}; see {log}")
 
 
-def finished_run(command: list[str], path: str, folder: Path, options: Options) -> RunFolder:
-    """Run SLAM with a program, or return the finished run in the folder."""
+def finished_run(command: list[str], path: str, folder: Path, options: Options, other: bool) -> RunFolder:
+    """Run SLAM with a program, with `other` that of another checkout, or return the finished run in the folder."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     done = (folder / "run.json").exists() and json.loads((folder / "run.json").read_text())["status"] == "complete"
     if not done:
         words = ["run", path, "--limit", str(options.limit), "--set", f"input.width={options.width}"]
         words += ["--seed", str(options.seed), "--out", str(folder), "--overwrite", "--no-eval"]
-        program([*command, *words], folder.with_suffix(".log"))
+        program([*command, *words], folder.with_suffix(".log"), other)
     return RunFolder.open(folder)
 
 
@@ -183,7 +183,7 @@ def measure(name: str, options: Options) -> list[Result]:
     commands |= {BEFORE: [str(options.before)]} if options.before else {}
     reference, made = reference_of(path, source, options), []
     for label, command in commands.items():
-        run = finished_run(command, path, folder / label.replace(" ", "-"), options)
+        run = finished_run(command, path, folder / label.replace(" ", "-"), options, other=label == BEFORE)
         ours = run.read_frames().path
         pair = true_path_of(source, ours)
         T_truth_world = align_rigid(pair[0].T_world_camera[:, :3, 3], pair[1].T_world_camera[:, :3, 3])
@@ -191,7 +191,8 @@ def measure(name: str, options: Options) -> list[Result]:
         wanted = {OURS: ["--axes", "camera"], ALL: ["--axes", "camera", "--triangles", "0"]}
         for mesh, words in (wanted if label == OURS else {BEFORE: []}).items():
             file = folder / f"{record.slug(mesh)}.ply"
-            program([*command, "mesh", str(run.path), "--out", str(file), "--overwrite", *words], folder / "mesh.log")
+            words = [*command, "mesh", str(run.path), "--out", str(file), "--overwrite", *words]
+            program(words, folder / "mesh.log", other=label == BEFORE)
             meshes[mesh] = read_mesh(file)
         if label == OURS:
             meshes |= open3d_meshes(source, ours, folder, options)

@@ -20,7 +20,8 @@ from sigmasplat.slam.final import final_map
 from sigmasplat.slam.loop_closure.candidates import Candidate, SubmapPair, gate
 from sigmasplat.slam.loop_closure.closer import LoopCloser
 from sigmasplat.slam.loop_closure.descriptors import similarity
-from sigmasplat.slam.loop_closure.registration import Registrar, differs
+from sigmasplat.slam.loop_closure.localisations import differs
+from sigmasplat.slam.loop_closure.registration import Registrar
 from sigmasplat.slam.predicted_submaps import PredictedSubmaps
 from sigmasplat.slam.slam import Slam
 from sigmasplat.sources import open_source

@@ -18,11 +18,12 @@ from sigmasplat.model.submap import MemoryStore, Picture, Submap
 from sigmasplat.render.backend import make_view
 from sigmasplat.slam.drift import floor
 from sigmasplat.slam.features import Extractor, Features, make_extractor
-from sigmasplat.slam.loop_closure import registration
+from sigmasplat.slam.loop_closure import localisations, registration
 from sigmasplat.slam.loop_closure.candidates import Candidate, SubmapPair
 from sigmasplat.slam.loop_closure.closer import LoopCloser
 from sigmasplat.slam.loop_closure.feature_guesses import FeatureGuesses
-from sigmasplat.slam.loop_closure.registration import Localisation, Registrar, Registration
+from sigmasplat.slam.loop_closure.localisations import Localisation
+from sigmasplat.slam.loop_closure.registration import Registrar, Registration
 from sigmasplat.slam.seeding import make_splats
 from sigmasplat.types import completed
 from small_room import frame_at, walk
@@ -59,7 +60,7 @@ def registered(
     error: Matrix,
     brighter: float = 1.0,
     config: Config = CONFIG,
-    unread: tuple[slice, slice] | None = None,
+    unread: Sequence[slice] = (),
 ) -> tuple[Registration, Matrix]:
     """Register submaps of frames a and b, told a T_a_b that is wrong by `error`; return the verdict and the truth.
 
@@ -67,7 +68,7 @@ def registered(
     """
     store = MemoryStore()
     ours, theirs = piece(store, a), piece(store, b, brighter)
-    for pictures, columns in zip(store.pictures, unread or (), strict=False):
+    for pictures, columns in zip(store.pictures, unread, strict=False):
         pictures[:] = [_without_readings(picture, columns) for picture in pictures]
     truth = walk().truth().T_world_camera
     T_a_b = se3.inverse(truth[a[0]]) @ truth[b[0]]
@@ -142,7 +143,7 @@ def test_a_loop_that_maps_show_but_no_recorded_image_is_refused() -> None:
     to_keyframe = CONFIG.changed(registration={"to_keyframe": True})
     halves = slice(0, 75), slice(85, 160)
     by_maps, _ = registered((0, 5), (3, 8), error, unread=halves)
-    by_images, truth = registered((0, 5), (3, 8), error, config=to_keyframe, unread=halves)
+    by_images, _ = registered((0, 5), (3, 8), error, config=to_keyframe, unread=halves)
     assert by_maps.accepted
     assert not by_images.accepted and "no image does" in by_images.reason
     whole, truth = registered((0, 5), (3, 8), error, config=to_keyframe, unread=(slice(0, 75), slice(0, 75)))
@@ -233,7 +234,7 @@ def localisation(T_a_b: Matrix, residual: float = 0.1, covariance: Matrix | None
 def test_one_stray_localisation_is_left_out() -> None:
     near = [localisation(se3.exp(np.full(6, 0.01 * k))) for k in range(3)]
     stray = localisation(se3.exp(np.array([1.0, 0, 0, 0, 0, 0.0])), residual=0.01)
-    agreed = registration.consensus([stray, *near], np.zeros(3), 0.1, 0.1)
+    agreed = localisations.consensus([stray, *near], np.zeros(3), 0.1, 0.1)
     assert len(agreed) == 3
     assert stray not in agreed
 
@@ -241,17 +242,17 @@ def test_one_stray_localisation_is_left_out() -> None:
 def test_a_turn_counts_where_the_keyframe_is_not_at_the_origin() -> None:
     turn = localisation(se3.exp(np.array([0.0, 0, 0, 0, 0, 0.05])))
     point = np.array([4.0, 0.0, 0.0])
-    assert registration.differs(turn.T_a_b, np.eye(4), point) == pytest.approx((0.2, 0.05), abs=1e-3)
-    assert len(registration.consensus([turn, localisation(np.eye(4))], point, 0.1, 0.1)) == 1
+    assert localisations.differs(turn.T_a_b, np.eye(4), point) == pytest.approx((0.2, 0.05), abs=1e-3)
+    assert len(localisations.consensus([turn, localisation(np.eye(4))], point, 0.1, 0.1)) == 1
 
 
 def test_the_mean_leans_towards_the_smaller_residual() -> None:
     far = np.eye(4)
     far[:3, 3] = [0.03, 0.0, 0.0]
-    mean = registration.combined([localisation(np.eye(4), 0.1), localisation(far, 0.2)])
+    mean = localisations.combined([localisation(np.eye(4), 0.1), localisation(far, 0.2)])
     assert mean[0, 3] == pytest.approx(0.01)
     turns = [localisation(se3.exp(np.array([0, 0, 0, 0, 0, angle])), 0.1) for angle in (0.1, 0.3)]
-    assert np.allclose(se3.log_rotation(registration.combined(turns)[:3, :3]), [0, 0, 0.2])
+    assert np.allclose(se3.log_rotation(localisations.combined(turns)[:3, :3]), [0, 0, 0.2])
 
 
 def test_turning_a_localisation_round_carries_its_covariance() -> None:
@@ -260,7 +261,7 @@ def test_turning_a_localisation_round_carries_its_covariance() -> None:
     half = np.diag([3e-3, 1e-3, 2e-3, 1e-3, 2e-3, 3e-3])
     draws = se3.exp_stack(random.standard_normal((20_000, 6)) @ half)
     drawn = np.cov(se3.log_stack(se3.inverse(draws @ T) @ T).T)
-    turned = registration.inverted(localisation(T, covariance=half @ half.T))
+    turned = localisations.inverted(localisation(T, covariance=half @ half.T))
     scale = np.sqrt(np.diag(drawn))
     assert np.allclose(turned.T_a_b, se3.inverse(T))
     assert np.abs((turned.covariance - drawn) / np.outer(scale, scale)).max() < 0.04
@@ -269,7 +270,7 @@ def test_turning_a_localisation_round_carries_its_covariance() -> None:
 def test_disagreement_costs_information() -> None:
     close = [localisation(np.eye(4)), localisation(np.eye(4))]
     apart = [localisation(se3.exp(np.array([s * 0.03, 0, 0, 0, 0, 0.0]))) for s in (-1.0, 1.0)]
-    sure, unsure = (registration.information(found, np.eye(4)) for found in (close, apart))
+    sure, unsure = (localisations.information(found, np.eye(4)) for found in (close, apart))
     assert np.linalg.inv(unsure)[0, 0] == pytest.approx(np.linalg.inv(sure)[0, 0] + 0.03**2)
     assert np.linalg.inv(sure)[0, 0] == pytest.approx(1e-6 + floor()[0, 0])
 

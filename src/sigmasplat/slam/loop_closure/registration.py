@@ -23,11 +23,11 @@ from sigmasplat.model import se3
 from sigmasplat.model.map_uncertainty import Background
 from sigmasplat.model.submap import Picture, Submap, SubmapStore
 from sigmasplat.render.view import View
-from sigmasplat.slam.drift import floor, symmetric
 from sigmasplat.slam.features import Extractor
 from sigmasplat.slam.localisation.verdict import confirmed
 from sigmasplat.slam.loop_closure.candidates import SubmapPair
 from sigmasplat.slam.loop_closure.feature_guesses import FeatureGuesses
+from sigmasplat.slam.loop_closure.localisations import Localisation, combined, consensus, information, inverted
 from sigmasplat.slam.predicted_submaps import PredictedSubmaps
 from sigmasplat.slam.rules import angle_between
 from sigmasplat.types import Matrix, Slices, long_slice
@@ -39,21 +39,6 @@ DOUBTFUL = 0.6
 OVERLAP_SAMPLE = 5000
 OPAQUE = 0.95
 """Pixels count if the other submap's alpha is above this (VarSplat §5 uses it for depth; here for colour too)."""
-
-
-@dataclass(frozen=True, eq=False)
-class Localisation:
-    """A keyframe's pose in the other submap, expressed as T_a_b [4, 4] between the submaps; residual: the final loss;
-    covariance [6, 6] of T_a_b's left twist (m, rad); agreement and overlap as in `PoseFit`; comparison: with the other
-    map rendered at the pose, if it was made; at_keyframe: whether the other submap's recorded image gave the pose."""
-
-    T_a_b: Matrix
-    residual: float
-    covariance: Matrix
-    agreement: float
-    overlap: float
-    comparison: Comparison | None = None
-    at_keyframe: bool = False
 
 
 class WeighedMap(NamedTuple):
@@ -134,10 +119,12 @@ class Registrar:
     def _refined(
         self, other: Submap, other_map: WeighedMap, target: Target, live: Pyramid, found: PoseFit
     ) -> Slices[tuple[PoseFit, bool]]:
-        """Refine a keyframe's pose in a submap, in slices: by alignment to the submap's nearest keyframe if that is
-        wanted and gives a valid pose, else by `registration.iterations` of gradient descent on the uncertainty-weighted
-        loss with exposure, which takes ten times as long and is only the guess of that alignment. Return the pose, and
-        whether the submap's keyframe gave it."""
+        """Refine a keyframe's pose in a submap, in slices; return it, and whether a keyframe of the submap gave it.
+
+        First the keyframe is aligned to the submap's nearest one, if that is wanted. Without a valid result,
+        `registration.iterations` of gradient descent on the uncertainty-weighted loss with exposure follow, which take
+        ten times as long. Their result is the guess of a second alignment to the nearest keyframe.
+        """
         at_keyframe = self._at_keyframe(other, target, live, found)
         yield
         if at_keyframe is not None:
@@ -189,6 +176,11 @@ class Registrar:
             guess = fit.T_camera_world
         return fit
 
+    @property
+    def _aligns_to_keyframes(self) -> bool:
+        """Return whether localised keyframes are aligned to recorded images, which needs the compiled kernels."""
+        return self.config.to_keyframe and fits_of(self.view).aligns
+
     def _at_keyframe(self, other: Submap, target: Target, live: Pyramid, found: PoseFit) -> PoseFit | None:
         """Align a keyframe that was found in a submap to the recorded image of its nearest keyframe there; return None
         if this is not wanted (`registration.to_keyframe`) or the result is not valid.
@@ -197,7 +189,7 @@ class Registrar:
         wrong pose. Readings are not.
         """
         c, depth_m = self.config, target.depth_image[target.depth_image > 0]
-        if not c.to_keyframe or not fits_of(self.view).aligns or not len(depth_m):
+        if not self._aligns_to_keyframes or not len(depth_m):
             return None
         T_other_camera, mean_m = se3.inverse(found.T_camera_world), float(depth_m.double().mean())
         k = int(np.argmin([angle_between(T, T_other_camera, mean_m) for T in other.T_submap_camera]))
@@ -237,7 +229,7 @@ class Registrar:
         agreed = consensus(good, centre_b, c.spread_m, np.deg2rad(c.spread_deg))
         if len(agreed) < 2:
             return refused(T_a_b, good, len(agreed), f"the poses of {len(good)} keyframes disagree")
-        if c.to_keyframe and fits_of(self.view).aligns and not any(f.at_keyframe for f in agreed):
+        if self._aligns_to_keyframes and not any(f.at_keyframe for f in agreed):
             return refused(T_a_b, agreed, len(agreed), f"only maps agree with {len(agreed)} keyframes, no image does")
         mean = combined(agreed)
         overlap = shared(a, b, mean, c.overlap_m)
@@ -277,51 +269,6 @@ def tracking_of(registration: RegistrationConfig, tracking: TrackingConfig) -> T
 def score(fit: PoseFit) -> float:
     """Return the share of a keyframe that its pose explains, in [0, 1]: agreement × overlap."""
     return fit.agreement * fit.overlap
-
-
-def inverted(found: Localisation) -> Localisation:
-    """Return the localisation with T_a_b [4, 4] inverted; the left twist of the inverse is −Ad(T⁻¹) ξ."""
-    T = se3.inverse(found.T_a_b)
-    A = se3.adjoint(T)
-    return dataclasses.replace(found, T_a_b=T, covariance=A @ found.covariance @ A.T)
-
-
-def differs(one: Matrix, other: Matrix, point_b: Matrix) -> tuple[float, float]:
-    """Return the difference of two T_a_b [4, 4]: in metres at a point of b (point_b [3], m), and in radians."""
-    apart = (one[:3, :3] - other[:3, :3]) @ point_b + one[:3, 3] - other[:3, 3]
-    return float(np.linalg.norm(apart)), se3.rotation_angle(one[:3, :3].T @ other[:3, :3])
-
-
-def consensus(found: Sequence[Localisation], point_b: Matrix, spread_m: float, spread_rad: float) -> list[Localisation]:
-    """Return the largest group of localisations that agree with one of them; between equal groups, the one with the
-    lower residual. Two agree if they map point_b [3] (m, in b) within `spread_m` of each other and their rotations
-    differ by at most `spread_rad`."""
-    best: list[Localisation] = []
-    for centre in sorted(found, key=lambda f: f.residual):
-        apart = [differs(centre.T_a_b, f.T_a_b, point_b) for f in found]
-        near = [f for f, (m, rad) in zip(found, apart, strict=True) if m <= spread_m and rad <= spread_rad]
-        if len(near) > len(best):
-            best = near
-    return best
-
-
-def combined(found: Sequence[Localisation]) -> Matrix:
-    """Average T_a_b [4, 4] with weights 1/residual (VarSplat §5); the rotation is the nearest to the weighted mean."""
-    weights = np.array([1.0 / max(f.residual, 1e-9) for f in found])
-    mean = np.eye(4)
-    mean[:3] = np.einsum("k,kij->ij", weights / weights.sum(), np.stack([f.T_a_b[:3] for f in found]))
-    return se3.orthonormalise(mean)
-
-
-def information(found: Sequence[Localisation], mean: Matrix, scene_scale: float = 1.0) -> Matrix:
-    """Return the information [6, 6] of the mean T_a_b: the inverse of estimated covariance + spread + floor.
-
-    mean: T_a_b [4, 4]; of its left twist, m and rad. The covariance is not divided by the number of localisations: they
-    use the same two maps, so their errors are correlated.
-    """
-    twists = np.stack([se3.log(f.T_a_b @ se3.inverse(mean)) for f in found])
-    covariance = np.mean([f.covariance for f in found], 0) + twists.T @ twists / len(found)
-    return symmetric(np.asarray(np.linalg.inv(symmetric(covariance) + floor(scene_scale)), np.float64))
 
 
 def shared(a: Submap, b: Submap, T_a_b: Matrix, distance_m: float) -> float:
