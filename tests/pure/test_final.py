@@ -220,7 +220,31 @@ def test_free_poses_lower_the_loss_and_recover_a_perturbed_keyframe() -> None:
     np.testing.assert_allclose(found["free"][0], true[0], atol=1e-12, err_msg="the first keyframe fixes the gauge")
 
 
-FREE = {"lr_pose_translation": 2e-3, "lr_pose_rotation": 1e-3, "order": "epochs", "lr_decay": 0.1}
+def test_a_pose_comes_to_rest_at_the_reach_and_the_first_one_stays() -> None:
+    """The picture of one keyframe asks for a pose 8 cm away; the tracked pose holds it at a distance of the reach."""
+    store, reach_m = make_store(), 0.01
+    store.submaps[0].T_submap_camera[1, 0, 3] += 0.08
+    given = poses(0)
+    given[1][0, 3] += 0.08
+    still = {f"lr_{name}": 0.0 for name in COLUMNS}
+    moved_m = {}
+    for reach in (0.0, reach_m, 1e-9):
+        settings = config(iterations=240, lr_pose_translation=3e-3, pose_reach_m=reach, order="epochs")
+        settings = replace(settings, mapping=replace(settings.mapping, **still))
+        view = ReferenceView(CAMERA, settings.render)
+        keyframes = KeyframeReader(store, ANCHORS, view)
+        refine(wall(-1.4, 1.6), keyframes, settings, view, np.random.default_rng(0), lambda done, total: None)
+        found = keyframes.poses_in(ANCHORS)[0]
+        moved_m[reach] = float(np.linalg.norm((found[1] - given[1])[:3, 3]))
+        np.testing.assert_allclose(found[0], given[0], atol=1e-12, err_msg="the first keyframe fixes the gauge")
+    assert moved_m[0.0] > 0.06, "without a limit the pose goes where its picture asks"
+    assert 0.3 * reach_m < moved_m[reach_m] < 1.5 * reach_m
+    assert moved_m[1e-9] < 1e-9, "a reach far below the rate holds the pose"
+
+
+FREE = {
+    "lr_pose_translation": 2e-3, "lr_pose_rotation": 1e-3, "pose_reach_m": 4e-3, "order": "epochs", "lr_decay": 0.1,
+}  # fmt: skip
 
 
 def test_a_stopped_refinement_continues_to_the_same_bytes() -> None:

@@ -75,6 +75,7 @@ class KeyframeReader:
             self._add(index, anchors[index])
         if not self.places:
             raise SigmaSplatError("the submaps have no keyframes, so the final map cannot be refined")
+        self.tracked = tuple(self.poses)
         self.motions, self.left = [VectorAdam.of(6) for _ in self.poses], list[int]()
         self.exposures = np.tile(NEUTRAL, (len(self.poses), 1, 1))
         self._target = lru_cache(max(1, CACHE_BYTES // (16 * view.alpha.numel())))(self._read)
@@ -110,6 +111,15 @@ class KeyframeReader:
             return int(random.integers(len(self)))
         self.left = self.left or random.permutation(len(self)).tolist()
         return self.left.pop()
+
+    def keep_pose(self, moved: Keyframe, share: float) -> None:
+        """Keep the pose of a keyframe that a step has moved, pulled back to the tracked one by a share of the motion
+        between them, 0 to 1: weight decay apart from Adam's step (Loshchilov & Hutter 2019), with the tracked pose as
+        its centre."""
+        T, tracked = moved.T_world_camera, self.tracked[moved.index]
+        if share and not moved.fixed:
+            T = se3.orthonormalise(T @ se3.exp(share * se3.log(se3.inverse(T) @ tracked)))
+        self.poses[moved.index] = T
 
     def state(self, done: int, field: GaussianField, spent_s: float, random: np.random.Generator) -> Refined:
         """Return a refinement after `done` steps, to be saved."""
@@ -153,8 +163,8 @@ def refine(
 ) -> list[float]:
     """Fit the field to all keyframes, one per step, and their poses with it; return the loss of each step.
 
-    Poses move at the rates `final.lr_pose_translation` and `final.lr_pose_rotation`; `keyframes.poses` has the moved
-    ones. Splats are pruned before, regularly, and at the end. Their shapes are limited (`slam.shape_limits`). Every
+    Poses move at the rates `final.lr_pose_translation` and `final.lr_pose_rotation`, about `final.pose_reach_m` at
+    most; `keyframes.poses` has the moved ones. Splats are pruned before, regularly, and at the end. Their shapes are limited (`slam.shape_limits`). Every
     `sh_every` steps, colours gain one degree of view dependence. `done`, `spent_s`: the steps that the field has
     already had, and their seconds. `saved` is offered the state after each pruning and each new degree.
     """
@@ -229,6 +239,13 @@ def _share(step: int, final: FinalConfig, clock: Clock) -> float:
     return min(1.0, max(step / max(final.iterations - 1, 1), clock.share))
 
 
+def pull(final: FinalConfig, pose_rate: float) -> float:
+    """Return the share by which a step pulls a pose back to the tracked one. A step of Adam moves a pose by at most
+    about its rate, so a pose whose gradient never changes its direction comes to rest at `final.pose_reach_m`;
+    pose_rate: factor on the rates."""
+    return min(pose_rate * final.lr_pose_translation / final.pose_reach_m, 1.0) if final.pose_reach_m else 0.0
+
+
 def refinement(config: Config) -> MappingConfig:
     """Return the mapping settings for refinement: the rates of its poses, no U if `final.weight_moment` is off, and no
     likelihood if `final.uncertainty` is off."""
@@ -256,6 +273,6 @@ def _draw(
         keyframe, share = keyframes.in_map_exposure(i), _share(step, config.final, clock)
         keyframe.pose_rate = config.final.lr_decay**share
         yield [keyframe]
-        keyframes.poses[i] = keyframe.T_world_camera
+        keyframes.keep_pose(keyframe, pull(config.final, keyframe.pose_rate))
         if config.final.exposure and share >= EXPOSURE_FROM:
             keyframes.exposures[i] = fit_exposure(view, keyframes[i].target)
