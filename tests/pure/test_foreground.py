@@ -99,11 +99,30 @@ def test_a_still_surface_that_comes_into_view_is_not_in_front(moved: tuple[float
     assert foreground(Earlier(scene_m, live_T), None, live_m, CAMERA) is None
 
 
-def screen_and_wall(T_world_camera: NDArray[np.float64]) -> Depth:
-    """Return the depth of a wall at z = 3 m with a screen at z = 1.2 m and x > 0.65 m in front of it."""
-    rays, (x0, _, z0) = CAMERA.rays(), T_world_camera[:3, 3]
-    screen = x0 + rays[..., 0] * (1.2 - z0) > 0.65
-    return np.where(screen, np.float32(1.2 - z0), np.float32(WALL_M - z0)).astype(np.float32)
+def screen_and_wall(T_world_camera: NDArray[np.float64], camera: Camera = CAMERA, wide_m: float = 9.0) -> Depth:
+    """Return the depth of a wall at z = 3 m with a screen at z = 1.2 m, from x = 0.65 m on, in front of it."""
+    rays, (x0, _, z0) = camera.rays() @ T_world_camera[:3, :3].T, T_world_camera[:3, 3]
+    to_screen, to_wall = (1.2 - z0) / rays[..., 2], (WALL_M - z0) / rays[..., 2]
+    screen = np.abs(x0 + rays[..., 0] * to_screen - 0.65 - wide_m / 2) < wide_m / 2
+    return np.where(screen, to_screen, to_wall).astype(np.float32)
+
+
+def turned(rad: float) -> NDArray[np.float64]:
+    return se3.exp(np.array([0.0, 0.0, 0.0, 0.0, rad, 0.0]))
+
+
+@pytest.mark.parametrize("error", [-0.07, 0.07])
+def test_an_edge_at_a_pose_that_is_wrong_by_a_share_of_a_wide_motion_is_not_in_front(error: float) -> None:
+    """The camera turns by a third of a radian, and the pose misses 7 % of it: the edge of the screen is off by pixels,
+    all along. A thing that has come is still in front."""
+    large = Camera(320, 240, 280.0, 280.0, 159.5, 119.5)
+    T_world_earlier, T_earlier_live, estimate = (turned(rad) for rad in (0.25, 0.35, 0.35 * (1.0 + error)))
+    scene = Earlier(screen_and_wall(T_world_earlier, large, wide_m=0.25), estimate)
+    live_m = screen_and_wall(T_world_earlier @ T_earlier_live, large, wide_m=0.25)
+    assert foreground(scene, None, live_m, large, whole_objects=True) is None
+    live_m[80:180, 60:140] = OBJECT_M
+    front = foreground(scene, None, live_m, large, whole_objects=True)
+    assert front is not None and front.hidden[80:180, 60:140].mean() > 0.95 and front.hidden.mean() < 0.15
 
 
 def test_in_a_walk_through_a_still_room_nothing_is_in_front() -> None:

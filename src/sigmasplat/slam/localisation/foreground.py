@@ -5,7 +5,7 @@ camera moves. But then its place was hidden or outside the earlier view. Somethi
 view saw through.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -25,8 +25,10 @@ STEP = 2
 """Every second row and column of the live image is tested, unless another step is given."""
 CLEAR_M, CLEAR_RELATIVE = 0.05, 0.05
 """A place was free if the reference saw a surface farther than it by this distance plus this share of its depth."""
-AROUND_PX = 5
-"""Size of the window around a pixel of the reference in which all readings must be farther: the pose is not exact."""
+AROUND_PX, ERROR = 5, 0.05
+"""Size of the window around a pixel of the reference in which all readings must be farther, because the pose is not
+exact: at least so many pixels, and this share of the image's motion to each side. Motion blur and calibration errors
+grow with the motion."""
 EDGE_RELATIVE = 0.05
 """A depth step, where a region ends: neighbouring pixels differ by more than this share of the nearer depth."""
 LEAST_REGION, LEAST_SHARE = 0.01, 0.15
@@ -66,16 +68,27 @@ class Earlier:
     depth_m: Depth
     T_earlier_live: Matrix
     known_near_m: Depth | None = None
+    further_px: int = 0
 
     @property
     def near_m(self) -> Depth:
         """Return the least reading around each pixel (`near_of`)."""
-        return near_of(self.depth_m) if self.known_near_m is None else self.known_near_m
+        near = near_of(self.depth_m) if self.known_near_m is None else self.known_near_m
+        return least_around(near, 2 * self.further_px + 1) if self.further_px else near
 
     @property
     def range_m(self) -> tuple[Depth, Depth]:
         """Return the least (inf without any) and the largest reading (0 without any) in a window around each pixel."""
-        return self.near_m, largest_around(self.depth_m, AROUND_PX)
+        return self.near_m, largest_around(self.depth_m, AROUND_PX + 2 * self.further_px)
+
+    def within_error(self, live_m: Depth, camera: Camera) -> "Earlier":
+        """Return the same with windows that grow with the motion between both images; live_m: live depth, m."""
+        read = live_m[live_m > 0]
+        if not len(read):
+            return self
+        apart, turned = np.linalg.norm(self.T_earlier_live[:3, 3]), se3.rotation_angle(self.T_earlier_live[:3, :3])
+        shift_px = camera.fx * (float(apart) / float(np.median(read)) + turned)
+        return replace(self, further_px=int(ERROR * shift_px))
 
 
 def near_of(depth_m: Depth) -> Depth:
@@ -119,6 +132,7 @@ def foreground(
     scene_scale: size of the scene relative to a room.
     """
     depth, clear_m = thinned(live_m, step), CLEAR_M * scene_scale
+    scene = scene.within_error(depth, camera)
     if before is None and _count_free(scene, depth, camera, step, clear_m) < LEAST_REGION * depth.size:
         return None
     free, again, same = _places(scene, before, depth, camera, step, clear_m)
