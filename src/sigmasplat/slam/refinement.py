@@ -164,9 +164,10 @@ def refine(
     """Fit the field to all keyframes, one per step, and their poses with it; return the loss of each step.
 
     Poses move at the rates `final.lr_pose_translation` and `final.lr_pose_rotation`, about `final.pose_reach_m` at
-    most; `keyframes.poses` has the moved ones. Splats are pruned before, regularly, and at the end. Their shapes are limited (`slam.shape_limits`). Every
-    `sh_every` steps, colours gain one degree of view dependence. `done`, `spent_s`: the steps that the field has
-    already had, and their seconds. `saved` is offered the state after each pruning and each new degree.
+    most; `keyframes.poses` has the moved ones. Splats are pruned before, regularly, and at the end. Their shapes are
+    limited (`slam.shape_limits`). Every `sh_every` steps, colours gain one degree of view dependence. `done`,
+    `spent_s`: the steps that the field has already had, and their seconds. `saved` is offered the state after each
+    pruning and each new degree.
     """
     final, mapping, losses, clock = config.final, refinement(config), list[float](), Clock(config.final, spent_s)
     if not done:
