@@ -180,8 +180,8 @@ def test_the_final_map_shows_frames_as_well_as_its_parts_and_the_path_stays_true
     final_db, submaps_db = np.mean(scores, 0)
     assert final_db > submaps_db
     assert slam.refinement_steps == 300 and len(slam.field) < sum(len(slam.store.load(i).field) for i in range(3))
-    # The poses follow the map: 1.3 to 1.6 mm off, over seeds and instruction sets.
-    assert error_m(slam) < error_m(run) + 1.5e-3
+    # The poses follow the map, but stay near the tracked ones: 0.5 mm farther off, over seeds.
+    assert error_m(slam) < error_m(run) + 0.8e-3
     assert np.array_equal(slam.trajectory().T_world_camera[0], np.eye(4))
 
 
