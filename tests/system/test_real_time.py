@@ -141,6 +141,18 @@ def test_the_first_map_is_left_unfinished_at_a_cut_if_a_keyframe_waits() -> None
     assert len(system.slam.atlas.anchors) > 2
 
 
+def test_a_map_that_falls_behind_is_still_fitted_and_cut() -> None:
+    """If every keyframe has another one behind it, and all but the last were only added, one submap would hold all."""
+    often = config(mapping__every="2", realtime__keyframe_deg="0.5")
+    system = RealTime(Slam(often), Late(slices=0))
+    steps = [system.step(frame) for frame in frames(40)]
+    system.settle()
+    assert sum(step.is_keyframe for step in steps) > 12
+    store = system.slam.store
+    assert len(store) >= 2
+    assert max(len(store.load(i).frames) for i in range(len(store))) <= 12
+
+
 def test_a_keyframe_is_aligned_again_when_the_weights_of_the_one_before_it_are_known() -> None:
     """Else the path would be that of an alignment without weights."""
     same = config(

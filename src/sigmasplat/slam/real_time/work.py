@@ -28,6 +28,10 @@ from sigmasplat.types import Matrix
 AS_GOOD = 0.99
 """An alignment replaces another one if its agreement × overlap is at least this share of the other's."""
 
+MOST_ADDED = 4
+"""At most so many keyframes in a row are added without a fit. Without a limit, a map that falls behind once stays
+behind: tracking gets no newer reference, and no submap ends."""
+
 
 class MapClock:
     """Does the work that tracking hands over, in the order of the frames. It owns the map, the atlas and the store.
@@ -42,7 +46,7 @@ class MapClock:
         self.with_errors = False
         self._before = Before.of(system)
         self._pending: deque[TrackedFrame | Task] = deque()
-        self._spare = 0
+        self._spare, self._added = 0, 0
         self._undescribed: TrackedKeyframe | None = None
         self._found = -1
         self._timer = StepTimer()
@@ -130,7 +134,7 @@ class MapClock:
         return se3.orthonormalise(se3.inverse(fit.T_camera_world)), fit.alignment
 
     def _map(self, each: TrackedFrame, offer: Offer) -> Iterator[None]:
-        """Map a keyframe. If another one waits, it is added to the map, and the fit is left to the newest one."""
+        """Map a keyframe. If another one waits, it is added to the map, and the fit is left to a later one."""
         system, number = self.system, each.number
         self._timer = system.start_timer()
         seen, first = offer.seen, not system.steps
@@ -143,10 +147,12 @@ class MapClock:
             state, (T, alignment) = "", self._realigned(each, offer)
             hop = system.hop_to(se3.inverse(T), alignment)
             self._add_drift(number, T, hop)
-        if not first and self._keyframe_waits():
+        if not first and self._added < MOST_ADDED and self._keyframe_waits():
             system.add_keyframe(seen, number, T, hop)
+            self._added += 1
             self._done(each)
             return
+        self._added = 0
         T = yield from system.map_keyframe(seen, number, T, hop, self._keyframe_waits)
         if system.submap_ends(number, T):
             yield from system.cut(T, self._keyframe_waits)
