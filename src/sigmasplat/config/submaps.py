@@ -157,8 +157,8 @@ class FinalConfig(Section, name="final"):
     lr_pose_rotation: NotNegative = 0.0
     """Learning rate of keyframe rotations during refinement, in rad; 0 = fixed (paper)."""
     pose_reach_m: NotNegative = 0.0
-    """About how far refinement can move a keyframe from its tracked pose, in metres: each step pulls the pose back by
-    the share `final.lr_pose_translation` / `final.pose_reach_m` of position and rotation. 0 = without limit."""
+    """About how far refinement can move a keyframe from its tracked pose, in metres: each step takes back
+    the share `final.lr_pose_translation` / `final.pose_reach_m` of this motion and turn. 0 = without limit."""
     seconds: NotNegative = 0.0
     """Time budget of the refinement in seconds: it ends at the latest then, even if steps are left, and learning rates
     fall in time. The result then depends on the speed of the machine. 0 = no limit."""

@@ -41,7 +41,7 @@ SIGMA = varsplat.FAST.changed(
         "lr_decay": 0.05,
         "lr_pose_translation": 3e-4,
         "lr_pose_rotation": 2e-4,
-        "pose_reach_m": 1e-3,  # without a limit, noise of the fit bends the path of exact depth by as much as tracking
+        "pose_reach_m": 1e-3,  # without a limit, refinement bends a path that tracking found to a millimetre
         "sh_degree": 3,
         "sh_every": 100,
         "max_needle_ratio": 8.0,

@@ -15,6 +15,7 @@ from scipy.ndimage import label
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.slam.localisation.windows import largest_around, largest_label, least_around, widened
+from sigmasplat.slam.rules import angle_between
 from sigmasplat.types import Matrix
 
 Depth = NDArray[np.float32]
@@ -25,9 +26,11 @@ STEP = 2
 """Every second row and column of the live image is tested, unless another step is given."""
 CLEAR_M, CLEAR_RELATIVE = 0.05, 0.05
 """A place was free if the reference saw a surface farther than it by this distance plus this share of its depth."""
-AROUND_PX, ERROR = 5, 0.05
-"""Size of the window around a pixel of the reference in which all readings must be farther, because the pose is not
-exact: at least so many pixels, and this share of the image's motion to each side. Motion blur and calibration errors
+AROUND_PX = 5
+"""Least size of the window around a pixel of the reference in which all readings must be farther: the pose is not
+exact."""
+POSE_ERROR = 0.05
+"""This share of the motion between both images is added to the window on each side: motion blur and calibration errors
 grow with the motion."""
 EDGE_RELATIVE = 0.05
 """A depth step, where a region ends: neighbouring pixels differ by more than this share of the nearer depth."""
@@ -63,7 +66,11 @@ def share_of(front: Foreground | None) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Earlier:
-    """Depth of an earlier image [H, W] m, 0 where it is not known, and its pose relative to a live camera, [4, 4]."""
+    """Depth of an earlier image [H, W] m, 0 where it is not known, and its pose relative to a live camera, [4, 4].
+
+    known_near_m: the least reading around each pixel (`near_of`), if it is known; further_px: windows are larger by so
+    many pixels on each side.
+    """
 
     depth_m: Depth
     T_earlier_live: Matrix
@@ -72,7 +79,7 @@ class Earlier:
 
     @property
     def near_m(self) -> Depth:
-        """Return the least reading around each pixel (`near_of`)."""
+        """Return the least reading in a window around each pixel, inf without any."""
         near = near_of(self.depth_m) if self.known_near_m is None else self.known_near_m
         return least_around(near, 2 * self.further_px + 1) if self.further_px else near
 
@@ -86,9 +93,8 @@ class Earlier:
         read = live_m[live_m > 0]
         if not len(read):
             return self
-        apart, turned = np.linalg.norm(self.T_earlier_live[:3, 3]), se3.rotation_angle(self.T_earlier_live[:3, :3])
-        shift_px = camera.fx * (float(apart) / float(np.median(read)) + turned)
-        return replace(self, further_px=int(ERROR * shift_px))
+        moved_rad = angle_between(np.eye(4), self.T_earlier_live, float(np.median(read)))
+        return replace(self, further_px=int(POSE_ERROR * camera.fx * moved_rad))
 
 
 def near_of(depth_m: Depth) -> Depth:
