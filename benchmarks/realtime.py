@@ -1,8 +1,9 @@
-"""Measure real time: recordings replayed at their own times, beside runs in which a frame waits for the one before it.
+"""Measure real time: recordings replayed at a camera's rate, beside runs in which a frame waits for the one before it.
 
-For each sequence and seed one run with --realtime and one without, each in a process of its own, one after the other.
-Figures come from the logs and scores of the runs: time from the arrival of an image to its pose, dropped frames, ATE
-and PSNR relative to the run without --realtime.
+A recording with another rate than `--rate` is replayed at this rate, in both runs. For each sequence and seed one run
+with --realtime and one without, each in a process of its own, one after the other. Figures come from the logs and
+scores of the runs: time from the arrival of an image to its pose, dropped frames, ATE and PSNR relative to the run
+without --realtime.
 Writes benchmarks/results/realtime-<machine>.json and prints tables.
 
 example: python benchmarks/realtime.py --sources livingroom --seeds 0
@@ -22,6 +23,7 @@ import numpy as np
 import program
 import record
 import tyro
+from replayed import at_rate
 from tables import Section, significant
 
 from sigmasplat.commands.options import Settings
@@ -38,13 +40,14 @@ GOALS = {"p50_ms": 12.0, "p99_ms": 33.0, "worst_ms": 66.0, "dropped": 0.0, "ate_
 
 @dataclass(frozen=True)
 class Options:
-    """Replay recordings at their own times; measure latency, dropped frames, ATE and PSNR."""
+    """Replay recordings at a camera's rate; measure latency, dropped frames, ATE and PSNR."""
 
     sources: Annotated[tuple[str, ...], arg(help="sequences: names in the data folder, or paths")] = (
         "redkitchen",
         "livingroom",
     )
     seeds: Annotated[tuple[int, ...], arg(help="random seeds, two runs for each")] = (0, 1, 2)
+    rate: Annotated[float, arg(help="frames per second")] = 30.0
     preset: Annotated[str, arg(help="preset to start from")] = default_preset()
     settings: Settings = ()
     limit: Annotated[int | None, arg(help="number of frames at most")] = None
@@ -55,9 +58,9 @@ class Options:
 def measure(source: str, seed: int, options: Options) -> dict[str, Any]:
     """Run one sequence with and without --realtime; return the figures of both. Raises SigmaSplatError if a run
     fails."""
-    with tempfile.TemporaryDirectory() as scratch:
+    with tempfile.TemporaryDirectory() as scratch, at_rate(Path(source), options.rate) as replayed:
         found = {
-            name: figures_of(made(source, seed, options, Path(scratch) / name, *more))
+            name: figures_of(made(str(replayed), seed, options, Path(scratch) / name, *more))
             for name, more in (("realtime", ("--realtime",)), ("in_turn", ()))
         }
     return {"source": Path(source).name, "seed": seed} | compared(found["realtime"], found["in_turn"])
@@ -123,10 +126,11 @@ def sections(measured: dict[str, Any]) -> list[Section]:
     g = GOALS
     goals = [g["p50_ms"], g["p99_ms"], g["worst_ms"], g["dropped"], None, None, g["ate_ratio"], g["psnr_loss_db"]]
     rows.append(["goal", "", *("" if goal is None else f"≤ {goal:g}" for goal in goals)])
+    rate = measured["config"]["rate"]
     note = (
-        "Each sequence is replayed at its own times (`run --realtime`). *In turn*: the same run without `--realtime`, "
-        "where each frame waits for the one before it. Latencies leave the first second out. PSNR on training views "
-        "of the final map."
+        f"Each sequence is replayed at {rate:g} frames per second (`run --realtime`). *In turn*: the same run without "
+        "`--realtime`, where each frame waits for the one before it. Latencies leave the first second out. PSNR on "
+        "training views of the final map."
     )
     return [Section("Real time", head, rows, note)]
 

@@ -16,6 +16,7 @@ from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import COLUMNS, GaussianField
 from sigmasplat.model.submap import MemoryStore, Picture, Submap
 from sigmasplat.render.backend import make_view
+from sigmasplat.slam import drift
 from sigmasplat.slam.drift import floor
 from sigmasplat.slam.features import Extractor, Features, make_extractor
 from sigmasplat.slam.loop_closure import localisations, registration
@@ -273,6 +274,20 @@ def test_disagreement_costs_information() -> None:
     sure, unsure = (localisations.information(found, np.eye(4)) for found in (close, apart))
     assert np.linalg.inv(unsure)[0, 0] == pytest.approx(np.linalg.inv(sure)[0, 0] + 0.03**2)
     assert np.linalg.inv(sure)[0, 0] == pytest.approx(1e-6 + floor()[0, 0])
+
+
+def test_the_stated_error_grows_with_the_motion_between_the_images(monkeypatch: pytest.MonkeyPatch) -> None:
+    a, b = (0, 1), (15, 20)
+    with_motion, _ = registered(a, b, np.eye(4))
+    monkeypatch.setattr(drift, "BIAS", 0.0)
+    without, _ = registered(a, b, np.eye(4))
+    more = np.linalg.inv(with_motion.information) - np.linalg.inv(without.information)
+    truth = walk().truth().T_world_camera
+    nearest = [(0, 15), (1, 15), (15, 1), (20, 1)]  # each keyframe is localised, the other submap's nearest one
+    turned_rad = [se3.rotation_angle(truth[i][:3, :3].T @ truth[j][:3, :3]) for i, j in nearest]
+    assert np.linalg.eigvalsh(more)[0] > 0.0
+    assert np.trace(more[3:, 3:]) == pytest.approx(3 * np.mean(np.square(turned_rad)) * 0.02**2, rel=0.05)
+    assert np.trace(more[:3, :3]) > 3 * 0.02**2 * np.linalg.norm(truth[15][:3, 3] - truth[1][:3, 3]) ** 2
 
 
 def test_overlap_is_the_larger_share_of_splats_with_a_neighbour() -> None:

@@ -74,13 +74,18 @@ class Drift:
         """Return the information matrix [6, 6] (m, rad) of the last keyframe's pose: the inverse of all covariances,
         constant errors and `BIAS` included. At least one hop must have been added.
         """
-        bent = np.repeat([(BIAS * self.travelled_m) ** 2, (BIAS * self.turned_rad) ** 2], 3)
-        return symmetric(np.asarray(np.linalg.inv(self.covariance + self.usual + np.diag(bent)), np.float64))
+        known = self.covariance + self.usual + systematic_errors(self.travelled_m, self.turned_rad)
+        return symmetric(np.asarray(np.linalg.inv(known), np.float64))
 
 
 def hop_errors(scene_scale: float = 1.0) -> Matrix:
     """Return the constant covariance [6, 6] of a hop, m² and rad²."""
     return np.diag(np.repeat([(HOP_M * scene_scale) ** 2, HOP_RAD**2], 3))
+
+
+def systematic_errors(moved_m: float, turned_rad: float) -> Matrix:
+    """Return the covariance [6, 6], m² and rad², of the errors that grow with a motion (`BIAS`)."""
+    return np.diag(np.repeat([(BIAS * moved_m) ** 2, (BIAS * turned_rad) ** 2], 3))
 
 
 def floor(scene_scale: float = 1.0) -> Matrix:

@@ -23,6 +23,7 @@ from sigmasplat.model import se3
 from sigmasplat.model.map_uncertainty import Background
 from sigmasplat.model.submap import Picture, Submap, SubmapStore
 from sigmasplat.render.view import View
+from sigmasplat.slam.drift import systematic_errors
 from sigmasplat.slam.features import Extractor
 from sigmasplat.slam.localisation.verdict import confirmed
 from sigmasplat.slam.loop_closure.candidates import SubmapPair
@@ -113,6 +114,7 @@ class Registrar:
         fit, at_keyframe = yield from self._refined(other, other_map, target, live, max(fits, key=score))
         A = se3.adjoint(T_own_camera)
         covariance, comparison = self._checked(other_map, live, fit.T_camera_world)
+        covariance = covariance + _errors_of_motion(other, fit.T_camera_world, target)
         T_own_other, covariance = T_own_camera @ fit.T_camera_world, A @ covariance @ A.T
         return Localisation(T_own_other, fit.loss, covariance, fit.agreement, fit.overlap, comparison, at_keyframe)
 
@@ -188,11 +190,10 @@ class Registrar:
         The map's surfaces are biased while it is young, and all keyframes that are localised in it then agree on a
         wrong pose. Readings are not.
         """
-        c, depth_m = self.config, target.depth_image[target.depth_image > 0]
-        if not self._aligns_to_keyframes or not len(depth_m):
+        c = self.config
+        if not self._aligns_to_keyframes or not bool((target.depth_image > 0).any()):
             return None
-        T_other_camera, mean_m = se3.inverse(found.T_camera_world), float(depth_m.double().mean())
-        k = int(np.argmin([angle_between(T, T_other_camera, mean_m) for T in other.T_submap_camera]))
+        k = _nearest_keyframe(other, found.T_camera_world, target)
         fit = fit_pose_align(self._reference_at(other, k), live, found.T_camera_world, self.tracking)
         return fit if fit.agreement >= c.agreement_least and score(fit) >= c.share_least else None
 
@@ -238,6 +239,19 @@ class Registrar:
         residual = float(np.mean([f.residual for f in agreed]))
         edge = information(agreed, mean, self.view.options.scene_scale)
         return Registration(mean, edge, residual, len(agreed), overlap, True, "accepted")
+
+
+def _nearest_keyframe(submap: Submap, T_camera_submap: Matrix, target: Target) -> int:
+    """Return the number of the submap's keyframe whose image is the least moved one in a camera with this image."""
+    depth_m, T_submap_camera = target.depth_image[target.depth_image > 0], se3.inverse(T_camera_submap)
+    mean_m = float(depth_m.double().mean()) if len(depth_m) else np.inf
+    return int(np.argmin([angle_between(T, T_submap_camera, mean_m) for T in submap.T_submap_camera]))
+
+
+def _errors_of_motion(submap: Submap, T_camera_submap: Matrix, target: Target) -> Matrix:
+    """Return the covariance [6, 6] of the errors that grow with the motion from the submap's nearest keyframe."""
+    T = T_camera_submap @ submap.T_submap_camera[_nearest_keyframe(submap, T_camera_submap, target)]
+    return systematic_errors(float(np.linalg.norm(T[:3, 3])), se3.rotation_angle(T[:3, :3]))
 
 
 def rendered_picture(maps: PoseMaps) -> Picture:
