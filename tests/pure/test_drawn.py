@@ -84,6 +84,11 @@ def test_a_box_that_looks_different_at_its_place_has_not_drawn_the_pose() -> Non
     assert not judged(sight(MOVED_M, 0.0, paint_m=0.05), MOVED_M)
 
 
+def test_a_box_that_agrees_better_at_the_right_pose_has_not_drawn_the_wrong_one() -> None:
+    """It has changed its look, so that it does not agree as well as the rest; the wrong pose is only a poor fit."""
+    assert not judged(sight(MOVED_M, 0.0, paint_m=-0.02), BETWEEN_M)
+
+
 def test_a_still_box_has_not_drawn_a_pose_that_fits_badly() -> None:
     assert not judged(sight(MOVED_M, 0.0), BETWEEN_M)
 

@@ -1,12 +1,13 @@
 """The rules of slam/: each is a question with a known answer on either side of its bound."""
 
 from collections import Counter
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
 
 from sigmasplat.fit.pose import PoseFit
-from sigmasplat.slam.rules import draw_keyframes, is_held_back, is_keyframe, is_lost, jumped
+from sigmasplat.slam.rules import draw_keyframes, is_held_back, is_keyframe, is_lost, jumped, never, unless
 
 NAN = float("nan")
 
@@ -88,3 +89,19 @@ def test_draws_follow_from_the_seed() -> None:
     assert drawn(3) == drawn(3) != drawn(4)
     assert len(drawn(3)) == 50
     assert list(draw_keyframes(range(7), 0, 0.4, 0, np.random.default_rng(0))) == []
+
+
+def test_guesses_end_when_the_next_frame_waits_but_the_least_number_is_made() -> None:
+    made = list[int]()
+
+    def guesses() -> Iterator[int]:
+        for number in range(5):
+            made.append(number)
+            yield number
+
+    asked = iter([False, False, True])
+    assert list(unless(lambda: next(asked), guesses(), least=1)) == [0, 1, 2] == made
+    made.clear()
+    assert list(unless(lambda: True, guesses())) == [] == made
+    assert list(unless(lambda: True, guesses(), least=2)) == [0, 1] == made
+    assert list(unless(never, range(3))) == [0, 1, 2]

@@ -38,6 +38,9 @@ UNKNOWN_M = 1.0
 """Standard deviation assumed for an undetermined direction, metres (for rotations: shift at the mean depth)."""
 
 
+UPPER = np.triu_indices(6)
+
+
 @dataclass(frozen=True, eq=False)
 class Alignment:
     """The result of an alignment: the motion T_live_reference and its quality.
@@ -237,5 +240,5 @@ def _slope(around: Sequence[Normal], steps: Matrix) -> Matrix:
 
 def _symmetric(upper: Matrix) -> Matrix:
     full = np.zeros((6, 6))
-    full[np.triu_indices(6)] = upper
+    full[UPPER] = upper
     return full + np.triu(full, 1).T

@@ -1,6 +1,7 @@
 """Decide by rules: small functions that answer yes or no, or choose from a list."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import islice
 from typing import TypeVar
 
 import numpy as np
@@ -115,9 +116,11 @@ def draw_keyframes(
         yield [everything[i] for i in drawn]
 
 
-def unless(hurried: Asked, guesses: Iterable[Item]) -> Iterator[Item]:
-    """Yield guesses while `hurried` returns False; a guess is not made before it is asked."""
+def unless(hurried: Asked, guesses: Iterable[Item], least: int = 0) -> Iterator[Item]:
+    """Yield guesses while `hurried` returns False, at least the first `least` ones; a guess is not made before it is
+    asked."""
     waiting = iter(guesses)
+    yield from islice(waiting, least)
     while not hurried():
         try:
             yield next(waiting)

@@ -127,7 +127,7 @@ class Tracker:
             return fit, first
         found = self._without_front(field, view, seen, first, expected, fit, before, hurried)
         if found is None and self.watch.config.find and not hurried():
-            found = self._without_object(field, view, seen, expected.predicted, fit, before is not None)
+            found = self._without_object(field, view, seen, expected.predicted, fit, before is not None, hurried)
         return (fit, first) if found is None else found
 
     def _without_front(
@@ -141,8 +141,8 @@ class Tracker:
         if fit.comparison is None or (slow is None and not self.watch.suspects(fit.comparison, known, hurried)):
             return None
         keyframe, predicted, expected_front = self.keyframe, expected.predicted, None
-        for guess in (predicted, se3.inverse(fit.T_camera_world)):
-            for _ in range(2):  # a better pose shows better what is in front
+        for guess in unless(hurried, (predicted, se3.inverse(fit.T_camera_world)), least=1):
+            for _ in unless(hurried, range(2), least=1):  # a better pose shows better what is in front
                 front = together(
                     self.watch.in_front(keyframe, self.keyframe_front, before, self.previous, seen, guess), slow
                 )
@@ -152,7 +152,7 @@ class Tracker:
                     break
                 shown = first if front is None else seen.aside(front, view)
                 found = self._fit(field, view, shown, guess)
-                found = self.watch.fitted_to_all(self.keyframe, shown.live, found, self.config)
+                found = self.watch.fitted_to_all(self.keyframe, shown.live, found, self.config, hurried)
                 guess = se3.inverse(found.T_camera_world)
             else:
                 if self._stands(found, predicted):
@@ -167,12 +167,12 @@ class Tracker:
         return None if self.front is None else (found, shown)
 
     def _without_object(
-        self, field: Splats, view: View, seen: Sight, predicted: Matrix, drawn: PoseFit, known: bool
+        self, field: Splats, view: View, seen: Sight, predicted: Matrix, drawn: PoseFit, known: bool, hurried: Asked
     ) -> tuple[PoseFit, Sight] | None:
         """Look for the thing that moves and has drawn the pose with it. Return the fit and the frame without it; None
         if there is none. known: the last frame had something in front."""
         contradicted, drops = self._contradicted(drawn), self.usual.agrees_less(drawn.comparison)
-        for front in self.watch.suspected(self.keyframe, seen, drawn, contradicted, known, drops):
+        for front in unless(hurried, self.watch.suspected(self.keyframe, seen, drawn, contradicted, known, drops)):
             shown = seen.aside(front, view)
             found = self._fit(field, view, shown, predicted)
             if self._stands(found, predicted) and has_drawn(front, self.keyframe, seen, drawn, found, contradicted):

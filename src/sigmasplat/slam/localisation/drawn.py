@@ -76,14 +76,18 @@ def has_drawn(
     thing: Foreground, keyframe: Reference | None, seen: Sight, drawn: PoseFit, found: PoseFit, contradicted: bool
 ) -> bool:
     """Return whether a thing has drawn a pose, by the pose that was fitted without it: the rest agrees much more there,
-    the thing does not agree with the rest, and it is shown elsewhere than at the drawn pose. contradicted: the images
-    contradict the drawn pose."""
+    the thing does not agree with the rest, it is shown elsewhere than at the drawn pose, and it agrees less than there.
+    contradicted: the images contradict the drawn pose."""
     if keyframe is None or not agrees_more(found.comparison, drawn.comparison, contradicted):
         return False
     whole = keyframe.compared(seen.live, found.T_camera_world)
     T_drawn_found = drawn.T_camera_world @ se3.inverse(found.T_camera_world)
     camera = seen.target.camera
-    return disagrees(whole, found.comparison) and shift_px(thing, camera, T_drawn_found) >= SHIFTED * camera.width
+    if not disagrees(whole, found.comparison) or shift_px(thing, camera, T_drawn_found) < SHIFTED * camera.width:
+        return False
+    alone = seen.live.hiding(thing.depth_m <= 0)
+    at_drawn, at_found = (keyframe.compared(alone, fit.T_camera_world).correlation for fit in (drawn, found))
+    return not at_found > at_drawn
 
 
 def shift_px(thing: Foreground, camera: Camera, T_b_a: Matrix) -> float:

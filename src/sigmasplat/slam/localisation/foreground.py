@@ -152,7 +152,7 @@ def foreground(
         return None
     whole, hidden = enlarged(moved, step, live_m, whole_objects)
     return Foreground(
-        hidden, np.where(whole, live_m, np.float32(0.0)), np.where(hidden, _behind(scene, camera), live_m)
+        hidden, np.where(whole, live_m, np.float32(0.0)), np.where(hidden, _behind(scene, camera, hidden), live_m)
     )
 
 
@@ -220,12 +220,12 @@ def _regions(inside: Mask, free: Mask, again: Mask) -> Mask:
     return np.asarray(chosen[regions])
 
 
-def _behind(scene: Earlier, camera: Camera) -> Depth:
-    """Return the scene as the live camera would see it, m, 0 where it is not known."""
+def _behind(scene: Earlier, camera: Camera, hidden: Mask) -> Depth:
+    """Return the scene as the live camera would see it at the hidden pixels, m, 0 where it is not known."""
     v, u = np.nonzero(scene.depth_m > 0)
-    points = camera.rays()[v, u].T.astype(np.float64) * scene.depth_m[v, u]
+    points = coarse_rays(camera, 1)[v, u].T * scene.depth_m[v, u]
     inside, row, column, z = projected(points, camera, se3.inverse(scene.T_earlier_live))
-    found = np.flatnonzero(inside)
+    found = np.flatnonzero(inside & widened(hidden, 3)[row, column])
     found = found[np.argsort(-z[found], kind="stable")]  # the nearest surface is written last
     seen = np.zeros(scene.depth_m.shape, np.float32)
     seen[row[found], column[found]] = z[found]

@@ -97,10 +97,12 @@ class Watch:
             return
         yield from suspected(keyframe, seen, fit, contradicted or drops)
 
-    def fitted_to_all(self, keyframe: Reference | None, live: Pyramid, fit: PoseFit, config: TrackingConfig) -> PoseFit:
+    def fitted_to_all(
+        self, keyframe: Reference | None, live: Pyramid, fit: PoseFit, config: TrackingConfig, hurried: Asked
+    ) -> PoseFit:
         """Return the fit of a frame without what is in front; if the newest keyframe shows little of the rest, fitted
-        to earlier keyframes too."""
-        c = fit.comparison
+        to earlier keyframes too, unless the next frame waits (`hurried`)."""
+        c = None if hurried() else fit.comparison
         if keyframe is None or c is None or not self.earlier or c.points >= ENOUGH * _compared_points(live):
             return fit
         references = [keyframe, *self.earlier]
