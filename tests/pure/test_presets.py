@@ -372,7 +372,7 @@ def test_sigma_adds_to_fast_and_removes_nothing() -> None:
         "mapping.lr_pose_rotation",
         "registration.to_keyframe", "registration.iterations", "loops.slices_per_frame",
         "final.lr_pose_translation", "final.lr_pose_rotation", "final.pose_reach_m", "final.prune_weight_px",
-        "recovery.relocalise", "recovery.new_map_after", "recovery.steady_frames", "surface.depth",
+        "recovery.relocalise", "recovery.new_map_after", "recovery.steady_frames", "surface.depth", "moving.find",
         "mapping.weight_depth", "mapping.weight_mean_depth", "render.depth", "seeding.thickness",
         "final.sh_degree", "final.sh_every", "final.max_needle_ratio", "final.max_axis_ratio", "final.exposure",
     }  # fmt: skip
