@@ -126,7 +126,7 @@ def sections(measured: dict[str, Any]) -> list[Section]:
     g = GOALS
     goals = [g["p50_ms"], g["p99_ms"], g["worst_ms"], g["dropped"], None, None, g["ate_ratio"], g["psnr_loss_db"]]
     rows.append(["goal", "", *("" if goal is None else f"≤ {goal:g}" for goal in goals)])
-    rate = measured["config"]["rate"]
+    rate = measured["config"].get("rate", 30.0)  # results before this option were at 30
     note = (
         f"Each sequence is replayed at {rate:g} frames per second (`run --realtime`). *In turn*: the same run without "
         "`--realtime`, where each frame waits for the one before it. Latencies leave the first second out. PSNR on "

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from sigmasplat.fit.compare import Comparison
 from sigmasplat.fit.pose import PoseFit
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference
@@ -13,9 +14,10 @@ from sigmasplat.fit.target import Target
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.frame import Frame
-from sigmasplat.slam.localisation.drawn import free_standing, has_drawn, shift_px, suspected
+from sigmasplat.slam.localisation.drawn import free_standing, has_drawn, is_still, shift_px, suspected
 from sigmasplat.slam.localisation.foreground import Foreground, thinned
 from sigmasplat.slam.localisation.sight import Sight
+from sigmasplat.slam.localisation.verdict import agrees_less
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 CAMERA = Camera(160, 120, 140.0, 140.0, 79.5, 59.5)
@@ -47,10 +49,11 @@ def pose(camera_m: float) -> NDArray[np.float64]:
     return se3.exp(np.array([-camera_m, 0, 0, 0, 0, 0]))
 
 
-def fitted(seen: Sight, camera_m: float, without: Foreground | None = None) -> PoseFit:
+def fitted(seen: Sight, camera_m: float, without: Foreground | None = None, turned_rad: float = 0.0) -> PoseFit:
     """Return the fit of a frame at a pose, relative to a keyframe that shows the box at x = 0."""
     live = seen.live if without is None else seen.live.hiding(without.hidden)
-    fit = PoseFit(pose(camera_m), 0.0, 0.0, 0, 1.0, 1.0)
+    turned = se3.exp(np.array([0, 0, 0, 0, turned_rad, 0]))
+    fit = PoseFit(turned @ pose(camera_m), 0.0, 0.0, 0, 1.0, 1.0)
     return replace(fit, comparison=keyframe().compared(live, fit.T_camera_world))
 
 
@@ -63,10 +66,10 @@ def box_of(seen: Sight) -> Foreground:
     return found
 
 
-def judged(seen: Sight, drawn_m: float) -> bool:
+def judged(seen: Sight, drawn_m: float, turned_rad: float = 0.0) -> bool:
     """Return whether the box has drawn a pose, if the pose without it is right."""
-    box = box_of(seen)
-    return has_drawn(box, keyframe(), seen, fitted(seen, drawn_m), fitted(seen, MOVED_M, box), contradicted=False)
+    box, drawn = box_of(seen), fitted(seen, drawn_m, turned_rad=turned_rad)
+    return has_drawn(box, keyframe(), seen, drawn, fitted(seen, MOVED_M, box), contradicted=False)
 
 
 def test_a_box_that_moves_with_the_camera_has_drawn_the_pose() -> None:
@@ -86,7 +89,24 @@ def test_a_box_that_looks_different_at_its_place_has_not_drawn_the_pose() -> Non
 
 def test_a_box_that_agrees_better_at_the_right_pose_has_not_drawn_the_wrong_one() -> None:
     """It has changed its look, so that it does not agree as well as the rest; the wrong pose is only a poor fit."""
-    assert not judged(sight(MOVED_M, 0.0, paint_m=-0.02), BETWEEN_M)
+    for paint_m in (-0.02, -0.01):
+        assert not judged(sight(MOVED_M, 0.0, paint_m=paint_m), MOVED_M, turned_rad=0.012)
+
+
+def test_a_still_box_is_told_from_one_that_moves() -> None:
+    for box_m, still in ((0.0, True), (0.02, False), (MOVED_M, False)):
+        seen = sight(MOVED_M, box_m)
+        box = box_of(seen)
+        assert is_still(box, keyframe(), seen.live, fitted(seen, MOVED_M, box)) == still
+    assert not is_still(box, None, seen.live, fitted(seen, MOVED_M, box))
+
+
+def test_images_that_agree_less_in_depth_and_gray_speak_against_leaving_something_out() -> None:
+    whole = Comparison(0.8, 0.99, 0.01, 0.0, 0.1, 0.95, 2000)
+    assert agrees_less(replace(whole, close=0.93, correlation=0.89), whole)
+    assert not agrees_less(replace(whole, close=0.93, correlation=0.94), whole)
+    assert not agrees_less(replace(whole, close=0.99, correlation=0.89), whole)
+    assert not agrees_less(None, whole) and not agrees_less(whole, None)
 
 
 def test_a_still_box_has_not_drawn_a_pose_that_fits_badly() -> None:

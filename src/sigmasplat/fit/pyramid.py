@@ -66,6 +66,13 @@ class Pyramid:
         finest = np.where(hidden, np.float32(HIDDEN_M), self.kernels.to_host(self.depth[0]))
         return replace(self, depth=[self.kernels.beside(finest, self.depth[0]), *self.depth[1:]])
 
+    def with_depth(self, depth_m: Any) -> "Pyramid":
+        """Return the same gray images with other depth [H, W], m, which is on the host."""
+        depth = [self.kernels.beside(np.ascontiguousarray(depth_m, np.float32), self.depth[0])]
+        for _ in self.cameras[1:]:
+            depth.append(self.kernels.halve((None, None), depth[-1], DEPTH_STEP_M * self.scene_scale)[2])
+        return replace(self, depth=depth)
+
     @staticmethod
     def of(
         gray: Plane,

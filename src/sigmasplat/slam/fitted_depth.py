@@ -24,7 +24,7 @@ def fitted_to_map(tracker: Tracker, field: Splats, view: View, seen: Observation
         return seen
     T_world_camera = tracker.expected(seen.frame.prior).predicted
     tracker.depth = _fitted(tracker.depth, field, view, seen, T_world_camera)
-    return _with_fit(tracker.depth, view, seen)
+    return _with_fit(tracker.depth, seen)
 
 
 def fitted_keyframe(
@@ -46,7 +46,7 @@ def fitted_keyframe(
     if connected:
         depth = _fitted(depth, field, view, seen, T_world_camera)
     tracker.depth = depth
-    return _with_fit(depth, view, seen)
+    return _with_fit(depth, seen)
 
 
 def _fitted(depth: DepthFit, field: Splats, view: View, seen: Observation, T_world_camera: Matrix) -> DepthFit:
@@ -63,5 +63,5 @@ def _depth_of_map(field: Splats, view: View, T_world_camera: Matrix) -> NDArray[
     return np.where(alpha > OPAQUE, depth / np.maximum(alpha, np.float32(OPAQUE)), np.float32(0.0))
 
 
-def _with_fit(depth: DepthFit, view: View, seen: Observation) -> Observation:
-    return seen.with_depth(depth.applied(seen.frame.depth_m), view)
+def _with_fit(depth: DepthFit, seen: Observation) -> Observation:
+    return seen.with_depth(depth.applied(seen.frame.depth_m))

@@ -53,7 +53,7 @@ class Slam(MapWork, ArrayInterface):
             connected = len(self.steps) > 0 and found.state == TRACKED
             pose = found.T_submap_camera
             seen = fitted_keyframe(self.tracker, self.mapper.field, self.view, seen, pose, connected)
-            seen = seen.without(self.tracker.front, self.view)
+            seen = seen.without(self.tracker.front)
             if self.config.mapping.exposure:
                 seen = seen.without_exposure(found.exposure)
             self._map(seen, found)

@@ -25,7 +25,7 @@ from sigmasplat.slam.localisation.foreground import Foreground
 from sigmasplat.slam.localisation.memory import together
 from sigmasplat.slam.localisation.sight import FoundKeyframe, Sight
 from sigmasplat.slam.localisation.tracked_keyframe import Splats, TrackedKeyframe, found_keyframe, mapped_keyframe
-from sigmasplat.slam.localisation.verdict import LEAST_COMMON, RECENT, Usual, confirmed, score, stands
+from sigmasplat.slam.localisation.verdict import LEAST_COMMON, RECENT, Usual, agrees_less, confirmed, score, stands
 from sigmasplat.slam.localisation.watch import Watch
 from sigmasplat.slam.rules import Asked, is_lost, is_wide, jumped, never, unless
 from sigmasplat.types import Matrix
@@ -85,7 +85,7 @@ class Tracker:
         True, that guess and the later ones are left out. A lost frame gets the best available guess (odometry, else the
         last pose), and the velocity is reset.
         """
-        expected, shown = self.expected(prior), seen.shown(view)
+        expected, shown = self.expected(prior), seen.shown
         if expected.given:
             best = self._fit(field, view, shown, expected.predicted, patience=0)
             best.T_camera_world = se3.inverse(expected.predicted)
@@ -100,7 +100,7 @@ class Tracker:
         best.T_camera_world = se3.orthonormalise(best.T_camera_world)
         if not self.lost:
             self._notice_rest(seen, se3.inverse(best.T_camera_world))
-        self._remember(best, seen.without(self.front, view))
+        self._remember(best, seen.without(self.front))
         return best
 
     def _estimated(
@@ -117,11 +117,8 @@ class Tracker:
     def _uncovered(
         self, field: Splats, view: View, seen: Sight, first: Sight, expected: Expected, fit: PoseFit, hurried: Asked
     ) -> tuple[PoseFit, Sight]:
-        """Find what is in front of the scene, and fit the pose without it; return the fit and the frame without it.
-
-        first: the frame as it was fitted. Returns the same fit and this frame if nothing is in front, or if the images
-        contradict the pose without it.
-        """
+        """Find what is in front of the scene, and fit the pose without it; return the fit and the frame without it. If
+        nothing is, or the images contradict that pose: the same fit, and the frame as it was fitted (`first`)."""
         before, self.front = self.front, None
         if fit.comparison is None or self.lost:
             return fit, first
@@ -134,9 +131,8 @@ class Tracker:
         self, field: Splats, view: View, seen: Sight, first: Sight, expected: Expected, fit: PoseFit,
         before: Foreground | None, hurried: Asked,
     ) -> tuple[PoseFit, Sight] | None:  # fmt: skip
-        """Return the fit and the frame without what is in space that was free; None without, or if the images
-        contradict the pose. before: in front in the last frame. The newest keyframe loses what has left it. If the same
-        thing hides most of it, the last image and the map give the pose."""
+        """Return the fit and the frame without what is in space that was free, or None; before: in front in the last
+        frame. The newest keyframe loses what has left it. If it is hidden, the last image and the map give the pose."""
         slow, known = self.watch.slow(seen, se3.inverse(fit.T_camera_world)), before or self.keyframe_front
         if fit.comparison is None or (slow is None and not self.watch.suspects(fit.comparison, known, hurried)):
             return None
@@ -150,20 +146,23 @@ class Tracker:
                 self.keyframe = self.watch.without_gone(keyframe, seen, guess)
                 if front is None and self.keyframe is keyframe:
                     break
-                shown = first if front is None else seen.aside(front, view)
+                shown = first if front is None else seen.aside(front)
                 found = self._fit(field, view, shown, guess)
                 found = self.watch.fitted_to_all(self.keyframe, shown.live, found, self.config, hurried)
                 guess = se3.inverse(found.T_camera_world)
             else:
-                if self._stands(found, predicted):
+                moves = self.watch.takes_for_moving(front, self.keyframe, seen, found)
+                if moves and self._stands(found, predicted, fit.comparison):
                     self.front = front
                     return found, shown
         self.keyframe = keyframe
         if expected_front is None or hurried():
             return None
-        shown = seen.aside(expected_front, view)
-        found = self._retry(field, view, shown, fit, expected, hurried)
-        self.front = expected_front if self._stands(found, predicted) else None
+        shown = seen.aside(expected_front)
+        judged = self._fit(field, view, shown, se3.inverse(fit.T_camera_world), patience=0)
+        found = self._retry(field, view, shown, judged, expected, hurried)
+        moves = self.watch.takes_for_moving(expected_front, keyframe, seen, found)
+        self.front = expected_front if moves and self._stands(found, predicted, fit.comparison) else None
         return None if self.front is None else (found, shown)
 
     def _without_object(
@@ -173,7 +172,7 @@ class Tracker:
         if there is none. known: the last frame had something in front."""
         contradicted, drops = self._contradicted(drawn), self.usual.agrees_less(drawn.comparison)
         for front in unless(hurried, self.watch.suspected(self.keyframe, seen, drawn, contradicted, known, drops)):
-            shown = seen.aside(front, view)
+            shown = seen.aside(front)
             found = self._fit(field, view, shown, predicted)
             if self._stands(found, predicted) and has_drawn(front, self.keyframe, seen, drawn, found, contradicted):
                 self.front = front
@@ -186,8 +185,9 @@ class Tracker:
         self.keyframe_front = None if self.front is not None and front is None else self.keyframe_front
         self.front, self.watch = front, self.watch.after(seen, front, T_world_camera)
 
-    def _stands(self, fit: PoseFit, predicted: Matrix) -> bool:
-        return not (self._is_lost(fit) or self._contradicted(fit) or self._leaps(fit, predicted))
+    def _stands(self, fit: PoseFit, predicted: Matrix, whole: Comparison | None = None) -> bool:
+        lost = self._is_lost(fit) or self._contradicted(fit) or self._leaps(fit, predicted)
+        return not (lost or agrees_less(fit.comparison, whole))
 
     def _remember(self, fit: PoseFit, seen: Sight) -> None:
         """Keep what the next frame needs."""

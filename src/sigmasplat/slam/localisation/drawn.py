@@ -5,7 +5,9 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.ndimage import label
 
+from sigmasplat.fit.compare import STEP as COMPARE_STEP
 from sigmasplat.fit.pose import PoseFit
+from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
@@ -22,7 +24,7 @@ from sigmasplat.slam.localisation.foreground import (
     with_margin,
 )
 from sigmasplat.slam.localisation.sight import Sight
-from sigmasplat.slam.localisation.verdict import agrees_more, disagrees, may_draw
+from sigmasplat.slam.localisation.verdict import agrees_more, differs, disagrees, may_draw
 from sigmasplat.slam.localisation.windows import widened
 from sigmasplat.types import Matrix
 
@@ -33,6 +35,8 @@ RING, FREE_AROUND = 3, 0.6
 SHIFTED = 1e-3
 """A thing has drawn the pose only if the pose without it shows the thing elsewhere: by at least this share of the
 width of the image. What has another brightness than before, and stays in place, changes the pose less."""
+MOST, STILL_CLOSE = 0.5, 0.8
+"""A thing is still if the keyframe shows at least this share of it, and this share of that is as far as before."""
 SHIFT_STEP = 4
 """Every fourth row and column of a thing is used to find this shift."""
 
@@ -76,8 +80,8 @@ def has_drawn(
     thing: Foreground, keyframe: Reference | None, seen: Sight, drawn: PoseFit, found: PoseFit, contradicted: bool
 ) -> bool:
     """Return whether a thing has drawn a pose, by the pose that was fitted without it: the rest agrees much more there,
-    the thing does not agree with the rest, it is shown elsewhere than at the drawn pose, and it agrees less than there.
-    contradicted: the images contradict the drawn pose."""
+    the thing does not agree with the rest, it is shown elsewhere than at the drawn pose, and the drawn pose is not only
+    a poor fit. contradicted: the images contradict the drawn pose."""
     if keyframe is None or not agrees_more(found.comparison, drawn.comparison, contradicted):
         return False
     whole = keyframe.compared(seen.live, found.T_camera_world)
@@ -85,9 +89,26 @@ def has_drawn(
     camera = seen.target.camera
     if not disagrees(whole, found.comparison) or shift_px(thing, camera, T_drawn_found) < SHIFTED * camera.width:
         return False
-    alone = seen.live.hiding(thing.depth_m <= 0)
+    return contradicted or not _fits_poorly(thing, keyframe, seen, drawn, found)
+
+
+def _fits_poorly(thing: Foreground, keyframe: Reference, seen: Sight, drawn: PoseFit, found: PoseFit) -> bool:
+    """Return whether the first pose is only a poor fit: the rest agrees hardly better there than with the thing, and
+    the thing itself agrees better at the other pose."""
+    alone, rest = seen.live.hiding(thing.depth_m <= 0), seen.live.hiding(thing.hidden)
     at_drawn, at_found = (keyframe.compared(alone, fit.T_camera_world).correlation for fit in (drawn, found))
-    return not at_found > at_drawn
+    return at_found > at_drawn and not may_draw(keyframe.compared(rest, drawn.T_camera_world), drawn.comparison)
+
+
+def is_still(thing: Foreground, keyframe: Reference | None, live: Pyramid, found: PoseFit) -> bool:
+    """Return whether what may be in front belongs to the scene: the keyframe shows most of it at the same place, with
+    gray values that agree as well as those of the rest."""
+    if keyframe is None or found.comparison is None:
+        return False
+    shown = keyframe.compared(live.hiding(thing.depth_m <= 0), found.T_camera_world)
+    whole = np.count_nonzero(thing.depth_m) / COMPARE_STEP**2
+    in_place = bool(shown.points >= MOST * whole and shown.close >= STILL_CLOSE)
+    return in_place and not (differs(shown) and disagrees(shown, found.comparison))
 
 
 def shift_px(thing: Foreground, camera: Camera, T_b_a: Matrix) -> float:

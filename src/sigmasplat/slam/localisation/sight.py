@@ -36,29 +36,29 @@ class Sight:
     image: FeatureImage | None = None
     ignored: NDArray[np.bool_] | None = None
 
-    def shown(self, view: View) -> Self:
+    @property
+    def shown(self) -> Self:
         """Return the frame for fits of its pose, which do not use the pixels that are to be ignored."""
-        return self if self.ignored is None else self.aside(None, view)
+        return self if self.ignored is None else self.aside(None)
 
-    def without(self, front: Foreground | None, view: View) -> Self:
+    def without(self, front: Foreground | None) -> Self:
         """Return the frame without depth where something is in front: it is neither mapped nor a reference there."""
         if front is None:
             return self
-        return self.with_depth(np.where(front.hidden, np.float32(0.0), self.target.depth_image.numpy()), view)
+        return self.with_depth(np.where(front.hidden, np.float32(0.0), self.target.depth_image.numpy()))
 
-    def with_depth(self, depth_m: NDArray[np.float32], view: View) -> Self:
+    def with_depth(self, depth_m: NDArray[np.float32]) -> Self:
         """Return the frame with other depth [H, W], m."""
-        target, live = self._with_depth(depth_m, view)
-        image = None if self.image is None else self.image.with_depth(target.depth_image.numpy())
-        return replace(self, target=target, live=live, image=image)
+        return replace(self._read_as(depth_m), live=self.live.with_depth(depth_m))
 
-    def aside(self, front: Foreground | None, view: View) -> Self:
+    def aside(self, front: Foreground | None) -> Self:
         """Return the frame for fits of its pose, which are to use neither depth nor colour of what is in front or
         ignored."""
+        depth_m = self.target.depth_image.numpy()
+        unread = self if front is None else self._read_as(np.where(front.hidden, np.float32(0.0), depth_m))
         hidden = np.zeros((), np.bool_) if front is None else front.hidden
         hidden = hidden if self.ignored is None else hidden | self.ignored
-        depth_m = np.where(hidden, np.float32(HIDDEN_M), self.target.depth_image.numpy())
-        return replace(self.without(front, view), live=self._with_depth(depth_m, view)[1])
+        return replace(unread, live=self.live.with_depth(np.where(hidden, np.float32(HIDDEN_M), depth_m)))
 
     def separate(self) -> Self:
         """Return the same frame with an own image for features, which are found and kept when they are first needed."""
@@ -68,9 +68,10 @@ class Sight:
         """Return the frame with the exposure (a, b) of exp(a) · colour + b removed from its target."""
         return replace(self, target=self.target.without_exposure(gray_exposure(*exposure)))
 
-    def _with_depth(self, depth_m: NDArray[np.float32], view: View) -> tuple[Target, Pyramid]:
-        target = self.target.with_depth(depth_m)
-        return target, live_image(view, target.image.numpy(), depth_m, target, self.live.noise[0])
+    def _read_as(self, depth_m: NDArray[np.float32]) -> Self:
+        """Return the frame with other depth [H, W], m, for everything but fits of its pose."""
+        image = None if self.image is None else self.image.with_depth(depth_m)
+        return replace(self, target=self.target.with_depth(depth_m), image=image)
 
 
 @dataclass(eq=False)

@@ -117,6 +117,14 @@ def disagrees(whole: Comparison, without: Comparison | None) -> bool:
     return without is not None and 1.0 - whole.correlation > DISAGREES * (1.0 - without.correlation)
 
 
+def agrees_less(without: Comparison | None, whole: Comparison | None) -> bool:
+    """Return whether the images agree less, in depth and in gray, without something at the pose that was fitted without
+    it than with it at the first pose: then it belongs to the scene."""
+    if without is None or whole is None or without.close >= whole.close:
+        return False
+    return not 1.0 - without.correlation <= DISAGREES * (1.0 - whole.correlation)
+
+
 def is_questionable(doubtful: int) -> bool:
     """Return whether the whole map is searched after this number of doubtful frames in a row."""
     return doubtful > 0 and doubtful % PATIENCE == 0

@@ -12,7 +12,7 @@ from sigmasplat.fit.pose import PoseFit
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference
 from sigmasplat.model import se3
-from sigmasplat.slam.localisation.drawn import suspected
+from sigmasplat.slam.localisation.drawn import is_still, suspected
 from sigmasplat.slam.localisation.foreground import Earlier, Foreground, foreground
 from sigmasplat.slam.localisation.memory import Memory
 from sigmasplat.slam.localisation.sight import Sight
@@ -96,6 +96,11 @@ class Watch:
         if not (contradicted or looks):
             return
         yield from suspected(keyframe, seen, fit, contradicted or drops)
+
+    def takes_for_moving(self, front: Foreground | None, keyframe: Reference | None, seen: Sight, fit: PoseFit) -> bool:
+        """Return whether what is in front moves, by a fit without it: a still thing can seem to be in free space where
+        poses or depth are wrong."""
+        return front is None or not (self.config.find and is_still(front, keyframe, seen.live, fit))
 
     def fitted_to_all(
         self, keyframe: Reference | None, live: Pyramid, fit: PoseFit, config: TrackingConfig, hurried: Asked

@@ -154,7 +154,7 @@ class CameraClock:
         alignment = self.tracker.hop(fit, seen.live)
         splats = NOTHING if self.snapshot is None else self.snapshot
         refitted = fitted_keyframe(self.tracker, splats, view, seen, found.T_submap_camera, connected=not self.found)
-        shown = refitted.without(self.tracker.front, view)
+        shown = refitted.without(self.tracker.front)
         self._follow(self.frames, shown, found.T_submap_camera)
         if len(self.waits) >= self.config.realtime.waiting_most:
             self.refused += 1
