@@ -17,7 +17,7 @@ from sigmasplat.model.frame import Frame
 from sigmasplat.slam.localisation.drawn import free_standing, has_drawn, is_still, shift_px, suspected
 from sigmasplat.slam.localisation.foreground import Foreground, thinned
 from sigmasplat.slam.localisation.sight import Sight
-from sigmasplat.slam.localisation.verdict import agrees_less
+from sigmasplat.slam.localisation.verdict import is_missed
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 CAMERA = Camera(160, 120, 140.0, 140.0, 79.5, 59.5)
@@ -103,10 +103,10 @@ def test_a_still_box_is_told_from_one_that_moves() -> None:
 
 def test_images_that_agree_less_in_depth_and_gray_speak_against_leaving_something_out() -> None:
     whole = Comparison(0.8, 0.99, 0.01, 0.0, 0.1, 0.95, 2000)
-    assert agrees_less(replace(whole, close=0.93, correlation=0.89), whole)
-    assert not agrees_less(replace(whole, close=0.93, correlation=0.94), whole)
-    assert not agrees_less(replace(whole, close=0.99, correlation=0.89), whole)
-    assert not agrees_less(None, whole) and not agrees_less(whole, None)
+    assert is_missed(replace(whole, close=0.93, correlation=0.89), whole)
+    assert not is_missed(replace(whole, close=0.93, correlation=0.94), whole)
+    assert not is_missed(replace(whole, close=0.99, correlation=0.89), whole)
+    assert not is_missed(None, whole) and not is_missed(whole, None)
 
 
 def test_a_still_box_has_not_drawn_a_pose_that_fits_badly() -> None:

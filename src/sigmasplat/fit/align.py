@@ -36,9 +36,8 @@ FINE_LEVELS = 2
 """An alignment to several references uses this number of levels."""
 UNKNOWN_M = 1.0
 """Standard deviation assumed for an undetermined direction, metres (for rotations: shift at the mean depth)."""
-
-
 UPPER = np.triu_indices(6)
+"""Rows and columns of the upper triangle of H, in the order of the kernels' sums."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,7 +24,7 @@ SIGMA = varsplat.FAST.changed(
     render={"depth": "ray"},
     seeding={"thickness": 0.1},  # the depth of a disc seen at an angle is right, and the path a little better
     tracking={"features": True, "verify": True},
-    moving={"find": True},  # no measurable time in still scenes, and mostly the same poses and splats there
+    moving={"find": True},  # no measurable time in a recording in which nothing moves
     recovery={"relocalise": True, "new_map_after": 20, "steady_frames": 2},
     # Descent hardly ever finds a keyframe that alignment does not find, and takes half of the time of a search.
     registration={"to_keyframe": True, "iterations": 0},

@@ -25,7 +25,7 @@ from sigmasplat.slam.localisation.foreground import Foreground
 from sigmasplat.slam.localisation.memory import together
 from sigmasplat.slam.localisation.sight import FoundKeyframe, Sight
 from sigmasplat.slam.localisation.tracked_keyframe import Splats, TrackedKeyframe, found_keyframe, mapped_keyframe
-from sigmasplat.slam.localisation.verdict import LEAST_COMMON, RECENT, Usual, agrees_less, confirmed, score, stands
+from sigmasplat.slam.localisation.verdict import LEAST_COMMON, RECENT, Usual, confirmed, is_missed, score, stands
 from sigmasplat.slam.localisation.watch import Watch
 from sigmasplat.slam.rules import Asked, is_lost, is_wide, jumped, never, unless
 from sigmasplat.types import Matrix
@@ -187,7 +187,7 @@ class Tracker:
 
     def _stands(self, fit: PoseFit, predicted: Matrix, whole: Comparison | None = None) -> bool:
         lost = self._is_lost(fit) or self._contradicted(fit) or self._leaps(fit, predicted)
-        return not (lost or agrees_less(fit.comparison, whole))
+        return not (lost or is_missed(fit.comparison, whole))
 
     def _remember(self, fit: PoseFit, seen: Sight) -> None:
         """Keep what the next frame needs."""

@@ -35,7 +35,7 @@ RING, FREE_AROUND = 3, 0.6
 SHIFTED = 1e-3
 """A thing has drawn the pose only if the pose without it shows the thing elsewhere: by at least this share of the
 width of the image. What has another brightness than before, and stays in place, changes the pose less."""
-MOST, STILL_CLOSE = 0.5, 0.8
+STILL_SHOWN, STILL_CLOSE = 0.5, 0.8
 """A thing is still if the keyframe shows at least this share of it, and this share of that is as far as before."""
 SHIFT_STEP = 4
 """Every fourth row and column of a thing is used to find this shift."""
@@ -107,7 +107,7 @@ def is_still(thing: Foreground, keyframe: Reference | None, live: Pyramid, found
         return False
     shown = keyframe.compared(live.hiding(thing.depth_m <= 0), found.T_camera_world)
     whole = np.count_nonzero(thing.depth_m) / COMPARE_STEP**2
-    in_place = bool(shown.points >= MOST * whole and shown.close >= STILL_CLOSE)
+    in_place = bool(shown.points >= STILL_SHOWN * whole and shown.close >= STILL_CLOSE)
     return in_place and not (differs(shown) and disagrees(shown, found.comparison))
 
 

@@ -117,9 +117,9 @@ def disagrees(whole: Comparison, without: Comparison | None) -> bool:
     return without is not None and 1.0 - whole.correlation > DISAGREES * (1.0 - without.correlation)
 
 
-def agrees_less(without: Comparison | None, whole: Comparison | None) -> bool:
-    """Return whether the images agree less, in depth and in gray, without something at the pose that was fitted without
-    it than with it at the first pose: then it belongs to the scene."""
+def is_missed(without: Comparison | None, whole: Comparison | None) -> bool:
+    """Return whether something belongs to the scene: the images agree less in depth and in gray without it, at the pose
+    that was fitted without it, than with it at the first pose."""
     if without is None or whole is None or without.close >= whole.close:
         return False
     return not 1.0 - without.correlation <= DISAGREES * (1.0 - whole.correlation)
