@@ -29,19 +29,60 @@ static LivePairs side_by_side(const AlignLevel& L, Buffer<float>& memory) {
     return {pairs, L.width};
 }
 
-// Residuals and derivatives of W reference pixels from (x, y) on. Adds to H and sums (acc) and to b (pull).
-SIGMA_INLINE void add_pixels(const AlignLevel& L, const LivePairs& live, const AlignOptions& o, const Motion& T, int x, int y, vf* acc, vf* pull) {
-    const size_t at = size_t(y) * L.width + x;
-    const int lanes = L.width - x < W ? L.width - x : W;
-    alignas(64) float edge[5][W] = {};
-    const float* planes[5] = {L.reference_depth, L.reference_gray, L.weight_gray, L.weight_depth, L.noise};
-    for (int k = 0; k < 5; k++) {
-        if (!planes[k]) continue;
-        planes[k] += at;
-        if (lanes < W) { memcpy(edge[k], planes[k], lanes * 4); planes[k] = edge[k]; }
+// The vectors of the rows of a cell that are computed together. Each stage runs over all of them before the next one
+// begins: its values fit into the registers, and the processor works on several vectors at once.
+constexpr int PART_ROWS = 8, PART = PART_ROWS * CELL / W;
+struct Part { Warped warped[PART]; Residuals residuals[PART]; Derivatives derivatives[PART]; size_t at[PART]; int lanes[PART]; };
+
+// The next cells are fetched ahead: a row of a cell is one cache line, too short for the processor to do so by itself.
+// Without this, most of the time is spent on waiting for memory. Beyond the end of an image a prefetch does nothing.
+constexpr int CELLS_AHEAD = 2;
+SIGMA_INLINE void fetch_ahead(const AlignLevel& L, size_t at) {
+    for (const float* plane : {L.reference_depth, L.reference_gray, L.weight_gray, L.weight_depth, L.noise})
+        if (plane) __builtin_prefetch(plane + at + CELLS_AHEAD * CELL);
+}
+
+SIGMA_INLINE vf load_lanes(const float* p, int lanes) {
+    if (lanes == W) return load(p);
+    vf r{};
+    memcpy(&r, p, lanes * sizeof(float));
+    return r;
+}
+SIGMA_INLINE vf load_lanes(const float* plane, size_t at, int lanes, float otherwise) { return plane ? load_lanes(plane + at, lanes) : splat(otherwise); }
+
+// Warp the pixels of a part; return the number of vectors with a pixel that is used.
+struct Bounds { int left, right, top, bottom; };
+static int warp_part(const AlignLevel& L, const Motion& T, Bounds in, Part& part) {
+    int n = 0;
+    for (int y = in.top; y < in.bottom; y++) {
+        fetch_ahead(L, size_t(y) * L.width + in.left);
+        for (int x = in.left; x < in.right; x += W) {
+            const size_t at = part.at[n] = size_t(y) * L.width + x;
+            const int lanes = part.lanes[n] = L.width - x < W ? L.width - x : W;
+            const Mask inside = gt(splat(float(lanes)), lane_index());
+            n += warp(L, T, load_lanes(L.reference_depth + at, lanes), lane_index() + (float(x) - L.cx), float(y) - L.cy, inside, part.warped[n]);
+        }
     }
-    const vf off_x = lane_index() + (float(x) - L.cx);
-    add_residuals(L, live, o, T, off_x, float(y) - L.cy, first_lanes(lanes), {planes[0], planes[1], planes[2], planes[3], planes[4]}, acc, pull);
+    return n;
+}
+
+// Add residuals and derivatives of reference pixels to H and sums (acc) and to b (pull).
+static void add_part(const AlignLevel& L, const LivePairs& live, const AlignOptions& o, const Motion& T, Bounds in, vf* acc, vf* pull) {
+    Part part;
+    const int n = warp_part(L, T, in, part);
+    for (int i = 0; i < n; i++) {
+        const Warped& w = part.warped[i];
+        const size_t at = part.at[i];
+        const int lanes = part.lanes[i];
+        __builtin_prefetch(live.pairs + 2 * (w.at[0] + CELLS_AHEAD * CELL));
+        const ReferencePixels pixels = {load_lanes(L.reference_gray + at, lanes), load_lanes(L.weight_gray, at, lanes, 1.f),
+                                        load_lanes(L.weight_depth, at, lanes, 1.f), load_lanes(L.noise, at, lanes, 1.f)};
+        part.residuals[i] = compared(o, w, neighbours(live, w.at), pixels, acc + MATRIX_TERMS);
+    }
+    for (int i = 0; i < n; i++) part.derivatives[i] = derivatives(L, part.warped[i], part.residuals[i]);
+    add_rows<0, 1>(part.residuals, part.derivatives, n, acc, pull);
+    add_rows<1, 3>(part.residuals, part.derivatives, n, acc, pull);
+    add_rows<3, 6>(part.residuals, part.derivatives, n, acc, pull);
 }
 
 static void linearise(const AlignLevel& L, const LivePairs& live, const AlignOptions* o, const double* T, double* H, double* b, double* S, double* sums) {
@@ -59,8 +100,8 @@ static void linearise(const AlignLevel& L, const LivePairs& live, const AlignOpt
             for (auto& a : pull) a = splat(0.f);
             const vf used = acc[22], read = acc[23], agreeing = acc[24];
             const int bottom = (band + 1) * CELL < L.height ? (band + 1) * CELL : L.height, right = (cell + 1) * CELL < L.width ? (cell + 1) * CELL : L.width;
-            for (int y = band * CELL; y < bottom; y++)
-                for (int x = cell * CELL; x < right; x += W) add_pixels(L, live, *o, motion, x, y, acc, pull);
+            for (int y = band * CELL; y < bottom; y += PART_ROWS)
+                add_part(L, live, *o, motion, {cell * CELL, right, y, y + PART_ROWS < bottom ? y + PART_ROWS : bottom}, acc, pull);
             double g[6];
             for (int k = 0; k < 6; k++) { g[k] = lane_sum(pull[k]); total[21 + k] += g[k]; }
             // Two counts in one sum, exact below 2²⁴: pixels in view without a reading or agreeing, and readings.

@@ -40,8 +40,6 @@ SIGMA_INLINE Motion motion_of(const double* T) {
     return m;
 }
 
-struct ReferencePixels { const float *depth, *gray, *weight_gray, *weight_depth, *noise; };   // weights and noise may be null
-
 // The number of a cell's pixels that both cameras see: those in view, unless live depth has a large hole there. Holes
 // that are scattered do not matter as long as a quarter of the pixels fall on a reading.
 inline double common_pixels(double in_view, double read) { return in_view < 4.0 * read ? in_view : 4.0 * read; }
@@ -49,67 +47,99 @@ inline double common_pixels(double in_view, double read) { return in_view < 4.0 
 // Gray and depth of live pixels: at a position, to its right, below it, and to the right of that.
 struct Neighbours { vf gray[4], depth[4]; };
 
-// Add residuals and derivatives of reference pixels to H (acc, 21), sums (acc + 21, 4) and b (pull, 6). off_x, off_y:
-// position relative to the principal point. inside: lanes that are pixels of the image. `neighbours(live, i)` reads the live
-// pixels next to those with the numbers i.
-template <class Live>
-SIGMA_INLINE void add_residuals(const AlignLevel& L, const Live& live, const AlignOptions& o, const Motion& T, vf off_x, float off_y, Mask inside,
-                                const ReferencePixels& pixels, vf* acc, vf* pull) {
+// Reference pixels in the live camera: position (px, py, pz), 1 / pz, and the live pixel `at` up and left of them, with the
+// shares (a, c) of the one to its right and the one below. ok: lanes that are used.
+struct Warped { vf px, py, pz, iz, a, c; vi at; Mask ok; };
+// off_x, off_y: position relative to the principal point. inside: lanes that are pixels of the image. Returns whether any
+// lane is used.
+SIGMA_INLINE bool warp(const AlignPinhole& L, const Motion& T, vf d, vf off_x, float off_y, Mask inside, Warped& w) {
     const float *R = T.R, *t = T.t;
-    const vf d = load(pixels.depth);
-    Mask ok = both(inside, gt(d, splat(0.f)));
-    if (!any(ok)) return;
+    w.ok = both(inside, gt(d, splat(0.f)));
+    if (!any(w.ok)) return false;
     const vf X = off_x * (1.f / L.fx) * d, Y = splat(off_y / L.fy) * d;
-    const vf px = R[0] * X + (R[1] * Y + (R[2] * d + t[0])), py = R[3] * X + (R[4] * Y + (R[5] * d + t[1])),
-             pz = R[6] * X + (R[7] * Y + (R[8] * d + t[2]));
-    ok = both(ok, gt(pz, splat(0.05f)));
-    const vf iz = 1.f / max(pz, splat(0.05f)), xn = px * iz, yn = py * iz;
-    vf u = L.fx * xn + L.cx, v = L.fy * yn + L.cy;
-    ok = both(ok, both(both(ge(u, splat(0.f)), ge(v, splat(0.f))), both(gt(splat(L.width - 1.f), u), gt(splat(L.height - 1.f), v))));
-    if (!any(ok)) return;
+    w.px = R[0] * X + (R[1] * Y + (R[2] * d + t[0]));
+    w.py = R[3] * X + (R[4] * Y + (R[5] * d + t[1]));
+    w.pz = R[6] * X + (R[7] * Y + (R[8] * d + t[2]));
+    w.ok = both(w.ok, gt(w.pz, splat(0.05f)));
+    w.iz = 1.f / max(w.pz, splat(0.05f));
+    vf u = L.fx * (w.px * w.iz) + L.cx, v = L.fy * (w.py * w.iz) + L.cy;
+    w.ok = both(w.ok, both(both(ge(u, splat(0.f)), ge(v, splat(0.f))), both(gt(splat(L.width - 1.f), u), gt(splat(L.height - 1.f), v))));
+    if (!any(w.ok)) return false;
     u = clamp(u, 0.f, L.width - 1.001f);
     v = clamp(v, 0.f, L.height - 1.001f);
-    const vf fu = floor(u), fv = floor(v), a = u - fu, c = v - fv;
-    const vi i00 = to_int(fma(fv, splat(float(L.width)), fu));
-    const Neighbours near = neighbours(live, i00);
+    const vf fu = floor(u), fv = floor(v);
+    w.a = u - fu;
+    w.c = v - fv;
+    w.at = to_int(fma(fv, splat(float(L.width)), fu));
+    return true;
+}
+
+struct ReferencePixels { vf gray, weight_gray, weight_depth, noise; };   // 1 without weights, or without noise
+// Residuals of gray and depth, their weights, and the derivatives of the live images.
+struct Residuals { vf gray, depth, weight_gray, weight_depth, gray_dx, gray_dy, depth_dx, depth_dy; };
+
+// Compare warped pixels with the live images, of which `near` are the neighbours. Adds to sums [4].
+SIGMA_INLINE Residuals compared(const AlignOptions& o, const Warped& w, const Neighbours& near, const ReferencePixels& pixels, vf* sums) {
     const vf *g = near.gray, d00 = near.depth[0], d10 = near.depth[1], d01 = near.depth[2], d11 = near.depth[3];
-    const Bilinear I = interpolate(g[0], g[1], g[2], g[3], a, c);
-    Bilinear D = interpolate(d00, d10, d01, d11, a, c);
+    const Mask ok = w.ok;
+    const Bilinear I = interpolate(g[0], g[1], g[2], g[3], w.a, w.c);
+    Bilinear D = interpolate(d00, d10, d01, d11, w.a, w.c);
     vf nearest = min(min(d00, d10), min(d01, d11));
     const vf farthest = max(max(d00, d10), max(d01, d11));
     Mask read = both(ok, gt(nearest, splat(0.f))), planar = read;
     if (any(both(ok, mask_not(read)))) {                       // a hole among the neighbours of some pixel
-        const Sparse s = interpolate_readings(d00, d10, d01, d11, a, c);
+        const Sparse s = interpolate_readings(d00, d10, d01, d11, w.a, w.c);
         D = {select(read, D.value, s.at.value), select(read, D.dx, s.at.dx), select(read, D.dy, s.at.dy)};
         nearest = s.nearest;
         planar = both(ok, s.planar);
         read = both(ok, s.read);
     }
-    const vf r_depth = D.value - pz, r_gray = I.value - load(pixels.gray);
+    const vf r_depth = D.value - w.pz, r_gray = I.value - pixels.gray;
     const Mask agrees = both(read, gt(splat(o.depth_gate), abs(r_depth)));
     // No derivative is used where the neighbours do not determine it or contain a depth step. Without live depth only
     // colour is used.
-    const Mask smooth = both(both(agrees, planar), gt(0.03f * pz, farthest - nearest));
+    const Mask smooth = both(both(agrees, planar), gt(0.03f * w.pz, farthest - nearest));
     const Mask color_ok = both(ok, mask_or(agrees, mask_not(read)));
-    const vf weight_gray = pixels.weight_gray ? load(pixels.weight_gray) : splat(1.f), weight_depth = pixels.weight_depth ? load(pixels.weight_depth) : splat(1.f);
-    vf hd = splat(o.huber_depth_relative) * pz * pz;          // sensor noise grows with z², unless readings have their own
-    if (pixels.noise) hd = hd * max(load(pixels.noise), splat(1e-3f));
-    const vf wi = only(color_ok, weight_gray * (o.weight_color / (o.huber_gray * o.huber_gray)) * huber_weight(r_gray, splat(o.huber_gray)));
-    const vf wd = only(smooth, weight_depth * (o.weight_depth / (hd * hd)) * huber_weight(r_depth, hd));
-    const vf fxz = L.fx * iz, fyz = L.fy * iz, zero = splat(0.f);
-    const vf du[6] = {fxz, zero, -fxz * xn, -fxz * xn * py, fma(fxz * xn, px, fxz * pz), -fxz * py};
-    const vf dv[6] = {zero, fyz, -fyz * yn, -fma(fyz * yn, py, fyz * pz), fyz * yn * px, fyz * px};
-    vf Ji[6], Jd[6];
-    for (int k = 0; k < 6; k++) { Ji[k] = fma(I.dx, du[k], I.dy * dv[k]); Jd[k] = fma(D.dx, du[k], D.dy * dv[k]); }
-    Jd[2] -= 1.f; Jd[3] -= py; Jd[4] += px;
-    int q = 0;
-    for (int i = 0; i < 6; i++) {
-        const vf ji = wi * Ji[i], jd = wd * Jd[i];
-        for (int j = i; j < 6; j++, q++) acc[q] = fma(ji, Ji[j], fma(jd, Jd[j], acc[q]));
-        pull[i] = fma(ji, r_gray, fma(jd, r_depth, pull[i]));
+    // Sensor noise grows with z², unless readings have their own.
+    const vf hd = splat(o.huber_depth_relative) * w.pz * w.pz * max(pixels.noise, splat(1e-3f));
+    const vf wi = only(color_ok, pixels.weight_gray * (o.weight_color / (o.huber_gray * o.huber_gray)) * huber_weight(r_gray, splat(o.huber_gray)));
+    const vf wd = only(smooth, pixels.weight_depth * (o.weight_depth / (hd * hd)) * huber_weight(r_depth, hd));
+    sums[0] += fma(wi * r_gray, r_gray, wd * r_depth * r_depth);
+    sums[1] += only(color_ok, splat(1.f));
+    sums[2] += only(read, splat(1.f));
+    sums[3] += only(agrees, splat(1.f));
+    return {r_gray, r_depth, wi, wd, I.dx, I.dy, D.dx, D.dy};
+}
+
+// Derivatives of both residuals with respect to the left twist.
+struct Derivatives { vf gray[6], depth[6]; };
+SIGMA_INLINE Derivatives derivatives(const AlignPinhole& L, const Warped& w, const Residuals& r) {
+    const vf xn = w.px * w.iz, yn = w.py * w.iz, fxz = L.fx * w.iz, fyz = L.fy * w.iz, zero = splat(0.f);
+    const vf du[6] = {fxz, zero, -fxz * xn, -fxz * xn * w.py, fma(fxz * xn, w.px, fxz * w.pz), -fxz * w.py};
+    const vf dv[6] = {zero, fyz, -fyz * yn, -fma(fyz * yn, w.py, fyz * w.pz), fyz * yn * w.px, fyz * w.px};
+    Derivatives J;
+    for (int k = 0; k < 6; k++) { J.gray[k] = fma(r.gray_dx, du[k], r.gray_dy * dv[k]); J.depth[k] = fma(r.depth_dx, du[k], r.depth_dy * dv[k]); }
+    J.depth[2] -= 1.f; J.depth[3] -= w.py; J.depth[4] += w.px;
+    return J;
+}
+
+// Add `count` vectors of pixels to the rows FROM to TO - 1 of H's upper triangle and of b. Few rows at once, so that their
+// sums stay in registers.
+constexpr int row_begin(int i) { return i * 6 - i * (i - 1) / 2; }
+template <int FROM, int TO>
+SIGMA_INLINE void add_rows(const Residuals* r, const Derivatives* J, int count, vf* H, vf* b) {
+    constexpr int BEGIN = row_begin(FROM), TERMS = row_begin(TO) - BEGIN;
+    vf h[TERMS], g[TO - FROM];
+    for (int q = 0; q < TERMS; q++) h[q] = H[BEGIN + q];
+    for (int i = FROM; i < TO; i++) g[i - FROM] = b[i];
+    for (int k = 0; k < count; k++) {
+        int q = 0;
+        for (int i = FROM; i < TO; i++) {
+            const vf ji = r[k].weight_gray * J[k].gray[i], jd = r[k].weight_depth * J[k].depth[i];
+            for (int j = i; j < 6; j++, q++) h[q] = fma(ji, J[k].gray[j], fma(jd, J[k].depth[j], h[q]));
+            g[i - FROM] = fma(ji, r[k].gray, fma(jd, r[k].depth, g[i - FROM]));
+        }
     }
-    acc[MATRIX_TERMS] += fma(wi * r_gray, r_gray, wd * r_depth * r_depth);
-    acc[MATRIX_TERMS + 1] += only(color_ok, splat(1.f));
-    acc[MATRIX_TERMS + 2] += only(read, splat(1.f));
-    acc[MATRIX_TERMS + 3] += only(agrees, splat(1.f));
+    for (int q = 0; q < TERMS; q++) H[BEGIN + q] = h[q];
+    for (int i = FROM; i < TO; i++) b[i] = g[i - FROM];
 }

@@ -94,9 +94,15 @@ inline void store_cell(const AlignLevel& L, const AlignOptions& o, const double*
     float terms[FLOATS] = {};
     if (x < L.width && y < L.height) {
         const size_t at = size_t(y) * L.width + x;
-        const ReferencePixels pixel = {L.reference_depth + at, L.reference_gray + at, L.weight_gray ? L.weight_gray + at : nullptr,
-                                       L.weight_depth ? L.weight_depth + at : nullptr, L.noise ? L.noise + at : nullptr};
-        add_residuals(L, LivePlanes{L.live_gray, L.live_depth, L.width}, o, motion_of(T), float(x) - L.cx, float(y) - L.cy, true, pixel, terms, terms + PULL);
+        const ReferencePixels pixel = {L.reference_gray[at], L.weight_gray ? L.weight_gray[at] : 1.f, L.weight_depth ? L.weight_depth[at] : 1.f,
+                                       L.noise ? L.noise[at] : 1.f};
+        Warped w;
+        if (warp(L, motion_of(T), L.reference_depth[at], float(x) - L.cx, float(y) - L.cy, true, w)) {
+            const LivePlanes live = {L.live_gray, L.live_depth, L.width};
+            const Residuals r = compared(o, w, neighbours(live, w.at), pixel, terms + MATRIX_TERMS);
+            const Derivatives J = derivatives(L, w, r);
+            add_rows<0, 6>(&r, &J, 1, terms, terms + PULL);
+        }
     }
     of_warps[thread / 32][thread % 32] = sum_of_lanes<16>(terms);
     __syncthreads();
