@@ -31,7 +31,7 @@ class Floor:
 
 
 FLOORS = (
-    Floor(("errors", "env", "types"), "base", "errors, environment, shared types"),
+    Floor(("errors", "env", "types", "threads"), "base", "errors, environment, shared types"),
     Floor(("reading",), "base", "files of users, within limits"),
     Floor(("config",), "base", "every setting, with units"),
     Floor(("presets",), "base", "values of the published systems"),

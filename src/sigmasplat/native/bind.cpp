@@ -7,6 +7,9 @@
 #include <vector>
 
 #include <omp.h>
+#ifdef __linux__
+#include <sched.h>
+#endif
 
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/pair.h>
@@ -213,6 +216,17 @@ static void project_double(Doubles view, Doubles means, Doubles quats, Doubles s
     }
 }
 
+// Give the other threads of the calling thread's team the priority of idle time: any other thread takes their core at once.
+static void idle_workers() {
+#ifdef __linux__
+#pragma omp parallel
+    if (omp_get_thread_num()) {
+        const sched_param none{};
+        sched_setscheduler(0, SCHED_IDLE, &none);
+    }
+#endif
+}
+
 NB_MODULE(_core, m) {
     nb::set_leak_warnings(false);         // autograd graphs can outlive the interpreter's orderly shutdown
     m.doc() = "SigmaSplat's CPU kernels. Arrays are float32, C-contiguous, on the CPU; see sigmasplat.render.cpu for the shapes.";
@@ -224,6 +238,7 @@ NB_MODULE(_core, m) {
     });
     m.def("set_threads", [](int n) { omp_set_num_threads(n); });
     m.def("threads", [] { return omp_get_max_threads(); });
+    m.def("idle_workers", idle_workers, nb::call_guard<nb::gil_scoped_release>());
     m.def("tile_size", [] { return std::vector<int>{active->pad.tile_width, active->pad.tile_height}; });
     m.def("project_forward", [](ConstFloats view, ConstFloats means, ConstFloats quats, ConstFloats scales, Floats means2d, Floats conics, Floats z, Floats radii, Maybe<Floats> slopes) {
         nb::gil_scoped_release unlocked;

@@ -121,3 +121,13 @@ def set_kernel_threads(count: int) -> int:
     if count:
         _core.set_threads(count)
     return before
+
+
+def idle_kernel_workers() -> None:
+    """Let the threads that help the calling thread in the CPU kernels run only where a core is idle (Linux). They hold
+    no lock, so no other thread waits for them."""
+    try:
+        from sigmasplat.native import _core
+    except ImportError:
+        return
+    _core.idle_workers()

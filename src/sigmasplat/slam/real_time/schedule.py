@@ -1,18 +1,15 @@
 """Run the work on the map beside tracking: on a thread of its own."""
 
 import gc
-import os
 import sys
 import threading
 from collections.abc import Iterator
 from typing import Protocol
 
 from sigmasplat import env
-from sigmasplat.render.backend import set_kernel_threads
+from sigmasplat.render.backend import idle_kernel_workers, set_kernel_threads
+from sigmasplat.threads import yield_to_others
 
-NICENESS = 5
-"""How much the mapping thread yields to tracking if both want the same core (Linux). With a larger value, other
-programs keep it from running while it holds the interpreter lock, and tracking has to wait for it."""
 SWITCH_S = 0.0005
 """How long a thread may hold the interpreter lock while another one waits for it; Python's default is 5 ms."""
 
@@ -85,9 +82,9 @@ class MappingThread:
             raise error
 
     def _run(self, work: Iterator[bool]) -> None:
-        if sys.platform == "linux":
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)
+        yield_to_others()
         set_kernel_threads(env.switches().threads)
+        idle_kernel_workers()
         try:
             while self._continues():
                 while next(work) and not self._stopped:
