@@ -31,11 +31,11 @@ class Floor:
 
 
 FLOORS = (
-    Floor(("errors", "env", "types", "threads"), "base", "errors, environment, shared types"),
+    Floor(("errors", "env", "types"), "base", "errors, environment, shared types"),
     Floor(("reading",), "base", "files of users, within limits"),
     Floor(("config",), "base", "every setting, with units"),
     Floor(("presets",), "base", "values of the published systems"),
-    Floor(("native",), "base", "C++ and CUDA kernels"),
+    Floor(("native",), "base", "C++ and CUDA kernels, threads"),
     Floor(("model",), "core", "data: camera, splats, submap"),
     Floor(("render",), "core", "images: colour, depth, variance"),
     Floor(("fit",), "core", "optimise poses and splats"),

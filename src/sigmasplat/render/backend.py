@@ -108,26 +108,3 @@ def make_covariance_view(view: View, correlations: Rows) -> CorrelationView:
     from sigmasplat.render.cpu.covariance_view import CpuCovarianceView
 
     return CpuCovarianceView(view, correlations)
-
-
-def set_kernel_threads(count: int) -> int:
-    """Set the number of threads that the CPU kernels use when the calling thread calls them, and return the number
-    before; 0 = no change."""
-    try:
-        from sigmasplat.native import _core
-    except ImportError:
-        return 0  # without the kernels there is nothing to set
-    before = _core.threads()
-    if count:
-        _core.set_threads(count)
-    return before
-
-
-def idle_kernel_workers() -> None:
-    """Let the threads that help the calling thread in the CPU kernels run only where a core is idle (Linux). They hold
-    no lock, so no other thread waits for them."""
-    try:
-        from sigmasplat.native import _core
-    except ImportError:
-        return
-    _core.idle_workers()

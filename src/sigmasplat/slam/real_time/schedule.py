@@ -7,8 +7,7 @@ from collections.abc import Iterator
 from typing import Protocol
 
 from sigmasplat import env
-from sigmasplat.render.backend import idle_kernel_workers, set_kernel_threads
-from sigmasplat.threads import yield_to_others
+from sigmasplat.native.threads import idle_kernel_workers, set_kernel_threads, yield_to_others
 
 SWITCH_S = 0.0005
 """How long a thread may hold the interpreter lock while another one waits for it; Python's default is 5 ms."""

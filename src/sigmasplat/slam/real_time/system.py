@@ -13,7 +13,7 @@ from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.map_uncertainty import MapUncertainty
 from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.render.backend import set_kernel_threads
+from sigmasplat.native.threads import set_kernel_threads
 from sigmasplat.render.view import View
 from sigmasplat.slam.array_interface import ArrayInterface
 from sigmasplat.slam.features import make_extractor

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
-from sigmasplat.threads import yield_to_others
+from sigmasplat.native.threads import yield_to_others
 
 Item = TypeVar("Item")
 
@@ -23,8 +23,7 @@ class _Result(Generic[Item]):
 def read_ahead(items: Iterable[Item], length: int = 4) -> Iterator[Item]:
     """Yield `items` in order while a thread computes up to `length` of them in advance.
 
-    Decoding an image takes 10 to 50 ms and releases the interpreter lock, so it runs in parallel with tracking, to which
-    it yields.
+    Decoding an image takes 10 to 50 ms and releases the interpreter lock, so it runs beside tracking, and yields to it.
     An exception of the producer is raised here in place of the item. The thread ends after the last item,
     or as soon as the consumer closes or deletes this generator.
     """
