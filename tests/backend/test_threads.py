@@ -41,6 +41,14 @@ def test_only_the_calling_thread_yields() -> None:
     assert niceness() == before < NICENESS
 
 
+def test_a_sandbox_that_forbids_priorities_stops_no_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(which: int, who: int, priority: int) -> None:
+        raise PermissionError("operation not permitted")
+
+    monkeypatch.setattr(os, "setpriority", refuse)
+    assert list(read_ahead([1, 2, 3])) == [1, 2, 3]
+
+
 def test_reading_ahead_yields_to_the_consumer() -> None:
     before = niceness()
 

@@ -238,6 +238,18 @@ def test_what_mapping_raises_reaches_the_caller(schedule: type) -> None:
     assert len(system.trajectory()) > 0
 
 
+def test_a_mapping_thread_that_fails_at_its_start_does_not_keep_the_caller_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(count: int) -> int:
+        raise MemoryError("no thread can be made")
+
+    monkeypatch.setattr("sigmasplat.slam.real_time.schedule.set_kernel_threads", fail)
+    schedule = MappingThread()
+    schedule.start(iter([False]))
+    with pytest.raises(MemoryError, match="no thread"):
+        schedule.settle()
+    schedule.stop()
+
+
 # ---- runs ----
 
 

@@ -3,6 +3,7 @@
 import os
 import sys
 import threading
+from contextlib import suppress
 
 from sigmasplat.native import kernels
 
@@ -32,6 +33,8 @@ def idle_kernel_workers() -> None:
 
 
 def yield_to_others() -> None:
-    """Lower the priority of the calling thread, and of the threads that it starts; no effect on other systems."""
+    """Lower the priority of the calling thread, and of the threads that it starts. No effect on other systems, or where
+    a sandbox forbids it."""
     if sys.platform == "linux":
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)
+        with suppress(OSError):
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)

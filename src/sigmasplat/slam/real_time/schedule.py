@@ -81,10 +81,10 @@ class MappingThread:
             raise error
 
     def _run(self, work: Iterator[bool]) -> None:
-        yield_to_others()
-        set_kernel_threads(env.switches().threads)
-        idle_kernel_workers()
         try:
+            yield_to_others()
+            set_kernel_threads(env.switches().threads)
+            idle_kernel_workers()
             while self._continues():
                 while next(work) and not self._stopped:
                     pass
