@@ -238,7 +238,9 @@ def test_what_mapping_raises_reaches_the_caller(schedule: type) -> None:
     assert len(system.trajectory()) > 0
 
 
-def test_a_mapping_thread_that_fails_at_its_start_does_not_keep_the_caller_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_mapping_thread_that_fails_at_its_start_does_not_keep_the_caller_waiting(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     def fail(count: int) -> int:
         raise MemoryError("no thread can be made")
 
