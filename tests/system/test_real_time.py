@@ -238,9 +238,7 @@ def test_what_mapping_raises_reaches_the_caller(schedule: type) -> None:
     assert len(system.trajectory()) > 0
 
 
-def test_a_mapping_thread_that_fails_at_its_start_does_not_keep_the_caller_waiting(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_what_fails_at_the_start_of_the_mapping_thread_reaches_the_caller(monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(count: int) -> int:
         raise MemoryError("no thread can be made")
 
