@@ -235,8 +235,9 @@ class TrackingConfig(Section, name="tracking"):
     align_depth_by: Literal["V", "U"] = "V"
     """Whether alignment weights depth residuals by V, like gray residuals, or in the same way by the depth variance U
     of the map (CG-SLAM eq. 10)."""
-    align_stop: NotNegative = 1e-4
-    """Alignment ends a pyramid level when a step is smaller than this (metres and radians)."""
+    align_stop: NotNegative = 2e-4
+    """Alignment ends the finest pyramid level when a step is smaller than this (metres and radians). The limit doubles
+    from each level to the next coarser one."""
     sensor_noise: bool = False
     """Whether alignment uses the part of σ that depends on the distance, by the model of `input.sensor`, instead of
     the law of `render.depth_noise_per_m`."""

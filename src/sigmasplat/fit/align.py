@@ -153,13 +153,15 @@ def align(
     T_live_reference: Matrix,
     iterations: int = 15,
     weight_color: float = 0.5,
-    update_stop: float = 1e-4,
+    update_stop: float = 2e-4,
     plateau_stop: float = 0.0,
 ) -> Alignment:
     """Find the motion from the reference to the live image, starting at an initial guess.
 
-    Each level takes at most `iterations` Gauss–Newton steps with Huber weights. A level ends when a step is below
-    `update_stop` (m, rad), or when the relative change of the cost is below `plateau_stop` (0 = off). If the finest
+    Each level takes at most `iterations` Gauss–Newton steps with Huber weights. H is too steep, as
+    `Alignment.covariance` explains. So a step is 1 to 3 times as long as H says: by the factor by which H exceeds the
+    change of the gradient along the step before. A level ends when a step is below `update_stop` (m, rad; twice as much
+    on each coarser level), or when the relative change of the cost is below `plateau_stop` (0 = off). If the finest
     level meets neither condition, its best iterate is returned. Undetermined directions keep the guess. weight_color in
     [0, 1] balances gray against depth, each in units of its Huber width. With 0 iterations the guess stays, and is
     judged. Raises BackendError without the compiled kernels, or if only one image is on a device.
@@ -189,7 +191,7 @@ def align_to_all(
     T_live_reference: Sequence[Matrix],
     iterations: int = 15,
     weight_color: float = 0.5,
-    update_stop: float = 1e-4,
+    update_stop: float = 2e-4,
 ) -> Matrix:
     """Find the motion of the live camera that fits several references at once, whose poses are fixed to each other.
 
@@ -213,7 +215,7 @@ def align_to_all(
             basis = directions[:, decided]
             twist = -basis @ np.linalg.solve(basis.T @ n.H @ basis, basis.T @ n.b)
             T = se3.exp(twist) @ T
-            if np.abs(twist).max() < update_stop:
+            if np.abs(twist).max() < update_stop * 2**k:
                 break
     return se3.orthonormalise(T)
 

@@ -71,10 +71,11 @@ inline void move_left(const double* twist, double* T) {
 constexpr double UNKNOWN_COST = 1.7976931348623157e308;
 
 // The progress of an alignment. T: T_live_reference; sums: those of the last step, or of the best one if a level ended
-// with it; best… and previous: values within a level; degenerate: number of directions that the last step did not
-// change; steps: on all levels.
+// with it; best… and previous: values within a level; last…: gradient and update of the step before, an update of 0 at
+// the start of a level; longer: factor of the last step (`lengthening`); degenerate: number of directions that the last
+// step did not change; steps: on all levels.
 struct Descent {
-    double T[12], sums[5], best_T[12], best_sums[5], best, previous;
+    double T[12], sums[5], best_T[12], best_sums[5], best, previous, last_b[6], last_update[6], longer;
     int level, taken, steps, degenerate;
 };
 
@@ -82,6 +83,7 @@ inline void begin_level(Descent& d, int level) {
     d.level = level;
     if (level < 0) return;                 // the finest level is done: its result is final
     d.best = d.previous = UNKNOWN_COST;
+    for (double& u : d.last_update) u = 0;
     d.taken = 0;
     d.degenerate = 6;
 }
@@ -89,8 +91,26 @@ inline void begin_level(Descent& d, int level) {
 inline Descent begin_descent(const double* T, int levels) {
     Descent d = {};
     copy(T, 12, d.T);
+    d.longer = 1;
     begin_level(d, levels - 1);
     return d;
+}
+
+constexpr double LONGEST = 3.0;            // maximum factor of a step
+
+// Return by which factor the next step is longer than a Gauss–Newton step: by how much H exceeds the measured change of
+// the gradient along the step before, sᵀHs / sᵀ(b − b₀), from 1 to LONGEST. H is computed from noisy image gradients, so
+// it is too steep, and its steps are too short. The first step of a level has the factor of the last one before it.
+inline double lengthening(const Descent& d, const double* H, const double* b) {
+    const double* s = d.last_update;
+    double expected = 0, measured = 0;
+    for (int i = 0, q = 0; i < 6; i++) {
+        measured += s[i] * (b[i] - d.last_b[i]);
+        for (int j = i; j < 6; j++, q++) expected += (i == j ? 1 : 2) * H[q] * s[i] * s[j];
+    }
+    if (expected == 0) return d.longer;
+    if (!(measured < expected)) return 1;
+    return measured * LONGEST > expected ? expected / measured : LONGEST;
 }
 
 // Take the step of the normal equations at d.T, in the order of NORMAL_TERMS. The last step of a level starts the next
@@ -106,9 +126,13 @@ inline void take_step(Descent& d, const AlignLoop& o, const double* normal) {
         const double cost = d.sums[0] / d.sums[1];
         if (cost < d.best) { d.best = cost; copy(d.T, 12, d.best_T); copy(d.sums, 5, d.best_sums); }
         d.degenerate = solve_decided(normal, normal + 21, o.depth_m, o.degenerate_share, update);
+        d.longer = lengthening(d, normal, normal + 21);
+        for (double& u : update) u *= d.longer;
+        copy(normal + 21, 6, d.last_b);
+        copy(update, 6, d.last_update);
         move_left(update, d.T);
         settled = true;
-        for (double u : update) settled = settled && ::fabs(u) < o.update_stop;
+        for (double u : update) settled = settled && ::fabs(u) < o.update_stop * (1 << d.level);    // coarse pixels are larger
         settled = settled || ::fabs(cost - d.previous) < o.plateau_stop * cost;
         d.previous = cost;
     }

@@ -30,7 +30,8 @@ LOOP = np.dtype(
 DESCENT = np.dtype(
     [
         ("T", "f8", 12), ("sums", "f8", 5), ("best_T", "f8", 12), ("best_sums", "f8", 5), ("best", "f8"),
-        ("previous", "f8"), ("level", "i4"), ("taken", "i4"), ("steps", "i4"), ("degenerate", "i4"),
+        ("previous", "f8"), ("last_b", "f8", 6), ("last_update", "f8", 6), ("longer", "f8"), ("level", "i4"),
+        ("taken", "i4"), ("steps", "i4"), ("degenerate", "i4"),
     ],
     align=True,
 )  # fmt: skip
