@@ -3,7 +3,6 @@
 from collections.abc import Iterator
 
 import numpy as np
-from scipy.ndimage import label
 
 from sigmasplat.fit.compare import STEP as COMPARE_STEP
 from sigmasplat.fit.pose import PoseFit
@@ -25,7 +24,7 @@ from sigmasplat.slam.localisation.foreground import (
 )
 from sigmasplat.slam.localisation.sight import Sight
 from sigmasplat.slam.localisation.verdict import agrees_more, differs, disagrees, may_draw
-from sigmasplat.slam.localisation.windows import widened
+from sigmasplat.slam.localisation.windows import labelled, widened
 from sigmasplat.types import Matrix
 
 OBJECT_SHARE, MOST_OBJECTS = (0.02, 0.7), 3
@@ -60,7 +59,7 @@ def _front(inside: Mask, live_m: Depth) -> Foreground:
 def free_standing(depth: Depth) -> Iterator[Mask]:
     """Yield the things that stand free in `thinned` depth [h, w], m, in front of farther surfaces all around, as masks
     [h, w]: the largest first, at most `MOST_OBJECTS`."""
-    regions, count = label(smooth(depth), np.ones((3, 3)))
+    regions, count = labelled(smooth(depth))
     sizes, found = np.bincount(regions.ravel(), minlength=count + 1) / depth.size, 0
     sizes[0] = 0.0
     for region in np.argsort(-sizes, kind="stable"):

@@ -10,11 +10,10 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import label
 
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
-from sigmasplat.slam.localisation.windows import largest_around, largest_label, least_around, widened
+from sigmasplat.slam.localisation.windows import labelled, largest_around, largest_label, least_around, widened
 from sigmasplat.slam.rules import angle_between
 from sigmasplat.types import Matrix
 
@@ -183,27 +182,28 @@ def _holes_in(mask: Mask, thing: Mask | None, depth_m: Depth) -> Mask:
     between two holes is too thin to be a region. Then lines without readings, as at outlines, join no holes.
     """
     unread = depth_m <= 0
-    holes, count = label(unread if thing is None else ~widened(~unread, 3), np.ones((3, 3)))
-    holes = holes if thing is None else np.where(unread, largest_label(holes), 0)
-    at_edge = np.where(depth_m > 0, largest_label(holes), 0)
-    edge = at_edge > 0
-    edges, covered = (np.bincount(at_edge[chosen], minlength=count + 1) for chosen in (edge, mask & edge))
+    holes, count = labelled(unread if thing is None else ~widened(~unread, 3))
+    holes = holes if thing is None else largest_label(holes) * unread
+    beside = largest_label(holes)
+    edge = np.flatnonzero((beside > 0) & ~unread)
+    hole, in_mask, z = beside.ravel()[edge], mask.ravel()[edge], depth_m.ravel()[edge].astype(np.float64)
+    edges, covered = (np.bincount(found, minlength=count + 1) for found in (hole, hole[in_mask]))
     own = (edges > 0) & (covered >= SURROUNDED * edges)
     if thing is not None:
-        near, far = np.full(count + 1, np.inf), np.zeros(count + 1)
-        np.minimum.at(near, at_edge[thing & edge], depth_m[thing & edge])
-        np.maximum.at(far, at_edge[thing & edge], depth_m[thing & edge])
+        near, far, of_thing = np.full(count + 1, np.inf), np.zeros(count + 1), thing.ravel()[edge]
+        np.minimum.at(near, hole[of_thing], z[of_thing])
+        np.maximum.at(far, hole[of_thing], z[of_thing])
         reach = 1 + EDGE_RELATIVE
-        alike = edge & (mask | ((depth_m * reach >= near[at_edge]) & (depth_m <= far[at_edge] * reach)))
-        own |= (2 * covered >= edges) & (np.bincount(at_edge[alike], minlength=count + 1) >= SURROUNDED * edges)
+        alike = in_mask | ((z * reach >= near[hole]) & (z <= far[hole] * reach))
+        own |= (2 * covered >= edges) & (np.bincount(hole[alike], minlength=count + 1) >= SURROUNDED * edges)
     own[0] = False
-    return np.asarray(own[holes])
+    return np.take(own, holes)
 
 
 def _objects(inside: Mask, free: Mask, again: Mask) -> Mask:
     """Return the whole regions of which a small part is in places that were free, or the larger part is where something
     was before."""
-    regions, count = label(inside, np.ones((3, 3)))
+    regions, count = labelled(inside)
     sizes, in_free, old = (np.bincount(regions[chosen], minlength=count + 1) for chosen in (regions > 0, free, again))
     moved = (in_free >= LEAST_REGION * free.size) & (in_free + old >= WHOLE_SHARE * sizes)
     chosen = moved | ((sizes >= LEAST_REGION * free.size) & (in_free + old >= SAME_THING * sizes))
@@ -213,7 +213,7 @@ def _objects(inside: Mask, free: Mask, again: Mask) -> Mask:
 
 def _regions(inside: Mask, free: Mask, again: Mask) -> Mask:
     """Return the connected regions of pixels that are in places which were free, or where something was before."""
-    regions, count = label(inside, np.ones((3, 3)))
+    regions, count = labelled(inside)
     sizes, in_free, old = (np.bincount(regions[chosen], minlength=count + 1) for chosen in (regions > 0, free, again))
     chosen = (in_free >= LEAST_REGION * free.size) & (in_free + old >= LEAST_SHARE * sizes)
     chosen[0] = False

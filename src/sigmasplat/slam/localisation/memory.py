@@ -4,7 +4,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.ndimage import label
 
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
@@ -19,7 +18,7 @@ from sigmasplat.slam.localisation.foreground import (
     seen_again,
     smooth,
 )
-from sigmasplat.slam.localisation.windows import widened
+from sigmasplat.slam.localisation.windows import labelled, widened
 from sigmasplat.types import Matrix
 
 EVERY = 5
@@ -91,7 +90,7 @@ class Memory:
             return front
         step = _step(camera)
         depth = np.where(front.depth_m > 0, depth_m, np.float32(0.0))[::step, ::step]
-        regions, count = label(smooth(depth), np.ones((3, 3)))
+        regions, count = labelled(smooth(depth))
         rests = np.ones(count + 1, np.bool_)
         for earlier in self.seen[before[-1] :]:  # what comes back to an earlier place has not rested there
             scene = Earlier(earlier.depth_m, se3.inverse(earlier.T_world_camera) @ T_world_camera)
