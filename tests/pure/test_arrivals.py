@@ -81,6 +81,30 @@ def test_a_live_camera_is_not_held_back() -> None:
     assert source.live and len(list(source.frames_from(0))) >= 1 and not waits
 
 
+def test_work_is_to_end_shortly_before_the_next_frame_is_due() -> None:
+    now, gate = [0.0], threading.Semaphore(0)
+
+    def wait(until_s: float, stop: threading.Event) -> None:
+        gate.acquire(timeout=10)
+        now[0] = until_s
+
+    source = Arrivals(Clip(), clock=lambda: now[0], wait=wait)
+    frames = source.frames_from(0)
+
+    def hurries(after_s: float) -> bool:
+        gate.release()
+        next(frames)
+        now[0] += after_s
+        return source.hurries()
+
+    assert [hurries(5.0) for _ in range(3)] == [False] * 3, "the time between frames is not known yet"
+    for _ in range(2):
+        hurries(0.0)
+    assert not hurries(0.05)
+    now[0] += 0.02
+    assert source.hurries()
+
+
 def test_an_unreadable_frame_ends_the_frames_with_its_error() -> None:
     seen = []
     with pytest.raises(SourceError, match="frame 2 is damaged"):

@@ -1,10 +1,13 @@
 """Deliver the frames of a source when they arrive: those of a recording at its own times, as a camera would."""
 
+import math
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import pairwise
+from statistics import median
 from typing import NamedTuple, Protocol
 
 from sigmasplat.model.frame import Frame
@@ -13,6 +16,10 @@ from sigmasplat.sources.base import Source
 
 WAITING_MOST = 2
 """Maximum number of frames that wait; a third one takes the place of the oldest, which is dropped."""
+DUE = 0.6
+"""The next frame is due soon if this share of the usual time between frames has passed since the last one arrived."""
+USUAL, FEW = 20, 5
+"""What is usual is the median over this many recent frames; with fewer than the second number, it is not known."""
 
 
 class Arrival(NamedTuple):
@@ -56,9 +63,11 @@ class Arrivals(Source):
     def __len__(self) -> int:
         return len(self._whole)
 
-    def waits(self) -> bool:
-        """Return whether the next frame has arrived already."""
-        return self._queue.waits
+    def hurries(self) -> bool:
+        """Return whether the next frame has arrived already, or is due soon. What is begun then makes that frame
+        late."""
+        late = self.arrived_s is not None and self._clock() - self.arrived_s > DUE * self._queue.usual_s
+        return late or self._queue.waits
 
     def frame(self, i: int) -> Frame:
         """Read frame i at once."""
@@ -104,10 +113,11 @@ class Arrivals(Source):
 
 @dataclass(eq=False)
 class _Newest:
-    """The frames that wait for the consumer."""
+    """The frames that wait for the consumer; usual_s: the usual time between frames, infinite if it is not known."""
 
     def __post_init__(self) -> None:
-        self.stop, self.dropped = threading.Event(), 0
+        self.stop, self.dropped, self.usual_s = threading.Event(), 0, math.inf
+        self._arrived_s = deque[float](maxlen=USUAL + 1)
         self._changed, self._frames = threading.Condition(), deque[Arrival]()
         self._ended, self._error = False, None
 
@@ -125,6 +135,9 @@ class _Newest:
                 self._frames.popleft()
                 self.dropped += 1
             self._frames.append(arrival)
+            self._arrived_s.append(arrival.arrived_s)
+            if len(self._arrived_s) > FEW:
+                self.usual_s = median(later - earlier for earlier, later in pairwise(self._arrived_s))
             self._changed.notify()
 
     def end(self, error: BaseException | None) -> None:

@@ -39,7 +39,7 @@ class RealTime(ArrayInterface):
     Between `step` calls the state of `slam` belongs to the mapping thread: read it in a task (`between_frames`), or
     after `settle`. The results depend on how fast the machine is, so they are not reproducible. schedule: when the work
     on the map runs, by default on a thread; covariances: whether `track` and `covariance` return covariances, which
-    cost some milliseconds of work per keyframe; hurried: returns whether the next frame has arrived already, then no
+    cost some milliseconds of work per keyframe; hurried: returns whether the next frame waits or is due soon, then no
     further guess of a doubtful pose is tried. Functions of `on_keyframe`, `on_loop` and `on_correction` are called by
     the thread that calls `step`, when it learns of the event.
     """
