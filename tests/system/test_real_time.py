@@ -149,8 +149,8 @@ def test_a_map_that_falls_behind_is_still_fitted_and_cut() -> None:
     system.settle()
     assert sum(step.is_keyframe for step in steps) > 12
     store = system.slam.store
-    assert len(store) >= 2
-    assert max(len(store.load(i).frames) for i in range(len(store))) <= 12
+    begins = [store.load(i).frames[0] for i in range(len(store))]
+    assert begins == [0, 12, 24], "a submap ends where it would in a recording"
 
 
 def test_a_keyframe_is_aligned_again_when_the_weights_of_the_one_before_it_are_known() -> None:
@@ -191,7 +191,7 @@ def test_a_hurried_frame_tries_no_further_guesses_and_tracking_recovers_afterwar
     """After a jump the first guess fails. While frames wait, it is the only one; then features find the camera."""
     seen, lost = frames(80), list[bool]()
     system = RealTime(Slam(config(recovery__relocalise="off")), AtOnce(), hurried=lambda: len(lost) < hurried)
-    for number, frame in enumerate([*seen[:6], *seen[18:22]]):
+    for number, frame in enumerate([*seen[40:46], *seen[58:62]]):
         lost.append(system.step(replace(frame, index=number, timestamp_s=number / 30)).lost)
     system.settle()
     assert np.isfinite(system.trajectory().T_world_camera).all()

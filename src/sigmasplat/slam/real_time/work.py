@@ -30,7 +30,7 @@ AS_GOOD = 0.99
 
 MOST_ADDED = 4
 """At most so many keyframes in a row are added without a fit. Without a limit, a map that falls behind once stays
-behind: tracking gets no newer reference, and no submap ends."""
+behind: tracking gets no newer reference."""
 
 
 class MapClock:
@@ -134,7 +134,8 @@ class MapClock:
         return se3.orthonormalise(se3.inverse(fit.T_camera_world)), fit.alignment
 
     def _map(self, each: TrackedFrame, offer: Offer) -> Iterator[None]:
-        """Map a keyframe. If another one waits, it is added to the map, and the fit is left to a later one."""
+        """Map a keyframe. If another one waits, it is added to the map, and the fit is left to a later one, but not if the
+        submap ends: drift within a submap stays, loops correct only what is between them."""
         system, number = self.system, each.number
         self._timer = system.start_timer()
         seen, first = offer.seen, not system.steps
@@ -147,7 +148,8 @@ class MapClock:
             state, (T, alignment) = "", self._realigned(each, offer)
             hop = system.hop_to(se3.inverse(T), alignment)
             self._add_drift(number, T, hop)
-        if not first and self._added < MOST_ADDED and self._keyframe_waits():
+        may_wait = not first and self._added < MOST_ADDED and not system.submap_ends(number, T)
+        if may_wait and self._keyframe_waits():
             system.add_keyframe(seen, number, T, hop)
             self._added += 1
             self._done(each)
