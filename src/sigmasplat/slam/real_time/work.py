@@ -134,8 +134,8 @@ class MapClock:
         return se3.orthonormalise(se3.inverse(fit.T_camera_world)), fit.alignment
 
     def _map(self, each: TrackedFrame, offer: Offer) -> Iterator[None]:
-        """Map a keyframe. If another one waits, it is added to the map, and the fit is left to a later one, but not if the
-        submap ends: drift within a submap stays, loops correct only what is between them."""
+        """Map a keyframe. If another one waits, it is only added to the map, and the fit is left to a later one, unless
+        the submap ends: loops do not correct the drift within a submap."""
         system, number = self.system, each.number
         self._timer = system.start_timer()
         seen, first = offer.seen, not system.steps
