@@ -3,11 +3,15 @@
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.ndimage import label
 
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.slam.localisation.foreground import Earlier, Foreground, foreground
+from sigmasplat.slam.localisation.windows import labelled
 from sigmasplat.sources import SyntheticRoom
+
+cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed (pip install opencv-python-headless)")
 
 Depth = NDArray[np.float32]
 CAMERA = Camera(160, 120, 140.0, 140.0, 79.5, 59.5)
@@ -35,6 +39,21 @@ def share(mask: NDArray[np.bool_]) -> tuple[float, float]:
 def found(scene_m: Depth, live_m: Depth, before: Foreground | None = None) -> Foreground | None:
     last = None if before is None else Earlier(before.depth_m, np.eye(4))
     return foreground(Earlier(scene_m, np.eye(4)), last, live_m, CAMERA)
+
+
+@pytest.mark.parametrize("threads", [1, 4])
+def test_regions_are_numbered_by_rows_and_connect_at_corners(threads: int) -> None:
+    random, before = np.random.default_rng(0), cv2.getNumThreads()
+    cv2.setNumThreads(threads)
+    try:
+        for share_inside in (0.1, 0.3, 0.5, 0.7):
+            mask = random.random((240, 320)) < share_inside
+            regions, count = labelled(mask)
+            wanted, wanted_count = label(mask, np.ones((3, 3)))
+            assert count == wanted_count
+            np.testing.assert_array_equal(regions, wanted)
+    finally:
+        cv2.setNumThreads(before)
 
 
 def test_an_object_in_front_of_a_wall_is_found() -> None:
