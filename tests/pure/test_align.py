@@ -64,7 +64,7 @@ def noisy(i: int, random: np.random.Generator) -> Pyramid:
 
 
 def test_noise_does_not_end_an_alignment_before_it_has_arrived() -> None:
-    """Steps by H alone stop 0.7 mm before on average, because noise makes H too steep."""
+    """Steps by H alone stop 1 mm before on average, because noise makes H too steep."""
     left_m, random = [], np.random.default_rng(0)
     for i, j in [(10, 12), (101, 99), (60, 62), (20, 21)] * 3:
         reference, live = noisy(i, random), noisy(j, random)
