@@ -37,6 +37,9 @@ DAMAGES = {
     "fewer poses": (changed("T_world_camera", lambda t: t[1:].clone()), "'T_world_camera' has"),
     "no number": (changed("edge_T_a_b", lambda t: t.new_full((1, 4, 4), torch.nan)), "'edge_T_a_b' has"),
     "numbers as flags": (changed("edge_is_loop", torch.Tensor.long), "'edge_is_loop' is torch.int64"),
+    "compared keyframe of another submap": (
+        changed("edge_keyframes", lambda t: torch.tensor([[0, 2]])), "'edge_keyframes' counts keyframes that its submap"
+    ),
     "keyframe of another submap": (changed("frame_keyframe", lambda t: t.clamp(min=1)), "counts keyframes|but there"),
 }  # fmt: skip
 

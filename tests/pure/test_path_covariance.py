@@ -52,6 +52,18 @@ class Loopy:
                 ends = ends @ se3.inverse(T_camera_before)
         self.loop = Edge(SUBMAPS - 1, 0, se3.inverse(ends), STIFF, loop=True)
 
+    def loop_between(self, in_last: int, in_first: int) -> Edge:
+        """Return the loop as one that compares two other keyframes, with a drift that only its information contains."""
+        drift = 1e-4 * np.eye(6)
+        information = np.linalg.inv(np.linalg.inv(STIFF) + drift)
+        return replace(self.loop, information=information, keyframes=(in_last, in_first), drift=drift)
+
+    def drifted(self, loop: Edge, keyframes: list[list[Array]]) -> Edge:
+        """Return a loop between keyframes that have moved in their submaps; the motion between the two is as before."""
+        (last, first), (in_last, in_first) = (self.keyframes({})[s] for s in (-1, 0)), loop.keyframes
+        T_last_first = se3.inverse(last[in_last]) @ loop.T_a_b @ first[in_first]
+        return replace(loop, T_a_b=keyframes[-1][in_last] @ T_last_first @ se3.inverse(keyframes[0][in_first]))
+
     def keyframes(self, errors: dict[tuple[int, int], Array]) -> list[list[Array]]:
         """Return T_submap_keyframe, with errors of some hops."""
         chains = []
@@ -69,7 +81,7 @@ class Loopy:
 
     def solved(self, errors: dict[tuple[int, int], Array], loop: Edge | None) -> tuple[Atlas, list[Edge]]:
         keyframes = self.keyframes(errors)
-        edges = self.edges(keyframes, loop)
+        edges = self.edges(keyframes, loop and self.drifted(loop, keyframes))
         start = [np.eye(4)]
         for chain in keyframes[:-1]:
             start.append(start[-1] @ chain[-1])
@@ -116,11 +128,14 @@ def test_marginals_are_the_blocks_of_the_dense_inverse() -> None:
         np.testing.assert_allclose(marginals.covariance(node), block, rtol=1e-9, atol=1e-9 * np.abs(block).max())
 
 
-@pytest.mark.parametrize("closed", [False, True])
-def test_covariances_follow_from_the_errors_of_hops_and_loops(closed: bool) -> None:
-    """Each error moves the solved path; the covariance is the sum over all errors, for poses and for motions."""
-    room = Loopy()
-    loop = room.loop if closed else None
+@pytest.mark.parametrize("keyframes", [None, (0, 0), (2, 0), (0, 2), (1, 3)])
+def test_covariances_follow_from_the_errors_of_hops_and_loops(keyframes: tuple[int, int] | None) -> None:
+    """Each error moves the solved path; the covariance is the sum over all errors, for poses and for motions.
+
+    A loop between two keyframes also has the errors of the hops to them.
+    """
+    room, closed = Loopy(), keyframes is not None
+    loop = None if keyframes is None else room.loop if keyframes == (0, 0) else room.loop_between(*keyframes)
     path, h = room.covariance(loop), 1e-5
     pairs = [(2, 7), (1, len(path) - 1), (3, 4), (6, 6)]
     poses, motions = np.zeros((len(path), 6, 6)), np.zeros((len(pairs), 6, 6))

@@ -17,14 +17,14 @@ from sigmasplat.model.field import COLUMNS, GaussianField
 from sigmasplat.model.submap import MemoryStore, Picture, Submap
 from sigmasplat.render.backend import make_view
 from sigmasplat.slam import drift
-from sigmasplat.slam.drift import floor
+from sigmasplat.slam.drift import floor, hop_errors
 from sigmasplat.slam.features import Extractor, Features, make_extractor
 from sigmasplat.slam.loop_closure import localisations, registration
 from sigmasplat.slam.loop_closure.candidates import Candidate, SubmapPair
 from sigmasplat.slam.loop_closure.closer import LoopCloser
 from sigmasplat.slam.loop_closure.feature_guesses import FeatureGuesses
 from sigmasplat.slam.loop_closure.localisations import Localisation
-from sigmasplat.slam.loop_closure.registration import Registrar, Registration
+from sigmasplat.slam.loop_closure.registration import Registrar, Registration, drift_between
 from sigmasplat.slam.seeding import make_splats
 from sigmasplat.types import completed
 from small_room import frame_at, walk
@@ -271,9 +271,9 @@ def test_turning_a_localisation_round_carries_its_covariance() -> None:
 def test_disagreement_costs_information() -> None:
     close = [localisation(np.eye(4)), localisation(np.eye(4))]
     apart = [localisation(se3.exp(np.array([s * 0.03, 0, 0, 0, 0, 0.0]))) for s in (-1.0, 1.0)]
-    sure, unsure = (localisations.information(found, np.eye(4)) for found in (close, apart))
-    assert np.linalg.inv(unsure)[0, 0] == pytest.approx(np.linalg.inv(sure)[0, 0] + 0.03**2)
-    assert np.linalg.inv(sure)[0, 0] == pytest.approx(1e-6 + floor()[0, 0])
+    sure, unsure = (localisations.mean_covariance(found, np.eye(4)) for found in (close, apart))
+    assert unsure[0, 0] == pytest.approx(sure[0, 0] + 0.03**2)
+    assert sure[0, 0] == pytest.approx(1e-6 + floor()[0, 0])
 
 
 def test_the_stated_error_grows_with_the_motion_between_the_images(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -281,13 +281,41 @@ def test_the_stated_error_grows_with_the_motion_between_the_images(monkeypatch: 
     with_motion, _ = registered(a, b, np.eye(4))
     monkeypatch.setattr(drift, "BIAS", 0.0)
     without, _ = registered(a, b, np.eye(4))
-    more = np.linalg.inv(with_motion.information) - np.linalg.inv(without.information)
+    more = np.subtract(*(np.linalg.inv(found.information) - found.drift for found in (with_motion, without)))
     truth = walk().truth().T_world_camera
     nearest = [(0, 15), (1, 15), (15, 1), (20, 1)]  # each keyframe is localised, the other submap's nearest one
     turned_rad = [se3.rotation_angle(truth[i][:3, :3].T @ truth[j][:3, :3]) for i, j in nearest]
     assert np.linalg.eigvalsh(more)[0] > 0.0
     assert np.trace(more[3:, 3:]) == pytest.approx(3 * np.mean(np.square(turned_rad)) * 0.02**2, rel=0.05)
     assert np.trace(more[:3, :3]) > 3 * 0.02**2 * np.linalg.norm(truth[15][:3, 3] - truth[1][:3, 3]) ** 2
+
+
+def test_the_stated_error_contains_the_drift_of_both_submaps_up_to_the_compared_keyframes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It is what T_a_b scatters by if the motion between the two keyframes is known and those to them are drawn."""
+    found, truth = registered((0, 1), (15, 20), np.eye(4))
+    a, b = (piece(MemoryStore(), frames) for frames in ((0, 1), (15, 20)))
+    np.testing.assert_allclose(found.drift, drift_between(a, b, found.keyframes, found.T_a_b, 1.0))
+    assert np.linalg.eigvalsh(np.linalg.inv(found.information) - found.drift)[0] > 0.0
+
+    monkeypatch.setattr(drift, "BIAS", 0.0)
+    random, count = np.random.default_rng(3), 20_000
+    hops = se3.exp_stack(random.normal(0, 0.2, (5, 6)))
+    chain = np.stack([np.linalg.multi_dot([np.eye(4), np.eye(4), *hops[:k]]) for k in range(6)])
+    a, b = replace(a, T_submap_camera=chain), replace(b, T_submap_camera=chain[::-1] @ se3.inverse(chain[5]))
+    measured = se3.inverse(a.T_submap_camera[3]) @ truth @ b.T_submap_camera[2]
+    roots = np.sqrt(np.diag(hop_errors()))
+    drawn_a, drawn_b = (np.repeat(np.eye(4)[None], count, 0) for _ in range(2))
+    for submap, drawn, last in ((a, drawn_a, 3), (b, drawn_b, 2)):
+        for k in range(1, last + 1):
+            hop = se3.inverse(submap.T_submap_camera[k - 1]) @ submap.T_submap_camera[k]
+            drawn[:] = drawn @ hop @ se3.exp_stack(roots * random.standard_normal((count, 6)))
+    scatter = np.cov(se3.log_stack(drawn_a @ measured @ se3.inverse(drawn_b) @ se3.inverse(truth)).T)
+    stated = drift_between(a, b, (3, 2), truth, 1.0)
+    scale = np.sqrt(np.diag(stated))
+    assert np.abs((stated - scatter) / np.outer(scale, scale)).max() < 0.04
+    assert not drift_between(a, b, (0, 0), truth, 1.0).any()
 
 
 def test_overlap_is_the_larger_share_of_splats_with_a_neighbour() -> None:

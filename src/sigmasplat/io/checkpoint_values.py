@@ -16,7 +16,7 @@ FINITE: Mapping[str, tuple[str, tuple[int, ...]]] = {
     "T_world_submap": ("submaps", POSE),
     "T_world_keyframe": ("places", POSE), "T_submap_keyframe": ("places", POSE),
     "hop_T_camera_before": ("places", POSE), "hop_bias": ("places", (6,)),
-    "edge_T_a_b": ("edges", POSE), "edge_information": ("edges", (6, 6)),
+    "edge_T_a_b": ("edges", POSE), "edge_information": ("edges", (6, 6)), "edge_drift": ("edges", (6, 6)),
 }  # fmt: skip
 """Tensors of finite numbers: what their rows are, and the shape of a row. A place is a keyframe of a submap."""
 UNKNOWN: Mapping[str, tuple[str, tuple[int, ...]]] = {"hop_covariance": ("places", (6, 6))}
@@ -25,6 +25,7 @@ WHOLE: Mapping[str, tuple[str, tuple[int, ...], str]] = {
     "keyframes": ("keyframes", NUMBER, "frames"), "frame_submap": ("frames", NUMBER, "submaps"),
     "frame_keyframe": ("frames", NUMBER, "places"), "keyframe_submap": ("places", NUMBER, "submaps"),
     "submap_component": ("submaps", NUMBER, "submaps"), "edge_submaps": ("edges", (2,), "submaps"),
+    "edge_keyframes": ("edges", (2,), "places"),
 }  # fmt: skip
 """Tensors of row numbers: what their rows are, the shape of a row, and what they count."""
 FLAGS: Mapping[str, tuple[str, tuple[int, ...]]] = {"edge_is_loop": ("edges", NUMBER)}
@@ -100,3 +101,5 @@ def _check_places(found: Mapping[str, Tensor], path: Path) -> None:
     counts = torch.bincount(submaps, minlength=len(found["T_world_submap"]))
     if bool((found["frame_keyframe"] >= counts[found["frame_submap"]]).any()):
         raise RunError(f"{path}: tensor 'frame_keyframe' counts keyframes that its submap does not have; {REMEDY}")
+    if "edge_keyframes" in found and bool((found["edge_keyframes"] >= counts[found["edge_submaps"]]).any()):
+        raise RunError(f"{path}: tensor 'edge_keyframes' counts keyframes that its submap does not have; {REMEDY}")

@@ -22,7 +22,7 @@ from sigmasplat.model.column import Column
 INLINE = 64
 """Arrays with at most this many numbers are stored in the text, since there are many poses and each tensor needs a
 header."""
-FORMAT = "6"
+FORMAT = "7"
 TEXT = "state"
 """Name of the tensor with the tree as JSON, bytes."""
 _json = json.JSONEncoder().encode

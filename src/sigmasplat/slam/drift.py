@@ -1,6 +1,7 @@
 """Accumulate the covariance of tracking within a submap. It decides when to cut a submap, and weights odometry
 edges."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -74,8 +75,22 @@ class Drift:
         """Return the information matrix [6, 6] (m, rad) of the last keyframe's pose: the inverse of all covariances,
         constant errors and `BIAS` included. At least one hop must have been added.
         """
-        known = self.covariance + self.usual + systematic_errors(self.travelled_m, self.turned_rad)
-        return symmetric(np.asarray(np.linalg.inv(known), np.float64))
+        return symmetric(np.asarray(np.linalg.inv(self.covariance + self.unestimated), np.float64))
+
+    @property
+    def unestimated(self) -> Matrix:
+        """Return the covariance [6, 6] (m², rad²) of the errors that alignment does not estimate: the constant ones and
+        `BIAS`."""
+        return self.usual + systematic_errors(self.travelled_m, self.turned_rad)
+
+
+def drift_to(keyframe: int, T_submap_camera: Sequence[Matrix] | Matrix, scene_scale: float = 1.0) -> Matrix:
+    """Return the covariance [6, 6] of the left twist (m, rad) of a keyframe's pose in its submap, without the part that
+    alignment estimates; T_submap_camera [n, 4, 4]: the poses of the submap's keyframes in order."""
+    drift = Drift(scene_scale=scene_scale)
+    for T in T_submap_camera[1 : keyframe + 1]:
+        drift.hop(T, None)
+    return drift.unestimated
 
 
 def hop_errors(scene_scale: float = 1.0) -> Matrix:

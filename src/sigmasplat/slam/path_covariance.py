@@ -12,10 +12,10 @@ A pose is a linear function of all errors, and so is the motion between two pose
 function: it is the pose graph's solution.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -56,6 +56,8 @@ def recorded(atlas: Atlas, edges: Sequence[Edge]) -> dict[str, Tensor]:
         "edge_T_a_b": known.T_a_b,
         "edge_information": known.information,
         "edge_is_loop": known.is_loop,
+        "edge_keyframes": known.keyframes,
+        "edge_drift": known.drift,
     }
     return {name: torch.from_numpy(array) for name, array in arrays.items()}
 
@@ -122,22 +124,17 @@ class PathCovariance:
         if "hop_covariance" not in checkpoint:
             return None
         read = {name: tensor.numpy() for name, tensor in checkpoint.items()}
-        edges = zip(
-            read["edge_submaps"].tolist(), read["edge_T_a_b"], read["edge_information"], read["edge_is_loop"],
-            strict=True,
-        )  # fmt: skip
+        columns: list[Iterable[Any]] = [read[name] for name in ("edge_T_a_b", "edge_information", "edge_is_loop")]
+        if "edge_drift" in read:  # older versions did not write it
+            columns += [map(tuple, read["edge_keyframes"].tolist()), read["edge_drift"]]
+        edges = zip(read["edge_submaps"].tolist(), *columns, strict=True)
         return PathCovariance(
-            read["T_world_submap"],
-            read["submap_component"],
-            read["frame_submap"],
-            read["frame_keyframe"],
-            read["T_keyframe_camera"],
-            np.isin(np.arange(len(read["frame_keyframe"])), read["keyframes"]),
-            read["keyframe_submap"],
-            read["T_submap_keyframe"],
+            read["T_world_submap"], read["submap_component"], read["frame_submap"], read["frame_keyframe"],
+            read["T_keyframe_camera"], np.isin(np.arange(len(read["frame_keyframe"])), read["keyframes"]),
+            read["keyframe_submap"], read["T_submap_keyframe"],
             Hops(read["hop_T_camera_before"], read["hop_covariance"], read["hop_bias"]),
-            tuple(Edge(a, b, T, information, bool(loop)) for (a, b), T, information, loop in edges),
-        )
+            tuple(Edge(a, b, T, information, bool(loop), *drift) for (a, b), T, information, loop, *drift in edges),
+        )  # fmt: skip
 
     def __len__(self) -> int:
         return len(self.frame_submap)
@@ -190,8 +187,10 @@ class PathCovariance:
             T_a_world = se3.inverse(chain.anchors[edge.a])
             twists.append(se3.log(T_a_world @ chain.anchors[edge.b] @ se3.inverse(edge.T_a_b)))
             error = chain._error_of_submap(edge.b) - chain._error_of_submap(edge.a)
-            errors.append(np.einsum("ij,jnk->ink", se3.adjoint(T_a_world), error))
-            claimed[i, :, i] = np.linalg.inv(edge.information)
+            error = np.einsum("ij,jnk->ink", se3.adjoint(T_a_world), error)
+            chain._add_drift(error, -np.eye(6), edge)
+            errors.append(error)
+            claimed[i, :, i] = edge.measured
         size = 6 * len(chosen)
         joint = np.concatenate(errors)
         bias, rest = joint[:, BIAS], np.delete(joint, BIAS, 1).reshape(size, -1)
@@ -275,7 +274,8 @@ class PathCovariance:
             if self._is_chain(edge):
                 self._add_hops(error, A @ G, self._rows_of_hops(edge.a))
             else:
-                error[:, count + number] += A @ G @ _root(np.asarray(np.linalg.inv(edge.information), np.float64))
+                error[:, count + number] += A @ G @ _root(edge.measured)
+                self._add_drift(error, A @ G, edge)
         return error
 
     def _add_hops(self, error: Matrix, A: Matrix, rows: slice) -> None:
@@ -283,6 +283,12 @@ class PathCovariance:
         error[:, rows] += np.swapaxes(A @ self._independent[rows], 0, 1)
         for shared, column in zip(self._shared, (BIAS, MEAN), strict=True):
             error[:, column] += A @ shared[rows].sum(0)
+
+    def _add_drift(self, error: Matrix, A: Matrix, edge: Edge) -> None:
+        """Add the errors of T_a_b of a loop that come from the hops to its two keyframes, transformed by A [6, 6]."""
+        in_a, in_b = edge.keyframes
+        self._add_hops(error, A, self._rows_of_hops(edge.a, int(self._first[edge.a]) + in_a))
+        self._add_hops(error, -A @ se3.adjoint(edge.T_a_b), self._rows_of_hops(edge.b, int(self._first[edge.b]) + in_b))
 
     @cached_property
     def _disagreement(self) -> tuple[Matrix, Matrix]:

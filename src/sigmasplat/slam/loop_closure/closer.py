@@ -209,8 +209,10 @@ class LoopCloser:
         b = self.store.load(pair.best.database_submap)
         known = se3.inverse(atlas.anchors[a.index]) @ atlas.anchors[b.index]
         found = yield from registrar.register(pair, a, b, known)
-        edge = Edge(a.index, b.index, found.T_a_b, found.information, loop=True) if found.accepted else None
-        return described(pair.best, a, b, found, known), edge
+        loop = described(pair.best, a, b, found, known)
+        if not found.accepted:
+            return loop, None
+        return loop, Edge(a.index, b.index, found.T_a_b, found.information, True, found.keyframes, found.drift)
 
     def solve_all(self, atlas: Atlas) -> None:
         """Solve the pose graph of each component as a whole; call it once, after the last submap."""

@@ -11,21 +11,24 @@ from sigmasplat.model.column import Column, Records
 from sigmasplat.slam.loop_closure.pose_graph import Edge
 from sigmasplat.types import Matrix
 
-NUMBERS = 3
+NUMBERS = 5
 """Columns before the motion, see `Edges.rows`."""
+INFORMATION = slice(NUMBERS + 16, NUMBERS + 16 + 36)
+DRIFT = slice(NUMBERS + 16 + 36, None)
 
 
 @dataclass(eq=False)
 class Edges(Records[Edge]):
     """Edges in their order. An edge is made when it is read.
 
-    rows [E, 55]: a, b, row of the loop that the edge is, −1 for a trusted edge, T_a_b and information by rows.
+    rows [E, 93]: a, b, row of the loop that the edge is, −1 for a trusted edge, both keyframes, T_a_b, information and
+    drift by rows.
     """
 
     POSE_COLUMNS: ClassVar[slice] = slice(NUMBERS, NUMBERS + 16)
     """The columns of `rows` that hold a pose."""
 
-    rows: Column = field(default_factory=lambda: Column.of(np.float64, NUMBERS + 16 + 36))
+    rows: Column = field(default_factory=lambda: Column.of(np.float64, NUMBERS + 16 + 2 * 36))
 
     @staticmethod
     def of(known: Iterable[Edge]) -> "Edges":
@@ -39,7 +42,8 @@ class Edges(Records[Edge]):
 
     def append(self, edge: Edge, loop_row: int = -1) -> None:
         """Append an edge; loop_row: of a loop, its row among all pairs that were tried."""
-        self.rows.append([edge.a, edge.b, loop_row, *edge.T_a_b.ravel(), *edge.information.ravel()])
+        numbers, matrices = (edge.a, edge.b, loop_row, *edge.keyframes), (edge.T_a_b, edge.information, edge.drift)
+        self.rows.append(np.concatenate([numbers, *(matrix.ravel() for matrix in matrices)]))
 
     @property
     def ends(self) -> NDArray[np.int64]:
@@ -54,7 +58,17 @@ class Edges(Records[Edge]):
     @property
     def information(self) -> Matrix:
         """Return the information of each edge [E, 6, 6]."""
-        return self.rows.used[:, NUMBERS + 16 :].reshape(-1, 6, 6).copy()
+        return self.rows.used[:, INFORMATION].reshape(-1, 6, 6).copy()
+
+    @property
+    def keyframes(self) -> NDArray[np.int64]:
+        """Return both keyframes of each edge [E, 2]."""
+        return np.asarray(self.rows.used[:, 3:NUMBERS].astype(np.int64))
+
+    @property
+    def drift(self) -> Matrix:
+        """Return the drift in each edge [E, 6, 6]."""
+        return self.rows.used[:, DRIFT].reshape(-1, 6, 6).copy()
 
     @property
     def is_loop(self) -> NDArray[np.bool_]:
@@ -72,6 +86,6 @@ class Edges(Records[Edge]):
 
     def _record(self, i: int) -> Edge:
         row = self.rows.used[i].copy()
-        a, b, loop_row = (int(number) for number in row[:NUMBERS].tolist())
-        T, information = row[NUMBERS : NUMBERS + 16].reshape(4, 4), row[NUMBERS + 16 :].reshape(6, 6)
-        return Edge(a, b, T, information, loop_row >= 0)
+        a, b, loop_row, in_a, in_b = (int(number) for number in row[:NUMBERS].tolist())
+        information, drift = (row[columns].reshape(6, 6) for columns in (INFORMATION, DRIFT))
+        return Edge(a, b, row[self.POSE_COLUMNS].reshape(4, 4), information, loop_row >= 0, (in_a, in_b), drift)

@@ -16,7 +16,8 @@ from sigmasplat.types import Matrix
 class Localisation:
     """A keyframe's pose in the other submap, expressed as T_a_b [4, 4] between the submaps; residual: the final loss;
     covariance [6, 6] of T_a_b's left twist (m, rad); agreement and overlap as in `PoseFit`; comparison: with the other
-    map rendered at the pose, if it was made; at_keyframe: whether the other submap's recorded image gave the pose."""
+    map rendered at the pose, if it was made; at_keyframe: whether the other submap's recorded image gave the pose;
+    keyframes: of a and of b, the localised one and the nearest one to it in the other submap."""
 
     T_a_b: Matrix
     residual: float
@@ -25,13 +26,14 @@ class Localisation:
     overlap: float
     comparison: Comparison | None = None
     at_keyframe: bool = False
+    keyframes: tuple[int, int] = (0, 0)
 
 
 def inverted(found: Localisation) -> Localisation:
     """Return the localisation with T_a_b [4, 4] inverted; the left twist of the inverse is −Ad(T⁻¹) ξ."""
     T = se3.inverse(found.T_a_b)
     A = se3.adjoint(T)
-    return dataclasses.replace(found, T_a_b=T, covariance=A @ found.covariance @ A.T)
+    return dataclasses.replace(found, T_a_b=T, covariance=A @ found.covariance @ A.T, keyframes=found.keyframes[::-1])
 
 
 def differs(one: Matrix, other: Matrix, point_b: Matrix) -> tuple[float, float]:
@@ -64,12 +66,12 @@ def combined(found: Sequence[Localisation]) -> Matrix:
     return se3.orthonormalise(mean)
 
 
-def information(found: Sequence[Localisation], mean: Matrix, scene_scale: float = 1.0) -> Matrix:
-    """Return the information [6, 6] of the mean T_a_b: the inverse of estimated covariance + spread + floor.
+def mean_covariance(found: Sequence[Localisation], mean: Matrix, scene_scale: float = 1.0) -> Matrix:
+    """Return the covariance [6, 6] of the mean T_a_b: estimated covariance + spread + floor.
 
     mean: T_a_b [4, 4]; of its left twist, m and rad. The covariance is not divided by the number of localisations: they
     use the same two maps, so their errors are correlated.
     """
     twists = np.stack([se3.log(f.T_a_b @ se3.inverse(mean)) for f in found])
     covariance = np.mean([f.covariance for f in found], 0) + twists.T @ twists / len(found)
-    return symmetric(np.asarray(np.linalg.inv(symmetric(covariance) + floor(scene_scale)), np.float64))
+    return symmetric(covariance) + floor(scene_scale)

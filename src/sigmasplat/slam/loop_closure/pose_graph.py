@@ -6,7 +6,7 @@ agree with the rest of the graph have. Then accepted loops get weight 1 and the 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,13 +38,24 @@ ROUGHLY = 1e-3
 @dataclass(frozen=True, eq=False, slots=True)
 class Edge:
     """A measurement T_a_b between nodes a and b, and the information [6, 6] (inverse covariance, 1/m² and 1/rad²) of
-    its left twist ξ = (ρ, φ): the true motion is exp(ξ) T_a_b. Odometry is trusted, a loop is judged."""
+    its left twist ξ = (ρ, φ): the true motion is exp(ξ) T_a_b. Odometry is trusted, a loop is judged.
+
+    A loop compares a keyframe of submap a with one of submap b: `keyframes`, counted in their submaps. drift [6, 6]:
+    the part of the covariance that is the drift from the submaps' first keyframes to these two.
+    """
 
     a: int
     b: int
     T_a_b: Matrix
     information: Matrix
     loop: bool
+    keyframes: tuple[int, int] = (0, 0)
+    drift: Matrix = field(default_factory=lambda: np.zeros((6, 6)))
+
+    @property
+    def measured(self) -> Matrix:
+        """Return the covariance [6, 6] of the measurement alone, without drift."""
+        return np.asarray(np.linalg.inv(self.information) - self.drift)
 
 
 @dataclass(frozen=True)

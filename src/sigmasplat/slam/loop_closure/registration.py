@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -23,12 +23,12 @@ from sigmasplat.model import se3
 from sigmasplat.model.map_uncertainty import Background
 from sigmasplat.model.submap import Picture, Submap, SubmapStore
 from sigmasplat.render.view import View
-from sigmasplat.slam.drift import systematic_errors
+from sigmasplat.slam.drift import drift_to, symmetric, systematic_errors
 from sigmasplat.slam.features import Extractor
 from sigmasplat.slam.localisation.verdict import confirmed
 from sigmasplat.slam.loop_closure.candidates import SubmapPair
 from sigmasplat.slam.loop_closure.feature_guesses import FeatureGuesses
-from sigmasplat.slam.loop_closure.localisations import Localisation, combined, consensus, information, inverted
+from sigmasplat.slam.loop_closure.localisations import Localisation, combined, consensus, inverted, mean_covariance
 from sigmasplat.slam.predicted_submaps import PredictedSubmaps
 from sigmasplat.slam.rules import angle_between
 from sigmasplat.types import Matrix, Slices, long_slice
@@ -54,7 +54,8 @@ class Registration:
     """T_a_b [4, 4] between submaps a and b, or the reason why the registration was refused.
 
     information [6, 6]: inverse covariance of T_a_b's left twist (m, rad); localised: the number of localisations that
-    were used; residual: their mean loss; overlap: share of splats with a neighbour in the other submap.
+    were used; residual: their mean loss; overlap: share of splats with a neighbour in the other submap; keyframes and
+    drift: as in `Edge`.
     """
 
     T_a_b: Matrix
@@ -64,6 +65,8 @@ class Registration:
     overlap: float
     accepted: bool
     reason: str
+    keyframes: tuple[int, int] = (0, 0)
+    drift: Matrix = field(default_factory=lambda: np.zeros((6, 6)))
 
 
 class Registrar:
@@ -114,9 +117,12 @@ class Registrar:
         fit, at_keyframe = yield from self._refined(other, other_map, target, live, max(fits, key=score))
         A = se3.adjoint(T_own_camera)
         covariance, comparison = self._checked(other_map, live, fit.T_camera_world)
-        covariance = covariance + _errors_of_motion(other, fit.T_camera_world, target)
+        nearest = _nearest_keyframe(other, fit.T_camera_world, target)
+        covariance = covariance + _errors_of_motion(fit.T_camera_world @ other.T_submap_camera[nearest])
         T_own_other, covariance = T_own_camera @ fit.T_camera_world, A @ covariance @ A.T
-        return Localisation(T_own_other, fit.loss, covariance, fit.agreement, fit.overlap, comparison, at_keyframe)
+        return Localisation(
+            T_own_other, fit.loss, covariance, fit.agreement, fit.overlap, comparison, at_keyframe, (keyframe, nearest)
+        )
 
     def _refined(
         self, other: Submap, other_map: WeighedMap, target: Target, live: Pyramid, found: PoseFit
@@ -237,8 +243,10 @@ class Registrar:
         if overlap < c.overlap_least:
             return refused(T_a_b, agreed, len(agreed), f"overlap {overlap:.2f} is below {c.overlap_least}", overlap)
         residual = float(np.mean([f.residual for f in agreed]))
-        edge = information(agreed, mean, self.view.options.scene_scale)
-        return Registration(mean, edge, residual, len(agreed), overlap, True, "accepted")
+        scale, keyframes = self.view.options.scene_scale, min(agreed, key=lambda f: f.residual).keyframes
+        drift = drift_between(a, b, keyframes, mean, scale)
+        information = symmetric(np.asarray(np.linalg.inv(mean_covariance(agreed, mean, scale) + drift)))
+        return Registration(mean, information, residual, len(agreed), overlap, True, "accepted", keyframes, drift)
 
 
 def _nearest_keyframe(submap: Submap, T_camera_submap: Matrix, target: Target) -> int:
@@ -248,10 +256,21 @@ def _nearest_keyframe(submap: Submap, T_camera_submap: Matrix, target: Target) -
     return int(np.argmin([angle_between(T, T_submap_camera, mean_m) for T in submap.T_submap_camera]))
 
 
-def _errors_of_motion(submap: Submap, T_camera_submap: Matrix, target: Target) -> Matrix:
+def _errors_of_motion(T_camera_keyframe: Matrix) -> Matrix:
     """Return the covariance [6, 6] of the errors that grow with the motion from the submap's nearest keyframe."""
-    T = T_camera_submap @ submap.T_submap_camera[_nearest_keyframe(submap, T_camera_submap, target)]
-    return systematic_errors(float(np.linalg.norm(T[:3, 3])), se3.rotation_angle(T[:3, :3]))
+    moved_m = float(np.linalg.norm(T_camera_keyframe[:3, 3]))
+    return systematic_errors(moved_m, se3.rotation_angle(T_camera_keyframe[:3, :3]))
+
+
+def drift_between(a: Submap, b: Submap, keyframes: tuple[int, int], T_a_b: Matrix, scene_scale: float) -> Matrix:
+    """Return the covariance [6, 6] of T_a_b's left twist (m, rad) from the drift of both submaps, from their first
+    keyframes to the two that were compared.
+
+    The motion between these two keyframes is measured, but the pose graph moves whole submaps.
+    """
+    A, (in_a, in_b) = se3.adjoint(T_a_b), keyframes
+    of_b = drift_to(in_b, b.T_submap_camera, scene_scale)
+    return symmetric(drift_to(in_a, a.T_submap_camera, scene_scale) + A @ of_b @ A.T)
 
 
 def rendered_picture(maps: PoseMaps) -> Picture:
