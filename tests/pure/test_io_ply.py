@@ -1,6 +1,8 @@
 """The map file: round trip, the columns that other programs need, and maps of other programs."""
 
 import struct
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -8,8 +10,10 @@ import pytest
 import torch
 
 from sigmasplat.errors import RunError, SourceError
+from sigmasplat.io.splats import ply
 from sigmasplat.io.splats.ply import SH_C0, read_field, write_field
-from sigmasplat.model.field import GaussianField, Rows
+from sigmasplat.model.field import ATTRIBUTES, GaussianField, Rows
+from sigmasplat.model.map_uncertainty import SplatStd
 
 
 def random_field(n: int = 50, seed: int = 0) -> GaussianField:
@@ -243,3 +247,40 @@ def test_a_missing_map_and_an_unwritable_folder_are_refused(tmp_path: Path) -> N
         read_field(tmp_path / "no.ply")
     with pytest.raises(RunError, match="cannot write"):
         write_field(tmp_path / "no" / "map.ply", random_field())
+
+
+@pytest.mark.parametrize("plain", [False, True])
+def test_a_map_that_is_converted_in_parts_has_the_same_bytes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, plain: bool
+) -> None:
+    field = random_field(23)
+    for name in ("harmonics", "correlations"):
+        field.get_or_create(name).params[:] = torch.randn(23, ATTRIBUTES[name], generator=torch.Generator())
+    std = SplatStd(*torch.rand(2, 23, generator=torch.Generator()))
+    write_field(tmp_path / "whole.ply", field, plain=plain, std=std)
+    monkeypatch.setattr(ply, "AT_ONCE", 5)
+    write_field(tmp_path / "parts.ply", field, plain=plain, std=std)
+    assert (tmp_path / "parts.ply").read_bytes() == (tmp_path / "whole.ply").read_bytes()
+
+
+MANY_SUBMAPS = """
+import sys, torch
+from pathlib import Path
+from sigmasplat.io.splats.ply import write_field
+from sigmasplat.model.field import GaussianField
+peak_mib = lambda: int(next(s for s in open("/proc/self/status") if s.startswith("VmHWM")).split()[1]) / 1024
+one = GaussianField(torch.rand(100_000, 17))
+before = peak_mib()
+field = GaussianField.side_by_side(one.moved(torch.eye(4)) for _ in range(30))
+write_field(Path(sys.argv[1]), field)
+print((peak_mib() - before) / (field.params.nbytes / 2**20))
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="peak memory is read from /proc")
+def test_joining_and_writing_the_maps_of_many_submaps_takes_little_more_than_twice_their_memory(tmp_path: Path) -> None:
+    """A run of half an hour has 50 million splats when Ctrl-C ends it."""
+    done = subprocess.run(
+        [sys.executable, "-c", MANY_SUBMAPS, str(tmp_path / "map.ply")], capture_output=True, text=True, check=True
+    )
+    assert float(done.stdout) < 3.5

@@ -3,6 +3,7 @@
 from collections.abc import Iterable
 from dataclasses import dataclass, field as dataclass_field, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -42,9 +43,9 @@ class Rows:
 
     def __post_init__(self) -> None:
         if self.moment1.shape != self.params.shape:
-            self.moment1 = torch.zeros_like(self.params)
+            self.moment1 = _zeros_like(self.params)
         if self.moment2.shape != self.params.shape:
-            self.moment2 = torch.zeros_like(self.params)
+            self.moment2 = _zeros_like(self.params)
         if len(self.last_step) != len(self.params) or self.last_step.device != self.params.device:
             self.last_step = torch.zeros(len(self.params), dtype=torch.int32, device=self.params.device)
 
@@ -93,6 +94,17 @@ class Rows:
         )
 
 
+def _zeros_like(params: Tensor, width: int | None = None) -> Tensor:
+    """Return zeros with the rows, type and device of params [N, m]; width: another number of columns.
+
+    In host memory they take no RAM until they are written: a map that is only saved has no use for Adam's moments.
+    """
+    shape = (len(params), params.shape[1] if width is None else width)
+    if params.device.type != "cpu":
+        return params.new_zeros(shape)
+    return torch.from_numpy(np.zeros(shape, np.float32)).to(params.dtype)
+
+
 @dataclass(eq=False)
 class GaussianField(Rows):
     """N splats as one float32 tensor `params` [N, 17], columns named in `COLUMNS`.
@@ -121,20 +133,22 @@ class GaussianField(Rows):
 
     @staticmethod
     def side_by_side(fields: Iterable["GaussianField"]) -> "GaussianField":
-        """Return the splats of fields in their order, with new ids, in host memory.
+        """Return the splats of fields in their order, with new ids and without optimiser state, in host memory.
 
-        Results of equal size are joined first, so that time does not grow with the square of the number of fields.
+        The sum may be many times larger than any map that is fitted: each part is copied once, into one tensor.
         """
-        parts = list[GaussianField]()
-        for number, field in enumerate(fields, 1):
-            parts.append(GaussianField.empty())
-            parts[-1].append(field)
-            while number % 2 == 0:
-                parts[-2].append(parts.pop())
-                number //= 2
-        while len(parts) > 1:
-            parts[-2].append(parts.pop())
-        return parts[0] if parts else GaussianField.empty()
+        params, attributes, count = [torch.zeros(0, WIDTH)], dict[str, list[tuple[int, Tensor]]](), 0
+        for field in filter(len, fields):
+            params.append(field.params.cpu())
+            for name, attribute in field.attributes.items():
+                attributes.setdefault(name, []).append((count, attribute.params))
+            count += len(field)
+        joined = GaussianField(torch.cat(params))
+        for name, parts in attributes.items():
+            rows = joined.get_or_create(name).params
+            for first, values in parts:
+                rows[first : first + len(values)] = values
+        return joined
 
     @staticmethod
     def from_values(
@@ -196,7 +210,7 @@ class GaussianField(Rows):
     def get_or_create(self, name: str) -> Rows:
         """Return an attribute by its name; if the field does not have it yet, it is created as zeros."""
         if name not in self.attributes:
-            self.attributes[name] = Rows(self.params.new_zeros(len(self), ATTRIBUTES[name]))
+            self.attributes[name] = Rows(_zeros_like(self.params, ATTRIBUTES[name]))
         return self.attributes[name]
 
     def append(self, other: "GaussianField") -> None:

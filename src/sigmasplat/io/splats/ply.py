@@ -10,6 +10,7 @@ columns, with f_rest 0 if a map has no harmonics. The header has no comments, be
 in line 3.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +39,8 @@ AFTER_HARMONICS = ["opacity", *PLY_COLUMNS["log_scales"], *PLY_COLUMNS["quats"]]
 REST = "f_rest_"
 CORRELATIONS = [f"correlation_{i}" for i in range(ATTRIBUTES["correlations"])]
 STD_COLUMNS = ("depth_std_m", "color_std")
+AT_ONCE = 1 << 18
+"""Splats that are converted at once: the file may be larger than the memory."""
 
 
 def write_field(path: Path, field: GaussianField, *, plain: bool = False, std: SplatStd | None = None) -> None:
@@ -45,39 +48,48 @@ def write_field(path: Path, field: GaussianField, *, plain: bool = False, std: S
 
     `std` adds its two columns unless `plain`. Raises RunError if the file cannot be written.
     """
-    params = field.params.detach().cpu().numpy().astype(np.float32)
-    harmonics = _harmonics_for_file(field)
-    rest = [f"{REST}{i}" for i in range(ATTRIBUTES["harmonics"] if plain else harmonics.shape[1])]
-    correlations = field.attributes.get("correlations")
-    ours = [] if plain else [*PLY_COLUMNS["log_variances"], *(CORRELATIONS if correlations is not None else [])]
-    of_std = {} if plain or std is None else {name: getattr(std, name) for name in STD_COLUMNS}
-    names_in_file = [*BEFORE_HARMONICS, *rest, *AFTER_HARMONICS, *ours, *of_std]
-    rows = np.zeros(len(params), np.dtype([(name, "<f4") for name in names_in_file]))
-    for group in (group for group, names in PLY_COLUMNS.items() if names[0] in names_in_file):
-        names, values = PLY_COLUMNS[group], params[:, COLUMNS[group]]
-        if group == "colors":
-            values = ((values.astype(np.float64) - 0.5) / SH_C0).astype(np.float32)
-        for i, name in enumerate(names):
-            rows[name] = values[:, i]
-    for i, name in enumerate(rest[: harmonics.shape[1]]):
-        rows[name] = harmonics[:, i]
-    if correlations is not None and not plain:
-        for i, name in enumerate(CORRELATIONS):
-            rows[name] = correlations.params[:, i].detach().cpu().numpy()
-    for name, column in of_std.items():
-        rows[name] = column.numpy()
-    properties = "".join(f"property float {name}\n" for name in names_in_file)
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{properties}end_header\n"
+    known = None if plain else std
+    names = _columns(field, plain, known)
+    properties = "".join(f"property float {name}\n" for name in names)
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(field)}\n{properties}end_header\n"
     with replacing(path) as temporary, temporary.open("wb") as file:
         file.write(header.encode("ascii"))
-        file.write(rows.tobytes())
+        for first in range(0, len(field), AT_ONCE):
+            file.write(_rows(field, known, names, slice(first, first + AT_ONCE)).tobytes())
 
 
-def _harmonics_for_file(field: GaussianField) -> NDArray[np.float32]:
-    """Return a field's harmonics in the file's order [N, 45], or [N, 0]."""
-    if "harmonics" not in field.attributes:
-        return np.empty((len(field), 0), np.float32)
-    return by_channel(field.attributes["harmonics"].params.detach().cpu().numpy().astype(np.float32))
+def _columns(field: GaussianField, plain: bool, std: SplatStd | None) -> list[str]:
+    """Return the names of a file's columns in their order."""
+    with_harmonics = plain or "harmonics" in field.attributes
+    rest = [f"{REST}{i}" for i in range(ATTRIBUTES["harmonics"] if with_harmonics else 0)]
+    correlations = CORRELATIONS if "correlations" in field.attributes else []
+    ours = [] if plain else [*PLY_COLUMNS["log_variances"], *correlations, *(() if std is None else STD_COLUMNS)]
+    return [*BEFORE_HARMONICS, *rest, *AFTER_HARMONICS, *ours]
+
+
+def _rows(field: GaussianField, std: SplatStd | None, columns: list[str], part: slice) -> NDArray[np.void]:
+    """Return some splats as rows of a file with these columns."""
+    params = field.params[part].detach().cpu().numpy().astype(np.float32)
+    rows = np.zeros(len(params), np.dtype([(name, "<f4") for name in columns]))
+    for group in (group for group, names in PLY_COLUMNS.items() if names[0] in columns):
+        values = params[:, COLUMNS[group]]
+        if group == "colors":
+            values = ((values.astype(np.float64) - 0.5) / SH_C0).astype(np.float32)
+        _fill(rows, PLY_COLUMNS[group], values)
+    if "harmonics" in field.attributes:
+        harmonics = field.attributes["harmonics"].params[part].detach().cpu().numpy()
+        _fill(rows, [f"{REST}{i}" for i in range(harmonics.shape[1])], by_channel(harmonics.astype(np.float32)))
+    if CORRELATIONS[0] in columns:
+        _fill(rows, CORRELATIONS, field.attributes["correlations"].params[part].detach().cpu().numpy())
+    if std is not None:
+        _fill(rows, STD_COLUMNS, np.stack([getattr(std, name)[part].numpy() for name in STD_COLUMNS], 1))
+    return rows
+
+
+def _fill(rows: NDArray[np.void], names: Sequence[str], values: NDArray[np.float32]) -> None:
+    """Set columns of rows [n] to values [n, m]."""
+    for i, name in enumerate(names):
+        rows[name] = values[:, i]
 
 
 def read_field(path: Path) -> GaussianField:
