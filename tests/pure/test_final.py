@@ -3,6 +3,7 @@
 import itertools
 from copy import deepcopy
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from sigmasplat.model import se3
 from sigmasplat.model.field import COLUMNS, GaussianField, Rows
 from sigmasplat.model.submap import MemoryStore, StorePart, Submap
 from sigmasplat.render.reference.view import ReferenceView
+from sigmasplat.slam import final
 from sigmasplat.slam.final import final_map, merged, survivors, z_order
 from sigmasplat.slam.fusion import FusionView, count_keyframes, fuse, fusion_views
 from sigmasplat.slam.predicted_submaps import PredictedSubmaps
@@ -70,6 +72,29 @@ def test_where_submaps_overlap_one_of_them_stays(uncertainty: bool) -> None:
     everything = torch.cat([wall(-1.4, 0.4).means, wall(-0.2, 1.6).means])
     away = cKDTree(field.means.numpy()).query(everything.numpy())[0]
     assert away.max() < SPACING_M * np.sqrt(3), "no hole"
+
+
+@pytest.mark.parametrize("uncertainty", [True, False])
+def test_a_room_that_many_submaps_show_is_merged_in_parts_with_the_same_result(
+    monkeypatch: pytest.MonkeyPatch, uncertainty: bool
+) -> None:
+    store, generator, most = MemoryStore(), torch.Generator().manual_seed(2), 0
+    for index in range(12):
+        part = wall(0.1 * (index % 5) - 1.4, 0.1 * (index % 7) + 0.4)
+        part.params += 0.03 * torch.randn(part.params.shape, generator=generator)
+        store.save(Submap(index, part, (), np.empty((0, 4, 4)), CAMERA), [])
+        most += len(part)
+    anchors, joined = [np.eye(4)] * 12, list[int]()
+    whole = merged(store, anchors, config(uncertainty=uncertainty))
+
+    def counted(means: np.ndarray, *more: Any) -> np.ndarray:
+        joined.append(len(means))
+        return survivors(means, *more)
+
+    monkeypatch.setattr(final, "AT_ONCE", 500)
+    monkeypatch.setattr(final, "survivors", counted)
+    assert torch.equal(merged(store, anchors, config(uncertainty=uncertainty)).params, whole.params)
+    assert len(joined) > 3 and max(joined) < most / 2
 
 
 @pytest.mark.parametrize("variance", ["published", "predicted"])

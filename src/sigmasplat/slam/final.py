@@ -1,7 +1,7 @@
 """The final map: merge all submaps, or seed new splats on their surface, and refine over all keyframes (VarSplat
 §7)."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from sigmasplat.config import Config
+from sigmasplat.config import Config, FinalConfig
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.model.field import COLUMNS, INITIAL_LOG_VARIANCE, GaussianField, Rows
 from sigmasplat.model.mesh import Mesh
@@ -26,6 +26,8 @@ from sigmasplat.types import Matrix, Progress, no_progress
 
 CELL_M, BITS = 0.01, 16
 """Size of the cells of `z_order`, and the bits of a cell's number along each axis."""
+AT_ONCE = 1 << 22
+"""Duplicates are removed when so many splats wait, so that memory does not grow with the time in one room."""
 
 
 class FinalMap(NamedTuple):
@@ -96,24 +98,43 @@ def _refuse_misfits(store: SubmapStore, anchors: Sequence[Matrix]) -> None:
 # ---- merging ----
 
 
+class OwnedSplats(NamedTuple):
+    """Splats in the world, the submap of each [N], and its log σ² [N]."""
+
+    field: GaussianField
+    owner: NDArray[np.int64]
+    log_variance: Tensor
+
+
 def merged(store: SubmapStore, anchors: Sequence[Matrix], config: Config) -> GaussianField:
-    """Merge the splats of all submaps in the world (anchors: T_world_submap [4, 4]), without duplicates
-    (`survivors`)."""
-    owner, variances, predicted = list[NDArray[np.int64]](), list[Tensor](), PredictedSubmaps(config, store)
+    """Merge the splats of all submaps in the world (anchors: T_world_submap [4, 4]), without duplicates (`survivors`).
 
-    def parts() -> Iterator[GaussianField]:
-        for index in range(len(store)):
-            part = _in_world(store, anchors, index)
-            owner.append(np.full(len(part), index))
-            is_predicted = config.final.uncertainty and config.final.variance == "predicted"
-            variances.append(_log_variance(predicted.rows(index) if is_predicted else part.params))
-            yield part
+    If there are more than `AT_ONCE` splats, duplicates are removed before all submaps are read. The result is the same:
+    the splats that win a voxel stay complete, and so does their mean.
+    """
+    predicted, kept, waiting = PredictedSubmaps(config, store), list[OwnedSplats](), list[OwnedSplats]()
+    for index in range(len(store)):
+        part = _in_world(store, anchors, index)
+        is_predicted = config.final.uncertainty and config.final.variance == "predicted"
+        log_variance = _log_variance(predicted.rows(index) if is_predicted else part.params)
+        waiting.append(OwnedSplats(part, np.full(len(part), index), log_variance))
+        if _count(waiting) >= max(AT_ONCE, _count(kept)):
+            kept, waiting = [_without_duplicates([*kept, *waiting], config.final)], []
+    return _without_duplicates([*kept, *waiting], config.final).field
 
-    field = GaussianField.side_by_side(parts())
-    log_variance = np.asarray(torch.cat(variances).double()) if config.final.uncertainty else None
-    keep = survivors(field.means.numpy(), np.concatenate(owner), log_variance, config.final.merge_m)
+
+def _count(parts: Sequence[OwnedSplats]) -> int:
+    return sum(len(part.field) for part in parts)
+
+
+def _without_duplicates(parts: Sequence[OwnedSplats], final: FinalConfig) -> OwnedSplats:
+    """Return the splats of parts that survive, in their order."""
+    field = GaussianField.side_by_side(part.field for part in parts)
+    owner, log_variance = np.concatenate([part.owner for part in parts]), torch.cat([p.log_variance for p in parts])
+    weigh = np.asarray(log_variance.double()) if final.uncertainty else None
+    keep = survivors(field.means.numpy(), owner, weigh, final.merge_m)
     field.keep(torch.from_numpy(keep))
-    return field
+    return OwnedSplats(field, owner[keep], log_variance[torch.from_numpy(keep)])
 
 
 def _in_world(store: SubmapStore, anchors: Sequence[Matrix], index: int) -> GaussianField:
