@@ -9,6 +9,7 @@ example: python benchmarks/long_live.py --quick
 """
 
 import os
+import resource
 import signal
 import sys
 import threading
@@ -144,6 +145,7 @@ def follow(path: str, scratch: Path, config: Config, frames: int, save_every_s: 
         "loops_tried": len(slam.loops),
         "loops_accepted": outcome.loops_closed,
         "keyframes_refused": system.keyframes_refused,
+        "peak_mib": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0),
         "valid": checked["status"] == "interrupted" and checked["poses"] == len(log) and folder.state.is_file(),
         "each": {
             "index": [line["index"] for line in log],
@@ -239,6 +241,7 @@ def minutes_table(figures: dict[str, Any]) -> Section:
         f"{figures['source']}, repeated at 30 Hz: {figures['frames']} frames tracked, {figures['dropped']} dropped, "
         f"{figures['lost']} lost, {figures['submaps']} submaps, loops accepted {figures['loops_accepted']} of "
         f"{figures['loops_tried']} tried. The run folder after Ctrl-C is {'' if figures['valid'] else '**not** '}valid."
+        + (f" Most memory, while the map is written: {figures['peak_mib']} MiB." if "peak_mib" in figures else "")
     )
     return Section("Minutes", head, rows, note)
 
