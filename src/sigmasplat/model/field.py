@@ -43,9 +43,9 @@ class Rows:
 
     def __post_init__(self) -> None:
         if self.moment1.shape != self.params.shape:
-            self.moment1 = _zeros_like(self.params)
+            self.moment1 = torch.zeros_like(self.params)
         if self.moment2.shape != self.params.shape:
-            self.moment2 = _zeros_like(self.params)
+            self.moment2 = torch.zeros_like(self.params)
         if len(self.last_step) != len(self.params) or self.last_step.device != self.params.device:
             self.last_step = torch.zeros(len(self.params), dtype=torch.int32, device=self.params.device)
 
@@ -94,15 +94,11 @@ class Rows:
         )
 
 
-def _zeros_like(params: Tensor, width: int | None = None) -> Tensor:
-    """Return zeros with the rows, type and device of params [N, m]; width: another number of columns.
-
-    In host memory they take no RAM until they are written: a map that is only saved has no use for Adam's moments.
-    """
-    shape = (len(params), params.shape[1] if width is None else width)
-    if params.device.type != "cpu":
-        return params.new_zeros(shape)
-    return torch.from_numpy(np.zeros(shape, np.float32)).to(params.dtype)
+def _without_optimiser_state(params: Tensor) -> Rows:
+    """Return rows in host memory whose moments take no RAM until they are written: a map that is only saved has no use
+    for them."""
+    moment1, moment2 = (torch.from_numpy(np.zeros(tuple(params.shape), np.float32)) for _ in range(2))
+    return Rows(params, moment1, moment2)
 
 
 @dataclass(eq=False)
@@ -138,17 +134,19 @@ class GaussianField(Rows):
         The sum may be many times larger than any map that is fitted: each part is copied once, into one tensor.
         """
         params, attributes, count = [torch.zeros(0, WIDTH)], dict[str, list[tuple[int, Tensor]]](), 0
-        for field in filter(len, fields):
-            params.append(field.params.cpu())
-            for name, attribute in field.attributes.items():
+        for part in filter(len, fields):
+            params.append(part.params.cpu())
+            for name, attribute in part.attributes.items():
                 attributes.setdefault(name, []).append((count, attribute.params))
-            count += len(field)
-        joined = GaussianField(torch.cat(params))
+            count += len(part)
+        joined = _without_optimiser_state(torch.cat(params))
+        field = GaussianField(joined.params, joined.moment1, joined.moment2)
         for name, parts in attributes.items():
-            rows = joined.get_or_create(name).params
+            rows = torch.zeros(count, ATTRIBUTES[name])
             for first, values in parts:
                 rows[first : first + len(values)] = values
-        return joined
+            field.attributes[name] = _without_optimiser_state(rows)
+        return field
 
     @staticmethod
     def from_values(
@@ -210,7 +208,7 @@ class GaussianField(Rows):
     def get_or_create(self, name: str) -> Rows:
         """Return an attribute by its name; if the field does not have it yet, it is created as zeros."""
         if name not in self.attributes:
-            self.attributes[name] = Rows(_zeros_like(self.params, ATTRIBUTES[name]))
+            self.attributes[name] = Rows(self.params.new_zeros(len(self), ATTRIBUTES[name]))
         return self.attributes[name]
 
     def append(self, other: "GaussianField") -> None:
