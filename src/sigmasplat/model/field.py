@@ -98,7 +98,7 @@ def _without_optimiser_state(params: Tensor) -> Rows:
     """Return rows in host memory whose moments take no RAM until they are written: a map that is only saved has no use
     for them."""
     moment1, moment2 = (torch.from_numpy(np.zeros(tuple(params.shape), np.float32)) for _ in range(2))
-    return Rows(params, moment1, moment2)
+    return Rows(params, moment1.to(params.dtype), moment2.to(params.dtype))
 
 
 @dataclass(eq=False)
