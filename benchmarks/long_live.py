@@ -9,7 +9,6 @@ example: python benchmarks/long_live.py --quick
 """
 
 import os
-import resource
 import signal
 import sys
 import threading
@@ -26,6 +25,7 @@ import program
 import record
 import tyro
 from cpu import alone
+from cpu_scene import peak_mib
 from long_run import draw_all, kept, resident_mib
 from scipy.stats import theilslopes
 from tables import Section, significant
@@ -145,7 +145,7 @@ def follow(path: str, scratch: Path, config: Config, frames: int, save_every_s: 
         "loops_tried": len(slam.loops),
         "loops_accepted": outcome.loops_closed,
         "keyframes_refused": system.keyframes_refused,
-        "peak_mib": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0),
+        "peak_mib": peak_mib(),
         "valid": checked["status"] == "interrupted" and checked["poses"] == len(log) and folder.state.is_file(),
         "each": {
             "index": [line["index"] for line in log],

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import accumulate
 from typing import Any, cast
 
 import numpy as np
@@ -302,7 +303,7 @@ def test_the_stated_error_contains_the_drift_of_both_submaps_up_to_the_compared_
     monkeypatch.setattr(drift, "BIAS", 0.0)
     random, count = np.random.default_rng(3), 20_000
     hops = se3.exp_stack(random.normal(0, 0.2, (5, 6)))
-    chain = np.stack([np.linalg.multi_dot([np.eye(4), np.eye(4), *hops[:k]]) for k in range(6)])
+    chain = np.stack([*accumulate(hops, np.matmul, initial=np.eye(4))])
     a, b = replace(a, T_submap_camera=chain), replace(b, T_submap_camera=chain[::-1] @ se3.inverse(chain[5]))
     measured = se3.inverse(a.T_submap_camera[3]) @ truth @ b.T_submap_camera[2]
     roots = np.sqrt(np.diag(hop_errors()))

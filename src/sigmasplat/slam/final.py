@@ -12,7 +12,7 @@ from torch import Tensor
 
 from sigmasplat.config import Config, FinalConfig
 from sigmasplat.errors import SigmaSplatError
-from sigmasplat.model.field import COLUMNS, INITIAL_LOG_VARIANCE, GaussianField, Rows
+from sigmasplat.model.field import COLUMNS, INITIAL_LOG_VARIANCE, GaussianField
 from sigmasplat.model.mesh import Mesh
 from sigmasplat.model.submap import SubmapStore
 from sigmasplat.model.tsdf import packed
@@ -138,11 +138,8 @@ def _without_duplicates(parts: Sequence[OwnedSplats], final: FinalConfig) -> Own
 
 
 def _in_world(store: SubmapStore, anchors: Sequence[Matrix], index: int) -> GaussianField:
-    """Return a submap's splats in the world, without optimiser state."""
-    part = store.load(index).field.moved(torch.from_numpy(anchors[index]))
-    return GaussianField(
-        part.params, attributes={name: Rows(attribute.params) for name, attribute in part.attributes.items()}
-    )
+    """Return a submap's splats in the world."""
+    return store.load(index).field.moved(torch.from_numpy(anchors[index]))
 
 
 def _log_variance(rows: Tensor) -> Tensor:
