@@ -22,7 +22,7 @@ import record
 import tyro
 
 SUBJECTS = {
-    "Whole runs": ("accuracy", "pace", "systems", "map_quality", "every_preset", "paper_presets"),
+    "Whole runs": ("accuracy", "pace", "systems", "map_quality", "full_resolution", "every_preset", "paper_presets"),
     "Other systems": ("peers", "peer_pace", "mesh_quality"),
     "Claims of the papers": ("claims",),
     "Effect of σ²": ("ablation", "weights", "color_covariance"),

@@ -13,7 +13,7 @@ from sigmasplat.evaluation.frame_states import score_states
 from sigmasplat.evaluation.moving_views import show_moving
 from sigmasplat.evaluation.path_scores import arbitrary_scale, in_metres, in_units_of_run, score_frame_sets
 from sigmasplat.evaluation.pose_covariance import score_pose_covariance
-from sigmasplat.evaluation.view_scoring import ViewScoring, score_full_resolution, score_test_views
+from sigmasplat.evaluation.view_scoring import ViewScoring, refined_fx, score_full_resolution, score_test_views
 from sigmasplat.io.frames import RunFrames
 from sigmasplat.io.run_values import frame_seconds
 from sigmasplat.io.runs import TRUTH, RunFolder
@@ -28,6 +28,7 @@ from sigmasplat.model.mesh import Mesh
 from sigmasplat.model.selection import evenly_spread
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.render import FieldRenderer
+from sigmasplat.render.low_pass import as_refined
 from sigmasplat.render.predictive import Predicted, predict
 from sigmasplat.report import charts
 from sigmasplat.report.page import report_plan, write_charts, write_page
@@ -74,10 +75,10 @@ def evaluate(
     known = None if problem else truth
     chosen = {kind: evenly_spread(views, views_per_kind) for kind, views in _kinds(log).items()}
     strips, config = ViewStrips(run, strips_per_kind), run.config()
-    standard, renderer = renderer is None, renderer or FieldRenderer(config.render, config.backend)
+    fx, aligned = refined_fx(config, source.camera), _alignment(frames, known)
+    standard, renderer = renderer is None, renderer or FieldRenderer(config.render, config.backend, (field, fx))
     maps = _map_sources(run, field, records, config.final)
-    maps, predictions = _with_prediction(maps, run, frames, config) if standard else (maps, views.PredictionScores())
-    aligned = _alignment(frames, known)
+    maps, predictions = _predicting(maps, run, frames, config, fx) if standard else (maps, views.PredictionScores())
     scoring = ViewScoring(source, config.input, maps, chosen, renderer, views_per_kind, aligned, lpips)
     metrics = _facts(run, source, records, field) | score_states(run, frames, known)
     metrics |= in_metres(path_scores | score_frame_sets(run, frames, known), scale) | {"path_scale": scale}
@@ -149,11 +150,11 @@ def _map_sources(run: RunFolder, field: GaussianField, records: Log, final: Fina
     return views.MapSources(field, run.submaps, anchors, T_submap_camera=poses, exposures=exposures)
 
 
-def _with_prediction(
-    maps: views.MapSources, run: RunFolder, frames: RunFrames, config: Config
+def _predicting(
+    maps: views.MapSources, run: RunFolder, frames: RunFrames, config: Config, fx: float | None
 ) -> tuple[views.MapSources, views.PredictionScores]:
-    """Add the prediction of errors to the maps if the run measured how sure its map is. Raises RunError if that belongs
-    to another map."""
+    """Add the prediction of errors to the maps if the run measured how sure its map is; fx: `refined_fx`. Raises
+    RunError if that belongs to another map."""
     known, field = run.read_uncertainty(), maps.final
     if known is None:
         return maps, views.PredictionScores()
@@ -164,7 +165,8 @@ def _with_prediction(
         )
 
     def predict_view(camera: Camera, T_camera_world: NDArray[np.float64]) -> Predicted:
-        return predict(field, known, camera, T_camera_world, config.render, config.backend)
+        options = as_refined(config.render, camera, fx)
+        return predict(field, known, camera, T_camera_world, options, config.backend)
 
     return replace(maps, predict=predict_view), views.PredictionScores(_probe_frames(run, frames))
 

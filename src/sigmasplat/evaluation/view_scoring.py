@@ -62,6 +62,16 @@ def full_width(config: Config, camera: Camera) -> int | None:
     return min(final.width_px, camera.width) if size and final.iterations and final.width_iterations else None
 
 
+def refined_fx(config: Config, camera: Camera) -> float | None:
+    """Return the focal length, pixels, of the images that the last stage of the final map used; None without that
+    stage.
+
+    camera: of the recording.
+    """
+    width = full_width(config, camera)
+    return None if width is None else camera.prepared(width).fx
+
+
 def input_of_width(settings: InputConfig, source: Source, width: int) -> InputConfig:
     """Return input settings for images of another width; the cropped edge covers the same part of the image."""
     scale = width / (settings.width or source.camera.width)

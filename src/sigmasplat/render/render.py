@@ -16,6 +16,7 @@ from sigmasplat.render.backend import backend_module, backend_name, options_on
 from sigmasplat.render.channels import covariance_features, covariance_of, features_of, variance_of
 from sigmasplat.render.cuda import launch as cuda_launch
 from sigmasplat.render.gated_depth import gated_depth
+from sigmasplat.render.low_pass import as_refined
 from sigmasplat.render.ray_depth import depth_at, depth_of, plane_features
 from sigmasplat.render.reference.operators import depth_slopes
 
@@ -120,10 +121,16 @@ def render(
 
 class FieldRenderer:
     """Renders repeatedly with the same settings. Each field is copied to a device once, so the last two fields rendered
-    must not change in between."""
+    must not change in between.
 
-    def __init__(self, options: RenderConfig, backend: str) -> None:
-        self.options, self.backend = options, backend
+    refined: a field and the focal length of the images that it was refined on (`as_refined`); None: no field is
+    refined on images larger than those rendered.
+    """
+
+    def __init__(
+        self, options: RenderConfig, backend: str, refined: tuple[GaussianField, float | None] | None = None
+    ) -> None:
+        self.options, self.backend, self.refined = options, backend, refined
         self._kept: deque[tuple[GaussianField, GaussianField]] = deque(maxlen=2)
 
     def __call__(
@@ -138,4 +145,6 @@ class FieldRenderer:
         if copied is None:
             copied = on_device(field, self.backend)
             self._kept.append((field, copied))
-        return render(copied, camera, T_camera_world, depth_reference, self.options, self.backend)
+        refined, refined_fx = self.refined or (None, None)
+        options = as_refined(self.options, camera, refined_fx if field is refined else None)
+        return render(copied, camera, T_camera_world, depth_reference, options, self.backend)

@@ -39,6 +39,7 @@ class FinalMap(NamedTuple):
     keyframe_poses: list[list[Matrix]] | None = None
     keyframe_exposures: list[Matrix] | None = None
     steps: int = 0
+    refined_fx: float | None = None
 
 
 def final_map(
@@ -80,11 +81,11 @@ def final_map(
     clock = Clock(config.final, spent_s)
     if done <= config.final.iterations:
         done += len(refine(on_device, keyframes, config, view, random, progress, done, saved, spent_s))
-    done = refine_on_photos(on_device, keyframes, config, view, random, progress, done, saved, clock)
+    done, refined_fx = refine_on_photos(on_device, keyframes, config, view, random, progress, done, saved, clock)
     moves = config.final.lr_pose_translation or config.final.lr_pose_rotation
     poses = keyframes.poses_in(anchors) if moves else None
     exposures = keyframes.exposures_in_submaps() if config.final.exposure else None
-    return FinalMap(on_device.to(torch.device("cpu")), poses, exposures, done)
+    return FinalMap(on_device.to(torch.device("cpu")), poses, exposures, done, refined_fx)
 
 
 def _refuse_misfits(store: SubmapStore, anchors: Sequence[Matrix]) -> None:

@@ -1,6 +1,7 @@
 """SLAM: track every frame, map keyframes, cut submaps, close loops. `Slam.step` follows the papers' overviews."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from sigmasplat.model.component import APART, LOST, RELOCALISED, TRACKED
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.hops import UNKNOWN_HOP, Hop
 from sigmasplat.model.submap import RefinedStore, StorePart
+from sigmasplat.render.low_pass import as_refined
 from sigmasplat.slam.array_interface import ArrayInterface
 from sigmasplat.slam.drift import mean_variance
 from sigmasplat.slam.final import final_map
@@ -95,7 +97,8 @@ class Slam(MapWork, ArrayInterface):
             self.atlas.refined = dict(zip(members, final.keyframe_poses, strict=True))
         if final.keyframe_exposures is not None:
             self.atlas.exposures = dict(zip(members, final.keyframe_exposures, strict=True))
-        self.uncertainty = final_uncertainty(self._final, refined, anchors, self.config, self.view, measuring)
+        shown = replace(self.config, render=as_refined(self.config.render, self.view.camera, final.refined_fx))
+        self.uncertainty = final_uncertainty(self._final, refined, anchors, shown, self.view, measuring)
         progress(total, total)
 
     def _refinement_steps(self) -> int:
