@@ -54,7 +54,7 @@ ORIGINS: dict[str, dict[str, str]] = {
         "registration.spread_deg": "ours",
         "final.seed_from": "paper", "final.spacing_m": "paper", "final.iterations": "paper", "final.sh_degree": "paper",
         "final.sh_every": "paper", "final.prune_every": "paper", "final.prune_opacity": "paper",
-        "final.lr_means_last": "ours", "final.uncertainty": "paper",
+        "final.lr_means_last": "ours", "final.lr_log_scales": "ours", "final.uncertainty": "paper",
     },
     "cgslam": {
         "input.crop_px": "code", "input.min_depth_m": "code", "input.max_depth_m": "code",

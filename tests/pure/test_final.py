@@ -364,6 +364,24 @@ def test_the_rate_of_the_means_falls_to_its_last_value_across_pruning(monkeypatc
     assert np.allclose(np.diff(np.log(used)), np.log(1.6e-2) / 24, rtol=1e-3)
 
 
+@pytest.mark.parametrize(("own", "first"), [(0.0, 8 * 5e-3), (0.02, 0.02)])
+def test_sizes_can_have_a_rate_of_their_own(monkeypatch: pytest.MonkeyPatch, own: float, first: float) -> None:
+    """It replaces that of mapping times the factor, and decays as the others do."""
+    used: dict[str, list[float]] = {"log_scales": [], "quats": []}
+
+    def fit(field: GaussianField, view: object, order: object, mapping: MappingConfig, **more: object) -> object:
+        rates = [rates.per_column for _, rates in zip(order, more["schedule"], strict=False)]  # type: ignore[call-overload]
+        for name, found in used.items():
+            found.extend(float(columns[COLUMNS[name]][0]) for columns in rates)
+        return type("Fit", (), {"losses": [0.0] * len(rates)})()
+
+    monkeypatch.setattr("sigmasplat.slam.refinement.fit_field", fit)
+    refined(make_store(), config(iterations=20, prune_every=7, lr_factor=8.0, lr_decay=0.1, lr_log_scales=own))
+    assert used["log_scales"][0] == pytest.approx(first) and used["log_scales"][-1] == pytest.approx(0.1 * first)
+    assert used["quats"][0] == pytest.approx(8 * MappingConfig().lr_quats)
+    assert np.allclose(np.diff(np.log(used["log_scales"])), np.diff(np.log(used["quats"])), rtol=1e-3)
+
+
 def around(angle: float) -> np.ndarray:
     """Return T_world_camera of a camera on an arc about the wall's middle, looking at it."""
     middle = np.eye(4)

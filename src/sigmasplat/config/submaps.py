@@ -171,6 +171,8 @@ class FinalConfig(Section, name="final"):
     lr_factor: Above0 = 1.0
     """Factor on the learning rates of mapping (`mapping.lr_…`) in the first refinement step, except that of
     positions."""
+    lr_log_scales: NotNegative = 0.0
+    """Learning rate of sizes in the first refinement step. 0 = `final.lr_factor` times `mapping.lr_log_scales`."""
     lr_decay: Above0 = 1.0
     """Learning rates of splats and poses in the last refinement step, as a share of those in the first; they decay
     exponentially. 1 = constant."""

@@ -216,20 +216,24 @@ class Clock:
 
 def _changes_rates(final: FinalConfig) -> bool:
     """Return whether the learning rates, or Adam's β₂, differ from those of mapping."""
-    return bool(final.lr_means_last) or (final.lr_factor, final.lr_decay, final.beta2) != (1.0, 1.0, BETA2)
+    own = final.lr_means_last or final.lr_log_scales
+    return bool(own) or (final.lr_factor, final.lr_decay, final.beta2) != (1.0, 1.0, BETA2)
 
 
 def decaying(mapping: MappingConfig, final: FinalConfig, done: int, clock: Clock) -> Iterator[Rates]:
     """Yield the rates of the refinement steps after `done`.
 
-    All rates start at `final.lr_factor` times those of mapping, that of the means at the one of mapping. They decay
-    exponentially to the share `final.lr_decay` of the first; that of the means decays from
-    `mapping.lr_means` to `final.lr_means_last` if this is set.
+    All rates start at `final.lr_factor` times those of mapping, that of the means at the one of mapping, that of the
+    sizes at `final.lr_log_scales` if this is set. They decay exponentially to the share `final.lr_decay` of the first;
+    that of the means decays from `mapping.lr_means` to `final.lr_means_last` if this is set.
     """
     for step in range(done, final.iterations + 1):
         rates, share = replace(Rates.of(mapping), beta2=final.beta2), _share(step, final, clock)
-        rates.per_column.mul_(final.lr_factor * final.lr_decay**share)
+        rates.per_column.mul_(final.lr_factor)
         rates.per_column[COLUMNS["means"]] /= final.lr_factor
+        if final.lr_log_scales:
+            rates.per_column[COLUMNS["log_scales"]] = final.lr_log_scales
+        rates.per_column.mul_(final.lr_decay**share)
         if final.lr_means_last:
             rates.per_column[COLUMNS["means"]] = mapping.lr_means ** (1.0 - share) * final.lr_means_last**share
         yield rates
