@@ -368,7 +368,8 @@ def test_sigma_adds_to_fast_and_removes_nothing() -> None:
     assert added == uncertainty | {
         "input.denoise_depth", "tracking.features", "tracking.verify",
         "final.iterations", "final.beta2", "final.merge_m", "final.order", "final.lr_factor", "final.lr_decay",
-        "final.lr_log_scales", "mapping.lr_log_scales", "seeding.scale_factor", "final.weight_moment", "mapping.divided", "mapping.first_iterations", "mapping.lr_pose_translation",
+        "final.lr_log_scales", "mapping.lr_log_scales", "seeding.scale_factor",
+        "final.weight_moment", "mapping.divided", "mapping.first_iterations", "mapping.lr_pose_translation",
         "mapping.lr_pose_rotation",
         "registration.to_keyframe", "registration.iterations", "loops.slices_per_frame",
         "final.lr_pose_translation", "final.lr_pose_rotation", "final.pose_reach_m", "final.prune_weight_px",
