@@ -204,7 +204,7 @@ class FinalConfig(Section, name="final"):
     """Width of the images in the last stage of refinement: working = no such stage, only working images are used;
     camera = as recorded; or a number of pixels, at most the recorded width. If it is above `input.width`, the colour of
     each keyframe is kept at this size."""
-    width_iterations: Count = 4000
+    width_iterations: Count = 8000
     """Number of refinement steps of the stage with images of `width`, after those of `iterations`, if `iterations` is
     above 0. Two thirds of them use working images, so that the map stays sharp at that size too."""
     weight_moment: bool = True
