@@ -32,6 +32,7 @@ from sigmasplat.io.runs import RunFolder
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.opencv import opencv
+from sigmasplat.presets import default_preset, preset
 from sigmasplat.render import FieldRenderer, Render
 from sigmasplat.sources import open_source
 
@@ -47,7 +48,7 @@ class Options:
     """Compare final maps with and without the last stage of refinement, on images of the camera's size."""
 
     sources: Annotated[tuple[str, ...], arg(help="sequences: names in the data folder, or paths")] = (
-        "redkitchen", "livingroom", "synthetic:frames=200,noise=1",
+        "redkitchen", "livingroom", "synthetic:frames=200,width=640,height=480,noise=1",
     )  # fmt: skip
     seeds: Annotated[tuple[int, ...], arg(help="random seeds, two runs for each")] = (0, 1, 2)
     limit: Annotated[int, arg(help="use at most this many frames; 0 = all")] = 0
@@ -95,7 +96,11 @@ def held_out_db(metrics: dict[str, Any]) -> float:
 
 
 def measured(source: str, seed: int, options: Options) -> dict[str, Any]:
-    """Run and score both maps of a sequence; return PSNR of held-out views, dB, and seconds of the final map."""
+    """Run and score both maps of a sequence; return PSNR of held-out views, dB, and seconds of the final map. Raises
+    SigmaSplatError if its images are not larger than working images."""
+    recorded, working = open_source(accuracy.located(source)).camera.width, preset(default_preset()).input.width
+    if recorded <= working:
+        raise SigmaSplatError(f"{source}: images are {recorded} pixels wide; give images wider than {working} pixels")
     before, after = (finished_run(source, seed, width, options) for width in ("working", "camera"))
     known = open_source(accuracy.located(source), before.config().input)
     rendered = evaluate(before, known, full_resolution=True)

@@ -1,6 +1,7 @@
 """benchmarks/full_resolution.py: what it enlarges, and its table."""
 
 import importlib
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import torch
 
 from benchmark_results import laid_out
 from sigmasplat.config.text import override
+from sigmasplat.errors import SigmaSplatError
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
 from sigmasplat.presets import preset
@@ -44,7 +46,11 @@ def test_the_table_has_a_row_per_sequence() -> None:
     assert made.rows[0][5] == "35.0 ± 1.4" and made.columns[5] == "after"
 
 
-def test_a_failed_run_is_named(tmp_path) -> None:
-    options = full_resolution.Options(("no-such-folder",), (0,), runs=tmp_path / "runs")
-    with pytest.raises(full_resolution.SigmaSplatError, match="no-such-folder"):
+@pytest.mark.parametrize(
+    ("source", "problem"), [("no-such-folder", "no-such-folder"), ("synthetic:frames=3", "wider than 320 pixels")]
+)
+def test_what_cannot_be_measured_is_refused(tmp_path: Path, source: str, problem: str) -> None:
+    options = full_resolution.Options((source,), (0,), runs=tmp_path / "runs")
+    with pytest.raises(SigmaSplatError, match=problem):
         full_resolution.measure(options)
+    assert not (tmp_path / "runs").exists()
