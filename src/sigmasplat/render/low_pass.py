@@ -11,9 +11,9 @@ def as_refined(options: RenderConfig, camera: Camera, refined_fx: float | None) 
 
     refined_fx: focal length in pixels of the images that the map was refined on; None: images of any size.
 
-    The low-pass keeps its size on the scene, so it has fewer px² in a smaller image. Splats that are smaller than a
-    pixel would else count as much as a pixel, because the low-pass widens splats without making them fainter (the fault
-    that Mip-Splatting describes, arXiv 2311.16493).
+    The low-pass keeps its size on the scene, so it has fewer px² in a smaller image. Otherwise splats that are smaller
+    than a pixel would count as much as a pixel, because the low-pass widens splats without making them fainter (the
+    fault that Mip-Splatting describes, arXiv 2311.16493).
     """
     if refined_fx is None or camera.fx >= refined_fx:
         return options

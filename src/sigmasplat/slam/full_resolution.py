@@ -27,9 +27,8 @@ WORKING_TURNS = 2
 """After one turn of steps on photos come this many turns on working images, whose steps cost a third. With one turn,
 livingroom gains 0.2 dB at full size and loses 0.2 dB at working size, and the stage takes a quarter longer."""
 FIRST_RATE, LAST_RATE = 4.0, 0.4
-"""Learning rates in the first and last step, relative to those of mapping. With the rates of mapping the stage needs a
-fifth more steps; with 12 times these rates many splats fade. Steps on single images leave noise in the splats, so the
-rates fall."""
+"""Learning rates in the first and last step, relative to those of mapping. With 12 in the first step a quarter of the
+splats of redkitchen fades. Steps on single images leave noise in the splats, so the rates fall."""
 
 
 class PhotoReader:
