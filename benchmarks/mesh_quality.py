@@ -2,8 +2,9 @@
 
 The reference is the true surface of the synthetic room, else a surface fused from true depth and true poses. Every
 sequence is run once with this checkout and, with --before, once with another one. Open3D fuses the sensor's depth of
-all frames at full size with the poses of our run; it needs a Python of its own (--open3d). A finished run in --runs is
-used again. Writes benchmarks/results/<name>-<machine>.json, prints a table.
+all frames at full size with the poses of our run; it needs a Python of its own (--open3d). All of it is repeated for
+each seed. A finished run of --before in --runs is used again. Writes benchmarks/results/<name>-<machine>.json
+and prints a table.
 
 example: python benchmarks/mesh_quality.py --before ../before/.venv/bin/sigmasplat --open3d ../peers/bin/python
 """
@@ -22,7 +23,8 @@ import peers
 import record
 import tables
 import tyro
-from tables import Section, significant
+from accuracy_tables import spread
+from tables import Section
 
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.io.mesh import read_mesh
@@ -66,7 +68,7 @@ class Options:
     voxels_m: Annotated[tuple[float, ...], arg(help="edges of Open3D's voxels, m")] = (0.01, 0.0058)
     limit: Annotated[int, arg(help="frames at most")] = 150
     width: Annotated[int, arg(help="width of our working images, pixels")] = 320
-    seed: Annotated[int, arg(help="seed of our runs")] = 0
+    seeds: Annotated[tuple[int, ...], arg(help="random seeds, one run of each checkout for each")] = (0, 1, 2)
     name: Annotated[str, arg(help="name of the results")] = "mesh-quality"
     runs: Annotated[Path, arg(help="folder of the runs and meshes")] = accuracy.RUNS / "mesh-quality"
     out: Annotated[Path, arg(help="folder of the results")] = record.RESULTS
@@ -88,13 +90,15 @@ def program(words: list[str], log: Path, other: bool = False) -> None:
         raise SigmaSplatError(f"{' '.join(words[:4])} … failed: {problem}; see {log}")
 
 
-def finished_run(command: list[str], path: str, folder: Path, options: Options, other: bool) -> RunFolder:
-    """Run SLAM with a program, with `other` that of another checkout, or return the finished run in the folder."""
+def finished_run(
+    command: list[str], path: str, folder: Path, options: Options, seed: int, other: bool = False
+) -> RunFolder:
+    """Run SLAM with a program; with `other`, that of another checkout, return the finished run if the folder has it."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     done = (folder / "run.json").exists() and json.loads((folder / "run.json").read_text())["status"] == "complete"
-    if not done:
+    if not (done and other):
         words = ["run", path, "--limit", str(options.limit), "--set", f"input.width={options.width}"]
-        words += ["--seed", str(options.seed), "--out", str(folder), "--overwrite", "--no-eval"]
+        words += ["--seed", str(seed), "--out", str(folder), "--overwrite", "--no-eval"]
         program([*command, *words], folder.with_suffix(".log"), other)
     return RunFolder.open(folder)
 
@@ -175,15 +179,21 @@ def open3d_meshes(source: Source, path: Trajectory, folder: Path, options: Optio
 
 
 def measure(name: str, options: Options) -> list[Result]:
-    """Return the scores of all meshes of one sequence."""
+    """Return the scores of all meshes of one sequence, for each seed."""
     path = accuracy.located(name)
     source = open_source(path)
-    folder = options.runs / record.slug(Path(name).name)
+    reference = reference_of(path, source, options)
+    return [row for seed in options.seeds for row in measured_with(seed, name, source, reference, options)]
+
+
+def measured_with(seed: int, name: str, source: Source, reference: Reference, options: Options) -> list[Result]:
+    """Run all checkouts on one sequence with a seed; return the scores of their meshes, and of Open3D's."""
+    path, made = accuracy.located(name), []
+    folder = options.runs / f"{record.slug(Path(name).name)}-seed{seed}"
     commands = {OURS: [sys.executable, "-m", "sigmasplat"]}
     commands |= {BEFORE: [str(options.before)]} if options.before else {}
-    reference, made = reference_of(path, source, options), []
     for label, command in commands.items():
-        run = finished_run(command, path, folder / label.replace(" ", "-"), options, other=label == BEFORE)
+        run = finished_run(command, path, folder / label.replace(" ", "-"), options, seed, other=label == BEFORE)
         ours = run.read_frames().path
         pair = true_path_of(source, ours)
         T_truth_world = align_rigid(pair[0].T_world_camera[:, :3, 3], pair[1].T_world_camera[:, :3, 3])
@@ -196,7 +206,7 @@ def measure(name: str, options: Options) -> list[Result]:
             meshes[mesh] = read_mesh(file)
         if label == OURS:
             meshes |= open3d_meshes(source, ours, folder, options)
-        facts = {"source": Path(name).name, "exact": reference.exact, "ate_m": ate(*pair).rmse_m}
+        facts = {"source": Path(name).name, "seed": seed, "exact": reference.exact, "ate_m": ate(*pair).rmse_m}
         for mesh, found in meshes.items():
             made.append(facts | {"mesh": mesh} | scores(found, reference, source, T_truth_world, options))
             print(json.dumps(made[-1]), file=sys.stderr, flush=True)
@@ -216,14 +226,16 @@ NOTE = (
 
 
 def sections(measured: dict[str, Any]) -> list[Section]:
-    """Return a table per sequence."""
-    made = []
-    for source in dict.fromkeys(row["source"] for row in measured["figures"]["meshes"]):
+    """Return a table per sequence: mean ± standard deviation over the seeds."""
+    made, meshes = [], measured["figures"]["meshes"]
+    for source in dict.fromkeys(row["source"] for row in meshes):
+        kinds = dict.fromkeys(row["mesh"] for row in meshes if row["source"] == source)
+        of = {kind: [row for row in meshes if (row["source"], row["mesh"]) == (source, kind)] for kind in kinds}
         rows = [
-            [row["mesh"], *(significant(1e3 * row[name]) for name in ("ate_m", "accuracy_m", "completion_m")),
-             *(significant(100 * row[name]) for name in ("precision", "recall", "f1", "far_share")),
-             f"{row['triangles']:,}"]
-            for row in measured["figures"]["meshes"] if row["source"] == source
+            [kind, *(spread([1e3 * row[name] for row in of[kind]]) for name in ("ate_m", "accuracy_m", "completion_m")),
+             *(spread([100 * row[name] for row in of[kind]]) for name in ("precision", "recall", "f1", "far_share")),
+             f"{round(np.mean([row['triangles'] for row in of[kind]])):,}"]
+            for kind in kinds
         ]  # fmt: skip
         made.append(Section(source, COLUMNS, rows, NOTE))
     return made
@@ -237,9 +249,7 @@ def main(options: Options) -> int:
         print(f"mesh_quality.py: {problem}", file=sys.stderr)
         return 2
     config = {name: value for name, value in asdict(options).items() if name in ("sources", "limit", "width")}
-    measured = record.results(
-        "mesh_quality", {"meshes": meshes}, name=options.name, seeds=[options.seed], config=config
-    )
+    measured = record.results("mesh_quality", {"meshes": meshes}, name=options.name, seeds=options.seeds, config=config)
     print(record.write(measured, options.out), file=sys.stderr)
     print(tables.table(measured))
     return 0
