@@ -1,5 +1,6 @@
 """The last stage of the final map: finer than the working images, deterministic, and it can be stopped."""
 
+import itertools
 import os
 import shutil
 import signal
@@ -9,6 +10,7 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -18,6 +20,7 @@ from numpy.typing import NDArray
 from command_line import exit_code
 from sigmasplat.config import Config
 from sigmasplat.config.text import override
+from sigmasplat.fit.adam import Rates
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.io.state import read_state
 from sigmasplat.metrics.image import psnr
@@ -26,6 +29,7 @@ from sigmasplat.model.camera import Camera
 from sigmasplat.presets import preset
 from sigmasplat.render import FieldRenderer
 from sigmasplat.run.resume import REFINEMENT_CLASSES
+from sigmasplat.slam import full_resolution
 from sigmasplat.slam.final import final_map
 from sigmasplat.slam.slam import Slam
 from sigmasplat.sources import open_source
@@ -115,6 +119,32 @@ def test_the_progress_covers_the_last_stage() -> None:
     slam.finish(lambda done, total: told.append((done, total)))
     dones, totals = zip(*told, strict=True)
     assert list(dones) == sorted(dones) and set(totals) == {dones[-1]} and dones[-1] >= 65
+
+
+def test_a_time_budget_covers_both_stages(slam: Slam, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each look at the clock takes a hundredth of a second. The stage at working size gets a third of the budget, and
+    the rates of the last stage fall in time, whatever the number of steps."""
+    ticks = itertools.count(0.0, 0.01)
+    monkeypatch.setattr("sigmasplat.slam.refinement.time.perf_counter", lambda: next(ticks))
+    config = settings(iterations="100000", width_iterations="100000", seconds="12.0")
+    told, rates = list[tuple[int, int]](), list[float]()
+    fit = full_resolution.fit_field
+
+    def noted(*of: Any, **named: Any) -> Any:
+        *plain, schedule = of
+        each = [made.per_column.clone() for made in schedule]
+        rates.extend(float(made[0]) / config.mapping.lr_means for made in each)
+        return fit(*plain, iter(Rates(per_column) for per_column in each), **named)
+
+    monkeypatch.setattr("sigmasplat.slam.full_resolution.fit_field", noted)
+    made = final_map(
+        slam.store, slam.atlas.anchors, config, slam.view, np.random.default_rng(0), lambda *at: told.append(at)
+    )
+    assert made.refined_fx is not None and 100_000 < made.steps < 101_000
+    assert rates[0] == pytest.approx(4.0, rel=0.1) and rates == sorted(rates, reverse=True)
+    assert rates[-1] == pytest.approx(0.4, rel=0.1)
+    dones = [done for done, _ in told]
+    assert dones == sorted(dones) and told[-1] == (200_000, 200_000)
 
 
 def arguments(out: Path) -> list[str]:

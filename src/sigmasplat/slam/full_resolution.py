@@ -7,7 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from sigmasplat.config import Config, MappingConfig
+from sigmasplat.config import Config, FinalConfig, MappingConfig
 from sigmasplat.fit.adam import Rates
 from sigmasplat.fit.field import fit_field
 from sigmasplat.fit.target import Keyframe, Target
@@ -29,6 +29,10 @@ livingroom gains 0.2 dB at full size and loses 0.2 dB at working size, and the s
 FIRST_RATE, LAST_RATE = 4.0, 0.4
 """Learning rates in the first and last step, relative to those of mapping. With 12 in the first step a quarter of the
 splats of redkitchen fades. Steps on single images leave noise in the splats, so the rates fall."""
+
+
+WORKING_SHARE = 1 / 3
+"""The share of a time budget after which the stage at working size ends, if there are photos."""
 
 
 class PhotoReader:
@@ -57,12 +61,21 @@ class PhotoReader:
         return Target.of(picture.photo.frame(picture.depth_m, self.keyframes.camera, self.camera), self.size)
 
 
+def has_photos(keyframes: KeyframeReader, config: Config) -> bool:
+    """Return whether the map is refined on photos."""
+    return bool(config.final.width_iterations and _photo_cameras(keyframes))
+
+
 def photo_view(keyframes: KeyframeReader, view: View, config: Config) -> View | None:
-    """Return a view like `view` for images as large as the largest photos; None without photos. A submap has photos of
-    one camera."""
-    found = [keyframes.store.picture(*place).photo for place in keyframes.places if place[1] == 0]
-    cameras = [photo.camera for photo in found if photo is not None]
+    """Return a view like `view` for images as large as the largest photos; None without photos."""
+    cameras = _photo_cameras(keyframes)
     return _like(view, max(cameras, key=lambda camera: camera.width), config, None) if cameras else None
+
+
+def _photo_cameras(keyframes: KeyframeReader) -> list[Camera]:
+    """Return the cameras of the photos. A submap has photos of one camera."""
+    found = [keyframes.store.picture(*place).photo for place in keyframes.places if place[1] == 0]
+    return [photo.camera for photo in found if photo is not None]
 
 
 def _like(view: View, camera: Camera, config: Config, refined_fx: float | None) -> View:
@@ -86,9 +99,9 @@ def refine_on_photos(
     """Fit the field to photos of keyframes, if there are any, and to their working images, in turns, at fixed poses.
 
     view: that of the working images. `done`: the number of steps that the field has already had; those of this stage
-    are counted from `final.iterations` on. Returns their number at the end, which is lower if the time budget is spent,
-    and the focal length of the photos, pixels (None: the field was not fitted to photos). Calls
-    `progress(steps done, total)`. `saved` is offered the state every `TURN_STEPS`.
+    are counted from `final.iterations` on. Returns their number at the end, which is lower if the time of `clock` is
+    spent, and the focal length of the photos, pixels (None: the field was not fitted to photos). Rates fall in time if
+    it is short. Calls `progress(steps done, total)`. `saved` is offered the state every `TURN_STEPS`.
     """
     final = config.final
     if not final.width_iterations or clock.is_over or (large := photo_view(keyframes, view, config)) is None:
@@ -103,8 +116,8 @@ def refine_on_photos(
         since = done - final.iterations
         of_view, images = turns[since // TURN_STEPS % len(turns)]
         steps = range(done, min(done + TURN_STEPS - since % TURN_STEPS, total))
-        rates = (falling(mapping, (step - final.iterations) / final.width_iterations) for step in steps)
-        fit_field(field, of_view, _draw(images, steps, total, random, progress), mapping, rates, degree=degree)
+        rates = (falling(mapping, _share(step, final, clock)) for step in steps)
+        fit_field(field, of_view, _draw(images, steps, final, random, progress, clock), mapping, rates, degree=degree)
         field.keep(field.opacities > final.prune_opacity)
         done = steps.stop
         if saved is not None:
@@ -121,10 +134,17 @@ def falling(mapping: MappingConfig, share: float) -> Rates:
     return rates
 
 
+def _share(step: int, final: FinalConfig, clock: Clock) -> float:
+    """Return the share of the stage that is done before a step, of its steps or of its time, 0 to 1."""
+    return min(1.0, max((step - final.iterations) / final.width_iterations, clock.share))
+
+
 def _draw(
-    images: PhotoReader | KeyframeReader, steps: range, total: int, random: np.random.Generator, progress: Progress
-) -> Iterator[Sequence[Keyframe]]:
+    images: PhotoReader | KeyframeReader, steps: range, final: FinalConfig, random: np.random.Generator,
+    progress: Progress, clock: Clock,
+) -> Iterator[Sequence[Keyframe]]:  # fmt: skip
     """Draw one keyframe per step, uniformly; call `progress` before each."""
+    total = final.iterations + final.width_iterations
     for step in steps:
-        progress(step, total)
+        progress(final.iterations + round(_share(step, final, clock) * final.width_iterations), total)
         yield [images.in_map_exposure(int(random.integers(len(images))))]

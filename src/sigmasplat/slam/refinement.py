@@ -159,17 +159,18 @@ def refine(
     progress: Progress,
     done: int = 0,
     saved: SavedRefinement | None = None,
-    spent_s: float = 0.0,
+    clock: "Clock | None" = None,
 ) -> list[float]:
     """Fit the field to all keyframes, one per step, and their poses with it; return the loss of each step.
 
     Poses move at the rates `final.lr_pose_translation` and `final.lr_pose_rotation`, about `final.pose_reach_m` at
     most; `keyframes.poses` has the moved ones. Splats are pruned before, regularly, and at the end. Their shapes are
-    limited (`slam.shape_limits`). Every `sh_every` steps, colours gain one degree of view dependence. `done`,
-    `spent_s`: the steps that the field has already had, and their seconds. `saved` is offered the state after each
-    pruning and each new degree.
+    limited (`slam.shape_limits`). Every `sh_every` steps, colours gain one degree of view dependence. `done`: the
+    number of steps that the field has already had. `clock`: None = from now on, with the budget `final.seconds`.
+    `saved` is offered the state after each pruning and each new degree.
     """
-    final, mapping, losses, clock = config.final, refinement(config), list[float](), Clock(config.final, spent_s)
+    final, mapping, losses = config.final, refinement(config), list[float]()
+    clock = clock or Clock(final.seconds)
     if not done:
         prune_by_weight(field, view, keyframes, final.prune_weight_px, final.max_splats)
     while done < final.iterations and not clock.is_over:
@@ -192,26 +193,37 @@ def refine(
 
 @dataclass(frozen=True)
 class Clock:
-    """Measures a refinement against its time budget; spent_s: seconds of an earlier start of the same refinement."""
+    """Measures a stage of a refinement against its time budget.
 
-    final: FinalConfig
-    earlier_s: float
+    ends_s: the stage ends after this many seconds of the whole refinement; 0 = without a budget. earlier_s: seconds of
+    an earlier start of the same refinement. begins_s: seconds of the refinement before this stage.
+    """
+
+    ends_s: float
+    earlier_s: float = 0.0
+    begins_s: float = 0.0
     started_s: float = dataclass_field(default_factory=lambda: time.perf_counter())
 
     @property
     def spent_s(self) -> float:
-        """Return the seconds spent so far."""
+        """Return the seconds of the refinement so far."""
         return self.earlier_s + time.perf_counter() - self.started_s
 
     @property
     def share(self) -> float:
-        """Return the share of the time budget that is spent; 0 without one."""
-        return self.spent_s / self.final.seconds if self.final.seconds else 0.0
+        """Return the share of the stage's time that is spent; 0 without a budget."""
+        if not self.ends_s:
+            return 0.0
+        return (self.spent_s - self.begins_s) / max(self.ends_s - self.begins_s, 1e-9)
 
     @property
     def is_over(self) -> bool:
-        """Return whether the time budget is spent."""
+        """Return whether the stage's time is spent."""
         return self.share >= 1.0
+
+    def next_stage(self, ends_s: float) -> "Clock":
+        """Return the clock of the next stage, which begins now."""
+        return replace(self, begins_s=min(self.spent_s, self.ends_s), ends_s=ends_s)
 
 
 def _changes_rates(final: FinalConfig) -> bool:
