@@ -19,7 +19,10 @@ POWERS = {
     "submaps": {"distance_m": 1, "uncertainty_m": 1},
     "loops": {"near_m": 1},
     "registration": {"lr_translation": 1, "overlap_m": 1, "spread_m": 1},
-    "final": {"lr_pose_translation": 1, "pose_reach_m": 1, "lr_means_last": 1, "spacing_m": 1, "merge_m": 1},
+    "final": {
+        "lr_pose_translation": 1, "pose_reach_m": 1, "pose_reach_most_m": 1, "lr_means_last": 1, "spacing_m": 1,
+        "merge_m": 1,
+    },
 }  # fmt: skip
 """The power of a length in each setting. Weights of losses in metres have −1, so that a loss keeps its value."""
 

@@ -25,6 +25,8 @@ from sigmasplat.slam.localisation.sight import Observation, refuse_first_without
 from sigmasplat.slam.localisation.verdict import is_better, is_questionable
 from sigmasplat.slam.loop_closure.loops import Loop
 from sigmasplat.slam.mapping import MapWork
+from sigmasplat.slam.path_covariance import PathCovariance
+from sigmasplat.slam.pose_reach import reaching
 from sigmasplat.slam.rules import is_held_back, is_keyframe
 from sigmasplat.slam.step_result import Step, StepTimer
 from sigmasplat.slam.uncertainty import final_uncertainty
@@ -90,7 +92,9 @@ class Slam(MapWork, ArrayInterface):
         members = self.atlas.members(0)
         store, anchors = StorePart(self.store, members), [self.atlas.anchors[s] for s in members]
         refining, measuring = (part_of(progress, first, total) for first in (0, steps))
-        final = final_map(store, anchors, self.config, self.view, self.random, refining, self.saved_refinement)
+        known = PathCovariance.of_keyframes(self.atlas, self.closer.believed)
+        config = replace(self.config, final=reaching(self.config.final, known))
+        final = final_map(store, anchors, config, self.view, self.random, refining, self.saved_refinement)
         self._final, self.refinement_steps = final.field, final.steps
         refined = RefinedStore(store, final.keyframe_poses, final.keyframe_exposures)
         if final.keyframe_poses is not None:

@@ -1,0 +1,43 @@
+"""How far refinement moves keyframes: as far as their poses may be wrong."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from sigmasplat.config import FinalConfig
+from sigmasplat.model.selection import evenly_spread
+from sigmasplat.slam.path_covariance import PathCovariance
+
+SHARE = 0.5
+"""The reach as a share of the stated standard deviation of keyframe positions. With 1, refinement bends a path without
+noise."""
+KEYFRAMES_MOST = 40
+"""The standard deviation is the median of at most this many keyframes, evenly spread: each one costs milliseconds."""
+
+
+def reaching(final: FinalConfig, path: PathCovariance) -> FinalConfig:
+    """Return the settings of a refinement with a reach that follows from the errors of the path (ours).
+
+    With `pose_reach_most_m`, the reach is `SHARE` times the median standard deviation of keyframe positions, from
+    `pose_reach_m` to `pose_reach_most_m`. The learning rates of poses grow in the same proportion.
+    """
+    if not final.pose_reach_m or final.pose_reach_most_m <= final.pose_reach_m:
+        return final
+    reach_m = min(max(SHARE * position_std_m(path), final.pose_reach_m), final.pose_reach_most_m)
+    factor = reach_m / final.pose_reach_m
+    return replace(
+        final,
+        pose_reach_m=reach_m,
+        lr_pose_translation=factor * final.lr_pose_translation,
+        lr_pose_rotation=factor * final.lr_pose_rotation,
+    )
+
+
+def position_std_m(path: PathCovariance) -> float:
+    """Return the median standard deviation of keyframe positions relative to the first camera, m: the square root of
+    the sum over the axes."""
+    first = np.unique(path.keyframe_submap, return_index=True)[1]
+    numbers = np.arange(len(path.keyframe_submap)) - np.repeat(first, np.diff([*first, len(path.keyframe_submap)]))
+    rows = evenly_spread(range(len(numbers)), KEYFRAMES_MOST)
+    covariances = (path.of_keyframe(int(path.keyframe_submap[row]), int(numbers[row])) for row in rows)
+    return float(np.median([np.sqrt(np.trace(covariance[:3, :3])) for covariance in covariances]))
