@@ -7,12 +7,14 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
+from sigmasplat.config import FinalConfig
 from sigmasplat.fit.align import BIAS_PX
 from sigmasplat.model import se3
 from sigmasplat.model.atlas import Atlas
 from sigmasplat.model.hops import UNKNOWN_HOP, Hop, TrackedHops
 from sigmasplat.slam.loop_closure.pose_graph import Edge, PoseGraph, Sensitivity, optimise
 from sigmasplat.slam.path_covariance import PathCovariance, recorded
+from sigmasplat.slam.pose_reach import reaching
 
 Array = NDArray[np.float64]
 LOOSE, STIFF = np.diag([400.0] * 3 + [900.0] * 3), np.diag([1e4] * 3 + [4e4] * 3)
@@ -260,3 +262,19 @@ def test_a_frame_that_is_no_keyframe_adds_the_error_of_its_own_motion() -> None:
     T = loose.T_world_camera[1]
     hop = se3.adjoint(se3.inverse(T)) @ own @ se3.adjoint(se3.inverse(T)).T
     np.testing.assert_allclose(hop, Loopy().covariances[0][1], rtol=1e-6, atol=1e-14)
+
+
+def test_refinement_moves_poses_as_far_as_the_path_may_be_wrong() -> None:
+    path = Loopy().covariance(Loopy().loop)
+    std_m = np.median([np.sqrt(np.trace(path.of_frame(frame)[:3, :3])) for frame in range(len(path))])
+    final = FinalConfig(pose_reach_m=1e-4, pose_reach_most_m=1.0, lr_pose_translation=3e-5, lr_pose_rotation=2e-5)
+    found = reaching(final, path)
+    assert 1e-3 < found.pose_reach_m == pytest.approx(0.5 * std_m)
+    for name in ("lr_pose_translation", "lr_pose_rotation"):
+        assert getattr(found, name) / getattr(final, name) == pytest.approx(found.pose_reach_m / 1e-4)
+    assert reaching(replace(final, pose_reach_most_m=2e-4), path).pose_reach_m == 2e-4
+    assert reaching(replace(final, pose_reach_most_m=2.0), Loopy().covariance(None, hops=False)).pose_reach_m > 0.4
+    exact = replace(final, pose_reach_m=0.1)
+    assert reaching(exact, path) == exact, "an exact path keeps its reach"
+    for off in (replace(final, pose_reach_most_m=0.0), replace(final, pose_reach_m=0.0)):
+        assert reaching(off, path) == off
