@@ -127,9 +127,10 @@ def sections(measured: dict[str, Any]) -> list[Section]:
     """Return a table with a row per sequence: mean ± standard deviation over the seeds."""
     runs = measured["figures"]["runs"]
     rows = [
-        [source, *(spread([run[name] for run in runs if run["source"] == source]) for name in COLUMNS)]
+        [source, *(spread([run[name] for run in runs if run["source"] == source and run[name] is not None])
+                   for name in COLUMNS)]
         for source in dict.fromkeys(run["source"] for run in runs)
-    ]
+    ]  # fmt: skip
     note = "PSNR of held-out views, dB. Before: without the last stage. Final map: with it."
     return [Section("The camera's size", ["sequence", *COLUMNS.values()], rows, note)]
 
