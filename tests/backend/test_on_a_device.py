@@ -178,7 +178,10 @@ QUICK = {
 RUNS = {
     "sigma": {},
     # Adam's first steps follow the sign of the gradient: after four, rounding decides about centimetres.
-    "sigma by descent": {"tracking.method": "adam", "tracking.iterations": "12", "loops.close": "no"},
+    # A frame in doubt is fitted again, with so many steps that a device would record a graph, which these cannot.
+    "sigma by descent": {
+        "tracking.method": "adam", "tracking.iterations": "12", "tracking.cuda_graphs": "no", "loops.close": "no",
+    },
     "cgslam-fast": {"submaps.frames": "0"},
     "cgslam-loops-fast": {
         "mapping.frames_per_step": "2", "primitives.split_gradient": "1e-6", "primitives.clone": "yes",

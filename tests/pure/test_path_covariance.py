@@ -273,7 +273,8 @@ def test_refinement_moves_poses_as_far_as_the_path_may_be_wrong() -> None:
     for name in ("lr_pose_translation", "lr_pose_rotation"):
         assert getattr(found, name) / getattr(final, name) == pytest.approx(found.pose_reach_m / 1e-4)
     assert reaching(replace(final, pose_reach_most_m=2e-4), path).pose_reach_m == 2e-4
-    assert reaching(replace(final, pose_reach_most_m=2.0), Loopy().covariance(None, hops=False)).pose_reach_m > 0.4
+    unknown = Loopy().covariance(None, hops=False)
+    assert reaching(final, unknown) == final, "the errors of descent are not estimated"
     exact = replace(final, pose_reach_m=0.1)
     assert reaching(exact, path) == exact, "an exact path keeps its reach"
     for off in (replace(final, pose_reach_most_m=0.0), replace(final, pose_reach_m=0.0)):
