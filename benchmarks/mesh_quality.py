@@ -3,8 +3,8 @@
 The reference is the true surface of the synthetic room, else a surface fused from true depth and true poses. Every
 sequence is run once with this checkout and, with --before, once with another one. Open3D fuses the sensor's depth of
 all frames at full size with the poses of our run; it needs a Python of its own (--open3d). All of it is repeated for
-each seed. A finished run of --before in --runs is used again. Writes benchmarks/results/<name>-<machine>.json
-and prints a table.
+each seed. A finished run of --before in --runs is used again.
+Writes benchmarks/results/<name>-<machine>.json and prints a table.
 
 example: python benchmarks/mesh_quality.py --before ../before/.venv/bin/sigmasplat --open3d ../peers/bin/python
 """

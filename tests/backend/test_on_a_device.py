@@ -178,7 +178,8 @@ QUICK = {
 RUNS = {
     "sigma": {},
     # Adam's first steps follow the sign of the gradient: after four, rounding decides about centimetres.
-    # A frame in doubt is fitted again, with so many steps that a device would record a graph, which these cannot.
+    # A frame in doubt is fitted again with twice the steps. From there on a device records a CUDA graph, but the
+    # stand-in for a device cannot.
     "sigma by descent": {
         "tracking.method": "adam", "tracking.iterations": "12", "tracking.cuda_graphs": "no", "loops.close": "no",
     },

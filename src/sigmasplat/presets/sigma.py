@@ -25,7 +25,7 @@ SIGMA = varsplat.FAST.changed(
     render={"depth": "ray"},
     seeding={
         "thickness": 0.1,  # the depth of a disc seen at an angle is right, and the path a little better
-        "scale_factor": 0.65,  # goes with the slower change of sizes: submaps are as sharp as with 0.8 and 1e-2
+        "scale_factor": 0.65,  # with the slower change of sizes, larger seeds blur submaps
     },
     tracking={"features": True, "verify": True},
     moving={"find": True},  # no measurable time in a recording in which nothing moves
@@ -48,7 +48,7 @@ SIGMA = varsplat.FAST.changed(
         "lr_pose_translation": 3e-4,
         "lr_pose_rotation": 2e-4,
         "pose_reach_m": 1e-3,  # without a limit, refinement bends a path that tracking found to a millimetre
-        "pose_reach_most_m": 1e-2,  # where tracking is less sure, views are up to 0.3 dB sharper
+        "pose_reach_most_m": 1e-2,  # where tracking is less sure, views are 0.2 to 0.3 dB sharper
         "sh_degree": 3,
         "sh_every": 100,
         "max_needle_ratio": 8.0,

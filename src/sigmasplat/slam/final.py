@@ -17,7 +17,7 @@ from sigmasplat.model.mesh import Mesh
 from sigmasplat.model.submap import SubmapStore
 from sigmasplat.model.tsdf import packed
 from sigmasplat.render.view import View
-from sigmasplat.slam.full_resolution import WORKING_SHARE, has_photos, refine_on_photos
+from sigmasplat.slam.full_resolution import refine_on_photos, working_seconds
 from sigmasplat.slam.fusion import count_keyframes, fuse, fusion_views
 from sigmasplat.slam.predicted_submaps import PredictedSubmaps
 from sigmasplat.slam.refinement import Clock, KeyframeReader, SavedRefinement, refine
@@ -78,7 +78,7 @@ def final_map(
         keyframes.take(found)
         random.bit_generator.state = found.numbers
     done, spent_s = (found.done, found.spent_s) if found else (0, 0.0)
-    clock = Clock(config.final.seconds * (WORKING_SHARE if has_photos(keyframes, config) else 1.0), spent_s)
+    clock = Clock(working_seconds(keyframes, config.final), spent_s)
     if done <= config.final.iterations:
         done += len(refine(on_device, keyframes, config, view, random, progress, done, saved, clock))
     clock = clock.next_stage(config.final.seconds)

@@ -29,8 +29,6 @@ livingroom gains 0.2 dB at full size and loses 0.2 dB at working size, and the s
 FIRST_RATE, LAST_RATE = 4.0, 0.4
 """Learning rates in the first and last step, relative to those of mapping. With 12 in the first step a quarter of the
 splats of redkitchen fades. Steps on single images leave noise in the splats, so the rates fall."""
-
-
 WORKING_SHARE = 1 / 3
 """The share of a time budget after which the stage at working size ends, if there are photos."""
 
@@ -61,9 +59,10 @@ class PhotoReader:
         return Target.of(picture.photo.frame(picture.depth_m, self.keyframes.camera, self.camera), self.size)
 
 
-def has_photos(keyframes: KeyframeReader, config: Config) -> bool:
-    """Return whether the map is refined on photos."""
-    return bool(config.final.width_iterations and _photo_cameras(keyframes))
+def working_seconds(keyframes: KeyframeReader, final: FinalConfig) -> float:
+    """Return after how many seconds of the refinement the stage at working size ends; 0 = no time budget."""
+    shared = final.seconds and final.width_iterations and _photo_cameras(keyframes)
+    return final.seconds * WORKING_SHARE if shared else final.seconds
 
 
 def photo_view(keyframes: KeyframeReader, view: View, config: Config) -> View | None:

@@ -45,8 +45,8 @@ def is_estimated(path: PathCovariance) -> bool:
 def position_std_m(path: PathCovariance) -> float:
     """Return the median standard deviation of keyframe positions relative to the first camera, m: the square root of
     the sum over the axes."""
-    first = np.unique(path.keyframe_submap, return_index=True)[1]
-    numbers = np.arange(len(path.keyframe_submap)) - np.repeat(first, np.diff([*first, len(path.keyframe_submap)]))
-    rows = evenly_spread(range(len(numbers)), KEYFRAMES_MOST)
-    covariances = (path.of_keyframe(int(path.keyframe_submap[row]), int(numbers[row])) for row in rows)
+    submaps = path.keyframe_submap
+    numbers = np.arange(len(submaps)) - np.searchsorted(submaps, submaps)  # of each keyframe in its submap
+    rows = evenly_spread(range(len(submaps)), KEYFRAMES_MOST)
+    covariances = (path.of_keyframe(int(submaps[row]), int(numbers[row])) for row in rows)
     return float(np.median([np.sqrt(np.trace(covariance[:3, :3])) for covariance in covariances]))
