@@ -241,6 +241,7 @@ def test_what_mapping_raises_reaches_the_caller(schedule: type) -> None:
 
 def test_what_fails_at_the_start_of_the_mapping_thread_reaches_the_caller(monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(count: int) -> int:
+        time.sleep(0.2)  # `settle` is called before it fails
         raise MemoryError("no thread can be made")
 
     monkeypatch.setattr("sigmasplat.slam.real_time.schedule.set_kernel_threads", fail)

@@ -48,6 +48,7 @@ class MappingThread:
         """Start the thread."""
         sys.setswitchinterval(SWITCH_S)
         gc.freeze()
+        self._idle = False  # until the thread waits for work: `settle` reports what fails before that
         self._thread = threading.Thread(target=self._run, args=(work,), name="mapping", daemon=True)
         self._thread.start()
 
