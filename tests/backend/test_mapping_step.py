@@ -39,8 +39,8 @@ def both_ways(
     view = view_on(kernels, camera, variance)
     target = target_of(camera, tuple(view.alpha.shape), valid_share)
     if weighed:
-        target.depth_std = 0.001 + target.depth**2 * (target.depth > 0)
-        target = target.weighed_by_std()
+        target.depth_std = 0.5 * target.depth**3  # weights 2 / z
+        target = target.weighed_by_std(1.0)
     draw_planes(view, target)
     exact = SimpleNamespace(
         sums=view.sums.double(), g_sums=torch.zeros_like(view.sums).double(), moment=view.moment.double(),

@@ -366,7 +366,7 @@ def test_sigma_adds_to_fast_and_removes_nothing() -> None:
     added = changed_settings(sigma, fast)
     uncertainty = {"mapping.iterations", "mapping.weight_moment", "primitives.uncertain_m2", "uncertainty.probes"}
     assert added == uncertainty | {
-        "input.denoise_depth", "tracking.features", "tracking.verify",
+        "input.denoise_depth", "tracking.features", "tracking.verify", "tracking.sensor_noise",
         "final.iterations", "final.beta2", "final.merge_m", "final.order", "final.lr_factor", "final.lr_decay",
         "final.lr_log_scales", "mapping.lr_log_scales", "seeding.scale_factor",
         "final.weight_moment", "mapping.divided", "mapping.first_iterations", "mapping.lr_pose_translation",

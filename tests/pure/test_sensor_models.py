@@ -14,18 +14,19 @@ from sigmasplat.config import Config, InputConfig, SeedConfig
 from sigmasplat.config.scale import for_scene
 from sigmasplat.config.sensors import SENSORS, SensorModel, sensor_model
 from sigmasplat.errors import ConfigError, SourceError
-from sigmasplat.fit.align import align
-from sigmasplat.fit.references import live_image, relative_noise
+from sigmasplat.fit.align import align, balanced
+from sigmasplat.fit.references import Reference, live_image, map_reference, picture_images, sureness_of
 from sigmasplat.fit.target import Target
 from sigmasplat.model.camera import Camera
-from sigmasplat.model.depth_std import generic_std, mean_one_weights, modelled_std
+from sigmasplat.model.depth_std import alignment_std, generic_std, modelled_std, relative_weights
+from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.frame_arrays import frame_from_arrays
 from sigmasplat.model.submap import Picture
 from sigmasplat.presets import preset
 from sigmasplat.slam.fusion import with_readings
 from sigmasplat.slam.localisation.sight import view_of, working_frame
-from sigmasplat.slam.seeding import first_pixels
+from sigmasplat.slam.seeding import first_pixels, make_splats
 from sigmasplat.sources.camera.calibration import read_calibration
 
 CAMERA = Camera(160, 120, 140.0, 140.0, 79.5, 59.5)
@@ -119,20 +120,58 @@ def test_standard_deviations_are_resized_with_their_readings() -> None:
 
 
 def test_a_model_equal_to_the_law_gives_the_same_bits() -> None:
-    config = preset("sigma").changed(input={"sensor": "z2:0.003", "width": 160})
+    config = preset("sigma").changed(input={"width": 160}, tracking={"sensor_noise": True})
     found = []
     for name in ("z2:0.003", "auto", "base:0.02,z2:0.001"):
         settings = config.changed(input={"sensor": name})
         frames = [working_frame(framed(wall(tilt)), settings) for tilt in (0.3, 0.31)]
-        view, noise = view_of(frames[0].camera, settings), sensor_model(name)
+        view = view_of(frames[0].camera, settings)
         targets = [Target.of(frame, (view.sums.shape[1], view.sums.shape[2])) for frame in frames]
         images = [
-            live_image(view, frame.color, frame.depth_m, target, noise and relative_noise(frame.depth_m, noise))
-            for frame, target in zip(frames, targets, strict=True)
+            live_image(view, frame.color, frame.depth_m, target) for frame, target in zip(frames, targets, strict=True)
         ]
         found.append(align(*images, np.eye(4)).T_live_reference)
     np.testing.assert_array_equal(found[0], found[1])
     assert (found[2] != found[1]).any()
+
+
+def test_every_alignment_uses_the_model() -> None:
+    """A stored keyframe, a rendered map, and a reference without a part of it align like the live image."""
+    noise = {}
+    for name in ("auto", "base:0.02,shared:0.003"):
+        settings = preset("sigma").changed(input={"sensor": name, "width": 160}, tracking={"uncertainty": False})
+        frame = working_frame(framed(wall(0.3)), settings)
+        view = view_of(frame.camera, settings)
+        target, stored = picture_images(view, Picture((255 * frame.color).astype(np.uint8), frame.depth_m), CAMERA)
+        solid = replace(settings.seeding, opacity=0.99)
+        field = make_splats(target, np.eye(4), frame.depth_m > 0, 1.0, GaussianField.empty(), solid)
+        rendered = map_reference(field.params, view, np.eye(4), settings.tracking)
+        part = Reference(stored, np.eye(4)).without(np.indices((120, 160))[1] < 40)
+        noise[name] = [pyramid.noise[0] for pyramid in (stored, rendered.pyramid, part.pyramid)]
+        depths = [np.asarray(pyramid.depth[0]) for pyramid in (stored, rendered.pyramid, part.pyramid)]
+    assert noise["auto"] == [None, None, None]
+    for relative, depth_m in zip(noise["base:0.02,shared:0.003"], depths, strict=True):
+        read = depth_m > 0
+        assert relative is not None and read.mean() > 0.5
+        expected = np.hypot(0.02, 0.003 * depth_m[read] ** 2) / (0.003 * depth_m[read] ** 2)
+        np.testing.assert_allclose(np.asarray(relative)[read], expected, rtol=1e-5)
+
+
+def test_gray_counts_more_where_depth_is_sure() -> None:
+    assert sureness_of(SensorModel(z2=0.003)) == 1.0 and sureness_of(SensorModel(z2=0.001)) == pytest.approx(3.0)
+    assert (
+        sureness_of(SENSORS["kinect-v1"]) == pytest.approx(1.0, abs=0.05) and sureness_of(SENSORS["time-of-flight"]) > 5
+    )
+    assert balanced(0.1, 1.0) == 0.1 and balanced(0.1, 4.0) == pytest.approx(2 / 11), "odds 1:9 become 2:9"
+    assert balanced(0.1, 1e6) == 0.5 and balanced(0.8, 4.0) == pytest.approx(0.8), "at most as much as depth"
+    assert balanced(0.1, 0.25) == pytest.approx(1 / 19) and balanced(0.0, 4.0) == 0.0 and balanced(1.0, 4.0) == 1.0
+
+
+def test_errors_that_readings_share_count_in_alignment_only() -> None:
+    depth_m, alone, shared = wall(0.0), SensorModel(z2=0.001), SensorModel(z2=0.001, shared=0.002)
+    np.testing.assert_array_equal(modelled_std(depth_m, alone, CAMERA), modelled_std(depth_m, shared, CAMERA))
+    np.testing.assert_allclose(alignment_std(depth_m, shared), np.hypot(0.001, 0.002) * depth_m**2, rtol=1e-6)
+    assert sensor_model(str(shared)) == shared
 
 
 def test_unsure_pixels_are_seeded_last() -> None:
@@ -150,14 +189,14 @@ def test_unsure_pixels_are_seeded_last() -> None:
     assert first_pixels(target, every, np.random.default_rng(0)).all(), "nothing better is left"
 
 
-def test_weights_of_the_loss_have_mean_one_and_fusion_prefers_sure_readings() -> None:
+def test_losses_and_fusion_prefer_sure_readings() -> None:
     depth_m = wall(0.0)
     depth_m[:10] = 0.0
     std_m = generic_std(depth_m, 0.003)
     std_m[:, 80:] *= 4
-    weight = mean_one_weights(std_m)
-    assert weight[depth_m > 0].mean() == pytest.approx(1.0, abs=1e-5) and not weight[:10].any()
-    assert weight[60, 0] == pytest.approx(4 * weight[60, 100])
+    weight = relative_weights(std_m, generic_std(depth_m, 0.003))
+    assert weight[60, 0] == pytest.approx(1.0) and weight[60, 100] == pytest.approx(0.25) and not weight[:10].any()
+    assert (relative_weights(std_m / 100, generic_std(depth_m, 0.003))[10:] == 4.0).all(), "no reading rules the map"
     picture = Picture(np.zeros((120, 160, 3), np.uint8), depth_m)
     fused, _, _ = with_readings(depth_m * np.float32(1.01), np.zeros((120, 160, 3), np.float32), picture, std_m)
     off = fused[60] / 2.0 - 1.0

@@ -197,7 +197,8 @@ class MappingConfig(Section, name="mapping"):
     """How the overlap of the window's keyframes is measured: by common dominant splats, by depth readings that the
     other keyframe sees too, or by the image descriptor of `loops`."""
     sensor_noise: bool = False
-    """Whether the losses of depth weigh each reading by 1/σ (`input.sensor`), with a mean of 1 over the image."""
+    """Whether the losses of depth weigh each reading by how many times as sure it is as the law of
+    `render.depth_noise_per_m` says (`input.sensor`), at most 4 times."""
     frames_per_step: Count = 1
     """Each step minimises the mean loss of this many keyframes of the window; 0 = of all of them (CG-SLAM)."""
 
@@ -240,7 +241,7 @@ class TrackingConfig(Section, name="tracking"):
     from each level to the next coarser one."""
     sensor_noise: bool = False
     """Whether alignment uses the part of σ that depends on the distance, by the model of `input.sensor`, instead of
-    the law of `render.depth_noise_per_m`."""
+    the law of `render.depth_noise_per_m`: in tracking, for loops, and where a lost camera is searched for."""
     align_weight_color: Share = 0.5
     """Weight of gray residuals in alignment; depth residuals have 1 minus this."""
     amsgrad: bool = False

@@ -4,6 +4,7 @@ The reference is a rendered map (tracking) or the previous frame (odometry). One
 replace dozens of renders. Alignment runs on the device that holds the images: the CPU or a CUDA device.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -93,7 +94,7 @@ class Alignment:
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """Two images to align, and the weight of gray relative to depth."""
+    """Two images to align, and the weight of gray relative to depth if readings are as sure as usual."""
 
     reference: Pyramid
     live: Pyramid
@@ -108,12 +109,27 @@ class Pair:
         """Return one pyramid level of both images in the layout of the kernels."""
         r, live, width = self.reference, self.live, min(k, LEVELS - 1)
         c, scale, noise = r.cameras[k], r.scene_scale, live.noise_per_m / NOISE_PER_M
-        options = [self.weight_color, 1.0 - self.weight_color]
+        weight_gray = balanced(self.weight_color, r.sureness)
+        options = [weight_gray, 1.0 - weight_gray]
         options += [HUBER_GRAY[width], HUBER_DEPTH_RELATIVE[width] * noise, DEPTH_GATES_M[width] * scale]
         return LevelPlanes(
             r.gray[k], r.depth[k], r.weight[k], r.weight_depth[k], live.gray[k], live.depth[k],
             [c.fx, c.fy, c.cx, c.cy], options, _noise_at(r.noise[k], width),
         )  # fmt: skip
+
+
+def balanced(weight_color: float, sureness: float) -> float:
+    """Return the weight of gray, 0 to 1, for readings that are `sureness` times as sure as usual.
+
+    Narrower widths alone give depth this many times as much weight, as if nothing but noise were wrong with it. The
+    error of an alignment has other parts, which do not become smaller: so gray's share grows with the square root, up
+    to that of depth.
+    """
+    if sureness == 1.0 or weight_color in (0.0, 1.0):
+        return weight_color
+    usual = weight_color / (1.0 - weight_color)
+    odds = min(usual * math.sqrt(sureness), max(usual, 1.0))
+    return odds / (1.0 + odds)
 
 
 def _noise_at(noise: Plane | None, width: int) -> Plane | None:

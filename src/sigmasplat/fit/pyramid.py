@@ -24,7 +24,8 @@ class Pyramid:
 
     backend: its image kernels halve and align the planes. Only the planes of CUDA are not in host memory.
     scene_scale: size of the scene relative to a room (`render.scene_scale`); noise_per_m: standard deviation of depth
-    readings, times z² (`render.depth_noise_per_m`); noise: σ of each reading relative to that law, None: all follow it.
+    readings, times z² (`render.depth_noise_per_m`); noise: σ of each reading relative to that law, None: all follow it;
+    sureness: how many times as sure readings are as that law, at the distance of a wall.
     """
 
     gray: list[Plane]
@@ -36,6 +37,7 @@ class Pyramid:
     backend: str = "cpu"
     scene_scale: float = 1.0
     noise_per_m: float = NOISE_PER_M
+    sureness: float = 1.0
 
     @property
     def kernels(self) -> ImageKernels:

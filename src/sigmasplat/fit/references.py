@@ -17,11 +17,14 @@ from sigmasplat.fit.pyramid import NOISE_PER_M, Pyramid
 from sigmasplat.fit.target import Target
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
-from sigmasplat.model.depth_std import distance_std, generic_std
+from sigmasplat.model.depth_std import alignment_std, generic_std
 from sigmasplat.model.map_uncertainty import Background
 from sigmasplat.model.submap import Picture
 from sigmasplat.render.view import View
 from sigmasplat.types import Matrix
+
+USUAL_M = 2.0
+"""Distance of a wall of a room."""
 
 
 @dataclass(eq=False)
@@ -42,9 +45,10 @@ class Reference:
         p = self.pyramid
         shown = p.depth[0] * p.kernels.beside((~hidden).astype(np.float32), p.depth[0])
         made = Pyramid.of(
-            p.gray[0], shown, p.cameras[0], backend=p.backend, scene_scale=p.scene_scale, noise_per_m=p.noise_per_m
-        )
-        pyramid = replace(made, weight=p.weight, weight_depth=p.weight_depth)
+            p.gray[0], shown, p.cameras[0], backend=p.backend, scene_scale=p.scene_scale, noise_per_m=p.noise_per_m,
+            noise=p.noise[0],
+        )  # fmt: skip
+        pyramid = replace(made, weight=p.weight, weight_depth=p.weight_depth, sureness=p.sureness)
         return Reference(pyramid, self.T_camera_world)
 
     def moved_by(self, T_new_old: Matrix) -> "Reference":
@@ -56,31 +60,41 @@ class Reference:
         return compare(self.pyramid, live, T_camera_world @ se3.inverse(self.T_camera_world))
 
 
-def live_image(view: View, color: Image, depth_m: Image, target: Target, noise: Image | None = None) -> Pyramid:
-    """Make the pyramid of a camera image, colour [H, W, 3] and depth [H, W] m, on the device that aligns it; noise:
-    that of its readings (`relative_noise`)."""
-    fits = fits_of(view)
-    gray, depth = fits.live_planes(view, color, depth_m, target)
-    return _pyramid(view, gray, depth, target.camera, None if noise is None else fits.images.beside(noise, depth))
+def live_image(view: View, color: Image, depth_m: Image, target: Target) -> Pyramid:
+    """Make the pyramid of a camera image, colour [H, W, 3] and depth [H, W] m, on the device that aligns it."""
+    gray, depth = fits_of(view).live_planes(view, color, depth_m, target)
+    return _pyramid(view, gray, depth, target.camera, depth_m)
 
 
 def relative_noise(depth_m: Image, sensor: SensorModel, noise_per_m: float = NOISE_PER_M) -> Image:
-    """Return σ of readings [H, W] relative to the law noise_per_m · z², 1 without a reading.
-
-    Only the part of σ that depends on the distance counts: readings at edges and on slanted surfaces are noisier, but
-    they are those that decide the pose.
-    """
-    std_m, law_m = distance_std(depth_m, sensor), generic_std(depth_m, noise_per_m)
+    """Return σ of readings in alignment [H, W], relative to the law noise_per_m · z²; 1 without a reading."""
+    std_m, law_m = alignment_std(depth_m, sensor), generic_std(depth_m, noise_per_m)
     return np.divide(std_m, law_m, out=np.ones_like(law_m), where=law_m > 0)
 
 
-def _pyramid(view: View, gray: Plane, depth: Plane, camera: Camera, noise: Plane | None = None) -> Pyramid:
-    """Build a pyramid on the device of a view, with its assumptions on scene and sensor."""
-    o = view.options
-    return Pyramid.of(
+def sureness_of(sensor: SensorModel, noise_per_m: float = NOISE_PER_M, scene_scale: float = 1.0) -> float:
+    """Return how many times as sure as the law noise_per_m · z² a sensor's readings are in alignment, at the distance
+    of a wall."""
+    wall_m = np.full(1, USUAL_M * scene_scale, np.float32)
+    return float((generic_std(wall_m, noise_per_m) / alignment_std(wall_m, sensor))[0])
+
+
+def _pyramid(view: View, gray: Plane, depth: Plane, camera: Camera, depth_m: Image | None = None) -> Pyramid:
+    """Build a pyramid on the device of a view, with its assumptions on scene and sensor; depth_m [H, W]: the depth in
+    host memory, if it is there.
+
+    All depth is aligned to readings, also that of a rendered map. So all has the noise of a reading at its distance.
+    """
+    o, images, noise, sureness = view.options, fits_of(view).images, None, 1.0
+    if view.sensor is not None:
+        host_m = images.to_host(depth) if depth_m is None else depth_m
+        noise = images.beside(relative_noise(host_m, view.sensor, o.depth_noise_per_m), depth)
+        sureness = sureness_of(view.sensor, o.depth_noise_per_m, o.scene_scale)
+    made = Pyramid.of(
         gray, depth, camera, backend=view.backend, scene_scale=o.scene_scale, noise_per_m=o.depth_noise_per_m,
         noise=noise,
     )  # fmt: skip
+    return made if sureness == 1.0 else replace(made, sureness=sureness)
 
 
 def picture_images(view: View, picture: Picture, camera: Camera) -> tuple[Target, Pyramid]:

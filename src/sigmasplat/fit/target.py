@@ -10,7 +10,7 @@ from torch import Tensor
 from sigmasplat.fit.adam import VectorAdam
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
-from sigmasplat.model.depth_std import mean_one_weights
+from sigmasplat.model.depth_std import generic_std, relative_weights
 from sigmasplat.model.frame import Detail, Frame
 from sigmasplat.model.photo import Photo
 from sigmasplat.model.submap import Picture
@@ -80,12 +80,14 @@ class Target:
             return None
         return np.asarray(self.depth_std[: self.camera.height, : self.camera.width].numpy())
 
-    def weighed_by_std(self) -> "Target":
-        """Return the target whose loss weighs each reading by its standard deviation, if that is known."""
+    def weighed_by_std(self, noise_per_m: float) -> "Target":
+        """Return the target whose loss weighs each reading by its standard deviation, if that is known, relative to
+        noise_per_m · z²."""
         std = self.depth_std_image
         if std is None:
             return self
-        return replace(self, depth_weight=padded(mean_one_weights(std), (self.depth.shape[0], self.depth.shape[1])))
+        weights = relative_weights(std, generic_std(self.depth_image.numpy(), noise_per_m))
+        return replace(self, depth_weight=padded(weights, (self.depth.shape[0], self.depth.shape[1])))
 
     def with_depth(self, depth_m: NDArray[np.float32]) -> "Target":
         """Return the same colour with other depth [H, W], m."""

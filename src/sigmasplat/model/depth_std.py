@@ -15,6 +15,8 @@ SMOOTHED_PX = 5
 """Normals are those of a surface that is averaged over a window of this width: their noise must be far below 1."""
 LEAST_COSINE = 0.2
 """Smallest cos θ: normals of surfaces seen at less than 12° are not measured well enough."""
+MOST_WEIGHT = 4.0
+"""Largest weight of a reading in a loss."""
 
 
 def modelled_std(depth_m: Floats, model: SensorModel, camera: Camera) -> Floats:
@@ -33,6 +35,15 @@ def distance_std(depth_m: Floats, model: SensorModel) -> Floats:
     """Return the part of σ that depends on the distance alone, m [H, W]: √(base² + (z1·z)² + (z2·z²)²)."""
     linear, square = np.float32(model.z1) * depth_m, np.float32(model.z2) * depth_m * depth_m
     return np.asarray(np.sqrt(np.float32(model.base) ** 2 + linear * linear + square * square), np.float32)
+
+
+def alignment_std(depth_m: Floats, model: SensorModel) -> Floats:
+    """Return the standard deviation of readings in alignment, m [H, W], which does not average out `shared`.
+
+    Only the distance counts: readings at edges and on slanted surfaces are noisier, but they are those that decide the
+    pose.
+    """
+    return np.asarray(np.hypot(distance_std(depth_m, model), np.float32(model.shared) * depth_m * depth_m), np.float32)
 
 
 def std_by_model(depth_m: Floats, camera: Camera, sensor: str) -> Floats | None:
@@ -84,10 +95,12 @@ def cosines(depth_m: Floats, camera: Camera) -> Floats:
     return np.where(known, cosine, np.float32(1.0)).astype(np.float32)
 
 
-def mean_one_weights(std_m: Floats) -> Floats:
-    """Return weights 1/σ of readings [H, W] whose mean over the readings is 1, 0 without a reading: those of an
-    absolute error in a loss."""
-    read = std_m > 0
-    weight = np.divide(np.float32(1.0), std_m, out=np.zeros_like(std_m), where=read)
-    mean = float(weight.sum(dtype=np.float64)) / max(int(read.sum()), 1)
-    return np.asarray(weight / mean if mean > 0 else weight, np.float32)
+def relative_weights(std_m: Floats, usual_std_m: Floats) -> Floats:
+    """Return weights of readings [H, W] in a loss of absolute errors: how many times as sure each is as usual, at most
+    `MOST_WEIGHT`; 0 without a reading.
+
+    The loss was balanced against colour for usual readings. If depth were followed without a limit, views would become
+    unsharp.
+    """
+    weight = np.divide(usual_std_m, std_m, out=np.zeros_like(std_m), where=std_m > 0)
+    return np.minimum(weight, np.float32(MOST_WEIGHT))

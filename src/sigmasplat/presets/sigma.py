@@ -27,7 +27,7 @@ SIGMA = varsplat.FAST.changed(
         "thickness": 0.1,  # the depth of a disc seen at an angle is right, and the path a little better
         "scale_factor": 0.65,  # with the slower change of sizes, larger seeds blur submaps
     },
-    tracking={"features": True, "verify": True},
+    tracking={"features": True, "verify": True, "sensor_noise": True},
     moving={"find": True},  # no measurable time in a recording in which nothing moves
     recovery={"relocalise": True, "new_map_after": 20, "steady_frames": 2},
     # Descent hardly ever finds a keyframe that alignment does not find, and takes half of the time of a search.

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.config import RenderConfig
+from sigmasplat.config.sensors import SensorModel
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import Rows
 from sigmasplat.render.reference import operators as reference
@@ -58,6 +59,8 @@ class View(Protocol):
     """Name of the renderer: "cpu", "cuda" or "reference"."""
     camera: Camera
     options: RenderConfig
+    sensor: SensorModel | None
+    """Noise of the readings that are aligned; None: all follow the law of `options.depth_noise_per_m`."""
     sums: Tensor
     alpha: Tensor
     g_sums: Tensor

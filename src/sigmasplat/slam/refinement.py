@@ -68,6 +68,7 @@ class KeyframeReader:
 
     def __init__(self, store: SubmapStore, anchors: Sequence[Matrix], view: View, sensor: str | None = None) -> None:
         self.store, self.camera, self.sensor = store, view.camera, sensor
+        self.noise_per_m = view.options.depth_noise_per_m
         self.size = (view.alpha.shape[0], view.alpha.shape[1])
         self.places: list[tuple[int, int]] = []
         self.poses: list[Matrix] = []
@@ -147,7 +148,7 @@ class KeyframeReader:
         picture = self.store.picture(*self.places[i])
         std_m = None if self.sensor is None else std_by_model(picture.depth_m, self.camera, self.sensor)
         target = Target.of_picture(picture, self.camera, self.size, std_m)
-        return target if std_m is None else target.weighed_by_std()
+        return target if std_m is None else target.weighed_by_std(self.noise_per_m)
 
 
 def refine(

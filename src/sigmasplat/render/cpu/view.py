@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from sigmasplat.config import RenderConfig
+from sigmasplat.config.sensors import SensorModel
 from sigmasplat.model.camera import Camera
 from sigmasplat.render.kernel_params import view_params
 from sigmasplat.render.view import NO_LAYERS, Layers
@@ -20,6 +21,7 @@ class CpuView:
     """A view on the compiled kernels."""
 
     backend = "cpu"
+    sensor: SensorModel | None = None
 
     def __init__(self, camera: Camera, options: RenderConfig, variance: bool = True) -> None:
         from sigmasplat.native import _core

@@ -5,6 +5,7 @@ import torch
 from torch import Tensor
 
 from sigmasplat.config import RenderConfig
+from sigmasplat.config.sensors import SensorModel
 from sigmasplat.errors import BackendError
 from sigmasplat.model.camera import Camera
 from sigmasplat.render.cuda import launch as cuda_launch
@@ -23,6 +24,7 @@ class CudaView:
     """
 
     backend = "cuda"
+    sensor: SensorModel | None = None
 
     def __init__(
         self, camera: Camera, options: RenderConfig, variance: bool = True, device: torch.device | None = None

@@ -23,7 +23,7 @@ class CovarianceView:
     _project = staticmethod(reference.project)
 
     def __init__(self, view: View, correlations: Rows) -> None:
-        self.camera, self.options, self._plain = view.camera, view.options, view
+        self.camera, self.options, self.sensor, self._plain = view.camera, view.options, view.sensor, view
         self.correlations, self.g_correlations = correlations, torch.empty(0)
         size = view.alpha.shape
         self.sums, self.g_sums = (view.sums.new_zeros(COVARIANCE_PLANES, *size) for _ in range(2))

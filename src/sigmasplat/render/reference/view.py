@@ -5,6 +5,7 @@ import torch
 from torch import Tensor
 
 from sigmasplat.config import RenderConfig
+from sigmasplat.config.sensors import SensorModel
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
 from sigmasplat.render.channels import features_of
@@ -19,6 +20,7 @@ class ReferenceView:
     """A view with the definition in plain torch: slow, for tests and for machines without the compiled kernels."""
 
     backend = "reference"
+    sensor: SensorModel | None = None
 
     def __init__(self, camera: Camera, options: RenderConfig, variance: bool = True) -> None:
         self.camera, self.options = camera, options

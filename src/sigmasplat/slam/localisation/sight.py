@@ -10,7 +10,7 @@ from sigmasplat.config import Config
 from sigmasplat.config.sensors import sensor_model
 from sigmasplat.errors import SourceError
 from sigmasplat.fit.pyramid import HIDDEN_M, Pyramid
-from sigmasplat.fit.references import Reference, live_image, relative_noise
+from sigmasplat.fit.references import Reference, live_image
 from sigmasplat.fit.target import Target
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.depth_std import std_by_model
@@ -93,12 +93,15 @@ class Observation(Sight):
 
 
 def view_of(camera: Camera, config: Config) -> View:
-    """Make the view for working images of a camera, with planes for σ² if the run learns it or weighs by it."""
+    """Make the view for working images of a camera, with planes for σ² if the run learns it or weighs by it, and with
+    the noise of readings if alignment uses it."""
     mapping, tracking, registration = config.mapping, config.tracking, config.registration
     learned = bool(mapping.weight_nll_color or mapping.weight_nll_depth)
     read = tracking.uncertainty and tracking.align_depth_by == "V"
     predicted = any(c.uncertainty and c.variance == "predicted" for c in (tracking, registration))
-    return make_view(config.backend, camera, config.render, variance=learned or read or predicted)
+    view = make_view(config.backend, camera, config.render, variance=learned or read or predicted)
+    view.sensor = sensor_model(config.input.sensor) if tracking.sensor_noise else None
+    return view
 
 
 def working_frame(frame: Frame, config: Config, camera: Camera | None = None) -> Frame:
@@ -125,10 +128,8 @@ def observe(whole: Frame, working: Frame, view: View, config: Config, extractor:
         working = replace(working, depth_m=np.where(ignored, np.float32(0.0), working.depth_m))
     target = Target.of(working, (view.sums.shape[1], view.sums.shape[2]))
     if config.mapping.sensor_noise:
-        target = target.weighed_by_std()
-    sensor = sensor_model(config.input.sensor) if config.tracking.sensor_noise else None
-    noise = None if sensor is None else relative_noise(working.depth_m, sensor, config.render.depth_noise_per_m)
-    live, image = live_image(view, working.color, working.depth_m, target, noise), None
+        target = target.weighed_by_std(config.render.depth_noise_per_m)
+    live, image = live_image(view, working.color, working.depth_m, target), None
     if extractor is not None:
         image = FeatureImage(LateDetail(whole, config.features.width), working.depth_m, working.camera)
     return Observation(target, live, image, ignored, frame=working, whole=whole)
