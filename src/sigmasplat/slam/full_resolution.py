@@ -115,7 +115,7 @@ def refine_on_photos(
         since = done - final.iterations
         of_view, images = turns[since // TURN_STEPS % len(turns)]
         steps = range(done, min(done + TURN_STEPS - since % TURN_STEPS, total))
-        rates = (falling(mapping, _share(step, final, clock)) for step in steps)
+        rates = (falling(mapping, clock.done(step - final.iterations, final.width_iterations)) for step in steps)
         fit_field(field, of_view, _draw(images, steps, final, random, progress, clock), mapping, rates, degree=degree)
         field.keep(field.opacities > final.prune_opacity)
         done = steps.stop
@@ -133,11 +133,6 @@ def falling(mapping: MappingConfig, share: float) -> Rates:
     return rates
 
 
-def _share(step: int, final: FinalConfig, clock: Clock) -> float:
-    """Return the share of the stage that is done before a step, of its steps or of its time, 0 to 1."""
-    return min(1.0, max((step - final.iterations) / final.width_iterations, clock.share))
-
-
 def _draw(
     images: PhotoReader | KeyframeReader, steps: range, final: FinalConfig, random: np.random.Generator,
     progress: Progress, clock: Clock,
@@ -145,5 +140,6 @@ def _draw(
     """Draw one keyframe per step, uniformly; call `progress` before each."""
     total = final.iterations + final.width_iterations
     for step in steps:
-        progress(final.iterations + round(_share(step, final, clock) * final.width_iterations), total)
+        share = clock.done(step - final.iterations, final.width_iterations)
+        progress(final.iterations + round(share * final.width_iterations), total)
         yield [images.in_map_exposure(int(random.integers(len(images))))]

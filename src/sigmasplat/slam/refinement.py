@@ -217,6 +217,10 @@ class Clock:
             return 0.0
         return (self.spent_s - self.begins_s) / max(self.ends_s - self.begins_s, 1e-9)
 
+    def done(self, step: int, steps: int) -> float:
+        """Return the share of the stage that is done before one of its steps, of its steps or of its time, 0 to 1."""
+        return min(1.0, max(step / max(steps, 1), self.share))
+
     @property
     def is_over(self) -> bool:
         """Return whether the stage's time is spent."""
@@ -241,7 +245,7 @@ def decaying(mapping: MappingConfig, final: FinalConfig, done: int, clock: Clock
     that of the means decays from `mapping.lr_means` to `final.lr_means_last` if this is set.
     """
     for step in range(done, final.iterations + 1):
-        rates, share = replace(Rates.of(mapping), beta2=final.beta2), _share(step, final, clock)
+        rates, share = replace(Rates.of(mapping), beta2=final.beta2), clock.done(step, final.iterations - 1)
         rates.per_column.mul_(final.lr_factor)
         rates.per_column[COLUMNS["means"]] /= final.lr_factor
         if final.lr_log_scales:
@@ -250,11 +254,6 @@ def decaying(mapping: MappingConfig, final: FinalConfig, done: int, clock: Clock
         if final.lr_means_last:
             rates.per_column[COLUMNS["means"]] = mapping.lr_means ** (1.0 - share) * final.lr_means_last**share
         yield rates
-
-
-def _share(step: int, final: FinalConfig, clock: Clock) -> float:
-    """Return the share of the refinement that is done before a step, of its steps or of its time budget, 0 to 1."""
-    return min(1.0, max(step / max(final.iterations - 1, 1), clock.share))
 
 
 def pull(final: FinalConfig, pose_rate: float) -> float:
@@ -288,7 +287,7 @@ def _draw(
             return
         progress(max(step, int(clock.share * config.final.iterations)), config.final.iterations)
         i = keyframes.draw(config.final.order, random)
-        keyframe, share = keyframes.in_map_exposure(i), _share(step, config.final, clock)
+        keyframe, share = keyframes.in_map_exposure(i), clock.done(step, config.final.iterations - 1)
         keyframe.pose_rate = config.final.lr_decay**share
         yield [keyframe]
         keyframes.keep_pose(keyframe, pull(config.final, keyframe.pose_rate))
