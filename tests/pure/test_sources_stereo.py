@@ -178,6 +178,18 @@ def test_settings_that_are_lengths_follow_the_scale_of_the_scene():
     assert (large.render.scene_scale, large.render.depth_noise_per_m) == (5.0, 0.001)
 
 
+def test_gray_counts_as_much_as_depth_of_a_stereo_pair():
+    config, name = preset("sigma"), "tracking.align_weight_color"
+    assert config.tracking.align_weight_color < 0.5
+    assert for_scene(config, 1.0, 0.006).tracking.align_weight_color == 0.5
+    for asked in (0.7, 0.2):
+        own = override(config, {name: str(asked)})
+        assert for_scene(own, 1.0, 0.006).tracking.align_weight_color == max(asked, 0.5)
+        assert for_scene(own, 1.0, 0.006, [name]).tracking.align_weight_color == asked
+    for noise, predicted in ((None, False), (0.1, True)):
+        assert for_scene(config, 1.0, noise, predicted_depth=predicted).tracking.align_weight_color < 0.5
+
+
 SHORT = {
     "input.width": "64", "input.limit": "1", "final.iterations": "0", "mapping.iterations": "1",
     "mapping.first_iterations": "2",

@@ -96,7 +96,7 @@ class InputConfig(Section, name="input"):
     stereo_disparities: Count = 0
     """Range of disparities that stereo matching searches, in pixels, rounded up to a multiple of 16. It limits the
     smallest depth to f·b / range. 0 = an eighth of the image width."""
-    stereo_std_px: Above0 = 0.33
+    stereo_std_px: Above0 = 0.15
     """Standard deviation σ_d of the disparity in pixels. Stereo depth z has σ_z = z²·σ_d / (f·b)."""
     stereo_max_std: Above0 = 0.05
     """Stereo depth is ignored where its standard deviation σ_z is larger than this share of it."""

@@ -33,6 +33,10 @@ POSES_STAY: Mapping[str, Mapping[str, object]] = {
 }
 """Settings for given poses (`input.poses`): nothing moves them."""
 
+LEAST_GRAY = 0.5
+"""Least `tracking.align_weight_color` where depth is computed from a stereo pair: neighbouring readings come from the
+same pixels and have the same errors, so many of them say less than their number."""
+
 PREDICTED_NOISE_PER_M = 0.1
 """`render.depth_noise_per_m` for predicted depth: about 10 % of the depth in a room."""
 
@@ -46,8 +50,8 @@ def for_scene(
     predicted_depth: bool = False,
 ) -> Config:
     """Return the settings for a scene of this size, depth of this noise, and this sensor (None = unknown, the setting
-    stays); predicted_depth: whether a network predicted depth, which is then fitted to the map. Poses that
-    `input.poses` gives stay as they are.
+    stays); predicted_depth: whether a network predicted depth, which is then fitted to the map; other depth of a known
+    noise is that of a stereo pair. Poses that `input.poses` gives stay as they are.
 
     given: names of settings that keep their values, as in ["input.max_depth_m"].
     """
@@ -60,6 +64,9 @@ def for_scene(
         depth_noise_per_m = depth_noise_per_m or PREDICTED_NOISE_PER_M
         if "tracking.fit_depth" not in given:
             config = config.changed(tracking={"fit_depth": True})
+    elif depth_noise_per_m is not None and "tracking.align_weight_color" not in given:
+        weight = max(config.tracking.align_weight_color, LEAST_GRAY)
+        config = config.changed(tracking={"align_weight_color": weight})
     if depth_noise_per_m is None or "render.depth_noise_per_m" in given:
         return config
     return config.changed(render={"depth_noise_per_m": depth_noise_per_m})

@@ -12,6 +12,7 @@ from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.opencv import opencv
 from sigmasplat.sources.camera.stereo_cameras import StereoCameras
+from sigmasplat.sources.camera.stereo_subpixel import Subpixel, refine
 from sigmasplat.types import Matrix
 
 Bytes = NDArray[np.uint8]
@@ -34,13 +35,17 @@ SUBPIXELS = 16.0
 """OpenCV's unit of disparity, per pixel."""
 REACH_PX, MOST_BEND_PX = 2, 0.6
 """Readings are removed where the disparity differs by more than `MOST_BEND_PX` from the mean of its neighbours at this
-distance, or next to such places: those are edges and wrong matches."""
-STD_LEAST, STD_TEXTURE, STD_BEND, STD_HOLE, STD_RANGE = 0.45, 0.42, 3.4, 0.76, 0.33
-"""Parts of σ_d in units of `input.stereo_std_px`: everywhere; divided by the horizontal gradient of the image in gray
-values per pixel; times the bend of the disparity in pixels; at a pixel without a reading, where the surface ends or the
-images differ, falling by e every `HOLE_PX`; times the range of disparities around, as a near surface looks wider than
-it is. Fitted to exact depth of synthetic rooms (seeds 1 to 4; baselines of 6, 10 and 18 cm)."""
-LEAST_GRADIENT = 0.5
+distance, or next to such places, before or after the refinement: those are edges and wrong matches."""
+STD_MATCH, STD_BEND, STD_HOLE, STD_RANGE = 0.97, 7.15, 3.5, 0.6
+"""Parts of σ_d in units of `input.stereo_std_px`: times the difference of the images after the refinement, divided by
+the gradient that decides it, px; times the bend of the disparity in pixels; at a pixel without a reading, where the surface
+ends or the images differ, falling by e every `HOLE_PX`; times the range of disparities around, as a near surface looks
+wider than it is. Fitted to exact depth of synthetic rooms (seeds 1 to 4; baselines of 6, 10 and 18 cm)."""
+LEAST_TEXTURE = 0.5
+"""Smallest gradient that is divided by, in gray values per pixel."""
+MOST_RESIDUAL = 3.0
+"""After the refinement, readings are removed where the images differ by more than this multiple of the median: those
+are occlusions, reflections, fine structures and wrong matches."""
 HOLE_PX, AROUND_PX, MOST_RANGE_PX = 8.0, 13, 2.0
 """The window of the range of disparities, and its largest value."""
 LEAST_TOGETHER = 0.85
@@ -117,11 +122,14 @@ class StereoMatcher:
         found = self._matcher().compute(*gray)[:, n:].astype(np.float32) / np.float32(SUBPIXELS)
         column = np.arange(left.shape[1], dtype=np.float32)
         matched = (found > 0) & (column - found >= BLOCK_PX // 2)
-        bend_px = _bend(found, matched)
         together = cv2.blur(matched.astype(np.float32), (AROUND_PX, AROUND_PX)) >= LEAST_TOGETHER
-        seen = matched & together & (bend_px <= MOST_BEND_PX)
-        depth_m = np.divide(self._focal_baseline, found, out=np.zeros_like(found), where=seen)
-        std_px = self._std_px * _relative_std(gray[0][:, n:], found, matched, seen, bend_px)
+        smooth = matched & together & (_bend(found, matched) <= MOST_BEND_PX)
+        fine = refine(gray[0][:, n:], gray[1][:, n:], found, smooth)
+        bend_px = _bend(fine.disparity, matched)
+        alike = fine.residual <= MOST_RESIDUAL * np.median(fine.residual[smooth]) if smooth.any() else smooth
+        seen = smooth & alike & (bend_px <= MOST_BEND_PX)
+        depth_m = np.divide(self._focal_baseline, fine.disparity, out=np.zeros_like(found), where=seen)
+        std_px = self._std_px * _relative_std(fine, matched, smooth, bend_px)
         std_m = depth_m * depth_m * std_px / self._focal_baseline
         usable = std_m <= self._max_std * depth_m
         return np.where(usable, depth_m, 0.0).astype(np.float32), np.where(usable, std_m, 0.0).astype(np.float32)
@@ -153,21 +161,16 @@ def scene_scale(depth_of: Callable[[int], Floats], frames: int) -> float:
     return 1.0
 
 
-def _relative_std(
-    gray: Bytes, disparity: Floats, matched: NDArray[np.bool_], seen: NDArray[np.bool_], bend_px: Floats
-) -> Floats:
-    """Return σ_d in units of `input.stereo_std_px` [H, W]; matched: pixels with a disparity, seen: those with depth."""
+def _relative_std(fine: Subpixel, matched: NDArray[np.bool_], smooth: NDArray[np.bool_], bend_px: Floats) -> Floats:
+    """Return σ_d in units of `input.stereo_std_px` [H, W]; matched: pixels with a disparity, smooth: refined ones."""
     cv2, window = opencv(), np.ones((AROUND_PX, AROUND_PX))
-    gradient = cv2.Sobel(gray.astype(np.float32), cv2.CV_32F, 1, 0, scale=1 / 8)
-    texture = np.sqrt(cv2.blur(gradient * gradient, (BLOCK_PX, BLOCK_PX)))
-    far, near = (np.where(matched, sign * disparity, np.float32(-1e6)) for sign in (-1.0, 1.0))
+    far, near = (np.where(matched, sign * fine.disparity, np.float32(-1e6)) for sign in (-1.0, 1.0))
     range_px = cv2.dilate(near, window) + cv2.dilate(far.astype(np.float32), window)
-    to_hole_px = cv2.distanceTransform(seen.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    to_hole_px = cv2.distanceTransform(smooth.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     return np.asarray(
         np.sqrt(
-            STD_LEAST**2
-            + (STD_TEXTURE / np.maximum(texture, LEAST_GRADIENT)) ** 2
-            + (STD_BEND * np.where(seen, bend_px, 0.0)) ** 2
+            (STD_MATCH * fine.residual / np.maximum(fine.texture, LEAST_TEXTURE)) ** 2
+            + (STD_BEND * np.where(smooth, bend_px, 0.0)) ** 2
             + (STD_HOLE * np.exp(-to_hole_px / HOLE_PX)) ** 2
             + (STD_RANGE * np.clip(range_px, 0.0, MOST_RANGE_PX)) ** 2
         ),
