@@ -38,9 +38,9 @@ REACH_PX, MOST_BEND_PX = 2, 0.6
 distance, or next to such places, before or after the refinement: those are edges and wrong matches."""
 STD_MATCH, STD_BEND, STD_HOLE, STD_RANGE = 0.97, 7.15, 3.5, 0.6
 """Parts of σ_d in units of `input.stereo_std_px`: times the difference of the images after the refinement, divided by
-the gradient that decides it, px; times the bend of the disparity in pixels; at a pixel without a reading, where the surface
-ends or the images differ, falling by e every `HOLE_PX`; times the range of disparities around, as a near surface looks
-wider than it is. Fitted to exact depth of synthetic rooms (seeds 1 to 4; baselines of 6, 10 and 18 cm)."""
+the gradient that decides it, px; times the bend of the disparity in pixels; at a pixel without a reading, where the
+surface ends or the images differ, falling by e every `HOLE_PX`; times the range of disparities around, as a near
+surface looks wider than it is. Fitted to exact depth of synthetic rooms (seeds 1 to 4; baselines of 6, 10, 18 cm)."""
 LEAST_TEXTURE = 0.5
 """Smallest gradient that is divided by, in gray values per pixel."""
 MOST_RESIDUAL = 3.0
