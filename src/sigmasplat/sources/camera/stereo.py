@@ -36,16 +36,16 @@ SUBPIXELS = 16.0
 REACH_PX, MOST_BEND_PX = 2, 0.6
 """Readings are removed where the disparity differs by more than `MOST_BEND_PX` from the mean of its neighbours at this
 distance, or next to such places, before or after the refinement: those are edges and wrong matches."""
-STD_MATCH, STD_BEND, STD_HOLE, STD_RANGE = 0.97, 7.15, 3.5, 0.6
-"""Parts of σ_d in units of `input.stereo_std_px`: times the difference of the images after the refinement, divided by
-the gradient that decides it, px; times the bend of the disparity in pixels; at a pixel without a reading, where the
-surface ends or the images differ, falling by e every `HOLE_PX`; times the range of disparities around, as a near
-surface looks wider than it is. Fitted to exact depth of synthetic rooms (seeds 1 to 4; baselines of 6, 10, 18 cm)."""
+STD_MATCH, STD_HOLE, STD_RANGE, STD_BEND = 1.04, 3.8, 0.51, 7.15
+"""Parts of σ_d in units of `input.stereo_std_px`. For each gray value by which the images differ after the refinement:
+divided by the gradient that decides it; at a pixel without a reading, where the surface ends, falling by e every
+`HOLE_PX`; for each pixel in the range of disparities around, as a near surface looks wider than it is. Besides: for
+each pixel by which the disparity bends. Fitted to exact depth of synthetic rooms (seeds 1 to 4; baselines of 6, 10 and
+18 cm)."""
+TAILS = 2.0
+"""Root mean square of the errors in the disparity relative to `input.stereo_std_px`: a few are much larger than σ_d."""
 LEAST_TEXTURE = 0.5
 """Smallest gradient that is divided by, in gray values per pixel."""
-MOST_RESIDUAL = 3.0
-"""After the refinement, readings are removed where the images differ by more than this multiple of the median: those
-are occlusions, reflections, fine structures and wrong matches."""
 HOLE_PX, AROUND_PX, MOST_RANGE_PX = 8.0, 13, 2.0
 """The window of the range of disparities, and its largest value."""
 LEAST_TOGETHER = 0.85
@@ -126,8 +126,7 @@ class StereoMatcher:
         smooth = matched & together & (_bend(found, matched) <= MOST_BEND_PX)
         fine = refine(gray[0][:, n:], gray[1][:, n:], found, smooth)
         bend_px = _bend(fine.disparity, matched)
-        alike = fine.residual <= MOST_RESIDUAL * np.median(fine.residual[smooth]) if smooth.any() else smooth
-        seen = smooth & alike & (bend_px <= MOST_BEND_PX)
+        seen = smooth & (bend_px <= MOST_BEND_PX)
         depth_m = np.divide(self._focal_baseline, fine.disparity, out=np.zeros_like(found), where=seen)
         std_px = self._std_px * _relative_std(fine, matched, smooth, bend_px)
         std_m = depth_m * depth_m * std_px / self._focal_baseline
@@ -136,8 +135,8 @@ class StereoMatcher:
 
     @property
     def noise_per_m(self) -> float:
-        """Return σ_d / (f b) for a usual σ_d: the standard deviation of depth z is about this times z²."""
-        return self._std_px / self._focal_baseline
+        """Return the root mean square error of readings, relative to z²."""
+        return TAILS * self._std_px / self._focal_baseline
 
     def _matcher(self) -> Any:
         cv2 = opencv()
@@ -169,10 +168,13 @@ def _relative_std(fine: Subpixel, matched: NDArray[np.bool_], smooth: NDArray[np
     to_hole_px = cv2.distanceTransform(smooth.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     return np.asarray(
         np.sqrt(
-            (STD_MATCH * fine.residual / np.maximum(fine.texture, LEAST_TEXTURE)) ** 2
+            fine.residual**2
+            * (
+                (STD_MATCH / np.maximum(fine.texture, LEAST_TEXTURE)) ** 2
+                + (STD_HOLE * np.exp(-to_hole_px / HOLE_PX)) ** 2
+                + (STD_RANGE * np.clip(range_px, 0.0, MOST_RANGE_PX)) ** 2
+            )
             + (STD_BEND * np.where(smooth, bend_px, 0.0)) ** 2
-            + (STD_HOLE * np.exp(-to_hole_px / HOLE_PX)) ** 2
-            + (STD_RANGE * np.clip(range_px, 0.0, MOST_RANGE_PX)) ** 2
         ),
         np.float32,
     )

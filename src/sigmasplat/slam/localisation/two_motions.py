@@ -1,0 +1,109 @@
+"""Tell two motions apart: where a frame agrees better with a keyframe at one pose of the camera, where at another."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sigmasplat.fit.pyramid import Pyramid
+from sigmasplat.fit.references import Reference
+from sigmasplat.model import se3
+from sigmasplat.model.opencv import opencv
+from sigmasplat.types import Matrix
+
+Image = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+LEVEL, STEP = 1, 2
+"""Every second row and column of images of half the size is compared."""
+SMOOTH = 2.0
+"""Standard deviation of the window in which points vote, in compared points."""
+MOST_GRAY = 0.15
+"""Largest gray difference that counts: a larger one is another surface."""
+CLOSE_M, CLOSE_RELATIVE = 0.02, 0.06
+"""A point is compared if the frame has the same surface there: within a distance that grows with the depth."""
+FEWEST = 100
+"""Two poses are not compared with fewer points in common."""
+REST_GAINS, THING_LOSES, LEAST_MOVES = 1.5, 1.2, 0.02
+"""Least factors of the squared gray differences, and least share of the compared points that move. In still recordings
+the rest gained at most 1.4 times."""
+
+
+@dataclass(frozen=True)
+class TwoMotions:
+    """How the gray values of a frame agree with a keyframe at two poses.
+
+    rest_gains: squared differences outside of a thing at the first pose, relative to the second; thing_loses: those of
+    its parts that agree better at the first pose, at the second pose relative to the first; moves: their share of the
+    compared points.
+    """
+
+    rest_gains: float
+    thing_loses: float
+    moves: float
+
+    @property
+    def apart(self) -> bool:
+        """Return whether thing and rest move differently: each agrees clearly better at a pose of its own."""
+        return self.rest_gains >= REST_GAINS and self.thing_loses >= THING_LOSES and self.moves >= LEAST_MOVES
+
+
+def two_motions(
+    keyframe: Reference, live: Pyramid, thing: Mask, T_first: Matrix, T_second: Matrix
+) -> TwoMotions | None:
+    """Compare a frame with a keyframe at two poses T_camera_world [4, 4], in and outside of a thing [H, W]; None if too
+    little is in view at both."""
+    first, second = (_differences(keyframe, live, T) for T in (T_first, T_second))
+    seen = np.isfinite(first.square) & np.isfinite(second.square)
+    if np.count_nonzero(seen) < FEWEST:
+        return None
+    inside = seen & thing[first.row, first.column]
+    better_first = _voted(first.square, seen) < _voted(second.square, seen)
+    moves, rest = inside & better_first, seen & ~inside
+    return TwoMotions(
+        _ratio(first.square[rest], second.square[rest]),
+        _ratio(second.square[moves], first.square[moves]),
+        np.count_nonzero(moves) / seen.size,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Differences:
+    """square: squared gray differences of the points of a keyframe [h, w], NaN where they are not seen; row, column:
+    where they are in the frame, in pixels of its finest level."""
+
+    square: Image
+    row: NDArray[np.intp]
+    column: NDArray[np.intp]
+
+
+def _differences(keyframe: Reference, live: Pyramid, T_camera_world: Matrix) -> _Differences:
+    p, level = keyframe.pyramid, min(LEVEL, len(keyframe.pyramid.cameras) - 1)
+    host, camera, T = p.kernels.to_host, p.cameras[level], T_camera_world @ se3.inverse(keyframe.T_camera_world)
+    z, gray = (host(plane[level])[::STEP, ::STEP] for plane in (p.depth, p.gray))
+    v, u = STEP * np.indices(z.shape, np.float32)
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)]) * z
+    x, y, ahead = np.tensordot(T[:3, :3], rays, 1) + T[:3, 3][:, None, None]
+    depth = np.maximum(ahead, 1e-3)
+    at = [(f * a / depth + c).astype(np.float32) for f, a, c in ((camera.fx, x, camera.cx), (camera.fy, y, camera.cy))]
+    inside = (at[0] >= 0) & (at[1] >= 0) & (at[0] <= camera.width - 1) & (at[1] <= camera.height - 1) & (z > 0)
+    cv2 = opencv()
+    there = cv2.remap(host(live.gray[level]), *at, cv2.INTER_LINEAR)
+    live_m = cv2.remap(host(live.depth[level]), *at, cv2.INTER_NEAREST)
+    same = inside & (live_m > 0) & (np.abs(live_m - ahead) < CLOSE_M * p.scene_scale + CLOSE_RELATIVE * ahead)
+    difference = there - gray
+    difference -= np.median(difference[same]) if same.any() else 0.0
+    square = np.where(same, np.minimum(difference**2, MOST_GRAY**2), np.nan).astype(np.float32)
+    finest = live.cameras[0]
+    ends = (finest.width - 1, finest.height - 1)
+    column, row = (np.clip(2**level * (a + 0.25), 0, end).astype(np.intp) for a, end in zip(at, ends, strict=True))
+    return _Differences(square, row, column)
+
+
+def _voted(square: Image, seen: Mask) -> Image:
+    """Return the sum of squared differences in a window around each point."""
+    return np.asarray(opencv().GaussianBlur(np.where(seen, square, np.float32(0.0)), (0, 0), SMOOTH), np.float32)
+
+
+def _ratio(a: Image, b: Image) -> float:
+    return float(a.sum(dtype=np.float64) / max(b.sum(dtype=np.float64), 1e-12)) if len(a) else 0.0
