@@ -62,6 +62,14 @@ class Pyramid:
         own = gray_weights if weight_depth is None else depth_weights
         return replace(self, weight=gray_weights, weight_depth=own)
 
+    def coarse(self, levels: int) -> "Pyramid":
+        """Return the coarsest `levels` sizes, for a quick alignment."""
+        first = max(0, len(self.cameras) - levels)
+        return replace(
+            self, gray=self.gray[first:], depth=self.depth[first:], weight=self.weight[first:],
+            weight_depth=self.weight_depth[first:], cameras=self.cameras[first:], noise=self.noise[first:],
+        )  # fmt: skip
+
     def hiding(self, hidden: Any) -> "Pyramid":
         """Return the same images for comparisons that leave out these pixels [H, W]: the finest level has `HIDDEN_M`
         there."""

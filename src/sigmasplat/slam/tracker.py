@@ -168,13 +168,13 @@ class Tracker:
     def _without_object(
         self, field: Splats, view: View, seen: Sight, predicted: Matrix, drawn: PoseFit, known: bool, hurried: Asked
     ) -> tuple[PoseFit, Sight] | None:
-        """Look for the thing that moves and has drawn the pose with it. Return the fit and the frame without it; None
-        if there is none. known: the last frame had something in front."""
-        contradicted, drops = self._contradicted(drawn), self.usual.agrees_less(drawn.comparison)
-        for front in unless(hurried, self.watch.suspected(self.keyframe, seen, drawn, contradicted, known, drops)):
-            shown = seen.aside(front)
-            found = self._fit(field, view, shown, predicted)
-            if self._stands(found, predicted) and has_drawn(front, self.keyframe, seen, drawn, found, contradicted):
+        """Return the fit and the frame without the thing that moves and has drawn the pose with it; None if there is
+        none. known: the last frame had something in front."""
+        doubts = (self._contradicted(drawn), known, self.usual.agrees_less(drawn.comparison))
+        things = self.watch.suspected(self.keyframe, seen, drawn, self.config, *doubts)
+        for front in unless(hurried, things):
+            found = self._fit(field, view, shown := seen.aside(front), predicted)
+            if self._stands(found, predicted) and has_drawn(front, self.keyframe, seen, drawn, found):
                 self.front = front
                 return found, shown
         return None

@@ -84,10 +84,11 @@ class Watch:
         return keyframe if gone is None else keyframe.without(gone.hidden)
 
     def suspected(
-        self, keyframe: Reference | None, seen: Sight, fit: PoseFit, contradicted: bool, known: bool, drops: bool
-    ) -> Iterator[Foreground]:
-        """Yield the things in front that may have drawn a pose: those without which the gray values agree better at
-        the same pose; if the images contradict it, all. Without contradiction, every second frame is looked at, and
+        self, keyframe: Reference | None, seen: Sight, fit: PoseFit, config: TrackingConfig, contradicted: bool,
+        known: bool, drops: bool,
+    ) -> Iterator[Foreground]:  # fmt: skip
+        """Yield the things in front that may have drawn a pose: those without which the rest agrees better at another
+        pose; if the images contradict it, all. Without contradiction, every second frame is looked at, and
         those after one in which something was in front (`known`). If the gray values agree much less than usual
         (`drops`), all are yielded in every frame: at a pose that was drawn far, nothing agrees."""
         if keyframe is None or fit.comparison is None:
@@ -95,7 +96,7 @@ class Watch:
         looks = (known or drops or self.memory.frames % DRAWN_EVERY == 0) and differs(fit.comparison)
         if not (contradicted or looks):
             return
-        yield from suspected(keyframe, seen, fit, contradicted or drops)
+        yield from suspected(keyframe, seen, fit, config, contradicted or drops)
 
     def takes_for_moving(self, front: Foreground | None, keyframe: Reference | None, seen: Sight, fit: PoseFit) -> bool:
         """Return whether what is in front moves, by a fit without it: a still thing can seem to be in free space where
