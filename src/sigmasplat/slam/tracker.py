@@ -170,11 +170,11 @@ class Tracker:
     ) -> tuple[PoseFit, Sight] | None:
         """Return the fit and the frame without the thing that moves and has drawn the pose with it; None if there is
         none. known: the last frame had something in front."""
-        doubts = (self._contradicted(drawn), known, self.usual.agrees_less(drawn.comparison))
-        things = self.watch.suspected(self.keyframe, seen, drawn, self.config, *doubts)
+        contradicted, drops = self._contradicted(drawn), self.usual.agrees_less(drawn.comparison)
+        things = self.watch.suspected(self.keyframe, seen, drawn, self.config, contradicted, known, drops)
         for front in unless(hurried, things):
             found = self._fit(field, view, shown := seen.aside(front), predicted)
-            if self._stands(found, predicted) and has_drawn(front, self.keyframe, seen, drawn, found):
+            if self._stands(found, predicted) and has_drawn(front, self.keyframe, seen, drawn, found, contradicted):
                 self.front = front
                 return found, shown
         return None

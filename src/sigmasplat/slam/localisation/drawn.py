@@ -22,10 +22,11 @@ from sigmasplat.slam.localisation.foreground import (
     enlarged,
     smooth,
     thinned,
+    with_margin,
 )
 from sigmasplat.slam.localisation.sight import Sight
 from sigmasplat.slam.localisation.two_motions import two_motions
-from sigmasplat.slam.localisation.verdict import differs, disagrees
+from sigmasplat.slam.localisation.verdict import agrees_more, differs, disagrees, may_draw
 from sigmasplat.slam.localisation.windows import labelled, widened
 from sigmasplat.types import Matrix
 
@@ -33,13 +34,16 @@ OBJECT_SHARE, MOST_OBJECTS = (0.02, 0.7), 3
 """Share of the image of a thing that stands free, and how many are considered."""
 RING, FREE_AROUND = 3, 0.6
 """Something stands free if at least this share of the pixels at this distance around it is farther."""
-QUICK_LEVELS, SUSPECTED = 2, 1.3
-"""A thing is suspected if without it a pose is found, on so many of the coarsest images, where the squared gray
+SHIFTED = 1e-3
+"""A thing has drawn the pose only if the pose without it shows the thing elsewhere: by at least this share of the
+width of the image. What has another brightness than before, and stays in place, changes the pose less."""
+QUICK_LEVELS, REST_GAINS = 2, 1.3
+"""A thing is also suspected if without it a pose is found, on so many of the coarsest images, where the squared gray
 differences of the rest are smaller by this factor."""
-DRAWN = 3e-3
-"""A thing has drawn the pose if the pose without it shows the thing elsewhere, and the rest agrees better there: least
-product of the shift, as a share of the width of the image, and of the gain in squared gray differences above 1. In
-still recordings it was at most two thirds of this: a poor fit gains little, or moves the thing little."""
+APART = 3e-3
+"""Two motions are apart if the shift of the thing, as a share of the width of the image, times the gain of the rest
+above 1 is at least this. In still recordings it was at most two thirds of it: a poor fit gains little, or moves the
+thing little."""
 STILL_SHOWN, STILL_CLOSE = 0.5, 0.8
 """A thing is still if the keyframe shows at least this share of it, and this share of that is as far as before."""
 SHIFT_STEP = 4
@@ -49,13 +53,20 @@ SHIFT_STEP = 4
 def suspected(
     keyframe: Reference, seen: Sight, fit: PoseFit, config: TrackingConfig, every: bool
 ) -> Iterator[Foreground]:
-    """Yield the things in front that may have drawn a pose: those without which a quick fit finds a pose where the rest
-    agrees better; with `every`, all that stand free."""
+    """Yield the things in front that may have drawn a pose: those without which the gray values agree better, at the
+    same pose or at one that a quick alignment finds; with `every`, all that stand free."""
     live_m = seen.target.depth_image.numpy()
     for inside in free_standing(thinned(live_m, STEP)):
         thing = _front(inside, live_m)
-        if every or _rest_moves(thing, keyframe, seen, fit, config):
+        if every or _agrees_without(inside, keyframe, seen, fit) or _rest_moves(thing, keyframe, seen, fit, config):
             yield thing
+
+
+def _agrees_without(inside: Mask, keyframe: Reference, seen: Sight, fit: PoseFit) -> bool:
+    """Return whether the gray values agree better at a pose without a thing, which has the mask [h, w] of thinned
+    depth."""
+    rest = seen.live.hiding(with_margin(inside, STEP, seen.target.depth_image.numpy())[1])
+    return may_draw(keyframe.compared(rest, fit.T_camera_world), fit.comparison)
 
 
 def _rest_moves(thing: Foreground, keyframe: Reference, seen: Sight, fit: PoseFit, config: TrackingConfig) -> bool:
@@ -68,7 +79,7 @@ def _rest_moves(thing: Foreground, keyframe: Reference, seen: Sight, fit: PoseFi
     )  # fmt: skip
     T_camera_world = found.T_live_reference @ keyframe.T_camera_world
     motions = two_motions(keyframe, seen.live, thing.hidden, fit.T_camera_world, T_camera_world)
-    return motions is not None and motions.rest_gains >= SUSPECTED
+    return motions is not None and motions.rest_gains >= REST_GAINS
 
 
 def _front(inside: Mask, live_m: Depth) -> Foreground:
@@ -96,16 +107,42 @@ def free_standing(depth: Depth) -> Iterator[Mask]:
             yield inside
 
 
-def has_drawn(thing: Foreground, keyframe: Reference | None, seen: Sight, drawn: PoseFit, found: PoseFit) -> bool:
-    """Return whether a thing has drawn a pose, by the pose that was fitted without it: the rest agrees much more there,
-    parts of the thing agree much less, and it is shown elsewhere than at the drawn pose."""
-    if keyframe is None:
+def has_drawn(
+    thing: Foreground, keyframe: Reference | None, seen: Sight, drawn: PoseFit, found: PoseFit, contradicted: bool
+) -> bool:
+    """Return whether a thing has drawn a pose, by the pose that was fitted without it, which shows it elsewhere.
+
+    Either the rest agrees much more there and the thing does not agree with it, or each of the two agrees clearly
+    better at a pose of its own. contradicted: the images contradict the drawn pose.
+    """
+    T_drawn_found = drawn.T_camera_world @ se3.inverse(found.T_camera_world)
+    shift = shift_px(thing, seen.target.camera, T_drawn_found) / seen.target.camera.width
+    if keyframe is None or shift < SHIFTED:
         return False
+    if _disturbs(thing, keyframe, seen, drawn, found, contradicted):
+        return True
     motions = two_motions(keyframe, seen.live, thing.hidden, drawn.T_camera_world, found.T_camera_world)
-    if motions is None or not motions.apart:
+    return motions is not None and motions.apart and (motions.rest_gains - 1.0) * shift >= APART
+
+
+def _disturbs(
+    thing: Foreground, keyframe: Reference, seen: Sight, drawn: PoseFit, found: PoseFit, contradicted: bool
+) -> bool:
+    """Return whether the rest agrees much more without a thing, the thing does not agree with the rest, and the drawn
+    pose is not only a poor fit."""
+    if not agrees_more(found.comparison, drawn.comparison, contradicted):
         return False
-    camera, T_drawn_found = seen.target.camera, drawn.T_camera_world @ se3.inverse(found.T_camera_world)
-    return (motions.rest_gains - 1.0) * shift_px(thing, camera, T_drawn_found) >= DRAWN * camera.width
+    if not disagrees(keyframe.compared(seen.live, found.T_camera_world), found.comparison):
+        return False
+    return contradicted or not _fits_poorly(thing, keyframe, seen, drawn, found)
+
+
+def _fits_poorly(thing: Foreground, keyframe: Reference, seen: Sight, drawn: PoseFit, found: PoseFit) -> bool:
+    """Return whether the first pose is only a poor fit: the rest agrees hardly better there than with the thing, and
+    the thing itself agrees better at the other pose."""
+    alone, rest = seen.live.hiding(thing.depth_m <= 0), seen.live.hiding(thing.hidden)
+    at_drawn, at_found = (keyframe.compared(alone, fit.T_camera_world).correlation for fit in (drawn, found))
+    return at_found > at_drawn and not may_draw(keyframe.compared(rest, drawn.T_camera_world), drawn.comparison)
 
 
 def is_still(thing: Foreground, keyframe: Reference | None, live: Pyramid, found: PoseFit) -> bool:

@@ -53,9 +53,15 @@ BETTER = 0.1
 DIFFERS, DRAWS = 0.02, 2.5
 """Something may have drawn the pose if the correlation of the gray values misses 1 by more than this. It has if what is
 missing is smaller by this factor without it: in recordings, the factor of still things was below 2."""
+SUSPECTED = 1.3
+"""Something is suspected if what is missing is smaller by this factor without it at the same pose. A drawn pose lies
+between the motion of the camera and that of the thing, so the rest does not agree there either: the factor is 1.6 to
+2.0 for a ball that covers a tenth of the image. The pose is fitted without it before anything is decided."""
 DISAGREES = 1.5
 """It moves only if it does not agree with the rest: at the pose without it, this many times as much is missing with it.
 Otherwise the first pose was only a poor fit."""
+AGREES_MORE = 0.05
+"""Something has also drawn a doubtful pose if the correlation of the gray values is higher by this without it."""
 
 
 def explained(c: Comparison) -> float:
@@ -91,6 +97,19 @@ def recognised(c: Comparison, matches: int) -> bool:
 def differs(c: Comparison) -> bool:
     """Return whether the gray values differ so much that something may have drawn the pose."""
     return 1.0 - c.correlation > DIFFERS
+
+
+def agrees_more(without: Comparison | None, c: Comparison | None, contradicted: bool) -> bool:
+    """Return whether something has drawn a pose, by a comparison without it; contradicted: the pose was doubtful."""
+    if without is None or c is None:
+        return False
+    much = differs(c) and DRAWS * (1.0 - without.correlation) < 1.0 - c.correlation
+    return much or (contradicted and without.correlation > c.correlation + AGREES_MORE)
+
+
+def may_draw(without: Comparison, c: Comparison | None) -> bool:
+    """Return whether something may have drawn a pose, by a comparison without it at the same pose."""
+    return c is not None and differs(c) and SUSPECTED * (1.0 - without.correlation) < 1.0 - c.correlation
 
 
 def disagrees(whole: Comparison, without: Comparison | None) -> bool:
