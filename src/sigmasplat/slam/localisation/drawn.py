@@ -40,10 +40,10 @@ width of the image. What has another brightness than before, and stays in place,
 QUICK_LEVELS, REST_GAINS = 2, 1.3
 """A thing is also suspected if without it a pose is found, on so many of the coarsest images, where the squared gray
 differences of the rest are smaller by this factor."""
-APART = 3e-3
+APART = 5e-3
 """Two motions are apart if the shift of the thing, as a share of the width of the image, times the gain of the rest
-above 1 is at least this. In still recordings it was at most two thirds of it: a poor fit gains little, or moves the
-thing little."""
+above 1 is at least this. In still recordings it was at most 0.2 %, and for balls in real recordings more than 1 %: a
+poor fit gains little, or moves the thing little."""
 STILL_SHOWN, STILL_CLOSE = 0.5, 0.8
 """A thing is still if the keyframe shows at least this share of it, and this share of that is as far as before."""
 SHIFT_STEP = 4

@@ -25,8 +25,10 @@ CLOSE_M, CLOSE_RELATIVE = 0.02, 0.06
 FEWEST = 100
 """Two poses are not compared with fewer points in common."""
 REST_GAINS, THING_LOSES, LEAST_MOVES = 1.5, 1.2, 0.02
-"""Least factors of the squared gray differences, and least share of the compared points that move. In still recordings
-the rest gained at most 1.4 times."""
+"""Least factors of the squared gray differences, and least share of the compared points that move."""
+MOST_OF_REST = 0.7
+"""Least share of the rest that agrees better at the second pose. With a still thing left out, the pose follows what
+moves: its squared differences can outweigh those of the whole rest, but it covers less of the image."""
 
 
 @dataclass(frozen=True)
@@ -35,17 +37,19 @@ class TwoMotions:
 
     rest_gains: squared differences outside of a thing at the first pose, relative to the second; thing_loses: those of
     its parts that agree better at the first pose, at the second pose relative to the first; moves: their share of the
-    compared points.
+    compared points; follows: share of the points outside of the thing that agree better at the second pose.
     """
 
     rest_gains: float
     thing_loses: float
     moves: float
+    follows: float
 
     @property
     def apart(self) -> bool:
         """Return whether thing and rest move differently: each agrees clearly better at a pose of its own."""
-        return self.rest_gains >= REST_GAINS and self.thing_loses >= THING_LOSES and self.moves >= LEAST_MOVES
+        enough = self.moves >= LEAST_MOVES and self.follows >= MOST_OF_REST
+        return enough and self.rest_gains >= REST_GAINS and self.thing_loses >= THING_LOSES
 
 
 def two_motions(
@@ -58,12 +62,13 @@ def two_motions(
     if np.count_nonzero(seen) < FEWEST:
         return None
     inside = seen & thing[first.row, first.column]
-    better_first = _voted(first.square, seen) < _voted(second.square, seen)
-    moves, rest = inside & better_first, seen & ~inside
+    at_first, at_second = (_voted(points.square, seen) for points in (first, second))
+    moves, rest = inside & (at_first < at_second), seen & ~inside
     return TwoMotions(
         _ratio(first.square[rest], second.square[rest]),
         _ratio(second.square[moves], first.square[moves]),
         np.count_nonzero(moves) / seen.size,
+        float((at_second < at_first)[rest].mean()) if rest.any() else 0.0,
     )
 
 
