@@ -37,9 +37,10 @@ RING, FREE_AROUND = 3, 0.6
 SHIFTED = 1e-3
 """A thing has drawn the pose only if the pose without it shows the thing elsewhere: by at least this share of the
 width of the image. What has another brightness than before, and stays in place, changes the pose less."""
-QUICK_LEVELS, REST_GAINS = 2, 1.3
-"""A thing is also suspected if without it a pose is found, on so many of the coarsest images, where the squared gray
-differences of the rest are smaller by this factor."""
+QUICK_LEVELS, QUICK_GAIN, QUICK_APART = 2, 0.3, 2.5e-3
+"""A thing is also suspected if without it a pose is found, on so many of the coarsest images, where the gain of the
+rest in squared gray differences is at least this above 1, and for which the product of `APART` is at least half as
+large."""
 APART = 5e-3
 """Two motions are apart if the shift of the thing, as a share of the width of the image, times the gain of the rest
 above 1 is at least this. In still recordings it was at most 0.2 %, and for balls in real recordings more than 1 %: a
@@ -78,8 +79,12 @@ def _rest_moves(thing: Foreground, keyframe: Reference, seen: Sight, fit: PoseFi
         config.align_iterations, config.align_weight_color, config.align_stop,
     )  # fmt: skip
     T_camera_world = found.T_live_reference @ keyframe.T_camera_world
+    shift = _shift(thing, seen, fit.T_camera_world, T_camera_world)
+    if shift < SHIFTED:
+        return False
     motions = two_motions(keyframe, seen.live, thing.hidden, fit.T_camera_world, T_camera_world)
-    return motions is not None and motions.rest_gains >= REST_GAINS
+    gain = 0.0 if motions is None else motions.rest_gains - 1.0
+    return gain >= QUICK_GAIN and gain * shift >= QUICK_APART
 
 
 def _front(inside: Mask, live_m: Depth) -> Foreground:
@@ -115,14 +120,18 @@ def has_drawn(
     Either the rest agrees much more there and the thing does not agree with it, or each of the two agrees clearly
     better at a pose of its own. contradicted: the images contradict the drawn pose.
     """
-    T_drawn_found = drawn.T_camera_world @ se3.inverse(found.T_camera_world)
-    shift = shift_px(thing, seen.target.camera, T_drawn_found) / seen.target.camera.width
+    shift = _shift(thing, seen, drawn.T_camera_world, found.T_camera_world)
     if keyframe is None or shift < SHIFTED:
         return False
     if _disturbs(thing, keyframe, seen, drawn, found, contradicted):
         return True
     motions = two_motions(keyframe, seen.live, thing.hidden, drawn.T_camera_world, found.T_camera_world)
     return motions is not None and motions.apart and (motions.rest_gains - 1.0) * shift >= APART
+
+
+def _shift(thing: Foreground, seen: Sight, T_first: Matrix, T_second: Matrix) -> float:
+    """Return by how much a thing is shifted between two poses T_camera_world [4, 4], as a share of the image's width."""
+    return shift_px(thing, seen.target.camera, T_first @ se3.inverse(T_second)) / seen.target.camera.width
 
 
 def _disturbs(
