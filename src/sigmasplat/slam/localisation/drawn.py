@@ -130,7 +130,7 @@ def has_drawn(
 
 
 def _shift(thing: Foreground, seen: Sight, T_first: Matrix, T_second: Matrix) -> float:
-    """Return by how much a thing is shifted between two poses T_camera_world [4, 4], as a share of the image's width."""
+    """Return by how much a thing is shifted between two poses T_camera_world [4, 4], as a share of the image width."""
     return shift_px(thing, seen.target.camera, T_first @ se3.inverse(T_second)) / seen.target.camera.width
 
 
