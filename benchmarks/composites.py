@@ -19,10 +19,10 @@ import numpy as np
 import program
 import record
 import tyro
-from moving import CLEAR_M, CLEAR_RELATIVE, HOLD_EVERY, Followed, followed
+from moving import CLEAR_M, CLEAR_RELATIVE, HOLD_EVERY, Followed, figure_text, followed
 from numpy.typing import NDArray
 from PIL import Image
-from tables import Section, significant
+from tables import Section
 
 from sigmasplat.commands.options import Settings
 from sigmasplat.config import Config, InputConfig
@@ -193,7 +193,7 @@ def sections(measured: dict[str, Any]) -> list[Section]:
         same = ("source", "seed", "find")
         still = [s["ate_cm"] for s in runs if s["share"] == 0 and all(s[name] == r[name] for name in same)]
         with_ratio = r | {"ratio": r["ate_cm"] / still[0] if still else None}
-        figures = (_shown(with_ratio[name]) for name in COLUMNS)
+        figures = (figure_text(with_ratio[name]) for name in COLUMNS)
         rows.append([r["source"], str(r["share"]), str(r["seed"]), "on" if r["find"] else "off", *figures])
     note = (
         "Ratio: ATE relative to the recording without the ball. IoU: of the masks of all frames. Too near: readings of "
@@ -201,10 +201,6 @@ def sections(measured: dict[str, Any]) -> list[Section]:
     )
     head = ("recording", "share, %", "seed", "search", "ATE, cm", "ratio", "lost frames", "IoU", "wrongly masked, %")
     return [Section("A ball in real recordings", (*head, "too near, %", "PSNR, dB"), rows, note)]
-
-
-def _shown(value: float | None) -> str:
-    return "–" if value is None else str(value) if isinstance(value, int) else significant(value)
 
 
 def main(options: Options) -> int:

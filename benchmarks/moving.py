@@ -195,11 +195,11 @@ def measure(options: Options) -> dict[str, Any]:
 def sections(measured: dict[str, Any]) -> list[Section]:
     """Tabulate the runs in the room, and those on recordings."""
     rooms = [
-        [str(r["share"]), str(r["seed"]), "on" if r["find"] else "off", *(_shown(r[name]) for name in ROOM)]
+        [str(r["share"]), str(r["seed"]), "on" if r["find"] else "off", *(figure_text(r[name]) for name in ROOM)]
         for r in measured["figures"]["runs"]
     ]
     still = [
-        [r["source"], str(r["seed"]), "on" if r["find"] else "off", *(_shown(r[name]) for name in STILL)]
+        [r["source"], str(r["seed"]), "on" if r["find"] else "off", *(figure_text(r[name]) for name in STILL)]
         for r in measured["figures"]["still"]
     ]
     note = (
@@ -218,7 +218,7 @@ ROOM = ("ate_cm", "lost", "iou", "masked_wrongly_pct", "in_front_pct", "left", "
 STILL = ("ate_cm", "lost", "masked_pct", "psnr_db", "splats", "frames_s")
 
 
-def _shown(value: float | None) -> str:
+def figure_text(value: float | None) -> str:
     return "–" if value is None else str(value) if isinstance(value, int) else significant(value)
 
 

@@ -8,7 +8,7 @@ Writes benchmarks/results/sensor-models-<machine>.json and prints tables.
 example: python benchmarks/sensor_models.py --sources redkitchen=kinect-v1 --seeds 0
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -85,8 +85,8 @@ def measure_pairs(source: Source, sensor: str, count: int, weight_color: float) 
         rows = associate(np.array([frame.timestamp_s for frame in pair]), truth.timestamps_s)[1]
         true = se3.inverse(truth.T_world_camera[rows[1]]) @ truth.T_world_camera[rows[0]]
         plain, guess = Pyramid.of(grays[0], depths[0], camera), true @ se3.exp(GUESS_OFF)
-        modelled = Pyramid.of(grays[0], depths[0], camera, noise=relative_noise(depths[0], model))
-        for reference in (plain, replace(modelled, sureness=sureness_of(model))):
+        noise, sureness = relative_noise(depths[0], model), sureness_of(model)
+        for reference in (plain, Pyramid.of(grays[0], depths[0], camera, noise=noise, sureness=sureness)):
             off = se3.inverse(true) @ align(reference, live, guess, weight_color=weight_color).T_live_reference
             errors.append((1000 * np.linalg.norm(off[:3, 3]), np.rad2deg(se3.rotation_angle(off[:3, :3]))))
     found = np.array(errors).reshape(-1, 2, 2)

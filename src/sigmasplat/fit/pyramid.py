@@ -94,10 +94,11 @@ class Pyramid:
         scene_scale: float = 1.0,
         noise_per_m: float = NOISE_PER_M,
         noise: Plane | None = None,
+        sureness: float = 1.0,
     ) -> "Pyramid":
         """Build a pyramid of at most `levels` sizes from gray [H, W], depth [H, W] and an optional weight [H, W] and
         noise [H, W]."""
-        p = Pyramid([], [], [None], [None], [camera], [noise], backend, scene_scale, noise_per_m)
+        p = Pyramid([], [], [None], [None], [camera], [noise], backend, scene_scale, noise_per_m, sureness)
         p.gray.append(p.kernels.contiguous(gray))
         p.depth.append(p.kernels.contiguous(depth_m))
         for _ in range(levels - 1):

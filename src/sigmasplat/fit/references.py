@@ -46,9 +46,9 @@ class Reference:
         shown = p.depth[0] * p.kernels.beside((~hidden).astype(np.float32), p.depth[0])
         made = Pyramid.of(
             p.gray[0], shown, p.cameras[0], backend=p.backend, scene_scale=p.scene_scale, noise_per_m=p.noise_per_m,
-            noise=p.noise[0],
+            noise=p.noise[0], sureness=p.sureness,
         )  # fmt: skip
-        pyramid = replace(made, weight=p.weight, weight_depth=p.weight_depth, sureness=p.sureness)
+        pyramid = replace(made, weight=p.weight, weight_depth=p.weight_depth)
         return Reference(pyramid, self.T_camera_world)
 
     def moved_by(self, T_new_old: Matrix) -> "Reference":
@@ -90,11 +90,10 @@ def _pyramid(view: View, gray: Plane, depth: Plane, camera: Camera, depth_m: Ima
         host_m = images.to_host(depth) if depth_m is None else depth_m
         noise = images.beside(relative_noise(host_m, view.sensor, o.depth_noise_per_m), depth)
         sureness = sureness_of(view.sensor, o.depth_noise_per_m, o.scene_scale)
-    made = Pyramid.of(
+    return Pyramid.of(
         gray, depth, camera, backend=view.backend, scene_scale=o.scene_scale, noise_per_m=o.depth_noise_per_m,
-        noise=noise,
+        noise=noise, sureness=sureness,
     )  # fmt: skip
-    return made if sureness == 1.0 else replace(made, sureness=sureness)
 
 
 def picture_images(view: View, picture: Picture, camera: Camera) -> tuple[Target, Pyramid]:

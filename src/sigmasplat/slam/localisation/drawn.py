@@ -8,7 +8,7 @@ from sigmasplat.config import TrackingConfig
 from sigmasplat.fit.align import align
 from sigmasplat.fit.compare import STEP as COMPARE_STEP
 from sigmasplat.fit.pose import PoseFit
-from sigmasplat.fit.pyramid import HIDDEN_M, Pyramid
+from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
@@ -22,7 +22,6 @@ from sigmasplat.slam.localisation.foreground import (
     enlarged,
     smooth,
     thinned,
-    with_margin,
 )
 from sigmasplat.slam.localisation.sight import Sight
 from sigmasplat.slam.localisation.two_motions import two_motions
@@ -59,23 +58,20 @@ def suspected(
     live_m = seen.target.depth_image.numpy()
     for inside in free_standing(thinned(live_m, STEP)):
         thing = _front(inside, live_m)
-        if every or _agrees_without(inside, keyframe, seen, fit) or _rest_moves(thing, keyframe, seen, fit, config):
+        if every or _agrees_without(thing, keyframe, seen, fit) or _rest_moves(thing, keyframe, seen, fit, config):
             yield thing
 
 
-def _agrees_without(inside: Mask, keyframe: Reference, seen: Sight, fit: PoseFit) -> bool:
-    """Return whether the gray values agree better at a pose without a thing, which has the mask [h, w] of thinned
-    depth."""
-    rest = seen.live.hiding(with_margin(inside, STEP, seen.target.depth_image.numpy())[1])
-    return may_draw(keyframe.compared(rest, fit.T_camera_world), fit.comparison)
+def _agrees_without(thing: Foreground, keyframe: Reference, seen: Sight, fit: PoseFit) -> bool:
+    """Return whether the gray values agree better without a thing, at the same pose."""
+    return may_draw(keyframe.compared(seen.live.hiding(thing.hidden), fit.T_camera_world), fit.comparison)
 
 
 def _rest_moves(thing: Foreground, keyframe: Reference, seen: Sight, fit: PoseFit, config: TrackingConfig) -> bool:
     """Return whether everything but a thing agrees better at another pose, by an alignment of small images."""
-    to_keyframe, live_m = se3.inverse(keyframe.T_camera_world), seen.target.depth_image.numpy()
-    live = seen.live.with_depth(np.where(thing.hidden, np.float32(HIDDEN_M), live_m))
     found = align(
-        keyframe.pyramid.coarse(QUICK_LEVELS), live.coarse(QUICK_LEVELS), fit.T_camera_world @ to_keyframe,
+        keyframe.pyramid.coarse(QUICK_LEVELS), seen.aside(thing).live.coarse(QUICK_LEVELS),
+        fit.T_camera_world @ se3.inverse(keyframe.T_camera_world),
         config.align_iterations, config.align_weight_color, config.align_stop,
     )  # fmt: skip
     T_camera_world = found.T_live_reference @ keyframe.T_camera_world
@@ -149,9 +145,9 @@ def _disturbs(
 def _fits_poorly(thing: Foreground, keyframe: Reference, seen: Sight, drawn: PoseFit, found: PoseFit) -> bool:
     """Return whether the first pose is only a poor fit: the rest agrees hardly better there than with the thing, and
     the thing itself agrees better at the other pose."""
-    alone, rest = seen.live.hiding(thing.depth_m <= 0), seen.live.hiding(thing.hidden)
+    alone = seen.live.hiding(thing.depth_m <= 0)
     at_drawn, at_found = (keyframe.compared(alone, fit.T_camera_world).correlation for fit in (drawn, found))
-    return at_found > at_drawn and not may_draw(keyframe.compared(rest, drawn.T_camera_world), drawn.comparison)
+    return at_found > at_drawn and not _agrees_without(thing, keyframe, seen, drawn)
 
 
 def is_still(thing: Foreground, keyframe: Reference | None, live: Pyramid, found: PoseFit) -> bool:

@@ -9,6 +9,7 @@ from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference
 from sigmasplat.model import se3
 from sigmasplat.model.opencv import opencv
+from sigmasplat.slam.localisation.foreground import coarse_rays
 from sigmasplat.types import Matrix
 
 Image = NDArray[np.float32]
@@ -57,7 +58,11 @@ def two_motions(
 ) -> TwoMotions | None:
     """Compare a frame with a keyframe at two poses T_camera_world [4, 4], in and outside of a thing [H, W]; None if too
     little is in view at both."""
-    first, second = (_differences(keyframe, live, T) for T in (T_first, T_second))
+    points_m = _points(keyframe.pyramid)
+    first, second = (
+        _differences(keyframe.pyramid, points_m, live, T @ se3.inverse(keyframe.T_camera_world))
+        for T in (T_first, T_second)
+    )
     seen = np.isfinite(first.square) & np.isfinite(second.square)
     if np.count_nonzero(seen) < FEWEST:
         return None
@@ -82,16 +87,27 @@ class _Differences:
     column: NDArray[np.intp]
 
 
-def _differences(keyframe: Reference, live: Pyramid, T_camera_world: Matrix) -> _Differences:
-    p, level = keyframe.pyramid, min(LEVEL, len(keyframe.pyramid.cameras) - 1)
-    host, camera, T = p.kernels.to_host, p.cameras[level], T_camera_world @ se3.inverse(keyframe.T_camera_world)
-    z, gray = (host(plane[level])[::STEP, ::STEP] for plane in (p.depth, p.gray))
-    v, u = STEP * np.indices(z.shape, np.float32)
-    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)]) * z
-    x, y, ahead = np.tensordot(T[:3, :3], rays, 1) + T[:3, 3][:, None, None]
+def _points(reference: Pyramid) -> Matrix:
+    """Return the compared points of a reference [3, h, w], m in its camera."""
+    level = _level(reference)
+    depth_m = reference.kernels.to_host(reference.depth[level])[::STEP, ::STEP]
+    return np.moveaxis(coarse_rays(reference.cameras[level], STEP), -1, 0) * depth_m
+
+
+def _level(reference: Pyramid) -> int:
+    return min(LEVEL, len(reference.cameras) - 1)
+
+
+def _differences(p: Pyramid, points_m: Matrix, live: Pyramid, T: Matrix) -> _Differences:
+    """Compare the points of a reference with a live image at T_live_reference [4, 4]."""
+    level, host = _level(p), p.kernels.to_host
+    camera, gray = p.cameras[level], host(p.gray[level])[::STEP, ::STEP]
+    x, y, ahead = np.tensordot(T[:3, :3], points_m, 1) + T[:3, 3][:, None, None]
     depth = np.maximum(ahead, 1e-3)
     at = [(f * a / depth + c).astype(np.float32) for f, a, c in ((camera.fx, x, camera.cx), (camera.fy, y, camera.cy))]
-    inside = (at[0] >= 0) & (at[1] >= 0) & (at[0] <= camera.width - 1) & (at[1] <= camera.height - 1) & (z > 0)
+    inside = (
+        (at[0] >= 0) & (at[1] >= 0) & (at[0] <= camera.width - 1) & (at[1] <= camera.height - 1) & (points_m[2] > 0)
+    )
     cv2 = opencv()
     there = cv2.remap(host(live.gray[level]), *at, cv2.INTER_LINEAR)
     live_m = cv2.remap(host(live.depth[level]), *at, cv2.INTER_NEAREST)

@@ -87,8 +87,8 @@ class Watch:
         self, keyframe: Reference | None, seen: Sight, fit: PoseFit, config: TrackingConfig, contradicted: bool,
         known: bool, drops: bool,
     ) -> Iterator[Foreground]:  # fmt: skip
-        """Yield the things in front that may have drawn a pose: those without which the rest agrees better at another
-        pose; if the images contradict it, all. Without contradiction, every second frame is looked at, and
+        """Yield the things in front that may have drawn a pose: those without which the rest agrees better, there or at
+        another pose; if the images contradict it, all. Without contradiction, every second frame is looked at, and
         those after one in which something was in front (`known`). If the gray values agree much less than usual
         (`drops`), all are yielded in every frame: at a pose that was drawn far, nothing agrees."""
         if keyframe is None or fit.comparison is None:
