@@ -15,6 +15,7 @@ from sigmasplat.fit.target import Target
 from sigmasplat.model import resizing, se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.frame import Frame
+from sigmasplat.slam.localisation.free_space import free_places, free_places_in_numpy
 
 Image = NDArray[np.float32]
 HEIGHT, WIDTH = 90, 122
@@ -91,3 +92,25 @@ def test_images_without_common_pixels_are_not_compared(isa: str) -> None:
     assert compare(image, image, away) == NOTHING == compare_in_numpy(image, image, away), isa
     flat = Pyramid.of(np.full((HEIGHT, WIDTH), 0.5, np.float32), depth(), CAMERA)
     assert np.isnan(compare(image, flat, np.eye(4)).correlation)
+
+
+@pytest.mark.parametrize("further_px", [0, 1, 7, 200])
+@pytest.mark.parametrize("shift_m", [0.0, -0.1, 0.5])
+def test_free_places_are_those_of_their_definition(isa: str, further_px: int, shift_m: float) -> None:
+    """Points on and in front of the surface, behind the camera and beside the image; every 17 floats, as in a map."""
+    random = np.random.default_rng(3)
+    rows = np.zeros((20_000, 17), np.float32)
+    rows[:, :3] = random.uniform((-2.5, -2.0, -0.5), (2.5, 2.0, 3.0), (20_000, 3))
+    T = se3.exp(np.array([shift_m, 0.01, -shift_m, 0.01, -0.02, 0.03]))
+    for points in (rows[:, :3].T, np.ascontiguousarray(rows[:, :3].T), rows[:0, :3].T):
+        found = free_places(points, T, depth(), CAMERA, 0.05, further_px)
+        assert np.array_equal(found, free_places_in_numpy(points, T, depth(), CAMERA, 0.05, further_px)), isa
+    if further_px < 200:  # in a window as large as the image, some reading is near
+        assert 100 < free_places(rows[:, :3].T, T, depth(), CAMERA, 0.05, further_px).sum() < 3000
+
+
+def test_free_places_need_points_and_an_image() -> None:
+    with pytest.raises(ValueError, match=r"points \[3, n\]"):
+        free_places(np.zeros((2, 5), np.float32), np.eye(4), depth(), CAMERA)
+    with pytest.raises(ValueError, match=r"image is \[H, W\]"):
+        free_places(np.zeros((3, 5), np.float32), np.eye(4), depth()[0], CAMERA)

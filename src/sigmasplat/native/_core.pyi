@@ -157,6 +157,16 @@ def compare(
     rules: list[float],
     found: Array,
 ) -> bool: ...
+def free_places(
+    points: Array,
+    T_camera_points: Array,
+    depth: Array,
+    intrinsics: list[float],
+    radius_px: int,
+    clear_m: float,
+    clear_relative: float,
+    free: Array,
+) -> None: ...
 
 class Level:
     def __init__(

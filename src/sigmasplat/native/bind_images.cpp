@@ -56,6 +56,17 @@ static bool compare(ConstFloats reference_depth, ConstFloats reference_gray, Con
     return active->images->compare({reference_depth.data(), reference_gray.data(), live_depth.data(), live_gray.data(), int(reference_depth.shape(1)), int(reference_depth.shape(0)),
                                     intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]}, T.data(), rules_of(rules), found.data());
 }
+static void free_places(nb::ndarray<const float, nb::ndim<2>, nb::device::cpu> points, ConstDoubles T, ConstFloats depth, std::vector<double> intrinsics,
+                        int radius_px, double clear_m, double clear_relative, Bytes free) {
+    need_image(depth);
+    need(points.shape(0) == 3 && free.size() == points.shape(1), "free_places: points [3, n] and a byte for each");
+    need(T.size() >= 12 && intrinsics.size() == 4 && radius_px >= 0, "free_places: a pose, four intrinsics, a radius of at least 0");
+    const float* x = points.data();
+    const int64_t row = points.stride(0);
+    active->images->free_places({x, x + row, x + 2 * row, int64_t(points.shape(1)), points.stride(1)}, T.data(),
+                                {depth.data(), int(depth.shape(1)), int(depth.shape(0)), intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]},
+                                {radius_px, clear_m, clear_relative}, free.data());
+}
 
 void sigmasplat::bind_images(nb::module_& m) {
     m.def("halve_color", halve_color);
@@ -75,4 +86,5 @@ void sigmasplat::bind_images(nb::module_& m) {
         return active->images->noise_scale(depth.data(), int(depth.shape(1)), int(depth.shape(0)), rules_of(rules));
     });
     m.def("compare", compare);
+    m.def("free_places", free_places);
 }

@@ -23,6 +23,11 @@ struct ComparedImages {                                // of width × height; pi
     double fx, fy, cx, cy;
 };
 
+struct PointColumns { const float *x, *y, *z; int64_t count, stride; };     // stride: floats from one point to the next
+struct DepthImage { const float* depth; int width, height; double fx, fy, cx, cy; };
+// A place is free if all readings within radius_px are farther by clear_m plus a share of its depth.
+struct FreeRules { int radius_px; double clear_m, clear_relative; };
+
 struct ImageKernels {
     // Colour [2h, 2w, 3] to [h, w, 3] (width = w): the mean of 2×2 pixels, limited to [0, 1].
     void (*halve_color)(const float* color, int width, int height, float* half);
@@ -40,6 +45,8 @@ struct ImageKernels {
     double (*noise_scale)(const float* depth, int width, int height, CompareRules);
     // Returns false if too few pixels can be compared.
     bool (*compare)(ComparedImages, const double* T_live_reference, CompareRules, double* found);
+    // Writes 1 for each point that the image sees through, else 0.
+    void (*free_places)(PointColumns, const double* T_camera_points, DepthImage, FreeRules, uint8_t* free);
 };
 
 }  // namespace sigmasplat

@@ -14,10 +14,11 @@ namespace {
 #include "buffer.h"
 #include "resize.h"
 #include "compare.h"
+#include "free_space.h"
 
 }  // namespace
 
 extern const ImageKernels image_table;
-const ImageKernels image_table = {halve_color, resize_depth, image_planes, gray, halve, halve_depth, noise_scale, compare};
+const ImageKernels image_table = {halve_color, resize_depth, image_planes, gray, halve, halve_depth, noise_scale, compare, free_places};
 
 }  // namespace sigmasplat::SIGMASPLAT_ISA

@@ -16,16 +16,8 @@ from sigmasplat.fit.target import Keyframe
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
-from sigmasplat.slam.localisation.foreground import (
-    CLEAR_M,
-    CLEAR_RELATIVE,
-    Depth,
-    Earlier,
-    Mask,
-    foreground,
-    near_of,
-    on_image,
-)
+from sigmasplat.slam.localisation.foreground import Earlier, foreground
+from sigmasplat.slam.localisation.free_space import CLEAR_M, CLEAR_RELATIVE, Depth, Mask, free_places, on_image
 from sigmasplat.types import Matrix
 
 COLUMNS_TESTED = 80
@@ -35,6 +27,8 @@ SUPPORT = 4
 
 STRAY = 0.001
 """Splats are removed if they are at least this share of the map: a few in free space are errors of depth."""
+SAMPLED = 4
+"""Every fourth splat tells whether so many are in free space."""
 
 
 def contradicted(own_m: Depth, other_m: Depth, T_other_own: Matrix, camera: Camera) -> Mask | None:
@@ -75,9 +69,12 @@ def _mask(own: Keyframe, other: Keyframe) -> None:
 def carve(field: GaussianField, keyframes: Sequence[Keyframe], votes: int) -> None:
     """Remove the splats whose place the newest keyframe and others see to be free, `votes` in all, unless one in
     `SUPPORT` shows a surface there. Stray ones stay."""
-    means = field.means.cpu().numpy()
-    rows = np.flatnonzero(_sees_through(means, keyframes[-1]))
-    if len(rows) and not _are_stray(len(rows), field):
+    means, newest = field.means.cpu().numpy(), keyframes[-1]
+    sample = _sees_through(means[::SAMPLED], newest)
+    if _are_stray(SAMPLED * int(np.count_nonzero(sample)), field):
+        return
+    rows = np.flatnonzero(_sees_through(means, newest))
+    if not _are_stray(len(rows), field):
         gone = np.zeros(len(field), np.bool_)
         gone[rows] = _is_free(means[rows], keyframes, votes)
         _remove(field, gone)
@@ -110,8 +107,11 @@ def _is_free(means_m: NDArray[np.float32], keyframes: Iterable[Keyframe], votes:
 
 def _sees_through(means_m: NDArray[np.float32], keyframe: Keyframe) -> Mask:
     """Return which splats with means [n, 3] m a keyframe sees through."""
-    depth, z, inside, at = _on_keyframe(means_m, keyframe)
-    return np.asarray(inside & (np.take(depth, at) > 0) & (z + _limit_m(z) < np.take(near_of(depth), at)))
+    depth_m, T_camera_world = keyframe.target.depth_image.numpy(), se3.inverse(keyframe.T_world_camera)
+    free = free_places(means_m.T, T_camera_world, depth_m, keyframe.target.camera)
+    depth, _, _, at = _on_keyframe(means_m[free], keyframe)
+    free[free] = np.take(depth, at) > 0
+    return free
 
 
 def _seen(means_m: NDArray[np.float32], keyframe: Keyframe) -> tuple[Mask, Mask]:

@@ -15,14 +15,13 @@ from sigmasplat.model.camera import Camera
 from sigmasplat.slam.localisation.foreground import (
     EDGE_RELATIVE,
     STEP,
-    Depth,
     Foreground,
-    Mask,
     coarse_rays,
     enlarged,
     smooth,
     thinned,
 )
+from sigmasplat.slam.localisation.free_space import Depth, Mask
 from sigmasplat.slam.localisation.sight import Sight
 from sigmasplat.slam.localisation.two_motions import two_motions
 from sigmasplat.slam.localisation.verdict import agrees_more, differs, disagrees, may_draw
@@ -70,7 +69,7 @@ def _agrees_without(thing: Foreground, keyframe: Reference, seen: Sight, fit: Po
 def _rest_moves(thing: Foreground, keyframe: Reference, seen: Sight, fit: PoseFit, config: TrackingConfig) -> bool:
     """Return whether everything but a thing agrees better at another pose, by an alignment of small images."""
     found = align(
-        keyframe.pyramid.coarse(QUICK_LEVELS), seen.aside(thing).live.coarse(QUICK_LEVELS),
+        keyframe.pyramid.coarse(QUICK_LEVELS), seen.live_aside(thing).coarse(QUICK_LEVELS),
         fit.T_camera_world @ se3.inverse(keyframe.T_camera_world),
         config.align_iterations, config.align_weight_color, config.align_stop,
     )  # fmt: skip

@@ -13,21 +13,21 @@ from numpy.typing import NDArray
 
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
+from sigmasplat.slam.localisation.free_space import (
+    AROUND_PX,
+    CLEAR_M,
+    CLEAR_RELATIVE,
+    Depth,
+    Mask,
+    free_places,
+    on_image,
+)
 from sigmasplat.slam.localisation.windows import labelled, largest_around, largest_label, least_around, widened
 from sigmasplat.slam.rules import angle_between
 from sigmasplat.types import Matrix
 
-Depth = NDArray[np.float32]
-Mask = NDArray[np.bool_]
-Floats = NDArray[np.floating]
-
 STEP = 2
 """Every second row and column of the live image is tested, unless another step is given."""
-CLEAR_M, CLEAR_RELATIVE = 0.05, 0.05
-"""A place was free if the reference saw a surface farther than it by this distance plus this share of its depth."""
-AROUND_PX = 5
-"""Least size of the window around a pixel of the reference in which all readings must be farther: the pose is not
-exact."""
 POSE_ERROR = 0.05
 """This share of the motion between both images is added to the window on each side: motion blur and calibration errors
 grow with the motion."""
@@ -67,38 +67,31 @@ def share_of(front: Foreground | None) -> float:
 class Earlier:
     """Depth of an earlier image [H, W] m, 0 where it is not known, and its pose relative to a live camera, [4, 4].
 
-    known_near_m: the least reading around each pixel (`near_of`), if it is known; further_px: windows are larger by so
-    many pixels on each side.
+    further_px: windows are larger by so many pixels on each side.
     """
 
     depth_m: Depth
     T_earlier_live: Matrix
-    known_near_m: Depth | None = None
     further_px: int = 0
 
     @property
-    def near_m(self) -> Depth:
-        """Return the least reading in a window around each pixel, inf without any."""
-        near = near_of(self.depth_m) if self.known_near_m is None else self.known_near_m
-        return least_around(near, 2 * self.further_px + 1) if self.further_px else near
+    def far_m(self) -> Depth:
+        """Return the largest reading in a window around each pixel, 0 without any."""
+        return largest_around(self.depth_m, AROUND_PX + 2 * self.further_px)
 
     @property
     def range_m(self) -> tuple[Depth, Depth]:
         """Return the least (inf without any) and the largest reading (0 without any) in a window around each pixel."""
-        return self.near_m, largest_around(self.depth_m, AROUND_PX + 2 * self.further_px)
+        return least_around(self.depth_m, AROUND_PX + 2 * self.further_px), self.far_m
 
     def within_error(self, live_m: Depth, camera: Camera) -> "Earlier":
         """Return the same with windows that grow with the motion between both images; live_m: live depth, m."""
         read = live_m[live_m > 0]
         if not len(read):
             return self
-        moved_rad = angle_between(np.eye(4), self.T_earlier_live, float(np.median(read)))
+        middle = len(read) // 2
+        moved_rad = angle_between(np.eye(4), self.T_earlier_live, float(np.partition(read, middle)[middle]))
         return replace(self, further_px=int(POSE_ERROR * camera.fx * moved_rad))
-
-
-def near_of(depth_m: Depth) -> Depth:
-    """Return the least reading in a window around each pixel [H, W], m, inf without any."""
-    return least_around(depth_m, AROUND_PX)
 
 
 @lru_cache(maxsize=8)
@@ -108,9 +101,9 @@ def coarse_rays(camera: Camera, step: int) -> Matrix:
 
 
 @lru_cache(maxsize=8)
-def _columns_of_rays(camera: Camera, step: int) -> Matrix:
-    """Return the same rays as columns [3, h · w]."""
-    return np.ascontiguousarray(coarse_rays(camera, step).reshape(-1, 3).T)
+def _columns_of_rays(camera: Camera, step: int) -> Depth:
+    """Return the same rays as columns [3, h · w], float32."""
+    return np.ascontiguousarray(coarse_rays(camera, step).reshape(-1, 3).T, np.float32)
 
 
 def thinned(live_m: Depth, step: int) -> Depth:
@@ -138,9 +131,10 @@ def foreground(
     """
     depth, clear_m = thinned(live_m, step), CLEAR_M * scene_scale
     scene = scene.within_error(depth, camera)
-    if before is None and _count_free(scene, depth, camera, step, clear_m) < LEAST_REGION * depth.size:
+    free = _free(scene, depth, camera, step, clear_m)
+    if before is None and np.count_nonzero(free) < LEAST_REGION * depth.size:
         return None
-    free, again, same = _places(scene, before, depth, camera, step, clear_m)
+    again, same = _places(scene, before, depth, free, camera, step, clear_m)
     if np.count_nonzero(free | again) < LEAST_REGION * depth.size:
         return None
     inside = smooth(depth)
@@ -178,8 +172,8 @@ def _holes_in(mask: Mask, thing: Mask | None, depth_m: Depth) -> Mask:
     """
     unread = depth_m <= 0
     holes, count = labelled(unread if thing is None else ~widened(~unread, 3))
-    holes = holes if thing is None else largest_label(holes) * unread
-    beside = largest_label(holes)
+    holes = holes if thing is None else largest_label(holes, count) * unread
+    beside = largest_label(holes, count)
     edge = np.flatnonzero((beside > 0) & ~unread)
     hole, in_mask, z = beside.ravel()[edge], mask.ravel()[edge], depth_m.ravel()[edge].astype(np.float64)
     edges, covered = (np.bincount(found, minlength=count + 1) for found in (hole, hole[in_mask]))
@@ -192,7 +186,7 @@ def _holes_in(mask: Mask, thing: Mask | None, depth_m: Depth) -> Mask:
         alike = in_mask | ((z * reach >= near[hole]) & (z <= far[hole] * reach))
         own |= (2 * covered >= edges) & (np.bincount(hole[alike], minlength=count + 1) >= SURROUNDED * edges)
     own[0] = False
-    return np.take(own, holes)
+    return np.take(own, holes) if own.any() else np.zeros_like(mask)
 
 
 def _objects(inside: Mask, free: Mask, again: Mask) -> Mask:
@@ -227,35 +221,30 @@ def _behind(scene: Earlier, camera: Camera, hidden: Mask) -> Depth:
     return np.where(seen > 0, seen, largest_around(seen, 3))
 
 
-def _count_free(scene: Earlier, depth: Depth, camera: Camera, step: int, clear_m: float) -> int:
-    """Return how many pixels of every `step`-th row and column are in places that were free, as `_places` does, but
-    without telling which: in a still scene, these are too few, and nothing else is needed."""
-    depths = depth.reshape(-1)
-    inside, row, column, z = projected(_columns_of_rays(camera, step) * depths, camera, scene.T_earlier_live)
-    near = np.take(scene.near_m, row * camera.width + column)  # inf without a reading
-    free = (z * (1 + CLEAR_RELATIVE) + clear_m < near) & inside & (depths > 0) & (near < np.inf)
-    return int(np.count_nonzero(free))
+def _free(scene: Earlier, depth: Depth, camera: Camera, step: int, clear_m: float) -> Mask:
+    """Return which pixels of every `step`-th row and column are in places that were free."""
+    points_m = _columns_of_rays(camera, step) * depth.reshape(-1)
+    free = free_places(points_m, scene.T_earlier_live, scene.depth_m, camera, clear_m, scene.further_px)
+    return np.asarray(free & (points_m[2] > 0)).reshape(depth.shape)
 
 
 def _places(
-    scene: Earlier, before: Earlier | None, depth: Depth, camera: Camera, step: int, clear_m: float
-) -> tuple[Mask, Mask, Mask]:
-    """Return which pixels of every `step`-th row and column are in places that were free, which are where something was
-    in front already, and which are on surfaces of the scene."""
-    v, u = np.nonzero(depth > 0)
+    scene: Earlier, before: Earlier | None, depth: Depth, free: Mask, camera: Camera, step: int, clear_m: float
+) -> tuple[Mask, Mask]:
+    """Return which of the pixels that are not in free places are where something was in front already, and which of the
+    rest are on surfaces of the scene."""
+    v, u = np.nonzero((depth > 0) & ~free)
     points = coarse_rays(camera, step)[v, u].T * depth[v, u]
-    near, far = scene.range_m
+    far = scene.far_m
     inside, row, column, z = projected(points, camera, scene.T_earlier_live)
     known, limit = inside & (far[row, column] > 0), clear_m + CLEAR_RELATIVE * z
-    places = np.zeros((3, *depth.shape), bool)
-    free, again, same = places
-    free[v, u] = known & (z * (1 + CLEAR_RELATIVE) + clear_m < near[row, column])
+    again, same = np.zeros((2, *depth.shape), bool)
     if before is not None:
         in_last, at_row, at_column, z_last = projected(points, camera, before.T_earlier_live)
         front = before.depth_m[at_row, at_column]
         again[v, u] = in_last & (front > 0) & (z_last < front + clear_m + CLEAR_RELATIVE * z_last)
     same[v, u] = known & (z < far[row, column] + limit)
-    return free, again & ~free, same & ~free & ~again
+    return again, same & ~again
 
 
 def seen_again(scene: Earlier, depth: Depth, camera: Camera, step: int) -> tuple[Mask, Mask]:
@@ -277,12 +266,3 @@ def projected(
     """Project live points [3, n] into an earlier image: whether they are inside, row, column (0 outside), depth."""
     x, y, z = T_earlier_live[:3, :3] @ points + T_earlier_live[:3, 3:]
     return *on_image(x, y, z, camera), z
-
-
-def on_image(x: Floats, y: Floats, z: Floats, camera: Camera) -> tuple[Mask, NDArray[np.intp], NDArray[np.intp]]:
-    """Return whether points x, y, z [n] m in a camera's frame are in its image; their row and column (0 outside)."""
-    ahead = np.maximum(z, 1e-3)
-    column, row = np.rint(camera.fx * x / ahead + camera.cx), np.rint(camera.fy * y / ahead + camera.cy)
-    inside = (z > 0.05) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
-    row, column = (np.where(inside, pixel, 0) for pixel in (row, column))
-    return np.asarray(inside), row.astype(np.intp), column.astype(np.intp)

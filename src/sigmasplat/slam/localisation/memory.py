@@ -1,7 +1,6 @@
 """Remember what recent frames saw, to notice what moves too slowly to show against the newest keyframe."""
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
@@ -9,15 +8,14 @@ from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.slam.localisation.foreground import (
     LEAST_REGION,
-    Depth,
     Earlier,
     Foreground,
     enlarged,
     foreground,
-    near_of,
     seen_again,
     smooth,
 )
+from sigmasplat.slam.localisation.free_space import Depth
 from sigmasplat.slam.localisation.windows import labelled, widened
 from sigmasplat.types import Matrix
 
@@ -41,11 +39,6 @@ class Seen:
     depth_m: Depth
     scene_m: Depth
     T_world_camera: Matrix
-
-    @cached_property
-    def scene_near_m(self) -> Depth:
-        """Return the least depth with what is behind moving things, around each pixel (`near_of`)."""
-        return near_of(self.scene_m)
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,8 +70,7 @@ class Memory:
         earlier = self.seen[max(len(self.seen) - AGES[turn % len(AGES)], 0)]
         if most_frames and self.frames - earlier.number > most_frames:
             return None
-        T_earlier_live = se3.inverse(earlier.T_world_camera) @ T_world_camera
-        scene = Earlier(earlier.scene_m, T_earlier_live, earlier.scene_near_m)
+        scene = Earlier(earlier.scene_m, se3.inverse(earlier.T_world_camera) @ T_world_camera)
         return foreground(scene, None, depth_m, camera, whole_objects=True, step=_step(camera))
 
     def still_moving(

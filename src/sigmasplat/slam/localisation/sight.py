@@ -56,9 +56,13 @@ class Sight:
         ignored."""
         depth_m = self.target.depth_image.numpy()
         unread = self if front is None else self._read_as(np.where(front.hidden, np.float32(0.0), depth_m))
+        return replace(unread, live=self.live_aside(front))
+
+    def live_aside(self, front: Foreground | None) -> Pyramid:
+        """Return the images of `aside` for alignment."""
         hidden = np.zeros((), np.bool_) if front is None else front.hidden
         hidden = hidden if self.ignored is None else hidden | self.ignored
-        return replace(unread, live=self.live.with_depth(np.where(hidden, np.float32(HIDDEN_M), depth_m)))
+        return self.live.with_depth(np.where(hidden, np.float32(HIDDEN_M), self.target.depth_image.numpy()))
 
     def separate(self) -> Self:
         """Return the same frame with an own image for features, which are found and kept when they are first needed."""

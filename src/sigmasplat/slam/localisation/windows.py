@@ -33,9 +33,10 @@ def labelled(mask: NDArray[np.bool_]) -> tuple[NDArray[np.int32], int]:
     return np.asarray(labels, np.int32), count - 1
 
 
-def largest_label(labels: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Return the largest label in a window of 3 pixels around each pixel [H, W]; labels are at most 2²⁴."""
-    return np.asarray(opencv().dilate(labels.astype(np.float32), _window(3)), np.int32)
+def largest_label(labels: NDArray[np.int32], count: int) -> NDArray[np.int32]:
+    """Return the largest label in a window of 3 pixels around each pixel [H, W]; labels are at most `count` ≤ 2²⁴."""
+    exact = np.uint16 if count <= np.iinfo(np.uint16).max else np.float32
+    return np.asarray(opencv().dilate(labels.astype(exact), _window(3)), np.int32)
 
 
 def _window(size: int) -> NDArray[np.uint8]:
