@@ -19,19 +19,28 @@ import numpy as np
 import program
 import record
 import tyro
-from moving import CLEAR_M, CLEAR_RELATIVE, HOLD_EVERY, Followed, figure_text, followed
+from moving import (
+    CLEAR_M,
+    CLEAR_RELATIVE,
+    HOLD_EVERY,
+    Followed,
+    Mask,
+    figure_text,
+    followed,
+    scored_config,
+    scored_masks,
+)
 from numpy.typing import NDArray
 from PIL import Image
 from tables import Section
 
 from sigmasplat.commands.options import Settings
 from sigmasplat.config import Config, InputConfig
-from sigmasplat.config.text import override, split_settings
 from sigmasplat.metrics.image import psnr
 from sigmasplat.metrics.trajectory import associate, ate
 from sigmasplat.model import se3
 from sigmasplat.model.frame import Frame
-from sigmasplat.presets import default_preset, preset
+from sigmasplat.presets import default_preset
 from sigmasplat.render import render
 from sigmasplat.slam.localisation.sight import working_frame
 from sigmasplat.sources import open_source
@@ -40,7 +49,6 @@ from sigmasplat.sources.room.mover import CENTER_M, mover
 from sigmasplat.sources.room.sensor import measured_color, measured_depth
 
 arg = tyro.conf.arg
-Mask = NDArray[np.bool_]
 AWAY = 0.6
 """Distance of the place from the camera, in median depths of the recording, on average."""
 CELLS = 9
@@ -122,15 +130,9 @@ def _in_front(ball_m: NDArray[np.float32], depth_m: NDArray[np.float32]) -> Mask
     return np.asarray((ball_m > 0) & ((depth_m == 0) | (ball_m < depth_m)))
 
 
-def config_of(options: Options, seed: int, find: int) -> Config:
-    """Return the settings of a run."""
-    more = {"seed": str(seed), "input.hold_every": str(HOLD_EVERY), "moving.find": str(bool(find)).lower()}
-    return override(preset(options.preset), more | split_settings(options.settings))
-
-
 def measure_run(name: str, share: int, seed: int, find: int, options: Options) -> dict[str, Any]:
     """Make one run; return its figures."""
-    config = config_of(options, seed, find)
+    config = scored_config(options.preset, options.settings, seed, bool(find))
     recording = open_source(accuracy.located(name), limit=options.limit)
     source = WithBall(recording, share / 100)
     run = followed(source, config)
@@ -147,16 +149,11 @@ def measure_run(name: str, share: int, seed: int, find: int, options: Options) -
 
 
 def masks_of(run: Followed, source: WithBall) -> dict[str, float | None]:
-    """Return the intersection over union of the masks, summed over all frames, and the share of the image beside the
-    ball that is masked."""
-    both = either = wrong = rest = 0
-    for i, mask in enumerate(run.masks):
-        size = mask.shape[1], mask.shape[0]
-        true = np.asarray(Image.fromarray(source.moving_of(i)).resize(size, Image.Resampling.NEAREST))
-        both, either = both + int((mask & true).sum()), either + int((mask | true).sum())
-        wrong, rest = wrong + int((mask & ~true).sum()), rest + int((~true).sum())
-    moves = source.radius_m > 0
-    return {"iou": both / max(either, 1) if moves else None, "masked_wrongly_pct": 100 * wrong / max(rest, 1)}
+    """Score the masks of a run, at working size."""
+    size, moves = run.masks[0].shape[::-1], source.radius_m > 0
+    true = (Image.fromarray(source.moving_of(i)) for i in range(len(run.masks)))
+    resized = (np.asarray(image.resize(size, Image.Resampling.NEAREST)) for image in true)
+    return scored_masks((mask, shows, moves) for mask, shows in zip(run.masks, resized, strict=True))
 
 
 def shown(run: Followed, recording: Source, i: int, config: Config) -> tuple[float, float]:

@@ -2,7 +2,8 @@
 
 For each share and seed one run on the room with the ball, with `moving.find` on and off, beside the still room (share
 0). Scored: path; mask of each frame against the true one, while the ball moves; what is left of the ball in the final
-map; held-out views of the still room. Recordings (--still) show what the search costs where nothing moves.
+map; held-out views of the still room. Recordings (--still) show how the search changes path and map where nothing
+moves; search_cost.py measures the time.
 Writes benchmarks/results/moving-<machine>.json and prints tables.
 
 example: python benchmarks/moving.py --shares 0 20 --seeds 0
@@ -10,6 +11,7 @@ example: python benchmarks/moving.py --shares 0 20 --seeds 0
 
 import sys
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -25,7 +27,7 @@ from tables import Section, significant
 
 from sigmasplat.commands.options import Settings
 from sigmasplat.config import Config
-from sigmasplat.config.text import override
+from sigmasplat.config.text import override, split_settings
 from sigmasplat.metrics.image import psnr
 from sigmasplat.metrics.trajectory import ate
 from sigmasplat.model import se3
@@ -38,6 +40,7 @@ from sigmasplat.sources.base import Source
 from sigmasplat.sources.synthetic import SyntheticRoom
 
 arg = tyro.conf.arg
+Mask = NDArray[np.bool_]
 HOLD_EVERY = 8
 NEAR_M = 0.05
 """Splats up to this far from the surface of the ball, at any place of its path, count as left of it."""
@@ -68,11 +71,14 @@ class Options:
     out: Annotated[Path, arg(help="folder of the results")] = record.RESULTS
 
 
-def config_of(options: Options, seed: int, find: int) -> Config:
-    """Return the settings of a run."""
-    given = dict(text.split("=", 1) for text in options.settings)
-    more = {"seed": str(seed), "input.hold_every": str(HOLD_EVERY), "moving.find": str(bool(find)).lower()}
-    return override(preset(options.preset), more | given)
+def config_of(base: str, settings: Settings, find: bool) -> Config:
+    """Return the settings of a run with the search or without, from the name of a preset."""
+    return override(preset(base), {"moving.find": str(find).lower()} | split_settings(settings))
+
+
+def scored_config(base: str, settings: Settings, seed: int, find: bool) -> Config:
+    """Return the same for a run whose held-out views are scored."""
+    return config_of(base, (f"seed={seed}", f"input.hold_every={HOLD_EVERY}", *settings), find)
 
 
 @dataclass(eq=False)
@@ -80,13 +86,13 @@ class Followed:
     """A finished run: the system, the masks of what moved [H, W] of each frame, and processor seconds of the frames."""
 
     slam: Slam
-    masks: list[NDArray[np.bool_]]
+    masks: list[Mask]
     frames_s: float
 
 
 def followed(source: Source, config: Config) -> Followed:
     """Run SLAM on a source, and keep what each frame took for moving."""
-    slam, masks, spent_s = Slam(config), list[NDArray[np.bool_]](), 0.0
+    slam, masks, spent_s = Slam(config), list[Mask](), 0.0
     for frame in source:
         since_s = time.process_time()
         slam.step(frame)
@@ -99,7 +105,7 @@ def followed(source: Source, config: Config) -> Followed:
 
 def measure_room(share: int, seed: int, find: int, options: Options) -> dict[str, Any]:
     """Make one run in the room; return its figures."""
-    config = config_of(options, seed, find).changed(input={"width": options.width})
+    config = scored_config(options.preset, options.settings, seed, bool(find)).changed(input={"width": options.width})
     text = f"synthetic:frames={options.frames},noise=1,exposure_change=0,seed={seed}"
     text += f",width={options.width},height={options.width * 3 // 4}"
     source, still, path_of = (open_source(f"{text},mover={n}") for n in (share, 0, share or LARGEST))
@@ -119,13 +125,19 @@ def measure_room(share: int, seed: int, find: int, options: Options) -> dict[str
 
 
 def masks_of(run: Followed, source: SyntheticRoom) -> dict[str, float | None]:
-    """Return the intersection over union of the masks, summed over the frames in which the ball moves, and the share of
-    the image that is masked where nothing moves."""
+    """Score the masks of a run in the room."""
+    ball = source.mover
+    moves = (ball is not None and ball.moves(i) for i in range(len(run.masks)))
+    return scored_masks(zip(run.masks, map(source.moving_of, range(len(run.masks))), moves, strict=True))
+
+
+def scored_masks(frames: Iterable[tuple[Mask, Mask, bool]]) -> dict[str, float | None]:
+    """Score masks by the true ones [H, W], which count only while something moves: return the intersection over union,
+    summed over the frames, and the share of the image that is masked where nothing moves."""
     both = either = wrong = rest = 0
-    for i, mask in enumerate(run.masks):
-        true = source.moving_of(i)
+    for mask, true, moves in frames:
         wrong, rest = wrong + int((mask & ~true).sum()), rest + int((~true).sum())
-        if source.mover is not None and source.mover.moves(i):
+        if moves:
             both, either = both + int((mask & true).sum()), either + int((mask | true).sum())
     return {"iou": both / either if either else None, "masked_wrongly_pct": 100 * wrong / max(rest, 1)}
 
@@ -157,7 +169,7 @@ def left_of(run: Followed, source: SyntheticRoom, still: SyntheticRoom) -> float
 
 def measure_still(source: str, seed: int, find: int, options: Options) -> dict[str, Any]:
     """Make one run on a recording in which nothing moves; return its figures."""
-    config = config_of(options, seed, find)
+    config = scored_config(options.preset, options.settings, seed, bool(find))
     if options.limit is not None:
         config = config.changed(input={"limit": options.limit})
     recording = open_source(accuracy.located(source), config.input)
@@ -171,7 +183,7 @@ def measure_still(source: str, seed: int, find: int, options: Options) -> dict[s
         "source": source, "seed": seed, "find": find, "psnr_db": float(np.mean(scores)),
         "ate_cm": None if truth is None else 100 * ate(path, truth).rmse_m,
         "masked_pct": 100 * float(np.mean([mask.mean() for mask in run.masks])),
-        "frames_s": run.frames_s, "splats": len(run.slam.field), "lost": sum(step.lost for step in run.slam.steps),
+        "splats": len(run.slam.field), "lost": sum(step.lost for step in run.slam.steps),
     }  # fmt: skip
 
 
@@ -210,12 +222,12 @@ def sections(measured: dict[str, Any]) -> list[Section]:
     )
     head = ("share, %", "seed", "search", "ATE, cm", "lost frames", "IoU", "wrongly masked, %", "too near, %", "left")
     found = [Section("Moving ball", (*head, "PSNR, dB", "time, s"), rooms, note)] if rooms else []
-    head = ("recording", "seed", "search", "ATE, cm", "lost frames", "masked, %", "PSNR, dB", "splats", "time, s")
-    return found + ([Section("Nothing moves", head, still)] if still else [])
+    columns = ("recording", "seed", "search", "ATE, cm", "lost frames", "masked, %", "PSNR, dB", "splats")
+    return found + ([Section("Nothing moves", columns, still)] if still else [])
 
 
 ROOM = ("ate_cm", "lost", "iou", "masked_wrongly_pct", "in_front_pct", "left", "psnr_db", "frames_s")
-STILL = ("ate_cm", "lost", "masked_pct", "psnr_db", "splats", "frames_s")
+STILL = ("ate_cm", "lost", "masked_pct", "psnr_db", "splats")
 
 
 def figure_text(value: float | None) -> str:

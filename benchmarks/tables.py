@@ -39,7 +39,7 @@ SUBJECTS = {
     "Stereo": ("stereo",),
     "RGB only": ("predicted",),
     "Known poses": ("given_poses",),
-    "Moving things": ("moving", "composites"),
+    "Moving things": ("moving", "composites", "search_cost"),
     "Long runs": ("long_run", "endurance", "viewer_memory"),
     "Start-up": ("startup",),
     "Killed runs": ("crashes",),

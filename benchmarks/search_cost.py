@@ -1,0 +1,108 @@
+"""Measure what the search for moving things costs where nothing moves: time of frames with and without it, in pairs.
+
+Both runs of a pair get the same frames from memory, in one process; the order changes with each pair. Before the first
+pair, each runs once. The final map is not made: its time is that of its steps, with the search and without it.
+Writes benchmarks/results/search-cost-<machine>.json and prints its table.
+
+example: python benchmarks/search_cost.py --sources redkitchen --pairs 4
+"""
+
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import accuracy
+import numpy as np
+import program
+import record
+import tyro
+from moving import config_of
+from tables import Section, significant
+
+from sigmasplat.commands.options import Settings
+from sigmasplat.config import Config
+from sigmasplat.model.frame import Frame
+from sigmasplat.presets import default_preset
+from sigmasplat.slam.slam import Slam
+from sigmasplat.sources import open_source
+
+arg = tyro.conf.arg
+CLOCKS = {"wall_s": "wall clock", "processor_s": "processor"}
+
+
+@dataclass(frozen=True)
+class Options:
+    """Measure what the search for moving things costs where nothing moves."""
+
+    sources: Annotated[tuple[str, ...], arg(help="names in the data folder, or paths")] = (
+        "redkitchen", "livingroom", "cubicles", "hololens",
+    )  # fmt: skip
+    pairs: Annotated[int, arg(help="pairs of runs of each recording")] = 8
+    limit: Annotated[int, arg(help="use at most this many frames; 0 = all")] = 0
+    preset: Annotated[str, arg(help="preset to start from")] = default_preset()
+    settings: Settings = ()
+    name: Annotated[str, arg(help="name of the results")] = "search-cost"
+    out: Annotated[Path, arg(help="folder of the results")] = record.RESULTS
+
+
+def timed(frames: Sequence[Frame], config: Config) -> dict[str, float]:
+    """Run SLAM on frames; return wall-clock and processor seconds."""
+    slam = Slam(config)
+    since_s = time.perf_counter(), time.process_time()
+    for frame in frames:
+        slam.step(frame)
+    return {"wall_s": time.perf_counter() - since_s[0], "processor_s": time.process_time() - since_s[1]}
+
+
+def measure_source(source: str, options: Options) -> dict[str, Any]:
+    """Measure one recording; return the times of each pair."""
+    configs = {name: config_of(options.preset, options.settings, name == "on") for name in ("off", "on")}
+    recording = open_source(accuracy.located(source), configs["on"].input, limit=options.limit or None)
+    frames, pairs = list(recording), []
+    for number in range(options.pairs + 1):
+        order = list(configs.items())[:: 1 if number % 2 else -1]
+        found = {name: timed(frames, config) for name, config in order}
+        print(f"{source}, pair {number}: {found}", file=sys.stderr, flush=True)
+        pairs.append(found)
+    return {"source": source, "frames": len(frames), "pairs": pairs[1:]}
+
+
+def measure(options: Options) -> dict[str, Any]:
+    """Measure every recording."""
+    return {"recordings": [measure_source(source, options) for source in options.sources]}
+
+
+# ---- tables ----
+
+
+def sections(measured: dict[str, Any]) -> list[Section]:
+    """Tabulate the times of each recording, and their ratios."""
+    head = ("recording", "frames", "clock", "off, s", "on, s", "on / off by pair, median (min – max)")
+    rows = [
+        [found["source"], str(found["frames"]), text, *_row(found["pairs"], clock)]
+        for found in measured["figures"]["recordings"]
+        for clock, text in CLOCKS.items()
+    ]
+    pairs = measured["config"]["pairs"]
+    note = f"All frames, without the final map; medians of {pairs} pairs of runs (in alternating order)."
+    return [Section("Cost of the search where nothing moves", head, rows, note)]
+
+
+def _row(pairs: Sequence[dict[str, Any]], clock: str) -> list[str]:
+    off, on = (np.array([pair[which][clock] for pair in pairs]) for which in ("off", "on"))
+    ratios = on / off
+    spread = " – ".join(f"{x:.3f}" for x in (ratios.min(), ratios.max()))
+    medians = [significant(float(np.median(x))) for x in (off, on)]
+    return [*medians, f"{np.median(ratios):.3f} ({spread})"]
+
+
+def main(options: Options) -> int:
+    """Measure, write the results, print them; return the exit code."""
+    return program.run("search_cost", options, measure)
+
+
+if __name__ == "__main__":
+    program.start(main, Options)
