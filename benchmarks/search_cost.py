@@ -60,7 +60,7 @@ def timed(frames: Sequence[Frame], config: Config) -> dict[str, float]:
 def measure_source(source: str, options: Options) -> dict[str, Any]:
     """Measure one recording; return the times of each pair."""
     configs = {name: config_of(options.preset, options.settings, name == "on") for name in ("off", "on")}
-    recording = open_source(accuracy.located(source), configs["on"].input, limit=options.limit or None)
+    recording = open_source(accuracy.located(source), configs["on"].input, limit=options.limit)
     frames, pairs = list(recording), []
     for number in range(options.pairs + 1):
         order = list(configs.items())[:: 1 if number % 2 else -1]
