@@ -85,12 +85,15 @@ static void add_part(const AlignLevel& L, const LivePairs& live, const AlignOpti
     add_rows<3, 6>(part.residuals, part.derivatives, n, acc, pull);
 }
 
+// So few bands take less time than waking the other threads.
+constexpr int FEW_BANDS = 4;
+
 static void linearise(const AlignLevel& L, const LivePairs& live, const AlignOptions* o, const double* T, double* H, double* b, double* S, double* sums) {
     const Motion motion = motion_of(T);
     const int bands = (L.height + CELL - 1) / CELL, cells = (L.width + CELL - 1) / CELL;
     Buffer<double> band_sums;
     band_sums.reserve(size_t(bands) * NORMAL_TERMS);
-#pragma omp parallel for schedule(dynamic, 1)
+#pragma omp parallel for schedule(dynamic, 1) if (bands > FEW_BANDS)
     for (int band = 0; band < bands; band++) {
         vf acc[MATRIX_TERMS + SUMS];                  // H and sums; b is summed per cell
         for (auto& a : acc) a = splat(0.f);

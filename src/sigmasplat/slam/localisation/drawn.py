@@ -20,6 +20,7 @@ from sigmasplat.slam.localisation.foreground import (
     enlarged,
     smooth,
     thinned,
+    with_margin,
 )
 from sigmasplat.slam.localisation.free_space import Depth, Mask
 from sigmasplat.slam.localisation.sight import Sight
@@ -56,9 +57,9 @@ def suspected(
     same pose or at one that a quick alignment finds; with `every`, all that stand free."""
     live_m = seen.target.depth_image.numpy()
     for inside in free_standing(thinned(live_m, STEP)):
-        thing = _front(inside, live_m)
+        thing = _front(*with_margin(inside, STEP, live_m), live_m)
         if every or _agrees_without(thing, keyframe, seen, fit) or _rest_moves(thing, keyframe, seen, fit, config):
-            yield thing
+            yield _front(*enlarged(inside, STEP, live_m), live_m)
 
 
 def _agrees_without(thing: Foreground, keyframe: Reference, seen: Sight, fit: PoseFit) -> bool:
@@ -67,9 +68,10 @@ def _agrees_without(thing: Foreground, keyframe: Reference, seen: Sight, fit: Po
 
 
 def _rest_moves(thing: Foreground, keyframe: Reference, seen: Sight, fit: PoseFit, config: TrackingConfig) -> bool:
-    """Return whether everything but a thing agrees better at another pose, by an alignment of small images."""
+    """Return whether everything but a thing agrees better at another pose, by an alignment of small images, or cannot
+    be compared."""
     found = align(
-        keyframe.pyramid.coarse(QUICK_LEVELS), seen.live_aside(thing).coarse(QUICK_LEVELS),
+        keyframe.pyramid.coarse(QUICK_LEVELS), seen.coarse_aside(thing, QUICK_LEVELS),
         fit.T_camera_world @ se3.inverse(keyframe.T_camera_world),
         config.align_iterations, config.align_weight_color, config.align_stop,
     )  # fmt: skip
@@ -78,13 +80,14 @@ def _rest_moves(thing: Foreground, keyframe: Reference, seen: Sight, fit: PoseFi
     if shift < SHIFTED:
         return False
     motions = two_motions(keyframe, seen.live, thing.hidden, fit.T_camera_world, T_camera_world)
-    gain = 0.0 if motions is None else motions.rest_gains - 1.0
+    if motions is None:
+        return True
+    gain = motions.rest_gains - 1.0
     return gain >= QUICK_GAIN and gain * shift >= QUICK_APART
 
 
-def _front(inside: Mask, live_m: Depth) -> Foreground:
-    """Return a thing that stands free; what is behind it is not known."""
-    whole, hidden = enlarged(inside, STEP, live_m)
+def _front(whole: Mask, hidden: Mask, live_m: Depth) -> Foreground:
+    """Return a thing that stands free, from its pixels and those that it hides; what is behind it is not known."""
     return Foreground(hidden, np.where(whole, live_m, np.float32(0.0)), np.where(hidden, np.float32(0.0), live_m))
 
 

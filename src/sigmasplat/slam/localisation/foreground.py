@@ -159,9 +159,14 @@ def enlarged(small: Mask, step: int, live_m: Depth, whole_objects: bool = True) 
     """Return a mask of every `step`-th pixel at the size of the image, and the same with a margin and with the holes in
     depth that it surrounds: what is too near for the sensor has no reading, but hides the scene too. whole_objects:
     what is as far as the edge of such a hole belongs to the same thing."""
-    whole = np.repeat(np.repeat(small, step, 0), step, 1)[: live_m.shape[0], : live_m.shape[1]]
-    hidden = widened(whole, 2 * MARGIN_PX + 1)
+    whole, hidden = with_margin(small, step, live_m)
     return whole, hidden | _holes_in(hidden, whole if whole_objects else None, live_m)
+
+
+def with_margin(small: Mask, step: int, live_m: Depth) -> tuple[Mask, Mask]:
+    """Return the same without the holes."""
+    whole = np.repeat(np.repeat(small, step, 0), step, 1)[: live_m.shape[0], : live_m.shape[1]]
+    return whole, widened(whole, 2 * MARGIN_PX + 1)
 
 
 def _holes_in(mask: Mask, thing: Mask | None, depth_m: Depth) -> Mask:

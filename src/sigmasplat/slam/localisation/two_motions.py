@@ -1,6 +1,7 @@
 """Tell two motions apart: where a frame agrees better with a keyframe at one pose of the camera, where at another."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,25 +33,60 @@ MOST_OF_REST = 0.7
 moves: its squared differences can outweigh those of the whole rest, but it covers less of the image."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TwoMotions:
     """How the gray values of a frame agree with a keyframe at two poses.
 
-    rest_gains: squared differences outside of a thing at the first pose, relative to the second; thing_loses: those of
-    its parts that agree better at the first pose, at the second pose relative to the first; moves: their share of the
-    compared points; follows: share of the points outside of the thing that agree better at the second pose.
+    first, second: squared differences [h, w] of the points of the keyframe at each pose; seen: the points that are seen
+    at both; inside: those of them that the thing shows at the first pose.
     """
 
-    rest_gains: float
-    thing_loses: float
-    moves: float
-    follows: float
+    first: Image
+    second: Image
+    seen: Mask
+    inside: Mask
+
+    @cached_property
+    def rest_gains(self) -> float:
+        """Return the squared differences outside of the thing at the first pose, relative to the second."""
+        return _ratio(self.first[self._rest], self.second[self._rest])
+
+    @cached_property
+    def thing_loses(self) -> float:
+        """Return the squared differences of the parts of the thing that agree better at the first pose, at the second
+        pose relative to the first."""
+        return _ratio(self.second[self._moving], self.first[self._moving])
+
+    @property
+    def moves(self) -> float:
+        """Return the share of these parts in the compared points."""
+        return np.count_nonzero(self._moving) / self.seen.size
+
+    @property
+    def follows(self) -> float:
+        """Return the share of the points outside of the thing that agree better at the second pose."""
+        at_first, at_second = self._voted
+        return float((at_second < at_first)[self._rest].mean()) if self._rest.any() else 0.0
 
     @property
     def apart(self) -> bool:
         """Return whether thing and rest move differently: each agrees clearly better at a pose of its own."""
-        enough = self.moves >= LEAST_MOVES and self.follows >= MOST_OF_REST
-        return enough and self.rest_gains >= REST_GAINS and self.thing_loses >= THING_LOSES
+        if self.rest_gains < REST_GAINS or self.thing_loses < THING_LOSES:
+            return False
+        return self.moves >= LEAST_MOVES and self.follows >= MOST_OF_REST
+
+    @cached_property
+    def _rest(self) -> Mask:
+        return self.seen & ~self.inside
+
+    @cached_property
+    def _moving(self) -> Mask:
+        at_first, at_second = self._voted
+        return self.inside & (at_first < at_second)
+
+    @cached_property
+    def _voted(self) -> tuple[Image, Image]:
+        return _voted(self.first, self.seen), _voted(self.second, self.seen)
 
 
 def two_motions(
@@ -66,15 +102,7 @@ def two_motions(
     seen = np.isfinite(first.square) & np.isfinite(second.square)
     if np.count_nonzero(seen) < FEWEST:
         return None
-    inside = seen & thing[first.row, first.column]
-    at_first, at_second = (_voted(points.square, seen) for points in (first, second))
-    moves, rest = inside & (at_first < at_second), seen & ~inside
-    return TwoMotions(
-        _ratio(first.square[rest], second.square[rest]),
-        _ratio(second.square[moves], first.square[moves]),
-        np.count_nonzero(moves) / seen.size,
-        float((at_second < at_first)[rest].mean()) if rest.any() else 0.0,
-    )
+    return TwoMotions(first.square, second.square, seen, seen & thing[first.row, first.column])
 
 
 @dataclass(frozen=True, eq=False)

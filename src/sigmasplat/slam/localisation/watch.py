@@ -89,14 +89,14 @@ class Watch:
     ) -> Iterator[Foreground]:  # fmt: skip
         """Yield the things in front that may have drawn a pose: those without which the rest agrees better, there or at
         another pose; if the images contradict it, all. Without contradiction, every second frame is looked at, and
-        those after one in which something was in front (`known`). If the gray values agree much less than usual
-        (`drops`), all are yielded in every frame: at a pose that was drawn far, nothing agrees."""
+        those after one in which something was in front (`known`), or in which the gray values agree much less than
+        usual (`drops`)."""
         if keyframe is None or fit.comparison is None:
             return
         looks = (known or drops or self.memory.frames % DRAWN_EVERY == 0) and differs(fit.comparison)
         if not (contradicted or looks):
             return
-        yield from suspected(keyframe, seen, fit, config, contradicted or drops)
+        yield from suspected(keyframe, seen, fit, config, contradicted)
 
     def takes_for_moving(self, front: Foreground | None, keyframe: Reference | None, seen: Sight, fit: PoseFit) -> bool:
         """Return whether what is in front moves, by a fit without it: a still thing can seem to be in free space where
