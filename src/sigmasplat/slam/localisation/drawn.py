@@ -25,7 +25,7 @@ from sigmasplat.slam.localisation.foreground import (
 from sigmasplat.slam.localisation.free_space import Depth, Mask
 from sigmasplat.slam.localisation.sight import Sight
 from sigmasplat.slam.localisation.two_motions import two_motions
-from sigmasplat.slam.localisation.verdict import agrees_more, differs, disagrees, may_draw
+from sigmasplat.slam.localisation.verdict import agrees_more, differs, disagrees, gray_gain, may_draw
 from sigmasplat.slam.localisation.windows import labelled, widened
 from sigmasplat.types import Matrix
 
@@ -36,10 +36,9 @@ RING, FREE_AROUND = 3, 0.6
 SHIFTED = 1e-3
 """A thing has drawn the pose only if the pose without it shows the thing elsewhere: by at least this share of the
 width of the image. What has another brightness than before, and stays in place, changes the pose less."""
-QUICK_LEVELS, QUICK_GAIN, QUICK_APART = 2, 0.3, 2.5e-3
+QUICK_LEVELS, QUICK_GAIN, QUICK_APART = 2, 0.5, 2.5e-3
 """A thing is also suspected if without it a pose is found, on so many of the coarsest images, where the gain of the
-rest in squared gray differences is at least this above 1, and for which the product of `APART` is at least half as
-large."""
+rest (`gray_gain`) is at least this, and for which the product of `APART` is at least half as large."""
 APART = 5e-3
 """Two motions are apart if the shift of the thing, as a share of the width of the image, times the gain of the rest
 above 1 is at least this. In still recordings it was at most 0.2 %, and for balls in real recordings more than 1 %: a
@@ -53,23 +52,20 @@ SHIFT_STEP = 4
 def suspected(
     keyframe: Reference, seen: Sight, fit: PoseFit, config: TrackingConfig, every: bool
 ) -> Iterator[Foreground]:
-    """Yield the things in front that may have drawn a pose: those without which the gray values agree better, at the
-    same pose or at one that a quick alignment finds; with `every`, all that stand free."""
+    """Yield the things in front that may have drawn a pose; with `every`, all that stand free."""
     live_m = seen.target.depth_image.numpy()
     for inside in free_standing(thinned(live_m, STEP)):
-        thing = _front(*with_margin(inside, STEP, live_m), live_m)
-        if every or _agrees_without(thing, keyframe, seen, fit) or _rest_moves(thing, keyframe, seen, fit, config):
+        if every or _may_have_drawn(_front(*with_margin(inside, STEP, live_m), live_m), keyframe, seen, fit, config):
             yield _front(*enlarged(inside, STEP, live_m), live_m)
 
 
-def _agrees_without(thing: Foreground, keyframe: Reference, seen: Sight, fit: PoseFit) -> bool:
-    """Return whether the gray values agree better without a thing, at the same pose."""
-    return may_draw(keyframe.compared(seen.live.hiding(thing.hidden), fit.T_camera_world), fit.comparison)
-
-
-def _rest_moves(thing: Foreground, keyframe: Reference, seen: Sight, fit: PoseFit, config: TrackingConfig) -> bool:
-    """Return whether everything but a thing agrees better at another pose, by an alignment of small images, or cannot
-    be compared."""
+def _may_have_drawn(thing: Foreground, keyframe: Reference, seen: Sight, fit: PoseFit, config: TrackingConfig) -> bool:
+    """Return whether the gray values agree better without a thing, at the same pose or at one that an alignment of
+    small images finds."""
+    rest = seen.live.hiding(thing.hidden)
+    here = keyframe.compared(rest, fit.T_camera_world)
+    if may_draw(here, fit.comparison):
+        return True
     found = align(
         keyframe.pyramid.coarse(QUICK_LEVELS), seen.coarse_aside(thing, QUICK_LEVELS),
         fit.T_camera_world @ se3.inverse(keyframe.T_camera_world),
@@ -79,10 +75,7 @@ def _rest_moves(thing: Foreground, keyframe: Reference, seen: Sight, fit: PoseFi
     shift = _shift(thing, seen, fit.T_camera_world, T_camera_world)
     if shift < SHIFTED:
         return False
-    motions = two_motions(keyframe, seen.live, thing.hidden, fit.T_camera_world, T_camera_world)
-    if motions is None:
-        return True
-    gain = motions.rest_gains - 1.0
+    gain = gray_gain(here, keyframe.compared(rest, T_camera_world))
     return gain >= QUICK_GAIN and gain * shift >= QUICK_APART
 
 
@@ -149,7 +142,8 @@ def _fits_poorly(thing: Foreground, keyframe: Reference, seen: Sight, drawn: Pos
     the thing itself agrees better at the other pose."""
     alone = seen.live.hiding(thing.depth_m <= 0)
     at_drawn, at_found = (keyframe.compared(alone, fit.T_camera_world).correlation for fit in (drawn, found))
-    return at_found > at_drawn and not _agrees_without(thing, keyframe, seen, drawn)
+    rest = keyframe.compared(seen.live.hiding(thing.hidden), drawn.T_camera_world)
+    return at_found > at_drawn and not may_draw(rest, drawn.comparison)
 
 
 def is_still(thing: Foreground, keyframe: Reference | None, live: Pyramid, found: PoseFit) -> bool:

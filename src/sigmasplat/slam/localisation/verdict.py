@@ -112,6 +112,12 @@ def may_draw(without: Comparison, c: Comparison | None) -> bool:
     return c is not None and differs(c) and SUSPECTED * (1.0 - without.correlation) < 1.0 - c.correlation
 
 
+def gray_gain(c: Comparison, better: Comparison) -> float:
+    """Return what the gray values miss to a correlation of 1, relative to what they miss at a better pose, minus 1; NaN
+    for flat images."""
+    return (1.0 - c.correlation) / max(1.0 - better.correlation, 1e-9) - 1.0
+
+
 def disagrees(whole: Comparison, without: Comparison | None) -> bool:
     """Return whether something does not agree with the rest, by comparisons with and without it at the same pose."""
     return without is not None and 1.0 - whole.correlation > DISAGREES * (1.0 - without.correlation)
