@@ -149,11 +149,13 @@ def measure_run(name: str, share: int, seed: int, find: int, options: Options) -
 
 
 def masks_of(run: Followed, source: WithBall) -> dict[str, float | None]:
-    """Score the masks of a run, at working size."""
-    size, moves = run.masks[0].shape[::-1], source.radius_m > 0
-    true = (Image.fromarray(source.moving_of(i)) for i in range(len(run.masks)))
-    resized = (np.asarray(image.resize(size, Image.Resampling.NEAREST)) for image in true)
-    return scored_masks((mask, shows, moves) for mask, shows in zip(run.masks, resized, strict=True))
+    """Score the masks of a run."""
+    return scored_masks((mask, _true_mask(source, i, mask), source.radius_m > 0) for i, mask in enumerate(run.masks))
+
+
+def _true_mask(source: WithBall, i: int, mask: Mask) -> Mask:
+    """Return the pixels of frame i that show the ball, at the size of another mask."""
+    return np.asarray(Image.fromarray(source.moving_of(i)).resize(mask.shape[::-1], Image.Resampling.NEAREST))
 
 
 def shown(run: Followed, recording: Source, i: int, config: Config) -> tuple[float, float]:

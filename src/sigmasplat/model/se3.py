@@ -3,6 +3,8 @@
 A twist is ξ = (ρ, φ): translation first, then rotation vector (radians).
 """
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -170,7 +172,8 @@ def quaternion_from_rotation(R: Matrix) -> Matrix:
 
 def rotation_angle(R: Matrix) -> float:
     """Return the angle of a rotation in radians."""
-    return float(np.linalg.norm(log_rotation(R)))
+    (a, b, c), (d, e, f), (g, h, i) = R.tolist()  # for so few numbers, numpy needs ten times as long
+    return math.atan2(math.hypot(h - f, c - g, d - b), a + e + i - 1.0)  # 2 sin and 2 cos
 
 
 def orthonormalise(T: Matrix) -> Matrix:

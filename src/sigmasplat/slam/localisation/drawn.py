@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sigmasplat.config import TrackingConfig
 from sigmasplat.fit.align import align
@@ -26,7 +27,7 @@ from sigmasplat.slam.localisation.free_space import Depth, Mask
 from sigmasplat.slam.localisation.sight import Sight
 from sigmasplat.slam.localisation.two_motions import two_motions
 from sigmasplat.slam.localisation.verdict import agrees_more, differs, disagrees, gray_gain, may_draw
-from sigmasplat.slam.localisation.windows import labelled, widened
+from sigmasplat.slam.localisation.windows import boxed, widened
 from sigmasplat.types import Matrix
 
 OBJECT_SHARE, MOST_OBJECTS = (0.02, 0.7), 3
@@ -36,9 +37,10 @@ RING, FREE_AROUND = 3, 0.6
 SHIFTED = 1e-3
 """A thing has drawn the pose only if the pose without it shows the thing elsewhere: by at least this share of the
 width of the image. What has another brightness than before, and stays in place, changes the pose less."""
-QUICK_LEVELS, QUICK_GAIN, QUICK_APART = 2, 0.5, 2.5e-3
+QUICK_LEVELS, QUICK_GAIN, QUICK_APART, QUICK_CLOSE = 2, 0.5, 2.5e-3, 5e-3
 """A thing is also suspected if without it a pose is found, on so many of the coarsest images, where the gain of the
-rest (`gray_gain`) is at least this, and for which the product of `APART` is at least half as large."""
+rest (`gray_gain`) is at least this, and for which the product of `APART` is at least half as large. At most this share
+of the rest has another depth there than at the first pose: so much can be off at a pose from small images."""
 APART = 5e-3
 """Two motions are apart if the shift of the thing, as a share of the width of the image, times the gain of the rest
 above 1 is at least this. In still recordings it was at most 0.2 %, and for balls in real recordings more than 1 %: a
@@ -55,28 +57,30 @@ def suspected(
     """Yield the things in front that may have drawn a pose; with `every`, all that stand free."""
     live_m = seen.target.depth_image.numpy()
     for inside in free_standing(thinned(live_m, STEP)):
-        if every or _may_have_drawn(_front(*with_margin(inside, STEP, live_m), live_m), keyframe, seen, fit, config):
+        thing = _front(*with_margin(inside, STEP, live_m), live_m)
+        if every or _may_have_drawn(thing, keyframe, seen, fit, config):
             yield _front(*enlarged(inside, STEP, live_m), live_m)
 
 
 def _may_have_drawn(thing: Foreground, keyframe: Reference, seen: Sight, fit: PoseFit, config: TrackingConfig) -> bool:
     """Return whether the gray values agree better without a thing, at the same pose or at one that an alignment of
-    small images finds."""
-    rest = seen.live.hiding(thing.hidden)
+    small images finds, where the depth agrees as well."""
+    rest = seen.hiding(thing)
     here = keyframe.compared(rest, fit.T_camera_world)
     if may_draw(here, fit.comparison):
         return True
     found = align(
-        keyframe.pyramid.coarse(QUICK_LEVELS), seen.coarse_aside(thing, QUICK_LEVELS),
+        keyframe.pyramid.coarse(QUICK_LEVELS), rest.coarse(QUICK_LEVELS),
         fit.T_camera_world @ se3.inverse(keyframe.T_camera_world),
         config.align_iterations, config.align_weight_color, config.align_stop,
     )  # fmt: skip
     T_camera_world = found.T_live_reference @ keyframe.T_camera_world
-    shift = _shift(thing, seen, fit.T_camera_world, T_camera_world)
-    if shift < SHIFTED:
+    there = keyframe.compared(rest, T_camera_world)
+    gain = gray_gain(here, there)
+    if not gain >= QUICK_GAIN or there.close < here.close - QUICK_CLOSE:
         return False
-    gain = gray_gain(here, keyframe.compared(rest, T_camera_world))
-    return gain >= QUICK_GAIN and gain * shift >= QUICK_APART
+    shift = _shift(thing, seen, fit.T_camera_world, T_camera_world)
+    return shift >= SHIFTED and gain * shift >= QUICK_APART
 
 
 def _front(whole: Mask, hidden: Mask, live_m: Depth) -> Foreground:
@@ -87,20 +91,25 @@ def _front(whole: Mask, hidden: Mask, live_m: Depth) -> Foreground:
 def free_standing(depth: Depth) -> Iterator[Mask]:
     """Yield the things that stand free in `thinned` depth [h, w], m, in front of farther surfaces all around, as masks
     [h, w]: the largest first, at most `MOST_OBJECTS`."""
-    regions, count = labelled(smooth(depth))
-    sizes, found = np.bincount(regions.ravel(), minlength=count + 1) / depth.size, 0
-    sizes[0] = 0.0
+    regions, boxes = boxed(smooth(depth))
+    sizes, found = boxes[:, -1] / depth.size, 0
     for region in np.argsort(-sizes, kind="stable"):
         if sizes[region] < OBJECT_SHARE[0] or found == MOST_OBJECTS:
             break
-        if sizes[region] > OBJECT_SHARE[1]:
-            continue
-        inside = regions == region
-        far_m = np.median(depth[inside]) * (1 + EDGE_RELATIVE)
-        ring = widened(inside, 2 * RING + 1) & ~widened(inside, 2 * RING - 1) & (depth > 0)
-        if ring.any() and (depth[ring] > far_m).mean() >= FREE_AROUND:
+        if sizes[region] <= OBJECT_SHARE[1] and _stands_free(depth, regions, region + 1, boxes[region]):
             found += 1
-            yield inside
+            yield regions == region + 1
+
+
+def _stands_free(depth: Depth, regions: NDArray[np.int32], region: int, box: NDArray[np.int32]) -> bool:
+    """Return whether most of what is around a region of depth [h, w], m, is farther; box: of `boxed`."""
+    left, top, width, height, _ = box.tolist()
+    around = slice(max(top - RING, 0), top + height + RING), slice(max(left - RING, 0), left + width + RING)
+    near_m, inside = depth[around], regions[around] == region
+    own_m = near_m[inside]
+    far_m = np.partition(own_m, len(own_m) // 2)[len(own_m) // 2] * (1 + EDGE_RELATIVE)
+    ring = widened(inside, 2 * RING + 1) & ~widened(inside, 2 * RING - 1) & (near_m > 0)
+    return bool(ring.any()) and bool((near_m[ring] > far_m).mean() >= FREE_AROUND)
 
 
 def has_drawn(
@@ -142,7 +151,7 @@ def _fits_poorly(thing: Foreground, keyframe: Reference, seen: Sight, drawn: Pos
     the thing itself agrees better at the other pose."""
     alone = seen.live.hiding(thing.depth_m <= 0)
     at_drawn, at_found = (keyframe.compared(alone, fit.T_camera_world).correlation for fit in (drawn, found))
-    rest = keyframe.compared(seen.live.hiding(thing.hidden), drawn.T_camera_world)
+    rest = keyframe.compared(seen.hiding(thing), drawn.T_camera_world)
     return at_found > at_drawn and not may_draw(rest, drawn.comparison)
 
 
