@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sigmasplat.config import TrackingConfig
+from sigmasplat.config import MovingConfig, TrackingConfig
 from sigmasplat.fit.compare import Comparison
 from sigmasplat.fit.pose import PoseFit
 from sigmasplat.fit.pyramid import Pyramid
@@ -20,6 +20,7 @@ from sigmasplat.slam.localisation.foreground import Foreground, thinned
 from sigmasplat.slam.localisation.sight import Sight
 from sigmasplat.slam.localisation.two_motions import two_motions
 from sigmasplat.slam.localisation.verdict import is_missed
+from sigmasplat.slam.localisation.watch import Watch
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 CAMERA = Camera(160, 120, 140.0, 140.0, 79.5, 59.5)
@@ -162,3 +163,35 @@ def test_what_another_thing_hides_in_part_does_not_stand_free() -> None:
     assert len(list(free_standing(thinned(depth_m, 2)))) == 1
     depth_m[30:90, 20:60] = depth_m[20:40, 40:110] = depth_m[80:100, 40:110] = BOX_M / 2
     assert not any(inside[25:35, 35:45].any() for inside in free_standing(thinned(depth_m, 2)))
+
+
+def looked(watch: Watch, contradicted: bool = False, known: bool = False, drops: bool = False) -> bool:
+    """Return whether a watch finds the box that has drawn a pose, in the next frame."""
+    seen = sight(MOVED_M, MOVED_M)
+    return bool(
+        list(watch.suspected(keyframe(), seen, fitted(seen, BETWEEN_M), CONFIG, contradicted, known=known, drops=drops))
+    )
+
+
+def test_what_draws_the_pose_is_looked_for_less_often_while_nothing_moves() -> None:
+    seen, watch = sight(0.0, 0.0), Watch(MovingConfig(find=True))
+    box, plain, dropped = box_of(sight(MOVED_M, MOVED_M)), list[bool](), list[bool]()
+    for _ in range(24):
+        assert looked(watch, known=True) and looked(watch, contradicted=True)
+        plain.append(looked(watch))
+        dropped.append(looked(watch, drops=True))
+        watch = watch.after(seen, None, np.eye(4))
+    assert plain == [n % 2 == 0 for n in range(15)] + [n % 4 == 0 for n in range(15, 24)]
+    assert dropped == [True] * 15 + [n % 2 == 0 for n in range(15, 24)]
+    for front in (box, None, None):  # it moves again
+        watch = watch.after(seen, front, np.eye(4))
+    assert not looked(watch) and looked(watch, drops=True) and looked(watch.after(seen, None, np.eye(4)))
+
+
+def test_a_box_is_not_suspected_for_a_pose_where_depth_does_not_agree() -> None:
+    """A wall whose paint has moved: gray agrees better at a pose that depth contradicts, without the box or with it."""
+    seen = sight(MOVED_M, 0.0)
+    wall = seen.target.depth_image.numpy() == WALL_M
+    gray = np.where(wall, np.roll(seen.live.gray[0], 6, 1), seen.live.gray[0])
+    painted = replace(seen, live=Pyramid.of(gray, seen.target.depth_image.numpy(), CAMERA))
+    assert not list(suspected(keyframe(), painted, fitted(painted, MOVED_M), CONFIG, every=False))
