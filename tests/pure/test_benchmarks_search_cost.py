@@ -20,7 +20,6 @@ def test_ratios_are_those_of_pairs() -> None:
 
 
 def test_all_frames_run_with_and_without_the_search() -> None:
-    """The runs that warm up are not kept."""
     options = search_cost.Options(pairs=2, settings=("mapping.iterations=1", "mapping.first_iterations=2"))
     found = search_cost.measure_source("synthetic:frames=4,width=64,height=48", options)
     assert found["frames"] == 4 and len(found["pairs"]) == 2

@@ -33,7 +33,7 @@ SAME_POSE = 1e-6
 
 DRAWN_EVERY, QUIET_FRAMES, QUIET_EVERY = 2, 15, 4
 """What draws the pose is looked for in every second frame: between keyframes, a wrong pose does not last. After so many
-frames in which nothing was in front, in every fourth. If gray values drop, twice as often."""
+frames in which nothing was in front, in every fourth."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,18 +90,18 @@ class Watch:
     ) -> Iterator[Foreground]:  # fmt: skip
         """Yield the things in front that may have drawn a pose: those without which the rest agrees better, there or at
         another pose; if the images contradict it, all. Without contradiction, some frames are looked at, and all after
-        one in which something was in front (`known`). drops: the gray values agree much less than usual."""
+        one in which something was in front (`known`), or in which the gray values agree much less than usual
+        (`drops`)."""
         if keyframe is None or fit.comparison is None:
             return
-        looks = (known or self._is_turn(drops)) and differs(fit.comparison)
+        looks = (known or drops or self._is_turn()) and differs(fit.comparison)
         if not (contradicted or looks):
             return
         yield from suspected(keyframe, seen, fit, config, contradicted)
 
-    def _is_turn(self, drops: bool) -> bool:
-        """Return whether what draws the pose is looked for in this frame."""
-        every = DRAWN_EVERY if self.memory.quiet < QUIET_FRAMES else QUIET_EVERY
-        return self.memory.frames % (every // 2 if drops else every) == 0
+    def _is_turn(self) -> bool:
+        """Return whether what draws the pose is looked for in this frame although nothing is known to move."""
+        return self.memory.frames % (DRAWN_EVERY if self.memory.quiet < QUIET_FRAMES else QUIET_EVERY) == 0
 
     def takes_for_moving(self, front: Foreground | None, keyframe: Reference | None, seen: Sight, fit: PoseFit) -> bool:
         """Return whether what is in front moves, by a fit without it: a still thing can seem to be in free space where
