@@ -165,25 +165,30 @@ def test_what_another_thing_hides_in_part_does_not_stand_free() -> None:
     assert not any(inside[25:35, 35:45].any() for inside in free_standing(thinned(depth_m, 2)))
 
 
-def looked(watch: Watch, contradicted: bool = False, known: bool = False, drops: bool = False) -> bool:
-    """Return whether a watch finds the box that has drawn a pose, in the next frame."""
+def look(watch: Watch, contradicted: bool = False, urgent: bool = False) -> tuple[Watch, bool]:
+    """Return the watch after a look for the box that has drawn a pose, and whether it finds it."""
     seen = sight(MOVED_M, MOVED_M)
-    return bool(
-        list(watch.suspected(keyframe(), seen, fitted(seen, BETWEEN_M), CONFIG, contradicted, known=known, drops=drops))
-    )
+    later, things = watch.suspected(keyframe(), seen, fitted(seen, BETWEEN_M), CONFIG, contradicted, urgent)
+    return later, bool(list(things))
 
 
-def test_what_draws_the_pose_is_looked_for_less_often_while_nothing_moves() -> None:
+def test_what_draws_the_pose_is_looked_for_less_often_after_looks_in_vain() -> None:
     seen, watch = sight(0.0, 0.0), Watch(MovingConfig(find=True))
-    box, plain = box_of(sight(MOVED_M, MOVED_M)), list[bool]()
-    for _ in range(24):
-        assert looked(watch, known=True) and looked(watch, contradicted=True) and looked(watch, drops=True)
-        plain.append(looked(watch))
+    box, found = box_of(sight(MOVED_M, MOVED_M)), list[bool]()
+    for _ in range(16):
+        assert all(look(watch, **{why: True})[1] for why in ("contradicted", "urgent"))
+        watch, looked = look(watch)
+        found.append(looked)
         watch = watch.after(seen, None, np.eye(4))
-    assert plain == [n % 2 == 0 for n in range(15)] + [n % 4 == 0 for n in range(15, 24)]
-    for front in (box, None, None):  # it moves again
+    assert found == [n % (2 if n < 8 else 4) == 0 for n in range(16)]
+    for front in (box, None):  # something was in front: frame 18 is looked at again
         watch = watch.after(seen, front, np.eye(4))
-    assert not looked(watch) and looked(watch.after(seen, None, np.eye(4)))
+    assert look(watch)[1] and not look(watch.after(seen, None, np.eye(4)))[1]
+    for _ in range(30):  # where nothing differs, nothing is looked for
+        watch, things = watch.suspected(keyframe(), seen, fitted(seen, 0.0), CONFIG, False, False)
+        assert not list(things)
+        watch = watch.after(seen, None, np.eye(4))
+    assert look(watch)[1] and not look(watch.after(seen, None, np.eye(4)))[1]
 
 
 def test_a_box_is_not_suspected_for_a_pose_where_depth_does_not_agree() -> None:

@@ -170,8 +170,8 @@ class Tracker:
     ) -> tuple[PoseFit, Sight] | None:
         """Return the fit and the frame without the thing that moves and has drawn the pose with it; None if there is
         none. known: the last frame had something in front."""
-        contradicted, drops = self._contradicted(drawn), self.usual.agrees_less(drawn.comparison)
-        things = self.watch.suspected(self.keyframe, seen, drawn, self.config, contradicted, known, drops)
+        contradicted, urgent = self._contradicted(drawn), known or self.usual.agrees_less(drawn.comparison)
+        self.watch, things = self.watch.suspected(self.keyframe, seen, drawn, self.config, contradicted, urgent)
         for front in unless(hurried, things):
             found = self._fit(field, view, shown := seen.aside(front), predicted)
             if self._stands(found, predicted) and has_drawn(front, self.keyframe, seen, drawn, found, contradicted):

@@ -43,22 +43,19 @@ class Seen:
 
 @dataclass(frozen=True, eq=False)
 class Memory:
-    """The number of frames so far, what some recent ones saw, the newest last, and the number of frames since something
-    was in front."""
+    """The number of frames so far, and what some recent ones saw, the newest last."""
 
     frames: int = 0
     seen: tuple[Seen, ...] = ()
-    quiet: int = 0
 
     def after(self, depth_m: Depth, front: Foreground | None, T_world_camera: Matrix, most_frames: int) -> "Memory":
         """Return the memory after one more frame, of at most `most_frames`."""
-        quiet = self.quiet + 1 if front is None else 0
         if self.frames % EVERY:
-            return replace(self, frames=self.frames + 1, quiet=quiet)
+            return replace(self, frames=self.frames + 1)
         scene_m = depth_m if front is None else np.where(front.hidden, front.scene_m, depth_m)
         kept = max(AGES[-1], most_frames // EVERY + 1)
         seen = (*self.seen, Seen(self.frames, depth_m, scene_m, T_world_camera))[-kept:]
-        return Memory(self.frames + 1, seen, quiet)
+        return Memory(self.frames + 1, seen)
 
     def moved_by(self, T_new_old: Matrix) -> "Memory":
         """Return the memory in other coordinates [4, 4]."""

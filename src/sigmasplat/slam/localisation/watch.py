@@ -31,19 +31,21 @@ RENEWED = 0.7
 SAME_POSE = 1e-6
 """Two keyframes whose poses differ by less than this are the same frame."""
 
-DRAWN_EVERY, QUIET_FRAMES, QUIET_EVERY = 2, 15, 4
+DRAWN_EVERY, IN_VAIN, SELDOM = 2, 4, 4
 """What draws the pose is looked for in every second frame: between keyframes, a wrong pose does not last. After so many
-frames in which nothing was in front, in every fourth."""
+looks in vain, in every fourth."""
 
 
 @dataclass(frozen=True, eq=False)
 class Watch:
-    """What is known of moving things between two frames: what recent frames saw, and the keyframes before the newest
-    one, the newest last. Without `config.find` nothing is remembered."""
+    """What is known of moving things between two frames: what recent frames saw, the keyframes before the newest one,
+    the newest last, and how often something that draws the pose was looked for since something was in front. Without
+    `config.find` nothing is remembered."""
 
     config: MovingConfig = field(default_factory=MovingConfig)
     memory: Memory = field(default_factory=Memory)
     earlier: tuple[Reference, ...] = ()
+    looks: int = 0
 
     def suspects(self, found: Comparison, known: Foreground | None, hurried: Asked) -> bool:
         """Return whether something may be in front of the scene, or may have left its place in it; known: what was
@@ -86,22 +88,20 @@ class Watch:
 
     def suspected(
         self, keyframe: Reference | None, seen: Sight, fit: PoseFit, config: TrackingConfig, contradicted: bool,
-        known: bool, drops: bool,
-    ) -> Iterator[Foreground]:  # fmt: skip
-        """Yield the things in front that may have drawn a pose: those without which the rest agrees better, there or at
-        another pose; if the images contradict it, all. Without contradiction, some frames are looked at, and all after
-        one in which something was in front (`known`), or in which the gray values agree much less than usual
-        (`drops`)."""
-        if keyframe is None or fit.comparison is None:
-            return
-        looks = (known or drops or self._is_turn()) and differs(fit.comparison)
-        if not (contradicted or looks):
-            return
-        yield from suspected(keyframe, seen, fit, config, contradicted)
+        urgent: bool,
+    ) -> tuple["Watch", Iterator[Foreground]]:  # fmt: skip
+        """Return the watch after a look, and the things in front that may have drawn a pose: those without which the
+        rest agrees better, there or at another pose; if the images contradict it, all.
 
-    def _is_turn(self) -> bool:
-        """Return whether what draws the pose is looked for in this frame although nothing is known to move."""
-        return self.memory.frames % (DRAWN_EVERY if self.memory.quiet < QUIET_FRAMES else QUIET_EVERY) == 0
+        Without contradiction, some frames are looked at. urgent: this one is, if gray values differ: something was in
+        front in the last one, or gray values agree much less than usual.
+        """
+        if keyframe is None or fit.comparison is None:
+            return self, iter(())
+        turn = self.memory.frames % (DRAWN_EVERY if self.looks < IN_VAIN else SELDOM) == 0
+        if not (contradicted or ((urgent or turn) and differs(fit.comparison))):
+            return self, iter(())
+        return replace(self, looks=self.looks + 1), suspected(keyframe, seen, fit, config, contradicted)
 
     def takes_for_moving(self, front: Foreground | None, keyframe: Reference | None, seen: Sight, fit: PoseFit) -> bool:
         """Return whether what is in front moves, by a fit without it: a still thing can seem to be in free space where
@@ -150,7 +150,8 @@ class Watch:
         if not self.config.find:
             return self
         depth_m, most = seen.target.depth_image.numpy(), self.config.still_frames
-        return replace(self, memory=self.memory.after(depth_m, front, T_world_camera, most))
+        memory = self.memory.after(depth_m, front, T_world_camera, most)
+        return replace(self, memory=memory, looks=self.looks if front is None else 0)
 
     def still_moving(self, front: Foreground | None, seen: Sight, T_world_camera: Matrix) -> Foreground | None:
         """Return what is in front without what has come to rest, which is part of the scene again."""
