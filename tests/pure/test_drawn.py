@@ -174,13 +174,15 @@ def look(watch: Watch, contradicted: bool = False, urgent: bool = False) -> tupl
 
 def test_what_draws_the_pose_is_looked_for_less_often_after_looks_in_vain() -> None:
     seen, watch = sight(0.0, 0.0), Watch(MovingConfig(find=True))
-    box, found = box_of(sight(MOVED_M, MOVED_M)), list[bool]()
+    box, found, urgent = box_of(sight(MOVED_M, MOVED_M)), list[bool](), list[bool]()
     for _ in range(16):
-        assert all(look(watch, **{why: True})[1] for why in ("contradicted", "urgent"))
+        assert look(watch, contradicted=True)[1]
+        urgent.append(look(watch, urgent=True)[1])
         watch, looked = look(watch)
         found.append(looked)
         watch = watch.after(seen, None, np.eye(4))
     assert found == [n % (2 if n < 8 else 4) == 0 for n in range(16)]
+    assert urgent == [n < 7 or n % 2 == 0 for n in range(16)]
     for front in (box, None):  # something was in front: frame 18 is looked at again
         watch = watch.after(seen, front, np.eye(4))
     assert look(watch)[1] and not look(watch.after(seen, None, np.eye(4)))[1]

@@ -109,8 +109,9 @@ def _sees_through(means_m: NDArray[np.float32], keyframe: Keyframe) -> Mask:
     """Return which splats with means [n, 3] m a keyframe sees through."""
     depth_m, T_camera_world = keyframe.target.depth_image.numpy(), se3.inverse(keyframe.T_world_camera)
     free = free_places(means_m.T, T_camera_world, depth_m, keyframe.target.camera)
-    depth, _, _, at = _on_keyframe(means_m[free], keyframe)
-    free[free] = np.take(depth, at) > 0
+    if free.any():
+        depth, _, _, at = _on_keyframe(means_m[free], keyframe)
+        free[free] = np.take(depth, at) > 0
     return free
 
 

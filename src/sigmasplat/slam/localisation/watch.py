@@ -31,9 +31,9 @@ RENEWED = 0.7
 SAME_POSE = 1e-6
 """Two keyframes whose poses differ by less than this are the same frame."""
 
-DRAWN_EVERY, IN_VAIN, SELDOM = 2, 4, 4
-"""What draws the pose is looked for in every second frame: between keyframes, a wrong pose does not last. After so many
-looks in vain, in every fourth."""
+DRAWN_EVERY, IN_VAIN = 2, 4
+"""What draws the pose is looked for in every second frame, in every one if it is urgent: between keyframes, a wrong
+pose does not last. After so many looks in vain, half as often."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,13 +93,13 @@ class Watch:
         """Return the watch after a look, and the things in front that may have drawn a pose: those without which the
         rest agrees better, there or at another pose; if the images contradict it, all.
 
-        Without contradiction, some frames are looked at. urgent: this one is, if gray values differ: something was in
-        front in the last one, or gray values agree much less than usual.
+        Without contradiction, frames in which gray values differ are looked at by turns. urgent: something was in front
+        in the last one, or gray values agree much less than usual.
         """
         if keyframe is None or fit.comparison is None:
             return self, iter(())
-        turn = self.memory.frames % (DRAWN_EVERY if self.looks < IN_VAIN else SELDOM) == 0
-        if not (contradicted or ((urgent or turn) and differs(fit.comparison))):
+        every = (1 if urgent else DRAWN_EVERY) * (1 if self.looks < IN_VAIN else 2)
+        if not (contradicted or (self.memory.frames % every == 0 and differs(fit.comparison))):
             return self, iter(())
         return replace(self, looks=self.looks + 1), suspected(keyframe, seen, fit, config, contradicted)
 
