@@ -181,8 +181,8 @@ def test_what_draws_the_pose_is_looked_for_less_often_after_looks_in_vain() -> N
         watch, looked = look(watch)
         found.append(looked)
         watch = watch.after(seen, None, np.eye(4))
-    assert found == [n % (2 if n < 8 else 4) == 0 for n in range(16)]
-    assert urgent == [n < 7 or n % 2 == 0 for n in range(16)]
+    assert found == [n % (2 if n < 6 else 4) == 0 for n in range(16)]
+    assert urgent == [n < 5 or n % 2 == 0 for n in range(16)]
     for front in (box, None):  # something was in front: frame 18 is looked at again
         watch = watch.after(seen, front, np.eye(4))
     assert look(watch)[1] and not look(watch.after(seen, None, np.eye(4)))[1]

@@ -31,7 +31,7 @@ RENEWED = 0.7
 SAME_POSE = 1e-6
 """Two keyframes whose poses differ by less than this are the same frame."""
 
-DRAWN_EVERY, IN_VAIN = 2, 4
+DRAWN_EVERY, IN_VAIN = 2, 3
 """What draws the pose is looked for in every second frame, in every one if it is urgent: between keyframes, a wrong
 pose does not last. After so many looks in vain, half as often."""
 
