@@ -90,7 +90,9 @@ def sections(measured: dict[str, Any]) -> list[Section]:
         for clock, text in CLOCKS.items()
     ]
     pairs = measured["config"]["pairs"]
-    note = f"All frames, without the final map; medians of {pairs} pairs of runs, frame by frame by turns."
+    note = (
+        f"Time of all frames, without the final map: medians of {pairs} pairs of runs. Each frame goes to both in turn."
+    )
     return [Section("Cost of the search where nothing moves", head, rows, note)]
 
 

@@ -71,8 +71,8 @@ class Pyramid:
         )  # fmt: skip
 
     def hiding(self, hidden: Any) -> "Pyramid":
-        """Return the same images for comparisons that leave out these pixels [H, W] of the finest size: each level has
-        `HIDDEN_M` there."""
+        """Return the same images for comparisons and quick fits that leave out these pixels [H, W] of the finest size:
+        each level has `HIDDEN_M` there."""
         return replace(self, depth=[self._hidden(depth, hidden) for depth in self.depth])
 
     def _hidden(self, depth: Plane, hidden: Any) -> Plane:

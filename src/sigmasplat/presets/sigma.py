@@ -28,7 +28,7 @@ SIGMA = varsplat.FAST.changed(
         "scale_factor": 0.65,  # with the slower change of sizes, larger seeds blur submaps
     },
     tracking={"features": True, "verify": True, "sensor_noise": True},
-    moving={"find": True},  # at most 3 % of the time of frames in a recording in which nothing moves
+    moving={"find": True},  # up to 3 % of the time where nothing moves (benchmarks/search_cost.py)
     recovery={"relocalise": True, "new_map_after": 20, "steady_frames": 2},
     # Descent hardly ever finds a keyframe that alignment does not find, and takes half of the time of a search.
     registration={"to_keyframe": True, "iterations": 0},

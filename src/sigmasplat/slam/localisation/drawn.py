@@ -27,7 +27,7 @@ from sigmasplat.slam.localisation.free_space import Depth, Mask
 from sigmasplat.slam.localisation.sight import Sight
 from sigmasplat.slam.localisation.two_motions import two_motions
 from sigmasplat.slam.localisation.verdict import agrees_more, differs, disagrees, gray_gain, may_draw
-from sigmasplat.slam.localisation.windows import boxed, widened
+from sigmasplat.slam.localisation.windows import boxed, upper_median, widened
 from sigmasplat.types import Matrix
 
 OBJECT_SHARE, MOST_OBJECTS = (0.02, 0.7), 3
@@ -57,8 +57,7 @@ def suspected(
     """Yield the things in front that may have drawn a pose; with `every`, all that stand free."""
     live_m = seen.target.depth_image.numpy()
     for inside in free_standing(thinned(live_m, STEP)):
-        thing = _front(*with_margin(inside, STEP, live_m), live_m)
-        if every or _may_have_drawn(thing, keyframe, seen, fit, config):
+        if every or _may_have_drawn(_front(*with_margin(inside, STEP, live_m), live_m), keyframe, seen, fit, config):
             yield _front(*enlarged(inside, STEP, live_m), live_m)
 
 
@@ -106,8 +105,7 @@ def _stands_free(depth: Depth, regions: NDArray[np.int32], region: int, box: NDA
     left, top, width, height, _ = box.tolist()
     around = slice(max(top - RING, 0), top + height + RING), slice(max(left - RING, 0), left + width + RING)
     near_m, inside = depth[around], regions[around] == region
-    own_m = near_m[inside]
-    far_m = np.partition(own_m, len(own_m) // 2)[len(own_m) // 2] * (1 + EDGE_RELATIVE)
+    far_m = upper_median(near_m[inside]) * (1 + EDGE_RELATIVE)
     ring = widened(inside, 2 * RING + 1) & ~widened(inside, 2 * RING - 1) & (near_m > 0)
     return bool(ring.any()) and bool((near_m[ring] > far_m).mean() >= FREE_AROUND)
 

@@ -22,7 +22,14 @@ from sigmasplat.slam.localisation.free_space import (
     free_places,
     on_image,
 )
-from sigmasplat.slam.localisation.windows import labelled, largest_around, largest_label, least_around, widened
+from sigmasplat.slam.localisation.windows import (
+    labelled,
+    largest_around,
+    largest_label,
+    least_around,
+    upper_median,
+    widened,
+)
 from sigmasplat.slam.rules import angle_between
 from sigmasplat.types import Matrix
 
@@ -89,8 +96,7 @@ class Earlier:
         read = live_m[live_m > 0]
         if not len(read):
             return self
-        middle = len(read) // 2
-        moved_rad = angle_between(np.eye(4), self.T_earlier_live, float(np.partition(read, middle)[middle]))
+        moved_rad = angle_between(np.eye(4), self.T_earlier_live, float(upper_median(read)))
         return replace(self, further_px=int(POSE_ERROR * camera.fx * moved_rad))
 
 

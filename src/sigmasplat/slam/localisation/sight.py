@@ -56,13 +56,17 @@ class Sight:
         ignored."""
         depth_m = self.target.depth_image.numpy()
         unread = self if front is None else self._read_as(np.where(front.hidden, np.float32(0.0), depth_m))
-        hidden = np.zeros((), np.bool_) if front is None else front.hidden
-        hidden = hidden if self.ignored is None else hidden | self.ignored
-        return replace(unread, live=self.live.with_depth(np.where(hidden, np.float32(HIDDEN_M), depth_m)))
+        hidden_m = np.where(self._unused(front), np.float32(HIDDEN_M), depth_m)
+        return replace(unread, live=self.live.with_depth(hidden_m))
 
     def hiding(self, front: Foreground) -> Pyramid:
         """Return the images for comparisons and quick fits without what is in front or ignored."""
-        return self.live.hiding(front.hidden if self.ignored is None else front.hidden | self.ignored)
+        return self.live.hiding(self._unused(front))
+
+    def _unused(self, front: Foreground | None) -> NDArray[np.bool_]:
+        """Return the pixels [H, W] of what is in front or ignored; without both, a single False."""
+        hidden = np.zeros((), np.bool_) if front is None else front.hidden
+        return hidden if self.ignored is None else hidden | self.ignored
 
     def separate(self) -> Self:
         """Return the same frame with an own image for features, which are found and kept when they are first needed."""

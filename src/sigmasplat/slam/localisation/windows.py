@@ -1,5 +1,5 @@
-"""Least and largest values in a window around each pixel, and connected regions. OpenCV needs a twentieth of SciPy's
-time for the first, and less than SciPy for the second."""
+"""Least and largest values in a window around each pixel, connected regions, and a quick median. OpenCV needs a
+twentieth of SciPy's time for the first, and less than SciPy for the second."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +44,12 @@ def largest_label(labels: NDArray[np.int32], count: int) -> NDArray[np.int32]:
     """Return the largest label in a window of 3 pixels around each pixel [H, W]; labels are at most `count` ≤ 2²⁴."""
     exact = np.uint16 if count <= np.iinfo(np.uint16).max else np.float32
     return np.asarray(opencv().dilate(labels.astype(exact), _window(3)), np.int32)
+
+
+def upper_median(values: Depth) -> np.float32:
+    """Return the median of values [n], n > 0, the larger one of two: `np.median` needs twice the time."""
+    middle = len(values) // 2
+    return np.float32(np.partition(values, middle)[middle])
 
 
 def _window(size: int) -> NDArray[np.uint8]:
