@@ -21,8 +21,8 @@ from sigmasplat.commands import options as described
 from sigmasplat.commands.bench import DEFAULT_PRESET, Ablation
 from sigmasplat.commands.input_options import Limit
 from sigmasplat.errors import SigmaSplatError
-from sigmasplat.evaluation.ablation import COMPARED, NAMES, WITHOUT_VARIANCE
-from sigmasplat.evaluation.paired_comparison import FIGURES, columns, paired_differences, passed_by_chance, rows
+from sigmasplat.plugins.evaluation.ablation import COMPARED, NAMES, WITHOUT_VARIANCE
+from sigmasplat.plugins.evaluation.paired_comparison import FIGURES, columns, paired_differences, passed_by_chance, rows
 
 arg = tyro.conf.arg
 SYNTHETIC = "synthetic:frames=240,overrun=20,noise=1,drift=6,seed={seed}"

@@ -24,10 +24,10 @@ import tyro
 
 import sigmasplat
 from sigmasplat.commands.options import Settings
+from sigmasplat.config.presets import default_preset, preset as preset_of
 from sigmasplat.config.text import override, split_settings
 from sigmasplat.errors import SigmaSplatError
-from sigmasplat.io.machine import INSTALLED, code_digest
-from sigmasplat.presets import default_preset, preset as preset_of
+from sigmasplat.files.machine import INSTALLED, code_digest
 
 arg = tyro.conf.arg
 SYNTHETIC = "synthetic:frames=200"

@@ -26,16 +26,16 @@ from tables import Section
 
 from sigmasplat.commands.options import Settings
 from sigmasplat.config import InputConfig, RenderConfig
-from sigmasplat.evaluation.view_selection import working_frame
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.metrics.trajectory import aligned_poses, associate
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.field import GaussianField
-from sigmasplat.model.frame import Frame
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.field import GaussianField
+from sigmasplat.data.frame import Frame
+from sigmasplat.plugins.evaluation.metrics.trajectory import aligned_poses, associate
+from sigmasplat.plugins.evaluation.view_selection import working_frame
+from sigmasplat.plugins.sources.synthetic import open_synthetic
 from sigmasplat.render import render
 from sigmasplat.render.reference.operators import project
-from sigmasplat.sources.synthetic import open_synthetic
+from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.types import Matrix
 
 arg = tyro.conf.arg

@@ -24,10 +24,10 @@ from pose_gradient import ONE_MAP, RATES
 import sigmasplat
 from sigmasplat.commands.options import Settings
 from sigmasplat.config import Config
+from sigmasplat.config.presets import preset
 from sigmasplat.config.text import override, split_settings
 from sigmasplat.errors import ConfigError, SigmaSplatError
-from sigmasplat.io.machine import INSTALLED, code_digest
-from sigmasplat.presets import preset
+from sigmasplat.files.machine import INSTALLED, code_digest
 
 arg = tyro.conf.arg
 ROOM = "synthetic:frames=200,width=160,height=120,noise=1,seed={seed}"

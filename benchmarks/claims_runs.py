@@ -10,21 +10,21 @@ from drift_rule import ADDED, hops_of
 from localise import Search, disturbed
 from weights_runs import VIEWS, mean, registrations, rendered, true_submaps
 
-from sigmasplat.evaluation.finished_run import FinishedRun
-from sigmasplat.evaluation.unseen_views import UnseenView, held_back_views
+from sigmasplat.data import se3
 from sigmasplat.fit.pose import fit_pose_adam
 from sigmasplat.fit.target import Target
-from sigmasplat.metrics.scored_view import ScoredView
-from sigmasplat.metrics.splats import score_splats
-from sigmasplat.metrics.trajectory import align_rigid, associate, score_path
-from sigmasplat.metrics.uncertainty import spearman
-from sigmasplat.metrics.views import sample_pixels, score_uncertainty
-from sigmasplat.model import se3
-from sigmasplat.slam.loop_closure.registration import tracking_of
-from sigmasplat.slam.predicted_submaps import PredictedSubmaps
+from sigmasplat.graph.registration import tracking_of
+from sigmasplat.input.source import Source
+from sigmasplat.plugins.evaluation.finished_run import FinishedRun
+from sigmasplat.plugins.evaluation.metrics.scored_view import ScoredView
+from sigmasplat.plugins.evaluation.metrics.splats import score_splats
+from sigmasplat.plugins.evaluation.metrics.trajectory import align_rigid, associate, score_path
+from sigmasplat.plugins.evaluation.metrics.uncertainty import spearman
+from sigmasplat.plugins.evaluation.metrics.views import sample_pixels, score_uncertainty
+from sigmasplat.plugins.evaluation.unseen_views import UnseenView, held_back_views
+from sigmasplat.plugins.sources import open_source
 from sigmasplat.slam.slam import Slam
-from sigmasplat.sources import open_source
-from sigmasplat.sources.base import Source
+from sigmasplat.uncertainty.predicted_submaps import PredictedSubmaps
 
 Rows = list[dict[str, Any]]
 Settings = dict[str, tuple[str, ...]]

@@ -15,7 +15,7 @@ from claims_evidence import Claim, Evidence
 from claims_papers import ATE, CHAMFER, CPU, DEPTH, ERROR, FLOATERS, HOPS, PAPERS, PSNR, RANK, SPLATS, STEPS
 from tables import Section
 
-from sigmasplat.evaluation.paired_comparison import (
+from sigmasplat.plugins.evaluation.paired_comparison import (
     Figure,
     PairedDifference,
     by_seed,

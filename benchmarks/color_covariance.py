@@ -26,18 +26,18 @@ from tables import Section
 from torch import Tensor
 
 from sigmasplat.config import Config, SubmapConfig
+from sigmasplat.config.presets import default_preset, preset as preset_of
+from sigmasplat.data import se3
+from sigmasplat.data.color_covariance import correlations_of
+from sigmasplat.data.field import GaussianField
+from sigmasplat.data.frame import Frame
 from sigmasplat.errors import SourceError
 from sigmasplat.fit import losses
-from sigmasplat.metrics import views
-from sigmasplat.metrics.scored_view import COVERED_ALPHA, ScoredView
-from sigmasplat.model import se3
-from sigmasplat.model.color_covariance import correlations_of
-from sigmasplat.model.field import GaussianField
-from sigmasplat.model.frame import Frame
-from sigmasplat.presets import default_preset, preset as preset_of
+from sigmasplat.plugins.evaluation.metrics import views
+from sigmasplat.plugins.evaluation.metrics.scored_view import COVERED_ALPHA, ScoredView
+from sigmasplat.plugins.sources import open_source
 from sigmasplat.render import Render, render
 from sigmasplat.slam.slam import Slam
-from sigmasplat.sources import open_source
 
 arg = tyro.conf.arg
 EXCLUDED = {"weight_moment": 0.0, "weight_alignment": 0.0}

@@ -36,17 +36,17 @@ from tables import Section
 
 from sigmasplat.commands.options import Settings
 from sigmasplat.config import Config, InputConfig
-from sigmasplat.metrics.image import psnr
-from sigmasplat.metrics.trajectory import associate, ate
-from sigmasplat.model import se3
-from sigmasplat.model.frame import Frame
-from sigmasplat.presets import default_preset
+from sigmasplat.config.presets import default_preset
+from sigmasplat.data import se3
+from sigmasplat.data.frame import Frame
+from sigmasplat.input.source import Source, Subset
+from sigmasplat.plugins.evaluation.metrics.image import psnr
+from sigmasplat.plugins.evaluation.metrics.trajectory import associate, ate
+from sigmasplat.plugins.sources import open_source
+from sigmasplat.plugins.sources.room.mover import CENTER_M, mover
+from sigmasplat.plugins.sources.room.sensor import measured_color, measured_depth
 from sigmasplat.render import render
-from sigmasplat.slam.localisation.sight import working_frame
-from sigmasplat.sources import open_source
-from sigmasplat.sources.base import Source, Subset
-from sigmasplat.sources.room.mover import CENTER_M, mover
-from sigmasplat.sources.room.sensor import measured_color, measured_depth
+from sigmasplat.tracking.sight import working_frame
 
 arg = tyro.conf.arg
 AWAY = 0.6

@@ -25,7 +25,8 @@ from tables import Section
 
 import sigmasplat
 from sigmasplat.errors import ConfigError, SigmaSplatError
-from sigmasplat.evaluation.paired_comparison import (
+from sigmasplat.files.machine import INSTALLED, code_digest
+from sigmasplat.plugins.evaluation.paired_comparison import (
     Figure,
     PairedDifference,
     best,
@@ -34,8 +35,7 @@ from sigmasplat.evaluation.paired_comparison import (
     passed_by_chance,
     rows,
 )
-from sigmasplat.io.machine import INSTALLED, code_digest
-from sigmasplat.report.tables import number
+from sigmasplat.run.figures import number
 
 arg = tyro.conf.arg
 SCENES: dict[str, tuple[str, int | None]] = {

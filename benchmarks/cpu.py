@@ -23,7 +23,7 @@ import record
 import tyro
 
 from sigmasplat.errors import SigmaSplatError
-from sigmasplat.io.machine import usable_cores
+from sigmasplat.files.machine import usable_cores
 
 arg = tyro.conf.arg
 REFERENCE, QUICK_REFERENCE = 20_000, 4_000

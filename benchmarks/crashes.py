@@ -30,11 +30,11 @@ from PIL import Image
 from tables import Section
 
 from sigmasplat.errors import SigmaSplatError, SourceError
-from sigmasplat.io.mesh import read_mesh
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.io.splats.any_format import read_any
-from sigmasplat.io.tensors import open_tensors
-from sigmasplat.io.trajectory import read_trajectory
+from sigmasplat.files.tensors import open_tensors
+from sigmasplat.plugins.outputs.meshes.mesh_files import read_mesh
+from sigmasplat.plugins.outputs.splats.any_format import read_any
+from sigmasplat.run_folder.runs import RunFolder
+from sigmasplat.run_folder.trajectory import read_trajectory
 
 arg = tyro.conf.arg
 KILLED = -9

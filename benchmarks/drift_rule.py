@@ -24,13 +24,13 @@ from tables import Section, significant
 
 from sigmasplat.commands.options import Settings
 from sigmasplat.config import Config, SubmapConfig
+from sigmasplat.config.presets import default_preset, preset as preset_of
 from sigmasplat.config.text import override, split_settings
-from sigmasplat.metrics.trajectory import associate
-from sigmasplat.metrics.uncertainty import spearman
-from sigmasplat.model import se3
-from sigmasplat.presets import default_preset, preset as preset_of
+from sigmasplat.data import se3
+from sigmasplat.plugins.evaluation.metrics.trajectory import associate
+from sigmasplat.plugins.evaluation.metrics.uncertainty import spearman
+from sigmasplat.plugins.sources import open_source
 from sigmasplat.slam.slam import Slam
-from sigmasplat.sources import open_source
 
 arg = tyro.conf.arg
 Matrix = NDArray[np.float64]

@@ -32,11 +32,11 @@ from tables import Section, significant
 
 from sigmasplat.commands.options import Settings
 from sigmasplat.config import Config
+from sigmasplat.config.presets import default_preset, preset as preset_of
 from sigmasplat.config.text import override, split_settings
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.presets import default_preset, preset as preset_of
+from sigmasplat.plugins.sources import open_source
 from sigmasplat.run.protocols import NullCallback, StepResult
-from sigmasplat.sources import open_source
+from sigmasplat.run_folder.runs import RunFolder
 
 arg = tyro.conf.arg
 SOURCE = "synthetic:frames=300,noise=1,width=64,height=48"

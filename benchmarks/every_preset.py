@@ -19,9 +19,9 @@ from accuracy_tables import failures
 from tables import Section, significant
 
 from sigmasplat.config import Config
+from sigmasplat.config.presets import list_presets, preset as preset_of
 from sigmasplat.errors import SigmaSplatError
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.presets import list_presets, preset as preset_of
+from sigmasplat.run_folder.runs import RunFolder
 
 arg = tyro.conf.arg
 SMALL = {"input.width": 160}

@@ -25,19 +25,19 @@ from tables import Section, significant
 
 from sigmasplat.commands.export import ExportOptions
 from sigmasplat.commands.options import source_of
+from sigmasplat.data.field import GaussianField
+from sigmasplat.data.frame import Frame
+from sigmasplat.data.mesh import Mesh
+from sigmasplat.data.selection import evenly_spread
 from sigmasplat.errors import SigmaSplatError, SourceError
-from sigmasplat.evaluation.reconstruct import FusionInput
-from sigmasplat.evaluation.view_selection import working_frame
-from sigmasplat.exports.formats import FORMATS, ExportSource, choose
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.io.splats.any_format import read_any
-from sigmasplat.metrics import views
-from sigmasplat.model.field import GaussianField
-from sigmasplat.model.frame import Frame
-from sigmasplat.model.mesh import Mesh
-from sigmasplat.model.selection import evenly_spread
+from sigmasplat.input.source import Source
+from sigmasplat.plugins.evaluation.metrics import views
+from sigmasplat.plugins.evaluation.reconstruct import FusionInput
+from sigmasplat.plugins.evaluation.view_selection import working_frame
+from sigmasplat.plugins.outputs.formats import FORMATS, ExportSource, choose
+from sigmasplat.plugins.outputs.splats.any_format import read_any
 from sigmasplat.render import FieldRenderer
-from sigmasplat.sources.base import Source
+from sigmasplat.run_folder.runs import RunFolder
 
 arg = tyro.conf.arg
 VOXEL_M = 0.04

@@ -1,4 +1,4 @@
-"""Fit the weights of the probability that a pose is off by more than 5 cm (slam/localisation/confidence.py).
+"""Fit the weights of the probability that a pose is off by more than 5 cm (graph/confidence.py).
 
 The data are disturbed recordings with known truth, kept by benchmarks/robustness.py --keep DIR. A model that is fitted
 to all sequences but one is judged on that one. Writes benchmarks/results/<name>-<machine>.json and prints the weights,
@@ -24,8 +24,8 @@ from scipy.optimize import minimize
 from scipy.special import expit
 from tables import Section, significant
 
-from sigmasplat.metrics.failures import OFF_M, brier
-from sigmasplat.slam.localisation.confidence import NEVER_LOST, WEIGHTS, evidence
+from sigmasplat.graph.confidence import NEVER_LOST, WEIGHTS, evidence
+from sigmasplat.plugins.evaluation.metrics.failures import OFF_M, brier
 
 arg = tyro.conf.arg
 SHRINK = 1.0

@@ -28,21 +28,21 @@ from tables import Section
 import sigmasplat
 from sigmasplat.commands.options import Settings
 from sigmasplat.config import Config
+from sigmasplat.config.presets import default_preset, preset as preset_of
 from sigmasplat.config.text import override, split_settings
+from sigmasplat.data import se3
+from sigmasplat.data.field import GaussianField
+from sigmasplat.data.frame import Frame
 from sigmasplat.errors import SourceError
+from sigmasplat.files.machine import code_digest
 from sigmasplat.fit.field import fit_field
 from sigmasplat.fit.target import Target
-from sigmasplat.io.machine import code_digest
-from sigmasplat.metrics.image import psnr
-from sigmasplat.metrics.trajectory import associate
-from sigmasplat.model import se3
-from sigmasplat.model.field import GaussianField
-from sigmasplat.model.frame import Frame
-from sigmasplat.presets import default_preset, preset as preset_of
+from sigmasplat.input.source import Source
+from sigmasplat.mapping.mapper import Mapper
+from sigmasplat.plugins.evaluation.metrics.image import psnr
+from sigmasplat.plugins.evaluation.metrics.trajectory import associate
+from sigmasplat.plugins.sources import open_source
 from sigmasplat.render import render
-from sigmasplat.slam.mapper import Mapper
-from sigmasplat.sources import open_source
-from sigmasplat.sources.base import Source
 
 try:
     from sigmasplat.render.backend import make_view
@@ -144,7 +144,7 @@ def denoised(frame: Frame, config: Config) -> Frame:
     """Return a frame with the depth that mapping would get; a checkout may be older than `input.denoise_depth`."""
     if not getattr(config.input, "denoise_depth", False):
         return frame
-    from sigmasplat.slam.localisation.denoise import denoised
+    from sigmasplat.tracking.denoise import denoised
 
     return replace(frame, depth_m=denoised(frame.depth_m))
 

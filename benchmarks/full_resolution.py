@@ -26,15 +26,15 @@ from tables import Section
 
 from sigmasplat.commands.options import Settings
 from sigmasplat.config import Config
+from sigmasplat.config.presets import default_preset, preset
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.field import GaussianField
+from sigmasplat.data.opencv import opencv
 from sigmasplat.errors import SigmaSplatError
-from sigmasplat.evaluation.evaluate import evaluate
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.field import GaussianField
-from sigmasplat.model.opencv import opencv
-from sigmasplat.presets import default_preset, preset
+from sigmasplat.plugins.evaluation.evaluate import evaluate
+from sigmasplat.plugins.sources import open_source
 from sigmasplat.render import FieldRenderer, Render
-from sigmasplat.sources import open_source
+from sigmasplat.run_folder.runs import RunFolder
 
 arg = tyro.conf.arg
 COLUMNS = {

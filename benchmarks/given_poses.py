@@ -21,10 +21,10 @@ import tyro
 from tables import Section, significant
 
 from sigmasplat.commands.options import Settings
-from sigmasplat.io.trajectory import write_trajectory
-from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.presets import default_preset
-from sigmasplat.sources import open_source
+from sigmasplat.config.presets import default_preset
+from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.plugins.sources import open_source
+from sigmasplat.run_folder.trajectory import write_trajectory
 
 arg = tyro.conf.arg
 METRES_PER_UNIT = 0.5

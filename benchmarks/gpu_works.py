@@ -14,17 +14,17 @@ from torch import Tensor
 from works import RENDER, Timing
 
 from sigmasplat.config import TrackingConfig
+from sigmasplat.config.presets import default_preset, preset
 from sigmasplat.config.text import override
 from sigmasplat.errors import BackendError
 from sigmasplat.fit.field import fit_field
 from sigmasplat.fit.pose import fit_pose_adam
 from sigmasplat.fit.target import Keyframe, Target
-from sigmasplat.metrics.trajectory import ate
-from sigmasplat.presets import default_preset, preset
+from sigmasplat.plugins.evaluation.metrics.trajectory import ate
+from sigmasplat.plugins.sources import SyntheticRoom
 from sigmasplat.render.cuda import launch as cuda_launch
 from sigmasplat.render.cuda.view import CudaView
 from sigmasplat.slam.slam import Slam
-from sigmasplat.sources import SyntheticRoom
 
 FRAME = 100
 WARMUPS, ITERATIONS, TRACKING_ITERATIONS = 3, 10, 60

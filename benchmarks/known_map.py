@@ -9,19 +9,19 @@ from numpy.typing import NDArray
 from tracking import relative_error
 
 from sigmasplat.config import Config, FeatureConfig
+from sigmasplat.data import se3
+from sigmasplat.data.field import GaussianField
+from sigmasplat.data.frame import Frame
+from sigmasplat.data.submap import MemoryStore, Picture, Submap
 from sigmasplat.fit.references import live_image
 from sigmasplat.fit.target import Target
-from sigmasplat.model import se3
-from sigmasplat.model.field import GaussianField
-from sigmasplat.model.frame import Frame
-from sigmasplat.model.submap import MemoryStore, Picture, Submap
+from sigmasplat.input.source import Source
 from sigmasplat.render.backend import make_view
-from sigmasplat.slam.features import make_extractor
-from sigmasplat.slam.localisation.feature_image import FeatureImage, detail_of
-from sigmasplat.slam.localisation.known_map import KnownMap
-from sigmasplat.slam.localisation.relocaliser import Relocaliser
-from sigmasplat.slam.localisation.sight import Sight
-from sigmasplat.sources.base import Source
+from sigmasplat.tracking.feature_image import FeatureImage, detail_of
+from sigmasplat.tracking.features import make_extractor
+from sigmasplat.tracking.known_map import KnownMap
+from sigmasplat.tracking.relocaliser import Relocaliser
+from sigmasplat.tracking.sight import Sight
 
 Matrix = NDArray[np.float64]
 EVERY, APART = 5, 40

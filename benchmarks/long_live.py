@@ -32,15 +32,15 @@ from tables import Section, significant
 
 from sigmasplat.commands.options import Settings
 from sigmasplat.config import Config
+from sigmasplat.config.presets import default_preset, preset as preset_of
 from sigmasplat.config.text import override, split_settings
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.model.frame import Frame
-from sigmasplat.model.frame_arrays import color_from_bytes
-from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.presets import default_preset, preset as preset_of
+from sigmasplat.data.frame import Frame
+from sigmasplat.data.frame_arrays import color_from_bytes
+from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.input.source import Source
+from sigmasplat.plugins.sources import open_source
 from sigmasplat.run.protocols import NullCallback, StepResult
-from sigmasplat.sources import open_source
-from sigmasplat.sources.base import Source
+from sigmasplat.run_folder.runs import RunFolder
 
 arg = tyro.conf.arg
 SOURCE = "synthetic:frames=900,rooms=2,noise=1,width=640,height=480"
@@ -120,11 +120,11 @@ class Samples(NullCallback):
 def follow(path: str, scratch: Path, config: Config, frames: int, save_every_s: float) -> dict[str, Any]:
     """Run SLAM in real time on the frames in scratch/frames, repeated; return samples, and figures of each frame."""
     from sigmasplat.commands.options import prepare_torch
+    from sigmasplat.plugins.sources.arrivals import Arrivals
+    from sigmasplat.realtime.system import RealTime
     from sigmasplat.run.resume import StateFile
     from sigmasplat.run.session import Session
-    from sigmasplat.slam.real_time.system import RealTime
     from sigmasplat.slam.slam import Slam
-    from sigmasplat.sources.arrivals import Arrivals
 
     prepare_torch()
     source = Repeated(open_source(path), scratch / "frames", frames)

@@ -27,17 +27,17 @@ from tables import Section, significant
 
 from sigmasplat.commands.options import Settings
 from sigmasplat.config import Config
+from sigmasplat.config.presets import default_preset, preset as preset_of
 from sigmasplat.config.text import override, split_settings
+from sigmasplat.data.frame import Frame
+from sigmasplat.data.frame_arrays import color_from_bytes
+from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SourceError
-from sigmasplat.io.machine import usable_cores
-from sigmasplat.io.submaps import DiskStore
-from sigmasplat.metrics.trajectory import ate
-from sigmasplat.model.frame import Frame
-from sigmasplat.model.frame_arrays import color_from_bytes
-from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.presets import default_preset, preset as preset_of
-from sigmasplat.sources import open_source
-from sigmasplat.sources.base import Source
+from sigmasplat.files.machine import usable_cores
+from sigmasplat.input.source import Source
+from sigmasplat.plugins.evaluation.metrics.trajectory import ate
+from sigmasplat.plugins.sources import open_source
+from sigmasplat.run_folder.submaps import DiskStore
 
 arg = tyro.conf.arg
 SOURCE = "synthetic:frames=2400,rooms=2,loops=4,noise=1"

@@ -22,19 +22,19 @@ from tracking import true_poses
 
 import sigmasplat
 from sigmasplat.config import SubmapConfig
+from sigmasplat.config.presets import default_preset
+from sigmasplat.data import se3
 from sigmasplat.errors import SigmaSplatError, SourceError
-from sigmasplat.io.machine import INSTALLED, code_digest
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.model import se3
-from sigmasplat.presets import default_preset
-from sigmasplat.sources import open_source
+from sigmasplat.files.machine import INSTALLED, code_digest
+from sigmasplat.plugins.sources import open_source
+from sigmasplat.run_folder.runs import RunFolder
 
 arg = tyro.conf.arg
 Matrix = NDArray[np.float64]
 Records = list[dict[str, Any]]
 Experiment = Literal["drift", "real"]
 DRIFTING = "synthetic:frames=720,rooms=2,overrun=20,noise=1,drift=6"
-"""`sigmasplat.sources.synthetic.SyntheticRoom` gives the reason for this path."""
+"""`sigmasplat.plugins.sources.synthetic.SyntheticRoom` gives the reason for this path."""
 ONE_SUBMAP = tuple(f"submaps.{field.name}=0" for field in fields(SubmapConfig))
 WAYS: dict[Experiment, dict[str, tuple[str, ...]]] = {
     "drift": {"loops": ("loops.close=true",)},

@@ -26,10 +26,10 @@ from tables import Section, significant
 
 import sigmasplat
 from sigmasplat.commands.options import Settings
-from sigmasplat.io.machine import INSTALLED, code_digest
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.model import se3
-from sigmasplat.model.field import GaussianField
+from sigmasplat.data import se3
+from sigmasplat.data.field import GaussianField
+from sigmasplat.files.machine import INSTALLED, code_digest
+from sigmasplat.run_folder.runs import RunFolder
 
 arg = tyro.conf.arg
 SYNTHETIC = "synthetic:frames=200,noise=1"

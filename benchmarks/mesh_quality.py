@@ -26,10 +26,14 @@ import tyro
 from accuracy_tables import spread
 from tables import Section
 
+from sigmasplat.data import isosurface, se3
+from sigmasplat.data.mesh import Mesh
+from sigmasplat.data.selection import evenly_spread
+from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.data.tsdf import Tsdf
 from sigmasplat.errors import SigmaSplatError
-from sigmasplat.io.mesh import read_mesh
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.metrics.reconstruction import (
+from sigmasplat.input.source import Source
+from sigmasplat.plugins.evaluation.metrics.reconstruction import (
     BEHIND_M,
     CORRECT_M,
     SLACK_M,
@@ -37,15 +41,11 @@ from sigmasplat.metrics.reconstruction import (
     f1,
     visible_points,
 )
-from sigmasplat.metrics.trajectory import align_rigid, ate, pair_poses
-from sigmasplat.model import isosurface, se3
-from sigmasplat.model.mesh import Mesh
-from sigmasplat.model.selection import evenly_spread
-from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.model.tsdf import Tsdf
+from sigmasplat.plugins.evaluation.metrics.trajectory import align_rigid, ate, pair_poses
+from sigmasplat.plugins.outputs.meshes.mesh_files import read_mesh
+from sigmasplat.plugins.sources import open_source
 from sigmasplat.render.mesh import mesh_depth
-from sigmasplat.sources import open_source
-from sigmasplat.sources.base import Source
+from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.types import Matrix
 
 arg = tyro.conf.arg

@@ -27,17 +27,17 @@ from tables import Section, significant
 
 from sigmasplat.commands.options import Settings
 from sigmasplat.config import Config
+from sigmasplat.config.presets import default_preset, preset
 from sigmasplat.config.text import override, split_settings
-from sigmasplat.metrics.image import psnr
-from sigmasplat.metrics.trajectory import ate
-from sigmasplat.model import se3
-from sigmasplat.presets import default_preset, preset
+from sigmasplat.data import se3
+from sigmasplat.input.source import Source
+from sigmasplat.plugins.evaluation.metrics.image import psnr
+from sigmasplat.plugins.evaluation.metrics.trajectory import ate
+from sigmasplat.plugins.sources import open_source
+from sigmasplat.plugins.sources.synthetic import SyntheticRoom
 from sigmasplat.render import render
-from sigmasplat.slam.localisation.sight import working_frame
 from sigmasplat.slam.slam import Slam
-from sigmasplat.sources import open_source
-from sigmasplat.sources.base import Source
-from sigmasplat.sources.synthetic import SyntheticRoom
+from sigmasplat.tracking.sight import working_frame
 
 arg = tyro.conf.arg
 Mask = NDArray[np.bool_]

@@ -18,9 +18,9 @@ from accuracy_tables import failures, spread, values_of
 from every_preset import with_submaps
 from tables import Section
 
+from sigmasplat.config.presets import preset as preset_of
 from sigmasplat.errors import SigmaSplatError
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.presets import preset as preset_of
+from sigmasplat.run_folder.runs import RunFolder
 
 arg = tyro.conf.arg
 PAPERS = (

@@ -33,9 +33,9 @@ from peers import OtherSystems, Peer, Result, pythons_of
 from tables import Section, significant
 
 from sigmasplat.errors import ConfigError, SigmaSplatError
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.io.trajectory import read_trajectory
-from sigmasplat.sources import open_source
+from sigmasplat.plugins.sources import open_source
+from sigmasplat.run_folder.runs import RunFolder
+from sigmasplat.run_folder.trajectory import read_trajectory
 
 arg = tyro.conf.arg
 QUICK_FRAMES, WATCHED_EVERY_S = 60, 0.02

@@ -25,15 +25,15 @@ from numpy.typing import NDArray
 from peer_clock import SECONDS, TOTALS
 from tables import Section
 
+from sigmasplat.config.presets import default_preset, preset as preset_of
+from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import ConfigError, SigmaSplatError, SourceError
-from sigmasplat.io.atomic import write_text
-from sigmasplat.io.machine import describe
-from sigmasplat.io.trajectory import read_trajectory
-from sigmasplat.metrics.trajectory import ate, pair_poses
-from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.presets import default_preset, preset as preset_of
-from sigmasplat.sources import open_source
-from sigmasplat.sources.base import Source
+from sigmasplat.files.atomic import write_text
+from sigmasplat.files.machine import describe
+from sigmasplat.input.source import Source
+from sigmasplat.plugins.evaluation.metrics.trajectory import ate, pair_poses
+from sigmasplat.plugins.sources import open_source
+from sigmasplat.run_folder.trajectory import read_trajectory
 
 arg = tyro.conf.arg
 Result = dict[str, Any]

@@ -16,15 +16,15 @@ import record
 import torch
 import tyro
 
-from sigmasplat.drawing.view_panels import BACKGROUND, ViewPanel, draw_view_strip, view_panels
+from sigmasplat.data import se3
 from sigmasplat.errors import SigmaSplatError
-from sigmasplat.exports.run_reader import RunReader
-from sigmasplat.exports.video import orbit_view
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.metrics.views import scored_view
-from sigmasplat.model import se3
+from sigmasplat.plugins.evaluation.metrics.views import scored_view
+from sigmasplat.plugins.outputs.drawing.view_panels import BACKGROUND, ViewPanel, draw_view_strip, view_panels
+from sigmasplat.plugins.outputs.run_reader import RunReader
+from sigmasplat.plugins.outputs.video import orbit_view
+from sigmasplat.plugins.sources import open_source
 from sigmasplat.render import FieldRenderer
-from sigmasplat.sources import open_source
+from sigmasplat.run_folder.runs import RunFolder
 
 arg = tyro.conf.arg
 DIRECTIONS = 36

@@ -19,13 +19,13 @@ import tyro
 from cpu import alone
 from tables import Section, significant
 
+from sigmasplat.config.presets import default_preset, preset as preset_of
 from sigmasplat.config.text import override
 from sigmasplat.errors import SourceError
-from sigmasplat.evaluation.pose_covariance import MOTIONS, score_path_covariance
-from sigmasplat.presets import default_preset, preset as preset_of
-from sigmasplat.slam.path_covariance import PathCovariance
+from sigmasplat.graph.path_covariance import PathCovariance
+from sigmasplat.plugins.evaluation.pose_covariance import MOTIONS, score_path_covariance
+from sigmasplat.plugins.sources import open_source
 from sigmasplat.slam.slam import Slam
-from sigmasplat.sources import open_source
 
 arg = tyro.conf.arg
 NOISY = f"{accuracy.SYNTHETIC},noise=1"

@@ -27,16 +27,16 @@ from numpy.typing import NDArray
 from tables import Section, significant
 
 from sigmasplat.config import Config
+from sigmasplat.config.presets import preset as preset_of
 from sigmasplat.config.text import override, split_settings
+from sigmasplat.data import se3
+from sigmasplat.data.field import GaussianField
+from sigmasplat.data.frame import Frame
+from sigmasplat.data.harmonics import DEGREES
 from sigmasplat.errors import ConfigError, SourceError
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.model import se3
-from sigmasplat.model.field import GaussianField
-from sigmasplat.model.frame import Frame
-from sigmasplat.model.harmonics import DEGREES
-from sigmasplat.presets import preset as preset_of
+from sigmasplat.plugins.sources import open_source
+from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.slam.slam import Slam
-from sigmasplat.sources import open_source
 
 arg = tyro.conf.arg
 Matrix = NDArray[np.float64]

@@ -22,11 +22,11 @@ from PIL import Image
 from tables import Section, significant
 
 from sigmasplat.commands.options import Settings
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.model.se3 import quaternion_from_rotation
-from sigmasplat.presets import default_preset
-from sigmasplat.sources import open_source
-from sigmasplat.sources.base import Source
+from sigmasplat.config.presets import default_preset
+from sigmasplat.data.se3 import quaternion_from_rotation
+from sigmasplat.input.source import Source
+from sigmasplat.plugins.sources import open_source
+from sigmasplat.run_folder.runs import RunFolder
 
 arg = tyro.conf.arg
 UNIT = 37.0

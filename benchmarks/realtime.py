@@ -27,9 +27,9 @@ from replayed import at_rate
 from tables import Section, significant
 
 from sigmasplat.commands.options import Settings
+from sigmasplat.config.presets import default_preset
 from sigmasplat.errors import SigmaSplatError
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.presets import default_preset
+from sigmasplat.run_folder.runs import RunFolder
 
 arg = tyro.conf.arg
 FIRST_S = 1.0

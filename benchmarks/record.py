@@ -11,8 +11,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from sigmasplat.io import machine
-from sigmasplat.io.machine import code_digest
+from sigmasplat.files import machine
+from sigmasplat.files.machine import code_digest
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
@@ -33,7 +33,7 @@ def slug(text: str) -> str:
 
 
 def machine_slug(described: dict[str, Any]) -> str:
-    """Return a machine's name from processor and cores, as `sigmasplat.io.machine.describe()` gives them."""
+    """Return a machine's name from processor and cores, as `sigmasplat.files.machine.describe()` gives them."""
     return f"{slug(str(described['cpu']))}-{described['cores']}-cores"
 
 

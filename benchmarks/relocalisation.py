@@ -31,17 +31,17 @@ from numpy.typing import NDArray
 from tracking import relative_error, true_poses
 
 from sigmasplat.config import FeatureConfig
+from sigmasplat.config.presets import default_preset, preset as preset_of
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.frame import Frame
+from sigmasplat.data.opencv import opencv
 from sigmasplat.errors import SourceError
 from sigmasplat.fit.gray import gray_of
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.frame import Frame
-from sigmasplat.model.opencv import opencv
-from sigmasplat.presets import default_preset, preset as preset_of
-from sigmasplat.slam.features import depth_readings, landmarks_of, make_extractor, pose_from_landmarks
-from sigmasplat.slam.features.base import Features, Pairs, matched_by_distance
-from sigmasplat.sources import open_source
-from sigmasplat.sources.base import Source
+from sigmasplat.input.source import Source
+from sigmasplat.plugins.sources import open_source
+from sigmasplat.tracking.features import depth_readings, landmarks_of, make_extractor, pose_from_landmarks
+from sigmasplat.tracking.features.base import Features, Pairs, matched_by_distance
 
 arg = tyro.conf.arg
 Matrix = NDArray[np.float64]

@@ -34,7 +34,7 @@ from disturbed_recordings import Original, original, write
 import sigmasplat
 from sigmasplat.commands.options import Settings
 from sigmasplat.errors import ConfigError, SigmaSplatError
-from sigmasplat.io.machine import INSTALLED, code_digest
+from sigmasplat.files.machine import INSTALLED, code_digest
 
 arg = tyro.conf.arg
 SYNTHETIC = "synthetic:frames=240,width=640,height=480,noise=1"

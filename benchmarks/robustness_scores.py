@@ -11,11 +11,11 @@ from disturbances import Plan
 from disturbed_recordings import FRAMES_PER_SECOND
 from numpy.typing import NDArray
 
-from sigmasplat.io.trajectory import read_trajectory
-from sigmasplat.metrics import failures
-from sigmasplat.metrics.failures import OFF_M, SILENT_M
-from sigmasplat.metrics.trajectory import align_rigid
-from sigmasplat.model import se3
+from sigmasplat.data import se3
+from sigmasplat.plugins.evaluation.metrics import failures
+from sigmasplat.plugins.evaluation.metrics.failures import OFF_M, SILENT_M
+from sigmasplat.plugins.evaluation.metrics.trajectory import align_rigid
+from sigmasplat.run_folder.trajectory import read_trajectory
 
 ANCHOR_FRAMES, ANCHOR_M = 20, 0.05
 """Without an event, this number of first frames fixes the world; frames further off than this do not count."""

@@ -8,17 +8,17 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from sigmasplat.config import RenderConfig
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.field import GaussianField
+from sigmasplat.data.frame import Frame
 from sigmasplat.errors import SourceError
 from sigmasplat.fit.align import align
 from sigmasplat.fit.gray import gray_of
 from sigmasplat.fit.pyramid import Pyramid
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.field import GaussianField
-from sigmasplat.model.frame import Frame
+from sigmasplat.input.source import Source
+from sigmasplat.plugins.sources import open_source
 from sigmasplat.render.reference import operators as reference
-from sigmasplat.sources import open_source
-from sigmasplat.sources.base import Source
 
 DEPTH_RANGE_M = (0.1, 8.0)
 OFFSETS = (0, 5, -5, 10, -10, 15, -15, 20, -20)

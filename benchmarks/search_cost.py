@@ -25,10 +25,10 @@ from tables import Section, significant
 
 from sigmasplat.commands.options import Settings
 from sigmasplat.config import Config
-from sigmasplat.model.frame import Frame
-from sigmasplat.presets import default_preset
+from sigmasplat.config.presets import default_preset
+from sigmasplat.data.frame import Frame
+from sigmasplat.plugins.sources import open_source
 from sigmasplat.slam.slam import Slam
-from sigmasplat.sources import open_source
 
 arg = tyro.conf.arg
 CLOCKS = {"wall_s": "wall clock", "processor_s": "processor"}

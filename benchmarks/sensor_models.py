@@ -21,18 +21,18 @@ from tables import Section, significant
 
 import sigmasplat
 from sigmasplat.commands.options import Settings
+from sigmasplat.config.presets import default_preset, preset
 from sigmasplat.config.sensors import sensor_model
+from sigmasplat.data import se3
+from sigmasplat.files.machine import INSTALLED, code_digest
 from sigmasplat.fit.align import align
 from sigmasplat.fit.gray import gray_of
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import relative_noise, sureness_of
-from sigmasplat.io.machine import INSTALLED, code_digest
-from sigmasplat.metrics.trajectory import associate
-from sigmasplat.model import se3
-from sigmasplat.presets import default_preset, preset
-from sigmasplat.slam.localisation.denoise import denoised
-from sigmasplat.sources import open_source
-from sigmasplat.sources.base import Source
+from sigmasplat.input.source import Source
+from sigmasplat.plugins.evaluation.metrics.trajectory import associate
+from sigmasplat.plugins.sources import open_source
+from sigmasplat.tracking.denoise import denoised
 
 arg = tyro.conf.arg
 USES = ("tracking", "mapping", "seeding", "surface")

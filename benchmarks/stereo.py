@@ -21,10 +21,10 @@ import tyro
 from tables import Section, significant
 
 from sigmasplat.commands.options import Settings
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.presets import default_preset
-from sigmasplat.sources import open_source
-from sigmasplat.sources.synthetic import SyntheticRoom
+from sigmasplat.config.presets import default_preset
+from sigmasplat.plugins.sources import open_source
+from sigmasplat.plugins.sources.synthetic import SyntheticRoom
+from sigmasplat.run_folder.runs import RunFolder
 
 arg = tyro.conf.arg
 ROOM = "synthetic:frames=200,noise=1"

@@ -13,7 +13,7 @@ import record
 import tables
 from ablation import verdict_counts
 
-from sigmasplat.evaluation.paired_comparison import passed_by_chance
+from sigmasplat.plugins.evaluation.paired_comparison import passed_by_chance
 
 SEQUENCES = ("livingroom", "synthetic", "redkitchen")
 

@@ -18,11 +18,11 @@ import tyro
 from accuracy_tables import Result, failures, groups, spread, values_of
 from tables import Section
 
+from sigmasplat.config.presets import preset as preset_of
 from sigmasplat.config.text import override, split_settings
 from sigmasplat.errors import ConfigError, SigmaSplatError
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.presets import preset as preset_of
-from sigmasplat.sources import open_source
+from sigmasplat.plugins.sources import open_source
+from sigmasplat.run_folder.runs import RunFolder
 
 arg = tyro.conf.arg
 SOURCES = ("synthetic", "livingroom", "redkitchen")

@@ -24,21 +24,21 @@ from numpy.typing import NDArray
 from tracking_tables import coverage
 
 from sigmasplat.config import Config
+from sigmasplat.config.presets import default_preset, preset as preset_of
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.frame import Frame
 from sigmasplat.errors import SourceError
 from sigmasplat.fit.gray import gray_of
 from sigmasplat.fit.pose import PoseFit, fit_pose_adam, fit_pose_align
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import map_reference
 from sigmasplat.fit.target import Target
-from sigmasplat.metrics.trajectory import associate
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.frame import Frame
-from sigmasplat.presets import default_preset, preset as preset_of
+from sigmasplat.input.source import Source
+from sigmasplat.plugins.evaluation.metrics.trajectory import associate
+from sigmasplat.plugins.sources import open_source
 from sigmasplat.render.backend import make_view
 from sigmasplat.slam.slam import Slam
-from sigmasplat.sources import open_source
-from sigmasplat.sources.base import Source
 
 arg = tyro.conf.arg
 Matrix = NDArray[np.float64]

@@ -27,19 +27,19 @@ from sigmasplat.commands import options as described
 from sigmasplat.commands.input_options import Limit
 from sigmasplat.commands.options import prepare_torch
 from sigmasplat.config.text import full_path
-from sigmasplat.evaluation.finished_run import FinishedRun, run_slam
-from sigmasplat.evaluation.uncertainty_benchmark import Study, study_config
-from sigmasplat.evaluation.unseen_views import held_back_views
-from sigmasplat.fit.calibration import fit_weights
+from sigmasplat.data import se3
+from sigmasplat.data.map_uncertainty import COLOR_PARTS, DEPTH_PARTS, SHIPPED
+from sigmasplat.final.refinement import KeyframeReader
+from sigmasplat.final.uncertainty import FIRM, LIMIT, Samples, probe_samples, probe_views
 from sigmasplat.fit.splat_residuals import background_of, splat_residuals
 from sigmasplat.fit.target import Keyframe, Target
-from sigmasplat.metrics.uncertainty import calibration_scores, z_scores
-from sigmasplat.model import se3
-from sigmasplat.model.map_uncertainty import COLOR_PARTS, DEPTH_PARTS, SHIPPED
+from sigmasplat.plugins.evaluation.finished_run import FinishedRun, run_slam
+from sigmasplat.plugins.evaluation.metrics.uncertainty import calibration_scores, z_scores
+from sigmasplat.plugins.evaluation.uncertainty_benchmark import Study, study_config
+from sigmasplat.plugins.evaluation.unseen_views import held_back_views
+from sigmasplat.plugins.sources import open_source
 from sigmasplat.render.backend import make_view
-from sigmasplat.slam.refinement import KeyframeReader
-from sigmasplat.slam.uncertainty import FIRM, LIMIT, Samples, probe_samples, probe_views
-from sigmasplat.sources import open_source
+from sigmasplat.uncertainty.calibration import fit_weights
 
 arg = tyro.conf.arg
 RUNS = record.ROOT / "runs" / "bench" / "uncertainty-weights"

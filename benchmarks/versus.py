@@ -22,7 +22,7 @@ from cpu import default_source
 from tables import Section, significant
 from versus_works import NAMES
 
-from sigmasplat.io.machine import usable_cores
+from sigmasplat.files.machine import usable_cores
 
 arg = tyro.conf.arg
 CHILD = Path(__file__).with_name("versus_works.py")

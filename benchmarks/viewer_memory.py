@@ -27,20 +27,20 @@ import torch
 import tyro
 from tables import Section, significant
 
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.field import GaussianField
+from sigmasplat.data.frame import Frame
 from sigmasplat.fit.target import Keyframe, Target
-from sigmasplat.io.submaps import DiskStore
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.field import GaussianField
-from sigmasplat.model.frame import Frame
-from sigmasplat.slam.mapper import Mapper
+from sigmasplat.mapping.mapper import Mapper
+from sigmasplat.plugins.viewer.live import LiveView
+from sigmasplat.plugins.viewer.snapshot import field_without_moments
+from sigmasplat.run_folder.submaps import DiskStore
 from sigmasplat.slam.slam import Slam
 from sigmasplat.slam.step_result import Step
-from sigmasplat.viewer.live import LiveView
-from sigmasplat.viewer.snapshot import field_without_moments
 
 if TYPE_CHECKING:
-    from sigmasplat.viewer.app import ViewerApp
+    from sigmasplat.plugins.viewer.app import ViewerApp
 
 arg = tyro.conf.arg
 STATM = Path("/proc/self/statm")
@@ -156,8 +156,8 @@ def in_use_mib() -> float:
 
 def measure(options: Options) -> dict[str, Any]:
     """Show the growing system for the given time; return the figures."""
-    from sigmasplat.viewer.app import ViewerApp
-    from sigmasplat.viewer.server import HOST, close, open_server
+    from sigmasplat.plugins.viewer.app import ViewerApp
+    from sigmasplat.plugins.viewer.server import HOST, close, open_server
 
     server = open_server(HOST, 8780, "viewer memory")
     viewer = ViewerApp(server)
@@ -176,7 +176,7 @@ def measure(options: Options) -> dict[str, Any]:
 
 def watch(growing: Growing, viewer: "ViewerApp", options: Options) -> dict[str, Any]:
     """Run the system and sample the memory; return the figures."""
-    from sigmasplat.viewer.panel import MODE_LABELS, VIEW_MODES
+    from sigmasplat.plugins.viewer.panel import MODE_LABELS, VIEW_MODES
 
     shown = 0
 

@@ -26,10 +26,10 @@ import tyro
 
 import sigmasplat
 from sigmasplat.config import Config
+from sigmasplat.config.presets import default_preset, preset
 from sigmasplat.config.text import override, split_settings
 from sigmasplat.errors import ConfigError, SigmaSplatError
-from sigmasplat.io.machine import INSTALLED, code_digest
-from sigmasplat.presets import default_preset, preset
+from sigmasplat.files.machine import INSTALLED, code_digest
 
 arg = tyro.conf.arg
 SEQUENCES: dict[str, tuple[str, ...]] = {

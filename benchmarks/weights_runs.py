@@ -7,26 +7,26 @@ import torch
 from numpy.typing import NDArray
 from weights import Job
 
-from sigmasplat.evaluation.finished_run import FinishedRun
-from sigmasplat.evaluation.unseen_views import UnseenView, held_back_views
-from sigmasplat.metrics.scored_view import ScoredView
-from sigmasplat.metrics.trajectory import associate, score_path
-from sigmasplat.metrics.views import scored_view
-from sigmasplat.model import se3
-from sigmasplat.model.field import GaussianField
-from sigmasplat.model.submap import StorePart
+from sigmasplat.data import se3
+from sigmasplat.data.field import GaussianField
+from sigmasplat.data.submap import StorePart
+from sigmasplat.final.final_map import final_map
+from sigmasplat.graph.candidates import Candidate, SubmapPair, gate
+from sigmasplat.graph.closer import LoopCloser
+from sigmasplat.graph.localisations import differs
+from sigmasplat.graph.registration import Registrar
+from sigmasplat.input.source import Source
+from sigmasplat.plugins.evaluation.finished_run import FinishedRun
+from sigmasplat.plugins.evaluation.metrics.scored_view import ScoredView
+from sigmasplat.plugins.evaluation.metrics.trajectory import associate, score_path
+from sigmasplat.plugins.evaluation.metrics.views import scored_view
+from sigmasplat.plugins.evaluation.unseen_views import UnseenView, held_back_views
+from sigmasplat.plugins.sources import open_source
 from sigmasplat.render import FieldRenderer
-from sigmasplat.slam.final import final_map
-from sigmasplat.slam.loop_closure.candidates import Candidate, SubmapPair, gate
-from sigmasplat.slam.loop_closure.closer import LoopCloser
-from sigmasplat.slam.loop_closure.descriptors import similarity
-from sigmasplat.slam.loop_closure.localisations import differs
-from sigmasplat.slam.loop_closure.registration import Registrar
-from sigmasplat.slam.predicted_submaps import PredictedSubmaps
 from sigmasplat.slam.slam import Slam
-from sigmasplat.sources import open_source
-from sigmasplat.sources.base import Source
+from sigmasplat.tracking.descriptors import similarity
 from sigmasplat.types import completed
+from sigmasplat.uncertainty.predicted_submaps import PredictedSubmaps
 
 Matrix = NDArray[np.float64]
 Rows = list[dict[str, Any]]

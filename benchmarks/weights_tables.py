@@ -8,7 +8,7 @@ from typing import Any
 from tables import Section
 from weights import DEFAULT
 
-from sigmasplat.evaluation.paired_comparison import (
+from sigmasplat.plugins.evaluation.paired_comparison import (
     Figure,
     PairedDifference,
     by_seed,

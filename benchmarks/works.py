@@ -11,6 +11,8 @@ from scenes import Scene
 from torch import Tensor
 
 from sigmasplat.config import RenderConfig
+from sigmasplat.config.presets import default_preset, preset
+from sigmasplat.data.field import GaussianField
 from sigmasplat.fit import losses
 from sigmasplat.fit.backends import fits_of
 from sigmasplat.fit.field import fit_field
@@ -19,9 +21,7 @@ from sigmasplat.fit.pose import fit_pose_adam, fit_pose_align
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import keyframe_reference, map_reference
 from sigmasplat.fit.target import Keyframe, Target
-from sigmasplat.model.field import GaussianField
 from sigmasplat.native import _core
-from sigmasplat.presets import default_preset, preset
 from sigmasplat.render.cpu import operators as _operators  # noqa: F401 # applies the switches before anybody sets them
 from sigmasplat.render.cpu.view import CpuView
 from sigmasplat.render.kernel_params import view_params

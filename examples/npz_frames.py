@@ -3,8 +3,8 @@
 camera.npz      width, height, fx, fy, cx, cy
 000000.npz …    t (seconds), color (uint8 [H, W, 3]), depth_m (float [H, W], 0 = no reading); T_world_camera if known
 
-Copy this file into src/sigmasplat/sources/, then run `make install`, because .venv holds an installed copy. Then
-`sigmasplat run FOLDER` reads the format; nothing else is needed.
+Copy this file into src/sigmasplat/plugins/sources/, then run `make install`, because .venv holds an installed copy.
+Then `sigmasplat run FOLDER` reads the format; nothing else is needed.
 """
 
 import zipfile
@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 
 from sigmasplat.config import InputConfig
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.frame import Frame
+from sigmasplat.data.frame_arrays import color_from_bytes
+from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SourceError
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.frame import Frame
-from sigmasplat.model.frame_arrays import color_from_bytes
-from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.sources.base import Source
-from sigmasplat.sources.opening import Format
+from sigmasplat.input.opening import Format
+from sigmasplat.input.source import Source
 
 
 def read(path: Path) -> dict[str, Any]:

@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 
 from sigmasplat import RealTime, SigmaSplatError, Slam
-from sigmasplat.io.splats.ply import write_field
-from sigmasplat.io.trajectory import write_trajectory
 from sigmasplat.run.session import interrupt_event
+from sigmasplat.run_folder.splat_ply import write_field
+from sigmasplat.run_folder.trajectory import write_trajectory
 
 FOCAL = [getattr(cv2, f"CAP_PROP_OBSENSOR_INTRINSIC_{name}") for name in ("FX", "FY", "CX", "CY")]
 

@@ -16,8 +16,8 @@ from torch import Tensor
 
 from sigmasplat import Camera, GaussianField, open_source
 from sigmasplat.config import RenderConfig
-from sigmasplat.model import se3
-from sigmasplat.model.frame import Frame
+from sigmasplat.data import se3
+from sigmasplat.data.frame import Frame
 from sigmasplat.render.cpu import operators as cpu
 
 OPTIONS = RenderConfig()

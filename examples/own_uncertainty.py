@@ -16,14 +16,14 @@ from torch import Tensor
 from sigmasplat import GaussianField, Slam, open_source, preset
 from sigmasplat.config import TrackingConfig
 from sigmasplat.config.text import override
+from sigmasplat.data import se3
+from sigmasplat.data.frame import Frame
 from sigmasplat.fit.confidence import uncertainty_weights
 from sigmasplat.fit.gray import gray_of
 from sigmasplat.fit.pose import fit_pose_align
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference
-from sigmasplat.metrics import uncertainty
-from sigmasplat.model import se3
-from sigmasplat.model.frame import Frame
+from sigmasplat.plugins.evaluation.metrics import uncertainty
 from sigmasplat.render.render import Render, render
 
 SETTINGS = {"input.width": "160", "mapping.first_iterations": "40", "mapping.iterations": "15"}

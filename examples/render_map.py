@@ -16,11 +16,11 @@ import torch
 from PIL import Image
 
 from sigmasplat import Camera, SigmaSplatError
-from sigmasplat.drawing import colormap
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.io.splats.any_format import read_any
-from sigmasplat.model import se3
+from sigmasplat.data import se3
+from sigmasplat.plugins.outputs.drawing import colormap
+from sigmasplat.plugins.outputs.splats.any_format import read_any
 from sigmasplat.render import render
+from sigmasplat.run_folder.runs import RunFolder
 
 CAMERA = Camera(width=320, height=240, fx=260.0, fy=260.0, cx=159.5, cy=119.5)
 """Any pinhole camera works; it need not be the one that recorded the map."""

@@ -19,8 +19,8 @@ from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, Image
 
 from sigmasplat import RealTime, SigmaSplatError, Slam
-from sigmasplat.io.splats.ply import write_field
 from sigmasplat.run.session import interrupt_event
+from sigmasplat.run_folder.splat_ply import write_field
 
 R_MAP_WORLD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 LAYOUTS = {"rgb8": ("u1", 3), "bgr8": ("u1", 3), "16UC1": ("u2", 1), "mono16": ("u2", 1), "32FC1": ("f4", 1)}

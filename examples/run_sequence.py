@@ -7,8 +7,8 @@ import sys
 from pathlib import Path
 
 from sigmasplat import SigmaSplatError, Slam, open_scene, preset
-from sigmasplat.io.splats.ply import write_field
-from sigmasplat.io.trajectory import write_trajectory
+from sigmasplat.run_folder.splat_ply import write_field
+from sigmasplat.run_folder.trajectory import write_trajectory
 
 
 def main(path: str, out: str = "sequence-out") -> None:

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
 
 Array = NDArray[np.float64]
 CAMERA = Camera(53, 41, 45.0, 47.0, 24.6, 21.3)

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.field import GaussianField
-from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.field import GaussianField
+from sigmasplat.data.trajectory import Trajectory
 
 CAMERA = Camera(160, 120, 80.0, 80.0, 79.5, 59.5)
 LOW, HIGH = np.array([-1.987, -1.513, 0.0]), np.array([2.013, 1.487, 2.5])

@@ -32,7 +32,7 @@ TINY_DEPTH_M = 2.0
 @pytest.fixture(autouse=True, scope="session")
 def views_of_the_room() -> Iterator[None]:
     """Render each view of the synthetic room once: many runs of this process begin with the same frames."""
-    from sigmasplat.sources import synthetic
+    from sigmasplat.plugins.sources import synthetic
 
     @lru_cache(maxsize=600)
     def rendered(scene: Any, camera: Any, pose: bytes) -> tuple[np.ndarray, np.ndarray]:

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sigmasplat.io.splats.quaternions import unit
-from sigmasplat.io.splats.values import SH_C0, SplatValues
-from sigmasplat.model.harmonics import count
+from sigmasplat.data.harmonics import count
+from sigmasplat.run_folder.quaternions import unit
+from sigmasplat.run_folder.splat_values import SH_C0, SplatValues
 
 FOLDER = Path(os.environ.get("SIGMASPLAT_READERS") or Path(__file__).parents[1] / "build" / "readers").resolve()
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from sigmasplat.sources import SyntheticRoom
+from sigmasplat.plugins.sources import SyntheticRoom
 
 stream = Enum("stream", "depth color infrared gyro accel")
 format_ = Enum("format", "z16 rgb8 y8 motion_xyz32f combined_motion")

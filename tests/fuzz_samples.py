@@ -15,15 +15,16 @@ import recordings
 from bag_recordings import Recorder, aligned
 from command_line import exit_code
 from room_run import made_run
-from sigmasplat.batch.job import Job
 from sigmasplat.commands.input_options import DEFAULT_INPUT_OPTIONS
 from sigmasplat.commands.options import configured
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.io.splats import compressed_ply, gltf, ply, sog, splat, spz
-from sigmasplat.model.field import GaussianField
-from sigmasplat.presets.table_files import TABLES
+from sigmasplat.data.field import GaussianField
+from sigmasplat.plugins.batch.job import Job
+from sigmasplat.plugins.outputs.splats import compressed_ply, gltf, sog, splat, spz
+from sigmasplat.plugins.papers.table_files import TABLES
+from sigmasplat.plugins.sources import open_source
 from sigmasplat.run.resume import StateFile
-from sigmasplat.sources import open_source
+from sigmasplat.run_folder import splat_ply as ply
+from sigmasplat.run_folder.runs import RunFolder
 
 Files = dict[str, bytes]
 INPUT, OUT = "INPUT", "OUT"

@@ -82,7 +82,7 @@ def _lines(path: Path) -> list[str]:
 
 def _show_once() -> None:
     """Make `view` end when it has shown a run, as with Ctrl-C."""
-    from sigmasplat.viewer import finished
+    from sigmasplat.plugins.viewer import finished
 
     follow = finished.follow_run
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from sigmasplat.model.camera import Camera
+from sigmasplat.data.camera import Camera
 
 FRAMES = 4
 VGA, SMALL = (640, 480), (32, 24)

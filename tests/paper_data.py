@@ -11,11 +11,11 @@ import numpy as np
 
 from layouts import opengl, rows, save, save_text, transforms, tum_line
 from sigmasplat.config import InputConfig
-from sigmasplat.io.mesh import write_mesh
-from sigmasplat.metrics.trajectory import associate
-from sigmasplat.model.frame import Frame
-from sigmasplat.model.mesh import Mesh
-from sigmasplat.sources import SyntheticRoom, open_source
+from sigmasplat.data.frame import Frame
+from sigmasplat.data.mesh import Mesh
+from sigmasplat.plugins.evaluation.metrics.trajectory import associate
+from sigmasplat.plugins.outputs.meshes.mesh_files import write_mesh
+from sigmasplat.plugins.sources import SyntheticRoom, open_source
 
 FRAMES, WIDTH, HEIGHT = 8, 80, 60
 TINY = {

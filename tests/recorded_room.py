@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from sigmasplat.model.frame import Frame
+from sigmasplat.data.frame import Frame
 
 OPTIONS = ("--fx", "128", "--cx", "79.5", "--cy", "59.5", "--depth-scale", "1000")
 """Options of `run` for the images of a frame of 160×120 pixels."""

@@ -6,11 +6,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.field import GaussianField, Rows
-from sigmasplat.model.harmonics import count
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.field import GaussianField, Rows
+from sigmasplat.data.harmonics import count
+from sigmasplat.plugins.sources.synthetic import SyntheticRoom
 from sigmasplat.render import render
-from sigmasplat.sources.synthetic import SyntheticRoom
 
 CAMERA = Camera(96, 72, 80.0, 80.0, 47.5, 35.5)
 

@@ -7,12 +7,12 @@ import torch
 
 from box_room import CAMERA, splats, walk
 from sigmasplat.config import Config
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.model import se3
-from sigmasplat.model.frame import Frame
-from sigmasplat.model.submap import Picture, Submap
-from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.sources.base import Source
+from sigmasplat.data import se3
+from sigmasplat.data.frame import Frame
+from sigmasplat.data.submap import Picture, Submap
+from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.input.source import Source
+from sigmasplat.run_folder.runs import RunFolder
 
 FRAMES, LOST = 6, 3
 T_ROOM = walk(np.eye(4), FRAMES).T_world_camera[0]

@@ -2,8 +2,8 @@
 
 from functools import cache
 
-from sigmasplat.model.frame import Frame
-from sigmasplat.sources import SyntheticRoom
+from sigmasplat.data.frame import Frame
+from sigmasplat.plugins.sources import SyntheticRoom
 
 SMALL = {"input.width": "160", "mapping.first_iterations": "60", "mapping.iterations": "20"}
 """Settings that make runs on these frames short."""

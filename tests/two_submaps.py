@@ -7,12 +7,12 @@ import numpy as np
 import torch
 
 from sigmasplat.config import Config, FinalConfig, MappingConfig, RenderConfig
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.field import COLUMNS, GaussianField
-from sigmasplat.model.submap import MemoryStore, Picture, Submap
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.field import COLUMNS, GaussianField
+from sigmasplat.data.submap import MemoryStore, Picture, Submap
+from sigmasplat.final.refinement import Refined
 from sigmasplat.render import render
-from sigmasplat.slam.refinement import Refined
 
 CAMERA = Camera(20, 15, 16.0, 16.0, 9.5, 7.0)
 CONFIG = Config(backend="reference", mapping=MappingConfig(weight_nll_color=1e-3, prune_opacity=0.1))

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from sigmasplat.model import se3
-from sigmasplat.sources import Source
+from sigmasplat.data import se3
+from sigmasplat.plugins.sources import Source
 
 
 def agreement(source: Source, i: int, j: int):

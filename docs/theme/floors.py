@@ -32,28 +32,23 @@ class Floor:
 
 FLOORS = (
     Floor(("errors", "env", "types"), "base", "errors, environment, shared types"),
-    Floor(("reading",), "base", "files of users, within limits"),
-    Floor(("config",), "base", "every setting, with units"),
-    Floor(("presets",), "base", "values of the published systems"),
+    Floor(("files",), "base", "read and write files, within limits"),
+    Floor(("config",), "base", "every setting, with units; presets"),
     Floor(("native",), "base", "C++ and CUDA kernels, threads"),
-    Floor(("model",), "core", "data: camera, splats, submap"),
+    Floor(("data",), "core", "camera, frame, splats, submap, poses"),
     Floor(("render",), "core", "images: colour, depth, variance"),
     Floor(("fit",), "core", "optimise poses and splats"),
-    Floor(("slam",), "core", "track, map, close loops"),
-    Floor(("sources",), "data", "read data sets and recordings"),
-    Floor(("io",), "data", "run folders, splats, meshes"),
-    Floor(("metrics",), "results", "scores"),
-    Floor(("drawing",), "results", "images, charts, contact sheets"),
-    Floor(("floorplan",), "results", "floor plan, regions to rescan"),
-    Floor(("report",), "results", "the HTML report"),
-    Floor(("checks",), "results", "check an installation, a recording"),
+    Floor(("uncertainty",), "core", "how sure the map is"),
+    Floor(("tracking",), "core", "find the camera in the map"),
+    Floor(("mapping",), "core", "seed, fit and prune the map"),
+    Floor(("graph",), "core", "loops, pose graph, covariance"),
+    Floor(("final",), "core", "the last map"),
+    Floor(("slam",), "core", "the main loop and its state"),
+    Floor(("realtime",), "core", "the same on two clocks"),
+    Floor(("input",), "programs", "what a recording is; opens one"),
+    Floor(("run_folder",), "programs", "the files of a run"),
     Floor(("run",), "programs", "run SLAM on a sequence"),
-    Floor(("evaluation",), "programs", "score runs, compare them"),
-    Floor(("batch",), "programs", "many runs, one table"),
-    Floor(("robots",), "programs", "ROS 2 messages: bag, live stream"),
-    Floor(("exports",), "programs", "formats of other programs"),
-    Floor(("viewer",), "programs", "a run in the browser"),
-    Floor(("download",), "programs", "public data sets"),
+    Floor(("plugins",), "plugins", "sources, outputs, viewer, scores, …"),
     Floor(("commands",), "programs", "one module per command"),
     Floor(("cli", "__init__", "__main__"), "programs", "command line and public names"),
 )
@@ -72,7 +67,7 @@ text { font: 13px system-ui, sans-serif; fill: #1f2328 }
 .line { stroke: #d1d9e0 }
 .guide { stroke: #d1d9e0; stroke-opacity: 0.6 }
 .dot { fill: #59636e }
-.base { fill: #8c959f } .core { fill: #0969da } .data { fill: #1a7f37 } .results { fill: #bc4c00 }
+.base { fill: #8c959f } .core { fill: #0969da } .plugins { fill: #bc4c00 }
 .programs { fill: #8250df }
 @media (prefers-color-scheme: dark) {
   text { fill: #e6edf3 }
@@ -80,7 +75,7 @@ text { font: 13px system-ui, sans-serif; fill: #1f2328 }
   .line { stroke: #3d444d }
   .guide { stroke: #3d444d; stroke-opacity: 0.6 }
   .dot { fill: #b1bac4 }
-  .base { fill: #9198a1 } .core { fill: #4493f8 } .data { fill: #3fb950 } .results { fill: #f0883e }
+  .base { fill: #9198a1 } .core { fill: #4493f8 } .plugins { fill: #f0883e }
   .programs { fill: #ab7df8 }
 }
 """

@@ -103,7 +103,7 @@ SCENES: dict[str, tuple[str, ...]] = {
 
 def paper_table(system: str) -> str:
     """Return the table of a paper's presets: a row per setting, a column per data set, and where the value is from."""
-    from sigmasplat.presets import preset
+    from sigmasplat.config.presets import preset
 
     columns = DATA_SETS[system]
     rows = [f"| setting | {' | '.join(columns)} | from |", "|---" * (len(columns) + 2) + "|"]
@@ -115,7 +115,7 @@ def paper_table(system: str) -> str:
 
 def scene_table(system: str) -> str:
     """Return the table of the released code's scenes: a row per preset, a column per setting; all from the code."""
-    from sigmasplat.presets import list_presets, preset
+    from sigmasplat.config.presets import list_presets, preset
 
     columns = SCENES[system]
     rows = [f"| scene | {' | '.join(f'`{name}`' for name in columns)} |", "|---" * (len(columns) + 1) + "|"]
@@ -129,7 +129,7 @@ def scene_table(system: str) -> str:
 def method_table(system: str) -> str:
     """Return the table of what all presets of the released code change: the setting, the paper's value, the code's."""
     from sigmasplat.config import Config
-    from sigmasplat.presets import list_presets, preset
+    from sigmasplat.config.presets import list_presets, preset
 
     released = [preset(name) for name in list_presets() if name.startswith(f"{system}-released-")]
     rows = ["| setting | paper's presets | released | from |", "|---|---|---|---|"]

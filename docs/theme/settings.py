@@ -55,7 +55,7 @@ def table(defaults: Any, chosen: Any, preset_name: str, prefix: str = "") -> str
 def page() -> str:
     """Return the whole page."""
     from sigmasplat.config import Config
-    from sigmasplat.presets import default_preset, preset
+    from sigmasplat.config.presets import default_preset, preset
 
     defaults, chosen = Config(), preset(default_preset())
     parts = [HEAD.format(preset=default_preset()), f"## Whole run\n\n{table(defaults, chosen, default_preset())}"]

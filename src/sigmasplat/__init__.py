@@ -15,29 +15,29 @@ from sigmasplat import env as env  # must come before torch: it sets how idle Op
 
 if TYPE_CHECKING:
     from sigmasplat.config import Config as Config
+    from sigmasplat.config.presets import preset as preset
+    from sigmasplat.data.camera import Camera as Camera
+    from sigmasplat.data.field import GaussianField as GaussianField
+    from sigmasplat.data.frame import Frame as Frame
     from sigmasplat.errors import SigmaSplatError as SigmaSplatError
-    from sigmasplat.model.camera import Camera as Camera
-    from sigmasplat.model.field import GaussianField as GaussianField
-    from sigmasplat.model.frame import Frame as Frame
-    from sigmasplat.presets import preset as preset
+    from sigmasplat.plugins.sources import open_source as open_source
+    from sigmasplat.realtime.system import RealTime as RealTime
     from sigmasplat.run.scene import open_scene as open_scene
-    from sigmasplat.slam.real_time.system import RealTime as RealTime
     from sigmasplat.slam.slam import Slam as Slam
-    from sigmasplat.sources import open_source as open_source
 
 # Imported at first use, so that `import sigmasplat` and `sigmasplat --help` do not load torch. The function `render` is
 # not here, because `sigmasplat.render` is its package: use `from sigmasplat.render import render`.
 _HOMES = {
-    "Camera": "sigmasplat.model.camera",
+    "Camera": "sigmasplat.data.camera",
     "Config": "sigmasplat.config",
-    "Frame": "sigmasplat.model.frame",
-    "GaussianField": "sigmasplat.model.field",
-    "RealTime": "sigmasplat.slam.real_time.system",
+    "Frame": "sigmasplat.data.frame",
+    "GaussianField": "sigmasplat.data.field",
+    "RealTime": "sigmasplat.realtime.system",
     "SigmaSplatError": "sigmasplat.errors",
     "Slam": "sigmasplat.slam.slam",
     "open_scene": "sigmasplat.run.scene",
-    "open_source": "sigmasplat.sources",
-    "preset": "sigmasplat.presets",
+    "open_source": "sigmasplat.plugins.sources",
+    "preset": "sigmasplat.config.presets",
 }
 __all__ = [*sorted(_HOMES), "__version__"]
 

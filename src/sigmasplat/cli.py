@@ -19,7 +19,7 @@ from typing import Any, TextIO
 import sigmasplat
 from sigmasplat import env
 from sigmasplat.errors import ConfigError, SigmaSplatError, is_out_of_memory, out_of_memory
-from sigmasplat.reading.guard import cause
+from sigmasplat.files.guard import cause
 
 REFUSED, INTERRUPTED, CLOSED = 2, 130, 141
 HELP = {"-h", "--help"}
@@ -160,7 +160,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if given == ["--version"]:
         print(f"sigmasplat {sigmasplat.__version__}")
         sys.exit(0)
-    warnings.filterwarnings("ignore", "Image size .* exceeds limit")  # our limit is lower (`reading/pictures.py`)
+    warnings.filterwarnings("ignore", "Image size .* exceeds limit")  # our limit is lower (`files/pictures.py`)
     try:
         env.switches()
         _refuse_unknown(given[0])

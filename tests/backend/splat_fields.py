@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 
 from sigmasplat.config import RenderConfig
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.field import COLUMNS, GaussianField
 from sigmasplat.fit.target import Keyframe
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.field import COLUMNS, GaussianField
 from sigmasplat.render.cpu.view import CpuView
 from sigmasplat.render.cuda.view import CudaView
 from sigmasplat.render.reference.view import ReferenceView

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.model import se3
+from sigmasplat.data import se3
 from splat_scenes import Scene
 
 Array = NDArray[np.float64]

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from sigmasplat.config import RenderConfig
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
 
 SMALL = Camera(16, 12, 14.0, 15.0, 7.1, 6.4)
 WIDE = Camera(45, 31, 40.0, 42.0, 21.3, 17.8)

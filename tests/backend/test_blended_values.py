@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from sigmasplat.config import RenderConfig
-from sigmasplat.model.field import COLUMNS, GaussianField
+from sigmasplat.data.field import COLUMNS, GaussianField
 from sigmasplat.render.backend import make_view
 from sigmasplat.render.blended_values import BlendedValues, blend_values
 from sigmasplat.render.render import on_device

@@ -9,6 +9,11 @@ import torch
 from torch import Tensor
 
 from sigmasplat.config import MappingConfig
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.color_covariance import MOST_CORRELATED, correlations_of, covariances_of
+from sigmasplat.data.field import COLUMNS, GaussianField, Rows
+from sigmasplat.data.frame import Frame
 from sigmasplat.fit import adam, losses
 from sigmasplat.fit.adam import Rates
 from sigmasplat.fit.color_covariance import FullCovarianceStep
@@ -16,11 +21,6 @@ from sigmasplat.fit.cpu.mapping_step import CompiledImages
 from sigmasplat.fit.field import fit_field
 from sigmasplat.fit.mapping_step import TorchStep
 from sigmasplat.fit.target import Keyframe, Target
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.color_covariance import MOST_CORRELATED, correlations_of, covariances_of
-from sigmasplat.model.field import COLUMNS, GaussianField, Rows
-from sigmasplat.model.frame import Frame
 from sigmasplat.render import render
 from sigmasplat.render.backend import make_view
 from sigmasplat.render.cpu.covariance_view import CpuCovarianceView

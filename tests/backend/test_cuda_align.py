@@ -11,6 +11,8 @@ from torch import Tensor
 
 from align_oracle import CAMERA, HUGE, MISSING, Pair, missing, oracle, pair
 from emulated_cuda import Emulator
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
 from sigmasplat.errors import BackendError
 from sigmasplat.fit import align as aligning
 from sigmasplat.fit.align import Alignment, align
@@ -20,9 +22,7 @@ from sigmasplat.fit.cuda.images import CUDA_IMAGES
 from sigmasplat.fit.gray import gray_of
 from sigmasplat.fit.interface import LevelPlanes
 from sigmasplat.fit.pyramid import Pyramid
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
-from sigmasplat.sources import SyntheticRoom
+from sigmasplat.plugins.sources import SyntheticRoom
 from splat_fits import Watch
 
 _core = pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")

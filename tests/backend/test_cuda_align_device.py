@@ -12,6 +12,8 @@ import torch
 
 from align_oracle import HUGE, oracle, pair
 from sigmasplat.config import TrackingConfig
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
 from sigmasplat.fit import align as aligning
 from sigmasplat.fit.align import align
 from sigmasplat.fit.cpu.images import CPU_IMAGES
@@ -19,13 +21,11 @@ from sigmasplat.fit.cuda.align import MOTIONS
 from sigmasplat.fit.cuda.images import CUDA_IMAGES
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference, keyframe_reference, live_image, map_reference
-from sigmasplat.io.state import read_state, write_state
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
 from sigmasplat.render.cpu.view import CpuView
 from sigmasplat.render.cuda import launch as cuda_launch
 from sigmasplat.render.cuda.view import CudaView
 from sigmasplat.render.view import View
+from sigmasplat.run_folder.state import read_state, write_state
 from sigmasplat.slam.slam import Slam
 from splat_fields import OPTIONS
 from splat_wall import CAMERA, TRUTH, seen_from, wall

@@ -10,25 +10,25 @@ import torch
 
 from emulated_cuda import Emulator
 from sigmasplat.config import TrackingConfig
+from sigmasplat.config.presets import default_preset, preset
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.frame import PosePrior
 from sigmasplat.fit.pose import fit_pose_align
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference, keyframe_reference, live_image, map_reference
-from sigmasplat.io.state import read_state, write_state
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.frame import PosePrior
-from sigmasplat.presets import default_preset, preset
+from sigmasplat.graph.registration import Registrar, WeighedMap
 from sigmasplat.render.cpu.view import CpuView
 from sigmasplat.render.cuda.view import CudaView
 from sigmasplat.render.reference.view import ReferenceView
 from sigmasplat.render.view import View
-from sigmasplat.slam.localisation import memory, watch
-from sigmasplat.slam.localisation.depth_fit import DepthFit
-from sigmasplat.slam.localisation.depth_shape import DepthShape
-from sigmasplat.slam.localisation.sight import Sight
-from sigmasplat.slam.localisation.verdict import Usual
-from sigmasplat.slam.loop_closure.registration import Registrar, WeighedMap
-from sigmasplat.slam.tracker import Tracker
+from sigmasplat.run_folder.state import read_state, write_state
+from sigmasplat.tracking.depth_fit import DepthFit
+from sigmasplat.tracking.depth_shape import DepthShape
+from sigmasplat.tracking.moving import memory, watch
+from sigmasplat.tracking.sight import Sight
+from sigmasplat.tracking.tracker import Tracker
+from sigmasplat.tracking.verdict import Usual
 from splat_fields import CPU, OPTIONS
 from splat_fits import Watch
 from splat_wall import CAMERA, TRUTH, seen_from, wall
@@ -128,7 +128,7 @@ def test_a_keyframe_is_aligned_to_a_submap_as_on_the_cpu() -> None:
     On so small an image a pixel more or less within the gates moves a pose by a tenth of a millimetre and its
     deviation by a sixth, so deviations are compared at one pose.
     """
-    from sigmasplat.model.submap import MemoryStore
+    from sigmasplat.data.submap import MemoryStore
 
     found = []
     for view in views():

@@ -14,15 +14,15 @@ import torch
 from torch import Tensor
 
 from sigmasplat.config import MappingConfig, TrackingConfig
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.field import COLUMNS, GaussianField
 from sigmasplat.fit.backends import step_for
 from sigmasplat.fit.cuda.descent import CudaTrackingLoss, descend_on_device
 from sigmasplat.fit.cuda.mapping_step import CudaStep
 from sigmasplat.fit.cuda.rows import CudaAccumulator
 from sigmasplat.fit.descent import Descent, descend
 from sigmasplat.fit.tracking_loss import tracking_gradient
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.field import COLUMNS, GaussianField
 from sigmasplat.render import render
 from sigmasplat.render.backend import make_view
 from sigmasplat.render.cpu.view import CpuView

@@ -12,18 +12,18 @@ import torch
 
 from emulated_cuda import Emulator
 from sigmasplat.config import Config, MappingConfig, TrackingConfig
+from sigmasplat.config.presets import default_preset, preset
 from sigmasplat.config.text import override
+from sigmasplat.data import se3
+from sigmasplat.data.field import GaussianField
 from sigmasplat.fit.field import fit_field
 from sigmasplat.fit.pose import fit_pose_adam
 from sigmasplat.fit.target import Keyframe
-from sigmasplat.model import se3
-from sigmasplat.model.field import GaussianField
-from sigmasplat.presets import default_preset, preset
+from sigmasplat.plugins.sources import SyntheticRoom
 from sigmasplat.render.cpu.view import CpuView
 from sigmasplat.render.cuda import view as cuda_view
 from sigmasplat.render.cuda.view import CudaView
 from sigmasplat.slam.slam import Slam
-from sigmasplat.sources import SyntheticRoom
 from splat_fields import OPTIONS, params_of
 from splat_fits import target_of
 from splat_scenes import assert_same_vector, scene

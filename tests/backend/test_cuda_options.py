@@ -13,6 +13,9 @@ import torch
 from torch import Tensor
 
 from sigmasplat.config import MappingConfig
+from sigmasplat.data import se3
+from sigmasplat.data.field import GaussianField, Rows
+from sigmasplat.data.harmonics import count
 from sigmasplat.errors import ConfigError
 from sigmasplat.fit.backends import step_for
 from sigmasplat.fit.color_covariance import FullCovarianceStep
@@ -24,9 +27,6 @@ from sigmasplat.fit.interface import MappingStep
 from sigmasplat.fit.mapping_step import GradientAccumulator, TorchStep
 from sigmasplat.fit.target import Keyframe
 from sigmasplat.fit.view_dependent import ViewDependentStep
-from sigmasplat.model import se3
-from sigmasplat.model.field import GaussianField, Rows
-from sigmasplat.model.harmonics import count
 from sigmasplat.render.cpu.view import CpuView
 from sigmasplat.render.cuda.covariance_view import CudaCovarianceView
 from sigmasplat.render.cuda.view import CudaView

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from emulated_cuda import Emulator
+from sigmasplat.data.field import GaussianField, Rows
 from sigmasplat.fit.cuda.mapping_step import CudaStep
-from sigmasplat.model.field import GaussianField, Rows
 from sigmasplat.render.cuda import stages as cuda_stages
 from sigmasplat.render.cuda.covariance_view import CudaCovarianceView
 from sigmasplat.render.cuda.stages import STAGES, Stages

@@ -12,6 +12,9 @@ from torch import Tensor
 
 from emulated_cuda import Emulator
 from sigmasplat.config import TrackingConfig
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.frame import Frame
 from sigmasplat.errors import BackendError
 from sigmasplat.fit.cuda import descent as cuda_descent
 from sigmasplat.fit.cuda.descent import CudaDescent, CudaTrackingLoss, descend_on_device
@@ -19,9 +22,6 @@ from sigmasplat.fit.descent import Descent, descend
 from sigmasplat.fit.pose import fit_pose_adam
 from sigmasplat.fit.target import Target
 from sigmasplat.fit.tracking_loss import tracking_gradient
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.frame import Frame
 from sigmasplat.render.cpu.view import CpuView
 from sigmasplat.render.cuda.view import CudaView
 from splat_fields import OPTIONS

@@ -11,6 +11,9 @@ import torch
 from torch import Tensor
 
 from sigmasplat.config import MappingConfig
+from sigmasplat.data import se3
+from sigmasplat.data.field import COLUMNS, GaussianField
+from sigmasplat.data.frame import Frame
 from sigmasplat.errors import ConfigError
 from sigmasplat.fit import losses
 from sigmasplat.fit.adam import Rates
@@ -18,9 +21,6 @@ from sigmasplat.fit.cpu.mapping_step import CompiledStep
 from sigmasplat.fit.field import fit_field, loss_weights
 from sigmasplat.fit.mapping_step import TorchStep
 from sigmasplat.fit.target import Keyframe, Target
-from sigmasplat.model import se3
-from sigmasplat.model.field import COLUMNS, GaussianField
-from sigmasplat.model.frame import Frame
 from sigmasplat.render.cpu.view import CpuView
 from sigmasplat.render.reference import operators as reference
 from sigmasplat.render.reference.view import ReferenceView

@@ -8,13 +8,13 @@ import torch
 from torch import Tensor
 
 from sigmasplat.config import MappingConfig
+from sigmasplat.data import se3
+from sigmasplat.data.field import GaussianField
 from sigmasplat.fit import fused_terms, losses
 from sigmasplat.fit.backends import step_for
 from sigmasplat.fit.field import fit_field, loss_weights
 from sigmasplat.fit.fused_terms import FusedTerm
 from sigmasplat.fit.target import Keyframe
-from sigmasplat.model import se3
-from sigmasplat.model.field import GaussianField
 from sigmasplat.render.reference.view import ReferenceView
 from sigmasplat.render.view import View
 from splat_fields import OPTIONS, params_of, view_on

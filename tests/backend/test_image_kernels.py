@@ -7,15 +7,15 @@ from numpy.typing import NDArray
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
+from sigmasplat.data import resizing, se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.frame import Frame
 from sigmasplat.fit.compare import NOTHING, compare, compare_in_numpy, noise_scale, noise_scale_in_numpy
 from sigmasplat.fit.cpu.images import halved, halved_depth, halved_depth_in_numpy, halved_in_numpy
 from sigmasplat.fit.gray import LUMA, gray_of
 from sigmasplat.fit.pyramid import HIDDEN_M, Pyramid
 from sigmasplat.fit.target import Target
-from sigmasplat.model import resizing, se3
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.frame import Frame
-from sigmasplat.slam.localisation.free_space import free_places, free_places_in_numpy
+from sigmasplat.tracking.moving.free_space import free_places, free_places_in_numpy
 
 Image = NDArray[np.float32]
 HEIGHT, WIDTH = 90, 122

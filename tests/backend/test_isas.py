@@ -13,12 +13,12 @@ from splat_scenes import KINDS, assert_same_vector, gradients, probe, render, sc
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
+from sigmasplat.data.field import GaussianField
 from sigmasplat.fit.adam import Rates
 from sigmasplat.fit.backends import CPU
 from sigmasplat.fit.cpu.mapping_step import CompiledStep
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.target import Target
-from sigmasplat.model.field import GaussianField
 from sigmasplat.native import _core
 from sigmasplat.render.cpu import operators as cpu
 from sigmasplat.render.cpu.view import CpuView

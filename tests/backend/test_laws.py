@@ -8,8 +8,8 @@ import pytest
 import torch
 from hypothesis import given, settings, strategies as st
 
-from sigmasplat.model import se3
-from sigmasplat.model.field import left_factor, quaternion_of, transformed
+from sigmasplat.data import se3
+from sigmasplat.data.field import left_factor, quaternion_of, transformed
 from splat_oracle import depths, flat, jacobian
 from splat_scenes import SMALL, Scene, assert_same_vector, make, probe, render, scene, twist_gradient
 

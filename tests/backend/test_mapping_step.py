@@ -9,13 +9,13 @@ import pytest
 import torch
 
 from emulated_cuda import Emulator
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.field import GaussianField
 from sigmasplat.fit import losses
 from sigmasplat.fit.adam import BETA1, BETA2, EPSILON, Rates, adam_step, settle
 from sigmasplat.fit.backends import fits_of
 from sigmasplat.fit.mapping_step import TorchStep
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.field import GaussianField
 from splat_fields import crowd, exact_view, params_of, view_on
 from splat_fits import RATES, TERMS, WEIGHTS, draw_planes, fields, random_gradient, target_of
 from splat_scenes import SMALL, WIDE, assert_same_vector

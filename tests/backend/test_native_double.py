@@ -5,7 +5,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from sigmasplat.model import se3
+from sigmasplat.data import se3
 from sigmasplat.render.reference import operators as reference
 from splat_oracle import depths
 from splat_scenes import KINDS, Scene, scene, twist_gradient

@@ -13,26 +13,26 @@ import pytest
 import torch
 
 from sigmasplat import cli
-from sigmasplat.checks import installation
 from sigmasplat.config import Config, MappingConfig, TrackingConfig
+from sigmasplat.config.presets import preset
 from sigmasplat.config.text import override
+from sigmasplat.data import se3
+from sigmasplat.data.field import GaussianField
 from sigmasplat.errors import BackendError
 from sigmasplat.fit.field import fit_field
 from sigmasplat.fit.pose import fit_pose_adam
 from sigmasplat.fit.target import Keyframe
-from sigmasplat.io.state import read_state, write_state
-from sigmasplat.model import se3
-from sigmasplat.model.field import GaussianField
-from sigmasplat.presets import preset
+from sigmasplat.plugins.checks import installation
+from sigmasplat.plugins.sources import SyntheticRoom
+from sigmasplat.plugins.viewer.layers import render_layer
+from sigmasplat.plugins.viewer.live import LiveView
+from sigmasplat.plugins.viewer.snapshot import Snapshot
 from sigmasplat.render import FieldRenderer, render
 from sigmasplat.render.cpu.view import CpuView
 from sigmasplat.render.cuda.view import CudaView
+from sigmasplat.run_folder.state import read_state, write_state
 from sigmasplat.slam.slam import Slam
 from sigmasplat.slam.state import CLASSES, fixed, restore, state_of
-from sigmasplat.sources import SyntheticRoom
-from sigmasplat.viewer.layers import render_layer
-from sigmasplat.viewer.live import LiveView
-from sigmasplat.viewer.snapshot import Snapshot
 from splat_fields import OPTIONS, Gradients, exact_view, params_of, there_and_back
 from splat_fits import target_of
 from splat_scenes import assert_same_vector, scene

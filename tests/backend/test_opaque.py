@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from sigmasplat.config import RenderConfig
-from sigmasplat.model import se3
-from sigmasplat.model.field import COLUMNS
+from sigmasplat.data import se3
+from sigmasplat.data.field import COLUMNS
 from sigmasplat.render.reference import operators as reference
 from sigmasplat.render.reference.view import ReferenceView
 from sigmasplat.render.view import View

@@ -9,17 +9,17 @@ import torch
 from torch import Tensor
 
 from sigmasplat.config import RegistrationConfig, TrackingConfig
+from sigmasplat.data import se3
+from sigmasplat.data.field import GaussianField
+from sigmasplat.data.frame import Frame
 from sigmasplat.fit.backends import fits_of
 from sigmasplat.fit.descent import descend
 from sigmasplat.fit.pose import PoseFit, fit_pose_adam
 from sigmasplat.fit.target import Target
-from sigmasplat.model import se3
-from sigmasplat.model.field import GaussianField
-from sigmasplat.model.frame import Frame
+from sigmasplat.graph.registration import tracking_of
 from sigmasplat.render import render
 from sigmasplat.render.backend import make_view
 from sigmasplat.render.view import View
-from sigmasplat.slam.loop_closure.registration import tracking_of
 from splat_fields import OPTIONS
 from splat_scenes import assert_same_vector, twist_gradient
 from splat_wall import CAMERA, TRUTH, Array, assert_near, lower_median, seen_from, wall

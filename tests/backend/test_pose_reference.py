@@ -8,17 +8,17 @@ import torch
 from torch import Tensor
 
 from sigmasplat.config import TrackingConfig
+from sigmasplat.data import se3
+from sigmasplat.data.field import COLUMNS, GaussianField
 from sigmasplat.fit.gray import gray_of
 from sigmasplat.fit.pose import fit_pose_align
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference, keyframe_reference, map_reference
 from sigmasplat.fit.target import Target
-from sigmasplat.model import se3
-from sigmasplat.model.field import COLUMNS, GaussianField
+from sigmasplat.plugins.sources import SyntheticRoom
 from sigmasplat.render import render
 from sigmasplat.render.backend import make_view
 from sigmasplat.render.view import View
-from sigmasplat.sources import SyntheticRoom
 from splat_fields import OPTIONS
 from splat_wall import CAMERA, TRUTH, assert_near, lower_median, seen_from, wall
 

@@ -9,13 +9,13 @@ import torch
 from torch import Tensor
 
 from sigmasplat.config import RenderConfig
+from sigmasplat.data import se3
+from sigmasplat.data.field import GaussianField, Rows
+from sigmasplat.data.harmonics import view_colors
 from sigmasplat.fit.adam import Rates
 from sigmasplat.fit.mapping_step import TorchStep
 from sigmasplat.fit.target import Target
 from sigmasplat.fit.view_dependent import ViewDependentStep
-from sigmasplat.model import se3
-from sigmasplat.model.field import GaussianField, Rows
-from sigmasplat.model.harmonics import view_colors
 from sigmasplat.render import Render, render
 from sigmasplat.render.channels import features_of
 from sigmasplat.render.reference import operators as reference

@@ -8,19 +8,19 @@ import torch
 from torch import Tensor
 
 from sigmasplat.config import RenderConfig, TrackingConfig
+from sigmasplat.data.field import COLUMNS, GaussianField
+from sigmasplat.data.map_uncertainty import SHIPPED, Background, MapUncertainty
 from sigmasplat.errors import ConfigError
 from sigmasplat.fit.gray import gray_of
 from sigmasplat.fit.predicted_variance import residuals_at, use_predicted_variance, with_residuals
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import keyframe_reference, map_reference
 from sigmasplat.fit.target import Target
-from sigmasplat.model.field import COLUMNS, GaussianField
-from sigmasplat.model.map_uncertainty import SHIPPED, Background, MapUncertainty
 from sigmasplat.render.backend import make_view
 from sigmasplat.render.blended_values import blend_values
 from sigmasplat.render.predictive import predict
 from sigmasplat.render.view import View
-from sigmasplat.slam.tracker import Tracker
+from sigmasplat.tracking.tracker import Tracker
 from splat_fields import OPTIONS
 from splat_scenes import WIDE, scene
 from splat_wall import CAMERA, TRUTH, seen_from, wall

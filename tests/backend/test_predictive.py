@@ -5,18 +5,11 @@ import pytest
 import torch
 
 from sigmasplat.config import RenderConfig
+from sigmasplat.data import se3
+from sigmasplat.data.field import GaussianField
+from sigmasplat.data.map_uncertainty import COLOR_PARTS, DEPTH_PARTS, SHIPPED, Background, Calibration, MapUncertainty
 from sigmasplat.fit.splat_residuals import splat_residuals
 from sigmasplat.fit.target import Keyframe, Target
-from sigmasplat.model import se3
-from sigmasplat.model.field import GaussianField
-from sigmasplat.model.map_uncertainty import (
-    COLOR_PARTS,
-    DEPTH_PARTS,
-    SHIPPED,
-    Background,
-    Calibration,
-    MapUncertainty,
-)
 from sigmasplat.render import render
 from sigmasplat.render.blended_values import blend_values
 from sigmasplat.render.predictive import novelty, predict, variance_parts

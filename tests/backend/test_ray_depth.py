@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from sigmasplat.config import Config, RenderConfig
+from sigmasplat.config.presets import preset
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.field import COLUMNS, GaussianField
 from sigmasplat.errors import BackendError, ConfigError
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.field import COLUMNS, GaussianField
-from sigmasplat.presets import preset
 from sigmasplat.render import render
 from sigmasplat.render.backend import options_on
 from sigmasplat.render.blended_values import blend_values

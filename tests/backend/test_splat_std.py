@@ -5,11 +5,11 @@ import pytest
 import torch
 
 from sigmasplat.config import RenderConfig
-from sigmasplat.fit.splat_std import splat_std
+from sigmasplat.data.field import GaussianField
+from sigmasplat.data.map_uncertainty import COLOR_PARTS, DEPTH_PARTS, Background, Calibration, MapUncertainty
 from sigmasplat.fit.target import Keyframe, Target
-from sigmasplat.model.field import GaussianField
-from sigmasplat.model.map_uncertainty import COLOR_PARTS, DEPTH_PARTS, Background, Calibration, MapUncertainty
 from sigmasplat.render.predictive import predict
+from sigmasplat.uncertainty.splat_std import splat_std
 from splat_scenes import WIDE
 
 OPTIONS = RenderConfig()

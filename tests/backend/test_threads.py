@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
+from sigmasplat.input.prefetch import read_ahead
 from sigmasplat.native.threads import NICENESS, idle_kernel_workers, set_kernel_threads, yield_to_others
-from sigmasplat.sources.files.prefetch import read_ahead
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only Linux has a priority for each thread")
 

@@ -10,18 +10,18 @@ import torch
 from torch import Tensor
 
 from sigmasplat.config import TrackingConfig
+from sigmasplat.data import se3
+from sigmasplat.data.field import GaussianField
+from sigmasplat.data.frame import Frame
 from sigmasplat.fit.backends import fits_of
 from sigmasplat.fit.gray import gray_of
 from sigmasplat.fit.pose import PoseFit, fit_pose_adam
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.target import Target
-from sigmasplat.model import se3
-from sigmasplat.model.field import GaussianField
-from sigmasplat.model.frame import Frame
 from sigmasplat.render.backend import make_view
 from sigmasplat.render.view import View
-from sigmasplat.slam import tracker
-from sigmasplat.slam.localisation.sight import Sight
+from sigmasplat.tracking import tracker
+from sigmasplat.tracking.sight import Sight
 from splat_fields import OPTIONS
 from splat_scenes import assert_same_vector
 from splat_wall import CAMERA, TRUTH, Array, assert_near, lower_median, seen_from, wall

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from sigmasplat.config import RenderConfig
-from sigmasplat.model.camera import Camera
+from sigmasplat.data.camera import Camera
 
 PIXEL = Camera(1, 1, 10.0, 10.0, 0.0, 0.0)
 OPTIONS = RenderConfig()

@@ -8,8 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.field import COLUMNS, GaussianField
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.field import COLUMNS, GaussianField
 from sigmasplat.render.reference import operators as reference
 from sigmasplat.render.reference.view import reaches
 from sigmasplat.render.view import View

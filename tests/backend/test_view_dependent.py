@@ -10,17 +10,17 @@ import torch
 from torch import Tensor
 
 from sigmasplat.config import MappingConfig
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.field import COLUMNS, GaussianField, Rows
+from sigmasplat.data.frame import Frame
+from sigmasplat.data.harmonics import count
 from sigmasplat.fit.adam import Rates
 from sigmasplat.fit.backends import fits_of, step_for
 from sigmasplat.fit.field import fit_field, loss_weights
 from sigmasplat.fit.mapping_step import TorchStep
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.fit.view_dependent import ViewDependentStep
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.field import COLUMNS, GaussianField, Rows
-from sigmasplat.model.frame import Frame
-from sigmasplat.model.harmonics import count
 from sigmasplat.render import render
 from sigmasplat.render.cpu.view import CpuView
 from sigmasplat.render.reference.view import ReferenceView

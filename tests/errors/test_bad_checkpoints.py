@@ -10,17 +10,17 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from sigmasplat.config import Config
+from sigmasplat.data.atlas import Atlas
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.field import GaussianField
+from sigmasplat.data.hops import UNKNOWN_HOP
+from sigmasplat.data.places import Place, Places
+from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import RunError, SigmaSplatError
-from sigmasplat.floorplan.floor_plan import floor_plan
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.model.atlas import Atlas
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.field import GaussianField
-from sigmasplat.model.hops import UNKNOWN_HOP
-from sigmasplat.model.places import Place, Places
-from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.graph.pose_graph import Edge
+from sigmasplat.plugins.outputs.floorplan.floor_plan import floor_plan
+from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.slam.checkpoint import checkpoint_of
-from sigmasplat.slam.loop_closure.pose_graph import Edge
 
 Tensors = dict[str, torch.Tensor]
 

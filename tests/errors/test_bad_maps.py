@@ -15,10 +15,11 @@ import zstandard
 from PIL import Image
 
 from sigmasplat import cli
+from sigmasplat.data.field import GaussianField
 from sigmasplat.errors import SourceError
-from sigmasplat.io.splats import compressed_ply, gltf, ply, sog, splat, spz
-from sigmasplat.io.splats.any_format import read_any
-from sigmasplat.model.field import GaussianField
+from sigmasplat.plugins.outputs.splats import compressed_ply, gltf, sog, splat, spz
+from sigmasplat.plugins.outputs.splats.any_format import read_any
+from sigmasplat.run_folder import splat_ply as ply
 
 WRITERS = {".ply": ply, ".compressed.ply": compressed_ply, ".splat": splat, ".spz": spz, ".sog": sog, ".glb": gltf}
 

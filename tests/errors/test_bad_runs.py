@@ -8,8 +8,8 @@ from safetensors import SafetensorError
 
 from sigmasplat.config import Config
 from sigmasplat.errors import ConfigError, RunError
-from sigmasplat.io import tensors
-from sigmasplat.io.runs import RunFolder
+from sigmasplat.files import tensors
+from sigmasplat.run_folder.runs import RunFolder
 
 
 def make(path: Path) -> RunFolder:

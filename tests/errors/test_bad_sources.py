@@ -7,8 +7,8 @@ import pytest
 from PIL import Image
 
 from sigmasplat.errors import SigmaSplatError
-from sigmasplat.sources import open_source
-from sigmasplat.sources.opening import formats
+from sigmasplat.input.opening import formats
+from sigmasplat.plugins.sources import open_source
 
 
 def refusal(path, **options) -> str:

@@ -10,8 +10,8 @@ import pytest
 from PIL import Image
 
 from command_line import exit_code
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.run_folder.runs import RunFolder
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 

@@ -11,8 +11,8 @@ import file_server as acts
 from archives import folder_content, tar_gz
 from file_server import Act, FileServer, serving
 from sigmasplat import cli
-from sigmasplat.download.entries import PublicRecording, PublicSet, RemoteFile
-from sigmasplat.download.fetch import RetryPolicy
+from sigmasplat.plugins.download.entries import PublicRecording, PublicSet, RemoteFile
+from sigmasplat.plugins.download.fetch import RetryPolicy
 
 DESK = "rgbd_dataset_freiburg1_desk"
 
@@ -29,13 +29,13 @@ def server(monkeypatch: pytest.MonkeyPatch, tiny_tum: Path) -> Iterator[FileServ
             name: PublicRecording(name, (RemoteFile(server.url(f"/{name}.tgz")),)) for name in ("desk", "bare", "gone")
         }
         tiny = PublicSet("Tiny", "http://page", "free", "tiny", recordings, 2**20, 99)
-        monkeypatch.setattr("sigmasplat.download.lookup.SETS", {"tiny": tiny})
+        monkeypatch.setattr("sigmasplat.plugins.download.lookup.SETS", {"tiny": tiny})
         wait(monkeypatch, RetryPolicy(max_attempts=2, first_wait_s=0.001))
         yield server
 
 
 def wait(monkeypatch: pytest.MonkeyPatch, retry: RetryPolicy) -> None:
-    monkeypatch.setattr("sigmasplat.download.downloader.RetryPolicy", lambda: retry)
+    monkeypatch.setattr("sigmasplat.plugins.download.downloader.RetryPolicy", lambda: retry)
 
 
 def said(capsys: pytest.CaptureFixture[str], code: int, *arguments: str) -> tuple[str, str]:
@@ -152,7 +152,7 @@ def test_ctrl_c(server: FileServer, capsys: pytest.CaptureFixture[str], monkeypa
     def interrupted(*arguments: object, **options: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("sigmasplat.download.downloader.fetch", interrupted)
+    monkeypatch.setattr("sigmasplat.plugins.download.downloader.fetch", interrupted)
     out, err = said(capsys, 130, "tiny", "desk")
     assert out.splitlines()[-1] == "the part downloaded so far is kept; the same command resumes the download"
     assert err == "sigmasplat: interrupted\n"

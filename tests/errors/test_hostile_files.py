@@ -20,10 +20,10 @@ from room_run import made_run
 from sigmasplat import cli
 from sigmasplat.config import Config
 from sigmasplat.errors import ConfigError, RunError, SourceError
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.io.splats.any_format import read_any
-from sigmasplat.sources import open_source
-from sigmasplat.sources.files.association import associate
+from sigmasplat.input.association import associate
+from sigmasplat.plugins.outputs.splats.any_format import read_any
+from sigmasplat.plugins.sources import open_source
+from sigmasplat.run_folder.runs import RunFolder
 
 DEEP = "[" * 200_000
 

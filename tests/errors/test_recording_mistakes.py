@@ -13,7 +13,7 @@ from bag_recordings import CAMERA_TOPICS, FOCAL, Recorder, aligned
 from fake_realsense import Device
 from recordings import FRAMES, Scene, encoded, r3d_members, scene, write_exr_export, write_stray, write_zip
 from sigmasplat.errors import SigmaSplatError
-from sigmasplat.sources import open_source
+from sigmasplat.plugins.sources import open_source
 
 for package in ("cv2", "lzfse", "OpenEXR", "rosbags"):
     pytest.importorskip(package, reason="recordings need the extras iphone and ros")

@@ -12,7 +12,7 @@ from PIL import Image
 
 from layouts import LAYOUTS, sample
 from sigmasplat.errors import SigmaSplatError
-from sigmasplat.sources import open_source
+from sigmasplat.plugins.sources import open_source
 
 Damage = Callable[[Path], Path | None]
 

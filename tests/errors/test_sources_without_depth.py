@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from sigmasplat.errors import SourceError
-from sigmasplat.sources import open_source
+from sigmasplat.plugins.sources import open_source
 
 COLOR = np.full((12, 16, 3), 90, np.uint8)
 GREY = np.full((12, 16), 90, np.uint8)

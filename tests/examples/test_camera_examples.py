@@ -15,7 +15,7 @@ import sigmasplat
 from documents import ROOT
 from module_files import module_from
 from sigmasplat import Slam
-from sigmasplat.model import se3
+from sigmasplat.data import se3
 from small_room import SMALL, walk
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")

@@ -12,9 +12,9 @@ import pytest
 from changed_settings import changed_settings
 from documents import DOCUMENTS, ROOT, prose
 from sigmasplat.config import Config
+from sigmasplat.config.presets import list_presets, preset
 from sigmasplat.fit.compare import Comparison
-from sigmasplat.presets import list_presets, preset
-from sigmasplat.presets.table_files import list_tables
+from sigmasplat.plugins.papers.table_files import list_tables
 
 PACKAGE = ROOT / "src" / "sigmasplat"
 SECTIONS = [f.name for f in dataclasses.fields(Config) if dataclasses.is_dataclass(getattr(Config(), f.name))]

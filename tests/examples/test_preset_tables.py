@@ -9,7 +9,7 @@ import pytest
 
 from changed_settings import changed_settings
 from sigmasplat.config import Config
-from sigmasplat.presets import list_presets, preset
+from sigmasplat.config.presets import list_presets, preset
 
 DOCS = Path(__file__).parents[2] / "docs"
 SYSTEMS = ("varsplat", "cgslam")

@@ -13,18 +13,18 @@ import pytest
 import torch
 
 import sigmasplat
-import sigmasplat.sources
+import sigmasplat.plugins.sources
 from command_line import exit_code
 from documents import DOCUMENTS, ROOT, blocks
 from module_files import module_from
 from sigmasplat import cli
 from sigmasplat.commands import options
+from sigmasplat.config.presets import default_preset, preset
 from sigmasplat.config.text import override
-from sigmasplat.io.runs import ALL_POSES, FILES, RunFolder
-from sigmasplat.presets import default_preset, preset
+from sigmasplat.input.opening import formats
+from sigmasplat.plugins.sources import open_source
 from sigmasplat.render import render
-from sigmasplat.sources import open_source
-from sigmasplat.sources.opening import formats
+from sigmasplat.run_folder.runs import ALL_POSES, FILES, RunFolder
 
 TINY = "synthetic:frames=120,width=64,height=48"
 TINY_SETTINGS = {
@@ -148,7 +148,7 @@ def test_a_format_is_one_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     extra.mkdir()
     data.mkdir()
     (extra / "npz_frames.py").write_text((ROOT / "examples" / "npz_frames.py").read_text(encoding="utf-8"))
-    monkeypatch.setattr(sigmasplat.sources, "__path__", [*sigmasplat.sources.__path__, str(extra)])
+    monkeypatch.setattr(sigmasplat.plugins.sources, "__path__", [*sigmasplat.plugins.sources.__path__, str(extra)])
     whole = open_source(TINY, limit=3)
     np.savez(data / "camera.npz", **dataclasses.asdict(whole.camera))
     for frame, T in zip(whole, whole.truth().T_world_camera, strict=False):
@@ -164,7 +164,7 @@ def test_a_format_is_one_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         assert [f.index for f in open_source(data)] == [0, 2]
     finally:
         formats.cache_clear()
-        sys.modules.pop("sigmasplat.sources.npz_frames", None)
+        sys.modules.pop("sigmasplat.plugins.sources.npz_frames", None)
 
 
 def commands() -> list[str]:

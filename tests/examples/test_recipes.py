@@ -48,7 +48,7 @@ def test_a_preset_is_values_and_a_setting_is_a_field(package: Path, run: Callabl
     presets = package / "presets"
     (presets / "mine.py").write_text(
         '"""Settings for my robot."""\n\nfrom sigmasplat.config.text import override\n'
-        "from sigmasplat.presets.sigma import SIGMA\n\n"
+        "from sigmasplat.plugins.papers.sigma import SIGMA\n\n"
         'PRESETS = {"robot": override(SIGMA, {"input.width": "480", "tracking.patience_s": "0.5"})}\n',
         encoding="utf-8",
     )
@@ -63,7 +63,7 @@ def test_a_preset_is_values_and_a_setting_is_a_field(package: Path, run: Callabl
     run(
         "from sigmasplat.config.text import override\n"
         "from sigmasplat.errors import ConfigError\n"
-        "from sigmasplat.presets import list_presets, preset\n"
+        "from sigmasplat.config.presets import list_presets, preset\n"
         "robot = preset('robot')\n"
         "assert (robot.name, robot.input.width, robot.tracking.patience_s) == ('robot', 480, 0.5)\n"
         "assert {'robot', 'varsplat-office', 'loopsplat-office'} <= set(list_presets())\n"
@@ -114,7 +114,7 @@ def test_an_attribute_of_splats_is_a_name_a_width_and_a_rate(package: Path, run:
     replace(rates, 'ATTRIBUTE_RATES = {"correlations"', 'ATTRIBUTE_RATES = {"heat": ("colors", 0.5), "correlations"')
     run(
         "import torch\n"
-        "from sigmasplat.model.field import GaussianField\n"
+        "from sigmasplat.data.field import GaussianField\n"
         "field = GaussianField.from_values(torch.rand(5, 3), torch.full((5,), 0.1), torch.rand(5, 3))\n"
         "field.get_or_create('heat')\n"
         "field.attributes['heat'].params[:, 1] = torch.arange(5.0)\n"

@@ -15,11 +15,13 @@ import sigmasplat
 from command_line import exit_code
 from sigmasplat.commands.bench import Ablation
 from sigmasplat.config import Config
+from sigmasplat.config.presets import preset
 from sigmasplat.config.text import override
 from sigmasplat.errors import ConfigError, RunError
-from sigmasplat.evaluation import ablation
-from sigmasplat.evaluation.ablation import COMPARED, NAMES, WITHOUT_VARIANCE, Job, Results, Study, run_jobs
-from sigmasplat.evaluation.paired_comparison import (
+from sigmasplat.files.machine import INSTALLED, code_digest
+from sigmasplat.plugins.evaluation import ablation
+from sigmasplat.plugins.evaluation.ablation import COMPARED, NAMES, WITHOUT_VARIANCE, Job, Results, Study, run_jobs
+from sigmasplat.plugins.evaluation.paired_comparison import (
     FIGURES,
     best,
     columns,
@@ -29,9 +31,7 @@ from sigmasplat.evaluation.paired_comparison import (
     passed_by_chance,
     spread,
 )
-from sigmasplat.io.machine import INSTALLED, code_digest
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.presets import preset
+from sigmasplat.run_folder.runs import RunFolder
 
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
 bench_ablation, record, tables = map(importlib.import_module, ("ablation", "record", "tables"))

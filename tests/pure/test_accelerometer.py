@@ -9,20 +9,20 @@ from scipy.spatial.transform import Rotation
 from bag_recordings import Recorder, aligned
 from box_room import CAMERA, seer, splats, walk
 from recordings import scene, write_stray
+from sigmasplat.config.presets import preset
+from sigmasplat.data import se3
+from sigmasplat.data.accelerometer import Accelerometer, accelerometer_from_samples, up_of_path
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.frame import Frame
+from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import RunError, SourceError
-from sigmasplat.exports.axes import level_cameras
-from sigmasplat.floorplan.ground import floor_frame
-from sigmasplat.floorplan.surface_samples import sample_surfaces
-from sigmasplat.io.frames import RunFrames, noted_up
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.model import se3
-from sigmasplat.model.accelerometer import Accelerometer, accelerometer_from_samples, up_of_path
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.frame import Frame
-from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.presets import preset
-from sigmasplat.sources import open_source
-from sigmasplat.sources.base import Source
+from sigmasplat.input.source import Source
+from sigmasplat.plugins.outputs.axes import level_cameras
+from sigmasplat.plugins.outputs.floorplan.ground import floor_frame
+from sigmasplat.plugins.outputs.floorplan.surface_samples import sample_surfaces
+from sigmasplat.plugins.sources import open_source
+from sigmasplat.run_folder.frames import RunFrames, noted_up
+from sigmasplat.run_folder.runs import RunFolder
 
 WORLD = se3.exp(np.array([3.0, -2.0, 1.0, 1.9, 0.4, -0.3]))
 UP = np.array([0.2, -0.9, 0.4]) / np.linalg.norm([0.2, -0.9, 0.4])

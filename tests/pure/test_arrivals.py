@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.frame import Frame
+from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SourceError
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.frame import Frame
-from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.sources.arrivals import Arrivals
-from sigmasplat.sources.base import Source
+from sigmasplat.input.source import Source
+from sigmasplat.plugins.sources.arrivals import Arrivals
 
 CAMERA = Camera(4, 3, 4.0, 4.0, 1.5, 1.0)
 FRAME = Frame(0, 0.0, np.zeros((3, 4, 3), np.float32), np.ones((3, 4), np.float32), CAMERA)

@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
+from sigmasplat.data import se3
+from sigmasplat.data.atlas import Atlas
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.column import Column
+from sigmasplat.data.field import GaussianField
+from sigmasplat.data.hops import UNKNOWN_HOP, Hop
+from sigmasplat.data.places import Place, Places
+from sigmasplat.data.submap import MemoryStore, Picture, RefinedStore, StorePart, Submap
 from sigmasplat.errors import SigmaSplatError
-from sigmasplat.model import se3
-from sigmasplat.model.atlas import Atlas
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.column import Column
-from sigmasplat.model.field import GaussianField
-from sigmasplat.model.hops import UNKNOWN_HOP, Hop
-from sigmasplat.model.places import Place, Places
-from sigmasplat.model.submap import MemoryStore, Picture, RefinedStore, StorePart, Submap
 
 CAMERA = Camera(4, 3, 4.0, 4.0, 1.5, 1.0)
 

@@ -7,11 +7,11 @@ import pytest
 
 from box_room import seer
 from room_run import PATH, WORLD, Walls, made_run
-from sigmasplat.exports import axes as module
-from sigmasplat.exports.axes import AXES, level_cameras, levelled, transform_to
-from sigmasplat.exports.run_reader import RunReader
-from sigmasplat.model import se3
-from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.data import se3
+from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.plugins.outputs import axes as module
+from sigmasplat.plugins.outputs.axes import AXES, level_cameras, levelled, transform_to
+from sigmasplat.plugins.outputs.run_reader import RunReader
 
 UP_ROW = {"y-up": 1, "z-up": 2}
 

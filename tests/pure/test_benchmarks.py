@@ -18,18 +18,18 @@ import torch
 from benchmark_results import BENCHMARKS, laid_out, results
 from sigmasplat import cli
 from sigmasplat.config import Config, RenderConfig
+from sigmasplat.config.presets import preset
 from sigmasplat.config.text import override
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.field import GaussianField
 from sigmasplat.errors import ConfigError, SourceError
 from sigmasplat.fit.pose import PoseFit
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.field import GaussianField
 from sigmasplat.native import _core
-from sigmasplat.presets import preset
+from sigmasplat.plugins.sources import open_source
 from sigmasplat.render import render
 from sigmasplat.render.reference import operators as reference
-from sigmasplat.slam.tracker import Tracker
-from sigmasplat.sources import open_source
+from sigmasplat.tracking.tracker import Tracker
 
 accuracy, accuracy_tables, cpu, cpu_scene, cpu_tables, record, scenes, tables, works = map(
     importlib.import_module,

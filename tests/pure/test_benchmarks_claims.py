@@ -8,7 +8,7 @@ import pytest
 
 from benchmark_results import laid_out, results
 from sigmasplat.errors import ConfigError
-from sigmasplat.evaluation.paired_comparison import Figure, PairedDifference
+from sigmasplat.plugins.evaluation.paired_comparison import Figure, PairedDifference
 
 claims, evidence, tables, record = map(
     importlib.import_module, ("claims", "claims_evidence", "claims_tables", "record")

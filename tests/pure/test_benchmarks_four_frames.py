@@ -8,7 +8,7 @@ import pytest
 
 from benchmark_results import laid_out
 from sigmasplat.errors import ConfigError, SourceError
-from sigmasplat.sources import open_source
+from sigmasplat.plugins.sources import open_source
 
 four_frames = importlib.import_module("four_frames")
 ROOM = "synthetic:frames=400,width=64,height=48"

@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from benchmark_results import laid_out
+from sigmasplat.config.presets import preset
 from sigmasplat.config.text import override
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.field import GaussianField
 from sigmasplat.errors import SigmaSplatError
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.field import GaussianField
-from sigmasplat.presets import preset
 from sigmasplat.render import render
 
 full_resolution = importlib.import_module("full_resolution")

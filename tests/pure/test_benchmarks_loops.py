@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from benchmark_results import laid_out
+from sigmasplat.config.presets import preset
+from sigmasplat.data import se3
 from sigmasplat.errors import SourceError
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.model import se3
-from sigmasplat.presets import preset
-from sigmasplat.sources import open_source
+from sigmasplat.plugins.sources import open_source
+from sigmasplat.run_folder.runs import RunFolder
 
 accuracy, long_run, loops, loops_tables, tables = map(
     importlib.import_module, ("accuracy", "long_run", "loops", "loops_tables", "tables")

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from benchmark_results import laid_out
-from sigmasplat.model.field import GaussianField
+from sigmasplat.data.field import GaussianField
 
 map_quality = importlib.import_module("map_quality")
 

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import ConfigError
-from sigmasplat.io.trajectory import write_trajectory
-from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.sources import open_source
+from sigmasplat.plugins.sources import open_source
+from sigmasplat.run_folder.trajectory import write_trajectory
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 sys.path.append(str(BENCHMARKS))

@@ -11,11 +11,11 @@ import pytest
 import torch
 
 from benchmark_results import laid_out
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.field import GaussianField, Rows
+from sigmasplat.data.frame import Frame
 from sigmasplat.errors import ConfigError
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.field import GaussianField, Rows
-from sigmasplat.model.frame import Frame
 from sigmasplat.render import render
 
 accuracy, localise, pose_gradient, tables = map(

@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 
 from benchmark_results import laid_out
+from sigmasplat.config.presets import list_presets, preset
 from sigmasplat.config.text import override, split_settings
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.presets import list_presets, preset
+from sigmasplat.run_folder.runs import RunFolder
 
 accuracy = importlib.import_module("accuracy")
 every_preset = importlib.import_module("every_preset")

@@ -8,7 +8,7 @@ import pytest
 
 from benchmark_results import laid_out
 from sigmasplat.config import Config
-from sigmasplat.io.runs import RunFolder
+from sigmasplat.run_folder.runs import RunFolder
 
 realtime, replayed = importlib.import_module("realtime"), importlib.import_module("replayed")
 

@@ -8,10 +8,10 @@ import pytest
 
 from benchmark_results import laid_out
 from sigmasplat.config import Config, FeatureConfig
+from sigmasplat.config.presets import preset
+from sigmasplat.data import se3
 from sigmasplat.errors import SourceError
-from sigmasplat.model import se3
-from sigmasplat.presets import preset
-from sigmasplat.sources.synthetic import SyntheticRoom
+from sigmasplat.plugins.sources.synthetic import SyntheticRoom
 
 known_map, relocalisation = map(importlib.import_module, ("known_map", "relocalisation"))
 

@@ -11,9 +11,9 @@ import pytest
 from numpy.typing import NDArray
 
 from benchmark_results import laid_out, results
-from sigmasplat.io.trajectory import write_trajectory
-from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.sources import open_source
+from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.plugins.sources import open_source
+from sigmasplat.run_folder.trajectory import write_trajectory
 
 disturbances, recordings, scores, robustness, tables = map(
     importlib.import_module,

@@ -12,7 +12,7 @@ import pytest
 from benchmark_results import laid_out
 from sigmasplat.config import Config
 from sigmasplat.errors import ConfigError
-from sigmasplat.io.runs import RunFolder
+from sigmasplat.run_folder.runs import RunFolder
 
 accuracy, consistency, systems, tables = map(
     importlib.import_module,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sigmasplat.fit.calibration import fit_weights
+from sigmasplat.uncertainty.calibration import fit_weights
 
 TRUE = {"a": 0.3, "b": 2.0, "c": 1e-4}
 START = {"a": 1.0, "b": 1.0, "c": 1e-3}

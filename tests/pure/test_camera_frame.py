@@ -7,9 +7,9 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.frame import Frame
 from sigmasplat.errors import ConfigError, SourceError
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.frame import Frame
 
 CAMERA = Camera(8, 6, 7.0, 6.5, 3.2, 2.9)
 

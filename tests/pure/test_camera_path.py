@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from sigmasplat.data import se3
+from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SigmaSplatError
-from sigmasplat.model import se3
-from sigmasplat.model.camera_path import look_along, orbit, smooth_path
-from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.plugins.outputs.camera_path import look_along, orbit, smooth_path
 
 WORLD = se3.exp(np.array([3.0, -2.0, 1.0, 1.9, 0.4, -0.3]))
 

@@ -22,24 +22,24 @@ from command_line import exit_code
 from lpips_weights import write_weights
 from sigmasplat import cli
 from sigmasplat.config import Config
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.component import Component
+from sigmasplat.data.field import GaussianField
+from sigmasplat.data.frame import Frame
+from sigmasplat.data.mesh import Mesh
+from sigmasplat.data.submap import SubmapStore
+from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SigmaSplatError, SourceError
-from sigmasplat.io.frames import noted_up
-from sigmasplat.io.mesh import write_mesh
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.io.splats.ply import read_field
-from sigmasplat.io.submaps import DiskStore
-from sigmasplat.io.trajectory import read_trajectory
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.component import Component
-from sigmasplat.model.field import GaussianField
-from sigmasplat.model.frame import Frame
-from sigmasplat.model.mesh import Mesh
-from sigmasplat.model.submap import SubmapStore
-from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.input.source import Source
+from sigmasplat.plugins.outputs.meshes.mesh_files import write_mesh
 from sigmasplat.render.cuda import stages as cuda_stages
 from sigmasplat.run.session import Session
 from sigmasplat.run.terminal import Screen
-from sigmasplat.sources.base import Source
+from sigmasplat.run_folder.frames import noted_up
+from sigmasplat.run_folder.runs import RunFolder
+from sigmasplat.run_folder.splat_ply import read_field
+from sigmasplat.run_folder.submaps import DiskStore
+from sigmasplat.run_folder.trajectory import read_trajectory
 
 CAMERA = Camera(8, 6, 8.0, 8.0, 3.5, 2.5)
 METRICS = {"ate": {"rmse_m": 0.0123}, "held_out": {"psnr_db": 27.31}, "training": {"psnr_db": 31.25}, "splats": 2}
@@ -177,11 +177,11 @@ def corridor(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Corridor:
     monkeypatch.setattr("sigmasplat.run.resume.StateFile.save", lambda *ignored: None)
     module = ModuleType("sigmasplat.slam.slam")
     module.Slam = MadeUpSlam  # type: ignore[attr-defined]
-    scores = ModuleType("sigmasplat.evaluation.evaluate")
+    scores = ModuleType("sigmasplat.plugins.evaluation.evaluate")
     scores.evaluate = evaluate  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, module.__name__, module)
     monkeypatch.setitem(sys.modules, scores.__name__, scores)
-    for place in ("sigmasplat.sources", "sigmasplat.run.scene"):
+    for place in ("sigmasplat.plugins.sources", "sigmasplat.run.scene"):
         monkeypatch.setattr(f"{place}.open_source", lambda path, settings=None: source)
     monkeypatch.setattr(MadeUpSlam, "at", {}, raising=False)
     monkeypatch.setattr(MadeUpSlam, "lost", set(), raising=False)

@@ -11,10 +11,10 @@ import pytest
 
 from sigmasplat import env
 from sigmasplat.config import SECTIONS, Config
+from sigmasplat.config.presets import list_presets, preset
 from sigmasplat.config.ranges import kinds_of, problem_of, unpacked
 from sigmasplat.config.text import override, split_settings
 from sigmasplat.errors import ConfigError
-from sigmasplat.presets import list_presets, preset
 
 
 def test_override_converts_to_each_type() -> None:

@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from sigmasplat.fit.compare import noise_scale
-from sigmasplat.slam.localisation.denoise import denoised
+from sigmasplat.tracking.denoise import denoised
 
 Depth = NDArray[np.float32]
 

@@ -6,14 +6,14 @@ import torch
 from torch import Tensor
 
 from sigmasplat.config import DensifyConfig
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.field import ATTRIBUTES, COLUMNS, WIDTH, GaussianField
 from sigmasplat.fit.adam import Rates, adam_step
 from sigmasplat.fit.densify_stats import DensifyStats
 from sigmasplat.fit.target import Keyframe, Target
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.field import ATTRIBUTES, COLUMNS, WIDTH, GaussianField
+from sigmasplat.mapping.densify import clone, densify_mask, multiply, split, too_large
 from sigmasplat.render.reference import operators as reference
-from sigmasplat.slam.densify import clone, densify_mask, multiply, split, too_large
 
 CAMERA = Camera(40, 30, 50.0, 52.0, 18.6, 15.3)
 MOVED = [*range(0, 3), *range(7, 10)]

@@ -11,9 +11,9 @@ import pytest
 from depth_networks import BYTES, FLOAT, HALF, network, node, weighted
 from sigmasplat.config import InputConfig
 from sigmasplat.errors import ConfigError, SourceError
-from sigmasplat.sources import open_source
-from sigmasplat.sources.files import predicted
-from sigmasplat.sources.files.depth_model import DepthModel
+from sigmasplat.plugins.predicted_depth import predicted_files as predicted
+from sigmasplat.plugins.predicted_depth.depth_model import DepthModel
+from sigmasplat.plugins.sources import open_source
 
 ROOM = "synthetic:frames=60,width=64,height=48"
 PLAIN = InputConfig(depth_model_colors="unit", depth_model_size=28)

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sigmasplat.model.frame import Frame
-from sigmasplat.slam.loop_closure.descriptors import Descriptor, OrientationGrid, similarity
-from sigmasplat.sources.opening import open_source
+from sigmasplat.data.frame import Frame
+from sigmasplat.input.opening import open_source
+from sigmasplat.tracking.descriptors import Descriptor, OrientationGrid, similarity
 
 GRID: Descriptor = OrientationGrid()
 

@@ -13,7 +13,7 @@ from sigmasplat.render.backend import BACKENDS
 PACKAGE = Path(__file__).parents[2] / "src" / "sigmasplat"
 MAY_CHOOSE = ("render/", "native/", "fit/cpu/", "fit/cuda/", "fit/backends.py", "fit/fused_terms.py")
 """Where code may depend on the device."""
-MAY_NAME = (*MAY_CHOOSE, "config/__init__.py", "env.py", "checks/installation.py", "io/state.py")
+MAY_NAME = (*MAY_CHOOSE, "config/__init__.py", "env.py", "plugins/checks/installation.py", "run_folder/state.py")
 """Those, and what reads the setting, describes the machine, or puts tensors back where they were."""
 DEVICE_CLASS = re.compile(r"(View|Step|Level)$")
 
@@ -75,7 +75,7 @@ def test_nothing_but_the_table_chooses_by_device() -> None:
     assert offenders(choices_by_device, MAY_CHOOSE) == {}
     assert offenders(names_of_devices, MAY_NAME) == {}
     # A file of weights may hold other things than tensors.
-    assert offenders(tensors_asked_for, (*MAY_CHOOSE, "slam/loop_closure/netvlad.py"), ("fit/", "slam/")) == {}
+    assert offenders(tensors_asked_for, (*MAY_CHOOSE, "graph/netvlad.py"), ("fit/", "slam/")) == {}
 
 
 def test_the_checks_notice_what_they_are_for() -> None:

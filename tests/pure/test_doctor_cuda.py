@@ -2,9 +2,9 @@
 
 import pytest
 
-from sigmasplat.checks import installation
 from sigmasplat.errors import BackendError
 from sigmasplat.native.cuda import cubins
+from sigmasplat.plugins.checks import installation
 from sigmasplat.render.cuda import launch as cuda_launch
 
 
@@ -53,8 +53,8 @@ def test_asking_for_cuda_without_a_device_is_refused_in_one_line() -> None:
     import numpy as np
 
     from sigmasplat.config import RenderConfig
-    from sigmasplat.model.camera import Camera
-    from sigmasplat.model.field import GaussianField
+    from sigmasplat.data.camera import Camera
+    from sigmasplat.data.field import GaussianField
     from sigmasplat.render import render
     from sigmasplat.render.backend import make_view
 

@@ -13,12 +13,12 @@ import pytest
 import file_server as acts
 from archives import folder_content, tar_gz, zipped
 from file_server import FileServer, serving
-from sigmasplat.download import describe_recordings, describe_sets, download_recording, find_recording
-from sigmasplat.download.catalogue import SETS
-from sigmasplat.download.downloader import MARKER
-from sigmasplat.download.entries import PublicRecording, PublicSet, RemoteFile
-from sigmasplat.download.fetch import RetryPolicy
 from sigmasplat.errors import DownloadError
+from sigmasplat.plugins.download import describe_recordings, describe_sets, download_recording, find_recording
+from sigmasplat.plugins.download.catalogue import SETS
+from sigmasplat.plugins.download.downloader import MARKER
+from sigmasplat.plugins.download.entries import PublicRecording, PublicSet, RemoteFile
+from sigmasplat.plugins.download.fetch import RetryPolicy
 
 HASTY = RetryPolicy(max_attempts=2, first_wait_s=0.001)
 FILES = {"rgb.txt": b"# colour\n", "rgb/1.png": bytes(i * i % 251 for i in range(5000))}

@@ -11,12 +11,12 @@ import torch
 import file_server as acts
 from file_server import FileServer, serving
 from lpips_weights import TRUNK_FILES, write_weights
-from sigmasplat.download import download_recording
-from sigmasplat.download.catalogue import SETS
-from sigmasplat.download.entries import PublicSet, RemoteFile
-from sigmasplat.download.fetch import RetryPolicy
 from sigmasplat.errors import DownloadError
-from sigmasplat.metrics.lpips import Lpips, Net, find_lpips
+from sigmasplat.plugins.download import download_recording
+from sigmasplat.plugins.download.catalogue import SETS
+from sigmasplat.plugins.download.entries import PublicSet, RemoteFile
+from sigmasplat.plugins.download.fetch import RetryPolicy
+from sigmasplat.plugins.evaluation.metrics.lpips import Lpips, Net, find_lpips
 
 HASTY = RetryPolicy(max_attempts=2, first_wait_s=0.001)
 

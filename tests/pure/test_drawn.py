@@ -7,20 +7,20 @@ import pytest
 from numpy.typing import NDArray
 
 from sigmasplat.config import MovingConfig, TrackingConfig
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.frame import Frame
 from sigmasplat.fit.compare import Comparison
 from sigmasplat.fit.pose import PoseFit
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference
 from sigmasplat.fit.target import Target
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.frame import Frame
-from sigmasplat.slam.localisation.drawn import free_standing, has_drawn, is_still, shift_px, suspected
-from sigmasplat.slam.localisation.foreground import Foreground, thinned
-from sigmasplat.slam.localisation.sight import Sight
-from sigmasplat.slam.localisation.two_motions import two_motions
-from sigmasplat.slam.localisation.verdict import is_missed
-from sigmasplat.slam.localisation.watch import Watch
+from sigmasplat.tracking.moving.drawn import free_standing, has_drawn, is_still, shift_px, suspected
+from sigmasplat.tracking.moving.foreground import Foreground, thinned
+from sigmasplat.tracking.moving.two_motions import two_motions
+from sigmasplat.tracking.moving.watch import Watch
+from sigmasplat.tracking.sight import Sight
+from sigmasplat.tracking.verdict import is_missed
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 CAMERA = Camera(160, 120, 140.0, 140.0, 79.5, 59.5)

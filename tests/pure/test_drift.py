@@ -7,11 +7,11 @@ import pytest
 from numpy.typing import NDArray
 
 from sigmasplat.config import SubmapConfig
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
 from sigmasplat.fit.pyramid import Pyramid
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
-from sigmasplat.slam.drift import BIAS, HOP_M, HOP_RAD, Drift
-from sigmasplat.slam.rules import ends_submap
+from sigmasplat.tracking.drift import BIAS, HOP_M, HOP_RAD, Drift
+from sigmasplat.tracking.rules import ends_submap
 
 Matrix = NDArray[np.float64]
 OWN = np.diag(np.repeat([HOP_M**2, HOP_RAD**2], 3))

@@ -10,15 +10,15 @@ import torch
 from command_line import exit_code
 from sigmasplat.commands.export import ExportOptions
 from sigmasplat.config import Config
-from sigmasplat.exports.formats import FORMATS, ExportFormat, ExportSource, choose, listed, owners
-from sigmasplat.io.ply_elements import read_header
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.io.splats import ply
-from sigmasplat.io.splats.any_format import read_any
-from sigmasplat.io.trajectory import read_trajectory
-from sigmasplat.model.field import GaussianField
-from sigmasplat.model.map_uncertainty import SHIPPED, Background, MapUncertainty, SplatStd
-from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.data.field import GaussianField
+from sigmasplat.data.map_uncertainty import SHIPPED, Background, MapUncertainty, SplatStd
+from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.files.ply_elements import read_header
+from sigmasplat.plugins.outputs.formats import FORMATS, ExportFormat, ExportSource, choose, listed, owners
+from sigmasplat.plugins.outputs.splats.any_format import read_any
+from sigmasplat.run_folder import splat_ply as ply
+from sigmasplat.run_folder.runs import RunFolder
+from sigmasplat.run_folder.trajectory import read_trajectory
 
 
 @pytest.fixture

@@ -10,22 +10,22 @@ from PIL import Image, ImageDraw
 
 from box_room import CAMERA, HIGH, LOW, seer, splats
 from room_run import FRAMES, LOST, PATH, T_ROOM, WORLD, Walls, made_run, picture
-from sigmasplat.drawing.film import FilmScale, legend_strip
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.component import Component
+from sigmasplat.data.field import GaussianField
+from sigmasplat.data.map_uncertainty import SHIPPED, Background, MapUncertainty, SplatStd
+from sigmasplat.data.mesh import Mesh
 from sigmasplat.errors import ConfigError, RunError
-from sigmasplat.evaluation.reconstruct import FusionInput
-from sigmasplat.exports.colmap import export_colmap
-from sigmasplat.exports.nerfstudio import export_nerfstudio
-from sigmasplat.exports.plan import export_plan, write_plan
-from sigmasplat.exports.points import export_points, splat_points
-from sigmasplat.exports.run_reader import RunReader
-from sigmasplat.exports.video import VideoOptions, export_video, film_camera, orbit_view
-from sigmasplat.floorplan.floor_plan import floor_plan
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.component import Component
-from sigmasplat.model.field import GaussianField
-from sigmasplat.model.map_uncertainty import SHIPPED, Background, MapUncertainty, SplatStd
-from sigmasplat.model.mesh import Mesh
+from sigmasplat.plugins.evaluation.reconstruct import FusionInput
+from sigmasplat.plugins.outputs.colmap import export_colmap
+from sigmasplat.plugins.outputs.drawing.film import FilmScale, legend_strip
+from sigmasplat.plugins.outputs.floorplan.floor_plan import floor_plan
+from sigmasplat.plugins.outputs.nerfstudio import export_nerfstudio
+from sigmasplat.plugins.outputs.plan import export_plan, write_plan
+from sigmasplat.plugins.outputs.points import export_points, splat_points
+from sigmasplat.plugins.outputs.run_reader import RunReader
+from sigmasplat.plugins.outputs.video import VideoOptions, export_video, film_camera, orbit_view
 
 
 @pytest.fixture(params=["submaps", "in one piece"])

@@ -6,18 +6,18 @@ import pytest
 import torch
 
 import two_submaps as room
+from sigmasplat.data.atlas import Atlas
+from sigmasplat.data.exposure import NEUTRAL, between, centred, exposed, unexposed
+from sigmasplat.data.frame import Frame
+from sigmasplat.data.places import Place, Places
+from sigmasplat.data.submap import MemoryStore, Picture, RefinedStore, Submap
+from sigmasplat.final.final_map import FinalMap, final_map
 from sigmasplat.fit.exposure import fit_exposure
 from sigmasplat.fit.target import Target
-from sigmasplat.metrics.image import psnr
-from sigmasplat.metrics.views import scored_view
-from sigmasplat.model.atlas import Atlas
-from sigmasplat.model.exposure import NEUTRAL, between, centred, exposed, unexposed
-from sigmasplat.model.frame import Frame
-from sigmasplat.model.places import Place, Places
-from sigmasplat.model.submap import MemoryStore, Picture, RefinedStore, Submap
+from sigmasplat.plugins.evaluation.metrics.image import psnr
+from sigmasplat.plugins.evaluation.metrics.views import scored_view
 from sigmasplat.render import render
 from sigmasplat.render.reference.view import ReferenceView
-from sigmasplat.slam.final import FinalMap, final_map
 from sigmasplat.types import Matrix
 
 GAINS = (1.0, 0.7, 1.2, 0.8, 1.15, 0.9)

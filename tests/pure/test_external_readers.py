@@ -8,12 +8,13 @@ import torch
 
 from command_line import exit_code
 from external_readers import convert, package, read_by_splat_transform, script
-from sigmasplat.io.splats import gltf, ply, sog, usd
-from sigmasplat.io.splats.any_format import read_any
-from sigmasplat.io.splats.values import SplatValues
-from sigmasplat.model.field import GaussianField, Rows
-from sigmasplat.model.harmonics import count
-from sigmasplat.model.map_uncertainty import SplatStd
+from sigmasplat.data.field import GaussianField, Rows
+from sigmasplat.data.harmonics import count
+from sigmasplat.data.map_uncertainty import SplatStd
+from sigmasplat.plugins.outputs.splats import gltf, sog, usd
+from sigmasplat.plugins.outputs.splats.any_format import read_any
+from sigmasplat.run_folder import splat_ply as ply
+from sigmasplat.run_folder.splat_values import SplatValues
 
 VALIDATE = """
 import {readFileSync} from 'fs'; import validator from 'gltf-validator';

@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sigmasplat.model.component import APART, LOST, RELOCALISED, TRACKED
-from sigmasplat.slam.localisation.confidence import Confidence, std_of
-from sigmasplat.slam.loop_closure.loops import Loop
+from sigmasplat.data.component import APART, LOST, RELOCALISED, TRACKED
+from sigmasplat.graph.confidence import Confidence, std_of
+from sigmasplat.graph.loops import Loop
 
 CLEAN: dict[str, float] = {
     "common": 0.9, "close": 0.98, "front": 0.01, "behind": 0.01, "residual": 0.3, "correlation": 0.97, "points": 3000.0,

@@ -12,12 +12,13 @@ import pytest
 from numpy.typing import NDArray
 
 from sigmasplat.config import FeatureConfig
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.frame import Frame
 from sigmasplat.errors import ConfigError
 from sigmasplat.fit.gray import gray_of
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.frame import Frame
-from sigmasplat.slam.features import (
+from sigmasplat.plugins.sources.synthetic import SyntheticRoom
+from sigmasplat.tracking.features import (
     Features,
     Landmarks,
     depth_readings,
@@ -25,7 +26,6 @@ from sigmasplat.slam.features import (
     make_extractor,
     pose_from_landmarks,
 )
-from sigmasplat.sources.synthetic import SyntheticRoom
 
 KINDS = ("sift", "orb", "xfeat")
 CAMERA = Camera(320, 240, 300.0, 300.0, 159.5, 119.5)
@@ -277,5 +277,5 @@ def test_unreadable_weights_of_xfeat(problem: Exception, monkeypatch: pytest.Mon
 
 
 def test_opencv_is_imported_when_it_is_needed() -> None:
-    code = "import sys, sigmasplat.slam.slam, sigmasplat.slam.features, sigmasplat.cli; print('cv2' in sys.modules)"
+    code = "import sys, sigmasplat.slam.slam, sigmasplat.tracking.features, sigmasplat.cli; print('cv2' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "False"

@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 
 from sigmasplat.config import RenderConfig
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.field import COLUMNS, WIDTH, GaussianField, left_factor, quaternion_of, transformed
 from sigmasplat.errors import SigmaSplatError
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.field import COLUMNS, WIDTH, GaussianField, left_factor, quaternion_of, transformed
 from sigmasplat.render import render
 
 CAMERA = Camera(33, 21, 30.0, 31.0, 15.2, 10.7)

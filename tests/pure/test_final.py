@@ -11,18 +11,18 @@ import torch
 from scipy.spatial import cKDTree
 
 from sigmasplat.config import Config, MappingConfig
+from sigmasplat.data import se3
+from sigmasplat.data.field import COLUMNS, GaussianField, Rows
+from sigmasplat.data.submap import MemoryStore, StorePart, Submap
 from sigmasplat.errors import ConfigError, SigmaSplatError
+from sigmasplat.final import final_map as final
+from sigmasplat.final.final_map import final_map, merged, survivors, z_order
+from sigmasplat.final.fusion import FusionView, count_keyframes, fuse, fusion_views
+from sigmasplat.final.refinement import KeyframeReader, refine
 from sigmasplat.fit.adam import ATTRIBUTE_RATES
-from sigmasplat.model import se3
-from sigmasplat.model.field import COLUMNS, GaussianField, Rows
-from sigmasplat.model.submap import MemoryStore, StorePart, Submap
+from sigmasplat.mapping.pruning import largest_weights, prune_by_weight
 from sigmasplat.render.reference.view import ReferenceView
-from sigmasplat.slam import final
-from sigmasplat.slam.final import final_map, merged, survivors, z_order
-from sigmasplat.slam.fusion import FusionView, count_keyframes, fuse, fusion_views
-from sigmasplat.slam.predicted_submaps import PredictedSubmaps
-from sigmasplat.slam.pruning import largest_weights, prune_by_weight
-from sigmasplat.slam.refinement import KeyframeReader, refine
+from sigmasplat.uncertainty.predicted_submaps import PredictedSubmaps
 from two_submaps import (
     ANCHORS,
     CAMERA,
@@ -319,7 +319,7 @@ def test_splats_that_no_keyframe_shows_are_removed_and_the_budget_holds() -> Non
 def test_a_time_budget_ends_refinement_early(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each look at the clock takes a hundredth of a second."""
     ticks = itertools.count(0.0, 0.01)
-    monkeypatch.setattr("sigmasplat.slam.refinement.time.perf_counter", lambda: next(ticks))
+    monkeypatch.setattr("sigmasplat.final.refinement.time.perf_counter", lambda: next(ticks))
     told, settings = list[tuple[int, int]](), config(iterations=1000, seconds=3.0, lr_decay=0.1)
     view = ReferenceView(CAMERA, settings.render)
     made = final_map(make_store(), ANCHORS, settings, view, np.random.default_rng(0), lambda *at: told.append(at))
@@ -341,7 +341,7 @@ def test_degrees_grow_and_faded_splats_go(monkeypatch: pytest.MonkeyPatch) -> No
         used.append((steps, degree, len(field)))
         return type("Fit", (), {"losses": [0.0] * steps})()
 
-    monkeypatch.setattr("sigmasplat.slam.refinement.fit_field", fit)
+    monkeypatch.setattr("sigmasplat.final.refinement.fit_field", fit)
     full = len(refined(store, config()))
     field = refined(store, config(iterations=25, sh_degree=2, sh_every=6, prune_every=10))
     assert [(steps, degree) for steps, degree, _ in used] == [(6, 0), (4, 1), (2, 1), (6, 2), (2, 2), (4, 2), (1, 2)]
@@ -358,7 +358,7 @@ def test_the_rate_of_the_means_falls_to_its_last_value_across_pruning(monkeypatc
         assert all(float(columns[COLUMNS["colors"]][0]) == pytest.approx(2.5e-3) for columns in rates)
         return type("Fit", (), {"losses": [0.0] * len(rates)})()
 
-    monkeypatch.setattr("sigmasplat.slam.refinement.fit_field", fit)
+    monkeypatch.setattr("sigmasplat.final.refinement.fit_field", fit)
     refined(make_store(), config(iterations=25, prune_every=10, sh_every=7, lr_means_last=1.6e-6))
     assert used[0] == pytest.approx(1e-4) and used[-1] == pytest.approx(1.6e-6)
     assert np.allclose(np.diff(np.log(used)), np.log(1.6e-2) / 24, rtol=1e-3)
@@ -375,7 +375,7 @@ def test_sizes_can_have_a_rate_of_their_own(monkeypatch: pytest.MonkeyPatch, own
             found.extend(float(columns[COLUMNS[name]][0]) for columns in rates)
         return type("Fit", (), {"losses": [0.0] * len(rates)})()
 
-    monkeypatch.setattr("sigmasplat.slam.refinement.fit_field", fit)
+    monkeypatch.setattr("sigmasplat.final.refinement.fit_field", fit)
     refined(make_store(), config(iterations=20, prune_every=7, lr_factor=8.0, lr_decay=0.1, lr_log_scales=own))
     assert used["log_scales"][0] == pytest.approx(first) and used["log_scales"][-1] == pytest.approx(0.1 * first)
     assert used["quats"][0] == pytest.approx(8 * MappingConfig().lr_quats)
@@ -413,7 +413,7 @@ def test_pictures_are_read_when_drawn_and_kept_while_there_is_room(monkeypatch: 
     store, read = make_store(), list[tuple[int, int]]()
     monkeypatch.setattr(store, "picture", lambda s, k: read.append((s, k)) or store.pictures[s][k])
     view = ReferenceView(CAMERA, CONFIG.render)
-    monkeypatch.setattr("sigmasplat.slam.refinement.CACHE_BYTES", 2 * 16 * 20 * 15)
+    monkeypatch.setattr("sigmasplat.final.refinement.CACHE_BYTES", 2 * 16 * 20 * 15)
     keyframes = KeyframeReader(store, ANCHORS, view)
     assert len(keyframes) == 6 and not read
     for i in (0, 5, 0, 5, 3, 0):

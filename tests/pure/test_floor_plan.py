@@ -11,9 +11,13 @@ import pytest
 import torch
 
 from box_room import CAMERA, CHEST, HIGH, LOW, PILLAR, cast, pose, seer, splats, walk
-from sigmasplat.drawing.plot import DARK, LIGHT
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import ConfigError, SigmaSplatError
-from sigmasplat.floorplan.floor_plan import (
+from sigmasplat.files.json_files import write_json
+from sigmasplat.plugins.outputs.drawing.plot import DARK, LIGHT
+from sigmasplat.plugins.outputs.floorplan.floor_plan import (
     CELL_M,
     FLOOR_UNOBSERVED,
     FREE,
@@ -24,14 +28,10 @@ from sigmasplat.floorplan.floor_plan import (
     FloorPlan,
     floor_plan,
 )
-from sigmasplat.floorplan.ground import floor_frame
-from sigmasplat.floorplan.picture import draw_floor_plan, draw_kinds
-from sigmasplat.floorplan.rescan import RescanRegion, unsure_rule
-from sigmasplat.floorplan.surface_samples import sample_surface, sample_surfaces
-from sigmasplat.io.json_files import write_json
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.plugins.outputs.floorplan.ground import floor_frame
+from sigmasplat.plugins.outputs.floorplan.picture import draw_floor_plan, draw_kinds
+from sigmasplat.plugins.outputs.floorplan.rescan import RescanRegion, unsure_rule
+from sigmasplat.plugins.outputs.floorplan.surface_samples import sample_surface, sample_surfaces
 from sigmasplat.render.predictive import Predicted
 
 WORLD = se3.exp(np.array([3.0, -2.0, 1.0, 1.9, 0.4, -0.3]))

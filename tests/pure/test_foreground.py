@@ -5,11 +5,11 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import label
 
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
-from sigmasplat.slam.localisation.foreground import Earlier, Foreground, foreground
-from sigmasplat.slam.localisation.windows import labelled
-from sigmasplat.sources import SyntheticRoom
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.plugins.sources import SyntheticRoom
+from sigmasplat.tracking.moving.foreground import Earlier, Foreground, foreground
+from sigmasplat.tracking.moving.windows import labelled
 
 cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed (pip install opencv-python-headless)")
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.frame import Frame
+from sigmasplat.data.frame_arrays import frame_from_arrays
 from sigmasplat.errors import ConfigError, SourceError
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.frame import Frame
-from sigmasplat.model.frame_arrays import frame_from_arrays
 
 CAMERA = Camera(8, 6, 7.0, 7.5, 3.5, 2.5)
 FOUR = (7.0, 7.5, 3.5, 2.5)

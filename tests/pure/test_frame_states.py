@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from sigmasplat.io.frames import RunFrames
-from sigmasplat.metrics.failures import auroc, brier, calibration, score_failures
-from sigmasplat.model.component import outside_world, submaps_outside
-from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.data.component import outside_world, submaps_outside
+from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.plugins.evaluation.metrics.failures import auroc, brier, calibration, score_failures
+from sigmasplat.run_folder.frames import RunFrames
 
 
 def path(*times_s: float) -> Trajectory:

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from skimage.measure import marching_cubes
 
+from sigmasplat.data.mesh import Mesh
 from sigmasplat.errors import ConfigError
-from sigmasplat.io.mesh import read_mesh, write_mesh
-from sigmasplat.model.decimation import decimated
-from sigmasplat.model.gap_filling import filled, gaps
-from sigmasplat.model.mesh import Mesh
+from sigmasplat.plugins.outputs.meshes.decimation import decimated
+from sigmasplat.plugins.outputs.meshes.gap_filling import filled, gaps
+from sigmasplat.plugins.outputs.meshes.mesh_files import read_mesh, write_mesh
 
 STEP_M, RADIUS_M = 0.03, 0.48
 

@@ -12,19 +12,19 @@ from scipy.spatial.transform import Rotation
 import recordings
 from command_line import exit_code
 from sigmasplat.config import Config
+from sigmasplat.config.presets import preset
 from sigmasplat.config.scale import for_scene
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SourceError
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.presets import preset
+from sigmasplat.input.pose_files import FLIP_YZ
+from sigmasplat.input.source import Source
+from sigmasplat.plugins.sources import open_source
 from sigmasplat.run.pose_scale import measured_scale, scale_warning, triangulated
 from sigmasplat.run.scene import open_scene
-from sigmasplat.slam.features import Features
-from sigmasplat.sources import open_source
-from sigmasplat.sources.base import Source
-from sigmasplat.sources.files.poses import FLIP_YZ
+from sigmasplat.run_folder.runs import RunFolder
+from sigmasplat.tracking.features import Features
 
 FRAMES = 6
 ROOM = f"synthetic:frames={FRAMES},width=64,height=48"

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sigmasplat.checks.recording import inspect_source
 from sigmasplat.config import InputConfig
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.frame import Frame
+from sigmasplat.data.gyroscope import Gyroscope
 from sigmasplat.errors import SourceError
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.frame import Frame
-from sigmasplat.model.gyroscope import Gyroscope
-from sigmasplat.sources import open_source
+from sigmasplat.plugins.checks.recording import inspect_source
+from sigmasplat.plugins.sources import open_source
 
 CAMERA = Camera(8, 6, 7.0, 6.5, 3.2, 2.9)
 

@@ -5,11 +5,11 @@ import pytest
 import torch
 from torch import Tensor
 
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.field import ATTRIBUTES, GaussianField, Rows
+from sigmasplat.data.harmonics import basis, count, turned, view_colors
 from sigmasplat.errors import ConfigError
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.field import ATTRIBUTES, GaussianField, Rows
-from sigmasplat.model.harmonics import basis, count, turned, view_colors
 from sigmasplat.render import render
 
 CAMERA = Camera(24, 18, 22.0, 22.0, 11.3, 8.6)

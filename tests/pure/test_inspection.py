@@ -8,13 +8,13 @@ import pytest
 from PIL import Image
 
 from command_line import exit_code
-from sigmasplat.checks.recording import inspect_source
-from sigmasplat.checks.registration import edge_agreement, outlines
 from sigmasplat.config import InputConfig
-from sigmasplat.model.camera import Camera
-from sigmasplat.sources import open_source
-from sigmasplat.sources.camera.depth_registration import DepthRegistration
-from sigmasplat.sources.tum import write_tum
+from sigmasplat.data.camera import Camera
+from sigmasplat.input.depth_registration import DepthRegistration
+from sigmasplat.plugins.checks.recording import inspect_source
+from sigmasplat.plugins.checks.registration import edge_agreement, outlines
+from sigmasplat.plugins.sources import open_source
+from sigmasplat.plugins.sources.tum import write_tum
 
 ROOM = "synthetic:frames=120,width=320,height=240"
 SEEN = InputConfig(stride=12)

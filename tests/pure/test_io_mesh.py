@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sigmasplat.data.mesh import Mesh
 from sigmasplat.errors import RunError, SourceError
-from sigmasplat.io.mesh import read_mesh, write_mesh
-from sigmasplat.model.mesh import Mesh
+from sigmasplat.plugins.outputs.meshes.mesh_files import read_mesh, write_mesh
 
 
 def some_mesh(colors: bool = True) -> Mesh:

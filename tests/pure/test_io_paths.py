@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import RunError
-from sigmasplat.exports import colmap, nerfstudio
-from sigmasplat.io.trajectory import write_kitti_poses
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.plugins.outputs import colmap, nerfstudio
+from sigmasplat.run_folder.trajectory import write_kitti_poses
 
 CAMERA = Camera(64, 48, 50.0, 51.0, 30.25, 24.75)
 NAMES = [f"frame-{i:06d}.png" for i in range(7)]

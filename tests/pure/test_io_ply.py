@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 
+from sigmasplat.data.field import ATTRIBUTES, GaussianField, Rows
+from sigmasplat.data.map_uncertainty import SplatStd
 from sigmasplat.errors import RunError, SourceError
-from sigmasplat.io.splats import ply
-from sigmasplat.io.splats.ply import SH_C0, read_field, write_field
-from sigmasplat.model.field import ATTRIBUTES, GaussianField, Rows
-from sigmasplat.model.map_uncertainty import SplatStd
+from sigmasplat.run_folder import splat_ply as ply
+from sigmasplat.run_folder.splat_ply import SH_C0, read_field, write_field
 
 
 def random_field(n: int = 50, seed: int = 0) -> GaussianField:
@@ -266,8 +266,8 @@ def test_a_map_that_is_converted_in_parts_has_the_same_bytes(
 MANY_SUBMAPS = """
 import sys, torch
 from pathlib import Path
-from sigmasplat.io.splats.ply import write_field
-from sigmasplat.model.field import GaussianField
+from sigmasplat.run_folder.splat_ply import write_field
+from sigmasplat.data.field import GaussianField
 peak_mib = lambda: int(next(s for s in open("/proc/self/status") if s.startswith("VmHWM")).split()[1]) / 1024
 one = GaussianField(torch.rand(100_000, 17))
 before = peak_mib()

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sigmasplat.exports.points import write_points
-from sigmasplat.io.glb import linear
-from sigmasplat.io.mesh import read_mesh, write_mesh
-from sigmasplat.model.mesh import Mesh
+from sigmasplat.data.mesh import Mesh
+from sigmasplat.plugins.outputs.meshes.glb import linear
+from sigmasplat.plugins.outputs.meshes.mesh_files import read_mesh, write_mesh
+from sigmasplat.plugins.outputs.points import write_points
 
 trimesh = pytest.importorskip("trimesh", reason="the [dev] extra is not installed")
 

@@ -12,12 +12,12 @@ import torch
 from PIL import Image
 
 from sigmasplat.config import Config, InputConfig
+from sigmasplat.data.field import GaussianField
+from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import RunError
-from sigmasplat.io import atomic
-from sigmasplat.io.json_files import to_json
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.model.field import GaussianField
-from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.files import atomic
+from sigmasplat.files.json_files import to_json
+from sigmasplat.run_folder.runs import RunFolder
 
 CONFIG = replace(Config(), name="test", seed=7, input=InputConfig(width=160))
 

@@ -13,13 +13,14 @@ import torch
 import zstandard
 
 from room_map import psnr_db, room_map
+from sigmasplat.data.field import GaussianField, Rows
+from sigmasplat.data.harmonics import count
 from sigmasplat.errors import ConfigError, RunError
-from sigmasplat.io.splats import any_format, compressed_ply, gltf, ply, sog, splat, spz, usd
-from sigmasplat.io.splats.codebooks import levels
-from sigmasplat.io.splats.quaternions import from_smallest_three, smallest_three
-from sigmasplat.io.splats.values import SplatValues, morton_order
-from sigmasplat.model.field import GaussianField, Rows
-from sigmasplat.model.harmonics import count
+from sigmasplat.plugins.outputs.splats import any_format, compressed_ply, gltf, sog, splat, spz, usd
+from sigmasplat.plugins.outputs.splats.codebooks import levels
+from sigmasplat.run_folder import splat_ply as ply
+from sigmasplat.run_folder.quaternions import from_smallest_three, smallest_three
+from sigmasplat.run_folder.splat_values import SplatValues, morton_order
 
 Writer = Callable[[Path, GaussianField], None]
 WRITERS: dict[str, Writer] = {

@@ -15,15 +15,15 @@ import pytest
 import safetensors.torch
 import torch
 
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.field import ATTRIBUTES, GaussianField, Rows
+from sigmasplat.data.frame import Detail, Frame
+from sigmasplat.data.submap import MemoryStore, Picture, Submap, SubmapStore
 from sigmasplat.errors import RunError, SigmaSplatError
-from sigmasplat.io import tensors
-from sigmasplat.io.submaps import DiskStore
-from sigmasplat.io.tensors import open_tensors, write_tensors
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.field import ATTRIBUTES, GaussianField, Rows
-from sigmasplat.model.frame import Detail, Frame
-from sigmasplat.model.submap import MemoryStore, Picture, Submap, SubmapStore
+from sigmasplat.files import tensors
+from sigmasplat.files.tensors import open_tensors, write_tensors
+from sigmasplat.run_folder.submaps import DiskStore
 from sigmasplat.slam.slam import Slam
 from sigmasplat.slam.state import state_of
 from sigmasplat.types import completed

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import RunError, SourceError
-from sigmasplat.io.trajectory import read_trajectory, write_trajectory
-from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.run_folder.trajectory import read_trajectory, write_trajectory
 
 
 def some_path(n: int = 40) -> Trajectory:

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from sigmasplat.errors import BackendError, RunError
-from sigmasplat.exports.video import write_video
+from sigmasplat.plugins.outputs.video import write_video
 
 SIZE = (48, 96)
 

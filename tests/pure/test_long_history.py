@@ -9,22 +9,22 @@ import numpy as np
 import pytest
 import torch
 
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.column import Column
+from sigmasplat.data.field import GaussianField
+from sigmasplat.data.hops import UNKNOWN_HOP
+from sigmasplat.data.places import Place
+from sigmasplat.data.poses import KeyframePoses, Poses
+from sigmasplat.data.submap import MemoryStore, Submap
 from sigmasplat.errors import RunError
-from sigmasplat.io.json_files import write_json
-from sigmasplat.io.state import read_state, write_state
-from sigmasplat.io.submaps import DiskStore
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.column import Column
-from sigmasplat.model.field import GaussianField
-from sigmasplat.model.hops import UNKNOWN_HOP
-from sigmasplat.model.places import Place
-from sigmasplat.model.poses import KeyframePoses, Poses
-from sigmasplat.model.submap import MemoryStore, Submap
-from sigmasplat.slam.loop_closure.described_submaps import DescribedSubmaps, SubmapDescriptor
-from sigmasplat.slam.loop_closure.edges import Edges
-from sigmasplat.slam.loop_closure.loops import Loop, Loops
-from sigmasplat.slam.loop_closure.pose_graph import Edge, LoopVerdict
+from sigmasplat.files.json_files import write_json
+from sigmasplat.graph.described_submaps import DescribedSubmaps, SubmapDescriptor
+from sigmasplat.graph.edges import Edges
+from sigmasplat.graph.loops import Loop, Loops
+from sigmasplat.graph.pose_graph import Edge, LoopVerdict
+from sigmasplat.run_folder.state import read_state, write_state
+from sigmasplat.run_folder.submaps import DiskStore
 from sigmasplat.slam.slam import Slam
 from sigmasplat.slam.step_result import Step
 

@@ -7,19 +7,19 @@ import pytest
 import torch
 
 from sigmasplat.config import Config, LoopConfig
+from sigmasplat.data import se3
+from sigmasplat.data.atlas import Atlas
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.field import GaussianField
+from sigmasplat.data.submap import MemoryStore, Picture, Submap
 from sigmasplat.errors import ConfigError
-from sigmasplat.model import se3
-from sigmasplat.model.atlas import Atlas
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.field import GaussianField
-from sigmasplat.model.submap import MemoryStore, Picture, Submap
-from sigmasplat.slam.loop_closure import closer
-from sigmasplat.slam.loop_closure.candidates import SubmapPair
-from sigmasplat.slam.loop_closure.closer import LoopCloser, make_descriptor
-from sigmasplat.slam.loop_closure.descriptors import OrientationGrid
-from sigmasplat.slam.loop_closure.neighbourhood import Incidence, Neighbourhood
-from sigmasplat.slam.loop_closure.pose_graph import Edge
-from sigmasplat.slam.loop_closure.registration import Registration
+from sigmasplat.graph import closer
+from sigmasplat.graph.candidates import SubmapPair
+from sigmasplat.graph.closer import LoopCloser, make_descriptor
+from sigmasplat.graph.neighbourhood import Incidence, Neighbourhood
+from sigmasplat.graph.pose_graph import Edge
+from sigmasplat.graph.registration import Registration
+from sigmasplat.tracking.descriptors import OrientationGrid
 from sigmasplat.types import Slices
 
 CAMERA = Camera(4, 3, 4.0, 4.0, 1.5, 1.0)

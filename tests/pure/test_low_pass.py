@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from sigmasplat.config import RenderConfig
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.field import GaussianField
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.field import GaussianField
 from sigmasplat.render import FieldRenderer, render
 from sigmasplat.render.low_pass import as_refined
 

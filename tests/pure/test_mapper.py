@@ -7,13 +7,13 @@ import pytest
 import torch
 
 from sigmasplat.config import Config, DensifyConfig, MappingConfig, RenderConfig, SeedConfig
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.field import COLUMNS
+from sigmasplat.data.frame import Frame
 from sigmasplat.fit.target import Keyframe, Target
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.field import COLUMNS
-from sigmasplat.model.frame import Frame
+from sigmasplat.mapping.mapper import Mapper
 from sigmasplat.render.reference.view import ReferenceView
-from sigmasplat.slam.mapper import Mapper
-from sigmasplat.slam.rules import never
+from sigmasplat.tracking.rules import never
 from sigmasplat.types import completed
 
 CAMERA = Camera(16, 12, 15.0, 15.0, 7.5, 5.5)

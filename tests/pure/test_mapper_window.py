@@ -9,16 +9,16 @@ import pytest
 import torch
 
 from sigmasplat.config import Config, DensifyConfig, MappingConfig, RenderConfig, SeedConfig
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.field import COLUMNS, GaussianField
+from sigmasplat.data.frame import Frame
 from sigmasplat.fit.adam import Rates
 from sigmasplat.fit.target import Keyframe, Target
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.field import COLUMNS, GaussianField
-from sigmasplat.model.frame import Frame
+from sigmasplat.mapping import mapper as mapper_module
+from sigmasplat.mapping.mapper import Mapper
 from sigmasplat.render.reference.view import ReferenceView
-from sigmasplat.slam import mapper as mapper_module
-from sigmasplat.slam.mapper import Mapper
-from sigmasplat.slam.rules import draw_keyframes
+from sigmasplat.tracking.rules import draw_keyframes
 
 CAMERA = Camera(24, 18, 22.0, 22.0, 11.5, 8.5)
 SEEDS = SeedConfig(

@@ -14,21 +14,21 @@ from PIL import Image
 
 from lpips_weights import write_weights
 from sigmasplat.config import Config, FinalConfig, InputConfig
-from sigmasplat.drawing.view_panels import FOOT, GAP, HEAD, PANEL_WIDTH
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.component import Component
+from sigmasplat.data.field import GaussianField
+from sigmasplat.data.frame import Frame
+from sigmasplat.data.submap import Picture, Submap
+from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import RunError, SourceError
-from sigmasplat.evaluation.evaluate import evaluate
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.io.submaps import DiskStore
-from sigmasplat.metrics.lpips import Lpips
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.component import Component
-from sigmasplat.model.field import GaussianField
-from sigmasplat.model.frame import Frame
-from sigmasplat.model.submap import Picture, Submap
-from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.report.view_strips import data_uri, file_data_uri
-from sigmasplat.sources.base import Source
+from sigmasplat.input.source import Source
+from sigmasplat.plugins.evaluation.evaluate import evaluate
+from sigmasplat.plugins.evaluation.metrics.lpips import Lpips
+from sigmasplat.plugins.evaluation.report.view_strips import data_uri, file_data_uri
+from sigmasplat.plugins.outputs.drawing.view_panels import FOOT, GAP, HEAD, PANEL_WIDTH
+from sigmasplat.run_folder.runs import RunFolder
+from sigmasplat.run_folder.submaps import DiskStore
 
 CAMERA = Camera(48, 36, 40.0, 40.0, 23.5, 17.5)
 FRAMES = 20

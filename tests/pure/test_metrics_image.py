@@ -7,7 +7,7 @@ import torch
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from sigmasplat.errors import SigmaSplatError
-from sigmasplat.metrics.image import depth_l1, ms_ssim, psnr, similarity_factors, ssim
+from sigmasplat.plugins.evaluation.metrics.image import depth_l1, ms_ssim, psnr, similarity_factors, ssim
 
 
 def pair(seed: int, height: int = 37, width: int = 52) -> tuple[np.ndarray, np.ndarray]:

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from lpips_weights import TRUNK_FILES, write_weights
 from sigmasplat.errors import ConfigError
-from sigmasplat.metrics.lpips import Lpips, Net, find_lpips
+from sigmasplat.plugins.evaluation.metrics.lpips import Lpips, Net, find_lpips
 
 TAPS = {"alex": (1, 4, 7, 9, 11), "vgg": (3, 8, 15, 22, 29)}
 """Numbers of the ReLUs whose outputs the public package compares."""

@@ -3,10 +3,17 @@
 import numpy as np
 import pytest
 
-from sigmasplat.metrics.reconstruction import MeshScores, distances, f1, sample_novel_views, score, visible_points
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.mesh import Mesh
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.mesh import Mesh
+from sigmasplat.plugins.evaluation.metrics.reconstruction import (
+    MeshScores,
+    distances,
+    f1,
+    sample_novel_views,
+    score,
+    visible_points,
+)
 from sigmasplat.render.mesh import mesh_depth
 
 CAMERA = Camera(80, 60, 60.0, 60.0, 39.5, 29.5)

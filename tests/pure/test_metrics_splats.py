@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from sigmasplat.metrics.splats import FLOATER_M, OPAQUE, SplatScores, score_splats
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.mesh import Mesh
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.mesh import Mesh
+from sigmasplat.plugins.evaluation.metrics.splats import FLOATER_M, OPAQUE, SplatScores, score_splats
 
 CAMERA = Camera(80, 60, 60.0, 60.0, 39.5, 29.5)
 AHEAD = np.eye(4)[None]

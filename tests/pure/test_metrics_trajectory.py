@@ -5,9 +5,16 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from scipy.spatial.transform import Rotation
 
+from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SourceError
-from sigmasplat.metrics.trajectory import align_rigid, align_similarity, associate, ate, pair_poses, rpe
-from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.plugins.evaluation.metrics.trajectory import (
+    align_rigid,
+    align_similarity,
+    associate,
+    ate,
+    pair_poses,
+    rpe,
+)
 
 Array = np.ndarray
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from sigmasplat.metrics.uncertainty import (
+from sigmasplat.plugins.evaluation.metrics.uncertainty import (
     LEVELS,
     auce,
     ause,

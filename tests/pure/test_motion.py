@@ -8,8 +8,8 @@ import pytest
 from numpy.typing import NDArray
 
 from sigmasplat.config import TrackingConfig
+from sigmasplat.data import se3
 from sigmasplat.fit.motion import AxisAngle, Parametrisation, QuaternionMotion, parametrisation
-from sigmasplat.model import se3
 
 Array = NDArray[np.float64]
 AXES = np.array([[0.6, -0.48, 0.64], [1.0, 0.0, 0.0], [0.0, 0.6, -0.8]])

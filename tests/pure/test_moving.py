@@ -9,15 +9,15 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from sigmasplat.config import MovingConfig
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.field import GaussianField
+from sigmasplat.data.frame import Frame
 from sigmasplat.errors import SourceError
 from sigmasplat.fit.target import Keyframe, Target
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.field import GaussianField
-from sigmasplat.model.frame import Frame
-from sigmasplat.slam.localisation.foreground import Foreground
-from sigmasplat.slam.localisation.memory import Memory
-from sigmasplat.slam.moving import carve, mask_keyframes
-from sigmasplat.sources import SyntheticRoom, open_source
+from sigmasplat.mapping.moving import carve, mask_keyframes
+from sigmasplat.plugins.sources import SyntheticRoom, open_source
+from sigmasplat.tracking.moving.foreground import Foreground
+from sigmasplat.tracking.moving.memory import Memory
 
 CAMERA = Camera(160, 120, 140.0, 140.0, 79.5, 59.5)
 WALL_M, BOX_M, FRAMES = 3.0, 1.0, 30

@@ -15,7 +15,7 @@ from safetensors.torch import load_file, save_file
 from scipy.io import savemat
 
 from sigmasplat.errors import ConfigError
-from sigmasplat.slam.loop_closure.netvlad import NetVlad, NetVladWeights
+from sigmasplat.graph.netvlad import NetVlad, NetVladWeights
 
 WIDTHS = (3, 2, 4, 3, 5, 4, 3, 6, 5, 2, 4, 3, 5, 4)  # channels before and after each of the 13 convolutions
 D, K, P = WIDTHS[-1], 3, 7

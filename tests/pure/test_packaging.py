@@ -13,10 +13,10 @@ import pytest
 
 import sigmasplat
 from module_files import module_from
-from sigmasplat.checks import installation
 from sigmasplat.cli import COMMANDS
-from sigmasplat.io.machine import package_version
-from sigmasplat.presets import list_presets
+from sigmasplat.config.presets import list_presets
+from sigmasplat.files.machine import package_version
+from sigmasplat.plugins.checks import installation
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
@@ -130,7 +130,7 @@ def checkout(tmp_path: Path) -> Path:
     if not shutil.which("git"):
         pytest.skip("no git here")
     (tmp_path / "src/sigmasplat/io").mkdir(parents=True)
-    shutil.copy(ROOT / "src/sigmasplat/io/machine.py", tmp_path / "src/sigmasplat/io")
+    shutil.copy(ROOT / "src/sigmasplat/files/machine.py", tmp_path / "src/sigmasplat/io")
     git(tmp_path, "init", "--quiet")
     git(tmp_path, "add", ".")
     git(tmp_path, "commit", "--quiet", "--message", "one")
@@ -140,7 +140,7 @@ def checkout(tmp_path: Path) -> Path:
 
 def code_of(package: Path) -> str:
     """Return the version of the code of a copy of the package."""
-    return str(module_from(package / "io/machine.py").code_version())
+    return str(module_from(package / "files/machine.py").code_version())
 
 
 def test_the_code_version_is_the_commit_of_the_checkout_else_of_the_build_else_the_release(checkout: Path) -> None:
@@ -148,7 +148,7 @@ def test_the_code_version_is_the_commit_of_the_checkout_else_of_the_build_else_t
     assert code_of(package) == head and len(head) == 40
     (package / "commit.txt").write_text("0123abc")
     assert code_of(package) == head, "of a checkout git knows more than an earlier build"
-    with (package / "io/machine.py").open("a") as file:
+    with (package / "files/machine.py").open("a") as file:
         file.write("# changed\n")
     assert code_of(package) == f"{head}-dirty"
     shutil.rmtree(checkout / ".git")
@@ -173,7 +173,7 @@ def test_a_build_stores_its_commit(checkout: Path) -> None:
     head = git(checkout, "rev-parse", "HEAD")
     assert written(checkout) == head
     assert written(checkout / "src") == "", "a repository further up is somebody else's"
-    (checkout / "src/sigmasplat/io/machine.py").write_text("")
+    (checkout / "src/sigmasplat/files/machine.py").write_text("")
     assert written(checkout) == f"{head}-dirty"
     text = (ROOT / "CMakeLists.txt").read_text()
     assert "commit.cmake" in text and "install(FILES ${OUT} DESTINATION sigmasplat)" in text

@@ -8,13 +8,13 @@ import torch
 from numpy.typing import NDArray
 
 from sigmasplat.config import FinalConfig
+from sigmasplat.data import se3
+from sigmasplat.data.atlas import Atlas
+from sigmasplat.data.hops import UNKNOWN_HOP, Hop, TrackedHops
+from sigmasplat.final.pose_reach import reaching
 from sigmasplat.fit.align import BIAS_PX
-from sigmasplat.model import se3
-from sigmasplat.model.atlas import Atlas
-from sigmasplat.model.hops import UNKNOWN_HOP, Hop, TrackedHops
-from sigmasplat.slam.loop_closure.pose_graph import Edge, PoseGraph, Sensitivity, optimise
-from sigmasplat.slam.path_covariance import PathCovariance, recorded
-from sigmasplat.slam.pose_reach import reaching
+from sigmasplat.graph.path_covariance import PathCovariance, recorded
+from sigmasplat.graph.pose_graph import Edge, PoseGraph, Sensitivity, optimise
 
 Array = NDArray[np.float64]
 LOOSE, STIFF = np.diag([400.0] * 3 + [900.0] * 3), np.diag([1e4] * 3 + [4e4] * 3)

@@ -5,12 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sigmasplat.io.submaps import DiskStore
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.field import GaussianField
-from sigmasplat.model.frame import Frame
-from sigmasplat.model.photo import Photo, enlarged_depth, photo_size
-from sigmasplat.model.submap import Picture, Submap
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.field import GaussianField
+from sigmasplat.data.frame import Frame
+from sigmasplat.data.photo import Photo, enlarged_depth, photo_size
+from sigmasplat.data.submap import Picture, Submap
+from sigmasplat.run_folder.submaps import DiskStore
 
 WHOLE = Camera(64, 48, 60.0, 61.0, 31.0, 24.0)
 

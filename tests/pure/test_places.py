@@ -5,8 +5,8 @@ from itertools import permutations
 import numpy as np
 import pytest
 
-from sigmasplat.model import se3
-from sigmasplat.slam.loop_closure.candidates import (
+from sigmasplat.data import se3
+from sigmasplat.graph.candidates import (
     Candidate,
     find_candidates,
     find_nearby,
@@ -16,7 +16,7 @@ from sigmasplat.slam.loop_closure.candidates import (
     self_similarity,
     variance_weights,
 )
-from sigmasplat.slam.loop_closure.described_submaps import SubmapDescriptor
+from sigmasplat.graph.described_submaps import SubmapDescriptor
 
 DEGREE = np.pi / 180
 

@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 
 from command_line import exit_code
 from room_run import LOST, PATH, made_run
-from sigmasplat.io.pose_covariance import KNOWN, write_ros, write_square
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.io.trajectory import write_trajectory
-from sigmasplat.metrics.pose_covariance import score_covariances
-from sigmasplat.model import se3
-from sigmasplat.model.atlas import Atlas
-from sigmasplat.model.hops import Hop
-from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.slam.path_covariance import PathCovariance, recorded
+from sigmasplat.data import se3
+from sigmasplat.data.atlas import Atlas
+from sigmasplat.data.hops import Hop
+from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.graph.path_covariance import PathCovariance, recorded
+from sigmasplat.plugins.evaluation.metrics.pose_covariance import score_covariances
+from sigmasplat.run_folder.pose_covariance import KNOWN, write_ros, write_square
+from sigmasplat.run_folder.runs import RunFolder
+from sigmasplat.run_folder.trajectory import write_trajectory
 
 Array = NDArray[np.float64]
 CALIBRATED = 2.366

@@ -13,11 +13,11 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import shortest_path
 from scipy.stats import chi2
 
+from sigmasplat.data import se3
 from sigmasplat.errors import SigmaSplatError
-from sigmasplat.model import se3
-from sigmasplat.slam.loop_closure import normal_equations, pose_graph
-from sigmasplat.slam.loop_closure.neighbourhood import Incidence, Neighbourhood
-from sigmasplat.slam.loop_closure.pose_graph import Edge, LoopVerdict, PoseGraph, optimise
+from sigmasplat.graph import normal_equations, pose_graph
+from sigmasplat.graph.neighbourhood import Incidence, Neighbourhood
+from sigmasplat.graph.pose_graph import Edge, LoopVerdict, PoseGraph, optimise
 
 Array = NDArray[np.float64]
 seeds = st.integers(0, 2**31)

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from sigmasplat.config import Config, InputConfig
-from sigmasplat.evaluation.path_scores import arbitrary_scale, in_metres, in_units_of_run
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.metrics.trajectory import align_similarity
-from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.input.opening import open_source
+from sigmasplat.input.source import Subset
+from sigmasplat.plugins.evaluation.metrics.trajectory import align_similarity
+from sigmasplat.plugins.evaluation.path_scores import arbitrary_scale, in_metres, in_units_of_run
 from sigmasplat.run.scene import config_for, config_of_facts, scene_facts
-from sigmasplat.slam.localisation.depth_fit import DepthFit, pixel_noise, smoothed
+from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.slam.slam import Slam
-from sigmasplat.sources.base import Subset
-from sigmasplat.sources.opening import open_source
+from sigmasplat.tracking.depth_fit import DepthFit, pixel_noise, smoothed
 
 HEIGHT, WIDTH = 96, 128
 

@@ -10,9 +10,9 @@ import pytest
 
 from changed_settings import changed_settings
 from sigmasplat.config import Config
+from sigmasplat.config.presets import FAMILIES, default_preset, list_presets, preset
 from sigmasplat.config.text import override
 from sigmasplat.errors import ConfigError
-from sigmasplat.presets import FAMILIES, default_preset, list_presets, preset
 
 DATASETS = ("replica", "tum", "scannet")
 PAPER = [f"cgslam-{dataset}" for dataset in DATASETS]

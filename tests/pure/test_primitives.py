@@ -9,18 +9,18 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.config import MappingConfig, RenderConfig
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.field import COLUMNS, GaussianField
+from sigmasplat.data.frame import Frame
 from sigmasplat.fit.field import fit_field
 from sigmasplat.fit.target import Keyframe, Target
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.field import COLUMNS, GaussianField
-from sigmasplat.model.frame import Frame
+from sigmasplat.mapping.pruning import depths, fade, splat_depth_residuals, splat_uncertainty, still_uncertain
 from sigmasplat.render.backend import make_view
 from sigmasplat.render.channels import features_of
 from sigmasplat.render.reference import operators as reference
 from sigmasplat.render.render import render
 from sigmasplat.render.view import View
-from sigmasplat.slam.pruning import depths, fade, splat_depth_residuals, splat_uncertainty, still_uncertain
 
 Array = NDArray[np.float64]
 CAMERA = Camera(20, 15, 18.0, 18.5, 9.3, 7.4)

@@ -5,8 +5,11 @@ import pytest
 import trimesh
 from numpy.typing import NDArray
 
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.mesh import Mesh
 from sigmasplat.errors import SigmaSplatError
-from sigmasplat.metrics.published_reconstruction import (
+from sigmasplat.plugins.evaluation.metrics.published_reconstruction import (
     aligned_by_icp,
     dense_points,
     depth_errors,
@@ -14,9 +17,6 @@ from sigmasplat.metrics.published_reconstruction import (
     random_views,
     score_published,
 )
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.mesh import Mesh
 from sigmasplat.render.mesh import mesh_depth
 
 SMALL = Camera(36, 30, 20.0, 20.0, 17.5, 14.5)

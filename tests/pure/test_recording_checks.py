@@ -11,15 +11,15 @@ from scipy.ndimage import gaussian_filter
 import bag_recordings
 import layouts
 from command_line import exit_code
-from sigmasplat.checks.motion import Motion, MotionWatch, motion_warnings
-from sigmasplat.checks.recording import inspect_source
-from sigmasplat.checks.timing import time_warnings
 from sigmasplat.config import InputConfig
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.frame import Frame
 from sigmasplat.errors import SourceError
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.frame import Frame
-from sigmasplat.sources import open_source
-from sigmasplat.sources.camera.calibration import refuse_impossible_camera, unlikely_camera
+from sigmasplat.input.calibration import refuse_impossible_camera, unlikely_camera
+from sigmasplat.plugins.checks.motion import Motion, MotionWatch, motion_warnings
+from sigmasplat.plugins.checks.recording import inspect_source
+from sigmasplat.plugins.checks.timing import time_warnings
+from sigmasplat.plugins.sources import open_source
 
 TIMES = np.arange(30) / 30.0
 FRAMES = 90

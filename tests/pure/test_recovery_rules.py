@@ -5,15 +5,15 @@ import pytest
 from numpy.typing import NDArray
 
 from sigmasplat.config import RecoveryConfig
+from sigmasplat.data import se3
+from sigmasplat.data.atlas import Atlas
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.frame import Detail, Frame
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.target import Target
-from sigmasplat.model import se3
-from sigmasplat.model.atlas import Atlas
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.frame import Detail, Frame
-from sigmasplat.slam.localisation.feature_image import FeatureImage
-from sigmasplat.slam.localisation.recovery import Link, Recovery, usable
-from sigmasplat.slam.localisation.sight import Sight
+from sigmasplat.tracking.feature_image import FeatureImage
+from sigmasplat.tracking.recovery import Link, Recovery, usable
+from sigmasplat.tracking.sight import Sight
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 

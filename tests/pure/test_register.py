@@ -11,22 +11,22 @@ import torch
 from numpy.typing import NDArray
 
 from sigmasplat.config import Config, RegistrationConfig, RenderConfig, SeedConfig, TrackingConfig
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.field import COLUMNS, GaussianField
+from sigmasplat.data.submap import MemoryStore, Picture, Submap
 from sigmasplat.fit.target import Target
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.field import COLUMNS, GaussianField
-from sigmasplat.model.submap import MemoryStore, Picture, Submap
+from sigmasplat.graph import localisations, registration
+from sigmasplat.graph.candidates import Candidate, SubmapPair
+from sigmasplat.graph.closer import LoopCloser
+from sigmasplat.graph.feature_guesses import FeatureGuesses
+from sigmasplat.graph.localisations import Localisation
+from sigmasplat.graph.registration import Registrar, Registration, drift_between
+from sigmasplat.mapping.seeding import make_splats
 from sigmasplat.render.backend import make_view
-from sigmasplat.slam import drift
-from sigmasplat.slam.drift import floor, hop_errors
-from sigmasplat.slam.features import Extractor, Features, make_extractor
-from sigmasplat.slam.loop_closure import localisations, registration
-from sigmasplat.slam.loop_closure.candidates import Candidate, SubmapPair
-from sigmasplat.slam.loop_closure.closer import LoopCloser
-from sigmasplat.slam.loop_closure.feature_guesses import FeatureGuesses
-from sigmasplat.slam.loop_closure.localisations import Localisation
-from sigmasplat.slam.loop_closure.registration import Registrar, Registration, drift_between
-from sigmasplat.slam.seeding import make_splats
+from sigmasplat.tracking import drift
+from sigmasplat.tracking.drift import floor, hop_errors
+from sigmasplat.tracking.features import Extractor, Features, make_extractor
 from sigmasplat.types import completed
 from small_room import frame_at, walk
 

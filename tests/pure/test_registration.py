@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from sigmasplat.data.camera import Camera
 from sigmasplat.errors import ConfigError, SourceError
-from sigmasplat.model.camera import Camera
-from sigmasplat.sources import open_source
-from sigmasplat.sources.camera.depth_registration import MAX_HALF_FOOTPRINT_PX, OVERLAP, DepthRegistration
+from sigmasplat.input.depth_registration import MAX_HALF_FOOTPRINT_PX, OVERLAP, DepthRegistration
+from sigmasplat.plugins.sources import open_source
 
 DEPTH = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
 COLOR = Camera(80, 60, 70.0, 72.0, 40.0, 29.0)

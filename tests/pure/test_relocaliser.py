@@ -11,22 +11,22 @@ import torch
 from numpy.typing import NDArray
 
 from sigmasplat.config import Config
+from sigmasplat.config.presets import preset
 from sigmasplat.config.text import override
+from sigmasplat.data import se3
+from sigmasplat.data.field import GaussianField
+from sigmasplat.data.submap import MemoryStore, Submap, SubmapStore
 from sigmasplat.fit.references import live_image
 from sigmasplat.fit.target import Keyframe, Target
-from sigmasplat.io.submaps import DiskStore
-from sigmasplat.model import se3
-from sigmasplat.model.field import GaussianField
-from sigmasplat.model.submap import MemoryStore, Submap, SubmapStore
-from sigmasplat.presets import preset
+from sigmasplat.plugins.sources import SyntheticRoom
 from sigmasplat.render.backend import make_view
 from sigmasplat.render.view import View
-from sigmasplat.slam.features import Extractor, make_extractor
-from sigmasplat.slam.localisation.feature_image import FeatureImage, detail_of, gray_levels, pose_by_features
-from sigmasplat.slam.localisation.known_map import KnownMap
-from sigmasplat.slam.localisation.relocaliser import Relocaliser, Relocation
-from sigmasplat.slam.localisation.sight import Sight
-from sigmasplat.sources import SyntheticRoom
+from sigmasplat.run_folder.submaps import DiskStore
+from sigmasplat.tracking.feature_image import FeatureImage, detail_of, gray_levels, pose_by_features
+from sigmasplat.tracking.features import Extractor, make_extractor
+from sigmasplat.tracking.known_map import KnownMap
+from sigmasplat.tracking.relocaliser import Relocaliser, Relocation
+from sigmasplat.tracking.sight import Sight
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 

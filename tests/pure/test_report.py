@@ -8,16 +8,23 @@ import numpy as np
 import pytest
 from PIL import Image, ImageFont
 
-from sigmasplat.drawing import colormap, plot
-from sigmasplat.drawing.view_panels import GAP, HEAD, PANEL_WIDTH, draw_view_strip, predicted_panels, view_panels
-from sigmasplat.floorplan.rescan import RescanMaps, RescanRegion, find_rescan_regions, unsure_rule
-from sigmasplat.io.frames import RunFrames
-from sigmasplat.metrics.scored_view import PredictedErrors, ScoredView
-from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.report import charts
-from sigmasplat.report.html import Contents, build_report
-from sigmasplat.report.tables import headline, number
-from sigmasplat.report.view_strips import PanelFigure
+from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.plugins.evaluation.metrics.scored_view import PredictedErrors, ScoredView
+from sigmasplat.plugins.evaluation.report import charts
+from sigmasplat.plugins.evaluation.report.html import Contents, build_report
+from sigmasplat.plugins.evaluation.report.view_strips import PanelFigure
+from sigmasplat.plugins.outputs.drawing import colormap, plot
+from sigmasplat.plugins.outputs.drawing.view_panels import (
+    GAP,
+    HEAD,
+    PANEL_WIDTH,
+    draw_view_strip,
+    predicted_panels,
+    view_panels,
+)
+from sigmasplat.plugins.outputs.floorplan.rescan import RescanMaps, RescanRegion, find_rescan_regions, unsure_rule
+from sigmasplat.run.figures import headline, number
+from sigmasplat.run_folder.frames import RunFrames
 
 STRIPS = {"held-out views": [[PanelFigure("input", "images/a.png")]]}
 VOID = {"meta", "img", "source", "br", "!doctype"}

@@ -15,23 +15,23 @@ from numpy.typing import NDArray
 from command_line import exit_code
 from room_run import FRAMES, LOST, PATH, made_run, picture
 from ros_reading import covariance, decoded, image, links, matrix, points, pose, read_bag, seconds
-from sigmasplat.floorplan.floor_plan import FREE, OBJECT, UNOBSERVED, WALL, FloorPlan
-from sigmasplat.model import se3
-from sigmasplat.model.atlas import Atlas
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.component import LOST as LOST_STATE, RELOCALISED, TRACKED
-from sigmasplat.model.hops import UNKNOWN_HOP, Hop
-from sigmasplat.robots.frames import T_LINK_OPTICAL, levelled_map, link_pose, ros_covariance
-from sigmasplat.robots.map_messages import grids
-from sigmasplat.robots.odometry import LiveOdometry, has_motion, odometry_poses
-from sigmasplat.robots.outlet import MOST_BULKY, MOST_JOBS, Outlet
+from sigmasplat.data import se3
+from sigmasplat.data.atlas import Atlas
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.component import LOST as LOST_STATE, RELOCALISED, TRACKED
+from sigmasplat.data.hops import UNKNOWN_HOP, Hop
+from sigmasplat.graph.path_covariance import PathCovariance
+from sigmasplat.graph.pose_graph import Edge
+from sigmasplat.plugins.outputs.floorplan.floor_plan import FREE, OBJECT, UNOBSERVED, WALL, FloorPlan
+from sigmasplat.plugins.robots.frames import T_LINK_OPTICAL, levelled_map, link_pose, ros_covariance
+from sigmasplat.plugins.robots.map_messages import grids
+from sigmasplat.plugins.robots.odometry import LiveOdometry, has_motion, odometry_poses
+from sigmasplat.plugins.robots.outlet import MOST_BULKY, MOST_JOBS, Outlet
 from sigmasplat.slam.checkpoint import path_errors
-from sigmasplat.slam.loop_closure.pose_graph import Edge
-from sigmasplat.slam.path_covariance import PathCovariance
 
 pytest.importorskip("rosbags", reason="rosbags is not installed (extra `ros`)")
-from sigmasplat.robots.bag import BagSink
-from sigmasplat.robots.ros_messages import ODOMETRY, POSE, TF, Encoded, Points, RosMessages, Topic, stamp_of
+from sigmasplat.plugins.robots.bag import BagSink
+from sigmasplat.plugins.robots.ros_messages import ODOMETRY, POSE, TF, Encoded, Points, RosMessages, Topic, stamp_of
 
 Array = NDArray[np.float64]
 MESSAGES = RosMessages()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sigmasplat.fit.pose import PoseFit
-from sigmasplat.slam.rules import draw_keyframes, is_held_back, is_keyframe, is_lost, jumped, never, unless
+from sigmasplat.tracking.rules import draw_keyframes, is_held_back, is_keyframe, is_lost, jumped, never, unless
 
 NAN = float("nan")
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sigmasplat.model import se3
-from sigmasplat.model.accelerometer import RunningAccelerometer
-from sigmasplat.model.gyroscope import Gyroscope, still_bias
-from sigmasplat.model.running_gyroscope import MOST_LATE_S, RunningGyroscope
-from sigmasplat.model.sensor_samples import KEPT_S, RecentSamples
+from sigmasplat.data import se3
+from sigmasplat.data.accelerometer import RunningAccelerometer
+from sigmasplat.data.gyroscope import Gyroscope, still_bias
+from sigmasplat.data.running_gyroscope import MOST_LATE_S, RunningGyroscope
+from sigmasplat.data.sensor_samples import KEPT_S, RecentSamples
 
 VELOCITY = np.array([0.2, 1.5, -0.4])
 """rad/s"""

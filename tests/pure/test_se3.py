@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from sigmasplat.model import se3
+from sigmasplat.data import se3
 
 Array = NDArray[np.float64]
 ANGLES = [0.0, 1e-12, 1e-9, 1e-7, 1e-5, 9.9e-5, 1.01e-4, 1e-3, 0.1, 1.0, 3.0, np.pi - 1e-3, np.pi - 1e-7, np.pi - 1e-12]

@@ -9,14 +9,14 @@ import torch
 from numpy.typing import NDArray
 
 from sigmasplat.config import SeedConfig
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.field import GaussianField
+from sigmasplat.data.frame import Frame
 from sigmasplat.fit.target import Target
 from sigmasplat.fit.tracking_loss import PoseMaps
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.field import GaussianField
-from sigmasplat.model.frame import Frame
+from sigmasplat.mapping.seeding import first_pixels, later_pixels, make_splats, thin_out, with_room
 from sigmasplat.render.reference.operators import rotations
-from sigmasplat.slam.seeding import first_pixels, later_pixels, make_splats, thin_out, with_room
 
 Array = NDArray[np.float32]
 Mask = NDArray[np.bool_]

@@ -9,25 +9,25 @@ import pytest
 from numpy.typing import NDArray
 
 from command_line import exit_code
-from sigmasplat.checks.sensor_noise import measure_noise
 from sigmasplat.config import Config, InputConfig, SeedConfig
+from sigmasplat.config.presets import preset
 from sigmasplat.config.scale import for_scene
 from sigmasplat.config.sensors import SENSORS, SensorModel, sensor_model
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.depth_std import alignment_std, generic_std, modelled_std, relative_weights
+from sigmasplat.data.field import GaussianField
+from sigmasplat.data.frame import Frame
+from sigmasplat.data.frame_arrays import frame_from_arrays
+from sigmasplat.data.submap import Picture
 from sigmasplat.errors import ConfigError, SourceError
+from sigmasplat.final.fusion import with_readings
 from sigmasplat.fit.align import align, balanced
 from sigmasplat.fit.references import Reference, live_image, map_reference, picture_images, sureness_of
 from sigmasplat.fit.target import Target
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.depth_std import alignment_std, generic_std, modelled_std, relative_weights
-from sigmasplat.model.field import GaussianField
-from sigmasplat.model.frame import Frame
-from sigmasplat.model.frame_arrays import frame_from_arrays
-from sigmasplat.model.submap import Picture
-from sigmasplat.presets import preset
-from sigmasplat.slam.fusion import with_readings
-from sigmasplat.slam.localisation.sight import view_of, working_frame
-from sigmasplat.slam.seeding import first_pixels, make_splats
-from sigmasplat.sources.camera.calibration import read_calibration
+from sigmasplat.input.calibration import read_calibration
+from sigmasplat.mapping.seeding import first_pixels, make_splats
+from sigmasplat.plugins.checks.sensor_noise import measure_noise
+from sigmasplat.tracking.sight import view_of, working_frame
 
 CAMERA = Camera(160, 120, 140.0, 140.0, 79.5, 59.5)
 Floats = NDArray[np.float32]

@@ -8,13 +8,13 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from sigmasplat.config import InputConfig
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.frame import Frame
+from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import ConfigError, SourceError
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.frame import Frame
-from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.sources.base import Source, Subset
-from sigmasplat.sources.files.association import associate
-from sigmasplat.sources.files.prefetch import read_ahead
+from sigmasplat.input.association import associate
+from sigmasplat.input.prefetch import read_ahead
+from sigmasplat.input.source import Source, Subset
 
 
 class Counting(Source):

@@ -8,10 +8,10 @@ from scipy.spatial.transform import Rotation
 
 from bag_recordings import Recorder, aligned
 from recordings import Scene, scene, write_stray
-from sigmasplat.model import se3
-from sigmasplat.model.gyroscope import gyroscope_from_samples, still_bias
-from sigmasplat.sources import open_source
-from sigmasplat.sources.base import Source
+from sigmasplat.data import se3
+from sigmasplat.data.gyroscope import gyroscope_from_samples, still_bias
+from sigmasplat.input.source import Source
+from sigmasplat.plugins.sources import open_source
 
 COLOR_FRAME, IMU_FRAME = "camera_color_optical_frame", "camera_imu_frame"
 VELOCITY = np.array([0.2, 1.5, -0.4])

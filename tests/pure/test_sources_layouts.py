@@ -9,11 +9,11 @@ from PIL import Image
 import layouts
 from documents import ROOT
 from layouts import FRAMES, LAYOUTS, SMALL_CAMERA, sample
-from sigmasplat.checks.recording import inspect_source
 from sigmasplat.config import InputConfig
-from sigmasplat.model.camera import Camera
-from sigmasplat.sources import open_source
-from sigmasplat.sources.opening import format_of, formats
+from sigmasplat.data.camera import Camera
+from sigmasplat.input.opening import format_of, formats
+from sigmasplat.plugins.checks.recording import inspect_source
+from sigmasplat.plugins.sources import open_source
 
 each_layout = pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from recordings import FRAMES, r3d_members, scene, write_exr_export, write_stray, write_zip
-from sigmasplat.model.camera import Camera
-from sigmasplat.sources import open_source
-from sigmasplat.sources.files.video import Video
+from sigmasplat.data.camera import Camera
+from sigmasplat.input.video import Video
+from sigmasplat.plugins.sources import open_source
 
 pytest.importorskip("lzfse", reason="Record3D needs the extra iphone")
 

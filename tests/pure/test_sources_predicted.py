@@ -8,9 +8,9 @@ from PIL import Image
 
 from command_line import exit_code
 from sigmasplat.errors import SourceError
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.sources import open_source
-from sigmasplat.sources.camera.calibration import CameraUnknown
+from sigmasplat.input.calibration import CameraUnknown
+from sigmasplat.plugins.sources import open_source
+from sigmasplat.run_folder.runs import RunFolder
 
 ROOM = "synthetic:frames=60,width=64,height=48"
 FRAMES = 6

@@ -9,10 +9,10 @@ import pytest
 from fake_realsense import Device, distortion
 from sigmasplat.config import InputConfig
 from sigmasplat.errors import RunError, SourceError
-from sigmasplat.sources import SyntheticRoom, open_source
-from sigmasplat.sources.camera.depth_units import depth_warning
-from sigmasplat.sources.live import LiveSource, recording_settings
-from sigmasplat.sources.realsense import WARM_UP_FRAMES
+from sigmasplat.input.depth_units import depth_warning
+from sigmasplat.plugins.sources import SyntheticRoom, open_source
+from sigmasplat.plugins.sources.live import LiveSource, recording_settings
+from sigmasplat.plugins.sources.realsense import WARM_UP_FRAMES
 
 
 @pytest.fixture

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from sigmasplat.data.camera import Camera
 from sigmasplat.errors import SourceError
-from sigmasplat.model.camera import Camera
-from sigmasplat.sources import open_source
+from sigmasplat.plugins.sources import open_source
 
 PARAMS = {"camera": {"w": 20, "h": 12, "fx": 15.0, "fy": 16.0, "cx": 9.5, "cy": 5.5, "scale": 6553.5}}
 

@@ -8,14 +8,14 @@ import pytest
 
 from bag_recordings import CAMERA_TOPICS, FOCAL, Recorder, aligned, compressed_depth, quantised_depth
 from recordings import FRAMES, Scene, encoded, scene
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.resizing import resized_color
 from sigmasplat.errors import SourceError
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.resizing import resized_color
-from sigmasplat.sources import open_source
-from sigmasplat.sources.camera.depth_registration import DepthRegistration
-from sigmasplat.sources.camera.distortion import Undistortion, distort
-from sigmasplat.sources.ros.bag import Bag
+from sigmasplat.input.depth_registration import DepthRegistration
+from sigmasplat.input.distortion import Undistortion, distort
+from sigmasplat.plugins.sources import open_source
+from sigmasplat.plugins.sources.ros.bag import Bag
 
 pytest.importorskip("rosbags", reason="bags need the extra ros")
 

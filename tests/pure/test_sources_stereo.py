@@ -9,23 +9,23 @@ import pytest
 from bag_recordings import Recorder
 from command_line import exit_code
 from layouts import save, save_text, tum_line
-from sigmasplat.batch.job import Job
-from sigmasplat.batch.make_run import make_run
-from sigmasplat.checks.recording import inspect_source
+from sigmasplat.config.presets import preset
 from sigmasplat.config.scale import for_scene, scaled
 from sigmasplat.config.text import override
+from sigmasplat.data.opencv import opencv
 from sigmasplat.errors import SourceError
-from sigmasplat.evaluation import ablation
-from sigmasplat.evaluation.ablation import run_job
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.model.opencv import opencv
-from sigmasplat.presets import preset
+from sigmasplat.input.images import read_color
+from sigmasplat.plugins.batch.job import Job
+from sigmasplat.plugins.batch.make_run import make_run
+from sigmasplat.plugins.checks.recording import inspect_source
+from sigmasplat.plugins.evaluation import ablation
+from sigmasplat.plugins.evaluation.ablation import run_job
+from sigmasplat.plugins.sources import open_source, stereo
+from sigmasplat.plugins.sources.camera.stereo import StereoRectification
+from sigmasplat.plugins.sources.camera.stereo_cameras import StereoCameras
 from sigmasplat.run.scene import open_scene
 from sigmasplat.run.terminal import Screen
-from sigmasplat.sources import open_source, stereo
-from sigmasplat.sources.camera.stereo import StereoRectification
-from sigmasplat.sources.camera.stereo_cameras import StereoCameras
-from sigmasplat.sources.files.images import read_color
+from sigmasplat.run_folder.runs import RunFolder
 
 BASELINE_M = 0.1
 ROOM = open_source("synthetic:frames=40,stereo=10")
@@ -203,8 +203,8 @@ def test_every_caller_gets_the_settings_of_the_scene_and_keeps_those_that_are_gi
     assert config.submaps.distance_m == source.scene_scale * usual.submaps.distance_m
     assert open_scene("synthetic:frames=2,width=64,height=48", usual)[1] == usual
     no_scores = lambda run, *_, **__: run.write_metrics({})  # noqa: E731
-    monkeypatch.setattr("sigmasplat.batch.make_run.evaluate", no_scores)
-    monkeypatch.setattr("sigmasplat.evaluation.evaluate.evaluate", no_scores)
+    monkeypatch.setattr("sigmasplat.plugins.batch.make_run.evaluate", no_scores)
+    monkeypatch.setattr("sigmasplat.plugins.evaluation.evaluate.evaluate", no_scores)
     given = ("render.near_m",)
     run_job(ablation.Job("deep", str(folder), "none", 0, usual, given), tmp_path / "ablation", Screen())
     table = Job("one", (str(folder),), usual, given=given)

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from sigmasplat.config import InputConfig
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
 from sigmasplat.errors import SourceError
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
-from sigmasplat.sources import SyntheticRoom, open_source, synthetic
-from sigmasplat.sources.room.render import build_scene, render_scene
-from sigmasplat.sources.room.sensor import DRIFT_KNOT_FRAMES, drifted_depth, measured_depth, noise_sigma_m
-from sigmasplat.sources.room.shapes import Rays, Shape, cast_rays, image_windows, surface_at
-from sigmasplat.sources.room.textures import Material, noise, plain
-from sigmasplat.sources.room.walk import camera_path
+from sigmasplat.plugins.sources import SyntheticRoom, open_source, synthetic
+from sigmasplat.plugins.sources.room.render import build_scene, render_scene
+from sigmasplat.plugins.sources.room.sensor import DRIFT_KNOT_FRAMES, drifted_depth, measured_depth, noise_sigma_m
+from sigmasplat.plugins.sources.room.shapes import Rays, Shape, cast_rays, image_windows, surface_at
+from sigmasplat.plugins.sources.room.textures import Material, noise, plain
+from sigmasplat.plugins.sources.room.walk import camera_path
 from view_agreement import agreement
 
 MATT = Material(plain((0.5, 0.5, 0.5)))

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from sigmasplat.data.camera import Camera
 from sigmasplat.errors import RunError
-from sigmasplat.model.camera import Camera
-from sigmasplat.sources import SyntheticRoom, open_source
-from sigmasplat.sources.camera.calibration import FREIBURG, freiburg_calibration
-from sigmasplat.sources.camera.depth_units import depth_warning
-from sigmasplat.sources.camera.distortion import Undistortion, distort, undistort
-from sigmasplat.sources.tum import write_tum
+from sigmasplat.input.calibration import FREIBURG, freiburg_calibration
+from sigmasplat.input.depth_units import depth_warning
+from sigmasplat.input.distortion import Undistortion, distort, undistort
+from sigmasplat.plugins.sources import SyntheticRoom, open_source
+from sigmasplat.plugins.sources.tum import write_tum
 from view_agreement import agreement
 
 FR1 = np.array(FREIBURG["1"].distortion)

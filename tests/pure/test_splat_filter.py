@@ -5,10 +5,10 @@ import math
 import pytest
 import torch
 
+from sigmasplat.data.field import GaussianField
+from sigmasplat.data.map_uncertainty import SplatStd
 from sigmasplat.errors import SigmaSplatError
-from sigmasplat.model import splat_filter
-from sigmasplat.model.field import GaussianField
-from sigmasplat.model.map_uncertainty import SplatStd
+from sigmasplat.plugins.outputs import splat_filter
 
 
 def three() -> GaussianField:

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from sigmasplat.model.opencv import opencv
-from sigmasplat.sources import open_source
-from sigmasplat.sources.camera.stereo_subpixel import refine
+from sigmasplat.data.opencv import opencv
+from sigmasplat.plugins.sources import open_source
+from sigmasplat.plugins.sources.camera.stereo_subpixel import refine
 
 SIZE = (120, 160)
 ROWS, COLUMNS = np.indices(SIZE, np.float32)

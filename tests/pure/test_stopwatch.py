@@ -2,8 +2,8 @@
 
 import pytest
 
-from sigmasplat.model import stopwatch
-from sigmasplat.model.stopwatch import Stopwatch
+from sigmasplat.data import stopwatch
+from sigmasplat.data.stopwatch import Stopwatch
 
 
 @pytest.fixture

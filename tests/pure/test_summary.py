@@ -10,15 +10,16 @@ import pytest
 from PIL import Image
 
 from sigmasplat.config import Config
+from sigmasplat.config.presets import preset
 from sigmasplat.config.text import override, split_settings
 from sigmasplat.errors import RunError
-from sigmasplat.floorplan.rescan import RescanRegion
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.presets import preset
-from sigmasplat.report.page import rerun_command, write_page
-from sigmasplat.report.summary import advice, rescan_sentences, summary_sentences
-from sigmasplat.report.tables import headline, score_tables, state_rows
-from sigmasplat.report.view_strips import PanelFigure, data_uri, file_data_uri
+from sigmasplat.plugins.evaluation.report.page import rerun_command, write_page
+from sigmasplat.plugins.evaluation.report.summary import advice, rescan_sentences, summary_sentences
+from sigmasplat.plugins.evaluation.report.tables import score_tables, state_rows
+from sigmasplat.plugins.evaluation.report.view_strips import PanelFigure, data_uri, file_data_uri
+from sigmasplat.plugins.outputs.floorplan.rescan import RescanRegion
+from sigmasplat.run.figures import headline
+from sigmasplat.run_folder.runs import RunFolder
 
 GOOD = {
     "source": "kitchen", "status": "complete", "frames": 500, "splats": 1000, "frames_per_s": 13.5, "lost": 0,

@@ -8,13 +8,13 @@ import pytest
 from box_room import CAMERA, CHEST, HIGH, LOW, PILLAR, cast, pose, seer, splats
 from sigmasplat.config import Config
 from sigmasplat.config.surface import SurfaceConfig
+from sigmasplat.data import se3
+from sigmasplat.data.mesh import Mesh
+from sigmasplat.data.submap import Picture
 from sigmasplat.errors import ConfigError
-from sigmasplat.model import se3
-from sigmasplat.model.decimation import decimated
-from sigmasplat.model.mesh import Mesh
-from sigmasplat.model.submap import Picture
+from sigmasplat.final.fusion import FusionView, fuse, with_readings
+from sigmasplat.plugins.outputs.meshes.decimation import decimated
 from sigmasplat.render.mesh import mesh_depth
-from sigmasplat.slam.fusion import FusionView, fuse, with_readings
 
 VOXEL_M = 0.04
 

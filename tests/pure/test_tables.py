@@ -7,15 +7,15 @@ from typing import Any
 import pytest
 
 from command_line import exit_code
-from sigmasplat.batch.definition import MEAN, Cell, Score, Table
-from sigmasplat.batch.job import Job
-from sigmasplat.batch.progress import Estimate, duration
-from sigmasplat.batch.road import DataRoots
-from sigmasplat.batch.scores import OURS, PAPER, rows
-from sigmasplat.batch.written import Written
 from sigmasplat.config import Config
 from sigmasplat.errors import ConfigError, SourceError
-from sigmasplat.presets.table_files import list_tables
+from sigmasplat.plugins.batch.definition import MEAN, Cell, Score, Table
+from sigmasplat.plugins.batch.job import Job
+from sigmasplat.plugins.batch.progress import Estimate, duration
+from sigmasplat.plugins.batch.road import DataRoots
+from sigmasplat.plugins.batch.scores import OURS, PAPER, rows
+from sigmasplat.plugins.batch.written import Written
+from sigmasplat.plugins.papers.table_files import list_tables
 
 WANTED = {
     "varsplat-replica", "varsplat-tum", "varsplat-scannet", "varsplat-scannetpp", "varsplat-ablation",

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.isosurface import surface
+from sigmasplat.data.mesh import Mesh
+from sigmasplat.data.tsdf import Tsdf, packed, unpacked
 from sigmasplat.errors import ConfigError, SigmaSplatError
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.isosurface import surface
-from sigmasplat.model.mesh import Mesh
-from sigmasplat.model.tsdf import Tsdf, packed, unpacked
 
 CAMERA = Camera(160, 120, 150.0, 150.0, 79.5, 59.5)
 VOXEL_M = 0.01

@@ -5,13 +5,13 @@ import torch
 from numpy.typing import NDArray
 
 from sigmasplat.config import MappingConfig, RenderConfig
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.field import GaussianField
+from sigmasplat.data.frame import Frame
 from sigmasplat.fit.adam import BETA1, BETA2, EPSILON, VectorAdam, VectorAmsgrad
 from sigmasplat.fit.field import fit_field
 from sigmasplat.fit.target import Keyframe, Target
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.field import GaussianField
-from sigmasplat.model.frame import Frame
 from sigmasplat.render.reference.view import ReferenceView
 
 Array = NDArray[np.float64]

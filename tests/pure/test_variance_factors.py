@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sigmasplat.slam.variance_factors import variance_factors
+from sigmasplat.graph.variance_factors import variance_factors
 
 
 def test_factors_are_those_of_the_drawn_residuals() -> None:

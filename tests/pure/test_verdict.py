@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from sigmasplat.fit.compare import NOTHING, Comparison
-from sigmasplat.slam.localisation.verdict import (
+from sigmasplat.tracking.verdict import (
     PATIENCE,
     RECENT,
     Usual,

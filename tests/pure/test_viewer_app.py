@@ -14,15 +14,15 @@ import pytest
 import torch
 
 from room_map import room_map
-from sigmasplat.model.map_uncertainty import SHIPPED, Background, MapUncertainty, SplatStd
-from sigmasplat.model.mesh import Mesh
+from sigmasplat.data.map_uncertainty import SHIPPED, Background, MapUncertainty, SplatStd
+from sigmasplat.data.mesh import Mesh
 
 viser = pytest.importorskip("viser", reason="viser is not installed (pip install 'sigmasplat[viewer]')")
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
-from sigmasplat.viewer.app import ViewerApp  # noqa: E402
-from sigmasplat.viewer.live import LiveView  # noqa: E402
-from sigmasplat.viewer.panel import (  # noqa: E402
+from sigmasplat.plugins.viewer.app import ViewerApp  # noqa: E402
+from sigmasplat.plugins.viewer.live import LiveView  # noqa: E402
+from sigmasplat.plugins.viewer.panel import (  # noqa: E402
     COLOURINGS,
     ERROR_PARTS,
     FINAL_MAP,
@@ -31,8 +31,8 @@ from sigmasplat.viewer.panel import (  # noqa: E402
     SUBMAPS,
     VIEW_MODES,
 )
-from sigmasplat.viewer.server import HOST, close, open_server  # noqa: E402
-from sigmasplat.viewer.snapshot import EMPTY_PATH, Piece, Snapshot  # noqa: E402
+from sigmasplat.plugins.viewer.server import HOST, close, open_server  # noqa: E402
+from sigmasplat.plugins.viewer.snapshot import EMPTY_PATH, Piece, Snapshot  # noqa: E402
 
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
 viewer_memory = importlib.import_module("viewer_memory")

@@ -8,16 +8,14 @@ import pytest
 import torch
 
 from sigmasplat.config import RenderConfig
-from sigmasplat.drawing import colormap
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.field import GaussianField
-from sigmasplat.model.map_uncertainty import SHIPPED, Background, MapUncertainty, SplatStd
-from sigmasplat.model.splat_filter import sigmas
-from sigmasplat.render import render
-from sigmasplat.render.predictive import predict
-from sigmasplat.viewer import lines
-from sigmasplat.viewer.layers import (
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.field import GaussianField
+from sigmasplat.data.map_uncertainty import SHIPPED, Background, MapUncertainty, SplatStd
+from sigmasplat.plugins.outputs.drawing import colormap
+from sigmasplat.plugins.outputs.splat_filter import sigmas
+from sigmasplat.plugins.viewer import lines
+from sigmasplat.plugins.viewer.layers import (
     Legend,
     browser_camera,
     draw_legend,
@@ -25,9 +23,9 @@ from sigmasplat.viewer.layers import (
     render_predicted,
     surface_normals,
 )
-from sigmasplat.viewer.panel import escaped
-from sigmasplat.viewer.snapshot import CameraPath, Piece, Snapshot, thin, within_budget
-from sigmasplat.viewer.splats import (
+from sigmasplat.plugins.viewer.panel import escaped
+from sigmasplat.plugins.viewer.snapshot import CameraPath, Piece, Snapshot, thin, within_budget
+from sigmasplat.plugins.viewer.splats import (
     VisibilityFilter,
     covariances,
     merge_pieces,
@@ -38,6 +36,8 @@ from sigmasplat.viewer.splats import (
     splat_arrays,
     visibility_filter,
 )
+from sigmasplat.render import render
+from sigmasplat.render.predictive import predict
 
 OPTIONS = RenderConfig()
 ERROR_PARTS = ("all", "aleatoric", "epistemic")

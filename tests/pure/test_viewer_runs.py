@@ -14,26 +14,26 @@ import torch
 
 from command_line import exit_code
 from sigmasplat.config import Config
+from sigmasplat.config.presets import default_preset, preset
 from sigmasplat.config.text import override
+from sigmasplat.data import se3
+from sigmasplat.data.component import Component
 from sigmasplat.errors import ConfigError, RunError, SigmaSplatError
-from sigmasplat.evaluation.evaluate import evaluate
-from sigmasplat.evaluation.reconstruct import FusionInput
-from sigmasplat.exports.formats import FORMATS, ExportSource, choose
-from sigmasplat.io.runs import TRUTH, RunFolder
-from sigmasplat.io.submaps import DiskStore
-from sigmasplat.io.trajectory import read_trajectory
-from sigmasplat.model import se3
-from sigmasplat.model.component import Component
-from sigmasplat.presets import default_preset, preset
+from sigmasplat.plugins.evaluation.evaluate import evaluate
+from sigmasplat.plugins.evaluation.reconstruct import FusionInput
+from sigmasplat.plugins.outputs.formats import FORMATS, ExportSource, choose
+from sigmasplat.plugins.sources import SyntheticRoom, open_source
+from sigmasplat.plugins.viewer.finished import SubmapCache, check_has_map, finished_snapshot, running_snapshot
+from sigmasplat.plugins.viewer.live import ACTIVE_SHARE, LiveView
+from sigmasplat.plugins.viewer.server import free_port, is_loopback, open_server, url_of
+from sigmasplat.plugins.viewer.snapshot import Snapshot
+from sigmasplat.plugins.viewer.splats import VisibilityFilter, merge_pieces
 from sigmasplat.run.protocols import CallbackList, NullCallback
 from sigmasplat.run.session import Session
+from sigmasplat.run_folder.runs import TRUTH, RunFolder
+from sigmasplat.run_folder.submaps import DiskStore
+from sigmasplat.run_folder.trajectory import read_trajectory
 from sigmasplat.slam.slam import Slam
-from sigmasplat.sources import SyntheticRoom, open_source
-from sigmasplat.viewer.finished import SubmapCache, check_has_map, finished_snapshot, running_snapshot
-from sigmasplat.viewer.live import ACTIVE_SHARE, LiveView
-from sigmasplat.viewer.server import free_port, is_loopback, open_server, url_of
-from sigmasplat.viewer.snapshot import Snapshot
-from sigmasplat.viewer.splats import VisibilityFilter, merge_pieces
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 

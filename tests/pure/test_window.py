@@ -8,14 +8,14 @@ import torch
 from numpy.typing import NDArray
 
 from sigmasplat.config import RenderConfig
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.field import GaussianField
+from sigmasplat.data.frame import Frame
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.fit.target import Keyframe, Target
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.field import GaussianField
-from sigmasplat.model.frame import Frame
+from sigmasplat.mapping.window import SCORES, choose_window, covisible_splats, dominating
 from sigmasplat.render.reference.view import ReferenceView
-from sigmasplat.slam.window import SCORES, choose_window, covisible_splats, dominating
 
 Array = NDArray[np.float64]
 CAMERA = Camera(48, 36, 40.0, 42.0, 22.6, 18.3)

@@ -13,12 +13,12 @@ from recorded_room import write_images
 from schedules import AtOnce, Drawn
 from sigmasplat import Camera, Slam, open_source
 from sigmasplat.config import Config, InputConfig
+from sigmasplat.config.presets import default_preset, preset
 from sigmasplat.config.text import override
+from sigmasplat.data import se3
 from sigmasplat.errors import ConfigError, SourceError
-from sigmasplat.model import se3
-from sigmasplat.presets import default_preset, preset
-from sigmasplat.slam.path_covariance import PathCovariance
-from sigmasplat.slam.real_time.system import RealTime
+from sigmasplat.graph.path_covariance import PathCovariance
+from sigmasplat.realtime.system import RealTime
 from sigmasplat.slam.step_result import Step
 from small_room import SMALL, frame_at, frames
 

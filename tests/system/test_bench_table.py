@@ -17,15 +17,15 @@ import pytest
 import paper_data
 from command_line import exit_code
 from lpips_weights import write_weights
-from sigmasplat.batch import dispatch
-from sigmasplat.batch.definition import Table
-from sigmasplat.batch.local import LocalRoad
-from sigmasplat.batch.make_run import make_run
-from sigmasplat.batch.road import Outcome
-from sigmasplat.batch.scores import run_record
-from sigmasplat.evaluation import reconstruct
-from sigmasplat.io.runs import RunFolder
+from sigmasplat.plugins.batch import dispatch
+from sigmasplat.plugins.batch.definition import Table
+from sigmasplat.plugins.batch.local import LocalRoad
+from sigmasplat.plugins.batch.make_run import make_run
+from sigmasplat.plugins.batch.road import Outcome
+from sigmasplat.plugins.batch.scores import run_record
+from sigmasplat.plugins.evaluation import reconstruct
 from sigmasplat.run.terminal import Screen
+from sigmasplat.run_folder.runs import RunFolder
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 

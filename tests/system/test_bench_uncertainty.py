@@ -10,13 +10,26 @@ import torch
 
 from sigmasplat.commands.bench_uncertainty import Uncertainty
 from sigmasplat.config import RenderConfig
+from sigmasplat.config.presets import preset
 from sigmasplat.config.text import override
+from sigmasplat.data import se3
+from sigmasplat.data.field import GaussianField
 from sigmasplat.errors import ConfigError, RunError
-from sigmasplat.evaluation.finished_run import FinishedRun, run_slam
-from sigmasplat.evaluation.splat_statistics import MapFacts, TrainingView, fisher, map_facts, ridge, splat_values
-from sigmasplat.evaluation.surface_errors import surface_errors
-from sigmasplat.evaluation.surface_predictors import SURFACE_PREDICTORS
-from sigmasplat.evaluation.uncertainty_benchmark import (
+from sigmasplat.fit.target import Keyframe, Target
+from sigmasplat.plugins.evaluation.finished_run import FinishedRun, run_slam
+from sigmasplat.plugins.evaluation.metrics.trajectory import aligned_poses
+from sigmasplat.plugins.evaluation.metrics.uncertainty import sparsification
+from sigmasplat.plugins.evaluation.splat_statistics import (
+    MapFacts,
+    TrainingView,
+    fisher,
+    map_facts,
+    ridge,
+    splat_values,
+)
+from sigmasplat.plugins.evaluation.surface_errors import surface_errors
+from sigmasplat.plugins.evaluation.surface_predictors import SURFACE_PREDICTORS
+from sigmasplat.plugins.evaluation.uncertainty_benchmark import (
     EXACT,
     FUSED,
     HELD_BACK,
@@ -27,19 +40,20 @@ from sigmasplat.evaluation.uncertainty_benchmark import (
     Study,
     measure,
 )
-from sigmasplat.evaluation.uncertainty_scores import ALL, COVERED, VISIBLE, Run, score_runs, sparsification_charts
-from sigmasplat.evaluation.unseen_views import held_back_views
-from sigmasplat.evaluation.view_predictors import PREDICTORS, see
-from sigmasplat.fit.target import Keyframe, Target
-from sigmasplat.metrics.trajectory import aligned_poses
-from sigmasplat.metrics.uncertainty import sparsification
-from sigmasplat.model import se3
-from sigmasplat.model.field import GaussianField
-from sigmasplat.presets import preset
+from sigmasplat.plugins.evaluation.uncertainty_scores import (
+    ALL,
+    COVERED,
+    VISIBLE,
+    Run,
+    score_runs,
+    sparsification_charts,
+)
+from sigmasplat.plugins.evaluation.unseen_views import held_back_views
+from sigmasplat.plugins.evaluation.view_predictors import PREDICTORS, see
+from sigmasplat.plugins.sources import open_source
 from sigmasplat.render import FieldRenderer
 from sigmasplat.render.backend import make_view
 from sigmasplat.render.reference import operators as reference
-from sigmasplat.sources import open_source
 from small_room import frame_at, walk
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")

@@ -9,14 +9,14 @@ import pytest
 from numpy.typing import NDArray
 
 from sigmasplat.config import Config
+from sigmasplat.config.presets import default_preset, preset
 from sigmasplat.config.text import override
+from sigmasplat.data import se3
 from sigmasplat.fit.target import Keyframe, Target
-from sigmasplat.model import se3
-from sigmasplat.presets import default_preset, preset
+from sigmasplat.mapping.mapper import Mapper
+from sigmasplat.plugins.sources import SyntheticRoom
 from sigmasplat.render.backend import make_view
-from sigmasplat.slam.mapper import Mapper
 from sigmasplat.slam.slam import Slam
-from sigmasplat.sources import SyntheticRoom
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from command_line import exit_code
-from sigmasplat.io.runs import RunFolder
+from sigmasplat.run_folder.runs import RunFolder
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 
+from sigmasplat.config.presets import preset
 from sigmasplat.config.text import override
-from sigmasplat.metrics.image import psnr
-from sigmasplat.metrics.trajectory import ate
-from sigmasplat.presets import preset
+from sigmasplat.plugins.evaluation.metrics.image import psnr
+from sigmasplat.plugins.evaluation.metrics.trajectory import ate
 from sigmasplat.render import render
 from sigmasplat.slam.slam import Slam
 from small_room import SMALL, frames, walk

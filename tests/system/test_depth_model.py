@@ -14,10 +14,10 @@ from command_line import exit_code
 from depth_networks import weighted
 from run_process import lines, wait_for
 from sigmasplat.config import InputConfig
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.model.frame_arrays import color_from_bytes
-from sigmasplat.sources import open_source
-from sigmasplat.sources.files.depth_model import DepthModel
+from sigmasplat.data.frame_arrays import color_from_bytes
+from sigmasplat.plugins.predicted_depth.depth_model import DepthModel
+from sigmasplat.plugins.sources import open_source
+from sigmasplat.run_folder.runs import RunFolder
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 

@@ -19,20 +19,20 @@ from numpy.typing import NDArray
 
 from command_line import exit_code
 from sigmasplat.config import Config
+from sigmasplat.config.presets import preset
 from sigmasplat.config.text import override
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.final import full_resolution
+from sigmasplat.final.final_map import final_map
 from sigmasplat.fit.adam import Rates
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.io.state import read_state
-from sigmasplat.metrics.image import psnr
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
-from sigmasplat.presets import preset
+from sigmasplat.plugins.evaluation.metrics.image import psnr
+from sigmasplat.plugins.sources import open_source
 from sigmasplat.render import FieldRenderer
 from sigmasplat.run.resume import REFINEMENT_CLASSES
-from sigmasplat.slam import full_resolution
-from sigmasplat.slam.final import final_map
+from sigmasplat.run_folder.runs import RunFolder
+from sigmasplat.run_folder.state import read_state
 from sigmasplat.slam.slam import Slam
-from sigmasplat.sources import open_source
 from sigmasplat.types import Matrix
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
@@ -125,7 +125,7 @@ def test_a_time_budget_covers_both_stages(slam: Slam, monkeypatch: pytest.Monkey
     """Each look at the clock takes a hundredth of a second. The stage at working size gets a third of the budget, and
     the rates of the last stage fall in time, whatever the number of steps."""
     ticks = itertools.count(0.0, 0.01)
-    monkeypatch.setattr("sigmasplat.slam.refinement.time.perf_counter", lambda: next(ticks))
+    monkeypatch.setattr("sigmasplat.final.refinement.time.perf_counter", lambda: next(ticks))
     config = settings(iterations="100000", width_iterations="100000", seconds="12.0")
     told, rates = list[tuple[int, int]](), list[float]()
     fit = full_resolution.fit_field
@@ -136,7 +136,7 @@ def test_a_time_budget_covers_both_stages(slam: Slam, monkeypatch: pytest.Monkey
         rates.extend(float(made[0]) / config.mapping.lr_means for made in each)
         return fit(*plain, iter(Rates(per_column) for per_column in each), **named)
 
-    monkeypatch.setattr("sigmasplat.slam.full_resolution.fit_field", noted)
+    monkeypatch.setattr("sigmasplat.final.full_resolution.fit_field", noted)
     made = final_map(
         slam.store, slam.atlas.anchors, config, slam.view, np.random.default_rng(0), lambda *at: told.append(at)
     )

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from sigmasplat.config import Config
+from sigmasplat.config.presets import preset
 from sigmasplat.config.scale import for_scene
 from sigmasplat.config.text import override
-from sigmasplat.io.state import read_state, write_state
-from sigmasplat.model import se3
-from sigmasplat.model.frame import Frame
-from sigmasplat.presets import preset
-from sigmasplat.slam.real_time.system import RealTime
+from sigmasplat.data import se3
+from sigmasplat.data.frame import Frame
+from sigmasplat.realtime.system import RealTime
+from sigmasplat.run_folder.state import read_state, write_state
 from sigmasplat.slam.slam import Slam
 from sigmasplat.slam.state import CLASSES, fixed, restore, state_of
 from small_room import SMALL, frame_at, walk

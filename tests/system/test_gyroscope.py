@@ -9,14 +9,14 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from sigmasplat.config.presets import preset
 from sigmasplat.config.text import override
-from sigmasplat.io.state import read_state, write_state
-from sigmasplat.model import se3
-from sigmasplat.model.frame import Frame
-from sigmasplat.presets import preset
+from sigmasplat.data import se3
+from sigmasplat.data.frame import Frame
+from sigmasplat.plugins.sources.room.render import build_scene, render_scene
+from sigmasplat.run_folder.state import read_state, write_state
 from sigmasplat.slam.slam import Slam
 from sigmasplat.slam.state import CLASSES, fixed, restore, state_of
-from sigmasplat.sources.room.render import build_scene, render_scene
 from small_room import SMALL, walk
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")

@@ -9,9 +9,9 @@ import torch
 from command_line import exit_code
 from run_process import PATIENCE_S, ROOM, lines, running, wait_for
 from sigmasplat.errors import RunError
-from sigmasplat.evaluation.evaluate import evaluate
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.sources import open_source
+from sigmasplat.plugins.evaluation.evaluate import evaluate
+from sigmasplat.plugins.sources import open_source
+from sigmasplat.run_folder.runs import RunFolder
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 

@@ -10,12 +10,12 @@ import pytest
 
 from command_line import exit_code
 from fake_realsense import Device, MotionSensor, stream
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.model.frame import Frame
-from sigmasplat.slam.real_time.system import RealTime
+from sigmasplat.data.frame import Frame
+from sigmasplat.plugins.sources import open_source
+from sigmasplat.plugins.sources.realsense import WARM_UP_FRAMES
+from sigmasplat.realtime.system import RealTime
+from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.slam.step_result import Step
-from sigmasplat.sources import open_source
-from sigmasplat.sources.realsense import WARM_UP_FRAMES
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 

@@ -9,14 +9,14 @@ import pytest
 
 from command_line import exit_code
 from recorded_room import OPTIONS, mirrored, write_images
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.io.trajectory import read_trajectory
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.frame import Frame
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.frame import Frame
+from sigmasplat.plugins.sources import SyntheticRoom, open_source
 from sigmasplat.run.finished_map import FinishedMap
 from sigmasplat.run.localise import FOUND, NOT_FOUND, Localiser
-from sigmasplat.sources import SyntheticRoom, open_source
+from sigmasplat.run_folder.runs import RunFolder
+from sigmasplat.run_folder.trajectory import read_trajectory
 
 pytest.importorskip("sigmasplat.native._core", reason="sigmasplat.native._core is not built")
 

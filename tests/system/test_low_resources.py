@@ -18,8 +18,8 @@ import torch
 from command_line import exit_code
 from run_process import PATIENCE_S, QUICK, ROOM, lines, running, wait_for
 from sigmasplat.errors import RunError
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.io.tensors import write_tensors
+from sigmasplat.files.tensors import write_tensors
+from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.slam.slam import Slam
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")

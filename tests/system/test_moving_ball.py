@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
+from sigmasplat.config.presets import preset
 from sigmasplat.config.text import override
-from sigmasplat.model import se3
-from sigmasplat.presets import preset
+from sigmasplat.data import se3
+from sigmasplat.plugins.sources import SyntheticRoom
 from sigmasplat.slam.slam import Slam
-from sigmasplat.sources import SyntheticRoom
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 SMALL = {

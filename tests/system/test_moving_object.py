@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from sigmasplat.config.presets import preset
 from sigmasplat.config.text import override
-from sigmasplat.io.state import read_state, write_state
-from sigmasplat.model import se3
-from sigmasplat.model.frame import Frame
-from sigmasplat.model.submap import MemoryStore
-from sigmasplat.presets import preset
+from sigmasplat.data import se3
+from sigmasplat.data.frame import Frame
+from sigmasplat.data.submap import MemoryStore
+from sigmasplat.run_folder.state import read_state, write_state
 from sigmasplat.slam.slam import Slam
 from sigmasplat.slam.state import CLASSES, fixed, restore, state_of
 from small_room import SMALL, frame_at, walk

@@ -12,16 +12,16 @@ import pytest
 
 from command_line import exit_code
 from recorded_room import OPTIONS, mirrored, write_images
-from sigmasplat.exports.run_reader import RunReader
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.io.trajectory import write_trajectory
-from sigmasplat.model import se3
-from sigmasplat.model.submap import MemoryStore
-from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.data import se3
+from sigmasplat.data.submap import MemoryStore
+from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.plugins.outputs.run_reader import RunReader
+from sigmasplat.plugins.sources import SyntheticRoom, open_source
+from sigmasplat.plugins.viewer.finished import SubmapCache, finished_snapshot
 from sigmasplat.run.finished_map import FinishedMap
+from sigmasplat.run_folder.runs import RunFolder
+from sigmasplat.run_folder.trajectory import write_trajectory
 from sigmasplat.slam.continuation import continued, take_over
-from sigmasplat.sources import SyntheticRoom, open_source
-from sigmasplat.viewer.finished import SubmapCache, finished_snapshot
 
 pytest.importorskip("sigmasplat.native._core", reason="sigmasplat.native._core is not built")
 

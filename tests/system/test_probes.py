@@ -7,14 +7,14 @@ import pytest
 import torch
 
 from sigmasplat.config import Config
+from sigmasplat.config.presets import preset
 from sigmasplat.config.text import override
+from sigmasplat.data.map_uncertainty import SHIPPED
+from sigmasplat.data.submap import RefinedStore
 from sigmasplat.errors import ConfigError
-from sigmasplat.io.submaps import DiskStore
-from sigmasplat.model.map_uncertainty import SHIPPED
-from sigmasplat.model.submap import RefinedStore
-from sigmasplat.presets import preset
+from sigmasplat.plugins.sources import open_source
+from sigmasplat.run_folder.submaps import DiskStore
 from sigmasplat.slam.slam import Slam
-from sigmasplat.sources import open_source
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 

@@ -10,12 +10,12 @@ import trimesh
 from command_line import exit_code
 from layouts import Sample, opengl, rows, save, save_text, transforms
 from lpips_weights import write_weights
-from sigmasplat.io.mesh import write_mesh
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.model.frame import Frame
-from sigmasplat.model.mesh import Mesh
-from sigmasplat.sources import SyntheticRoom
-from sigmasplat.sources.base import Source
+from sigmasplat.data.frame import Frame
+from sigmasplat.data.mesh import Mesh
+from sigmasplat.input.source import Source
+from sigmasplat.plugins.outputs.meshes.mesh_files import write_mesh
+from sigmasplat.plugins.sources import SyntheticRoom
+from sigmasplat.run_folder.runs import RunFolder
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 

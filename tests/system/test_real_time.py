@@ -15,16 +15,16 @@ import pytest
 from command_line import exit_code
 from schedules import AtOnce, Drawn, Late
 from sigmasplat.config import Config
+from sigmasplat.config.presets import preset
 from sigmasplat.config.text import override
+from sigmasplat.data.component import LOST, RELOCALISED
+from sigmasplat.data.frame import Frame
+from sigmasplat.data.submap import MemoryStore
 from sigmasplat.errors import RunError
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.metrics.trajectory import ate
-from sigmasplat.model.component import LOST, RELOCALISED
-from sigmasplat.model.frame import Frame
-from sigmasplat.model.submap import MemoryStore
-from sigmasplat.presets import preset
-from sigmasplat.slam.real_time.schedule import MappingThread
-from sigmasplat.slam.real_time.system import RealTime
+from sigmasplat.plugins.evaluation.metrics.trajectory import ate
+from sigmasplat.realtime.schedule import MappingThread
+from sigmasplat.realtime.system import RealTime
+from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.slam.slam import Slam
 from sigmasplat.slam.state import restore, state_of
 from small_room import SMALL, frames, walk
@@ -244,7 +244,7 @@ def test_what_fails_at_the_start_of_the_mapping_thread_reaches_the_caller(monkey
         time.sleep(0.2)  # `settle` is called before it fails
         raise MemoryError("no thread can be made")
 
-    monkeypatch.setattr("sigmasplat.slam.real_time.schedule.set_kernel_threads", fail)
+    monkeypatch.setattr("sigmasplat.realtime.schedule.set_kernel_threads", fail)
     schedule = MappingThread()
     schedule.start(iter([False]))
     with pytest.raises(MemoryError, match="no thread"):

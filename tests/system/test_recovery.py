@@ -12,17 +12,17 @@ import torch
 from numpy.typing import NDArray
 
 from sigmasplat.config import Config
+from sigmasplat.config.presets import preset
 from sigmasplat.config.text import override
-from sigmasplat.io.state import read_state, write_state
-from sigmasplat.model import se3
-from sigmasplat.model.frame import Frame
-from sigmasplat.model.submap import MemoryStore
-from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.presets import preset
+from sigmasplat.data import se3
+from sigmasplat.data.frame import Frame
+from sigmasplat.data.submap import MemoryStore
+from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.input.source import Source
 from sigmasplat.run.session import Session, new_folder
+from sigmasplat.run_folder.state import read_state, write_state
 from sigmasplat.slam.slam import Slam
 from sigmasplat.slam.state import CLASSES, fixed, restore, state_of
-from sigmasplat.sources.base import Source
 from small_room import frame_at, walk
 
 _core = pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from sigmasplat import cli
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.model.field import GaussianField
+from sigmasplat.data.field import GaussianField
+from sigmasplat.run_folder.runs import RunFolder
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")

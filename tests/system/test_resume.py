@@ -15,23 +15,23 @@ import torch
 from command_line import exit_code
 from sigmasplat.commands.run import resume_line
 from sigmasplat.config import Config
+from sigmasplat.config.presets import preset
 from sigmasplat.config.text import override
+from sigmasplat.data.column import Column
+from sigmasplat.data.hops import TrackedHops
+from sigmasplat.data.places import Places
+from sigmasplat.data.poses import KeyframePoses, Poses
 from sigmasplat.errors import RunError
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.io.state import read_state, write_state
-from sigmasplat.io.submaps import DiskStore
-from sigmasplat.model.column import Column
-from sigmasplat.model.hops import TrackedHops
-from sigmasplat.model.places import Places
-from sigmasplat.model.poses import KeyframePoses, Poses
-from sigmasplat.presets import preset
+from sigmasplat.graph.edges import Edges
+from sigmasplat.graph.loops import Loops
+from sigmasplat.plugins.sources import open_source
 from sigmasplat.run.resume import REFINEMENT_CLASSES
-from sigmasplat.slam.loop_closure.edges import Edges
-from sigmasplat.slam.loop_closure.loops import Loops
+from sigmasplat.run_folder.runs import RunFolder
+from sigmasplat.run_folder.state import read_state, write_state
+from sigmasplat.run_folder.submaps import DiskStore
 from sigmasplat.slam.slam import Slam
 from sigmasplat.slam.state import CLASSES, fixed, restore, state_of
 from sigmasplat.slam.steps import Steps
-from sigmasplat.sources import open_source
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 

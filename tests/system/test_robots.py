@@ -20,13 +20,13 @@ from scipy.spatial.transform import Rotation
 from command_line import exit_code
 from ros_reading import covariance, decoded, image, links, points, pose, read_bag, seconds
 from sigmasplat.config import Config
+from sigmasplat.config.presets import default_preset, preset
 from sigmasplat.config.text import override
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.frame import Frame
-from sigmasplat.presets import default_preset, preset
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.frame import Frame
+from sigmasplat.plugins.sources import open_source
+from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.slam.slam import Slam
-from sigmasplat.sources import open_source
 from small_room import frame_at, walk
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
@@ -35,11 +35,11 @@ pytest.importorskip("websockets", reason="websockets is not installed (extra `fo
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
-from sigmasplat.robots.bag import BagSink
-from sigmasplat.robots.live import LiveRobot
-from sigmasplat.robots.outlet import Outlet, Sink
-from sigmasplat.robots.ros_messages import TOPICS, RosMessages
-from sigmasplat.robots.stream import MOST_REQUEST_BYTES, SUBPROTOCOLS, StreamSink
+from sigmasplat.plugins.robots.bag import BagSink
+from sigmasplat.plugins.robots.live import LiveRobot
+from sigmasplat.plugins.robots.outlet import Outlet, Sink
+from sigmasplat.plugins.robots.ros_messages import TOPICS, RosMessages
+from sigmasplat.plugins.robots.stream import MOST_REQUEST_BYTES, SUBPROTOCOLS, StreamSink
 
 SETTINGS = {
     "input.width": "160", "mapping.first_iterations": "40", "mapping.iterations": "10", "final.iterations": "4",

@@ -8,19 +8,19 @@ import pytest
 import torch
 
 from sigmasplat.config import Config
+from sigmasplat.config.presets import default_preset, preset
 from sigmasplat.config.text import override
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.frame import Frame
+from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SourceError
-from sigmasplat.metrics.image import psnr
-from sigmasplat.metrics.trajectory import ate
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.frame import Frame
-from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.presets import default_preset, preset
+from sigmasplat.plugins.evaluation.metrics.image import psnr
+from sigmasplat.plugins.evaluation.metrics.trajectory import ate
+from sigmasplat.plugins.sources import SyntheticRoom
 from sigmasplat.render import render
 from sigmasplat.slam.slam import Slam
 from sigmasplat.slam.step_result import Step
-from sigmasplat.sources import SyntheticRoom
 from small_room import SMALL, frames, walk
 
 _core = pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")

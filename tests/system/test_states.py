@@ -8,16 +8,16 @@ import pytest
 
 from command_line import exit_code
 from sigmasplat.config import Config
+from sigmasplat.config.presets import default_preset, preset
 from sigmasplat.config.text import override
-from sigmasplat.evaluation.evaluate import evaluate
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.io.trajectory import read_trajectory
-from sigmasplat.model.frame import Frame
-from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.presets import default_preset, preset
+from sigmasplat.data.frame import Frame
+from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.plugins.evaluation.evaluate import evaluate
+from sigmasplat.plugins.sources import SyntheticRoom
 from sigmasplat.run.session import Outcome, Session
+from sigmasplat.run_folder.runs import RunFolder
+from sigmasplat.run_folder.trajectory import read_trajectory
 from sigmasplat.slam.slam import Slam
-from sigmasplat.sources import SyntheticRoom
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 

@@ -8,8 +8,8 @@ import pytest
 
 from command_line import exit_code
 from sigmasplat.config import Config
-from sigmasplat.io.runs import RunFolder
 from sigmasplat.run import step_logs
+from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.slam.step_result import Step
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")

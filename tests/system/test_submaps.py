@@ -10,16 +10,16 @@ import pytest
 import torch
 
 from sigmasplat.config import Config
+from sigmasplat.config.presets import default_preset, preset
 from sigmasplat.config.text import override
+from sigmasplat.data import se3
+from sigmasplat.data.frame import Frame
+from sigmasplat.data.submap import SubmapStore
 from sigmasplat.errors import ConfigError
-from sigmasplat.io.submaps import DiskStore
-from sigmasplat.metrics.image import psnr
-from sigmasplat.metrics.trajectory import ate
-from sigmasplat.model import se3
-from sigmasplat.model.frame import Frame
-from sigmasplat.model.submap import SubmapStore
-from sigmasplat.presets import default_preset, preset
+from sigmasplat.plugins.evaluation.metrics.image import psnr
+from sigmasplat.plugins.evaluation.metrics.trajectory import ate
 from sigmasplat.render import render
+from sigmasplat.run_folder.submaps import DiskStore
 from sigmasplat.slam.slam import Slam
 from small_room import frame_at, walk
 

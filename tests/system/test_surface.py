@@ -13,21 +13,21 @@ import trimesh
 
 from command_line import exit_code
 from sigmasplat.config import Config, InputConfig
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.field import GaussianField
+from sigmasplat.data.frame import Frame
+from sigmasplat.data.mesh import Mesh
+from sigmasplat.data.submap import Picture, Submap
+from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import ConfigError, RunError
-from sigmasplat.evaluation.evaluate import evaluate
-from sigmasplat.evaluation.reconstruct import FusionInput
-from sigmasplat.io.mesh import read_mesh
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.metrics.reconstruction import distances
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.field import GaussianField
-from sigmasplat.model.frame import Frame
-from sigmasplat.model.mesh import Mesh
-from sigmasplat.model.submap import Picture, Submap
-from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.sources import SyntheticRoom, open_source
-from sigmasplat.sources.base import Source
+from sigmasplat.input.source import Source
+from sigmasplat.plugins.evaluation.evaluate import evaluate
+from sigmasplat.plugins.evaluation.metrics.reconstruction import distances
+from sigmasplat.plugins.evaluation.reconstruct import FusionInput
+from sigmasplat.plugins.outputs.meshes.mesh_files import read_mesh
+from sigmasplat.plugins.sources import SyntheticRoom, open_source
+from sigmasplat.run_folder.runs import RunFolder
 
 CAMERA = Camera(96, 72, 80.0, 80.0, 47.5, 35.5)
 """The run works at half this size."""
@@ -305,8 +305,8 @@ def test_the_triangles_of_the_room_match_its_depth() -> None:
 
 @pytest.mark.parametrize("kind", ["box", "ball", "drum"])
 def test_the_shapes_of_the_room_are_closed_and_face_outwards(kind: str) -> None:
-    from sigmasplat.sources.room.furnish import furnish_rooms
-    from sigmasplat.sources.room.solid import triangulate
+    from sigmasplat.plugins.sources.room.furnish import furnish_rooms
+    from sigmasplat.plugins.sources.room.solid import triangulate
 
     shape = next(s for s in furnish_rooms(1, 0)[0] if s.kind == kind)
     a, b, c = np.moveaxis(triangulate([shape]).corners - shape.center, 1, 0)

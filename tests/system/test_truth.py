@@ -8,18 +8,18 @@ import pytest
 from command_line import exit_code
 from sigmasplat import cli
 from sigmasplat.config import Config
+from sigmasplat.config.presets import default_preset, preset
 from sigmasplat.config.text import override
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.model import se3
-from sigmasplat.model.frame import Frame
-from sigmasplat.model.mesh import Mesh
-from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.presets import default_preset, preset
+from sigmasplat.data import se3
+from sigmasplat.data.frame import Frame
+from sigmasplat.data.mesh import Mesh
+from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.input.source import Source
+from sigmasplat.plugins.sources import SyntheticRoom
+from sigmasplat.plugins.sources.tum import write_tum
 from sigmasplat.run.session import Session
+from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.slam.slam import Slam
-from sigmasplat.sources import SyntheticRoom
-from sigmasplat.sources.base import Source
-from sigmasplat.sources.tum import write_tum
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
@@ -67,7 +67,7 @@ def test_slam_and_session_never_read_the_truth(tmp_path: Path) -> None:
 
 
 def test_the_command_line_reads_the_truth_only_to_evaluate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for place in ("sigmasplat.sources", "sigmasplat.run.scene"):
+    for place in ("sigmasplat.plugins.sources", "sigmasplat.run.scene"):
         monkeypatch.setattr(f"{place}.open_source", lambda path, settings=None: SourceWithoutTruth())
     assert exit_code("run", "room", "--out", str(tmp_path / "run"), "--no-eval", *OPTIONS) == 0
     assert exit_code("mesh", str(tmp_path / "run"), "--voxel-m", "0.1") == 0

@@ -16,9 +16,9 @@ import pytest
 
 from command_line import exit_code
 from run_process import PATIENCE_S, ROOM, lines, running, wait_for
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.sources import open_source
-from sigmasplat.sources.tum import write_tum
+from sigmasplat.plugins.sources import open_source
+from sigmasplat.plugins.sources.tum import write_tum
+from sigmasplat.run_folder.runs import RunFolder
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
@@ -60,7 +60,7 @@ def test_a_second_process_is_refused_until_the_first_one_ends(
 HOLD = """
 import sys
 from pathlib import Path
-from sigmasplat.io.lock import locked
+from sigmasplat.files.lock import locked
 with locked(Path(sys.argv[1])):
     print("held", flush=True)
     sys.stdin.read()

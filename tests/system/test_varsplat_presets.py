@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from sigmasplat.config import Config
+from sigmasplat.config.presets import list_presets, preset
 from sigmasplat.config.text import override
-from sigmasplat.presets import list_presets, preset
 from sigmasplat.slam.slam import Slam
 from small_room import frames
 

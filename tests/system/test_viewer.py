@@ -20,13 +20,13 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
+from sigmasplat.config.presets import default_preset, preset
 from sigmasplat.config.text import override
-from sigmasplat.drawing import colormap
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.presets import default_preset, preset
+from sigmasplat.plugins.outputs.drawing import colormap
+from sigmasplat.plugins.sources import open_source
 from sigmasplat.run.session import Session
+from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.slam.slam import Slam
-from sigmasplat.sources import open_source
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 pytest.importorskip("viser", reason="viser is not installed (pip install 'sigmasplat[viewer]')")

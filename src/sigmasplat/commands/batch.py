@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING
 
 from sigmasplat.commands import batch_options, options
 from sigmasplat.commands.input_options import DEFAULT_INPUT_OPTIONS, InputOptionsFlat
+from sigmasplat.config.presets import default_preset
 from sigmasplat.config.text import full_path
 from sigmasplat.errors import ConfigError, SourceError
-from sigmasplat.presets import default_preset
 
 if TYPE_CHECKING:
-    from sigmasplat.batch.batch import Batch
+    from sigmasplat.plugins.batch.batch import Batch
     from sigmasplat.run.terminal import Screen
 
 OK, FAILED = 0, 1
@@ -37,8 +37,8 @@ def batch(
 
     Finished runs are kept, stopped ones resume. example: sigmasplat batch data/kitchen data/hall --jobs 2
     """
-    from sigmasplat.batch.batch import Batch, open_road
-    from sigmasplat.batch.job import Job
+    from sigmasplat.plugins.batch.batch import Batch, open_road
+    from sigmasplat.plugins.batch.job import Job
     from sigmasplat.run.terminal import Screen
 
     if not recordings:
@@ -76,9 +76,9 @@ def _show(screen: "Screen", made: "Batch") -> None:
     """Print the main figures of every finished run."""
     from rich.table import Table
 
-    from sigmasplat.batch.definition import Score
-    from sigmasplat.io.runs import RunFolder
-    from sigmasplat.report.tables import number
+    from sigmasplat.plugins.batch.definition import Score
+    from sigmasplat.run.figures import number
+    from sigmasplat.run_folder.runs import RunFolder
 
     shown = (
         Score("frames", ("frames",), digits=0), Score("lost", ("lost",), digits=0),

@@ -13,10 +13,19 @@ from sigmasplat.commands.bench_table import PaperTable
 from sigmasplat.commands.bench_uncertainty import Uncertainty
 from sigmasplat.commands.input_options import Limit
 from sigmasplat.commands.options import prepare_torch
+from sigmasplat.config.presets import default_preset
 from sigmasplat.config.text import split_settings
 from sigmasplat.errors import ConfigError
-from sigmasplat.evaluation.ablation import COMPARED, Job, Results, Runner, Study, common_config, run_job, run_jobs
-from sigmasplat.presets import default_preset
+from sigmasplat.plugins.evaluation.ablation import (
+    COMPARED,
+    Job,
+    Results,
+    Runner,
+    Study,
+    common_config,
+    run_job,
+    run_jobs,
+)
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -105,8 +114,8 @@ def check_sources(study: Study, screen: "Screen") -> None:
 
     Raises SourceError.
     """
-    from sigmasplat.sources import open_source
-    from sigmasplat.sources.camera.depth_units import depth_warning
+    from sigmasplat.input.depth_units import depth_warning
+    from sigmasplat.plugins.sources import open_source
 
     for source in study.sources:
         paths = dict.fromkeys(job.path for job in study.jobs(source))
@@ -130,7 +139,7 @@ def table(study: Study, source: str, runs: Sequence[dict[str, Any]]) -> "Table":
     """Return mean ± standard deviation over seeds, one row per variant; * marks the best of a column."""
     from rich.table import Table
 
-    from sigmasplat.evaluation.paired_comparison import columns, rows
+    from sigmasplat.plugins.evaluation.paired_comparison import columns, rows
 
     figures = columns(runs)
     caption = f"mean ± standard deviation of {study.seeds} seeds · τ {study.config.tracking.tau:g} · * {BEST}"
@@ -144,7 +153,7 @@ def table(study: Study, source: str, runs: Sequence[dict[str, Any]]) -> "Table":
 
 def verdict_lines(variants: Sequence[str], runs: Sequence[dict[str, Any]], seeds: int) -> list[str]:
     """Return a line per pair of variants: which figures change, and how likely such a change is by chance."""
-    from sigmasplat.evaluation.paired_comparison import described, paired_differences, passed_by_chance
+    from sigmasplat.plugins.evaluation.paired_comparison import described, paired_differences, passed_by_chance
 
     pairs = [(changed, against) for changed, against in COMPARED if {changed, against} <= set(variants)]
     lines = [

@@ -9,11 +9,11 @@ from sigmasplat.commands import batch_options, options
 from sigmasplat.commands.input_options import Limit
 from sigmasplat.config.text import split_settings
 from sigmasplat.errors import ConfigError, SourceError
-from sigmasplat.presets.table_files import list_tables, read_table
+from sigmasplat.plugins.papers.table_files import list_tables, read_table
 
 if TYPE_CHECKING:
-    from sigmasplat.batch.batch import Batch
-    from sigmasplat.batch.definition import Cell, Table
+    from sigmasplat.plugins.batch.batch import Batch
+    from sigmasplat.plugins.batch.definition import Cell, Table
 
 OK, FAILED = 0, 1
 LIST = "list"
@@ -49,8 +49,8 @@ class PaperTable:
         if self.table == LIST:
             print("\n".join(f"{name:20} {read_table(name)['title']}" for name in list_tables()))
             return OK
-        from sigmasplat.batch.batch import Batch, open_road
-        from sigmasplat.batch.definition import Table
+        from sigmasplat.plugins.batch.batch import Batch, open_road
+        from sigmasplat.plugins.batch.definition import Table
         from sigmasplat.run.terminal import Screen
 
         if not self.data:
@@ -78,7 +78,7 @@ class PaperTable:
         self, table: "Table", cells: "list[Cell]", batch: "Batch", settings: Mapping[str, str], out: Path
     ) -> str:
         """Write the table with the runs that are finished, and return it as Markdown."""
-        from sigmasplat.batch.written import Written
+        from sigmasplat.plugins.batch.written import Written
 
         finished = {job.name for job in batch.finished()}
         remarks = self._remarks(batch, settings, {cell.job.name: cell.scene for cell in cells})
@@ -87,14 +87,14 @@ class PaperTable:
         return made.markdown()
 
     def _conditions(self, settings: Mapping[str, str]) -> dict[str, Any]:
-        from sigmasplat.batch.job import installed_code
+        from sigmasplat.plugins.batch.job import installed_code
 
         return {"settings": dict(settings), "limit": self.limit, "seeds": self.seeds, "code": installed_code()}
 
     def _remarks(self, batch: "Batch", settings: Mapping[str, str], scene: Mapping[str, str]) -> list[str]:
         """Return the conditions of our numbers, and what is missing, as lines below the table."""
-        from sigmasplat.batch.job import installed_code
-        from sigmasplat.io.machine import package_version
+        from sigmasplat.files.machine import package_version
+        from sigmasplat.plugins.batch.job import installed_code
 
         seeds = f"{self.seeds} seeds, mean ± standard deviation" if self.seeds > 1 else "one seed"
         lines = [f"Ours: SigmaSplat {package_version()} (code {installed_code()}), {seeds}."]

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any
 from sigmasplat.commands import options
 from sigmasplat.commands.input_options import Limit
 from sigmasplat.commands.options import prepare_torch
+from sigmasplat.config.presets import default_preset
 from sigmasplat.config.text import split_settings
 from sigmasplat.errors import ConfigError
-from sigmasplat.presets import default_preset
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from sigmasplat.evaluation.uncertainty_benchmark import Job, Measured, Study
+    from sigmasplat.plugins.evaluation.uncertainty_benchmark import Job, Measured, Study
     from sigmasplat.run.terminal import Screen
 
 DEFAULT_PRESET = default_preset()
@@ -51,7 +51,7 @@ class Uncertainty:
 
     def study(self) -> "Study":
         """Return what to measure. Raises ConfigError on invalid values."""
-        from sigmasplat.evaluation.uncertainty_benchmark import Study, study_config
+        from sigmasplat.plugins.evaluation.uncertainty_benchmark import Study, study_config
 
         if not self.sources:
             raise ConfigError("no SOURCE given; give one or more folders of sequences")
@@ -62,10 +62,10 @@ class Uncertainty:
 
     def run(self) -> int:
         """Make the missing runs, score all of them, print the tables, and return 0. Raises SigmaSplatError."""
-        from sigmasplat.evaluation.uncertainty_benchmark import HELD_BACK
-        from sigmasplat.evaluation.uncertainty_files import SCORES, StudyFolder
+        from sigmasplat.plugins.evaluation.uncertainty_benchmark import HELD_BACK
+        from sigmasplat.plugins.evaluation.uncertainty_files import SCORES, StudyFolder
+        from sigmasplat.plugins.sources import open_source
         from sigmasplat.run.terminal import Screen
-        from sigmasplat.sources import open_source
 
         screen, study = Screen(), self.study()
         jobs = study.jobs()
@@ -96,8 +96,8 @@ class Uncertainty:
 
 def run_job(job: "Job", views: int, screen: "Screen") -> "Measured":
     """Run SLAM with a job's settings and collect its samples."""
-    from sigmasplat.evaluation.finished_run import run_slam
-    from sigmasplat.evaluation.uncertainty_benchmark import measure
+    from sigmasplat.plugins.evaluation.finished_run import run_slam
+    from sigmasplat.plugins.evaluation.uncertainty_benchmark import measure
     from sigmasplat.run.scene import open_scene
 
     source, config = open_scene(job.path, job.config, job.given)
@@ -137,7 +137,7 @@ def path_tables(source: str, runs: Sequence[dict[str, Any]]) -> Iterator["Table"
 
 def pose_rows(runs: Sequence[dict[str, Any]]) -> list[list[str]]:
     """Return a row for each kind of motion that was scored: its name, and the cells of `POSE_COLUMNS`."""
-    from sigmasplat.evaluation.pose_covariance import MOTIONS
+    from sigmasplat.plugins.evaluation.pose_covariance import MOTIONS
 
     rows = []
     for kind, name in MOTIONS.items():
@@ -204,7 +204,7 @@ def written(values: Sequence[float | None], digits: int) -> str:
     """Write the mean of the known values, ± their standard deviation if there are several."""
     import statistics
 
-    from sigmasplat.report.tables import number
+    from sigmasplat.run.figures import number
 
     known = [value for value in values if value is not None and value == value]
     if not known:

@@ -4,7 +4,7 @@ import subprocess
 import sys
 
 from sigmasplat.commands import options
-from sigmasplat.presets import list_presets
+from sigmasplat.config.presets import list_presets
 
 # tyro's script suggests commands and options. In other places it suggests one empty word, which is removed here, so
 # that bash completes file names.

@@ -8,7 +8,7 @@ def doctor() -> int:
 
     exit code 1 if a check fails; example: sigmasplat doctor
     """
-    from sigmasplat.checks.installation import Finding, check_installation, verdict
+    from sigmasplat.plugins.checks.installation import Finding, check_installation, verdict
 
     findings: list[Finding] = []
     for finding in check_installation():

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 if TYPE_CHECKING:
-    from sigmasplat.download.entries import PublicSet
+    from sigmasplat.plugins.download.entries import PublicSet
     from sigmasplat.run.terminal import Screen
 
 arg = tyro.conf.arg
@@ -42,7 +42,7 @@ def download(
 
     example: sigmasplat download tum fr1/desk
     """
-    from sigmasplat.download import find_recording
+    from sigmasplat.plugins.download import find_recording
     from sigmasplat.run.terminal import Screen
 
     screen = Screen()
@@ -61,7 +61,7 @@ def download(
 
 
 def _list(screen: "Screen", set_names: tuple[str, ...]) -> None:
-    from sigmasplat.download import describe_recordings, describe_sets
+    from sigmasplat.plugins.download import describe_recordings, describe_sets
 
     for line in (line for name in set_names for line in describe_recordings(name)) if set_names else describe_sets():
         screen.say(line)
@@ -70,7 +70,7 @@ def _list(screen: "Screen", set_names: tuple[str, ...]) -> None:
 def _download(
     screen: "Screen", public_set: "PublicSet", name: str, out: Path, overwrite: bool, keep_archive: bool
 ) -> Path:
-    from sigmasplat.download import download_recording
+    from sigmasplat.plugins.download import download_recording
 
     try:
         with screen.transfers() as progress:
@@ -83,7 +83,7 @@ def _download(
 def _check_readable(folder: Path) -> None:
     """Raise DownloadError if the downloaded folder cannot be opened as a sequence."""
     from sigmasplat.errors import DownloadError, SourceError
-    from sigmasplat.sources import open_source
+    from sigmasplat.plugins.sources import open_source
 
     try:
         open_source(folder)

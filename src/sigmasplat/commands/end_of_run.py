@@ -3,10 +3,10 @@
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from sigmasplat.checks.motion import MotionWatch
-    from sigmasplat.io.runs import RunFolder
+    from sigmasplat.input.source import Source
+    from sigmasplat.plugins.checks.motion import MotionWatch
     from sigmasplat.run.terminal import Screen
-    from sigmasplat.sources.base import Source
+    from sigmasplat.run_folder.runs import RunFolder
 
 CONTRADICTED_MOST = 0.05
 """Given poses are reported if the images contradict a larger share of them."""
@@ -30,7 +30,7 @@ def warn_at_the_end(
 
 def _warn_of_skipped_frames(screen: "Screen", source: "Source") -> None:
     """Print how many frames are missing from the run, and why, and what else did not work."""
-    from sigmasplat.sources.live import LiveSource
+    from sigmasplat.plugins.sources.live import LiveSource
 
     if source.skipped:
         images = "image" if len(source.skipped) == 1 else "images"

@@ -12,10 +12,10 @@ from sigmasplat.config.ranges import Range
 from sigmasplat.env import LPIPS_FOLDER
 
 if TYPE_CHECKING:
-    from sigmasplat.io.runs import RunFolder
-    from sigmasplat.metrics.lpips import Lpips
+    from sigmasplat.input.source import Source
+    from sigmasplat.plugins.evaluation.metrics.lpips import Lpips
     from sigmasplat.run.terminal import Screen
-    from sigmasplat.sources.base import Source
+    from sigmasplat.run_folder.runs import RunFolder
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class EvalOptions:
     def network(self) -> tuple["Lpips | None", str]:
         """Load the network of LPIPS, or return the line that says why it is not scored. Raises ConfigError if weights
         are damaged, or missing in a folder that was given."""
-        from sigmasplat.metrics.lpips import Lpips, find_lpips
+        from sigmasplat.plugins.evaluation.metrics.lpips import Lpips, find_lpips
 
         if self.lpips is not None:
             return Lpips.load(self.lpips, self.lpips_net), ""
@@ -75,8 +75,8 @@ def evaluate_run(
 
     example: sigmasplat eval runs/kitchen-sigma
     """
-    from sigmasplat.io.runs import RunFolder
     from sigmasplat.run.terminal import Screen
+    from sigmasplat.run_folder.runs import RunFolder
 
     folder, screen = RunFolder.open(run), Screen()
     with folder.locked(screen.warn):
@@ -99,8 +99,8 @@ def score(
 
     Returns the line that says why LPIPS is not scored, or "".
     """
-    from sigmasplat.evaluation.evaluate import evaluate
-    from sigmasplat.io.mesh import read_mesh
+    from sigmasplat.plugins.evaluation.evaluate import evaluate
+    from sigmasplat.plugins.outputs.meshes.mesh_files import read_mesh
 
     try:
         lpips, unscored = eval_options.network()

@@ -8,8 +8,8 @@ import tyro
 
 from sigmasplat.commands import export_options, options, picture_options
 from sigmasplat.commands.options import prepare_torch, refuse_existing, source_of
-from sigmasplat.exports.formats import FORMATS, ExportSource, choose, listed, refuse_unused
-from sigmasplat.io.lock import output_locked
+from sigmasplat.files.lock import output_locked
+from sigmasplat.plugins.outputs.formats import FORMATS, ExportSource, choose, listed, refuse_unused
 
 
 @dataclass(frozen=True)

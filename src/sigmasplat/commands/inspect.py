@@ -8,7 +8,7 @@ import tyro
 from sigmasplat.commands import options
 from sigmasplat.commands.input_options import DEFAULT_INPUT_OPTIONS, InputOptionsFlat
 from sigmasplat.commands.options import configured
-from sigmasplat.presets import default_preset
+from sigmasplat.config.presets import default_preset
 
 OK, WARNED = 0, 1
 SHEETS = Path("runs/inspect")
@@ -36,9 +36,9 @@ def inspect(
     """
     from rich.table import Table
 
-    from sigmasplat.checks.recording import inspect_source
-    from sigmasplat.io.atomic import replacing
-    from sigmasplat.io.json_files import write_json
+    from sigmasplat.files.atomic import replacing
+    from sigmasplat.files.json_files import write_json
+    from sigmasplat.plugins.checks.recording import inspect_source
     from sigmasplat.run.terminal import Screen
 
     screen = Screen()

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from sigmasplat.config import Config
+    from sigmasplat.input.source import Source
     from sigmasplat.run.localise import Localisation, Localiser
-    from sigmasplat.sources.base import Source
     from sigmasplat.types import Progress
 
 OK, NONE_FOUND = 0, 1
@@ -37,11 +37,11 @@ def localise(
 
     exit code 1 if no image was found; example: sigmasplat localise data/kitchen2 --in runs/kitchen-sigma --stride 10
     """
-    from sigmasplat.io.runs import RunFolder
+    from sigmasplat.plugins.sources import open_source
     from sigmasplat.run.finished_map import FinishedMap
     from sigmasplat.run.localise import FOUND, Localiser, write_localisations
     from sigmasplat.run.terminal import Screen
-    from sigmasplat.sources import open_source
+    from sigmasplat.run_folder.runs import RunFolder
 
     _refuse_ending(out)
     refuse_existing(out, overwrite)

@@ -8,7 +8,7 @@ from sigmasplat.commands.options import prepare_torch, refuse_existing, source_o
 from sigmasplat.errors import ConfigError
 
 if TYPE_CHECKING:
-    from sigmasplat.exports.axes import Axes
+    from sigmasplat.plugins.outputs.axes import Axes
 
 
 def make_mesh(
@@ -25,15 +25,15 @@ def make_mesh(
 
     example: sigmasplat mesh runs/kitchen-sigma --out kitchen.glb
     """
-    from sigmasplat.evaluation.reconstruct import FusionInput
-    from sigmasplat.exports.axes import levelled, transform_to
-    from sigmasplat.exports.run_reader import RunReader
-    from sigmasplat.io.lock import output_locked
-    from sigmasplat.io.mesh import check_ending, write_mesh
-    from sigmasplat.io.runs import MESH, RunFolder
-    from sigmasplat.model.decimation import decimated, refuse_budget
-    from sigmasplat.model.gap_filling import filled
+    from sigmasplat.files.lock import output_locked
+    from sigmasplat.plugins.evaluation.reconstruct import FusionInput
+    from sigmasplat.plugins.outputs.axes import levelled, transform_to
+    from sigmasplat.plugins.outputs.meshes.decimation import decimated, refuse_budget
+    from sigmasplat.plugins.outputs.meshes.gap_filling import filled
+    from sigmasplat.plugins.outputs.meshes.mesh_files import check_ending, write_mesh
+    from sigmasplat.plugins.outputs.run_reader import RunReader
     from sigmasplat.run.terminal import Screen
+    from sigmasplat.run_folder.runs import MESH, RunFolder
 
     screen, folder, target = Screen(), RunFolder.open(run), out or run / MESH
     check_ending(target)

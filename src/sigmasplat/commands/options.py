@@ -11,15 +11,15 @@ from sigmasplat import env
 from sigmasplat.commands.input_options import DEFAULT_INPUT_OPTIONS, InputOptions
 from sigmasplat.commands.option_ranges import From0, From1, Whole
 from sigmasplat.config import Config, InputConfig
+from sigmasplat.config.presets import FAMILIES, preset as preset_of
 from sigmasplat.config.ranges import Range
 from sigmasplat.config.text import override, split_settings
 from sigmasplat.errors import RunError
-from sigmasplat.presets import FAMILIES, preset as preset_of
-from sigmasplat.viewer.server import HOST, PORT
+from sigmasplat.plugins.viewer.server import HOST, PORT
 
 if TYPE_CHECKING:
-    from sigmasplat.io.runs import RunFolder
-    from sigmasplat.sources.base import Source
+    from sigmasplat.input.source import Source
+    from sigmasplat.run_folder.runs import RunFolder
 
 arg = tyro.conf.arg
 
@@ -197,8 +197,8 @@ def working_images(config: Config) -> dict[str, str]:
 def source_of(folder: "RunFolder", moved_to: str | None) -> "Source":
     """Open the sequence of a run. Raises RunError if the run does not contain its path, or if depth is predicted by
     another network than in the run."""
+    from sigmasplat.plugins.sources import open_source
     from sigmasplat.run.same_conditions import refuse_other_model
-    from sigmasplat.sources import open_source
 
     facts = folder.facts()
     path = moved_to or facts.get("source_path")

@@ -10,13 +10,13 @@ import tyro
 
 from sigmasplat.commands.option_ranges import Whole
 from sigmasplat.config.ranges import Range
-from sigmasplat.viewer.server import is_loopback
+from sigmasplat.plugins.viewer.server import is_loopback
 
 if TYPE_CHECKING:
-    from sigmasplat.io.runs import RunFolder
-    from sigmasplat.robots.live import LiveRobot
-    from sigmasplat.robots.outlet import Sink
+    from sigmasplat.plugins.robots.live import LiveRobot
+    from sigmasplat.plugins.robots.outlet import Sink
     from sigmasplat.run.terminal import Screen
+    from sigmasplat.run_folder.runs import RunFolder
     from sigmasplat.slam.slam import Slam
 
 Bag = Annotated[
@@ -61,11 +61,11 @@ def check_robot_output(asked: RobotOptions) -> None:
     ConfigError if the port is out of range.
     """
     if asked.bag is not None:
-        from sigmasplat.robots.bag import BagSink
+        from sigmasplat.plugins.robots.bag import BagSink
 
         BagSink(asked.bag)
     if asked.stream is not None:
-        from sigmasplat.robots.stream import check_stream
+        from sigmasplat.plugins.robots.stream import check_stream
 
         check_stream(asked.stream)
 
@@ -82,11 +82,11 @@ def robot_output(
     if asked.bag is None and asked.stream is None:
         yield None
         return
-    from sigmasplat.robots.bag import BagSink
-    from sigmasplat.robots.live import LiveRobot
-    from sigmasplat.robots.outlet import Outlet
-    from sigmasplat.robots.ros_messages import RosMessages
-    from sigmasplat.robots.stream import StreamSink
+    from sigmasplat.plugins.robots.bag import BagSink
+    from sigmasplat.plugins.robots.live import LiveRobot
+    from sigmasplat.plugins.robots.outlet import Outlet
+    from sigmasplat.plugins.robots.ros_messages import RosMessages
+    from sigmasplat.plugins.robots.stream import StreamSink
 
     messages, sinks = RosMessages(), list["Sink"]()
     if asked.stream is not None:

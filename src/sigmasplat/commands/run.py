@@ -22,22 +22,22 @@ from sigmasplat.commands.robot_output import (
     robot_output,
 )
 from sigmasplat.commands.view import keep_showing, serve_viewer
+from sigmasplat.config.presets import default_preset
 from sigmasplat.config.text import full_path, split_settings
 from sigmasplat.errors import ConfigError
-from sigmasplat.presets import default_preset
 
 if TYPE_CHECKING:
     from sigmasplat.config import Config
-    from sigmasplat.io.runs import RunFolder
-    from sigmasplat.robots.live import LiveRobot
+    from sigmasplat.input.source import Source
+    from sigmasplat.plugins.robots.live import LiveRobot
+    from sigmasplat.plugins.viewer.app import ViewerApp
+    from sigmasplat.realtime.system import RealTime
     from sigmasplat.run.finished_map import FinishedMap
     from sigmasplat.run.protocols import Callback
     from sigmasplat.run.resume import StartPoint
     from sigmasplat.run.session import Outcome
     from sigmasplat.run.terminal import Screen
-    from sigmasplat.slam.real_time.system import RealTime
-    from sigmasplat.sources.base import Source
-    from sigmasplat.viewer.app import ViewerApp
+    from sigmasplat.run_folder.runs import RunFolder
 
 OK, INTERRUPTED = 0, 130
 DEFAULT_PRESET = default_preset()
@@ -90,12 +90,12 @@ def run(
     example: sigmasplat run data/kitchen --limit 200 --set input.width=480
     for robots: sigmasplat run data/kitchen --bag kitchen-bag --stream 8765
     """
-    from sigmasplat.io.runs import RunFolder
     from sigmasplat.run.finished_map import FinishedMap, continue_map
     from sigmasplat.run.resume import StartPoint
     from sigmasplat.run.session import new_run
     from sigmasplat.run.step_logs import log_names
     from sigmasplat.run.terminal import Screen
+    from sigmasplat.run_folder.runs import RunFolder
     from sigmasplat.slam.slam import Slam
 
     log_names(run_options.log)
@@ -130,11 +130,11 @@ def resume(
 
     The result has the same bytes as an uninterrupted run. example: sigmasplat resume runs/kitchen-sigma
     """
-    from sigmasplat.io.runs import RunFolder
     from sigmasplat.run.resume import resume as resumed
     from sigmasplat.run.same_conditions import other_instruction_set
     from sigmasplat.run.step_logs import log_names
     from sigmasplat.run.terminal import Screen
+    from sigmasplat.run_folder.runs import RunFolder
 
     log_names(run_options.log)
     check_robot_output(robot_options)
@@ -162,10 +162,10 @@ def _opened(
     earlier: "FinishedMap | None",
 ) -> tuple["Source", "Config"]:  # fmt: skip
     """Open the source and warn of doubtful depth; return it with the settings for its scene, or for the earlier map."""
-    from sigmasplat.checks.timing import time_warnings, times_of
+    from sigmasplat.input.depth_units import depth_warning
+    from sigmasplat.plugins.checks.timing import time_warnings, times_of
+    from sigmasplat.plugins.sources.live import LiveSource, recording_settings
     from sigmasplat.run.scene import open_scene
-    from sigmasplat.sources.camera.depth_units import depth_warning
-    from sigmasplat.sources.live import LiveSource, recording_settings
 
     asked = config
     source, config = open_scene(path, asked, given)
@@ -209,7 +209,7 @@ def _say_of_scale(screen: "Screen", asked: "Config", source: "Source", config: "
 
 def _warn_without_weights(screen: "Screen", config: "Config") -> None:
     """Print a warning if the built-in descriptor replaces the NetVLAD that the preset asks for."""
-    from sigmasplat.slam.loop_closure.closer import lacks_weights
+    from sigmasplat.graph.closer import lacks_weights
 
     if lacks_weights(config.loops) and (config.loops.close or config.mapping.covisibility == "descriptor"):
         screen.warn("no NetVLAD weights, so the built-in descriptor is used; to use NetVLAD: --set loops.weights=FILE")
@@ -222,8 +222,8 @@ def _viewer(screen: "Screen", run_options: options.RunOptions) -> AbstractContex
 
 def _announce(screen: "Screen", preset: str, source: "Source", folder: "RunFolder", record: Path | None) -> None:
     """Print what runs and where; record a live camera to `record` or into the run folder, to be read again later."""
+    from sigmasplat.plugins.sources.live import LiveSource
     from sigmasplat.run.session import unused_path
-    from sigmasplat.sources.live import LiveSource
 
     if not isinstance(source, LiveSource):
         screen.say(f"{source.name}: {len(source)} frames, {preset} → {folder.path}")
@@ -251,13 +251,13 @@ def _run_and_score(
 
     Raises KeyboardInterrupt if Ctrl-C came before the first frame was done.
     """
-    from sigmasplat.checks.motion import MotionWatch
+    from sigmasplat.plugins.checks.motion import MotionWatch
+    from sigmasplat.plugins.sources.arrivals import Arrivals
+    from sigmasplat.plugins.sources.live import LiveSource
+    from sigmasplat.realtime.system import RealTime
     from sigmasplat.render.cuda import stages as cuda_stages
     from sigmasplat.run.resume import RefinementFile, StateFile
     from sigmasplat.run.session import Session
-    from sigmasplat.slam.real_time.system import RealTime
-    from sigmasplat.sources.arrivals import Arrivals
-    from sigmasplat.sources.live import LiveSource
 
     cuda_stages.measure(run_options.profile)
     state = StateFile(start.slam, folder, run_options.save_every)
@@ -313,7 +313,7 @@ def _progress(
     ):
         readers: list[Callback] = [robot] if robot else []  # they read the system, not only the step
         if viewer is not None:
-            from sigmasplat.viewer.live import LiveView
+            from sigmasplat.plugins.viewer.live import LiveView
 
             readers.append(LiveView(start.slam, viewer.show, source.name))
         if system:

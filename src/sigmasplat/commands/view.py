@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 from sigmasplat.commands import options
 from sigmasplat.commands.options import prepare_torch, source_of
 from sigmasplat.errors import SigmaSplatError
-from sigmasplat.viewer.server import HOST, PORT, close, is_loopback, open_server, url_of
+from sigmasplat.plugins.viewer.server import HOST, PORT, close, is_loopback, open_server, url_of
 
 if TYPE_CHECKING:
-    from sigmasplat.io.runs import RunFolder
+    from sigmasplat.input.source import Source
+    from sigmasplat.plugins.viewer.app import ViewerApp
     from sigmasplat.run.terminal import Screen
-    from sigmasplat.sources.base import Source
-    from sigmasplat.viewer.app import ViewerApp
+    from sigmasplat.run_folder.runs import RunFolder
 
 
 def view(run: options.RunPath, host: options.Host = HOST, port: options.Port = PORT) -> int:
@@ -22,9 +22,9 @@ def view(run: options.RunPath, host: options.Host = HOST, port: options.Port = P
 
     example: sigmasplat view runs/kitchen-sigma
     """
-    from sigmasplat.io.runs import RunFolder
+    from sigmasplat.plugins.viewer.finished import check_has_map, follow_run
     from sigmasplat.run.terminal import Screen
-    from sigmasplat.viewer.finished import check_has_map, follow_run
+    from sigmasplat.run_folder.runs import RunFolder
 
     folder = RunFolder.open(run)
     check_has_map(folder)
@@ -45,7 +45,7 @@ def serve_viewer(screen: "Screen", host: str, port: int) -> Iterator["ViewerApp"
     Raises SigmaSplatError if viser is missing or no port is free.
     """
     server = open_server(host, port, "SigmaSplat")
-    from sigmasplat.viewer.app import ViewerApp
+    from sigmasplat.plugins.viewer.app import ViewerApp
 
     viewer, found = ViewerApp(server), server.get_port()
     try:
@@ -62,7 +62,7 @@ def serve_viewer(screen: "Screen", host: str, port: int) -> Iterator["ViewerApp"
 
 def keep_showing(screen: "Screen", viewer: "ViewerApp", folder: "RunFolder", source: "Source") -> None:
     """Keep showing a finished run until Ctrl-C."""
-    from sigmasplat.viewer.finished import finished_snapshot
+    from sigmasplat.plugins.viewer.finished import finished_snapshot
 
     try:
         viewer.show(finished_snapshot(folder, source))

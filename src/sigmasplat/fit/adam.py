@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.config import MappingConfig
-from sigmasplat.model.field import ATTRIBUTES, COLUMNS, WIDTH, Rows
+from sigmasplat.data.field import ATTRIBUTES, COLUMNS, WIDTH, Rows
 
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
 ATTRIBUTE_RATES = {"correlations": ("log_variances", 0.03), "harmonics": ("colors", 1.0 / 20.0)}

@@ -12,10 +12,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from sigmasplat.data import se3
 from sigmasplat.errors import BackendError
 from sigmasplat.fit.interface import AlignRules, ImageKernels, LevelPlanes, Plane
 from sigmasplat.fit.pyramid import LEVELS, NOISE_PER_M, Pyramid
-from sigmasplat.model import se3
 from sigmasplat.types import Matrix
 
 HUBER_GRAY = (0.02, 0.05, 0.1, 0.2)

@@ -8,6 +8,7 @@ from typing import Protocol
 import numpy as np
 from torch import Tensor
 
+from sigmasplat.data.field import GaussianField
 from sigmasplat.errors import ConfigError
 from sigmasplat.fit import adam, tracking_loss
 from sigmasplat.fit.color_covariance import FullCovarianceStep
@@ -24,7 +25,6 @@ from sigmasplat.fit.interface import DeviceFits, MappingStep, Twist, Weights
 from sigmasplat.fit.mapping_step import OwnTermsStep, TorchStep
 from sigmasplat.fit.reference_maps import reference_arrays, reference_maps
 from sigmasplat.fit.view_dependent import ImageStep, ViewDependentStep
-from sigmasplat.model.field import GaussianField
 from sigmasplat.render.backend import make_covariance_view
 from sigmasplat.render.cpu.view import CpuView
 from sigmasplat.render.view import CorrelationView, View

@@ -9,12 +9,12 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from sigmasplat.data.field import COLUMNS, GaussianField
 from sigmasplat.fit import losses
 from sigmasplat.fit.adam import ROWS_AT_ONCE, Rates, adam_rows
 from sigmasplat.fit.interface import Accumulator, Weights, one_image_only
 from sigmasplat.fit.mapping_step import shape_gradient
 from sigmasplat.fit.target import Target
-from sigmasplat.model.field import COLUMNS, GaussianField
 from sigmasplat.render.channels import covariance_of
 from sigmasplat.render.view import CorrelationView, View
 from sigmasplat.types import Matrix

@@ -4,8 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from sigmasplat.data.exposure import NEUTRAL
 from sigmasplat.fit.target import Target
-from sigmasplat.model.exposure import NEUTRAL
 from sigmasplat.render.view import View
 from sigmasplat.types import Matrix
 

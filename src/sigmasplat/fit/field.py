@@ -8,15 +8,15 @@ import numpy as np
 from torch import Tensor
 
 from sigmasplat.config import MappingConfig
+from sigmasplat.data import se3
+from sigmasplat.data.field import COLUMNS, GaussianField
+from sigmasplat.data.stopwatch import Stopwatch
 from sigmasplat.errors import BackendError
 from sigmasplat.fit import losses
 from sigmasplat.fit.adam import Rates, settle
 from sigmasplat.fit.backends import fits_of, step_for
 from sigmasplat.fit.interface import FitStats, Twist
 from sigmasplat.fit.target import Keyframe
-from sigmasplat.model import se3
-from sigmasplat.model.field import COLUMNS, GaussianField
-from sigmasplat.model.stopwatch import Stopwatch
 from sigmasplat.render.view import View
 from sigmasplat.types import Matrix, Slices, completed
 

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.config import TrackingConfig
+from sigmasplat.data.field import GaussianField, Rows
 from sigmasplat.errors import ConfigError
 from sigmasplat.fit.adam import Rates
 from sigmasplat.fit.target import Keyframe, Target
-from sigmasplat.model.field import GaussianField, Rows
 from sigmasplat.render.view import CorrelationView, View
 from sigmasplat.types import Matrix
 

@@ -3,12 +3,12 @@
 import torch
 from torch import Tensor
 
+from sigmasplat.data.field import COLUMNS, GaussianField
 from sigmasplat.fit import losses
 from sigmasplat.fit.adam import Rates, adam_step
 from sigmasplat.fit.fused_terms import SHAPE_TERMS
 from sigmasplat.fit.interface import MappingStep, Weights
 from sigmasplat.fit.target import Target
-from sigmasplat.model.field import COLUMNS, GaussianField
 from sigmasplat.render.channels import variance_of
 from sigmasplat.render.view import View
 from sigmasplat.types import Matrix

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.config import TrackingConfig
-from sigmasplat.model import se3
+from sigmasplat.data import se3
 from sigmasplat.types import Matrix
 
 Vector = NDArray[np.float64]

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from sigmasplat.config import TrackingConfig
+from sigmasplat.data import se3
 from sigmasplat.fit.align import Alignment, align
 from sigmasplat.fit.backends import fits_of
 from sigmasplat.fit.compare import Comparison
@@ -12,7 +13,6 @@ from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference
 from sigmasplat.fit.target import Target
 from sigmasplat.fit.tracking_loss import PoseMaps, agreement
-from sigmasplat.model import se3
 from sigmasplat.render.view import View
 from sigmasplat.types import Matrix
 

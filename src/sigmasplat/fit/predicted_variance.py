@@ -8,10 +8,10 @@ formula of a weight changes.
 import torch
 from torch import Tensor
 
+from sigmasplat.data.field import COLUMNS
+from sigmasplat.data.map_uncertainty import SHIPPED, Background
 from sigmasplat.fit.splat_residuals import PSEUDO_PIXELS, background_of
 from sigmasplat.fit.target import Keyframe, Target
-from sigmasplat.model.field import COLUMNS
-from sigmasplat.model.map_uncertainty import SHIPPED, Background
 from sigmasplat.render.predictive import COVERED, slope2, unexplained
 from sigmasplat.render.splat_sums import gather
 from sigmasplat.render.view import View

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from sigmasplat.data.camera import Camera
 from sigmasplat.fit.backends import fits_of
 from sigmasplat.fit.interface import DEPTH_STEP_M, ImageKernels, Plane
-from sigmasplat.model.camera import Camera
 
 LEVELS = 4
 NOISE_PER_M = 0.003

@@ -8,6 +8,11 @@ from torch import Tensor
 
 from sigmasplat.config import TrackingConfig
 from sigmasplat.config.sensors import SensorModel
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.depth_std import alignment_std, generic_std
+from sigmasplat.data.map_uncertainty import Background
+from sigmasplat.data.submap import Picture
 from sigmasplat.fit.backends import fits_of
 from sigmasplat.fit.compare import Comparison, compare
 from sigmasplat.fit.gray import Image
@@ -15,11 +20,6 @@ from sigmasplat.fit.interface import Plane
 from sigmasplat.fit.predicted_variance import predicted_at, use_predicted_depth_variance, use_predicted_variance
 from sigmasplat.fit.pyramid import NOISE_PER_M, Pyramid
 from sigmasplat.fit.target import Target
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.depth_std import alignment_std, generic_std
-from sigmasplat.model.map_uncertainty import Background
-from sigmasplat.model.submap import Picture
 from sigmasplat.render.view import View
 from sigmasplat.types import Matrix
 

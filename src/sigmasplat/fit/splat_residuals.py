@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 
 from sigmasplat.config import RenderConfig
+from sigmasplat.data import se3
+from sigmasplat.data.field import COLUMNS, GaussianField
+from sigmasplat.data.map_uncertainty import Background
 from sigmasplat.fit.target import Keyframe
-from sigmasplat.model import se3
-from sigmasplat.model.field import COLUMNS, GaussianField
-from sigmasplat.model.map_uncertainty import Background
 from sigmasplat.render.blended_values import blend_values
 from sigmasplat.render.predictive import COVERED, directions_toward
 from sigmasplat.render.render import on_device

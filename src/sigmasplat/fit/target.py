@@ -7,13 +7,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.depth_std import generic_std, relative_weights
+from sigmasplat.data.frame import Detail, Frame
+from sigmasplat.data.photo import Photo
+from sigmasplat.data.submap import Picture
 from sigmasplat.fit.adam import VectorAdam
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.depth_std import generic_std, relative_weights
-from sigmasplat.model.frame import Detail, Frame
-from sigmasplat.model.photo import Photo
-from sigmasplat.model.submap import Picture
 from sigmasplat.native import kernels
 
 

@@ -6,12 +6,12 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from sigmasplat.data.field import COLUMNS, GaussianField, Rows
+from sigmasplat.data.harmonics import basis, count, view_colors
 from sigmasplat.fit.adam import ROWS_AT_ONCE, Rates, adam_rows
 from sigmasplat.fit.interface import Accumulator, Weights, one_image_only
 from sigmasplat.fit.mapping_step import render_for, shape_gradient
 from sigmasplat.fit.target import Target
-from sigmasplat.model.field import COLUMNS, GaussianField, Rows
-from sigmasplat.model.harmonics import basis, count, view_colors
 from sigmasplat.render.view import View
 from sigmasplat.types import Matrix
 

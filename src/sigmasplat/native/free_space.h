@@ -1,4 +1,4 @@
-// Find the points in space that a depth image sees to be free, in double precision. slam/localisation/free_space.py is
+// Find the points in space that a depth image sees to be free, in double precision. tracking/moving/free_space.py is
 // the description and the definition.
 
 // Whether the image sees through a point at depth z behind pixel (u, v): there are readings around it, all farther.

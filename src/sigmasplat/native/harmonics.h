@@ -1,5 +1,5 @@
 // Spherical harmonics of degrees 1 to 3 and their derivatives, templated on the number type (float, SIMD lanes). Has no
-// includes and no namespace, like splat.h. model/harmonics.py is the definition.
+// includes and no namespace, like splat.h. data/harmonics.py is the definition.
 
 template <class T> struct Dual { T value, by[3]; };   // a number and its derivatives with respect to x, y, z
 template <class T> inline __attribute__((always_inline)) Dual<T> operator+(Dual<T> a, Dual<T> b) {

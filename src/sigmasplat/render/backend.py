@@ -12,9 +12,9 @@ import torch
 
 from sigmasplat import env
 from sigmasplat.config import RenderConfig
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.field import Rows
 from sigmasplat.errors import BackendError
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.field import Rows
 from sigmasplat.render.view import CorrelationView, View
 
 BACKENDS = ("auto", "cpu", "cuda", "reference")

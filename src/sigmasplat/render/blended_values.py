@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.config import RenderConfig
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.field import COLUMNS, GaussianField
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.field import COLUMNS, GaussianField
 from sigmasplat.render.backend import backend_module, backend_name, options_on
 from sigmasplat.render.gated_depth import gated_depth
 from sigmasplat.render.ray_depth import depth_of, plane_features

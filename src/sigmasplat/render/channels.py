@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from sigmasplat.model.color_covariance import covariances_of, outer
+from sigmasplat.data.color_covariance import covariances_of, outer
 
 COVARIANCE_PLANES = 10
 """Channels of `covariance_features`."""

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from sigmasplat.config import RenderConfig
-from sigmasplat.model.camera import Camera
+from sigmasplat.data.camera import Camera
 from sigmasplat.render.backend import make_view
 from sigmasplat.render.pose_gradient import pose_gradient
 

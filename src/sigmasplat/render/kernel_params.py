@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.config import RenderConfig
-from sigmasplat.model.camera import Camera
+from sigmasplat.data.camera import Camera
 from sigmasplat.render.reference.operators import FRUSTUM_MARGIN
 
 

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from sigmasplat.config import RenderConfig
-from sigmasplat.model.camera import Camera
+from sigmasplat.data.camera import Camera
 
 
 def as_refined(options: RenderConfig, camera: Camera, refined_fx: float | None) -> RenderConfig:

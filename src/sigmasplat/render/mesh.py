@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.mesh import Mesh
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.mesh import Mesh
 from sigmasplat.native import _core
 
 Doubles = NDArray[np.float64]

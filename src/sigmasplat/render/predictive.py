@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.config import RenderConfig
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.field import COLUMNS, GaussianField
-from sigmasplat.model.map_uncertainty import (
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.field import COLUMNS, GaussianField
+from sigmasplat.data.map_uncertainty import (
     COLOR_PARTS,
     DEPTH_PARTS,
     EPISTEMIC,

@@ -7,7 +7,7 @@ over splats is a plane per pixel, blended as three features.
 import torch
 from torch import Tensor
 
-from sigmasplat.model.camera import Camera
+from sigmasplat.data.camera import Camera
 from sigmasplat.render.reference.operators import Projection
 
 PLANES = 3

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.config import RenderConfig
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.field import COLUMNS, GaussianField, Rows
-from sigmasplat.model.harmonics import view_colors
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.field import COLUMNS, GaussianField, Rows
+from sigmasplat.data.harmonics import view_colors
 from sigmasplat.render.backend import backend_module, backend_name, options_on
 from sigmasplat.render.channels import covariance_features, covariance_of, features_of, variance_of
 from sigmasplat.render.cuda import launch as cuda_launch

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from sigmasplat.model.field import COLUMNS
+from sigmasplat.data.field import COLUMNS
 from sigmasplat.render.cpu.view import CpuView
 from sigmasplat.render.view import View
 

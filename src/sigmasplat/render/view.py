@@ -13,8 +13,8 @@ from torch import Tensor
 
 from sigmasplat.config import RenderConfig
 from sigmasplat.config.sensors import SensorModel
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.field import Rows
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.field import Rows
 from sigmasplat.render.reference import operators as reference
 from sigmasplat.types import Matrix
 

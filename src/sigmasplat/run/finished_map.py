@@ -10,14 +10,14 @@ import numpy as np
 
 from sigmasplat.config import Config
 from sigmasplat.config.scale import for_scene
+from sigmasplat.data.camera import Camera
 from sigmasplat.errors import RunError
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.io.submaps import DiskStore
-from sigmasplat.model.camera import Camera
+from sigmasplat.input.source import Source
 from sigmasplat.run.scene import noted_scale
+from sigmasplat.run_folder.runs import RunFolder
+from sigmasplat.run_folder.submaps import DiskStore
 from sigmasplat.slam.continuation import continued, refuse_without_relocalisation, take_over
 from sigmasplat.slam.slam import Slam
-from sigmasplat.sources.base import Source
 from sigmasplat.types import Matrix
 
 LEAST_SHARE = 0.5

@@ -8,19 +8,19 @@ from typing import Any
 import numpy as np
 
 from sigmasplat.config import Config
+from sigmasplat.data.field import GaussianField
+from sigmasplat.data.frame import Frame
+from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.files.atomic import write_text
+from sigmasplat.files.json_files import json_line
 from sigmasplat.fit.compare import Comparison
-from sigmasplat.io.atomic import write_text
-from sigmasplat.io.json_files import json_line
-from sigmasplat.io.trajectory import write_trajectory
-from sigmasplat.model.field import GaussianField
-from sigmasplat.model.frame import Frame
-from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.run.finished_map import FinishedMap
-from sigmasplat.slam.features import make_extractor
-from sigmasplat.slam.localisation.known_map import KnownMap
-from sigmasplat.slam.localisation.recovery import usable
-from sigmasplat.slam.localisation.relocaliser import Relocaliser, Relocation, SearchResult
-from sigmasplat.slam.localisation.sight import observe, view_of, working_frame
+from sigmasplat.run_folder.trajectory import write_trajectory
+from sigmasplat.tracking.features import make_extractor
+from sigmasplat.tracking.known_map import KnownMap
+from sigmasplat.tracking.recovery import usable
+from sigmasplat.tracking.relocaliser import Relocaliser, Relocation, SearchResult
+from sigmasplat.tracking.sight import observe, view_of, working_frame
 from sigmasplat.types import Matrix
 
 FOUND, APART, NOT_FOUND = "found", "apart", "not found"

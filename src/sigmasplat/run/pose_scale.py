@@ -10,12 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from sigmasplat.config import Config
+from sigmasplat.data import se3
 from sigmasplat.errors import SourceError
-from sigmasplat.model import se3
-from sigmasplat.slam.features import Extractor, Features, make_extractor
-from sigmasplat.slam.localisation.depth_shape import depth_at
-from sigmasplat.slam.localisation.feature_image import FeatureImage, LateDetail, motion_by_features
-from sigmasplat.sources.base import Source
+from sigmasplat.input.source import Source
+from sigmasplat.tracking.depth_shape import depth_at
+from sigmasplat.tracking.feature_image import FeatureImage, LateDetail, motion_by_features
+from sigmasplat.tracking.features import Extractor, Features, make_extractor
 from sigmasplat.types import Matrix
 
 PLACES, STEPS = 12, (32, 16, 8, 4, 2, 1)

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from sigmasplat.io.run_values import frame_seconds
+from sigmasplat.run_folder.run_values import frame_seconds
 
 STAGES: dict[str, tuple[str, ...]] = {
     "project": ("project",),

@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sigmasplat.model.component import Component
-from sigmasplat.model.field import GaussianField
-from sigmasplat.model.frame import Frame
-from sigmasplat.model.map_uncertainty import MapUncertainty
-from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.data.component import Component
+from sigmasplat.data.field import GaussianField
+from sigmasplat.data.frame import Frame
+from sigmasplat.data.map_uncertainty import MapUncertainty
+from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.types import Progress
 
 

@@ -4,21 +4,21 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from sigmasplat.data.field import GaussianField, Rows
 from sigmasplat.errors import RunError
+from sigmasplat.files.atomic import write_text
+from sigmasplat.files.guard import guarded
+from sigmasplat.files.json_files import read_text
+from sigmasplat.final.refinement import Refined
 from sigmasplat.fit.adam import VectorAdam
-from sigmasplat.io.atomic import write_text
-from sigmasplat.io.json_files import read_text
-from sigmasplat.io.run_values import STATE_FIELDS, check_fields
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.io.state import read_state, write_state
-from sigmasplat.model.field import GaussianField, Rows
-from sigmasplat.reading.guard import guarded
+from sigmasplat.input.source import Source
 from sigmasplat.run.same_conditions import refuse_other_sequence
 from sigmasplat.run.session import run_now
-from sigmasplat.slam.refinement import Refined
+from sigmasplat.run_folder.run_values import STATE_FIELDS, check_fields
+from sigmasplat.run_folder.runs import RunFolder
+from sigmasplat.run_folder.state import read_state, write_state
 from sigmasplat.slam.slam import Slam
 from sigmasplat.slam.state import CLASSES, fixed, restore, state_of
-from sigmasplat.sources.base import Source
 
 REFINEMENT_CLASSES: tuple[type, ...] = (GaussianField, Refined, Rows, VectorAdam)
 """The classes that a partly refined final map contains."""

@@ -7,10 +7,10 @@ from typing import Any
 
 from sigmasplat import env
 from sigmasplat.errors import RunError
-from sigmasplat.io.frames import SAME_TIME_S
-from sigmasplat.io.runs import RunFolder
+from sigmasplat.input.source import Source
 from sigmasplat.run.scene import scene_facts
-from sigmasplat.sources.base import Source
+from sigmasplat.run_folder.frames import SAME_TIME_S
+from sigmasplat.run_folder.runs import RunFolder
 
 SAME_SHARE = 1e-6
 """Numbers of a calibration that differ by less are equal: a recording has them as text."""

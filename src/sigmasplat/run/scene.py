@@ -6,9 +6,9 @@ from typing import Any
 
 from sigmasplat.config import Config
 from sigmasplat.config.scale import for_scene
+from sigmasplat.input.opening import open_source
+from sigmasplat.input.source import Source
 from sigmasplat.run.pose_scale import with_measured_scale, with_scaled_depth
-from sigmasplat.sources.base import Source
-from sigmasplat.sources.opening import open_source
 
 
 def open_scene(path: str | Path, config: Config | None = None, given: Collection[str] = ()) -> tuple[Source, Config]:

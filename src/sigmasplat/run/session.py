@@ -14,12 +14,11 @@ from pathlib import Path
 from typing import Any
 
 from sigmasplat.config import Config
+from sigmasplat.data.component import RELOCALISED
+from sigmasplat.data.frame import Frame
 from sigmasplat.errors import RunError
-from sigmasplat.io.frames import RunFrames
-from sigmasplat.io.lock import LOCK, locked, no_warning
-from sigmasplat.io.runs import ALL_POSES, RunFolder
-from sigmasplat.model.component import RELOCALISED
-from sigmasplat.model.frame import Frame
+from sigmasplat.files.lock import LOCK, locked, no_warning
+from sigmasplat.input.source import Source
 from sigmasplat.run.profile import profile
 from sigmasplat.run.protocols import (
     Callback,
@@ -31,7 +30,8 @@ from sigmasplat.run.protocols import (
 )
 from sigmasplat.run.same_conditions import start_facts
 from sigmasplat.run.signals import interrupt_event
-from sigmasplat.sources.base import Source
+from sigmasplat.run_folder.frames import RunFrames
+from sigmasplat.run_folder.runs import ALL_POSES, RunFolder
 
 RUNS = Path("runs")
 LOOPS_GROWTH = 1.05

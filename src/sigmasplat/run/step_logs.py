@@ -14,9 +14,9 @@ from typing import Any
 from sigmasplat.config.text import nearest
 from sigmasplat.env import install_extra
 from sigmasplat.errors import ConfigError
-from sigmasplat.io.atomic import make_folder, write_text
-from sigmasplat.io.runs import RunFolder
+from sigmasplat.files.atomic import make_folder, write_text
 from sigmasplat.run.protocols import Callback, LoopResult, StepResult
+from sigmasplat.run_folder.runs import RunFolder
 
 EXTRA = "logs"
 CSV, TENSORBOARD, RERUN = "steps.csv", "tensorboard", "steps{}.rrd"

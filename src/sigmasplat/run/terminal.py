@@ -18,8 +18,8 @@ from rich.progress import (
 )
 from rich.table import Table
 
-from sigmasplat.model.component import APART, RELOCALISED
-from sigmasplat.report.tables import format_ranges, headline, number
+from sigmasplat.data.component import APART, RELOCALISED
+from sigmasplat.run.figures import format_ranges, headline, number
 from sigmasplat.run.profile import shares
 from sigmasplat.run.protocols import LoopResult, StepResult
 from sigmasplat.types import Progress

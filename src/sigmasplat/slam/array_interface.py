@@ -5,12 +5,12 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TypeVar
 
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.frame import Frame
+from sigmasplat.data.frame_arrays import Array, ColorOrder, frame_from_arrays
 from sigmasplat.errors import SourceError
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.frame import Frame
-from sigmasplat.model.frame_arrays import Array, ColorOrder, frame_from_arrays
+from sigmasplat.graph.loops import Loop
 from sigmasplat.slam.listeners import Correction, Listeners
-from sigmasplat.slam.loop_closure.loops import Loop
 from sigmasplat.slam.step_result import Step
 from sigmasplat.types import Matrix
 

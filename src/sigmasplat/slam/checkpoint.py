@@ -6,11 +6,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sigmasplat.model.atlas import Atlas
-from sigmasplat.model.field import GaussianField, Rows
-from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.slam.loop_closure.pose_graph import Edge
-from sigmasplat.slam.path_covariance import recorded
+from sigmasplat.data.atlas import Atlas
+from sigmasplat.data.field import GaussianField, Rows
+from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.graph.path_covariance import recorded
+from sigmasplat.graph.pose_graph import Edge
 
 
 def checkpoint_of(

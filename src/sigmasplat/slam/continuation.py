@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from sigmasplat.config import Config
+from sigmasplat.data import se3
+from sigmasplat.data.submap import SubmapStore
 from sigmasplat.errors import ConfigError
-from sigmasplat.model import se3
-from sigmasplat.model.submap import SubmapStore
 from sigmasplat.slam.slam import Slam
 from sigmasplat.types import Matrix
 

@@ -8,8 +8,8 @@ from typing import Concatenate, Literal, ParamSpec, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.model.atlas import Atlas
-from sigmasplat.slam.loop_closure.loops import Loop, Loops
+from sigmasplat.data.atlas import Atlas
+from sigmasplat.graph.loops import Loop, Loops
 from sigmasplat.slam.step_result import Step
 from sigmasplat.slam.steps import Steps
 from sigmasplat.types import Matrix

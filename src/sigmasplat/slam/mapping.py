@@ -8,21 +8,21 @@ from math import inf
 
 import numpy as np
 
+from sigmasplat.data import se3
+from sigmasplat.data.field import GaussianField
+from sigmasplat.data.hops import UNKNOWN_HOP, Hop
 from sigmasplat.fit.align import Alignment
 from sigmasplat.fit.target import Keyframe
-from sigmasplat.model import se3
-from sigmasplat.model.field import GaussianField
-from sigmasplat.model.hops import UNKNOWN_HOP, Hop
-from sigmasplat.slam.drift import Drift
-from sigmasplat.slam.localisation.confidence import std_of
-from sigmasplat.slam.localisation.known_map import KnownMap
-from sigmasplat.slam.localisation.recovery import Link, usable
-from sigmasplat.slam.localisation.relocaliser import INDEX_AT_MOST, Relocation, sight_of
-from sigmasplat.slam.localisation.sight import Observation, Sight
-from sigmasplat.slam.loop_closure.closer import OwedSearch
-from sigmasplat.slam.mapper import Mapper
-from sigmasplat.slam.rules import ends_submap, never
+from sigmasplat.graph.closer import OwedSearch
+from sigmasplat.graph.confidence import std_of
+from sigmasplat.mapping.mapper import Mapper
 from sigmasplat.slam.world import World
+from sigmasplat.tracking.drift import Drift
+from sigmasplat.tracking.known_map import KnownMap
+from sigmasplat.tracking.recovery import Link, usable
+from sigmasplat.tracking.relocaliser import INDEX_AT_MOST, Relocation, sight_of
+from sigmasplat.tracking.rules import ends_submap, never
+from sigmasplat.tracking.sight import Observation, Sight
 from sigmasplat.types import Matrix, Slices, completed
 
 LAST_TRIES = 3

@@ -5,31 +5,31 @@ from dataclasses import replace
 
 import numpy as np
 
+from sigmasplat.data import se3
+from sigmasplat.data.component import APART, LOST, RELOCALISED, TRACKED
+from sigmasplat.data.frame import Frame
+from sigmasplat.data.hops import UNKNOWN_HOP, Hop
+from sigmasplat.data.submap import RefinedStore, StorePart
+from sigmasplat.final.final_map import final_map
+from sigmasplat.final.pose_reach import reaching
+from sigmasplat.final.uncertainty import final_uncertainty
 from sigmasplat.fit.pose import PoseFit
-from sigmasplat.model import se3
-from sigmasplat.model.component import APART, LOST, RELOCALISED, TRACKED
-from sigmasplat.model.frame import Frame
-from sigmasplat.model.hops import UNKNOWN_HOP, Hop
-from sigmasplat.model.submap import RefinedStore, StorePart
+from sigmasplat.graph.loops import Loop
+from sigmasplat.graph.path_covariance import PathCovariance
 from sigmasplat.render.low_pass import as_refined
 from sigmasplat.slam.array_interface import ArrayInterface
-from sigmasplat.slam.drift import mean_variance
-from sigmasplat.slam.final import final_map
-from sigmasplat.slam.fitted_depth import fitted_keyframe, fitted_to_map
-from sigmasplat.slam.found import Found
 from sigmasplat.slam.listeners import notifying
-from sigmasplat.slam.localisation.foreground import share_of
-from sigmasplat.slam.localisation.recovery import usable
-from sigmasplat.slam.localisation.relocaliser import Relocation
-from sigmasplat.slam.localisation.sight import Observation, refuse_first_without_depth, working_frame
-from sigmasplat.slam.localisation.verdict import is_better, is_questionable
-from sigmasplat.slam.loop_closure.loops import Loop
 from sigmasplat.slam.mapping import MapWork
-from sigmasplat.slam.path_covariance import PathCovariance
-from sigmasplat.slam.pose_reach import reaching
-from sigmasplat.slam.rules import is_held_back, is_keyframe
 from sigmasplat.slam.step_result import Step, StepTimer
-from sigmasplat.slam.uncertainty import final_uncertainty
+from sigmasplat.tracking.drift import mean_variance
+from sigmasplat.tracking.fitted_depth import fitted_keyframe, fitted_to_map
+from sigmasplat.tracking.found import Found
+from sigmasplat.tracking.moving.foreground import share_of
+from sigmasplat.tracking.recovery import usable
+from sigmasplat.tracking.relocaliser import Relocation
+from sigmasplat.tracking.rules import is_held_back, is_keyframe
+from sigmasplat.tracking.sight import Observation, refuse_first_without_depth, working_frame
+from sigmasplat.tracking.verdict import is_better, is_questionable
 from sigmasplat.types import Matrix, completed, no_progress, part_of
 
 

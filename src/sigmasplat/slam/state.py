@@ -2,42 +2,42 @@
 
 from typing import Any
 
+from sigmasplat.data.atlas import Atlas
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.column import Column
+from sigmasplat.data.field import GaussianField, Rows
+from sigmasplat.data.frame import Detail, PosePrior
+from sigmasplat.data.hops import TrackedHops
+from sigmasplat.data.photo import Photo
+from sigmasplat.data.places import Places
+from sigmasplat.data.poses import KeyframePoses, Poses
+from sigmasplat.data.submap import Picture
 from sigmasplat.errors import RunError
 from sigmasplat.fit.adam import VectorAdam
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference
 from sigmasplat.fit.target import Keyframe, Target
-from sigmasplat.model.atlas import Atlas
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.column import Column
-from sigmasplat.model.field import GaussianField, Rows
-from sigmasplat.model.frame import Detail, PosePrior
-from sigmasplat.model.hops import TrackedHops
-from sigmasplat.model.photo import Photo
-from sigmasplat.model.places import Places
-from sigmasplat.model.poses import KeyframePoses, Poses
-from sigmasplat.model.submap import Picture
-from sigmasplat.slam.drift import Drift
-from sigmasplat.slam.localisation.confidence import Confidence
-from sigmasplat.slam.localisation.depth_fit import DepthFit
-from sigmasplat.slam.localisation.depth_shape import DepthShape, SeenKeyframe
-from sigmasplat.slam.localisation.feature_image import FeatureImage
-from sigmasplat.slam.localisation.foreground import Foreground
-from sigmasplat.slam.localisation.memory import Memory, Seen
-from sigmasplat.slam.localisation.recovery import Link, Recovery
-from sigmasplat.slam.localisation.relocaliser import Relocaliser
-from sigmasplat.slam.localisation.verdict import Usual
-from sigmasplat.slam.localisation.watch import Watch
-from sigmasplat.slam.loop_closure.closer import LoopCloser, OwedSearch
-from sigmasplat.slam.loop_closure.described_submaps import DescribedSubmaps
-from sigmasplat.slam.loop_closure.edges import Edges
-from sigmasplat.slam.loop_closure.loops import Loop, Loops
-from sigmasplat.slam.mapper import Mapper, SecondHalf
-from sigmasplat.slam.probes import Probe, Probes
+from sigmasplat.graph.closer import LoopCloser, OwedSearch
+from sigmasplat.graph.confidence import Confidence
+from sigmasplat.graph.described_submaps import DescribedSubmaps
+from sigmasplat.graph.edges import Edges
+from sigmasplat.graph.loops import Loop, Loops
+from sigmasplat.mapping.mapper import Mapper, SecondHalf
+from sigmasplat.mapping.probes import Probe, Probes
 from sigmasplat.slam.slam import Slam
 from sigmasplat.slam.step_result import Step
 from sigmasplat.slam.steps import Steps
-from sigmasplat.slam.tracker import Tracker
+from sigmasplat.tracking.depth_fit import DepthFit
+from sigmasplat.tracking.depth_shape import DepthShape, SeenKeyframe
+from sigmasplat.tracking.drift import Drift
+from sigmasplat.tracking.feature_image import FeatureImage
+from sigmasplat.tracking.moving.foreground import Foreground
+from sigmasplat.tracking.moving.memory import Memory, Seen
+from sigmasplat.tracking.moving.watch import Watch
+from sigmasplat.tracking.recovery import Link, Recovery
+from sigmasplat.tracking.relocaliser import Relocaliser
+from sigmasplat.tracking.tracker import Tracker
+from sigmasplat.tracking.verdict import Usual
 
 CLASSES: tuple[type, ...] = (
     Atlas, Camera, Column, Confidence, DepthFit, DepthShape, DescribedSubmaps, Detail, Drift, Edges, FeatureImage,

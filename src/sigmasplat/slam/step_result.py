@@ -8,11 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.fit.pose import PoseFit
-from sigmasplat.model.component import TRACKED
-from sigmasplat.model.stopwatch import Stopwatch
+from sigmasplat.data.component import TRACKED
+from sigmasplat.data.stopwatch import Stopwatch
+from sigmasplat.graph.loops import Loop
 from sigmasplat.render.view import View
-from sigmasplat.slam.loop_closure.loops import Loop
 
 KERNELS = ("project", "sort", "blend", "blend_backward", "project_backward")
 """The stages that `View.seconds` counts, in its order."""
@@ -43,15 +42,6 @@ class Step:
     component: int = 0
     p_off: float = 0.0
     covariance: NDArray[np.float64] | None = None
-
-
-def metrics_of(fit: PoseFit) -> dict[str, float]:
-    """Return the tracking values that a step reports."""
-    compared = {} if fit.comparison is None else vars(fit.comparison)
-    return {
-        "agreement": fit.agreement, "overlap": fit.overlap, "first_loss": fit.first_loss,
-        "loss": fit.loss, "iterations": float(fit.iterations),
-    } | compared  # fmt: skip
 
 
 @dataclass(eq=False)

@@ -6,8 +6,8 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.model.column import Column, Records
-from sigmasplat.model.component import APART, LOST, RELOCALISED, TRACKED
+from sigmasplat.data.column import Column, Records
+from sigmasplat.data.component import APART, LOST, RELOCALISED, TRACKED
 from sigmasplat.slam.step_result import Step
 
 WHOLE_STEPS = 1000

@@ -8,37 +8,37 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.config import Config
+from sigmasplat.config.presets import configured
+from sigmasplat.data.atlas import Atlas
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.column import Column
+from sigmasplat.data.component import LOST, Component
+from sigmasplat.data.field import GaussianField
+from sigmasplat.data.frame import Frame
+from sigmasplat.data.map_uncertainty import MapUncertainty
+from sigmasplat.data.submap import MemoryStore, OnDisk, SubmapStore
+from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SourceError
-from sigmasplat.model.atlas import Atlas
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.column import Column
-from sigmasplat.model.component import LOST, Component
-from sigmasplat.model.field import GaussianField
-from sigmasplat.model.frame import Frame
-from sigmasplat.model.map_uncertainty import MapUncertainty
-from sigmasplat.model.submap import MemoryStore, OnDisk, SubmapStore
-from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.presets import configured
+from sigmasplat.final.merged import components_apart, merged_field
+from sigmasplat.final.refinement import SavedRefinement
+from sigmasplat.graph.closer import LoopCloser, make_descriptor
+from sigmasplat.graph.confidence import Confidence
+from sigmasplat.graph.loops import Loop, Loops
+from sigmasplat.graph.newest_covariance import NewestCovariance, PoseErrors
+from sigmasplat.mapping.mapper import Mapper
+from sigmasplat.mapping.probes import Probes
 from sigmasplat.render.view import View
 from sigmasplat.slam.checkpoint import checkpoint_of
-from sigmasplat.slam.drift import Drift
-from sigmasplat.slam.features import Extractor, make_extractor
 from sigmasplat.slam.listeners import Listeners
-from sigmasplat.slam.localisation.confidence import Confidence
-from sigmasplat.slam.localisation.recovery import Recovery
-from sigmasplat.slam.localisation.relocaliser import Relocaliser
-from sigmasplat.slam.localisation.sight import Observation, observe, view_of, working_frame
-from sigmasplat.slam.localisation.watch import Watch
-from sigmasplat.slam.loop_closure.closer import LoopCloser, make_descriptor
-from sigmasplat.slam.loop_closure.loops import Loop, Loops
-from sigmasplat.slam.mapper import Mapper
-from sigmasplat.slam.merged import components_apart, merged_field
-from sigmasplat.slam.newest_covariance import NewestCovariance, PoseErrors
-from sigmasplat.slam.probes import Probes
-from sigmasplat.slam.refinement import SavedRefinement
 from sigmasplat.slam.step_result import Step, StepTimer
 from sigmasplat.slam.steps import Steps
-from sigmasplat.slam.tracker import Tracker
+from sigmasplat.tracking.drift import Drift
+from sigmasplat.tracking.features import Extractor, make_extractor
+from sigmasplat.tracking.moving.watch import Watch
+from sigmasplat.tracking.recovery import Recovery
+from sigmasplat.tracking.relocaliser import Relocaliser
+from sigmasplat.tracking.sight import Observation, observe, view_of, working_frame
+from sigmasplat.tracking.tracker import Tracker
 from sigmasplat.types import Matrix, Slices
 
 HOST = torch.device("cpu")

@@ -1,7 +1,7 @@
 """Settle a field's Adam state with the compiled CPU kernels (native/adam.h)."""
 
+from sigmasplat.data.field import Rows
 from sigmasplat.fit.adam import BETA1, EPSILON, Rates
-from sigmasplat.model.field import Rows
 
 
 def settle(field: Rows, rates: Rates) -> None:

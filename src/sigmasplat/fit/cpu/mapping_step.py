@@ -6,12 +6,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from sigmasplat.data.field import GaussianField
 from sigmasplat.fit.adam import BETA1, EPSILON, Rates
 from sigmasplat.fit.fused_terms import PIXEL_TERMS, SHAPE_TERMS, kernel_weights, pixel_weights
 from sigmasplat.fit.interface import Weights
 from sigmasplat.fit.mapping_step import GradientAccumulator, render_for
 from sigmasplat.fit.target import Target
-from sigmasplat.model.field import GaussianField
 from sigmasplat.render.cpu.view import CpuView
 from sigmasplat.render.view import View
 from sigmasplat.types import Matrix

@@ -4,12 +4,12 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
+from sigmasplat.data.field import GaussianField
 from sigmasplat.fit.adam import Rates
 from sigmasplat.fit.cpu.mapping_step import step_rows
 from sigmasplat.fit.interface import Accumulator, Weights, one_image_only
 from sigmasplat.fit.target import Target
 from sigmasplat.fit.view_dependent import ImageStep
-from sigmasplat.model.field import GaussianField
 from sigmasplat.render.cpu.view import CpuView
 from sigmasplat.types import Matrix
 

@@ -5,13 +5,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from sigmasplat.data.field import GaussianField
 from sigmasplat.fit.adam import Rates
 from sigmasplat.fit.cuda.rows import CudaAccumulator, add_shape_gradient, step_rows
 from sigmasplat.fit.fused_terms import pixel_weights
 from sigmasplat.fit.interface import Accumulator, Weights, one_image_only
 from sigmasplat.fit.mapping_step import render_for
 from sigmasplat.fit.target import Target
-from sigmasplat.model.field import GaussianField
 from sigmasplat.render.cuda.covariance_view import CudaCovarianceView
 from sigmasplat.render.cuda.launch import blocks_for
 from sigmasplat.render.cuda.view import CudaView

@@ -6,10 +6,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from sigmasplat.data.field import ATTRIBUTES, GaussianField, Rows
 from sigmasplat.fit.adam import BETA1, EPSILON, Rates
 from sigmasplat.fit.fused_terms import SHAPE_TERMS, kernel_weights
 from sigmasplat.fit.interface import Twist, Weights
-from sigmasplat.model.field import ATTRIBUTES, GaussianField, Rows
 from sigmasplat.render.cuda.launch import blocks_for
 from sigmasplat.render.cuda.view import CudaView
 from sigmasplat.types import Matrix

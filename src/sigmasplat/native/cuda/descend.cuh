@@ -51,7 +51,7 @@ inline void times(const double* R, const double* v, double* out) {
     for (int i = 0; i < 3; i++) out[i] = R[3 * i] * v[0] + R[3 * i + 1] * v[1] + R[3 * i + 2] * v[2];
 }
 
-// Compute the rotation exp([w]×) and its left Jacobian, by rows (model/se3.py: exp).
+// Compute the rotation exp([w]×) and its left Jacobian, by rows (data/se3.py: exp).
 inline void rotation_of_axis(const double* w, double* R, double* jacobian) {
     const double theta2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2], theta = sqrt(theta2);
     const bool small = theta2 < 1e-8;

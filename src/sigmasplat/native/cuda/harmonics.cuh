@@ -1,4 +1,4 @@
-// View-dependent colours on a GPU: from splats to the colours that a camera sees, and back. model/harmonics.py defines
+// View-dependent colours on a GPU: from splats to the colours that a camera sees, and back. data/harmonics.py defines
 // the functions, fit/view_dependent.py the mapping step that uses them.
 #pragma once
 #include "sums.cuh"

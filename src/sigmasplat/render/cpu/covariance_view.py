@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from sigmasplat.model.field import Rows
+from sigmasplat.data.field import Rows
 from sigmasplat.render.channels import COVARIANCE_PLANES
 from sigmasplat.render.cpu import operators as cpu
 from sigmasplat.render.reference.covariance_view import CovarianceView

@@ -6,8 +6,8 @@ from torch import Tensor
 
 from sigmasplat import env
 from sigmasplat.config import RenderConfig
+from sigmasplat.data.camera import Camera
 from sigmasplat.errors import BackendError
-from sigmasplat.model.camera import Camera
 from sigmasplat.native import _core
 from sigmasplat.render.kernel_operators import blend_with, project_with
 from sigmasplat.render.kernel_params import view_params

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from sigmasplat.config import RenderConfig
 from sigmasplat.config.sensors import SensorModel
-from sigmasplat.model.camera import Camera
+from sigmasplat.data.camera import Camera
 from sigmasplat.render.kernel_params import view_params
 from sigmasplat.render.view import NO_LAYERS, Layers
 from sigmasplat.types import Matrix

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from sigmasplat.model.field import COLUMNS, Rows
+from sigmasplat.data.field import COLUMNS, Rows
 from sigmasplat.render.channels import COVARIANCE_PLANES, covariance_features
 from sigmasplat.render.cuda.view import CudaView
 from sigmasplat.render.kernel_params import view_params

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.config import RenderConfig
+from sigmasplat.data.camera import Camera
 from sigmasplat.errors import BackendError
-from sigmasplat.model.camera import Camera
 from sigmasplat.native.cuda.cubins import FEATURE_COUNTS
 from sigmasplat.render.cuda import launch as cuda_launch
 from sigmasplat.render.cuda.launch import blocks_for

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.config import RenderConfig
+from sigmasplat.data.camera import Camera
 from sigmasplat.errors import BackendError
-from sigmasplat.model.camera import Camera
 from sigmasplat.native.cuda.cubins import FEATURE_COUNTS, FITTING
 from sigmasplat.render.cuda.launch import Argument, Launcher, Struct, blocks_for
 

@@ -6,8 +6,8 @@ from torch import Tensor
 
 from sigmasplat.config import RenderConfig
 from sigmasplat.config.sensors import SensorModel
+from sigmasplat.data.camera import Camera
 from sigmasplat.errors import BackendError
-from sigmasplat.model.camera import Camera
 from sigmasplat.render.cuda import launch as cuda_launch
 from sigmasplat.render.cuda.raster import Planes, Raster
 from sigmasplat.render.cuda.stages import Stages

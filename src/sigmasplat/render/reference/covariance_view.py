@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sigmasplat.model.field import COLUMNS, Rows
+from sigmasplat.data.field import COLUMNS, Rows
 from sigmasplat.render.channels import COVARIANCE_PLANES, covariance_features
 from sigmasplat.render.pose_gradient import twist_matrix
 from sigmasplat.render.reference import operators as reference

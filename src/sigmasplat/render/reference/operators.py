@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from sigmasplat.config import RenderConfig
-from sigmasplat.model.camera import Camera
+from sigmasplat.data.camera import Camera
 
 ALPHA_MAX = 0.99
 """Maximum alpha of a splat at a pixel, so that the backward pass can divide by 1 − α (3DGS)."""

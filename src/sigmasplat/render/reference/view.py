@@ -6,8 +6,8 @@ from torch import Tensor
 
 from sigmasplat.config import RenderConfig
 from sigmasplat.config.sensors import SensorModel
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.field import GaussianField
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.field import GaussianField
 from sigmasplat.render.channels import features_of
 from sigmasplat.render.pose_gradient import twist_matrix
 from sigmasplat.render.ray_depth import PLANES, depth_at, depth_of, plane_features

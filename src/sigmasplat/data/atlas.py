@@ -1,0 +1,150 @@
+"""All poses: of submaps in the world, of keyframes in submaps, of frames relative to keyframes."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sigmasplat.data import se3
+from sigmasplat.data.column import Column
+from sigmasplat.data.exposure import between
+from sigmasplat.data.hops import UNKNOWN_HOP, Hop, TrackedHops
+from sigmasplat.data.places import Place, Places
+from sigmasplat.data.poses import KeyframePoses, Poses
+from sigmasplat.types import Matrix
+
+
+@dataclass(eq=False)
+class Atlas:
+    """Poses of submaps, keyframes and frames, each relative to the level above; world poses are computed on reading.
+
+    anchors: T_world_submap of each submap, the first one the identity; closing a loop changes only these.
+    odometry: the same poses from tracking alone; no loop changes them.
+    keyframe_poses: T_submap_camera of each submap's keyframes; those of the last submap change while it is mapped.
+    hops: one per keyframe: how tracking found it from the keyframe before it in the submap. places: one per frame.
+    refined: T_submap_camera of the keyframes of each submap in the final map, after its refinement has moved them; the
+    world poses of keyframes and of their frames then come from these.
+    exposures: those of the same keyframes [K, 3, 2] relative to the final map (`model.exposure`).
+    components: one number per submap. Submaps of a component are connected, and their anchors are in one frame: the
+    world for component 0, else the first camera of the component. A component joins another when a place is recognised.
+    """
+
+    anchors: Poses = field(default_factory=Poses)
+    odometry: Poses = field(default_factory=Poses)
+    keyframe_poses: KeyframePoses = field(default_factory=KeyframePoses)
+    hops: TrackedHops = field(default_factory=TrackedHops)
+    places: Places = field(default_factory=Places)
+    components: list[int] = field(default_factory=list)
+    refined: dict[int, list[Matrix]] = field(default_factory=dict)
+    exposures: dict[int, Matrix] = field(default_factory=dict)
+
+    def begin_submap(self, T_parent_submap: Matrix | None = None, parent: int = -1) -> None:
+        """Append a submap at its pose in a parent submap, the last one by default; without a pose, a new component
+        begins with it."""
+        for chain in (self.anchors, self.odometry):
+            new = np.eye(4) if T_parent_submap is None else se3.orthonormalise(chain[parent] @ T_parent_submap)
+            chain.append(new)
+        begun = max(self.components, default=-1) + 1
+        self.components.append(begun if T_parent_submap is None else self.components[parent])
+        self.keyframe_poses.begin([])
+
+    def add_finished(self, T_world_submap: Matrix, keyframe_poses: list[Matrix]) -> None:
+        """Append a submap of an earlier session to the world, with T_submap_camera [4, 4] of its keyframes."""
+        self.anchors.append(T_world_submap)
+        self.odometry.append(T_world_submap)
+        self.components.append(0)
+        self.keyframe_poses.begin(keyframe_poses)
+        for _ in keyframe_poses:
+            self.hops.append(len(self.anchors) - 1, UNKNOWN_HOP)
+
+    def set_keyframes(self, keyframe_poses: list[Matrix], hop: Hop) -> None:
+        """Set T_submap_camera [4, 4] of the last submap's keyframes, with a new one at the end, and the hop to it."""
+        self.keyframe_poses.newest = keyframe_poses
+        self.hops.append(len(self.anchors) - 1, hop)
+
+    def join(self, a: int, b: int, T_a_b: Matrix) -> None:
+        """Join the components of two submaps, given T_a_b [4, 4]: the one with the higher number moves to the other."""
+        if self.components[a] > self.components[b]:
+            a, b, T_a_b = b, a, se3.inverse(T_a_b)
+        kept, moved = self.components[a], self.components[b]
+        for chain in (self.anchors, self.odometry):
+            motion = chain[a] @ T_a_b @ se3.inverse(chain[b])
+            for s, component in enumerate(self.components):
+                if component == moved:
+                    chain[s] = se3.orthonormalise(motion @ chain[s])
+        self.components = [kept if component == moved else component for component in self.components]
+
+    def members(self, component: int) -> list[int]:
+        """Return the submaps of a component."""
+        return [s for s, number in enumerate(self.components) if number == component]
+
+    @property
+    def columns(self) -> tuple[Column, ...]:
+        """Return what grows with every frame or keyframe."""
+        return self.keyframe_poses.rows, self.hops.rows, self.places.rows
+
+    @property
+    def in_world(self) -> NDArray[np.bool_]:
+        """Return which frames are in a submap that is connected to the world, bool [F]."""
+        return np.asarray(np.array(self.components, np.int64)[self.places.submap] == 0)
+
+    def place_frame(self, T_submap_camera: Matrix) -> None:
+        """Append a frame, relative to the newest keyframe of the last submap."""
+        self.place_by_keyframe(se3.inverse(self.keyframe_poses.last[-1]) @ T_submap_camera)
+
+    def place_by_keyframe(self, T_keyframe_camera: Matrix) -> None:
+        """Append a frame at its pose [4, 4] relative to the newest keyframe of the last submap."""
+        place = Place(len(self.anchors) - 1, len(self.keyframe_poses.last) - 1, se3.orthonormalise(T_keyframe_camera))
+        self.places.append(place)
+
+    def T_world_camera(self, loops: bool = True) -> Matrix:
+        """Return the poses of all frames [F, 4, 4]; without `loops` those of tracking alone."""
+        if not loops:
+            return self._frames(self._in_world(self.odometry, {}))
+        return self._frames(self._in_world(self.anchors, self.refined))
+
+    @property
+    def T_submap_camera(self) -> Matrix:
+        """Return the poses of all frames in their submaps [F, 4, 4], to which the splats of the submaps were fitted."""
+        return self._frames(self.keyframe_poses.stacked())
+
+    @property
+    def T_world_keyframes(self) -> Matrix:
+        """Return the poses of all keyframes [K, 4, 4], submap by submap."""
+        return self._in_world(self.anchors, self.refined)
+
+    def T_world_keyframes_of(self, submaps: Sequence[int]) -> dict[int, Matrix]:
+        """Return the poses of the keyframes [K, 4, 4] of some submaps, by submap."""
+        poses, ends = self.T_world_keyframes, np.cumsum([0, *self.keyframe_poses.counts]).tolist()
+        return {submap: poses[ends[submap] : ends[submap + 1]] for submap in submaps}
+
+    def _in_world(self, anchors: Poses, refined: Mapping[int, Sequence[Matrix]]) -> Matrix:
+        """Return the poses of all keyframes [K, 4, 4] in the world; refined: as the attribute."""
+        poses, counts = self.keyframe_poses.stacked(), self.keyframe_poses.counts
+        first = np.cumsum(counts) - counts
+        for submap, moved in refined.items():
+            poses[first[submap] : first[submap] + len(moved)] = moved
+        return np.asarray(np.repeat(np.array(anchors), counts, axis=0) @ poses)
+
+    def _frames(self, keyframe_poses: Matrix) -> Matrix:
+        """Return the poses of all frames [F, 4, 4], given those [K, 4, 4] of the keyframes."""
+        first = np.cumsum([0, *self.keyframe_poses.counts])
+        places = self.places.first(len(self.places))  # another thread may append some
+        return np.asarray(keyframe_poses[first[places.submap] + places.keyframe] @ places.T_keyframe_camera)
+
+    def frame_exposures(self) -> Matrix:
+        """Return the exposures of all frames [F, 3, 2] relative to the final map, interpolated between keyframes."""
+        first = dict[tuple[int, int], int]()
+        places = zip(self.places.submap.tolist(), self.places.keyframe.tolist(), strict=True)
+        for row, place in enumerate(places):
+            first.setdefault(place, row)
+        known = [(row, self.exposures[s][k]) for (s, k), row in first.items() if s in self.exposures]
+        rows = np.array([row for row, _ in known], np.int64)
+        exposures = np.array([exposure for _, exposure in known]).reshape(-1, 3, 2)
+        return between(rows, exposures, np.arange(len(self.places)))
+
+    def T_world_keyframe(self, submap: int) -> Matrix:
+        """Return the poses of a submap's keyframes [K, 4, 4]."""
+        poses = self.refined.get(submap, self.keyframe_poses[submap])
+        return np.array([self.anchors[submap] @ T for T in poses]).reshape(-1, 4, 4)

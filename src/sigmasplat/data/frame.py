@@ -1,0 +1,238 @@
+"""One RGB-D image: immutable, checked on construction, without ground truth."""
+
+import copy
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.resizing import resized_color, resized_depth, resized_std, within
+from sigmasplat.errors import SourceError
+from sigmasplat.types import Matrix
+
+COLOR_LIMITS = (-1.0, 2.0)
+"""Colour outside these limits has another unit, usually 0…255. Values just outside [0, 1] are accepted."""
+
+
+@dataclass(frozen=True, eq=False)
+class Detail:
+    """The gray image of a frame, uint8 [H, W], at its own size (or reduced to a maximum width), and its pinhole.
+
+    Features are found in it: the working image is too small for them.
+    """
+
+    gray: NDArray[np.uint8]
+    camera: Camera
+
+
+class PosePrior(NamedTuple):
+    """What is known of a frame's pose apart from its images: `R_inertial_camera` and `T_given_camera` of `Frame`."""
+
+    R_inertial_camera: Matrix | None = None
+    T_given_camera: Matrix | None = None
+
+
+NO_PRIOR = PosePrior()
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One image of colour and depth.
+
+    color: float32 [H, W, 3] in [0, 1]; depth_m: float32 [H, W] along the optical axis in metres, 0 = no reading;
+    camera: the pinhole of both; timestamp_s: seconds; index: position in the source; R_inertial_camera [3, 3]: rotation
+    from the camera's axes to fixed axes, the same for all frames, measured by a gyroscope; None = not measured. Only
+    the rotation between two frames is used, so any fixed axes will do; depth_std_m: float32 [H, W], the standard
+    deviation of each depth reading, metres, if the sensor knows it; ignored: pixels of the frame as it was read
+    (`ignored_by` resamples them) whose colour is not used either, None = none; they have no depth; T_given_camera
+    [4, 4]: pose of the camera in fixed axes, metres, which is used as it is; None = the pose is estimated. Only the
+    motion between two frames is used; specific_force_m_s2 [3]: measured by an accelerometer along the camera's axes,
+    9.81 upwards at rest, from which a run finds the vertical direction; None = not measured. The frame keeps read-only
+    views of the arrays and does not copy them: do not write to them later (`frame_from_arrays` copies). Raises
+    SourceError if an array is not float32, on inconsistent shapes, values that are not finite, colour in 0…255,
+    negative depth, a reading whose standard deviation is not above 0, a matrix that is not a rotation, a pose that is
+    not rigid, or a force that is not three finite numbers.
+    """
+
+    index: int
+    timestamp_s: float
+    color: NDArray[np.float32]
+    depth_m: NDArray[np.float32]
+    camera: Camera
+    R_inertial_camera: Matrix | None = None
+    depth_std_m: NDArray[np.float32] | None = None
+    ignored: NDArray[np.bool_] | None = None
+    T_given_camera: Matrix | None = None
+    specific_force_m_s2: NDArray[np.float64] | None = None
+
+    def __post_init__(self) -> None:
+        for name, array in (("colour", self.color), ("depth", self.depth_m)):
+            if not isinstance(array, np.ndarray) or array.dtype != np.float32:
+                raise SourceError(
+                    f"frame {self.index}: {name} is {described(array)}; give numpy float32, or use Slam.track or "
+                    "frame_from_arrays, which convert other arrays"
+                )
+        size = (self.camera.height, self.camera.width)
+        if self.color.shape != (*size, 3) or self.depth_m.shape != size:
+            raise SourceError(
+                f"frame {self.index}: colour is {self.color.shape}, depth is {self.depth_m.shape}, the camera is "
+                f"{size[1]}×{size[0]}; register depth to colour and give both one size"
+            )
+        self._check_values()
+        if self.depth_std_m is not None:
+            self._check_std(self.depth_std_m)
+        if self.R_inertial_camera is not None and not se3.is_rotation(self.R_inertial_camera):
+            raise SourceError(
+                f"frame {self.index}: R_inertial_camera is not a rotation [3, 3]; give None if it is not measured"
+            )
+        if self.T_given_camera is not None and not se3.is_rigid(self.T_given_camera):
+            raise SourceError(
+                f"frame {self.index}: T_given_camera is not a rigid pose [4, 4]; give None if it is to be estimated"
+            )
+        force = self.specific_force_m_s2
+        if force is not None and not (np.shape(force) == (3,) and np.isfinite(force).all()):
+            raise SourceError(
+                f"frame {self.index}: specific_force_m_s2 is not three finite numbers; give None if it is not measured"
+            )
+        self._keep(self.color, self.depth_m, self.depth_std_m)
+
+    @property
+    def prior(self) -> PosePrior:
+        """Return what is known of the pose apart from the images."""
+        return PosePrior(self.R_inertial_camera, self.T_given_camera)
+
+    def _keep(
+        self, color: NDArray[np.float32], depth_m: NDArray[np.float32], depth_std_m: NDArray[np.float32] | None
+    ) -> None:
+        """Keep read-only views of the images; the caller's arrays stay writeable."""
+        for name, array in (("color", color), ("depth_m", depth_m), ("depth_std_m", depth_std_m)):
+            if array is None:
+                object.__setattr__(self, name, None)
+                continue
+            view = np.ascontiguousarray(array).view()
+            view.setflags(write=False)
+            object.__setattr__(self, name, view)
+
+    def _check_values(self) -> None:
+        """Raise SourceError on values that are not finite or out of range."""
+        low, high = float(self.color.min()), float(self.color.max())  # both are NaN if a value is NaN
+        nearest_m, farthest_m = float(self.depth_m.min()), float(self.depth_m.max())
+        for name, values in (("colour", (low, high)), ("depth", (nearest_m, farthest_m))):
+            if not np.isfinite(values).all():
+                raise SourceError(f"frame {self.index}: {name} holds NaN or inf; write 0 where there is no reading")
+        if low < COLOR_LIMITS[0] or high > COLOR_LIMITS[1]:
+            raise SourceError(f"frame {self.index}: {color_range(low, high)}")
+        if nearest_m < 0.0:
+            raise SourceError(f"frame {self.index}: depth is negative ({nearest_m:.3f} m); 0 means no reading")
+
+    def _check_std(self, std_m: NDArray[np.float32]) -> None:
+        """Raise SourceError unless every reading has a standard deviation above 0."""
+        if not isinstance(std_m, np.ndarray) or std_m.dtype != np.float32 or std_m.shape != self.depth_m.shape:
+            raise SourceError(
+                f"frame {self.index}: depth_std_m is {described(std_m)}; give float32, one value per pixel of depth"
+            )
+        wrong = ~(np.isfinite(std_m) & (std_m > 0)) & (self.depth_m > 0)
+        if wrong.any():
+            raise SourceError(
+                f"frame {self.index}: {int(wrong.sum())} depth readings have a standard deviation that is not above 0; "
+                "give finite metres above 0, or depth 0 where there is no reading"
+            )
+
+    def resized(self, width: int, height: int) -> "Frame":
+        """Return the frame at another size: colour averaged over the pixel's area, depth by `resized_depth`."""
+        if (width, height) == (self.camera.width, self.camera.height):
+            return self
+        color, depth_m = resized_color(self.color, width, height), resized_depth(self.depth_m, width, height)
+        std_m = resized_std(self.depth_std_m, depth_m)
+        return self._with_images(color, depth_m, self.camera.resized(width, height), std_m)
+
+    def prepared(self, width: int, min_depth_m: float, max_depth_m: float, crop_px: int = 0) -> "Frame":
+        """Return the working frame: the size of `Camera.prepared`, and depth 0 outside the range.
+
+        Raises ConfigError if no pixel would remain after the crop.
+        """
+        camera = self.camera.prepared(width, crop_px)
+        size = camera.width + 2 * crop_px, camera.height + 2 * crop_px
+        if size == (self.camera.width, self.camera.height):
+            color, depth_m = self.color, within(self.depth_m, min_depth_m, max_depth_m)
+        else:
+            color, depth_m = (
+                resized_color(self.color, *size),
+                resized_depth(self.depth_m, *size, min_depth_m, max_depth_m),
+            )
+        if color is self.color and depth_m is self.depth_m and not crop_px:
+            return self
+        inner = np.s_[crop_px : crop_px + camera.height, crop_px : crop_px + camera.width]
+        std_m = resized_std(self.depth_std_m, depth_m)
+        return self._with_images(color[inner], depth_m[inner], camera, None if std_m is None else std_m[inner])
+
+    def with_depth(self, depth_m: NDArray[np.float32], depth_std_m: NDArray[np.float32] | None) -> "Frame":
+        """Return the frame with depth, and its standard deviation, that were made from its own."""
+        return self._with_images(self.color, depth_m, self.camera, depth_std_m)
+
+    def _with_images(
+        self,
+        color: NDArray[np.float32],
+        depth_m: NDArray[np.float32],
+        camera: Camera,
+        depth_std_m: NDArray[np.float32] | None,
+    ) -> "Frame":
+        """Return the frame with images that were made from its own: their values need no check."""
+        frame = copy.copy(self)
+        object.__setattr__(frame, "camera", camera)
+        frame._keep(color, depth_m, depth_std_m)
+        return frame
+
+    def ignored_by(self, camera: Camera) -> NDArray[np.bool_] | None:
+        """Return the ignored pixels as a camera with other intrinsics at the same pose sees them, by the nearest pixel;
+        None without any. This frame must be as it was read."""
+        if self.ignored is None or not self.ignored.any():
+            return None
+        columns, rows = (np.rint(pixels).astype(np.intp) for pixels in camera.pixels_in(self.camera))
+        height, width = self.ignored.shape
+        return np.asarray(self.ignored[np.clip(rows, 0, height - 1)][:, np.clip(columns, 0, width - 1)])
+
+    def seen_by(self, camera: Camera) -> "Frame":
+        """Return the frame as a camera with other intrinsics at the same pose sees it: a homography, exact for depth.
+
+        Colour is averaged if the new pixels are larger, and interpolated; depth is that of the nearest pixel. Pixels
+        outside the frame have depth 0 and the colour of its edge.
+        """
+        size = self.camera.width, self.camera.height
+        scales = (camera.fx / self.camera.fx, camera.fy / self.camera.fy)
+        width, height = (max(1, round(n * min(scale, 1.0))) for n, scale in zip(size, scales, strict=True))
+        columns, rows = camera.pixels_in(self.camera.resized(width, height))
+        color = _interpolated(_interpolated(resized_color(self.color, width, height), rows).swapaxes(0, 1), columns)
+        u, v = (np.rint(pixels).astype(np.intp) for pixels in camera.pixels_in(self.camera))
+        read = ((v >= 0) & (v < size[1]))[:, None] & (u >= 0) & (u < size[0])
+
+        def nearest(image: NDArray[np.float32]) -> NDArray[np.float32]:
+            return np.where(read, image[np.clip(v, 0, size[1] - 1)][:, np.clip(u, 0, size[0] - 1)], np.float32(0.0))
+
+        std = None if self.depth_std_m is None else nearest(self.depth_std_m)
+        color = np.ascontiguousarray(color.swapaxes(0, 1))
+        return replace(self, color=color, depth_m=nearest(self.depth_m), camera=camera, depth_std_m=std)
+
+
+def described(value: object) -> str:
+    """Return the type of a value in words, of an array its dtype and shape."""
+    dtype, shape = getattr(value, "dtype", None), getattr(value, "shape", None)
+    kind = "None" if value is None else type(value).__name__
+    return kind if dtype is None or shape is None else f"{kind} {dtype} {list(shape)}"
+
+
+def color_range(low: float, high: float) -> str:
+    """Return what to say of colours from `low` to `high` if they are not in [0, 1]."""
+    return f"colour is from {low:g} to {high:g}; give float values in 0…1 (divide by 255), or uint8"
+
+
+def _interpolated(color: NDArray[np.float32], rows: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Return colour at rows that are not whole numbers; beyond the first and the last row it is theirs."""
+    at = np.clip(rows, 0, len(color) - 1)
+    above = np.minimum(at.astype(np.intp), max(len(color) - 2, 0))
+    share = (at - above).astype(np.float32)[:, None, None]
+    below = np.minimum(above + 1, len(color) - 1)
+    return np.asarray((1 - share) * color[above] + share * color[below], np.float32)

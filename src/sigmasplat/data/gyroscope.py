@@ -1,0 +1,102 @@
+"""Measurements of a gyroscope that moves with the camera, integrated to rotations."""
+
+from dataclasses import dataclass, field
+from itertools import accumulate
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from sigmasplat.data.sensor_samples import in_time_order
+from sigmasplat.errors import SourceError
+from sigmasplat.types import Matrix
+
+MAX_RAD_S = 40.0
+"""Gyroscopes of phones and cameras measure up to 2000 °/s = 35 rad/s. Larger values are probably in degrees."""
+STILL_SAMPLES = 20
+"""A second with fewer samples is not judged."""
+STILL_NOISE_RAD_S = 0.01
+"""A gyroscope is still if its samples of one second vary by less than this (standard deviation): more than the noise of
+phones and cameras, less than a hand shakes."""
+MAX_BIAS_RAD_S = 0.05
+"""Biases of such gyroscopes are below 3 °/s; a larger mean is a turn."""
+
+
+@dataclass(frozen=True, eq=False)
+class Gyroscope:
+    """Angular velocities over time: timestamps_s [M], increasing, from the clock of the frames;
+    angular_velocity_rad_s [M, 3] about the axes of the camera (x right, y down, z forward), by the right-hand rule.
+
+    Raises SourceError on shapes that do not match, fewer than two samples, values that are not finite or above
+    `MAX_RAD_S`, or timestamps that do not increase.
+    """
+
+    timestamps_s: NDArray[np.float64]
+    angular_velocity_rad_s: NDArray[np.float64]
+    _R_inertial_camera: NDArray[np.float64] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        times_s, rates = self.timestamps_s, self.angular_velocity_rad_s
+        if len(times_s) < 2 or rates.shape != (len(times_s), 3):
+            raise SourceError(f"gyroscope has {len(times_s)} timestamps but angular velocities of shape {rates.shape}")
+        if not (np.isfinite(times_s).all() and np.isfinite(rates).all()):
+            raise SourceError("gyroscope: timestamps or angular velocities hold NaN or inf; delete these samples")
+        if not (np.diff(times_s) > 0).all():
+            k = int(np.argmin(np.diff(times_s) > 0))
+            raise SourceError(f"gyroscope: time {times_s[k + 1]} s follows {times_s[k]} s; sort the samples by time")
+        if (largest := float(np.abs(rates).max())) > MAX_RAD_S:
+            raise SourceError(f"gyroscope: {largest:.1f} rad/s is too fast; convert degrees per second to radians")
+        means = 0.5 * (rates[1:] + rates[:-1])
+        steps = Rotation.from_rotvec(means * np.diff(times_s)[:, None]).as_matrix()
+        object.__setattr__(self, "_R_inertial_camera", np.stack(list(accumulate([np.eye(3), *steps], np.matmul))))
+
+    def measured_any(self, times_s: NDArray[np.float64]) -> bool:
+        """Return whether any of the times [N] is between the first and the last sample."""
+        return bool(((self.timestamps_s[0] <= times_s) & (times_s <= self.timestamps_s[-1])).any())
+
+    def R_inertial_camera(self, time_s: float) -> Matrix | None:
+        """Return the rotation [3, 3] from the camera's axes at a time to its axes at the first sample; None outside the
+        samples.
+
+        Between two samples the velocity is interpolated linearly, and its mean is the rotation vector of the step.
+        The rotation between two times a and b is R_inertial_camera(a)ᵀ R_inertial_camera(b).
+        """
+        times_s, rates = self.timestamps_s, self.angular_velocity_rad_s
+        if not times_s[0] <= time_s <= times_s[-1]:
+            return None
+        k = min(int(np.searchsorted(times_s, time_s, "right")), len(times_s) - 1) - 1
+        since_s = time_s - times_s[k]
+        mean = rates[k] + 0.5 * (rates[k + 1] - rates[k]) * since_s / (times_s[k + 1] - times_s[k])
+        return np.asarray(self._R_inertial_camera[k] @ Rotation.from_rotvec(mean * since_s).as_matrix())
+
+
+def gyroscope_from_samples(
+    times_s: NDArray[np.float64], angular_velocity_rad_s: NDArray[np.float64]
+) -> Gyroscope | None:
+    """Make a gyroscope of recorded samples [M] and [M, 3] (`in_time_order`), without its bias (`still_bias`); None if
+    they are unusable."""
+    times, rates = in_time_order(times_s, angular_velocity_rad_s)
+    if len(times) < 2 or not rates.any() or np.abs(rates).max() > MAX_RAD_S:
+        return None
+    return Gyroscope(times, rates - still_bias(times, rates))
+
+
+def still_bias(times_s: NDArray[np.float64], angular_velocity_rad_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the bias [3], rad/s: the median over all seconds in which the gyroscope was still; 0 if it never was.
+
+    A slow turn without any shaking looks like a bias. The rotation is only a guess for tracking, so this costs no pose.
+    """
+    seconds = np.floor(times_s - times_s[0]).astype(np.int64)
+    starts = np.flatnonzero(np.diff(seconds, prepend=-1))
+    means = [still_mean(rates) for rates in np.split(angular_velocity_rad_s, starts[1:])]
+    still = [mean for mean in means if mean is not None]
+    return np.median(still, axis=0) if still else np.zeros(3)
+
+
+def still_mean(angular_velocity_rad_s: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """Return the mean [3] of the samples [M, 3] of one second, rad/s; None if the gyroscope was not still."""
+    rates = angular_velocity_rad_s
+    if len(rates) < STILL_SAMPLES or rates.std(0).max() >= STILL_NOISE_RAD_S:
+        return None
+    mean: NDArray[np.float64] = rates.mean(0)
+    return mean if np.linalg.norm(mean) < MAX_BIAS_RAD_S else None

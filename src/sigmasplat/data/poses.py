@@ -1,0 +1,106 @@
+"""Poses of all submaps, and of the keyframes in them, in columns."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sigmasplat.data.column import Column, Records
+from sigmasplat.types import Matrix
+
+
+def _of_poses() -> Column:
+    return Column.of(np.float64, 4, 4)
+
+
+@dataclass(eq=False)
+class Poses(Records[Matrix]):
+    """A list of poses [4, 4]; those that are read are copies. rows [N, 4, 4]."""
+
+    POSE_COLUMNS: ClassVar[slice] = slice(None)
+
+    rows: Column = field(default_factory=_of_poses)
+
+    def __setitem__(self, i: int, pose: Matrix) -> None:
+        self.rows.used[range(len(self))[i]] = pose
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        return np.array(self.rows.used, dtype)
+
+    def append(self, pose: Matrix) -> None:
+        """Append a pose."""
+        self.rows.append(pose)
+
+    def copied(self) -> "Poses":
+        """Return the same poses in other memory."""
+        return Poses(Column(self.rows.used.copy(), len(self)))
+
+    def _record(self, i: int) -> Matrix:
+        return np.array(self.rows.values[i])
+
+
+@dataclass(eq=False)
+class KeyframePoses(Sequence[Sequence[Matrix]]):
+    """T_submap_camera [4, 4] of the keyframes of each submap. Those of the last submap may change; the others are
+    final.
+
+    rows [K, 4, 4]: those of all submaps but the last; ends [S - 1]: number of keyframes up to the end of each of these
+    submaps; newest: those of the last submap, None before the first one.
+    """
+
+    POSE_COLUMNS: ClassVar[slice] = slice(None)
+
+    rows: Column = field(default_factory=_of_poses)
+    ends: Column = field(default_factory=lambda: Column.of(np.int64))
+    newest: list[Matrix] | None = None
+
+    def __len__(self) -> int:
+        return len(self.ends) + (self.newest is not None)
+
+    @overload
+    def __getitem__(self, i: int) -> Sequence[Matrix]: ...
+    @overload
+    def __getitem__(self, i: slice) -> Sequence[Sequence[Matrix]]: ...
+    def __getitem__(self, i: int | slice) -> Sequence[Matrix] | Sequence[Sequence[Matrix]]:
+        known = range(len(self))
+        return [self._of(s) for s in known[i]] if isinstance(i, slice) else self._of(known[i])
+
+    def _of(self, submap: int) -> Sequence[Matrix]:
+        if submap == len(self.ends):
+            return self.last
+        first = int(self.ends.values[submap - 1]) if submap else 0
+        return list(self.rows.used[first : int(self.ends.values[submap])].copy())
+
+    @property
+    def last(self) -> list[Matrix]:
+        """Return the poses of the last submap's keyframes; a change of this list changes them."""
+        return [] if self.newest is None else self.newest
+
+    @property
+    def counts(self) -> NDArray[np.int64]:
+        """Return the number of keyframes of each submap [S]."""
+        newest = [] if self.newest is None else [len(self.newest)]
+        return np.concatenate([np.diff(self.ends.used, prepend=0), np.array(newest, np.int64)])
+
+    @property
+    def total(self) -> int:
+        """Return the number of keyframes."""
+        return len(self.rows) + len(self.last)
+
+    def stacked(self) -> Matrix:
+        """Return the poses of all keyframes [K, 4, 4], submap by submap."""
+        return np.concatenate([self.rows.used, np.array(self.last, np.float64).reshape(-1, 4, 4)])
+
+    def begin(self, poses: list[Matrix]) -> None:
+        """Begin the next submap, with poses of its first keyframes; those of the submap before are final."""
+        if self.newest is not None:
+            self.rows.extend(np.array(self.newest, np.float64).reshape(-1, 4, 4))
+            self.ends.append(len(self.rows))
+        self.newest = poses
+
+    def copied(self) -> "KeyframePoses":
+        """Return the same poses; those of the last submap may then change here only."""
+        rows, ends = (column.first(len(column)) for column in (self.rows, self.ends))
+        return KeyframePoses(rows, ends, None if self.newest is None else list(self.newest))

@@ -1,0 +1,209 @@
+"""Submaps, and the stores that keep finished ones."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field as dataclass_field, replace
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.exposure import between, unexposed
+from sigmasplat.data.field import GaussianField
+from sigmasplat.data.frame import Detail
+from sigmasplat.data.photo import Photo
+from sigmasplat.errors import SigmaSplatError
+from sigmasplat.types import Matrix
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """The images of a keyframe: color [H, W, 3] uint8 RGB, depth_m [H, W] float32 metres, 0 = no reading; detail: the
+    gray image in which features are found, and photo: the colour at the camera's own size, if they were kept."""
+
+    color: NDArray[np.uint8]
+    depth_m: NDArray[np.float32]
+    detail: Detail | None = None
+    photo: Photo | None = None
+
+    @property
+    def unit_color(self) -> NDArray[np.float32]:
+        """Return the colour in [0, 1]."""
+        return self.color.astype(np.float32) / np.float32(255.0)
+
+    def without_exposure(self, exposure: Matrix) -> "Picture":
+        """Return the same images with the colour in the exposure of the map (`model.exposure`); photo and detail are
+        not changed."""
+        color = np.rint(unexposed(self.unit_color, exposure) * 255.0).astype(np.uint8)
+        return replace(self, color=color)
+
+
+@dataclass(frozen=True, eq=False)
+class Submap:
+    """A finished part of the map in its own frame, which is the camera of its first keyframe.
+
+    field: its splats; frames [K]: the frame numbers of its keyframes, counted from the first frame of the run (those of
+    an earlier session are negative, −1 is its last frame: `run --onto`); T_submap_camera [K, 4, 4]: their poses;
+    camera: shared by all keyframes. The `SubmapStore` keeps the keyframes' images, the `Atlas` the submap's pose in the
+    world.
+    probe_frames [P], T_submap_probe [P, 4, 4]: the same of its probe views, to which nothing is fitted.
+    """
+
+    index: int
+    field: GaussianField
+    frames: tuple[int, ...]
+    T_submap_camera: Matrix
+    camera: Camera
+    probe_frames: tuple[int, ...] = ()
+    T_submap_probe: Matrix = dataclass_field(default_factory=lambda: np.empty((0, 4, 4)))
+
+
+class SubmapStore(Protocol):
+    """Keeps finished submaps. They are numbered from 0 in the order of saving."""
+
+    def __len__(self) -> int: ...
+
+    def save(self, submap: Submap, pictures: list[Picture], probes: Sequence[Picture] = ()) -> None:
+        """Save a submap and the images of its keyframes and probe views. A finished submap never changes."""
+
+    def load(self, index: int) -> Submap:
+        """Return a submap; the caller may change it."""
+        ...
+
+    def picture(self, index: int, keyframe: int) -> Picture:
+        """Return the images of one keyframe of a submap."""
+        ...
+
+    def probe(self, index: int, probe: int) -> Picture:
+        """Return the images of one probe view of a submap."""
+        ...
+
+
+@runtime_checkable
+class OnDisk(Protocol):
+    """A store in a folder, which may not exist before the first submap."""
+
+    folder: Path
+
+    def settle(self) -> None:
+        """Wait until what was saved is on the disk."""
+
+
+@dataclass(eq=False)
+class MemoryStore:
+    """Keeps submaps in memory: for short runs, and when no files may be written."""
+
+    submaps: list[Submap] = dataclass_field(default_factory=list)
+    pictures: list[list[Picture]] = dataclass_field(default_factory=list)
+    probes: list[list[Picture]] = dataclass_field(default_factory=list)
+
+    def __len__(self) -> int:
+        return len(self.submaps)
+
+    def save(self, submap: Submap, pictures: list[Picture], probes: Sequence[Picture] = ()) -> None:
+        """Save a submap. Raises SigmaSplatError unless it is the next one and has images for all its views."""
+        refuse_misfit(submap, pictures, len(self), probes)
+        self.submaps.append(submap)
+        self.pictures.append(pictures)
+        self.probes.append(list(probes))
+
+    def load(self, index: int) -> Submap:
+        """Return a submap."""
+        return self.submaps[index]
+
+    def picture(self, index: int, keyframe: int) -> Picture:
+        """Return the images of one keyframe of a submap."""
+        return self.pictures[index][keyframe]
+
+    def probe(self, index: int, probe: int) -> Picture:
+        """Return the images of one probe view of a submap."""
+        return self.probes[index][probe]
+
+
+@dataclass(frozen=True, eq=False)
+class StorePart:
+    """Some submaps of a store, numbered from 0 in the order of `members`. It can only be read."""
+
+    store: SubmapStore
+    members: Sequence[int]
+
+    def __len__(self) -> int:
+        return len(self.members)
+
+    def save(self, submap: Submap, pictures: list[Picture], probes: Sequence[Picture] = ()) -> None:
+        """Raise SigmaSplatError: a part cannot grow."""
+        raise SigmaSplatError(f"submap {submap.index} cannot be saved in a part of a store; save it in the whole store")
+
+    def load(self, index: int) -> Submap:
+        """Return a submap."""
+        return self.store.load(self.members[index])
+
+    def picture(self, index: int, keyframe: int) -> Picture:
+        """Return the images of one keyframe of a submap."""
+        return self.store.picture(self.members[index], keyframe)
+
+    def probe(self, index: int, probe: int) -> Picture:
+        """Return the images of one probe view of a submap."""
+        return self.store.probe(self.members[index], probe)
+
+
+@dataclass(frozen=True, eq=False)
+class RefinedStore:
+    """The submaps of a store as the final map sees them: with the poses of their keyframes that its refinement has
+    moved, and with images in the exposure of the map. Probe views follow their keyframe. It can only be read.
+
+    keyframe_poses: T_submap_camera [4, 4] of each submap's keyframes, None: not moved. The splats of the submaps fit
+    the old poses. exposures: [K, 3, 2] of each submap's keyframes (`model.exposure`), None: not fitted.
+    """
+
+    store: SubmapStore
+    keyframe_poses: Sequence[Sequence[Matrix]] | None = None
+    exposures: Sequence[Matrix] | None = None
+
+    def __len__(self) -> int:
+        return len(self.store)
+
+    def save(self, submap: Submap, pictures: list[Picture], probes: Sequence[Picture] = ()) -> None:
+        """Raise SigmaSplatError: the final map is complete."""
+        raise SigmaSplatError(f"submap {submap.index} cannot be saved after the final map is made")
+
+    def load(self, index: int) -> Submap:
+        """Return a submap with the moved poses."""
+        submap = self.store.load(index)
+        if self.keyframe_poses is None:
+            return submap
+        poses = np.array(self.keyframe_poses[index]).reshape(-1, 4, 4)
+        keyframe = np.searchsorted(submap.frames, submap.probe_frames, side="right") - 1
+        before = submap.T_submap_camera[keyframe]
+        probes = poses[keyframe] @ se3.inverse(before) @ submap.T_submap_probe
+        return replace(submap, T_submap_camera=poses, T_submap_probe=probes)
+
+    def picture(self, index: int, keyframe: int) -> Picture:
+        """Return the images of one keyframe of a submap, in the exposure of the map."""
+        picture = self.store.picture(index, keyframe)
+        return picture if self.exposures is None else picture.without_exposure(self.exposures[index][keyframe])
+
+    def probe(self, index: int, probe: int) -> Picture:
+        """Return the images of one probe view of a submap, in the exposure of the map: its exposure is interpolated
+        between those of keyframes."""
+        picture = self.store.probe(index, probe)
+        if self.exposures is None:
+            return picture
+        submap = self.store.load(index)
+        at = np.array(submap.probe_frames[probe : probe + 1])
+        return picture.without_exposure(between(np.array(submap.frames), self.exposures[index], at)[0])
+
+
+def refuse_misfit(submap: Submap, pictures: Sequence[Picture], next_index: int, probes: Sequence[Picture] = ()) -> None:
+    """Raise SigmaSplatError if a submap is not the next one to save, or its keyframes or probe views do not match their
+    images."""
+    if submap.index != next_index:
+        raise SigmaSplatError(f"submap {submap.index} cannot be saved: the next index is {next_index}")
+    if not len(submap.frames) == len(submap.T_submap_camera) == len(pictures):
+        counts = f"{len(submap.frames)} frames, {len(submap.T_submap_camera)} poses, {len(pictures)} pictures"
+        raise SigmaSplatError(f"submap {submap.index} cannot be saved: {counts}")
+    if not len(submap.probe_frames) == len(submap.T_submap_probe) == len(probes):
+        counts = f"{len(submap.probe_frames)} frames, {len(submap.T_submap_probe)} poses, {len(probes)} pictures"
+        raise SigmaSplatError(f"submap {submap.index} cannot be saved: {counts} of probe views")

@@ -1,6 +1,0 @@
-"""Download public data sets: catalogue, resumable downloads, and safe unpacking of archives."""
-
-from sigmasplat.download.downloader import download_recording
-from sigmasplat.download.lookup import describe_recordings, describe_sets, find_recording
-
-__all__ = ["describe_recordings", "describe_sets", "download_recording", "find_recording"]

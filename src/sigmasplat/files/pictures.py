@@ -1,0 +1,96 @@
+"""Decode images and arrays that users give: the format and the number of pixels are checked before decoding."""
+
+import io
+import math
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.lib import format as npy
+from numpy.typing import NDArray
+from PIL import Image, UnidentifiedImageError
+
+from sigmasplat.errors import SigmaSplatError, SourceError
+from sigmasplat.files.guard import guarded
+from sigmasplat.files.reading import open_regular
+
+FORMATS = ("JPEG", "PNG", "BMP", "PPM", "TIFF", "WEBP")
+"""Formats of images in recordings. Others are refused: Pillow gives EPS, for example, to Ghostscript, which runs it."""
+MOST_PIXELS = 36_000_000
+"""Largest image; 8K video has 33 megapixels. As float32 its colours take 0.4 GB."""
+MOST_BYTES = 1 << 29
+REMEDY = "download or copy it again"
+
+
+@contextmanager
+def open_image(
+    path: Path,
+    data: bytes | None = None,
+    formats: tuple[str, ...] = FORMATS,
+    error: type[SigmaSplatError] = SourceError,
+) -> Iterator[Image.Image]:
+    """Open an image file, or `data` of one that `path` names, and yield it before its pixels are decoded.
+
+    Raises `error` naming the file if it is not one of the formats, has more than `MOST_PIXELS`, or if the block cannot
+    decode it.
+    """
+    with _opened(path, data, error) as file, guarded(path, REMEDY, error, "unreadable image"):
+        try:
+            image = Image.open(file, formats=formats)
+        except (Image.DecompressionBombError, UnidentifiedImageError) as problem:
+            bomb = isinstance(problem, Image.DecompressionBombError)
+            why = "too many pixels" if bomb else f"not {', '.join(formats)}, or damaged"
+            raise error(f"{path}: unreadable image ({why}); {'reduce it' if bomb else REMEDY}") from problem
+        with image:
+            check_pixels(path, image.size, error)
+            yield image
+
+
+def check_pixels(path: Path, size: tuple[int, int], error: type[SigmaSplatError] = SourceError) -> None:
+    """Raise `error` if an image of `size` (width, height) has more than `MOST_PIXELS`."""
+    if math.prod(size) > MOST_PIXELS:
+        raise error(
+            f"{path}: unreadable image ({size[0]}×{size[1]} pixels, the limit is {MOST_PIXELS / 1e6:.0f} megapixels); "
+            "reduce it"
+        )
+
+
+def npy_shape(path: Path) -> tuple[int, ...]:
+    """Return the shape of a .npy file from its header. Raises SourceError as `read_npy` does."""
+    with open_regular(path, most=MOST_BYTES) as file:
+        return _npy_header(path, file)[0]
+
+
+def read_npy(path: Path) -> NDArray[Any]:
+    """Read a .npy file. Raises SourceError if it is not one, holds objects, or is shorter than its header says."""
+    with open_regular(path, most=MOST_BYTES) as file:
+        shape, fortran, kind = _npy_header(path, file)
+        values = np.frombuffer(file.read(math.prod(shape) * kind.itemsize), kind)
+        return values.reshape(shape, order="F" if fortran else "C")
+
+
+def _npy_header(path: Path, file: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Read shape, order and type, and check them against the size of the file."""
+    with guarded(path, REMEDY, SourceError, "unreadable image"):
+        version = npy.read_magic(file)
+        read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
+        shape, fortran, kind = read(file)
+        if kind.hasobject or not kind.itemsize or len(shape) not in (2, 3) or min(shape) < 1:
+            raise ValueError(f"not a depth image: an array of {kind} with shape {shape}")
+        left = os.fstat(file.fileno()).st_size - file.tell()
+        if left < math.prod(shape) * kind.itemsize:
+            raise ValueError(f"its header says {kind} of shape {shape}, but only {left} bytes follow")
+    check_pixels(path, (shape[1], shape[0]))
+    return shape, fortran, kind
+
+
+@contextmanager
+def _opened(path: Path, data: bytes | None, error: type[SigmaSplatError]) -> Iterator[BinaryIO]:
+    if data is not None:
+        yield io.BytesIO(data)
+        return
+    with open_regular(path, error, MOST_BYTES) as file:
+        yield file

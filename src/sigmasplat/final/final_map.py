@@ -1,0 +1,233 @@
+"""The final map: merge all submaps, or seed new splats on their surface, and refine over all keyframes (VarSplat
+§7)."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from sigmasplat.config import Config, FinalConfig
+from sigmasplat.data.field import COLUMNS, INITIAL_LOG_VARIANCE, GaussianField
+from sigmasplat.data.mesh import Mesh
+from sigmasplat.data.submap import SubmapStore
+from sigmasplat.data.tsdf import packed
+from sigmasplat.errors import SigmaSplatError
+from sigmasplat.final.full_resolution import refine_on_photos, working_seconds
+from sigmasplat.final.fusion import count_keyframes, fuse, fusion_views
+from sigmasplat.final.refinement import Clock, KeyframeReader, SavedRefinement, refine
+from sigmasplat.final.still_store import carved, without_moving
+from sigmasplat.render.view import View
+from sigmasplat.types import Matrix, Progress, no_progress
+from sigmasplat.uncertainty.predicted_submaps import PredictedSubmaps
+
+CELL_M, BITS = 0.01, 16
+"""Size of the cells of `z_order`, and the bits of a cell's number along each axis."""
+AT_ONCE = 1 << 22
+"""Duplicates are removed when so many splats wait, so that memory does not grow with the time in one room."""
+
+
+class FinalMap(NamedTuple):
+    """The global map in the world, in host memory; the poses of its keyframes, T_submap_camera [4, 4] of each submap's
+    keyframes, as refinement has moved them (None: it has moved none); their exposures [K, 3, 2] relative to the map
+    (None: not fitted); the number of refinement steps."""
+
+    field: GaussianField
+    keyframe_poses: list[list[Matrix]] | None = None
+    keyframe_exposures: list[Matrix] | None = None
+    steps: int = 0
+    refined_fx: float | None = None
+
+
+def final_map(
+    store: SubmapStore,
+    anchors: Sequence[Matrix],
+    config: Config,
+    view: View,
+    random: np.random.Generator,
+    progress: Progress = no_progress,
+    saved: SavedRefinement | None = None,
+) -> FinalMap:
+    """Return the map in the world: made from submaps at `anchors` (T_world_submap [4, 4] each), then refined with
+    `view`.
+
+    Calls `progress(steps done, total)`. With `saved`, refinement continues after the last saved step, and the result
+    has the same bytes as that of an uninterrupted refinement. Memory contains this map, one submap and some pictures.
+    Raises SigmaSplatError if there is no submap, a submap has no anchor, or its camera is not the view's.
+    """
+    _refuse_misfits(store, anchors)
+    seed = seeded_on_surface if config.final.seed_from == "mesh" else merged
+    found = None if saved is None else saved.load()
+    if config.moving.find:
+        store = without_moving(store, anchors, config.moving)
+    field = seed(store, anchors, config) if found is None else found.field
+    if config.moving.find and found is None:
+        carved(field, store, anchors, config.moving)
+    if not config.final.iterations:
+        return FinalMap(field)
+    if found is None:
+        field.keep(torch.from_numpy(z_order(field.means.numpy())))
+    on_device, keyframes = (
+        field.to(view.sums.device),
+        KeyframeReader(store, anchors, view, config.input.sensor if config.mapping.sensor_noise else None),
+    )
+    if found is not None:
+        keyframes.take(found)
+        random.bit_generator.state = found.numbers
+    done, spent_s = (found.done, found.spent_s) if found else (0, 0.0)
+    clock = Clock(working_seconds(keyframes, config.final), spent_s)
+    if done <= config.final.iterations:
+        done += len(refine(on_device, keyframes, config, view, random, progress, done, saved, clock))
+    clock = clock.next_stage(config.final.seconds)
+    done, refined_fx = refine_on_photos(on_device, keyframes, config, view, random, progress, done, saved, clock)
+    moves = config.final.lr_pose_translation or config.final.lr_pose_rotation
+    poses = keyframes.poses_in(anchors) if moves else None
+    exposures = keyframes.exposures_in_submaps() if config.final.exposure else None
+    return FinalMap(on_device.to(torch.device("cpu")), poses, exposures, done, refined_fx)
+
+
+def _refuse_misfits(store: SubmapStore, anchors: Sequence[Matrix]) -> None:
+    """Raise SigmaSplatError if no final map can be made."""
+    if not 0 < len(store) <= len(anchors):
+        raise SigmaSplatError(
+            f"the final map needs submaps and one anchor for each, found {len(store)} and {len(anchors)}"
+        )
+
+
+# ---- merging ----
+
+
+class OwnedSplats(NamedTuple):
+    """Splats in the world, the submap of each [N], and its log σ² [N]."""
+
+    field: GaussianField
+    owner: NDArray[np.int64]
+    log_variance: Tensor
+
+
+def merged(store: SubmapStore, anchors: Sequence[Matrix], config: Config) -> GaussianField:
+    """Merge the splats of all submaps in the world (anchors: T_world_submap [4, 4]), without duplicates (`survivors`).
+
+    If there are more than `AT_ONCE` splats, duplicates are removed before all submaps are read. The result is the same:
+    the splats that win a voxel stay complete, and so does their mean.
+    """
+    predicted, kept, waiting = PredictedSubmaps(config, store), list[OwnedSplats](), list[OwnedSplats]()
+    for index in range(len(store)):
+        part = _in_world(store, anchors, index)
+        is_predicted = config.final.uncertainty and config.final.variance == "predicted"
+        log_variance = _log_variance(predicted.rows(index) if is_predicted else part.params)
+        waiting.append(OwnedSplats(part, np.full(len(part), index), log_variance))
+        if _count(waiting) >= max(AT_ONCE, _count(kept)):
+            kept, waiting = [_without_duplicates([*kept, *waiting], config.final)], []
+    return _without_duplicates([*kept, *waiting], config.final).field
+
+
+def _count(parts: Sequence[OwnedSplats]) -> int:
+    return sum(len(part.field) for part in parts)
+
+
+def _without_duplicates(parts: Sequence[OwnedSplats], final: FinalConfig) -> OwnedSplats:
+    """Return the splats of parts that survive, in their order."""
+    field = GaussianField.side_by_side(part.field for part in parts)
+    owner, log_variance = np.concatenate([part.owner for part in parts]), torch.cat([p.log_variance for p in parts])
+    weigh = np.asarray(log_variance.double()) if final.uncertainty else None
+    keep = survivors(field.means.numpy(), owner, weigh, final.merge_m)
+    field.keep(torch.from_numpy(keep))
+    return OwnedSplats(field, owner[keep], log_variance[torch.from_numpy(keep)])
+
+
+def _in_world(store: SubmapStore, anchors: Sequence[Matrix], index: int) -> GaussianField:
+    """Return a submap's splats in the world."""
+    return store.load(index).field.moved(torch.from_numpy(anchors[index]))
+
+
+def _log_variance(rows: Tensor) -> Tensor:
+    """Return log σ² of rows [N, 17], mean over the channels."""
+    return rows[:, COLUMNS["log_variances"]].mean(1)
+
+
+def survivors(
+    means: NDArray[np.floating],
+    owner: NDArray[np.int64],
+    log_variance: NDArray[np.float64] | None,
+    spacing_m: float,
+) -> NDArray[np.bool_]:
+    """Return which splats to keep, bool [N]: in each voxel of `spacing_m` only the splats of one submap.
+
+    means [N, 3] m, world; owner [N]: the submap of each splat; log_variance [N]: log σ². The submap with the lowest
+    mean log σ² in the voxel is kept; without log_variance, or between equal means, the earlier submap.
+    """
+    submaps = int(owner.max(initial=0)) + 1
+    _, voxel = np.unique(packed(np.floor(means / spacing_m).astype(np.int64)), return_inverse=True)
+    pairs, pair = np.unique(voxel * submaps + owner, return_inverse=True)
+    place, score = pairs // submaps, np.zeros(len(pairs))
+    if log_variance is not None:
+        score += np.bincount(pair, log_variance) / np.bincount(pair)
+    order = np.lexsort((pairs % submaps, score, place))
+    _, first = np.unique(place[order], return_index=True)
+    return np.isin(pair, order[first])
+
+
+def z_order(points: Matrix) -> NDArray[np.int64]:
+    """Return the rows of points [N, 3] m in the order of the Z-curve (Morton) through cells of `CELL_M`.
+
+    Kernels process splats in groups of neighbouring rows. In this order a camera sees most groups completely or not at
+    all, so it does less work.
+    """
+    cells = np.floor((points - points.min(0, initial=np.inf)) / CELL_M).clip(0, (1 << BITS) - 1).astype(np.uint64)
+    code = np.zeros(len(points), np.uint64)
+    for bit in range(BITS):
+        for axis in range(3):
+            code |= ((cells[:, axis] >> np.uint64(bit)) & np.uint64(1)) << np.uint64(3 * bit + axis)
+    return np.argsort(code, kind="stable")
+
+
+# ---- seeding on the surface ----
+
+
+def seeded_on_surface(store: SubmapStore, anchors: Sequence[Matrix], config: Config) -> GaussianField:
+    """Place splats on the fused surface of the submaps, with distance and size `spacing_m` (VarSplat §7).
+
+    anchors: T_world_submap [4, 4] of each submap. A splat gets the σ² of the nearest submap splat, or the initial σ² if
+    `final.uncertainty` is off. Raises SigmaSplatError if there is no surface.
+    """
+    final = config.final
+    mesh = fuse(fusion_views(store, anchors), count_keyframes(store), config, weigh=final.uncertainty)
+    if not len(mesh.vertices):
+        raise SigmaSplatError("the submaps have no surface for the seeds of the final map; use final.seed_from=submaps")
+    points, colors = thinned_vertices(mesh, final.spacing_m)
+    log_variances = torch.full((len(points), 3), INITIAL_LOG_VARIANCE)
+    if final.uncertainty:
+        log_variances = nearest_log_variances(points, store, anchors)
+    scales = torch.full((len(points), 3), final.spacing_m)
+    return GaussianField.from_values(
+        torch.from_numpy(points).float(), scales, torch.from_numpy(colors).float(), log_variances=log_variances
+    )
+
+
+def thinned_vertices(mesh: Mesh, spacing_m: float) -> tuple[Matrix, Matrix]:
+    """Return the mean position [M, 3] m and colour [M, 3] of a mesh's vertices in each voxel of `spacing_m`."""
+    cells = packed(np.floor(mesh.vertices / spacing_m).astype(np.int64))
+    _, cell, counts = np.unique(cells, return_inverse=True, return_counts=True)
+    colors = np.full_like(mesh.vertices, 0.5) if mesh.colors is None else mesh.colors
+    sums = [np.bincount(cell, column) for column in (*mesh.vertices.T, *colors.T)]
+    means = np.stack(sums, 1) / counts[:, None]
+    return means[:, :3], means[:, 3:]
+
+
+def nearest_log_variances(points: Matrix, store: SubmapStore, anchors: Sequence[Matrix]) -> Tensor:
+    """Return log σ² [M, 3] of the splat nearest to each point [M, 3] m; anchors: T_world_submap [4, 4] of each
+    submap."""
+    found, distance = torch.full((len(points), 3), INITIAL_LOG_VARIANCE), np.full(len(points), np.inf)
+    for index in range(len(store)):
+        part = _in_world(store, anchors, index)
+        if not len(part):
+            continue
+        away, which = map(np.asarray, cKDTree(part.means.numpy()).query(points))
+        nearer = away < distance
+        found[nearer] = part.params[which[nearer], COLUMNS["log_variances"]]
+        distance[nearer] = away[nearer]
+    return found

@@ -1,0 +1,108 @@
+"""Estimate the probability that the pose of a frame is off by more than 5 cm.
+
+Two things make a pose wrong: the fit of this frame, which the comparison of surfaces judges, and the path to its
+submap, whose spread grows with every hop between keyframes and shrinks with every loop. A logistic model combines them;
+`benchmarks/failure_probability.py` fits its weights to disturbed recordings with known truth.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from sigmasplat.data.component import APART, LOST, RELOCALISED
+from sigmasplat.graph.loops import Loop
+from sigmasplat.types import Matrix
+
+LOOP_STD_M = 0.01
+"""Standard deviation of the position that a loop gives, in a room."""
+NEVER_LOST = 1_000_000
+"""Number of frames since the last lost one, before any was lost."""
+MEMORY = 20.0
+"""A lost frame is forgotten after about this many tracked ones."""
+BIAS = -1.0
+WEIGHTS: dict[str, float] = {
+    "log_position_std": 1.07,
+    "log_residual": 2.96,
+    "unexplained": 1.52,
+    "not_close": 3.21,
+    "uncorrelated": 4.0,
+    "lately_lost": 1.41,
+}
+"""Weights of the logistic model. Doubtful frames in a row and few compared points added nothing in the fit."""
+CERTAIN = {LOST: 0.85, APART: 0.99}
+"""Fixed probabilities: of a lost frame (the share of lost frames whose guess is off), and of a frame whose place in the
+world is not known."""
+
+
+@dataclass(eq=False)
+class Confidence:
+    """spread_m: standard deviation of each submap's position in its component; parents: the submap that each began at,
+    None: it began a component; since_lost: number of frames since the last one that was lost or relocalised."""
+
+    spread_m: list[float] = field(default_factory=list)
+    parents: list[int | None] = field(default_factory=list)
+    since_lost: int = NEVER_LOST
+
+    def begun(self, parent: int | None, position_m: float) -> None:
+        """Add a submap: at position_m (standard deviation, m) from its parent, or the first of a component."""
+        self.parents.append(parent)
+        self.spread_m.append(0.0 if parent is None else math.hypot(self.spread_m[parent], position_m))
+
+    def joined(self, members: Sequence[int], submap: int, kept: int, link_m: float) -> None:
+        """Add the path to the component that the submaps `members` join: from `submap`, one of them, by a link of
+        link_m (standard deviation, m) to submap `kept`."""
+        path_m = math.hypot(self.spread_m[kept], link_m, self.spread_m[submap])
+        for s in members:
+            self.spread_m[s] = math.hypot(path_m, self.spread_m[s])
+
+    def closed(self, loops: Sequence[Loop], scene_scale: float = 1.0) -> None:
+        """Take the loops of a finished submap into account, also for the submaps that began at it before its loops were
+        known; scene_scale: size of the scene relative to a room."""
+        for loop in loops:
+            if loop.accepted:
+                ours, theirs = loop.query, math.hypot(self.spread_m[loop.database], LOOP_STD_M * scene_scale)
+                lower = max(0.0, self.spread_m[ours] ** 2 - theirs**2)
+                for s in (ours, *(s for s, parent in enumerate(self.parents) if parent == ours)):
+                    self.spread_m[s] = math.sqrt(max(0.0, self.spread_m[s] ** 2 - lower))
+
+    def position_std_m(self, in_submap_m: float) -> float:
+        """Return the standard deviation of the camera's position in its component, given that in its submap, metres."""
+        return math.hypot(self.spread_m[-1], in_submap_m)
+
+    def probability(self, state: str, tracking: Mapping[str, float]) -> float:
+        """Return the probability that the pose of the newest frame is off by more than 5 cm.
+
+        tracking: values of its fit (`metrics_of`), with position_std_m and usual_residual.
+        """
+        self.since_lost = 0 if state in (LOST, RELOCALISED) else self.since_lost + 1
+        if state in CERTAIN:
+            return CERTAIN[state]
+        values = evidence(tracking, self.since_lost)
+        return 1.0 / (1.0 + math.exp(-BIAS - sum(WEIGHTS[name] * value for name, value in values.items())))
+
+
+def evidence(tracking: Mapping[str, float], since_lost: int) -> dict[str, float]:
+    """Return the inputs of the logistic model by name; without a comparison of surfaces, agreement stands for it."""
+    close, behind = tracking.get("close", tracking.get("agreement", 1.0)), tracking.get("behind", 0.0)
+    residual, usual = tracking.get("residual", 0.0), tracking.get("usual_residual", math.nan)
+    excess = _log_residual(residual) - _log_residual(usual) if math.isfinite(usual) else 0.0
+    correlation = tracking.get("correlation", 0.95)
+    return {
+        "log_position_std": math.log(tracking.get("position_std_m", 0.0) + 1e-3),
+        "log_residual": max(excess, 0.0),
+        "unexplained": behind / max(close + behind, 1e-9),
+        "not_close": 1.0 - close,
+        "uncorrelated": 0.1 if math.isnan(correlation) else 1.0 - max(correlation, 0.0),
+        "lately_lost": math.exp(-since_lost / MEMORY),
+    }
+
+
+def _log_residual(residual: float) -> float:
+    return math.log((min(residual, 10.0) if math.isfinite(residual) else 10.0) + 0.05)
+
+
+def std_of(information: Matrix) -> float:
+    """Return the standard deviation of the position, m, from the information [6, 6] of a twist."""
+    return float(np.sqrt(np.trace(np.linalg.inv(information)[:3, :3])))

@@ -1,0 +1,350 @@
+"""Covariance of every pose of a path: errors of hops between keyframes, added along submaps and through the pose graph.
+
+All errors are small. Three kinds of error move a hop:
+- the error that alignment estimates, and the random part of the disagreement between tracking and mapping, which moves
+  keyframes after they were tracked: independent from hop to hop;
+- the mean of this disagreement over all hops: the same in all hops, in the camera's axes;
+- the systematic error of alignment, which its estimate does not contain (`fit.align.BIAS_PX`): the same in all hops.
+The disagreement is measured in the run itself, so no constant describes how well tracking and mapping agree. Closed
+loops measure two more numbers in the run: factors on the variances of loops and of the systematic error (`Factors`).
+
+A pose is a linear function of all errors, and so is the motion between two poses. The closed loops are part of this
+function: it is the pose graph's solution.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import breadth_first_order
+from torch import Tensor
+
+from sigmasplat.data import se3
+from sigmasplat.data.atlas import Atlas
+from sigmasplat.data.places import Places
+from sigmasplat.data.selection import evenly_spread
+from sigmasplat.graph.edges import Edges
+from sigmasplat.graph.pose_graph import Edge, Sensitivity
+from sigmasplat.graph.variance_factors import variance_factors
+from sigmasplat.tracking.drift import UNKNOWN
+from sigmasplat.types import Matrix
+
+Numbers = NDArray[np.int64]
+BIAS, MEAN = -2, -1
+"""Columns of the errors that are the same in all hops."""
+LOOPS_MOST = 40
+"""At most this many loops, evenly spread, determine `Factors`: a few already do, and the time grows with the cube."""
+
+
+def recorded(atlas: Atlas, edges: Sequence[Edge]) -> dict[str, Tensor]:
+    """Return what a checkpoint keeps of the errors of a path; edges: the trusted ones and the accepted loops."""
+    counts, known = atlas.keyframe_poses.counts, Edges.of(edges)
+    arrays = {
+        "frame_keyframe": atlas.places.keyframe,
+        "T_keyframe_camera": atlas.places.T_keyframe_camera,
+        "keyframe_submap": np.repeat(np.arange(len(counts)), counts),
+        "T_submap_keyframe": atlas.keyframe_poses.stacked(),
+        "hop_T_camera_before": atlas.hops.T_camera_before,
+        "hop_covariance": atlas.hops.covariance,
+        "hop_bias": atlas.hops.bias,
+        "edge_submaps": known.ends,
+        "edge_T_a_b": known.T_a_b,
+        "edge_information": known.information,
+        "edge_is_loop": known.is_loop,
+        "edge_keyframes": known.keyframes,
+        "edge_drift": known.drift,
+    }
+    return {name: torch.from_numpy(array) for name, array in arrays.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class Hops:
+    """The motion to each of K keyframes from the one before it in its submap, as tracking found it (`model.hops.Hop`):
+    T_camera_before [K, 4, 4], covariance [K, 6, 6], bias [K, 6]."""
+
+    T_camera_before: Matrix
+    covariance: Matrix
+    bias: Matrix
+
+    def known(self, row: int) -> Matrix | None:
+        """Return the covariance [6, 6] that tracking estimated for one hop, with its bias; None if it is not known."""
+        covariance = self.covariance[row]
+        return covariance + np.diag(self.bias[row] ** 2) if np.isfinite(covariance).all() else None
+
+
+class Factors(NamedTuple):
+    """Factors on variances, measured in a run: of its loops, whose claimed covariance is careful, and of the systematic
+    error. Both are 1 without a loop."""
+
+    loops: float = 1.0
+    bias: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class PathCovariance:
+    """The errors of a path of F frames, K keyframes, S submaps, and edges between submaps.
+
+    anchors [S, 4, 4]: T_world_submap; components [S]; frame_submap, frame_keyframe [F], the latter counted in its
+    submap, T_keyframe_camera [F, 4, 4], is_keyframe [F]; keyframe_submap [K], T_submap_keyframe [K, 4, 4]; hops to the
+    keyframes; edges: the trusted ones and the accepted loops; known_factors: `factors`, None = computed on reading.
+    """
+
+    anchors: Matrix
+    components: Numbers
+    frame_submap: Numbers
+    frame_keyframe: Numbers
+    T_keyframe_camera: Matrix
+    is_keyframe: NDArray[np.bool_]
+    keyframe_submap: Numbers
+    T_submap_keyframe: Matrix
+    hops: Hops
+    edges: tuple[Edge, ...]
+    known_factors: Factors | None = None
+
+    @staticmethod
+    def of_keyframes(atlas: Atlas, edges: Sequence[Edge], factors: Factors | None = None) -> "PathCovariance":
+        """Return the errors of the keyframes alone, without other frames; factors: known ones, so that they need not be
+        computed."""
+        read = {name: tensor.numpy() for name, tensor in recorded(replace(atlas, places=Places()), edges).items()}
+        none, anchors, components = np.empty(0, np.int64), np.array(atlas.anchors), np.array(atlas.components, np.int64)
+        return PathCovariance(
+            anchors, components, none, none, read["T_keyframe_camera"], none.astype(bool),
+            read["keyframe_submap"], read["T_submap_keyframe"],
+            Hops(read["hop_T_camera_before"], read["hop_covariance"], read["hop_bias"]), tuple(edges), factors,
+        )  # fmt: skip
+
+    @staticmethod
+    def of(checkpoint: Mapping[str, Tensor]) -> "PathCovariance | None":
+        """Read the errors of a path from a checkpoint; None if an older version wrote it."""
+        if "hop_covariance" not in checkpoint:
+            return None
+        read = {name: tensor.numpy() for name, tensor in checkpoint.items()}
+        columns: list[Iterable[Any]] = [read[name] for name in ("edge_T_a_b", "edge_information", "edge_is_loop")]
+        if "edge_drift" in read:  # older versions did not write it
+            columns += [map(tuple, read["edge_keyframes"].tolist()), read["edge_drift"]]
+        edges = zip(read["edge_submaps"].tolist(), *columns, strict=True)
+        return PathCovariance(
+            read["T_world_submap"], read["submap_component"], read["frame_submap"], read["frame_keyframe"],
+            read["T_keyframe_camera"], np.isin(np.arange(len(read["frame_keyframe"])), read["keyframes"]),
+            read["keyframe_submap"], read["T_submap_keyframe"],
+            Hops(read["hop_T_camera_before"], read["hop_covariance"], read["hop_bias"]),
+            tuple(Edge(a, b, T, information, bool(loop), *drift) for (a, b), T, information, loop, *drift in edges),
+        )  # fmt: skip
+
+    def __len__(self) -> int:
+        return len(self.frame_submap)
+
+    def of_frame(self, frame: int) -> Matrix:
+        """Return the covariance [6, 6] of the left twist (ρ, φ), m and rad, of T_world_camera.
+
+        The world is the first camera of the frame's component, whose covariance is 0.
+        """
+        error, own = self._error_of(frame)
+        return np.asarray(error @ error.T + own)
+
+    def of_keyframe(self, submap: int, keyframe: int) -> Matrix:
+        """Return the covariance [6, 6] of a keyframe's pose, as `of_frame`; keyframe: counted in its submap."""
+        error = self._error_of_keyframe(int(self._first[submap]) + keyframe)
+        return np.asarray(error @ error.T)
+
+    def between(self, a: int, b: int) -> Matrix:
+        """Return the covariance [6, 6] of the left twist of T_a_b, the pose of frame b in the camera of frame a.
+
+        Both frames must be in the same component.
+        """
+        if a == b:
+            return np.zeros((6, 6))
+        (error_a, own_a), (error_b, own_b) = self._error_of(a), self._error_of(b)
+        A, error = se3.adjoint(se3.inverse(self.T_world_camera[a])), error_b - error_a
+        return np.asarray(A @ (error @ error.T + own_a + own_b) @ A.T)
+
+    @cached_property
+    def T_world_camera(self) -> Matrix:
+        """Return the poses of the frames [F, 4, 4]."""
+        return np.asarray(self.anchors[self.frame_submap] @ self.T_submap_keyframe[self._row] @ self.T_keyframe_camera)
+
+    @cached_property
+    def factors(self) -> Factors:
+        """Return the factors on variances that make the disagreement of the loops with the chain of hops most probable.
+
+        A loop from a to b and the chain both measure T_a_b. The twist between the two is the loop's error minus that of
+        the chain. Loops between neighbouring submaps share most of the chain, so they show the errors of loops alone.
+        """
+        if self.known_factors is not None:
+            return self.known_factors
+        loops = [number for number, edge in enumerate(self.edges) if edge.loop]
+        if not loops:
+            return Factors()
+        chosen = evenly_spread(loops, LOOPS_MOST)
+        chain, twists, errors = self.without_loops(), [], []
+        claimed = np.zeros((len(chosen), 6, len(chosen), 6))
+        for i, edge in enumerate(self.edges[number] for number in chosen):
+            T_a_world = se3.inverse(chain.anchors[edge.a])
+            twists.append(se3.log(T_a_world @ chain.anchors[edge.b] @ se3.inverse(edge.T_a_b)))
+            error = chain._error_of_submap(edge.b) - chain._error_of_submap(edge.a)
+            error = np.einsum("ij,jnk->ink", se3.adjoint(T_a_world), error)
+            chain._add_drift(error, -np.eye(6), edge)
+            errors.append(error)
+            claimed[i, :, i] = edge.measured
+        size = 6 * len(chosen)
+        joint = np.concatenate(errors)
+        bias, rest = joint[:, BIAS], np.delete(joint, BIAS, 1).reshape(size, -1)
+        parts = [claimed.reshape(size, size), bias @ bias.T]
+        return Factors(*variance_factors(np.concatenate(twists), rest @ rest.T, parts))
+
+    def without_loops(self) -> "PathCovariance":
+        """Return the path as the trusted edges alone give it: odometry, and places where the camera was found."""
+        edges = tuple(edge for edge in self.edges if not edge.loop)
+        motions = {(edge.a, edge.b): edge.T_a_b for edge in edges}
+        motions |= {(edge.b, edge.a): se3.inverse(edge.T_a_b) for edge in edges}
+        a, b = np.array(list(motions), np.intp).reshape(-1, 2).T
+        connected, anchors = coo_array((np.ones(len(a)), (a, b)), shape=(len(self.anchors),) * 2), self.anchors.copy()
+        for first in np.unique(self.components, return_index=True)[1]:
+            order, before = breadth_first_order(connected, first)
+            for submap in order[1:]:
+                anchors[submap] = anchors[before[submap]] @ motions[before[submap], submap]
+        return replace(self, anchors=anchors, edges=edges)
+
+    # ---- rows of keyframes ----
+
+    @cached_property
+    def _first(self) -> Numbers:
+        """Return the row of each submap's first keyframe [S]."""
+        return np.asarray(np.searchsorted(self.keyframe_submap, np.arange(len(self.anchors))))
+
+    @cached_property
+    def _row(self) -> Numbers:
+        """Return the row of each frame's keyframe [F]."""
+        return np.asarray(self._first[self.frame_submap] + self.frame_keyframe)
+
+    def _rows_of_hops(self, submap: int, last: int | None = None) -> slice:
+        """Return the rows of the hops in a submap, up to a keyframe."""
+        end = int(np.searchsorted(self.keyframe_submap, submap, side="right")) if last is None else last + 1
+        return slice(int(self._first[submap]) + 1, end)
+
+    # ---- errors as linear functions of standard normal twists ----
+
+    def _error_of(self, frame: int) -> tuple[Matrix, Matrix]:
+        """Return the error of a frame's pose: a matrix [6, 6n] to multiply with n standard normal twists, which other
+        frames share, and the covariance [6, 6] of the rest."""
+        A = se3.adjoint(self.T_world_camera[frame])
+        own = np.zeros((6, 6)) if self.is_keyframe[frame] else A @ self._hop_of_frame(frame) @ A.T
+        return self._error_of_keyframe(int(self._row[frame])), own
+
+    def _hop_of_frame(self, frame: int) -> Matrix:
+        """Return the covariance [6, 6] of a frame's motion from its keyframe.
+
+        It is that of the hop to the next keyframe, which is tracked against the same image; at the end of a submap,
+        that of the hop before. If the submap has no hop yet, it is that of the newest hop before. Computing it for each
+        frame would double the time of tracking.
+        """
+        rows, row = self._rows_of_hops(int(self.frame_submap[frame])), int(self._row[frame])
+        near = [r for r in (row + 1, row) if rows.start <= r < rows.stop]
+        known = (self.hops.known(r) for r in near or range(row, -1, -1))
+        return next((covariance for covariance in known if covariance is not None), UNKNOWN)
+
+    @lru_cache(maxsize=64)  # noqa: B019 - the object lives as long as one evaluation or export
+    def _error_of_keyframe(self, row: int) -> Matrix:
+        """Return the error of a keyframe's pose: that of its submap and that of the hops to it."""
+        submap = int(self.keyframe_submap[row])
+        error = self._error_of_submap(submap).copy()
+        self._add_hops(error, se3.adjoint(self.anchors[submap]), self._rows_of_hops(submap, row))
+        loops = len(self.keyframe_submap) + np.flatnonzero([edge.loop for edge in self.edges])
+        error[:, loops] *= np.sqrt(self.factors.loops)
+        error[:, BIAS] *= np.sqrt(self.factors.bias)
+        return error.reshape(6, -1)
+
+    @lru_cache(maxsize=8)  # noqa: B019
+    def _error_of_submap(self, submap: int) -> Matrix:
+        """Return the error of an anchor as a matrix [6, n, 6], before `factors`: n is K hops, then all edges, then
+        `_shared`."""
+        count = len(self.keyframe_submap)
+        error = np.zeros((6, count + len(self.edges) + len(self._shared), 6))
+        graph = self._graphs[int(self.components[submap])]
+        if graph.sensitivity is None:
+            return error
+        A = se3.adjoint(self.anchors[graph.submaps[0]])
+        for number, G in zip(graph.edges, graph.sensitivity.of(graph.submaps.index(submap)), strict=True):
+            edge = self.edges[number]
+            if self._is_chain(edge):
+                self._add_hops(error, A @ G, self._rows_of_hops(edge.a))
+            else:
+                error[:, count + number] += A @ G @ _root(edge.measured)
+                self._add_drift(error, A @ G, edge)
+        return error
+
+    def _add_hops(self, error: Matrix, A: Matrix, rows: slice) -> None:
+        """Add the errors of a chain of hops, transformed by A [6, 6]."""
+        error[:, rows] += np.swapaxes(A @ self._independent[rows], 0, 1)
+        for shared, column in zip(self._shared, (BIAS, MEAN), strict=True):
+            error[:, column] += A @ shared[rows].sum(0)
+
+    def _add_drift(self, error: Matrix, A: Matrix, edge: Edge) -> None:
+        """Add the errors of T_a_b of a loop that come from the hops to its two keyframes, transformed by A [6, 6]."""
+        in_a, in_b = edge.keyframes
+        self._add_hops(error, A, self._rows_of_hops(edge.a, int(self._first[edge.a]) + in_a))
+        self._add_hops(error, -A @ se3.adjoint(edge.T_a_b), self._rows_of_hops(edge.b, int(self._first[edge.b]) + in_b))
+
+    @cached_property
+    def _disagreement(self) -> tuple[Matrix, Matrix]:
+        """Return mean [6] and covariance [6, 6] of the twists from the tracked hops to the final ones."""
+        rows = np.flatnonzero(np.isfinite(self.hops.covariance).all((1, 2)))
+        if not len(rows):
+            return np.zeros(6), np.zeros((6, 6))
+        T_final = se3.inverse(self.T_submap_keyframe[rows]) @ self.T_submap_keyframe[rows - 1]
+        moved = se3.log_stack(T_final @ se3.inverse(self.hops.T_camera_before[rows]))
+        mean = moved.mean(0)
+        return np.asarray(mean), np.asarray((moved - mean).T @ (moved - mean) / len(moved))
+
+    @cached_property
+    def _independent(self) -> Matrix:
+        """Return the independent errors of the hops [K, 6, 6], in the frames of their submaps."""
+        spread = self._disagreement[1]
+        known = np.isfinite(self.hops.covariance).all((1, 2), keepdims=True)
+        roots = _root(np.where(known, self.hops.covariance + spread, UNKNOWN))
+        return np.asarray(-se3.adjoint(self.T_submap_keyframe) @ roots)
+
+    @cached_property
+    def _shared(self) -> tuple[Matrix, Matrix]:
+        """Return the errors that are the same in all hops [K, 6, 6], in the frames of their submaps: of bias, and the
+        mean disagreement."""
+        A, mean = -se3.adjoint(self.T_submap_keyframe), np.zeros((6, 6))
+        mean[:, 0] = self._disagreement[0]
+        return A * self.hops.bias[:, None], A @ mean
+
+    @cached_property
+    def _graphs(self) -> "dict[int, _Graph]":
+        return {int(component): self._graph(int(component)) for component in np.unique(self.components)}
+
+    def _graph(self, component: int) -> "_Graph":
+        submaps = np.flatnonzero(self.components == component).tolist()
+        node = {submap: i for i, submap in enumerate(submaps)}
+        numbers = [i for i, edge in enumerate(self.edges) if edge.a in node]
+        edges = [replace(e, a=node[e.a], b=node[e.b]) for e in (self.edges[i] for i in numbers)]
+        poses = se3.inverse(self.anchors[submaps[:1]]) @ self.anchors[submaps]
+        return _Graph(submaps, numbers, Sensitivity(poses, edges) if edges else None)
+
+    def _is_chain(self, edge: Edge) -> bool:
+        """Return whether an edge leads to the last keyframe of its submap: then its error is that of the hops."""
+        last = self._rows_of_hops(edge.a).stop - 1
+        return not edge.loop and np.array_equal(edge.T_a_b, self.T_submap_keyframe[last])
+
+
+@dataclass(frozen=True, eq=False)
+class _Graph:
+    """The submaps of a component, the numbers of its edges, and how their errors move the submaps, if it has edges."""
+
+    submaps: list[int]
+    edges: list[int]
+    sensitivity: Sensitivity | None
+
+
+def _root(covariance: Matrix) -> Matrix:
+    """Return W [..., 6, 6] with W Wᵀ = a covariance, which may be singular."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :])

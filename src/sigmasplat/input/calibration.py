@@ -1,0 +1,279 @@
+"""List the cameras of the public data sets, and read the calibration of a recording."""
+
+import re
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sigmasplat.config import InputConfig
+from sigmasplat.config.sensors import sensor_problems
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.errors import ConfigError, SourceError
+from sigmasplat.files.reading import exists
+from sigmasplat.files.structured import read_json
+
+Distortion = tuple[float, ...]
+"""Radial and tangential distortion k1, k2, p1, p2, k3 [, k4, k5, k6 of the rational model's denominator]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """The cameras of a recording.
+
+    camera, distortion: of the colour image, None for no distortion; depth_units_per_metre: of whole-number depth;
+    depth_camera, depth_distortion: of depth images that are not registered to colour, None if they are registered;
+    T_color_depth [4, 4]: transforms points of the depth camera to the colour camera, metres;
+    register_by_default: whether unregistered depth is moved to colour if input.register_depth is "auto"; sensor: the
+    depth sensor or its model (`config.sensors`), None if it is unknown.
+    """
+
+    camera: Camera
+    depth_units_per_metre: float
+    distortion: Distortion | None = None
+    depth_camera: Camera | None = None
+    depth_distortion: Distortion | None = None
+    T_color_depth: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
+    register_by_default: bool = True
+    sensor: str | None = None
+
+
+class CameraUnknown(SourceError):
+    """Neither the recording nor the user gives a focal length; `size` is (width, height) of the images."""
+
+    def __init__(self, size: tuple[int, int], message: str) -> None:
+        super().__init__(message)
+        self.size = size
+
+
+MOST_NUMBER = 1e100
+"""Larger numbers are refused: their squares are not finite, and no field of a recording needs them."""
+
+TUM_UNITS_PER_METRE = 5000.0
+
+# The values published with the TUM RGB-D benchmark (CG-SLAM's loaders use the same), 640×480.
+FREIBURG = {
+    "1": Calibration(
+        Camera(640, 480, 517.3, 516.5, 318.6, 255.3), TUM_UNITS_PER_METRE, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)
+    ),
+    "2": Calibration(
+        Camera(640, 480, 520.9, 521.0, 325.1, 249.7), TUM_UNITS_PER_METRE, (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)
+    ),
+    "3": Calibration(Camera(640, 480, 535.4, 539.2, 320.1, 247.6), TUM_UNITS_PER_METRE),
+}
+
+REPLICA = Calibration(Camera(1200, 680, 600.0, 600.0, 599.5, 339.5), 6553.5)
+
+MM_PER_METRE = 1000.0
+
+# 585, 320, 240 are the values of the 7-Scenes page. They belong to the depth camera, and so do the published poses. The
+# colour camera and its position were fitted to the RedKitchen sequence by maximising the agreement of neighbouring
+# images (andyzeng/tsdf-fusion-python, data/; the fit is in shared/data/redkitchen/calibration.json).
+SEVEN_SCENES = Calibration(Camera(640, 480, 585.0, 585.0, 320.0, 240.0), MM_PER_METRE)
+SEVEN_SCENES_COLOR = Calibration(
+    Camera(640, 480, 528.12, 528.12, 318.96, 232.91),
+    MM_PER_METRE,
+    depth_camera=SEVEN_SCENES.camera,
+    T_color_depth=np.array(
+        [
+            [0.999969, -0.007635, 0.001694, -0.02421],
+            [0.007625, 0.999954, 0.005732, 0.005946],
+            [-0.001738, -0.005719, 0.999982, 0.006997],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    ),
+)
+
+# Published as fy = −480, for a camera whose y points up; ours points down (`plugins/sources/icl_nuim.py`).
+ICL_NUIM = Calibration(Camera(640, 480, 481.2, 480.0, 319.5, 239.5), TUM_UNITS_PER_METRE)
+
+# The values of the page of the Bonn RGB-D Dynamic Dataset.
+BONN = Calibration(
+    Camera(640, 480, 542.822841, 542.57687, 315.59352, 237.756098),
+    TUM_UNITS_PER_METRE,
+    (0.039903, -0.099343, -0.00073, -0.000144, 0.0),
+)
+
+# Factory values of the PrimeSense cameras, used for the Redwood recordings (Open3D's PrimeSenseDefault).
+PRIMESENSE = Calibration(Camera(640, 480, 525.0, 525.0, 319.5, 239.5), MM_PER_METRE)
+
+
+def freiburg_calibration(folder: Path) -> Calibration | None:
+    """Return the TUM camera named by the folder or a parent (`freiburg1` or `fr1` in the name), else None."""
+    for part in reversed(folder.resolve().parts):
+        match = re.search(r"freiburg([123])|(?:^|[^a-z0-9])fr([123])(?:[^0-9]|$)", part.lower())
+        if match:
+            return FREIBURG[match.group(1) or match.group(2)]
+    return None
+
+
+def read_calibration(path: Path, size: tuple[int, int], default_units_per_metre: float) -> Calibration:
+    """Read `calibration.json`: fx, fy, cx, cy; optional width, height, depth_scale (PNG units per metre), distortion,
+    sensor (`config.sensors`).
+
+    For depth that is not registered to colour: depth_camera, an object of the same fields, and T_color_depth, 4 rows.
+    `size` (width, height) in pixels is the default for a missing size. Raises SourceError naming file and field.
+    """
+    fields = read_json_object(path)
+    units = json_number(path, fields, "depth_scale", default_units_per_metre)
+    lens, sensor = read_distortion(path, fields), fields.get("sensor")
+    if problems := sensor_problems(sensor) if isinstance(sensor, str) else [f"sensor is {sensor!r}"] * bool(sensor):
+        raise SourceError(f'{path}: field "sensor": {problems[0]}')
+    scale = check_positive(path, "depth_scale", units)
+    calibration = Calibration(read_camera(path, fields, size), scale, lens, sensor=sensor)
+    inner = fields.get("depth_camera")
+    if inner is None:
+        return calibration
+    if not isinstance(inner, dict):
+        raise SourceError(f'{path}: field "depth_camera" is {inner!r}, expected an object with fx, fy, cx, cy')
+    camera, lens = read_camera(path, inner, size), read_distortion(path, inner)
+    T_color_depth = read_rigid_transform(path, fields, "T_color_depth")
+    return replace(calibration, depth_camera=camera, depth_distortion=lens, T_color_depth=T_color_depth)
+
+
+def resolve_calibration(
+    folder: Path, recorded: Calibration | None, size: tuple[int, int], settings: InputConfig, default_units: float
+) -> Calibration:
+    """Return the calibration to use: from the settings, else from calibration.json, else from the recording.
+
+    `folder` is the recording, a folder or a file; `size` (width, height) is that of the colour image. Raises
+    CameraUnknown if no focal length is given.
+    """
+    beside = folder / "calibration.json"
+    if settings.calibration or exists(beside):
+        recorded = read_calibration(Path(settings.calibration or beside), size, default_units)
+    if recorded is None and not settings.fx:
+        place = "a file for --calibration" if folder.is_file() else beside
+        raise CameraUnknown(
+            size,
+            f"camera unknown: {folder} has no intrinsics; write {place} with fx, fy, cx, cy, "
+            "depth_scale (PNG units per metre), or give --fx PIXELS (and --fy, --cx, --cy, --depth-scale)",
+        )
+    if recorded is None:
+        centred = Camera(*size, settings.fx, settings.fy or settings.fx, (size[0] - 1) / 2, (size[1] - 1) / 2)
+        recorded = Calibration(centred, default_units)
+    given = {key: value for key in ("fx", "fy", "cx", "cy") if (value := getattr(settings, key))}
+    units = settings.depth_scale or recorded.depth_units_per_metre
+    return replace(recorded, camera=replace(recorded.camera, **given), depth_units_per_metre=units)
+
+
+def read_replica_calibration(path: Path) -> Calibration:
+    """Read Replica's `cam_params.json`: {"camera": {w, h, fx, fy, cx, cy, scale}}. Raises SourceError."""
+    fields = read_json_object(path).get("camera")
+    if not isinstance(fields, dict):
+        raise SourceError(f'{path}: no "camera" object with w, h, fx, fy, cx, cy, scale')
+    w, h, fx, fy, cx, cy, scale = (
+        json_number(path, fields, key) for key in ("w", "h", "fx", "fy", "cx", "cy", "scale")
+    )
+    return Calibration(build_camera(path, int(w), int(h), [fx, fy, cx, cy]), check_positive(path, "scale", scale))
+
+
+def read_json_object(path: Path) -> dict[str, Any]:
+    """Read a JSON file that holds one object. Raises SourceError naming the file."""
+    content = read_json(path)
+    if not isinstance(content, dict):
+        raise SourceError(f"{path}: holds a {type(content).__name__}, not an object with fx, fy, cx, cy")
+    return content
+
+
+def json_number(path: Path, fields: dict[str, Any], key: str, default: float | None = None) -> float:
+    """Return one finite number of a JSON object. Raises SourceError naming file and field."""
+    value = fields.get(key, default)
+    if value is None:
+        raise SourceError(f'{path}: field "{key}" is missing (found {", ".join(sorted(fields)) or "nothing"}); add it')
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= MOST_NUMBER:
+        raise SourceError(f'{path}: field "{key}" is {str(value)[:60]}, expected a finite number')
+    return float(value)
+
+
+def check_positive(path: Path, key: str, value: float) -> float:
+    """Return a number that must be positive. Raises SourceError naming file and field."""
+    if value <= 0:
+        raise SourceError(f'{path}: field "{key}" is {value:g}, it must be above 0')
+    return value
+
+
+def build_camera(path: Path, width: int, height: int, focal: list[float]) -> Camera:
+    """Build a camera from values of a file. Raises SourceError naming the file if they are not valid."""
+    try:
+        return Camera(width, height, *focal)
+    except ConfigError as error:
+        raise SourceError(f"{path}: {error}") from error
+
+
+POSSIBLE_VIEW_DEG = (2.0, 170.0)
+"""A pinhole image with a field of view outside this range is taken for a mistake in the calibration."""
+USUAL_VIEW_DEG = (25.0, 120.0)
+"""Horizontal field of view of depth cameras and phones."""
+CENTRED = 0.2
+"""Principal points are usually within this share of the image size from its centre."""
+
+
+def refuse_impossible_camera(name: str, camera: Camera) -> None:
+    """Raise SourceError if the intrinsics cannot be those of a camera with such images."""
+    low, high = POSSIBLE_VIEW_DEG
+    for axis, degrees in zip("xy", fields_of_view_deg(camera), strict=True):
+        if not low <= degrees <= high:
+            raise SourceError(
+                f"{name}: f{axis} = {getattr(camera, 'f' + axis):g} pixels gives a field of view of {degrees:.3g}°; "
+                f"correct the calibration, or give --f{axis} PIXELS"
+            )
+    if not (-0.5 <= camera.cx <= camera.width - 0.5 and -0.5 <= camera.cy <= camera.height - 0.5):
+        raise SourceError(
+            f"{name}: the principal point ({camera.cx:g}, {camera.cy:g}) is outside the image of "
+            f"{camera.width}×{camera.height}; correct the calibration, or give --cx and --cy"
+        )
+
+
+def unlikely_camera(camera: Camera) -> str | None:
+    """Return a warning if the intrinsics are unusual, None if they are plausible."""
+    degrees, (low, high) = fields_of_view_deg(camera)[0], USUAL_VIEW_DEG
+    if not low <= degrees <= high:
+        return f"the field of view is {degrees:.0f}°, which is unusual for a depth camera; check fx"
+    if not 0.8 <= camera.fx / camera.fy <= 1.25:
+        return f"fx = {camera.fx:g} and fy = {camera.fy:g} differ; pixels are usually square: check both"
+    x, y = camera.cx - (camera.width - 1) / 2, camera.cy - (camera.height - 1) / 2
+    if abs(x) > CENTRED * camera.width or abs(y) > CENTRED * camera.height:
+        return f"the principal point is ({x:+.0f}, {y:+.0f}) pixels from the image centre; check cx and cy"
+    return None
+
+
+def fields_of_view_deg(camera: Camera) -> tuple[float, float]:
+    """Return the horizontal and the vertical field of view of the image, degrees."""
+    return (
+        float(np.degrees(2 * np.arctan(0.5 * camera.width / camera.fx))),
+        float(np.degrees(2 * np.arctan(0.5 * camera.height / camera.fy))),
+    )
+
+
+def read_camera(path: Path, fields: dict[str, Any], size: tuple[int, int]) -> Camera:
+    """Read fx, fy, cx, cy and width, height, by default `size`. Raises SourceError naming file and field."""
+    width, height = json_number(path, fields, "width", size[0]), json_number(path, fields, "height", size[1])
+    return build_camera(
+        path, int(width), int(height), [json_number(path, fields, key) for key in ("fx", "fy", "cx", "cy")]
+    )  # fmt: skip
+
+
+def read_rigid_transform(path: Path, fields: dict[str, Any], key: str) -> NDArray[np.float64]:
+    """Read a transform, identity if absent. Raises SourceError unless it is a rigid 4×4 matrix."""
+    try:
+        T = np.array(fields.get(key, np.eye(4)), np.float64)
+    except (ValueError, TypeError):
+        T = np.zeros(0)
+    if T.shape != (4, 4) or not se3.is_rigid(T):
+        raise SourceError(f'{path}: field "{key}" is not a rigid 4×4 matrix by rows, metres')
+    return T
+
+
+def read_distortion(path: Path, fields: dict[str, Any]) -> tuple[float, ...] | None:
+    """Read distortion [k1, k2, p1, p2, k3], None if it is absent or 0. Raises SourceError naming file and field."""
+    values = fields.get("distortion")
+    if values is None:
+        return None
+    if not isinstance(values, list) or len(values) not in (4, 5):
+        raise SourceError(f'{path}: field "distortion" is {values!r}, expected [k1, k2, p1, p2, k3]')
+    numbers = [json_number(path, {"distortion": v}, "distortion") for v in [*values, 0.0][:5]]
+    return tuple(numbers) if any(numbers) else None

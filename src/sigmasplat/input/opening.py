@@ -1,0 +1,164 @@
+"""Open a sequence of any known format: ask each format of this folder whether it recognises the path."""
+
+import importlib
+import pkgutil
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, fields, replace
+from functools import cache
+from pathlib import Path
+from typing import Any, cast
+
+from sigmasplat.config import InputConfig
+from sigmasplat.config.text import nearest
+from sigmasplat.errors import ConfigError, SourceError
+from sigmasplat.files.guard import guarded
+from sigmasplat.input.color_only import without_depth
+from sigmasplat.input.masked import Masked
+from sigmasplat.input.posed import Posed
+from sigmasplat.input.source import Source, Subset
+
+PACKED = (".bag", ".mcap", ".db3", ".r3d")
+"""Endings of files that may each be a whole sequence. A folder of such files is refused with their names."""
+
+
+@dataclass(frozen=True)
+class Format:
+    """One layout of a sequence on disk. Every module of this folder that defines `FORMAT` is found automatically.
+
+    recognises(path): returns whether the path has this format, from its content only;
+    looked_for: names the files that identify the format, for messages;
+    open(path, settings): builds the source of all its frames;
+    priority: formats of higher priority are asked first, so that a special format comes before a general one. Above 0:
+    other formats recognise the same files; below 0: the format is a guess;
+    sensor: the depth sensor of all its recordings (`config.sensors`), None if it varies.
+    """
+
+    name: str
+    looked_for: str
+    recognises: Callable[[str], bool]
+    open: Callable[[str, InputConfig], Source]
+    priority: int = 0
+    sensor: str | None = None
+
+
+@cache
+def formats() -> tuple[Format, ...]:
+    """Return the formats of all modules directly in `plugins/sources` that define FORMAT, by priority and name."""
+    folders = importlib.import_module("sigmasplat.plugins.sources").__path__
+    names = sorted(module.name for module in pkgutil.iter_modules(folders) if not module.ispkg)
+    modules = [importlib.import_module(f"sigmasplat.plugins.sources.{name}") for name in names]
+    found = [module.FORMAT for module in modules if hasattr(module, "FORMAT")]
+    return tuple(sorted(found, key=lambda known: -known.priority))
+
+
+def open_source(path: str | Path, settings: InputConfig | None = None, **changes: Any) -> Source:
+    """Open a recorded or synthetic sequence; the format is recognised from the content of `path`.
+
+    `path` is a folder or file, or "synthetic" with options as in "synthetic:frames=200,seed=1,noise=1". `settings`
+    choose which frames are read and how they are processed; each can also be given by name: stride=2, limit=100.
+    Raises SourceError if the path does not exist, no format recognises it, or its content cannot be used;
+    ConfigError on an unknown setting.
+    """
+    chosen = with_changes(settings or InputConfig(), changes)
+    predicted = chosen.predicted_depth or chosen.depth_model
+    source = _with_predicted_depth(path, chosen) if predicted else _recorded(path, chosen)
+    with _guarded(path):
+        source = Masked(source, Path(chosen.masks)) if chosen.masks else source
+        scales = chosen.poses_scale or 1.0, chosen.predicted_scale or 1.0
+        source = Posed(source, chosen.poses, *scales) if chosen.poses else source
+    part = chosen.stride > 1 or chosen.limit or chosen.start_s or chosen.end_s
+    return Subset(source, chosen) if part and not source.live else source
+
+
+def format_name(path: str | Path, settings: InputConfig) -> str:
+    """Return the name of the format that `open_source` reads. Raises SourceError if none recognises the path."""
+    if not (settings.predicted_depth or settings.depth_model):
+        return format_of(path).name
+    known = _sure_format(path)
+    return f"{known.name if known else 'colour only'}, with predicted depth"
+
+
+def _recorded(path: str | Path, settings: InputConfig) -> Source:
+    """Open a whole sequence with its own depth."""
+    known = format_of(path)
+    with _guarded(path):
+        source = known.open(str(path), settings)
+        source.sensor = source.sensor or known.sensor
+    return source
+
+
+def _with_predicted_depth(path: str | Path, settings: InputConfig) -> Source:
+    """Open a whole sequence with predicted depth: images without depth, or any other sequence."""
+    predicted = importlib.import_module("sigmasplat.plugins.predicted_depth.source")
+    known = _sure_format(path)
+    with _guarded(path):
+        if predicted.lacks_depth(Path(path), known is not None):
+            return cast(Source, predicted.open_color_only(Path(path), settings))
+    source = _recorded(path, settings)
+    with _guarded(path):
+        return cast(Source, predicted.WithPredictedDepth(source, settings))
+
+
+def _guarded(path: str | Path) -> AbstractContextManager[None]:
+    """Return a context that turns what the readers of formats do not catch themselves into SourceError."""
+    return guarded(path, "check its files and permissions, or copy it again", SourceError, "cannot be used")
+
+
+def format_of(path: str | Path) -> Format:
+    """Return the first format that recognises the path. Raises SourceError if none does."""
+    known = _matching_format(path)
+    if known is None:
+        raise _unknown_format(Path(path))
+    return known
+
+
+def _matching_format(path: str | Path) -> Format | None:
+    with _guarded(path):
+        return next((known for known in formats() if known.recognises(str(path))), None)
+
+
+def _sure_format(path: str | Path) -> Format | None:
+    """Return the format that recognises the path, None if it only guesses, or there is none."""
+    known = _matching_format(path)
+    return known if known is not None and known.priority >= 0 else None
+
+
+def with_changes(settings: InputConfig, changes: Mapping[str, Any]) -> InputConfig:
+    """Return the settings with some of them replaced by name. Raises ConfigError on an unknown name."""
+    known = [field.name for field in fields(InputConfig)]
+    for name in changes:
+        if name not in known:
+            raise ConfigError(f"unknown setting input.{name}{nearest(name, known)}; there are {', '.join(known)}")
+    return replace(settings, **changes)
+
+
+def _unknown_format(path: Path) -> SourceError:
+    """Return the error for a path that no format recognises: missing, of several sequences, without depth, unknown."""
+    if not path.exists():  # a loop of links, or a name that is too long, was refused before
+        return SourceError(
+            f"no such folder or file: {path}; give a recording, or 'synthetic' for the built-in room, "
+            "or 'realsense' for the camera"
+        )
+    with _guarded(path):
+        entries = sorted(path.iterdir()) if path.is_dir() else []
+    candidates = (entry for entry in entries if entry.is_dir() or entry.suffix in PACKED)
+    inner = [(entry.name, known) for entry in candidates if (known := _matching_format(entry))]
+    if inner:
+        names = ", ".join(f"{name} ({known.name}: {known.looked_for})" for name, known in inner[:4])
+        names += ", …" * (len(inner) > 4)
+        return SourceError(
+            f"{path} holds sequences: {names}; give the path of one of them, for example {path / inner[0][0]}"
+        )
+    if problem := without_depth(path):
+        return problem
+    known_names = ", ".join(known.name for known in formats())
+    if not path.is_dir():
+        return SourceError(
+            f"{path} is a file of unknown format; give the folder of the sequence (known formats: {known_names})"
+        )
+    found = [entry.name + "/" * entry.is_dir() for entry in entries]
+    listing = ", ".join(found[:8]) + (f", … {len(found)} entries" if len(found) > 8 else "") or "an empty folder"
+    return SourceError(
+        f"unknown format: {path} (found {listing}; known formats: {known_names}); docs/data.md shows the layouts"
+    )

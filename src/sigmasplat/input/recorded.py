@@ -1,0 +1,176 @@
+"""Read recorded sequences: a format lists the image pairs, this module reads and rectifies them."""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sigmasplat.config import InputConfig
+from sigmasplat.data.accelerometer import Accelerometer
+from sigmasplat.data.frame import Frame
+from sigmasplat.data.frame_arrays import color_from_bytes
+from sigmasplat.data.gyroscope import Gyroscope
+from sigmasplat.data.resizing import resized_color
+from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.errors import SourceError
+from sigmasplat.input.calibration import Calibration, refuse_impossible_camera
+from sigmasplat.input.depth_units import refuse_without_depth
+from sigmasplat.input.images import image_size, read_color, read_depth
+from sigmasplat.input.rectification import Rectification, check_image_sizes
+from sigmasplat.input.source import Source
+
+Size = tuple[int, int]
+File = TypeVar("File")
+Value = TypeVar("Value")
+
+
+@dataclass(frozen=True)
+class ImagePair:
+    """The colour and the depth file of one frame, and its time in seconds.
+
+    Formats whose images are not separate files (members of an archive, frames of a video, messages of a bag) derive
+    from this class and override the readers; the paths then only name the images in error messages.
+    """
+
+    timestamp_s: float
+    color: Path
+    depth: Path
+
+    def read_color(self) -> NDArray[np.uint8]:
+        """Read 8-bit RGB [H, W, 3]. Raises SourceError naming `color`."""
+        return read_color(self.color)
+
+    def read_depth(self, units_per_metre: float) -> NDArray[np.float32]:
+        """Read depth in metres [H, W], 0 = no reading; whole numbers are divided. Raises SourceError naming `depth`."""
+        return read_depth(self.depth, units_per_metre)
+
+    def read(self, units_per_metre: float) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32] | None]:
+        """Read both images, as `read_color` and `read_depth` do, and the standard deviation of depth, m [H, W], if it
+        is known."""
+        return self.read_color(), self.read_depth(units_per_metre), None
+
+    def sizes(self) -> tuple[Size, Size]:
+        """Return (width, height) of colour and of depth in pixels. Raises SourceError naming the unreadable file."""
+        return image_size(self.color), image_size(self.depth)
+
+
+class RecordedSource(Source):
+    """A sequence of image pairs, rectified to one pinhole camera."""
+
+    def __init__(
+        self,
+        name: str,
+        images: Sequence[ImagePair],
+        calibration: Calibration,
+        settings: InputConfig,
+        truth: Trajectory | None = None,
+        skipped: Sequence[str] = (),
+        test: Source | None = None,
+        gyroscope: Gyroscope | None = None,
+        accelerometer: Accelerometer | None = None,
+        surface: Path | None = None,
+        estimated: bool = False,
+    ) -> None:
+        """Store image pairs in order of time; `truth` is the path of the colour camera; `skipped` lists files left out.
+
+        test: separate test views; gyroscope, accelerometer: in the axes of the colour camera; surface: file of the true
+        surface; estimated: whether `truth` is an estimate of the recording device.
+        Raises SourceError if the first images do not match the calibration, no image has a depth reading, or no image
+        was taken while the gyroscope measured.
+        """
+        refuse_impossible_camera(name, calibration.camera)
+        self._rectified = Rectification(name, calibration, settings)
+        super().__init__(name, self._rectified.camera, settings.strict)
+        self.depth_units_per_metre: float = calibration.depth_units_per_metre
+        self.depth_registered = self._rectified.moves_depth
+        self.registrable, self.sensor = calibration.depth_camera is not None, calibration.sensor
+        self.skipped = list(skipped)
+        self._images, self._truth, self._test = images, truth, test
+        self._gyroscope, self._accelerometer = gyroscope, accelerometer
+        self._surface, self._estimated = surface, estimated
+        self._refuse_sizes_of_first()
+        self._refuse_other_clock()
+        refuse_without_depth(self)
+
+    def __len__(self) -> int:
+        return len(self._images)
+
+    def timestamp_s(self, i: int) -> float:
+        """Return the time of frame i without reading it."""
+        return self._images[self._checked_index(i)].timestamp_s
+
+    def frame(self, i: int) -> Frame:
+        """Read frame i: colour and depth of one camera, lens distortion removed."""
+        files = self._images[self._checked_index(i)]
+        recorded, depth_m, std_m = files.read(self.depth_units_per_metre)
+        color = color_from_bytes(recorded)
+        check_image_sizes(self._rectified, files.color, color.shape[1::-1], files.depth, depth_m.shape[::-1])
+        color, depth_m = self._rectified(color, depth_m)
+        color = resized_color(color, self.camera.width, self.camera.height)
+        R_inertial_camera = None if self._gyroscope is None else self._gyroscope.R_inertial_camera(files.timestamp_s)
+        force = None if self._accelerometer is None else self._accelerometer.at(files.timestamp_s)
+        return Frame(
+            i, files.timestamp_s, color, depth_m, self.camera, R_inertial_camera, std_m, specific_force_m_s2=force
+        )
+
+    def depth_of(self, i: int) -> NDArray[np.float32]:
+        """Read the depth of frame i as `frame` does, without reading colour."""
+        files = self._images[self._checked_index(i)]
+        depth_m, camera = files.read_depth(self.depth_units_per_metre), self._rectified.calibration.camera
+        check_image_sizes(self._rectified, files.color, (camera.width, camera.height), files.depth, depth_m.shape[::-1])
+        return self._rectified.depth(depth_m)
+
+    def truth(self) -> Trajectory | None:
+        """Return the whole recorded path with its own timestamps."""
+        return self._truth
+
+    def image_name(self, i: int) -> str:
+        """Return the name of the file of colour image i."""
+        return self._images[self._checked_index(i)].color.name
+
+    def device_path(self) -> Trajectory | None:
+        """Return the recorded path if the device estimated it."""
+        return self._truth if self._estimated else None
+
+    def test_views(self) -> Source | None:
+        """Return the separate test views, None without them."""
+        return self._test
+
+    def true_surface_file(self) -> Path | None:
+        """Return the file of the true surface, None without one."""
+        return self._surface
+
+    def _refuse_sizes_of_first(self) -> None:
+        """Raise SourceError before a run if the image sizes do not match the calibration."""
+        files, (size, depth_size) = first_readable(self._images, lambda pair: (pair, pair.sizes()))
+        check_image_sizes(self._rectified, files.color, size, files.depth, depth_size)
+
+    def _refuse_other_clock(self) -> None:
+        """Raise SourceError before a run if the gyroscope measured at another time than the images were taken."""
+        if self._gyroscope is None:
+            return
+        if not self._gyroscope.measured_any(np.array([pair.timestamp_s for pair in self._images])):
+            first_s, last_s = self._gyroscope.timestamps_s[[0, -1]]
+            raise SourceError(
+                f"{self.name}: the gyroscope measured from {first_s:.3f} to {last_s:.3f} s, but the images were taken "
+                f"from {self._images[0].timestamp_s:.3f} to {self._images[-1].timestamp_s:.3f} s; use the same clock"
+            )
+
+
+def first_size(paths: Sequence[Path]) -> tuple[int, int]:
+    """Return (width, height) of the first image whose header can be read. Raises SourceError if none can."""
+    return first_readable(paths, image_size)
+
+
+def first_readable(files: Iterable[File], read: Callable[[File], Value]) -> Value:
+    """Return `read` of the first file for which it raises no SourceError. Raises SourceError if it fails for all."""
+    problem: SourceError | None = None
+    for file in files:
+        try:
+            return read(file)
+        except SourceError as error:
+            problem = problem or error
+    raise SourceError(f"no pair of colour and depth can be read (first: {problem})")

@@ -1,0 +1,234 @@
+"""Define the interface of an input sequence, the same for every format."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sigmasplat.config import InputConfig
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.frame import Frame
+from sigmasplat.data.mesh import Mesh
+from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.errors import SourceError
+from sigmasplat.files.guard import guarded
+from sigmasplat.input.prefetch import read_ahead
+
+
+class Source(ABC):
+    """An RGB-D sequence: frames in order of time, one camera, and the ground-truth path if it is known.
+
+    name: for titles; camera: the pinhole camera of every frame; skipped: files left out, each with the reason;
+    strict: whether an unreadable image raises an error instead of being skipped;
+    depth_units_per_metre: divisor of whole-number depth, None if depth is stored in metres;
+    depth_registered: whether the source itself moved depth to the colour camera; registrable: whether it could do so,
+    because the depth camera is known;
+    computed_depth: whether the source computes depth itself, from a stereo pair; predicted_depth: whether a network
+    predicted depth, so that its scale is arbitrary; depth_model: name and SHA-256 of the file with that network, None
+    if depth comes from elsewhere;
+    scene_scale: size of the scene relative to a room, above 1 outdoors; depth_noise_per_m: standard deviation
+    of depth, times z²; None if it is unknown (`config.scale.for_scene` uses both);
+    sensor: the depth sensor (`config.sensors`), None if it is unknown;
+    live: whether frames come from a live camera: each only once, and their number is unknown (LiveSource);
+    arrived_s: when the last frame arrived, by `time.perf_counter`, if frames do not wait for the consumer (Arrivals);
+    dropped: number of frames that were dropped because the consumer was late.
+    """
+
+    name: str
+    camera: Camera
+    strict: bool = False
+    depth_units_per_metre: float | None = None
+    depth_registered: bool = False
+    registrable: bool = False
+    computed_depth: bool = False
+    predicted_depth: bool = False
+    depth_model: Mapping[str, str] | None = None
+    scene_scale: float = 1.0
+    depth_noise_per_m: float | None = None
+    sensor: str | None = None
+    live: bool = False
+    arrived_s: float | None = None
+    dropped: int = 0
+
+    def __init__(self, name: str, camera: Camera, strict: bool = False) -> None:
+        self.name = name
+        self.camera = camera
+        self.strict = strict
+        self.skipped: list[str] = []
+
+    @abstractmethod
+    def __len__(self) -> int:
+        """Return the number of frames, including unreadable ones."""
+
+    @abstractmethod
+    def frame(self, i: int) -> Frame:
+        """Read frame i, 0 ≤ i < len. Raises SourceError if its files cannot be read, IndexError if i is too large."""
+
+    def timestamp_s(self, i: int) -> float:
+        """Return the time of frame i; formats may override this to avoid reading it. Raises as `frame`."""
+        return self.frame(i).timestamp_s
+
+    def depth_of(self, i: int) -> NDArray[np.float32]:
+        """Read the depth of frame i, m [H, W]; formats override this to avoid reading colour. Raises as `frame`."""
+        return self.frame(i).depth_m
+
+    def exact_depth_of(self, i: int) -> NDArray[np.float32] | None:
+        """Return the exact depth of frame i, m [H, W], 0 where there is no surface; None if it is unknown."""
+        return None
+
+    def depth_std_of(self, i: int) -> NDArray[np.float32] | None:
+        """Return the standard deviation of the depth of frame i, m [H, W], 0 without a reading; None if it is
+        unknown."""
+        return None
+
+    @abstractmethod
+    def truth(self) -> Trajectory | None:
+        """Return the ground-truth path as recorded, with its own timestamps and world frame; None if it is unknown."""
+
+    def described_truth(self) -> str | None:
+        """Describe the size of the ground-truth path in words, not the path itself; None if it is unknown."""
+        path = self.truth()
+        if path is None:
+            return None
+        length_m = float(np.linalg.norm(np.diff(path.T_world_camera[:, :3, 3], axis=0), axis=1).sum())
+        return f"{len(path)} true poses, {length_m:.1f} m long"
+
+    def image_name(self, i: int) -> str:
+        """Return the name of the file of colour image i; "" if images are not files."""
+        return ""
+
+    def device_path(self) -> Trajectory | None:
+        """Return the path of the camera that the recording device estimated itself, such as ARKit's, with timestamps in
+        the clock of the frames; None without one."""
+        return None
+
+    def test_views(self) -> "Source | None":
+        """Return test views away from the camera path, with poses in `truth`'s world frame; None without them."""
+        return None
+
+    def true_surface(self) -> Mesh | None:
+        """Return the true surface in `truth`'s world frame, with hidden parts, faces of a few cm; None if unknown."""
+        return None
+
+    def true_surface_file(self) -> Path | None:
+        """Return the PLY file of the true surface, in `truth`'s world frame, if the data set has one beside the
+        sequence; else None."""
+        return None
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Yield the frames in order; a background thread decodes a few frames ahead.
+
+        An unreadable frame is skipped and listed in `skipped`, or raises SourceError if `strict`. Raises SourceError
+        if no frame can be read.
+        """
+        return self.frames_from(0)
+
+    def frames_from(self, first: int) -> Iterator[Frame]:
+        """Yield the frames from index `first`, in the same way as iteration."""
+        return read_ahead(self._readable(first))
+
+    def _readable(self, first: int) -> Iterator[Frame]:
+        found = first > 0  # an earlier pass has read some
+        for i in range(first, len(self)):
+            try:
+                with guarded(f"{self.name}, frame {i}", "copy its files again", SourceError):
+                    frame = self.frame(i)
+            except SourceError as error:
+                self._skip(error)
+                continue
+            found = True
+            yield frame
+        if not found:
+            raise SourceError(f"{self.name}: none of {len(self)} frames can be read (first: {self.skipped[:1]})")
+
+    def _skip(self, error: SourceError) -> None:
+        if self.strict:
+            raise error
+        if str(error) not in self.skipped:  # a second pass finds the same damage
+            self.skipped.append(str(error))
+
+    def _checked_index(self, i: int) -> int:
+        if not 0 <= i < len(self):
+            raise IndexError(f"{self.name}: frame {i} requested, there are {len(self)}")
+        return i
+
+
+class Subset(Source):
+    """Part of another source: a time span, every `stride`-th frame, at most `limit`; frames are numbered from 0."""
+
+    def __init__(self, whole: Source, settings: InputConfig) -> None:
+        """Select the frames. Raises SourceError if no frame is left."""
+        super().__init__(whole.name, whole.camera, whole.strict)
+        self.skipped = whole.skipped
+        self.depth_units_per_metre = whole.depth_units_per_metre
+        self.depth_registered, self.registrable = whole.depth_registered, whole.registrable
+        self.computed_depth, self.scene_scale = whole.computed_depth, whole.scene_scale
+        self.predicted_depth, self.depth_model = whole.predicted_depth, whole.depth_model
+        self.depth_noise_per_m, self.sensor = whole.depth_noise_per_m, whole.sensor
+        self._whole = whole
+        self._indices: Sequence[int] = _within(whole, settings)[:: settings.stride][: settings.limit or None]
+        if not len(self._indices):
+            raise SourceError(
+                f"{whole.name}: no frame between input.start_s={settings.start_s:g} and end_s={settings.end_s:g}; "
+                f"its {len(whole)} frames take {whole.timestamp_s(len(whole) - 1) - whole.timestamp_s(0):.1f} s"
+            )
+
+    def __len__(self) -> int:
+        return len(self._indices)
+
+    def frame(self, i: int) -> Frame:
+        """Read the i-th selected frame."""
+        return replace(self._whole.frame(self._indices[self._checked_index(i)]), index=i)
+
+    def timestamp_s(self, i: int) -> float:
+        """Return the time of the i-th selected frame."""
+        return self._whole.timestamp_s(self._indices[self._checked_index(i)])
+
+    def depth_of(self, i: int) -> NDArray[np.float32]:
+        """Read the depth of the i-th selected frame."""
+        return self._whole.depth_of(self._indices[self._checked_index(i)])
+
+    def exact_depth_of(self, i: int) -> NDArray[np.float32] | None:
+        """Return the exact depth of the i-th selected frame, None if it is unknown."""
+        return self._whole.exact_depth_of(self._indices[self._checked_index(i)])
+
+    def depth_std_of(self, i: int) -> NDArray[np.float32] | None:
+        """Return the standard deviation of the depth of the i-th selected frame, None if it is unknown."""
+        return self._whole.depth_std_of(self._indices[self._checked_index(i)])
+
+    def truth(self) -> Trajectory | None:
+        """Return the ground-truth path of the whole source; it has its own timestamps."""
+        return self._whole.truth()
+
+    def image_name(self, i: int) -> str:
+        """Return the name of the file of colour image i."""
+        return self._whole.image_name(self._indices[self._checked_index(i)])
+
+    def device_path(self) -> Trajectory | None:
+        """Return the path that the device of the whole source estimated; it has its own timestamps."""
+        return self._whole.device_path()
+
+    def test_views(self) -> Source | None:
+        """Return the test views of the whole source."""
+        return self._whole.test_views()
+
+    def true_surface(self) -> Mesh | None:
+        """Return the true surface of the whole source."""
+        return self._whole.true_surface()
+
+    def true_surface_file(self) -> Path | None:
+        """Return the file of the true surface of the whole source."""
+        return self._whole.true_surface_file()
+
+
+def _within(whole: Source, settings: InputConfig) -> range:
+    """Return the frames between start_s and end_s, seconds after the first frame."""
+    if not settings.start_s and not settings.end_s:
+        return range(len(whole))
+    begin_s = whole.timestamp_s(0)
+    elapsed_s = [whole.timestamp_s(i) - begin_s for i in range(len(whole))]
+    first = sum(t < settings.start_s for t in elapsed_s)
+    return range(first, sum(t < settings.end_s for t in elapsed_s) if settings.end_s else len(whole))

@@ -1,0 +1,196 @@
+"""Check consecutive frames of a recording: delay between colour and depth, jumps of the view, swapped and black frames.
+
+Every frame is reduced to a few thousand pixels. The motion energy of a frame is its mean change since the frame before,
+of colour and of depth. Both follow the motion of the camera, so that their best correlation is at the delay between
+them.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from sigmasplat.data.frame import Frame
+
+Numbers = NDArray[np.float64]
+
+WIDTH = 80
+"""Image width, pixels, at which frames are compared."""
+REACH = 8
+"""Largest delay that is searched, frames."""
+FEWEST = 40
+"""A delay is estimated from at least this many frames."""
+MIN_CORRELATION = 0.6
+"""Below this correlation of the motion energies the delay is unknown."""
+MIN_GAIN = 0.1
+"""A delay is reported if its correlation is above that without a delay by this."""
+MIN_DELAY = 0.7
+"""Shorter delays, in frames, are not reported."""
+JUMP = 2.8
+"""A view jumps if the image changes by more than this multiple of the median change around it."""
+JUMP_LEAST = 0.08
+"""Smallest mean change of a jump, colours 0 to 1."""
+SWAPPED = 0.75
+"""Frames are swapped if the images before and after fit together with less than this share of the change."""
+BLACK = 0.02
+"""A frame is black if 99 % of its pixels are below this, colours 0 to 1."""
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Consecutive frames, reduced: times [N] in seconds, gray images [N, h, w], depth in metres [N, h, w], 0 = none."""
+
+    times_s: Numbers
+    gray: NDArray[np.float32]
+    depth_m: NDArray[np.float32]
+
+    @staticmethod
+    def of(frames: Iterable[Frame]) -> "Motion":
+        """Reduce the frames."""
+        times, grays, depths = [], [], []
+        for frame in frames:
+            step = max(1, frame.camera.width // WIDTH)
+            height, width = (size // step * step for size in frame.depth_m.shape)
+            gray = frame.color[:height, :width].mean(-1)
+            grays.append(gray.reshape(height // step, step, width // step, step).mean((1, 3)))
+            depths.append(frame.depth_m[step // 2 : height : step, step // 2 : width : step])
+            times.append(frame.timestamp_s)
+        return Motion(np.array(times), np.array(grays, np.float32), np.array(depths, np.float32))
+
+    def changes(self, apart: int = 1) -> Numbers:
+        """Return the mean change of the image between frames `apart`, without the change of mean brightness."""
+        plain = self.gray - self.gray.mean((1, 2), keepdims=True)
+        return np.asarray(np.abs(plain[apart:] - plain[:-apart]).mean((1, 2)), np.float64)
+
+    def depth_changes(self) -> Numbers:
+        """Return the mean relative change of depth between neighbouring frames, over pixels with depth in both."""
+        first, second = self.depth_m[:-1], self.depth_m[1:]
+        both = (first > 0) & (second > 0)
+        ratio = np.log(np.where(both, second, 1.0) / np.where(both, first, 1.0))
+        return np.asarray(np.minimum(np.abs(ratio), 0.2).sum((1, 2)) / np.maximum(both.sum((1, 2)), 1), np.float64)
+
+    def delay_frames(self) -> float | None:
+        """Return by how many frames depth is behind colour; None if it is unknown, or too small to be reported."""
+        if len(self.times_s) < FEWEST:
+            return None
+        color, depth = _varying(self.changes()), _varying(self.depth_changes())
+        lags = np.arange(-REACH, REACH + 1)
+        scores = np.array([_correlation(color, depth, int(lag)) for lag in lags])
+        best = int(scores.argmax())
+        if not 0 < best < len(lags) - 1 or scores[best] < MIN_CORRELATION or scores[best] - scores[REACH] < MIN_GAIN:
+            return None
+        below, peak, above = scores[best - 1 : best + 2]
+        delay = float(lags[best] + 0.5 * (below - above) / (below - 2 * peak + above - 1e-12))
+        return delay if abs(delay) >= MIN_DELAY else None
+
+    def swapped(self) -> list[int]:
+        """Return the frames that should be one place later: the next frame fits the one before it clearly better."""
+        return swapped_in(self.changes(), self.changes(2))
+
+    def jumps(self) -> list[int]:
+        """Return the frames whose view is far from that of the frame before, compared with the frames around."""
+        return jumps_in(self.changes())
+
+    def black(self) -> list[int]:
+        """Return the frames that are black."""
+        return [int(i) for i in np.flatnonzero(np.percentile(self.gray, 99, axis=(1, 2)) < BLACK)]
+
+
+@dataclass(eq=False)
+class MotionWatch:
+    """Looks for swapped, black and jumping frames during a run. It keeps three numbers per frame, and two images."""
+
+    numbers: list[int] = field(default_factory=list)
+    black: list[int] = field(default_factory=list)
+    one: list[float] = field(default_factory=list)
+    two: list[float] = field(default_factory=list)
+    last: list[NDArray[np.float32]] = field(default_factory=list)
+
+    def __call__(self, frame: Frame) -> None:
+        """Take the next frame into account."""
+        gray = reduced(frame.color)
+        if float(np.percentile(gray, 99)) < BLACK:
+            self.black.append(frame.index)
+        gray -= gray.mean()
+        for earlier, changes in zip(self.last[::-1], (self.one, self.two), strict=False):
+            changes.append(float(np.abs(gray - earlier).mean()))
+        self.numbers.append(frame.index)
+        self.last = [*self.last[-1:], gray]
+
+    def warnings(self) -> list[str]:
+        """Return warnings about the frames so far."""
+        one, two = np.array(self.one), np.array(self.two)
+        swapped, jumps = ([self.numbers[i] for i in found] for found in (swapped_in(one, two), jumps_in(one)))
+        return frame_warnings(self.black, swapped, jumps)
+
+
+def reduced(color: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return a gray image about `WIDTH` pixels wide from colours [H, W, 3]: means of squares of about 2 × 2 pixels;
+    of larger images only some rows and columns are read."""
+    apart = max(1, color.shape[1] // (2 * WIDTH))
+    color = color[::apart, ::apart]
+    step = max(1, color.shape[1] // WIDTH)
+    height, width = (size // step * step for size in color.shape[:2])
+    rows = color[:height, :width].reshape(height // step, step, width // step, step * 3)
+    return np.asarray(rows.mean((1, 3)), np.float32)
+
+
+def swapped_in(one: Numbers, two: Numbers) -> list[int]:
+    """Return the frames that should be one place later, from the changes to the next frame and to the one after it."""
+    if len(one) < 3:
+        return []
+    between = (one[1:-1] < one[:-2]) & (one[1:-1] < one[2:])
+    found = between & (two[:-1] < SWAPPED * one[:-2]) & (two[1:] < SWAPPED * one[2:])
+    return [int(i) + 1 for i in np.flatnonzero(found)]
+
+
+def jumps_in(change: Numbers) -> list[int]:
+    """Return the frames before which the view jumps, from the changes to the next frame."""
+    usual = ndimage.median_filter(change, size=min(21, len(change)), mode="nearest") if len(change) else change
+    return [int(i) + 1 for i in np.flatnonzero((change > JUMP * usual) & (change > JUMP_LEAST))]
+
+
+def _varying(energy: Numbers) -> Numbers:
+    """Return the fast part of the logarithm of an energy, without its slow trend and without outliers."""
+    level = np.log(energy + 1e-4)
+    fast = level - ndimage.gaussian_filter1d(level, 10.0, mode="nearest")
+    spread = 1.4826 * float(np.median(np.abs(fast - np.median(fast)))) + 1e-9
+    return np.asarray(np.clip(fast, -4 * spread, 4 * spread))
+
+
+def _correlation(first: Numbers, second: Numbers, lag: int) -> float:
+    """Return the correlation of `first` with `second` that is `lag` samples later."""
+    a = first[: len(first) - lag] if lag >= 0 else first[-lag:]
+    b = second[lag:] if lag >= 0 else second[: len(second) + lag]
+    return float(np.corrcoef(a, b)[0, 1]) if a.std() > 0 and b.std() > 0 else 0.0
+
+
+def motion_warnings(motion: Motion, first: int = 0) -> list[str]:
+    """Return warnings about consecutive frames; `first` is the number of the first one in the recording."""
+    warnings = []
+    delay = motion.delay_frames()
+    if delay is not None:
+        seconds = abs(delay) * float(np.median(np.diff(motion.times_s)))
+        late, early = ("depth", "colour") if delay > 0 else ("colour", "depth")
+        warnings.append(
+            f"{late} is {seconds:.3f} s ({abs(delay):.1f} frames) behind {early}, judged by the motion of both; "
+            f"subtract this from the times of {late}"
+        )
+    faults = ([first + i for i in found] for found in (motion.black(), motion.swapped(), motion.jumps()))
+    return warnings + frame_warnings(*faults)
+
+
+def frame_warnings(black: list[int], swapped: list[int], jumps: list[int]) -> list[str]:
+    """Return warnings about the frames with these numbers."""
+    warnings = [
+        f"{len(frames)} frames are {name} (first: frame {frames[0]}); remove or correct them"
+        for name, frames in {"black": black, "swapped with the next": swapped}.items()
+        if frames
+    ]
+    if jumps:
+        warnings.append(
+            f"the view jumps {len(jumps)} times (first: before frame {jumps[0]}); tracking may be lost there"
+        )
+    return warnings

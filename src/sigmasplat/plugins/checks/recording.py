@@ -1,0 +1,258 @@
+"""Inspect a recording before a run: format, size, depth and poses; problems that degrade the map, and their fixes."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from sigmasplat.config import InputConfig
+from sigmasplat.config.presets import default_preset, list_presets
+from sigmasplat.config.sensors import AUTO
+from sigmasplat.data.frame import Frame
+from sigmasplat.errors import SourceError
+from sigmasplat.input.calibration import CameraUnknown, unlikely_camera
+from sigmasplat.input.depth_units import depth_warning
+from sigmasplat.input.opening import format_name
+from sigmasplat.input.source import Source
+from sigmasplat.plugins.checks.motion import Motion, motion_warnings
+from sigmasplat.plugins.checks.registration import EdgeAgreement, edge_agreement, overlay
+from sigmasplat.plugins.checks.sensor_noise import SensorNoise, measure_noise
+from sigmasplat.plugins.checks.timing import time_warnings, times_of
+from sigmasplat.plugins.outputs.drawing import colormap, contact_sheet
+from sigmasplat.plugins.sources import open_source
+
+SAMPLES = 16
+SHOWN = 6
+USUAL_FOCAL = 0.9
+"""Typical focal length of depth cameras, in image widths: a field of view of 58°. Enough to inspect, not to map."""
+CONSECUTIVE = 300
+"""Number of consecutive frames, in the middle of the recording, whose motion is checked."""
+MANY_UNUSED = 0.05
+"""If more than this share of the images is not used, warn."""
+MANY_HOLES = 0.45
+"""If more than this share of the pixels has no depth, warn of holes in the map."""
+MAX_BRIGHTNESS_STEP = 0.2
+"""If the median change of brightness between sampled frames is larger than this share, suggest `tracking.exposure`."""
+
+
+@dataclass(frozen=True, eq=False)
+class Inspection:
+    """Results: rows of (name, value), warnings with a fix, a contact sheet, the check of depth registration, and the
+    noise of depth (`SensorNoise.record`)."""
+
+    title: str
+    rows: list[tuple[str, str]]
+    warnings: list[str]
+    sheet: Image.Image
+    agreement: EdgeAgreement | None
+    noise: dict[str, Any] | None = None
+
+    def record(self) -> dict[str, Any]:
+        """Return what was found as values for JSON."""
+        return {"title": self.title, "found": dict(self.rows), "warnings": self.warnings, "depth_noise": self.noise}
+
+
+def inspect_source(path: str | Path, settings: InputConfig, samples: int = SAMPLES) -> Inspection:
+    """Open a recording and inspect `samples` frames, evenly spaced. Raises SourceError if it cannot be opened."""
+    name, (source, guessed) = format_name(path, settings), _opened(path, settings)
+    frames = _sampled(source, samples)
+    if not frames:
+        raise SourceError(f"{source.name}: none of {samples} sampled frames can be read; check the image files")
+    agreement = None if source.computed_depth else edge_agreement(frames)  # stereo depth has the left image's pixels
+    noise = None if source.predicted_depth else measure_noise(frames)
+    sensor = (source.sensor or AUTO) if settings.sensor == AUTO else settings.sensor
+    times_s = times_of(source)
+    first = max(0, (len(source) - CONSECUTIVE) // 2)
+    warnings = [
+        *guessed,
+        *_warnings_of_one(unlikely_camera(source.camera)),
+        *time_warnings(times_s),
+        *_unused_warnings(source),
+        *_depth_warnings(source, frames, settings),
+        *_registration_warnings(source, agreement),
+        *_brightness_warnings(frames),
+        *motion_warnings(Motion.of(_consecutive(source, first)), first),
+    ]
+    rows = [
+        ("format", name),
+        *_size_rows(source, frames[0]),
+        *_depth_rows(source, frames, settings),
+        ("depth noise", _noise_row(source, noise, sensor)),
+        ("colour–depth alignment", "unknown: no outlines in depth" if agreement is None else agreement.sentence()),
+        ("poses", source.described_truth() or "none: the error of the path cannot be measured"),
+        *_imu_rows(frames),
+        ("skipped", f"{len(source.skipped)} files (first: {source.skipped[0]})" if source.skipped else "nothing"),
+        ("suggested preset", _suggested(name)),
+    ]
+    record = None if noise is None else noise.record(sensor)
+    return Inspection(source.name, rows, warnings, _sheet(frames), agreement, record)
+
+
+def _opened(path: str | Path, settings: InputConfig) -> tuple[Source, list[str]]:
+    """Open a recording. If its camera is unknown, use a typical one and warn."""
+    try:
+        return open_source(path, settings), []
+    except CameraUnknown as problem:
+        fx = round(USUAL_FOCAL * problem.size[0])
+        return open_source(path, settings, fx=float(fx)), [f"{problem}; this inspection assumes fx = {fx} pixels"]
+
+
+def _sampled(source: Source, samples: int) -> list[Frame]:
+    """Read evenly spaced frames. Unreadable ones are added to `source.skipped`."""
+    frames = []
+    for i in sorted({int(k) for k in np.linspace(0, len(source) - 1, min(samples, len(source))).round()}):
+        try:
+            frames.append(source.frame(i))
+        except SourceError as problem:
+            source.skipped.append(str(problem))
+    return frames
+
+
+def _consecutive(source: Source, first: int) -> Iterator[Frame]:
+    """Yield the readable frames of the part whose motion is checked."""
+    for i in range(first, min(first + CONSECUTIVE, len(source))):
+        try:
+            yield source.frame(i)
+        except SourceError:
+            continue
+
+
+def _warnings_of_one(warning: str | None) -> list[str]:
+    return [warning] if warning else []
+
+
+def _unused_warnings(source: Source) -> list[str]:
+    """Warn if many images are not used, with the reason of the first one."""
+    unused = len(source.skipped)
+    if unused <= MANY_UNUSED * (len(source) + unused):
+        return []
+    return [f"{unused} of {len(source) + unused} images are not used (first: {source.skipped[0]})"]
+
+
+def _size_rows(source: Source, first: Frame) -> list[tuple[str, str]]:
+    count, camera = len(source), source.camera
+    span_s = source.timestamp_s(count - 1) - first.timestamp_s
+    rate = f"{(count - 1) / span_s:.1f} per second, {span_s:.1f} s" if span_s > 0 else "no times"
+    return [
+        ("frames", f"{count}, {rate}"),
+        ("size", f"{camera.width}×{camera.height} pixels"),
+        ("camera", f"fx {camera.fx:.1f}, fy {camera.fy:.1f}, cx {camera.cx:.1f}, cy {camera.cy:.1f} pixels"),
+    ]
+
+
+def _depth_rows(source: Source, frames: list[Frame], settings: InputConfig) -> list[tuple[str, str]]:
+    unit = f"{source.depth_units_per_metre:g} per metre" if source.depth_units_per_metre else "metres"
+    readings = np.concatenate([frame.depth_m[frame.depth_m > 0] for frame in frames])
+    if not len(readings):
+        return [("depth", "no depth reading in the sampled frames")]
+    low, middle, high = np.percentile(readings, (1, 50, 99))
+    scale = source.scene_scale
+    used = ((readings >= settings.min_depth_m * scale) & (readings <= settings.max_depth_m * scale)).mean()
+    return [
+        ("depth unit", "arbitrary: a network predicted depth" if source.predicted_depth else unit),
+        ("depth", f"{low:.2f} to {high:.2f} m, median {middle:.2f} m; {used:.0%} within the limits of the run"),
+        ("without depth", f"{_holes(frames):.0%} of the pixels"),
+        ("depth camera", _depth_camera(source, settings)),
+        *_scale_question(middle, settings),
+    ]
+
+
+def _noise_row(source: Source, noise: SensorNoise | None, sensor: str) -> str:
+    """Describe the noise of depth, if it was measured."""
+    if noise is not None:
+        return noise.row(sensor)
+    return "not measured: depth is predicted" if source.predicted_depth else "unknown: too few flat surfaces"
+
+
+def _imu_rows(frames: list[Frame]) -> list[tuple[str, str]]:
+    """Return how many of the sampled frames have values of a gyroscope and of an accelerometer, no row if none has."""
+    measured = {
+        "gyroscope": sum(frame.R_inertial_camera is not None for frame in frames),
+        "accelerometer": sum(frame.specific_force_m_s2 is not None for frame in frames),
+    }
+    return [(name, f"measured {n} of {len(frames)} sampled frames") for name, n in measured.items() if n]
+
+
+def _depth_camera(source: Source, settings: InputConfig) -> str:
+    """Describe whether depth is in the pixels of the colour camera."""
+    if source.depth_registered:
+        return "separate; SigmaSplat registers depth to colour"
+    if source.registrable and settings.register_depth == "off":
+        return "separate; depth is not registered (--register-depth off)"
+    return "same as colour, according to the recording"
+
+
+def _scale_question(middle_m: float, settings: InputConfig) -> list[tuple[str, str]]:
+    """Return a question about the median depth if the user gave a depth scale, else no row."""
+    if not settings.depth_scale:
+        return []
+    return [("your depth scale", f"it gives a median depth of {middle_m:.2f} m: is this plausible?")]
+
+
+def _holes(frames: list[Frame]) -> float:
+    return float(np.mean([(frame.depth_m == 0).mean() for frame in frames]))
+
+
+def _depth_warnings(source: Source, frames: list[Frame], settings: InputConfig) -> list[str]:
+    warnings = _warnings_of_one(depth_warning(source))
+    if _holes(frames) > MANY_HOLES:
+        warnings.append(f"{_holes(frames):.0%} of the pixels have no depth; the map will have holes")
+    max_depth_m = settings.max_depth_m * source.scene_scale
+    beyond = np.mean([(frame.depth_m > max_depth_m).mean() for frame in frames])
+    if beyond > 0.2:
+        warnings.append(
+            f"{beyond:.0%} of the pixels are beyond {max_depth_m:g} m and are not used; "
+            "to use them: --set input.max_depth_m=METRES"
+        )
+    return warnings
+
+
+def _registration_warnings(source: Source, agreement: EdgeAgreement | None) -> list[str]:
+    if agreement is None or agreement.registered:
+        return []
+    remedy = (
+        "--register-depth on registers it"
+        if source.registrable and not source.depth_registered
+        else "give depth_camera and T_color_depth in calibration.json, or correct them"
+    )
+    return [f"depth is not registered to colour ({agreement.sentence()}); {remedy}"]
+
+
+def _brightness_warnings(frames: list[Frame]) -> list[str]:
+    brightness = np.array([frame.color.mean() for frame in frames])
+    change = float(np.ptp(brightness) / max(float(brightness.mean()), 1e-6))
+    steps = np.abs(np.diff(brightness)) / max(float(brightness.mean()), 1e-6)
+    if len(steps) and float(np.median(steps)) > MAX_BRIGHTNESS_STEP:
+        return [f"brightness changes by {change:.0%}; if exposure is automatic: --set tracking.exposure=true"]
+    return []
+
+
+def _suggested(format_name: str) -> str:
+    """Return the default preset, and the presets with the settings of the papers for this data set."""
+    data_set = format_name.lower().replace("++", "pp")
+    papers = [name for name in list_presets() if name.endswith(f"-{data_set}") and name.count("-") == 1]
+    return default_preset() + (f" (settings of the papers, slow on CPUs: {', '.join(papers)})" if papers else "")
+
+
+def _sheet(frames: list[Frame]) -> Image.Image:
+    """Draw colour, depth, and the image with depth outlines, one column per frame."""
+    chosen = [frames[int(k)] for k in np.linspace(0, len(frames) - 1, min(SHOWN, len(frames))).round()]
+    depths = np.concatenate([frame.depth_m.reshape(-1) for frame in chosen])
+    low, high = colormap.value_range(depths, depths > 0)
+    columns = [
+        contact_sheet.SheetColumn(
+            f"{frame.timestamp_s:.2f} s",
+            (
+                (frame.color * 255.0).round().astype(np.uint8),
+                colormap.apply_masked(frame.depth_m, frame.depth_m > 0, low, high, colormap.VIRIDIS),
+                overlay(frame),
+            ),
+        )
+        for frame in chosen
+    ]
+    return contact_sheet.draw_contact_sheet(
+        columns, ("colour", f"depth, {low:.2f} to {high:.2f} m", "depth outlines on the image")
+    )

@@ -1,0 +1,225 @@
+"""Fetch a file over HTTP, with resume and retries; the file gets its final name only when it is complete."""
+
+import http.client
+import socket
+import ssl
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Callable
+from dataclasses import dataclass
+from email.message import Message
+from pathlib import Path
+from typing import TYPE_CHECKING
+from urllib.parse import urlsplit
+
+from sigmasplat.errors import DownloadError
+from sigmasplat.plugins.download.partial import PartialFile, RemoteVersion, open_partial
+
+if TYPE_CHECKING:
+    from sigmasplat.types import Progress
+
+CHUNK_BYTES = 2**18
+RETRIED_CODES = {408, 425, 429, 500, 502, 503, 504}
+RANGE_NOT_SATISFIABLE = 416
+CheckSize = Callable[[int | None, int], None]
+"""Called with the size from the server (None: unknown) and the bytes already here; raises to refuse the download."""
+
+
+@dataclass(frozen=True)
+class RetryPolicy:
+    """How long to wait for the server, and how often to retry.
+
+    timeout_s: limit on the time without an answer, or with fewer than `min_bytes_per_s`; max_attempts: limit on
+    consecutive attempts that gain less than `progress_bytes`; first_wait_s: wait before a retry, doubled up to
+    max_wait_s.
+    """
+
+    timeout_s: float = 30.0
+    min_bytes_per_s: float = 500.0
+    max_attempts: int = 6
+    progress_bytes: int = 2**20
+    first_wait_s: float = 1.0
+    max_wait_s: float = 30.0
+
+
+class _TransferError(Exception):
+    """A failed attempt that can be retried. hopeless: do not retry before any byte has arrived (no network, no such
+    host)."""
+
+    def __init__(self, why: str, wait_s: float = 0.0, hopeless: bool = False) -> None:
+        super().__init__(why)
+        self.wait_s, self.hopeless = wait_s, hopeless
+
+
+def fetch(url: str, target: Path, progress: "Progress", check_size: CheckSize, retry: RetryPolicy) -> None:
+    """Download `url` to `target`; resume from `target`.part if an earlier call left one.
+
+    The part downloaded so far is kept on Ctrl-C and on every error. Raises DownloadError.
+    """
+    with open_partial(target) as part:
+        failures = 0
+        while True:
+            before = part.size_bytes
+            try:
+                _continue(url, part, progress, check_size, retry)
+                break
+            except _TransferError as broken:
+                gained = part.size_bytes - before
+                failures = 0 if gained >= retry.progress_bytes else failures + 1
+                if failures >= retry.max_attempts or (broken.hopeless and not part.size_bytes):
+                    raise DownloadError(f"{broken}{_resume_hint(part)}") from broken
+                time.sleep(_wait_s(failures, broken.wait_s, retry))
+        part.finish()
+
+
+def _resume_hint(part: PartialFile) -> str:
+    return f"; {part.size_bytes:,} bytes are kept, run it again to resume" if part.size_bytes else ""
+
+
+def _wait_s(failures: int, requested_s: float, retry: RetryPolicy) -> float:
+    waited = retry.first_wait_s * 2.0 ** max(failures - 1, 0)
+    return min(max(waited, requested_s), retry.max_wait_s)
+
+
+def _continue(url: str, part: PartialFile, progress: "Progress", check_size: CheckSize, retry: RetryPolicy) -> None:
+    """Request the missing bytes and write them. Raises _Broken if not all of it comes."""
+    version = part.version_of(url)
+    if version and version.size_bytes == part.size_bytes:
+        return
+    with _request(url, version, part, retry) as response:
+        size_bytes = _prepare(url, response, part, version)
+        check_size(size_bytes, part.size_bytes)
+        _receive(response, part, size_bytes, progress, retry)
+    if size_bytes is not None and part.size_bytes != size_bytes:
+        if part.size_bytes > size_bytes:
+            part.restart()
+        raise _TransferError(f"{_host(url)} closed the connection after {part.size_bytes:,} of {size_bytes:,} bytes")
+
+
+def _request(
+    url: str, version: RemoteVersion | None, part: PartialFile, retry: RetryPolicy
+) -> http.client.HTTPResponse:
+    """Send the request; return the response before its body is read."""
+    headers = {"User-Agent": "sigmasplat", "Accept-Encoding": "identity"}
+    if version and part.size_bytes:
+        headers["Range"] = f"bytes={part.size_bytes}-"
+        if version.version:
+            headers["If-Range"] = version.version
+    request = urllib.request.Request(url, headers=headers)
+    try:
+        opener = urllib.request.build_opener(_SafeRedirect())
+        response: http.client.HTTPResponse = opener.open(request, timeout=retry.timeout_s)
+        return response
+    except urllib.error.HTTPError as refusal:
+        with refusal:
+            raise _http_error(url, refusal, part) from refusal
+    except urllib.error.URLError as problem:
+        raise _connection_error(url, problem.reason) from problem
+    except (OSError, http.client.HTTPException) as problem:
+        raise _TransferError(f"{_host(url)} does not answer properly ({problem!r})") from problem
+
+
+def _http_error(url: str, refusal: urllib.error.HTTPError, part: PartialFile) -> Exception:
+    why = f"HTTP {refusal.code} {refusal.reason}".rstrip()
+    if refusal.code == RANGE_NOT_SATISFIABLE and part.size_bytes:
+        part.restart()
+        return _TransferError(f"{url}: {why}")
+    if refusal.code in RETRIED_CODES:
+        after = refusal.headers.get("Retry-After", "")
+        return _TransferError(
+            f"{_host(url)} is busy or out of service ({why}); try later", float(after) if after.isdigit() else 0
+        )
+    return DownloadError(f"{url} is not available ({why}); it may have moved or require a login")
+
+
+def _connection_error(url: str, reason: object) -> Exception:
+    host = _host(url)
+    if isinstance(reason, ssl.SSLCertVerificationError):
+        return DownloadError(f"the certificate of {host} is not trusted ({reason.verify_message}); check the clock")
+    if isinstance(reason, socket.gaierror):
+        return _TransferError(f"cannot find {host} ({reason.strerror}); is this machine online?", hopeless=True)
+    if isinstance(reason, TimeoutError):
+        why = f"{host} does not answer; is this machine online, does it need a proxy (https_proxy)?"
+        return _TransferError(why, hopeless=True)
+    return _TransferError(f"cannot connect to {host} ({reason}); is this machine online?", hopeless=True)
+
+
+def _prepare(
+    url: str, response: http.client.HTTPResponse, part: PartialFile, version: RemoteVersion | None
+) -> int | None:
+    """Prepare `part` for the body; return the size of the whole file, None if the server does not send it."""
+    headers = response.headers
+    if headers.get_content_type() == "text/html":
+        raise DownloadError(f"{_host(url)} answers with a web page, not the file; is there a login page in between?")
+    if response.status == http.client.PARTIAL_CONTENT and version and part.size_bytes:
+        start, size_bytes = _content_range(headers.get("Content-Range", ""))
+        if start == part.size_bytes and size_bytes in (None, version.size_bytes):
+            return version.size_bytes
+        part.restart()
+        raise _TransferError(f"{_host(url)} sent another part of the file than requested")
+    part.restart()
+    length = headers.get("Content-Length", "")
+    if not length.isdigit() and not response.chunked:  # the end would look like a broken connection
+        raise DownloadError(
+            f"{_host(url)} does not send the length of the file, so a complete download could not be recognised"
+        )
+    size_bytes = int(length) if length.isdigit() else None
+    part.begin(RemoteVersion(url, _version(headers), size_bytes))
+    return size_bytes
+
+
+def _version(headers: Message) -> str:
+    """Return the value for If-Range: a strong ETag, or the date."""
+    etag = str(headers.get("ETag", ""))
+    return etag if etag.startswith('"') else str(headers.get("Last-Modified", ""))
+
+
+def _content_range(value: str) -> tuple[int, int | None]:
+    """Parse "bytes 10-99/100": first byte and total size; (-1, None) for any other format."""
+    unit, _, rest = value.partition(" ")
+    span, _, size = rest.partition("/")
+    start = span.partition("-")[0]
+    if unit != "bytes" or not start.isdigit():
+        return -1, None
+    return int(start), int(size) if size.isdigit() else None
+
+
+def _receive(
+    response: http.client.HTTPResponse,
+    part: PartialFile,
+    size_bytes: int | None,
+    progress: "Progress",
+    retry: RetryPolicy,
+) -> None:
+    """Write the body as it arrives. Raises _TransferError if the connection fails or is too slow."""
+    host = response.geturl()
+    since_s, since_bytes = time.monotonic(), part.size_bytes
+    while True:
+        try:
+            chunk = response.read1(CHUNK_BYTES)
+        except (OSError, http.client.HTTPException) as problem:
+            raise _TransferError(f"the connection to {_host(host)} broke ({problem!r})") from problem
+        if not chunk:
+            return
+        part.add(chunk)
+        progress(part.size_bytes, size_bytes or 0)
+        passed_s = time.monotonic() - since_s
+        if passed_s >= retry.timeout_s:
+            if part.size_bytes - since_bytes < retry.min_bytes_per_s * passed_s:
+                raise _TransferError(f"{_host(host)} sends too slowly")
+            since_s, since_bytes = time.monotonic(), part.size_bytes
+
+
+class _SafeRedirect(urllib.request.HTTPRedirectHandler):
+    """Follow redirects, but not from https to an address without encryption."""
+
+    def redirect_request(self, req, fp, code, msg, headers, newurl):  # type: ignore[no-untyped-def]
+        """Return the redirected request. Raises DownloadError if it leaves https."""
+        if urlsplit(newurl).scheme not in {"https", urlsplit(req.full_url).scheme}:
+            raise DownloadError(f"{_host(req.full_url)} redirects to {newurl}, which is not https; not followed")
+        return super().redirect_request(req, fp, code, msg, headers, newurl)
+
+
+def _host(url: str) -> str:
+    return urlsplit(url).hostname or url

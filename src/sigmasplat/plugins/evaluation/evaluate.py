@@ -1,0 +1,301 @@
+"""Score a finished run; only this folder reads ground truth. Writes metrics.json, images/ and report.html."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sigmasplat.config import Config, FinalConfig
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.field import GaussianField
+from sigmasplat.data.mesh import Mesh
+from sigmasplat.data.selection import evenly_spread
+from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.errors import RunError
+from sigmasplat.input.source import Source
+from sigmasplat.plugins.evaluation import reconstruct
+from sigmasplat.plugins.evaluation.frame_states import score_states
+from sigmasplat.plugins.evaluation.metrics import views
+from sigmasplat.plugins.evaluation.metrics.lpips import Lpips
+from sigmasplat.plugins.evaluation.metrics.published_reconstruction import VIEWS
+from sigmasplat.plugins.evaluation.metrics.trajectory import aligned_truth, score_path, truth_in_estimate
+from sigmasplat.plugins.evaluation.moving_views import show_moving
+from sigmasplat.plugins.evaluation.path_scores import arbitrary_scale, in_metres, in_units_of_run, score_frame_sets
+from sigmasplat.plugins.evaluation.pose_covariance import score_pose_covariance
+from sigmasplat.plugins.evaluation.report import charts
+from sigmasplat.plugins.evaluation.report.page import report_plan, write_charts, write_page
+from sigmasplat.plugins.evaluation.report.view_strips import ViewStrips
+from sigmasplat.plugins.evaluation.view_scoring import ViewScoring, refined_fx, score_full_resolution, score_test_views
+from sigmasplat.render import FieldRenderer
+from sigmasplat.render.low_pass import as_refined
+from sigmasplat.render.predictive import Predicted, predict
+from sigmasplat.run_folder.frames import RunFrames
+from sigmasplat.run_folder.run_values import frame_seconds
+from sigmasplat.run_folder.runs import TRUTH, RunFolder
+from sigmasplat.run_folder.trajectory import write_trajectory
+from sigmasplat.types import Progress, no_progress
+
+Log = list[dict[str, Any]]
+
+
+def evaluate(
+    run: RunFolder,
+    source: Source,
+    *,
+    renderer: views.Renderer | None = None,
+    views_per_kind: int = 40,
+    strips_per_kind: int = 3,
+    mesh: bool = False,
+    true_mesh: Mesh | None = None,
+    random_views: int = VIEWS,
+    full_resolution: bool = False,
+    fill_gaps_m: float = 0.0,
+    lpips: Lpips | None = None,
+    progress: Progress = no_progress,
+) -> dict[str, Any]:
+    """Score trajectory, map and uncertainty of a run against its source, and return the metrics written.
+
+    Path and views are scored on the frames whose pose is believed: those of trajectory.txt, without lost frames.
+    Training views are the run's keyframes; held-out views are the frames that no map was fitted to. At most
+    `views_per_kind` of each are scored, evenly spread. They are rendered from the final map at the estimated poses and
+    the run's working resolution, with `renderer` or the run's render settings. If the run kept its submaps, each view
+    is also rendered from the submap of its frame. If the run has uncertainty.json and no `renderer` is given, the
+    predictive variances are scored too. LPIPS needs its network. With `full_resolution` the views are also scored at
+    the size of the recording, else at that of the final map's last stage. Calls `progress(done, total)` with views.
+    With `mesh` the keyframes are fused into mesh.ply, which is scored against `true_mesh`, in the world frame of the
+    truth, or the source's true surface, with `random_views` for its depth, and also with gaps up to `fill_gaps_m`
+    closed. Raises RunError if the run stopped before it had a map; SourceError if truth and run share no timestamps,
+    after everything else has been written.
+    """
+    frames, field = _read_frames(run), run.read_map()
+    records, log = frames.log, frames.posed_log()
+    truth, scale = _truth(run, frames, source) if log else (None, None)  # without a believed pose nothing is aligned
+    path_scores, problem = score_path(frames.path, _believed_odometry(run, frames), truth)
+    known = None if problem else truth
+    chosen = {kind: evenly_spread(views, views_per_kind) for kind, views in _kinds(log).items()}
+    strips, config = ViewStrips(run, strips_per_kind), run.config()
+    fx, aligned = refined_fx(config, source.camera), _alignment(frames, known)
+    standard, renderer = renderer is None, renderer or FieldRenderer(config.render, config.backend, (field, fx))
+    maps = _map_sources(run, field, records, config.final)
+    maps, predictions = _predicting(maps, run, frames, config, fx) if standard else (maps, views.PredictionScores())
+    scoring = ViewScoring(source, config.input, maps, chosen, renderer, views_per_kind, aligned, lpips)
+    metrics = _facts(run, source, records, field) | score_states(run, frames, known)
+    metrics |= in_metres(path_scores | score_frame_sets(run, frames, known), scale) | {"path_scale": scale}
+    metrics |= _score_views(scoring, config.final, predictions, strips, progress)
+    metrics |= {"lpips_network": lpips.net if lpips else None, "reconstruction": None, "reconstruction_published": None}
+    metrics["full_resolution"] = score_full_resolution(scoring, config, full_resolution, progress)
+    if mesh:
+        surface = None if scale else true_mesh or reconstruct.known_surface(source)  # it is in metres
+        how = surface, known, random_views, fill_gaps_m, renderer, progress
+        metrics |= reconstruct.fuse_and_score(run, source.camera, *how)
+    metrics["pose_covariance"] = score_pose_covariance(run, frames, known)
+    metrics["calibration"] = _calibration(run) if standard else None
+    metrics["test_views"] = None if scale else score_test_views(scoring, config.input, strips)
+    show_moving(strips, source, config.input, run.submaps, records)
+    run.write_metrics(metrics)
+    plan = report_plan(run, frames.path, source.camera) if standard else None
+    write_page(run, metrics, strips.figures, _draw_plots(run, frames, known), [str(problem)] if problem else [], plan)
+    if problem:
+        raise problem
+    return metrics
+
+
+def _read_frames(run: RunFolder) -> RunFrames:
+    """Read the frames of a run. Raises RunError if it has none, or if its log and its path do not match."""
+    records, path = run.read_log(), run.read_trajectory()
+    if not records:
+        raise RunError(f"run {run.path} stopped before its first frame: its log.jsonl is empty; run it again")
+    frames = RunFrames.of(records, path)
+    if len(path) and not len(frames.rows):
+        raise RunError(f"run {run.path}: trajectory.txt and log.jsonl share no timestamps; do they belong to one run?")
+    return frames
+
+
+def _truth(run: RunFolder, frames: RunFrames, source: Source) -> tuple[Trajectory | None, float | None]:
+    """Return the true path in the units of the run, and the run's unit in metres if it is arbitrary."""
+    truth = source.truth()
+    scale = arbitrary_scale(run, frames.path, truth)
+    return None if truth is None else in_units_of_run(truth, scale), scale
+
+
+def _alignment(frames: RunFrames, truth: Trajectory | None) -> NDArray[np.float64] | None:
+    """Return T_estimate_truth [4, 4], the alignment of the ATE; None without a truth."""
+    path = frames.path
+    return None if truth is None else truth_in_estimate(path.timestamps_s, path.T_world_camera[:, :3, 3], truth)
+
+
+def _anchors(run: RunFolder, records: Log, final: FinalConfig) -> NDArray[np.float64] | None:
+    """Return T_world_submap [S, 4, 4] if the run kept the submaps of all its frames, else None.
+
+    Returns None too if there is one submap and the final map is an unchanged copy of it.
+    """
+    count = _submaps(records)
+    if len(run.submaps) != count or (count == 1 and final.seed_from == "submaps" and not final.iterations):
+        return None
+    anchors = run.read_checkpoint()[0].get("T_world_submap")
+    return None if anchors is None or len(anchors) != count else np.asarray(anchors, np.float64)
+
+
+def _map_sources(run: RunFolder, field: GaussianField, records: Log, final: FinalConfig) -> views.MapSources:
+    """Return the final map and the submaps, with the poses of the frames in them and the exposures of the frames, if
+    the checkpoint has these."""
+    anchors = _anchors(run, records, final)
+    saved = run.read_checkpoint()[0] if (run.path / "checkpoint.safetensors").is_file() else {}
+    poses, exposures = (
+        np.asarray(saved[name], np.float64) if len(saved.get(name, ())) == len(records) else None
+        for name in ("T_submap_camera", "exposure")
+    )
+    poses = None if anchors is None else poses
+    return views.MapSources(field, run.submaps, anchors, T_submap_camera=poses, exposures=exposures)
+
+
+def _predicting(
+    maps: views.MapSources, run: RunFolder, frames: RunFrames, config: Config, fx: float | None
+) -> tuple[views.MapSources, views.PredictionScores]:
+    """Add the prediction of errors to the maps if the run measured how sure its map is; fx: `refined_fx`. Raises
+    RunError if that belongs to another map."""
+    known, field = run.read_uncertainty(), maps.final
+    if known is None:
+        return maps, views.PredictionScores()
+    if len(known.splats) != len(field):
+        raise RunError(
+            f"uncertainty.safetensors of run {run.path} has {len(known.splats)} splats, map.ply has {len(field)}; "
+            "delete uncertainty.json to evaluate without it"
+        )
+
+    def predict_view(camera: Camera, T_camera_world: NDArray[np.float64]) -> Predicted:
+        options = as_refined(config.render, camera, fx)
+        return predict(field, known, camera, T_camera_world, options, config.backend)
+
+    return replace(maps, predict=predict_view), views.PredictionScores(_probe_frames(run, frames))
+
+
+def _calibration(run: RunFolder) -> dict[str, Any] | None:
+    """Return the number of probe views, the fitted weights and the temperatures of the predicted variances; None if
+    not measured."""
+    known = run.read_uncertainty()
+    if known is None:
+        return None
+    return {"probes": known.probes} | {name: dict(of) for name, of in vars(known.calibration).items()}
+
+
+def _probe_frames(run: RunFolder, frames: RunFrames) -> frozenset[int]:
+    """Return the numbers, in the source, of the frames that the predictive variances were calibrated on."""
+    rows = [row for index in range(len(run.submaps)) for row in run.submaps.load(index).probe_frames]
+    return frozenset(frames.log[row]["index"] for row in rows if 0 <= row < len(frames))
+
+
+def _submaps(log: Log) -> int:
+    """Count submaps; the log of an old version does not name any, which counts as one."""
+    return 1 + max(int(record.get("submap", 0)) for record in log)
+
+
+def _believed_odometry(run: RunFolder, frames: RunFrames) -> Trajectory | None:
+    """Return the path of tracking alone at the believed frames; None if the run has no such path or no loop."""
+    odometry = run.read_odometry()
+    return None if odometry is None else odometry.at(frames.rows[frames.rows < len(odometry)])
+
+
+def _kinds(log: Log) -> dict[str, Log]:
+    """Split the frames by whether a map was fitted to them."""
+    return {
+        "held-out": [record for record in log if not record["is_keyframe"]],
+        "training": [record for record in log if record["is_keyframe"]],
+    }
+
+
+def _score_views(
+    scoring: ViewScoring, final: FinalConfig, predictions: views.PredictionScores, strips: ViewStrips,
+    progress: Progress,
+) -> dict[str, Any]:  # fmt: skip
+    """Render the chosen views from the final map and from their submaps; average scores per kind and map; judge V and
+    the predictive variances. V is judged on held-out views, or on training views if every frame was mapped.
+    """
+    chosen, maps = scoring.chosen, scoring.maps
+    judged_on = "held-out" if chosen["held-out"] else "training"
+    scores = {kind: views.ViewScores(kind == judged_on, scoring.lpips) for kind in chosen}
+    before = {kind: views.ViewScores(kind == judged_on, scoring.lpips) for kind in chosen}
+    shown = {(kind, r["index"]) for kind, records in chosen.items() for r in evenly_spread(records, strips.per_kind)}
+    for done, (view, in_submap) in enumerate(scoring.rendered(scoring.input), 1):
+        scores[view.kind].add(view)
+        predictions.add(view)
+        if (view.kind, view.index) in shown:
+            strips.add(view)
+        if in_submap:
+            before[view.kind].add(in_submap)
+            if view.kind == "held-out" and (view.kind, view.index) in shown:
+                strips.add(in_submap, ", in their submaps")
+        progress(done, scoring.count)
+    kept = maps.T_world_submap is not None
+    judged, judged_before = (views.score_uncertainty(found[judged_on].samples, judged_on) for found in (scores, before))
+    return views.kind_scores(scores, before, maps) | {
+        "uncertainty": judged_before if kept else judged,
+        "uncertainty_final": judged if kept and _keeps_variance(final) else None,
+        "predictive": predictions.scores(),
+    }
+
+
+def _keeps_variance(final: FinalConfig) -> bool:
+    """Return whether σ² of the final map is valid: still learned during refinement, or taken over from the submaps."""
+    return final.uncertainty if final.iterations else final.seed_from == "submaps"
+
+
+def _facts(run: RunFolder, source: Source, log: Log, field: GaussianField) -> dict[str, Any]:
+    """Return counts, size and speed of the run."""
+    loops = run.read_loops()
+    return {
+        "source": source.name,
+        "status": run.facts().get("status"),
+        "frames": len(log),
+        "keyframes": sum(bool(record["is_keyframe"]) for record in log),
+        "skipped": run.facts().get("skipped", list(source.skipped)),
+        "splats": len(field),
+        "map_bytes": run.map_bytes(),
+        "frames_per_s": _frames_per_s(run, log),
+        "worst_frame_s": _worst_frame_s(log),
+        "submaps": _submaps(log),
+        "onto": (run.facts().get("onto") or {}).get("run"),
+        "loops": {"tried": len(loops), "accepted": sum(bool(loop.get("accepted")) for loop in loops)},
+        "finish_s": run.facts().get("finish_s"),
+        "final_steps": run.facts().get("final_steps"),
+        "total_s": _total_s(run),
+    }
+
+
+def _frames_per_s(run: RunFolder, log: Log) -> float | None:
+    """Return the end-to-end speed: from wall_s of run.json if it exists, else from the sum of the frames' times."""
+    seconds = run.facts().get("wall_s") or sum(frame_seconds(record) for record in log)
+    return len(log) / seconds if seconds else None
+
+
+def _total_s(run: RunFolder) -> float | None:
+    """Return the seconds of all frames plus the final map, or None if run.json does not have both."""
+    frames_s, finish_s = (run.facts().get(key) for key in ("wall_s", "finish_s"))
+    return None if frames_s is None or finish_s is None else float(frames_s + finish_s)
+
+
+def _worst_frame_s(log: Log) -> float | None:
+    """Return the longest time of a frame except the first, which creates the map; None if no frame was timed."""
+    return max(map(frame_seconds, log[1:]), default=0.0) or None
+
+
+def _draw_plots(run: RunFolder, frames: RunFrames, truth: Trajectory | None) -> dict[str, str]:
+    """Draw the charts of path, states, submaps and times, and write truth.txt; return the captions by name."""
+    times, estimate = frames.path.timestamps_s, frames.path.T_world_camera[:, :3, 3]
+    known: NDArray[np.float64] | None = None
+    aligned: Trajectory | None = None
+    if truth is not None:
+        rows, aligned = aligned_truth(times, estimate, truth)
+        known = np.full_like(estimate, np.nan)
+        known[rows] = aligned.T_world_camera[:, :3, 3]
+    _write_truth(run, aligned)
+    return write_charts(run, charts.run_charts(frames, known, run.read_loops()))
+
+
+def _write_truth(run: RunFolder, aligned: Trajectory | None) -> None:
+    """Write truth.txt for the viewer and exports; delete an old one if the truth is not known."""
+    if aligned is None:
+        (run.path / TRUTH).unlink(missing_ok=True)
+    else:
+        write_trajectory(run.path / TRUTH, aligned)

@@ -1,0 +1,201 @@
+"""Score a trajectory against the truth: absolute error (ATE) after a rigid alignment, and relative error (RPE)."""
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sigmasplat.data import se3
+from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.errors import SourceError
+from sigmasplat.types import Matrix
+
+Rows = NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class AbsoluteError:
+    """Distances between aligned positions, metres, over `pairs` poses."""
+
+    rmse_m: float
+    mean_m: float
+    median_m: float
+    max_m: float
+    pairs: int
+
+
+@dataclass(frozen=True)
+class RelativeError:
+    """Error of the motion over `delta_frames` frames, metres and degrees: root mean square over `pairs` motions."""
+
+    translation_rmse_m: float
+    rotation_rmse_deg: float
+    pairs: int
+    delta_frames: int
+
+
+def align_rigid(estimate: Matrix, truth: Matrix) -> Matrix:
+    """Fit T_truth_estimate [4, 4] that maps positions `estimate` [N, 3] to `truth` [N, 3], by least squares.
+
+    Closed form without scale: the rotation comes from the SVD of the cross-covariance (Umeyama 1991, eq. 40–42, c = 1).
+    """
+    centre_estimate, centre_truth = estimate.mean(0), truth.mean(0)
+    covariance = (truth - centre_truth).T @ (estimate - centre_estimate)
+    u, _, vt = np.linalg.svd(covariance)
+    R = u @ np.diag([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)]) @ vt
+    T = np.eye(4)
+    T[:3, :3] = R
+    T[:3, 3] = centre_truth - R @ centre_estimate
+    return T
+
+
+def align_similarity(estimate: Matrix, truth: Matrix) -> tuple[float, Matrix]:
+    """Fit the scale c and T [4, 4] that map positions `estimate` [N, 3], times c, to `truth`, by least squares (Umeyama
+    1991, eq. 40–42): for paths whose scale is arbitrary. c is 1 if the estimate does not move."""
+    T = align_rigid(estimate, truth)
+    centred = estimate - estimate.mean(0)
+    square = float((centred**2).sum())
+    c = float(((centred @ T[:3, :3].T) * (truth - truth.mean(0))).sum()) / square if square > 0 else 1.0
+    T[:3, 3] = truth.mean(0) - c * T[:3, :3] @ estimate.mean(0)
+    return c, T
+
+
+def aligned_truth(times_s: Matrix, estimate: Matrix, truth: Trajectory) -> tuple[Rows, Trajectory]:
+    """Return the rows of the frames with a true pose, and their true poses in the world of the estimate.
+
+    The rigid alignment is that of the ATE. times_s [N], s, and estimate [N, 3], m: of all frames.
+    """
+    rows, truth_rows = associate(times_s, truth.timestamps_s)
+    T_estimate_truth = truth_in_estimate(times_s, estimate, truth)
+    return rows, Trajectory(times_s[rows], T_estimate_truth @ truth.T_world_camera[truth_rows])
+
+
+def aligned_poses(T_truth_camera: Matrix, T_estimate_camera: Matrix) -> Matrix:
+    """Return T_estimate_truth [4, 4] from poses [K, 4, 4] of the same frames: the mean rotation, and the mean shift.
+
+    The alignment of the ATE uses positions only. On a short or straight path they do not fix the rotation, which would
+    move views and surfaces by more than their errors.
+    """
+    rotations = T_estimate_camera[:, :3, :3] @ T_truth_camera[:, :3, :3].swapaxes(1, 2)
+    u, _, vt = np.linalg.svd(rotations.sum(0))
+    found = np.eye(4)
+    found[:3, :3] = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    found[:3, 3] = (T_estimate_camera[:, :3, 3] - T_truth_camera[:, :3, 3] @ found[:3, :3].T).mean(0)
+    return found
+
+
+def truth_in_estimate(times_s: Matrix, estimate: Matrix, truth: Trajectory) -> Matrix:
+    """Return T_estimate_truth [4, 4], the rigid alignment of the ATE: true positions to estimated ones [N, 3], m."""
+    rows, truth_rows = associate(times_s, truth.timestamps_s)
+    return align_rigid(truth.T_world_camera[truth_rows, :3, 3], estimate[rows])
+
+
+def associate(times_a_s: Matrix, times_b_s: Matrix, max_difference_s: float = 0.02) -> tuple[Rows, Rows]:
+    """Pair timestamps that are mutual nearest neighbours and differ by at most `max_difference_s`: rows of a and of b.
+
+    Pairs are one-to-one. If a low-rate truth paired one pose with two frames, the RPE would see no motion there.
+    """
+    if not len(times_a_s) or not len(times_b_s):
+        return np.empty(0, np.intp), np.empty(0, np.intp)
+    nearest_b = _nearest(times_a_s, times_b_s)
+    nearest_a = _nearest(times_b_s, times_a_s)
+    rows_a = np.arange(len(times_a_s))
+    mutual = nearest_a[nearest_b] == rows_a
+    close = np.abs(times_a_s - times_b_s[nearest_b]) <= max_difference_s
+    chosen = rows_a[mutual & close]
+    return chosen, nearest_b[chosen]
+
+
+def _nearest(wanted: Matrix, among: Matrix) -> Rows:
+    """Return for each value of `wanted` the row of the nearest value of `among` (unsorted; a tie takes the earlier)."""
+    order = np.argsort(among, kind="stable")
+    ordered = among[order]
+    right = np.clip(np.searchsorted(ordered, wanted), 1, max(len(among) - 1, 1))
+    left = right - 1
+    right = np.minimum(right, len(among) - 1)
+    nearer_right = np.abs(ordered[right] - wanted) < np.abs(ordered[left] - wanted)
+    return order[np.where(nearer_right, right, left)]
+
+
+def pair_poses(estimate: Trajectory, truth: Trajectory, max_difference_s: float = 0.02) -> tuple[Matrix, Matrix]:
+    """Return T_world_camera of both trajectories [M, 4, 4] at shared timestamps, in the order of the estimate.
+
+    Raises SourceError if no timestamps agree within `max_difference_s`.
+    """
+    rows, truth_rows = associate(estimate.timestamps_s, truth.timestamps_s, max_difference_s)
+    if not len(rows):
+        raise SourceError(
+            f"estimate and truth share no timestamps within {max_difference_s} s: {_span(estimate)} against "
+            f"{_span(truth)}; are both in seconds, from one clock and one recording?"
+        )
+    return estimate.T_world_camera[rows], truth.T_world_camera[truth_rows]
+
+
+def _span(path: Trajectory) -> str:
+    """Describe the time span of a trajectory."""
+    if not len(path):
+        return "no poses"
+    return f"{path.timestamps_s.min():.3f} … {path.timestamps_s.max():.3f} s ({len(path)} poses)"
+
+
+def ate(estimate: Trajectory, truth: Trajectory, max_difference_s: float = 0.02) -> AbsoluteError:
+    """Measure the absolute trajectory error: position errors after `align_rigid` (Sturm et al. 2012, eq. 3).
+
+    Raises SourceError if no timestamps match.
+    """
+    ours, theirs = pair_poses(estimate, truth, max_difference_s)
+    return absolute_error(ours[:, :3, 3], theirs[:, :3, 3])
+
+
+def absolute_error(estimate: Matrix, truth: Matrix) -> AbsoluteError:
+    """Measure the distances between positions [N, 3], N ≥ 1, after `align_rigid`."""
+    T = align_rigid(estimate, truth)
+    distance = np.linalg.norm(estimate @ T[:3, :3].T + T[:3, 3] - truth, axis=1)
+    return AbsoluteError(
+        _root_mean_square(distance),
+        float(distance.mean()),
+        float(np.median(distance)),
+        float(distance.max()),
+        len(distance),
+    )
+
+
+def rpe(
+    estimate: Trajectory, truth: Trajectory, delta_frames: int = 1, max_difference_s: float = 0.02
+) -> RelativeError:
+    """Measure the relative pose error over `delta_frames` paired frames (Sturm et al. 2012, eq. 1), without alignment.
+
+    With fewer than delta_frames + 1 pairs the errors are nan and pairs = 0. Raises SourceError if no timestamps match.
+    """
+    ours, theirs = pair_poses(estimate, truth, max_difference_s)
+    motion_ours = se3.inverse(ours[:-delta_frames]) @ ours[delta_frames:]
+    motion_theirs = se3.inverse(theirs[:-delta_frames]) @ theirs[delta_frames:]
+    error = se3.inverse(motion_theirs) @ motion_ours
+    angles = np.array([se3.rotation_angle(E[:3, :3]) for E in error])
+    shift = np.linalg.norm(error[:, :3, 3], axis=1)
+    rotation_deg = float(np.degrees(_root_mean_square(angles)))
+    return RelativeError(_root_mean_square(shift), rotation_deg, len(error), delta_frames)
+
+
+def _root_mean_square(values: Matrix) -> float:
+    """Return √mean(x²); nan without values."""
+    return float(np.sqrt(np.mean(values**2))) if len(values) else float("nan")
+
+
+def score_path(
+    path: Trajectory, odometry: Trajectory | None, truth: Trajectory | None
+) -> tuple[dict[str, Any], SourceError | None]:
+    """Return ATE and RPE over all poses, and the ATE of the path without loop closures (`odometry`) if given.
+
+    All scores are None without a truth. If the truth shares no timestamps with the path, the scores are None and the
+    error is returned too.
+    """
+    unknown: dict[str, Any] = {"ate": None, "rpe": None, "ate_odometry": None}
+    if truth is None:
+        return unknown, None
+    try:
+        found = {"ate": asdict(ate(path, truth)), "rpe": asdict(rpe(path, truth))}
+        return unknown | found | ({"ate_odometry": asdict(ate(odometry, truth))} if odometry else {}), None
+    except SourceError as problem:
+        return unknown, problem

@@ -1,0 +1,226 @@
+"""Render many views and summarise their scores: means per kind of view, and scores of V over all sampled pixels."""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from itertools import groupby
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.exposure import exposed
+from sigmasplat.data.field import GaussianField
+from sigmasplat.data.frame import Frame
+from sigmasplat.data.submap import SubmapStore
+from sigmasplat.plugins.evaluation.metrics import uncertainty
+from sigmasplat.plugins.evaluation.metrics.lpips import Lpips
+from sigmasplat.plugins.evaluation.metrics.scored_view import COVERED_ALPHA, PredictedErrors, ScoredView
+from sigmasplat.render import Render
+from sigmasplat.render.predictive import Predicted
+
+Renderer = Callable[[GaussianField, Camera, NDArray[np.float64]], Render]
+"""Renders a field from T_camera_world."""
+Predictor = Callable[[Camera, NDArray[np.float64]], Predicted]
+"""Predicts the variances of a view of the final map from T_camera_world."""
+HELD_OUT = "held-out"
+"""The kind of views that no map was fitted to."""
+PIXELS_PER_VIEW = 20_000
+"""At most this many valid pixels per view, every k-th one, go into the uncertainty scores: sorting stays fast."""
+
+
+@dataclass(eq=False)
+class ViewScores:
+    """Scores of the views of one kind, with LPIPS if given. With `keep_samples`, pixels are sampled to score V over
+    all views."""
+
+    keep_samples: bool
+    lpips: Lpips | None = None
+    rows: list[dict[str, float]] = field(default_factory=list)
+    samples: list[NDArray[np.float32]] = field(default_factory=list)
+
+    def add(self, view: ScoredView) -> None:
+        """Score a view."""
+        self.rows.append(view.scores(self.lpips))
+        if self.keep_samples:
+            self.samples.append(sample_pixels(view))
+
+
+@dataclass(frozen=True, eq=False)
+class MapSources:
+    """The maps that views are rendered from: the final map, and the submaps if T_world_submap [S, 4, 4] is known.
+
+    predict: predicts the variances of views of the final map; None if it was not measured how sure the map is.
+    T_submap_camera [F, 4, 4]: the pose of each frame in its submap, which differs from the pose in the world if the
+    refinement of the final map has moved keyframes; None: it follows from the pose in the world.
+    exposures [F, 3, 2]: those of the frames relative to the final map (`model.exposure`); None: not fitted.
+    """
+
+    final: GaussianField
+    store: SubmapStore
+    T_world_submap: NDArray[np.float64] | None
+    predict: Predictor | None = None
+    T_submap_camera: NDArray[np.float64] | None = None
+    exposures: NDArray[np.float64] | None = None
+
+    def exposure(self, record: Mapping[str, Any]) -> NDArray[np.float64] | None:
+        """Return the exposure [3, 2] of a view relative to the final map; None if exposures are not fitted."""
+        return None if self.exposures is None or "row" not in record else self.exposures[record["row"]]
+
+    def T_camera_submap(self, record: Mapping[str, Any]) -> NDArray[np.float64] | None:
+        """Return the pose [4, 4] of a view that the splats of its submap were fitted to; None if the run kept no
+        submaps."""
+        if self.T_world_submap is None:
+            return None
+        if self.T_submap_camera is not None and "row" in record:
+            return se3.inverse(self.T_submap_camera[record["row"]])
+        T_world_submap = self.T_world_submap[record.get("submap", 0)]
+        return np.asarray(se3.inverse(record["T_world_camera"]) @ T_world_submap)
+
+    def submap(self, index: int) -> GaussianField | None:
+        """Return the splats of a submap in its own frame; None if the run kept no submaps."""
+        return None if self.T_world_submap is None else self.store.load(index).field
+
+
+def render_views(
+    frame_of: Callable[[int], Frame], maps: MapSources, chosen: Mapping[str, list[dict[str, Any]]], renderer: Renderer
+) -> Iterator[tuple[ScoredView, ScoredView | None]]:
+    """Render the chosen records of each kind at their `T_world_camera`, in the final map and, if kept, in their submap.
+
+    `submap` of a record names its submap (default 0). Views are ordered by submap: each submap is loaded once, and only
+    one is in memory. Variances are predicted for held-out views only: the map was fitted to training views, so their
+    errors are smaller.
+    """
+    wanted = [(record.get("submap", 0), kind, record) for kind, records in chosen.items() for record in records]
+    for index, group in groupby(sorted(wanted, key=lambda view: view[0]), key=lambda view: view[0]):
+        submap = maps.submap(index)
+        for _, kind, record in group:
+            frame, T_camera_world = frame_of(record["index"]), se3.inverse(record["T_world_camera"])
+            rendered = renderer(maps.final, frame.camera, T_camera_world)
+            final = scored_view(frame, rendered, kind, exposure=maps.exposure(record))
+            if maps.predict is not None and kind == HELD_OUT:
+                final = replace(final, predicted=predicted_errors(maps.predict(frame.camera, T_camera_world)))
+            before = None
+            T_camera_submap = maps.T_camera_submap(record)
+            if submap is not None and T_camera_submap is not None:
+                rendered = renderer(submap, frame.camera, T_camera_submap)
+                before = scored_view(frame, rendered, kind, (f"in submap {index}",))
+            yield final, before
+
+
+def scored_view(
+    frame: Frame,
+    rendered: Render,
+    kind: str,
+    notes: tuple[str, ...] = (),
+    exposure: NDArray[np.float64] | None = None,
+) -> ScoredView:
+    """Pair a frame with its rendering, in the frame's exposure [3, 2] if given. Depth is Σwz/Σw where the map covers
+    the pixel, else 0."""
+    alpha, neutral = _array(rendered.alpha), np.clip(_array(rendered.color), 0.0, 1.0)
+    shown = neutral if exposure is None else exposed(_array(rendered.color), exposure)
+    depth = np.where(alpha > COVERED_ALPHA, _array(rendered.depth) / np.maximum(alpha, COVERED_ALPHA), 0.0)
+    return ScoredView(
+        frame.index, kind, frame.color, frame.depth_m, shown, depth.astype(np.float32), alpha,
+        _array(rendered.variance), notes, neutral=neutral,
+    )  # fmt: skip
+
+
+def predicted_errors(found: Predicted) -> PredictedErrors:
+    """Return the predictive variances of a view as arrays."""
+    variances = found.color_aleatoric, found.color_epistemic, found.reading_m2, found.depth_epistemic_m2
+    return PredictedErrors(*map(_array, variances))
+
+
+def sample_pixels(view: ScoredView) -> NDArray[np.float32]:
+    """Return (V, squared error, alpha) [3, P] of every k-th pixel with a depth reading, at most `PIXELS_PER_VIEW`."""
+    return _every_kth(np.stack([plane[view.valid] for plane in (view.uncertainty, view.squared_error, view.alpha)]))
+
+
+def mean_scores(rows: list[dict[str, float]]) -> dict[str, Any]:
+    """Average each score over the views that have it; None if no view has it. `views` is the number of views."""
+    columns = {name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else ())}
+    return {"views": len(rows)} | {name: _mean(column) for name, column in columns.items()}
+
+
+def kind_scores(final: Mapping[str, ViewScores], before: Mapping[str, ViewScores], maps: MapSources) -> dict[str, Any]:
+    """Return the mean scores of each kind of views in the final map, and in their submaps (None if they are not
+    kept)."""
+    kept = maps.T_world_submap is not None
+    names = {kind: kind.replace("-", "_") for kind in final}
+    return {name: mean_scores(final[kind].rows) for kind, name in names.items()} | {
+        f"{name}_submaps": mean_scores(before[kind].rows) if kept else None for kind, name in names.items()
+    }
+
+
+def score_uncertainty(samples: list[NDArray[np.float32]], judged_on: str = "held-out") -> dict[str, Any] | None:
+    """Score V against the squared error over all sampled pixels (`uncertainty.score`); None without pixels.
+
+    Adds judged_on (the kind of the views), spearman_covered (only pixels that the map covers) and spearman_per_view
+    (mean of the correlations per view).
+    """
+    if not sum(part.shape[1] for part in samples):
+        return None
+    variance, squared_error, alpha = np.concatenate(samples, axis=1)
+    covered = alpha > COVERED_ALPHA
+    return uncertainty.score(variance, squared_error) | {
+        "judged_on": judged_on,
+        "spearman_covered": uncertainty.spearman(variance[covered], squared_error[covered]),
+        "spearman_per_view": _mean(np.array([uncertainty.spearman(part[0], part[1]) for part in samples])),
+    }
+
+
+@dataclass(eq=False)
+class PredictionScores:
+    """Samples of views with predictive variances, of the pixels that V is scored on: variance and the squared error of
+    each channel, [1 + C, P].
+
+    Frames in `calibrated_on` are left out, because the weights of the parts were fitted to them.
+    """
+
+    calibrated_on: frozenset[int] = frozenset()
+    color: list[NDArray[np.float32]] = field(default_factory=list)
+    depth: list[NDArray[np.float32]] = field(default_factory=list)
+
+    def add(self, view: ScoredView) -> None:
+        """Sample a view if it has predictive variances."""
+        found = view.predicted
+        if found is None or view.index in self.calibrated_on:
+            return
+        read, compared = view.valid, view.depth_compared
+        self.color.append(_every_kth(np.stack([found.color[read], *view.squared_errors[read].T])))
+        self.depth.append(_every_kth(np.stack([found.reading_m2[compared], view.depth_squared_error[compared]])))
+
+    def scores(self) -> dict[str, Any] | None:
+        """Return the number of views, and the scores of colour and depth over all their pixels; None without views."""
+        if not self.color:
+            return None
+        return {"views": len(self.color), "color": _calibrated(self.color), "depth": _calibrated(self.depth)}
+
+
+def _calibrated(samples: list[NDArray[np.float32]]) -> dict[str, Any] | None:
+    """Return all scores of a variance with a unit; None without pixels."""
+    variance, *channels = np.concatenate(samples, axis=1)
+    if not variance.size:
+        return None
+    squared_error = np.stack(channels, -1)
+    of_mean = uncertainty.score(variance, uncertainty.over_channels(variance, squared_error))
+    return of_mean | uncertainty.calibration_scores(variance, squared_error)
+
+
+def _every_kth(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return every k-th column, at most `PIXELS_PER_VIEW`."""
+    return values[:, :: max(1, -(-values.shape[1] // PIXELS_PER_VIEW))]
+
+
+def _mean(values: NDArray[np.float64]) -> float | None:
+    """Return the mean of the values that are not nan; None if all are nan."""
+    existing = values[~np.isnan(values)]
+    return float(existing.mean()) if len(existing) else None
+
+
+def _array(values: Tensor) -> NDArray[np.float32]:
+    """Copy a tensor from any device to a numpy array."""
+    return np.asarray(values.detach().cpu(), np.float32)

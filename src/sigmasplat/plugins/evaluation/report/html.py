@@ -1,0 +1,294 @@
+"""Build report.html: summary, figures, floor plan, views, scores, times, advice, settings. One file, no scripts."""
+
+import html
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from sigmasplat.plugins.evaluation.report import tables
+from sigmasplat.plugins.evaluation.report.summary import Advice
+from sigmasplat.plugins.evaluation.report.view_strips import PanelFigure
+from sigmasplat.plugins.outputs.floorplan.rescan import RescanRegion
+from sigmasplat.run.figures import headline, number
+
+NARROW = "(max-width: 640px)"
+"""Pages this narrow show the narrow version of charts and plan."""
+
+STYLE = """
+:root { color-scheme: light dark; --page: #f6f7f9; --card: #ffffff; --ink: #1b1f24; --soft: #5c6670; --line: #e1e4e8;
+  --accent: #c2501b; --unsure: #d65a1e; --unseen: #286ebe; --thin: #825aaa; }
+@media (prefers-color-scheme: dark) {
+  :root { --page: #101317; --card: #181b20; --ink: #e8ebef; --soft: #99a3ad; --line: #2c3138;
+    --accent: #ff8c46; --unsure: #ff8c46; --unseen: #64aafa; --thin: #be96e6; } }
+* { box-sizing: border-box; }
+body { margin: 0; background: var(--page); color: var(--ink); overflow-wrap: break-word;
+  font: 16px/1.55 system-ui, -apple-system, "Segoe UI", "Helvetica Neue", sans-serif; }
+main { max-width: 1180px; margin: 0 auto; padding: 40px 24px 80px; }
+h1 { font-size: 30px; line-height: 1.2; letter-spacing: -0.02em; margin: 0 0 4px; }
+h2 { font-size: 20px; letter-spacing: -0.01em; margin: 48px 0 12px; }
+h3 { font-size: 15px; margin: 0 0 12px; }
+p { max-width: 74ch; margin: 0 0 12px; }
+.soft, figcaption, th, .unit { color: var(--soft); }
+.alarm { color: var(--accent); font-weight: 600; }
+.tiles { display: grid; grid-template-columns: repeat(auto-fit, minmax(148px, 1fr)); gap: 12px; margin: 24px 0; }
+.card { background: var(--card); border: 1px solid var(--line); border-radius: 10px; padding: 14px 16px;
+  overflow-x: auto; }
+.tile b { display: block; font-size: 26px; line-height: 1.25; font-weight: 620; font-variant-numeric: tabular-nums; }
+.tile span { font-size: 13px; color: var(--soft); }
+.tile .unit { display: inline; font-size: 15px; font-weight: 400; }
+.pair { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(420px, 100%), 1fr)); gap: 12px;
+  align-items: start; }
+table { border-collapse: collapse; width: 100%; font-size: 14.5px; font-variant-numeric: tabular-nums; }
+th, td { text-align: right; padding: 6px 10px; border-bottom: 1px solid var(--line); font-weight: 400; }
+th:first-child, td:first-child { text-align: left; padding-left: 0; }
+tr:last-child td { border-bottom: 0; }
+figure { margin: 0 0 14px; }
+figure img { display: block; width: 100%; height: auto; border-radius: 10px; border: 1px solid var(--line); }
+figcaption { font-size: 14px; margin-top: 6px; }
+.view { display: grid; grid-template-columns: repeat(auto-fit, minmax(150px, 1fr)); gap: 10px;
+  background: #15181d; color: #e9edf2; border-radius: 10px; padding: 10px; font-size: 13px; line-height: 1.4; }
+.view.large { grid-template-columns: repeat(6, 1fr); } .view.large div { grid-column: span 2; }
+.view.large div:nth-child(-n+2) { grid-column: span 3; }
+.view img { border: 0; border-radius: 4px; margin: 4px 0; }
+.view span { color: #9aa2ac; }
+.bar { display: grid; grid-template-columns: auto 1fr auto; gap: 6px; align-items: center; white-space: nowrap; }
+.bar i { height: 8px; border-radius: 2px; }
+.regions { list-style: none; padding: 0; font-size: 15px; }
+.regions li { display: grid; grid-template-columns: 26px 1fr; gap: 10px; align-items: start; }
+.regions b { width: 24px; height: 24px; border-radius: 50%; color: var(--card); font-size: 13px; line-height: 24px;
+  text-align: center; }
+.regions .unseen b { background: var(--unseen); } .regions .thin b { background: var(--thin); }
+.regions .unsure b { background: var(--unsure); }
+ul { max-width: 74ch; padding-left: 20px; } li { margin-bottom: 10px; }
+li pre { background: var(--card); border: 1px solid var(--line); border-radius: 8px; padding: 8px 12px;
+  margin-top: 4px; user-select: all; }
+details { margin-top: 12px; } summary { cursor: pointer; }
+pre { white-space: pre-wrap; overflow-wrap: anywhere; margin: 0;
+  font: 13px/1.5 ui-monospace, "SF Mono", Menlo, Consolas, monospace; }
+@media NARROW {
+  main { padding: 24px 12px 56px; } h1 { font-size: 24px; } h2 { margin-top: 36px; }
+  .tiles { gap: 8px; grid-template-columns: 1fr 1fr; } .tile b { font-size: 22px; }
+  .view.large div, .view.large div:nth-child(-n+2) { grid-column: span 6; }
+  th, td { padding: 6px; } .card { padding: 12px; } }
+""".replace("NARROW", NARROW)
+
+
+PREDICTED_EXPLANATION = (
+    "<p class=soft>Below each held-out view: its errors, and the predicted errors, one standard deviation each. Their "
+    "aleatoric part is noise and detail that the map cannot show; more or better views reduce the epistemic part.</p>"
+)
+
+
+@dataclass(frozen=True)
+class Contents:
+    """What a report shows.
+
+    summary: sentences; advice: what to try next, with or without a command; rescan: sentences about what to scan again;
+    regions: the same numbered regions as in the floor plan; strips: panels of views by heading; plots: captions by
+    name; seconds: time per stage; loops: the records of loops.json. `picture` turns the name of a picture file into an
+    address for the page. Each plot has four files: images/<name>-light.png, <name>-dark.png, <name>-narrow-light.png
+    and <name>-narrow-dark.png.
+    """
+
+    title: str
+    subtitle: str
+    metrics: dict[str, Any]
+    strips: dict[str, list[list[PanelFigure]]] = field(default_factory=dict)
+    plots: dict[str, str] = field(default_factory=dict)
+    config: str = ""
+    warnings: list[str] = field(default_factory=list)
+    loops: list[dict[str, Any]] = field(default_factory=list)
+    summary: list[str] = field(default_factory=list)
+    advice: list[Advice] = field(default_factory=list)
+    rescan: list[str] = field(default_factory=list)
+    regions: Sequence[RescanRegion] = ()
+    seconds: dict[str, float] = field(default_factory=dict)
+    picture: Callable[[str], str] = str
+
+
+def build_report(contents: Contents) -> str:
+    """Return the whole page as HTML. `metrics` is what `evaluate` returns; absent values show as a dash."""
+    parts = [
+        f"<h1>{html.escape(contents.title)}</h1><p class=soft>{html.escape(contents.subtitle)}</p>",
+        "".join(f"<p class=alarm>{html.escape(warning)}</p>" for warning in contents.warnings),
+        _summary(contents.summary),
+        _tiles(contents.metrics),
+        _rescan(contents),
+        _plot(contents, "trajectory", "Trajectory"),
+        _states(contents),
+        _plot(contents, "moving", "What moved"),
+        _strips(contents),
+        _submaps(contents),
+        _tables(contents.metrics),
+        _time(contents),
+        _advice(contents.advice),
+        _settings(contents),
+    ]
+    head = "<meta charset=utf-8><meta name=viewport content='width=device-width, initial-scale=1'>"
+    title, body = html.escape(contents.title), "\n".join(parts)
+    return (
+        f"<!doctype html>\n<html lang=en>{head}<title>{title}</title><style>{STYLE}</style>\n"
+        f"<main>\n{body}\n</main></html>\n"
+    )
+
+
+def _tiles(metrics: dict[str, Any]) -> str:
+    """Show the headline figures as tiles."""
+    tiles = [
+        f"<div class='card tile'><b>{value} <span class=unit>{unit}</span></b><span>{html.escape(name)}</span></div>"
+        for name, value, unit in headline(metrics)
+    ]
+    return f"<div class=tiles>{''.join(tiles)}</div>"
+
+
+def _summary(sentences: list[str]) -> str:
+    """Show the summary sentences."""
+    return f"<h2>Summary</h2><p>{html.escape(' '.join(sentences))}</p>" if sentences else ""
+
+
+def _rescan(contents: Contents) -> str:
+    """Show where to scan again: sentences, the floor plan, and the list of its numbered regions."""
+    if not contents.rescan and "plan" not in contents.plots:
+        return ""
+    words = "".join(f"<p>{html.escape(sentence)}</p>" for sentence in contents.rescan)
+    items = "".join(
+        f"<li class={html.escape(region.why)}><b>{number}</b><span>{html.escape(region.sentence())}</span></li>"
+        for number, region in enumerate(contents.regions, 1)
+    )
+    listed = f"<ol class=regions>{items}</ol>" if items else ""
+    return f"<h2>Where to scan again</h2>{words}{_figure(contents, 'plan', 'Floor plan')}{listed}"
+
+
+def _time(contents: Contents) -> str:
+    """Show where the time went: per frame, and in total per stage, including the final map."""
+    if "seconds" not in contents.plots and not contents.seconds:
+        return ""
+    finish_s = contents.metrics.get("finish_s")
+    seconds = contents.seconds | ({} if finish_s is None else {"final map": finish_s})
+    total_s = sum(seconds.values()) or 1.0
+    longest_first = sorted(seconds.items(), key=lambda item: -item[1])
+    rows = [[stage, number(spent, 1), number(spent / total_s, 0, 100.0)] for stage, spent in longest_first]
+    table = f"<div class=card>{_table([['stage', 'seconds', '%'], *rows])}</div>" if rows else ""
+    return f"<h2>Time</h2>{_figure(contents, 'seconds', 'Seconds per frame')}{table}"
+
+
+def _advice(advice: list[Advice]) -> str:
+    """Show what to try next, with commands. A click on a command selects all of it."""
+    if not advice:
+        return ""
+    items = [
+        f"<li>{html.escape(words)}{f'<pre>{html.escape(command)}</pre>' if command else ''}</li>"
+        for words, command in advice
+    ]
+    return f"<h2>What to try next</h2><ul>{''.join(items)}</ul>"
+
+
+def _strips(contents: Contents) -> str:
+    """Show the views of each kind, each as a row of panels that wraps on narrow pages."""
+    if not any(contents.strips.values()):
+        return ""
+    explanation = (
+        "<p class=soft>Images are rendered at the estimated poses. The map predicts V, the variance of colour along "
+        "each ray. The root of V and the RMS error have separate colour scales. Where both look alike, V predicts "
+        "the error well. Slate pixels: no depth reading, or no surface in the map.</p>"
+    )
+    if contents.metrics.get("calibration"):
+        explanation += PREDICTED_EXPLANATION
+    parts = ["<h2>Views</h2>", explanation]
+    for kind, strips in contents.strips.items():
+        if strips:
+            parts.append(f"<h3>{html.escape(kind)}</h3>")
+            parts += map(_view, strips)
+    return "".join(parts)
+
+
+def _view(panels: list[PanelFigure]) -> str:
+    """Show the panels of a view. With five of them, the image and its render are half as wide as the page."""
+    large = " large" if len(panels) == 5 else ""
+    return f"<figure class='view{large}'>{''.join(map(_panel, panels))}</figure>"
+
+
+def _panel(panel: PanelFigure) -> str:
+    """Show one panel of a view: title, picture, its colour bar and its caption."""
+    low, high = (html.escape(end) for end in panel.ends)
+    ramp = f"<i style='background: linear-gradient(90deg, {', '.join(panel.bar)})'></i>"
+    below = f"<span class=bar>{low}{ramp}{high}</span>" if panel.bar else ""
+    below += f"<span>{html.escape(panel.caption)}</span>" if panel.caption else ""
+    title = html.escape(panel.title)
+    return f"<div>{title}<img src='{html.escape(panel.address)}' alt='{title}'>{below}</div>"
+
+
+def _states(contents: Contents) -> str:
+    """Show the states of the frames: the chart and the table."""
+    if "states" not in contents.plots:
+        return ""
+    table = f"<div class=card>{_table(tables.state_rows(contents.metrics))}</div>"
+    return f"<h2>States of the frames</h2>{_figure(contents, 'states', 'States of the frames')}{table}"
+
+
+def _plot(contents: Contents, name: str, title: str) -> str:
+    """Show a plot below its own heading."""
+    return f"<h2>{title}</h2>{_figure(contents, name, title)}" if name in contents.plots else ""
+
+
+def _figure(contents: Contents, name: str, title: str) -> str:
+    """Show a plot in the version that fits the page: light or dark, wide or narrow."""
+    if name not in contents.plots:
+        return ""
+    light, dark, narrow_light, narrow_dark = (
+        html.escape(contents.picture(f"images/{name}-{version}.png"))
+        for version in ("light", "dark", "narrow-light", "narrow-dark")
+    )
+    dark_page = "(prefers-color-scheme: dark)"
+    return (
+        f"<figure><picture><source media='{NARROW} and {dark_page}' srcset='{narrow_dark}'>"
+        f"<source media='{NARROW}' srcset='{narrow_light}'><source media='{dark_page}' srcset='{dark}'>"
+        f"<img src='{light}' alt='{title}'></picture>"
+        f"<figcaption>{html.escape(contents.plots[name])}</figcaption></figure>"
+    )
+
+
+def _tables(metrics: dict[str, Any]) -> str:
+    """Show all scores of images, path, surface and uncertainty."""
+    body = "".join(
+        f"<div class=card><h3>{title}</h3>{_table(rows)}</div>"
+        for title, rows in tables.score_tables(metrics)
+        if rows[1:]
+    )
+    return f"<h2>Scores</h2><div class=pair>{body}</div>"
+
+
+def _submaps(contents: Contents) -> str:
+    """Show the submaps and the loops between them, if there are several submaps."""
+    if (contents.metrics.get("submaps") or 1) < 2:
+        return ""
+    accepted = [loop for loop in contents.loops if loop.get("accepted")]
+    refused = [loop for loop in contents.loops if not loop.get("accepted")]
+    parts = [
+        "<h2>Submaps and loops</h2>",
+        f"<p class=soft>{html.escape(tables.submap_sentence(contents.metrics))}</p>",
+        _figure(contents, "submaps", "Submaps and loops"),
+    ]
+    if accepted:
+        parts.append(f"<div class=card><h3>Loops accepted</h3>{_table(tables.loop_rows(accepted))}</div>")
+    if refused:
+        rows = _table(tables.loop_rows(refused))
+        parts.append(f"<details class=card><summary>{len(refused)} loops tried and refused</summary>{rows}</details>")
+    return "".join(parts)
+
+
+def _table(rows: list[list[str]]) -> str:
+    """Return a table of text; the first row is the head."""
+    head = "".join(f"<th>{html.escape(cell)}</th>" for cell in rows[0])
+    body = "".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows[1:])
+    return f"<table><tr>{head}</tr>{body}</table>"
+
+
+def _settings(contents: Contents) -> str:
+    """Show the settings of the run, folded."""
+    if not contents.config:
+        return ""
+    return (
+        "<h2>Settings</h2><details class=card><summary>all settings (config.json)</summary>"
+        f"<pre>{html.escape(contents.config)}</pre></details>"
+    )

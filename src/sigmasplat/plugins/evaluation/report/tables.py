@@ -1,0 +1,230 @@
+"""Turn metrics into rows of text: headline figures, and the tables of the report, whose first row is the head."""
+
+from typing import Any
+
+from sigmasplat.data.component import APART, LOST, RELOCALISED, TRACKED
+from sigmasplat.data.map_uncertainty import SHIPPED
+from sigmasplat.run.figures import format_ranges, number
+
+
+def state_rows(metrics: dict[str, Any]) -> list[list[str]]:
+    """Return one row per state that occurs: number of frames, share, and which frames."""
+    frames = metrics.get("frames") or 0
+    listed = {state: metrics.get(f"{state}_frames") or [] for state in (RELOCALISED, LOST, APART)}
+    counts = [(TRACKED, frames - sum(map(len, listed.values())), "")]
+    counts += [(state, len(found), format_ranges(found)) for state, found in listed.items() if found]
+    return [["state", "frames", "%", "which"]] + [
+        [state, number(count, 0), number(count / max(frames, 1), 1, 100.0), where] for state, count, where in counts
+    ]
+
+
+def score_tables(metrics: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
+    """Return the tables of scores with their titles. A table without figures has at most a head."""
+    kind = (metrics.get("uncertainty") or {}).get("judged_on", "held-out")
+    views = f"{kind}, in submaps" if metrics.get("held_out_submaps") else kind
+    return [
+        ("Rendered images", _image_rows(metrics)),
+        _full_resolution_table(metrics),
+        ("Path", _path_rows(metrics)),
+        ("Surface", _surface_rows(metrics)),
+        ("Surface, by the protocol of published systems", _published_rows(metrics)),
+        (f"Uncertainty V, {views}", _uncertainty_rows(metrics.get("uncertainty"))),
+        (f"Uncertainty V, {kind}, final map", _uncertainty_rows(metrics.get("uncertainty_final"))),
+        (f"Calibration of V, {views}", _calibration_rows(metrics.get("uncertainty"))),
+        ("Predicted errors, held-out, final map", _predictive_rows(metrics.get("predictive"))),
+        ("Calibration of predicted errors", _weight_rows(metrics.get("calibration"))),
+        ("Covariance of poses", _covariance_rows(metrics.get("pose_covariance"))),
+    ]
+
+
+def submap_sentence(metrics: dict[str, Any]) -> str:
+    """Describe how many submaps and loops there are, and how long the final map took."""
+    loops, finish_s = metrics.get("loops") or {}, metrics.get("finish_s")
+    tried = f"Loops between them: {loops.get('tried', 0)} tried, {loops.get('accepted', 0)} accepted."
+    after = f" The final map took {number(finish_s, 1)} s after the last frame." if finish_s is not None else ""
+    return f"The map has {metrics['submaps']} submaps. {tried}{after}"
+
+
+def loop_rows(loops: list[dict[str, Any]]) -> list[list[str]]:
+    """Return one row per loop: submaps, frames, similarity, quality of fit, correction of the pose, verdict."""
+    head = [
+        "submaps",
+        "frames",
+        "similarity",
+        "residual",
+        "overlap, %",
+        "shift, cm",
+        "rotation, °",
+        "verdict",
+        "reason",
+    ]
+    return [head, *(_loop_row(loop) for loop in loops)]
+
+
+def _loop_row(loop: dict[str, Any]) -> list[str]:
+    reason = loop.get("reason") or ""
+    return [
+        f"{loop.get('query')} → {loop.get('database')}",
+        f"{loop.get('query_frame')} → {loop.get('database_frame')}",
+        number(loop.get("similarity"), 3),
+        number(loop.get("residual"), 4),
+        number(loop.get("overlap"), 0, 100.0),
+        number(loop.get("translation_m"), 1, 100.0),
+        number(loop.get("rotation_deg"), 2),
+        "accepted" if loop.get("accepted") else "refused",
+        "" if reason == "accepted" else reason,
+    ]
+
+
+def _image_rows(metrics: dict[str, Any]) -> list[list[str]]:
+    columns = {"training": "training", "held-out": "held_out"}
+    if metrics.get("test_views"):
+        columns |= {"novel views": "test_views"}
+    if metrics.get("training_submaps") or metrics.get("held_out_submaps"):
+        columns |= {"training, in submaps": "training_submaps", "held-out, in submaps": "held_out_submaps"}
+    kinds = [metrics.get(key) or {} for key in columns.values()]
+    lines = [("Views", "views", 0, 1.0), ("PSNR, dB", "psnr_db", 2, 1.0), ("SSIM", "ssim", 4, 1.0),
+             ("Depth L1, cm", "depth_l1_m", 2, 100.0), ("Depth covered, %", "depth_coverage", 1, 100.0),
+             ("PSNR, all pixels, dB", "psnr_image_db", 2, 1.0), ("MS-SSIM, all pixels", "ms_ssim", 4, 1.0)]  # fmt: skip
+    network = metrics.get("lpips_network")
+    lines.append((f"LPIPS ({network or 'no weights'}), all pixels", "lpips", 4, 1.0))
+    return [["", *columns]] + [
+        [label, *(number(kind.get(key), digits, scale) for kind in kinds)] for label, key, digits, scale in lines
+    ]
+
+
+def _full_resolution_table(metrics: dict[str, Any]) -> tuple[str, list[list[str]]]:
+    found = metrics.get("full_resolution")
+    if not found:
+        return "", []
+    rows = _image_rows(found | {"lpips_network": metrics.get("lpips_network")})
+    return f"Rendered images, full resolution: {found['width']} × {found['height']}", rows
+
+
+def _path_rows(metrics: dict[str, Any]) -> list[list[str]]:
+    ate, rpe = metrics.get("ate"), metrics.get("rpe")
+    if not ate or not rpe:
+        return []
+    rows = [[f"ATE {name}, cm", number(ate[f"{name}_m"], 3, 100.0)] for name in ("rmse", "mean", "median", "max")]
+    kinds = {"keyframes": metrics.get("ate_keyframes"), "all frames, with lost ones": metrics.get("ate_all_frames")}
+    for kind, found in kinds.items():
+        if found and found["pairs"] != ate["pairs"]:
+            rows.append([f"ATE rmse of {kind} ({found['pairs']} poses), cm", number(found["rmse_m"], 3, 100.0)])
+    factor, without = metrics.get("path_scale"), metrics.get("ate_odometry")
+    alignment = f"aligned with scale factor {number(factor, 3)}" if factor else "rigid alignment"
+    if without:
+        rows.append(["ATE rmse without loop closure, cm", number(without["rmse_m"], 3, 100.0)])
+    return [
+        [f"believed frames, {alignment}", f"{ate['pairs']} poses"],
+        *rows,
+        ["RPE translation, cm per frame", number(rpe["translation_rmse_m"], 3, 100.0)],
+        ["RPE rotation, ° per frame", number(rpe["rotation_rmse_deg"], 3)],
+        *_failure_rows(metrics),
+    ]
+
+
+def _failure_rows(metrics: dict[str, Any]) -> list[list[str]]:
+    """Return how honest the run is about its path: silent failures, and scores of the predicted probability."""
+    found = metrics.get("failures")
+    if not found:
+        return []
+    return [
+        ["silent failures: believed, but off by > 10 cm", number(found["silent"], 0)],
+        ["frames off by > 5 cm, with lost ones", f"{number(found['off'], 0)} of {number(found['frames'], 0)}"],
+        ["AUROC of the probability of > 5 cm", number(found["auroc"], 3)],
+        ["Brier score of it", number(found["brier"], 4)],
+    ]
+
+
+def _surface_rows(metrics: dict[str, Any]) -> list[list[str]]:
+    found = metrics.get("reconstruction")
+    if not found:
+        return []
+    lines = [("Accuracy, cm", "accuracy_m", 2), ("Completion, cm", "completion_m", 2),
+             ("Completion ratio (< 5 cm), %", "completion_ratio", 1), ("Precision (< 1 cm), %", "precision", 1),
+             ("Recall (< 1 cm), %", "recall", 1), ("F1 (1 cm), %", "f1", 1),
+             ("Depth L1, novel views, cm", "depth_l1_m", 2), ("Depth covered, novel views, %", "depth_coverage", 1),
+             ("Splats to surface, cm", "splats_accuracy_m", 2), ("Surface to splats, cm", "splats_completion_m", 2),
+             ("Chamfer distance of splats, cm", "splats_chamfer_m", 2),
+             ("Floaters (> 10 cm) among opaque splats, %", "floaters", 2)]  # fmt: skip
+    return [["parts visible from keyframes", "mesh.ply, map.ply"]] + [
+        [label, number(found.get(key), digits, 100.0)] for label, key, digits in lines
+    ]
+
+
+def _published_rows(metrics: dict[str, Any]) -> list[list[str]]:
+    found = metrics.get("reconstruction_published")
+    if not found:
+        return []
+    lines = [("Accuracy, cm", "accuracy_m", 2), ("Completion, cm", "completion_m", 2),
+             ("Chamfer distance, cm", "chamfer_m", 2), ("Completion ratio (< 5 cm), %", "completion_ratio", 1),
+             ("Precision (< 1 cm), %", "precision", 1), ("Recall (< 1 cm), %", "recall", 1), ("F1 (1 cm), %", "f1", 1),
+             ("Depth L1, random views, cm", "depth_l1_m", 2)]  # fmt: skip
+    return [["points on both surfaces", f"{number(found['depth_views'], 0)} random views"]] + [
+        [label, number(found.get(key), digits, 100.0)] for label, key, digits in lines
+    ]
+
+
+def _uncertainty_rows(scores: dict[str, Any] | None) -> list[list[str]]:
+    if not scores:
+        return []
+    return [
+        ["pixels with a depth reading", f"{number(scores['pixels'], 0)} pixels"],
+        ["Spearman of V and squared error", number(scores["spearman"], 3)],
+        ["Spearman, only covered pixels", number(scores.get("spearman_covered"), 3)],
+        ["AUSE (0 = perfect ranking)", number(scores["ause"], 3)],
+        ["Gaussian NLL", number(scores["nll"], 3)],
+        ["mean V, 10⁻³", number(scores["mean_variance"], 3, 1e3)],
+        ["mean squared error, 10⁻³", number(scores["mean_squared_error"], 3, 1e3)],
+    ]
+
+
+def _calibration_rows(scores: dict[str, Any] | None) -> list[list[str]]:
+    rows = (scores or {}).get("reliability") or []
+    return [["decile of V", "mean V, 10⁻³", "squared error, 10⁻³"]] + [
+        [str(i), number(row["predicted"], 3, 1e3), number(row["empirical"], 3, 1e3)] for i, row in enumerate(rows, 1)
+    ]
+
+
+def _predictive_rows(scores: dict[str, Any] | None) -> list[list[str]]:
+    if not scores:
+        return []
+    lines = [("Pixels", "pixels", 0, 1.0), ("Within 1 standard deviation, % (ideal 68)", "coverage_68", 1, 100.0),
+             ("Within 1.96 standard deviations, % (95)", "coverage_95", 1, 100.0),
+             ("AUCE (0 = right size)", "auce", 3, 1.0), ("AUSE (0 = perfect ranking)", "ause", 3, 1.0),
+             ("Spearman of variance and squared error", "spearman", 3, 1.0),
+             ("Gaussian NLL", "nll", 3, 1.0)]  # fmt: skip
+    kinds = [scores.get(key) or {} for key in ("color", "depth")]
+    return [[f"{scores['views']} views", "colour", "depth"]] + [
+        [label, *(number(kind.get(key), digits, scale) for kind in kinds)] for label, key, digits, scale in lines
+    ]
+
+
+def _weight_rows(calibration: dict[str, Any] | None) -> list[list[str]]:
+    """Return the fitted weight of each part of the predicted variances, and that of the preset; the temperatures."""
+    if not calibration:
+        return []
+    parts = dict.fromkeys([*calibration["color"], *calibration["depth"]])
+    columns = [calibration["color"], SHIPPED.color, calibration["depth"], SHIPPED.depth]
+    temperatures = calibration.get("temperature", {}), SHIPPED.temperature
+    return (
+        [[f"weights, {calibration['probes']} probe views", "colour", "… preset", "depth", "… preset"]]
+        + [[part, *("" if part not in weights else f"{weights[part]:.2g}" for weights in columns)] for part in parts]
+        + [["temperature", *(f"{of.get(name, 1.0):.2g}" for name in ("color", "depth") for of in temperatures)]]
+    )
+
+
+def _covariance_rows(scores: dict[str, Any] | None) -> list[list[str]]:
+    columns = {"hops": "keyframe to keyframe", "windows": "50 frames", "from_start": "from the start"}
+    known = {name: (scores or {}).get(key) for key, name in columns.items()}
+    kinds = {name: found for name, found in known.items() if found}
+    if not kinds:
+        return []
+    lines = [("Motions", "count", 0, 1.0), ("Poses in their 90 % ellipsoid, %", "coverage_90", 1, 100.0),
+             ("Positions in their 90 % ellipsoid, %", "position_coverage_90", 1, 100.0),
+             ("NEES, mean (ideal 6)", "nees_mean", 2, 1.0),
+             ("k of the position (ideal 1)", "position_k", 2, 1.0)]  # fmt: skip
+    return [["", *kinds]] + [
+        [label, *(number(kind.get(key), digits, scale) for kind in kinds.values())]
+        for label, key, digits, scale in lines
+    ]

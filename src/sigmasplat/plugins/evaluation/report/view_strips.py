@@ -1,0 +1,97 @@
+"""Draw view strips for the report: files in images/, and one figure per panel for the page."""
+
+import base64
+import io
+from dataclasses import dataclass
+from pathlib import Path
+
+from PIL import Image
+
+from sigmasplat.errors import RunError
+from sigmasplat.plugins.evaluation.metrics.scored_view import ScoredView
+from sigmasplat.plugins.outputs.drawing.view_panels import (
+    PANEL_WIDTH,
+    ViewPanel,
+    draw_view_strip,
+    predicted_panels,
+    view_panels,
+)
+from sigmasplat.run_folder.runs import RunFolder
+
+QUALITY, EFFORT = 86, 2
+"""Quality of WebP, and the effort to compress (0 to 6; a larger one takes longer and hardly saves space)."""
+PAGE_WIDTH = 1152
+"""Width of the page's text column at twice the resolution of a panel, in pixels."""
+HEADINGS = {"test": "novel views"}
+"""Headings of kinds of views; without an entry "<kind> views"."""
+
+
+@dataclass(frozen=True)
+class PanelFigure:
+    """One panel of a view on the page: title, address of its picture, and a caption, a colour bar, or both.
+
+    bar: CSS colours from low to high; ends: the labels of both ends of the bar.
+    """
+
+    title: str
+    address: str
+    caption: str = ""
+    bar: tuple[str, ...] = ()
+    ends: tuple[str, str] = ("", "")
+
+
+class ViewStrips:
+    """Draw the strips of a few views of each kind into images/, and collect their panels for the page."""
+
+    def __init__(self, run: RunFolder, per_kind: int) -> None:
+        """Start empty. Strips of an earlier evaluation are deleted, because the views may differ."""
+        self.run, self.per_kind = run, per_kind
+        self.figures: dict[str, list[list[PanelFigure]]] = {}
+        for old in run.images.glob("view-*.png"):
+            old.unlink()
+
+    def add(self, view: ScoredView, place: str = "") -> None:
+        """Draw one view, and strips of its predicted errors of colour and depth if they are known; `place` is added to
+        the heading if the view was not rendered from the final map.
+        """
+        name, heading = f"view-{view.kind.replace(' ', '-')}", HEADINGS.get(view.kind, f"{view.kind} views") + place
+        self.draw(f"{name}{place and '-submap'}-{view.index:06d}.png", heading, view_panels(view))
+        if view.predicted is not None:
+            panels = predicted_panels(view, view.predicted)
+            for quantity, of_quantity in (("color", panels[:4]), ("depth", panels[4:])):
+                self.draw(f"{name}-predicted-{quantity}-{view.index:06d}.png", heading, of_quantity)
+
+    def draw(self, name: str, heading: str, panels: list[ViewPanel]) -> None:
+        """Write a strip, and keep its panels for the page."""
+        self.run.write_image(name, draw_view_strip(panels))
+        self.figures.setdefault(heading, []).append([panel_figure(panel) for panel in panels])
+
+
+def panel_figure(panel: ViewPanel) -> PanelFigure:
+    """Return a panel for the page, with its picture as a data: URI.
+
+    Pictures larger than a panel of a strip keep their size, up to `PAGE_WIDTH`.
+    """
+    width = min(max(PANEL_WIDTH, panel.pixels.shape[1]), PAGE_WIDTH)
+    height = round(width * panel.pixels.shape[0] / panel.pixels.shape[1])
+    colours = () if panel.bar is None else tuple(f"rgb({r:.0f} {g:.0f} {b:.0f})" for r, g, b in panel.bar)
+    return PanelFigure(panel.title, data_uri(panel.picture(width, height)), panel.caption, colours, panel.ends)
+
+
+def data_uri(picture: Image.Image) -> str:
+    """Return a picture as a data: URI, WebP."""
+    buffer = io.BytesIO()
+    picture.convert("RGB").save(buffer, "WEBP", quality=QUALITY, method=EFFORT)
+    return _uri("webp", buffer.getvalue())
+
+
+def file_data_uri(path: Path) -> str:
+    """Return a PNG file as a data: URI; it is not compressed again. Raises RunError if it cannot be read."""
+    try:
+        return _uri("png", path.read_bytes())
+    except OSError as problem:
+        raise RunError(f"cannot read picture {path}: {problem}") from problem
+
+
+def _uri(kind: str, content: bytes) -> str:
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode('ascii')}"

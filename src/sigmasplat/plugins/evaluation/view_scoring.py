@@ -1,0 +1,116 @@
+"""Render and score the views of a run: at working resolution, at the resolution of the recording, and test views.
+
+Scores at different resolutions are never mixed: each resolution has its own object in metrics.json.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sigmasplat.config import Config, InputConfig
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.photo import photo_size
+from sigmasplat.input.source import Source
+from sigmasplat.plugins.evaluation.metrics import views
+from sigmasplat.plugins.evaluation.metrics.lpips import Lpips
+from sigmasplat.plugins.evaluation.metrics.scored_view import ScoredView
+from sigmasplat.plugins.evaluation.novel_views import score_novel_views
+from sigmasplat.plugins.evaluation.report.view_strips import ViewStrips
+from sigmasplat.plugins.evaluation.view_selection import working_frame
+from sigmasplat.types import Progress, no_progress
+
+
+@dataclass(frozen=True, eq=False)
+class ViewScoring:
+    """What every scoring of views needs.
+
+    input: the run's settings of working images; chosen: the log records of the scored views by kind; most: the largest
+    number of test views; T_estimate_truth [4, 4]: the alignment of the ATE, None without a truth; lpips: the network of
+    LPIPS, if it is scored.
+    """
+
+    source: Source
+    input: InputConfig
+    maps: views.MapSources
+    chosen: Mapping[str, list[dict[str, Any]]]
+    renderer: views.Renderer
+    most: int
+    T_estimate_truth: NDArray[np.float64] | None
+    lpips: Lpips | None = None
+
+    @property
+    def count(self) -> int:
+        """Return the number of chosen views."""
+        return sum(len(records) for records in self.chosen.values())
+
+    def rendered(self, settings: InputConfig) -> Iterator[tuple[ScoredView, ScoredView | None]]:
+        """Render the chosen views at the size of `settings` (`views.render_views`)."""
+        return views.render_views(partial(working_frame, self.source, settings), self.maps, self.chosen, self.renderer)
+
+
+def full_width(config: Config, camera: Camera) -> int | None:
+    """Return the width of the images that the last stage of the final map used; None without that stage.
+
+    camera: of the recording.
+    """
+    final, settings = config.final, config.input
+    size = photo_size(camera, settings.width, settings.crop_px, final.width_px)
+    return min(final.width_px, camera.width) if size and final.iterations and final.width_iterations else None
+
+
+def refined_fx(config: Config, camera: Camera) -> float | None:
+    """Return the focal length, pixels, of the images that the last stage of the final map used; None without that
+    stage.
+
+    camera: of the recording.
+    """
+    width = full_width(config, camera)
+    return None if width is None else camera.prepared(width).fx
+
+
+def input_of_width(settings: InputConfig, source: Source, width: int) -> InputConfig:
+    """Return input settings for images of another width; the cropped edge covers the same part of the image."""
+    scale = width / (settings.width or source.camera.width)
+    return replace(settings, width=width, crop_px=round(settings.crop_px * scale))
+
+
+def score_full_resolution(
+    scoring: ViewScoring, config: Config, recorded: bool, progress: Progress = no_progress
+) -> dict[str, Any] | None:
+    """Score the chosen views and the test views at the size of the recording if `recorded`, else at that of the final
+    map's last stage; None without that stage.
+
+    Returns width, height, and the keys of the scores at working resolution: training, held_out, both in their submaps,
+    and test_views. Calls `progress(done, total)` with the chosen views.
+    """
+    width = scoring.source.camera.width if recorded else full_width(config, scoring.source.camera)
+    if width is None:
+        return None
+    settings, chosen = input_of_width(scoring.input, scoring.source, width), scoring.chosen
+    camera = scoring.source.camera.prepared(settings.width, settings.crop_px)
+    final, before = ({kind: views.ViewScores(False, scoring.lpips) for kind in chosen} for _ in range(2))
+    unpredicted = replace(scoring, maps=replace(scoring.maps, predict=None))
+    for done, (view, in_submap) in enumerate(unpredicted.rendered(settings), 1):
+        final[view.kind].add(view)
+        if in_submap:
+            before[view.kind].add(in_submap)
+        progress(done, scoring.count)
+    scores = views.kind_scores(final, before, scoring.maps) | {"test_views": score_test_views(scoring, settings)}
+    return {"width": camera.width, "height": camera.height} | scores
+
+
+def score_test_views(
+    scoring: ViewScoring, settings: InputConfig, strips: ViewStrips | None = None
+) -> dict[str, Any] | None:
+    """Score the source's test views at the size of `settings`; None without test views or without a truth."""
+    test_views, T_estimate_truth = scoring.source.test_views(), scoring.T_estimate_truth
+    if test_views is None or T_estimate_truth is None:
+        return None
+    return score_novel_views(
+        test_views, test_views.truth(), T_estimate_truth, scoring.maps.final, settings, scoring.renderer, strips,
+        scoring.most, scoring.lpips,
+    )  # fmt: skip

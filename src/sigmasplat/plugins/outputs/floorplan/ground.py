@@ -1,0 +1,140 @@
+"""Find the floor from surface samples: the up direction, the height of the floor, the direction of the walls."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sigmasplat.errors import SigmaSplatError
+from sigmasplat.plugins.outputs.floorplan.surface_samples import SurfaceSample
+from sigmasplat.types import Matrix
+
+MAX_TILT_COS = np.cos(np.deg2rad(40.0))
+"""Cameras are assumed upright within 40°."""
+MEASURED_COS = np.cos(np.deg2rad(6.0))
+"""A direction from an accelerometer is right within 6°, also if the camera gained 1 m/s in one second."""
+PARALLEL_COS = np.cos(np.deg2rad(8.0))
+CANDIDATES = 400
+MIN_LEVEL_SHARE = 0.02
+"""If level surfaces have less than this share of all area, they are not used to find the up direction."""
+LAYER_M = 0.025
+MIN_FLOOR_SHARE = 0.1
+"""The floor is the lowest layer with at least this share of the largest layer's area: a table may have more area."""
+MAX_POINTS = 16_000
+"""Samples are reduced to about this many points."""
+
+
+def floor_frame(samples: Sequence[SurfaceSample], up_world: Matrix | None = None) -> Matrix:
+    """Return T_floor_world: z up, floor at z = 0, origin below the first camera, x and y along the walls.
+
+    up_world [3]: unit vector that points up, if an accelerometer measured it; the floor and the walls make it exact. y
+    is the direction along the walls that is nearest to the viewing direction of the first camera. Raises
+    SigmaSplatError if no surface is visible.
+    """
+    points, normals, area = _subsampled(samples)
+    poses = np.stack([sample.T_world_camera for sample in samples])
+    if up_world is None:
+        up = up_direction(normals, area, _unit(-poses[:, :3, 1].sum(0), -poses[0, :3, 1]))
+    else:
+        up = up_direction(normals, area, up_world, MEASURED_COS)
+    height_m = floor_height(points @ up, normals @ up, area, float((poses[:, :3, 3] @ up).min()))
+    ahead = _horizontal(poses[0], up)
+    ahead = along_walls(normals, area, up, ahead)
+    R = np.stack([np.cross(ahead, up), ahead, up])
+    foot = poses[0, :3, 3] - (poses[0, :3, 3] @ up - height_m) * up
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, -R @ foot
+    return T
+
+
+def _subsampled(samples: Sequence[SurfaceSample]) -> tuple[Matrix, Matrix, Matrix]:
+    """Return points, normals [P, 3] and areas [P] of every k-th sample."""
+    total = sum(len(sample.points) for sample in samples)
+    if not total:
+        raise SigmaSplatError("no surface of the map is visible from its path; do map and path belong together?")
+    step = max(1, total // MAX_POINTS)
+    stacked = [np.concatenate([getattr(s, name) for s in samples])[::step] for name in ("points", "normals", "area_m2")]
+    points, normals, area = (values.astype(np.float64) for values in stacked)
+    return points, normals, area
+
+
+def up_direction(normals: Matrix, area: Matrix, about_up: Matrix, within_cos: float = MAX_TILT_COS) -> Matrix:
+    """Return the unit vector that points up, near `about_up` [3].
+
+    Candidates are normals whose angle to `about_up` has at least the cosine `within_cos`. The best one has the most
+    area whose normals are parallel (weight 1) or perpendicular (weight ½) to it. With too few level surfaces the result
+    is perpendicular to the walls. Without walls it is `about_up`.
+    """
+    level = np.abs(normals @ about_up) > within_cos
+    if area[level].sum() < MIN_LEVEL_SHARE * area.sum():
+        return _across_walls(normals, area, about_up, within_cos)
+    rows = np.flatnonzero(level)
+    candidates = normals[rows[np.linspace(0, len(rows) - 1, min(CANDIDATES, len(rows))).astype(int)]]
+    cosines = np.abs(candidates @ normals.T)
+    votes = ((cosines > PARALLEL_COS) + 0.5 * (cosines < np.sqrt(1.0 - PARALLEL_COS**2))) @ area
+    up = candidates[int(votes.argmax())]
+    for _ in range(3):
+        cosine = normals @ up
+        agree = np.abs(cosine) > PARALLEL_COS
+        up = _unit((np.sign(cosine) * area)[agree] @ normals[agree], up)
+    return np.asarray(up * np.sign(up @ about_up))
+
+
+def _across_walls(normals: Matrix, area: Matrix, about_up: Matrix, within_cos: float) -> Matrix:
+    """Return the direction perpendicular to the walls if there are walls in two directions, else `about_up`."""
+    walls = np.abs(normals @ about_up) < np.sqrt(1.0 - within_cos**2)
+    values, vectors = np.linalg.eigh((normals[walls] * area[walls, None]).T @ normals[walls])
+    if not walls.any() or values[0] > 0.2 * values[1]:
+        return about_up
+    up = vectors[:, 0] * np.sign(vectors[:, 0] @ about_up)
+    return up if up @ about_up > within_cos else about_up
+
+
+def floor_height(heights_m: Matrix, cosines: Matrix, area: Matrix, camera_m: float) -> float:
+    """Return the height of the floor: the lowest layer with much area that faces up and is below all cameras.
+
+    heights_m [P] and cosines to up [P] of surface points. Without such a layer, the 1st percentile of the heights.
+    """
+    level = (cosines > PARALLEL_COS) & (heights_m < camera_m)
+    if area[level].sum() < 0.1 * MIN_LEVEL_SHARE * area.sum():
+        return float(np.quantile(heights_m, 0.01))
+    edges = np.arange(heights_m[level].min() - 2 * LAYER_M, camera_m + 3 * LAYER_M, LAYER_M)
+    layers, _ = np.histogram(heights_m[level], edges, weights=area[level])
+    pairs = layers[:-1] + layers[1:]  # a layer split by a bin edge counts as one
+    lowest = int(np.argmax(pairs >= MIN_FLOOR_SHARE * pairs.max()))
+    peak = lowest + int(np.argmax(pairs[lowest : lowest + 3]))
+    near = level & (np.abs(heights_m - edges[peak + 1]) < 1.5 * LAYER_M)
+    order = np.argsort(heights_m[near])
+    half = np.searchsorted(np.cumsum(area[near][order]), 0.5 * area[near].sum())
+    return float(heights_m[near][order][half])
+
+
+def along_walls(normals: Matrix, area: Matrix, up: Matrix, ahead: Matrix) -> Matrix:
+    """Rotate a level direction by at most 45° so that it is parallel to most walls; unchanged without walls."""
+    walls = np.abs(normals @ up) < np.sqrt(1.0 - PARALLEL_COS**2)
+    if area[walls].sum() < MIN_LEVEL_SHARE * area.sum():
+        return ahead
+    aside = np.cross(ahead, up)
+    angle = np.arctan2(normals[walls] @ aside, normals[walls] @ ahead)
+    # Angles count modulo 90°, so that perpendicular walls vote for one angle: the best degree, then the mean around it.
+    votes = np.bincount(np.rint(np.rad2deg(angle)).astype(int) % 90, area[walls], 90)
+    best = np.deg2rad(float(np.argmax(np.convolve(np.r_[votes[-2:], votes, votes[:2]], np.ones(5), "valid"))))
+    off = np.angle(np.exp(4j * (angle - best))) / 4.0
+    near = np.abs(off) < np.deg2rad(8.0)
+    turn = best + (off[near] @ area[walls][near]) / area[walls][near].sum()
+    turn = (turn + np.pi / 4) % (np.pi / 2) - np.pi / 4
+    return np.asarray(np.cos(turn) * ahead + np.sin(turn) * aside)
+
+
+def _horizontal(T_world_camera: Matrix, up: Matrix) -> Matrix:
+    """Return the horizontal viewing direction of a camera; looking straight down, that of the image's upper edge."""
+    for direction in (T_world_camera[:3, 2], -T_world_camera[:3, 1]):
+        level = direction - (direction @ up) * up
+        if np.linalg.norm(level) > 0.3:
+            break
+    return _unit(level, level)
+
+
+def _unit(vector: Matrix, otherwise: Matrix) -> Matrix:
+    """Return a vector scaled to length 1, or `otherwise` if its length is 0."""
+    length = float(np.linalg.norm(vector))
+    return np.asarray(vector / length) if length > 1e-9 else otherwise

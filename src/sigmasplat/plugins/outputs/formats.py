@@ -1,0 +1,245 @@
+"""List the formats of `sigmasplat export`. A new format is one function and one row of `FORMATS`, at the end.
+
+Imports that load torch are inside the functions, so that `sigmasplat export --help` is fast.
+"""
+
+import inspect
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sigmasplat.errors import ConfigError
+from sigmasplat.plugins.outputs import splat_formats
+from sigmasplat.plugins.outputs.source import ExportSource as ExportSource
+
+if TYPE_CHECKING:
+    from sigmasplat.data.trajectory import Trajectory
+    from sigmasplat.plugins.outputs.axes import Axes
+    from sigmasplat.plugins.outputs.run_reader import RunReader
+    from sigmasplat.types import Matrix, Progress
+
+
+@dataclass(frozen=True)
+class ExportFormat:
+    """A row of the table: the name for --format, the endings that select it, a line of help, and its writer.
+
+    An ending selects the first row that has it. Without --out, an export gets the row's first ending. `write(source,
+    target, …)` writes the target, a file or folder that does not exist or may be replaced, and returns a short
+    description of its content. Its keyword-only parameters are the options of the command line that the format accepts.
+    reads_sequence: the format also accepts --source.
+    """
+
+    name: str
+    endings: tuple[str, ...]
+    help: str
+    write: Callable[..., str]
+    reads_sequence: bool = False
+
+    @property
+    def options(self) -> tuple[str, ...]:
+        """Return the names of the writer's options."""
+        parameters = inspect.signature(self.write).parameters.values()
+        return tuple(p.name for p in parameters if p.kind is p.KEYWORD_ONLY)
+
+    def accepts(self, option: str) -> bool:
+        """Return whether an option of the command line can be used with this format."""
+        return option in self.options or (option == "source" and self.reads_sequence)
+
+
+def owners(formats: tuple[ExportFormat, ...]) -> dict[str, ExportFormat]:
+    """Return the format that each ending selects: the first one with that ending."""
+    endings: dict[str, ExportFormat] = {}
+    for row in formats:
+        for ending in row.endings:
+            endings.setdefault(ending, row)
+    return endings
+
+
+def listed(formats: tuple[ExportFormat, ...]) -> list[str]:
+    """Return a line of help for each format: the endings that select it, its name and its description."""
+    own = owners(formats)
+    endings = (", ".join(ending for ending in row.endings if own[ending] is row) or "--format" for row in formats)
+    return [f"{ending:<15} {row.name}: {row.help}" for ending, row in zip(endings, formats, strict=True)]
+
+
+def choose(formats: tuple[ExportFormat, ...], name: str | None, out: Path | None) -> ExportFormat:
+    """Return the format with this name, else the one that the ending of `out` selects, else the first one.
+
+    Raises ConfigError if the name or the ending is unknown.
+    """
+    if name is not None:
+        named = [row for row in formats if row.name == name]
+        if not named:
+            raise ConfigError(f"no format '{name}'; there are {', '.join(row.name for row in formats)}")
+        return named[0]
+    if out is None:
+        return formats[0]
+    endings = owners(formats)
+    fitting = [ending for ending in endings if out.name.lower().endswith(ending)]
+    if not fitting:
+        raise ConfigError(f"unknown ending of {out}; end it in {', '.join(endings)}, or give --format")
+    return endings[max(fitting, key=len)]
+
+
+def refuse_unused(chosen: ExportFormat, formats: tuple[ExportFormat, ...], given: list[str]) -> None:
+    """Raise ConfigError if an option is given that the format does not accept."""
+    for option in given:
+        if not chosen.accepts(option):
+            others = ", ".join(row.name for row in formats if row.accepts(option))
+            raise ConfigError(
+                f"--{option.replace('_', '-')} cannot be used with format {chosen.name}, only with {others}"
+            )
+
+
+@contextmanager
+def _counting(title: str) -> "Iterator[Progress]":
+    from sigmasplat.run.terminal import Screen
+
+    with Screen().counting(title) as progress:
+        yield progress
+
+
+def _trajectory(source: ExportSource, target: Path) -> str:
+    from sigmasplat.run_folder.trajectory import write_trajectory
+
+    reader = source.reader()
+    has_log = (reader.run.path / "log.jsonl").is_file()
+    path = reader.believed_path() if has_log else reader.run.read_trajectory()
+    write_trajectory(target, path)
+    return f"{len(path):,} poses{reader.left_out() if has_log else ''}"
+
+
+def _covariance(source: ExportSource, target: Path) -> str:
+    from sigmasplat.run_folder.pose_covariance import write_square
+
+    return _write_covariances(source, target, write_square)
+
+
+def _ros_covariance(source: ExportSource, target: Path) -> str:
+    from sigmasplat.run_folder.pose_covariance import write_ros
+
+    return _write_covariances(source, target, write_ros)
+
+
+def _write_covariances(source: ExportSource, target: Path, write: "Callable[[Path, Trajectory, Matrix], None]") -> str:
+    reader = source.reader()
+    path = reader.believed_path()
+    write(target, path, reader.covariances())
+    return f"{len(path):,} poses with their covariance{reader.left_out()}"
+
+
+def _kitti(source: ExportSource, target: Path) -> str:
+    """Write one line per frame, since the line number is the frame number; nan for frames without a believed pose."""
+    import numpy as np
+
+    from sigmasplat.run_folder.trajectory import write_kitti_poses
+
+    reader = source.reader()
+    poses = np.full((len(reader.frames), 4, 4), np.nan)
+    poses[reader.believed_frames()] = reader.believed_path().T_world_camera
+    write_kitti_poses(target, poses)
+    left_out = reader.left_out()
+    return f"{len(reader.frames.rows):,} poses{left_out}{' (written as nan)' if left_out else ''}"
+
+
+def _nerfstudio(source: ExportSource, target: Path, *, pictures: bool) -> str:
+    from sigmasplat.plugins.outputs.nerfstudio import export_nerfstudio
+
+    return _export_views(export_nerfstudio, source, target, pictures)
+
+
+def _colmap(source: ExportSource, target: Path, *, pictures: bool) -> str:
+    from sigmasplat.plugins.outputs.colmap import export_colmap
+
+    return _export_views(export_colmap, source, target, pictures)
+
+
+def _export_views(
+    export: "Callable[[RunReader, Path, bool, Progress], int]", source: ExportSource, target: Path, pictures: bool
+) -> str:
+    from sigmasplat.types import no_progress
+
+    reader = source.reader()
+    if not pictures:
+        count = export(reader, target, False, no_progress)
+        return f"{count:,} views, no pictures (--pictures){reader.left_out()}"
+    with _counting("pictures") as progress:
+        count = export(reader, target, True, progress)
+        return f"{count:,} views with their pictures{reader.left_out(keyframes=True)}"
+
+
+def _points(source: ExportSource, target: Path, *, voxel_m: float | None, axes: "Axes | None") -> str:
+    from sigmasplat.plugins.evaluation.reconstruct import FusionInput
+    from sigmasplat.plugins.outputs.axes import levelled, transform_to
+    from sigmasplat.plugins.outputs.points import export_points
+
+    reader, chosen = source.reader(), axes or "y-up"
+    with _counting("surface") as progress:
+        surface = FusionInput.at(reader.run, reader.camera).surface(voxel_m, progress=progress)
+    if chosen != "camera":
+        surface = surface.moved(transform_to(chosen, levelled(reader)))
+    return f"{export_points(surface, target):,} points, axes {chosen}"
+
+
+def _video(
+    source: ExportSource, target: Path, *, size: int, fps: float, seconds: float | None, path: str, panels: str
+) -> str:
+    from sigmasplat.plugins.outputs.video import VideoOptions, export_video
+
+    options = VideoOptions(size, fps, seconds, path, panels)  # type: ignore[arg-type]
+    with _counting("film") as progress:
+        count = export_video(source.reader(), target, options, progress=progress)
+    return f"{count:,} images, {count / fps:.1f} s"
+
+
+def _plan(source: ExportSource, target: Path, *, cell_m: float) -> str:
+    from sigmasplat.plugins.outputs.plan import export_plan
+
+    with _counting("floor plan") as progress:
+        plan = export_plan(source.reader(), target, cell_m=cell_m, progress=progress)
+    regions = "no places to scan again" if not plan.regions else f"{len(plan.regions)} places to scan again"
+    return f"{regions}, also in {target.with_suffix('.json').name}"
+
+
+def _bag(source: ExportSource, target: Path, *, pictures: bool) -> str:
+    from sigmasplat.plugins.outputs.bag import export_bag
+
+    reader = source.reader()
+    with _counting("floor plan") as progress:
+        counts = export_bag(reader, target, pictures=pictures, progress=progress)
+    return f"{sum(counts.values()):,} messages of {len(counts)} topics{reader.left_out()}"
+
+
+FORMATS = (
+    ExportFormat("ply", (".ply",), "3DGS PLY with σ², for every viewer", splat_formats.ply),
+    ExportFormat(
+        "compressed-ply",
+        (".compressed.ply",),
+        "SuperSplat's compressed PLY, a fifth of the size",
+        splat_formats.like_ply("compressed_ply"),
+    ),
+    ExportFormat("splat", (".splat",), "32 bytes per splat, for web viewers", splat_formats.like_ply("splat")),
+    ExportFormat("spz", (".spz",), "Niantic's SPZ, less than a fifth of the size", splat_formats.spz),
+    ExportFormat("sog", (".sog",), "SuperSplat's SOG, the smallest", splat_formats.like_ply("sog")),
+    ExportFormat("gltf", (".glb", ".gltf"), "glTF with splats (KHR) and σ", splat_formats.scene("gltf")),
+    ExportFormat("usd", (".usdc", ".usda", ".usd"), "OpenUSD with splats and σ", splat_formats.scene("usd")),
+    ExportFormat("trajectory", (".txt",), "the path as TUM text", _trajectory),
+    ExportFormat("covariance", (".cov.txt",), "the path as TUM text with the covariance of each pose", _covariance),
+    ExportFormat("ros-covariance", (".ros.txt",), "the same as geometry_msgs/PoseWithCovariance", _ros_covariance),
+    ExportFormat("kitti", (".kitti.txt",), "the path as KITTI text, one line per frame", _kitti, True),
+    ExportFormat("nerfstudio", (".json",), "views as nerfstudio's transforms.json", _nerfstudio, True),
+    ExportFormat("colmap", ("-colmap",), "a folder with COLMAP's text model in sparse/0", _colmap, True),
+    ExportFormat("points", (".points.ply",), "the surface as points with normals", _points, True),
+    ExportFormat(
+        "video",
+        (".webm", ".mp4", ".gif", ".webp"),
+        "a video: colour, depth, uncertainty",
+        _video,
+        True,
+    ),
+    ExportFormat("bag", (".mcap", "-bag"), "ROS 2 messages: path with covariance, loops, map", _bag, True),
+    ExportFormat("plan", (".plan.png", ".png"), "a floor plan with regions to scan again", _plan, True),
+)
+"""All formats. The first one is the default."""

@@ -1,0 +1,235 @@
+"""Close small gaps of a mesh by patches that continue the surface around them smoothly.
+
+A patch has the connectivity of a disc, minimises the bending over itself and its edge (the square of the Laplacian, as
+in Botsch and Kobbelt 2004), and is marked: nobody has seen it.
+"""
+
+from collections import defaultdict
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array, csc_array, csr_array
+from scipy.sparse.linalg import splu
+from scipy.spatial import Delaunay, cKDTree
+from scipy.spatial.distance import pdist
+
+from sigmasplat.data.mesh import Mesh
+from sigmasplat.errors import ConfigError
+from sigmasplat.types import Matrix
+
+Indices = NDArray[np.int64]
+
+STD_PER_M = 0.5
+"""Standard deviation of a patch, added per distance from the seen edge: the surface may bend by about 27°."""
+MOST_POINTS = 4000
+"""Largest number of points inside one patch."""
+ROUNDS, LEAST_LENGTH = 4, 0.3
+"""Times a patch is placed, each time with the lengths of its edges found before; shorter ones count as this share of
+the median."""
+OUTWARD = 0.3
+"""Mean cosine between the surface beside an edge and the direction away from the middle of the loop. It is 1 around a
+hole in a plane, 0 at the rim of a cup, and −1 at the outer border of a part."""
+
+
+@dataclass(frozen=True, eq=False)
+class Patch:
+    """A patch of a loop: numbers of the loop's vertices [n]; positions of the new ones [m, 3]; faces [f, 3] with the
+    numbers 0 … n − 1 for the loop and n … n + m − 1 for the new ones; colours and standard deviations of the new ones,
+    None if the mesh has none."""
+
+    loop: Indices
+    points: Matrix
+    faces: Indices
+    colors: Matrix | None
+    depth_std_m: Matrix | None
+
+
+def filled(mesh: Mesh, largest_m: float) -> Mesh:
+    """Return the mesh with its gaps closed whose vertices are at most `largest_m` apart; larger ones stay open.
+
+    New vertices follow the others. They have the colours of the edge, a standard deviation that grows with the distance
+    from it (if the mesh has any), and `Mesh.filled` true. Outer borders and rims stay open. largest_m = 0 closes none.
+    Raises ConfigError if it is negative.
+    """
+    if not largest_m >= 0:
+        raise ConfigError(f"--fill-gaps must be at least 0 m (0 = none), found {largest_m:g}")
+    if not largest_m or not len(mesh.faces):
+        return mesh
+    neighbours = _neighbours(mesh.faces.astype(np.int64), len(mesh.vertices))
+    patches = [_patch(mesh, loop, neighbours) for loop in gaps(mesh, largest_m)]
+    return _joined(mesh, [patch for patch in patches if patch is not None])
+
+
+def gaps(mesh: Mesh, largest_m: float) -> list[Indices]:
+    """Return the loops around gaps that are at most `largest_m` across, in the order of a patch's border."""
+    beside = _border(mesh)
+    found = []
+    for loop in _loops(beside):
+        points = mesh.vertices[loop].astype(np.float64)
+        if len(loop) < 3 or (np.ptp(points, axis=0) > largest_m).any() or pdist(points).max() > largest_m:
+            continue
+        across, opposite = points - points.mean(0), mesh.vertices[[beside[edge] for edge in _edges(loop)]]
+        along = np.roll(points, -1, axis=0) - points
+        away = opposite - points
+        away -= along * (_dot(away, along) / np.maximum(_dot(along, along), 1e-18))[:, None]
+        cosines = _dot(away, across) / np.maximum(np.linalg.norm(away, axis=1) * np.linalg.norm(across, axis=1), 1e-18)
+        if cosines.mean() > OUTWARD:
+            found.append(loop)
+    return found
+
+
+def _border(mesh: Mesh) -> dict[tuple[int, int], int]:
+    """Return the directed edges of missing faces, each with the third vertex of the face on its other side."""
+    faces = mesh.faces.astype(np.int64)
+    start, end = faces[:, [0, 1, 2]].ravel(), faces[:, [1, 2, 0]].ravel()
+    third, n = faces[:, [2, 0, 1]].ravel(), len(mesh.vertices)
+    _, which, uses = np.unique(
+        np.minimum(start, end) * n + np.maximum(start, end), return_inverse=True, return_counts=True
+    )
+    open_edges = np.flatnonzero(uses[which] == 1)
+    return {(int(end[i]), int(start[i])): int(third[i]) for i in open_edges}
+
+
+def _loops(edges: dict[tuple[int, int], int]) -> list[Indices]:
+    """Follow directed edges to loops. Where loops touch at a vertex, they are separated there."""
+    following = defaultdict[int, list[int]](list)
+    for a, b in sorted(edges, reverse=True):
+        following[a].append(b)
+    loops = []
+    for first in sorted(following):
+        while following[first]:
+            path, place = [first], {first: 0}
+            while following[path[-1]]:
+                at = following[path[-1]].pop()
+                if at in place:
+                    begin = place[at]
+                    loops.append(np.array(path[begin:], np.int64))
+                    for left in path[begin + 1 :]:
+                        del place[left]
+                    del path[begin + 1 :]
+                    if len(path) == 1 and not following[first]:
+                        break
+                else:
+                    place[at] = len(path)
+                    path.append(at)
+    return loops
+
+
+def _edges(loop: Indices) -> list[tuple[int, int]]:
+    return list(zip(loop.tolist(), np.roll(loop, -1).tolist(), strict=True))
+
+
+def _patch(mesh: Mesh, loop: Indices, neighbours: csr_array) -> Patch | None:
+    """Make the patch of a loop; None if the loop cannot be triangulated."""
+    n = len(loop)
+    disc, faces = _disc(n)
+    sides = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    pairs, uses = np.unique(sides, axis=0, return_counts=True)
+    if (uses == 1).sum() != n or pairs[uses == 1].max() >= n:
+        return None
+    if len(disc) == n:
+        none = np.empty((0, 3))
+        return Patch(loop, none, faces, none, none[:, 0])
+    known = np.concatenate([loop, np.setdiff1d(neighbours[loop].indices, loop)])
+    points = mesh.vertices[known].astype(np.float64)
+    pairs = _pairs(_neighbours(faces, len(disc)), _numbered(neighbours[loop], known))
+    new = np.arange(n, len(disc))
+    placed = np.concatenate([points[:n], np.zeros((len(new), 3)), points[n:]])
+    lengths = np.ones(pairs.shape[1])
+    for _ in range(ROUNDS):
+        rows = _laplacian(pairs, lengths, len(disc), len(placed))
+        free = rows[:, new]
+        placed[new] = 0.0
+        placed[new] = splu(csc_array(free.T @ free)).solve(-(free.T @ (rows @ placed)))
+        lengths = np.linalg.norm(placed[pairs[0]] - placed[pairs[1]], axis=1)
+        lengths = np.maximum(lengths, LEAST_LENGTH * np.median(lengths))
+    membrane = splu(csc_array(rows[new][:, new]))
+
+    def from_edge(values: NDArray[np.float32]) -> Matrix:
+        return np.asarray(membrane.solve(-(rows[new][:, :n] @ values.astype(np.float64))))
+
+    colors = None if mesh.colors is None else np.clip(from_edge(mesh.colors[loop]), 0.0, 1.0)
+    std = None
+    if mesh.depth_std_m is not None:
+        distance, _ = cKDTree(points[:n]).query(placed[new])
+        std = np.hypot(from_edge(mesh.depth_std_m[loop]), STD_PER_M * distance)
+    return Patch(loop, placed[new], faces, colors, std)
+
+
+def _disc(n: int) -> tuple[Matrix, Indices]:
+    """Return n points on the unit circle followed by points inside it, equally dense, and triangles between them."""
+    angle = 2.0 * np.pi * np.arange(n) / n
+    circle = np.stack([np.cos(angle), np.sin(angle)], 1)
+    step = max(2.0 * np.pi / n, np.sqrt(2.0 * np.pi / np.sqrt(3.0) / MOST_POINTS))
+    count = int(np.ceil(1.0 / step)) + 1
+    row, column = np.mgrid[-2 * count : 2 * count + 1, -2 * count : 2 * count + 1].reshape(2, -1)
+    grid = step * np.stack([column + 0.5 * row, row * np.sqrt(0.75)], 1) + step * np.array([0.137, 0.071])
+    points = np.concatenate([circle, grid[np.linalg.norm(grid, axis=1) < 1.0 - 0.7 * step]])
+    faces = Delaunay(points).simplices.astype(np.int64)
+    a, b, c = (points[faces[:, k]] for k in range(3))
+    area = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
+    faces = np.where((area > 0)[:, None], faces, faces[:, ::-1])
+    return points, faces[np.abs(area) > 1e-9]
+
+
+def _pairs(inside: csr_array, around: csr_array) -> Indices:
+    """Return pairs of neighbours [2, P]: those inside a patch [n + m, n + m], and those of its loop in the mesh [n, n +
+    others]. Numbers: first the loop, then new vertices, then other vertices beside the loop."""
+    n, m = around.shape[0], inside.shape[0] - around.shape[0]
+    (row, column), (of_loop, other) = inside.nonzero(), around.nonzero()
+    other = np.where(other < n, other, other + m)
+    both = np.concatenate([np.stack([row, column]), np.stack([of_loop, other])], axis=1)
+    return np.unique(both, axis=1).astype(np.int64)  # an edge of the loop is in both
+
+
+def _laplacian(pairs: Indices, lengths: Matrix, rows: int, columns: int) -> csc_array:
+    """Return the mean of the vectors to the neighbours, each divided by its length [rows, columns]: on a smooth surface
+    it is the curvature times the distance of the vertices, also if they are not equally dense."""
+    row, column = pairs
+    weight = 1.0 / (lengths * np.bincount(row, minlength=rows)[row])
+    out = coo_array((weight, (row, column)), shape=(rows, columns))
+    own = coo_array((np.bincount(row, weight, rows), (np.arange(rows), np.arange(rows))), shape=(rows, columns))
+    return csc_array(out - own)
+
+
+def _neighbours(faces: Indices, vertices: int) -> csr_array:
+    """Return which vertices have an edge in common [V, V]."""
+    start, end = faces[:, [0, 1, 2]].ravel(), faces[:, [1, 2, 0]].ravel()
+    row, column = np.concatenate([start, end]), np.concatenate([end, start])
+    return csr_array(coo_array((np.ones(len(row)), (row, column)), shape=(vertices, vertices)))
+
+
+def _numbered(rows: csr_array, known: Indices) -> csr_array:
+    """Return rows [n, V] with only the columns of `known`, in their order."""
+    return csr_array(rows[:, known])
+
+
+def _joined(mesh: Mesh, patches: list[Patch]) -> Mesh:
+    """Return the mesh with patches."""
+    if not patches:
+        return mesh
+    start, faces = len(mesh.vertices), [mesh.faces.astype(np.int64)]
+    for patch in patches:
+        faces.append(np.concatenate([patch.loop, start + np.arange(len(patch.points))])[patch.faces])
+        start += len(patch.points)
+
+    def with_new(values: NDArray[np.float32], new: list[Matrix]) -> NDArray[np.float32]:
+        return np.concatenate([values, *(part.astype(np.float32) for part in new)])
+
+    colors, std = mesh.colors, mesh.depth_std_m
+    marks = np.zeros(len(mesh.vertices), bool) if mesh.filled is None else mesh.filled
+    return replace(
+        mesh,
+        vertices=with_new(mesh.vertices, [patch.points for patch in patches]),
+        faces=np.concatenate(faces).astype(np.int32),
+        colors=None if colors is None else with_new(colors, [p.colors for p in patches if p.colors is not None]),
+        depth_std_m=None
+        if std is None
+        else with_new(std, [p.depth_std_m for p in patches if p.depth_std_m is not None]),
+        filled=np.concatenate([marks, np.ones(start - len(marks), bool)]),
+    )
+
+
+def _dot(a: Matrix, b: Matrix) -> Matrix:
+    return np.asarray(np.einsum("ij,ij->i", a, b))

@@ -1,0 +1,121 @@
+"""Read the parts of a run that exports need: its camera, its path, and the images of its keyframes."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from sigmasplat.config import Config
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.component import APART, LOST
+from sigmasplat.data.submap import Picture
+from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.errors import RunError
+from sigmasplat.graph.path_covariance import PathCovariance
+from sigmasplat.input.source import Source
+from sigmasplat.run_folder.frames import RunFrames
+from sigmasplat.run_folder.runs import RunFolder
+from sigmasplat.types import Matrix
+
+
+@dataclass(frozen=True, eq=False)
+class RunReader:
+    """A run, and its sequence, which is opened only if the run kept no submaps."""
+
+    run: RunFolder
+    open_source: Callable[[], Source]
+
+    @cached_property
+    def source(self) -> Source:
+        """Return the sequence."""
+        return self.open_source()
+
+    @cached_property
+    def config(self) -> Config:
+        """Return the run's settings."""
+        return self.run.config()
+
+    @cached_property
+    def camera(self) -> Camera:
+        """Return the camera at the run's working resolution."""
+        if len(self.run.submaps):
+            return self.run.submaps.load(0).camera
+        return self.source.camera.prepared(self.config.input.width, self.config.input.crop_px)
+
+    @cached_property
+    def frames(self) -> RunFrames:
+        """Return the frames of the run. Raises RunError if it has no path, or if its log is shorter than its path."""
+        path = self.run.read_trajectory()
+        log = self.run.read_log()
+        if len(log) < len(path):
+            raise RunError(f"run {self.run.path}: its log has {len(log)} frames, its path {len(path)} poses")
+        return RunFrames.of(log, path)
+
+    def believed_frames(self) -> list[int]:
+        """Return the frames whose pose is believed, counted from the run's start. Raises RunError if there is none."""
+        if not len(self.frames.rows):
+            raise RunError(
+                f"run {self.run.path} has no frame whose pose is known in its world, so it has no pose to export; "
+                "run it again"
+            )
+        return [int(row) for row in self.frames.rows]
+
+    def believed_path(self) -> Trajectory:
+        """Return the poses of `believed_frames`. Raises RunError if there is none."""
+        self.believed_frames()
+        return self.frames.path
+
+    def poses_of(self, frames: Sequence[int]) -> Trajectory:
+        """Return the poses of some frames. Raises RunError if the pose of one is not believed."""
+        if unknown := sorted(set(frames) - set(self.believed_frames())):
+            raise RunError(f"run {self.run.path} has no believed pose of frame {unknown[0]}; choose another frame")
+        return self.frames.path.at(np.searchsorted(self.frames.rows, frames))
+
+    def covariances(self) -> Matrix:
+        """Return the covariance of the poses of `believed_path` [B, 6, 6], of left twists in the world, m and rad.
+
+        Raises RunError if the run did not record the errors of its path.
+        """
+        rows = self.believed_frames()
+        errors = PathCovariance.of(self.run.read_checkpoint()[0])
+        if errors is None or len(errors) <= rows[-1]:
+            raise RunError(
+                f"run {self.run.path} did not record the errors of its path, because an older version made it; "
+                "run it again"
+            )
+        return np.stack([errors.of_frame(row) for row in rows])
+
+    def left_out(self, keyframes: bool = False) -> str:
+        """Describe how many frames have no believed pose, of all or of the keyframes; empty if there are none."""
+        log, states = self.frames.log, self.frames.states
+        counted = [s for s, record in zip(states, log, strict=True) if not keyframes or record["is_keyframe"]]
+        found = [f"{counted.count(state):,} {state}" for state in (LOST, APART) if state in counted]
+        return f"; left out: {', '.join(found)}" if found else ""
+
+    def count_keyframes(self) -> int:
+        """Return the number of keyframes that `keyframes` yields."""
+        return sum(bool(record["is_keyframe"]) for record in self.frames.log)
+
+    def keyframes(self) -> Iterator[tuple[int, Picture]]:
+        """Yield each keyframe once, in order of time: its frame number, and its images, one at a time in memory."""
+        if not len(self.run.submaps):
+            yield from self._keyframes_of_sequence()
+            return
+        seen = set[int]()
+        for index in range(len(self.run.submaps)):
+            for k, frame in enumerate(self.run.submaps.load(index).frames):
+                # Submaps share the keyframe between them. Frame numbers below 0 belong to an earlier session.
+                if 0 <= frame < len(self.frames) and frame not in seen:
+                    seen.add(frame)
+                    yield frame, self.run.submaps.picture(index, k)
+
+    def _keyframes_of_sequence(self) -> Iterator[tuple[int, Picture]]:
+        """Read the keyframes from the sequence again."""
+        s = self.config.input
+        for i, record in enumerate(self.frames.log):
+            if record["is_keyframe"]:
+                read = self.source.frame(record["index"])
+                frame = read.prepared(s.width, s.min_depth_m, s.max_depth_m, s.crop_px)
+                color = np.rint(frame.color * np.float32(255.0)).astype(np.uint8)
+                yield i, Picture(color, frame.depth_m)

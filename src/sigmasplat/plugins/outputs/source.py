@@ -1,0 +1,63 @@
+"""What is exported: a run folder, or a file that holds a map. Imports that load torch are inside the functions."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sigmasplat.errors import RunError
+
+if TYPE_CHECKING:
+    from sigmasplat.data.field import GaussianField
+    from sigmasplat.data.map_uncertainty import SplatStd
+    from sigmasplat.input.source import Source
+    from sigmasplat.plugins.outputs.run_reader import RunReader
+    from sigmasplat.run_folder.runs import RunFolder
+
+
+def _no_sequence(run: "RunFolder") -> "Source":
+    raise RunError(f"run {run.path} kept no submaps, and its sequence was not given")
+
+
+@dataclass(frozen=True)
+class ExportSource:
+    """What is exported: a run folder, or a file that holds a map.
+
+    open_sequence: opens the sequence of a run, for keyframe images that the run did not keep.
+    """
+
+    path: Path
+    open_sequence: "Callable[[RunFolder], Source]" = _no_sequence
+
+    @property
+    def name(self) -> str:
+        """Return the default name of exports: the run's name, or the file's name without its ending."""
+        path = self.path.resolve()
+        return path.stem.removesuffix(".compressed") if path.is_file() else path.name
+
+    def run(self) -> "RunFolder":
+        """Open the run. Raises RunError if there is no run, or if the source is a map."""
+        from sigmasplat.run_folder.runs import RunFolder
+
+        if self.path.is_file():
+            raise RunError(f"{self.path} is a file, which can be exported only as another map; give a run folder")
+        return RunFolder.open(self.path)
+
+    def reader(self) -> "RunReader":
+        """Open the run to read its path, camera and keyframe images. Raises RunError as `run` does."""
+        from sigmasplat.plugins.outputs.run_reader import RunReader
+
+        run = self.run()
+        return RunReader(run, lambda: self.open_sequence(run))
+
+    def splats(self) -> "tuple[GaussianField, SplatStd | None]":
+        """Read the map, and the standard deviations of its splats if a run has measured them.
+
+        Raises RunError if there is no run, SourceError if the map cannot be read.
+        """
+        from sigmasplat.plugins.outputs.splats.any_format import read_any
+
+        if self.path.is_file() or (not self.path.exists() and self.path.suffix != ""):
+            return read_any(self.path), None
+        run = self.run()
+        return run.read_splat_std() or (run.read_map(), None)

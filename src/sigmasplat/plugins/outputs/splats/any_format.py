@@ -1,0 +1,74 @@
+"""Read a map in any format. The format is recognised by the content, not by the file's name."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from sigmasplat.data.field import GaussianField
+from sigmasplat.errors import SourceError
+from sigmasplat.files.binary import open_binary
+from sigmasplat.files.guard import guarded
+from sigmasplat.files.ply_elements import read_header
+from sigmasplat.plugins.outputs.splats import compressed_ply, gltf, sog, splat, spz, spz_container, usd
+from sigmasplat.run_folder import splat_ply as ply
+
+READABLE = ".ply, .compressed.ply, .splat, .spz, .sog, .glb, .gltf, .usda, .usdc or .usd"
+START = 4096
+"""The first bytes of a file, which decide its format. A .gltf nearly always says `asset` in them."""
+READERS: dict[bytes, Callable[[Path], GaussianField]] = {
+    spz_container.GZIP: spz.read_field,
+    spz_container.MAGIC: spz.read_field,
+    sog.MAGIC: sog.read_field,
+    gltf.MAGIC: gltf.read_field,
+    usd.BINARY: usd.read_field,
+    usd.TEXT: usd.read_field,
+}
+"""Readers by the first bytes of a file."""
+OTHER_FILES = {
+    b"version https://git-lfs": "is a Git LFS pointer, not the map itself; run: git lfs pull",
+    b"<": "is a web page or XML, not the map itself; download the map again",
+    b"{": "is JSON; give the file with the splats",
+    b"\x89PNG": "is an image; give the file with the splats",
+}
+"""Messages about other files that users give by mistake, by their first bytes."""
+
+
+def read_any(path: Path) -> GaussianField:
+    """Read a map in any of the formats of `READABLE`; σ² that is not in the file becomes exp(−7).
+
+    Raises SourceError if it is missing, a folder, damaged, or of another format; SigmaSplatError if it is OpenUSD and
+    usd-core is not installed.
+    """
+    if path.is_dir():
+        raise SourceError(f"{path} is a folder, not a map; give a file: {READABLE}")
+    with guarded(path, "copy or download it again", SourceError, "damaged"):
+        return _read_known(path)
+
+
+def _read_known(path: Path) -> GaussianField:
+    with open_binary(path, "cannot read map") as file:
+        start = file.read(START)
+    if start[:3] == b"ply" and start[3:4].isspace():
+        return _read_ply(path)
+    for magic, read in READERS.items():
+        if start.startswith(magic):
+            return read(path)
+    return _read_headerless(path, start)
+
+
+def _read_ply(path: Path) -> GaussianField:
+    with open_binary(path, "cannot read map") as file:
+        compressed = compressed_ply.is_compressed(read_header(file, path))
+    return compressed_ply.read_field(path) if compressed else ply.read_field(path)
+
+
+def _read_headerless(path: Path, start: bytes) -> GaussianField:
+    """Read a .splat file, which has no header, or a .gltf, which is JSON. Raises SourceError if it is neither."""
+    try:
+        return splat.read_field(path)
+    except SourceError as problem:
+        if start.lstrip().startswith(b"{") and (b'"asset"' in start or path.suffix.lower() == ".gltf"):
+            return gltf.read_field(path)
+        for magic, what in OTHER_FILES.items():
+            if start.lstrip().startswith(magic):
+                raise SourceError(f"{path} {what}") from problem
+        raise

@@ -1,0 +1,246 @@
+"""Render a run as a video along its path or on an orbit: colour alone, or with depth and uncertainty beside it."""
+
+import os
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from PIL import Image
+
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.field import GaussianField
+from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.env import install_package
+from sigmasplat.errors import BackendError, ConfigError, RunError
+from sigmasplat.files.atomic import replacing
+from sigmasplat.plugins.outputs.camera_path import orbit, smooth_path
+from sigmasplat.plugins.outputs.drawing.colormap import Rgb
+from sigmasplat.plugins.outputs.drawing.film import FilmMaps, FilmScale, color_bytes, film_image, legend_strip
+from sigmasplat.plugins.outputs.floorplan.ground import floor_frame
+from sigmasplat.plugins.outputs.floorplan.surface_samples import SurfaceRenderer, sample_surfaces
+from sigmasplat.plugins.outputs.run_reader import RunReader
+from sigmasplat.render import FieldRenderer
+from sigmasplat.run_folder.frames import noted_up
+from sigmasplat.types import Matrix, Progress, no_progress
+
+SHORTEST_S, LONGEST_S, ORBIT_S = 4.0, 20.0, 12.0
+SAMPLES = 12
+"""Number of images from which the film's colour scale is computed."""
+SURFACE_VIEWS = 20
+CEILING_M = 0.1
+"""On an orbit, splats higher than this above the camera's median height are removed: mostly the ceiling."""
+
+
+@dataclass(frozen=True)
+class VideoOptions:
+    """The options of a video.
+
+    width_px: width of a panel (0: that of the run's images); fps: images per second; seconds: length (None: that of the
+    path, within 4 to 20 s; 12 s for an orbit); path: along the run's path or on an orbit; panels: colour, depth and
+    uncertainty side by side ("all"), or colour alone ("color").
+
+    Raises ConfigError on a size, rate or length out of range.
+    """
+
+    width_px: int = 0
+    fps: float = 25.0
+    seconds: float | None = None
+    path: Literal["run", "orbit"] = "run"
+    panels: Literal["all", "color"] = "all"
+
+    def __post_init__(self) -> None:
+        if not (self.width_px == 0 or 32 <= self.width_px <= 4096):
+            raise ConfigError(f"a video's panels must be 32 to 4096 pixels wide, found {self.width_px}")
+        if not 1.0 <= self.fps <= 120.0 or not (self.seconds is None or 0.04 <= self.seconds <= 3600.0):
+            raise ConfigError(
+                f"a video must have 1 to 120 images/s and last 0.04 s to 1 h, found {self.fps} and {self.seconds} s"
+            )
+        if self.path not in ("run", "orbit"):
+            raise ConfigError(f"a video's path must be 'run' or 'orbit', found {self.path!r}")
+        if self.panels not in ("all", "color"):
+            raise ConfigError(f"a video's panels must be 'all' or 'color', found {self.panels!r}")
+
+    def images(self, path_s: float) -> int:
+        """Return the number of images of the film, for a path that lasts `path_s` seconds."""
+        usual = ORBIT_S if self.path == "orbit" else float(np.clip(path_s, SHORTEST_S, LONGEST_S))
+        return max(1, round((self.seconds or usual) * self.fps))
+
+
+def export_video(
+    reader: RunReader,
+    target: Path,
+    options: VideoOptions | None = None,
+    *,
+    renderer: SurfaceRenderer | None = None,
+    progress: Progress = no_progress,
+) -> int:
+    """Write a video and return its number of images. Calls `progress(done, total)` at the start and after each image.
+
+    Raises RunError on an unknown ending, or without a map or path; BackendError without OpenCV for .webm and .mp4.
+    """
+    options = options or VideoOptions()
+    check_ending(target)
+    config, path = reader.config, reader.believed_path()
+    renderer = renderer or FieldRenderer(config.render, config.backend)
+    field, camera = reader.run.read_map(), film_camera(reader.camera, options.width_px)
+    count = options.images(float(path.timestamps_s[-1] - path.timestamps_s[0]))
+    if options.path == "orbit":
+        field, poses = orbit_view(field, path, camera, count, renderer, noted_up(reader.run.facts()))
+    else:
+        poses = smooth_path(path, count)
+    show = partial(_show, renderer, field, camera)
+    draw = _color_images if options.panels == "color" else _images
+    progress(0, count)
+    write_video(target, draw(show, poses, camera.width, progress), options.fps)
+    return count
+
+
+def film_camera(camera: Camera, width_px: int) -> Camera:
+    """Return the camera resized to a width (0: unchanged), with even width and height as codecs require."""
+    width = (width_px or camera.width) // 2 * 2
+    return camera.resized(width, max(2, round(camera.height * width / camera.width / 2) * 2))
+
+
+def orbit_view(
+    field: GaussianField,
+    path: Trajectory,
+    camera: Camera,
+    images: int,
+    renderer: SurfaceRenderer,
+    up_world: Matrix | None = None,
+) -> tuple[GaussianField, Matrix]:
+    """Return the map without its ceiling, and poses [images, 4, 4] on a circle above it from which it is visible;
+    up_world: as in `floor_frame`."""
+    samples = list(sample_surfaces(field, path, camera, renderer, SURFACE_VIEWS))
+    T = floor_frame(samples, up_world)
+    points = np.concatenate([sample.points for sample in samples]) @ T[:3, :3].T + T[:3, 3]
+    low, high = np.quantile(points, [0.02, 0.98], axis=0)
+    ceiling_m = float(np.median(path.T_world_camera[:, :3, 3] @ T[2, :3] + T[2, 3])) + CEILING_M
+    middle = np.append((low + high)[:2] / 2.0, min(ceiling_m, 0.8) / 2.0)
+    half_view = np.arctan(min(camera.width / camera.fx, camera.height / camera.fy) / 2.0)
+    radius_m = 0.85 * float(np.linalg.norm((high - low)[:2]) / 2.0 / np.sin(half_view))
+    T_world_floor = se3.inverse(T)
+    center = T_world_floor[:3, :3] @ middle + T_world_floor[:3, 3]
+    kept = field.moved(torch.eye(4))  # makes a copy
+    kept.keep(torch.from_numpy(field.means.numpy().astype(np.float64) @ T[2, :3] + T[2, 3] < ceiling_m))
+    return kept, orbit(center, T[2, :3], T[1, :3], radius_m, images)
+
+
+def _show(renderer: SurfaceRenderer, field: GaussianField, camera: Camera, T_world_camera: Matrix) -> FilmMaps:
+    with torch.inference_mode():
+        return FilmMaps.of(renderer(field, camera, se3.inverse(T_world_camera)))
+
+
+def _images(show: Callable[[Matrix], FilmMaps], poses: Matrix, width: int, progress: Progress) -> Iterator[Rgb]:
+    """Yield the images of a video; a few of them determine the colour scale."""
+    rows = np.unique(np.linspace(0, len(poses) - 1, min(SAMPLES, len(poses))).round().astype(int))
+    scale = FilmScale.of([show(poses[row]) for row in rows])
+    strip = legend_strip(scale, width)
+    for done, pose in enumerate(poses, 1):
+        yield film_image(show(pose), scale, strip)
+        progress(done, len(poses))
+
+
+def _color_images(show: Callable[[Matrix], FilmMaps], poses: Matrix, width: int, progress: Progress) -> Iterator[Rgb]:
+    """Yield the colours of a video."""
+    for done, pose in enumerate(poses, 1):
+        yield color_bytes(show(pose))
+        progress(done, len(poses))
+
+
+CODECS = {".webm": "VP90", ".mp4": "vp09"}
+ANIMATIONS = {".gif": "GIF", ".webp": "WEBP"}
+ENDINGS = (*CODECS, *ANIMATIONS)
+NO_IMAGES = "a video needs at least one image, found none"
+
+
+def write_video(path: Path, images: Iterable[Rgb], fps: float) -> None:
+    """Write images uint8 RGB [H, W, 3] of equal size as a video in the format of the path's ending, atomically.
+
+    Raises RunError on an unknown ending, an unwritable file or a missing codec; BackendError without OpenCV.
+    """
+    check_ending(path)
+    kind = path.suffix.lower()
+    with replacing(path) as temporary:
+        scratch = temporary.with_suffix(kind)  # OpenCV selects the format by the ending
+        try:
+            if kind in CODECS:
+                _write_vp9(scratch, images, fps, CODECS[kind])
+            else:
+                _write_animation(scratch, iter(images), fps, ANIMATIONS[kind])
+            os.replace(scratch, temporary)
+        finally:
+            scratch.unlink(missing_ok=True)
+
+
+def check_ending(path: Path) -> None:
+    """Raise RunError unless the path's ending is that of a video, BackendError if it needs OpenCV, which is missing."""
+    if path.suffix.lower() not in ENDINGS:
+        raise RunError(f"cannot write a video as {path.name}; give a name that ends in {', '.join(ENDINGS)}")
+    if path.suffix.lower() in CODECS:
+        _opencv()
+
+
+def _opencv() -> Any:
+    try:
+        import cv2
+    except ImportError as problem:
+        raise BackendError(
+            f"videos as .webm and .mp4 need OpenCV: {install_package('opencv-python-headless')}; or write .gif or .webp"
+        ) from problem
+    return cv2
+
+
+def _write_vp9(path: Path, images: Iterable[Rgb], fps: float, codec: str) -> None:
+    """Encode with VP9, which needs even sizes: an odd last row or column is dropped."""
+    cv2, writer, size = _opencv(), None, (0, 0)
+    try:
+        for image in images:
+            if writer is None:
+                size = (image.shape[1] // 2 * 2, image.shape[0] // 2 * 2)
+                with _quiet():
+                    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*codec), fps, size)
+                if not writer.isOpened():
+                    raise RunError(
+                        f"cannot write {path.name} with this OpenCV; choose .gif or .webp, or a writable place"
+                    )
+            writer.write(np.ascontiguousarray(image[: size[1], : size[0], ::-1]))
+    finally:
+        if writer is not None:
+            writer.release()
+    if writer is None:
+        raise RunError(NO_IMAGES)
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Silence the process's standard error, where OpenCV prints a harmless warning about a tag in .webm."""
+    sys.stderr.flush()
+    kept = os.dup(2)
+    try:
+        with open(os.devnull, "wb") as nowhere:
+            os.dup2(nowhere.fileno(), 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+
+
+def _write_animation(path: Path, images: Iterator[Rgb], fps: float, kind: str) -> None:
+    """Write an animation that repeats endlessly."""
+    first = next(images, None)
+    if first is None:
+        raise RunError(NO_IMAGES)
+    rest = (Image.fromarray(image) for image in images)
+    duration_ms = round(1000.0 / fps)
+    options = {"quality": 80} if kind == "WEBP" else {}
+    Image.fromarray(first).save(
+        path, kind, save_all=True, append_images=rest, duration=duration_ms, loop=0, **options
+    )  # fmt: skip

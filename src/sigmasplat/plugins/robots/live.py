@@ -1,0 +1,290 @@
+"""Give a run that goes on to outlets: transforms, odometry, loops, images, and the map as points and as a grid."""
+
+from array import array
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property, partial
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sigmasplat.data import se3
+from sigmasplat.data.accelerometer import up_of_path
+from sigmasplat.data.field import GaussianField
+from sigmasplat.data.frame import Frame
+from sigmasplat.data.submap import SubmapStore
+from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.errors import SigmaSplatError
+from sigmasplat.graph.path_covariance import PathCovariance
+from sigmasplat.plugins.outputs.floorplan.floor_plan import FloorPlan, floor_plan
+from sigmasplat.plugins.robots.frames import (
+    FLOOR,
+    LINK,
+    MAP,
+    ODOM,
+    OPTICAL,
+    T_LINK_OPTICAL,
+    T_MAP_WORLD,
+    WORLD,
+    camera_links,
+    levelled_map,
+    link_pose,
+    ros_covariance,
+)
+from sigmasplat.plugins.robots.map_messages import MAX_POINTS, grids, points_of
+from sigmasplat.plugins.robots.odometry import LiveOdometry, has_motion
+from sigmasplat.plugins.robots.outlet import Job, Outlet
+from sigmasplat.plugins.robots.ros_messages import (
+    CLOUD,
+    COLOR,
+    COLOR_INFO,
+    DEPTH,
+    DEPTH_INFO,
+    GRID,
+    GRID_STD,
+    LOOP,
+    ODOMETRY,
+    TF,
+    TF_STATIC,
+    Encoded,
+    Points,
+    RosMessages,
+    Topic,
+    stamp_of,
+)
+from sigmasplat.render import FieldRenderer
+from sigmasplat.render.predictive import predict
+from sigmasplat.run.protocols import LoopResult, StepResult
+from sigmasplat.slam.checkpoint import path_errors
+from sigmasplat.slam.slam import Slam
+from sigmasplat.types import Matrix
+
+Images = Literal["none", "keyframes", "all"]
+SUBMAP_POINTS = 20_000
+"""At most this many points of each submap while the run goes on; fewer if there are many submaps."""
+STATIC = ((MAP, WORLD, T_MAP_WORLD), (LINK, OPTICAL, T_LINK_OPTICAL))
+"""Each message of static transforms contains all of them, because late subscribers get only the last one."""
+
+
+class LiveRobot:
+    """A `protocols.Callback` that gives messages to outlets.
+
+    It copies small data in the thread of the run. Messages are made and written on the threads of the outlets. images:
+    of which frames images are given. warn: prints a line if an outlet fails.
+    """
+
+    def __init__(
+        self, slam: Slam, outlets: Sequence[Outlet], warn: Callable[[str], None], images: Images = "keyframes"
+    ) -> None:
+        self.slam, self.outlets, self.warn, self.images = slam, outlets, warn, images
+        self.odometry = LiveOdometry(slam.atlas)
+        self._frames, self._forces = dict[int, Frame](), _Forces()
+        self._submaps = list[_SubmapPoints]()
+        self._stamp_ns = -1
+        self._failed = set[str]()
+
+    def watch(self, frame: Frame) -> None:
+        """Keep until a frame's step the force on it, and its images if they may be wanted."""
+        self._forces.watch(frame)
+        if self.images != "none":
+            self._frames[frame.index] = frame
+
+    def __call__(self, step: StepResult) -> None:
+        """Give the messages of a step to the outlets."""
+        self._now(step.timestamp_s)
+        self._forces.step(step.index, len(self.slam.steps) - 1)
+        self._offer_images(step)
+        moved = has_motion(step.state, step.tracking)
+        T_odom_camera = self.odometry.step(moved, step.lost, step.is_keyframe)
+        if not step.lost:
+            self._offer_pose(step, T_odom_camera)
+        if any(loop.accepted for loop in step.loops):
+            self._offer_loop(len(self.slam.steps) - 1)
+        self._offer_submaps(step.submap)
+        self._report_failures()
+
+    def finishing(self, done: int, total: int) -> None:
+        """Do nothing while the final map is made."""
+
+    def last_loops(self, loops: Sequence[LoopResult]) -> None:
+        """Give the final map, and the last pose if the last loops have moved it."""
+        self._now(self.slam.steps[-1].timestamp_s)
+        if any(loop.accepted for loop in loops):
+            self._offer_loop(len(self.slam.steps) - 1)
+        self._offer_final_map()
+
+    def close(self) -> None:
+        """Write what waits, and report outlets that failed."""
+        for outlet in self.outlets:
+            outlet.close()
+        self._report_failures()
+
+    # ---- in the thread of the run ----
+
+    def _offer(self, job: Job, *topics: Topic, bulky: bool = False) -> None:
+        for outlet in self.outlets:
+            outlet.offer(job, *topics, bulky=bulky)
+
+    def _now(self, timestamp_s: float) -> None:
+        """Set the time of the next messages; the first time, give the static transforms."""
+        first, self._stamp_ns = self._stamp_ns < 0, stamp_of(timestamp_s)
+        if first:
+            self._offer(partial(_static, self._stamp_ns, STATIC), TF_STATIC)
+
+    def _offer_images(self, step: StepResult) -> None:
+        frame = self._frames.pop(step.index, None)
+        for index in list(self._frames):  # a copy: in real time `watch` runs on another thread
+            if index < step.index:
+                del self._frames[index]
+        if frame is not None and (self.images == "all" or step.is_keyframe):
+            job = partial(_images, self._stamp_ns, frame)
+            self._offer(job, COLOR, COLOR_INFO, DEPTH, DEPTH_INFO, bulky=True)
+
+    def _offer_pose(self, step: StepResult, T_odom_camera: Matrix) -> None:
+        """Give the transforms and the odometry of a frame that is not lost.
+
+        If the frame's component is not connected to the world, map → odom is not known and left out.
+        """
+        T_odom_link = link_pose(T_LINK_OPTICAL @ T_odom_camera)
+        links = camera_links(T_odom_link, None if step.component else link_pose(T_MAP_WORLD @ step.T_world_camera))
+        known = self.odometry.covariance
+        covariance = None if known is None else ros_covariance(known, T_LINK_OPTICAL, T_odom_link)
+        self._offer(partial(_pose, self._stamp_ns, links, covariance), TF, ODOMETRY)
+
+    def _offer_loop(self, row: int) -> None:
+        """Give the pose of a frame in the map with its covariance; this is computed on the outlet's thread."""
+        slam = self.slam
+        if slam.atlas.in_world[row]:
+            errors = path_errors(slam.atlas, slam.keyframe_indices, slam.closer.believed)
+            self._offer(partial(_loop, self._stamp_ns, errors, row), LOOP)
+
+    def _offer_submaps(self, finished: int) -> None:
+        """Give the points of all finished submaps of the world, when one more is finished; they are read on the thread
+        of the outlet."""
+        if len(self._submaps) == finished:
+            return
+        atlas = self.slam.atlas
+        new = range(len(self._submaps), finished)
+        self._submaps.extend(_SubmapPoints(self.slam.store, index) for index in new)
+        parts = [
+            (submap, T_MAP_WORLD @ atlas.anchors[s])
+            for s, submap in enumerate(self._submaps)
+            if not atlas.components[s]
+        ]
+        if parts:
+            self._offer(partial(_submaps, self._stamp_ns, parts), CLOUD)
+
+    def _offer_final_map(self) -> None:
+        """Give the final map as points and as a grid."""
+        field, known = self.slam.field, self.slam.uncertainty
+        std = None if known is None or known.std is None else known.std.depth_std_m
+        self._offer(partial(_final_cloud, self._stamp_ns, field, std), CLOUD)
+        plan = self._floor_plan()
+        if plan is not None:
+            floor = (MAP, FLOOR, T_MAP_WORLD @ se3.inverse(levelled_map(plan.T_floor_world)))
+            self._offer(partial(_static, self._stamp_ns, [*STATIC, floor]), TF_STATIC)
+            self._offer(partial(grids, plan, self._stamp_ns, FLOOR), GRID, GRID_STD)
+
+    def _floor_plan(self) -> FloorPlan | None:
+        """Return the floor plan of the final map; None if no surface is visible."""
+        slam, config, field, known = self.slam, self.slam.config, self.slam.field, self.slam.uncertainty
+        whole, believed = slam.trajectory(), slam.believed()
+        path, up_world = whole.at(believed), self._forces.up_of(whole, believed)
+        predictor = None
+        if known is not None:
+            predictor = partial(predict, field, known, options=config.render, backend=config.backend)
+        renderer, camera = FieldRenderer(config.render, config.backend), slam.view.camera
+        try:
+            if not len(path):
+                return None
+            return floor_plan(field, path, camera, renderer=renderer, predictor=predictor, up_world=up_world)
+        except SigmaSplatError:
+            return None
+
+    def _report_failures(self) -> None:
+        for outlet in self.outlets:
+            name = outlet.sink.name
+            if outlet.failure and name not in self._failed:
+                self._failed.add(name)
+                self.warn(f"the {name} ended ({outlet.failure}) after {outlet.written} messages; the run goes on")
+
+
+# ---- jobs, on the threads of the outlets ----
+
+
+def _static(stamp_ns: int, links: Sequence[tuple[str, str, Matrix]], messages: RosMessages) -> list[Encoded]:
+    return [messages.transforms(TF_STATIC, stamp_ns, links)]
+
+
+def _images(stamp_ns: int, frame: Frame, messages: RosMessages) -> list[Encoded]:
+    return messages.images(stamp_ns, frame.camera, frame.color, frame.depth_m)
+
+
+def _pose(
+    stamp_ns: int, links: Sequence[tuple[str, str, Matrix]], covariance: Matrix | None, messages: RosMessages
+) -> list[Encoded]:
+    T_odom_link = links[-1][2]
+    return [
+        messages.transforms(TF, stamp_ns, links),
+        messages.odometry(stamp_ns, ODOM, LINK, T_odom_link, covariance),
+    ]
+
+
+def _loop(stamp_ns: int, errors: Mapping[str, Tensor], row: int, messages: RosMessages) -> list[Encoded]:
+    path = PathCovariance.of(errors)
+    assert path is not None
+    T_map_link = link_pose(T_MAP_WORLD @ path.T_world_camera[row])
+    covariance = ros_covariance(path.of_frame(row), T_MAP_WORLD, T_map_link)
+    return [messages.pose(LOOP, stamp_ns, MAP, T_map_link, covariance)]
+
+
+class _Forces:
+    """The forces that an accelerometer measures on the frames, if there is one."""
+
+    def __init__(self) -> None:
+        self._waiting = dict[int, NDArray[np.float64]]()
+        self._rows, self._forces_m_s2 = array("q"), array("d")
+
+    def watch(self, frame: Frame) -> None:
+        """Keep the force on a frame until its step; frames that real time drops have none."""
+        if frame.specific_force_m_s2 is not None:
+            self._waiting[frame.index] = frame.specific_force_m_s2
+
+    def step(self, index: int, row: int) -> None:
+        """Note the force on the frame with this index, which is the step `row`."""
+        for waiting in [i for i in list(self._waiting) if i <= index]:  # a copy: `watch` may run on another thread
+            force = self._waiting.pop(waiting)
+            if waiting == index:
+                self._rows.append(row)
+                self._forces_m_s2.extend(force)
+
+    def up_of(self, path: Trajectory, believed: NDArray[np.bool_]) -> NDArray[np.float64] | None:
+        """Return the unit vector [3] that points up in the world, from the believed poses of a path; None if it was not
+        measured."""
+        rows, forces = np.array(self._rows, np.intp), np.array(self._forces_m_s2).reshape(-1, 3)
+        use = believed[rows]
+        return up_of_path(path.T_world_camera[rows[use]], forces[use])
+
+
+class _SubmapPoints:
+    """The points of a finished submap, in its frame; read once."""
+
+    def __init__(self, store: SubmapStore, index: int) -> None:
+        self.store, self.index = store, index
+
+    @cached_property
+    def points(self) -> Points:
+        return points_of(self.store.load(self.index).field, None, SUBMAP_POINTS)
+
+
+def _submaps(stamp_ns: int, parts: Sequence[tuple[_SubmapPoints, Matrix]], messages: RosMessages) -> list[Encoded]:
+    each = MAX_POINTS // len(parts)
+    moved = [submap.points.thinned(each).moved(T) for submap, T in parts]
+    return [messages.cloud(stamp_ns, MAP, Points.joined(moved))]
+
+
+def _final_cloud(
+    stamp_ns: int, field: GaussianField, depth_std_m: Tensor | None, messages: RosMessages
+) -> list[Encoded]:
+    return [messages.cloud(stamp_ns, MAP, points_of(field, depth_std_m).moved(T_MAP_WORLD))]

@@ -1,0 +1,234 @@
+"""Make ROS 2 messages from poses, maps and images, as bytes (CDR), through the rosbags package (Apache-2.0).
+
+Stamps are the times of the frames, nanoseconds.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.files.optional import import_optional
+from sigmasplat.plugins.robots.frames import OPTICAL
+from sigmasplat.types import Matrix
+
+EXTRA = "ros"
+KNOWN_VARIANCE = 1e-10
+"""Variance written for a pose that is known exactly (10 µm, 10 µrad), because readers invert covariances."""
+UNKNOWN = (-1.0, *(0.0,) * 35)
+"""Covariance that is not known: ROS marks it by −1 in the first element."""
+
+
+class Topic(NamedTuple):
+    """A topic: its name, its message type, and whether late subscribers get the last message (transient local)."""
+
+    name: str
+    msgtype: str
+    latched: bool = False
+
+
+TF = Topic("/tf", "tf2_msgs/msg/TFMessage")
+TF_STATIC = Topic("/tf_static", "tf2_msgs/msg/TFMessage", True)
+ODOMETRY = Topic("/sigmasplat/odometry", "nav_msgs/msg/Odometry")
+POSE = Topic("/sigmasplat/pose", "geometry_msgs/msg/PoseWithCovarianceStamped")
+LOOP = Topic("/sigmasplat/loop_closure", "geometry_msgs/msg/PoseWithCovarianceStamped")
+CLOUD = Topic("/sigmasplat/cloud", "sensor_msgs/msg/PointCloud2", True)
+GRID = Topic("/map", "nav_msgs/msg/OccupancyGrid", True)
+GRID_STD = Topic("/sigmasplat/map_depth_std_cm", "nav_msgs/msg/OccupancyGrid", True)
+COLOR = Topic("/camera/color/image_raw", "sensor_msgs/msg/Image")
+COLOR_INFO = Topic("/camera/color/camera_info", "sensor_msgs/msg/CameraInfo")
+DEPTH = Topic("/camera/aligned_depth_to_color/image_raw", "sensor_msgs/msg/Image")
+DEPTH_INFO = Topic("/camera/aligned_depth_to_color/camera_info", "sensor_msgs/msg/CameraInfo")
+TOPICS = (
+    TF, TF_STATIC, ODOMETRY, POSE, LOOP, CLOUD, GRID, GRID_STD, COLOR, COLOR_INFO, DEPTH, DEPTH_INFO,
+)  # fmt: skip
+
+
+class Encoded(NamedTuple):
+    """A message as CDR bytes, with its topic and the time of its frame."""
+
+    topic: Topic
+    stamp_ns: int
+    data: bytes
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """Points of a map: positions [N, 3] m, colors [N, 3] in [0, 1], opacities [N], depth_std_m [N] (nan: not known)."""
+
+    positions: NDArray[np.float32]
+    colors: NDArray[np.float32]
+    opacities: NDArray[np.float32]
+    depth_std_m: NDArray[np.float32]
+
+    def moved(self, T: Matrix) -> "Points":
+        """Return the points transformed by T [4, 4]."""
+        positions = self.positions.astype(np.float64) @ T[:3, :3].T + T[:3, 3]
+        return Points(positions.astype(np.float32), self.colors, self.opacities, self.depth_std_m)
+
+    def thinned(self, most: int) -> "Points":
+        """Return at most `most` points, spread evenly over the rows."""
+        if len(self.positions) <= most:
+            return self
+        rows = np.linspace(0, len(self.positions) - 1, most).astype(int)
+        return Points(self.positions[rows], self.colors[rows], self.opacities[rows], self.depth_std_m[rows])
+
+    @staticmethod
+    def joined(parts: "Sequence[Points]") -> "Points":
+        """Return the points of all parts, at least one."""
+        names = ("positions", "colors", "opacities", "depth_std_m")
+        return Points(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
+
+def stamp_of(timestamp_s: float) -> int:
+    """Return a time in nanoseconds; ROS has no negative times."""
+    return max(0, round(timestamp_s * 1e9))
+
+
+class RosMessages:
+    """Makes messages. Raises SourceError without the rosbags package."""
+
+    def __init__(self) -> None:
+        typesys = import_optional("rosbags.typesys", EXTRA, "ROS messages")
+        self.store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+
+    def schema(self, topic: Topic) -> str:
+        """Return the definition of a topic's message type, with the types that it contains."""
+        definition: str = self.store.generate_msgdef(topic.msgtype, ros_version=2)[0]
+        return definition
+
+    def transforms(self, topic: Topic, stamp_ns: int, links: Sequence[tuple[str, str, Matrix]]) -> Encoded:
+        """Make a message of transforms (parent, child, T_parent_child [4, 4])."""
+        stamped = [
+            self._make(
+                "geometry_msgs/msg/TransformStamped",
+                header=self._header(stamp_ns, parent),
+                child_frame_id=child,
+                transform=self._make(
+                    "geometry_msgs/msg/Transform",
+                    translation=self._vector("geometry_msgs/msg/Vector3", T[:3, 3]),
+                    rotation=self._quaternion(T),
+                ),
+            )
+            for parent, child, T in links
+        ]
+        return self._encoded(topic, stamp_ns, transforms=stamped)
+
+    def odometry(self, stamp_ns: int, parent: str, child: str, T: Matrix, covariance: Matrix | None) -> Encoded:
+        """Make nav_msgs/Odometry: the pose T_parent_child with covariance [6, 6] (`frames.ros_covariance`), None if it
+        is not known. Velocities are not estimated: their covariance is marked as not known."""
+        zero = self._vector("geometry_msgs/msg/Vector3", np.zeros(3))
+        twist = self._make(
+            "geometry_msgs/msg/TwistWithCovariance",
+            twist=self._make("geometry_msgs/msg/Twist", linear=zero, angular=zero),
+            covariance=np.array(UNKNOWN),
+        )
+        return self._encoded(
+            ODOMETRY,
+            stamp_ns,
+            header=self._header(stamp_ns, parent),
+            child_frame_id=child,
+            pose=self._pose_with_covariance(T, covariance),
+            twist=twist,
+        )
+
+    def pose(self, topic: Topic, stamp_ns: int, parent: str, T: Matrix, covariance: Matrix | None) -> Encoded:
+        """Make geometry_msgs/PoseWithCovarianceStamped, arguments as for `odometry`."""
+        header = self._header(stamp_ns, parent)
+        return self._encoded(topic, stamp_ns, header=header, pose=self._pose_with_covariance(T, covariance))
+
+    def cloud(self, stamp_ns: int, frame: str, points: Points) -> Encoded:
+        """Make sensor_msgs/PointCloud2 with the fields x, y, z, rgb, opacity, depth_std (m, nan if not known)."""
+        names = ("x", "y", "z", "rgb", "opacity", "depth_std")
+        rows = np.zeros(len(points.positions), [(name, "<f4") for name in names])
+        for i, name in enumerate(names[:3]):
+            rows[name] = points.positions[:, i]
+        red, green, blue = (np.rint(255.0 * np.clip(points.colors, 0.0, 1.0))).astype(np.uint32).T
+        rows["rgb"] = (red << 16 | green << 8 | blue).view("<f4")
+        rows["opacity"], rows["depth_std"] = points.opacities, points.depth_std_m
+        size = rows.dtype.itemsize
+        fields = [
+            self._make("sensor_msgs/msg/PointField", name=name, offset=4 * i, datatype=7, count=1)
+            for i, name in enumerate(names)
+        ]
+        return self._encoded(
+            CLOUD, stamp_ns, header=self._header(stamp_ns, frame), height=1, width=len(rows), fields=fields,
+            is_bigendian=False, point_step=size, row_step=size * len(rows),
+            data=np.frombuffer(rows.tobytes(), np.uint8), is_dense=bool(np.isfinite(points.positions).all()),
+        )  # fmt: skip
+
+    def grid(
+        self, topic: Topic, stamp_ns: int, frame: str, cells: NDArray[np.int8], cell_m: float, T_frame_grid: Matrix
+    ) -> Encoded:
+        """Make nav_msgs/OccupancyGrid: cells [rows, columns], 0 to 100, −1 not known; T_frame_grid: the pose of the
+        outer corner of row 0, column 0; columns grow along its x axis, rows along y."""
+        header = self._header(stamp_ns, frame)
+        info = self._make(
+            "nav_msgs/msg/MapMetaData", map_load_time=header.stamp, resolution=cell_m, width=cells.shape[1],
+            height=cells.shape[0], origin=self._pose(T_frame_grid),
+        )  # fmt: skip
+        return self._encoded(topic, stamp_ns, header=header, info=info, data=cells.reshape(-1))
+
+    def images(
+        self, stamp_ns: int, camera: Camera, color: NDArray[np.float32], depth_m: NDArray[np.float32]
+    ) -> list[Encoded]:
+        """Make two sensor_msgs/Image and their CameraInfo: colour [H, W, 3] in [0, 1] as rgb8, depth [H, W] m as 32FC1
+        with nan where there is no reading (REP 118)."""
+        rgb = np.rint(255.0 * color).astype(np.uint8)
+        depth = np.where(depth_m > 0, depth_m, np.float32(np.nan)).astype("<f4")
+        header, info = self._header(stamp_ns, OPTICAL), self._camera_info(stamp_ns, camera)
+        found = []
+        for topic, about, array, kind in ((COLOR, COLOR_INFO, rgb, "rgb8"), (DEPTH, DEPTH_INFO, depth, "32FC1")):
+            step = array.nbytes // camera.height
+            image = self._encoded(
+                topic, stamp_ns, header=header, height=camera.height, width=camera.width, encoding=kind,
+                is_bigendian=0, step=step, data=np.ascontiguousarray(array).reshape(-1).view(np.uint8),
+            )  # fmt: skip
+            found += [Encoded(about, stamp_ns, info), image]
+        return found
+
+    def _camera_info(self, stamp_ns: int, camera: Camera) -> bytes:
+        fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
+        roi = self._make(
+            "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
+        )
+        return self._encoded(
+            COLOR_INFO, stamp_ns, header=self._header(stamp_ns, OPTICAL), height=camera.height, width=camera.width,
+            distortion_model="plumb_bob", d=np.zeros(5), k=np.array([fx, 0, cx, 0, fy, cy, 0, 0, 1.0]),
+            r=np.eye(3).reshape(-1), p=np.array([fx, 0, cx, 0, 0, fy, cy, 0, 0, 0, 1.0, 0]), binning_x=0, binning_y=0,
+            roi=roi,
+        ).data  # fmt: skip
+
+    # ---- parts of messages ----
+
+    def _make(self, kind: str, **fields: Any) -> Any:
+        return self.store.types[kind](**fields)
+
+    def _encoded(self, topic: Topic, stamp_ns: int, **fields: Any) -> Encoded:
+        message = self._make(topic.msgtype, **fields)
+        return Encoded(topic, stamp_ns, bytes(self.store.serialize_cdr(message, topic.msgtype)))
+
+    def _header(self, stamp_ns: int, frame: str) -> Any:
+        stamp = self._make("builtin_interfaces/msg/Time", sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+        return self._make("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
+
+    def _vector(self, kind: str, values: Matrix) -> Any:
+        return self._make(kind, **dict(zip("xyz", map(float, values), strict=True)))
+
+    def _quaternion(self, T: Matrix) -> Any:
+        w, x, y, z = map(float, se3.quaternion_from_rotation(T[:3, :3]))
+        return self._make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
+
+    def _pose(self, T: Matrix) -> Any:
+        position = self._vector("geometry_msgs/msg/Point", T[:3, 3])
+        return self._make("geometry_msgs/msg/Pose", position=position, orientation=self._quaternion(T))
+
+    def _pose_with_covariance(self, T: Matrix, covariance: Matrix | None) -> Any:
+        values = np.array(UNKNOWN)
+        if covariance is not None:
+            values = (covariance if covariance.any() else KNOWN_VARIANCE * np.eye(6)).reshape(-1).astype(np.float64)
+        return self._make("geometry_msgs/msg/PoseWithCovariance", pose=self._pose(T), covariance=values)

@@ -1,0 +1,288 @@
+"""Stream messages to Foxglove and other viewers over a WebSocket, with Foxglove's protocol.
+
+Protocol: https://docs.foxglove.dev/docs/sdk/websocket-server, https://github.com/foxglove/ws-protocol. Foxglove's SDK
+is not used: it answers any page in the browser, because it does not check the header Origin. A test compares the
+messages with those of the SDK.
+
+Nothing that a client sends reaches the run: only `subscribe` and `unsubscribe` are read. Each client has a bounded
+queue; if it reads too slowly, its oldest messages are dropped.
+"""
+
+import asyncio
+import contextlib
+import ipaddress
+import json
+import logging
+import socket
+import struct
+import threading
+from collections import deque
+from concurrent.futures import Future
+from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
+
+from sigmasplat.errors import ConfigError, SigmaSplatError
+from sigmasplat.files.optional import import_optional
+from sigmasplat.plugins.robots.ros_messages import TOPICS, Encoded, RosMessages, Topic
+
+if TYPE_CHECKING:
+    from websockets.asyncio.server import ServerConnection
+    from websockets.http11 import Request, Response
+
+EXTRA = "foxglove"
+HOST, PORT = "127.0.0.1", 8765
+SUBPROTOCOLS = ("foxglove.sdk.v1", "foxglove.websocket.v1")
+WEB_APP = "app.foxglove.dev"
+MOST_WAITING, MOST_WAITING_BYTES = 64, 32_000_000
+"""At most this many messages wait for a client, and at most this many bytes, except for the newest message."""
+SEND_BUFFER_BYTES = 262_144
+"""Size of the system's own queue in front of a client. By default it grows to megabytes, all of them out of date."""
+MOST_CLIENTS = 16
+MOST_REQUESTS = 1000
+"""A client that sends more requests is disconnected."""
+MOST_REQUEST_BYTES = 65536
+"""A longer message from a client closes its connection."""
+CLOSE_S = 2.0
+"""At the end, clients have this many seconds to receive what waits."""
+MESSAGE_DATA = struct.Struct("<BIQ")
+"""Operation code 1, subscription, time in nanoseconds; then the message."""
+
+
+def is_allowed_origin(origin: str | None) -> bool:
+    """Return whether a request with this header Origin may read the stream.
+
+    Allowed are programs that are not browsers (no Origin, or a scheme of their own, as desktop applications have),
+    pages of this machine, and Foxglove's web application. Any other page in the browser is refused.
+    """
+    if origin is None:
+        return True
+    try:
+        page = urlsplit(origin.lower())
+        name = page.hostname or ""
+    except ValueError:
+        return False
+    if page.scheme not in ("http", "https"):
+        return bool(page.scheme)  # "null" has no scheme: a page in a sandbox
+    return name == "localhost" or (name == WEB_APP and page.scheme == "https") or _is_loopback(name)
+
+
+def _is_loopback(name: str) -> bool:
+    try:
+        return ipaddress.ip_address(name).is_loopback
+    except ValueError:
+        return False
+
+
+def check_stream(port: int) -> None:
+    """Raise ConfigError if the port is out of range, SourceError if the packages of the extra are missing."""
+    if not 0 <= port <= 65535:
+        raise ConfigError(f"--stream must be a port from 0 to 65535, found {port}")
+    for module in ("websockets.asyncio.server", "rosbags.typesys"):
+        import_optional(module, EXTRA, "--stream")
+
+
+class _Client:
+    """A connection: the topics of its subscriptions, and the messages that wait for it. Used on the loop only."""
+
+    def __init__(self, connection: "ServerConnection") -> None:
+        self.connection = connection
+        self.topics = dict[int, Topic]()
+        self.waiting, self.waiting_bytes = deque[bytes](), 0
+        self.ready, self.idle = asyncio.Event(), asyncio.Event()
+        self.idle.set()
+        self.dropped = 0
+
+    def add(self, message: Encoded) -> None:
+        """Queue a message for each subscription to its topic."""
+        for subscription, topic in self.topics.items():
+            if topic is message.topic:
+                self.queue(subscription, message)
+
+    def queue(self, subscription: int, message: Encoded) -> None:
+        """Queue a message for one subscription; drop the oldest ones if too much waits."""
+        data = MESSAGE_DATA.pack(1, subscription, message.stamp_ns) + message.data
+        while self.waiting and (
+            len(self.waiting) >= MOST_WAITING or self.waiting_bytes + len(data) > MOST_WAITING_BYTES
+        ):
+            self._next()
+            self.dropped += 1
+        self.waiting.append(data)
+        self.waiting_bytes += len(data)
+        self.ready.set()
+        self.idle.clear()
+
+    async def send_waiting(self) -> None:
+        """Send messages until the connection ends."""
+        from websockets.exceptions import ConnectionClosed
+
+        with contextlib.suppress(ConnectionClosed):
+            while True:
+                await self.ready.wait()
+                while self.waiting:
+                    await self.connection.send(self._next())
+                self.ready.clear()
+                self.idle.set()
+
+    def _next(self) -> bytes:
+        data = self.waiting.popleft()
+        self.waiting_bytes -= len(data)
+        return data
+
+
+class StreamSink:
+    """A WebSocket server on a thread of its own.
+
+    port, url: where it listens; missed: number of messages that slow clients did not get.
+    """
+
+    name = "stream"
+
+    def __init__(self, messages: RosMessages, host: str = HOST, port: int = PORT) -> None:
+        """Start to listen; port 0 means any free port.
+
+        Raises SigmaSplatError if a package is missing or the port is not free, ConfigError if it is out of range.
+        """
+        check_stream(port)
+        logging.getLogger("websockets.server").setLevel(logging.CRITICAL)  # do not log clients that disconnect
+        self.host, self.missed = host, 0
+        self._clients = set[_Client]()
+        self._last = dict[str, Encoded]()
+        self._wanted = frozenset[str]()
+        channels = [
+            {
+                "id": number, "topic": topic.name, "encoding": "cdr", "schemaName": topic.msgtype,
+                "schemaEncoding": "ros2msg", "schema": messages.schema(topic),
+            }
+            for number, topic in enumerate(TOPICS, 1)
+        ]  # fmt: skip
+        self._advertisement = json.dumps({"op": "advertise", "channels": channels})
+        started = Future[tuple[asyncio.AbstractEventLoop, asyncio.Event, int]]()
+        self._thread = threading.Thread(
+            target=lambda: asyncio.run(self._run(port, started)), name="sigmasplat-websocket", daemon=True
+        )
+        self._thread.start()
+        try:
+            self._loop, self._stop, self.port = started.result()
+        except OSError as problem:
+            raise SigmaSplatError(
+                f"cannot stream on {host}:{port} ({problem.strerror or problem}); give another port: --stream PORT"
+            ) from problem
+        self.url = f"ws://{f'[{host}]' if ':' in host else host}:{self.port}"
+
+    def open(self, messages: RosMessages) -> None:
+        """Do nothing: the server listens already."""
+
+    def wants(self, *topics: Topic) -> bool:
+        """Return whether a client subscribes to one of these topics, or a later client would get its last message."""
+        return any(topic.latched or topic.name in self._wanted for topic in topics)
+
+    def write(self, message: Encoded) -> None:
+        """Queue a message for its subscribers."""
+        self._loop.call_soon_threadsafe(self._publish, message)
+
+    def close(self) -> None:
+        """Give clients a moment to receive what waits, then disconnect them."""
+        with contextlib.suppress(RuntimeError):  # the loop has ended already
+            self._loop.call_soon_threadsafe(self._stop.set)
+        self._thread.join(2 * CLOSE_S)
+
+    def abort(self) -> None:
+        """Disconnect all clients."""
+        self.close()
+
+    # ---- on the loop ----
+
+    async def _run(self, port: int, started: "Future[tuple[asyncio.AbstractEventLoop, asyncio.Event, int]]") -> None:
+        """Serve until `_stop` is set; report loop, event and port, or why the port cannot be used."""
+        from websockets.asyncio.server import serve
+
+        try:
+            server = await serve(
+                self._serve, self.host, port, process_request=self._answer, select_subprotocol=self._subprotocol,
+                compression=None, max_size=MOST_REQUEST_BYTES, max_queue=4, open_timeout=5.0, close_timeout=1.0,
+            )  # fmt: skip
+        except Exception as problem:
+            return started.set_exception(problem)
+        stop = asyncio.Event()
+        started.set_result((asyncio.get_running_loop(), stop, int(next(iter(server.sockets)).getsockname()[1])))
+        await stop.wait()
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(asyncio.gather(*(client.idle.wait() for client in self._clients)), CLOSE_S)
+        for client in self._clients:
+            if not client.idle.is_set():
+                client.connection.transport.abort()  # it does not read, so it would not answer a farewell
+        server.close()
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(server.wait_closed(), CLOSE_S)
+
+    def _answer(self, connection: "ServerConnection", request: "Request") -> "Response | None":
+        """Refuse pages of other sites, and more clients than `MOST_CLIENTS`."""
+        if not is_allowed_origin(request.headers.get("Origin")):
+            return connection.respond(403, "this page may not read the stream\n")
+        if len(self._clients) >= MOST_CLIENTS:
+            return connection.respond(503, f"{MOST_CLIENTS} clients are connected already\n")
+        return None
+
+    def _subprotocol(self, connection: "ServerConnection", offered: Any) -> Any:
+        """Choose the newest protocol that a client offers; refuse clients that offer none."""
+        from websockets.exceptions import NegotiationError
+
+        found = next((name for name in SUBPROTOCOLS if name in offered), None)
+        if found is None:
+            raise NegotiationError(f"the stream speaks {SUBPROTOCOLS[0]} only")
+        return found
+
+    async def _serve(self, connection: "ServerConnection") -> None:
+        """Serve a client until it disconnects."""
+        from websockets.exceptions import ConnectionClosed
+
+        client = _Client(connection)
+        connection.transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
+        self._clients.add(client)
+        sending = asyncio.ensure_future(client.send_waiting())
+        try:
+            info = {"op": "serverInfo", "name": "SigmaSplat", "capabilities": [], "metadata": {}, "sessionId": "run"}
+            await connection.send(json.dumps(info))
+            await connection.send(self._advertisement)
+            requests = 0
+            async for text in connection:
+                self._request(client, text)
+                requests += 1
+                if requests == MOST_REQUESTS:
+                    break
+        except ConnectionClosed:
+            pass
+        finally:
+            sending.cancel()
+            self._clients.discard(client)
+            self.missed += client.dropped
+            self._count_subscriptions()
+
+    def _request(self, client: _Client, text: str | bytes) -> None:
+        """Handle a request of a client; ignore what is no valid subscription."""
+        with contextlib.suppress(ValueError, KeyError, TypeError, AttributeError, IndexError, RecursionError):
+            request = json.loads(text)
+            if request["op"] == "subscribe":
+                for entry in request["subscriptions"][: len(TOPICS)]:
+                    number, channel = entry["id"], entry["channelId"]
+                    known = isinstance(number, int) and 0 <= number < 2**32 and 1 <= channel <= len(TOPICS)
+                    if known and len(client.topics) < len(TOPICS):
+                        self._subscribe(client, number, TOPICS[channel - 1])
+            elif request["op"] == "unsubscribe":
+                for number in request["subscriptionIds"]:
+                    client.topics.pop(number, None)
+        self._count_subscriptions()
+
+    def _subscribe(self, client: _Client, number: int, topic: Topic) -> None:
+        client.topics[number] = topic
+        if topic.name in self._last:
+            client.queue(number, self._last[topic.name])
+
+    def _count_subscriptions(self) -> None:
+        self._wanted = frozenset(topic.name for client in self._clients for topic in client.topics.values())
+
+    def _publish(self, message: Encoded) -> None:
+        if message.topic.latched:
+            self._last[message.topic.name] = message
+        for client in self._clients:
+            client.add(message)

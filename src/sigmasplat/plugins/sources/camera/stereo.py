@@ -1,0 +1,201 @@
+"""Compute depth from a stereo pair: rectify both images, match them, convert disparity to depth."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sigmasplat.config import InputConfig
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.opencv import opencv
+from sigmasplat.plugins.sources.camera.stereo_cameras import StereoCameras
+from sigmasplat.plugins.sources.camera.stereo_subpixel import Subpixel, refine
+from sigmasplat.types import Matrix
+
+Bytes = NDArray[np.uint8]
+Floats = NDArray[np.float32]
+Maps = tuple[Floats, Floats]
+
+BLOCK_PX = 5
+"""Edge of the matched blocks."""
+SMALL_STEP, LARGE_STEP = 8 * BLOCK_PX**2, 32 * BLOCK_PX**2
+"""Penalties of a disparity step of 1 px, and of a larger one (OpenCV's recommendation for one channel)."""
+PREFILTER = 31
+"""Largest value of the horizontal derivative that is compared."""
+CONSISTENT_PX = 1
+"""Left–right check: largest difference of the disparities that the two images find."""
+UNIQUE_PERCENT = 10
+"""The best match must be better than the second one by this."""
+SPECKLE_PX, SPECKLE_STEP_PX = 100, 1
+"""Regions with fewer pixels are removed; within a region neighbours differ by at most this disparity."""
+SUBPIXELS = 16.0
+"""OpenCV's unit of disparity, per pixel."""
+REACH_PX, MOST_BEND_PX = 2, 0.6
+"""Readings are removed where the disparity differs by more than `MOST_BEND_PX` from the mean of its neighbours at this
+distance, or next to such places, before or after the refinement: those are edges and wrong matches."""
+STD_MATCH, STD_HOLE, STD_RANGE, STD_BEND = 1.04, 3.8, 0.51, 7.15
+"""Parts of σ_d in units of `input.stereo_std_px`. For each gray value by which the images differ after the refinement:
+divided by the gradient that decides it; at a pixel without a reading, where the surface ends, falling by e every
+`HOLE_PX`; for each pixel in the range of disparities around, as a near surface looks wider than it is. Besides: for
+each pixel by which the disparity bends. Fitted to exact depth of synthetic rooms (seeds 1 to 4; baselines of 6, 10 and
+18 cm)."""
+TAILS = 2.0
+"""Root mean square of the errors in the disparity relative to `input.stereo_std_px`: a few are much larger than σ_d."""
+LEAST_TEXTURE = 0.5
+"""Smallest gradient that is divided by, in gray values per pixel."""
+HOLE_PX, AROUND_PX, MOST_RANGE_PX = 8.0, 13, 2.0
+"""The window of the range of disparities, and its largest value."""
+LEAST_TOGETHER = 0.85
+"""Readings are removed where a smaller share of this window has a match: those are often wrong by several pixels."""
+INDOOR_MEDIAN_M = 2.0
+"""Median depth of a usual indoor recording: the default settings are made for it."""
+SMALL_SCENE = 2.0
+"""Scenes below this multiple of `INDOOR_MEDIAN_M` use the default settings."""
+
+
+@dataclass(frozen=True, eq=False)
+class StereoRectification:
+    """Maps both images to one pinhole camera with a baseline along its x axis (Fusiello et al. 2000; OpenCV).
+
+    camera: of both rectified images; T_left_rectified [4, 4]: rotation from the rectified to the recorded left camera.
+    """
+
+    camera: Camera
+    baseline_m: float
+    T_left_rectified: Matrix = field(default_factory=lambda: np.eye(4))
+    maps: tuple[Maps, Maps] | None = None
+
+    @classmethod
+    def of(cls, cameras: StereoCameras) -> "StereoRectification":
+        """Return the rectification of two cameras; without remapping if they are rectified."""
+        if cameras.rectified:
+            return cls(cameras.left, float(-cameras.T_right_left[0, 3]))
+        cv2, size = opencv(), (cameras.left.width, cameras.left.height)
+        inner = [(_matrix(cameras.left), np.array(cameras.left_distortion or (0.0,) * 5))]
+        inner += [(_matrix(cameras.right), np.array(cameras.right_distortion or (0.0,) * 5))]
+        R, t = cameras.T_right_left[:3, :3].copy(), cameras.T_right_left[:3, 3:].copy()
+        R_left, R_right, P_left, P_right, *_ = cv2.stereoRectify(
+            *inner[0], *inner[1], size, R, t, flags=cv2.CALIB_ZERO_DISPARITY, alpha=0
+        )
+        maps = tuple(
+            cv2.initUndistortRectifyMap(*camera, rotation, projection[:, :3], size, cv2.CV_32FC1)
+            for camera, rotation, projection in zip(inner, (R_left, R_right), (P_left, P_right), strict=True)
+        )
+        camera = Camera(*size, *(float(P_left[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2))))
+        T_left_rectified = np.eye(4)
+        T_left_rectified[:3, :3] = R_left.T
+        baseline_m = float(-P_right[0, 3] / P_right[0, 0])
+        return cls(camera, baseline_m, se3.orthonormalise(T_left_rectified), maps)
+
+    def left(self, image: Bytes) -> Bytes:
+        """Rectify the left image, uint8 [H, W] or [H, W, 3]."""
+        return image if self.maps is None else _remapped(image, self.maps[0])
+
+    def right(self, image: Bytes) -> Bytes:
+        """Rectify the right image, uint8 [H, W] or [H, W, 3]."""
+        return image if self.maps is None else _remapped(image, self.maps[1])
+
+
+class StereoMatcher:
+    """Depth by semi-global matching (Hirschmüller 2008, OpenCV's five directions, one thread)."""
+
+    def __init__(self, camera: Camera, baseline_m: float, settings: InputConfig) -> None:
+        """Prepare for rectified images of `camera`, whose right one is `baseline_m` to the right."""
+        self._camera, self._focal_baseline = camera, camera.fx * baseline_m
+        self._count = settings.stereo_disparities or max(16, -(-camera.width // 128) * 16)
+        self._count = -(-self._count // 16) * 16
+        self._std_px, self._max_std = settings.stereo_std_px, settings.stereo_max_std
+
+    def depth_and_std_m(self, left: Bytes, right: Bytes) -> tuple[Floats, Floats]:
+        """Match two rectified RGB images [H, W, 3]: depth z of the left one, m [H, W], 0 = no reading, and its standard
+        deviation σ_z = z² σ_d / (f b), m [H, W]. σ_d is larger where there is little texture, where the surface bends,
+        and near its edges."""
+        cv2, n = opencv(), self._count
+        # The columns left of the image let far points near the left edge be matched.
+        gray = [
+            cv2.copyMakeBorder(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), 0, 0, n, 0, cv2.BORDER_REPLICATE)
+            for image in (left, right)
+        ]
+        found = self._matcher().compute(*gray)[:, n:].astype(np.float32) / np.float32(SUBPIXELS)
+        column = np.arange(left.shape[1], dtype=np.float32)
+        matched = (found > 0) & (column - found >= BLOCK_PX // 2)
+        together = cv2.blur(matched.astype(np.float32), (AROUND_PX, AROUND_PX)) >= LEAST_TOGETHER
+        smooth = matched & together & (_bend(found, matched) <= MOST_BEND_PX)
+        fine = refine(gray[0][:, n:], gray[1][:, n:], found, smooth)
+        bend_px = _bend(fine.disparity, matched)
+        seen = smooth & (bend_px <= MOST_BEND_PX)
+        depth_m = np.divide(self._focal_baseline, fine.disparity, out=np.zeros_like(found), where=seen)
+        std_px = self._std_px * _relative_std(fine, matched, smooth, bend_px)
+        std_m = depth_m * depth_m * std_px / self._focal_baseline
+        usable = std_m <= self._max_std * depth_m
+        return np.where(usable, depth_m, 0.0).astype(np.float32), np.where(usable, std_m, 0.0).astype(np.float32)
+
+    @property
+    def noise_per_m(self) -> float:
+        """Return the root mean square error of readings, relative to z²."""
+        return TAILS * self._std_px / self._focal_baseline
+
+    def _matcher(self) -> Any:
+        cv2 = opencv()
+        return cv2.StereoSGBM_create(
+            minDisparity=0, numDisparities=self._count, blockSize=BLOCK_PX, P1=SMALL_STEP, P2=LARGE_STEP,
+            disp12MaxDiff=CONSISTENT_PX, preFilterCap=PREFILTER, uniquenessRatio=UNIQUE_PERCENT,
+            speckleWindowSize=SPECKLE_PX, speckleRange=SPECKLE_STEP_PX, mode=cv2.STEREO_SGBM_MODE_SGBM,
+        )  # fmt: skip
+
+
+def scene_scale(depth_of: Callable[[int], Floats], frames: int) -> float:
+    """Return the size of a scene relative to a room, from the median depth of the first frame that has readings.
+
+    It is 1 for a median below 4 m; else the median divided by 2 m, with two digits.
+    """
+    for i in range(min(frames, 5)):
+        depth_m = depth_of(i)
+        if (depth_m > 0).any():
+            ratio = float(np.median(depth_m[depth_m > 0])) / INDOOR_MEDIAN_M
+            return float(f"{ratio:.2g}") if ratio >= SMALL_SCENE else 1.0
+    return 1.0
+
+
+def _relative_std(fine: Subpixel, matched: NDArray[np.bool_], smooth: NDArray[np.bool_], bend_px: Floats) -> Floats:
+    """Return σ_d in units of `input.stereo_std_px` [H, W]; matched: pixels with a disparity, smooth: refined ones."""
+    cv2, window = opencv(), np.ones((AROUND_PX, AROUND_PX))
+    far, near = (np.where(matched, sign * fine.disparity, np.float32(-1e6)) for sign in (-1.0, 1.0))
+    range_px = cv2.dilate(near, window) + cv2.dilate(far.astype(np.float32), window)
+    to_hole_px = cv2.distanceTransform(smooth.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return np.asarray(
+        np.sqrt(
+            fine.residual**2
+            * (
+                (STD_MATCH / np.maximum(fine.texture, LEAST_TEXTURE)) ** 2
+                + (STD_HOLE * np.exp(-to_hole_px / HOLE_PX)) ** 2
+                + (STD_RANGE * np.clip(range_px, 0.0, MOST_RANGE_PX)) ** 2
+            )
+            + (STD_BEND * np.where(smooth, bend_px, 0.0)) ** 2
+        ),
+        np.float32,
+    )
+
+
+def _bend(disparity: Floats, seen: NDArray[np.bool_]) -> Floats:
+    """Return the largest difference between a disparity and the mean of its two neighbours in row or column, within
+    two pixels, px [H, W]; neighbours without a match are not compared, and a pixel without any counts as bent."""
+    cv2, k = opencv(), REACH_PX
+    known = np.where(seen, disparity, np.float32(np.nan))
+    padded, (h, w) = np.pad(known, k, constant_values=np.nan), disparity.shape
+    along_row = np.abs(known - 0.5 * (padded[k : k + h, :w] + padded[k : k + h, 2 * k :]))
+    along_column = np.abs(known - 0.5 * (padded[:h, k : k + w] + padded[2 * k :, k : k + w]))
+    bend = np.nan_to_num(np.fmax(along_row, along_column), nan=2.0 * MOST_BEND_PX)
+    return np.asarray(cv2.dilate(bend, np.ones((2 * k + 1, 2 * k + 1))), np.float32)
+
+
+def _matrix(camera: Camera) -> Matrix:
+    return np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
+
+
+def _remapped(image: Bytes, maps: Maps) -> Bytes:
+    cv2 = opencv()
+    return np.asarray(cv2.remap(image, *maps, cv2.INTER_LINEAR), np.uint8)

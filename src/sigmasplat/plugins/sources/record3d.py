@@ -1,0 +1,219 @@
+"""Read iPhone recordings of the app Record3D: .r3d files, and folders of its export "EXR + RGB".
+
+.r3d is a zip: metadata (JSON)   rgbd/0.jpg   rgbd/0.depth, rgbd/0.conf: LZFSE of float32 metres and of bytes
+the export:    metadata.json     rgb/0.jpg    depth/0.exr
+
+metadata: w, h, dw, dh (sizes in pixels), K (3×3 by columns), fps, frameTimestamps (seconds), perFrameIntrinsicCoeffs
+(fx, fy, cx, cy), poses (qx, qy, qz, qw, x, y, z of the camera, in OpenGL's axes). Layout: marek-simonik/record3d,
+issues 7 and 27; nerfstudio, record3d_utils.py. Depth has fewer pixels than colour, but the same camera; confidence is
+0, 1 or 2, and readings with confidence 0 are ignored.
+"""
+
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sigmasplat.config import InputConfig
+from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.errors import SourceError
+from sigmasplat.files.guard import DAMAGED
+from sigmasplat.files.optional import import_optional
+from sigmasplat.files.pictures import check_pixels
+from sigmasplat.files.reading import refuse_special
+from sigmasplat.files.structured import MOST_JSON_BYTES, parse_json
+from sigmasplat.input.calibration import Calibration, build_camera, check_positive, json_number, resolve_calibration
+from sigmasplat.input.images import decode_color, depth_to_metres, image_size
+from sigmasplat.input.opening import Format
+from sigmasplat.input.pose_files import FLIP_YZ, rigid_transform
+from sigmasplat.input.recorded import ImagePair, RecordedSource, Size, first_readable
+from sigmasplat.plugins.sources.files.archive import Archive
+from sigmasplat.plugins.sources.stray_scanner import with_coarser_depth
+
+
+@dataclass(frozen=True)
+class R3dImagePair(ImagePair):
+    """One frame of a .r3d file: three members of the archive."""
+
+    archive: Archive
+    number: int
+    depth_size: Size
+    lzfse: Any
+
+    def read_color(self) -> NDArray[np.uint8]:
+        """Read 8-bit RGB [H, W, 3]. Raises SourceError naming the member."""
+        return decode_color(self.color, self.archive.read(f"rgbd/{self.number}.jpg"))
+
+    def read_depth(self, units_per_metre: float) -> NDArray[np.float32]:
+        """Read depth in metres [H, W], 0 at confidence 0. Raises SourceError naming the member."""
+        depth_m = self._unpacked("depth", np.float32)
+        depth_m = np.nan_to_num(depth_m, nan=0.0, posinf=0.0, neginf=0.0)
+        name = f"rgbd/{self.number}.conf"
+        if name in self.archive:
+            depth_m = np.where(self._unpacked("conf", np.uint8) > 0, depth_m, np.float32(0.0))
+        return depth_to_metres(self.depth, depth_m, units_per_metre)
+
+    def sizes(self) -> tuple[Size, Size]:
+        """Return (width, height) of colour and depth. Raises SourceError naming the colour image."""
+        height, width = self.read_color().shape[:2]
+        return (width, height), self.depth_size
+
+    def _unpacked(self, ending: str, kind: type[np.generic]) -> NDArray[Any]:
+        name, (width, height) = f"rgbd/{self.number}.{ending}", self.depth_size
+        where, data = self.archive.path / name, self.archive.read(name)
+        try:
+            return np.frombuffer(self.lzfse.decompress(data), kind).reshape(height, width)
+        except (self.lzfse.error, ValueError, MemoryError) as error:  # truncated data can request very much memory
+            raise SourceError(
+                f"{where}: not {width}×{height} LZFSE-compressed values ({error}); export it again"
+            ) from error
+
+
+@dataclass(frozen=True)
+class ExrImagePair(ImagePair):
+    """One frame of the export: a colour image and an EXR file."""
+
+    openexr: Any
+
+    def read_depth(self, units_per_metre: float) -> NDArray[np.float32]:
+        """Read depth in metres [H, W]. Raises SourceError naming the file."""
+        channels = self._opened().channels()
+        name = next((name for name in ("R", "Y", "Z") if name in channels), next(iter(channels)))
+        depth_m = np.asarray(channels[name].pixels, np.float32)
+        return depth_to_metres(self.depth, np.nan_to_num(depth_m, nan=0.0, posinf=0.0, neginf=0.0), units_per_metre)
+
+    def sizes(self) -> tuple[Size, Size]:
+        """Return (width, height) of colour and depth. Raises SourceError naming the file."""
+        return image_size(self.color), self._size()
+
+    def _size(self) -> Size:
+        low, high = self._opened(header_only=True).header()["dataWindow"]
+        return int(high[0] - low[0]) + 1, int(high[1] - low[1]) + 1
+
+    def _opened(self, header_only: bool = False) -> Any:
+        if not header_only:
+            check_pixels(self.depth, self._size(), SourceError)
+        refuse_special(self.depth)
+        try:
+            return self.openexr.File(str(self.depth), separate_channels=True, header_only=header_only)
+        except Exception as error:  # the library can raise any C++ exception
+            raise SourceError(f"{self.depth}: unreadable EXR file ({error}); export it again") from error
+
+
+def open_record3d(path: Path, settings: InputConfig) -> RecordedSource:
+    """Open a .r3d file, packed or unpacked, or an export. Raises SourceError if metadata or images cannot be used."""
+    archive = Archive(path)
+    name = "metadata.json" if "metadata.json" in archive else "metadata"
+    metadata = _metadata(archive, name)
+    native = archive.by_number("rgbd", "depth")
+    colors = archive.by_number("rgbd", "jpg") if native else archive.by_number("rgb", "jpg|png")
+    depths = native or archive.by_number("depth", "exr")
+    numbers = sorted(colors.keys() & depths.keys())
+    if not numbers:
+        raise SourceError(
+            f"no depth images in {path} (looked for rgbd/0.depth and depth/0.exr beside the images); "
+            "export it as Shareable/Internal format (.r3d) or EXR + RGB"
+        )
+    times_s = _times_s(path / name, metadata, numbers)
+    pairs = [(float(t), path / colors[n], path / depths[n]) for t, n in zip(times_s, numbers, strict=True)]
+    images: Sequence[ImagePair]
+    if native:
+        lzfse = import_optional("lzfse", "iphone", f"{path}: depth of Record3D")
+        size = _depth_size(path / name, metadata)
+        images = [R3dImagePair(*pair, archive, n, size, lzfse) for pair, n in zip(pairs, numbers, strict=True)]
+    else:
+        openexr = import_optional("OpenEXR", "iphone", f"{path}: depth of Record3D")
+        images = [ExrImagePair(*pair, openexr) for pair in pairs]
+    calibration = _calibration(path, path / name, metadata, images, settings)
+    skipped = [f"{path / colors[n]}: no depth image {n}" for n in sorted(colors.keys() - depths.keys())]
+    truth = _truth(path / name, metadata, numbers, times_s)
+    return RecordedSource(path.resolve().stem, images, calibration, settings, truth, skipped, estimated=True)
+
+
+def _metadata(archive: Archive, name: str) -> dict[str, Any]:
+    content = parse_json(archive.read(name, MOST_JSON_BYTES), archive.path / name)
+    if not isinstance(content, dict):
+        raise SourceError(f"{archive.path / name}: holds a {type(content).__name__}, not an object with K, w, h")
+    return content
+
+
+def _depth_size(path: Path, metadata: dict[str, Any]) -> Size:
+    """Return (width, height) of depth; older files lack it and have the LiDAR's 256×192, rotated like colour."""
+    width, height = (int(json_number(path, metadata, key)) for key in ("w", "h"))
+    wide = (256, 192) if width > height else (192, 256)
+    return int(json_number(path, metadata, "dw", wide[0])), int(json_number(path, metadata, "dh", wide[1]))
+
+
+def _calibration(
+    path: Path, where: Path, metadata: dict[str, Any], images: Sequence[ImagePair], settings: InputConfig
+) -> Calibration:
+    """Read the camera, scaled to the image size, which is larger in exports than in the metadata."""
+    size, depth_size = first_readable(images, lambda pair: pair.sizes())
+    width, height = (int(json_number(where, metadata, key, value)) for key, value in zip(("w", "h"), size, strict=True))
+    focal = _rows(where, metadata, "perFrameIntrinsicCoeffs", 4)
+    if focal is not None and len(focal):
+        middle = np.median(focal, 0).tolist()
+    else:
+        k = _rows(where, {"K": [metadata.get("K")]}, "K", 9) if metadata.get("K") else None
+        middle = [float(k[0][i]) for i in (0, 4, 6, 7)] if k is not None else None
+    recorded = Calibration(build_camera(where, width, height, middle).resized(*size), 1.0) if middle else None
+    return with_coarser_depth(resolve_calibration(path, recorded, size, settings, 1.0), depth_size)
+
+
+def _times_s(where: Path, metadata: dict[str, Any], numbers: list[int]) -> NDArray[np.float64]:
+    """Return the times of the frames, from the frame rate if times are not recorded. Raises SourceError."""
+    times = metadata.get("frameTimestamps")
+    if isinstance(times, list) and len(times) > numbers[-1]:
+        values = [json_number(where, {"frameTimestamps": times[n]}, "frameTimestamps") for n in numbers]
+        return np.array(values)
+    return np.array(numbers) / (check_positive(where, "fps", json_number(where, metadata, "fps", 60.0) or 60.0))
+
+
+def _truth(
+    where: Path, metadata: dict[str, Any], numbers: list[int], times_s: NDArray[np.float64]
+) -> Trajectory | None:
+    """Return ARKit's path: an estimate by the phone, not ground truth; the front camera has none."""
+    poses = _rows(where, metadata, "poses", 7)
+    if poses is None or len(poses) <= numbers[-1] or np.ptp(poses, 0).max() == 0:
+        return None
+    T = np.stack([rigid_transform(f"{where}, pose {n}", poses[n, 4:], poses[n, [3, 0, 1, 2]]) for n in numbers])
+    return Trajectory(times_s, T @ FLIP_YZ)
+
+
+def _rows(where: Path, metadata: dict[str, Any], key: str, count: int) -> NDArray[np.float64] | None:
+    """Read rows of `count` numbers, None if the field is missing. Raises SourceError naming file and field."""
+    if not metadata.get(key):
+        return None
+    try:
+        rows = np.array(metadata[key], np.float64)
+    except (TypeError, ValueError):
+        rows = np.zeros(0)
+    if rows.ndim != 2 or rows.shape[1] != count or not np.isfinite(rows).all():
+        raise SourceError(f'{where}: field "{key}" is not a list of rows with {count} finite numbers; export it again')
+    return rows
+
+
+def _recognises(path: str) -> bool:
+    place = Path(path)
+    if place.is_file():
+        try:
+            with zipfile.ZipFile(place) as archive:
+                return any(name.startswith("rgbd/") for name in archive.namelist())
+        except DAMAGED:
+            return place.suffix.lower() == ".r3d"
+    return any((place / "rgbd").glob("*.depth")) or (
+        (place / "metadata.json").is_file() and any((place / "depth").glob("*.exr"))
+    )
+
+
+FORMAT = Format(
+    "Record3D",
+    "a .r3d file, or metadata.json with rgb/ and depth/*.exr",
+    _recognises,
+    lambda path, settings: open_record3d(Path(path), settings),
+    sensor="lidar-iphone",
+)

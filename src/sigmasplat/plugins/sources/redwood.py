@@ -1,0 +1,154 @@
+"""Read folders in the layout of Open3D's reconstruction system, and the Redwood recordings.
+
+color|rgb|image/000000.jpg  depth/000000.png              paired by the number in the name
+rgb/0000001-000000033000.jpg  depth/0000001-0000….png     Redwood: number and time in µs; paired by time
+intrinsic.json | camera_intrinsic.json                    width, height, intrinsic_matrix (9 numbers by columns);
+                                                          and depth_scale, fps if written by Open3D's recorders
+trajectory.log | NAME.log                                 per pose three numbers and 4 matrix rows, camera to world
+
+Without an intrinsic file, PrimeSense's factory values are used (Redwood's camera); depth in mm.
+"""
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from sigmasplat.config import InputConfig
+from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.errors import SourceError
+from sigmasplat.files.reading import open_regular
+from sigmasplat.input.association import MAX_GAP_S, associate, no_pairs, refuse_other_units
+from sigmasplat.input.calibration import (
+    MM_PER_METRE,
+    PRIMESENSE,
+    Calibration,
+    build_camera,
+    check_positive,
+    json_number,
+    read_json_object,
+    resolve_calibration,
+)
+from sigmasplat.input.folders import (
+    COLOR_ENDINGS,
+    COLOR_FOLDERS,
+    DEPTH_ENDINGS,
+    FRAMES_PER_SECOND,
+    first_subfolder,
+    index_by_number,
+    list_images,
+    pair_images,
+)
+from sigmasplat.input.lists import parse_numbers, read_lines
+from sigmasplat.input.opening import Format
+from sigmasplat.input.pose_files import build_trajectory, checked_pose, to_matrix
+from sigmasplat.input.recorded import ImagePair, RecordedSource, first_size
+
+INTRINSIC_NAMES = ("intrinsic.json", "intrinsics.json", "camera_intrinsic.json", "camera_intrinsics.json")
+
+_TIMED = re.compile(r"([0-9]+)-([0-9]{9,})")
+
+
+def open_redwood(folder: Path, settings: InputConfig) -> RecordedSource:
+    """Open a folder. Raises SourceError if images, camera or trajectory cannot be used."""
+    path = _intrinsic_file(folder)
+    fields = read_json_object(path) if path else {}
+    rate = check_positive(path or folder, "fps", json_number(path or folder, fields, "fps", FRAMES_PER_SECOND))
+    colors = list_images(first_subfolder(folder, COLOR_FOLDERS), COLOR_ENDINGS)
+    depths = list_images(folder / "depth", DEPTH_ENDINGS)
+    images, skipped = _timed(folder, colors, depths) or _numbered(folder, colors, depths, rate)
+    recorded = _recorded(path, fields) if path else PRIMESENSE
+    size = first_size([i.color for i in images])
+    calibration = resolve_calibration(folder, recorded, size, settings, recorded.depth_units_per_metre)
+    return RecordedSource(folder.resolve().name, images, calibration, settings, _truth(folder, images), skipped)
+
+
+def _timed(folder: Path, colors: list[Path], depths: list[Path]) -> tuple[list[ImagePair], list[str]] | None:
+    """Pair images by the time in their names, None if the names contain no time."""
+    if not (colors and depths and all(_TIMED.fullmatch(path.stem) for path in colors + depths)):
+        return None
+    times_s = [np.array([int(path.stem.split("-")[1]) * 1e-6 for path in paths]) for paths in (colors, depths)]
+    named = {"colour": times_s[0], "depth": times_s[1]}
+    refuse_other_units(folder, named)
+    pairs = associate(times_s[0], times_s[1])
+    if not len(pairs):
+        raise no_pairs(folder, named)
+    paired = set(pairs[:, 0].tolist())
+    skipped = [f"{path}: no depth within {MAX_GAP_S:g} s" for i, path in enumerate(colors) if i not in paired]
+    return [ImagePair(float(times_s[1][j]), colors[i], depths[j]) for i, j in pairs], skipped
+
+
+def _numbered(folder: Path, colors: list[Path], depths: list[Path], rate: float) -> tuple[list[ImagePair], list[str]]:
+    of_color, of_depth = index_by_number(colors), index_by_number(depths)
+    keys, skipped = pair_images(folder, of_color, of_depth, f"{'|'.join(COLOR_FOLDERS)}/*.jpg", "depth/*.png")
+    return [ImagePair(n / rate, of_color[n], of_depth[n]) for n in keys], skipped
+
+
+def _recorded(path: Path, fields: dict[str, object]) -> Calibration:
+    """Build the camera from Open3D's JSON. Raises SourceError naming file and field."""
+    values = fields.get("intrinsic_matrix")
+    if not isinstance(values, list) or len(values) != 9:
+        raise SourceError(f'{path}: field "intrinsic_matrix" is {values!r}, expected 9 numbers by columns')
+    fx, fy, cx, cy = (json_number(path, {"intrinsic_matrix": values[i]}, "intrinsic_matrix") for i in (0, 4, 6, 7))
+    width, height = (int(json_number(path, fields, key)) for key in ("width", "height"))
+    units = check_positive(path, "depth_scale", json_number(path, fields, "depth_scale", MM_PER_METRE))
+    return Calibration(build_camera(path, width, height, [fx, fy, cx, cy]), units)
+
+
+def _truth(folder: Path, images: list[ImagePair]) -> Trajectory | None:
+    """Read the log; the first number of a pose is the index of its depth image, from 0."""
+    path = _log_in(folder)
+    if path is None:
+        return None
+    rows = [(line, parse_numbers(path, line, words)) for line, words in read_lines(path)]
+    if len(rows) % 5 or any(len(row) != (3 if i % 5 == 0 else 4) for i, (_, row) in enumerate(rows)):
+        raise SourceError(f"{path}: each pose needs 5 lines: three numbers, then 4 rows of 4; is the file truncated?")
+    depths = list_images(folder / "depth", DEPTH_ENDINGS)
+    times = {image.depth: image.timestamp_s for image in images}
+    timed = []
+    for start in range(0, len(rows), 5):
+        line, (index, *_) = rows[start]
+        time = times.get(depths[int(index)]) if 0 <= index < len(depths) else None
+        if time is not None:
+            where = f"{path}:{line}"
+            timed.append((time, checked_pose(where, to_matrix(where, [row for _, row in rows[start + 1 : start + 5]]))))
+    return build_trajectory(timed)
+
+
+def _log_in(folder: Path) -> Path | None:
+    """Return trajectory.log, else the only log that starts like a trajectory and is not odometry."""
+    if (folder / "trajectory.log").is_file():
+        return folder / "trajectory.log"
+    logs = [path for path in folder.glob("*.log") if "odom" not in path.name and _begins_as_trajectory(path)]
+    return logs[0] if len(logs) == 1 else None
+
+
+def _begins_as_trajectory(path: Path) -> bool:
+    if not path.is_file():
+        return False
+    with open_regular(path) as file:
+        words = file.readline(200).decode("utf-8", "replace").split()
+    return len(words) == 3 and all(word.isdecimal() for word in words)
+
+
+def _intrinsic_file(folder: Path) -> Path | None:
+    return next((folder / name for name in INTRINSIC_NAMES if (folder / name).is_file()), None)
+
+
+def recognises(path: str) -> bool:
+    """Return whether there are image folders with a camera file, a trajectory, or names with times as in Redwood."""
+    folder = Path(path)
+    colors = first_subfolder(folder, COLOR_FOLDERS)
+    if colors is None and not (folder / "depth").is_dir():
+        return False
+    timed = colors is not None and any(_TIMED.fullmatch(entry.stem) for entry in colors.iterdir())
+    return timed or _intrinsic_file(folder) is not None or _log_in(folder) is not None
+
+
+FORMAT = Format(
+    "Redwood / Open3D",
+    "color/, depth/ and camera_intrinsic.json or trajectory.log",
+    recognises,
+    lambda path, settings: open_redwood(Path(path), settings),
+    sensor="kinect-v1",
+)

@@ -1,0 +1,249 @@
+"""Build the rooms and their furniture.
+
+A room spans x ∈ [−2.5, 2.5], y ∈ [−2, 2], z ∈ [0, 2.6] m about its centre. Further rooms follow along x, PITCH_M apart,
+with doorways at y = 0. The space above 1.1 m within 1.2 m of the centre line is free for the camera.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from sigmasplat.plugins.sources.room.pictures import books, leaves, painting, rug, sky
+from sigmasplat.plugins.sources.room.shapes import Kind, Shape
+from sigmasplat.plugins.sources.room.textures import (
+    Color,
+    Material,
+    Texture,
+    brick,
+    checks,
+    plain,
+    two_tone,
+    wallpaper,
+    weave,
+    wood,
+)
+
+HALF_X_M, HALF_Y_M, HEIGHT_M = 2.5, 2.0, 2.6
+WALL_M = 0.15
+PITCH_M = 2 * HALF_X_M + WALL_M
+DOOR_HALF_M, DOOR_HEIGHT_M = 0.55, 2.15
+
+WALLPAPERS: tuple[tuple[Color, Color], ...] = (
+    ((0.78, 0.80, 0.72), (0.45, 0.58, 0.50)),
+    ((0.86, 0.78, 0.66), (0.66, 0.42, 0.34)),
+    ((0.72, 0.78, 0.84), (0.36, 0.46, 0.62)),
+    ((0.84, 0.80, 0.84), (0.52, 0.38, 0.54)),
+)
+SOFAS: tuple[Color, ...] = ((0.20, 0.40, 0.46), (0.56, 0.26, 0.22), (0.30, 0.36, 0.24), (0.34, 0.30, 0.46))
+
+
+@dataclass
+class Room:
+    """The shapes of one room. `place` uses room coordinates and mirrors every second room in x."""
+
+    number: int
+    seed: int
+    shapes: list[Shape] = field(default_factory=list)
+
+    def place(
+        self,
+        kind: Kind,
+        center: tuple[float, float, float],
+        half: tuple[float, float, float],
+        material: Material | Texture,
+        yaw_rad: float = 0.0,
+    ) -> None:
+        """Add a shape: centre and half extents in metres; if `material` is only a texture, the material is matt."""
+        side = -1.0 if self.number % 2 else 1.0
+        x, y, z = center
+        made = material if isinstance(material, Material) else Material(material)
+        at = np.array([side * x + self.number * PITCH_M, y, z], np.float32)
+        self.shapes.append(Shape(kind, at, np.array(half, np.float32), side * yaw_rad, made))
+
+    def pick(self, choices: int) -> int:
+        """Return which of several variants to use: by the seed, and different in neighbouring rooms."""
+        return (self.seed + self.number) % choices
+
+
+def furnish_rooms(rooms: int, seed: int) -> list[list[Shape]]:
+    """Build a row of furnished rooms; return the shapes of each, a shared wall with the earlier room."""
+    built = []
+    for number in range(rooms):
+        room = Room(number, seed)
+        _shell(room, rooms)
+        for furnish in (_north_wall, _south_wall, _corners, _middle):
+            furnish(room, 1000 * seed + 100 * number)
+        built.append(room.shapes)
+    return built
+
+
+def _shell(room: Room, rooms: int) -> None:
+    """Build floor, ceiling and walls; door walls are shared with the next room."""
+    seed, half = room.seed * 10 + room.number, WALL_M / 2
+    ground, figure = WALLPAPERS[room.pick(len(WALLPAPERS))]
+    span_x, middle_z = PITCH_M / 2, HEIGHT_M / 2  # neighbouring rooms meet inside the shared wall
+    place = room.place
+    place("box", (0, 0, -half), (span_x, HALF_Y_M + WALL_M, half), wood((0.58, 0.42, 0.28), seed=seed))
+    place(
+        "box", (0, 0, HEIGHT_M + half), (span_x, HALF_Y_M + WALL_M, half), plain((0.90, 0.89, 0.86), 0.04, 0.25, seed)
+    )
+    place("box", (0, HALF_Y_M + half, middle_z), (span_x, half, middle_z), wallpaper(ground, figure, 0.34, seed))
+    south = two_tone((0.86, 0.82, 0.72), (0.50, 0.58, 0.60), 0.95 - middle_z, seed)
+    place("box", (0, -HALF_Y_M - half, middle_z), (span_x, half, middle_z), south)
+    bare = plain((0.84, 0.82, 0.78), 0.006, 0.5, seed)  # the nearly textureless wall
+    bricks = brick((0.66, 0.42, 0.34), (0.80, 0.77, 0.72), seed)
+    away = -1.0 if room.number % 2 else 1.0  # x of the wall towards the next room, before mirroring
+    _wall(room, away * (HALF_X_M + half), bare if away > 0 else bricks, room.number < rooms - 1)
+    if room.number == 0:
+        _wall(room, -HALF_X_M - half, bricks, False)
+
+
+def _wall(room: Room, x: float, texture: Texture, door: bool) -> None:
+    if not door:
+        room.place("box", (x, 0, HEIGHT_M / 2), (WALL_M / 2, HALF_Y_M, HEIGHT_M / 2), texture)
+        return
+    half = (HALF_Y_M - DOOR_HALF_M) / 2
+    for side in (-1, 1):
+        room.place("box", (x, side * (DOOR_HALF_M + half), HEIGHT_M / 2), (WALL_M / 2, half, HEIGHT_M / 2), texture)
+    lintel = (HEIGHT_M - DOOR_HEIGHT_M) / 2
+    room.place("box", (x, 0, HEIGHT_M - lintel), (WALL_M / 2, DOOR_HALF_M, lintel), texture)
+    room.place("box", (x, 0, 0.0), (WALL_M / 2 + 0.02, DOOR_HALF_M, 0.008), plain((0.36, 0.25, 0.17), 0.1))  # the sill
+
+
+def _north_wall(room: Room, seed: int) -> None:
+    """Add bookshelf, sofa, painting and floor lamp along the wall with wallpaper."""
+    place = room.place
+    _bookshelf(room, -1.62, seed)
+    cloth = SOFAS[room.pick(len(SOFAS))]
+    pale: Color = (min(cloth[0] + 0.14, 1), min(cloth[1] + 0.14, 1), min(cloth[2] + 0.14, 1))
+    fabric = weave(cloth, pale, 0.05, seed)
+    place("box", (0.35, 1.5, 0.24), (0.82, 0.38, 0.2), fabric)
+    place("box", (0.35, 1.84, 0.5), (0.82, 0.12, 0.36), weave(cloth, pale, 0.06, seed + 1))
+    for side in (-1, 1):
+        place("box", (0.35 + side * 0.9, 1.52, 0.32), (0.1, 0.4, 0.3), fabric)
+    place("ball", (-0.1, 1.66, 0.58), (0.2, 0.11, 0.17), checks((0.86, 0.78, 0.58), (0.72, 0.34, 0.24), 0.06, seed))
+    place("ball", (0.85, 1.64, 0.57), (0.2, 0.12, 0.17), weave((0.82, 0.72, 0.30), (0.92, 0.86, 0.62), 0.05, seed))
+    place("box", (0.4, 1.985, 1.62), (0.58, 0.02, 0.4), painting(0.58, 0.4, seed + 11))
+    place("drum", (1.8, 1.5, 0.02), (0.16, 0.16, 0.02), plain((0.25, 0.24, 0.23)))
+    place("drum", (1.8, 1.5, 0.75), (0.016, 0.016, 0.75), plain((0.30, 0.28, 0.25)))
+    place("drum", (1.8, 1.5, 1.62), (0.2, 0.2, 0.15), Material(plain((0.98, 0.90, 0.72), 0.05), glow=0.85))
+
+
+def _bookshelf(room: Room, x: float, seed: int) -> None:
+    """Add a bookshelf with four boards; each board holds three groups of books of different height."""
+    timber = wood((0.46, 0.31, 0.19), 0.11, seed)
+    upright = wood((0.44, 0.30, 0.18), 0.2, seed + 1)
+    room.place("box", (x, 1.97, 0.95), (0.62, 0.02, 0.95), upright)
+    for side in (-1, 1):
+        room.place("box", (x + side * 0.6, 1.82, 0.95), (0.02, 0.16, 0.95), upright)
+    rng = np.random.default_rng((seed, 1))
+    for board, z in enumerate((0.06, 0.52, 0.98, 1.44, 1.88)):
+        room.place("box", (x, 1.82, z), (0.6, 0.16, 0.018), timber)
+        if board == 4:
+            break
+        for group, offset in enumerate((-0.37, 0.0, 0.36)):
+            half_z = float(rng.uniform(0.11, 0.19))
+            look = books(float(rng.uniform(0.035, 0.06)), seed + 10 * board + group)
+            half_x = float(rng.uniform(0.12, 0.175))
+            room.place("box", (x + offset, 1.85, z + 0.018 + half_z), (half_x, 0.1, half_z), look)
+
+
+def _south_wall(room: Room, seed: int) -> None:
+    """Add window, sideboard with a vase, and mirror along the two-tone wall."""
+    place = room.place
+    place("box", (-0.85, -1.985, 1.6), (0.72, 0.02, 0.5), Material(sky(0.5), glow=1.0))
+    white = plain((0.93, 0.92, 0.89), 0.02)
+    for x, z, half_x, half_z in (
+        (-0.85, 2.12, 0.78, 0.035),
+        (-0.85, 1.08, 0.82, 0.04),
+        (-1.6, 1.6, 0.035, 0.5),
+        (-0.1, 1.6, 0.035, 0.5),
+        (-0.85, 1.6, 0.022, 0.5),
+    ):
+        place("box", (x, -1.97, z), (half_x, 0.045, half_z), white)
+    place("box", (-0.85, -1.74, 0.36), (0.7, 0.24, 0.3), wood((0.50, 0.30, 0.20), 0.2, seed + 5, 0.47))
+    place("box", (-0.85, -1.74, 0.68), (0.73, 0.26, 0.02), wood((0.62, 0.42, 0.28), 0.13, seed + 6))
+    place(
+        "ball",
+        (-1.2, -1.72, 0.84),
+        (0.1, 0.1, 0.15),
+        Material(checks((0.2, 0.34, 0.6), (0.9, 0.9, 0.88), 0.04), gloss=0.3),
+    )
+    place("box", (-0.5, -1.74, 0.76), (0.13, 0.1, 0.06), books(0.03, seed + 7), 0.35)
+    place("box", (1.25, -1.985, 1.35), (0.5, 0.02, 0.68), wood((0.55, 0.42, 0.20), 0.08, seed + 8))
+    place("box", (1.25, -1.965, 1.35), (0.45, 0.012, 0.63), Material(plain((0.62, 0.66, 0.68), 0.0), mirror=0.8))
+
+
+def _corners(room: Room, seed: int) -> None:
+    """Add a plant, crates and small paintings near the side walls; the doorways stay free."""
+    place = room.place
+    place("drum", (-2.1, -1.5, 0.2), (0.19, 0.19, 0.2), checks((0.70, 0.42, 0.30), (0.78, 0.52, 0.38), 0.08, seed))
+    place("drum", (-2.1, -1.5, 0.6), (0.022, 0.022, 0.25), plain((0.36, 0.26, 0.16)))
+    rng = np.random.default_rng((seed, 2))
+    for k in range(6):
+        angle, radius = k * 2.1, 0.08 + 0.03 * k
+        size = float(rng.uniform(0.13, 0.19))
+        x, y = -2.1 + radius * float(np.cos(angle)), -1.5 + radius * float(np.sin(angle))
+        place("ball", (x, y, 0.8 + 0.085 * k), (size, size, 0.8 * size), leaves(seed + k))
+    place("box", (2.12, -1.6, 0.24), (0.28, 0.28, 0.24), wood((0.72, 0.56, 0.36), 0.12, seed + 3), 0.12)
+    place("box", (2.1, -1.62, 0.64), (0.2, 0.2, 0.16), checks((0.30, 0.42, 0.58), (0.78, 0.80, 0.78), 0.08, seed), 0.5)
+    place("box", (1.58, -1.66, 0.17), (0.2, 0.2, 0.17), weave((0.62, 0.50, 0.34), (0.80, 0.70, 0.52), 0.07, seed), -0.3)
+    place("box", (-2.485, 1.15, 1.5), (0.02, 0.34, 0.42), painting(0.34, 0.42, seed + 21, (0.16, 0.15, 0.15)))
+    place("box", (-2.485, -1.0, 1.6), (0.02, 0.26, 0.26), painting(0.26, 0.26, seed + 22, (0.60, 0.48, 0.24)))
+
+
+def _middle(room: Room, seed: int) -> None:
+    """Add rug, table, chairs, objects on the table and the ceiling lamp in the middle."""
+    place, turn = room.place, 0.25
+    place(
+        "drum",
+        (0.1, 0.0, 0.008),
+        (1.15, 1.15, 0.008),
+        rug(1.15, (0.58, 0.20, 0.18), (0.85, 0.76, 0.58), (0.22, 0.26, 0.40), seed),
+    )
+    top = wood((0.68, 0.48, 0.30), 0.12, seed + 4, 2.0)
+    place("box", (0.1, 0.0, 0.70), (0.58, 0.36, 0.022), top, turn)
+    for sx in (-1, 1):
+        for sy in (-1, 1):
+            x, y = _rotated(0.5 * sx, 0.29 * sy, turn)
+            place("drum", (0.1 + x, y, 0.34), (0.032, 0.032, 0.34), plain((0.42, 0.30, 0.20), 0.05))
+    x, y = _rotated(0.22, 0.06, turn)
+    chrome = Material(plain((0.42, 0.44, 0.48), 0.02), mirror=0.3, gloss=0.9)  # the specular sphere
+    place("ball", (0.1 + x, y, 0.722 + 0.13), (0.13, 0.13, 0.13), chrome)
+    x, y = _rotated(-0.3, 0.1, turn)
+    place(
+        "box",
+        (0.1 + x, y, 0.722 + 0.09),
+        (0.09, 0.09, 0.09),
+        checks((0.86, 0.62, 0.18), (0.22, 0.24, 0.30), 0.06, seed),
+        0.7,
+    )
+    x, y = _rotated(-0.12, -0.17, turn)
+    place("box", (0.1 + x, y, 0.722 + 0.03), (0.14, 0.1, 0.03), books(0.06, seed + 9), 0.1)
+    x, y = _rotated(0.4, -0.15, turn)
+    place(
+        "drum", (0.1 + x, y, 0.722 + 0.05), (0.042, 0.042, 0.05), Material(plain((0.75, 0.25, 0.2), 0.05), gloss=0.25)
+    )
+    for x, y, yaw_rad in ((-0.75, -0.45, 0.5), (0.95, 0.5, 2.9)):
+        _chair(room, x, y, yaw_rad, seed)
+    shade = Material(plain((1.0, 0.97, 0.90), 0.01), glow=1.0)
+    place("drum", (0.0, 0.0, HEIGHT_M - 0.06), (0.3, 0.3, 0.05), shade)
+
+
+def _chair(room: Room, x: float, y: float, yaw_rad: float, seed: int) -> None:
+    timber = wood((0.40, 0.27, 0.18), 0.06, seed + 12)
+    room.place(
+        "box", (x, y, 0.44), (0.2, 0.2, 0.025), weave((0.52, 0.20, 0.18), (0.72, 0.42, 0.34), 0.05, seed), yaw_rad
+    )
+    back_x, back_y = _rotated(-0.19, 0.0, yaw_rad)
+    room.place("box", (x + back_x, y + back_y, 0.72), (0.018, 0.2, 0.2), timber, yaw_rad)
+    for sx in (-1, 1):
+        for sy in (-1, 1):
+            leg_x, leg_y = _rotated(0.175 * sx, 0.175 * sy, yaw_rad)
+            height = 0.36 if sx < 0 else 0.21  # the posts of the back are taller
+            room.place("box", (x + leg_x, y + leg_y, height), (0.02, 0.02, height), timber, yaw_rad)
+
+
+def _rotated(x: float, y: float, angle_rad: float) -> tuple[float, float]:
+    c, s = float(np.cos(angle_rad)), float(np.sin(angle_rad))
+    return c * x - s * y, s * x + c * y

@@ -1,0 +1,102 @@
+"""Add the noise of a structured-light sensor to exact images."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates, maximum_filter, minimum_filter, zoom
+
+from sigmasplat.data.camera import Camera
+
+Image = NDArray[np.float32]
+
+JITTER_PX = 0.6
+RANGE_M = (0.35, 7.0)
+COLOR_SIGMA = 0.008
+PREDICTED_SCALE_ERROR, PREDICTED_NOISE = 0.1, 0.1
+"""Standard deviations of predicted depth, shares of the depth: of its smooth error, and at each pixel."""
+DRIFT_KNOT_FRAMES = 300
+"""Frames between the random values of the calibration drift; it is a spline between them."""
+
+
+def noise_sigma_m(depth_m: Image) -> Image:
+    """Return the standard deviation of Kinect depth, metres: 1.2 mm + 1.9 mm/m² (z − 0.4 m)² (Nguyen 2012)."""
+    return (0.0012 + 0.0019 * (depth_m - 0.4) ** 2).astype(np.float32)
+
+
+def measured_depth(depth_m: Image, camera: Camera, rng: np.random.Generator) -> Image:
+    """Return noisy sensor depth for true depth [H, W]: jittered edges, noise that grows with z², holes as 0.
+
+    Holes: grazing surfaces, a rim along depth discontinuities, random patches and speckles, and out-of-range depth.
+    """
+    seen = _jittered(depth_m, rng)
+    noisy = seen + rng.standard_normal(seen.shape, np.float32) * noise_sigma_m(seen)
+    in_range = (noisy > RANGE_M[0]) & (noisy < RANGE_M[1])
+    blind = _grazing(depth_m, camera) | _rims(depth_m, rng) | _patches(depth_m.shape, rng)
+    return np.where(in_range & ~blind, noisy, 0.0).astype(np.float32)
+
+
+def drifted_depth(depth_m: Image, i: int, seed: int, deviation: float) -> Image:
+    """Return the depth [H, W] read at frame i by a sensor whose calibration drifts as it warms up.
+
+    The relative error is a polynomial of second degree over the image. Each coefficient is an independent smooth random
+    process over the frames; `deviation` is the standard deviation of their sum, over image and time. The error depends
+    only on seed and i, and changes slowly: neighbouring frames agree while the path drifts, as with a real sensor.
+    """
+    height, width = depth_m.shape
+    v, u = np.linspace(-1.0, 1.0, height)[:, None], np.linspace(-1.0, 1.0, width)
+    # Legendre polynomials: orthogonal, each with mean square 1, so that their variances add up.
+    one, tilt_u, tilt_v = np.ones((height, width)), np.sqrt(3.0) * u, np.sqrt(3.0) * v
+    shapes = (one, tilt_u, tilt_v, tilt_u * tilt_v, *(np.sqrt(1.25) * (3.0 * x**2 - 1.0) for x in (u, v)))
+    error = sum(_smooth_process(i, (seed, k, 8)) * shape for k, shape in enumerate(shapes)) / np.sqrt(len(shapes))
+    return np.asarray(depth_m * (1.0 + deviation * error), np.float32)
+
+
+def predicted_depth(depth_m: Image, i: int, seed: int, rng: np.random.Generator) -> Image:
+    """Return depth [H, W] as a network may predict it for frame i: true depth times a scale error of
+    `PREDICTED_SCALE_ERROR` that changes slowly over image and time, with `PREDICTED_NOISE` at each pixel."""
+    scaled = drifted_depth(depth_m, i, seed, PREDICTED_SCALE_ERROR)
+    factor = 1.0 + PREDICTED_NOISE * rng.standard_normal(scaled.shape, np.float32)
+    return np.where(depth_m > 0, np.maximum(scaled * factor, 0.0), 0.0).astype(np.float32)
+
+
+def _smooth_process(i: int, seed: tuple[int, ...]) -> float:
+    """Return a smooth random process of mean 0 and variance 1 at frame i: a cubic spline of normal numbers."""
+    knot, s = divmod(i / DRIFT_KNOT_FRAMES, 1.0)
+    weights = np.array([(1 - s) ** 3, 3 * s**3 - 6 * s**2 + 4, -3 * s**3 + 3 * s**2 + 3 * s + 1, s**3])
+    normals = [np.random.default_rng((*seed, int(knot) + k)).standard_normal() for k in range(4)]
+    return float(weights @ normals / np.linalg.norm(weights))
+
+
+def measured_color(color: Image, rng: np.random.Generator) -> Image:
+    """Return colour [H, W, 3] with image noise."""
+    return np.clip(color + COLOR_SIGMA * rng.standard_normal(color.shape, np.float32), 0.0, 1.0)
+
+
+def _jittered(depth_m: Image, rng: np.random.Generator) -> Image:
+    """Sample every pixel at a random offset below a pixel: edges become noisy, surfaces hardly change."""
+    v, u = np.indices(depth_m.shape, np.float32)
+    offsets = rng.normal(0.0, JITTER_PX, (2, *depth_m.shape)).astype(np.float32)
+    return np.asarray(map_coordinates(depth_m, [v + offsets[0], u + offsets[1]], order=0, mode="nearest"))
+
+
+def _grazing(depth_m: Image, camera: Camera) -> NDArray[np.bool_]:
+    """Mark surfaces seen at less than about 10°, where the light pattern is too distorted."""
+    points = camera.rays() * depth_m[..., None]
+    along_v, along_u = np.gradient(points, axis=0), np.gradient(points, axis=1)
+    normal = np.cross(along_u, along_v)
+    norms = np.linalg.norm(normal, axis=-1) * np.linalg.norm(points, axis=-1)
+    cosine = np.abs((normal * points).sum(-1)) / np.maximum(norms, 1e-12)
+    return np.asarray(cosine < 0.17)
+
+
+def _rims(depth_m: Image, rng: np.random.Generator) -> NDArray[np.bool_]:
+    """Mark most pixels beside a depth discontinuity: the shadow of the projector."""
+    jump = maximum_filter(depth_m, 3) - minimum_filter(depth_m, 3) > 0.06 * depth_m
+    return np.asarray(jump & (rng.random(depth_m.shape) < 0.8))
+
+
+def _patches(shape: tuple[int, ...], rng: np.random.Generator) -> NDArray[np.bool_]:
+    """Mark a few random patches and single pixels, about 1.5 % of the image."""
+    height, width = shape
+    coarse = rng.random((height // 8 + 2, width // 8 + 2)).astype(np.float32)
+    clouds = zoom(coarse, 8, order=1)[:height, :width]
+    return np.asarray((clouds > 0.93) | (rng.random(shape) < 0.004))

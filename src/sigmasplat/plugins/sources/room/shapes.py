@@ -1,0 +1,182 @@
+"""Intersect many rays with boxes, balls and drums (ellipsoids and elliptic cylinders).
+
+Every shape is a unit shape scaled by `half`, rotated by `yaw_rad` about the vertical and moved to `center`. A ray is
+transformed to the unit shape; its parameter t stays the same. The room's frame: metres, z up, floor at z = 0.
+Rays are stored as [3, N] so that each coordinate is contiguous.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sigmasplat.data.camera import Camera
+from sigmasplat.plugins.sources.room.textures import Floats, Material
+
+Indices = NDArray[np.intp]
+Kind = Literal["box", "ball", "drum"]
+
+MIN_RAY_PARAMETER = 1e-3
+"""Hits with a smaller ray parameter are on the surface where the ray starts."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """A solid: kind, center [3] m, half extents [3] m, yaw (radians about z), material."""
+
+    kind: Kind
+    center: Floats
+    half: Floats
+    yaw_rad: float
+    material: Material
+
+    def to_local_axes(self, vectors: Floats) -> Floats:
+        """Rotate room vectors [3, ...] to the shape's axes."""
+        return _rotated_about_z(vectors, -self.yaw_rad)
+
+    def to_room_axes(self, vectors: Floats) -> Floats:
+        """Rotate vectors [3, ...] from the shape's axes to the room."""
+        return _rotated_about_z(vectors, self.yaw_rad)
+
+    def local(self, points: Floats) -> Floats:
+        """Return room points [3, N] in the shape's frame, metres."""
+        return self.to_local_axes(points - self.center[:, None])
+
+    def first_hit(self, origins: Floats, directions: Floats) -> Floats:
+        """Return the ray parameter [N] where rays enter, inf for a miss; origins [3, 1] or [3, N]."""
+        o = self.local(origins) / self.half[:, None]
+        d = self.to_local_axes(directions) / self.half[:, None]
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            enter, leave = _INTERVALS[self.kind](o, d)
+            hit = (enter < leave) & (enter > MIN_RAY_PARAMETER)
+        return np.where(hit, enter, np.float32(np.inf)).astype(np.float32)
+
+    def corners(self) -> NDArray[np.float64]:
+        """Return the 8 corners of the bounding box, room frame [8, 3]."""
+        signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float32)
+        return (self.to_room_axes((signs * self.half).T).T + self.center).astype(np.float64)
+
+
+def dot(a: Floats, b: Floats) -> Floats:
+    """Return the inner products [N] of vectors [2 or 3, N], by coordinate, which is faster than a sum over the axis."""
+    total: Floats = a[0] * b[0] + a[1] * b[1]
+    return total if len(a) == 2 else total + a[2] * b[2]
+
+
+def normalised(v: Floats) -> Floats:
+    """Return unit vectors [3, N]."""
+    return (v / np.maximum(np.sqrt(dot(v, v)), 1e-9)).astype(np.float32)
+
+
+def _rotated_about_z(v: Floats, angle_rad: float) -> Floats:
+    if angle_rad == 0.0:
+        return v
+    c, s = np.float32(np.cos(angle_rad)), np.float32(np.sin(angle_rad))
+    return np.stack([c * v[0] - s * v[1], s * v[0] + c * v[1], np.broadcast_to(v[2], v[0].shape)])
+
+
+def _slab(o: Floats, d: Floats) -> tuple[Floats, Floats]:
+    """Return the interval of t with |o + t d| ≤ 1 for one coordinate."""
+    per_unit = 1.0 / np.where(d == 0.0, np.float32(1e-9), d)
+    middle, half = -o * per_unit, np.abs(per_unit)
+    return middle - half, middle + half
+
+
+def _within_unit(o: Floats, d: Floats) -> tuple[Floats, Floats]:
+    """Return the interval of t with ‖o + t d‖ ≤ 1, about the closest point for accuracy."""
+    a = np.maximum(dot(d, d), 1e-12)
+    middle = -dot(o, d) / a
+    nearest = o + middle * d
+    half_chord = np.sqrt(np.maximum((1.0 - dot(nearest, nearest)) / a, 0.0))
+    return middle - half_chord, middle + half_chord
+
+
+def _box_interval(o: Floats, d: Floats) -> tuple[Floats, Floats]:
+    (enter_x, leave_x), (enter_y, leave_y), (enter_z, leave_z) = (_slab(o[k], d[k]) for k in range(3))
+    enter = np.maximum(np.maximum(enter_x, enter_y), enter_z)
+    return enter, np.minimum(np.minimum(leave_x, leave_y), leave_z)
+
+
+def _drum_interval(o: Floats, d: Floats) -> tuple[Floats, Floats]:
+    (near_side, far_side), (near_cap, far_cap) = _within_unit(o[:2], d[:2]), _slab(o[2], d[2])
+    return np.maximum(near_side, near_cap), np.minimum(far_side, far_cap)
+
+
+_INTERVALS = {"box": _box_interval, "ball": _within_unit, "drum": _drum_interval}
+
+
+def surface_at(shape: Shape, points: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return outward normals [3, N] (room frame) and surface coordinates u, v [N] in metres at points on a shape.
+
+    u, v run along the face of a box and the cap of a drum, around and up a ball or a drum's side.
+    """
+    p = shape.local(points)
+    unit = p / shape.half[:, None]
+    if shape.kind == "box":
+        axis = np.abs(unit).argmax(0)
+        normal = np.where(np.arange(3)[:, None] == axis, np.sign(unit), 0.0).astype(np.float32)
+        return shape.to_room_axes(normal), np.where(axis == 0, p[1], p[0]), np.where(axis == 2, p[1], p[2])
+    around = (np.arctan2(unit[1], unit[0]) * shape.half[0]).astype(np.float32)
+    if shape.kind == "ball":
+        return shape.to_room_axes(normalised(unit / shape.half[:, None])), around, p[2]
+    cap = np.abs(unit[2]) > np.hypot(unit[0], unit[1])
+    side = unit / shape.half[:, None] * np.array([[1.0], [1.0], [0.0]], np.float32)
+    normal = np.where(cap, np.sign(unit[2]) * np.array([[0.0], [0.0], [1.0]]), normalised(side)).astype(np.float32)
+    return shape.to_room_axes(normal), np.where(cap, p[0], around), np.where(cap, p[1], p[2])
+
+
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """Rays from origins [3, 1] or [3, N] along directions [3, N]; pixels [2, N]: their image coordinates."""
+
+    origins: Floats
+    directions: Floats
+    pixels: Floats | None = None
+
+
+Windows = list[tuple[float, float, float, float] | None]
+
+
+def cast_rays(shapes: Sequence[Shape], rays: Rays, windows: Windows | None = None) -> tuple[Floats, Indices]:
+    """Return the nearest hit of each ray: its parameter [N] (inf: none) and the index of the shape [N] (−1: none).
+
+    `windows`, from `image_windows`, limits each shape to the pixels where it can be visible.
+    """
+    n = rays.directions.shape[1]
+    nearest, index = np.full(n, np.inf, np.float32), np.full(n, -1, np.intp)
+    for k, shape in enumerate(shapes):
+        if windows is None or rays.pixels is None:
+            t = shape.first_hit(rays.origins, rays.directions)
+            first = np.flatnonzero(t < nearest)
+            nearest[first], index[first] = t[first], k
+        elif (window := windows[k]) is not None:
+            among = _inside(rays.pixels, window)
+            t = shape.first_hit(rays.origins, rays.directions if len(among) == n else rays.directions[:, among])
+            closer = t < nearest[among]
+            nearest[among[closer]], index[among[closer]] = t[closer], k
+    return nearest, index
+
+
+def _inside(pixels: Floats, window: tuple[float, float, float, float]) -> Indices:
+    u, v = pixels
+    return np.flatnonzero((u >= window[0]) & (u <= window[2]) & (v >= window[1]) & (v <= window[3]))
+
+
+def image_windows(shapes: Sequence[Shape], T_camera_world: NDArray[np.float64], camera: Camera) -> Windows:
+    """Return the bounding box of each shape in the image: (u0, v0, u1, v1) pixels, None if it is not visible."""
+    return [_window(shape.corners() @ T_camera_world[:3, :3].T + T_camera_world[:3, 3], camera) for shape in shapes]
+
+
+def _window(corners: NDArray[np.float64], camera: Camera) -> tuple[float, float, float, float] | None:
+    z = corners[:, 2]
+    if z.max() < 0.01:
+        return None
+    if z.min() < 0.01:  # partly behind the camera: the projected corners do not bound it
+        return -1.0, -1.0, camera.width, camera.height
+    u = camera.fx * corners[:, 0] / z + camera.cx
+    v = camera.fy * corners[:, 1] / z + camera.cy
+    if u.max() < -1 or v.max() < -1 or u.min() > camera.width or v.min() > camera.height:
+        return None
+    return float(u.min()), float(v.min()), float(u.max()), float(v.max())

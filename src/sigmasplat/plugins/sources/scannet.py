@@ -1,0 +1,139 @@
+"""Read ScanNet scenes extracted from .sens files, in both layouts of SensReader.
+
+color/0.jpg  depth/0.png  pose/0.txt                         SensReader/python; also 000000.jpg
+intrinsic/intrinsic_color.txt  intrinsic_depth.txt  extrinsic_color.txt  extrinsic_depth.txt
+intrinsics_color.txt  intrinsics_depth.txt                   or in the scene's folder, as in scannet_frames_25k
+frame-000000.color.jpg  .depth.pgm  .pose.txt  _info.txt     SensReader/c++; also 3RScan's, BundleFusion's (info.txt)
+
+Depth (640×480, mm) has its own camera. It is registered to colour (1296×968), and the working width is depth's.
+Extrinsics transform a common frame to each camera: T_color_depth = E_color · E_depth⁻¹ (as in BundleFusion).
+Poses are camera to world, and −inf where tracking was lost: these frames are kept, without ground truth.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from sigmasplat.config import InputConfig
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.errors import SourceError
+from sigmasplat.files.reading import read_text
+from sigmasplat.input.calibration import MM_PER_METRE, Calibration, build_camera, check_positive, resolve_calibration
+from sigmasplat.input.folders import (
+    COLOR_ENDINGS,
+    DEPTH_ENDINGS,
+    FRAMES_PER_SECOND,
+    FrameFiles,
+    first_subfolder,
+    frame_files,
+    has_frame_files,
+    index_by_number,
+    list_images,
+    pair_images,
+)
+from sigmasplat.input.lists import parse_numbers
+from sigmasplat.input.opening import Format
+from sigmasplat.input.pose_files import read_matrix, read_pose_files, to_matrix
+from sigmasplat.input.recorded import ImagePair, RecordedSource, first_size
+from sigmasplat.types import Matrix
+
+COLOR_SIZE, DEPTH_SIZE = (1296, 968), (640, 480)
+"""Width and height of ScanNet's recordings. The published matrices are for these sizes, even if images are resized."""
+
+INFO_NAMES = ("_info.txt", "info.txt")
+
+
+def open_scannet(folder: Path, settings: InputConfig) -> RecordedSource:
+    """Open a scene's folder. Raises SourceError if images, cameras or poses cannot be used."""
+    files = _files(folder)
+    if not files["color"] and not files["depth"] and (packed := sorted(folder.glob("*.sens"))):
+        raise SourceError(
+            f"{packed[0]} is not extracted; extract color, depth, pose and intrinsic from it with ScanNet's SensReader"
+        )
+    keys, skipped = pair_images(folder, files["color"], files["depth"], "color/*.jpg", "depth/*.png")
+    images = [ImagePair(n / FRAMES_PER_SECOND, files["color"][n], files["depth"][n]) for n in keys]
+    size, depth_size = first_size([i.color for i in images]), first_size([i.depth for i in images])
+    recorded = _recorded(folder, size, depth_size)
+    calibration = resolve_calibration(folder, recorded, size, settings, MM_PER_METRE)
+    truth = read_pose_files((n / FRAMES_PER_SECOND, files["pose"][n]) for n in keys if n in files["pose"])
+    return RecordedSource(folder.resolve().name, images, calibration, settings, truth, skipped)
+
+
+def _files(folder: Path) -> FrameFiles:
+    if has_frame_files(folder):
+        return frame_files(folder)
+    return {
+        "color": index_by_number(list_images(first_subfolder(folder, ("color", "rgb")), COLOR_ENDINGS)),
+        "depth": index_by_number(list_images(folder / "depth", DEPTH_ENDINGS)),
+        "pose": index_by_number(list_images(folder / "pose", (".txt",))),
+    }
+
+
+def _recorded(folder: Path, size: tuple[int, int], depth_size: tuple[int, int]) -> Calibration | None:
+    """Build both cameras from the scene's matrices, None if they are missing. Raises SourceError if one is damaged."""
+    where, found, units = _matrices(folder)
+    if "color_intrinsic" not in found:
+        return None
+    camera = _camera(where["color_intrinsic"], found["color_intrinsic"], size, COLOR_SIZE)
+    if "depth_intrinsic" not in found:
+        raise SourceError(f"{where['color_intrinsic']}: the depth camera's matrix is missing; extract it too")
+    depth_camera = _camera(where["depth_intrinsic"], found["depth_intrinsic"], depth_size, DEPTH_SIZE)
+    ends = [found.get(f"{kind}_extrinsic", np.eye(4)) for kind in ("color", "depth")]
+    if not all(se3.is_rigid(T) for T in ends):
+        raise SourceError(f"{folder}: the extrinsics of colour or depth are not rigid; correct or delete them")
+    T_color_depth = ends[0] @ se3.inverse(ends[1])
+    return Calibration(camera, units, depth_camera=depth_camera, T_color_depth=T_color_depth)
+
+
+def _matrices(folder: Path) -> tuple[dict[str, Path], dict[str, Matrix], float]:
+    """Return file and value of each matrix by `{color|depth}_{intrinsic|extrinsic}`, and depth units per metre."""
+    where, found, units = {}, {}, MM_PER_METRE
+    for info in (folder / name for name in INFO_NAMES if (folder / name).is_file()):
+        entries = dict(_entry(line) for line in read_text(info, errors="replace").splitlines() if "=" in line)
+        if shift := entries.get("m_depthShift"):
+            units = check_positive(info, "m_depthShift", parse_numbers(info, 1, [shift])[0])
+        for key, kind in (("Color", "color"), ("Depth", "depth")):
+            for part in ("Intrinsic", "Extrinsic"):
+                if text := entries.get(f"m_calibration{key}{part}"):
+                    name = f"{kind}_{part.lower()}"
+                    where[name], found[name] = info, to_matrix(f"{info} {key}{part}", text.split())
+        return where, found, units
+    for kind in ("color", "depth"):
+        for part in ("intrinsic", "extrinsic"):
+            names = (f"intrinsic/{part}_{kind}.txt", f"{part}s_{kind}.txt", f"{part}_{kind}.txt")
+            path = next((folder / name for name in names if (folder / name).is_file()), None)
+            if path:
+                where[f"{kind}_{part}"], found[f"{kind}_{part}"] = path, read_matrix(path)
+    return where, found, units
+
+
+def _entry(line: str) -> tuple[str, str]:
+    key, _, value = line.partition("=")
+    return key.strip(), value.strip()
+
+
+def _camera(path: Path, K: Matrix, size: tuple[int, int], published: tuple[int, int]) -> Camera:
+    """Build the camera for images of `size`; if the principal point does not fit it, resize the published camera."""
+    own = size if abs(2 * K[0, 2] - size[0]) < 0.2 * size[0] else published
+    return build_camera(path, *own, [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]).resized(*size)
+
+
+def recognises(path: str) -> bool:
+    """Return whether it is a scene, extracted or not."""
+    folder = Path(path)
+    has_info = any((folder / name).is_file() for name in INFO_NAMES)
+    if any(folder.glob("*.sens")) or (has_info and has_frame_files(folder)):
+        return True
+    images = first_subfolder(folder, ("color", "rgb", "depth"))
+    camera = (folder / "intrinsic").is_dir() or any(folder.glob("intrinsic*_*.txt"))
+    return images is not None and (camera or (folder / "pose").is_dir())
+
+
+FORMAT = Format(
+    "ScanNet",
+    "color/, depth/ and pose/",
+    recognises,
+    lambda path, settings: open_scannet(Path(path), settings),
+    sensor="kinect-v1",
+)

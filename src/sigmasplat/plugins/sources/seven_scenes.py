@@ -1,0 +1,82 @@
+"""Read the 7-Scenes sequences as published: three files per frame, depth not registered to colour.
+
+seq-01/frame-000000.color.png  .depth.png  .pose.txt      (also .color.jpg); depth in mm, 0 and 65535 = no reading
+SCENE/seq-01/ seq-02/ …                                   the scene's folder, if it holds one sequence
+
+The poses are those of the depth camera. By default colour is assumed to have the same camera, as in published results;
+the error is up to some centimetres for near surfaces. With register_depth=on, depth is moved to the colour camera, and
+the ground-truth path is converted: T_world_color = T_world_depth · T_depth_color.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+from sigmasplat.config import InputConfig
+from sigmasplat.data import se3
+from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.errors import SourceError
+from sigmasplat.input.calibration import (
+    MM_PER_METRE,
+    SEVEN_SCENES,
+    SEVEN_SCENES_COLOR,
+    Calibration,
+    resolve_calibration,
+)
+from sigmasplat.input.folders import FRAMES_PER_SECOND, frame_files, has_frame_files, pair_images
+from sigmasplat.input.opening import Format
+from sigmasplat.input.pose_files import read_pose_files
+from sigmasplat.input.recorded import ImagePair, RecordedSource, first_size
+from sigmasplat.input.rectification import registers_depth
+
+
+def open_seven_scenes(folder: Path, settings: InputConfig) -> RecordedSource:
+    """Open the folder of a sequence, or of a scene with one sequence. Raises SourceError if it cannot be used."""
+    if not has_frame_files(folder):
+        folder = _only_sequence(folder)
+    files = frame_files(folder)
+    numbers, skipped = pair_images(folder, files["color"], files["depth"], "frame-*.color.png", "frame-*.depth.png")
+    images = [ImagePair(n / FRAMES_PER_SECOND, files["color"][n], files["depth"][n]) for n in numbers]
+    calibration = _calibration(folder, images, settings)
+    truth = read_pose_files((n / FRAMES_PER_SECOND, files["pose"][n]) for n in numbers if n in files["pose"])
+    if truth and registers_depth(calibration, settings):
+        truth = Trajectory(truth.timestamps_s, truth.T_world_camera @ se3.inverse(calibration.T_color_depth))
+    source = RecordedSource(folder.resolve().name, images, calibration, settings, truth, skipped)
+    source.registrable = source.registrable or calibration.camera == SEVEN_SCENES.camera
+    return source
+
+
+def _calibration(folder: Path, images: list[ImagePair], settings: InputConfig) -> Calibration:
+    known = SEVEN_SCENES_COLOR if settings.register_depth == "on" else SEVEN_SCENES
+    size = first_size([files.color for files in images])
+    calibration = resolve_calibration(folder, known, size, settings, MM_PER_METRE)
+    T = calibration.T_color_depth
+    return replace(calibration, T_color_depth=se3.orthonormalise(T))
+
+
+def _only_sequence(scene: Path) -> Path:
+    """Return the only sequence of a scene. Raises SourceError unless there is exactly one."""
+    sequences = [path for path in sorted(scene.glob("seq-*")) if path.is_dir() and has_frame_files(path)]
+    packed = [path.name for path in sorted(scene.glob("seq-*.zip"))]
+    if not sequences and packed:
+        raise SourceError(f"{scene}: the sequences are not unpacked ({', '.join(packed[:3])}); unzip them first")
+    if len(sequences) != 1:
+        names = ", ".join(path.name for path in sequences)
+        raise SourceError(f"{scene} holds {len(sequences)} sequences ({names}); give one, for example {sequences[0]}")
+    return sequences[0]
+
+
+def recognises(path: str) -> bool:
+    """Return whether it is a sequence without a camera file, or a scene with such sequences."""
+    folder = Path(path)
+    if has_frame_files(folder):
+        return not any((folder / name).is_file() for name in ("_info.txt", "info.txt"))
+    return any(has_frame_files(entry) or entry.suffix == ".zip" for entry in folder.glob("seq-*"))
+
+
+FORMAT = Format(
+    "7-Scenes",
+    "frame-*.color.png",
+    recognises,
+    lambda path, settings: open_seven_scenes(Path(path), settings),
+    sensor="kinect-v1",
+)

@@ -1,0 +1,211 @@
+"""Read LiDAR recordings of the iPhone app Stray Scanner (layout: strayrobots/scanner, docs/format.md).
+
+rgb.mp4                       depth/000000.png    16-bit millimetres, fewer pixels, same camera
+camera_matrix.csv   3×3       confidence/000000.png   0, 1 or 2: readings with 0 are ignored
+odometry.csv        timestamp, frame, x, y, z, qx, qy, qz, qw [, fx, fy, cx, cy]
+imu.csv             timestamp, a_x, a_y, a_z, alpha_x, alpha_y, alpha_z; optional
+                    alpha: angular velocity, rad/s; a: of CMAccelerometerData in g, −1 upwards at rest
+
+The app converts ARKit's camera axes to ours before it writes a pose (OdometryEncoder.swift). Frame, depth and pose
+share one number. The clock of imu.csv is that of the frames, and its axes are those of the phone (IMUEncoder.swift,
+DatasetEncoder.swift). Recordings of 2021, whose odometry.csv has no header, are not supported.
+"""
+
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sigmasplat.config import InputConfig
+from sigmasplat.data import se3
+from sigmasplat.data.accelerometer import GRAVITY_M_S2, accelerometer_from_samples
+from sigmasplat.data.gyroscope import gyroscope_from_samples
+from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.errors import SourceError
+from sigmasplat.files.reading import read_text
+from sigmasplat.files.structured import csv_rows
+from sigmasplat.input.calibration import MM_PER_METRE, Calibration, build_camera, resolve_calibration
+from sigmasplat.input.images import image_size, read_depth, read_values
+from sigmasplat.input.opening import Format
+from sigmasplat.input.recorded import ImagePair, RecordedSource, Size, first_size
+from sigmasplat.input.video import Video
+
+POSE = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")
+ANGULAR, LINEAR = ("alpha_x", "alpha_y", "alpha_z"), ("a_x", "a_y", "a_z")
+R_CAMERA_PHONE = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+"""To the camera's axes from those of the phone. Held upright, the phone has x right, y up and z towards the user. The
+image's x points from the top of the phone to its bottom (ARKit's camera axes, with y and z reversed)."""
+INTRINSICS = ("fx", "fy", "cx", "cy")
+Rows = dict[int, dict[str, float]]
+
+
+@dataclass(frozen=True)
+class StrayImagePair(ImagePair):
+    """A frame of the video, a depth image, and the confidence of each reading."""
+
+    video: Video
+    number: int
+    confidence: Path
+
+    def read_color(self) -> NDArray[np.uint8]:
+        """Read 8-bit RGB [H, W, 3]. Raises SourceError naming the video."""
+        return self.video.frame(self.number)
+
+    def read_depth(self, units_per_metre: float) -> NDArray[np.float32]:
+        """Read depth in metres [H, W], 0 at confidence 0. Raises SourceError naming the file."""
+        depth_m = read_depth(self.depth, units_per_metre)
+        if not self.confidence.is_file():
+            return depth_m
+        confidence = read_values(self.confidence)
+        if confidence.shape != depth_m.shape:
+            raise SourceError(
+                f"{self.confidence}: {confidence.shape} values for depth of {depth_m.shape}; copy it again"
+            )
+        return np.where(confidence > 0, depth_m, np.float32(0.0))
+
+    def sizes(self) -> tuple[Size, Size]:
+        """Return (width, height) of colour and depth. Raises SourceError naming the depth file."""
+        return self.video.size, image_size(self.depth)
+
+
+def open_stray_scanner(folder: Path, settings: InputConfig) -> RecordedSource:
+    """Open a folder. Raises SourceError if video, depth, camera or poses cannot be used."""
+    video_path, depths = folder / "rgb.mp4", _numbered(folder / "depth")
+    if not video_path.is_file():
+        raise SourceError(f"no video in {folder} (looked for rgb.mp4); copy the whole folder from the phone")
+    if not depths:
+        raise SourceError(f"no depth images in {folder} (looked for depth/000000.png, …); does the phone have a LiDAR?")
+    rows, video = _odometry(folder / "odometry.csv"), Video(video_path)
+    numbers = [n for n in sorted(depths) if n in rows and n < video.count]
+    if not numbers:
+        raise SourceError(
+            f"{folder}: no frame has video ({video.count} frames), depth and a line of odometry.csv "
+            f"({len(rows)} lines); copy the whole folder again"
+        )
+    images = [
+        StrayImagePair(rows[n]["timestamp"], folder / f"rgb.mp4 frame {n}", depths[n], video, n,
+                      folder / "confidence" / depths[n].name)
+        for n in numbers
+    ]  # fmt: skip
+    kept = set(numbers)
+    skipped = [f"{depths[n]}: no frame {n} in rgb.mp4 or odometry.csv" for n in sorted(depths) if n not in kept]
+    calibration = _calibration(folder, rows, video.size, first_size([depths[n] for n in numbers]), settings)
+    truth, (moved_s, rates, forces) = _truth(rows, numbers), _imu(folder / "imu.csv")
+    gyroscope = gyroscope_from_samples(moved_s, rates)
+    if gyroscope and not gyroscope.measured_any(np.array([rows[n]["timestamp"] for n in numbers])):
+        gyroscope = None
+    return RecordedSource(
+        folder.resolve().name, images, calibration, settings, truth, skipped, estimated=True,
+        gyroscope=gyroscope, accelerometer=accelerometer_from_samples(moved_s, forces),
+    )  # fmt: skip
+
+
+def with_coarser_depth(calibration: Calibration, depth_size: Size) -> Calibration:
+    """Return the calibration of a phone whose depth has fewer pixels than colour, but the same camera."""
+    if depth_size == (calibration.camera.width, calibration.camera.height) or calibration.depth_camera:
+        return calibration
+    camera, lens = calibration.camera.resized(*depth_size), calibration.distortion
+    return Calibration(calibration.camera, calibration.depth_units_per_metre, lens, camera, lens)
+
+
+def _numbered(folder: Path) -> dict[int, Path]:
+    return {int(path.stem): path for path in sorted(folder.glob("*.png")) if path.stem.isdecimal()}
+
+
+def _odometry(path: Path) -> Rows:
+    """Read odometry.csv as rows by frame number. Raises SourceError naming file and line."""
+    if not path.is_file():
+        raise SourceError(f"{path} is missing: it holds the times of the frames; copy the whole folder again")
+    lines = csv_rows(path)
+    _, names = next(lines, (0, []))
+    if not set(POSE) <= set(names):
+        raise SourceError(
+            f"{path}: expected columns {', '.join(POSE)} in the first line, found {', '.join(names)[:200]}; "
+            "record with a Stray Scanner of 2022 or later"
+        )
+    rows = {}
+    for number, line in lines:
+        row = _row(f"{path}:{number}", names, line)
+        rows[int(row["frame"])] = row
+    return rows
+
+
+def _row(where: str, names: list[str], words: list[str]) -> dict[str, float]:
+    try:
+        row = {name: float(word) for name, word in zip(names, words, strict=True)}
+    except ValueError as error:
+        raise SourceError(f"{where}: expected {len(names)} numbers, found {','.join(words)[:80]!r}") from error
+    if not np.isfinite(list(row.values())).all():
+        raise SourceError(f"{where}: not finite: {','.join(words)[:80]!r}; delete the line")
+    return row
+
+
+def _calibration(folder: Path, rows: Rows, size: Size, depth_size: Size, settings: InputConfig) -> Calibration:
+    """Read the camera: the median of all frames if they have intrinsics, because autofocus changes them slightly."""
+    path = folder / "camera_matrix.csv"
+    recorded = None
+    if rows and set(INTRINSICS) <= set(next(iter(rows.values()))):
+        focal = np.median([[row[name] for name in INTRINSICS] for row in rows.values()], 0)
+        recorded = Calibration(build_camera(folder / "odometry.csv", *size, focal.tolist()), MM_PER_METRE)
+    elif path.is_file():
+        recorded = Calibration(build_camera(path, *size, _matrix(path)), MM_PER_METRE)
+    return with_coarser_depth(resolve_calibration(folder, recorded, size, settings, MM_PER_METRE), depth_size)
+
+
+def _matrix(path: Path) -> list[float]:
+    """Read fx, fy, cx, cy. Raises SourceError naming the file."""
+    try:
+        rows = np.array(
+            [[float(word) for word in line.split(",")] for line in read_text(path).split("\n") if line.strip()]
+        )
+    except ValueError as error:
+        raise SourceError(f"{path}: expected a 3×3 matrix of numbers ({error}); copy it again") from error
+    if rows.shape != (3, 3):
+        raise SourceError(f"{path}: expected a 3×3 matrix, found {rows.shape}; copy it again")
+    return [float(v) for v in (rows[0, 0], rows[1, 1], rows[0, 2], rows[1, 2])]
+
+
+def _truth(rows: Rows, numbers: list[int]) -> Trajectory | None:
+    """Return ARKit's path: an estimate by the phone, not ground truth."""
+    poses = np.tile(np.eye(4), (len(numbers), 1, 1))
+    for T, n in zip(poses, numbers, strict=True):
+        row = rows[n]
+        T[:3, :3] = se3.rotation_from_quaternion(np.array([row["qw"], row["qx"], row["qy"], row["qz"]]))
+        T[:3, 3] = row["x"], row["y"], row["z"]
+    return Trajectory(np.array([rows[n]["timestamp"] for n in numbers]), poses)
+
+
+def _imu(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Read times [M], angular velocities and specific forces [M, 3] along the camera's axes; Apple's sign is that of
+    gravity. What is missing or cannot be read is nan: the app may be stopped while it writes a line."""
+    lines = csv_rows(path, errors="replace") if path.is_file() else iter(())
+    _, header = next(lines, (0, []))
+    samples = []
+    for _, line in lines:
+        words = dict(zip(header, line, strict=False))
+        samples.append([_number(words.get(name)) for name in ("timestamp", *ANGULAR, *LINEAR)])
+    values = np.array(samples).reshape(-1, 7)
+    rates, forces = values[:, 1:4], -GRAVITY_M_S2 * values[:, 4:]
+    return values[:, 0], rates @ R_CAMERA_PHONE.T, forces @ R_CAMERA_PHONE.T
+
+
+def _number(word: str | None) -> float:
+    with suppress(ValueError):
+        return np.nan if word is None else float(word)
+    return np.nan
+
+
+def _recognises(path: str) -> bool:
+    folder = Path(path)
+    return (folder / "odometry.csv").is_file() or ((folder / "rgb.mp4").is_file() and (folder / "depth").is_dir())
+
+
+FORMAT = Format(
+    "Stray Scanner",
+    "rgb.mp4, depth/ and odometry.csv",
+    _recognises,
+    lambda path, settings: open_stray_scanner(Path(path), settings),
+    sensor="lidar-iphone",
+)

@@ -1,0 +1,258 @@
+"""Render the synthetic room: exact depth and poses, any length and size, the same bytes for the same seed."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sigmasplat.config import InputConfig
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.frame import Frame
+from sigmasplat.data.frame_arrays import color_from_bytes
+from sigmasplat.data.mesh import Mesh
+from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.errors import SourceError
+from sigmasplat.input.opening import Format
+from sigmasplat.input.source import Source
+from sigmasplat.plugins.sources.camera.stereo import StereoMatcher
+from sigmasplat.plugins.sources.room.furnish import furnish_rooms
+from sigmasplat.plugins.sources.room.mover import mask_of, mover as moving_ball
+from sigmasplat.plugins.sources.room.render import RoomScene, build_scene, render_scene
+from sigmasplat.plugins.sources.room.sensor import drifted_depth, measured_color, measured_depth, predicted_depth
+from sigmasplat.plugins.sources.room.solid import triangulate
+from sigmasplat.plugins.sources.room.walk import camera_path
+from sigmasplat.types import Matrix
+
+FRAMES_PER_SECOND = 30.0
+FOCAL_PER_WIDTH = 0.8
+EXPOSURE_SWING = 0.08
+AWAY_M, AWAY_RAD = np.array([0.45, 0.25, 0.45]), np.deg2rad([12.0, 40.0, 8.0])
+"""Largest motion of a test view from the path, camera x, y, z, and rotation about them."""
+CLEARANCE_M = 0.3
+MOST_MOVER = 50
+
+Floats = NDArray[np.float32]
+
+
+class SyntheticRoom(Source):
+    """A furnished room (or several), ray-cast frame by frame.
+
+    frames, width, height: length and image size, pixels; seed: appearance of the room, start of the path and all noise;
+    noise: whether depth and colour have sensor noise; loops: rounds of the path; exposure_change: whether the image
+    gain varies by ±8 % over the sequence; rooms: number of rooms, joined by doorways; overrun: how far the path
+    continues past its start, percent of a round; drift: standard deviation of the depth calibration's slow drift
+    (`room.sensor.drifted_depth`), tenths of a percent of the depth; test_views: number of exact views away from the
+    path (`SyntheticRoom.test_views`); stereo: if above 0, depth is computed from a stereo pair with this baseline in cm
+    instead of being exact (`right_image`); mover: the share of the image, in percent on average, that a ball covers
+    which moves through the room by itself (`room.mover`); scored views and the true surface show the room without it;
+    predicted: whether depth is that of an imagined network, with a smooth scale error (`room.sensor.predicted_depth`).
+
+    A path with loops to close: frames=720,rooms=2,overrun=20,noise=1,drift=6. A round of 600 frames is a slow pace. The
+    way back looks in other directions than the way out, so drift accumulates over a whole round; the last 120 frames
+    see the views of the first 120 again. The path error is then 15 to 30 cm, many times that of noise alone, while the
+    depths of both visits agree within 2 % nearly everywhere.
+    Frame i depends only on these options and on i, not on frames read before.
+    """
+
+    def __init__(
+        self,
+        frames: int = 200,
+        width: int = 320,
+        height: int = 240,
+        seed: int = 0,
+        noise: bool = False,
+        loops: int = 1,
+        exposure_change: bool = True,
+        rooms: int = 1,
+        overrun: int = 0,
+        drift: int = 0,
+        test_views: int = 0,
+        stereo: int = 0,
+        mover: int = 0,
+        predicted: bool = False,
+    ) -> None:
+        """Compute the camera path, no image yet. Raises SourceError unless counts and sizes are ≥ 1, the rest ≥ 0."""
+        counts = {"frames": frames, "width": width, "height": height, "loops": loops, "rooms": rooms}
+        for key, value in counts.items():
+            if value < 1:
+                raise SourceError(f"synthetic room: {key} must be at least 1, found {value}")
+        others = {"seed": seed, "overrun": overrun, "drift": drift, "test_views": test_views, "stereo": stereo}
+        for key, value in others.items():
+            if value < 0:
+                raise SourceError(f"synthetic room: {key} must be at least 0, found {value}")
+        if not 0 <= mover <= MOST_MOVER or (mover and rooms > 1):
+            found = f"{mover} and rooms={rooms}" if rooms > 1 else str(mover)
+            raise SourceError(f"synthetic room: mover is 0 to {MOST_MOVER} percent and needs rooms=1, found {found}")
+        focal_px = FOCAL_PER_WIDTH * width
+        camera = Camera(width, height, focal_px, focal_px, (width - 1) / 2, (height - 1) / 2)
+        super().__init__("synthetic", camera)
+        if predicted and stereo:
+            raise SourceError("synthetic room: depth is either predicted or from stereo; leave out predicted or stereo")
+        self.predicted_depth = predicted
+        self._seed, self._noise, self._rooms = seed, noise, rooms
+        self._exposure_change, self._drift = exposure_change, drift / 1000
+        self._test_views = test_views
+        self.computed_depth, self._baseline_m = stereo > 0, stereo / 100
+        self._matcher = StereoMatcher(camera, self._baseline_m, InputConfig()) if stereo else None
+        self.depth_noise_per_m = self._matcher.noise_per_m if self._matcher else None
+        self._T_world_camera = camera_path(frames, loops, rooms, seed, overrun / 100)
+        self.mover = moving_ball(self._T_world_camera, camera, mover / 100) if mover else None
+
+    def __len__(self) -> int:
+        return len(self._T_world_camera)
+
+    def frame(self, i: int) -> Frame:
+        """Render frame i; colour has steps of 1/255, as from a camera."""
+        T_world_camera = self._T_world_camera[self._checked_index(i)]
+        color, depth_m = render_scene(self._scene(i), self.camera, T_world_camera)
+        color = np.clip(color * np.float32(self._gain(i)), 0.0, 1.0)
+        if self._drift:
+            depth_m = drifted_depth(depth_m, i, self._seed, self._drift)
+        if self._noise:
+            rng = np.random.default_rng((self._seed, i, 7))
+            color, depth_m = measured_color(color, rng), measured_depth(depth_m, self.camera, rng)
+        if self.predicted_depth:
+            depth_m = predicted_depth(depth_m, i, self._seed, np.random.default_rng((self._seed, i, 12)))
+        bytes_, std_m = np.rint(color * 255.0).astype(np.uint8), None
+        if self._matcher:
+            depth_m, std_m = self._matcher.depth_and_std_m(bytes_, self.right_image(i))
+        return Frame(i, self.timestamp_s(i), color_from_bytes(bytes_), depth_m, self.camera, depth_std_m=std_m)
+
+    def right_image(self, i: int) -> NDArray[np.uint8]:
+        """Render the right image of frame i of the stereo pair, RGB [H, W, 3]: the baseline to the right of the left
+        one, with the same exposure."""
+        T_left_right = np.eye(4)
+        T_left_right[0, 3] = self._baseline_m
+        T_world_right = self._T_world_camera[self._checked_index(i)] @ T_left_right
+        color = render_scene(self._scene(i), self.camera, T_world_right)[0]
+        color = np.clip(color * np.float32(self._gain(i)), 0.0, 1.0)
+        if self._noise:
+            color = measured_color(color, np.random.default_rng((self._seed, i, 9)))
+        return np.asarray(np.rint(color * 255.0), np.uint8)
+
+    def depth_std_of(self, i: int) -> NDArray[np.float32] | None:
+        """Return the standard deviation of stereo depth; None without `stereo`."""
+        if self._matcher is None:
+            return None
+        left = np.rint(self.frame(i).color * 255.0).astype(np.uint8)
+        return self._matcher.depth_and_std_m(left, self.right_image(i))[1]
+
+    def timestamp_s(self, i: int) -> float:
+        """Return the time of frame i, without rendering it."""
+        return self._checked_index(i) / FRAMES_PER_SECOND
+
+    def exact_depth_of(self, i: int) -> NDArray[np.float32]:
+        """Return the depth of frame i without noise and drift."""
+        T_world_camera = self._T_world_camera[self._checked_index(i)]
+        return render_scene(self._scene(i), self.camera, T_world_camera)[1]
+
+    def moving_of(self, i: int) -> NDArray[np.bool_]:
+        """Return the pixels [H, W] of frame i that show the ball which moves through the room."""
+        depth_m = self.exact_depth_of(i)
+        if self.mover is None:
+            return np.zeros(depth_m.shape, np.bool_)
+        return mask_of(self.mover.shape(i), self.camera, self._T_world_camera[i], depth_m)
+
+    def _scene(self, i: int) -> RoomScene:
+        """Return the room as it is at frame i."""
+        room = build_scene(self._rooms, self._seed)
+        return room if self.mover is None else RoomScene([*room.shapes, self.mover.shape(i)], room.lights)
+
+    def test_views(self) -> Source | None:
+        """Return exact views (no noise, gain 1) up to 0.7 m and 40° away from the path; None without `test_views`."""
+        if not self._test_views:
+            return None
+        return self.views_away(self._test_views, AWAY_M, AWAY_RAD)
+
+    def views_away(self, count: int, away_m: Matrix, away_rad: Matrix) -> Source:
+        """Return exact views (no noise, gain 1) near the path: moved by at most away_m [3] along the axes of the camera
+        and rotated by a vector of at most away_rad [3]."""
+        scene = build_scene(self._rooms, self._seed)
+        random = np.random.default_rng((self._seed, 11))
+        return _ViewsAway(self.camera, scene, random, self._T_world_camera, count, (away_m, away_rad))
+
+    def truth(self) -> Trajectory:
+        """Return the exact pose of every frame, in the room's frame (z up)."""
+        return Trajectory(np.arange(len(self)) / FRAMES_PER_SECOND, self._T_world_camera.copy())
+
+    def true_surface(self) -> Mesh:
+        """Return the surfaces of all shapes in the room's frame, including hidden parts."""
+        return triangulate([shape for shapes in furnish_rooms(self._rooms, self._seed) for shape in shapes])
+
+    def _gain(self, i: int) -> float:
+        """Return the exposure gain of frame i: one sine period over the sequence."""
+        if not self._exposure_change:
+            return 1.0
+        return 1.0 + EXPOSURE_SWING * float(np.sin(2 * np.pi * i / max(len(self) - 1, 1)))
+
+
+class _ViewsAway(Source):
+    """Exact views of the room away from a camera path, in free space: nothing is nearer than `CLEARANCE_M`."""
+
+    def __init__(
+        self,
+        camera: Camera,
+        scene: RoomScene,
+        random: np.random.Generator,
+        T_world_path: Matrix,
+        count: int,
+        away: tuple[Matrix, Matrix],
+    ) -> None:
+        super().__init__("synthetic test views", camera)
+        self._scene, (self._away_m, self._away_rad) = scene, away
+        on_path = T_world_path[np.linspace(0, len(T_world_path) - 1, count).round().astype(int)]
+        self._images = [self._image_near(T, random) for T in on_path]
+
+    def _image_near(self, T_world_path: Matrix, random: np.random.Generator) -> tuple[Matrix, Floats, Floats]:
+        """Draw poses near one of the path until one is free; return it with its colour and depth."""
+        while True:
+            T_path_camera = se3.exp(np.concatenate([np.zeros(3), random.uniform(-1, 1, 3) * self._away_rad]))
+            T_path_camera[:3, 3] = random.uniform(-1, 1, 3) * self._away_m
+            T_world_camera = se3.orthonormalise(T_world_path @ T_path_camera)
+            color, depth_m = render_scene(self._scene, self.camera, T_world_camera)
+            if depth_m[depth_m > 0].min(initial=np.inf) > CLEARANCE_M and (depth_m > 0).any():
+                return T_world_camera, color, depth_m
+
+    def __len__(self) -> int:
+        return len(self._images)
+
+    def frame(self, i: int) -> Frame:
+        _, color, depth_m = self._images[self._checked_index(i)]
+        bytes_ = np.rint(np.clip(color, 0.0, 1.0) * 255.0).astype(np.uint8)
+        return Frame(i, i / FRAMES_PER_SECOND, color_from_bytes(bytes_), depth_m, self.camera)
+
+    def exact_depth_of(self, i: int) -> Floats:
+        return self._images[self._checked_index(i)][2]
+
+    def truth(self) -> Trajectory:
+        poses = np.stack([T_world_camera for T_world_camera, _, _ in self._images])
+        return Trajectory(np.arange(len(self)) / FRAMES_PER_SECOND, poses)
+
+
+def open_synthetic(text: str) -> SyntheticRoom:
+    """Build a room from "synthetic" or "synthetic:frames=200,seed=1,noise=1". Raises SourceError on other options."""
+    options: dict[str, Any] = {}
+    for part in filter(None, text.partition(":")[2].split(",")):
+        key, _, value = (word.strip() for word in part.partition("="))
+        if key not in _OPTIONS or not value.lstrip("-").isdecimal():
+            raise SourceError(f"synthetic room: unknown option {part!r}; give whole numbers for {', '.join(_OPTIONS)}")
+        options[key] = int(value)
+    for key in ("noise", "exposure_change", "predicted"):
+        if key in options:
+            options[key] = bool(options[key])
+    return SyntheticRoom(**options)
+
+
+_OPTIONS = (
+    "frames", "width", "height", "seed", "noise", "loops", "exposure_change", "rooms", "overrun", "drift", "test_views",
+    "stereo", "mover", "predicted",
+)  # fmt: skip
+
+FORMAT = Format(
+    "synthetic",
+    "the word 'synthetic'",
+    lambda path: path.partition(":")[0] == "synthetic",
+    lambda path, settings: open_synthetic(path),
+    priority=3,
+)

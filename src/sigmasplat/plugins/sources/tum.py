@@ -1,0 +1,196 @@
+"""Read and write sequences in the layout of the TUM RGB-D benchmark.
+
+rgb.txt  depth.txt  groundtruth.txt     lines of "t path" or "t tx ty tz qx qy qz qw", comments after #
+calibration.json                        optional: fx fy cx cy width height depth_scale [distortion]
+gyroscope.txt                           optional: "t wx wy wz", rad/s about the camera's x, y, z (right, down, forward)
+"""
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from sigmasplat.config import InputConfig
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.frame import Frame
+from sigmasplat.data.frame_arrays import UINT16_MAX
+from sigmasplat.data.gyroscope import Gyroscope
+from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.errors import RunError, SourceError
+from sigmasplat.files.reading import exists
+from sigmasplat.input.association import MAX_GAP_S, associate, nearest_gaps_s, no_pairs, refuse_other_units
+from sigmasplat.input.calibration import TUM_UNITS_PER_METRE, Calibration, freiburg_calibration, resolve_calibration
+from sigmasplat.input.lists import parse_numbers, read_lines, read_poses
+from sigmasplat.input.opening import Format
+from sigmasplat.input.recorded import ImagePair, RecordedSource, first_size
+from sigmasplat.input.source import Source
+
+
+def open_tum(
+    folder: Path,
+    settings: InputConfig,
+    camera: Calibration | None = None,
+    camera_path: Callable[[Trajectory], Trajectory] | None = None,
+) -> RecordedSource:
+    """Open a folder. Raises SourceError if its lists, images, calibration, ground-truth poses or gyroscope cannot be
+    used.
+
+    camera: the calibration, if it does not follow from the folder's name;
+    camera_path: converts the recorded path to the camera's path, if another body was recorded.
+    """
+    color_times_s, colors = read_list(folder / "rgb.txt")
+    depth_times_s, depths = _depth_list(folder)
+    times_s = {"rgb.txt": color_times_s, "depth.txt": depth_times_s}
+    refuse_other_units(folder, times_s)
+    pairs = associate(color_times_s, depth_times_s)
+    if not len(pairs):
+        raise no_pairs(folder, times_s)
+    images = [ImagePair(float(color_times_s[i]), colors[i], depths[j]) for i, j in pairs]
+    paired = set(pairs[:, 0].tolist())
+    gaps_s = nearest_gaps_s(color_times_s, depth_times_s)
+    skipped = [
+        f"{path}: no depth within {MAX_GAP_S:g} s, nearest {gaps_s[i]:.3f} s away"
+        + " (used by another image)" * bool(gaps_s[i] < MAX_GAP_S)
+        for i, path in enumerate(colors)
+        if i not in paired
+    ]
+    truth_path = folder / "groundtruth.txt"
+    # Read now: damaged ground truth must stop the run before it starts, not its evaluation an hour later.
+    truth = read_poses(truth_path) if exists(truth_path) else None
+    if truth and camera_path:
+        truth = camera_path(truth)
+    size = first_size([pair.color for pair in images])
+    calibration = resolve_calibration(
+        folder, camera or freiburg_calibration(folder), size, settings, TUM_UNITS_PER_METRE
+    )
+    gyroscope = read_gyroscope(folder / "gyroscope.txt") if exists(folder / "gyroscope.txt") else None
+    return RecordedSource(folder.resolve().name, images, calibration, settings, truth, skipped, gyroscope=gyroscope)
+
+
+def write_tum(source: Source, folder: str | Path) -> None:
+    """Write any source as a TUM folder: PNG images, lists, calibration.json and the ground-truth path, if known.
+
+    Depth has steps of 1/5000 m; readings above 13.1 m do not fit 16 bits and become 0 (no reading).
+    Raises RunError if the folder already holds a sequence or cannot be written.
+    """
+    folder = Path(folder)
+    _create_folder(folder, source.camera)
+    try:
+        _write_truth(source.truth(), folder / "groundtruth.txt")
+        stems = [write_images(frame, folder) for frame in source]
+        for part in ("depth", "rgb"):  # rgb.txt last: it marks a complete folder
+            (folder / f"{part}.txt").write_text("# timestamp path\n" + "".join(f"{s} {part}/{s}.png\n" for s in stems))
+    except OSError as error:
+        raise RunError(f"cannot write the sequence to {folder} ({error})") from error
+
+
+def _create_folder(folder: Path, camera: Camera) -> None:
+    """Create an empty TUM folder with calibration.json. Raises RunError if it holds a sequence or cannot be written."""
+    if (folder / "rgb.txt").exists():
+        raise RunError(f"{folder} already holds a sequence (rgb.txt); give another folder")
+    try:
+        for part in ("rgb", "depth"):
+            (folder / part).mkdir(parents=True, exist_ok=True)
+        calibration = asdict(camera) | {"depth_scale": TUM_UNITS_PER_METRE}
+        (folder / "calibration.json").write_text(json.dumps(calibration, indent=1) + "\n")
+    except OSError as error:
+        raise RunError(f"cannot write the sequence to {folder} ({error})") from error
+
+
+def _write_truth(truth: Trajectory | None, path: Path) -> None:
+    if truth is None:
+        return
+    lines = ["# timestamp tx ty tz qx qy qz qw\n"]
+    for t, T in zip(truth.timestamps_s, truth.T_world_camera, strict=True):
+        w, x, y, z = se3.quaternion_from_rotation(T[:3, :3])
+        lines.append(f"{t:.6f} " + " ".join(f"{v:.9f}" for v in (*T[:3, 3], x, y, z, w)) + "\n")
+    path.write_text("".join(lines))
+
+
+def _depth_list(folder: Path) -> tuple[NDArray[np.float64], list[Path]]:
+    path = folder / "depth.txt"
+    if path.is_file():
+        times_s, paths = read_list(path)
+        if any(p.is_file() for p in paths):
+            return times_s, paths
+    looked_for = f"the {len(paths)} files of depth.txt" if path.is_file() else "depth.txt"
+    raise SourceError(
+        f"no depth images in {folder} (looked for {looked_for}); is this the RGB-only download? "
+        "see docs/data.md#without-depth"
+    )
+
+
+def read_list(path: Path) -> tuple[NDArray[np.float64], list[Path]]:
+    """Read "t path" lines: timestamps [N] seconds and image paths. Raises SourceError naming file and line."""
+    times, paths = [], []
+    for line, words in read_lines(path):
+        if len(words) < 2:
+            raise SourceError(f"{path}:{line}: expected 'timestamp path', found {' '.join(words)!r}")
+        times.append(parse_numbers(path, line, words[:1])[0])
+        paths.append(path.parent / " ".join(words[1:]))
+    if not paths:
+        raise SourceError(f"{path}: lists no images")
+    return np.array(times), paths
+
+
+def read_gyroscope(path: Path) -> Gyroscope:
+    """Read "t wx wy wz" lines, seconds and rad/s in camera axes. Raises SourceError naming the file, and the line if
+    it has other values or no later time than the line before."""
+    rows: list[list[float]] = []
+    for line, words in read_lines(path):
+        if len(words) != 4:
+            raise SourceError(f"{path}:{line}: expected 't wx wy wz', found {len(words)} values")
+        rows.append(parse_numbers(path, line, words))
+        if len(rows) > 1 and rows[-1][0] <= rows[-2][0]:
+            raise SourceError(f"{path}:{line}: time {words[0]} is not after that of the line before; sort the lines")
+    if len(rows) < 2:
+        raise SourceError(f"{path}: holds {len(rows)} measurements; delete it or add measurements")
+    values = np.array(rows)
+    try:
+        return Gyroscope(values[:, 0], values[:, 1:])
+    except SourceError as error:
+        raise SourceError(f"{path}: {error}") from error
+
+
+class TumWriter:
+    """Writes frames to a new TUM folder: both images first, then a line in each list."""
+
+    def __init__(self, folder: Path, camera: Camera) -> None:
+        """Create the folder. Raises RunError if it already holds a sequence or cannot be written."""
+        self.folder = folder
+        _create_folder(folder, camera)
+
+    def add(self, frame: Frame) -> None:
+        """Write one more frame; timestamps must increase. Raises RunError if the folder cannot be written."""
+        try:
+            stem = write_images(frame, self.folder)
+            for part in ("depth", "rgb"):
+                with (self.folder / f"{part}.txt").open("a", encoding="utf-8") as file:
+                    file.write(f"{stem} {part}/{stem}.png\n")
+        except OSError as error:
+            raise RunError(f"cannot write the sequence to {self.folder} ({error})") from error
+
+
+def write_images(frame: Frame, folder: Path) -> str:
+    """Write rgb/T.png and depth/T.png, 1/5000 m, and return T; readings above 13.1 m do not fit and become 0."""
+    stem = f"{frame.timestamp_s:.6f}"
+    units = np.rint(frame.depth_m * TUM_UNITS_PER_METRE)
+    depth = np.where(units < UINT16_MAX, units, 0).astype(np.uint16)
+    color = np.rint(frame.color * 255.0).astype(np.uint8)
+    Image.fromarray(color).save(folder / "rgb" / f"{stem}.png", compress_level=1)
+    Image.fromarray(depth).save(folder / "depth" / f"{stem}.png", compress_level=1)
+    return stem
+
+
+FORMAT = Format(
+    "TUM",
+    "rgb.txt and depth.txt",
+    lambda path: (Path(path) / "rgb.txt").is_file() or (Path(path) / "depth.txt").is_file(),
+    lambda path, settings: open_tum(Path(path), settings),
+    priority=1,
+)

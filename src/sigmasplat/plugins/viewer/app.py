@@ -1,0 +1,301 @@
+"""Draw the newest snapshot of a run according to the controls, in one thread and at a bounded rate."""
+
+import contextlib
+import ctypes
+import sys
+import threading
+from typing import Any
+
+import viser
+
+from sigmasplat.errors import SigmaSplatError
+from sigmasplat.plugins.outputs.drawing.colormap import INFERNO
+from sigmasplat.plugins.viewer import lines
+from sigmasplat.plugins.viewer.layers import (
+    LayerImage,
+    Legend,
+    browser_camera,
+    draw_legend,
+    render_layer,
+    render_predicted,
+)
+from sigmasplat.plugins.viewer.panel import PREDICTED_MODES, ControlPanel, ControlState, escaped
+from sigmasplat.plugins.viewer.scene import ViserScene, camera_pose, move_camera, set_initial_camera
+from sigmasplat.plugins.viewer.snapshot import BUDGET, Piece, Snapshot, within_budget
+from sigmasplat.plugins.viewer.splats import (
+    Floats,
+    VisibilityFilter,
+    merge_pieces,
+    merged_uncertainty,
+    palette_range,
+    sorted_depth_stds,
+    sorted_sigmas,
+    splat_arrays,
+    visibility_filter,
+)
+
+REST_S, LIVE_REST_S = 0.05, 0.5
+"""Pause after each drawing, so that mouse moves do not keep the CPU busy and do not slow SLAM down."""
+ROWS, LIVE_ROWS, SHARP_ROWS = 480, 240, 1080
+"""Height in pixels of the images that SigmaSplat renders: of a finished run, of a live one, and of a finished run after
+the view has been still for `STILL_S`, at most the height of the browser's window."""
+STILL_S = 0.3
+BACK_M, UP_M = 0.7, 0.25
+"""Position of the following camera: behind and above the camera of the run."""
+
+
+def release_memory() -> None:
+    """Return freed memory to the operating system; does nothing where libc has no `malloc_trim`.
+
+    Several threads repeatedly allocate arrays of tens of MB. glibc keeps the freed memory, which adds up to hundreds of
+    MB within minutes.
+    """
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).malloc_trim(0)
+
+
+class IdentityKey:
+    """Compares objects by identity. It keeps the object alive, because a freed object's id can be used again."""
+
+    def __init__(self, thing: object) -> None:
+        self.thing = thing
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, IdentityKey) and self.thing is other.thing
+
+    __hash__ = None  # type: ignore[assignment]
+
+
+class ViewerApp:
+    """Shows snapshots in the browser. `show` and the controls only set a flag; a thread draws the newest snapshot."""
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self.server = server
+        self.panel = ControlPanel(server, self.changed, self._look_from)
+        self.scene = ViserScene(server, self._clicked)
+        self._snapshot: Snapshot | None = None
+        self._drawn: dict[Any, Any] = {}
+        self._values: tuple[list[IdentityKey], dict[str, Floats]] = (
+            [], {"σ": sorted_sigmas(()), "depth error": sorted_depth_stds(())}
+        )  # fmt: skip
+        self._merged: tuple[Any, Any] = (None, None)
+        self._wake, self._stop = threading.Event(), threading.Event()
+        self._sharp, self._can_sharpen = False, False
+        server.on_client_connect(self._welcome)
+        server.on_client_disconnect(lambda client: self._drawn.pop(("layer", client.client_id), None))
+        self._thread = threading.Thread(target=self._work, name="viewer", daemon=True)
+        self._thread.start()
+
+    def show(self, snapshot: Snapshot) -> None:
+        """Show a snapshot from now on; returns immediately."""
+        self._snapshot = snapshot
+        self.changed()
+
+    def changed(self) -> None:
+        """Ask the thread to redraw what has changed."""
+        self._wake.set()
+
+    def stop(self) -> None:
+        """End the thread; the server keeps running."""
+        self._stop.set()
+        self._wake.set()
+        self._thread.join()
+
+    def _work(self) -> None:
+        trimmed: Snapshot | None = None
+        while True:
+            self._sharp = not self._wake.wait(STILL_S if self._can_sharpen else None)
+            if self._stop.is_set():
+                return
+            self._wake.clear()
+            self._can_sharpen = False
+            snapshot = self._snapshot
+            if snapshot is not None:
+                try:
+                    self._draw(snapshot)
+                    if snapshot is not trimmed:
+                        trimmed = snapshot
+                        release_memory()
+                except Exception as problem:  # an error in the viewer must not end the run
+                    print(f"viewer: {type(problem).__name__}: {problem}", file=sys.stderr)
+                self._stop.wait(LIVE_REST_S if snapshot.live else REST_S)
+
+    def _draw(self, snapshot: Snapshot) -> None:
+        path = snapshot.path
+        has_final, has_submaps = snapshot.final is not None, bool(snapshot.pieces)
+        self.panel.adapt(len(path), snapshot.live, snapshot.true_positions is not None, has_final and has_submaps)
+        controls = self.panel.state()
+        pieces = snapshot.visible_pieces(controls.final_map, controls.row)
+        self.panel.offer(any(piece.uncertainty is not None for piece in pieces), snapshot.mesh is not None)
+        controls = self.panel.state()
+        ordered = self._values_of(pieces)
+        visible = visibility_filter(
+            ordered["σ"], controls.hidden_share, controls.min_opacity, controls.max_std_m
+        )  # fmt: skip
+        span = palette_range(ordered["depth error" if controls.colouring == "depth error" else "σ"])
+        with self.server.atomic():
+            self._draw_path(snapshot, controls)
+            self._draw_splats(pieces, controls, span, visible)
+            self._draw_mesh(snapshot, controls)
+        self._draw_keyframes(snapshot, controls)
+        self._show_texts(snapshot, controls, pieces, visible)
+        self._follow(snapshot, controls)
+        legend = None
+        if controls.mode == "splats" and controls.colouring != "colour":
+            legend = Legend(INFERNO, *span, " m" if controls.colouring == "depth error" else "")
+        for client in self.server.get_clients().values():
+            legend = self._draw_layer(client, snapshot, controls, pieces, visible) or legend
+        if self._is_new("legend", legend and legend[1:]):
+            self.panel.show_legend(None if legend is None else draw_legend(legend))
+
+    def _is_new(self, what: Any, state: Any) -> bool:
+        """Return whether something was not drawn in this state before, and remember the state."""
+        if what in self._drawn and self._drawn[what] == state:
+            return False
+        self._drawn[what] = state
+        return True
+
+    def _values_of(self, pieces: tuple[Piece, ...]) -> dict[str, Floats]:
+        """Return σ and depth errors of the splats in ascending order."""
+        fields = [IdentityKey(piece.field) for piece in pieces]
+        if self._values[0] != fields:
+            self._values = (fields, {"σ": sorted_sigmas(pieces), "depth error": sorted_depth_stds(pieces)})
+        return self._values[1]
+
+    def _draw_path(self, snapshot: Snapshot, controls: ControlState) -> None:
+        path, row = snapshot.path, controls.row
+        if self._is_new("initial camera", len(path) > 0) and len(path):
+            set_initial_camera(self.server, path.T_world_camera[0], BACK_M, UP_M)
+        if self._is_new("path", (IdentityKey(path), row, controls.path)):
+            self.scene.show_lines("path", lines.path_segments(path, row) if controls.path else None)
+            self.scene.show_lost(lines.lost_points(path, row if controls.path else -1))
+            at = min(row, len(path) - 1)
+            current = path.T_world_camera[at] if len(path) and path.inside[at] else None
+            self.scene.show_current_camera(snapshot.camera, current, bool(len(path) and path.lost[at]))
+        truth = snapshot.true_positions
+        if self._is_new("true path", (IdentityKey(truth), controls.true_path)):
+            shown = truth is not None and controls.true_path
+            self.scene.show_lines("truth", lines.truth_segments(truth) if shown and truth is not None else None)
+
+    def _draw_splats(
+        self, pieces: tuple[Piece, ...], controls: ControlState, span: tuple[float, float], visible: VisibilityFilter
+    ) -> None:
+        if controls.mode != "splats":
+            pieces = ()
+        ends = None if controls.colouring == "colour" else span  # own colours do not depend on the range
+        state = ([(p.name, IdentityKey(p.field)) for p in pieces], controls.colouring, ends, visible)
+        if self._is_new("splats", state):
+            sent = within_budget(pieces, BUDGET)  # a large final map is rendered completely, but sent thinned
+            drawn = {p.name: (splat_arrays(p, controls.colouring, span, visible), p.T_world_piece) for p in sent}
+            self.scene.show_splats(drawn)
+        else:
+            self.scene.place_splats({piece.name: piece.T_world_piece for piece in pieces})
+
+    def _draw_mesh(self, snapshot: Snapshot, controls: ControlState) -> None:
+        mesh = snapshot.mesh if controls.mode == "mesh" else None
+        if self._is_new("mesh", IdentityKey(mesh)):
+            self.scene.show_mesh(mesh)
+
+    def _draw_keyframes(self, snapshot: Snapshot, controls: ControlState) -> None:
+        path = snapshot.path
+        if self._is_new("keyframes", (IdentityKey(path), controls.row, controls.keyframes, controls.thumbnails)):
+            rows = lines.keyframes_to_show(path, controls.row) if controls.keyframes else ()
+            poses = {row: path.T_world_camera[row] for row in rows}
+            self.scene.show_keyframes(snapshot.camera, poses, snapshot.image if controls.thumbnails else None)
+
+    def _draw_layer(
+        self, client: viser.ClientHandle, snapshot: Snapshot, controls: ControlState, pieces: tuple[Piece, ...],
+        visible: VisibilityFilter,
+    ) -> Legend | None:  # fmt: skip
+        """Render the selected layer from a browser's viewpoint as the background of its scene; return its legend."""
+        key, c = ("layer", client.client_id), client.camera
+        if controls.layer is None:
+            if self._drawn.pop(key, None) is not None:
+                client.scene.set_background_image(None)
+            return None
+        pose, splats = camera_pose(c), ([(IdentityKey(p.field), p.T_world_piece.tobytes()) for p in pieces], visible)
+        state = (controls.layer, controls.error_part, pose.tobytes(), c.fov, c.aspect, splats)
+        drawn, rows = self._drawn.get(key), LIVE_ROWS if snapshot.live else ROWS
+        sharp_rows = rows if snapshot.live else max(rows, min(SHARP_ROWS, c.image_height))
+        rows = sharp_rows if self._sharp else rows
+        if drawn is None or drawn[0] != state or drawn[2] < rows:
+            if self._merged[0] != splats:
+                self._merged = (splats, (merge_pieces(pieces, visible), merged_uncertainty(pieces, visible)))
+            camera = browser_camera(c.fov, c.aspect, rows)
+            (field, known), how = self._merged[1], (snapshot.options, snapshot.backend)
+            made: LayerImage
+            if controls.layer in PREDICTED_MODES and known is not None:
+                made = render_predicted(field, known, camera, pose, controls.layer, controls.error_part, *how)
+            else:
+                made = render_layer(field, camera, pose, controls.layer, *how)
+            if client.client_id not in self.server.get_clients():
+                return None  # the client has disconnected in the meantime
+            client.scene.set_background_image(made.pixels, "jpeg", jpeg_quality=85)
+            drawn = self._drawn[key] = (state, made.legend, rows)
+        self._can_sharpen |= drawn[2] < sharp_rows
+        legend: Legend | None = drawn[1]
+        return legend
+
+    def _show_texts(
+        self, snapshot: Snapshot, controls: ControlState, pieces: tuple[Piece, ...], visible: VisibilityFilter
+    ) -> None:
+        path = snapshot.path
+        splats, kept = sum(len(p.field) for p in pieces), sum(int(visible.mask(p).sum()) for p in pieces)
+        submaps = int(path.submaps[-1]) + 1 if len(path) else 0
+        outside = int((~path.inside & ~path.lost).sum())
+        apart = f", {outside} apart (not shown)" if outside else ""
+        title, status = escaped(snapshot.title), escaped(snapshot.status)
+        facts = (
+            f"**{title}** ({status})  \n{len(path)} frames, {len(path.keyframes)} keyframes, "
+            f"{int(path.lost.sum())} lost{apart}, {submaps} submap{'s' * (submaps != 1)}  \n"
+            f"{kept:,} of {splats:,} splats shown"
+        )
+        limits = [f"σ above {visible.max_sigma:.3g}"] if visible.max_sigma < float("inf") else []
+        limits += [f"error of depth above {visible.max_std_m:g} m"] if visible.max_std_m < float("inf") else []
+        hidden = f"hidden: {', '.join(limits)}" if limits else ""
+        self.panel.show_texts(facts, hidden, _frame_text(snapshot, controls.row))
+
+    def _follow(self, snapshot: Snapshot, controls: ControlState) -> None:
+        path = snapshot.path
+        if controls.follow and snapshot.live and len(path) and self._is_new("followed", IdentityKey(path)):
+            for client in self.server.get_clients().values():
+                move_camera(client, path.T_world_camera[-1], BACK_M, UP_M)
+
+    def _welcome(self, client: viser.ClientHandle) -> None:
+        client.camera.on_update(lambda _: self.changed())
+        self.changed()
+
+    def _clicked(self, row: int, client: viser.ClientHandle) -> None:
+        snapshot = self._snapshot
+        if snapshot is None or row >= len(snapshot.path):
+            return
+        self._go(client, snapshot, row)
+        try:
+            image = snapshot.image(row)
+        except SigmaSplatError as problem:
+            self.panel.show_image(f"frame {row}: {escaped(str(problem))}", None)
+            return
+        missing = "" if image is not None else ": its image was not kept"
+        self.panel.show_image(f"frame {row}{missing}", image)
+
+    def _look_from(self, client: viser.ClientHandle) -> None:
+        snapshot = self._snapshot
+        if snapshot is not None and len(snapshot.path):
+            self._go(client, snapshot, min(self.panel.state().row, len(snapshot.path) - 1))
+
+    def _go(self, client: viser.ClientHandle, snapshot: Snapshot, row: int) -> None:
+        """Move a browser's camera to the pose of a frame; hide the thumbnails, which would cover the view."""
+        self.panel.thumbnails.value = False
+        move_camera(client, snapshot.path.T_world_camera[row])
+        self.changed()
+
+
+def _frame_text(snapshot: Snapshot, row: int) -> str:
+    """Describe the frame selected on the timeline."""
+    path = snapshot.path
+    if not len(path):
+        return "no frame yet"
+    row = min(row, len(path) - 1)
+    apart = "" if path.inside[row] else ", not connected to the world"
+    kind = "lost" if path.lost[row] else "keyframe" if row in set(path.keyframes) else "tracked"
+    return f"frame {row}: {kind}, submap {path.submaps[row]}{apart}"

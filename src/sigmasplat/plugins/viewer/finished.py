@@ -1,0 +1,197 @@
+"""Read snapshots from a run folder, either finished or still written by another process."""
+
+import threading
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.component import outside_world, submaps_outside
+from sigmasplat.data.field import GaussianField
+from sigmasplat.data.mesh import Mesh
+from sigmasplat.errors import RunError, SigmaSplatError
+from sigmasplat.input.source import Source
+from sigmasplat.plugins.outputs.drawing.colormap import Rgb
+from sigmasplat.plugins.outputs.meshes.mesh_files import read_mesh
+from sigmasplat.plugins.viewer.snapshot import (
+    BUDGET,
+    DEFAULT_CAMERA,
+    CameraPath,
+    Piece,
+    Snapshot,
+    thin,
+    within_budget,
+    without_moments,
+)
+from sigmasplat.run_folder.frames import RunFrames
+from sigmasplat.run_folder.runs import MESH, TRUTH, RunFolder
+from sigmasplat.run_folder.trajectory import read_trajectory
+from sigmasplat.types import Matrix
+
+EVERY_S = 2.0
+Log = list[dict[str, Any]]
+ShowSnapshot = Callable[[Snapshot], None]
+
+
+def finished_snapshot(run: RunFolder, source: Source | None = None, budget: int = BUDGET) -> Snapshot:
+    """Read the snapshot of a finished run; `source` provides keyframe images that the run did not keep.
+
+    Raises RunError if the run stopped before it had a map, or if its uncertainty belongs to another map.
+    """
+    frames, final, tensors = run.read_frames(), run.read_map(), run.read_checkpoint()[0]
+    config, true_file = run.config(), run.path / TRUTH
+    outside = frames.submaps_outside()
+    cache = SubmapCache(run, budget)
+    cache.load_all(np.asarray(tensors["T_world_submap"], np.float64))
+    pieces = list(cache.pieces.values())
+    if pieces and len(pieces) < len(tensors["T_world_submap"]):
+        active = GaussianField(tensors["params"])
+        pieces.append(Piece(len(pieces), thin(active, budget), np.asarray(tensors["T_world_submap"][-1])))
+    pieces = [piece for piece in pieces if piece.submap not in outside]
+    return Snapshot(
+        run.path.resolve().name,
+        _final_path(frames, tensors),
+        Piece(None, without_moments(final), uncertainty=run.uncertainty_of(final)),
+        within_budget(pieces, budget),
+        read_trajectory(true_file).T_world_camera[:, :3, 3] if true_file.is_file() else None,
+        _camera(run, cache, source),
+        partial(_image, cache, frames.log, run, source),
+        config.render,
+        config.backend,
+        status=str(run.facts().get("status")),
+        mesh=_mesh(run),
+    )
+
+
+def running_snapshot(run: RunFolder, cache: "SubmapCache") -> Snapshot:
+    """Read the snapshot of an unfinished run: the path of its log, and its finished submaps.
+
+    A submap has the logged pose of its first keyframe; submaps that are not connected to the world are left out.
+    `cache` holds the submaps that were read before.
+    """
+    log = run.read_log() if (run.path / "log.jsonl").is_file() else []
+    config, poses = run.config(), [np.array(record["T_world_camera"], np.float64) for record in log]
+    cache.load_new(poses)
+    keyframes = tuple(row for row, record in enumerate(log) if record["is_keyframe"])
+    lost, submaps = _lost_and_submaps(log)
+    states = np.array([record.get("state", "") for record in log], str)
+    outside = submaps_outside(states, submaps)
+    path = CameraPath(np.array(poses).reshape(-1, 4, 4), lost, submaps, keyframes, outside_world(states))
+    pieces = tuple(piece for piece in cache.pieces.values() if piece.submap not in outside)
+    return Snapshot(
+        run.path.resolve().name, path, None, pieces, None, cache.camera or DEFAULT_CAMERA,
+        cache.image, config.render, config.backend, live=True, status="running",
+    )  # fmt: skip
+
+
+def follow_run(run: RunFolder, show: ShowSnapshot, stop: threading.Event, source: Source | None = None) -> None:
+    """Show an unfinished run repeatedly until it ends, then show the finished run and return.
+
+    Returns earlier if `stop` is set. Raises RunError if the run has ended without a map.
+    """
+    cache = SubmapCache(run)
+    while run.facts().get("status") == "running":
+        show(running_snapshot(run, cache))
+        if stop.wait(EVERY_S):
+            return
+    show(finished_snapshot(run, source))
+
+
+class SubmapCache:
+    """The finished submaps of a run that have been read so far, within a budget of splats, and their images.
+
+    earlier [E, 4, 4]: T_world_submap of the submaps of an earlier session that the run continues.
+    """
+
+    def __init__(self, run: RunFolder, budget: int = BUDGET) -> None:
+        self.store, self.budget = run.submaps, budget
+        self.earlier = np.array(run.facts().get("onto", {}).get("T_world_submap", [])).reshape(-1, 4, 4)
+        self.pieces: dict[int, Piece] = {}
+        self.camera: Camera | None = None
+        self._keyframes: dict[int, tuple[int, int]] = {}
+
+    def load_new(self, T_world_camera: list[Matrix]) -> None:
+        """Read the submaps that were not read before and whose first keyframe has a pose."""
+        for index in range(len(self.pieces), len(self.store)):
+            if index < len(self.earlier):
+                self._add(index, lambda first, T=self.earlier[index]: T)  # type: ignore[misc]
+            else:
+                self._add(index, lambda first: T_world_camera[first] if first < len(T_world_camera) else None)
+
+    def load_all(self, T_world_submap: NDArray[np.float64]) -> None:
+        """Read all submaps that have a pose."""
+        for index in range(min(len(self.store), len(T_world_submap))):
+            self._add(index, lambda first, T=T_world_submap[index]: T)  # type: ignore[misc]
+
+    def image(self, row: int) -> Rgb | None:
+        """Return the image of the keyframe at a row of the path, or None if its submap was not read."""
+        if row not in self._keyframes:
+            return None
+        return self.store.picture(*self._keyframes[row]).color
+
+    def _add(self, index: int, anchor_of: Callable[[int], Matrix | None]) -> None:
+        submap = self.store.load(index)
+        T_world_submap = anchor_of(submap.frames[0])
+        if T_world_submap is None or index != len(self.pieces):
+            return
+        self.camera = submap.camera
+        self.pieces[index] = Piece(index, thin(submap.field, self.budget), T_world_submap)
+        fitting = within_budget(tuple(self.pieces.values()), self.budget)
+        self.pieces = dict(zip(self.pieces, fitting, strict=True))
+        for k, row in enumerate(submap.frames):
+            self._keyframes.setdefault(row, (index, k))
+
+
+def _mesh(run: RunFolder) -> Mesh | None:
+    """Read the mesh that `sigmasplat mesh` has written into the run folder; None without one, or if it is damaged."""
+    try:
+        return read_mesh(run.path / MESH) if (run.path / MESH).is_file() else None
+    except SigmaSplatError:
+        return None
+
+
+def _final_path(frames: RunFrames, tensors: Mapping[str, Tensor]) -> CameraPath:
+    """Return the path of a finished run: believed poses from trajectory.txt, the others from the checkpoint."""
+    poses = np.tile(np.eye(4), (len(frames), 1, 1))
+    kept = np.asarray(tensors["T_world_camera"], np.float64)[: len(frames)]
+    poses[: len(kept)] = kept
+    poses[frames.rows] = frames.path.T_world_camera
+    keyframes = tuple(row for row in tensors["keyframes"].tolist() if row < len(frames))
+    return CameraPath(poses, *_lost_and_submaps(frames.log), keyframes, frames.outside())
+
+
+def _lost_and_submaps(log: Log) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+    """Return whether each frame is lost [F], and its submap [F]."""
+    lost = np.array([bool(record.get("lost")) for record in log], np.bool_)
+    return lost, np.array([record.get("submap", 0) for record in log], np.int64)
+
+
+def _camera(run: RunFolder, cache: SubmapCache, source: Source | None) -> Camera:
+    """Return the camera at the run's working resolution, or a default if it is not known."""
+    if cache.camera:
+        return cache.camera
+    settings = run.config().input
+    return source.camera.prepared(settings.width, settings.crop_px) if source else DEFAULT_CAMERA
+
+
+def _image(cache: SubmapCache, log: Log, run: RunFolder, source: Source | None, row: int) -> Rgb | None:
+    """Return the image of a keyframe from its submap, else from the sequence if it is available."""
+    kept = cache.image(row)
+    if kept is not None or source is None or row >= len(log):
+        return kept
+    s = run.config().input
+    try:
+        frame = source.frame(log[row]["index"]).prepared(s.width, s.min_depth_m, s.max_depth_m, s.crop_px)
+    except SigmaSplatError:
+        return None
+    return (frame.color * 255.0).round().astype(np.uint8)
+
+
+def check_has_map(run: RunFolder) -> None:
+    """Raise RunError if a run has ended without a map."""
+    if run.facts().get("status") != "running" and not (run.path / "map.ply").is_file():
+        raise RunError(f"run {run.path} has no map to show: it stopped before its first frame; run it again")

@@ -1,0 +1,156 @@
+"""Render the map from a browser's viewpoint with SigmaSplat's renderer, and draw one layer of it in colours."""
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+from torch import Tensor
+
+from sigmasplat.config import RenderConfig
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.field import GaussianField
+from sigmasplat.data.map_uncertainty import MapUncertainty
+from sigmasplat.plugins.evaluation.metrics.scored_view import COVERED_ALPHA
+from sigmasplat.plugins.outputs.drawing import colormap
+from sigmasplat.render import render
+from sigmasplat.render.predictive import predicted, variance_parts
+from sigmasplat.types import Matrix
+
+Layer = Literal["colour", "depth", "normals", "V", "U", "opacity", "color error", "depth error"]
+ErrorPart = Literal["all", "aleatoric", "epistemic"]
+Floats = NDArray[np.float32]
+GREY = np.array([(0, 0, 0), (255, 255, 255)], np.float64)
+LEGEND_SIZE, LEGEND_BAR, INK, PAPER = (280, 34), 14, (233, 237, 242), (36, 40, 46)
+
+
+class Legend(NamedTuple):
+    """A palette [K, 3], the values at its two ends, and their unit."""
+
+    palette: NDArray[np.float64]
+    low: float
+    high: float
+    unit: str
+
+
+class LayerImage(NamedTuple):
+    """Pixels uint8 [H, W, 3], and their legend unless they show the scene's own colours."""
+
+    pixels: colormap.Rgb
+    legend: Legend | None = None
+
+
+def browser_camera(fov: float, aspect: float, height: int) -> Camera:
+    """Return a browser's camera from its vertical field of view (radians), width / height, and the image's height."""
+    width, f = max(round(height * aspect), 1), 0.5 * height / np.tan(0.5 * fov)
+    return Camera(width, height, float(f), float(f), 0.5 * (width - 1), 0.5 * (height - 1))
+
+
+def render_layer(
+    field: GaussianField, camera: Camera, T_world_camera: Matrix, layer: Layer, options: RenderConfig, backend: str
+) -> LayerImage:
+    """Render a field and draw one layer of the result.
+
+    Layers: colour; depth D̂/A in m; normals of the surface at that depth (`surface_normals`); V: √V averaged over the
+    channels, colours being 0 to 1 (VarSplat §1); U: √U about that depth, in m (CG-SLAM eq. 10); opacity A. Depth,
+    normals, V and U are drawn only where A > ½.
+    """
+    T_camera_world = se3.inverse(T_world_camera)
+    with torch.no_grad():
+        seen = render(field, camera, T_camera_world, None, options, backend)
+        alpha = _array(seen.alpha)
+        covered = alpha > COVERED_ALPHA
+        depth_m = np.where(covered, _array(seen.depth) / np.maximum(alpha, COVERED_ALPHA), 0.0).astype(np.float32)
+        if layer == "colour":
+            return LayerImage((seen.color.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).cpu().numpy())
+        if layer == "opacity":
+            return LayerImage(colormap.apply(alpha, 0.0, 1.0, GREY), Legend(GREY, 0.0, 1.0, ""))
+        if layer == "depth":
+            return _mapped(depth_m, covered, colormap.value_range(depth_m, covered), colormap.VIRIDIS, " m")
+        if layer == "normals":
+            return LayerImage(_drawn_normals(surface_normals(depth_m, camera)))
+        if layer == "V":
+            return _from_zero(_array(seen.variance.mean(2).clamp(min=0.0).sqrt()), covered, "")
+        spread = render(field, camera, T_camera_world, torch.from_numpy(depth_m), options, backend).uncertainty
+        assert spread is not None
+        about = np.sqrt(np.maximum(_array(spread), 0.0) / np.maximum(alpha, COVERED_ALPHA))
+        return _from_zero(about, covered, " m")
+
+
+def render_predicted(
+    field: GaussianField, known: MapUncertainty, camera: Camera, T_world_camera: Matrix, layer: Layer,
+    part: ErrorPart, options: RenderConfig, backend: str,
+) -> LayerImage:  # fmt: skip
+    """Draw the predicted standard deviation of colour ("color error") or of depth in m ("depth error"), or a part.
+
+    The scale ends at the 99th percentile of the whole error, so that the parts can be compared. Depth is drawn only
+    where A > ½; colour is predicted where the map is empty too.
+    """
+    T_camera_world = se3.inverse(T_world_camera)
+    with torch.no_grad():
+        parts = variance_parts(field, known.splats, known.background, camera, T_camera_world, options, backend)
+        found = predicted(parts, known.calibration)
+    covered = _array(parts.alpha) > COVERED_ALPHA
+    if layer == "color error":
+        aleatoric, epistemic = found.color_aleatoric, found.color_epistemic
+        covered, unit = np.ones_like(covered), ""
+    else:
+        aleatoric, epistemic, unit = found.depth_aleatoric_m2, found.depth_epistemic_m2, " m"
+    total = aleatoric + epistemic
+    shown = {"all": total, "aleatoric": aleatoric, "epistemic": epistemic}[part]
+    ends = 0.0, colormap.value_range(_array(total.sqrt()), covered)[1]
+    return _mapped(_array(shown.sqrt()), covered, ends, colormap.INFERNO, unit)
+
+
+def surface_normals(depth_m: Floats, camera: Camera) -> Floats:
+    """Return the unit normals [H, W, 3] of a depth image [H, W] m (0 = no surface), in the camera's frame, towards it.
+
+    A normal is the cross product of the differences between neighbouring surface points; 0 where one of them has no
+    depth.
+    """
+    v, u = np.mgrid[: depth_m.shape[0], : depth_m.shape[1]].astype(np.float32)
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1)
+    points = rays * depth_m[..., None]
+    along_u, along_v = np.gradient(points, axis=1), np.gradient(points, axis=0)
+    normals = np.cross(along_v, along_u)
+    padded = np.pad(depth_m > 0, 1, constant_values=True)
+    known = padded[1:-1, :-2] & padded[1:-1, 2:] & padded[:-2, 1:-1] & padded[2:, 1:-1] & (depth_m > 0)
+    length = np.linalg.norm(normals, axis=-1, keepdims=True)
+    return np.where(known[..., None] & (length > 0), normals / np.maximum(length, 1e-20), 0.0).astype(np.float32)
+
+
+def _drawn_normals(normals: Floats) -> colormap.Rgb:
+    """Draw normals as colours: red = to the right, green = up, blue = towards the camera."""
+    colors = 127.5 + 127.5 * normals * np.array([1.0, -1.0, -1.0], np.float32)
+    missing = (normals == 0.0).all(-1)
+    colors[missing] = colormap.NO_READING
+    return np.asarray(colors.round().astype(np.uint8))
+
+
+def draw_legend(legend: Legend) -> colormap.Rgb:
+    """Draw a palette and the values at its ends, uint8 [34, 280, 3]."""
+    width, height = LEGEND_SIZE
+    image = Image.new("RGB", LEGEND_SIZE, PAPER)
+    ramp = colormap.apply(np.tile(np.linspace(0.0, 1.0, width), (LEGEND_BAR, 1)), 0.0, 1.0, legend.palette)
+    image.paste(Image.fromarray(ramp), (0, 0))
+    draw, font = ImageDraw.Draw(image), ImageFont.load_default(14)
+    middle = (height + LEGEND_BAR) // 2
+    draw.text((1, middle), f"{legend.low:.3g}{legend.unit}", INK, font, anchor="lm")
+    draw.text((width - 1, middle), f"{legend.high:.3g}{legend.unit}", INK, font, anchor="rm")
+    return np.asarray(image)
+
+
+def _array(values: Tensor) -> Floats:
+    return np.asarray(values.cpu(), np.float32)
+
+
+def _from_zero(values: Floats, valid: NDArray[np.bool_], unit: str) -> LayerImage:
+    return _mapped(values, valid, (0.0, colormap.value_range(values, valid)[1]), colormap.INFERNO, unit)
+
+
+def _mapped(
+    values: Floats, valid: NDArray[np.bool_], ends: tuple[float, float], colours: NDArray[np.float64], unit: str
+) -> LayerImage:
+    return LayerImage(colormap.apply_masked(values, valid, *ends, colours), Legend(colours, *ends, unit))

@@ -1,0 +1,202 @@
+"""Lay out the controls beside the scene and read their state."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import viser
+
+from sigmasplat.plugins.outputs.drawing.colormap import NO_READING, Rgb
+from sigmasplat.plugins.viewer.layers import LEGEND_SIZE, ErrorPart, Layer
+from sigmasplat.plugins.viewer.splats import Colouring
+
+ViewMode = Literal["splats", "mesh", "colour", "depth", "normals", "V", "U", "opacity", "color error", "depth error"]
+VIEW_MODES: tuple[ViewMode, ...] = (
+    "splats", "mesh", "colour", "depth", "normals", "V", "U", "opacity", "color error", "depth error",
+)  # fmt: skip
+PREDICTED_MODES: tuple[ViewMode, ...] = ("color error", "depth error")
+"""Only for maps with predicted errors."""
+MODE_LABELS: dict[ViewMode, str] = {
+    "splats": "splats, drawn by the browser",
+    "mesh": "mesh",
+    "colour": "colour, rendered by SigmaSplat",
+    "depth": "depth",
+    "normals": "normals of the surface",
+    "V": "√V: standard deviation of colour",
+    "U": "√U: standard deviation of depth",
+    "opacity": "opacity",
+    "color error": "predicted error of colour",
+    "depth error": "predicted error of depth",
+}
+COLOURINGS: dict[Colouring, str] = {"colour": "colour", "σ": "σ", "depth error": "predicted error of depth"}
+ERROR_PARTS: dict[ErrorPart, str] = {
+    "all": "all",
+    "aleatoric": "aleatoric: noise and detail",
+    "epistemic": "epistemic: more views reduce it",
+}
+MOST_STD_M = 0.3
+"""End of the slider for predicted errors of depth; there, no splat is hidden."""
+FINAL_MAP, SUBMAPS = "final map", "submaps"
+
+
+@dataclass(frozen=True)
+class ControlState:
+    """The values of the controls at one time."""
+
+    mode: ViewMode
+    colouring: Colouring
+    final_map: bool
+    error_part: ErrorPart
+    hidden_share: float
+    min_opacity: float
+    max_std_m: float
+    row: int
+    path: bool
+    keyframes: bool
+    thumbnails: bool
+    true_path: bool
+    follow: bool
+
+    @property
+    def layer(self) -> Layer | None:
+        """Return the layer that SigmaSplat renders, or None if the browser draws the scene."""
+        return None if self.mode == "splats" or self.mode == "mesh" else self.mode
+
+
+class ControlPanel:
+    """The controls. Calls `changed()` after each change, and `look_from(client)` after a click on "look from here"."""
+
+    def __init__(
+        self, server: viser.ViserServer, changed: Callable[[], None], look_from: Callable[[viser.ClientHandle], None]
+    ) -> None:
+        gui = server.gui
+        gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, brand_color=(214, 90, 30))
+        self.facts = gui.add_markdown("waiting for the first frame")
+        self.caption = gui.add_markdown("")
+        self.image = gui.add_image(np.full((3, 4, 3), NO_READING, np.uint8), visible=False, jpeg_quality=90)
+        self._add_map_controls(gui)
+        self._add_path_controls(gui)
+        self.look.on_click(lambda event: look_from(event.client) if event.client else None)
+        for control in self._controls():
+            control.on_update(lambda _: changed())
+
+    def _add_map_controls(self, gui: viser.GuiApi) -> None:
+        with gui.add_folder("Map"):
+            self.mode: Any = gui.add_dropdown("show", _mode_options(frozenset((*PREDICTED_MODES, "mesh"))))
+            self.error_part = gui.add_dropdown(
+                "part of the error", tuple(ERROR_PARTS.values()), visible=False,
+                hint="one standard deviation of the whole predicted error or of a part, on the scale of the whole",
+            )  # fmt: skip
+            self.colouring: Any = gui.add_dropdown(
+                "splat colour",
+                _colouring_options(predicted=False),
+                hint="the splats' own colours, σ of their colour, or predicted error of depth: bright = uncertain",
+            )
+            self.part = gui.add_dropdown(
+                "map", (FINAL_MAP, SUBMAPS), hint="the final map, or the submaps from which it was made"
+            )
+            self.legend = gui.add_image(np.zeros((*LEGEND_SIZE[::-1], 3), np.uint8), visible=False, format="png")
+            self.hidden = gui.add_slider(
+                "hide uncertain", 0, 99, 1, 0, hint="hide this percentage of the splats: those with the largest σ"
+            )
+            self.max_std = gui.add_slider(
+                "hide above, m", 0.005, MOST_STD_M, 0.005, MOST_STD_M, visible=False,
+                hint="hide splats with a larger predicted standard deviation of depth; at the right end none is hidden",
+            )  # fmt: skip
+            self.min_opacity = gui.add_slider(
+                "minimum opacity", 0.0, 0.99, 0.01, 0.0, hint="hide splats with a lower opacity"
+            )
+            self.hidden_text = gui.add_markdown("")
+
+    def _add_path_controls(self, gui: viser.GuiApi) -> None:
+        with gui.add_folder("Path", expand_by_default=False):  # Any: mypy takes `value` for read-only
+            self.row: Any = gui.add_slider("frame", 0, 1, 1, 1, hint="show the path and the submaps up to this frame")
+            self.frame = gui.add_markdown("")
+            self.look = gui.add_button("look from here")
+            self.follow = gui.add_checkbox("follow the camera", False, visible=False)
+            self.path = gui.add_checkbox("path", True)
+            self.keyframes = gui.add_checkbox(
+                "keyframes", False, hint="click a keyframe to move there and to see its image"
+            )
+            self.thumbnails: Any = gui.add_checkbox("keyframe images", False)
+            self.true_path = gui.add_checkbox("ground truth", True, visible=False)
+
+    def _controls(self) -> tuple[Any, ...]:
+        return (
+            self.mode, self.error_part, self.colouring, self.part, self.hidden, self.max_std, self.min_opacity,
+            self.row, self.follow, self.path, self.keyframes, self.thumbnails, self.true_path,
+        )  # fmt: skip
+
+    def state(self) -> ControlState:
+        """Return the current values of the controls."""
+        return ControlState(
+            next(mode for mode in VIEW_MODES if MODE_LABELS[mode] == self.mode.value),
+            next(name for name, label in COLOURINGS.items() if label == self.colouring.value),
+            self.part.value == FINAL_MAP,
+            next(name for name, label in ERROR_PARTS.items() if label == self.error_part.value),
+            self.hidden.value / 100.0,
+            float(self.min_opacity.value),
+            float(self.max_std.value) if self.max_std.visible and self.max_std.value < MOST_STD_M else float("inf"),
+            int(self.row.value),
+            self.path.value,
+            self.keyframes.value,
+            self.thumbnails.value,
+            self.true_path.value,
+            self.follow.value,
+        )
+
+    def adapt(self, frames: int, live: bool, truth_known: bool, can_choose_map: bool) -> None:
+        """Adapt the controls to the snapshot; a timeline at its end stays there while frames are added."""
+        last = max(frames - 1, 1)
+        at_end = self.row.value >= self.row.max
+        if last != self.row.max:
+            if last < self.row.value:
+                self.row.value = last
+            self.row.max = last
+            if at_end:
+                self.row.value = last
+        self.follow.visible, self.true_path.visible, self.part.visible = live, truth_known, can_choose_map
+
+    def offer(self, known: bool, has_mesh: bool) -> None:
+        """Offer the controls of predicted errors if the shown map has them (`known`), and the mesh if there is one."""
+        absent = frozenset((() if known else PREDICTED_MODES) + (() if has_mesh else ("mesh",)))
+        for control, options in (
+            (self.mode, _mode_options(absent)),
+            (self.colouring, _colouring_options(known)),
+        ):
+            if control.options != options:
+                control.options = options
+        self.max_std.visible = known
+        self.error_part.visible = known and self.mode.value in {MODE_LABELS[mode] for mode in PREDICTED_MODES}
+
+    def show_texts(self, facts: str, hidden: str, frame: str) -> None:
+        """Show texts about the run, about the hidden splats, and about the selected frame."""
+        self.facts.content, self.hidden_text.content, self.frame.content = facts, hidden, frame
+
+    def show_legend(self, pixels: Rgb | None) -> None:
+        """Show the colour legend, or hide it if None."""
+        if pixels is not None:
+            self.legend.image = pixels
+        self.legend.visible = pixels is not None
+
+    def show_image(self, caption: str, pixels: Rgb | None) -> None:
+        """Show the image of a keyframe, or the caption alone if None."""
+        self.caption.content = caption
+        if pixels is not None:
+            self.image.image = pixels
+        self.image.visible = pixels is not None
+
+
+def escaped(text: str) -> str:
+    """Return text from a file or a path so that the browser shows it and runs nothing: viser's Markdown has tags, and
+    expressions in braces."""
+    return "".join(c if c.isalnum() or c in " .,-" or not c.isascii() else f"&#{ord(c)};" for c in text)
+
+
+def _mode_options(absent: frozenset[str]) -> tuple[str, ...]:
+    return tuple(MODE_LABELS[mode] for mode in VIEW_MODES if mode not in absent)
+
+
+def _colouring_options(predicted: bool) -> tuple[str, ...]:
+    return tuple(label for name, label in COLOURINGS.items() if predicted or name != "depth error")

@@ -1,0 +1,178 @@
+"""Update viser's scene: nodes have fixed names and are changed in place or replaced, so their number is bounded."""
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any, Literal
+
+import numpy as np
+import trimesh
+import viser
+from PIL import Image
+
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.mesh import Mesh
+from sigmasplat.plugins.outputs.drawing.colormap import Rgb
+from sigmasplat.plugins.viewer.lines import LOST_COLOUR, Bytes, Floats, Segments
+from sigmasplat.plugins.viewer.splats import SplatArrays
+from sigmasplat.types import Matrix
+
+FRUSTUM_M, THUMBNAIL_PX = 0.08, 160
+LINE_PX, FRUSTUM_PX, DOT_M = {"path": 4.0, "truth": 2.0}, 1.0, 0.03
+KEYFRAME_COLOUR, CURRENT_COLOUR = (112, 120, 130), (255, 210, 60)
+AHEAD_M = 1.0
+"""Distance in front of a moved camera of the point that the mouse rotates it about."""
+
+Clicked = Callable[[int, viser.ClientHandle], None]
+
+
+class ViserScene:
+    """The part of the scene that all browsers share."""
+
+    def __init__(self, server: viser.ViserServer, clicked: Clicked) -> None:
+        """Start with an empty scene; a click on a keyframe calls `clicked(row, client)`."""
+        self.server, self.clicked = server, clicked
+        self._splats: dict[str, viser.GaussianSplatHandle] = {}
+        self._keyframes: dict[int, viser.CameraFrustumHandle] = {}
+        self._with_images = True
+        self._marks: dict[str, Any] = {}
+        server.scene.set_up_direction("-y")
+
+    def show_splats(self, splats: Mapping[str, tuple[SplatArrays, Matrix]]) -> None:
+        """Show exactly these pieces, by name, each at its T_world_piece."""
+        drawn = {name: part for name, part in splats.items() if len(part[0])}
+        for name in self._splats.keys() - drawn.keys():
+            self._splats.pop(name).remove()
+        for name, (part, _) in drawn.items():
+            arrays = (part.centers, part.covariances, part.colors, part.opacities[:, None])
+            if name in self._splats:
+                self._splats[name].set_gaussians(*arrays)
+            else:
+                self._splats[name] = self.server.scene.add_gaussian_splats(f"/splats/{name}", *arrays)
+        self.place_splats({name: T for name, (_, T) in drawn.items()})
+
+    def place_splats(self, T_world_piece: Mapping[str, Matrix]) -> None:
+        """Move the visible pieces to their poses."""
+        for name, T in T_world_piece.items():
+            if name in self._splats:
+                _place(self._splats[name], T)
+
+    def show_mesh(self, mesh: Mesh | None) -> None:
+        """Show a mesh in its own colours without light and shadow, or remove it if None."""
+        self._drop("mesh")
+        if mesh is not None and len(mesh.faces):
+            grey = np.full_like(mesh.vertices, 0.7)
+            colors = np.rint(255.0 * (grey if mesh.colors is None else mesh.colors)).astype(np.uint8)
+            drawn = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colors, process=False)
+            self._marks["mesh"] = self.server.scene.add_mesh_trimesh(
+                "/mesh", drawn, cast_shadow=False, receive_shadow=False
+            )
+
+    def show_lines(self, name: Literal["path", "truth"], segments: Segments | None) -> None:
+        """Show line segments under a name, or remove them if None."""
+        if segments is None or not len(segments.points):
+            self._drop(name)
+            return
+        self._marks[name] = self.server.scene.add_line_segments(
+            f"/{name}",
+            segments.points,
+            srgb_to_linear(segments.colors),
+            thickness=LINE_PX[name],
+            thickness_units="screen",
+        )
+
+    def show_lost(self, points: Floats) -> None:
+        """Mark the positions [L, 3] of lost frames."""
+        if not len(points):
+            self._drop("lost")
+            return
+        self._marks["lost"] = self.server.scene.add_point_cloud(
+            "/lost", points, LOST_COLOUR, point_size=DOT_M, point_shape="circle"
+        )
+
+    def show_current_camera(self, camera: Camera, T_world_camera: Matrix | None, lost: bool = False) -> None:
+        """Show the camera of the frame selected on the timeline; a lost one has another colour."""
+        shown, hidden = ("lost camera", "current") if lost else ("current", "lost camera")
+        self._drop(hidden)
+        if T_world_camera is None:
+            self._drop(shown)
+            return
+        if shown not in self._marks:
+            colour = LOST_COLOUR if lost else CURRENT_COLOUR
+            self._marks[shown] = self._frustum(f"/{shown.replace(' ', '-')}", camera, 1.5 * FRUSTUM_M, colour, None)
+        _place(self._marks[shown], T_world_camera)
+
+    def show_keyframes(
+        self, camera: Camera, T_world_camera: Mapping[int, Matrix], image: Callable[[int], Rgb | None] | None
+    ) -> None:
+        """Show exactly the frusta of these keyframes, by row, with thumbnails unless `image` is None."""
+        with_images = image is not None
+        all_change = with_images != self._with_images
+        removed = self._keyframes.keys() if all_change else self._keyframes.keys() - T_world_camera.keys()
+        for row in tuple(removed):
+            self._keyframes.pop(row).remove()
+        self._with_images = with_images
+        for row, T in T_world_camera.items():
+            if row not in self._keyframes:
+                small = thumbnail(image(row)) if image else None
+                frustum = self._frustum(f"/keyframes/{row}", camera, FRUSTUM_M, KEYFRAME_COLOUR, small)
+                frustum.on_click(partial(self._pass_on, row))
+                self._keyframes[row] = frustum
+            _place(self._keyframes[row], T)
+
+    def _frustum(
+        self, name: str, camera: Camera, scale: float, color: tuple[int, int, int], image: Rgb | None
+    ) -> viser.CameraFrustumHandle:
+        fov = 2.0 * float(np.arctan(0.5 * camera.height / camera.fy))
+        return self.server.scene.add_camera_frustum(
+            name, fov, camera.width / camera.height, scale=scale, thickness=FRUSTUM_PX, thickness_units="screen",
+            color=color, image=image, format="jpeg", jpeg_quality=80, cast_shadow=False, receive_shadow=False,
+        )  # fmt: skip
+
+    def _pass_on(self, row: int, event: viser.SceneNodePointerEvent[viser.CameraFrustumHandle]) -> None:
+        self.clicked(row, event.client)
+
+    def _drop(self, name: str) -> None:
+        if name in self._marks:
+            self._marks.pop(name).remove()
+
+
+def move_camera(client: viser.ClientHandle, T_world_camera: Matrix, back_m: float = 0.0, up_m: float = 0.0) -> None:
+    """Move a browser's camera to a pose, or to a position behind and above it."""
+    position = T_world_camera @ np.array([0.0, -up_m, -back_m, 1.0])
+    with client.atomic():
+        client.camera.position = position[:3]
+        client.camera.look_at = (T_world_camera @ np.array([0.0, 0.0, AHEAD_M, 1.0]))[:3]
+
+
+def set_initial_camera(server: viser.ViserServer, T_world_camera: Matrix, back_m: float, up_m: float) -> None:
+    """Set the camera of browsers that open the page later."""
+    server.initial_camera.position = (T_world_camera @ np.array([0.0, -up_m, -back_m, 1.0]))[:3]
+    server.initial_camera.look_at = (T_world_camera @ np.array([0.0, 0.0, AHEAD_M, 1.0]))[:3]
+
+
+def camera_pose(camera: viser.CameraHandle) -> Matrix:
+    """Return T_world_camera [4, 4] of a browser's camera."""
+    T = np.eye(4)
+    T[:3, :3] = se3.rotation_from_quaternion(camera.wxyz)
+    T[:3, 3] = camera.position
+    return T
+
+
+def srgb_to_linear(colors: Bytes) -> Bytes:
+    """Convert sRGB colours to linear ones, 0 to 255, which viser expects for lines."""
+    return (255.0 * (colors / 255.0) ** 2.2).round().astype(np.uint8)
+
+
+def thumbnail(image: Rgb | None) -> Rgb | None:
+    """Return an image scaled down to at most `THUMBNAIL_PX` on each side."""
+    if image is None:
+        return None
+    small = Image.fromarray(image)
+    small.thumbnail((THUMBNAIL_PX, THUMBNAIL_PX))
+    return np.asarray(small)
+
+
+def _place(node: Any, T_world_node: Matrix) -> None:
+    """Set the pose of a node."""
+    node.wxyz, node.position = se3.quaternion_from_rotation(T_world_node[:3, :3]), T_world_node[:3, 3]

@@ -1,0 +1,92 @@
+"""Start the viewer's server, by default for this machine only, on the requested port or the next free one."""
+
+import contextlib
+import errno
+import io
+import logging
+import socket
+from typing import TYPE_CHECKING
+
+from sigmasplat.env import install_extra
+from sigmasplat.errors import ConfigError, SigmaSplatError
+from sigmasplat.plugins.viewer.origin import own_pages_only
+
+if TYPE_CHECKING:
+    from viser import ViserServer
+
+HOST, PORT = "127.0.0.1", 8080
+ATTEMPTS = 100
+PORT_BUSY = (errno.EADDRINUSE,)
+
+
+def open_server(host: str, port: int, title: str) -> "ViserServer":
+    """Start viser's server on the first free port from `port` upwards; it accepts requests of its own pages only.
+
+    Raises SigmaSplatError if viser is missing or cannot be restricted to its own pages, or if no port is free.
+    """
+    try:
+        import viser
+    except ImportError as problem:
+        raise SigmaSplatError(
+            f"the viewer needs viser ({problem}); install it with: {install_extra('viewer')}"
+        ) from problem
+
+    class LocalServer(viser.ViserServer):
+        """Refuses to share: viser would open a public tunnel if a page asked for one."""
+
+        def request_share_url(self, verbose: bool = True) -> str | None:
+            return None
+
+    found = free_port(host, port)
+    logging.getLogger("websockets.server").setLevel(logging.CRITICAL)  # do not log clients that disconnect
+    with own_pages_only(host) as restricted, contextlib.redirect_stdout(io.StringIO()):  # no banner from viser
+        server = LocalServer(host=host, port=found, label=title, verbose=False)
+    if not restricted:
+        close(server)
+        raise SigmaSplatError(
+            f"viser {viser.__version__} would show the run to any page open in the browser; install viser==1.1.1, the "
+            "tested version"
+        )
+    return server
+
+
+def close(server: "ViserServer") -> None:
+    """Stop a server without its closing message."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        server.stop()
+
+
+def free_port(host: str, port: int) -> int:
+    """Return the first free port of a host from `port` upwards; 0 means any.
+
+    Raises ConfigError if the number is out of range, SigmaSplatError if no port is free or the host's address does not
+    belong to this machine.
+    """
+    if not 0 <= port <= 65535:
+        raise ConfigError(f"--port must be from 0 to 65535, found {port}")
+    for candidate in range(port, min(port + ATTEMPTS, 65536)):
+        try:
+            with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                probe.bind((host, candidate))
+                return candidate
+        except PermissionError:
+            continue
+        except OSError as problem:
+            if problem.errno not in PORT_BUSY:
+                raise SigmaSplatError(
+                    f"cannot listen on {host} ({problem.strerror or problem}); give an address of this machine as "
+                    f"--host, or {HOST} to allow only this machine"
+                ) from problem
+    raise SigmaSplatError(f"no free port from {port} to {candidate}; give another --port")
+
+
+def url_of(host: str, port: int) -> str:
+    """Return the address to open in a browser on this machine."""
+    reached = {"0.0.0.0": HOST, "::": "[::1]"}.get(host, f"[{host}]" if ":" in host else host)
+    return f"http://{reached}:{port}"
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether an address can be reached from this machine only."""
+    return host in ("localhost", "::1") or host.startswith("127.")

@@ -1,0 +1,160 @@
+"""Store the state of a run that the viewer shows at one time: path, keyframes, map. Needs no browser and no file."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field as dataclass_field, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sigmasplat.config import RenderConfig
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.field import COLUMNS, GaussianField, Rows
+from sigmasplat.data.map_uncertainty import MapUncertainty
+from sigmasplat.data.mesh import Mesh
+from sigmasplat.plugins.outputs.drawing.colormap import Rgb
+from sigmasplat.types import Matrix
+
+BUDGET = 300_000
+"""Maximum number of splats sent to a browser: 10 MB, which it sorts after each camera move."""
+DEFAULT_CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
+"""Gives the frusta their shape if the run's camera is not known."""
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """A part of the map: splats in their own frame, and the pose T_world_piece of that frame.
+
+    submap: its number, or None for the final map. If splats change, the piece gets a new field object; an unchanged
+    object means unchanged splats. uncertainty: how sure the splats are, None if it was not measured.
+    """
+
+    submap: int | None
+    field: GaussianField
+    T_world_piece: Matrix = dataclass_field(default_factory=lambda: np.eye(4))
+    uncertainty: MapUncertainty | None = None
+
+    @property
+    def name(self) -> str:
+        """Return the piece's name in the scene."""
+        return "map" if self.submap is None else f"submap-{self.submap}"
+
+    @property
+    def depth_std_m(self) -> Tensor | None:
+        """Return the predicted standard deviation of the depth that each splat shows [N], m; None if not measured."""
+        std = None if self.uncertainty is None else self.uncertainty.std
+        return None if std is None else std.depth_std_m
+
+    def thinned(self, most: int) -> "Piece":
+        """Return a copy with at most `most` splats (`thin`)."""
+        known = None if self.uncertainty is None else self.uncertainty.at(thinned_rows(len(self.field), most))
+        return replace(self, field=thin(self.field, most), uncertainty=known)
+
+
+@dataclass(frozen=True, eq=False)
+class CameraPath:
+    """The frames so far: poses T_world_camera [F, 4, 4], whether each is lost bool [F], its submap [F], and the rows of
+    the keyframes in ascending order.
+
+    outside: whether each frame is not connected to the world (`outside_world`) [F]; such frames are not drawn, because
+    their poses are in the frame of another component. None: all are connected.
+    """
+
+    T_world_camera: Matrix
+    lost: NDArray[np.bool_]
+    submaps: NDArray[np.int64]
+    keyframes: tuple[int, ...]
+    outside: NDArray[np.bool_] | None = None
+
+    @property
+    def inside(self) -> NDArray[np.bool_]:
+        """Return whether each frame is connected to the world [F]."""
+        return np.ones(len(self), np.bool_) if self.outside is None else ~self.outside
+
+    def __len__(self) -> int:
+        return len(self.T_world_camera)
+
+
+EMPTY_PATH = CameraPath(np.empty((0, 4, 4)), np.empty(0, np.bool_), np.empty(0, np.int64), ())
+
+
+@dataclass(frozen=True, eq=False)
+class Snapshot:
+    """The state of a run at one time.
+
+    final: the final map, None before it is made; pieces: the submaps, which may be missing if there is a final map.
+    true_positions [M, 3] m in the run's world, None unless an evaluation has stored them. image(row) returns the image
+    of the keyframe at a row of the path, or None if it was not kept. mesh: the surface that `sigmasplat mesh` has
+    written, None without one.
+    """
+
+    title: str
+    path: CameraPath = EMPTY_PATH
+    final: Piece | None = None
+    pieces: tuple[Piece, ...] = ()
+    true_positions: Matrix | None = None
+    camera: Camera = DEFAULT_CAMERA
+    image: Callable[[int], Rgb | None] = lambda row: None
+    options: RenderConfig = dataclass_field(default_factory=RenderConfig)
+    backend: str = "auto"
+    live: bool = False
+    status: str = ""
+    mesh: Mesh | None = None
+
+    def visible_pieces(self, final_map: bool, row: int) -> tuple[Piece, ...]:
+        """Return the final map if it exists and is requested, else the submaps started up to frame `row`."""
+        if self.final is not None and (final_map or not self.pieces):
+            return (self.final,)
+        if not len(self.path):
+            return self.pieces
+        last = int(self.path.submaps[np.clip(row, 0, len(self.path) - 1)])
+        return tuple(piece for piece in self.pieces if piece.submap is None or piece.submap <= last)
+
+
+def field_without_moments(params: Tensor, attributes: Mapping[str, Tensor]) -> GaussianField:
+    """Return a field of parameter rows [N, 17] and attributes that is not optimised.
+
+    Adam's moments are views of a single zero, which saves two thirds of the memory.
+    """
+    moments = [values.new_zeros(()).expand_as(values) for values in (params, *attributes.values())]
+    rows = {n: Rows(values, zero, zero) for (n, values), zero in zip(attributes.items(), moments[1:], strict=True)}
+    return GaussianField(params, moments[0], moments[0], attributes=rows)
+
+
+def without_moments(splats: GaussianField) -> GaussianField:
+    """Return the splats without Adam's moments; parameters are shared, not copied."""
+    return field_without_moments(splats.params, {name: rows.params for name, rows in splats.attributes.items()})
+
+
+def thinned_rows(n: int, most: int) -> Tensor:
+    """Return the rows of at most `most` of `n` splats, spread evenly."""
+    return torch.arange(n) if n <= most else (torch.arange(max(most, 0)) * n).div(most, rounding_mode="floor")
+
+
+def thin(splats: GaussianField, most: int) -> GaussianField:
+    """Return a copy on the host of at most `most` splats, spread evenly over the rows.
+
+    The remaining splats are enlarged, so that the covered area stays the same.
+    """
+    n = len(splats)
+    rows = thinned_rows(n, most).to(splats.params.device)
+    kept = field_without_moments(
+        splats.params[rows].cpu(), {name: extra.params[rows].cpu() for name, extra in splats.attributes.items()}
+    )
+    if len(kept):
+        kept.params[:, COLUMNS["log_scales"]] += 0.5 * float(np.log(n / len(kept)))
+    return kept
+
+
+def within_budget(pieces: Sequence[Piece], budget: int) -> tuple[Piece, ...]:
+    """Return the pieces with at most `budget` splats in total.
+
+    Pieces that fit are returned unchanged. Otherwise each one is thinned by the same factor, to three quarters of the
+    budget in total, so that the next pieces do not cause another thinning immediately.
+    """
+    total = sum(len(piece.field) for piece in pieces)
+    if total <= budget:
+        return tuple(pieces)
+    share = 0.75 * budget / total
+    return tuple(piece.thinned(int(share * len(piece.field))) for piece in pieces)

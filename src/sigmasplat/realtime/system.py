@@ -1,0 +1,227 @@
+"""SLAM in real time: a frame is tracked at once, and the work on the map never makes it wait."""
+
+import queue
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sigmasplat.data.component import LOST, Component
+from sigmasplat.data.field import GaussianField
+from sigmasplat.data.frame import Frame
+from sigmasplat.data.map_uncertainty import MapUncertainty
+from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.errors import SourceError
+from sigmasplat.graph.loops import Loops
+from sigmasplat.native.threads import set_kernel_threads
+from sigmasplat.realtime.messages import Snapshot, Task
+from sigmasplat.realtime.schedule import MappingThread, Schedule
+from sigmasplat.realtime.tracking import CameraClock
+from sigmasplat.realtime.work import MapClock
+from sigmasplat.render.view import View
+from sigmasplat.slam.array_interface import ArrayInterface
+from sigmasplat.slam.listeners import Events
+from sigmasplat.slam.slam import Slam
+from sigmasplat.slam.step_result import Step, StepTimer
+from sigmasplat.tracking.features import make_extractor
+from sigmasplat.tracking.moving.watch import Watch
+from sigmasplat.tracking.recovery import Recovery
+from sigmasplat.tracking.sight import view_of, working_frame
+from sigmasplat.tracking.tracker import Tracker
+from sigmasplat.types import Matrix, Progress, no_progress
+
+
+class RealTime(ArrayInterface):
+    """Runs a `Slam` on two clocks. `step` tracks a frame and returns; a mapping thread does everything else, and hands
+    back snapshots of the map.
+
+    Between `step` calls the state of `slam` belongs to the mapping thread: read it in a task (`between_frames`), or
+    after `settle`. The results depend on how fast the machine is, so they are not reproducible. schedule: when the work
+    on the map runs, by default on a thread; covariances: whether `track` and `covariance` return covariances, which
+    cost some milliseconds of work per keyframe; hurried: returns whether the next frame waits or is due soon, then no
+    further guess of a doubtful pose is tried. Functions of `on_keyframe`, `on_loop` and `on_correction` are called by
+    the thread that calls `step`, when it learns of the event.
+    """
+
+    def __init__(
+        self,
+        slam: Slam,
+        schedule: Schedule | None = None,
+        covariances: bool = True,
+        hurried: Callable[[], bool] = lambda: False,
+    ) -> None:
+        self.slam, self._hurried, c = slam, hurried, slam.config
+        wanted = c.tracking.features or c.recovery.relocalise
+        self._extractor = make_extractor(c.features) if wanted else None  # not shared with the mapping thread
+        tracker = Tracker(c.tracking, self._extractor if c.tracking.features else None, watch=Watch(c.moving))
+        self._camera = CameraClock(c, tracker, Recovery(c.recovery))
+        self._snapshots: queue.SimpleQueue[Snapshot] = queue.SimpleQueue()
+        self._map = MapClock(slam, self._snapshots.put)
+        self._map.with_errors = covariances
+        self.listeners = slam.listeners
+        self._newest, self._events = slam.newest_step(), Events(slam.loops)
+        self._schedule = MappingThread() if schedule is None else schedule
+        self._view: View | None = None
+        self._runs, self._threads = False, 0
+
+    # ---- frames ----
+
+    def step(self, frame: Frame) -> Step:
+        """Track one frame and hand it to the map. Raises SourceError as `Slam.step`, and what the work on the map has
+        raised."""
+        timer = StepTimer()
+        if self._view is None:
+            self._view = self._start(frame)
+        mapping_s = self._adopt()
+        with timer.stage("prepare"):
+            timer.start_kernels(self._view)
+            seen = self.slam.observed(frame, self._view, self._extractor)
+        if mapping_s:
+            timer.add({"mapping": mapping_s})
+        tracked = self._camera.track(seen, self._view, timer, self._hurried)
+        self._map.given.put(tracked)
+        self._schedule.wake()
+        self._newest = tracked.step
+        self._events.tell(self.listeners, [tracked.step] if tracked.step.is_keyframe else [])
+        return tracked.step
+
+    def newest_step(self) -> Step | None:
+        """Return the result of the newest frame; None before the first one."""
+        return self._newest
+
+    def covariance(self) -> Matrix | None:
+        """Return the covariance [6, 6] of the newest frame's pose, as `Slam.covariance`; None if that frame is
+        lost, or without `covariances`.
+
+        Raises SourceError before the first frame.
+        """
+        if self._newest is None:
+            raise SourceError("no pose yet: give a frame to `track` or `step` first")
+        if self._newest.state == LOST or not self._map.with_errors:
+            return None
+        return self._camera.covariance(self._newest)
+
+    def _start(self, frame: Frame) -> View:
+        """Make the two views of the camera, and start the mapping thread."""
+        if self.slam.is_prepared:
+            camera = self.slam.view.camera
+        else:
+            camera = working_frame(frame, self.slam.config).camera
+            self.slam.prepare(camera)
+        self._threads = set_kernel_threads(1)
+        self._schedule.start(self._map.slices())
+        self._runs = True
+        return view_of(camera, self.slam.config)
+
+    def _adopt(self) -> float:
+        """Adopt the snapshots that have arrived; return the seconds of work that they contain."""
+        mapping_s = 0.0
+        while True:
+            try:
+                snapshot = self._snapshots.get_nowait()
+            except queue.Empty:
+                return mapping_s
+            mapping_s += snapshot.seconds
+            self._camera.adopt(snapshot)
+            self._events.add(snapshot.loops, snapshot.correction)
+
+    @property
+    def snapshot(self) -> Snapshot | None:
+        """Return the snapshot that tracking uses; None before the first one."""
+        return self._camera.snapshot
+
+    @property
+    def keyframes_refused(self) -> int:
+        """Return the number of frames that did not become keyframes because too many waited."""
+        return self._camera.refused
+
+    # ---- between frames ----
+
+    def between_frames(self, task: Callable[[], None]) -> None:
+        """Run a task on the mapping thread as soon as all frames so far are in the map. It may read `slam`."""
+        self._map.given.put(Task(task))
+        self._schedule.wake()
+
+    def save(self, write: Callable[[], None]) -> None:
+        """Run a task as `between_frames` does, with the whole state in `slam`, as after `Slam.step`."""
+        camera = self._camera.copied()
+
+        def save() -> None:
+            if self._map.last is not None and self._map.last is not camera.snapshot:
+                camera.adopt_newest(self._map.last)
+            self._give_back(camera)
+            write()
+
+        self.between_frames(save)
+
+    def settle(self) -> None:
+        """Finish the work on all frames so far, end the mapping thread, and put the whole state into `slam`. Raises
+        what the work has raised."""
+        if not self._runs:
+            return
+        self._runs = False
+        try:
+            self._schedule.wake()
+            self._schedule.settle()
+        finally:
+            self._schedule.stop()
+            set_kernel_threads(self._threads)
+            self._adopt()
+            self._give_back(self._camera.copied())
+        self.slam.settle()
+        self._events.add(*self._map.unreported())  # the last frames may have closed loops
+        self._events.tell(self.listeners)
+
+    def _give_back(self, camera: CameraClock) -> None:
+        """Put the state of tracking into `slam`."""
+        slam, tracker = self.slam, camera.tracker
+        tracker.extractor = slam.tracker.extractor
+        slam.tracker = tracker
+        slam.recovery.lost, slam.recovery.steady = camera.recovery.lost, camera.recovery.steady
+        slam.confidence.since_lost = camera.confidence.since_lost
+
+    # ---- results ----
+
+    def finish(self, progress: Progress = no_progress) -> None:
+        """Settle, and make the final map as `Slam.finish` does."""
+        self.settle()
+        self.slam.finish(progress)
+
+    @property
+    def loops(self) -> Loops:
+        """Return every pair of submaps that was tried as a loop, as of the newest snapshot while frames arrive."""
+        if self._runs:
+            return Loops() if self._camera.snapshot is None else self._camera.snapshot.loops
+        return self.slam.loops
+
+    @property
+    def field(self) -> GaussianField:
+        """Return the map, as `Slam.field`, after `settle`."""
+        return self.slam.field
+
+    @property
+    def uncertainty(self) -> MapUncertainty | None:
+        """Return how sure the final map is, as `Slam.uncertainty`."""
+        return self.slam.uncertainty
+
+    @property
+    def refinement_steps(self) -> int | None:
+        """Return the number of refinement steps of the final map, as `Slam.refinement_steps`."""
+        return self.slam.refinement_steps
+
+    def trajectory(self) -> Trajectory:
+        """Return the poses of all frames, as `Slam.trajectory`, after `settle`."""
+        return self.slam.trajectory()
+
+    def believed(self) -> NDArray[np.bool_]:
+        """Return which poses are believed [F], as `Slam.believed`, after `settle`."""
+        return self.slam.believed()
+
+    def components(self) -> Sequence[Component]:
+        """Return the components that are not connected to the world, as `Slam.components`, after `settle`."""
+        return self.slam.components()
+
+    def checkpoint(self) -> dict[str, Tensor]:
+        """Return what is needed to read a run back, as `Slam.checkpoint`, after `settle`."""
+        return self.slam.checkpoint()

@@ -1,0 +1,347 @@
+"""Write and read the folder of a run, which is valid at any time."""
+
+import shutil
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from PIL import Image
+from torch import Tensor
+
+from sigmasplat.config import Config
+from sigmasplat.data.component import Component
+from sigmasplat.data.field import GaussianField
+from sigmasplat.data.map_uncertainty import MapUncertainty, SplatStd
+from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.errors import RunError
+from sigmasplat.files import machine
+from sigmasplat.files.atomic import part_of, replacing, sync_file, write_text
+from sigmasplat.files.json_files import append_line, read_json, read_lines, write_json, write_json_on_full_disk
+from sigmasplat.files.leftovers import remove_leftovers
+from sigmasplat.files.lock import LOCK, locked, no_warning
+from sigmasplat.files.tensors import open_tensors, write_tensors
+from sigmasplat.run_folder import splat_ply as ply, trajectory as tum, uncertainty as uncertainty_files
+from sigmasplat.run_folder.checkpoint_values import check_checkpoint
+from sigmasplat.run_folder.components import COMPONENT_FILES, component_numbers, write_components
+from sigmasplat.run_folder.frames import RunFrames
+from sigmasplat.run_folder.run_values import FACTS, check_fields, check_log, check_profile
+from sigmasplat.run_folder.submaps import DiskStore
+
+PROGRAM = "sigmasplat"
+TRUTH = "truth.txt"
+"""The true path in the run's world, written by an evaluation if the truth is known."""
+MESH = "mesh.ply"
+"""The surface, written by `sigmasplat mesh`."""
+STATE = "state.safetensors"
+"""The state from which an unfinished run resumes."""
+REFINEMENT = "refinement.safetensors"
+"""The final map of an unfinished run between two steps of its refinement."""
+ALL_POSES = "trajectory_all.txt"
+"""The poses of all frames, written if requested."""
+FILES = (
+    "config.json", "trajectory.txt", "map.ply", "checkpoint.safetensors", "log.jsonl", "loops.json",
+    "metrics.json", "profile.json", "report.html", TRUTH, uncertainty_files.JSON, uncertainty_files.TENSORS,
+)  # fmt: skip
+"""Files that a run may have in addition to run.json, which always exists and identifies the folder as ours."""
+COMPONENTS = "components"
+"""Components that are not connected to the world."""
+FIRST_FILES = {part_of(Path("run.json")).name, LOCK}
+"""The only files of a run that was killed before run.json."""
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """One run on disk: config.json, run.json (source, version, machine, status), log.jsonl (one line per frame),
+    trajectory.txt, map.ply, checkpoint.safetensors, loops.json, profile.json, metrics.json, report.html, images/,
+    submaps/, components/.
+
+    Files are replaced atomically, and the log grows by complete lines, so an interrupted run can still be read.
+    """
+
+    path: Path
+
+    @staticmethod
+    def create(path: Path, config: Config, source_name: str, overwrite: bool = False) -> "RunFolder":
+        """Start a run in a new or empty folder; with `overwrite`, remove the files of an earlier run first.
+
+        Raises RunError if the folder has other content or cannot be written.
+        """
+        run = RunFolder(Path(path))
+        facts = {
+            "program": PROGRAM, "version": machine.package_version(), "code": machine.code_version(),
+            "source": source_name, "machine": machine.describe(), "status": "running",
+        }  # fmt: skip
+        try:
+            run._claim(overwrite, facts)
+        except OSError as problem:
+            reason = problem.strerror or problem
+            raise RunError(f"cannot write output {path}: {reason}; choose a writable --out") from problem
+        write_json(run.path / "config.json", config.to_dict())
+        return run
+
+    @staticmethod
+    def open(path: Path) -> "RunFolder":
+        """Open the folder of an existing run. Raises RunError, with the missing files, if it is not one."""
+        run = RunFolder(Path(path))
+        if not run.path.is_dir():
+            raise RunError(f"no run folder {path}; `sigmasplat run` creates one")
+        missing = [name for name in ("config.json", "run.json") if not (run.path / name).is_file()]
+        if missing:
+            raise RunError(f"{path} is not a run folder: no {' and no '.join(missing)}")
+        run._refuse_unless_ours()
+        return run
+
+    def _claim(self, overwrite: bool, facts: dict[str, Any]) -> None:
+        """Create the folder, write run.json first, then remove the files of an earlier run. Raises RunError.
+
+        With this order, a run that is killed at any time leaves a folder that the next run can overwrite.
+        """
+        self.refuse_taken(self.path, overwrite)
+        self.path.mkdir(parents=True, exist_ok=True)
+        write_json(self.path / "run.json", facts)
+        self._clear()
+        self.images.mkdir(exist_ok=True)
+
+    @staticmethod
+    def refuse_taken(path: Path, overwrite: bool) -> None:
+        """Raise RunError if a new run cannot have this folder: it has other content, or a run that must be kept."""
+        if path.exists() and not path.is_dir():
+            raise RunError(f"output {path} is a file; give a folder")
+        if path.is_dir() and any(entry.name not in FIRST_FILES for entry in path.iterdir()):
+            RunFolder(path)._refuse_to_clear(overwrite)
+
+    def _refuse_to_clear(self, overwrite: bool) -> None:
+        """Raise RunError unless the folder is that of an earlier run and may be overwritten."""
+        if not overwrite:
+            raise RunError(
+                f"output {self.path} exists and is not empty; give another --out, or --overwrite to replace its run"
+            )
+        try:
+            if not (self.path / "run.json").is_file():
+                raise RunError(f"{self.path} is not a run folder: no run.json")
+            self._refuse_unless_ours()
+        except RunError as problem:
+            raise RunError(f"not overwriting {self.path}: {problem}; give another --out") from problem
+
+    def _refuse_unless_ours(self) -> None:
+        if self.facts().get("program") != PROGRAM:
+            raise RunError(f"{self.path} is not a run folder: run.json was written by another program")
+
+    def _clear(self) -> None:
+        """Remove the files of an earlier run, and keep files that the user added."""
+        for name in (*FILES, ALL_POSES, MESH, STATE, REFINEMENT):
+            (self.path / name).unlink(missing_ok=True)
+        for picture in self.images.glob("*.png"):
+            picture.unlink()
+        shutil.rmtree(self.logs, ignore_errors=True)
+        self.remove_leftovers()
+        self.submaps.clear()
+        self.write_components(())
+
+    @property
+    def images(self) -> Path:
+        """Return the folder of images, images/."""
+        return self.path / "images"
+
+    @property
+    def logs(self) -> Path:
+        """Return the folder of logs for other programs, logs/, which `run --log` writes."""
+        return self.path / "logs"
+
+    @property
+    def submaps(self) -> DiskStore:
+        """Return the store of finished submaps, submaps/; it is empty if the run has a single map."""
+        return DiskStore(self.path / "submaps")
+
+    @property
+    def state(self) -> Path:
+        """Return the path of the state from which an unfinished run resumes."""
+        return self.path / STATE
+
+    @property
+    def refinement(self) -> Path:
+        """Return the path of the partly refined final map from which an unfinished run resumes."""
+        return self.path / REFINEMENT
+
+    def config(self) -> Config:
+        """Read the settings of the run. Raises ConfigError if they cannot be read."""
+        return Config.load(self.path / "config.json")
+
+    def facts(self) -> dict[str, Any]:
+        """Read run.json: source, version, machine, status and facts of `note`. Raises RunError if it is damaged."""
+        return check_fields(self._read_values("run.json"), FACTS, (), self.path / "run.json")
+
+    def note(self, **facts: Any) -> None:
+        """Add or change facts in run.json, for instance status="complete" or "interrupted", wall_s=…"""
+        write_json_on_full_disk(self.path / "run.json", self.facts() | facts)
+
+    def locked(self, warn: Callable[[str], None] = no_warning) -> AbstractContextManager[None]:
+        """Hold the run while a block writes to it. Raises RunError if another process holds it (`io.lock`)."""
+        return locked(self.path, warn)
+
+    def remove_leftovers(self) -> None:
+        """Remove temporary files of killed processes, and the state of a complete run."""
+        remove_leftovers(self.path, self.images, self.submaps.folder, *(self.path / COMPONENTS).glob("*"))
+        if self.facts().get("status") == "complete":
+            self.state.unlink(missing_ok=True)
+            self.refinement.unlink(missing_ok=True)
+
+    def log(self, record: dict[str, Any]) -> None:
+        """Append one line to log.jsonl. Raises RunError if the file cannot be written."""
+        append_line(self.path / "log.jsonl", record)
+
+    def sync_log(self) -> None:
+        """Wait until the lines of log.jsonl are on the disk. Raises RunError if they cannot be written."""
+        sync_file(self.path / "log.jsonl")
+
+    def read_log(self) -> list[dict[str, Any]]:
+        """Read the lines of log.jsonl; an incomplete last line, left by an interruption, is skipped.
+
+        Raises RunError if it is missing, or another line is damaged or has a wrong value."""
+        return check_log(read_lines(path := self._existing("log.jsonl")), path)
+
+    def write_loops(self, records: Iterable[dict[str, Any]]) -> None:
+        """Write loops.json: all tried pairs of submaps with their latest results."""
+        write_json(self.path / "loops.json", iter(records))
+
+    def read_loops(self) -> list[dict[str, Any]]:
+        """Read loops.json; the list is empty if there is no such file. Raises RunError if it is damaged."""
+        path = self.path / "loops.json"
+        loops = read_json(path) if path.is_file() else []
+        if not isinstance(loops, list) or not all(isinstance(loop, dict) for loop in loops):
+            raise RunError(f"{path} is not a list of loops")
+        return loops
+
+    def write_trajectory(self, trajectory: Trajectory) -> None:
+        """Write trajectory.txt: the believed poses (TUM text, T_world_camera)."""
+        tum.write_trajectory(self.path / "trajectory.txt", trajectory)
+
+    def read_trajectory(self) -> Trajectory:
+        """Read trajectory.txt; it is empty if no pose is believed.
+
+        Raises RunError if it is missing, SourceError if it is damaged.
+        """
+        return tum.read_trajectory(self._existing("trajectory.txt"), may_be_empty=True)
+
+    def read_frames(self) -> RunFrames:
+        """Read log.jsonl and trajectory.txt together: the state of each frame at the end of the run, and its pose.
+        Raises RunError or SourceError as `read_log` and `read_trajectory` do.
+        """
+        return RunFrames.of(self.read_log(), self.read_trajectory())
+
+    def write_all_poses(self, trajectory: Trajectory) -> None:
+        """Write trajectory_all.txt: the poses of all frames, including lost ones and those of other components."""
+        tum.write_trajectory(self.path / ALL_POSES, trajectory)
+
+    def write_components(self, components: Sequence[Component]) -> None:
+        """Write components/, the path and map of each component that is not connected to the world; remove others."""
+        write_components(self.path / COMPONENTS, components)
+
+    def component_numbers(self) -> list[int]:
+        """Return the numbers of the components that are not connected to the world, in ascending order."""
+        return component_numbers(self.path / COMPONENTS)
+
+    def read_component(self, number: int) -> Component:
+        """Read a component from components/. Raises RunError if a file is missing, SourceError if it is damaged."""
+        trajectory, field = (self._existing(f"{COMPONENTS}/{number}/{name}") for name in COMPONENT_FILES)
+        return Component(number, ply.read_field(field), tum.read_trajectory(trajectory))
+
+    def write_map(self, field: GaussianField) -> None:
+        """Write map.ply (3DGS PLY, world frame)."""
+        ply.write_field(self.path / "map.ply", field)
+
+    def read_map(self) -> GaussianField:
+        """Read map.ply. Raises RunError if it is missing, SourceError if it is damaged."""
+        return ply.read_field(self._existing("map.ply"))
+
+    def write_uncertainty(self, uncertainty: MapUncertainty) -> None:
+        """Write uncertainty.json and uncertainty.safetensors: how sure map.ply is."""
+        uncertainty_files.write_uncertainty(self.path, uncertainty)
+
+    def read_uncertainty(self) -> MapUncertainty | None:
+        """Return how sure map.ply is; None if the run has not measured it. Raises RunError if a file is damaged."""
+        return uncertainty_files.read_uncertainty(self.path)
+
+    def read_splat_std(self) -> tuple[GaussianField, SplatStd] | None:
+        """Return map.ply and the standard deviations of its splats; None if the run has not measured them.
+
+        Raises RunError if a file is damaged, or does not have one row for each splat; SourceError as `read_map` does.
+        """
+        if not (self.path / uncertainty_files.JSON).is_file():
+            return None
+        field = self.read_map()
+        uncertainty = self.uncertainty_of(field)
+        return None if uncertainty is None or uncertainty.std is None else (field, uncertainty.std)
+
+    def uncertainty_of(self, field: GaussianField) -> MapUncertainty | None:
+        """Return how sure `field`, the map of the run, is; None if the run has not measured it.
+
+        Raises RunError if a file is damaged, or does not have one row for each splat.
+        """
+        uncertainty = self.read_uncertainty()
+        if uncertainty is not None:
+            uncertainty_files.refuse_misfit(self.path, uncertainty, len(field))
+        return uncertainty
+
+    def map_bytes(self) -> int:
+        """Return the size of map.ply. Raises RunError if it is missing."""
+        return self._existing("map.ply").stat().st_size
+
+    def write_checkpoint(self, tensors: dict[str, Tensor], text: dict[str, str]) -> None:
+        """Write checkpoint.safetensors: named tensors and text."""
+        write_tensors(self.path / "checkpoint.safetensors", tensors, text)
+
+    def read_checkpoint(self) -> tuple[dict[str, Tensor], dict[str, str]]:
+        """Read checkpoint.safetensors: tensors and text. Raises RunError if it is missing or damaged."""
+        with open_tensors(path := self._existing("checkpoint.safetensors"), "checkpoint") as file:
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            return check_checkpoint(tensors, path), file.metadata() or {}
+
+    def read_odometry(self) -> Trajectory | None:
+        """Return the path of tracking alone, without loop closure; None if the run has no such path or no loop.
+
+        Raises RunError if the checkpoint is missing or damaged.
+        """
+        if not any(loop["accepted"] for loop in self.read_loops()):
+            return None
+        tensors, _ = self.read_checkpoint()
+        poses = tensors.get("T_world_camera_odometry")
+        return None if poses is None else Trajectory(tensors["timestamps_s"].numpy(), poses.numpy())
+
+    def write_metrics(self, metrics: dict[str, Any]) -> None:
+        """Write metrics.json; nan and inf become null."""
+        write_json(self.path / "metrics.json", metrics)
+
+    def write_profile(self, seconds: dict[str, float]) -> None:
+        """Write profile.json: seconds by stage."""
+        write_json(self.path / "profile.json", seconds)
+
+    def read_profile(self) -> dict[str, float]:
+        """Read profile.json. Raises RunError if it is missing or damaged."""
+        return check_profile(self._read_values("profile.json"), self.path / "profile.json")
+
+    def read_metrics(self) -> dict[str, Any]:
+        """Read metrics.json. Raises RunError if it is missing or damaged."""
+        return self._read_values("metrics.json")
+
+    def write_report(self, html: str) -> None:
+        """Write report.html."""
+        write_text(self.path / "report.html", html)
+
+    def write_image(self, name: str, picture: Image.Image) -> None:
+        """Write images/<name>, a PNG."""
+        with replacing(self.images / name) as temporary:
+            picture.save(temporary, "PNG")
+
+    def _existing(self, name: str) -> Path:
+        if not (self.path / name).is_file():
+            raise RunError(f"run {self.path} has no {name}; did it stop before writing it? run it again")
+        return self.path / name
+
+    def _read_values(self, name: str) -> dict[str, Any]:
+        values = read_json(self._existing(name))
+        if not isinstance(values, dict):
+            raise RunError(f"{self.path / name} is not a JSON object")
+        return values

@@ -1,0 +1,151 @@
+"""Convert fields to the arrays that splat files are packed from, and back."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from sigmasplat.data.field import ATTRIBUTES, COLUMNS, INITIAL_LOG_VARIANCE, WIDTH, GaussianField, Rows
+from sigmasplat.data.harmonics import DEGREES, count, turned
+from sigmasplat.errors import SourceError
+from sigmasplat.run_folder.quaternions import Doubles, unit
+
+SH_C0 = 0.28209479177387814
+"""Y₀₀ = 1/(2√π): the constant spherical harmonic."""
+R_RUB_RDF = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
+"""Rotates axes x right, y down, z forward to x right, y up, z back, and back."""
+Number = TypeVar("Number", bound=np.generic)
+MORTON_BITS, ROUNDING = 20, 1e-6
+
+MOST_REPEATED = 1_000_000
+"""Number of splats that any compressed file may announce."""
+
+
+@dataclass(frozen=True)
+class SplatValues:
+    """N splats as float64 arrays, without σ² and correlations, which other programs' formats cannot hold.
+
+    means [N, 3] m; quats [N, 4] wxyz, unit length; log_scales [N, 3] log metres; opacities [N] in [0, 1];
+    colors [N, 3]; harmonics [N, 3·k] of the lowest sufficient degree: k = 0, 3, 8 or 15 per channel, columns
+    3·i + channel.
+    """
+
+    means: Doubles
+    quats: Doubles
+    log_scales: Doubles
+    opacities: Doubles
+    colors: Doubles
+    harmonics: Doubles
+
+    @staticmethod
+    def of(field: GaussianField) -> "SplatValues":
+        """Return the values of a field."""
+        params = field.params.detach().cpu().double()
+        part = {name: params[:, columns].numpy() for name, columns in COLUMNS.items()}
+        opacities = torch.sigmoid(params[:, 10]).numpy()
+        return SplatValues(
+            part["means"], unit(part["quats"]), part["log_scales"], opacities, part["colors"], _harmonics(field)
+        )
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @property
+    def degree(self) -> int:
+        """Return the degree of the harmonics, 0 to 3."""
+        return [3 * count(degree) for degree in range(DEGREES + 1)].index(self.harmonics.shape[1])
+
+    def ordered(self, rows: NDArray[np.intp]) -> "SplatValues":
+        """Return the splats selected by an index array, in its order."""
+        return SplatValues(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
+
+    def turned_about_x(self) -> "SplatValues":
+        """Return the splats rotated by 180° about x: from axes x right, y down, z forward to x right, y up, z back.
+
+        It is its own inverse. Only signs change: of means, quaternions and harmonics.
+        """
+        xyz = R_RUB_RDF.diagonal().numpy()
+        ones = torch.ones(1, ATTRIBUTES["harmonics"], dtype=torch.float64)
+        signs = turned(ones, R_RUB_RDF).round().numpy()[:, : self.harmonics.shape[1]]
+        quats = self.quats * np.array([1.0, *xyz])
+        return replace(self, means=self.means * xyz, quats=quats, harmonics=self.harmonics * signs)
+
+    def field(self, path: Path) -> GaussianField:
+        """Return a field of the values read from `path`, with initial σ². Raises SourceError unless all are finite."""
+        params = np.full((len(self), WIDTH), INITIAL_LOG_VARIANCE, np.float32)
+        for name in ("means", "quats", "log_scales", "colors"):
+            params[:, COLUMNS[name]] = getattr(self, name)
+        params[:, 10] = np.log(self.opacities) - np.log1p(-self.opacities)
+        check_values(params, path)
+        field = GaussianField(torch.from_numpy(params))
+        if self.degree:
+            harmonics = np.zeros((len(self), ATTRIBUTES["harmonics"]), np.float32)
+            harmonics[:, : self.harmonics.shape[1]] = self.harmonics
+            field.attributes["harmonics"] = Rows(torch.from_numpy(harmonics))
+        return field
+
+
+def _harmonics(field: GaussianField) -> Doubles:
+    """Return a field's harmonics without the highest degrees that are 0 up to rounding."""
+    if "harmonics" not in field.attributes:
+        return np.empty((len(field), 0))
+    values = field.attributes["harmonics"].params.detach().cpu().double().numpy()
+    needed = int(np.flatnonzero((np.abs(values) > ROUNDING).any(0)).max(initial=-1)) + 1
+    return values[:, : next(n for n in (3 * count(degree) for degree in range(DEGREES + 1)) if n >= needed)]
+
+
+def by_channel(harmonics: NDArray[Number]) -> NDArray[Number]:
+    """Return harmonics [N, 3·k] with columns 3·i + channel in the order of PLY files: all of red, green, then blue."""
+    rows, columns = harmonics.shape
+    return harmonics.reshape(rows, columns // 3, 3).swapaxes(1, 2).reshape(rows, columns)
+
+
+def opacity_bytes(opacities: Doubles) -> NDArray[np.uint8]:
+    """Convert opacities in [0, 1] to bytes."""
+    return np.round(opacities * 255.0).astype(np.uint8)
+
+
+def opacities_of(values: NDArray[np.uint8]) -> Doubles:
+    """Convert bytes to opacities; 0 and 255 become slightly larger and smaller, so that logits are finite."""
+    return np.clip(values / 255.0, 0.25 / 255.0, 1.0 - 0.25 / 255.0)
+
+
+def morton_order(points: Doubles) -> NDArray[np.intp]:
+    """Return the rows of points [N, 3] in Morton order: points that are close in space are close in the file."""
+    if not len(points):
+        return np.empty(0, np.intp)
+    low = points.min(0)
+    span = max(float((points.max(0) - low).max()), np.finfo(np.float64).tiny)
+    cells = ((points - low) / span * ((1 << MORTON_BITS) - 1)).astype(np.uint64)
+    code = np.zeros(len(points), np.uint64)
+    for bit in range(MORTON_BITS):
+        for axis in range(3):
+            code |= ((cells[:, axis] >> np.uint64(bit)) & np.uint64(1)) << np.uint64(3 * bit + axis)
+    return np.argsort(code, kind="stable")
+
+
+def check_count(count: int, packed_size: int, path: Path) -> None:
+    """Raise SourceError if a compressed file of `packed_size` bytes announces more splats than it can hold: a splat
+    needs 8 bytes or more, but equal splats, as in tests, compress further."""
+    if count > max(MOST_REPEATED, packed_size):
+        raise SourceError(
+            f"{path} is damaged: its header says {count} splats, which do not fit into {packed_size} bytes"
+        )
+
+
+def check_values(params: NDArray[np.float32], path: Path) -> None:
+    """Raise SourceError at the first splat with nan, inf or a zero quaternion."""
+    check_finite(params, path)
+    zero = np.flatnonzero(np.linalg.norm(params[:, COLUMNS["quats"]], axis=1) == 0)
+    if len(zero):
+        raise SourceError(f"{path}: splat {zero[0]} has a zero quaternion, which is not a rotation")
+
+
+def check_finite(values: NDArray[np.float32], path: Path) -> None:
+    """Raise SourceError at the first splat whose row of values [N, m] has nan or inf."""
+    bad = np.flatnonzero(~np.isfinite(values).all(1))
+    if len(bad):
+        raise SourceError(f"{path}: splat {bad[0]} has nan or inf ({len(bad)} of {len(values)} splats do)")

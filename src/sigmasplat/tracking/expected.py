@@ -1,0 +1,57 @@
+"""Where the camera is expected before its image is used, and its motion since the last image."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sigmasplat.config import TrackingConfig
+from sigmasplat.data import se3
+from sigmasplat.data.frame import PosePrior
+from sigmasplat.fit.align import align
+from sigmasplat.fit.pyramid import Pyramid
+from sigmasplat.types import Matrix
+
+
+@dataclass(frozen=True, eq=False)
+class Expected:
+    """Expected motion and pose of the camera, known before its image is used.
+
+    motion: T_previous_camera with constant velocity; turn: T_previous_camera without translation; predicted:
+    T_world_camera, the first guess; last: T_world_camera, the last pose. If a gyroscope measured the rotation since the
+    last frame (`measured`), this rotation is part of all four. given: whether `predicted` is the pose itself, because
+    the motion since the last frame is given.
+    """
+
+    motion: Matrix
+    turn: Matrix
+    predicted: Matrix
+    last: Matrix
+    measured: bool
+    given: bool = False
+
+
+def expect(previous: Matrix, velocity: Matrix, before: PosePrior, now: PosePrior, motion_model: bool) -> Expected:
+    """Predict the pose by constant velocity; with a gyroscope, its rotation replaces that of the velocity; given poses
+    replace the whole motion.
+
+    previous, velocity [4, 4]: the last pose T_world_camera and motion; before, now: of the last frame and of this one;
+    motion_model: whether the first guess assumes the velocity.
+    """
+    if before.T_given_camera is not None and now.T_given_camera is not None:
+        motion = se3.inverse(before.T_given_camera) @ now.T_given_camera
+        return Expected(motion, np.eye(4), previous @ motion, previous, measured=False, given=True)
+    R_before, R_now = before.R_inertial_camera, now.R_inertial_camera
+    motion, turn, last, measured = velocity, np.eye(4), previous, False
+    if R_before is not None and R_now is not None:
+        motion, measured = motion.copy(), True
+        motion[:3, :3] = turn[:3, :3] = R_before.T @ R_now
+        last = last @ turn
+    return Expected(motion, turn, previous @ motion if motion_model else last, last, measured)
+
+
+def odometry(last: Pyramid, live: Pyramid, expected: Expected, config: TrackingConfig) -> Matrix | None:
+    """Align the last image to this one and return T_live_last [4, 4]; None if it fails."""
+    guesses = (se3.inverse(expected.motion), expected.turn.T.copy())  # the inverse, because it has no translation
+    found = [align(last, live, g, 2 * config.align_iterations, config.align_weight_color) for g in guesses]
+    best = max(found, key=lambda a: a.agreement * a.overlap)
+    return None if best.agreement * best.overlap < config.lost_share else best.T_live_reference

@@ -1,0 +1,176 @@
+"""Find the thing that has drawn a pose: it moves, and the images agree much better without it."""
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sigmasplat.config import TrackingConfig
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.fit.align import align
+from sigmasplat.fit.compare import STEP as COMPARE_STEP
+from sigmasplat.fit.pose import PoseFit
+from sigmasplat.fit.pyramid import Pyramid
+from sigmasplat.fit.references import Reference
+from sigmasplat.tracking.moving.foreground import (
+    EDGE_RELATIVE,
+    STEP,
+    Foreground,
+    coarse_rays,
+    enlarged,
+    smooth,
+    thinned,
+    with_margin,
+)
+from sigmasplat.tracking.moving.free_space import Depth, Mask
+from sigmasplat.tracking.moving.two_motions import two_motions
+from sigmasplat.tracking.moving.windows import boxed, upper_median, widened
+from sigmasplat.tracking.sight import Sight
+from sigmasplat.tracking.verdict import agrees_more, differs, disagrees, gray_gain, may_draw
+from sigmasplat.types import Matrix
+
+OBJECT_SHARE, MOST_OBJECTS = (0.02, 0.7), 3
+"""Share of the image of a thing that stands free, and how many are considered."""
+RING, FREE_AROUND = 3, 0.6
+"""Something stands free if at least this share of the pixels at this distance around it is farther."""
+SHIFTED = 1e-3
+"""A thing has drawn the pose only if the pose without it shows the thing elsewhere: by at least this share of the
+width of the image. What has another brightness than before, and stays in place, changes the pose less."""
+QUICK_LEVELS, QUICK_GAIN, QUICK_APART, QUICK_CLOSE = 2, 0.5, 2.5e-3, 5e-3
+"""A thing is also suspected if without it a pose is found, on so many of the coarsest images, where the gain of the
+rest (`gray_gain`) is at least this, and for which the product of `APART` is at least half as large. At most this share
+of the rest has another depth there than at the first pose: so much can be off at a pose from small images."""
+APART = 5e-3
+"""Two motions are apart if the shift of the thing, as a share of the width of the image, times the gain of the rest
+above 1 is at least this. In still recordings it was at most 0.2 %, and for balls in real recordings more than 1 %: a
+poor fit gains little, or moves the thing little."""
+STILL_SHOWN, STILL_CLOSE = 0.5, 0.8
+"""A thing is still if the keyframe shows at least this share of it, and this share of that is as far as before."""
+SHIFT_STEP = 4
+"""Every fourth row and column of a thing is used to find this shift."""
+
+
+def suspected(
+    keyframe: Reference, seen: Sight, fit: PoseFit, config: TrackingConfig, every: bool
+) -> Iterator[Foreground]:
+    """Yield the things in front that may have drawn a pose; with `every`, all that stand free."""
+    live_m = seen.target.depth_image.numpy()
+    for inside in free_standing(thinned(live_m, STEP)):
+        if every or _may_have_drawn(_front(*with_margin(inside, STEP, live_m), live_m), keyframe, seen, fit, config):
+            yield _front(*enlarged(inside, STEP, live_m), live_m)
+
+
+def _may_have_drawn(thing: Foreground, keyframe: Reference, seen: Sight, fit: PoseFit, config: TrackingConfig) -> bool:
+    """Return whether the gray values agree better without a thing, at the same pose or at one that an alignment of
+    small images finds, where the depth agrees as well."""
+    rest = seen.hiding(thing)
+    here = keyframe.compared(rest, fit.T_camera_world)
+    if may_draw(here, fit.comparison):
+        return True
+    found = align(
+        keyframe.pyramid.coarse(QUICK_LEVELS), rest.coarse(QUICK_LEVELS),
+        fit.T_camera_world @ se3.inverse(keyframe.T_camera_world),
+        config.align_iterations, config.align_weight_color, config.align_stop,
+    )  # fmt: skip
+    T_camera_world = found.T_live_reference @ keyframe.T_camera_world
+    there = keyframe.compared(rest, T_camera_world)
+    gain = gray_gain(here, there)
+    if not gain >= QUICK_GAIN or there.close < here.close - QUICK_CLOSE:
+        return False
+    shift = _shift(thing, seen, fit.T_camera_world, T_camera_world)
+    return shift >= SHIFTED and gain * shift >= QUICK_APART
+
+
+def _front(whole: Mask, hidden: Mask, live_m: Depth) -> Foreground:
+    """Return a thing that stands free, from its pixels and those that it hides; what is behind it is not known."""
+    return Foreground(hidden, np.where(whole, live_m, np.float32(0.0)), np.where(hidden, np.float32(0.0), live_m))
+
+
+def free_standing(depth: Depth) -> Iterator[Mask]:
+    """Yield the things that stand free in `thinned` depth [h, w], m, in front of farther surfaces all around, as masks
+    [h, w]: the largest first, at most `MOST_OBJECTS`."""
+    regions, boxes = boxed(smooth(depth))
+    sizes, found = boxes[:, -1] / depth.size, 0
+    for region in np.argsort(-sizes, kind="stable"):
+        if sizes[region] < OBJECT_SHARE[0] or found == MOST_OBJECTS:
+            break
+        if sizes[region] <= OBJECT_SHARE[1] and _stands_free(depth, regions, region + 1, boxes[region]):
+            found += 1
+            yield regions == region + 1
+
+
+def _stands_free(depth: Depth, regions: NDArray[np.int32], region: int, box: NDArray[np.int32]) -> bool:
+    """Return whether most of what is around a region of depth [h, w], m, is farther; box: of `boxed`."""
+    left, top, width, height, _ = box.tolist()
+    around = slice(max(top - RING, 0), top + height + RING), slice(max(left - RING, 0), left + width + RING)
+    near_m, inside = depth[around], regions[around] == region
+    far_m = upper_median(near_m[inside]) * (1 + EDGE_RELATIVE)
+    ring = widened(inside, 2 * RING + 1) & ~widened(inside, 2 * RING - 1) & (near_m > 0)
+    return bool(ring.any()) and bool((near_m[ring] > far_m).mean() >= FREE_AROUND)
+
+
+def has_drawn(
+    thing: Foreground, keyframe: Reference | None, seen: Sight, drawn: PoseFit, found: PoseFit, contradicted: bool
+) -> bool:
+    """Return whether a thing has drawn a pose, by the pose that was fitted without it, which shows it elsewhere.
+
+    Either the rest agrees much more there and the thing does not agree with it, or each of the two agrees clearly
+    better at a pose of its own. contradicted: the images contradict the drawn pose.
+    """
+    shift = _shift(thing, seen, drawn.T_camera_world, found.T_camera_world)
+    if keyframe is None or shift < SHIFTED:
+        return False
+    if _disturbs(thing, keyframe, seen, drawn, found, contradicted):
+        return True
+    motions = two_motions(keyframe, seen.live, thing.hidden, drawn.T_camera_world, found.T_camera_world)
+    return motions is not None and motions.apart and (motions.rest_gains - 1.0) * shift >= APART
+
+
+def _shift(thing: Foreground, seen: Sight, T_first: Matrix, T_second: Matrix) -> float:
+    """Return by how much a thing is shifted between two poses T_camera_world [4, 4], as a share of the image width."""
+    return shift_px(thing, seen.target.camera, T_first @ se3.inverse(T_second)) / seen.target.camera.width
+
+
+def _disturbs(
+    thing: Foreground, keyframe: Reference, seen: Sight, drawn: PoseFit, found: PoseFit, contradicted: bool
+) -> bool:
+    """Return whether the rest agrees much more without a thing, the thing does not agree with the rest, and the drawn
+    pose is not only a poor fit."""
+    if not agrees_more(found.comparison, drawn.comparison, contradicted):
+        return False
+    if not disagrees(keyframe.compared(seen.live, found.T_camera_world), found.comparison):
+        return False
+    return contradicted or not _fits_poorly(thing, keyframe, seen, drawn, found)
+
+
+def _fits_poorly(thing: Foreground, keyframe: Reference, seen: Sight, drawn: PoseFit, found: PoseFit) -> bool:
+    """Return whether the first pose is only a poor fit: the rest agrees hardly better there than with the thing, and
+    the thing itself agrees better at the other pose."""
+    alone = seen.live.hiding(thing.depth_m <= 0)
+    at_drawn, at_found = (keyframe.compared(alone, fit.T_camera_world).correlation for fit in (drawn, found))
+    rest = keyframe.compared(seen.hiding(thing), drawn.T_camera_world)
+    return at_found > at_drawn and not may_draw(rest, drawn.comparison)
+
+
+def is_still(thing: Foreground, keyframe: Reference | None, live: Pyramid, found: PoseFit) -> bool:
+    """Return whether what may be in front belongs to the scene: the keyframe shows most of it at the same place, with
+    gray values that agree as well as those of the rest."""
+    if keyframe is None or found.comparison is None:
+        return False
+    shown = keyframe.compared(live.hiding(thing.depth_m <= 0), found.T_camera_world)
+    whole = np.count_nonzero(thing.depth_m) / COMPARE_STEP**2
+    in_place = bool(shown.points >= STILL_SHOWN * whole and shown.close >= STILL_CLOSE)
+    return in_place and not (differs(shown) and disagrees(shown, found.comparison))
+
+
+def shift_px(thing: Foreground, camera: Camera, T_b_a: Matrix) -> float:
+    """Return by how many pixels a thing that camera a sees is shifted in camera b [4, 4]: the median of its pixels."""
+    depth = thing.depth_m[::SHIFT_STEP, ::SHIFT_STEP]
+    v, u = np.nonzero(depth > 0)
+    if not len(u):
+        return 0.0
+    rays = coarse_rays(camera, SHIFT_STEP)[v, u].T
+    x, y, z = T_b_a[:3, :3] @ (rays * depth[v, u]) + T_b_a[:3, 3:]
+    ahead = np.maximum(z, 1e-3)
+    return float(np.median(np.hypot(camera.fx * (x / ahead - rays[0]), camera.fy * (y / ahead - rays[1]))))

@@ -1,0 +1,158 @@
+"""Tell two motions apart: where a frame agrees better with a keyframe at one pose of the camera, where at another."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sigmasplat.data import se3
+from sigmasplat.data.opencv import opencv
+from sigmasplat.fit.pyramid import Pyramid
+from sigmasplat.fit.references import Reference
+from sigmasplat.tracking.moving.foreground import coarse_rays
+from sigmasplat.types import Matrix
+
+Image = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+LEVEL, STEP = 1, 2
+"""Every second row and column of images of half the size is compared."""
+SMOOTH = 2.0
+"""Standard deviation of the window in which points vote, in compared points."""
+MOST_GRAY = 0.15
+"""Largest gray difference that counts: a larger one is another surface."""
+CLOSE_M, CLOSE_RELATIVE = 0.02, 0.06
+"""A point is compared if the frame has the same surface there: within a distance that grows with the depth."""
+FEWEST = 100
+"""Two poses are not compared with fewer points in common."""
+REST_GAINS, THING_LOSES, LEAST_MOVES = 1.5, 1.2, 0.02
+"""Least factors of the squared gray differences, and least share of the compared points that move."""
+MOST_OF_REST = 0.7
+"""Least share of the rest that agrees better at the second pose. With a still thing left out, the pose follows what
+moves: its squared differences can outweigh those of the whole rest, but it covers less of the image."""
+
+
+@dataclass(frozen=True, eq=False)
+class TwoMotions:
+    """How the gray values of a frame agree with a keyframe at two poses.
+
+    first, second: squared differences [h, w] of the points of the keyframe at each pose; seen: the points that are seen
+    at both; inside: those of them that the thing shows at the first pose.
+    """
+
+    first: Image
+    second: Image
+    seen: Mask
+    inside: Mask
+
+    @cached_property
+    def rest_gains(self) -> float:
+        """Return the squared differences outside of the thing at the first pose, relative to the second."""
+        return _ratio(self.first[self._rest], self.second[self._rest])
+
+    @cached_property
+    def thing_loses(self) -> float:
+        """Return the squared differences of the parts of the thing that agree better at the first pose, at the second
+        pose relative to the first."""
+        return _ratio(self.second[self._moving], self.first[self._moving])
+
+    @property
+    def moves(self) -> float:
+        """Return the share of these parts in the compared points."""
+        return np.count_nonzero(self._moving) / self.seen.size
+
+    @property
+    def follows(self) -> float:
+        """Return the share of the points outside of the thing that agree better at the second pose."""
+        at_first, at_second = self._voted
+        return float((at_second < at_first)[self._rest].mean()) if self._rest.any() else 0.0
+
+    @property
+    def apart(self) -> bool:
+        """Return whether thing and rest move differently: each agrees clearly better at a pose of its own."""
+        if self.rest_gains < REST_GAINS or self.thing_loses < THING_LOSES:
+            return False
+        return self.moves >= LEAST_MOVES and self.follows >= MOST_OF_REST
+
+    @cached_property
+    def _rest(self) -> Mask:
+        return self.seen & ~self.inside
+
+    @cached_property
+    def _moving(self) -> Mask:
+        at_first, at_second = self._voted
+        return self.inside & (at_first < at_second)
+
+    @cached_property
+    def _voted(self) -> tuple[Image, Image]:
+        return _voted(self.first, self.seen), _voted(self.second, self.seen)
+
+
+def two_motions(
+    keyframe: Reference, live: Pyramid, thing: Mask, T_first: Matrix, T_second: Matrix
+) -> TwoMotions | None:
+    """Compare a frame with a keyframe at two poses T_camera_world [4, 4], in and outside of a thing [H, W]; None if too
+    little is in view at both."""
+    points_m = _points(keyframe.pyramid)
+    first, second = (
+        _differences(keyframe.pyramid, points_m, live, T @ se3.inverse(keyframe.T_camera_world))
+        for T in (T_first, T_second)
+    )
+    seen = np.isfinite(first.square) & np.isfinite(second.square)
+    if np.count_nonzero(seen) < FEWEST:
+        return None
+    return TwoMotions(first.square, second.square, seen, seen & thing[first.row, first.column])
+
+
+@dataclass(frozen=True, eq=False)
+class _Differences:
+    """square: squared gray differences of the points of a keyframe [h, w], NaN where they are not seen; row, column:
+    where they are in the frame, in pixels of its finest level."""
+
+    square: Image
+    row: NDArray[np.intp]
+    column: NDArray[np.intp]
+
+
+def _points(reference: Pyramid) -> Matrix:
+    """Return the compared points of a reference [3, h, w], m in its camera."""
+    level = _level(reference)
+    depth_m = reference.kernels.to_host(reference.depth[level])[::STEP, ::STEP]
+    return np.moveaxis(coarse_rays(reference.cameras[level], STEP), -1, 0) * depth_m
+
+
+def _level(reference: Pyramid) -> int:
+    return min(LEVEL, len(reference.cameras) - 1)
+
+
+def _differences(p: Pyramid, points_m: Matrix, live: Pyramid, T: Matrix) -> _Differences:
+    """Compare the points of a reference with a live image at T_live_reference [4, 4]."""
+    level, host = _level(p), p.kernels.to_host
+    camera, gray = p.cameras[level], host(p.gray[level])[::STEP, ::STEP]
+    x, y, ahead = np.tensordot(T[:3, :3], points_m, 1) + T[:3, 3][:, None, None]
+    depth = np.maximum(ahead, 1e-3)
+    at = [(f * a / depth + c).astype(np.float32) for f, a, c in ((camera.fx, x, camera.cx), (camera.fy, y, camera.cy))]
+    inside = (
+        (at[0] >= 0) & (at[1] >= 0) & (at[0] <= camera.width - 1) & (at[1] <= camera.height - 1) & (points_m[2] > 0)
+    )
+    cv2 = opencv()
+    there = cv2.remap(host(live.gray[level]), *at, cv2.INTER_LINEAR)
+    live_m = cv2.remap(host(live.depth[level]), *at, cv2.INTER_NEAREST)
+    same = inside & (live_m > 0) & (np.abs(live_m - ahead) < CLOSE_M * p.scene_scale + CLOSE_RELATIVE * ahead)
+    difference = there - gray
+    difference -= np.median(difference[same]) if same.any() else 0.0
+    square = np.where(same, np.minimum(difference**2, MOST_GRAY**2), np.nan).astype(np.float32)
+    finest = live.cameras[0]
+    ends = (finest.width - 1, finest.height - 1)
+    column, row = (np.clip(2**level * (a + 0.25), 0, end).astype(np.intp) for a, end in zip(at, ends, strict=True))
+    return _Differences(square, row, column)
+
+
+def _voted(square: Image, seen: Mask) -> Image:
+    """Return the sum of squared differences in a window around each point."""
+    return np.asarray(opencv().GaussianBlur(np.where(seen, square, np.float32(0.0)), (0, 0), SMOOTH), np.float32)
+
+
+def _ratio(a: Image, b: Image) -> float:
+    return float(a.sum(dtype=np.float64) / max(b.sum(dtype=np.float64), 1e-12)) if len(a) else 0.0

@@ -1,0 +1,218 @@
+"""Find a lost camera in the whole map: retrieve keyframes by features, compute a pose, align, verify the surface.
+
+Many cheap candidates come first, then a minimal solver, dense alignment, and acceptance by depth and overlap. A pose is
+never accepted by its number of inliers alone, because a repeated pattern has many.
+"""
+
+from collections import OrderedDict
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, field, replace
+
+import numpy as np
+
+from sigmasplat.config import Config, TrackingConfig
+from sigmasplat.data import se3
+from sigmasplat.fit.compare import Comparison
+from sigmasplat.fit.pose import PoseFit, fit_pose_align
+from sigmasplat.fit.references import Reference, map_reference, picture_images
+from sigmasplat.render.view import View
+from sigmasplat.tracking.drift import floor, symmetric
+from sigmasplat.tracking.feature_image import pose_by_features
+from sigmasplat.tracking.features import Extractor, Features, Landmarks, matches_by_descriptor
+from sigmasplat.tracking.known_map import KnownKeyframe, KnownMap, Where
+from sigmasplat.tracking.sight import FoundKeyframe, Sight
+from sigmasplat.tracking.verdict import MOST_SPREAD_M, recognised, score
+from sigmasplat.types import Matrix, Slices, completed
+
+STRONGEST = 400
+"""Number of features of each image that are compared to choose candidates."""
+LEAST_MATCHES = 8
+INDEX_AT_MOST = 25
+"""Maximum number of keyframes whose features are found per call: 25 take about a second."""
+KEPT_LANDMARKS = 64
+"""Number of keyframes whose complete landmarks stay in memory, half a megabyte each."""
+UNKNOWN = np.eye(6)
+"""Covariance of a pose without an estimate, m² and rad²."""
+ENOUGH = 0.5
+"""A pose with a higher score ends the search."""
+
+
+@dataclass(frozen=True, eq=False)
+class Relocation:
+    """Where the camera was found: submap and keyframe by number, the keyframe, the number of matches that support the
+    pose, the fit whose T_camera_world is T_camera_submap [4, 4], and its comparison with the map."""
+
+    where: Where
+    keyframe: FoundKeyframe
+    inliers: int
+    fit: PoseFit
+    comparison: Comparison
+    scene_scale: float = 1.0
+
+    @property
+    def T_submap_camera(self) -> Matrix:
+        """Return the pose [4, 4] of the camera in the submap."""
+        return se3.inverse(self.fit.T_camera_world)
+
+    @property
+    def _estimated(self) -> Matrix:
+        estimated = self.fit.covariance
+        return UNKNOWN if estimated is None or not np.isfinite(estimated).all() else estimated
+
+    @property
+    def covariance(self) -> Matrix:
+        """Return the covariance [6, 6] of the camera's translation and rotation in its own axes, m and rad."""
+        return self._estimated + floor(self.scene_scale)
+
+    @property
+    def position_m(self) -> float:
+        """Return the standard deviation of the position, metres."""
+        return float(np.sqrt(np.trace(self.covariance[:3, :3])))
+
+    @property
+    def information(self) -> Matrix:
+        """Return the information [6, 6] of T_submap_camera's left twist, m and rad."""
+        A = se3.adjoint(self.T_submap_camera)
+        covariance = A @ self._estimated @ A.T + floor(self.scene_scale)
+        return symmetric(np.asarray(np.linalg.inv(symmetric(covariance)), np.float64))
+
+    def values(self) -> dict[str, float]:
+        """Return the comparison with the map and the number of matches, as a step reports them."""
+        return asdict(self.comparison) | {"inliers": float(self.inliers)}
+
+    @property
+    def score(self) -> float:
+        """Return the share of the reference that the pose explains, 0 to 1."""
+        return score(self.comparison)
+
+
+@dataclass(frozen=True, eq=False)
+class SearchResult:
+    """Where the camera was found, if the map confirms it; the number of similar keyframes; the best refused pose."""
+
+    found: Relocation | None
+    candidates: int
+    refused: Relocation | None
+
+
+@dataclass(eq=False)
+class Relocaliser:
+    """Searches a map for the camera. The features of keyframes are found when they are first needed.
+
+    indexed: the keyframes that are searched, in the order in which they were added.
+    """
+
+    config: Config
+    extractor: Extractor | None
+    indexed: list[Where] = field(default_factory=list)
+    _strongest: dict[Where, Features] = field(default_factory=dict, init=False)
+    _landmarks: "OrderedDict[Where, Landmarks]" = field(default_factory=OrderedDict, init=False)
+
+    def find(
+        self, known: KnownMap, view: View, seen: Sight, index_at_most: int | None = INDEX_AT_MOST
+    ) -> Relocation | None:
+        """Return where the camera is, or None if no keyframe leads to a pose that the map confirms.
+
+        index_at_most: number of keyframes that may be added to the search; None = all.
+        """
+        return self.search(known, view, seen, index_at_most).found
+
+    def search(
+        self, known: KnownMap, view: View, seen: Sight, index_at_most: int | None = INDEX_AT_MOST
+    ) -> SearchResult:
+        """Search as `find` does, and also return what was refused."""
+        return completed(self.searching(known, view, seen, index_at_most))
+
+    def searching(
+        self, known: KnownMap, view: View, seen: Sight, index_at_most: int | None = INDEX_AT_MOST
+    ) -> Slices[SearchResult]:
+        """Search as `search` does, in slices: the features of one keyframe, one pose. `known` must not change."""
+        wanted = known.keyframes()
+        yield from self._index(known, view, wanted, index_at_most)
+        candidates = self._candidates(wanted, seen)
+        best: dict[bool, Relocation] = {}
+        for tried in (pose for where in candidates for pose in self._poses(known, view, seen, where)):
+            spread_m = MOST_SPREAD_M * view.options.scene_scale
+            verdict = recognised(tried.comparison, tried.inliers) and tried.position_m <= spread_m
+            if verdict not in best or tried.score > best[verdict].score:
+                best[verdict] = tried
+            if verdict and tried.score > ENOUGH:
+                break
+            yield
+        return SearchResult(best.get(True), len(candidates), best.get(False))
+
+    def _index(self, known: KnownMap, view: View, wanted: Sequence[Where], at_most: int | None) -> Slices[None]:
+        """Add keyframes to the search, and find the features that are missing, also those of a resumed run."""
+        have = set(self.indexed)
+        self.indexed += [where for where in wanted if where not in have][:at_most]
+        for where in self.indexed:
+            if where not in self._strongest:
+                self._landmarks_of(known, view, where)
+                yield
+
+    def _landmarks_of(self, known: KnownMap, view: View, where: Where) -> Landmarks:
+        """Return the landmarks of a keyframe; those used last stay in memory."""
+        if where not in self._landmarks:
+            assert self.extractor is not None
+            landmarks = known.keyframe(where).image(view.camera).landmarks(self.extractor)
+            self._landmarks[where] = landmarks
+            some = landmarks.features.take(np.arange(min(STRONGEST, len(landmarks))))
+            self._strongest[where] = replace(some, descriptors=_compact(some.descriptors))
+            if len(self._landmarks) > KEPT_LANDMARKS:
+                self._landmarks.popitem(last=False)
+        self._landmarks.move_to_end(where)
+        return self._landmarks[where]
+
+    def _candidates(self, wanted: Sequence[Where], seen: Sight) -> list[Where]:
+        """Return the keyframes with the most matches, best first."""
+        assert seen.image is not None and self.extractor is not None
+        live = seen.image.features(self.extractor)
+        live, searched = live.take(np.arange(min(STRONGEST, len(live)))), set(self.indexed)
+        votes = [
+            (len(matches_by_descriptor(self._strongest[where], live, self.extractor)), where)
+            for where in wanted
+            if where in searched
+        ]
+        best = sorted((vote for vote in votes if vote[0] >= LEAST_MATCHES), key=lambda vote: -vote[0])
+        return [where for _, where in best[: self.config.recovery.candidates]]
+
+    def _poses(self, known: KnownMap, view: View, seen: Sight, where: Where) -> Iterator[Relocation]:
+        """Yield the pose of a candidate, aligned to the keyframe's own image, then to the map rendered there."""
+        assert seen.image is not None and self.extractor is not None
+        keyframe, landmarks = known.keyframe(where), self._landmarks_of(known, view, where)
+        found = pose_by_features(landmarks, seen.image, self.extractor, seed=self.config.seed)
+        if found is None:
+            return
+        guess = found.T_live_reference @ se3.inverse(keyframe.T_submap_camera)
+        scale = view.options.scene_scale
+        _, pyramid = picture_images(view, keyframe.picture, view.camera)
+        own = FoundKeyframe(pyramid, se3.inverse(keyframe.T_submap_camera), keyframe.image(view.camera))
+        yield Relocation(where, own, found.inliers, *aligned(own, seen, guess, self.config.tracking), scale)
+        params = known.splats(where[0]).params.to(view.sums.device)
+        rendered = map_reference(params, view, guess, self.config.tracking)
+        yield Relocation(where, own, found.inliers, *aligned(rendered, seen, guess, self.config.tracking), scale)
+
+
+def aligned(
+    reference: Reference, seen: Sight, T_camera_world: Matrix, config: TrackingConfig
+) -> tuple[PoseFit, Comparison]:
+    """Align a frame to a reference from a guess; return the fit, and the comparison of both images at it.
+
+    Where only a wall is in view, alignment can slide along it: then the guess explains the image better, and is kept.
+    """
+    found = list[tuple[PoseFit, Comparison]]()
+    for settings in (config, replace(config, align_iterations=0)):
+        fit = fit_pose_align(reference, seen.live, T_camera_world, settings)
+        fit.comparison = reference.compared(seen.live, fit.T_camera_world)
+        found.append((fit, fit.comparison))
+    return max(found, key=lambda each: score(each[1]))
+
+
+def _compact(descriptors: Matrix) -> Matrix:
+    """Return float descriptors in half precision, which holds them exactly."""
+    return descriptors.astype(np.float16) if descriptors.dtype == np.float32 else descriptors
+
+
+def sight_of(keyframe: KnownKeyframe, view: View) -> Sight:
+    """Return a keyframe of the map in the form of a frame to be found."""
+    return Sight(*picture_images(view, keyframe.picture, view.camera), keyframe.image(view.camera))

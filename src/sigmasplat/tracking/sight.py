@@ -1,0 +1,160 @@
+"""One frame, or one keyframe of the map, in the forms that tracking needs."""
+
+from dataclasses import dataclass, field, replace
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sigmasplat.config import Config
+from sigmasplat.config.sensors import sensor_model
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.depth_std import std_by_model
+from sigmasplat.data.exposure import gray_exposure, unexposed
+from sigmasplat.data.frame import Frame
+from sigmasplat.data.photo import Photo, photo_size
+from sigmasplat.errors import SourceError
+from sigmasplat.fit.pyramid import HIDDEN_M, Pyramid
+from sigmasplat.fit.references import Reference, live_image
+from sigmasplat.fit.target import Target
+from sigmasplat.render.backend import make_view
+from sigmasplat.render.view import View
+from sigmasplat.tracking.denoise import denoised
+from sigmasplat.tracking.depth_fit import smoothed
+from sigmasplat.tracking.feature_image import FeatureImage, LateDetail
+from sigmasplat.tracking.features import Extractor
+from sigmasplat.tracking.moving.foreground import Foreground
+
+
+@dataclass(eq=False)
+class Sight:
+    """A frame in the forms that tracking needs: the target of the fits, its pyramid, the image for features, and the
+    pixels [H, W] that the user wants to be ignored, which have no depth."""
+
+    target: Target
+    live: Pyramid
+    image: FeatureImage | None = None
+    ignored: NDArray[np.bool_] | None = None
+
+    @property
+    def shown(self) -> Self:
+        """Return the frame for fits of its pose, which do not use the pixels that are to be ignored."""
+        return self if self.ignored is None else self.aside(None)
+
+    def without(self, front: Foreground | None) -> Self:
+        """Return the frame without depth where something is in front: it is neither mapped nor a reference there."""
+        if front is None:
+            return self
+        return self.with_depth(np.where(front.hidden, np.float32(0.0), self.target.depth_image.numpy()))
+
+    def with_depth(self, depth_m: NDArray[np.float32]) -> Self:
+        """Return the frame with other depth [H, W], m."""
+        return replace(self._read_as(depth_m), live=self.live.with_depth(depth_m))
+
+    def aside(self, front: Foreground | None) -> Self:
+        """Return the frame for fits of its pose, which are to use neither depth nor colour of what is in front or
+        ignored."""
+        depth_m = self.target.depth_image.numpy()
+        unread = self if front is None else self._read_as(np.where(front.hidden, np.float32(0.0), depth_m))
+        hidden_m = np.where(self._unused(front), np.float32(HIDDEN_M), depth_m)
+        return replace(unread, live=self.live.with_depth(hidden_m))
+
+    def hiding(self, front: Foreground) -> Pyramid:
+        """Return the images for comparisons and quick fits without what is in front or ignored."""
+        return self.live.hiding(self._unused(front))
+
+    def _unused(self, front: Foreground | None) -> NDArray[np.bool_]:
+        """Return the pixels [H, W] of what is in front or ignored; without both, a single False."""
+        hidden = np.zeros((), np.bool_) if front is None else front.hidden
+        return hidden if self.ignored is None else hidden | self.ignored
+
+    def separate(self) -> Self:
+        """Return the same frame with an own image for features, which are found and kept when they are first needed."""
+        return replace(self, image=None if self.image is None else self.image.with_depth(self.image.depth_m))
+
+    def without_exposure(self, exposure: tuple[float, float]) -> Self:
+        """Return the frame with the exposure (a, b) of exp(a) · colour + b removed from its target."""
+        return replace(self, target=self.target.without_exposure(gray_exposure(*exposure)))
+
+    def _read_as(self, depth_m: NDArray[np.float32]) -> Self:
+        """Return the frame with other depth [H, W], m, for everything but fits of its pose."""
+        image = None if self.image is None else self.image.with_depth(depth_m)
+        return replace(self, target=self.target.with_depth(depth_m), image=image)
+
+
+@dataclass(eq=False)
+class Observation(Sight):
+    """A frame in the forms that tracking and mapping need: also the working frame, and the whole one as it was read."""
+
+    frame: Frame = field(kw_only=True)
+    whole: Frame = field(kw_only=True)
+
+    def without_exposure(self, exposure: tuple[float, float]) -> "Observation":
+        """Return the frame with the exposure (a, b) of exp(a) · colour + b removed from its target and its photo."""
+        whole = replace(self.whole, color=unexposed(self.whole.color, gray_exposure(*exposure)))
+        return replace(super().without_exposure(exposure), whole=whole)
+
+    def photo(self, config: Config) -> Photo | None:
+        """Return the colour at the size of the final map's last stage; None if working images are as large."""
+        size = photo_size(self.whole.camera, config.input.width, config.input.crop_px, config.final.width_px)
+        return None if size is None else Photo.of(self.whole, *size)
+
+
+def view_of(camera: Camera, config: Config) -> View:
+    """Make the view for working images of a camera, with planes for σ² if the run learns it or weighs by it, and with
+    the noise of readings if alignment uses it."""
+    mapping, tracking, registration = config.mapping, config.tracking, config.registration
+    learned = bool(mapping.weight_nll_color or mapping.weight_nll_depth)
+    read = tracking.uncertainty and tracking.align_depth_by == "V"
+    predicted = any(c.uncertainty and c.variance == "predicted" for c in (tracking, registration))
+    view = make_view(config.backend, camera, config.render, variance=learned or read or predicted)
+    view.sensor = sensor_model(config.input.sensor) if tracking.sensor_noise else None
+    return view
+
+
+def working_frame(frame: Frame, config: Config, camera: Camera | None = None) -> Frame:
+    """Return a frame at working size, with depth denoised if the settings say so, and with the standard deviation of
+    its readings if `input.sensor` names a model; if `camera` is given and differs, the frame is resampled to it."""
+    i = config.input
+    working = frame.prepared(i.width, i.min_depth_m, i.max_depth_m, i.crop_px)
+    if camera is not None and working.camera != camera:
+        working = frame.seen_by(camera).prepared(0, i.min_depth_m, i.max_depth_m)
+    depth_m, std_m, r = working.depth_m, working.depth_std_m, config.render
+    if config.tracking.fit_depth:
+        depth_m = smoothed(depth_m)
+    elif i.denoise_depth:
+        depth_m = denoised(depth_m, r.depth_noise_per_m, r.scene_scale)
+    modelled = std_by_model(depth_m, working.camera, i.sensor)
+    return working.with_depth(depth_m, std_m if modelled is None else modelled)
+
+
+def observe(whole: Frame, working: Frame, view: View, config: Config, extractor: Extractor | None) -> Observation:
+    """Return a frame in the forms that tracking needs: features are found in the whole frame, everything else is made
+    from the working frame."""
+    ignored = whole.ignored_by(working.camera)
+    if ignored is not None:
+        working = replace(working, depth_m=np.where(ignored, np.float32(0.0), working.depth_m))
+    target = Target.of(working, (view.sums.shape[1], view.sums.shape[2]))
+    if config.mapping.sensor_noise:
+        target = target.weighed_by_std(config.render.depth_noise_per_m)
+    live, image = live_image(view, working.color, working.depth_m, target), None
+    if extractor is not None:
+        image = FeatureImage(LateDetail(whole, config.features.width), working.depth_m, working.camera)
+    return Observation(target, live, image, ignored, frame=working, whole=whole)
+
+
+@dataclass(eq=False)
+class FoundKeyframe(Reference):
+    """A keyframe of the map that shows what the camera sees: a reference with its pose in its submap, and its image for
+    features."""
+
+    image: FeatureImage
+
+
+def refuse_first_without_depth(frame: Frame, config: Config) -> None:
+    """Raise SourceError if the first frame of a map, at working size, has no depth."""
+    if not (frame.depth_m > 0).any():
+        raise SourceError(
+            f"frame {frame.index} has no depth reading in [{config.input.min_depth_m}, {config.input.max_depth_m}] m "
+            "to start a map from; check the depth scale or start at a later one"
+        )

@@ -1,0 +1,50 @@
+"""A keyframe in the form that tracking needs: a reference to align to, and the image for features."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from torch import Tensor
+
+from sigmasplat.config import TrackingConfig
+from sigmasplat.data import se3
+from sigmasplat.fit.backends import fits_of
+from sigmasplat.fit.references import Reference, keyframe_reference
+from sigmasplat.render.view import View
+from sigmasplat.tracking.feature_image import FeatureImage
+from sigmasplat.tracking.moving.foreground import Foreground
+from sigmasplat.tracking.sight import FoundKeyframe, Sight
+from sigmasplat.types import Matrix
+
+
+class Splats(Protocol):
+    """What tracking reads of a map: rows of splats [N, 17]."""
+
+    @property
+    def params(self) -> Tensor: ...
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedKeyframe:
+    """reference: its image with the weights of the map, None if nothing aligns to it; image: for features; front: what
+    was in front of the scene."""
+
+    reference: Reference | None
+    image: FeatureImage | None
+    front: Foreground | None = None
+
+
+def mapped_keyframe(
+    params: Tensor, view: View, seen: Sight, T_world_camera: Matrix, config: TrackingConfig, front: Foreground | None
+) -> TrackedKeyframe:
+    """Return a keyframe that was just mapped, weighed by the map with rows `params` [N, 17]."""
+    if config.method != "align" and not fits_of(view).aligns:
+        return TrackedKeyframe(None, seen.image, front)  # nothing aligns to it
+    T_camera_world = se3.inverse(T_world_camera)
+    reference = keyframe_reference(params, view, seen.live, T_camera_world, config, seen.target)
+    return TrackedKeyframe(reference, seen.image and seen.image.weighed(reference.weights), front)
+
+
+def found_keyframe(params: Tensor, view: View, keyframe: FoundKeyframe, config: TrackingConfig) -> TrackedKeyframe:
+    """Return a keyframe of the map at which the camera was found, weighed by the map with rows `params` [N, 17]."""
+    reference = keyframe_reference(params, view, keyframe.pyramid, keyframe.T_camera_world, config)
+    return TrackedKeyframe(reference, keyframe.image.weighed(reference.weights))

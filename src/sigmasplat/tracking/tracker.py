@@ -1,0 +1,350 @@
+"""Tracking: predict the pose, fit it to the fixed map, judge the fit, and try other guesses if it is doubtful."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field as dataclass_field, replace
+
+import numpy as np
+
+from sigmasplat.config import TrackingConfig
+from sigmasplat.data import se3
+from sigmasplat.data.frame import NO_PRIOR, PosePrior
+from sigmasplat.errors import ConfigError
+from sigmasplat.fit.align import Alignment, align
+from sigmasplat.fit.backends import fits_of
+from sigmasplat.fit.compare import Comparison
+from sigmasplat.fit.pose import PoseFit, fit_pose_adam, fit_pose_align
+from sigmasplat.fit.pyramid import Pyramid
+from sigmasplat.fit.references import Reference, map_reference
+from sigmasplat.render.view import View
+from sigmasplat.tracking.depth_fit import NOTHING_FITTED, DepthFit
+from sigmasplat.tracking.expected import Expected, expect, odometry
+from sigmasplat.tracking.feature_image import FeatureImage, motion_by_features
+from sigmasplat.tracking.features import Extractor
+from sigmasplat.tracking.moving.drawn import has_drawn
+from sigmasplat.tracking.moving.foreground import Foreground
+from sigmasplat.tracking.moving.memory import together
+from sigmasplat.tracking.moving.watch import Watch
+from sigmasplat.tracking.rules import Asked, is_lost, is_wide, jumped, never, unless
+from sigmasplat.tracking.sight import FoundKeyframe, Sight
+from sigmasplat.tracking.tracked_keyframe import Splats, TrackedKeyframe, found_keyframe, mapped_keyframe
+from sigmasplat.tracking.verdict import LEAST_COMMON, RECENT, Usual, confirmed, is_missed, score, stands
+from sigmasplat.types import Matrix
+
+DOUBT = 0.7
+"""A pose is doubtful if its agreement × overlap falls below this share of the usual value."""
+
+
+@dataclass(eq=False)
+class Tracker:
+    """Keeps the last pose, the velocity, the last image, the reference keyframe, and statistics of recent fits.
+
+    prior: that of the last frame; lost: tracking of the last frame failed; doubtful: number of frames in a
+    row whose best pose the images contradict (`_contradicted`); front: what was in front of the scene in the last
+    frame, None if there was nothing or the frame was lost; keyframe_front: the same for the newest keyframe; watch:
+    what is known of moving things; depth: what is known of predicted depth (`tracking.fit_depth`).
+    Raises ConfigError on settings that do not fit together.
+    """
+
+    config: TrackingConfig
+    extractor: Extractor | None = None
+    previous: Matrix = dataclass_field(default_factory=lambda: np.eye(4))
+    velocity: Matrix = dataclass_field(default_factory=lambda: np.eye(4))
+    last_image: Pyramid | None = None
+    last_features: FeatureImage | None = None
+    keyframe: Reference | None = None
+    keyframe_features: FeatureImage | None = None
+    keyframe_front: Foreground | None = None
+    front: Foreground | None = None
+    watch: Watch = dataclass_field(default_factory=Watch)
+    depth: DepthFit = NOTHING_FITTED
+    agreements: list[float] = dataclass_field(default_factory=list)
+    first_losses: list[float] = dataclass_field(default_factory=list)
+    usual: Usual = dataclass_field(default_factory=Usual)
+    prior: PosePrior = NO_PRIOR
+    lost: bool = False
+    doubtful: int = 0
+    started: bool = False
+    """Whether a frame has been tracked yet."""
+
+    def __post_init__(self) -> None:
+        c = self.config
+        if c.uncertainty and c.variance == "predicted" and c.method == "adam":
+            raise ConfigError("tracking.variance=predicted needs tracking.method=align; set it, or variance=published")
+
+    def start(self, seen: Sight, prior: PosePrior = NO_PRIOR) -> None:
+        """Fix the gauge: the first camera is the world."""
+        self.last_image, self.last_features, self.prior = seen.live, seen.image, prior
+
+    def track(
+        self, field: Splats, view: View, seen: Sight, prior: PosePrior = NO_PRIOR, hurried: Asked = never
+    ) -> PoseFit:
+        """Estimate T_camera_world of a frame; `self.lost` then says whether tracking failed. A given pose is taken as
+        it is, and judged by the images.
+
+        prior: what is known of the pose apart from the images. hurried: asked before each further guess; if it returns
+        True, that guess and the later ones are left out. A lost frame gets the best available guess (odometry, else the
+        last pose), and the velocity is reset.
+        """
+        expected, shown = self.expected(prior), seen.shown
+        if expected.given:
+            best = self._fit(field, view, shown, expected.predicted, patience=0)
+            best.T_camera_world = se3.inverse(expected.predicted)
+            self.front, self.lost, self.doubtful = None, False, 0
+        else:
+            best = self._estimated(field, view, seen, shown, expected, hurried)
+            self.lost = self._is_lost(best) or self._leaps(best, expected.predicted)
+            self.doubtful = self.doubtful + 1 if self._contradicted(best) else 0
+        self.prior = prior
+        if self.lost:  # poses of earlier frames do not agree with later ones
+            self.front, self.watch = None, self.watch.cleared()
+        best.T_camera_world = se3.orthonormalise(best.T_camera_world)
+        if not self.lost:
+            self._notice_rest(seen, se3.inverse(best.T_camera_world))
+        self._remember(best, seen.without(self.front))
+        return best
+
+    def _estimated(
+        self, field: Splats, view: View, seen: Sight, shown: Sight, expected: Expected, hurried: Asked
+    ) -> PoseFit:
+        """Return the best of the fits from all guesses; shown: the frame as it is fitted first."""
+        best = self._fit(field, view, shown, expected.predicted)
+        best, shown = self._uncovered(field, view, seen, shown, expected, best, hurried)
+        if is_wide(self.previous, best, view.camera, self.extractor is not None) or self._doubts(best):
+            guesses = unless(hurried, self._other_guesses(shown, expected))
+            best = max([best, *(self._fit(field, view, shown, guess) for guess in guesses)], key=self._score)
+        return self._retry(field, view, shown, best, expected, hurried) if self._doubts(best) else best
+
+    def _uncovered(
+        self, field: Splats, view: View, seen: Sight, first: Sight, expected: Expected, fit: PoseFit, hurried: Asked
+    ) -> tuple[PoseFit, Sight]:
+        """Find what is in front of the scene, and fit the pose without it; return the fit and the frame without it. If
+        nothing is, or the images contradict that pose: the same fit, and the frame as it was fitted (`first`)."""
+        before, self.front = self.front, None
+        if fit.comparison is None or self.lost:
+            return fit, first
+        found = self._without_front(field, view, seen, first, expected, fit, before, hurried)
+        if found is None and self.watch.config.find and not hurried():
+            found = self._without_object(field, view, seen, expected.predicted, fit, before is not None, hurried)
+        return (fit, first) if found is None else found
+
+    def _without_front(
+        self, field: Splats, view: View, seen: Sight, first: Sight, expected: Expected, fit: PoseFit,
+        before: Foreground | None, hurried: Asked,
+    ) -> tuple[PoseFit, Sight] | None:  # fmt: skip
+        """Return the fit and the frame without what is in space that was free, or None; before: in front in the last
+        frame. The newest keyframe loses what has left it. If it is hidden, the last image and the map give the pose."""
+        slow, known = self.watch.slow(seen, se3.inverse(fit.T_camera_world)), before or self.keyframe_front
+        if fit.comparison is None or (slow is None and not self.watch.suspects(fit.comparison, known, hurried)):
+            return None
+        keyframe, predicted, expected_front = self.keyframe, expected.predicted, None
+        for guess in unless(hurried, (predicted, se3.inverse(fit.T_camera_world)), least=1):
+            for _ in unless(hurried, range(2), least=1):  # a better pose shows better what is in front
+                front = together(
+                    self.watch.in_front(keyframe, self.keyframe_front, before, self.previous, seen, guess), slow
+                )
+                expected_front = front if expected_front is None else expected_front
+                self.keyframe = self.watch.without_gone(keyframe, seen, guess)
+                if front is None and self.keyframe is keyframe:
+                    break
+                shown = first if front is None else seen.aside(front)
+                found = self._fit(field, view, shown, guess)
+                found = self.watch.fitted_to_all(self.keyframe, shown.live, found, self.config, hurried)
+                guess = se3.inverse(found.T_camera_world)
+            else:
+                moves = self.watch.takes_for_moving(front, self.keyframe, seen, found)
+                if moves and self._stands(found, predicted, fit.comparison):
+                    self.front = front
+                    return found, shown
+        self.keyframe = keyframe
+        if expected_front is None or hurried():
+            return None
+        shown = seen.aside(expected_front)
+        judged = self._fit(field, view, shown, se3.inverse(fit.T_camera_world), patience=0)
+        found = self._retry(field, view, shown, judged, expected, hurried)
+        moves = self.watch.takes_for_moving(expected_front, keyframe, seen, found)
+        self.front = expected_front if moves and self._stands(found, predicted, fit.comparison) else None
+        return None if self.front is None else (found, shown)
+
+    def _without_object(
+        self, field: Splats, view: View, seen: Sight, predicted: Matrix, drawn: PoseFit, known: bool, hurried: Asked
+    ) -> tuple[PoseFit, Sight] | None:
+        """Return the fit and the frame without the thing that moves and has drawn the pose with it; None if there is
+        none. known: the last frame had something in front."""
+        contradicted, urgent = self._contradicted(drawn), known or self.usual.agrees_less(drawn.comparison)
+        self.watch, things = self.watch.suspected(self.keyframe, seen, drawn, self.config, contradicted, urgent)
+        for front in unless(hurried, things):
+            found = self._fit(field, view, shown := seen.aside(front), predicted)
+            if self._stands(found, predicted) and has_drawn(front, self.keyframe, seen, drawn, found, contradicted):
+                self.front = front
+                return found, shown
+        return None
+
+    def _notice_rest(self, seen: Sight, T_world_camera: Matrix) -> None:
+        """Take what has come to rest for a part of the scene, and remember the frame."""
+        front = self.watch.still_moving(self.front, seen, T_world_camera)
+        self.keyframe_front = None if self.front is not None and front is None else self.keyframe_front
+        self.front, self.watch = front, self.watch.after(seen, front, T_world_camera)
+
+    def _stands(self, fit: PoseFit, predicted: Matrix, whole: Comparison | None = None) -> bool:
+        lost = self._is_lost(fit) or self._contradicted(fit) or self._leaps(fit, predicted)
+        return not (lost or is_missed(fit.comparison, whole))
+
+    def _remember(self, fit: PoseFit, seen: Sight) -> None:
+        """Keep what the next frame needs."""
+        T_world_camera = se3.inverse(fit.T_camera_world)
+        if self.lost:
+            self.velocity = np.eye(4)
+        else:
+            self.velocity = se3.inverse(self.previous) @ T_world_camera
+            self.agreements = [*self.agreements, fit.agreement * fit.overlap][-RECENT:]
+            self.first_losses = [*self.first_losses, fit.first_loss][-RECENT:]
+            if fit.comparison is not None:
+                self.usual.add(fit.comparison, float(np.linalg.norm(self.velocity[:3, 3])))
+        self.previous = T_world_camera
+        self.last_image, self.last_features, self.started = seen.live, seen.image, True
+
+    # ---- guesses ----
+
+    def expected(self, prior: PosePrior) -> Expected:
+        """Return where the camera of the next frame is expected."""
+        return expect(self.previous, self.velocity, self.prior, prior, self.config.motion_model)
+
+    def _fit(self, field: Splats, view: View, seen: Sight, guess: Matrix, patience: int = 1) -> PoseFit:
+        """Fit from an initial T_world_camera; patience: factor on the number of iterations of gradient descent; with 0,
+        the pose stays as it is, and is only judged."""
+        T_camera_world, c = se3.inverse(guess), self.config
+        if c.method == "adam":
+            config = c if self.started else c.without_motion()
+            return fit_pose_adam(field.params, view, seen.target, T_camera_world, config, patience * config.iterations)
+        reference = self.keyframe if c.align_to == "keyframe" else None
+        reference = reference or map_reference(field.params, view, T_camera_world, c)
+        return self._aligned(reference, seen.live, T_camera_world, patience > 0)
+
+    def _aligned(self, reference: Reference, live: Pyramid, T_camera_world: Matrix, moves: bool = True) -> PoseFit:
+        config = self.config if moves else replace(self.config, align_iterations=0)
+        fit = fit_pose_align(reference, live, T_camera_world, config)
+        if self.config.verify:
+            fit.comparison = self._compared(reference, live, fit.T_camera_world)
+        return fit
+
+    def _compared(self, reference: Reference, live: Pyramid, T_camera_world: Matrix) -> Comparison:
+        """Compare a frame at a pose with the newest keyframe, so that all guesses and frames are judged alike; where it
+        shows too little of the frame, with the reference of the alignment."""
+        if self.keyframe is not None and self.keyframe is not reference:
+            found = self.keyframe.compared(live, T_camera_world)
+            if found.common >= LEAST_COMMON:
+                return found
+        return reference.compared(live, T_camera_world)
+
+    def _other_guesses(self, seen: Sight, expected: Expected) -> Iterator[Matrix]:
+        """Yield T_world_camera by features, and by constant velocity alone if a gyroscope changed the first guess."""
+        if self.extractor is not None and seen.image is not None:
+            known = None if self.keyframe is None else self.keyframe_features
+            motion = motion_by_features(known, seen.image, self.extractor)
+            if self.keyframe is not None and motion is not None:
+                yield se3.inverse(motion @ self.keyframe.T_camera_world)
+            motion = motion_by_features(self.last_features, seen.image, self.extractor)
+            if motion is not None:
+                yield self.previous @ se3.inverse(motion)
+        if expected.measured:
+            yield self.previous @ self.velocity if self.config.motion_model else self.previous
+
+    def _retry(
+        self, field: Splats, view: View, seen: Sight, fit: PoseFit, expected: Expected, hurried: Asked
+    ) -> PoseFit:
+        """Retry from odometry with twice the iterations (VarSplat §3), and from the last pose; return the best fit.
+
+        With alignment, also try the map rendered at these poses: it contains more than the newest keyframe.
+        """
+        odometry = None if hurried() else self._odometry(view, seen.live, expected)
+        starts = [expected.last] if odometry is None else [odometry, expected.last]
+        fits = [fit, *(self._fit(field, view, seen, start, 2) for start in unless(hurried, starts))]
+        by_map = self.config.method == "align" and self.config.align_to == "keyframe"  # with "map", `_fit` has tried it
+        for start in unless(hurried, starts if by_map else ()):
+            reference = map_reference(field.params, view, se3.inverse(start), self.config)
+            fits.append(self._aligned(reference, seen.live, se3.inverse(start)))
+        best = max(fits, key=self._score)
+        if self._is_lost(best):
+            best.T_camera_world = se3.inverse(starts[0])
+        return best
+
+    def _odometry(self, view: View, live: Pyramid, expected: Expected) -> Matrix | None:
+        """Align the last image to this one and return T_world_camera; None if this fails too."""
+        if self.last_image is None or (self.config.method == "adam" and not fits_of(view).aligns):
+            return None  # alignment needs the compiled kernels
+        found = odometry(self.last_image, live, expected, self.config)
+        return None if found is None else np.asarray(self.previous @ se3.inverse(found))
+
+    # ---- verdicts ----
+
+    def _score(self, fit: PoseFit) -> float:
+        return fit.agreement * fit.overlap if fit.comparison is None else score(fit.comparison)
+
+    def _is_lost(self, fit: PoseFit) -> bool:
+        if fit.comparison is None:
+            return is_lost(fit, self.config.lost_agreement, self.config.lost_share)
+        if self.lost:  # after a lost frame the path of the camera does not support a pose
+            return not confirmed(fit.comparison)
+        return self.usual.is_lost(fit.comparison, self.config.lost_share)
+
+    def _leaps(self, fit: PoseFit, predicted: Matrix) -> bool:
+        """Return whether a verified pose is so far from the predicted one that the camera cannot have moved there."""
+        if fit.comparison is None or self.lost or self.keyframe is None:
+            return False
+        apart = se3.inverse(fit.T_camera_world)[:3, 3] - predicted[:3, 3]
+        return self.usual.is_leap(float(np.linalg.norm(apart)), self.keyframe.pyramid.scene_scale)
+
+    def _doubts(self, fit: PoseFit) -> bool:
+        if fit.comparison is not None:
+            return self.usual.doubts(fit.comparison)
+        worse = fit.agreement * fit.overlap < DOUBT * (float(np.median(self.agreements)) if self.agreements else 1.0)
+        return worse or jumped(fit.first_loss, self.first_losses, self.config.reinit_factor)
+
+    def _contradicted(self, fit: PoseFit) -> bool:
+        """Return whether a pose is doubtful for another reason than a small overlap, which a new keyframe mends."""
+        return self._doubts(fit) if fit.comparison is None else self.usual.contradicts(fit.comparison)
+
+    def is_certain(self, fit: PoseFit) -> bool:
+        """Return whether the pose of the last frame may be used for mapping."""
+        doubtful = self.doubtful if self.config.verify else 0
+        return not doubtful or (fit.comparison is not None and stands(fit.comparison, doubtful))
+
+    # ---- keyframes ----
+
+    def keep_keyframe(self, field: Splats, view: View, seen: Sight, T_world_camera: Matrix) -> None:
+        """Use a keyframe that was just mapped: its refined pose, and its image as the reference of the next frames."""
+        self.move_by(T_world_camera @ se3.inverse(self.previous))  # at a cut, the coordinates change
+        self.previous, self.lost = T_world_camera, False
+        self.follow(mapped_keyframe(field.params, view, seen, T_world_camera, self.config, self.front))
+
+    def follow(self, keyframe: TrackedKeyframe) -> None:
+        """Use a keyframe as the reference of the next frames."""
+        if keyframe.reference is not None:
+            self.watch = self.watch.followed(self.keyframe, keyframe.reference)
+            self.keyframe = keyframe.reference
+        self.keyframe_features, self.keyframe_front = keyframe.image, keyframe.front
+
+    def move_to(self, field: Splats, view: View, keyframe: FoundKeyframe, T_world_camera: Matrix) -> None:
+        """Continue at another pose, with a keyframe as the reference of the next frames."""
+        self.previous, self.velocity, self.lost = T_world_camera, np.eye(4), False
+        self.watch = self.watch.cleared()
+        self.follow(found_keyframe(field.params, view, keyframe, self.config))
+
+    def move_by(self, T_new_old: Matrix) -> None:
+        """Express the last pose and the reference in other coordinates [4, 4]."""
+        self.previous = T_new_old @ self.previous
+        self.keyframe = None if self.keyframe is None else self.keyframe.moved_by(T_new_old)
+        self.watch = self.watch.moved_by(T_new_old)
+
+    def forget(self) -> None:
+        """Restart at the identity, as for the first frame."""
+        self.previous, self.velocity, self.keyframe, self.keyframe_features = np.eye(4), np.eye(4), None, None
+        self.front, self.keyframe_front, self.watch = None, None, self.watch.cleared()
+
+    def hop(self, fit: PoseFit, live: Pyramid) -> Alignment | None:
+        """Return the alignment to the newest keyframe that gives the covariance of a fit; None without the kernels. For
+        a pose found by gradient descent, it takes no step."""
+        if fit.alignment is not None or self.keyframe is None:
+            return fit.alignment
+        T_live_keyframe = fit.T_camera_world @ se3.inverse(self.keyframe.T_camera_world)
+        return align(self.keyframe.pyramid, live, T_live_keyframe, 0, self.config.align_weight_color)
