@@ -34,7 +34,7 @@ from sigmasplat.input.source import Source
 from sigmasplat.plugins.evaluation.metrics import views
 from sigmasplat.plugins.evaluation.reconstruct import FusionInput
 from sigmasplat.plugins.evaluation.view_selection import working_frame
-from sigmasplat.plugins.outputs.formats import FORMATS, ExportSource, choose
+from sigmasplat.plugins.outputs.formats import PLUGIN, ExportSource, choose
 from sigmasplat.plugins.outputs.splats.any_format import read_any
 from sigmasplat.render import FieldRenderer
 from sigmasplat.run_folder.runs import RunFolder
@@ -134,7 +134,7 @@ def write_and_read(
     """Export in the run's own axes, read back, score; return size, times and PSNR."""
     with TemporaryDirectory() as folder:
         target = Path(folder) / f"map{ending}"
-        row = choose(FORMATS, None, target)
+        row = choose(PLUGIN, None, target)
         asked = asdict(ExportOptions()) | {"axes": "camera"} | given
         start_s = time.perf_counter()
         row.write(source, target, **{name: asked[name] for name in row.options})

@@ -19,8 +19,8 @@ from sigmasplat.data.frame import Frame
 from sigmasplat.data.frame_arrays import color_from_bytes
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SourceError
-from sigmasplat.input.opening import Format
 from sigmasplat.input.source import Source
+from sigmasplat.registry import SourceFormat
 
 
 def read(path: Path) -> dict[str, Any]:
@@ -62,7 +62,7 @@ class NpzFrames(Source):
         return Trajectory(times_s, np.stack([frame["T_world_camera"] for frame in arrays]).astype(np.float64))
 
 
-FORMAT = Format(
+PLUGIN = SourceFormat(
     "npz frames",
     "camera.npz and 000000.npz",
     lambda path: (Path(path) / "camera.npz").is_file(),

@@ -31,7 +31,8 @@ DESCRIPTION = """RGB-D SLAM on 3D Gaussian splats, with uncertainty.
 
 Start with: sigmasplat demo, then: sigmasplat run PATH.
 
-sigmasplat --version    print the version and exit"""
+sigmasplat --version                   print the version and exit
+sigmasplat --plugin FILE.py run PATH    use a file with plug-ins of yours; before or after any command"""
 
 COMMANDS = {
     "demo": ("run", "demo"),
@@ -62,7 +63,7 @@ def command(name: str) -> Callable[..., int]:
 def _refuse_unknown(command: str) -> None:
     """Raise ConfigError unless the word is a command or an option."""
     if command not in COMMANDS and not command.startswith("-"):
-        from sigmasplat.config.text import nearest
+        from sigmasplat.errors import nearest
 
         raise ConfigError(f"no command '{command}'{nearest(command, COMMANDS)}; the commands are {', '.join(COMMANDS)}")
 
@@ -163,9 +164,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     warnings.filterwarnings("ignore", "Image size .* exceeds limit")  # our limit is lower (`files/pictures.py`)
     try:
         env.switches()
+        _refuse_nul(given)
+        given = _with_plugins(given)
         _refuse_unknown(given[0])
         _refuse_memory_limit()
-        _refuse_nul(given)
         with _without_collection():
             call = _call_of(given)
         code = call()
@@ -199,6 +201,24 @@ def _without_collection() -> Iterator[None]:
         gc.freeze()
         gc.set_threshold(COLLECTED_AFTER)
         gc.enable()
+
+
+def _with_plugins(given: Sequence[str]) -> list[str]:
+    """Use the files of all --plugin options; return the other arguments. Raises ConfigError if a file is missing."""
+    rest, files, words = list[str](), list[str](), iter(given)
+    for word in words:
+        name, equals, value = word.partition("=")
+        if name != "--plugin":
+            rest.append(word)
+        elif not (file := value if equals else next(words, "")):
+            raise ConfigError("--plugin needs a file; give a Python file that defines PLUGIN")
+        else:
+            files.append(file)
+    if files:
+        from sigmasplat.registry import use_files
+
+        use_files(files)
+    return rest or ["--help"]
 
 
 def _refuse_nul(given: Sequence[str]) -> None:

@@ -5,6 +5,7 @@
 | SIGMASPLAT_THREADS | whole number ≥ 0 | number of threads of the kernels and of torch; 0 or unset = all cores |
 | SIGMASPLAT_ISA | auto, avx512, avx2, baseline | instruction set of the CPU kernels; auto = the widest supported one |
 | SIGMASPLAT_BACKEND | auto, cpu, cuda, reference | renderer if the setting `backend` is auto |
+| SIGMASPLAT_PLUGINS | files, separated by colons | plug-ins of yours, the same as --plugin (`registry`) |
 """
 
 import os

@@ -1,5 +1,7 @@
 """Define the errors that a user can cause. On the command line each is one line and exit code 2."""
 
+from collections.abc import Iterable
+
 
 class SigmaSplatError(Exception):
     """Base class; the message says in one line what is wrong, what was found and what to do."""
@@ -47,3 +49,11 @@ def out_of_memory(problem: BaseException) -> str:
     what = next(iter(str(problem).strip().splitlines()), "") or type(problem).__name__
     notes = "".join(f"; {note}" for note in getattr(problem, "__notes__", ()))
     return f"out of memory ({what}); close other programs, or use smaller images (--set input.width=…){notes}"
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Return a suggestion for a misspelt name, "" if no known name is similar."""
+    import difflib  # only a message needs it
+
+    close = difflib.get_close_matches(name, list(known), 1)
+    return f" (did you mean {close[0]}?)" if close else ""

@@ -14,8 +14,9 @@ from sigmasplat.data.field import GaussianField
 from sigmasplat.data.map_uncertainty import SHIPPED, Background, MapUncertainty, SplatStd
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.files.ply_elements import read_header
-from sigmasplat.plugins.outputs.formats import FORMATS, ExportFormat, ExportSource, choose, listed, owners
+from sigmasplat.plugins.outputs.formats import PLUGIN, ExportSource, choose, listed, owners
 from sigmasplat.plugins.outputs.splats.any_format import read_any
+from sigmasplat.registry import Output
 from sigmasplat.run_folder import splat_ply as ply
 from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.run_folder.trajectory import read_trajectory
@@ -137,21 +138,21 @@ def test_plain_writes_only_the_columns_of_3dgs(export: Callable[..., str]) -> No
 
 
 def test_every_format_can_be_selected_by_its_name_and_its_own_endings() -> None:
-    names = [row.name for row in FORMATS]
+    names = [row.name for row in PLUGIN]
     assert len(set(names)) == len(names)
-    for row in FORMATS:
-        assert row.endings and row.help and choose(FORMATS, row.name, None) is row
+    for row in PLUGIN:
+        assert row.endings and row.help and choose(PLUGIN, row.name, None) is row
         assert set(row.options) <= set(ExportOptions.__dataclass_fields__)
-    for ending, row in owners(FORMATS).items():
-        assert choose(FORMATS, None, Path(f"a{ending}")) is row
-    assert len(listed(FORMATS)) == len(FORMATS)
+    for ending, row in owners(PLUGIN).items():
+        assert choose(PLUGIN, None, Path(f"a{ending}")) is row
+    assert len(listed(PLUGIN)) == len(PLUGIN)
 
 
 def test_the_first_format_with_an_ending_owns_it_and_longer_endings_win() -> None:
     def nothing(source: ExportSource, target: Path) -> str:
         return ""
 
-    first, second, longer = (ExportFormat(name, ends, "", nothing) for name, ends in
+    first, second, longer = (Output(name, ends, "", nothing) for name, ends in
                              (("one", (".x",)), ("two", (".x",)), ("three", (".y.x",))))  # fmt: skip
     rows = (first, second, longer)
     assert choose(rows, None, Path("a.x")) is first and choose(rows, None, Path("a.y.x")) is longer

@@ -21,7 +21,7 @@ from sigmasplat.data.component import Component
 from sigmasplat.errors import ConfigError, RunError, SigmaSplatError
 from sigmasplat.plugins.evaluation.evaluate import evaluate
 from sigmasplat.plugins.evaluation.reconstruct import FusionInput
-from sigmasplat.plugins.outputs.formats import FORMATS, ExportSource, choose
+from sigmasplat.plugins.outputs.formats import PLUGIN, ExportSource, choose
 from sigmasplat.plugins.sources import SyntheticRoom, open_source
 from sigmasplat.plugins.viewer.finished import SubmapCache, check_has_map, finished_snapshot, running_snapshot
 from sigmasplat.plugins.viewer.live import ACTIVE_SHARE, LiveView
@@ -186,7 +186,7 @@ def test_a_run_of_an_old_release_is_shown_evaluated_and_exported(finished: RunFo
     assert (metrics["frames"], metrics["believed"], metrics["lost"], metrics["apart"]) == (FRAMES, FRAMES - 1, 1, 0)
     assert metrics["failures"]["auroc"] is None or np.isnan(metrics["failures"]["auroc"])
     for name, said in (("path.txt", "13 poses; left out: 1 lost"), ("path.kitti.txt", "13 poses; left out: 1 lost")):
-        chosen = choose(FORMATS, None, tmp_path / name)
+        chosen = choose(PLUGIN, None, tmp_path / name)
         assert chosen.write(ExportSource(run.path), tmp_path / name).startswith(said)
     assert len(read_trajectory(tmp_path / "path.txt")) == FRAMES - 1
     rows = np.loadtxt(tmp_path / "path.kitti.txt")

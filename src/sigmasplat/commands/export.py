@@ -9,12 +9,13 @@ import tyro
 from sigmasplat.commands import export_options, options, picture_options
 from sigmasplat.commands.options import prepare_torch, refuse_existing, source_of
 from sigmasplat.files.lock import output_locked
-from sigmasplat.plugins.outputs.formats import FORMATS, ExportSource, choose, listed, refuse_unused
+from sigmasplat.plugins.outputs.formats import ExportSource, choose, listed, refuse_unused
+from sigmasplat.registry import Output, rows
 
 
 @dataclass(frozen=True)
 class ExportOptions:
-    """Options that only some formats accept, under their names on the command line (`ExportFormat.options`)."""
+    """Options that only some formats accept, under their names on the command line (`Output.options`)."""
 
     sigma_below: export_options.SigmaBelow = None
     std_below_m: export_options.StdBelowM = None
@@ -55,8 +56,9 @@ def export(
 
     example: sigmasplat export runs/kitchen-sigma --out kitchen.spz --sigma-below 0.02
     """
-    chosen = choose(FORMATS, format, out)
-    refuse_unused(chosen, FORMATS, asked.given())
+    formats = rows(Output)
+    chosen = choose(formats, format, out)
+    refuse_unused(chosen, formats, asked.given())
     source = ExportSource(run, lambda folder: source_of(folder, asked.source))
     target = out or Path(source.name + chosen.endings[0])
     refuse_existing(target, overwrite)
@@ -72,4 +74,4 @@ def _size(target: Path) -> str:
     return f", {target.stat().st_size / 1e6:.1f} MB" if target.is_file() else ""
 
 
-export.__doc__ = (export.__doc__ or "").format(formats="\n    ".join(listed(FORMATS)))
+export.__doc__ = (export.__doc__ or "").format(formats="\n    ".join(listed(rows(Output))))

@@ -37,6 +37,9 @@ class InputConfig(Section, name="input"):
     masks: str = ""
     """Path of a folder with one image per frame of the recording, in the order of the numbers in their names: pixels
     that are not 0 are ignored in tracking, in the map and in scores; empty = none."""
+    filters: str = ""
+    """Masks and depth filters of plug-ins that change each frame, in this order, separated by commas. They change what
+    SLAM sees; scores use the frames as they were recorded. Empty = none."""
     predicted_depth: str = ""
     """Path of a folder with depth that a network predicted, one image per frame of the recording; it replaces the
     recorded depth, or is the depth of a video or of colour images. Its scale may be arbitrary; empty = none."""

@@ -1,28 +1,19 @@
 """Provide the presets by name. A preset is a set of values; each system has its own module."""
 
 import dataclasses
-from collections.abc import Callable, Mapping
-from functools import cache
-from importlib import import_module
+from collections.abc import Mapping
 
 from sigmasplat.config import Config
-from sigmasplat.config.text import nearest, override
-from sigmasplat.errors import ConfigError
+from sigmasplat.config.text import override
+from sigmasplat.errors import ConfigError, nearest
+from sigmasplat.registry import Preset, rows
 
-SYSTEMS = ("varsplat", "varsplat_released", "cgslam", "cgslam_released", "sigma")
-"""The modules of `plugins/papers` that define presets."""
 FAMILIES = ("sigma", "cgslam-*", "loopsplat-*", "varsplat-*")
 """The names of all presets in short, the default first: a name, or a pattern for several names."""
 
 
-@cache
-def _presets() -> dict[str, Config | Callable[[], Config]]:
-    """Return the settings of each preset, or a function that makes them: most of the many scenes are never used.
-
-    The modules are imported when the first preset is asked for: the help of a command needs none.
-    """
-    systems = (import_module(f"sigmasplat.plugins.papers.{name}").PRESETS for name in SYSTEMS)
-    return {name: config for presets in systems for name, config in presets.items()}
+def _presets() -> dict[str, Preset]:
+    return {row.name: row for row in rows(Preset)}
 
 
 def default_preset() -> str:
@@ -39,8 +30,7 @@ def preset(name: str) -> Config:
     """Return the settings of a preset. Raises ConfigError on an unknown name, with similar names or all names."""
     if name not in _presets():
         raise ConfigError(f"no preset {name!r}{_similar(name) or _all(name)}")
-    config = _presets()[name]
-    return dataclasses.replace(config if isinstance(config, Config) else config(), name=name)
+    return dataclasses.replace(_presets()[name].make(), name=name)
 
 
 def configured(config: Config | str | None, settings: Mapping[str, object] | None = None) -> Config:

@@ -1,14 +1,13 @@
 """Change settings given as text, as on the command line: SECTION.NAME=VALUE."""
 
 import dataclasses
-import difflib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
 from sigmasplat.config import SECTIONS, Config
 from sigmasplat.config.ranges import kinds_of, problem_of, refuse, shown, unpacked
-from sigmasplat.errors import ConfigError
+from sigmasplat.errors import ConfigError, nearest
 
 
 def override(config: Config, settings: Mapping[str, str]) -> Config:
@@ -99,12 +98,6 @@ def _chosen(name: str, allowed: Mapping[str, Any], text: str) -> Any:
     if text not in allowed:
         raise ConfigError(f"{name} must be one of {', '.join(allowed)}, found {text!r}")
     return allowed[text]
-
-
-def nearest(name: str, known: Mapping[str, Any] | list[str]) -> str:
-    """Return a suggestion for a misspelt name, "" if no known name is similar."""
-    close = difflib.get_close_matches(name, list(known), 1)
-    return f" (did you mean {close[0]}?)" if close else ""
 
 
 def full_path(path: str) -> str:

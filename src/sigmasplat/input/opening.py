@@ -1,55 +1,28 @@
-"""Open a sequence of any known format: ask each format of this folder whether it recognises the path."""
+"""Open a sequence of any known format: ask each format whether it recognises the path."""
 
 import importlib
-import pkgutil
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, fields, replace
-from functools import cache
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, cast
 
 from sigmasplat.config import InputConfig
-from sigmasplat.config.text import nearest
-from sigmasplat.errors import ConfigError, SourceError
+from sigmasplat.errors import ConfigError, SourceError, nearest
 from sigmasplat.files.guard import guarded
 from sigmasplat.input.color_only import without_depth
 from sigmasplat.input.masked import Masked
 from sigmasplat.input.posed import Posed
 from sigmasplat.input.source import Source, Subset
+from sigmasplat.registry import SourceFormat, rows
 
 PACKED = (".bag", ".mcap", ".db3", ".r3d")
 """Endings of files that may each be a whole sequence. A folder of such files is refused with their names."""
 
 
-@dataclass(frozen=True)
-class Format:
-    """One layout of a sequence on disk. Every module of this folder that defines `FORMAT` is found automatically.
-
-    recognises(path): returns whether the path has this format, from its content only;
-    looked_for: names the files that identify the format, for messages;
-    open(path, settings): builds the source of all its frames;
-    priority: formats of higher priority are asked first, so that a special format comes before a general one. Above 0:
-    other formats recognise the same files; below 0: the format is a guess;
-    sensor: the depth sensor of all its recordings (`config.sensors`), None if it varies.
-    """
-
-    name: str
-    looked_for: str
-    recognises: Callable[[str], bool]
-    open: Callable[[str, InputConfig], Source]
-    priority: int = 0
-    sensor: str | None = None
-
-
-@cache
-def formats() -> tuple[Format, ...]:
-    """Return the formats of all modules directly in `plugins/sources` that define FORMAT, by priority and name."""
-    folders = importlib.import_module("sigmasplat.plugins.sources").__path__
-    names = sorted(module.name for module in pkgutil.iter_modules(folders) if not module.ispkg)
-    modules = [importlib.import_module(f"sigmasplat.plugins.sources.{name}") for name in names]
-    found = [module.FORMAT for module in modules if hasattr(module, "FORMAT")]
-    return tuple(sorted(found, key=lambda known: -known.priority))
+def formats() -> tuple[SourceFormat, ...]:
+    """Return the formats of all plug-ins, by priority and name."""
+    return tuple(sorted(rows(SourceFormat), key=lambda known: -known.priority))
 
 
 def open_source(path: str | Path, settings: InputConfig | None = None, **changes: Any) -> Source:
@@ -105,7 +78,7 @@ def _guarded(path: str | Path) -> AbstractContextManager[None]:
     return guarded(path, "check its files and permissions, or copy it again", SourceError, "cannot be used")
 
 
-def format_of(path: str | Path) -> Format:
+def format_of(path: str | Path) -> SourceFormat:
     """Return the first format that recognises the path. Raises SourceError if none does."""
     known = _matching_format(path)
     if known is None:
@@ -113,12 +86,12 @@ def format_of(path: str | Path) -> Format:
     return known
 
 
-def _matching_format(path: str | Path) -> Format | None:
+def _matching_format(path: str | Path) -> SourceFormat | None:
     with _guarded(path):
         return next((known for known in formats() if known.recognises(str(path))), None)
 
 
-def _sure_format(path: str | Path) -> Format | None:
+def _sure_format(path: str | Path) -> SourceFormat | None:
     """Return the format that recognises the path, None if it only guesses, or there is none."""
     known = _matching_format(path)
     return known if known is not None and known.priority >= 0 else None

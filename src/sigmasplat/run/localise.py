@@ -10,6 +10,7 @@ import numpy as np
 from sigmasplat.config import Config
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.frame import Frame
+from sigmasplat.data.frame_filters import frame_filter
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.files.atomic import write_text
 from sigmasplat.files.json_files import json_line
@@ -70,6 +71,7 @@ class Localiser:
     def __init__(self, finished: FinishedMap, config: Config) -> None:
         """Prepare the search. Raises ConfigError if the packages of the features are not installed."""
         self.finished, self.config = finished, config
+        self.filtered = frame_filter(config.input.filters)
         self.extractor = make_extractor(config.features)
         self.view = view_of(finished.camera, config)
         self.relocaliser = Relocaliser(config, self.extractor)
@@ -77,6 +79,7 @@ class Localiser:
 
     def locate(self, frame: Frame) -> Localisation:
         """Return where an image was taken."""
+        frame = self.filtered(frame)
         working = working_frame(frame, self.config, self.finished.camera)
         seen = observe(frame, working, self.view, self.config, self.extractor)
         if not usable(seen):

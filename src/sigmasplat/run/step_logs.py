@@ -11,9 +11,8 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
-from sigmasplat.config.text import nearest
 from sigmasplat.env import install_extra
-from sigmasplat.errors import ConfigError
+from sigmasplat.errors import ConfigError, nearest
 from sigmasplat.files.atomic import make_folder, write_text
 from sigmasplat.run.protocols import Callback, LoopResult, StepResult
 from sigmasplat.run_folder.runs import RunFolder

@@ -15,6 +15,7 @@ from sigmasplat.data.column import Column
 from sigmasplat.data.component import LOST, Component
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.frame import Frame
+from sigmasplat.data.frame_filters import frame_filter
 from sigmasplat.data.map_uncertainty import MapUncertainty
 from sigmasplat.data.submap import MemoryStore, OnDisk, SubmapStore
 from sigmasplat.data.trajectory import Trajectory
@@ -62,6 +63,7 @@ class World:
         settings: Mapping[str, object] | None = None,
     ) -> None:
         self.config = configured(config, settings).checked()
+        self.filtered = frame_filter(self.config.input.filters)
         self.random = np.random.default_rng(self.config.seed)
         self.store = MemoryStore() if store is None else store
         self.atlas = Atlas()
@@ -195,6 +197,7 @@ class World:
     def observed(self, frame: Frame, view: View, extractor: Extractor | None) -> Observation:
         """Resize a frame to working size and prepare it for the fits. Raises SourceError if it comes from another
         camera than the first."""
+        frame = self.filtered(frame)
         working = working_frame(frame, self.config, view.camera if self._resample else None)
         if working.camera != view.camera:
             raise SourceError(f"frame {frame.index} comes from another camera ({working.camera}) than the first")

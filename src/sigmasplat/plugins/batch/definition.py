@@ -6,8 +6,8 @@ from typing import Any, get_args, get_origin, get_type_hints
 
 from sigmasplat.config import Config
 from sigmasplat.config.presets import list_presets, preset
-from sigmasplat.config.text import nearest, override
-from sigmasplat.errors import ConfigError
+from sigmasplat.config.text import override
+from sigmasplat.errors import ConfigError, nearest
 from sigmasplat.files.guard import guarded
 from sigmasplat.plugins.batch.job import Job
 from sigmasplat.plugins.papers.table_files import read_table

@@ -1,1 +1,1 @@
-"""Write a run or a map in other programs' formats. `formats.FORMATS` lists them; each other module writes one."""
+"""Write a run or a map in other programs' formats. `formats` lists them; each other module writes one."""

@@ -1,18 +1,17 @@
-"""List the formats of `sigmasplat export`. A new format is one function and one row of `FORMATS`, at the end.
+"""List the formats of `sigmasplat export`. A new format is one function and one row of `PLUGIN`, at the end.
 
 Imports that load torch are inside the functions, so that `sigmasplat export --help` is fast.
 """
 
-import inspect
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sigmasplat.errors import ConfigError
 from sigmasplat.plugins.outputs import splat_formats
 from sigmasplat.plugins.outputs.source import ExportSource as ExportSource
+from sigmasplat.registry import Output
 
 if TYPE_CHECKING:
     from sigmasplat.data.trajectory import Trajectory
@@ -21,50 +20,23 @@ if TYPE_CHECKING:
     from sigmasplat.types import Matrix, Progress
 
 
-@dataclass(frozen=True)
-class ExportFormat:
-    """A row of the table: the name for --format, the endings that select it, a line of help, and its writer.
-
-    An ending selects the first row that has it. Without --out, an export gets the row's first ending. `write(source,
-    target, …)` writes the target, a file or folder that does not exist or may be replaced, and returns a short
-    description of its content. Its keyword-only parameters are the options of the command line that the format accepts.
-    reads_sequence: the format also accepts --source.
-    """
-
-    name: str
-    endings: tuple[str, ...]
-    help: str
-    write: Callable[..., str]
-    reads_sequence: bool = False
-
-    @property
-    def options(self) -> tuple[str, ...]:
-        """Return the names of the writer's options."""
-        parameters = inspect.signature(self.write).parameters.values()
-        return tuple(p.name for p in parameters if p.kind is p.KEYWORD_ONLY)
-
-    def accepts(self, option: str) -> bool:
-        """Return whether an option of the command line can be used with this format."""
-        return option in self.options or (option == "source" and self.reads_sequence)
-
-
-def owners(formats: tuple[ExportFormat, ...]) -> dict[str, ExportFormat]:
+def owners(formats: tuple[Output, ...]) -> dict[str, Output]:
     """Return the format that each ending selects: the first one with that ending."""
-    endings: dict[str, ExportFormat] = {}
+    endings: dict[str, Output] = {}
     for row in formats:
         for ending in row.endings:
             endings.setdefault(ending, row)
     return endings
 
 
-def listed(formats: tuple[ExportFormat, ...]) -> list[str]:
+def listed(formats: tuple[Output, ...]) -> list[str]:
     """Return a line of help for each format: the endings that select it, its name and its description."""
     own = owners(formats)
     endings = (", ".join(ending for ending in row.endings if own[ending] is row) or "--format" for row in formats)
     return [f"{ending:<15} {row.name}: {row.help}" for ending, row in zip(endings, formats, strict=True)]
 
 
-def choose(formats: tuple[ExportFormat, ...], name: str | None, out: Path | None) -> ExportFormat:
+def choose(formats: tuple[Output, ...], name: str | None, out: Path | None) -> Output:
     """Return the format with this name, else the one that the ending of `out` selects, else the first one.
 
     Raises ConfigError if the name or the ending is unknown.
@@ -83,7 +55,7 @@ def choose(formats: tuple[ExportFormat, ...], name: str | None, out: Path | None
     return endings[max(fitting, key=len)]
 
 
-def refuse_unused(chosen: ExportFormat, formats: tuple[ExportFormat, ...], given: list[str]) -> None:
+def refuse_unused(chosen: Output, formats: tuple[Output, ...], given: list[str]) -> None:
     """Raise ConfigError if an option is given that the format does not accept."""
     for option in given:
         if not chosen.accepts(option):
@@ -212,34 +184,34 @@ def _bag(source: ExportSource, target: Path, *, pictures: bool) -> str:
     return f"{sum(counts.values()):,} messages of {len(counts)} topics{reader.left_out()}"
 
 
-FORMATS = (
-    ExportFormat("ply", (".ply",), "3DGS PLY with σ², for every viewer", splat_formats.ply),
-    ExportFormat(
+PLUGIN = (
+    Output("ply", (".ply",), "3DGS PLY with σ², for every viewer", splat_formats.ply),
+    Output(
         "compressed-ply",
         (".compressed.ply",),
         "SuperSplat's compressed PLY, a fifth of the size",
         splat_formats.like_ply("compressed_ply"),
     ),
-    ExportFormat("splat", (".splat",), "32 bytes per splat, for web viewers", splat_formats.like_ply("splat")),
-    ExportFormat("spz", (".spz",), "Niantic's SPZ, less than a fifth of the size", splat_formats.spz),
-    ExportFormat("sog", (".sog",), "SuperSplat's SOG, the smallest", splat_formats.like_ply("sog")),
-    ExportFormat("gltf", (".glb", ".gltf"), "glTF with splats (KHR) and σ", splat_formats.scene("gltf")),
-    ExportFormat("usd", (".usdc", ".usda", ".usd"), "OpenUSD with splats and σ", splat_formats.scene("usd")),
-    ExportFormat("trajectory", (".txt",), "the path as TUM text", _trajectory),
-    ExportFormat("covariance", (".cov.txt",), "the path as TUM text with the covariance of each pose", _covariance),
-    ExportFormat("ros-covariance", (".ros.txt",), "the same as geometry_msgs/PoseWithCovariance", _ros_covariance),
-    ExportFormat("kitti", (".kitti.txt",), "the path as KITTI text, one line per frame", _kitti, True),
-    ExportFormat("nerfstudio", (".json",), "views as nerfstudio's transforms.json", _nerfstudio, True),
-    ExportFormat("colmap", ("-colmap",), "a folder with COLMAP's text model in sparse/0", _colmap, True),
-    ExportFormat("points", (".points.ply",), "the surface as points with normals", _points, True),
-    ExportFormat(
+    Output("splat", (".splat",), "32 bytes per splat, for web viewers", splat_formats.like_ply("splat")),
+    Output("spz", (".spz",), "Niantic's SPZ, less than a fifth of the size", splat_formats.spz),
+    Output("sog", (".sog",), "SuperSplat's SOG, the smallest", splat_formats.like_ply("sog")),
+    Output("gltf", (".glb", ".gltf"), "glTF with splats (KHR) and σ", splat_formats.scene("gltf")),
+    Output("usd", (".usdc", ".usda", ".usd"), "OpenUSD with splats and σ", splat_formats.scene("usd")),
+    Output("trajectory", (".txt",), "the path as TUM text", _trajectory),
+    Output("covariance", (".cov.txt",), "the path as TUM text with the covariance of each pose", _covariance),
+    Output("ros-covariance", (".ros.txt",), "the same as geometry_msgs/PoseWithCovariance", _ros_covariance),
+    Output("kitti", (".kitti.txt",), "the path as KITTI text, one line per frame", _kitti, True),
+    Output("nerfstudio", (".json",), "views as nerfstudio's transforms.json", _nerfstudio, True),
+    Output("colmap", ("-colmap",), "a folder with COLMAP's text model in sparse/0", _colmap, True),
+    Output("points", (".points.ply",), "the surface as points with normals", _points, True),
+    Output(
         "video",
         (".webm", ".mp4", ".gif", ".webp"),
         "a video: colour, depth, uncertainty",
         _video,
         True,
     ),
-    ExportFormat("bag", (".mcap", "-bag"), "ROS 2 messages: path with covariance, loops, map", _bag, True),
-    ExportFormat("plan", (".plan.png", ".png"), "a floor plan with regions to scan again", _plan, True),
+    Output("bag", (".mcap", "-bag"), "ROS 2 messages: path with covariance, loops, map", _bag, True),
+    Output("plan", (".plan.png", ".png"), "a floor plan with regions to scan again", _plan, True),
 )
-"""All formats. The first one is the default."""
+"""The formats of this package. The first one is the default."""

@@ -4,8 +4,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-from sigmasplat.config.text import nearest
-from sigmasplat.errors import ConfigError
+from sigmasplat.errors import ConfigError, nearest
 from sigmasplat.files.guard import guarded
 from sigmasplat.files.reading import read_text
 

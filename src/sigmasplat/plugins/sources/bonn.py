@@ -15,9 +15,9 @@ from sigmasplat.config import InputConfig
 from sigmasplat.data import se3
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.input.calibration import BONN
-from sigmasplat.input.opening import Format
 from sigmasplat.input.recorded import RecordedSource
 from sigmasplat.plugins.sources.tum import open_tum
+from sigmasplat.registry import SourceFormat
 
 T_ROS = np.array([[-1.0, 0, 0, 0], [0, 0, 1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 T_MARKERS_CAMERA = se3.orthonormalise(
@@ -49,7 +49,7 @@ def recognises(path: str) -> bool:
     return lists and any("bonn" in part.lower() for part in folder.resolve().parts[-3:])
 
 
-FORMAT = Format(
+PLUGIN = SourceFormat(
     "Bonn dynamic",
     "TUM's lists under rgbd_bonn_…",
     recognises,

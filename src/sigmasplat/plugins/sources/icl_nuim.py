@@ -20,8 +20,8 @@ from sigmasplat.files.reading import exists
 from sigmasplat.input.calibration import ICL_NUIM, TUM_UNITS_PER_METRE, freiburg_calibration, resolve_calibration
 from sigmasplat.input.folders import FRAMES_PER_SECOND
 from sigmasplat.input.lists import parse_numbers, read_lines, read_poses
-from sigmasplat.input.opening import Format
 from sigmasplat.input.recorded import ImagePair, RecordedSource, first_size
+from sigmasplat.registry import SourceFormat
 
 LIST_NAMES = ("associations.txt", "association.txt", "associate.txt")
 MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
@@ -75,7 +75,7 @@ def _list_in(folder: Path) -> Path | None:
     return next((folder / name for name in LIST_NAMES if (folder / name).is_file()), None)
 
 
-FORMAT = Format(
+PLUGIN = SourceFormat(
     "ICL-NUIM",
     "associations.txt",
     lambda path: _list_in(Path(path)) is not None or any(Path(path).glob("scene_*_0000.depth")),

@@ -13,10 +13,10 @@ from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.input.calibration import Calibration, check_positive, json_number, read_json_object, resolve_calibration
 from sigmasplat.input.folders import FRAMES_PER_SECOND, natural_key
-from sigmasplat.input.opening import Format
 from sigmasplat.input.pose_files import build_trajectory
 from sigmasplat.input.recorded import ImagePair, RecordedSource, first_size
 from sigmasplat.input.transforms import Fields, read_camera, read_frames, read_pose
+from sigmasplat.registry import SourceFormat
 
 NAME = "transforms.json"
 METRES_PER_UNIT = 0.001
@@ -64,7 +64,7 @@ def _calibration(
     return resolve_calibration(path.parent, known, size, settings, units)
 
 
-FORMAT = Format(
+PLUGIN = SourceFormat(
     "nerfstudio",
     "transforms.json",
     lambda path: (Path(path) / NAME).is_file(),

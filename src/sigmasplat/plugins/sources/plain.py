@@ -26,8 +26,8 @@ from sigmasplat.input.folders import (
     times_of_names,
 )
 from sigmasplat.input.lists import read_poses
-from sigmasplat.input.opening import Format
 from sigmasplat.input.recorded import ImagePair, RecordedSource, first_size
+from sigmasplat.registry import SourceFormat
 
 COLOR_NAME, DEPTH_NAME = "color|rgb|images/*", "depth/*"
 
@@ -66,7 +66,7 @@ def _pairs(folder: Path, colors: list[Path], depths: list[Path]) -> tuple[list[t
     return [(color_by_number[n], depth_by_number[n]) for n in keys], skipped
 
 
-FORMAT = Format(
+PLUGIN = SourceFormat(
     "plain folder",
     "color/ (or rgb/, images/) and depth/",
     lambda path: first_subfolder(Path(path), (*COLOR_FOLDERS, *DEPTH_FOLDERS)) is not None,

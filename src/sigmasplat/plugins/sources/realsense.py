@@ -24,12 +24,12 @@ from sigmasplat.data.resizing import resized_color
 from sigmasplat.errors import SourceError
 from sigmasplat.files.optional import import_optional
 from sigmasplat.input.calibration import Calibration, Distortion, resolve_calibration
-from sigmasplat.input.opening import Format
 from sigmasplat.input.rectification import Rectification
 from sigmasplat.plugins.sources.camera.stereo import StereoMatcher, StereoRectification
 from sigmasplat.plugins.sources.camera.stereo_cameras import StereoCameras
 from sigmasplat.plugins.sources.live import LiveSource
 from sigmasplat.plugins.sources.realsense_imu import NOT_MEASURED, MotionModule, open_motion_module
+from sigmasplat.registry import SourceFormat
 from sigmasplat.types import Matrix
 
 Images = tuple[NDArray[np.float32], NDArray[np.float32]]
@@ -249,7 +249,7 @@ def _transform(extrinsics: Any) -> NDArray[np.float64]:
     return T
 
 
-FORMAT = Format(
+PLUGIN = SourceFormat(
     "RealSense",
     "the word 'realsense', for the camera",
     lambda path: path.partition(":")[0] == "realsense",

@@ -28,11 +28,11 @@ from sigmasplat.files.reading import refuse_special
 from sigmasplat.files.structured import MOST_JSON_BYTES, parse_json
 from sigmasplat.input.calibration import Calibration, build_camera, check_positive, json_number, resolve_calibration
 from sigmasplat.input.images import decode_color, depth_to_metres, image_size
-from sigmasplat.input.opening import Format
 from sigmasplat.input.pose_files import FLIP_YZ, rigid_transform
 from sigmasplat.input.recorded import ImagePair, RecordedSource, Size, first_readable
 from sigmasplat.plugins.sources.files.archive import Archive
 from sigmasplat.plugins.sources.stray_scanner import with_coarser_depth
+from sigmasplat.registry import SourceFormat
 
 
 @dataclass(frozen=True)
@@ -210,7 +210,7 @@ def _recognises(path: str) -> bool:
     )
 
 
-FORMAT = Format(
+PLUGIN = SourceFormat(
     "Record3D",
     "a .r3d file, or metadata.json with rgb/ and depth/*.exr",
     _recognises,

@@ -40,9 +40,9 @@ from sigmasplat.input.folders import (
     pair_images,
 )
 from sigmasplat.input.lists import parse_numbers, read_lines
-from sigmasplat.input.opening import Format
 from sigmasplat.input.pose_files import build_trajectory, checked_pose, to_matrix
 from sigmasplat.input.recorded import ImagePair, RecordedSource, first_size
+from sigmasplat.registry import SourceFormat
 
 INTRINSIC_NAMES = ("intrinsic.json", "intrinsics.json", "camera_intrinsic.json", "camera_intrinsics.json")
 
@@ -145,7 +145,7 @@ def recognises(path: str) -> bool:
     return timed or _intrinsic_file(folder) is not None or _log_in(folder) is not None
 
 
-FORMAT = Format(
+PLUGIN = SourceFormat(
     "Redwood / Open3D",
     "color/, depth/ and camera_intrinsic.json or trajectory.log",
     recognises,

@@ -17,8 +17,8 @@ from sigmasplat.errors import SourceError
 from sigmasplat.files.reading import exists, read_text
 from sigmasplat.input.calibration import REPLICA, Calibration, read_replica_calibration, resolve_calibration
 from sigmasplat.input.folders import FRAMES_PER_SECOND, pair_images
-from sigmasplat.input.opening import Format
 from sigmasplat.input.recorded import ImagePair, RecordedSource
+from sigmasplat.registry import SourceFormat
 
 
 def open_replica(folder: Path, settings: InputConfig) -> RecordedSource:
@@ -84,7 +84,7 @@ def _matrix(where: str, line: str) -> np.ndarray[tuple[int, ...], np.dtype[np.fl
         ) from error
 
 
-FORMAT = Format(
+PLUGIN = SourceFormat(
     "Replica",
     "results/frame*.jpg and results/depth*.png",
     lambda path: bool(_numbered(Path(path), "frame") or _numbered(Path(path), "depth")),

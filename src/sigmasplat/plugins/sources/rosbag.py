@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from sigmasplat.config import InputConfig
 from sigmasplat.input.association import MAX_GAP_S, associate, no_pairs, refuse_other_units
-from sigmasplat.input.opening import Format
 from sigmasplat.input.recorded import ImagePair, RecordedSource, Size
 from sigmasplat.plugins.sources.ros.bag import Bag, Entry, is_bag
 from sigmasplat.plugins.sources.ros.cameras import read_bag_calibration
@@ -22,6 +21,7 @@ from sigmasplat.plugins.sources.ros.imu import read_bag_imu
 from sigmasplat.plugins.sources.ros.topics import color_topic, depth_topic
 from sigmasplat.plugins.sources.ros.truth import read_truth
 from sigmasplat.plugins.sources.stereo_bag import open_stereo_bag, stereo_topics
+from sigmasplat.registry import SourceFormat
 
 Times = NDArray[np.float64]
 
@@ -107,7 +107,7 @@ def _message_path(path: Path, topic: str, time_s: float) -> Path:
     return path / f"{topic.lstrip('/')} at {time_s:.3f} s"
 
 
-FORMAT = Format(
+PLUGIN = SourceFormat(
     "ROS bag",
     "a .bag, .mcap or .db3 file, or a folder with metadata.yaml",
     lambda path: is_bag(Path(path)),

@@ -33,9 +33,9 @@ from sigmasplat.input.folders import (
     pair_images,
 )
 from sigmasplat.input.lists import parse_numbers
-from sigmasplat.input.opening import Format
 from sigmasplat.input.pose_files import read_matrix, read_pose_files, to_matrix
 from sigmasplat.input.recorded import ImagePair, RecordedSource, first_size
+from sigmasplat.registry import SourceFormat
 from sigmasplat.types import Matrix
 
 COLOR_SIZE, DEPTH_SIZE = (1296, 968), (640, 480)
@@ -130,7 +130,7 @@ def recognises(path: str) -> bool:
     return images is not None and (camera or (folder / "pose").is_dir())
 
 
-FORMAT = Format(
+PLUGIN = SourceFormat(
     "ScanNet",
     "color/, depth/ and pose/",
     recognises,

@@ -15,10 +15,10 @@ from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.input.calibration import MM_PER_METRE, read_json_object, resolve_calibration
 from sigmasplat.input.folders import FRAMES_PER_SECOND
-from sigmasplat.input.opening import Format
 from sigmasplat.input.pose_files import build_trajectory
 from sigmasplat.input.recorded import ImagePair, RecordedSource, first_size
 from sigmasplat.input.transforms import Fields, read_camera, read_frames, read_pose
+from sigmasplat.registry import SourceFormat
 
 TRANSFORMS = Path("nerfstudio") / "transforms_undistorted.json"
 IMAGES, DEPTHS, LISTS = "undistorted_images", "undistorted_depths", "train_test_lists.json"
@@ -74,7 +74,7 @@ def _dslr(scene: Path) -> Path:
     return scene if (scene / TRANSFORMS).is_file() else scene / "dslr"
 
 
-FORMAT = Format(
+PLUGIN = SourceFormat(
     "ScanNet++",
     "dslr/nerfstudio/",
     lambda path: (_dslr(Path(path)) / TRANSFORMS).is_file(),

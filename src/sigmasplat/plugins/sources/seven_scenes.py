@@ -23,10 +23,10 @@ from sigmasplat.input.calibration import (
     resolve_calibration,
 )
 from sigmasplat.input.folders import FRAMES_PER_SECOND, frame_files, has_frame_files, pair_images
-from sigmasplat.input.opening import Format
 from sigmasplat.input.pose_files import read_pose_files
 from sigmasplat.input.recorded import ImagePair, RecordedSource, first_size
 from sigmasplat.input.rectification import registers_depth
+from sigmasplat.registry import SourceFormat
 
 
 def open_seven_scenes(folder: Path, settings: InputConfig) -> RecordedSource:
@@ -73,7 +73,7 @@ def recognises(path: str) -> bool:
     return any(has_frame_files(entry) or entry.suffix == ".zip" for entry in folder.glob("seq-*"))
 
 
-FORMAT = Format(
+PLUGIN = SourceFormat(
     "7-Scenes",
     "frame-*.color.png",
     recognises,

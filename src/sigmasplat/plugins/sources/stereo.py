@@ -28,12 +28,12 @@ from sigmasplat.input.calibration import Calibration, build_camera, resolve_cali
 from sigmasplat.input.folders import COLOR_ENDINGS, list_images
 from sigmasplat.input.images import read_color
 from sigmasplat.input.lists import parse_numbers, read_lines, read_poses
-from sigmasplat.input.opening import Format
 from sigmasplat.input.pose_files import build_trajectory, checked_pose, rigid_transform, to_matrix
 from sigmasplat.input.recorded import ImagePair, RecordedSource, Size, first_size
 from sigmasplat.plugins.sources.camera.stereo import StereoMatcher, StereoRectification, scene_scale
 from sigmasplat.plugins.sources.camera.stereo_cameras import StereoCameras, read_stereo_cameras
 from sigmasplat.plugins.sources.tum import read_list
+from sigmasplat.registry import SourceFormat
 from sigmasplat.types import Matrix
 
 KITTI_PAIRS = (("image_2", "image_3"), ("image_0", "image_1"))
@@ -317,7 +317,7 @@ def recognises(path: str) -> bool:
     return kitti or _euroc_root(folder) is not None
 
 
-FORMAT = Format(
+PLUGIN = SourceFormat(
     "stereo pair",
     "rgb.txt and right.txt, image_2/ and image_3/ with calib.txt, or mav0/cam0 and mav0/cam1",
     recognises,

@@ -17,12 +17,12 @@ from sigmasplat.data import se3
 from sigmasplat.errors import SourceError
 from sigmasplat.input.calibration import Calibration, check_positive, json_number, read_json_object
 from sigmasplat.input.folders import FRAMES_PER_SECOND, natural_key
-from sigmasplat.input.opening import Format
 from sigmasplat.input.pose_files import build_trajectory
 from sigmasplat.input.recorded import first_size
 from sigmasplat.input.transforms import Fields, read_camera, read_frames, read_pose
 from sigmasplat.plugins.sources.camera.stereo_cameras import StereoCameras
 from sigmasplat.plugins.sources.stereo import StereoSource, given_intrinsics
+from sigmasplat.registry import SourceFormat
 from sigmasplat.types import Matrix
 
 NAME, LEFT, RIGHT = "transforms.json", "left", "right"
@@ -114,7 +114,7 @@ def recognises(path: str) -> bool:
     return not any("depth_file_path" in frame for frame in frames) and bool(_pairs(frames)[0])
 
 
-FORMAT = Format(
+PLUGIN = SourceFormat(
     "nerfstudio stereo",
     "transforms.json with right_file_path, or with left and right frames",
     recognises,

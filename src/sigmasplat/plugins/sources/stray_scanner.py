@@ -28,9 +28,9 @@ from sigmasplat.files.reading import read_text
 from sigmasplat.files.structured import csv_rows
 from sigmasplat.input.calibration import MM_PER_METRE, Calibration, build_camera, resolve_calibration
 from sigmasplat.input.images import image_size, read_depth, read_values
-from sigmasplat.input.opening import Format
 from sigmasplat.input.recorded import ImagePair, RecordedSource, Size, first_size
 from sigmasplat.input.video import Video
+from sigmasplat.registry import SourceFormat
 
 POSE = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")
 ANGULAR, LINEAR = ("alpha_x", "alpha_y", "alpha_z"), ("a_x", "a_y", "a_z")
@@ -202,7 +202,7 @@ def _recognises(path: str) -> bool:
     return (folder / "odometry.csv").is_file() or ((folder / "rgb.mp4").is_file() and (folder / "depth").is_dir())
 
 
-FORMAT = Format(
+PLUGIN = SourceFormat(
     "Stray Scanner",
     "rgb.mp4, depth/ and odometry.csv",
     _recognises,

@@ -13,7 +13,6 @@ from sigmasplat.data.frame_arrays import color_from_bytes
 from sigmasplat.data.mesh import Mesh
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SourceError
-from sigmasplat.input.opening import Format
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.sources.camera.stereo import StereoMatcher
 from sigmasplat.plugins.sources.room.furnish import furnish_rooms
@@ -22,6 +21,7 @@ from sigmasplat.plugins.sources.room.render import RoomScene, build_scene, rende
 from sigmasplat.plugins.sources.room.sensor import drifted_depth, measured_color, measured_depth, predicted_depth
 from sigmasplat.plugins.sources.room.solid import triangulate
 from sigmasplat.plugins.sources.room.walk import camera_path
+from sigmasplat.registry import SourceFormat
 from sigmasplat.types import Matrix
 
 FRAMES_PER_SECOND = 30.0
@@ -249,7 +249,7 @@ _OPTIONS = (
     "stereo", "mover", "predicted",
 )  # fmt: skip
 
-FORMAT = Format(
+PLUGIN = SourceFormat(
     "synthetic",
     "the word 'synthetic'",
     lambda path: path.partition(":")[0] == "synthetic",

@@ -26,9 +26,9 @@ from sigmasplat.files.reading import exists
 from sigmasplat.input.association import MAX_GAP_S, associate, nearest_gaps_s, no_pairs, refuse_other_units
 from sigmasplat.input.calibration import TUM_UNITS_PER_METRE, Calibration, freiburg_calibration, resolve_calibration
 from sigmasplat.input.lists import parse_numbers, read_lines, read_poses
-from sigmasplat.input.opening import Format
 from sigmasplat.input.recorded import ImagePair, RecordedSource, first_size
 from sigmasplat.input.source import Source
+from sigmasplat.registry import SourceFormat
 
 
 def open_tum(
@@ -187,7 +187,7 @@ def write_images(frame: Frame, folder: Path) -> str:
     return stem
 
 
-FORMAT = Format(
+PLUGIN = SourceFormat(
     "TUM",
     "rgb.txt and depth.txt",
     lambda path: (Path(path) / "rgb.txt").is_file() or (Path(path) / "depth.txt").is_file(),

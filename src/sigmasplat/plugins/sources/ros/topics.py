@@ -3,8 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from sigmasplat.config.text import nearest
-from sigmasplat.errors import SourceError
+from sigmasplat.errors import SourceError, nearest
 from sigmasplat.plugins.sources.ros.bag import Bag, list_topics
 from sigmasplat.plugins.sources.ros.images import COMPRESSED, RAW, ImageKind, image_kind, message_size
 
