@@ -162,9 +162,22 @@ def changed_by_all(released: list[Any], papers: list[Any], default: Any) -> list
     return chosen
 
 
+def fast_list(system: str) -> str:
+    """Return the settings in which a system's preset for two CPU cores differs from that for TUM: both values."""
+    from sigmasplat.presets import preset
+
+    theirs, ours = preset(f"{system}-tum"), preset(f"{system}-fast")
+    changed = []
+    for section, values in ours.to_dict().items():
+        for name in (f"{section}.{inner}" for inner in (values if isinstance(values, dict) else ())):
+            if (value := _value(ours, name)) != (other := _value(theirs, name)):
+                changed.append(f"`{name}` {other} → {value}")
+    return ", ".join(changed)
+
+
 def rewritten(text: str) -> str:
     """Return a document with its tables between <!-- presets:KIND SYSTEM --> and <!-- /presets --> made again."""
-    kinds = {"paper": paper_table, "scenes": scene_table, "methods": method_table}
+    kinds = {"paper": paper_table, "scenes": scene_table, "methods": method_table, "fast": fast_list}
 
     def made(found: re.Match[str]) -> str:
         return f"<!-- presets:{found[1]} {found[2]} -->\n{kinds[found[1]](found[2])}\n<!-- /presets -->"
