@@ -102,27 +102,33 @@ SCENES: dict[str, tuple[str, ...]] = {
 
 
 def paper_table(system: str) -> str:
-    """Return the table of a paper's presets: a row per setting, a column per data set, and where the value is from."""
-    from sigmasplat.config.presets import preset
+    """Return a paper's presets: a row per setting that differs between data sets, then the others by origin."""
+    from sigmasplat.presets import preset
 
     columns = DATA_SETS[system]
     rows = [f"| setting | {' | '.join(columns)} | from |", "|---" * (len(columns) + 2) + "|"]
+    same: dict[str, list[str]] = {}
     for name, origin in ORIGINS[system].items():
         values = [_value(preset(f"{system}-{column}"), name) for column in columns]
-        rows.append(f"| `{name}` | {' | '.join(values)} | {origin} |")
-    return "\n".join(rows)
+        if len(set(values)) > 1:
+            rows.append(f"| `{name}` | {' | '.join(values)} | {origin} |")
+        else:
+            same.setdefault(origin, []).append(f"`{name}` {values[0]}")
+    equal = (f"- {origin}: {', '.join(settings)}" for origin, settings in same.items())
+    return "\n".join((*rows, "", "The same for all data sets:", "", *equal))
 
 
 def scene_table(system: str) -> str:
-    """Return the table of the released code's scenes: a row per preset, a column per setting; all from the code."""
-    from sigmasplat.config.presets import list_presets, preset
+    """Return the released code's scenes: a row per set of values, a column per setting; all from the code."""
+    from sigmasplat.presets import list_presets, preset
 
-    columns = SCENES[system]
-    rows = [f"| scene | {' | '.join(f'`{name}`' for name in columns)} |", "|---" * (len(columns) + 1) + "|"]
-    prefix = f"{system}-released-"
+    columns, prefix = SCENES[system], f"{system}-released-"
+    scenes: dict[tuple[str, ...], list[str]] = {}
     for name in (name for name in list_presets() if name.startswith(prefix)):
-        values = [_value(preset(name), column) for column in columns]
-        rows.append(f"| `{name.removeprefix(prefix)}` | {' | '.join(values)} |")
+        values = tuple(_value(preset(name), column) for column in columns)
+        scenes.setdefault(values, []).append(f"`{name.removeprefix(prefix)}`")
+    rows = [f"| scenes | {' | '.join(f'`{name}`' for name in columns)} |", "|---" * (len(columns) + 1) + "|"]
+    rows += (f"| {', '.join(names)} | {' | '.join(values)} |" for values, names in scenes.items())
     return "\n".join(rows)
 
 
@@ -156,9 +162,22 @@ def changed_by_all(released: list[Any], papers: list[Any], default: Any) -> list
     return chosen
 
 
+def fast_list(system: str) -> str:
+    """Return the settings in which a system's preset for two CPU cores differs from that for TUM: both values."""
+    from sigmasplat.presets import preset
+
+    theirs, ours = preset(f"{system}-tum"), preset(f"{system}-fast")
+    changed = []
+    for section, values in ours.to_dict().items():
+        for name in (f"{section}.{inner}" for inner in (values if isinstance(values, dict) else ())):
+            if (value := _value(ours, name)) != (other := _value(theirs, name)):
+                changed.append(f"`{name}` {other} → {value}")
+    return ", ".join(changed)
+
+
 def rewritten(text: str) -> str:
     """Return a document with its tables between <!-- presets:KIND SYSTEM --> and <!-- /presets --> made again."""
-    kinds = {"paper": paper_table, "scenes": scene_table, "methods": method_table}
+    kinds = {"paper": paper_table, "scenes": scene_table, "methods": method_table, "fast": fast_list}
 
     def made(found: re.Match[str]) -> str:
         return f"<!-- presets:{found[1]} {found[2]} -->\n{kinds[found[1]](found[2])}\n<!-- /presets -->"

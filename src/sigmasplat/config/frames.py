@@ -116,11 +116,11 @@ class MappingConfig(Section, name="mapping"):
     """Optimisation steps for the first keyframe of a map. Until about 150 steps, a new map renders surfaces too close,
     with `weight_mean_depth` until about 75."""
     divided: bool = False
-    """Whether the steps of a keyframe are divided: the first half at once, the second half at the frames before the
-    next keyframe, so that no frame takes much longer than others. If mapping moves poses (`lr_pose_*`), all are made at
-    once: the next frames are tracked from these poses. The first keyframe of a map begins with `iterations` steps.
-    The frames after them make as many each, or a fifteenth of `first_iterations` if this is more, until
-    `first_iterations` are made."""
+    """Whether the steps of a keyframe are spread over frames, so that no frame takes much longer than others. The first
+    half runs at the keyframe, the second half during the frames before the next keyframe. If mapping moves poses
+    (`lr_pose_*`), all steps run at the keyframe, because the next frames are tracked from these poses. The first
+    keyframe of a map runs `iterations` steps. Each frame after it runs `iterations` steps, or `first_iterations` / 15
+    if that is more, until `first_iterations` are done."""
     newest_probability: Share = 0.4
     """Probability that a step uses the newest keyframe; the other steps use older ones, drawn uniformly."""
     weight_l1: NotNegative = 0.8

@@ -160,9 +160,9 @@ class FinalConfig(Section, name="final"):
     """About how far refinement can move a keyframe from its tracked pose, in metres: each step takes back
     the share `final.lr_pose_translation` / `final.pose_reach_m` of this motion and turn. 0 = without limit."""
     pose_reach_most_m: NotNegative = 0.0
-    """If above `final.pose_reach_m`: the reach is half of the median standard deviation of keyframe positions, at least
-    `final.pose_reach_m` and at most this, in metres; the learning rates of poses grow in proportion. 0 = the reach is
-    always `final.pose_reach_m`."""
+    """If above `final.pose_reach_m`, the reach is half the median standard deviation of the keyframe positions, limited
+    to the range from `final.pose_reach_m` to this value, in metres. The learning rates of poses grow in proportion. 0 =
+    the reach is always `final.pose_reach_m`."""
     seconds: NotNegative = 0.0
     """Time budget of the refinement in seconds: it ends at the latest then, even if steps are left, and learning rates
     fall in time. The result then depends on the speed of the machine. 0 = no limit."""

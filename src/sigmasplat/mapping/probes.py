@@ -24,8 +24,8 @@ class Probe:
 class Probes:
     """The probe views of the active submap: at most `most`, one per keyframe, spread over the submap.
 
-    every: frames between keyframes. The distance from a probe to its keyframe changes from keyframe to keyframe, so
-    that probes are as near to keyframes as other frames are: the farthest ones would have larger errors than most.
+    every: frames between keyframes. The number of frames from a keyframe to its probe varies, so that probes are as
+    near to keyframes as frames are on average. The farthest frames have larger errors than most.
     """
 
     most: int

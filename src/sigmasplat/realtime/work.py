@@ -26,11 +26,11 @@ from sigmasplat.tracking.verdict import is_better
 from sigmasplat.types import Matrix
 
 AS_GOOD = 0.99
-"""An alignment replaces another one if its agreement × overlap is at least this share of the other's."""
+"""A repeated alignment replaces the first one if its agreement × overlap is at least this share of the first one's."""
 
 MOST_ADDED = 4
-"""At most so many keyframes in a row are added without a fit. Without a limit, a map that falls behind once stays
-behind: tracking gets no newer reference."""
+"""Largest number of keyframes in a row that are added without a fit. Without this limit, a map that falls behind never
+catches up, because tracking gets no newer reference."""
 
 
 class MapClock:
@@ -120,8 +120,8 @@ class MapClock:
         return T_submap_keyframe @ se3.inverse(known) @ each.T_submap_camera
 
     def _realigned(self, each: TrackedFrame, offer: Offer) -> tuple[Matrix, Alignment | None]:
-        """Return a keyframe's pose and its alignment to the keyframe before it; if that one was not mapped yet when the
-        frame was tracked, they are found again, with the weights of its pixels. Such errors would add up."""
+        """Return a keyframe's pose and its alignment to the keyframe before it. Both are fitted again, with the weights
+        of that keyframe's pixels, if it was not mapped yet when the frame was tracked: errors of keyframes add up."""
         T, first, last = self._pose(each), offer.alignment, self.last
         if first is None or last is None or offer.seen.frame.T_given_camera is not None:
             return T, first

@@ -39,9 +39,11 @@ COVERED = 0.5
 
 @dataclass(frozen=True, eq=False)
 class VarianceParts:
-    """Unweighted parts of the variance of a view: color [6, H, W] as `COLOR_PARTS`, depth [7, H, W] as `DEPTH_PARTS`,
-    systematic [H, W]: the part of depth that takes the place of residual for the depth of the map itself; with what was
-    rendered: image Ĉ [H, W, 3], depth_m D̂/A [H, W], alpha [H, W]; seen: the blend of the splats.
+    """Unweighted parts of the variance of a view, and the rendered view itself.
+
+    Variance: color [6, H, W] in the order of `COLOR_PARTS`, depth [7, H, W] in the order of `DEPTH_PARTS`; systematic
+    [H, W] replaces the part residual of depth in the variance of the map's own depth, which has no sensor noise.
+    View: image Ĉ [H, W, 3], depth_m D̂/A [H, W], alpha [H, W]; seen: the blend of the splats.
 
     Colour: mixture = Σw(σ²+c²) − |Ĉ|²/A, the variance among the splats of a pixel; residual = Σ w r², r² the squared
     residual of a splat at the keyframes; unexplained = T (σ_b² + A |c_b − Ĉ/A|²) + T² |c_b|², T = 1 − A, of a

@@ -171,7 +171,7 @@ class Slam(MapWork, ArrayInterface):
             found.T_submap_camera = self._mapped(seen, np.eye(4))  # the next submap begins with the same keyframe
 
     def _look_for_loops(self) -> None:
-        """Continue the search for loops that is owed, by as much as a frame does."""
+        """Continue the pending search for loops by the number of slices that one frame does."""
         with self._timer.stage("loops"):
             completed(self.closing(self.config.loops.slices_per_frame))
 

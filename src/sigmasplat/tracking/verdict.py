@@ -51,17 +51,19 @@ correlation: blur and exposure lower the correlation at right poses too."""
 BETTER = 0.1
 """A pose from the whole map replaces a doubtful one if its score is higher by this."""
 DIFFERS, DRAWS = 0.02, 2.5
-"""Something may have drawn the pose if the correlation of the gray values misses 1 by more than this. It has if what is
-missing is smaller by this factor without it: in recordings, the factor of still things was below 2."""
+"""A moving thing may have pulled the pose if 1 − correlation of the gray values is above the first value. It has pulled
+the pose if 1 − correlation falls by more than the second, a factor, when the thing is left out. For still things in
+recordings the factor was below 2."""
 SUSPECTED = 1.3
-"""Something is suspected if what is missing is smaller by this factor without it at the same pose. A drawn pose lies
-between the motion of the camera and that of the thing, so the rest does not agree there either: the factor is 1.6 to
-2.0 for a ball that covers a tenth of the image. The pose is fitted without it before anything is decided."""
+"""A thing is suspected if 1 − correlation falls by this factor when the thing is left out at the same pose. The factor
+is low because a pulled pose lies between the motion of the camera and that of the thing, where the rest of the image
+does not agree either: it is 1.6 to 2.0 for a ball that covers a tenth of the image. The pose is then fitted without the
+thing, and the other tests decide."""
 DISAGREES = 1.5
-"""It moves only if it does not agree with the rest: at the pose without it, this many times as much is missing with it.
-Otherwise the first pose was only a poor fit."""
+"""A suspected thing moves only if it disagrees with the rest of the image: at the pose fitted without the thing,
+1 − correlation is this many times larger with the thing than without it. Otherwise the first pose was a poor fit."""
 AGREES_MORE = 0.05
-"""Something has also drawn a doubtful pose if the correlation of the gray values is higher by this without it."""
+"""A thing has also pulled a doubtful pose if leaving it out raises the correlation of the gray values by this."""
 
 
 def explained(c: Comparison) -> float:
@@ -95,12 +97,12 @@ def recognised(c: Comparison, matches: int) -> bool:
 
 
 def differs(c: Comparison) -> bool:
-    """Return whether the gray values differ so much that something may have drawn the pose."""
+    """Return whether the gray values differ so much that something may have pulled the pose."""
     return 1.0 - c.correlation > DIFFERS
 
 
 def agrees_more(without: Comparison | None, c: Comparison | None, contradicted: bool) -> bool:
-    """Return whether something has drawn a pose, by a comparison without it; contradicted: the pose was doubtful."""
+    """Return whether something has pulled a pose, by a comparison without it; contradicted: the pose was doubtful."""
     if without is None or c is None:
         return False
     much = differs(c) and DRAWS * (1.0 - without.correlation) < 1.0 - c.correlation
@@ -108,7 +110,7 @@ def agrees_more(without: Comparison | None, c: Comparison | None, contradicted: 
 
 
 def may_draw(without: Comparison, c: Comparison | None) -> bool:
-    """Return whether something may have drawn a pose, by a comparison without it at the same pose."""
+    """Return whether something may have pulled a pose, by a comparison without it at the same pose."""
     return c is not None and differs(c) and SUSPECTED * (1.0 - without.correlation) < 1.0 - c.correlation
 
 
@@ -124,8 +126,8 @@ def disagrees(whole: Comparison, without: Comparison | None) -> bool:
 
 
 def is_missed(without: Comparison | None, whole: Comparison | None) -> bool:
-    """Return whether something belongs to the scene: the images agree less in depth and in gray without it, at the pose
-    that was fitted without it, than with it at the first pose."""
+    """Return whether a thing that was left out belongs to the still scene: the fit is worse without it. The images
+    agree less, in depth and in gray, at the pose fitted without the thing than with the thing at the first pose."""
     if without is None or whole is None or without.close >= whole.close:
         return False
     return not 1.0 - without.correlation <= DISAGREES * (1.0 - whole.correlation)
@@ -193,7 +195,7 @@ class Usual:
         return worse or self.contradicts(c)
 
     def agrees_less(self, c: Comparison | None) -> bool:
-        """Return whether the gray values agree so much less than usual that something may have drawn the pose far."""
+        """Return whether the gray values agree so much less than usual that something may have pulled the pose far."""
         return c is not None and 1.0 - c.correlation > DRAWS * max(1.0 - _median(self.correlations, 0.9), DIFFERS)
 
     def contradicts(self, c: Comparison) -> bool:

@@ -1,4 +1,4 @@
-"""Find the thing that has drawn a pose: it moves, and the images agree much better without it."""
+"""Find the thing that has pulled a pose: it moves, and the images agree much better without it."""
 
 from collections.abc import Iterator
 
@@ -35,12 +35,12 @@ OBJECT_SHARE, MOST_OBJECTS = (0.02, 0.7), 3
 RING, FREE_AROUND = 3, 0.6
 """Something stands free if at least this share of the pixels at this distance around it is farther."""
 SHIFTED = 1e-3
-"""A thing has drawn the pose only if the pose without it shows the thing elsewhere: by at least this share of the
-width of the image. What has another brightness than before, and stays in place, changes the pose less."""
+"""A thing has pulled the pose only if the pose fitted without it shifts the thing by at least this share of the width
+of the image. A thing that stays in place and only changes its brightness shifts less."""
 QUICK_LEVELS, QUICK_GAIN, QUICK_APART, QUICK_CLOSE = 2, 0.5, 2.5e-3, 5e-3
-"""A thing is also suspected if without it a pose is found, on so many of the coarsest images, where the gain of the
-rest (`gray_gain`) is at least this, and for which the product of `APART` is at least half as large. At most this share
-of the rest has another depth there than at the first pose: so much can be off at a pose from small images."""
+"""The quick check fits the pose without a thing, on the `QUICK_LEVELS` coarsest images. The thing is suspected if the
+rest of the image gains at least `QUICK_GAIN` (`gray_gain`) and gain × shift is at least `QUICK_APART`, half of `APART`.
+The share of close depths may fall by `QUICK_CLOSE`: poses from small images are not more exact."""
 APART = 5e-3
 """Two motions are apart if the shift of the thing, as a share of the width of the image, times the gain of the rest
 above 1 is at least this. In still recordings it was at most 0.2 %, and for balls in real recordings more than 1 %: a
@@ -54,7 +54,7 @@ SHIFT_STEP = 4
 def suspected(
     keyframe: Reference, seen: Sight, fit: PoseFit, config: TrackingConfig, every: bool
 ) -> Iterator[Foreground]:
-    """Yield the things in front that may have drawn a pose; with `every`, all that stand free."""
+    """Yield the things in front that may have pulled a pose; with `every`, all that stand free."""
     live_m = seen.target.depth_image.numpy()
     for inside in free_standing(thinned(live_m, STEP)):
         if every or _may_have_drawn(_front(*with_margin(inside, STEP, live_m), live_m), keyframe, seen, fit, config):
@@ -113,10 +113,10 @@ def _stands_free(depth: Depth, regions: NDArray[np.int32], region: int, box: NDA
 def has_drawn(
     thing: Foreground, keyframe: Reference | None, seen: Sight, drawn: PoseFit, found: PoseFit, contradicted: bool
 ) -> bool:
-    """Return whether a thing has drawn a pose, by the pose that was fitted without it, which shows it elsewhere.
+    """Return whether a thing has pulled a pose, by the pose that was fitted without it, which shows it elsewhere.
 
     Either the rest agrees much more there and the thing does not agree with it, or each of the two agrees clearly
-    better at a pose of its own. contradicted: the images contradict the drawn pose.
+    better at a pose of its own. contradicted: the images contradict the pulled pose.
     """
     shift = _shift(thing, seen, drawn.T_camera_world, found.T_camera_world)
     if keyframe is None or shift < SHIFTED:
@@ -135,7 +135,7 @@ def _shift(thing: Foreground, seen: Sight, T_first: Matrix, T_second: Matrix) ->
 def _disturbs(
     thing: Foreground, keyframe: Reference, seen: Sight, drawn: PoseFit, found: PoseFit, contradicted: bool
 ) -> bool:
-    """Return whether the rest agrees much more without a thing, the thing does not agree with the rest, and the drawn
+    """Return whether the rest agrees much more without a thing, the thing does not agree with the rest, and the pulled
     pose is not only a poor fit."""
     if not agrees_more(found.comparison, drawn.comparison, contradicted):
         return False

@@ -29,8 +29,9 @@ FEWEST = 100
 REST_GAINS, THING_LOSES, LEAST_MOVES = 1.5, 1.2, 0.02
 """Least factors of the squared gray differences, and least share of the compared points that move."""
 MOST_OF_REST = 0.7
-"""Least share of the rest that agrees better at the second pose. With a still thing left out, the pose follows what
-moves: its squared differences can outweigh those of the whole rest, but it covers less of the image."""
+"""Least share of the rest of the image that agrees better at the second pose. If a still thing is left out, the second
+pose follows the moving thing instead. That thing's squared differences can outweigh those of the whole rest, but it
+covers a smaller part of the image."""
 
 
 @dataclass(frozen=True, eq=False)

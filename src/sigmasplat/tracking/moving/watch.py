@@ -90,7 +90,7 @@ class Watch:
         self, keyframe: Reference | None, seen: Sight, fit: PoseFit, config: TrackingConfig, contradicted: bool,
         urgent: bool,
     ) -> tuple["Watch", Iterator[Foreground]]:  # fmt: skip
-        """Return the watch after a look, and the things in front that may have drawn a pose: those without which the
+        """Return the watch after a look, and the things in front that may have pulled a pose: those without which the
         rest agrees better, there or at another pose; if the images contradict it, all.
 
         Without contradiction, frames in which gray values differ are looked at by turns. urgent: something was in front
