@@ -19,6 +19,16 @@ from sigmasplat.errors import RunError
 
 NATIVE = Path("src/sigmasplat/native")
 MODULE = "_core*.so"
+START = """
+import os, runpy, sys
+sys.meta_path[:] = [finder for finder in sys.meta_path if "Redirecting" not in type(finder).__name__]
+import sigmasplat
+if not sigmasplat.__file__.startswith(os.environ["PYTHONPATH"]):
+    sys.exit(f"{sigmasplat.__file__} is not the code in {os.environ['PYTHONPATH']}")
+sys.argv[0] = "sigmasplat"
+runpy.run_module("sigmasplat", run_name="__main__")
+"""
+"""As `python -m sigmasplat`, but never the code of an editable install, which goes before PYTHONPATH."""
 
 
 def commit_of(revision: str) -> str:
@@ -57,32 +67,35 @@ def checkout(revision: str) -> Path:
     return tree
 
 
+def command() -> list[str]:
+    """Return the words that start `sigmasplat` of the tree whose `environment` the process gets."""
+    return [sys.executable, "-c", START]
+
+
 def environment(tree: Path) -> dict[str, str]:
-    """Return the environment in which `python -m sigmasplat` runs a tree's code, with one thread."""
+    """Return the environment in which `command` runs a tree's code, with one thread."""
     return {
         **os.environ, "PYTHONPATH": str(tree / "src"), "SIGMASPLAT_THREADS": "1", "OMP_NUM_THREADS": "1",
     }  # fmt: skip
 
 
 def built(tree: Path) -> bool:
-    """Return whether a tree has compiled kernels."""
-    return any((tree / "src").rglob(MODULE))
+    """Return whether a tree has compiled kernels that are not older than their sources."""
+    modules = [path.stat().st_mtime for path in (tree / NATIVE).glob(MODULE)]
+    sources = [path.stat().st_mtime for path in (tree / NATIVE).iterdir() if path.suffix in (".h", ".cpp")]
+    return bool(modules) and min(modules) >= max(sources)
 
 
 def _copy_kernels(commit: str, tree: Path) -> bool:
     """Copy the module of this checkout into a tree of a commit; return False if its sources may be others."""
-    modules = list((record.ROOT / NATIVE).glob(MODULE))
-    sources = [path for path in (record.ROOT / NATIVE).rglob("*") if path.suffix in (".h", ".cpp")]
-    if not modules or not (tree / NATIVE).is_dir():
-        return False
-    if min(m.stat().st_mtime for m in modules) < max(s.stat().st_mtime for s in sources):
+    if not built(record.ROOT) or not (tree / NATIVE).is_dir():
         return False
     different = subprocess.run(
         ["git", "-C", str(record.ROOT), "diff", "--quiet", commit, "--", str(NATIVE), "CMakeLists.txt"]
     )
     if different.returncode:
         return False
-    for module in modules:
+    for module in (record.ROOT / NATIVE).glob(MODULE):
         shutil.copy2(module, tree / NATIVE)
     return True
 
