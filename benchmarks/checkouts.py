@@ -17,7 +17,6 @@ import record
 
 from sigmasplat.errors import RunError
 
-NATIVE = Path("src/sigmasplat/native")
 MODULE = "_core*.so"
 START = """
 import os, runpy, sys
@@ -48,13 +47,23 @@ def checkout(revision: str) -> Path:
     """Return a tree of a revision's code with compiled kernels; its src/ can be put on PYTHONPATH.
 
     The tree is kept. The kernels are those of this checkout if they have the same sources and are newer than these;
-    otherwise they are compiled, which takes minutes. Raises RunError for an unknown revision, and if they do not
-    compile.
+    otherwise they are compiled, which takes minutes. Raises RunError for an unknown revision, if they do not
+    compile, and if the folder cannot be written.
     """
     commit = commit_of(revision)
     tree = folder_of(commit) / "tree"
     if tree.is_dir():
         return tree
+    try:
+        _make(commit, tree)
+    except OSError as problem:
+        raise RunError(
+            f"cannot write {tree}: {problem.strerror or problem}; choose another folder with SIGMASPLAT_BEFORE"
+        ) from problem
+    return tree
+
+
+def _make(commit: str, tree: Path) -> None:
     tree.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="tree-", dir=tree.parent) as temporary:
         made = Path(temporary) / "tree"
@@ -64,7 +73,6 @@ def checkout(revision: str) -> Path:
             _compile_kernels(made)
         if not tree.is_dir():  # another process may have been faster
             made.rename(tree)
-    return tree
 
 
 def command() -> list[str]:
@@ -73,30 +81,33 @@ def command() -> list[str]:
 
 
 def environment(tree: Path) -> dict[str, str]:
-    """Return the environment in which `command` runs a tree's code, with one thread."""
-    return {
-        **os.environ, "PYTHONPATH": str(tree / "src"), "SIGMASPLAT_THREADS": "1", "OMP_NUM_THREADS": "1",
-    }  # fmt: skip
+    """Return the environment in which `command` runs a tree's code, with one thread and no switch of SigmaSplat set."""
+    others = {name: value for name, value in os.environ.items() if not name.startswith("SIGMASPLAT_")}
+    return {**others, "PYTHONPATH": str(tree / "src"), "SIGMASPLAT_THREADS": "1", "OMP_NUM_THREADS": "1"}
 
 
 def built(tree: Path) -> bool:
     """Return whether a tree has compiled kernels that are not older than their sources."""
-    modules = [path.stat().st_mtime for path in (tree / NATIVE).glob(MODULE)]
-    sources = [path.stat().st_mtime for path in (tree / NATIVE).iterdir() if path.suffix in (".h", ".cpp")]
-    return bool(modules) and min(modules) >= max(sources)
+    modules = [path.stat().st_mtime for path in _modules(tree)]
+    sources = [path.stat().st_mtime for end in ("cpp", "h") for path in (tree / "src").rglob(f"*.{end}")]
+    return bool(modules) and min(modules) >= max(sources, default=0.0)
+
+
+def _modules(tree: Path) -> list[Path]:
+    return sorted((tree / "src").rglob(MODULE))
 
 
 def _copy_kernels(commit: str, tree: Path) -> bool:
     """Copy the module of this checkout into a tree of a commit; return False if its sources may be others."""
-    if not built(record.ROOT) or not (tree / NATIVE).is_dir():
+    if not built(record.ROOT):
         return False
-    different = subprocess.run(
-        ["git", "-C", str(record.ROOT), "diff", "--quiet", commit, "--", str(NATIVE), "CMakeLists.txt"]
-    )
-    if different.returncode:
-        return False
-    for module in (record.ROOT / NATIVE).glob(MODULE):
-        shutil.copy2(module, tree / NATIVE)
+    for module in _modules(record.ROOT):
+        folder = module.parent.relative_to(record.ROOT)
+        sources = [str(folder), "CMakeLists.txt"]
+        different = subprocess.run(["git", "-C", str(record.ROOT), "diff", "--quiet", commit, "--", *sources])
+        if different.returncode or not (tree / folder).is_dir():
+            return False
+        shutil.copy2(module, tree / folder)
     return True
 
 

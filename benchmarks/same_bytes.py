@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from hashlib import sha256
+from importlib import metadata
 from pathlib import Path
 from typing import Annotated
 
@@ -116,20 +117,24 @@ def run(tree: Path, words: Sequence[str], folder: Path) -> tuple[int, Ran]:
 
 
 def run_before(name: str, commit: str, tree: Path) -> Ran:
-    """Return a run of the other commit: the kept one of this machine, otherwise a new one, which is kept unless it
-    fails."""
-    spellings = list(dict.fromkeys([spelled_before(CASES[name]), CASES[name]]))
-    conditions = json.dumps([spellings, machine.describe()], sort_keys=True)
-    folder = checkouts.folder_of(commit) / "same-bytes" / f"{name}-{sha256(conditions.encode()).hexdigest()[:8]}"
-    if (folder / DONE).is_file():
-        return Ran(folder, json.loads((folder / DONE).read_text())["cpu_s"])
+    """Return a run of the other commit, which is made once on each kind of machine and then kept, unless it fails."""
+    spellings = dict.fromkeys([spelled_before(CASES[name]), CASES[name]])
     for words in spellings:
+        folder = kept_folder(name, commit, words)
+        if (folder / DONE).is_file():
+            return Ran(folder, json.loads((folder / DONE).read_text())["cpu_s"])
         code, ran = run(tree, command_words(words), folder)
         if code != REFUSED:
             break
     if ran.problem is None:
         (folder / DONE).write_text(json.dumps({"words": words, "cpu_s": round(ran.cpu_s, 2)}) + "\n")
     return ran
+
+
+def kept_folder(name: str, commit: str, words: str) -> Path:
+    """Return the folder of a kept run, which depends on its words, the machine, and the version of torch."""
+    conditions = json.dumps([words, machine.describe(), metadata.version("torch")], sort_keys=True)
+    return checkouts.folder_of(commit) / "same-bytes" / f"{name}-{sha256(conditions.encode()).hexdigest()[:8]}"
 
 
 def compare(name: str, commit: str, tree: Path, renamed: dict[str, str]) -> tuple[bool, str, float, float]:

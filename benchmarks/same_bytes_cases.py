@@ -9,7 +9,7 @@ FEW = (
     "input.width=160", "input.crop_px=4", "mapping.first_iterations=20", "mapping.iterations=8",
     "tracking.iterations=10", "registration.iterations=6", "final.iterations=30", "final.sh_every=10",
 )  # fmt: skip
-CUTS = ("submaps.frames=10", "loops.min_interval=1", "loops.near_m=2", "loops.near_deg=60")
+CUTS = ("submaps.frames=5", "loops.min_interval=1", "loops.near_m=2", "loops.near_deg=60")
 """Settings of presets that cut submaps."""
 
 
@@ -18,44 +18,44 @@ def words(text: str, *settings: str) -> str:
     return " ".join([text, *(f"--set {setting}" for setting in settings)])
 
 
-def few(preset: str, frames: int, *settings: str) -> str:
+def few(preset: str, *settings: str) -> str:
     """Return the words of a short run of a preset on redkitchen."""
-    return words(f"redkitchen --preset {preset} --limit {frames} --no-eval", *FEW, *settings)
+    return words(f"redkitchen --preset {preset} --limit 16 --no-eval", *FEW, *settings)
 
 
 ROOM = "synthetic:width=160,height=120,noise=1"
-SCORED = "input.width=160"
+SCORED = ("input.width=160", *PLAIN)
 """Scores and their pictures take longer than the run itself: runs with scores have small images."""
 CASES = {
     "redkitchen-sigma": words("redkitchen --limit 60 --hold-out 8 --all-poses --no-eval", "final.iterations=60"),
-    "livingroom-sigma": words("livingroom --limit 40 --hold-out 10", SCORED, *PLAIN),
+    "livingroom-sigma": words("livingroom --limit 40 --no-eval", *PLAIN),
     "hololens-sigma": words("hololens --limit 40 --no-eval", *PLAIN),
     "cubicles-sigma": words("cubicles --limit 50 --no-eval", *PLAIN),
     "fr1_xyz-sigma": words("fr1_xyz --limit 40 --no-eval", *PLAIN),
-    "cabinet58-sigma": words("cabinet58 --no-eval", *PLAIN),
-    "lost-sigma": words("fr1_xyz --stride 12 --hold-out 10", SCORED, *PLAIN),
-    "raw-sigma": words("redkitchen_raw --limit 12 --no-eval", *PLAIN),
-    "stereo-sigma": words("street --limit 6 --no-eval", *PLAIN),
+    "cabinet58-sigma": words("cabinet58 --limit 40 --no-eval", *PLAIN),
+    "lost-sigma": words("fr1_xyz --stride 15 --hold-out 10", *SCORED),
+    "raw-sigma": words("redkitchen_raw --limit 10 --no-eval", *PLAIN),
+    "stereo-sigma": words("street --limit 5 --no-eval", *PLAIN),
     "loops-sigma": words(f"{ROOM},frames=240,rooms=2,overrun=20,drift=6 --no-eval", "final.iterations=20"),
-    "ball-sigma": words(f"{ROOM},frames=50,mover=20 --seed 1 --no-eval", *PLAIN),
-    "predicted-sigma": words(f"{ROOM},frames=30,predicted=1 --no-eval", *PLAIN),
-    "varsplat-fast": words("redkitchen --preset varsplat-fast --limit 40 --hold-out 10", *FEW),
-    "cgslam-fast": few("cgslam-fast", 30),
-    "loopsplat-fast": few("loopsplat-fast", 40, *CUTS),
-    "cgslam-loops-fast": few("cgslam-loops-fast", 30, *CUTS),
-    "varsplat-tum": few("varsplat-tum", 25, *CUTS),
-    "varsplat-replica": few("varsplat-replica", 30, *CUTS),
-    "varsplat-scannetpp": few("varsplat-scannetpp", 25, *CUTS),
-    "loopsplat-tum": few("loopsplat-tum", 25, *CUTS),
-    "cgslam-tum": few("cgslam-tum", 20, "mapping.every=5"),
-    "cgslam-replica": few("cgslam-replica", 20, "mapping.every=5"),
-    "cgslam-light-tum": few("cgslam-light-tum", 20, "mapping.every=5"),
-    "cgslam-loops-tum": few("cgslam-loops-tum", 25, "mapping.every=5", *CUTS),
-    "varsplat-released-fr1-desk": few("varsplat-released-fr1-desk", 25, *CUTS),
-    "varsplat-released-room0": few("varsplat-released-room0", 30, *CUTS),
-    "varsplat-released-scene0000": few("varsplat-released-scene0000", 25, *CUTS),
-    "cgslam-released-fr1-desk": few("cgslam-released-fr1-desk", 20, "mapping.every=5"),
-    "cgslam-released-replica": few("cgslam-released-replica", 20, "mapping.every=5"),
+    "ball-sigma": words(f"{ROOM},frames=40,mover=20 --seed 1 --no-eval", *PLAIN),
+    "predicted-sigma": words(f"{ROOM},frames=20,predicted=1 --no-eval", *PLAIN),
+    "varsplat-fast": words("redkitchen --preset varsplat-fast --limit 25 --hold-out 10", *FEW, *CUTS),
+    "cgslam-fast": few("cgslam-fast"),
+    "loopsplat-fast": few("loopsplat-fast", *CUTS),
+    "cgslam-loops-fast": few("cgslam-loops-fast", *CUTS),
+    "varsplat-tum": few("varsplat-tum", *CUTS),
+    "varsplat-replica": few("varsplat-replica", *CUTS),
+    "varsplat-scannetpp": few("varsplat-scannetpp", *CUTS),
+    "loopsplat-tum": few("loopsplat-tum", *CUTS),
+    "cgslam-tum": few("cgslam-tum", "mapping.every=5"),
+    "cgslam-replica": few("cgslam-replica", "mapping.every=5"),
+    "cgslam-light-tum": few("cgslam-light-tum", "mapping.every=5"),
+    "cgslam-loops-tum": few("cgslam-loops-tum", "mapping.every=3", *CUTS),
+    "varsplat-released-fr1-desk": few("varsplat-released-fr1-desk", *CUTS),
+    "varsplat-released-room0": few("varsplat-released-room0", *CUTS),
+    "varsplat-released-scene0000": few("varsplat-released-scene0000", *CUTS),
+    "cgslam-released-fr1-desk": few("cgslam-released-fr1-desk", "mapping.every=5"),
+    "cgslam-released-replica": few("cgslam-released-replica", "mapping.every=5"),
 }
 """Words of the command line after `sigmasplat run`, as this checkout has them, by the name of the run."""
 SPELLED_BEFORE: dict[str, str] = {}

@@ -13,6 +13,7 @@ from sigmasplat.errors import RunError
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
 checkouts, record = map(importlib.import_module, ("checkouts", "record"))
 
+NATIVE = Path("src/sigmasplat/native")
 SPY = """
 import sys
 class RedirectingFinder:
@@ -32,7 +33,7 @@ def git(folder: Path, *words: str) -> None:
 def repository(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Make a repository with one commit, tagged first, and kernels that are "compiled" from its sources."""
     root = tmp_path / "checkout"
-    native = root / checkouts.NATIVE
+    native = root / NATIVE
     native.mkdir(parents=True)
     (root / ".gitignore").write_text("*.so\nbuild/\n")
     (root / "CMakeLists.txt").write_text("project(a)\n")
@@ -48,14 +49,14 @@ def repository(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.delenv("SIGMASPLAT_BEFORE", raising=False)
 
     def compiled(tree: Path) -> None:
-        (tree / checkouts.NATIVE / "_core.so").write_text("compiled again")
+        (tree / NATIVE / "_core.so").write_text("compiled again")
 
     monkeypatch.setattr(checkouts, "_compile_kernels", compiled)
     return root
 
 
 def module(tree: Path) -> str:
-    return (tree / checkouts.NATIVE / "_core.so").read_text()
+    return (tree / NATIVE / "_core.so").read_text()
 
 
 def test_a_checkout_has_the_code_of_its_commit_and_is_kept(repository: Path) -> None:
@@ -77,14 +78,14 @@ def test_the_folder_of_checkouts_can_be_chosen(
 
 
 def test_kernels_are_compiled_if_their_sources_differ(repository: Path) -> None:
-    (repository / checkouts.NATIVE / "a.cpp").write_text("int b;\n")
-    later = (repository / checkouts.NATIVE / "a.cpp").stat().st_mtime + 10
-    os.utime(repository / checkouts.NATIVE / "_core.so", (later, later))
+    (repository / NATIVE / "a.cpp").write_text("int b;\n")
+    later = (repository / NATIVE / "a.cpp").stat().st_mtime + 10
+    os.utime(repository / NATIVE / "_core.so", (later, later))
     assert checkouts.built(repository) and module(checkouts.checkout("first")) == "compiled again"
 
 
 def test_kernels_older_than_their_sources_are_not_used(repository: Path) -> None:
-    os.utime(repository / checkouts.NATIVE / "_core.so", (0, 0))
+    os.utime(repository / NATIVE / "_core.so", (0, 0))
     assert not checkouts.built(repository) and module(checkouts.checkout("first")) == "compiled again"
 
 
@@ -95,7 +96,7 @@ def test_nothing_is_left_of_a_checkout_whose_kernels_do_not_compile(
         raise RunError("no compiler")
 
     monkeypatch.setattr(checkouts, "_compile_kernels", fails)
-    (repository / checkouts.NATIVE / "_core.so").unlink()
+    (repository / NATIVE / "_core.so").unlink()
     with pytest.raises(RunError, match="no compiler"):
         checkouts.checkout("first")
     assert not list(checkouts.folder_of(checkouts.commit_of("first")).iterdir())
@@ -117,6 +118,22 @@ def test_the_command_runs_the_code_of_the_tree_and_not_that_of_an_editable_insta
     (repository / "src" / "sitecustomize.py").write_text(SPY)
     assert ran(repository, repository / "src").stdout == "first sigmasplat run x\n"
     assert checkouts.environment(repository)["PYTHONPATH"] == str(repository / "src")
+
+
+def test_switches_of_the_callers_environment_do_not_change_results(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SIGMASPLAT_ISA", "baseline")
+    monkeypatch.setenv("SIGMASPLAT_THREADS", "2")
+    found = checkouts.environment(Path("a"))
+    assert "SIGMASPLAT_ISA" not in found and found["SIGMASPLAT_THREADS"] == found["OMP_NUM_THREADS"] == "1"
+
+
+def test_a_folder_that_cannot_be_written_is_refused(
+    repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("SIGMASPLAT_BEFORE", str(tmp_path / "file"))
+    with pytest.raises(RunError, match=r"cannot write .*SIGMASPLAT_BEFORE"):
+        checkouts.checkout("first")
 
 
 def test_the_command_never_runs_other_code(repository: Path, tmp_path: Path) -> None:

@@ -197,8 +197,8 @@ def test_the_other_commit_gets_its_own_spelling_unless_it_refuses_it(
     assert same_bytes.main(options("fast")) == 0
     assert sides.ran == [("before", "run synthetic --preset a --set x=1"), ("now", "run synthetic --preset b")]
     sides.ran.clear()
-    sides.code = {"x=1": 2}
-    monkeypatch.setenv("SIGMASPLAT_BEFORE", str(same_bytes.NOW / "none kept"))
+    sides.code = {"y=1": 2}
+    monkeypatch.setattr(same_bytes, "SPELLED_BEFORE", {"--preset b": "--preset a --set y=1"})
     assert same_bytes.main(options("fast")) == 0
     assert [text for side, text in sides.ran if side == "before"][1] == "run synthetic --preset b"
 
