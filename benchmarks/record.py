@@ -9,8 +9,10 @@ import sys
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
+from sigmasplat.errors import ConfigError
 from sigmasplat.io import machine
 from sigmasplat.io.machine import code_digest
 
@@ -73,6 +75,16 @@ def results(
         "command": shlex.join(["python", *sys.argv]),
         "figures": figures,
     }
+
+
+def refuse_unwritable(folder: Path) -> None:
+    """Check before anything is measured that results can be written. Raises ConfigError if they cannot."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with TemporaryFile(dir=folder):
+            pass
+    except OSError as problem:
+        raise ConfigError(f"results cannot be written to {folder} ({problem.strerror}); give another --out") from None
 
 
 def write(measured: dict[str, Any], folder: Path = RESULTS) -> Path:
