@@ -91,10 +91,15 @@ def write(measured: dict[str, Any], folder: Path = RESULTS) -> Path:
     """Write results as <name>-<machine>.json, replacing those of the same name and machine; return the path."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{slug(measured['name'])}-{machine_slug(measured['machine'])}.json"
-    temporary = path.with_suffix(".part")
-    temporary.write_text(json.dumps(measured, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    temporary.replace(path)
+    write_json(measured, path)
     return path
+
+
+def write_json(values: dict[str, Any], path: Path) -> None:
+    """Write a JSON file, whole or not at all."""
+    temporary = path.with_suffix(".part")
+    temporary.write_text(json.dumps(values, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    temporary.replace(path)
 
 
 def read(path: Path) -> dict[str, Any]:
