@@ -12,11 +12,15 @@ import record
 from disturbances import Color, Plan, disturbed
 from numpy.typing import NDArray
 
+from sigmasplat.checks.timing import times_of
 from sigmasplat.config import InputConfig
 from sigmasplat.data.camera import Camera
 from sigmasplat.errors import SourceError
-from sigmasplat.plugins.evaluation.metrics.trajectory import associate
-from sigmasplat.plugins.sources import open_source
+from sigmasplat.metrics.trajectory import associate
+from sigmasplat.model.camera import Camera
+from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.sources import open_source
+from sigmasplat.sources.base import Source
 
 FRAMES_PER_SECOND = 30.0
 """Frame i of every disturbed recording has the time i / 30 s: times do not reveal what was cut out."""
@@ -26,23 +30,29 @@ QUANTILE_FRAMES = 10
 
 @dataclass(frozen=True, eq=False)
 class Original:
-    """A recording with its true path, read from disk frame by frame.
+    """The frames of a recording that have a true pose, read from disk one by one.
 
-    color: uint8 [N, H, W, 3]; depth: uint16 [N, H, W], 1/5000 m; T_world_camera: [N, 4, 4], the true poses.
+    color: uint8 [N, H, W, 3] and depth: uint16 [N, H, W], 1/5000 m, of all frames; frames [K]: those with a true pose;
+    T_world_camera [K, 4, 4]: their true poses.
     """
 
     name: str
     camera: Camera
     color: Color
     depth: NDArray[np.uint16]
+    frames: NDArray[np.intp]
     T_world_camera: NDArray[np.float64]
 
     def __len__(self) -> int:
-        return len(self.color)
+        return len(self.frames)
+
+    def color_of(self, index: int) -> Color:
+        """Return the colour of a frame with a true pose."""
+        return self.color[self.frames[index]]
 
     def depth_m(self, index: int) -> NDArray[np.float32]:
-        """Return the depth of a frame, m, 0 = no reading."""
-        return np.asarray(self.depth[index] / np.float32(UNITS_PER_METRE), np.float32)
+        """Return the depth of a frame with a true pose, m, 0 = no reading."""
+        return np.asarray(self.depth[self.frames[index]] / np.float32(UNITS_PER_METRE), np.float32)
 
     @cached_property
     def _readings_m(self) -> NDArray[np.float32]:
@@ -56,24 +66,34 @@ class Original:
         return float(np.quantile(self._readings_m, share))
 
 
-def original(path: str, start_s: float, folder: Path) -> Original:
-    """Open a recording or a synthetic room from `start_s` seconds on.
-
-    Its decoded frames are kept in `folder`, and read from there the next time. Raises SourceError if it cannot be read
-    or a frame has no true pose.
-    """
-    source = open_source(path, InputConfig(start_s=start_s))
+def with_truth(path: str, start_s: float, limit: int = 0) -> tuple[Source, Trajectory, int]:
+    """Open a recording or a synthetic room from `start_s` seconds on, with its true path and the number of its frames
+    that have a true pose. No image is decoded. Raises SourceError if it cannot be read or has no true pose."""
+    source = open_source(path, InputConfig(start_s=start_s, limit=limit))
     truth = source.truth()
     if truth is None:
         raise SourceError(f"{path}: the true path is unknown, so nothing can be scored")
-    stem = folder / record.slug(f"{path} {start_s:g}")
+    frames = associate(times_of(source), truth.timestamps_s)[0]
+    if not len(frames):
+        raise SourceError(f"{path}: no frame has a true pose, so nothing can be scored")
+    return source, truth, len(frames)
+
+
+def original(path: str, start_s: float, folder: Path, limit: int = 0) -> Original:
+    """Open the frames of a recording or a synthetic room that have a true pose, from `start_s` seconds on.
+
+    Its decoded frames are kept in `folder`, and read from there the next time. Raises SourceError if it cannot be read
+    or has no true pose.
+    """
+    source, truth, _ = with_truth(path, start_s, limit)
+    stem = folder / record.slug(f"{path} {start_s:g}{f' {limit}' if limit else ''}")
     color_path, depth_path, times_path = (stem.with_suffix(f".{part}.npy") for part in ("color", "depth", "times"))
     if not times_path.is_file():
         folder.mkdir(parents=True, exist_ok=True)
         size = (len(source), source.camera.height, source.camera.width)
         color = np.lib.format.open_memmap(color_path, "w+", np.uint8, (*size, 3))
         depth = np.lib.format.open_memmap(depth_path, "w+", np.uint16, size)
-        times_s = np.zeros(len(source))
+        times_s = np.full(len(source), np.nan)  # of a frame that cannot be read
         for frame in source:
             units = np.rint(frame.depth_m * UNITS_PER_METRE)
             depth[frame.index] = np.where(units < UINT16_MAX, units, 0)
@@ -82,11 +102,11 @@ def original(path: str, start_s: float, folder: Path) -> Original:
         color.flush()
         depth.flush()
         np.save(times_path, times_s)  # written last: the other two are complete
-    rows, truth_rows = associate(np.load(times_path), truth.timestamps_s)
-    if len(rows) < len(source):
-        raise SourceError(f"{path}: {len(source) - len(rows)} of {len(source)} frames have no true pose")
-    poses = truth.T_world_camera[truth_rows]
-    return Original(source.name, source.camera, np.load(color_path, "r"), np.load(depth_path, "r"), poses)
+    times_s = np.load(times_path)
+    read = np.flatnonzero(np.isfinite(times_s))
+    rows, truth_rows = associate(times_s[read], truth.timestamps_s)
+    images, poses = (np.load(color_path, "r"), np.load(depth_path, "r")), truth.T_world_camera[truth_rows]
+    return Original(source.name, source.camera, *images, read[rows], poses)
 
 
 def write(from_: Original, planned: Plan, name: str, severity: int, seed: int, folder: Path) -> None:
@@ -96,7 +116,7 @@ def write(from_: Original, planned: Plan, name: str, severity: int, seed: int, f
     calibration = asdict(from_.camera) | {"depth_scale": UNITS_PER_METRE}
     (folder / "calibration.json").write_text(json.dumps(calibration) + "\n")
     for index in range(len(planned)):
-        images = from_.color[planned.color[index]], from_.depth_m(planned.depth[index])
+        images = from_.color_of(planned.color[index]), from_.depth_m(planned.depth[index])
         color, depth = disturbed(name, severity, seed, planned, index, *images, from_.depth_quantile)
         cv2.imwrite(str(folder / f"rgb/{index:06d}.bmp"), color[..., ::-1])
         units = np.minimum(np.rint(depth * UNITS_PER_METRE), UINT16_MAX - 1)

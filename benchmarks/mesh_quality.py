@@ -244,6 +244,7 @@ def sections(measured: dict[str, Any]) -> list[Section]:
 def main(options: Options) -> int:
     """Measure, write, print; return exit code 2 if a run or an option is invalid."""
     try:
+        record.refuse_unwritable(options.out)
         meshes = [row for name in options.sources for row in measure(name, options)]
     except (SigmaSplatError, subprocess.SubprocessError) as problem:
         print(f"mesh_quality.py: {problem}", file=sys.stderr)

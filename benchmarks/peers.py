@@ -17,6 +17,7 @@ from typing import Annotated, Any
 
 import accuracy
 import numpy as np
+import program
 import record
 import tables
 import tyro
@@ -301,4 +302,4 @@ def main(options: Options) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(tyro.cli(Options, description=__doc__, config=(tyro.conf.FlagCreatePairsOff,))))
+    program.start(main, Options, __doc__)

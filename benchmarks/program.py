@@ -4,13 +4,14 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 import record
 import tables
 import tyro
 
-from sigmasplat.errors import SigmaSplatError
+from sigmasplat.errors import ConfigError, SigmaSplatError
 
 Options = TypeVar("Options")
 NOT_RECORDED = ("runs", "out", "fresh", "quick", "scratch", "other", "collect", "keep")
@@ -18,8 +19,14 @@ NOT_RECORDED = ("runs", "out", "fresh", "quick", "scratch", "other", "collect", 
 
 
 def start(main: Callable[[Options], int], options: type[Options], description: str | None = None) -> NoReturn:
-    """Parse the command line, run `main`, exit with its code."""
-    sys.exit(main(tyro.cli(options, description=description, config=(tyro.conf.FlagCreatePairsOff,))))
+    """Parse the command line, check that results can be written, run `main`, exit with its code."""
+    parsed = tyro.cli(options, description=description, config=(tyro.conf.FlagCreatePairsOff,))
+    if hasattr(parsed, "out") and not getattr(parsed, "quick", False):
+        try:
+            record.refuse_unwritable(parsed.out)
+        except ConfigError as problem:
+            sys.exit(refuse(Path(sys.argv[0]).stem, problem))
+    sys.exit(main(parsed))
 
 
 def environment_of(other: bool) -> dict[str, str]:

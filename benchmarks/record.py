@@ -9,10 +9,12 @@ import sys
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
-from sigmasplat.files import machine
-from sigmasplat.files.machine import code_digest
+from sigmasplat.errors import ConfigError
+from sigmasplat.io import machine
+from sigmasplat.io.machine import code_digest
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
@@ -75,14 +77,29 @@ def results(
     }
 
 
+def refuse_unwritable(folder: Path) -> None:
+    """Check before anything is measured that results can be written. Raises ConfigError if they cannot."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with TemporaryFile(dir=folder):
+            pass
+    except OSError as problem:
+        raise ConfigError(f"results cannot be written to {folder} ({problem.strerror}); give another --out") from None
+
+
 def write(measured: dict[str, Any], folder: Path = RESULTS) -> Path:
     """Write results as <name>-<machine>.json, replacing those of the same name and machine; return the path."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{slug(measured['name'])}-{machine_slug(measured['machine'])}.json"
-    temporary = path.with_suffix(".part")
-    temporary.write_text(json.dumps(measured, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    temporary.replace(path)
+    write_json(measured, path)
     return path
+
+
+def write_json(values: dict[str, Any], path: Path) -> None:
+    """Write a JSON file, whole or not at all."""
+    temporary = path.with_suffix(".part")
+    temporary.write_text(json.dumps(values, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    temporary.replace(path)
 
 
 def read(path: Path) -> dict[str, Any]:

@@ -29,7 +29,7 @@ import record
 import robustness_scores as scores
 import tyro
 from disturbances import DISTURBANCES, plan
-from disturbed_recordings import Original, original, write
+from disturbed_recordings import Original, original, with_truth, write
 
 import sigmasplat
 from sigmasplat.commands.options import Settings
@@ -168,10 +168,36 @@ def call(words: Sequence[str], other: bool) -> str | None:
     return (lines[-1][:300] if lines else f"exit code {ended.returncode}") if ended.returncode else None
 
 
+def possible(jobs: list[Job]) -> tuple[list[Job], list[str]]:
+    """Return the jobs that the frames with a true pose suffice for, and one line for all that is left out.
+
+    No image is decoded. Raises SourceError if a recording has no true pose, ConfigError if no job is possible.
+    """
+    available, left_out, kept = dict[tuple[str, float], int](), list[str](), list[Job]()
+    for job in jobs:
+        part = job.path, job.start_s
+        if part not in available:
+            source, _, available[part] = with_truth(*part)
+            if missing := len(source) - available[part]:
+                left_out.append(f"{job.sequence}: {missing} of {len(source)} frames, which have no true pose")
+        try:
+            plan(job.disturbance, job.severity, job.seed, job.frames, available[part])
+            kept.append(job)
+        except ValueError as problem:
+            left_out.append(f"{job.stem}: {problem}")
+    if not kept:
+        raise ConfigError(f"nothing can be run: {'; '.join(left_out)}")
+    return kept, left_out
+
+
 def measure(options: Options) -> dict[str, Any]:
-    """Run or read every job, `jobs` at a time. Raises SigmaSplatError or ValueError if a job cannot be prepared."""
+    """Run or read every job that its recording suffices for, `jobs` at a time. Raises SigmaSplatError if there is none,
+    or a recording cannot be read."""
     cv2.setNumThreads(1)
-    listed, folder = jobs_of(options), options.runs / options.name
+    folder = options.runs / options.name
+    listed, left_out = (jobs_of(options), []) if options.collect else possible(jobs_of(options))
+    for line in left_out:
+        print(f"left out: {line}", file=sys.stderr, flush=True)
     parts = [] if options.collect else sorted({(job.path, job.start_s) for job in listed})
     originals = {part: original(*part, options.runs / "frames") for part in parts}
 
@@ -186,7 +212,8 @@ def measure(options: Options) -> dict[str, Any]:
         return result
 
     with ThreadPoolExecutor(options.jobs) as pool:
-        return figures_of([result for result in pool.map(work, enumerate(listed, 1)) if result])
+        found = [result for result in pool.map(work, enumerate(listed, 1)) if result]
+    return figures_of(found) | {"left_out": left_out}
 
 
 def said(figures: dict[str, Any]) -> str:

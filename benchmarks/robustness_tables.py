@@ -154,7 +154,8 @@ def _suite(figures: dict[str, Any]) -> Section:
             [title, significant(figures["p_off"][name]), *("–" for _ in names)]
             for title, name in (("AUROC of p_off", "auroc"), ("Brier score of p_off", "brier"))
         ]
-    note = f"Code that was measured: commit {str(figures['measured'])[:9]}. {NOTE}"
+    left_out = "".join(f" Left out: {line}." for line in figures.get("left_out", ()))
+    note = f"Code that was measured: commit {str(figures['measured'])[:9]}. {NOTE}{left_out}"
     return Section("Suite", ["figure", "all", *names], rows, note)
 
 

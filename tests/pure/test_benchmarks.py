@@ -6,7 +6,7 @@ import re
 import runpy
 import sys
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -35,7 +35,7 @@ accuracy, accuracy_tables, cpu, cpu_scene, cpu_tables, record, scenes, tables, w
     importlib.import_module,
     ("accuracy", "accuracy_tables", "cpu", "cpu_scene", "cpu_tables", "record", "scenes", "tables", "works"),
 )
-tracking, tracking_tables = map(importlib.import_module, ("tracking", "tracking_tables"))
+program, tracking, tracking_tables = map(importlib.import_module, ("program", "tracking", "tracking_tables"))
 ROOM = "synthetic:frames=200,width=64,height=48"
 
 
@@ -98,6 +98,36 @@ def test_latest_is_the_newest_of_the_very_name(tmp_path: Path) -> None:
     assert record.latest("cpu", tmp_path)["date"] == "2025-01-03"
     assert record.latest("cpu-old-1-cores", tmp_path)["date"] == "2025-01-01"
     assert record.latest("gpu", tmp_path) is None
+
+
+@dataclass(frozen=True)
+class Writing:
+    out: Path
+    quick: bool = False
+
+
+def test_a_benchmark_checks_first_that_it_can_write(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").write_text("in the way")
+    started: list[Path] = []
+
+    def main(options: Writing) -> int:
+        started.append(options.out)
+        return 3
+
+    def exit_code(*words: str) -> Any:
+        monkeypatch.setattr(sys, "argv", ["some_benchmark.py", *words])
+        with pytest.raises(SystemExit) as left:
+            program.start(main, Writing)
+        return left.value.code
+
+    within = str(tmp_path / "file" / "results")
+    assert exit_code("--out", within) == 2 and started == []
+    said = capsys.readouterr().err
+    assert said.startswith("some_benchmark.py: results cannot be written to ") and said.count("\n") == 1
+    assert exit_code("--out", within, "--quick") == 3  # it writes nothing
+    assert exit_code("--out", str(tmp_path / "new")) == 3 and list((tmp_path / "new").iterdir()) == []
 
 
 def test_figures_have_three_digits() -> None:

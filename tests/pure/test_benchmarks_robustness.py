@@ -164,6 +164,45 @@ def test_a_recording_is_written_without_truth_and_read_back(tmp_path: Path) -> N
     np.testing.assert_array_equal(original.T_world_camera, source.truth().T_world_camera)  # type: ignore[union-attr]
 
 
+def recorded(folder: Path, frames: int, without_truth: set[int] = frozenset()) -> Path:  # type: ignore[assignment]
+    """Write a recording with truth, in which some frames have no true pose."""
+    original = recordings.original(f"synthetic:frames={frames},width=64,height=48", 0.0, folder / "frames")
+    recordings.write(original, disturbances.plan("clean", 1, 0, frames, frames), "clean", 1, 0, folder / "recording")
+    known = [i for i in range(frames) if i not in without_truth]
+    path = Trajectory(np.array(known) / recordings.FRAMES_PER_SECOND, original.T_world_camera[known])
+    write_trajectory(folder / "recording" / "groundtruth.txt", path)
+    return folder / "recording"
+
+
+def test_frames_without_a_true_pose_are_left_out(tmp_path: Path) -> None:
+    path = recorded(tmp_path, 6, {2})
+    original = recordings.original(str(path), 0.0, tmp_path / "decoded")
+    assert len(original) == len(original.T_world_camera) == 5 and original.frames.tolist() == [0, 1, 3, 4, 5]
+    np.testing.assert_array_equal(original.color_of(2), original.color[3])
+    recordings.write(original, disturbances.plan("clean", 1, 0, 6, 5), "clean", 1, 0, tmp_path / "again")
+    read, source = open_source(str(tmp_path / "again")), open_source(str(path))
+    assert len(read) == 5
+    np.testing.assert_array_equal(read.frame(2).color, source.frame(3).color)
+
+
+def test_rows_that_a_recording_is_too_short_for_are_left_out_before_anything_is_decoded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = recorded(tmp_path, 8, {7})
+    chosen = robustness.Options((str(path),), ("black", "clean"), (1, 2), seeds=(0,), frames=7, runs=tmp_path / "runs")
+    kept, left_out = robustness.possible(robustness.jobs_of(chosen))
+    assert [job.stem for job in kept] == ["recording-clean-1-seed0"]
+    assert left_out == ["recording: 1 of 8 frames, which have no true pose"] + [
+        f"recording-black-{severity}-seed0: 7 frames are too few for black, severity {severity}, with 7 frames"
+        for severity in (1, 2)
+    ]
+    monkeypatch.setattr(robustness, "original", lambda *_: pytest.fail("an image was decoded"))
+    none = replace(chosen, disturbances=("black",), severities=(2, 3), out=tmp_path / "results")
+    assert robustness.main(none) == 2 and "nothing can be run: recording: 1 of 8" in capsys.readouterr().err
+    figures = {"measured": "abc", "p_off": None, "runs": [run_of("clean", 1, 0)], "left_out": left_out}
+    assert "Left out: recording: 1 of 8 frames" in laid_out("robustness", figures)["Suite"].note
+
+
 # ---- scores ----
 
 
