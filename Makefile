@@ -1,7 +1,8 @@
 # make demo     install into .venv and run SLAM on the synthetic room
-# make install  install into .venv; run it again after a change to the sources
-# make test     install with the development tools, then run lint, type checks and tests
-# make native   compile the kernels into the source tree, to work with PYTHONPATH=src
+# make install  install into .venv, which then imports from src/; run it again after a change to the C++ sources
+# make test     install with the development tools, then run lint, type checks and the tests that are not marked slow
+# make test-all  the same with every test
+# make native   compile the kernels into the source tree, if their sources have changed
 # make docs     build the documentation as a site in site/, which can be read without a server
 # make gpu      run all checks and measurements that need an NVIDIA GPU (benchmarks/GPU.md)
 # make readers  install the programs of Node that read exported maps in the tests into build/readers (needs npm)
@@ -18,10 +19,10 @@ PYTHON ?= python3
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 PIP_ARGS ?=
 PYTEST_ARGS ?=
+NOT_RUN := slow
 VENV := .venv
 BIN := $(VENV)/bin
-PACKAGED := pyproject.toml CMakeLists.txt constraints.txt LICENSE README.md \
-            $(shell find src -type f -not -name '*.so' -not -path '*/__pycache__/*')
+NATIVE := CMakeLists.txt $(shell find src -name '*.h' -o -name '*.cpp' -o -name '*.cmake')
 INSTALL := $(BIN)/python -m pip install --disable-pip-version-check --quiet $(PIP_ARGS) -c constraints.txt
 
 refuse = { echo "make: $(1)" >&2; exit 1; }
@@ -34,13 +35,16 @@ version_of = $(shell $(1) -c 'import sys; print("%d.%d" % sys.version_info[:2])'
 same_python = $(filter $(call version_of,$(PYTHON)),$(or $(call version_of,$(BIN)/python),$(call version_of,$(PYTHON))))
 WHEEL_VENV = $(if $(same_python),$(VENV),build/venv-$(or $(call version_of,$(PYTHON)),missing))
 
-.PHONY: demo test lint types pytest install install-dev native docs gpu readers wheel sdist wheel-here clean
+.PHONY: demo test test-all lint types pytest install install-dev native docs gpu readers wheel sdist wheel-here clean
 .DELETE_ON_ERROR:
 
 demo: install
 	$(BIN)/sigmasplat demo
 
 test: lint types pytest
+
+test-all: NOT_RUN =
+test-all: test
 
 lint: install-dev
 	$(BIN)/ruff check .
@@ -52,20 +56,25 @@ types: install-dev
 # In sequence even under -j, so that the summary of pytest is the last line. One worker per core: each starts with a
 # contiguous half of the tests, so that most fixtures of a file are made once; the first to finish takes over tests.
 pytest: lint types
-	$(BIN)/pytest -n auto --maxprocesses 8 --dist worksteal $(PYTEST_ARGS)
+	$(BIN)/pytest -n auto --maxprocesses 8 --dist worksteal $(if $(NOT_RUN),-m 'not $(NOT_RUN)') $(PYTEST_ARGS)
 
-install: $(VENV)/installed
-install-dev: $(VENV)/installed-dev
+install: $(VENV)/installed $(VENV)/native
+install-dev: $(VENV)/installed-dev $(VENV)/native
 
-$(VENV)/installed: $(VENV)/build-tools $(VENV)/torch $(PACKAGED)
-	@echo "installing sigmasplat into $(VENV) (takes a few minutes the first time)"
-	$(INSTALL) --no-build-isolation .
+# Editable: a changed Python file needs no installation. The finder that scikit-build-core adds is removed, because it
+# would hide another checkout on PYTHONPATH.
+editable = $(INSTALL) --no-build-isolation -C wheel.cmake=false -C wheel.py-api=py3 -C editable.mode=inplace -e '.$(1)' && \
+	sed -i '/^import /d' $(VENV)/lib/python3*/site-packages/_editable_skbc_sigmasplat.pth
+
+$(VENV)/installed: $(VENV)/build-tools $(VENV)/torch pyproject.toml constraints.txt
+	@echo "installing sigmasplat into $(VENV)"
+	$(call editable)
 	@touch $@
 
 # The development install includes the full install, so that `make demo` need not repeat it.
-$(VENV)/installed-dev: $(VENV)/build-tools $(VENV)/torch $(PACKAGED)
-	@echo "installing sigmasplat[dev] into $(VENV) (takes a few minutes the first time)"
-	$(INSTALL) --no-build-isolation '.[dev]'
+$(VENV)/installed-dev: $(VENV)/build-tools $(VENV)/torch pyproject.toml constraints.txt
+	@echo "installing sigmasplat[dev] into $(VENV)"
+	$(call editable,[dev])
 	@touch $@ $(VENV)/installed
 
 $(VENV)/created:
@@ -96,10 +105,18 @@ $(VENV)/build-tools: $(VENV)/created
 	$(INSTALL) scikit-build-core nanobind cmake ninja
 	@touch $@
 
-native: $(VENV)/build-tools
-	$(BIN)/cmake -S . -B build/inplace -G Ninja -DSIGMASPLAT_INPLACE=ON \
-		-DPython_EXECUTABLE=$(abspath $(BIN)/python) -DCMAKE_MAKE_PROGRAM=$(abspath $(BIN)/ninja)
-	$(BIN)/cmake --build build/inplace
+native: $(VENV)/native
+
+# The module is that of a wheel, so that `make wheel` compiles nothing again.
+raw_wheel = rm -rf build/raw-wheel && \
+	$(BIN)/python -m pip wheel --disable-pip-version-check --quiet . --no-deps --no-build-isolation -w build/raw-wheel
+
+$(VENV)/native: $(VENV)/build-tools pyproject.toml $(NATIVE)
+	@echo "compiling the kernels (takes a few minutes the first time)"
+	$(raw_wheel)
+	$(BIN)/python -m zipfile -e build/raw-wheel/*.whl build/raw-wheel/unpacked
+	install build/raw-wheel/unpacked/sigmasplat/native/_core*.so src/sigmasplat/native
+	@touch $@
 
 gpu: install-dev
 	benchmarks/first_flight.sh
@@ -121,8 +138,7 @@ wheel:
 # auditwheel finds the C library that the module needs and names the wheel after it (manylinux_2_27). OpenMP's runtime is
 # excluded, because torch contains it (CMakeLists.txt explains how it is found).
 wheel-here: $(VENV)/wheel-tools
-	rm -rf build/raw-wheel
-	$(BIN)/python -m pip wheel --disable-pip-version-check --quiet . --no-deps --no-build-isolation -w build/raw-wheel
+	$(raw_wheel)
 	PATH="$(abspath $(BIN)):$$PATH" $(BIN)/python -m auditwheel repair --exclude libgomp.so.1 -w dist build/raw-wheel/*.whl
 
 sdist: $(VENV)/wheel-tools

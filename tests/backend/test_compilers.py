@@ -74,6 +74,7 @@ def test_a_broken_lane_operation_is_found(operation: str, written: str, broken: 
     assert answer.returncode == 1 and f"differs: {operation}\n" in answer.stdout
 
 
+@pytest.mark.slow
 def test_all_compilers_and_processors_agree() -> None:
     """Takes minutes where every program is installed; elsewhere the script says which one is missing."""
     if not shutil.which("bash"):

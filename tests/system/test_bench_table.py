@@ -70,8 +70,8 @@ def frames_logged(out: Path, run: str) -> int:
     return log.read_text().count("\n") if log.exists() else 0
 
 
-@pytest.fixture
-def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
+@contextlib.contextmanager
+def one_process() -> Iterator[None]:
     """Make runs without a process of their own, which costs more than a tiny run."""
 
     def made(road: LocalRoad, jobs: list, out: Path) -> Iterator[Outcome]:
@@ -79,7 +79,15 @@ def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
             make_run(job, out / job.name, road.data, road.save_every_s)
             yield Outcome(job)
 
-    monkeypatch.setattr(LocalRoad, "make", made)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(LocalRoad, "make", made)
+        yield
+
+
+@pytest.fixture
+def in_this_process() -> Iterator[None]:
+    with one_process():
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -92,7 +100,8 @@ def replica(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def whole(replica: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the folder of a table that was made without a break, one run after the other."""
     out = tmp_path_factory.mktemp("whole") / "table"
-    assert exit_code(*arguments(out, replica)) == 0
+    with one_process():
+        assert exit_code(*arguments(out, replica)) == 0
     return out
 
 
@@ -138,6 +147,7 @@ def test_a_finished_table_is_not_run_again(whole: Path, replica: Path, capsys: p
     assert "runs of other settings" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_killed_table_ends_as_one_that_was_not_stopped(tmp_path: Path, replica: Path, whole: Path) -> None:
     out, log, run = tmp_path / "table", tmp_path / "log", "office0-varsplat-seed0"
     process = started(*arguments(out, replica), log=log)
@@ -172,13 +182,17 @@ EVERY_TABLE = [
     ("cgslam-runtime", "CG-SLAM", "replica", SYNTHETIC, ("tracking per iteration", "mapping per iteration", "map")),
 ]
 """Tables, a system of each, a layout, where its frames are from, and the scores that its scene must have."""
+QUICK = {"varsplat-tum", "varsplat-scannet", "varsplat-scannetpp", "varsplat-runtime"}
+"""One table of each layout, not marked slow."""
 
 
 @pytest.mark.usefixtures("in_this_process")
 @pytest.mark.parametrize(
     ("table", "system", "layout", "frames", "scores"),
-    EVERY_TABLE,
-    ids=[f"{table}-{frames}" for table, _, _, frames, _ in EVERY_TABLE],
+    [
+        pytest.param(*row, id=f"{row[0]}-{row[3]}", marks=() if row[0] in QUICK else pytest.mark.slow)
+        for row in EVERY_TABLE
+    ],
 )
 def test_every_table_is_made_from_its_layout(
     table: str, system: str, layout: str, frames: str, scores: tuple[str, ...], tmp_path: Path,
@@ -193,6 +207,7 @@ def test_every_table_is_made_from_its_layout(
 
 
 @pytest.mark.usefixtures("in_this_process")
+@pytest.mark.slow
 def test_replicas_true_mesh_and_the_weights_of_lpips_fill_their_columns(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -255,6 +270,7 @@ def cluster(tmp_path: Path, names: tuple[str, ...]) -> Iterator[tuple[str, dict[
                 process.wait()
 
 
+@pytest.mark.slow
 def test_a_worker_that_dies_changes_nothing(tmp_path: Path, replica: Path, whole: Path) -> None:
     out, log = tmp_path / "table", tmp_path / "log"
     (tmp_path / "elsewhere").symlink_to(replica)
@@ -269,6 +285,7 @@ def test_a_worker_that_dies_changes_nothing(tmp_path: Path, replica: Path, whole
 
 
 @pytest.mark.parametrize("comes_back", [False, True])
+@pytest.mark.slow
 def test_a_scene_that_only_a_dead_worker_has_is_missing_unless_another_worker_brings_it(
     comes_back: bool, tmp_path: Path, replica: Path, whole: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -334,6 +351,7 @@ def test_a_batch_keeps_what_is_done_and_names_what_is_missing(
     assert "1 of 2 runs are finished" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_ctrl_c_saves_the_running_run(tmp_path: Path, replica: Path, whole: Path) -> None:
     out, log, run = tmp_path / "table", tmp_path / "log", "office0-varsplat-seed0"
     words = [word if word != "0.001" else "0" for word in arguments(out, replica, "--scenes", "office0")]

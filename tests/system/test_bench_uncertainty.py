@@ -276,6 +276,7 @@ def test_a_surface_is_compared_with_the_true_one(run: FinishedRun) -> None:
     assert 0.4 < (off_m < std_m).mean() < 0.95 and (off_m < 2.0 * std_m).mean() > 0.75
 
 
+@pytest.mark.slow
 def test_without_a_true_surface_the_reference_is_fused_from_the_readings(
     run: FinishedRun, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -47,9 +47,23 @@ RUNS: list[Any] = [
     pytest.param("cgslam-fast", SMALL, 0.004, 26.0, id="fast"),
     pytest.param("sigma", SMALL, 0.004, 26.0, id="sigma"),
     pytest.param("cgslam-replica", PAPER, 0.02, 24.0, id="paper"),
-    pytest.param("cgslam-replica", PAPER | {"mapping.covisibility": "frustum"}, 0.02, 24.0, id="by-frustum"),
+    pytest.param(
+        "cgslam-replica",
+        PAPER | {"mapping.covisibility": "frustum"},
+        0.02,
+        24.0,
+        id="by-frustum",
+        marks=pytest.mark.slow,
+    ),
     pytest.param("cgslam-fast", SMALL | {"mapping.covisibility": "descriptor"}, 0.004, 26.0, id="by-descriptor"),
-    pytest.param("cgslam-released-replica", PAPER | {"tracking.first_iterations": "60"}, 0.02, 24.0, id="released"),
+    pytest.param(
+        "cgslam-released-replica",
+        PAPER | {"tracking.first_iterations": "60"},
+        0.02,
+        24.0,
+        id="released",
+        marks=pytest.mark.slow,
+    ),
 ]
 
 
@@ -64,7 +78,9 @@ def test_the_path_is_followed_and_the_room_shown(
     assert torch.isfinite(slam.field.params).all()
 
 
-@pytest.mark.parametrize(("name", "changes"), [("cgslam-replica", PAPER), ("sigma", SMALL)])
+@pytest.mark.parametrize(
+    ("name", "changes"), [pytest.param("cgslam-replica", PAPER, marks=pytest.mark.slow), ("sigma", SMALL)]
+)
 def test_same_input_same_bytes(name: str, changes: dict[str, str]) -> None:
     first, second = followed_once(name, tuple(changes.items())).checkpoint(), followed(name, changes).checkpoint()
     assert all(first[key].numpy().tobytes() == second[key].numpy().tobytes() for key in first)

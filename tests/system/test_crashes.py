@@ -16,6 +16,7 @@ power_loss = import_module("power_loss")
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+@pytest.mark.slow
 def test_killed_commands_and_power_failures_lose_nothing(tmp_path: Path) -> None:
     command = [sys.executable, str(BENCHMARKS / "crashes.py"), "--quick", "--scratch", str(tmp_path)]
     ended = subprocess.run(

@@ -9,6 +9,8 @@ import time
 from pathlib import Path
 from unittest import mock
 
+import pytest
+
 from command_line import exit_code
 from run_process import lines, wait_for
 
@@ -32,6 +34,7 @@ def contents(out: Path) -> list[bytes]:
     return [(out / name).read_bytes() for name in ("map.ply", "trajectory.txt", "checkpoint.safetensors")]
 
 
+@pytest.mark.slow
 def test_two_runs_at_once_with_jumping_clocks_and_a_pause_are_those_of_one_with_a_slow_disk(tmp_path: Path) -> None:
     outs = tmp_path / "one", tmp_path / "two"
     runs = [subprocess.Popen([sys.executable, "-c", JUMPING, *words(out)], stderr=subprocess.PIPE) for out in outs]

@@ -161,6 +161,7 @@ def steps_saved(run: RunFolder, tmp_path: Path) -> int:
     return done
 
 
+@pytest.mark.slow
 def test_a_run_killed_in_the_last_stage_gives_the_same_bytes(tmp_path: Path) -> None:
     assert exit_code(*arguments(tmp_path / "whole")) == 0
     run = RunFolder(tmp_path / "cut")

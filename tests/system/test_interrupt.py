@@ -40,6 +40,7 @@ def test_ctrl_c_leaves_a_usable_run(tmp_path: Path, capsys: pytest.CaptureFixtur
     capsys.readouterr()
 
 
+@pytest.mark.slow
 def test_ctrl_c_with_submaps_keeps_them_and_writes_their_map(tmp_path: Path) -> None:
     out = tmp_path / "run"
     with running(out, "submaps.frames=8", "loops.min_interval=1") as process:
@@ -63,6 +64,7 @@ def test_ctrl_c_with_submaps_keeps_them_and_writes_their_map(tmp_path: Path) -> 
     ]
 
 
+@pytest.mark.slow
 def test_ctrl_c_during_refinement_keeps_the_unrefined_map(tmp_path: Path) -> None:
     out = tmp_path / "run"
 
@@ -84,7 +86,7 @@ def test_ctrl_c_during_refinement_keeps_the_unrefined_map(tmp_path: Path) -> Non
     assert metrics["held_out_submaps"]["views"] == metrics["held_out"]["views"] == 4
 
 
-@pytest.mark.parametrize("moment", ["folder", "log"])
+@pytest.mark.parametrize("moment", [pytest.param("folder", marks=pytest.mark.slow), "log"])
 def test_a_killed_run_is_read_or_refused_in_one_line(
     tmp_path: Path, moment: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -112,7 +114,7 @@ def test_a_killed_run_is_read_or_refused_in_one_line(
         assert refusal.startswith("sigmasplat: ") and refusal.count("\n") == 1, refusal
 
 
-@pytest.mark.parametrize("moment", ["folder", "log"])
+@pytest.mark.parametrize("moment", ["folder", pytest.param("log", marks=pytest.mark.slow)])
 def test_a_killed_run_can_be_repeated_with_overwrite(tmp_path: Path, moment: str) -> None:
     out = tmp_path / "run"
     with running(out) as process:
