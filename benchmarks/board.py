@@ -30,7 +30,7 @@ from disturbances import plan
 from disturbed_recordings import with_truth
 
 from sigmasplat.errors import SigmaSplatError
-from sigmasplat.sources import open_source
+from sigmasplat.plugins.sources import open_source
 
 arg = tyro.conf.arg
 ROWS = (

@@ -14,7 +14,7 @@ import record
 from board_runs import Row, environment
 
 from sigmasplat.errors import ConfigError
-from sigmasplat.io import machine
+from sigmasplat.files import machine
 
 MEASURED = ("src", "CMakeLists.txt")
 """What figures of a run depend on."""

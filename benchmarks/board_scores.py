@@ -10,21 +10,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.config import Config
+from sigmasplat.data import se3
+from sigmasplat.data.selection import evenly_spread
 from sigmasplat.errors import SigmaSplatError, SourceError
-from sigmasplat.evaluation.frame_states import score_states
-from sigmasplat.evaluation.pose_covariance import WINDOW_FRAMES, score_pose_covariance
-from sigmasplat.evaluation.view_selection import working_frame
-from sigmasplat.io.frames import RunFrames
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.metrics.image import depth_l1, psnr
-from sigmasplat.metrics.trajectory import associate, ate
-from sigmasplat.metrics.views import scored_view
-from sigmasplat.model import se3
-from sigmasplat.model.selection import evenly_spread
-from sigmasplat.presets import default_preset, preset
+from sigmasplat.input.source import Source
+from sigmasplat.plugins.evaluation.frame_states import score_states
+from sigmasplat.plugins.evaluation.metrics.image import depth_l1, psnr
+from sigmasplat.plugins.evaluation.metrics.trajectory import associate, ate
+from sigmasplat.plugins.evaluation.metrics.views import scored_view
+from sigmasplat.plugins.evaluation.pose_covariance import WINDOW_FRAMES, score_pose_covariance
+from sigmasplat.plugins.evaluation.view_selection import working_frame
+from sigmasplat.plugins.papers import default_preset, preset
+from sigmasplat.plugins.sources import open_source
 from sigmasplat.render import FieldRenderer
-from sigmasplat.sources import open_source
-from sigmasplat.sources.base import Source
+from sigmasplat.run_folder.frames import RunFrames
+from sigmasplat.run_folder.runs import RunFolder
 
 VIEWS = 20
 """Number of scored views, evenly spread over the believed frames that no map was fitted to."""

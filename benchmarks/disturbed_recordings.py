@@ -12,15 +12,14 @@ import record
 from disturbances import Color, Plan, disturbed
 from numpy.typing import NDArray
 
-from sigmasplat.checks.timing import times_of
 from sigmasplat.config import InputConfig
 from sigmasplat.data.camera import Camera
+from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SourceError
-from sigmasplat.metrics.trajectory import associate
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.sources import open_source
-from sigmasplat.sources.base import Source
+from sigmasplat.input.source import Source
+from sigmasplat.plugins.checks.timing import times_of
+from sigmasplat.plugins.evaluation.metrics.trajectory import associate
+from sigmasplat.plugins.sources import open_source
 
 FRAMES_PER_SECOND = 30.0
 """Frame i of every disturbed recording has the time i / 30 s: times do not reveal what was cut out."""

@@ -13,8 +13,8 @@ from tempfile import TemporaryFile
 from typing import Any
 
 from sigmasplat.errors import ConfigError
-from sigmasplat.io import machine
-from sigmasplat.io.machine import code_digest
+from sigmasplat.files import machine
+from sigmasplat.files.machine import code_digest
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"

@@ -27,7 +27,7 @@ from same_bytes_cases import CASES, RENAMED, SPELLED_BEFORE
 from same_bytes_results import differences, read_run
 
 from sigmasplat.errors import ConfigError, RunError, SigmaSplatError
-from sigmasplat.io import machine
+from sigmasplat.files import machine
 
 arg = tyro.conf.arg
 NOW = record.ROOT / "runs" / "same-bytes"
