@@ -103,7 +103,7 @@ SCENES: dict[str, tuple[str, ...]] = {
 
 def paper_table(system: str) -> str:
     """Return a paper's presets: a row per setting that differs between data sets, then the others by origin."""
-    from sigmasplat.plugins.papers import preset
+    from sigmasplat.config.presets import preset
 
     columns = DATA_SETS[system]
     rows = [f"| setting | {' | '.join(columns)} | from |", "|---" * (len(columns) + 2) + "|"]
@@ -120,7 +120,7 @@ def paper_table(system: str) -> str:
 
 def scene_table(system: str) -> str:
     """Return the released code's scenes: a row per set of values, a column per setting; all from the code."""
-    from sigmasplat.plugins.papers import list_presets, preset
+    from sigmasplat.config.presets import list_presets, preset
 
     columns, prefix = SCENES[system], f"{system}-released-"
     scenes: dict[tuple[str, ...], list[str]] = {}
@@ -164,7 +164,7 @@ def changed_by_all(released: list[Any], papers: list[Any], default: Any) -> list
 
 def fast_list(system: str) -> str:
     """Return the settings in which a system's preset for two CPU cores differs from that for TUM: both values."""
-    from sigmasplat.plugins.papers import preset
+    from sigmasplat.config.presets import preset
 
     theirs, ours = preset(f"{system}-tum"), preset(f"{system}-fast")
     changed = []
