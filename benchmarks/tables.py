@@ -22,6 +22,7 @@ import record
 import tyro
 
 SUBJECTS = {
+    "A change": ("board",),
     "Whole runs": ("accuracy", "pace", "systems", "map_quality", "full_resolution", "every_preset", "paper_presets"),
     "Other systems": ("peers", "peer_pace", "mesh_quality"),
     "Claims of the papers": ("claims",),
