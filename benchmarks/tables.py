@@ -26,7 +26,7 @@ SUBJECTS = {
     "Whole runs": ("accuracy", "pace", "systems", "map_quality", "full_resolution", "every_preset", "paper_presets"),
     "Other systems": ("peers", "peer_pace", "mesh_quality"),
     "Claims of the papers": ("claims",),
-    "Effect of σ²": ("ablation", "weights", "color_covariance"),
+    "Effect of σ²": ("ablation", "weights"),
     "Uncertainty": ("uncertainty", "uncertainty_weights", "pose_covariance"),
     "Camera tracking": ("tracking", "pose_gradient", "relocalisation"),
     "Robustness": ("robustness", "failure_probability", "fuzz"),

@@ -158,7 +158,6 @@ def test_measured_tables_have_their_places() -> None:
             "drift-rule",
             "long-run",
             "ablation",
-            "color-covariance",
         ),
         "docs/cgslam.md": ("systems", "consistency", "pose-gradient"),
         "docs/claims.md": ("verdicts",),
