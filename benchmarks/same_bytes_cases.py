@@ -33,7 +33,7 @@ CASES = {
     "cubicles-sigma": words("cubicles --limit 50 --no-eval", *PLAIN),
     "fr1_xyz-sigma": words("fr1_xyz --limit 40 --no-eval", *PLAIN),
     "cabinet58-sigma": words("cabinet58 --limit 40 --no-eval", *PLAIN),
-    "lost-sigma": words("fr1_xyz --stride 15 --hold-out 10", *SCORED),
+    "wide-sigma": words("fr1_xyz --stride 15 --hold-out 10", *SCORED),
     "raw-sigma": words("redkitchen_raw --limit 10 --no-eval", *PLAIN),
     "stereo-sigma": words("street --limit 5 --no-eval", *PLAIN),
     "loops-sigma": words("redkitchen --limit 30 --no-eval", "input.width=160", *CUTS, "final.iterations=20"),
