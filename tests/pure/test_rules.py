@@ -7,7 +7,10 @@ import numpy as np
 import pytest
 
 from sigmasplat.fit.pose import PoseFit
-from sigmasplat.tracking.rules import draw_keyframes, is_held_back, is_keyframe, is_lost, jumped, never, unless
+from sigmasplat.mapping.window import draw_keyframes
+from sigmasplat.tracking.keyframe_rule import is_held_back, is_keyframe
+from sigmasplat.tracking.pose_validation import is_lost, jumped
+from sigmasplat.types import never, unless
 
 NAN = float("nan")
 
