@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from sigmasplat.run.finished_map import FinishedMap
     from sigmasplat.run.protocols import Callback
     from sigmasplat.run.resume import StartPoint
-    from sigmasplat.run.session import Outcome
     from sigmasplat.run.terminal import Screen
     from sigmasplat.run_folder.runs import RunFolder
 
@@ -284,15 +283,15 @@ def _run_and_score(
         screen.profile(folder.read_profile())
     warn_at_the_end(screen, source, read, folder, motion)
     if outcome.status == "interrupted":
-        _say_interrupted(screen, outcome, folder)
+        kept = f"interrupted after {outcome.summary()}; the trajectory, map and checkpoint so far are in {folder.path}"
+        screen.next_commands([f"sigmasplat resume {folder.path}"], kept)
         return INTERRUPTED
     if isinstance(source, LiveSource):
         source = source_of(folder, None)  # the steps below read the recording
     if run_options.evaluate:
         score(screen, folder, source)
     else:
-        screen.say(f"{outcome.summary()}: {folder.path}")
-        screen.next_commands([f"sigmasplat eval {folder.path}"])
+        screen.next_commands([f"sigmasplat eval {folder.path}"], f"{outcome.summary()}: {folder.path}")
     if viewer:
         keep_showing(screen, viewer, folder, source)
     return OK
@@ -320,11 +319,3 @@ def _progress(
         if system:
             readers = [BetweenFrames(reader, system.between_frames) for reader in readers]
         yield CallbackList(steps, *logs, *readers)
-
-
-def _say_interrupted(screen: "Screen", outcome: "Outcome", folder: "RunFolder") -> None:
-    """Print what an interrupted run has kept, and how to resume it."""
-    screen.say(
-        f"interrupted after {outcome.summary()}; the trajectory, map and checkpoint so far are in {folder.path}; "
-        f"to resume: sigmasplat resume {folder.path}"
-    )
