@@ -246,9 +246,7 @@ def _run_and_score(
 ) -> int:
     """Run the session, then score it, and keep showing it in the viewer until Ctrl-C; return the exit code.
 
-    realtime: whether frames are tracked when they arrive, on two clocks.
-
-    Raises KeyboardInterrupt if Ctrl-C came before the first frame was done.
+    realtime: track frames when they arrive. Raises KeyboardInterrupt if Ctrl-C came before the first frame was done.
     """
     from sigmasplat.plugins.checks.motion import MotionWatch
     from sigmasplat.plugins.sources.arrivals import Arrivals
@@ -277,12 +275,13 @@ def _run_and_score(
         session.watch = robot.watch if robot else motion if not (system or source.live) else session.watch
         session.later = system.between_frames if system else session.later
         outcome = session.execute()
-    if outcome.status == "interrupted" and not outcome.frames:
+    stopped = outcome.status == "interrupted"
+    if stopped and not outcome.frames:
         raise KeyboardInterrupt  # the folder has no results, and no state to resume from
     if run_options.profile:
         screen.profile(folder.read_profile())
     warn_at_the_end(screen, source, read, folder, motion)
-    if outcome.status == "interrupted":
+    if stopped:
         kept = f"interrupted after {outcome.summary()}; the trajectory, map and checkpoint so far are in {folder.path}"
         screen.next_commands([f"sigmasplat resume {folder.path}"], kept)
         return INTERRUPTED
