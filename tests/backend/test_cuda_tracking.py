@@ -16,14 +16,14 @@ from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.frame import Frame
 from sigmasplat.errors import BackendError
-from sigmasplat.fit.cuda import descent as cuda_descent
-from sigmasplat.fit.cuda.descent import CudaDescent, CudaTrackingLoss, descend_on_device
 from sigmasplat.fit.descent import Descent, descend
 from sigmasplat.fit.pose import fit_pose_adam
 from sigmasplat.fit.target import Target
 from sigmasplat.fit.tracking_loss import tracking_gradient
+from sigmasplat.plugins.cuda import descent as cuda_descent
+from sigmasplat.plugins.cuda.descent import CudaDescent, CudaTrackingLoss, descend_on_device
+from sigmasplat.plugins.cuda.view import CudaView
 from sigmasplat.render.cpu.view import CpuView
-from sigmasplat.render.cuda.view import CudaView
 from splat_fields import OPTIONS
 from splat_fits import Watch
 from splat_scenes import assert_same_vector
@@ -354,7 +354,7 @@ def pairs_at(T_camera_world: Array) -> int:
 
 
 def test_pairs_that_cannot_be_numbered_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sigmasplat.render.cuda.raster.MOST_PAIRS", 100)
+    monkeypatch.setattr("sigmasplat.plugins.cuda.raster.MOST_PAIRS", 100)
     with pytest.raises(BackendError, match=r"\d+ pairs of splats and tiles are too many"):
         descended(3, 7)
 

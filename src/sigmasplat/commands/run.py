@@ -249,10 +249,10 @@ def _run_and_score(
     realtime: track frames when they arrive. Raises KeyboardInterrupt if Ctrl-C came before the first frame was done.
     """
     from sigmasplat.plugins.checks.motion import MotionWatch
+    from sigmasplat.plugins.cuda import stages as cuda_stages
     from sigmasplat.plugins.sources.arrivals import Arrivals
     from sigmasplat.plugins.sources.live import LiveSource
     from sigmasplat.realtime.system import RealTime
-    from sigmasplat.render.cuda import stages as cuda_stages
     from sigmasplat.run.resume import RefinementFile, StateFile
     from sigmasplat.run.session import Session
 
