@@ -106,7 +106,7 @@ class Options(OtherSystems):
         tuple[str, ...],
         arg(help="SYSTEM=SEQUENCE=FILE: also score a TUM text file that another system has written", metavar="PATHS"),
     ] = ()
-    keep: Annotated[bool, arg(help="keep the rows of other systems in the earlier results")] = False
+    keep: Annotated[bool, arg(help="keep the earlier results of other systems and sequences")] = False
     name: Annotated[str, arg(help="name of the results")] = "peers"
     fresh: Annotated[bool, arg(help="run also what has been run before")] = False
     runs: Annotated[Path, arg(help="folder of the run folders")] = accuracy.RUNS
@@ -275,11 +275,11 @@ def _row(system: str, runs: list[Result], sources: list[str]) -> list[str]:
     return [system, *cells, ", ".join(without) or ("0" if known else "–"), *PROPERTIES.get(system, ("–", "–"))]
 
 
-def kept_rows(options: Options, measured: set[str]) -> list[Result]:
-    """Return the earlier results of systems that were not measured now, with the commit at which they were measured."""
+def kept_rows(options: Options, measured: set[tuple[str, str]]) -> list[Result]:
+    """Return the earlier results of systems and sequences that were not measured now, with their commit."""
     path = options.out / f"{record.slug(options.name)}-{record.machine_slug(describe())}.json"
     earlier = record.read(path)
-    rows = [row for row in earlier["figures"]["runs"] if row["system"] not in measured]
+    rows = [row for row in earlier["figures"]["runs"] if (row["system"], row["source"]) not in measured]
     return [{"commit": earlier["commit"], **row} for row in rows]
 
 
@@ -288,11 +288,11 @@ def main(options: Options) -> int:
     try:
         extra = read_paths(options)
         runs = [*run_ours(options), *run_peers(options), *extra]
-        runs += kept_rows(options, {run["system"] for run in runs}) if options.keep else []
+        runs += kept_rows(options, {(run["system"], run["source"]) for run in runs}) if options.keep else []
     except SigmaSplatError as problem:
         print(f"peers.py: {problem}", file=sys.stderr)
         return 2
-    names = {Path(name).name for name in options.sources}
+    names = {run["source"] for run in runs}
     figures = {"runs": runs, "quoted": [figure for figure in QUOTED if figure["source"] in names]}
     config = {n: v for n, v in asdict(options).items() if n in ("sources", "systems", "limit", "paths")}
     measured = record.results("peers", figures, name=options.name, seeds=options.seeds, config=config)

@@ -28,27 +28,6 @@ def sections(measured: dict[str, Any]) -> list[Section]:
     return [section for section in made if section.rows]
 
 
-def compared(measured: Sequence[dict[str, Any]], source: str) -> Section:
-    """Compare results of several checkouts, oldest first, on one sequence, or on all of them if `source` is "all".
-
-    With "suite" there is one row for each checkout, otherwise one for each disturbance and severity.
-    """
-    if source == "suite":
-        rows = [[_code(results), *_whole(results["figures"])] for results in measured]
-        titles = [f"ATE < {bound} cm" for bound in BOUNDS_CM]
-        return Section("Checkouts compared", ["code", *titles, "lost", "silent", "AUROC of p_off"], rows, NOTE)
-    chosen = {"sequence": source} if source != "all" else {}
-    all_runs = [_of(results["figures"]["runs"], **chosen) for results in measured]
-    rows = [
-        [title, label, *(" → ".join(write(runs) for runs in at) for write in (_median_ate, _lost, _silent, _success))]
-        for title, label, at in _rows(all_runs)
-    ]
-    head = [*HEAD, "ATE, cm (median)", "lost, %", "silent, %", "ATE < 5 cm, % of runs"]
-    where = "all sequences" if source == "all" else source
-    note = f"{' → '.join(map(_code, measured))}. {NOTE}"
-    return Section(f"Disturbances, before and now: {where}", head, rows, note)
-
-
 NOTE = (
     "ATE of the believed frames; a run that believes less than half of the frames outside the event does not count as "
     "below a bound. Lost: not believed. Silent: believed and off by more than 10 cm."
