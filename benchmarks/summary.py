@@ -162,7 +162,7 @@ ROWS: tuple[tuple[str, Callable[[Results], str], tuple[str, ...]], ...] = (
     ("Which other uses of an uncertainty help?", uses_of_uncertainty, ("weights",)),
     ("Which claims of the papers hold here?", claims, ("verdicts",)),
     ("Alignment or Adam for tracking?", alignment, ("tracking",)),
-    ("Do loops help?", loops, ("loops", "loops-real")),
+    ("Do loops help?", loops, ("loops",)),
     ("What becomes of disturbed recordings?", disturbed, ("robustness",)),
     ("How fast are the kernels?", kernels, ("cpu",)),
     ("Does a long run slow down?", growth, ("long-run", "viewer-memory")),
