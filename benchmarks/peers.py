@@ -30,7 +30,6 @@ from sigmasplat.config.presets import default_preset, preset as preset_of
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import ConfigError, SigmaSplatError, SourceError
 from sigmasplat.files.atomic import write_text
-from sigmasplat.files.machine import describe
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.evaluation.metrics.trajectory import ate, pair_poses
 from sigmasplat.plugins.sources import open_source
@@ -264,8 +263,9 @@ def _row(system: str, runs: list[Result], sources: list[str]) -> list[str]:
 
 def kept_rows(options: Options, measured: set[tuple[str, str]]) -> list[Result]:
     """Return the earlier results of systems and sequences that were not measured now, with their commit."""
-    path = options.out / f"{record.slug(options.name)}-{record.machine_slug(describe())}.json"
-    earlier = record.read(path)
+    earlier = record.latest(options.name, options.out)
+    if earlier is None:
+        raise ConfigError(f"--keep: {options.out} has no results {options.name!r}")
     rows = [row for row in earlier["figures"]["runs"] if (row["system"], row["source"]) not in measured]
     return [{"commit": earlier["commit"], **row} for row in rows]
 
