@@ -58,7 +58,7 @@ def rows(job: Job, registered: Settings, plateaus: Settings) -> Rows:
 
 def path_figures(slam: Slam, done: FinishedRun, source: Source, views: list[UnseenView]) -> dict[str, Any]:
     """Return the figures of path, views and, if the true surface is known, splats."""
-    scores, _ = score_path(done.path.at(done.believed), None, source.truth())
+    scores, _ = score_path(done.path.at(done.valid), None, source.truth())
     scored = [seen(done, view) for view in views]
     judged = score_uncertainty([sample_pixels(view) for view in scored]) or {}
     of_views = mean(scored)
@@ -69,7 +69,7 @@ def path_figures(slam: Slam, done: FinishedRun, source: Source, views: list[Unse
         "psnr_db": of_views["psnr_db"],
         "depth_l1_m": of_views["depth_l1_m"],
         "spearman": judged.get("spearman"),
-        "lost": int((~done.believed).sum()),
+        "lost": int((~done.valid).sum()),
         "splats": len(done.field),
         **surface_figures(slam, done, source),
     }

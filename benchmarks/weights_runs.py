@@ -67,7 +67,7 @@ def rows(job: Job, weights: dict[str, tuple[str, ...]]) -> Rows:
 
 def path_figures(slam: Slam, done: FinishedRun, source: Source, views: list[UnseenView]) -> dict[str, Any]:
     """Return the figures of path, submaps and final map."""
-    scores, _ = score_path(done.path.at(done.believed), None, source.truth())
+    scores, _ = score_path(done.path.at(done.valid), None, source.truth())
     final, before = view_scores(done, views, done.field), submap_scores(done, views)
     return {
         "ate_m": scores["ate"]["rmse_m"],
@@ -77,7 +77,7 @@ def path_figures(slam: Slam, done: FinishedRun, source: Source, views: list[Unse
         "depth_l1_before_m": before["depth_l1_m"],
         "psnr_db": final["psnr_db"],
         "depth_l1_m": final["depth_l1_m"],
-        "lost": int((~done.believed).sum()),
+        "lost": int((~done.valid).sum()),
         "loops": sum(loop.accepted for loop in slam.loops),
         "loops_tried": len(slam.loops),
         "splats": len(done.field),

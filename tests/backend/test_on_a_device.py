@@ -31,8 +31,8 @@ from sigmasplat.render import FieldRenderer, render
 from sigmasplat.render.cpu.view import CpuView
 from sigmasplat.render.cuda.view import CudaView
 from sigmasplat.run_folder.state import read_state, write_state
+from sigmasplat.slam.saved_state import CLASSES, fixed, restore, state_of
 from sigmasplat.slam.slam import Slam
-from sigmasplat.slam.state import CLASSES, fixed, restore, state_of
 from splat_fields import OPTIONS, Gradients, exact_view, params_of, there_and_back
 from splat_fits import target_of
 from splat_scenes import assert_same_vector, scene

@@ -156,7 +156,7 @@ class MadeUpSlam:
         poses = np.array([step.T_world_camera for step in self.steps]).reshape(-1, 4, 4)
         return Trajectory(np.array([step.timestamp_s for step in self.steps]), poses)
 
-    def believed(self) -> np.ndarray:
+    def valid(self) -> np.ndarray:
         worlds = {0, *self.joined}
         return np.array([not step.lost and step.component in worlds for step in self.steps])
 
@@ -235,7 +235,7 @@ def test_a_run_writes_all_files(corridor: Corridor, capsys: pytest.CaptureFixtur
     assert "LOST" not in said
 
 
-def test_only_believed_poses_are_in_the_trajectory(corridor: Corridor, capsys: pytest.CaptureFixture[str]) -> None:
+def test_only_valid_poses_are_in_the_trajectory(corridor: Corridor, capsys: pytest.CaptureFixture[str]) -> None:
     MadeUpSlam.lost, MadeUpSlam.relocalised, MadeUpSlam.apart = {1, 3}, {2}, {3: 1, 4: 1, 5: 2}
     assert exit_code("run", "corridor", "--no-eval", "--out", "mine", "--all-poses") == 0
     run = RunFolder.open(Path("mine"))

@@ -24,8 +24,8 @@ from sigmasplat.errors import RunError, SigmaSplatError
 from sigmasplat.files import tensors
 from sigmasplat.files.tensors import open_tensors, write_tensors
 from sigmasplat.run_folder.submaps import DiskStore
+from sigmasplat.slam.saved_state import state_of
 from sigmasplat.slam.slam import Slam
-from sigmasplat.slam.state import state_of
 from sigmasplat.types import completed
 
 CAMERA = Camera(8, 6, 7.25, 7.5, 3.5 + 1 / 3, 2.5)

@@ -244,8 +244,8 @@ def test_the_strip_shows_each_range_of_frames_in_one_state() -> None:
     states = ["tracked", "tracked", "lost", "relocalised", "tracked", "lost", "lost", "apart"]
     log = [{"index": 2 * i, "timestamp_s": float(i), "lost": s == "lost", "state": s, "p_off": 0.1 * i}
            for i, s in enumerate(states)]  # fmt: skip
-    believed = [0, 1, 3, 4]
-    path = Trajectory(np.array(believed, np.float64), np.tile(np.eye(4), (4, 1, 1)))
+    valid = [0, 1, 3, 4]
+    path = Trajectory(np.array(valid, np.float64), np.tile(np.eye(4), (4, 1, 1)))
     found = charts.run_charts(RunFrames.of(log, path), None)
     strip, along = found["states"][0]
     ranges = [(c.colour, *c.points[:, 0]) for c in strip.curves[1:]]
@@ -255,7 +255,7 @@ def test_the_strip_shows_each_range_of_frames_in_one_state() -> None:
         (colours["tracked"], 7.5, 8.5), (colours["lost"], 9.5, 12.5), (colours["apart"], 13.5, 14.5),
     ]  # fmt: skip
     assert {c.name for c in strip.curves if c.name} == {"tracked", "relocalised", "lost", "apart"}
-    assert sum(len(c.points) for c in along.curves if c.dots) == 4, "only believed frames have a place"
+    assert sum(len(c.points) for c in along.curves if c.dots) == 4, "only valid frames have a place"
     for theme in (plot.LIGHT, plot.DARK):
         plot.draw_charts([strip, along], theme)
 

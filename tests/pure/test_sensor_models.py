@@ -22,12 +22,12 @@ from sigmasplat.data.submap import Picture
 from sigmasplat.errors import ConfigError, SourceError
 from sigmasplat.final.fusion import with_readings
 from sigmasplat.fit.align import align, balanced
-from sigmasplat.fit.references import Reference, live_image, map_reference, picture_images, sureness_of
+from sigmasplat.fit.references import Reference, confidence_of, live_image, map_reference, picture_images
 from sigmasplat.fit.target import Target
 from sigmasplat.input.calibration import read_calibration
 from sigmasplat.mapping.seeding import first_pixels, make_splats
 from sigmasplat.plugins.checks.sensor_noise import measure_noise
-from sigmasplat.tracking.sight import view_of, working_frame
+from sigmasplat.tracking.prepared_frame import view_of, working_frame
 
 CAMERA = Camera(160, 120, 140.0, 140.0, 79.5, 59.5)
 Floats = NDArray[np.float32]
@@ -158,9 +158,10 @@ def test_every_alignment_uses_the_model() -> None:
 
 
 def test_gray_counts_more_where_depth_is_sure() -> None:
-    assert sureness_of(SensorModel(z2=0.003)) == 1.0 and sureness_of(SensorModel(z2=0.001)) == pytest.approx(3.0)
+    assert confidence_of(SensorModel(z2=0.003)) == 1.0 and confidence_of(SensorModel(z2=0.001)) == pytest.approx(3.0)
     assert (
-        sureness_of(SENSORS["kinect-v1"]) == pytest.approx(1.0, abs=0.05) and sureness_of(SENSORS["time-of-flight"]) > 5
+        confidence_of(SENSORS["kinect-v1"]) == pytest.approx(1.0, abs=0.05)
+        and confidence_of(SENSORS["time-of-flight"]) > 5
     )
     assert balanced(0.1, 1.0) == 0.1 and balanced(0.1, 4.0) == pytest.approx(2 / 11), "odds 1:9 become 2:9"
     assert balanced(0.1, 1e6) == 0.5 and balanced(0.8, 4.0) == pytest.approx(0.8), "at most as much as depth"

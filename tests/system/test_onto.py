@@ -134,7 +134,7 @@ def test_a_recording_that_is_recognised_later_joins_with_all_its_frames(place: P
         faint = np.float32(0.5) + np.float32(0.05) * (frame.color - np.float32(0.5))
         slam.step(replace(frame, index=i, color=faint if i < 4 else frame.color))
     assert slam.steps[0].state == slam.steps[5].state == "apart" and slam.steps[-1].state == "tracked"
-    assert slam.believed().all() and set(slam.atlas.components) == {0}
+    assert slam.valid().all() and set(slam.atlas.components) == {0}
     expected = se3.inverse(room.truth().T_world_camera[0]) @ room.truth().T_world_camera[list(walked)]
     assert np.linalg.norm((slam.trajectory().T_world_camera - expected)[:, :3, 3], axis=1).max() < 0.05
 

@@ -210,8 +210,8 @@ def test_a_successor_that_inherits_splats_makes_the_second_half_of_the_steps(inh
         step = slam.step(frame)
         steps.append(slam.mapper.field.steps)
         if step.submap and step.is_keyframe:
-            assert slam.mapper.owed == 5
-    assert slam.mapper.owed == 0
+            assert slam.mapper.pending == 5
+    assert slam.mapper.pending == 0
     cut = 10
     if inherit:  # two keyframes of the first submap with 10 steps, and half of the third
         assert steps[cut - 1 : cut + 4] == [20, 25, 27, 29, 30]

@@ -18,7 +18,7 @@ from sigmasplat.fit.backends import fits_of, step_for
 from sigmasplat.fit.interface import FitStats, Twist
 from sigmasplat.fit.target import Keyframe
 from sigmasplat.render.view import View
-from sigmasplat.types import Matrix, Slices, completed
+from sigmasplat.types import Matrix, Task, completed
 
 
 @dataclass
@@ -99,7 +99,7 @@ def fitting(
     frozen_colors: int = 0,
     degree: int = 0,
     stats: FitStats | None = None,
-) -> Slices[FieldFit]:
+) -> Task[FieldFit]:
     """Fit as `fit_field` does, in slices of one step."""
     if field.params.device != view.sums.device:
         where = f"the field is on {field.params.device}, the view on {view.sums.device}"

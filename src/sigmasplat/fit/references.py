@@ -46,7 +46,7 @@ class Reference:
         shown = p.depth[0] * p.kernels.beside((~hidden).astype(np.float32), p.depth[0])
         made = Pyramid.of(
             p.gray[0], shown, p.cameras[0], backend=p.backend, scene_scale=p.scene_scale, noise_per_m=p.noise_per_m,
-            noise=p.noise[0], sureness=p.sureness,
+            noise=p.noise[0], confidence=p.confidence,
         )  # fmt: skip
         pyramid = replace(made, weight=p.weight, weight_depth=p.weight_depth)
         return Reference(pyramid, self.T_camera_world)
@@ -72,7 +72,7 @@ def relative_noise(depth_m: Image, sensor: SensorModel, noise_per_m: float = NOI
     return np.divide(std_m, law_m, out=np.ones_like(law_m), where=law_m > 0)
 
 
-def sureness_of(sensor: SensorModel, noise_per_m: float = NOISE_PER_M, scene_scale: float = 1.0) -> float:
+def confidence_of(sensor: SensorModel, noise_per_m: float = NOISE_PER_M, scene_scale: float = 1.0) -> float:
     """Return how many times as sure as the law noise_per_m · z² a sensor's readings are in alignment, at the distance
     of a wall."""
     wall_m = np.full(1, USUAL_M * scene_scale, np.float32)
@@ -85,14 +85,14 @@ def _pyramid(view: View, gray: Plane, depth: Plane, camera: Camera, depth_m: Ima
 
     All depth is aligned to readings, also that of a rendered map. So all has the noise of a reading at its distance.
     """
-    o, images, noise, sureness = view.options, fits_of(view).images, None, 1.0
+    o, images, noise, confidence = view.options, fits_of(view).images, None, 1.0
     if view.sensor is not None:
         host_m = images.to_host(depth) if depth_m is None else depth_m
         noise = images.beside(relative_noise(host_m, view.sensor, o.depth_noise_per_m), depth)
-        sureness = sureness_of(view.sensor, o.depth_noise_per_m, o.scene_scale)
+        confidence = confidence_of(view.sensor, o.depth_noise_per_m, o.scene_scale)
     return Pyramid.of(
         gray, depth, camera, backend=view.backend, scene_scale=o.scene_scale, noise_per_m=o.depth_noise_per_m,
-        noise=noise, sureness=sureness,
+        noise=noise, confidence=confidence,
     )  # fmt: skip
 
 

@@ -28,9 +28,9 @@ from sigmasplat.graph.localisations import Localisation, combined, consensus, in
 from sigmasplat.render.view import View
 from sigmasplat.tracking.drift import drift_to, symmetric, systematic_errors
 from sigmasplat.tracking.features import Extractor
+from sigmasplat.tracking.pose_validation import confirmed
 from sigmasplat.tracking.rules import angle_between
-from sigmasplat.tracking.verdict import confirmed
-from sigmasplat.types import Matrix, Slices, long_slice
+from sigmasplat.types import Matrix, Task, long_slice
 from sigmasplat.uncertainty.predicted_submaps import PredictedSubmaps
 
 HOPELESS = 0.5
@@ -89,7 +89,7 @@ class Registrar:
         self._images: dict[tuple[int, int], tuple[Target, Pyramid]] = {}
         self._references: dict[tuple[int, int], Reference] = {}
 
-    def register(self, pair: SubmapPair, a: Submap, b: Submap, T_a_b: Matrix) -> Slices[Registration]:
+    def register(self, pair: SubmapPair, a: Submap, b: Submap, T_a_b: Matrix) -> Task[Registration]:
         """Register the submaps a (query) and b (database) of a pair, in slices of one alignment; T_a_b [4, 4] is the
         current estimate."""
         found = list[Localisation]()
@@ -102,7 +102,7 @@ class Registrar:
 
     def _localise(
         self, own: Submap, keyframe: int, other: Submap, alike: Sequence[int], T_own_other: Matrix
-    ) -> Slices[Localisation]:
+    ) -> Task[Localisation]:
         """Localise a keyframe of `own` in `other`, in slices: align from the expected pose, and from those of similar
         keyframes and by features if that explains too little; then refine the best pose."""
         T_own_camera, other_map = own.T_submap_camera[keyframe], self._map_of(other)
@@ -126,7 +126,7 @@ class Registrar:
 
     def _refined(
         self, other: Submap, other_map: WeighedMap, target: Target, live: Pyramid, found: PoseFit
-    ) -> Slices[tuple[PoseFit, bool]]:
+    ) -> Task[tuple[PoseFit, bool]]:
         """Refine a keyframe's pose in a submap, in slices; return it, and whether a keyframe of the submap gave it.
 
         First the keyframe is aligned to the submap's nearest one, if that is wanted. Without a valid result,
@@ -166,7 +166,7 @@ class Registrar:
             return WeighedMap(submap.field.params.to(device))
         return WeighedMap(self.predicted.rows(submap.index).to(device), self.predicted.background(submap.index))
 
-    def _all_aligned(self, other: WeighedMap, live: Pyramid, guesses: Iterable[Matrix]) -> Slices[list[PoseFit]]:
+    def _all_aligned(self, other: WeighedMap, live: Pyramid, guesses: Iterable[Matrix]) -> Task[list[PoseFit]]:
         """Align a keyframe from each guess, in slices."""
         fits = list[PoseFit]()
         for guess in guesses:

@@ -24,7 +24,7 @@ STRETCH_MOST = 3.0
 
 def first_pixels(target: Target, config: SeedConfig, random: np.random.Generator) -> Mask:
     """Choose pixels for an empty map, bool [H, W]: uniform, by gradient, and on Canny edges; only with depth."""
-    valid, sure = target.depth_image.numpy() > 0, sureness(target, config)
+    valid, sure = target.depth_image.numpy() > 0, confidence(target, config)
     gray = gray_of(target.image.numpy())
     chosen = _draw(valid * sure, config.first_uniform, random)
     chosen |= _draw(gradient_magnitude(gray) * valid * sure, config.first_gradient, random)
@@ -50,7 +50,7 @@ def later_pixels(maps: PoseMaps, target: Target, config: SeedConfig) -> Mask:
     return chosen
 
 
-def sureness(target: Target, config: SeedConfig) -> NDArray[np.float64]:
+def confidence(target: Target, config: SeedConfig) -> NDArray[np.float64]:
     """Return with which weight pixels are drawn [H, W]: 1/σ² of their readings relative to others at the same depth, so
     that edges and grazing surfaces are seeded last, but far surfaces are not; 1 without σ or `sensor_noise`."""
     std_m = target.depth_std_image if config.sensor_noise else None
@@ -65,7 +65,7 @@ def thin_out(
     pixels: Mask, config: SeedConfig, random: np.random.Generator, sure: NDArray[np.float64] | None = None
 ) -> Mask:
     """Keep a random share of the pixels, bool [H, W]: `density` of them, at most `later_max`; sure [H, W]: their
-    weights (`sureness`)."""
+    weights (`confidence`)."""
     count = round(config.density * int(pixels.sum()))
     most = min(count, config.later_max) if config.later_max else count
     return _draw(pixels * (1.0 if sure is None else sure), most, random)

@@ -13,7 +13,7 @@ from sigmasplat.data.camera import Camera
 from sigmasplat.fit.pose import PoseFit
 
 Item = TypeVar("Item")
-Asked = Callable[[], bool]
+ShouldStop = Callable[[], bool]
 """Asked again and again during long work."""
 WIDE = 0.065
 """A motion between two frames is wide if it moves the image by more than this share of its width: the basin of
@@ -116,12 +116,12 @@ def draw_keyframes(
         yield [everything[i] for i in drawn]
 
 
-def unless(hurried: Asked, guesses: Iterable[Item], least: int = 0) -> Iterator[Item]:
-    """Yield guesses while `hurried` returns False, at least the first `least` ones; a guess is not made before it is
-    asked."""
+def unless(should_stop: ShouldStop, guesses: Iterable[Item], least: int = 0) -> Iterator[Item]:
+    """Yield guesses while `should_stop` returns False, at least the first `least` ones; a guess is not made before it
+    is asked."""
     waiting = iter(guesses)
     yield from islice(waiting, least)
-    while not hurried():
+    while not should_stop():
         try:
             yield next(waiting)
         except StopIteration:

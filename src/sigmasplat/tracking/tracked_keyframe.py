@@ -11,8 +11,8 @@ from sigmasplat.fit.backends import fits_of
 from sigmasplat.fit.references import Reference, keyframe_reference
 from sigmasplat.render.view import View
 from sigmasplat.tracking.feature_image import FeatureImage
-from sigmasplat.tracking.moving.foreground import Foreground
-from sigmasplat.tracking.sight import FoundKeyframe, Sight
+from sigmasplat.tracking.moving.dynamic_mask import DynamicMask
+from sigmasplat.tracking.prepared_frame import FoundKeyframe, PreparedImages
 from sigmasplat.types import Matrix
 
 
@@ -30,11 +30,16 @@ class TrackedKeyframe:
 
     reference: Reference | None
     image: FeatureImage | None
-    front: Foreground | None = None
+    front: DynamicMask | None = None
 
 
 def mapped_keyframe(
-    params: Tensor, view: View, seen: Sight, T_world_camera: Matrix, config: TrackingConfig, front: Foreground | None
+    params: Tensor,
+    view: View,
+    seen: PreparedImages,
+    T_world_camera: Matrix,
+    config: TrackingConfig,
+    front: DynamicMask | None,
 ) -> TrackedKeyframe:
     """Return a keyframe that was just mapped, weighed by the map with rows `params` [N, 17]."""
     if config.method != "align" and not fits_of(view).aligns:

@@ -22,7 +22,7 @@ def export_plan(
     """
     if target.suffix.lower() != ".png":
         raise RunError(f"cannot write a floor plan as {target.name}; give a name that ends in .png")
-    plan = run_floor_plan(reader.run, reader.believed_path(), reader.camera, cell_m=cell_m, progress=progress)
+    plan = run_floor_plan(reader.run, reader.valid_path(), reader.camera, cell_m=cell_m, progress=progress)
     write_plan(plan, target)
     return plan
 

@@ -76,9 +76,9 @@ def _write_plan(run: RunFolder, plan: FloorPlan) -> None:
 
 
 def report_plan(run: RunFolder, path: Trajectory, camera: Camera) -> FloorPlan | None:
-    """Return the floor plan of a run, seen from its believed poses; None if no surface is visible.
+    """Return the floor plan of a run, seen from its valid poses; None if no surface is visible.
 
-    path: the believed poses; camera: that of the source.
+    path: the valid poses; camera: that of the source.
     """
     settings = run.config().input
     try:

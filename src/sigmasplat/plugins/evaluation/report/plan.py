@@ -17,7 +17,7 @@ def run_floor_plan(
 ) -> FloorPlan:
     """Make the floor plan of a run's map.
 
-    path: the believed poses; camera: that of the images the run worked on. It is rendered with the run's settings, and
+    path: the valid poses; camera: that of the images the run worked on. It is rendered with the run's settings, and
     its errors are predicted if the run has measured how sure its map is. Calls `progress(poses done, total)`. Raises
     RunError without a map, or if the uncertainty belongs to another map; ConfigError unless 1 mm ≤ cell_m ≤ 1 m;
     SigmaSplatError if no surface is visible.

@@ -115,7 +115,7 @@ def _path_rows(metrics: dict[str, Any]) -> list[list[str]]:
     if without:
         rows.append(["ATE rmse without loop closure, cm", number(without["rmse_m"], 3, 100.0)])
     return [
-        [f"believed frames, {alignment}", f"{ate['pairs']} poses"],
+        [f"valid frames, {alignment}", f"{ate['pairs']} poses"],
         *rows,
         ["RPE translation, cm per frame", number(rpe["translation_rmse_m"], 3, 100.0)],
         ["RPE rotation, ° per frame", number(rpe["rotation_rmse_deg"], 3)],
@@ -129,7 +129,7 @@ def _failure_rows(metrics: dict[str, Any]) -> list[list[str]]:
     if not found:
         return []
     return [
-        ["silent failures: believed, but off by > 10 cm", number(found["silent"], 0)],
+        ["silent failures: valid, but off by > 10 cm", number(found["silent"], 0)],
         ["frames off by > 5 cm, with lost ones", f"{number(found['off'], 0)} of {number(found['frames'], 0)}"],
         ["AUROC of the probability of > 5 cm", number(found["auroc"], 3)],
         ["Brier score of it", number(found["brier"], 4)],
