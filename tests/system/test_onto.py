@@ -115,7 +115,9 @@ def test_another_room_stays_apart(place: Path, tmp_path: Path, capsys: pytest.Ca
     out = tmp_path / "run"
     assert exit_code("run", str(recording), *OPTIONS, "--onto", str(place / "first"), "--out", str(out), *SHORT) == 0
     told = capsys.readouterr()
-    assert "8 of 8 frames are APART" in told.out and "never recognised" in told.err
+    assert (
+        "8 of 8 images have no pose (0–7), of which 8 are in components/" in told.out and "never recognised" in told.err
+    )
     run = RunFolder(out)
     assert len(run.read_trajectory()) == 0 and run.component_numbers() == [1]
     assert len(run.read_component(1).trajectory) == 8

@@ -292,6 +292,7 @@ def _run_and_score(
         score(screen, folder, source)
     else:
         screen.say(f"{outcome.summary()}: {folder.path}")
+        screen.next_commands([f"sigmasplat eval {folder.path}"])
     if viewer:
         keep_showing(screen, viewer, folder, source)
     return OK

@@ -37,6 +37,8 @@ from sigmasplat.run_folder.trajectory import write_trajectory
 from sigmasplat.types import Progress, no_progress
 
 Log = list[dict[str, Any]]
+LIKELY = 0.5
+"""The report names a believed frame whose `p_off` is larger."""
 
 
 def evaluate(
@@ -95,7 +97,9 @@ def evaluate(
     show_moving(strips, source, config.input, run.submaps, records)
     run.write_metrics(metrics)
     plan = report_plan(run, frames.path, source.camera) if standard else None
-    write_page(run, metrics, strips.figures, _draw_plots(run, frames, known), [str(problem)] if problem else [], plan)
+    unsure = [frames.log[row]["index"] for row in frames.rows if frames.p_off[row] > LIKELY]
+    plots, problems = _draw_plots(run, frames, known), [str(problem)] if problem else []
+    write_page(run, metrics, strips.figures, plots, problems, plan, unsure)
     if problem:
         raise problem
     return metrics

@@ -15,9 +15,9 @@ from sigmasplat.data.component import LOST
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import RunError, SigmaSplatError
 from sigmasplat.graph.path_covariance import PathCovariance
-from sigmasplat.plugins.evaluation.report.plan import run_floor_plan
 from sigmasplat.plugins.outputs.axes import level_cameras
 from sigmasplat.plugins.outputs.floorplan.floor_plan import FloorPlan
+from sigmasplat.plugins.outputs.plan import run_floor_plan
 from sigmasplat.plugins.outputs.run_reader import RunReader
 from sigmasplat.plugins.robots.bag import BagSink
 from sigmasplat.plugins.robots.frames import (

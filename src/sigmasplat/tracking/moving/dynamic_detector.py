@@ -91,8 +91,8 @@ class DynamicDetector:
         return keyframe if gone is None else keyframe.without(gone.hidden)
 
     def suspected(
-        self, keyframe: Reference | None, seen: PreparedImages, fit: PoseFit, config: TrackingConfig, contradicted: bool,
-        urgent: bool,
+        self, keyframe: Reference | None, seen: PreparedImages, fit: PoseFit, config: TrackingConfig,
+        contradicted: bool, urgent: bool,
     ) -> tuple["DynamicDetector", Iterator[DynamicMask]]:  # fmt: skip
         """Return the watch after a look, and the things in front that may have pulled a pose: those without which the
         rest agrees better, there or at another pose; if the images contradict it, all.
