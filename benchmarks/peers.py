@@ -39,7 +39,7 @@ arg = tyro.conf.arg
 Result = dict[str, Any]
 FOLDER = Path(__file__).parent
 SOURCES = ("redkitchen", "livingroom", "cubicles", "hololens")
-OURS, OURS_BEFORE_LOOPS = "SigmaSplat, `sigma`", "… before loops are closed"
+OURS = "SigmaSplat, `sigma`"
 
 
 @dataclass(frozen=True)
@@ -147,17 +147,15 @@ def score(path: Trajectory, source: Source, limit: int | None) -> dict[str, Any]
 
 
 def run_ours(options: Options) -> list[Result]:
-    """Run SigmaSplat as `accuracy.py` does; return two results per run: with loops, and the path without loops."""
+    """Run SigmaSplat as `accuracy.py` does; return a result per run."""
     # Poses are final when the refinement of the map begins, so it is left out.
     settings = ("final.iterations=0",)
     wanted = accuracy.Options(options.sources, seeds=options.seeds, settings=settings, limit=options.limit)
     made = []
     for result in accuracy.run_all(accuracy.jobs_of(wanted), options):  # type: ignore[arg-type]
-        figures = result["figures"]
-        for system, name in ((OURS, "ate_m"), (OURS_BEFORE_LOOPS, "ate_odometry_m")):
-            error_m = figures.get(name) or figures.get("ate_m")  # without loops both paths are the same
-            kept = {"frames": figures.get("frames"), "without_pose": figures.get("lost"), "ate_m": error_m}
-            made.append({"system": system, "source": result["job"]["source"], "problem": result["problem"], **kept})
+        figures, found = result["figures"], {"system": OURS, "source": result["job"]["source"]}
+        kept = {"frames": figures.get("frames"), "without_pose": figures.get("lost"), "ate_m": figures.get("ate_m")}
+        made.append({**found, "problem": result["problem"], **kept})
     return made
 
 
@@ -235,7 +233,9 @@ def sections(measured: dict[str, Any]) -> list[Section]:
     sources = list(dict.fromkeys(run["source"] for run in runs))
     systems = dict.fromkeys(run["system"] for run in [*runs, *quoted])
     rows = [row for system in systems if (row := _row(system, [*runs, *quoted], sources))]
-    made = [Section("ATE in cm", ["system", *sources, "frames without a pose"], rows, NOTE)]
+    commits = sorted({run["commit"][:9] for run in runs if run.get("commit")})
+    note = NOTE + (f" Some results were kept from earlier runs, of commits {', '.join(commits)}." if commits else "")
+    made = [Section("ATE in cm", ["system", *sources, "frames without a pose"], rows, note)]
     failed = [[f"{run['source']}, {run['system']}", str(run["problem"])] for run in runs if run["problem"]]
     return [*made, Section("Failed", ["run", "last words"], failed)] if failed else made
 
