@@ -35,7 +35,7 @@ from sigmasplat.plugins.sources import open_source
 from sigmasplat.tracking.denoise import denoised
 
 arg = tyro.conf.arg
-USES = ("tracking", "mapping", "seeding", "surface")
+USES = ("tracking", "mapping")
 PAIR_M, PAIR_WIDTH, PAIR_RANGE_M = 0.06, 320, (0.1, 8.0)
 """Pairs are about as far apart as a frame and its keyframe."""
 GUESS_OFF = np.array([0.01, -0.01, 0.01, 0.005, -0.005, 0.005])

@@ -76,7 +76,7 @@ ORIGINS: dict[str, dict[str, str]] = {
         "mapping.covisibility": "ours", "mapping.frames_per_step": "paper",
         "primitives.uncertain_m2": "paper", "primitives.owner": "paper", "primitives.faded_opacity": "ours",
         "primitives.least_opacity": "ours", "primitives.split_gradient": "code", "primitives.split_scale_m": "code",
-        "primitives.clone": "paper", "primitives.most_scale_m": "code", "primitives.most_radius_px": "code",
+        "primitives.clone": "paper", "primitives.most_scale_m": "code",
         "tracking.parametrisation": "paper", "tracking.iterations": "paper", "tracking.lr_rotation": "paper",
         "tracking.lr_translation": "paper", "tracking.weight_color": "paper", "tracking.uncertainty": "paper",
         "tracking.alpha_power": "paper", "tracking.alpha_above": "code", "tracking.outlier_factor": "code",

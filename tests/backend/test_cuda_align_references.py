@@ -17,7 +17,7 @@ from sigmasplat.data.frame import PosePrior
 from sigmasplat.fit.pose import fit_pose_align
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference, keyframe_reference, live_image, map_reference
-from sigmasplat.graph.registration import Registrar, WeighedMap
+from sigmasplat.graph.registration import Registrar
 from sigmasplat.render.cpu.view import CpuView
 from sigmasplat.render.cuda.view import CudaView
 from sigmasplat.render.reference.view import ReferenceView
@@ -133,8 +133,8 @@ def test_a_keyframe_is_aligned_to_a_submap_as_on_the_cpu() -> None:
     found = []
     for view in views():
         registrar = Registrar(preset(default_preset()), MemoryStore(), view)
-        fit = registrar._aligned(WeighedMap(thick()), live(view), TRUTH)
-        found.append((fit, *registrar._checked(WeighedMap(thick()), live(view), TRUTH)))
+        fit = registrar._aligned(thick(), live(view), TRUTH)
+        found.append((fit, *registrar._checked(thick(), live(view), TRUTH)))
     assert all(fit.alignment is not None for fit, *_ in found)
     np.testing.assert_allclose(found[0][0].T_camera_world, found[1][0].T_camera_world, atol=5e-4)
     deviations = [np.sqrt(np.diag(covariance)) for _, covariance, _ in found]

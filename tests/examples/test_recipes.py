@@ -106,11 +106,11 @@ def test_a_rule_is_a_function_and_a_descriptor_a_class(package: Path, run: Calla
 def test_an_attribute_of_splats_is_a_name_a_width_and_a_rate(package: Path, run: Callable[[str], None]) -> None:
     replace(
         package / "data" / "field.py",
-        'ATTRIBUTES = {"correlations": 3,',
-        'ATTRIBUTES = {"heat": 2, "correlations": 3,',
+        'ATTRIBUTES = {"harmonics": 45}',
+        'ATTRIBUTES = {"heat": 2, "harmonics": 45}',
     )
     rates = package / "fit" / "adam.py"
-    replace(rates, 'ATTRIBUTE_RATES = {"correlations"', 'ATTRIBUTE_RATES = {"heat": ("colors", 0.5), "correlations"')
+    replace(rates, 'ATTRIBUTE_RATES = {"harmonics"', 'ATTRIBUTE_RATES = {"heat": ("colors", 0.5), "harmonics"')
     run(
         "import torch\n"
         "from sigmasplat.data.field import GaussianField\n"

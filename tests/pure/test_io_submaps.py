@@ -60,9 +60,7 @@ def assert_same(found: Submap, wanted: Submap) -> None:
         assert torch.equal(found.field.attributes[name].params, attribute.params)
 
 
-@pytest.mark.parametrize(
-    "attributes", [(), ("correlations",), tuple(ATTRIBUTES)], ids=["plain", "one attribute", "all attributes"]
-)
+@pytest.mark.parametrize("attributes", [(), tuple(ATTRIBUTES)], ids=["plain", "all attributes"])
 def test_a_submap_is_read_back_bit_for_bit(store: DiskStore, attributes: tuple[str, ...]) -> None:
     submap, pictures = some_submap(attributes=attributes)
     store.save(submap, pictures)

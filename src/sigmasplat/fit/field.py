@@ -45,13 +45,11 @@ def loss_weights(config: MappingConfig) -> dict[str, float]:
     VarSplat §2: 0.8 L1 + 0.2 (1 − SSIM) + depth + L_reg + NLL. CG-SLAM eq. 18: with median depth, isotropy as a ratio,
     and U. Any other term of `fit.losses` has the weight `weight_<term>` if the settings have such a field.
     """
-    full = config.color_covariance == "full"
     weights = {
         "l1": config.weight_l1,
         "ssim": config.weight_ssim,
         "depth": config.weight_depth,
-        "nll_color": 0.0 if full else config.weight_nll_color,
-        "nll_color_full": config.weight_nll_color if full else 0.0,
+        "nll_color": config.weight_nll_color,
         "nll_depth": config.weight_nll_depth,
         "isotropy": config.weight_isotropy,
         "isotropy_ratio": config.weight_isotropy_ratio,
@@ -134,7 +132,7 @@ class _Steps:
     ) -> None:
         self.field, self.weights, self.frozen_colors, self.stats = field, weights, frozen_colors, stats
         field.moment1[:frozen_colors, COLUMNS["colors"]] = 0.0  # otherwise Adam would keep moving them
-        self.step, self.to_host = step_for(field, view, weights, degree), fits_of(view).to_host
+        self.step, self.to_host = step_for(view, weights, degree), fits_of(view).to_host
         self.grad2d = None if stats is None else field.params.new_zeros(len(field))
 
     def take(self, batch: Sequence[Keyframe], rates: Rates, stopwatch: Stopwatch) -> tuple[float, list[Matrix]]:

@@ -24,7 +24,6 @@ from sigmasplat.render.view import View
 from sigmasplat.tracking.descriptors import Descriptor, OrientationGrid
 from sigmasplat.tracking.features import Extractor
 from sigmasplat.types import Matrix, Task, completed
-from sigmasplat.uncertainty.predicted_submaps import PredictedSubmaps
 
 RIGID = np.diag(np.repeat([1e-4, 1e-5], 3) ** -2.0)
 """Information of the edge to a submap of an earlier session: 0.1 mm and 0.0006°. Its map is finished, and poses in its
@@ -86,7 +85,6 @@ class LoopCloser:
     pending: list[PendingSearch] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.predicted = PredictedSubmaps(self.config, self.store)
         self.graph = Incidence(self.edges)
 
     def connect(self, a: int, b: int, T_a_b: Matrix, information: Matrix) -> None:
@@ -119,10 +117,7 @@ class LoopCloser:
 
     def opacity_ratio(self, submap: Submap) -> float:
         """Return the variance-weighted opacity ratio of a submap (VarSplat §4)."""
-        c, rows = self.config.loops, submap.field.params
-        if c.uncertainty and c.variance == "predicted":
-            rows = self.predicted.rows(submap.index)
-        log_variances = rows[:, COLUMNS["log_variances"]].numpy()
+        c, log_variances = self.config.loops, submap.field.params[:, COLUMNS["log_variances"]].numpy()
         return opacity_ratio(submap.field.opacities.numpy(), log_variances, c.tau, c.weight_max)
 
     def submap_finished(
@@ -146,7 +141,7 @@ class LoopCloser:
         if not self.config.loops.close or not descriptors:
             return []
         query = self._described(submap, descriptors)
-        registrar = Registrar(self.config, self.store, view, self.extractor, self.predicted)
+        registrar = Registrar(self.config, self.store, view, self.extractor)
         tried = list[tuple[Loop, Edge | None]]()
         for pair in self._pairs(query, atlas):
             yield

@@ -21,10 +21,10 @@ from sigmasplat.fit.densify_stats import DensifyStats
 from sigmasplat.fit.field import FieldFit, fitting
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.fit.tracking_loss import PoseMaps
-from sigmasplat.mapping.densify import densify_mask, multiply, split, too_large
+from sigmasplat.mapping.densify import densify_mask, multiply, split, too_large, too_wide
 from sigmasplat.mapping.moving import carve, mask_keyframes
-from sigmasplat.mapping.pruning import fade, splat_depth_residuals, splat_uncertainty, still_uncertain
-from sigmasplat.mapping.seeding import confidence, first_pixels, later_pixels, make_splats, thin_out
+from sigmasplat.mapping.pruning import fade, splat_uncertainty, still_uncertain
+from sigmasplat.mapping.seeding import first_pixels, later_pixels, make_splats, thin_out
 from sigmasplat.mapping.window import choose_window, dominating
 from sigmasplat.render.view import View
 from sigmasplat.tracking.rules import draw_keyframes, never
@@ -220,8 +220,8 @@ class Mapper:
     ) -> Task[FieldFit]:
         """Fit the field to the window, in slices; splats with ids below `frozen_below` keep their colours."""
         c = self.config.mapping
-        together, history = c.frames_per_step or len(window), c.keyframe_history
-        batches = draw_keyframes(window[::-1], steps, c.newest_probability, history, self.random, together)
+        together = c.frames_per_step or len(window)
+        batches = draw_keyframes(window[::-1], steps, c.newest_probability, self.random, together)
         frozen = int((self.field.ids < frozen_below).sum())
         wanted = stats if self.config.primitives.split_gradient > 0 else None
         shortened = _shortened(batches, round(steps * least_share), should_stop)
@@ -274,7 +274,7 @@ class Mapper:
         else:
             view.forward(self.field.params, se3.inverse(T_world_camera))
             wanted = later_pixels(PoseMaps.of(view), target, c)
-            pixels = thin_out(wanted, c, self.random, confidence(target, c))
+            pixels = thin_out(wanted, c, self.random)
         spacing_px = float(np.sqrt(wanted.sum() / max(pixels.sum(), 1)))
         new = make_splats(target, T_world_camera, pixels, spacing_px, self.field, c)
         room = c.max_splats - len(self.field) if c.max_splats else len(new)
@@ -290,7 +290,7 @@ class Mapper:
         multiply(self.field, densify_mask(stats, p.split_gradient, room), p, self.random)
         if p.split_radius_px:
             T_camera_world = se3.inverse(self.keyframes[-1].T_world_camera)
-            coarse = too_large(self.field, T_camera_world, view.camera, 0.0, p.split_radius_px)
+            coarse = too_wide(self.field, T_camera_world, view.camera, p.split_radius_px)
             coarse[coarse.nonzero()[max(most - len(self.field), 0) if most else len(coarse) :]] = False
             split(self.field, coarse, self.random)
 
@@ -316,16 +316,13 @@ class Mapper:
 
     def _uncertainty_m2(self, view: View, window: list[Keyframe]) -> Tensor:
         """Return how far each splat [N] is from the depth readings, m²."""
-        p, keyframes = self.config.primitives, self._judging_keyframes(window)
-        if p.uncertain_by == "residual":
-            return splat_depth_residuals(self.field, view, keyframes)
-        return splat_uncertainty(self.field, view, keyframes, p.owner)[0]
+        keyframes = self._judging_keyframes(window)
+        return splat_uncertainty(self.field, view, keyframes, self.config.primitives.owner)[0]
 
     def _prune(self, view: View, also: Tensor | None = None) -> None:
         """Remove splats that are too faint or too large, and those marked in `also` [N]."""
-        p, T_camera_world = self.config.primitives, se3.inverse(self.keyframes[-1].T_world_camera)
         gone = self.field.opacities <= self.config.mapping.prune_opacity
-        gone |= too_large(self.field, T_camera_world, view.camera, p.most_scale_m, p.most_radius_px)
+        gone |= too_large(self.field, self.config.primitives.most_scale_m)
         self.field.keep(~(gone if also is None else gone | also))
 
 

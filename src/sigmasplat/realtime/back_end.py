@@ -9,7 +9,7 @@ import numpy as np
 
 from sigmasplat.data import se3
 from sigmasplat.data.component import APART, RELOCALISED
-from sigmasplat.data.hops import UNKNOWN_HOP, Hop
+from sigmasplat.data.hops import UNKNOWN_HOP
 from sigmasplat.fit.align import Alignment
 from sigmasplat.fit.pose import fit_pose_align
 from sigmasplat.graph.loops import Loops
@@ -18,7 +18,6 @@ from sigmasplat.realtime.messages import BetweenFrames, Offer, Search, Snapshot,
 from sigmasplat.slam.listeners import Before, Correction, correction_since
 from sigmasplat.slam.mapping_backend import MappingBackend
 from sigmasplat.slam.step_result import StepTimer
-from sigmasplat.tracking.drift import mean_variance
 from sigmasplat.tracking.pose_validation import is_better
 from sigmasplat.tracking.prepared_frame import PreparedFrame
 from sigmasplat.tracking.relocaliser import Relocation
@@ -147,7 +146,8 @@ class BackEnd:
         else:
             state, (T, alignment) = "", self._realigned(each, offer)
             hop = system.hop_to(se3.inverse(T), alignment)
-            self._add_drift(number, T, hop)
+            if system.cuts:
+                system.add_drift(T, hop)
         may_wait = not first and self._added < MOST_ADDED and not system.submap_ends(number, T)
         if may_wait and self._keyframe_waits():
             system.add_keyframe(seen, number, T, hop)
@@ -168,14 +168,6 @@ class BackEnd:
         """Place a keyframe, which is the newest one."""
         self.system.atlas.place_frame(self.system.atlas.keyframe_poses.last[-1])
         self.system.steps.append(each.step)
-
-    def _add_drift(self, number: int, T_submap_camera: Matrix, hop: Hop) -> None:
-        system = self.system
-        if system.config.submaps.variance_sum:  # V of the frames in between is taken to be that of the keyframe
-            mean = mean_variance(system.mapper.field, system.view, se3.inverse(T_submap_camera))
-            system.drift.variance_sum += mean * (number - self._newest)
-        if system.cuts:
-            system.add_drift(T_submap_camera, hop)
 
     def _reference(self, seen: PreparedFrame, T_submap_camera: Matrix, offer: Offer | None) -> TrackedKeyframe:
         system, front = self.system, None if offer is None else offer.front

@@ -97,7 +97,7 @@ class MappingBackend(SlamState):
     def submap_ends(self, index: int, T_submap_camera: Matrix) -> bool:
         """Return whether a rule ends the active submap at frame number `index`."""
         since, moved_m = index - self.mapper.keyframes[0].index, self.drift.position_m(T_submap_camera)
-        return bool(ends_submap(T_submap_camera, since, moved_m, self.config.submaps, self.drift.variance_sum))
+        return bool(ends_submap(T_submap_camera, since, moved_m, self.config.submaps))
 
     def cut(self, T_submap_camera: Matrix, should_stop: Callable[[], bool] = never) -> Task[None]:
         """Finish the active submap (`finish_submap`) and start the next one at its newest keyframe, in slices. A next

@@ -21,7 +21,6 @@ from sigmasplat.slam.array_interface import ArrayInterface
 from sigmasplat.slam.listeners import notifying
 from sigmasplat.slam.mapping_backend import MappingBackend
 from sigmasplat.slam.step_result import Step, StepTimer
-from sigmasplat.tracking.drift import mean_variance
 from sigmasplat.tracking.fitted_depth import fitted_keyframe, fitted_to_map
 from sigmasplat.tracking.frame_estimate import FrameEstimate
 from sigmasplat.tracking.moving.dynamic_mask import share_of
@@ -134,9 +133,6 @@ class Slam(MappingBackend, ArrayInterface):
         self.recovery.count(lost, self.tracker.doubtful > 0, seen)
         found = FrameEstimate.of(fit, se3.inverse(fit.T_camera_world), lost)
         if not lost:
-            if self.config.submaps.variance_sum:
-                self.drift.variance_sum += mean_variance(self.mapper.field, self.view, fit.T_camera_world)
-                found.tracking["variance_sum"] = self.drift.variance_sum
             certain = self.recovery.is_steady and self.tracker.is_certain(fit)
             found.mapped = certain and not held_back and self._is_keyframe(fit)
             if found.mapped:

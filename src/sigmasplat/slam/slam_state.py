@@ -219,7 +219,7 @@ class SlamState:
     def cuts(self) -> bool:
         """Return whether any rule may end a submap."""
         s = self.config.submaps
-        return bool(s.distance_m or s.angle_deg or s.frames or s.uncertainty_m or s.variance_sum)
+        return bool(s.distance_m or s.angle_deg or s.frames or s.uncertainty_m)
 
     @property
     def _describes(self) -> bool:

@@ -103,11 +103,10 @@ class PreparedFrame(PreparedImages):
 def view_of(camera: Camera, config: Config) -> View:
     """Make the view for working images of a camera, with planes for σ² if the run learns it or weighs by it, and with
     the noise of readings if alignment uses it."""
-    mapping, tracking, registration = config.mapping, config.tracking, config.registration
+    mapping, tracking = config.mapping, config.tracking
     learned = bool(mapping.weight_nll_color or mapping.weight_nll_depth)
     read = tracking.uncertainty and tracking.align_depth_by == "V"
-    predicted = any(c.uncertainty and c.variance == "predicted" for c in (tracking, registration))
-    view = make_view(config.backend, camera, config.render, variance=learned or read or predicted)
+    view = make_view(config.backend, camera, config.render, variance=learned or read)
     view.sensor = sensor_model(config.input.sensor) if tracking.sensor_noise else None
     return view
 

@@ -45,7 +45,7 @@ def mapped_keyframe(
     if config.method != "align" and not fits_of(view).aligns:
         return TrackedKeyframe(None, seen.image, front)  # nothing aligns to it
     T_camera_world = se3.inverse(T_world_camera)
-    reference = keyframe_reference(params, view, seen.live, T_camera_world, config, seen.target)
+    reference = keyframe_reference(params, view, seen.live, T_camera_world, config)
     return TrackedKeyframe(reference, seen.image and seen.image.weighed(reference.weights), front)
 
 

@@ -8,7 +8,6 @@ import numpy as np
 from sigmasplat.config import TrackingConfig
 from sigmasplat.data import se3
 from sigmasplat.data.frame import NO_PRIOR, PosePrior
-from sigmasplat.errors import ConfigError
 from sigmasplat.fit.align import Alignment, align
 from sigmasplat.fit.backends import fits_of
 from sigmasplat.fit.compare import Comparison
@@ -73,11 +72,6 @@ class Tracker:
     doubtful: int = 0
     started: bool = False
     """Whether a frame has been tracked yet."""
-
-    def __post_init__(self) -> None:
-        c = self.config
-        if c.uncertainty and c.variance == "predicted" and c.method == "adam":
-            raise ConfigError("tracking.variance=predicted needs tracking.method=align; set it, or variance=published")
 
     def start(self, seen: PreparedImages, prior: PosePrior = NO_PRIOR) -> None:
         """Fix the gauge: the first camera is the world."""
@@ -249,8 +243,7 @@ class Tracker:
         if c.method == "adam":
             config = c if self.started else c.without_motion()
             return fit_pose_adam(field.params, view, seen.target, T_camera_world, config, patience * config.iterations)
-        reference = self.keyframe if c.align_to == "keyframe" else None
-        reference = reference or map_reference(field.params, view, T_camera_world, c)
+        reference = self.keyframe or map_reference(field.params, view, T_camera_world, c)
         return self._aligned(reference, seen.live, T_camera_world, patience > 0)
 
     def _aligned(self, reference: Reference, live: Pyramid, T_camera_world: Matrix, moves: bool = True) -> PoseFit:
@@ -298,8 +291,7 @@ class Tracker:
         odometry = None if should_stop() else self._odometry(view, seen.live, prediction)
         starts = [prediction.last] if odometry is None else [odometry, prediction.last]
         fits = [fit, *(self._fit(field, view, seen, start, 2) for start in unless(should_stop, starts))]
-        by_map = self.config.method == "align" and self.config.align_to == "keyframe"  # with "map", `_fit` has tried it
-        for start in unless(should_stop, starts if by_map else ()):
+        for start in unless(should_stop, starts if self.config.method == "align" else ()):
             reference = map_reference(field.params, view, se3.inverse(start), self.config)
             fits.append(self._aligned(reference, seen.live, se3.inverse(start)))
         best = max(fits, key=self._score)
