@@ -6,8 +6,11 @@ from typing import Any
 import numpy as np
 import torch
 from claims import Job
-from drift_rule import hops_of
+from drift_rule import ADDED, hops_of
+from finished_run import FinishedRun
 from localise import Search, disturbed
+from sigmasplat.uncertainty.predicted_submaps import PredictedSubmaps
+from unseen_views import UnseenView, held_back_views
 from weights_runs import VIEWS, mean, registrations, rendered, true_submaps
 
 from sigmasplat.data import se3
@@ -15,13 +18,11 @@ from sigmasplat.fit.pose import fit_pose_adam
 from sigmasplat.fit.target import Target
 from sigmasplat.graph.registration import tracking_of
 from sigmasplat.input.source import Source
-from sigmasplat.plugins.evaluation.finished_run import FinishedRun
 from sigmasplat.plugins.evaluation.metrics.scored_view import ScoredView
 from sigmasplat.plugins.evaluation.metrics.splats import score_splats
 from sigmasplat.plugins.evaluation.metrics.trajectory import align_rigid, associate, score_path
 from sigmasplat.plugins.evaluation.metrics.uncertainty import spearman
 from sigmasplat.plugins.evaluation.metrics.views import sample_pixels, score_uncertainty
-from sigmasplat.plugins.evaluation.unseen_views import UnseenView, held_back_views
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.slam.slam import Slam
 
@@ -48,8 +49,9 @@ def rows(job: Job, registered: Settings, plateaus: Settings) -> Rows:
     figures = path_figures(slam, done, source, views) | {"cpu_s": cpu_s / len(slam.steps)}
     found = [{"group": job.group, "variant": job.variant, "figures": figures}]
     if job.group == SUBMAPS:
+        truth, predicted = true_submaps(slam, source), PredictedSubmaps(slam.config, slam.store)
         found += hop_ranks(slam, source)
-        found += registrations(job, slam, true_submaps(slam, source), registered)
+        found += registrations(job, slam, truth, predicted, registered)
         found += localisations(job, slam, done, views, plateaus)
     return found
 
@@ -96,15 +98,18 @@ def surface_figures(slam: Slam, done: FinishedRun, source: Source) -> dict[str, 
 
 
 def hop_ranks(slam: Slam, source: Source) -> Rows:
-    """Return the rank correlation of the true errors of hops with what they add to the accumulated covariance."""
+    """Return the rank correlation of the true errors of hops with what they add to each rule's value."""
     truth = source.truth()
     assert truth is not None, "every sequence of this benchmark has a true path"
     own, theirs = associate(np.array([step.timestamp_s for step in slam.steps]), truth.timestamps_s)
     known = dict(zip(own.tolist(), truth.T_world_camera[theirs], strict=True))
     hops = hops_of(slam, slam.trajectory().T_world_camera, known)["hops"]
-    pairs = np.array([(hop["added_m2"], hop["error_m"]) for hop in hops]).reshape(-1, 2)
-    rank = float(spearman(*pairs.T)) if len(pairs) > 2 else None
-    return [{"group": "hops", "variant": "covariance", "figures": {"rank": rank, "hops": len(pairs)}}]
+    found = Rows()
+    for rule, added in ADDED.items():
+        pairs = np.array([(hop[added], hop["error_m"]) for hop in hops if np.isfinite(hop[added])]).reshape(-1, 2)
+        rank = float(spearman(*pairs.T)) if len(pairs) > 2 else None
+        found.append({"group": "hops", "variant": rule, "figures": {"rank": rank, "hops": len(pairs)}})
+    return found
 
 
 def localisations(job: Job, slam: Slam, done: FinishedRun, views: list[UnseenView], ways: Settings) -> Rows:
