@@ -8,12 +8,11 @@ Both are scored by today's code. Writes benchmarks/results/<name>-<machine>.json
 example: python benchmarks/board.py HEAD~1
 """
 
-import multiprocessing
 import os
 import sys
 import tempfile
 import time
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -127,15 +126,13 @@ def measure(options: Options) -> dict[str, Any]:
 
 
 def run_all(tasks: list[Task], kept: dict[Code, Kept]) -> None:
-    """Perform tasks, two at a time, and keep each result when it is there."""
+    """Perform tasks, two at a time, each run in its own process; keep each result when it is there."""
     if not tasks:
         return
-    os.environ.update(board_runs.ONE_THREAD)  # of the processes that score; they inherit it
     with ExitStack() as stack:
         scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="board-")))
         checkouts = {code: code.ready(stack, scratch) for code in dict.fromkeys(task.code for task in tasks)}
-        context = multiprocessing.get_context("spawn")
-        pool = stack.enter_context(ProcessPoolExecutor(PROCESSES, context, board_runs.one_thread))
+        pool = stack.enter_context(ThreadPoolExecutor(PROCESSES, initializer=board_runs.one_thread))
         running = {
             pool.submit(board_runs.perform, task.row, task.seed, checkouts[task.code], scratch): task for task in tasks
         }

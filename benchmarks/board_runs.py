@@ -22,6 +22,7 @@ from disturbances import plan
 from disturbed_recordings import original, write
 
 from sigmasplat.errors import ConfigError, SigmaSplatError
+from sigmasplat.native.threads import set_kernel_threads
 
 ONE_THREAD = {"SIGMASPLAT_THREADS": "1", "OMP_NUM_THREADS": "1"}
 SETTINGS = ("final.iterations=0",)
@@ -70,8 +71,9 @@ def environment(checkout: Path) -> dict[str, str]:
 
 
 def one_thread() -> None:
-    """Let this process compute with one thread."""
+    """Let the calling thread score without the help of others."""
     torch.set_num_threads(1)
+    set_kernel_threads(1)
     cv2.setNumThreads(1)
 
 

@@ -74,16 +74,6 @@ def of_scores(quantity: str, pixels: str) -> Callable[[dict[str, Any]], Runs]:
     return read
 
 
-def of_kinds(measured: dict[str, Any]) -> Runs:
-    """Read color_covariance.py; a variant is a kind of covariance."""
-    return [
-        {"source": source["source"].partition(":")[0], "variant": kind, "seed": run["seed"], "figures": run[kind]}
-        for source in measured["figures"]["sources"]
-        for run in source["runs"]
-        for kind in ("diagonal", "full")
-    ]
-
-
 def of_loops(measured: dict[str, Any]) -> Runs:
     """Read the drift experiment of loops.py: the path of each run with its loops, and without them."""
     return [

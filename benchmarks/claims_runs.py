@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import torch
 from claims import Job
-from drift_rule import ADDED, hops_of
+from drift_rule import hops_of
 from localise import Search, disturbed
 from weights_runs import VIEWS, mean, registrations, rendered, true_submaps
 
@@ -24,7 +24,6 @@ from sigmasplat.plugins.evaluation.metrics.views import sample_pixels, score_unc
 from sigmasplat.plugins.evaluation.unseen_views import UnseenView, held_back_views
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.slam.slam import Slam
-from sigmasplat.uncertainty.predicted_submaps import PredictedSubmaps
 
 Rows = list[dict[str, Any]]
 Settings = dict[str, tuple[str, ...]]
@@ -49,16 +48,15 @@ def rows(job: Job, registered: Settings, plateaus: Settings) -> Rows:
     figures = path_figures(slam, done, source, views) | {"cpu_s": cpu_s / len(slam.steps)}
     found = [{"group": job.group, "variant": job.variant, "figures": figures}]
     if job.group == SUBMAPS:
-        truth, predicted = true_submaps(slam, source), PredictedSubmaps(slam.config, slam.store)
         found += hop_ranks(slam, source)
-        found += registrations(job, slam, truth, predicted, registered)
+        found += registrations(job, slam, true_submaps(slam, source), registered)
         found += localisations(job, slam, done, views, plateaus)
     return found
 
 
 def path_figures(slam: Slam, done: FinishedRun, source: Source, views: list[UnseenView]) -> dict[str, Any]:
     """Return the figures of path, views and, if the true surface is known, splats."""
-    scores, _ = score_path(done.path.at(done.believed), None, source.truth())
+    scores, _ = score_path(done.path.at(done.valid), None, source.truth())
     scored = [seen(done, view) for view in views]
     judged = score_uncertainty([sample_pixels(view) for view in scored]) or {}
     of_views = mean(scored)
@@ -69,7 +67,7 @@ def path_figures(slam: Slam, done: FinishedRun, source: Source, views: list[Unse
         "psnr_db": of_views["psnr_db"],
         "depth_l1_m": of_views["depth_l1_m"],
         "spearman": judged.get("spearman"),
-        "lost": int((~done.believed).sum()),
+        "lost": int((~done.valid).sum()),
         "splats": len(done.field),
         **surface_figures(slam, done, source),
     }
@@ -98,18 +96,15 @@ def surface_figures(slam: Slam, done: FinishedRun, source: Source) -> dict[str, 
 
 
 def hop_ranks(slam: Slam, source: Source) -> Rows:
-    """Return the rank correlation of the true errors of hops with what they add to each rule's value."""
+    """Return the rank correlation of the true errors of hops with what they add to the accumulated covariance."""
     truth = source.truth()
     assert truth is not None, "every sequence of this benchmark has a true path"
     own, theirs = associate(np.array([step.timestamp_s for step in slam.steps]), truth.timestamps_s)
     known = dict(zip(own.tolist(), truth.T_world_camera[theirs], strict=True))
     hops = hops_of(slam, slam.trajectory().T_world_camera, known)["hops"]
-    found = Rows()
-    for rule, added in ADDED.items():
-        pairs = np.array([(hop[added], hop["error_m"]) for hop in hops if np.isfinite(hop[added])]).reshape(-1, 2)
-        rank = float(spearman(*pairs.T)) if len(pairs) > 2 else None
-        found.append({"group": "hops", "variant": rule, "figures": {"rank": rank, "hops": len(pairs)}})
-    return found
+    pairs = np.array([(hop["added_m2"], hop["error_m"]) for hop in hops]).reshape(-1, 2)
+    rank = float(spearman(*pairs.T)) if len(pairs) > 2 else None
+    return [{"group": "hops", "variant": "covariance", "figures": {"rank": rank, "hops": len(pairs)}}]
 
 
 def localisations(job: Job, slam: Slam, done: FinishedRun, views: list[UnseenView], ways: Settings) -> Rows:

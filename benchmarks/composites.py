@@ -46,7 +46,7 @@ from sigmasplat.plugins.sources import open_source
 from sigmasplat.plugins.sources.room.mover import CENTER_M, mover
 from sigmasplat.plugins.sources.room.sensor import measured_color, measured_depth
 from sigmasplat.render import render
-from sigmasplat.tracking.sight import working_frame
+from sigmasplat.tracking.prepared_frame import working_frame
 
 arg = tyro.conf.arg
 AWAY = 0.6

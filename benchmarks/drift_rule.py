@@ -1,9 +1,8 @@
-"""Measure whether the uncertainty rules cut submaps where tracking is weak (VarSplat §2, issues 4 and 18).
+"""Measure whether the uncertainty rule cuts submaps where tracking is weak (VarSplat §2, issues 4 and 18).
 
-Runs SLAM with `submaps.uncertainty_m` (the covariance of tracking) as the only rule, then with `submaps.variance_sum`
-(V of the tracked frames, the paper's reading). The limit of the second rule is chosen so that it fires about as often.
-Compares the motion from each keyframe to the next (a hop) with the ground truth, where a rule fires and where it does
-not, and ranks the hops by what each rule adds there.
+Runs SLAM with `submaps.uncertainty_m` (the covariance of tracking) as the only rule. Compares the motion from each
+keyframe to the next (a hop) with the ground truth, where the rule fires and where it does not, and ranks the hops by
+what they add to the covariance.
 Writes benchmarks/results/drift_rule-<machine>.json and prints tables.
 
 example: python benchmarks/drift_rule.py --sources hololens --limit 120
@@ -34,17 +33,13 @@ from sigmasplat.slam.slam import Slam
 
 arg = tyro.conf.arg
 Matrix = NDArray[np.float64]
-NEVER = 1e9
-"""A limit that no sum of V reaches: the sum is recorded and ends no submap."""
-SUMS = ("drift_m", "variance_sum")
-"""Values in the log of a keyframe: the standard deviation of its position in the submap, and the sum of V."""
 ADDED = {"covariance": "added_m2", "V": "variance"}
-"""What a hop adds to the value of each rule."""
+"""What a hop adds to the value of each rule; V in earlier results only."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """Cut submaps by accumulated uncertainty only, by two rules, and measure the true error there."""
+    """Cut submaps by accumulated uncertainty only, and measure the true error there."""
 
     sources: Annotated[tuple[str, ...], arg(help="sequences: names in the data folder, or paths")] = (
         "livingroom",
@@ -60,19 +55,11 @@ class Options:
 
 
 def measure(path: str, options: Options) -> list[dict[str, Any]]:
-    """Run one sequence once per rule; return the hops and the number of submaps of each. Raises SourceError if it
-    cannot be read."""
+    """Run one sequence; return its hops and the number of submaps. Raises SourceError if it cannot be read."""
     config = override(preset_of(options.preset), split_settings(options.settings))
-    both = SubmapConfig(uncertainty_m=options.uncertainty_m, variance_sum=NEVER, inherit=config.submaps.inherit)
-    first = followed(path, replace(config, submaps=both), options.limit)
-    increases = sum(hop["variance"] for hop in first["hops"])
-    limit = increases / first["submaps"] if increases else NEVER
-    by_variance = SubmapConfig(variance_sum=limit, inherit=config.submaps.inherit)
-    second = followed(path, replace(config, submaps=by_variance), options.limit)
-    return [
-        {"rule": "covariance", "limit": options.uncertainty_m, **first},
-        {"rule": "V", "limit": round(limit, 6), **second},
-    ]
+    rule = SubmapConfig(uncertainty_m=options.uncertainty_m, inherit=config.submaps.inherit)
+    found = followed(path, replace(config, submaps=rule), options.limit)
+    return [{"rule": "covariance", "limit": options.uncertainty_m, **found}]
 
 
 def followed(path: str, config: Config, limit: int | None) -> dict[str, Any]:
@@ -91,24 +78,23 @@ def followed(path: str, config: Config, limit: int | None) -> dict[str, Any]:
 
 
 def hops_of(slam: Slam, path: Matrix, known: dict[int, Matrix]) -> dict[str, Any]:
-    """Return each hop: its last frame, its submap, what it adds to δ² (m²) and to the sum of V, whether a submap ended,
-    and the true error, m."""
+    """Return each hop: its last frame, its submap, what it adds to δ² (m²), whether a submap ended, and the true
+    error, m."""
     hops = []
     for before, after in pairwise(slam.keyframe_indices):
         if before not in known or after not in known:
             continue
         estimate, truth = (se3.inverse(p[before]) @ p[after] for p in (path, known))
         submap = slam.steps[before].submap
-        drift, sum_of_V = ([slam.steps[k].tracking.get(name, 0.0) for k in (before, after)] for name in SUMS)
+        drift = [slam.steps[k].tracking.get("drift_m", 0.0) for k in (before, after)]
         if before == 0 or (before - 1 >= 0 and slam.steps[before - 1].submap != submap):
-            drift[0] = sum_of_V[0] = 0.0  # the submap begins with this keyframe
+            drift[0] = 0.0  # the submap begins with this keyframe
         hops.append(
             {
                 "frame": after,
                 "submap": submap,
                 "drift_m": round(drift[1], 6),
                 "added_m2": drift[1] ** 2 - drift[0] ** 2,
-                "variance": sum_of_V[1] - sum_of_V[0],
                 "cut": slam.steps[after].submap != submap,
                 "error_m": round(float(np.linalg.norm((se3.inverse(truth) @ estimate)[:3, 3])), 6),
             }
@@ -137,9 +123,9 @@ def sections(measured: dict[str, Any]) -> list[Section]:
     limit_cm = significant(100 * measured["config"]["uncertainty_m"])
     note = (
         f"Rule *covariance*: a submap ends where the camera's position in it is uncertain by more than {limit_cm} cm. "
-        "Rule *V*: it ends where the sum of the mean V of the tracked frames exceeds a limit, with which it fires "
-        "about as often. Hops lead from keyframe to keyframe; errors are relative to the ground truth, which no rule "
-        "uses. Spearman: rank correlation of the error of a hop with what it adds to the rule's value."
+        "Rule *V*, which is gone: it ended where the sum of the mean V of the tracked frames exceeded a limit. "
+        "Hops lead from keyframe to keyframe; errors are relative to the ground truth, which no rule uses. "
+        "Spearman: rank correlation of the error of a hop with what it adds to the rule's value."
     )
     return [Section("Uncertainty rule", head, rows, note)]
 

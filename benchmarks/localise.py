@@ -1,4 +1,4 @@
-"""Find a camera pose in a map by gradient descent through `render`, with some or all paths of the pose gradient."""
+"""Find a camera pose in a map by gradient descent through `render`, without and with the gradient's covariance path."""
 
 import time
 from dataclasses import dataclass
@@ -17,13 +17,8 @@ from sigmasplat.render import Render, render
 from sigmasplat.render.pose_gradient import twist_matrix
 
 Matrix = NDArray[np.float64]
-WAYS = {
-    "mean + depth": RenderConfig(covariance_pose_gradient=False, color_pose_gradient=False),
-    "+ covariance": RenderConfig(color_pose_gradient=False),
-    "+ harmonics": RenderConfig(),
-}
-"""Each way includes the paths of the ways before it."""
-PATHS = ("mean", "depth", "covariance", "color")
+WAYS = {"without covariance": RenderConfig(covariance_pose_gradient=False), "with covariance": RenderConfig()}
+"""Both include the paths through means, depths and colours."""
 COVERED_ALPHA = 0.95
 
 
@@ -85,15 +80,14 @@ def gradient(
 
 
 def shares(field: GaussianField, frame: Frame, T_camera_world: Matrix, search: Search) -> dict[str, list[float]]:
-    """Return the magnitude of each path's gradient relative to the whole gradient, for ρ and for φ: |∂L| of the path
-    over |∂L|."""
-    whole = gradient(field, frame, T_camera_world, RenderConfig(), search)
-    found = {}
-    for path in PATHS:
-        alone = RenderConfig(**{f"{other}_pose_gradient": other == path for other in PATHS})
-        part = gradient(field, frame, T_camera_world, alone, search)
-        found[path] = [float(np.linalg.norm(part[k]) / np.linalg.norm(whole[k])) for k in (slice(0, 3), slice(3, 6))]
-    return found
+    """Return the magnitude of the gradient with and without the covariance path relative to the whole gradient, for ρ
+    and for φ: |∂L| of the part over |∂L|."""
+    without, whole = (gradient(field, frame, T_camera_world, way, search) for way in WAYS.values())
+    parts = {"covariance": whole - without, "all others": without}
+    return {
+        name: [float(np.linalg.norm(part[k]) / np.linalg.norm(whole[k])) for k in (slice(0, 3), slice(3, 6))]
+        for name, part in parts.items()
+    }
 
 
 def pose_loss(seen: Render, color: Tensor, depth_m: Tensor, weight_color: float) -> Tensor:

@@ -131,7 +131,7 @@ def follow(path: str, scratch: Path, config: Config, frames: int, save_every_s: 
     folder = RunFolder.create(scratch / "run", config, source.name)
     slam = Slam(config, folder.submaps)
     read, state = Arrivals(source), StateFile(slam, folder, save_every_s)
-    system = RealTime(slam, covariances=False, hurried=read.hurries)
+    system = RealTime(slam, covariances=False, should_stop=read.hurries)
     state.run_save = system.save
     samples = Samples(folder, frames - 3)  # a late frame may be dropped, but not three in a row at the end
     outcome = Session(system, read, folder, samples, state, later=system.between_frames).execute()

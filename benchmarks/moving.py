@@ -37,7 +37,7 @@ from sigmasplat.plugins.sources import open_source
 from sigmasplat.plugins.sources.synthetic import SyntheticRoom
 from sigmasplat.render import render
 from sigmasplat.slam.slam import Slam
-from sigmasplat.tracking.sight import working_frame
+from sigmasplat.tracking.prepared_frame import working_frame
 
 arg = tyro.conf.arg
 Mask = NDArray[np.bool_]

@@ -46,7 +46,7 @@ def panels(run: RunFolder, index: int, direction: int) -> list[ViewPanel]:
     T_camera_world = se3.inverse(reader.poses_of([index]).T_world_camera[0])
     with torch.inference_mode():
         view = scored_view(frame, renderer(field, frame.camera, T_camera_world), "")
-        below, poses = orbit_view(field, reader.believed_path(), frame.camera, DIRECTIONS, renderer)
+        below, poses = orbit_view(field, reader.valid_path(), frame.camera, DIRECTIONS, renderer)
         near = replace(frame.camera, fx=ZOOM * frame.camera.fx, fy=ZOOM * frame.camera.fy)
         above = renderer(below, near, se3.inverse(poses[direction % DIRECTIONS]))
     backdrop = np.array(BACKGROUND, np.float32) / 255.0

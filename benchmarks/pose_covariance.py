@@ -63,8 +63,8 @@ def measure(path: str, options: Options) -> dict[str, Any]:
     slam.finish()
     errors = PathCovariance.of(slam.checkpoint())
     assert errors is not None
-    believed = np.flatnonzero(slam.believed())
-    found = score_path_covariance(errors, slam.trajectory().at(believed), believed, slam.keyframe_indices, truth)
+    valid = np.flatnonzero(slam.valid())
+    found = score_path_covariance(errors, slam.trajectory().at(valid), valid, slam.keyframe_indices, truth)
     loops = sum(loop.accepted for loop in slam.loops)
     return {"frames": len(slam.steps), "submaps": len(slam.atlas.anchors), "loops": loops, **found}
 

@@ -29,14 +29,14 @@ Truth = NDArray[np.float64]
 class RunPath:
     """The frames of a run: poses when they were tracked and at the end, T_world_camera [N, 4, 4], nan without a pose.
 
-    believed: in trajectory.txt and not lost; p_off [N]: nan if the log does not have it; log: the lines of log.jsonl,
+    valid: in trajectory.txt and not lost; p_off [N]: nan if the log does not have it; log: the lines of log.jsonl,
     None for a frame without one.
     """
 
     tracked: NDArray[np.float64]
     final: NDArray[np.float64]
     lost: NDArray[np.bool_]
-    believed: NDArray[np.bool_]
+    valid: NDArray[np.bool_]
     p_off: NDArray[np.float64]
     log: list[dict[str, Any] | None]
 
@@ -58,8 +58,8 @@ def read_run(folder: Path, frames: int) -> RunPath:
     path = read_trajectory(folder / "trajectory.txt")
     rows = np.rint(path.timestamps_s * FRAMES_PER_SECOND).astype(int)
     final[rows] = path.T_world_camera
-    believed = np.isfinite(final[:, 0, 0]) & ~lost  # a component that joined the world later is believed at the end
-    return RunPath(tracked, final, lost, believed, p_off, log)
+    valid = np.isfinite(final[:, 0, 0]) & ~lost  # a component that joined the world later is valid at the end
+    return RunPath(tracked, final, lost, valid, p_off, log)
 
 
 def world_of_truth(estimate: NDArray[np.float64], truth: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -81,10 +81,10 @@ def world_of_truth(estimate: NDArray[np.float64], truth: NDArray[np.float64]) ->
 def errors_m(poses: NDArray[np.float64], run: RunPath, truth: Truth, event: int) -> NDArray[np.float64]:
     """Return how far the positions of poses [N, 4, 4] are from the truth, m [N]; nan without a pose.
 
-    The nearer one counts where colour and depth have different true poses. The world is fixed by the believed frames
+    The nearer one counts where colour and depth have different true poses. The world is fixed by the valid frames
     before frame `event`, the first 20 if that is 0.
     """
-    early = np.flatnonzero(run.believed[: event or ANCHOR_FRAMES])
+    early = np.flatnonzero(run.valid[: event or ANCHOR_FRAMES])
     if not len(early):
         return np.full(len(poses), np.nan)
     T = world_of_truth(poses[early], truth[0, early])
@@ -93,11 +93,11 @@ def errors_m(poses: NDArray[np.float64], run: RunPath, truth: Truth, event: int)
 
 
 def ate_m(run: RunPath, truth: Truth) -> float | None:
-    """Return the RMSE of the believed positions after the usual rigid alignment, m; None with fewer than 3."""
-    positions = run.final[run.believed, :3, 3]
+    """Return the RMSE of the valid positions after the usual rigid alignment, m; None with fewer than 3."""
+    positions = run.final[run.valid, :3, 3]
     if len(positions) < 3:
         return None
-    true = truth[0, run.believed, :3, 3]
+    true = truth[0, run.valid, :3, 3]
     T = align_rigid(positions, true)
     return float(np.sqrt(((positions @ T[:3, :3].T + T[:3, 3] - true) ** 2).sum(1).mean()))
 
@@ -114,26 +114,26 @@ def known_views(truth: Truth, begin: int, end: int) -> NDArray[np.bool_]:
 def score(run: RunPath, truth: Truth, planned: Plan) -> dict[str, Any]:
     """Return the figures of a run.
 
-    Frames off by more than 10 cm are wrong; those that are believed are silent failures, and `silent_in_a_row` is the
+    Frames off by more than 10 cm are wrong; those that are valid are silent failures, and `silent_in_a_row` is the
     longest time, in frames, until one is declared. `recovery` is the number of frames from the end of the event to the
     first right one, `recovery_known` from the first known view, which comes `known` frames after the end; None if
     there is none.
     """
     off = errors_m(run.final, run, truth, planned.begin)
-    wrong = run.believed & ~(off <= SILENT_M)
-    right = run.believed & ~wrong
+    wrong = run.valid & ~(off <= SILENT_M)
+    right = run.valid & ~wrong
     outside = np.ones(len(off), bool)
     outside[planned.begin : planned.end] = False
     known = _first(known_views(truth, planned.begin, planned.end), planned.end) if planned.end else None
     return {
         "frames": len(off),
         "lost": int(run.lost.sum()),
-        "believed": int(run.believed.sum()),
+        "believed": int(run.valid.sum()),
         "silent": int(wrong.sum()),
         "silent_in_a_row": max((len([*row]) for is_wrong, row in groupby(wrong) if is_wrong), default=0),
         "ate_m": ate_m(run, truth),
         "outside": int(outside.sum()),
-        "missed_outside": int((outside & ~run.believed).sum()),
+        "missed_outside": int((outside & ~run.valid).sum()),
         "event": [planned.begin, planned.end] if planned.end else None,
         "recovery": _first(right, planned.end) if planned.end else None,
         "known": known,
@@ -166,7 +166,7 @@ def arrays(run: RunPath, truth: Truth, planned: Plan) -> dict[str, NDArray[Any]]
         "error_tracked_m": errors_m(run.tracked, run, truth, planned.begin),
         "error_final_m": errors_m(run.final, run, truth, planned.begin),
         "lost": run.lost,
-        "believed": run.believed,
+        "believed": run.valid,
         "p_off": run.p_off,
         "is_keyframe": np.array([bool(line and line["is_keyframe"]) for line in run.log]),
         "T_tracked": run.tracked,

@@ -29,8 +29,8 @@ def sections(measured: dict[str, Any]) -> list[Section]:
 
 
 NOTE = (
-    "ATE of the believed frames; a run that believes less than half of the frames outside the event does not count as "
-    "below a bound. Lost: not believed. Silent: believed and off by more than 10 cm."
+    "ATE of the valid frames; a run that believes less than half of the frames outside the event does not count as "
+    "below a bound. Lost: not valid. Silent: valid and off by more than 10 cm."
 )
 
 
@@ -58,7 +58,7 @@ def _rows(runs: Sequence[Run]) -> list[tuple[str, str, list[Run]]]:
 
 
 def succeeded(run: Run, bound_cm: float) -> bool:
-    """Return whether the ATE is below a bound, and at least half of the frames outside the event are believed."""
+    """Return whether the ATE is below a bound, and at least half of the frames outside the event are valid."""
     enough = run["missed_outside"] <= run["outside"] / 2
     return bool(enough and run["ate_m"] is not None and 100 * run["ate_m"] < bound_cm)
 
@@ -78,7 +78,7 @@ def _success(runs: Sequence[Run], bound_cm: float = 5) -> str:
 
 
 def _lost(runs: Sequence[Run]) -> str:
-    """Return the share of the frames that are not believed."""
+    """Return the share of the frames that are not valid."""
     return _percent(1 - share_of_frames(runs, "believed")) if runs else "–"
 
 
@@ -180,7 +180,7 @@ def goals(figures: dict[str, Any]) -> Section:
         if run["ate_m"] is not None and clean["ate_m"]
     ]
     if ratios:
-        text = "kidnapped: ATE of believed frames ≤ 1.5 × that of the undisturbed run"
+        text = "kidnapped: ATE of valid frames ≤ 1.5 × that of the undisturbed run"
         rows.append(_goal(text, f"{significant(max(ratios))} at most", max(ratios) <= ATE_RATIO_GOAL))
     return Section("Goals", ["goal", "measured", "reached by all"], rows)
 

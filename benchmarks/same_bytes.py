@@ -24,15 +24,13 @@ import program
 import record
 import tyro
 from same_bytes_cases import CASES, RENAMED, SPELLED_BEFORE
-from same_bytes_results import differences, read_run
+from same_bytes_results import DONE, differences, read_run
 
 from sigmasplat.errors import ConfigError, RunError, SigmaSplatError
 from sigmasplat.files import machine
 
 arg = tyro.conf.arg
 NOW = record.ROOT / "runs" / "same-bytes"
-DONE = "same-bytes.json"
-"""In the folder of a finished run: its processor time."""
 NOT_KEPT = ("report.html", "images")
 REFUSED = 2
 """Exit code of a command whose words are wrong."""
@@ -144,8 +142,11 @@ def compare(name: str, commit: str, tree: Path, renamed: dict[str, str]) -> tupl
     failed = [f"{side} fails: {ran.problem}" for side, ran in (("before", before), ("now", now)) if ran.problem]
     if failed:
         return False, "\n".join(f"    {line}" for line in failed), before.cpu_s, now.cpu_s
-    found = differences(*(read_run(ran.folder, renamed) for ran in (before, now)))
-    lines = [f"    {file}: {said}" for file, said in found.items() if file != DONE]
+    sides = [read_run(ran.folder, renamed) for ran in (before, now)]
+    if not all(sides):
+        return False, "    a side has no results", before.cpu_s, now.cpu_s
+    found = differences(*sides)
+    lines = [f"    {file}: {said}" for file, said in found.items()]
     return not lines, "\n".join(lines), before.cpu_s, now.cpu_s
 
 

@@ -12,7 +12,9 @@ from safetensors import safe_open
 
 Value = Any
 """A number, a text, a truth value, None, or an array."""
-NOT_COMPARED = {"config.json", "profile.json", "report.html", "images", "logs", ".lock"}
+DONE = "same-bytes.json"
+"""In the folder of a kept run: its words and processor time."""
+NOT_COMPARED = {DONE, "config.json", "profile.json", "report.html", "images", "logs", ".lock"}
 """Settings, times and pictures."""
 LEFT_OUT = {
     "seconds", "wall_s", "finish_s", "total_s", "frames_per_s", "worst_frame_s",

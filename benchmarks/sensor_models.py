@@ -28,14 +28,14 @@ from sigmasplat.files.machine import INSTALLED, code_digest
 from sigmasplat.fit.align import align
 from sigmasplat.fit.gray import gray_of
 from sigmasplat.fit.pyramid import Pyramid
-from sigmasplat.fit.references import relative_noise, sureness_of
+from sigmasplat.fit.references import confidence_of, relative_noise
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.evaluation.metrics.trajectory import associate
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.tracking.denoise import denoised
 
 arg = tyro.conf.arg
-USES = ("tracking", "mapping", "seeding", "surface")
+USES = ("tracking", "mapping")
 PAIR_M, PAIR_WIDTH, PAIR_RANGE_M = 0.06, 320, (0.1, 8.0)
 """Pairs are about as far apart as a frame and its keyframe."""
 GUESS_OFF = np.array([0.01, -0.01, 0.01, 0.005, -0.005, 0.005])
@@ -85,8 +85,8 @@ def measure_pairs(source: Source, sensor: str, count: int, weight_color: float) 
         rows = associate(np.array([frame.timestamp_s for frame in pair]), truth.timestamps_s)[1]
         true = se3.inverse(truth.T_world_camera[rows[1]]) @ truth.T_world_camera[rows[0]]
         plain, guess = Pyramid.of(grays[0], depths[0], camera), true @ se3.exp(GUESS_OFF)
-        noise, sureness = relative_noise(depths[0], model), sureness_of(model)
-        for reference in (plain, Pyramid.of(grays[0], depths[0], camera, noise=noise, sureness=sureness)):
+        noise, confidence = relative_noise(depths[0], model), confidence_of(model)
+        for reference in (plain, Pyramid.of(grays[0], depths[0], camera, noise=noise, confidence=confidence)):
             off = se3.inverse(true) @ align(reference, live, guess, weight_color=weight_color).T_live_reference
             errors.append((1000 * np.linalg.norm(off[:3, 3]), np.rad2deg(se3.rotation_angle(off[:3, :3]))))
     found = np.array(errors).reshape(-1, 2, 2)

@@ -1,4 +1,4 @@
-"""Measure what each use of an uncertainty changes: V as published, the predicted variance, no weights, CG-SLAM's terms.
+"""Measure what each use of an uncertainty changes: V as published, no weights, CG-SLAM's terms.
 
 Sequences × seeds × variants of `sigma`, one value of τ for all. Every 8th frame is held back from the map and scored.
 Of the default run, registrations of its submaps, the gate of loop candidates and final maps are measured as well.
@@ -50,7 +50,6 @@ COMMON = (
 DEFAULT = "default"
 """The run of the preset itself, of which the maps are measured too."""
 NO_WEIGHTS = tuple(f"{part}.uncertainty=false" for part in ("tracking", "loops", "registration", "final"))
-PREDICTED = tuple(f"{part}.variance=predicted" for part in ("tracking", "loops", "registration", "final"))
 PATH: dict[str, tuple[str, ...]] = {
     "no weights at all": NO_WEIGHTS,
     "tracking: no weights": ("tracking.uncertainty=false",),
@@ -58,8 +57,6 @@ PATH: dict[str, tuple[str, ...]] = {
     "mapping: no U": ("mapping.weight_moment=0",),
     "mapping: with alignment": ("mapping.weight_alignment=0.25",),
     "pruning: no fading": ("primitives.uncertain_m2=0",),
-    "tracking: predicted": ("tracking.variance=predicted",),
-    "pruning: by residuals": ("primitives.uncertain_by=residual",),
 }
 """Settings of the complete runs that are compared with `default`, the preset: V as published in every weight, U in the
 loss, and fading."""
@@ -67,9 +64,7 @@ TAU_2 = ("registration.tau=2", "loops.tau=2")
 WEIGHTS: dict[str, tuple[str, ...]] = {
     "V": (),
     "no weights": NO_WEIGHTS,
-    "predicted": PREDICTED,
     "V, τ 2": TAU_2,
-    "predicted, τ 2": (*PREDICTED, *TAU_2),
 }
 """Settings of what is measured of the maps of the default run."""
 RUNS = record.ROOT / "runs" / "bench" / "weights"

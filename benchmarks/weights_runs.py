@@ -26,7 +26,6 @@ from sigmasplat.render import FieldRenderer
 from sigmasplat.slam.slam import Slam
 from sigmasplat.tracking.descriptors import similarity
 from sigmasplat.types import completed
-from sigmasplat.uncertainty.predicted_submaps import PredictedSubmaps
 
 Matrix = NDArray[np.float64]
 Rows = list[dict[str, Any]]
@@ -59,15 +58,15 @@ def rows(job: Job, weights: dict[str, tuple[str, ...]]) -> Rows:
     found = [{"group": "path", "variant": job.variant, "figures": path_figures(slam, done, source, views)}]
     if not weights:
         return found
-    truth, predicted = true_submaps(slam, source), PredictedSubmaps(slam.config, slam.store)
+    truth = true_submaps(slam, source)
     found += final_maps(job, slam, done, views, weights)
-    found += registrations(job, slam, truth, predicted, weights)
-    return found + gates(job, slam, truth, predicted, weights)
+    found += registrations(job, slam, truth, weights)
+    return found + gates(job, slam, truth, weights)
 
 
 def path_figures(slam: Slam, done: FinishedRun, source: Source, views: list[UnseenView]) -> dict[str, Any]:
     """Return the figures of path, submaps and final map."""
-    scores, _ = score_path(done.path.at(done.believed), None, source.truth())
+    scores, _ = score_path(done.path.at(done.valid), None, source.truth())
     final, before = view_scores(done, views, done.field), submap_scores(done, views)
     return {
         "ate_m": scores["ate"]["rmse_m"],
@@ -77,7 +76,7 @@ def path_figures(slam: Slam, done: FinishedRun, source: Source, views: list[Unse
         "depth_l1_before_m": before["depth_l1_m"],
         "psnr_db": final["psnr_db"],
         "depth_l1_m": final["depth_l1_m"],
-        "lost": int((~done.believed).sum()),
+        "lost": int((~done.valid).sum()),
         "loops": sum(loop.accepted for loop in slam.loops),
         "loops_tried": len(slam.loops),
         "splats": len(done.field),
@@ -169,9 +168,7 @@ def apart(ours: Matrix, theirs: Matrix) -> tuple[Matrix, Matrix]:
     return distance_m, np.arccos(np.clip(cosine, -1.0, 1.0))
 
 
-def registrations(
-    job: Job, slam: Slam, truth: list[Matrix], predicted: PredictedSubmaps, weights: dict[str, tuple[str, ...]]
-) -> Rows:
+def registrations(job: Job, slam: Slam, truth: list[Matrix], weights: dict[str, tuple[str, ...]]) -> Rows:
     """Register pairs of submaps from poses with errors; return the error of each weight's results where all weights
     accept."""
     chosen = pairs_of(truth)
@@ -180,7 +177,7 @@ def registrations(
     starts = [se3.exp(random.normal(size=6) * np.repeat([START_M, START_RAD], 3)) for _ in chosen]
     errors: dict[str, list[tuple[float, float] | None]] = {}
     for name, settings in weights.items():
-        registrar = Registrar(job.config(settings), slam.store, slam.view, slam.tracker.extractor, predicted)
+        registrar = Registrar(job.config(settings), slam.store, slam.view, slam.tracker.extractor)
         errors[name] = []
         for (_, i, j, q, d), start in zip(chosen, starts, strict=True):
             a, b = slam.store.load(i), slam.store.load(j)
@@ -203,14 +200,11 @@ def registrations(
     return listed
 
 
-def gates(
-    job: Job, slam: Slam, truth: list[Matrix], predicted: PredictedSubmaps, weights: dict[str, tuple[str, ...]]
-) -> Rows:
+def gates(job: Job, slam: Slam, truth: list[Matrix], weights: dict[str, tuple[str, ...]]) -> Rows:
     """Return the average precision with which similarity × gate finds keyframes that show the same place."""
     found = Rows()
     for name, settings in weights.items():
         closer = LoopCloser(job.config(settings), slam.store)
-        closer.predicted = predicted
         figures = {"average_precision": gate_precision(closer, slam, truth)}
         found.append({"group": "gate", "variant": name, "figures": figures})
     return found

@@ -61,24 +61,15 @@ class Change:
 CHANGES = (
     Change("all weights by V", "path", DEFAULT, "no weights at all"),
     Change("tracking by V", "path", DEFAULT, "tracking: no weights"),
-    Change("tracking by the predicted variance", "path", "tracking: predicted", "tracking: no weights"),
-    Change("tracking: predicted instead of V", "path", "tracking: predicted", DEFAULT),
     Change("tracking: depth by U instead of V", "path", "tracking: depth by U", DEFAULT),
     Change("mapping: U in the loss", "path", DEFAULT, "mapping: no U"),
     Change("mapping: alignment in the loss", "path", "mapping: with alignment", DEFAULT),
     Change("pruning: fading by ν", "path", DEFAULT, "pruning: no fading"),
-    Change("pruning: fading by residuals", "path", "pruning: by residuals", "pruning: no fading"),
     Change("registration by V", "registration", "V", "no weights"),
-    Change("registration by the predicted variance", "registration", "predicted", "no weights"),
     Change("registration by V, τ 2", "registration", "V, τ 2", "no weights"),
-    Change("registration by the predicted variance, τ 2", "registration", "predicted, τ 2", "no weights"),
     Change("loop gate by σ²", "gate", "V", "no weights"),
-    Change("loop gate by the predicted variance", "gate", "predicted", "no weights"),
     Change("loop gate by σ², τ 2", "gate", "V, τ 2", "no weights"),
-    Change("loop gate by the predicted variance, τ 2", "gate", "predicted, τ 2", "no weights"),
     Change("merging and refinement by σ²", "final", "V", "no weights"),
-    Change("merging by the predicted variance, refinement by σ²", "final", "predicted", "no weights"),
-    Change("merging: predicted instead of σ²", "final", "predicted", "V"),
 )  # fmt: skip
 
 

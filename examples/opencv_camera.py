@@ -55,7 +55,7 @@ def main(out: str = "camera-out") -> RealTime:
     slam.finish()
     folder = Path(out)
     folder.mkdir(parents=True, exist_ok=True)
-    write_trajectory(folder / "trajectory.txt", slam.trajectory().at(slam.believed()))
+    write_trajectory(folder / "trajectory.txt", slam.trajectory().at(slam.valid()))
     write_field(folder / "map.ply", slam.field)
     return slam
 

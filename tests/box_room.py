@@ -18,7 +18,7 @@ LOW, HIGH = np.array([-1.987, -1.513, 0.0]), np.array([2.013, 1.487, 2.5])
 PILLAR = (np.array([0.913, 0.513, 0.0]), np.array([1.313, 0.913, 2.5]))
 CHEST = (np.array([-1.987, -0.3, 0.0]), np.array([-1.5, 0.4, 0.6]))
 Box = tuple[np.ndarray, np.ndarray]
-Seen = Callable[..., Any]
+RememberedDepth = Callable[..., Any]
 
 
 def pose(position: tuple[float, float, float], yaw: float, pitch: float) -> np.ndarray:
@@ -54,7 +54,7 @@ def seer(
     boxes: tuple[Box, ...] = (PILLAR, CHEST),
     alpha: Callable[[np.ndarray], np.ndarray] = lambda at: np.ones(at.shape[:-1]),
     sigma_m: Callable[[np.ndarray], np.ndarray] = lambda at: np.full(at.shape[:-1], 0.01),
-) -> Seen:
+) -> RememberedDepth:
     """Return a renderer of the room; alpha and how far splats disagree are functions of the place in it [..., 3]."""
 
     def show(field: GaussianField, camera: Camera, T_camera_world: Any, depth_reference: Any = None) -> Any:

@@ -76,7 +76,7 @@ ORIGINS: dict[str, dict[str, str]] = {
         "mapping.covisibility": "ours", "mapping.frames_per_step": "paper",
         "primitives.uncertain_m2": "paper", "primitives.owner": "paper", "primitives.faded_opacity": "ours",
         "primitives.least_opacity": "ours", "primitives.split_gradient": "code", "primitives.split_scale_m": "code",
-        "primitives.clone": "paper", "primitives.most_scale_m": "code", "primitives.most_radius_px": "code",
+        "primitives.clone": "paper", "primitives.most_scale_m": "code",
         "tracking.parametrisation": "paper", "tracking.iterations": "paper", "tracking.lr_rotation": "paper",
         "tracking.lr_translation": "paper", "tracking.weight_color": "paper", "tracking.uncertainty": "paper",
         "tracking.alpha_power": "paper", "tracking.alpha_above": "code", "tracking.outlier_factor": "code",
@@ -103,7 +103,7 @@ SCENES: dict[str, tuple[str, ...]] = {
 
 def paper_table(system: str) -> str:
     """Return a paper's presets: a row per setting that differs between data sets, then the others by origin."""
-    from sigmasplat.plugins.papers import preset
+    from sigmasplat.config.presets import preset
 
     columns = DATA_SETS[system]
     rows = [f"| setting | {' | '.join(columns)} | from |", "|---" * (len(columns) + 2) + "|"]
@@ -120,7 +120,7 @@ def paper_table(system: str) -> str:
 
 def scene_table(system: str) -> str:
     """Return the released code's scenes: a row per set of values, a column per setting; all from the code."""
-    from sigmasplat.plugins.papers import list_presets, preset
+    from sigmasplat.config.presets import list_presets, preset
 
     columns, prefix = SCENES[system], f"{system}-released-"
     scenes: dict[tuple[str, ...], list[str]] = {}
@@ -164,7 +164,7 @@ def changed_by_all(released: list[Any], papers: list[Any], default: Any) -> list
 
 def fast_list(system: str) -> str:
     """Return the settings in which a system's preset for two CPU cores differs from that for TUM: both values."""
-    from sigmasplat.plugins.papers import preset
+    from sigmasplat.config.presets import preset
 
     theirs, ours = preset(f"{system}-tum"), preset(f"{system}-fast")
     changed = []

@@ -11,17 +11,17 @@ Matrix = NDArray[np.float64]
 Progress = Callable[[int, int], None]
 """Called with (done, total) while a long task runs; a total of 0 is not known yet."""
 Result = TypeVar("Result")
-Slices = Generator[None, None, Result]
+Task = Generator[None, None, Result]
 """A long task in slices: it yields after each slice, and returns its result after the last one."""
 
 
-def long_slice() -> Slices[None]:
+def long_slice() -> Task[None]:
     """End a slice that takes as long as several others: it counts as three."""
     for _ in range(3):
         yield
 
 
-def completed(slices: Slices[Result]) -> Result:
+def completed(slices: Task[Result]) -> Result:
     """Run all slices of a task and return its result."""
     while True:
         try:

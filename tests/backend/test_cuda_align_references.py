@@ -17,7 +17,7 @@ from sigmasplat.data.frame import PosePrior
 from sigmasplat.fit.pose import fit_pose_align
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference, keyframe_reference, live_image, map_reference
-from sigmasplat.graph.registration import Registrar, WeighedMap
+from sigmasplat.graph.registration import Registrar
 from sigmasplat.render.cpu.view import CpuView
 from sigmasplat.render.cuda.view import CudaView
 from sigmasplat.render.reference.view import ReferenceView
@@ -26,11 +26,11 @@ from sigmasplat.run_folder.state import read_state, write_state
 from sigmasplat.tracking.depth_fit import DepthFit
 from sigmasplat.tracking.depth_shape import DepthShape
 from sigmasplat.tracking.moving import memory, watch
-from sigmasplat.tracking.sight import Sight
+from sigmasplat.tracking.pose_validation import TrackingStatistics
+from sigmasplat.tracking.prepared_frame import PreparedImages
 from sigmasplat.tracking.tracker import Tracker
-from sigmasplat.tracking.verdict import Usual
 from splat_fields import CPU, OPTIONS
-from splat_fits import Watch
+from splat_fits import DynamicDetector
 from splat_wall import CAMERA, TRUTH, seen_from, wall
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
@@ -103,7 +103,7 @@ def test_the_host_waits_for_no_plane_of_a_reference(kind: str, config: TrackingC
     view, _ = views()
     params, image = thick(), live(view)
     view.forward(params, TRUTH)  # says how many pairs to expect
-    with Watch() as watch:
+    with DynamicDetector() as watch:
         if kind == "map":
             map_reference(params, view, TRUTH, config)
         else:
@@ -133,8 +133,8 @@ def test_a_keyframe_is_aligned_to_a_submap_as_on_the_cpu() -> None:
     found = []
     for view in views():
         registrar = Registrar(preset(default_preset()), MemoryStore(), view)
-        fit = registrar._aligned(WeighedMap(thick()), live(view), TRUTH)
-        found.append((fit, *registrar._checked(WeighedMap(thick()), live(view), TRUTH)))
+        fit = registrar._aligned(thick(), live(view), TRUTH)
+        found.append((fit, *registrar._checked(thick(), live(view), TRUTH)))
     assert all(fit.alignment is not None for fit, *_ in found)
     np.testing.assert_allclose(found[0][0].T_camera_world, found[1][0].T_camera_world, atol=5e-4)
     deviations = [np.sqrt(np.diag(covariance)) for _, covariance, _ in found]
@@ -148,10 +148,21 @@ def test_what_a_tracker_remembers_is_kept_and_read_back(tmp_path: Path) -> None:
     kept = reference("keyframe", view, CONFIGS["V"])
     tracker, classes = (
         Tracker(CONFIGS["V"], keyframe=kept),
-        (Tracker, PosePrior, Reference, Pyramid, Camera, Usual, watch.Watch, memory.Memory, DepthFit, DepthShape),
+        (
+            Tracker,
+            PosePrior,
+            Reference,
+            Pyramid,
+            Camera,
+            TrackingStatistics,
+            watch.DynamicDetector,
+            memory.DepthHistory,
+            DepthFit,
+            DepthShape,
+        ),
     )
-    tracker.start(Sight(seen_from(view, TRUTH), kept.pyramid))
-    fixed = {"tracking": CONFIGS["V"], "moving": tracker.watch.config}
+    tracker.start(PreparedImages(seen_from(view, TRUTH), kept.pyramid))
+    fixed = {"tracking": CONFIGS["V"], "moving": tracker.detector.config}
     write_state(tmp_path / "state", tracker, classes, fixed)
     again = read_state(tmp_path / "state", classes, fixed)
     assert again.keyframe.pyramid.backend == "cuda"

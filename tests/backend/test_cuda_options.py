@@ -1,10 +1,8 @@
 """Hold what a CUDA mapping step can do besides to its definitions in torch, float64, on the emulated kernels.
 
-Several keyframes a step, the full colour covariance, colours that depend on the view; and who waits for whom.
+Several keyframes a step, colours that depend on the view; and who waits for whom.
 """
 
-from dataclasses import replace
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -18,7 +16,6 @@ from sigmasplat.data.field import GaussianField, Rows
 from sigmasplat.data.harmonics import count
 from sigmasplat.errors import ConfigError
 from sigmasplat.fit.backends import step_for
-from sigmasplat.fit.color_covariance import FullCovarianceStep
 from sigmasplat.fit.cuda.mapping_step import CudaStep
 from sigmasplat.fit.cuda.rows import CudaAccumulator, to_host
 from sigmasplat.fit.cuda.view_dependent import CudaViewDependentStep
@@ -28,27 +25,21 @@ from sigmasplat.fit.mapping_step import GradientAccumulator, TorchStep
 from sigmasplat.fit.target import Keyframe
 from sigmasplat.fit.view_dependent import ViewDependentStep
 from sigmasplat.render.cpu.view import CpuView
-from sigmasplat.render.cuda.covariance_view import CudaCovarianceView
 from sigmasplat.render.cuda.view import CudaView
-from sigmasplat.render.reference.covariance_view import CovarianceView
 from sigmasplat.render.reference.view import ReferenceView
 from sigmasplat.render.view import View
 from splat_fields import (
     CPU,
     OPTIONS,
     Gradients,
-    assert_same_wide_view,
     crowd,
     exact_view,
     params_of,
-    plane_gradients,
 )
-from splat_fits import RATES, WEIGHTS, fields, random_gradient, target_of
-from splat_scenes import KINDS, SMALL, WIDE, Scene, assert_same_vector, scene
+from splat_fits import RATES, fields, random_gradient, target_of
+from splat_scenes import WIDE, Scene, assert_same_vector, scene
 
 SHAPES = {"isotropy": 0.7, "isotropy_ratio": 0.01}
-FULL = {**dict.fromkeys(WEIGHTS, 0.0), "l1": 0.8, "ssim": 0.2, "depth": 1.0, "nll_depth": 2e-2, "nll_color_full": 1e-2}
-ATTRIBUTES = ("correlations", "harmonics")
 
 
 pytestmark = pytest.mark.usefixtures("on_the_cpu")
@@ -62,12 +53,11 @@ def turned(s: Scene, angle: float) -> np.ndarray:
 def pair_of_fields(n: int) -> tuple[GaussianField, GaussianField]:
     """Make a field and its double mid-run, its attributes too: some rows were moved last a while ago, some never."""
     pair, rng = fields(n), np.random.default_rng(7)
-    for name, width in zip(ATTRIBUTES, (3, 45), strict=True):
-        drawn = [torch.as_tensor(rng.normal(0, s, (n, width))) for s in (0.3, 1e-3, 1e-3)]
-        last = torch.as_tensor(rng.choice([29, 29, 12, 0], n), dtype=torch.int32)
-        for field in pair:
-            params, moment1, moment2 = (x.to(field.params, copy=True) for x in drawn)
-            field.attributes[name] = Rows(params, moment1, moment2.square(), last.clone(), 29)
+    drawn = [torch.as_tensor(rng.normal(0, s, (n, 45))) for s in (0.3, 1e-3, 1e-3)]
+    last = torch.as_tensor(rng.choice([29, 29, 12, 0], n), dtype=torch.int32)
+    for field in pair:
+        params, moment1, moment2 = (x.to(field.params, copy=True) for x in drawn)
+        field.attributes["harmonics"] = Rows(params, moment1, moment2.square(), last.clone(), 29)
     return pair
 
 
@@ -118,115 +108,11 @@ def test_gathered_images_step_as_by_definition(n: int) -> None:
         assert 5 < int((want.last_step <= 99).sum()) < n
 
 
-# ---- the full colour covariance
-
-
-def wide_views(
-    s: Scene, field: GaussianField, double: GaussianField, device: torch.device = CPU
-) -> tuple[CudaCovarianceView, CovarianceView]:
-    exact = CovarianceView(exact_view(s.camera, True), double.attributes["correlations"])
-    return CudaCovarianceView(CudaView(s.camera, OPTIONS, True, device), field.attributes["correlations"]), exact
-
-
-def correlated(s: Scene) -> tuple[GaussianField, GaussianField]:
-    params, drawn = params_of(s), torch.as_tensor(np.random.default_rng(0).normal(size=(len(s.means), 3))).float()
-    return tuple(  # type: ignore[return-value]
-        GaussianField(params.to(t), attributes={"correlations": Rows(drawn.to(t))})
-        for t in (torch.float32, torch.float64)
-    )
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_ten_planes_rows_and_twist_agree(kind: str) -> None:
-    s = scene(kind, 60)
-    field, double = correlated(s)
-    (got, want), T = wide_views(s, field, double), s.T_camera_world.numpy()
-    assert_same_wide_view(got, want, field, double, T)
-    pose = got.backward_pose(field.params)
-    want.forward(double.params, T)
-    assert_same_vector(torch.as_tensor(pose), torch.as_tensor(want.backward_pose(double.params)), 1e-3, "pose")
-
-
-def test_moment_layers_and_pull_are_those_of_seven_planes() -> None:
-    """Gradients on a moment and a median depth too, which the plain view knows how to carry."""
-    s = scene("random", 60)
-    field, _ = correlated(s)
-    plain = CudaView(s.camera, OPTIONS, True, CPU)
-    found = []
-    for view in (plain, CudaCovarianceView(plain, field.attributes["correlations"])):
-        view.forward(field.params, s.T_camera_world.numpy(), s.ref_depth.float(), layers=True)
-        view.g_sums.zero_()
-        view.g_sums[:7], view.g_alpha[:] = plane_gradients(s.camera, 7)
-        view.g_moment[:], view.g_median_depth[:] = plane_gradients(s.camera, 2, seed=9)[0]
-        rows, pull = torch.full_like(field.params, torch.nan), torch.full((60,), torch.nan)
-        twist = torch.as_tensor(view.backward(field.params, rows, pull))
-        found.append([view.sums[:7].clone(), view.alpha, view.moment, *view.layers, rows, pull, twist])
-    for a, b in zip(*found, strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-4 * max(float(b.abs().max()), 1.0))
-
-
-@pytest.mark.parametrize("valid", [0.8, 0.0])
-@pytest.mark.parametrize("camera", [SMALL, WIDE], ids=lambda c: f"{c.width}x{c.height}")
-def test_likelihood_under_a_full_covariance(camera: Any, valid: float) -> None:
-    """Against autograd through `nll_color_full`, from planes with V of every kind, below zero by rounding too."""
-    s, rng = scene("random", 12, camera), np.random.default_rng(3)
-    target, size = target_of(camera, (camera.height, camera.width), valid), (camera.height, camera.width)
-    A = rng.normal(size=(*size, 3, 3)) * np.exp(rng.uniform(-2, 0, (*size, 1, 1)))
-    V = A @ A.transpose(0, 1, 3, 2) + 0.1 * np.eye(3)
-    kind = rng.integers(0, 5, size)
-    V[kind == 0] = np.diag([-1e-4, 0.02, 0.03])  # below zero by rounding
-    V[kind == 1] = np.diag([0.01, -1e-4, 0.02]) + 0.02 * (1 - np.eye(3))  # nothing a covariance is
-    V[kind == 2] = np.diag([0.03, 0.02, 0.01]) + 0.018 * (1 - np.eye(3))  # V's last pivot is below zero
-    color = rng.uniform(0, 1, (*size, 3))
-    second = (V + color[..., None] * color[..., None, :])[..., [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
-    planes = np.concatenate([color, rng.uniform(0.5, 4.0, (*size, 1)), second], -1)
-    results = []
-    for view in wide_views(s, *correlated(s)):
-        view.sums.copy_(torch.as_tensor(planes).float().movedim(-1, 0))
-        view.g_sums.fill_(torch.nan)
-        on_cuda = isinstance(view, CudaCovarianceView)
-        step = CudaStep(view) if on_cuda else FullCovarianceStep(view, TorchStep(view))
-        results.append((float(step.images(target, FULL)), view.g_sums.clone()))
-    (loss, got), (want_loss, want) = results
-    assert loss == pytest.approx(want_loss, rel=1e-4, abs=1e-6)
-    assert valid or torch.count_nonzero(got) == 0
-    for plane, case in product(range(10), range(5) if valid else ()):
-        a, b = got[plane, kind == case], want[plane, kind == case]
-        if b.any():
-            assert_same_vector(a, b, 2e-3, f"plane {plane}, case {case}")
-        assert torch.equal(a != 0, b != 0)
-
-
-@pytest.mark.parametrize("n", [0, 7, 300])
-def test_a_step_under_a_full_covariance_follows_its_definition(n: int) -> None:
-    s, (got, want) = crowd(), pair_of_fields(n)
-    starts = [want.params.clone(), want.attributes["correlations"].params.clone()]
-    view, exact = wide_views(s, got, want)
-    steps = ((got, CudaStep(view)), (want, FullCovarianceStep(exact, TorchStep(exact))))
-    for k, angle in enumerate((0.7, -0.5, 0.7)):
-        results = []
-        for field, step in steps:
-            field.steps += 1
-            step.view.forward(field.params, turned(s, angle))
-            random_gradient(step.view, k)  # type: ignore[arg-type]
-            results.append(step.splats(field, RATES, SHAPES, n // 3))
-        (twist, cost), (want_twist, want_cost) = results
-        assert float(cost) == pytest.approx(want_cost, rel=1e-4)
-        if n:
-            assert_same_vector(torch.as_tensor(twist), torch.as_tensor(want_twist), 1e-3, "twist")
-    if n:
-        assert_same_steps(got, want, starts[0], 99, "rows")
-        assert_same_steps(
-            got.attributes["correlations"], want.attributes["correlations"], starts[1], 29, "correlations"
-        )
-
-
 # ---- colours that depend on the view
 
 
-def view_dependent(s: Scene, degree: int, options: Any = OPTIONS) -> tuple[CudaViewDependentStep, ViewDependentStep]:
-    view, exact = CudaView(s.camera, options, True, CPU), exact_view(s.camera, True)
-    exact.options = options
+def view_dependent(s: Scene, degree: int) -> tuple[CudaViewDependentStep, ViewDependentStep]:
+    view, exact = CudaView(s.camera, OPTIONS, True, CPU), exact_view(s.camera, True)
     return CudaViewDependentStep(CudaStep(view), degree), ViewDependentStep(TorchStep(exact), degree)
 
 
@@ -261,12 +147,9 @@ def test_a_step_of_shown_colours_follows_its_definition(degree: int, n: int) -> 
         assert torch.equal(harmonics.params[:, width:], starts[1][:, width:].float())
 
 
-@pytest.mark.parametrize("felt", [True, False])
-def test_a_pose_feels_the_directions_where_it_is_asked_to(felt: bool) -> None:
-    s = scene("random", 60)
-    options, (got, want) = replace(OPTIONS, color_pose_gradient=felt), pair_of_fields(60)
-    twists = []
-    for field, step in zip((got, want), view_dependent(s, 3, options), strict=True):
+def test_a_pose_feels_the_directions() -> None:
+    s, twists = scene("random", 60), []
+    for field, step in zip(pair_of_fields(60), view_dependent(s, 3), strict=True):
         field.params = params_of(s).to(field.params)
         field.steps += 1
         target = target_of(s.camera, (s.camera.height, s.camera.width))
@@ -275,7 +158,7 @@ def test_a_pose_feels_the_directions_where_it_is_asked_to(felt: bool) -> None:
         twists.append(torch.as_tensor(step.splats(field, RATES, {}, 0)[0]))
         step.view.forward(step.rows, s.T_camera_world.numpy())
         plain = torch.as_tensor(step.view.backward(step.rows, torch.empty_like(field.params)))
-        assert torch.allclose(plain[:3], twists[-1][:3]) != felt
+        assert not torch.allclose(plain[:3], twists[-1][:3])
     assert_same_vector(*twists, 1e-3, "twist")
 
 
@@ -309,15 +192,12 @@ def fitted(
     return field, fit.losses, np.stack([k.T_world_camera for k in seen])
 
 
-@pytest.mark.parametrize(
-    ("images", "degree", "full"),
-    [(3, 0, False), (1, 0, True), (1, 1, False), (1, 2, False), (1, 3, False), (1, 2, True)],
-)
-def test_fits_are_those_of_the_cpu(images: int, degree: int, full: bool) -> None:
+@pytest.mark.parametrize(("images", "degree"), [(3, 0), (1, 1), (1, 2), (1, 3)])
+def test_fits_are_those_of_the_cpu(images: int, degree: int) -> None:
     pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
     config = MappingConfig(
-        color_covariance="full" if full else "diagonal", weight_nll_color=1e-2, weight_isotropy_ratio=0.1,
-        lr_pose_translation=1e-3, lr_pose_rotation=1e-3, weight_alignment=0.0 if full else 0.3,
+        weight_nll_color=1e-2, weight_isotropy_ratio=0.1, lr_pose_translation=1e-3, lr_pose_rotation=1e-3,
+        weight_alignment=0.3,
     )  # fmt: skip
     start = params_of(scene("random", 60))
     ours, losses, poses = fitted(CudaView(WIDE, OPTIONS, True, CPU), config, images, degree)
@@ -327,33 +207,23 @@ def test_fits_are_those_of_the_cpu(images: int, degree: int, full: bool) -> None
     assert_same_vector(ours.params - start, theirs.params - start, 3e-2, "what Adam moved")
     assert sorted(ours.attributes) == sorted(theirs.attributes)
     for name, attribute in theirs.attributes.items():
-        if name == "harmonics" or not degree:
-            assert_same_vector(ours.attributes[name].params, attribute.params, 3e-2, name)
-        else:
-            assert not ours.attributes[name].params.any() and not attribute.params.any()
+        assert_same_vector(ours.attributes[name].params, attribute.params, 3e-2, name)
 
 
 def test_each_device_has_its_step() -> None:
-    field, plain, full = GaussianField(params_of(scene("random", 12))), MappingConfig(), MappingConfig(
-        color_covariance="full", weight_nll_color=1e-2
-    )  # fmt: skip
-    view = CudaView(WIDE, OPTIONS, True, CPU)
+    view, plain = CudaView(WIDE, OPTIONS, True, CPU), loss_weights(MappingConfig())
     kinds: list[tuple[MappingStep, type, type]] = [
-        (step_for(field, view, loss_weights(plain), 0), CudaStep, CudaView),
-        (step_for(field, view, loss_weights(full), 0), CudaStep, CudaCovarianceView),
-        (step_for(field, view, loss_weights(plain), 2), CudaViewDependentStep, CudaView),
-        (step_for(field, view, loss_weights(full), 2), CudaViewDependentStep, CudaCovarianceView),
-        (step_for(field, ReferenceView(WIDE, OPTIONS), loss_weights(full), 0), FullCovarianceStep, CovarianceView),
+        (step_for(view, plain, 0), CudaStep, CudaView),
+        (step_for(view, plain, 2), CudaViewDependentStep, CudaView),
+        (step_for(ReferenceView(WIDE, OPTIONS), plain, 0), TorchStep, ReferenceView),
     ]
     for step, kind, seen in kinds:
         assert type(step) is kind and type(step.view) is seen
 
 
-@pytest.mark.parametrize(("degree", "kind"), [(1, "diagonal"), (0, "full")])
-def test_several_keyframes_are_refused_as_on_the_cpu(degree: int, kind: Any) -> None:
-    config = MappingConfig(color_covariance=kind, weight_nll_color=1e-2)
+def test_several_keyframes_are_refused_as_on_the_cpu() -> None:
     with pytest.raises(ConfigError, match="frames_per_step must be 1"):
-        fitted(CudaView(WIDE, OPTIONS, True, CPU), config, 2, degree)
+        fitted(CudaView(WIDE, OPTIONS, True, CPU), MappingConfig(weight_nll_color=1e-2), 2, degree=1)
 
 
 def test_what_a_step_left_on_a_device_arrives_in_its_places() -> None:

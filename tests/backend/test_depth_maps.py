@@ -14,7 +14,6 @@ from sigmasplat.config import MappingConfig
 from sigmasplat.data import se3
 from sigmasplat.data.field import COLUMNS, GaussianField
 from sigmasplat.data.frame import Frame
-from sigmasplat.errors import ConfigError
 from sigmasplat.fit import losses
 from sigmasplat.fit.adam import Rates
 from sigmasplat.fit.cpu.mapping_step import CompiledStep
@@ -26,7 +25,7 @@ from sigmasplat.render.reference import operators as reference
 from sigmasplat.render.reference.view import ReferenceView
 from sigmasplat.render.view import View
 from splat_fields import OPTIONS, Gradients, crowd, exact_view, params_of, plane_gradients
-from splat_scenes import KINDS, SMALL, WIDE, Scene, assert_same_vector, scene
+from splat_scenes import KINDS, WIDE, Scene, assert_same_vector, scene
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
@@ -266,17 +265,6 @@ def test_statistics_receive_every_gradient_and_movable_poses_move() -> None:
     assert [index for index, _ in stats.given] == [0, 1, 1] and all(grad2d.sum() > 0 for _, grad2d in stats.given)
     assert np.array_equal(before[0], keyframes[0].T_world_camera)
     assert not np.array_equal(before[1], keyframes[1].T_world_camera)
-
-
-def test_terms_that_full_colour_covariance_has_no_maps_for_are_refused() -> None:
-    s = scene("random", 20, SMALL)
-    view = CpuView(s.camera, OPTIONS)
-    full = MappingConfig(color_covariance="full", weight_alignment=0.1)
-    with pytest.raises(ConfigError, match="weight_alignment"):
-        fit_field(GaussianField(params_of(s)), view, [], full)
-    two = keyframes_of(s, view, (0.0, 0.1))
-    with pytest.raises(ConfigError, match="frames_per_step must be 1"):
-        fit_field(GaussianField(params_of(s)), view, [two], MappingConfig(color_covariance="full"))
 
 
 def test_median_depth_is_felt_by_one_splat_alone() -> None:

@@ -187,15 +187,17 @@ def paper_twist(s: Scene, push: Any) -> tuple[Any, Any]:
 def test_covariance_path_of_one_splat_equals_the_derivation_on_paper(backend: Any, scales: list[float]) -> None:
     s = make("random", 1, SMALL, 3, channels=1)
     s = replace(s, scales=torch.tensor([scales]), opacities=torch.tensor([0.6]), features=torch.ones(1, 1))
-    s = s.to(torch.float64).with_options(mean_pose_gradient=False, depth_pose_gradient=False)
+    s = s.to(torch.float64)
     push = np.random.default_rng(7).normal(size=(SMALL.height, SMALL.width))
     want, turn = paper_twist(s, push)
     assert (np.abs(turn).max() < 1e-7) == (len(set(scales)) == 1)
-    leaves = s.to(torch.float32).requiring_grad()
-    (render(backend, leaves)[1].sums[..., 0] * torch.as_tensor(push)).sum().backward()
-    assert leaves.T_camera_world.grad is not None
-    got = twist_gradient(leaves.T_camera_world.grad, s.T_camera_world)
-    assert_same_vector(got, torch.as_tensor(want), what="covariance twist")
+    twists = []
+    for path in (True, False):
+        leaves = s.with_options(covariance_pose_gradient=path).to(torch.float32).requiring_grad()
+        (render(backend, leaves)[1].sums[..., 0] * torch.as_tensor(push)).sum().backward()
+        assert leaves.T_camera_world.grad is not None
+        twists.append(twist_gradient(leaves.T_camera_world.grad, s.T_camera_world))
+    assert_same_vector(twists[0] - twists[1], torch.as_tensor(want), what="covariance twist")
 
 
 def test_empty_field_renders_nothing(backend: Any) -> None:

@@ -26,7 +26,7 @@ pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built
 from sigmasplat.render.cpu import operators as cpu
 from sigmasplat.render.cpu.view import CpuView
 
-OPTIONS = RenderConfig(depth_pose_gradient=False)
+OPTIONS = RenderConfig()
 """Walls as wide as the world move the image by their depth alone: without it the pose feels what lies behind them."""
 WALLS, BEHIND = 2, 200
 FAINT = 0.01

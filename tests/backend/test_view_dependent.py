@@ -244,5 +244,5 @@ def test_frozen_colours_keep_their_harmonics_too() -> None:
 
 def test_degree_0_is_the_plain_step() -> None:
     view, weights = ReferenceView(CAMERA, OPTIONS), loss_weights(MappingConfig())
-    assert isinstance(step_for(shiny_wall(), view, weights, 0), TorchStep)
-    assert isinstance(step_for(shiny_wall(), view, weights, 1), ViewDependentStep)
+    assert isinstance(step_for(view, weights, 0), TorchStep)
+    assert isinstance(step_for(view, weights, 1), ViewDependentStep)

@@ -146,9 +146,9 @@ def test_strict_stops_at_a_truncated_image_and_keeps_the_results(
     assert len(refusal) == 1 and "rgb/2.png: unreadable image" in refusal[0] and "Traceback" not in err
     run = RunFolder.open(tmp_path / "run")
     assert run.facts()["status"] == "failed"
-    believed = [line for line in run.read_log() if not line["lost"]]
+    valid = [line for line in run.read_log() if not line["lost"]]
     assert len(run.read_log()) == 2 and len(run.read_map()) > 0
-    assert len(run.read_trajectory()) == len(believed) >= 1
+    assert len(run.read_trajectory()) == len(valid) >= 1
 
 
 def scaled(folder: Path, units_per_metre: float) -> None:

@@ -21,8 +21,8 @@ from sigmasplat import cli
 from sigmasplat.commands import options
 from sigmasplat.config.presets import default_preset, preset
 from sigmasplat.config.text import override
-from sigmasplat.input.opening import formats
 from sigmasplat.plugins.sources import open_source
+from sigmasplat.registry import rows
 from sigmasplat.render import render
 from sigmasplat.run_folder.runs import ALL_POSES, FILES, RunFolder
 
@@ -155,7 +155,7 @@ def test_a_format_is_one_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         color = np.rint(frame.color * 255).astype(np.uint8)
         arrays = {"t": frame.timestamp_s, "color": color, "depth_m": frame.depth_m, "T_world_camera": T}
         np.savez(data / f"{frame.index:06d}.npz", **arrays)
-    formats.cache_clear()
+    rows.cache_clear()
     try:
         source = open_source(data)
         same = [np.array_equal(a.color, b.color) for a, b in zip(source, whole, strict=True)]
@@ -163,7 +163,7 @@ def test_a_format_is_one_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         (data / "000001.npz").write_bytes(b"PK damaged")
         assert [f.index for f in open_source(data)] == [0, 2]
     finally:
-        formats.cache_clear()
+        rows.cache_clear()
         sys.modules.pop("sigmasplat.plugins.sources.npz_frames", None)
 
 

@@ -45,15 +45,14 @@ def run(package: Path) -> Callable[[str], None]:
 
 
 def test_a_preset_is_values_and_a_setting_is_a_field(package: Path, run: Callable[[str], None]) -> None:
-    presets = package / "presets"
+    presets = package / "plugins" / "papers"
     (presets / "mine.py").write_text(
-        '"""Settings for my robot."""\n\nfrom sigmasplat.config.text import override\n'
-        "from sigmasplat.plugins.papers.sigma import SIGMA\n\n"
-        'PRESETS = {"robot": override(SIGMA, {"input.width": "480", "tracking.patience_s": "0.5"})}\n',
+        '"""Settings for my robot."""\n\nfrom sigmasplat.api import Preset, preset\n'
+        "from sigmasplat.config.text import override\n\n"
+        "SET = {'input.width': '480', 'tracking.patience_s': '0.5'}\n"
+        'PLUGIN = Preset("robot", lambda: override(preset("sigma"), SET))\n',
         encoding="utf-8",
     )
-    replace(presets / "__init__.py", "cgslam_released, sigma", "cgslam_released, mine, sigma")
-    replace(presets / "__init__.py", "sigma.PRESETS)", "sigma.PRESETS, mine.PRESETS)")
     replace(presets / "varsplat.py", '"fast": FAST}', '"fast": FAST, "office": TUM}')
     frames = package / "config" / "frames.py"
     source = frames.read_text(encoding="utf-8")
@@ -77,10 +76,10 @@ def test_a_preset_is_values_and_a_setting_is_a_field(package: Path, run: Callabl
 
 def test_a_rule_is_a_function_and_a_descriptor_a_class(package: Path, run: Callable[[str], None]) -> None:
     pytest.importorskip("sigmasplat.native._core", reason="sigmasplat.native._core is not built")
-    with (package / "slam" / "rules.py").open("a", encoding="utf-8") as rules:
+    with (package / "tracking" / "rules.py").open("a", encoding="utf-8") as rules:
         rules.write("\n\ndef is_keyframe(*arguments):\n    return True\n")
-    loops = package / "slam" / "loop_closure"
-    with (loops / "descriptors.py").open("a", encoding="utf-8") as descriptors:
+    loops = package / "graph"
+    with (package / "tracking" / "descriptors.py").open("a", encoding="utf-8") as descriptors:
         descriptors.write(
             "\n\nclass MeanColor:\n    def describe(self, color, depth_m):\n"
             "        mean = color.mean((0, 1))\n        return mean / np.linalg.norm(mean)\n"
@@ -106,12 +105,12 @@ def test_a_rule_is_a_function_and_a_descriptor_a_class(package: Path, run: Calla
 
 def test_an_attribute_of_splats_is_a_name_a_width_and_a_rate(package: Path, run: Callable[[str], None]) -> None:
     replace(
-        package / "model" / "field.py",
-        'ATTRIBUTES = {"correlations": 3,',
-        'ATTRIBUTES = {"heat": 2, "correlations": 3,',
+        package / "data" / "field.py",
+        'ATTRIBUTES = {"harmonics": 45}',
+        'ATTRIBUTES = {"heat": 2, "harmonics": 45}',
     )
     rates = package / "fit" / "adam.py"
-    replace(rates, 'ATTRIBUTE_RATES = {"correlations"', 'ATTRIBUTE_RATES = {"heat": ("colors", 0.5), "correlations"')
+    replace(rates, 'ATTRIBUTE_RATES = {"harmonics"', 'ATTRIBUTE_RATES = {"heat": ("colors", 0.5), "harmonics"')
     run(
         "import torch\n"
         "from sigmasplat.data.field import GaussianField\n"

@@ -16,7 +16,7 @@ from sigmasplat.config import Config
 
 DOCS = ROOT / "docs"
 PACKAGE = ROOT / "src" / "sigmasplat"
-NOT_DOCUMENTED = {"native", "commands", "cli", "report", "viewer", "__init__", "__main__"}
+NOT_DOCUMENTED = {"native", "commands", "cli", "__init__", "__main__"}
 """Kernels, and what is used from the command line only."""
 
 

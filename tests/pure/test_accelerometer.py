@@ -86,15 +86,15 @@ def test_a_map_of_a_camera_that_was_held_sideways_stands_upright(rolled_deg: flo
     np.testing.assert_allclose(level_cameras(sideways, measured)[2], measured, atol=1e-12)
 
 
-def test_a_run_knows_up_by_the_forces_on_its_believed_frames(tmp_path: Path) -> None:
+def test_a_run_knows_up_by_the_forces_on_its_valid_frames(tmp_path: Path) -> None:
     poses, forces = held()
     log = [
         {"timestamp_s": i / 30, "state": "lost" if i % 7 == 3 else "tracked", "lost": i % 7 == 3, "is_keyframe": False}
         | ({} if i % 5 == 1 else {"specific_force_m_s2": (forces[i] if i % 7 != 3 else -forces[i]).tolist()})
         for i in range(len(poses))
     ]
-    believed = [i for i in range(len(poses)) if i % 7 != 3]
-    frames = RunFrames.of(log, Trajectory(np.array(believed) / 30, poses[believed]))
+    valid = [i for i in range(len(poses)) if i % 7 != 3]
+    frames = RunFrames.of(log, Trajectory(np.array(valid) / 30, poses[valid]))
     up = frames.measured_up()
     assert up is not None and np.rad2deg(np.arccos(up @ UP)) < 1.5
     run = RunFolder.create(tmp_path / "run", preset("sigma"), "x")

@@ -50,7 +50,7 @@ def test_frames_are_found_by_every_way() -> None:
         assert np.linalg.norm(error[:3, 3]) < 0.2 * SEARCH.off_m and ms > 0
         assert np.degrees(se3.rotation_angle(error[:3, :3])) < 0.2 * SEARCH.off_deg
     found = localise.shares(field, frame, start, SEARCH)
-    assert tuple(found) == localise.PATHS and all(min(part) > 0 for part in found.values())
+    assert tuple(found) == ("covariance", "all others") and all(min(part) > 0 for part in found.values())
     assert localise.view_dependence(field, frame, T_true) > 0.01
     assert localise.view_dependence(GaussianField(field.params), frame, T_true) == 0
 
@@ -64,22 +64,15 @@ def test_a_start_is_so_far_off() -> None:
     assert len({start.tobytes() for start in starts}) == 4
 
 
-def test_each_way_has_one_path_more() -> None:
-    paths = ("mean", "depth", "covariance", "color")
-    on = [[getattr(way, f"{path}_pose_gradient") for path in paths] for way in localise.WAYS.values()]
-    assert on == [[True, True, False, False], [True, True, True, False], [True] * 4]
-
-
-def test_shares_of_a_plain_map_that_is_off_in_depth_alone() -> None:
-    """Of one colour, without harmonics, seen from too far away: colour's path has no share, depth's is most."""
+def test_the_covariance_has_a_small_share_in_a_plain_map_that_is_off_in_depth_alone() -> None:
+    """Of one colour, without harmonics, seen from too far away."""
     params = shiny_corner().params
     params[:, 11:14] = 0.5
     field = GaussianField(params)
     seen = render(field, CAMERA, np.eye(4))
     frame = Frame(0, 0.0, seen.color.clamp(0, 1).numpy().copy(), seen.depth.numpy() - np.float32(0.1), CAMERA)
     found = localise.shares(field, frame, np.eye(4), replace(SEARCH, weight_color=0.0))
-    assert found["color"] == [0.0, 0.0] and 0.7 < found["depth"][0] < 1.1
-    assert max(found["mean"][0], found["covariance"][0]) < 0.4
+    assert 0.0 < found["covariance"][0] < 0.4 and 0.7 < found["all others"][0] < 1.3
 
 
 def test_pixels_without_reading_or_map_have_no_part_in_the_loss() -> None:
@@ -125,13 +118,13 @@ def test_runs_differ_by_the_switch_alone(tmp_path: Path, monkeypatch: pytest.Mon
     configs = [job.key()["config"] for job in asked]
     switches = [config["render"].pop("covariance_pose_gradient") for config in configs]
     assert switches == [False] * 4 + [True] * 4 and configs[:4] == configs[4:]
-    rates = [pose_gradient.Options(rates=name).tracking_settings("+ covariance")[-3] for name in pose_gradient.RATES]
+    rates = [pose_gradient.Options(rates=name).tracking_settings("with covariance")[-3] for name in pose_gradient.RATES]
     assert rates == ["tracking.lr_rotation=0.002", "tracking.lr_rotation=0.0002", "tracking.lr_rotation=0.00075"]
     assert configs[0]["tracking"]["method"] == "adam" and configs[0]["tracking"]["iterations"] == 30
     rules = [value for name, value in configs[0]["submaps"].items() if name != "inherit"]
     assert configs[0]["final"]["iterations"] == 0 and not any(rules)
     made = laid_out("pose_gradient", {"sequence": jobs})
-    rows = [["s", "mean + depth", "1", "2"], ["s", "+ covariance", "1", "2"], ["t", "mean + depth", "1", "2"]]
+    rows = [[s, f"{way} covariance", "1", "2"] for s, way in (("s", "without"), ("s", "with"), ("t", "without"))]
     assert [row[:4] for row in made["Sequences"].rows[:3]] == rows
     assert made["Sequences"].rows[0][-1] == "10" and len(made["Failed"].rows) == 4
 
@@ -159,7 +152,7 @@ def test_frames_are_found_and_held_against_the_truth(monkeypatch: pytest.MonkeyP
         assert (f["ms"] > 0) == (f["way"] in localise.WAYS)
     made = laid_out("pose_gradient", {"localise": [{"source": "room", "maps": [found]}]})
     assert [row[1] for row in made["Localisation"].rows] == ways
-    assert [row[1] for row in made["Paths"].rows] == list(localise.PATHS) and len(found["shares"]) == 2
+    assert [row[1] for row in made["Paths"].rows] == ["covariance", "all others"] and len(found["shares"]) == 2
 
 
 def test_medians_and_how_many_are_nearer() -> None:

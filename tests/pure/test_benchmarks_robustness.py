@@ -251,7 +251,7 @@ def test_a_right_path_has_no_failure(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("leave_out", [True, False])
-def test_wrong_frames_are_silent_only_if_they_are_believed(tmp_path: Path, leave_out: bool) -> None:
+def test_wrong_frames_are_silent_only_if_they_are_valid(tmp_path: Path, leave_out: bool) -> None:
     poses, lost = TRUTH[0].copy(), set(range(14, 22))
     poses[14:30, 1, 3] += 0.3
     found = scored(tmp_path, poses, lost, leave_out=leave_out)
@@ -268,7 +268,7 @@ def test_a_wrong_second_half_does_not_move_the_world(tmp_path: Path) -> None:
     assert found["silent"] == 22 and found["recovery"] is None and found["recovery_known"] is None
 
 
-def test_a_component_that_joined_later_is_believed_at_the_end(tmp_path: Path) -> None:
+def test_a_component_that_joined_later_is_valid_at_the_end(tmp_path: Path) -> None:
     state = ["tracked"] * 20 + ["apart"] * 15 + ["relocalised"] * 5
     found = scored(tmp_path, TRUTH[0], set(), state=state)  # trajectory.txt has all frames
     assert found["believed"] == 40 and found["lost"] == found["silent"] == found["missed_outside"] == 0
@@ -400,8 +400,8 @@ def run_of(disturbance: str, severity: int, seed: int, **figures: Any) -> dict[s
 EVENT = {"event": [30, 50], "known": 6}
 RUNS = [
     run_of("clean", 1, 0),
-    run_of("kidnapped", 3, 0, **EVENT, recovery=8, recovery_known=2, believed=50, ate_m=0.012),
-    run_of("kidnapped", 3, 1, **EVENT, believed=40, silent=8, silent_in_a_row=8, ate_m=0.03, missed_outside=41),
+    run_of("kidnapped", 3, 0, **EVENT, recovery=8, recovery_known=2, valid=50, ate_m=0.012),
+    run_of("kidnapped", 3, 1, **EVENT, valid=40, silent=8, silent_in_a_row=8, ate_m=0.03, missed_outside=41),
     {"sequence": "room", "disturbance": "black", "severity": 1, "seed": 0, "problem": "out of | memory"},
 ]
 P_OFF = scores.probability_scores([(0.9, True), (0.2, False), (0.1, False)])

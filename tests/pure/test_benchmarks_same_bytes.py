@@ -210,6 +210,12 @@ def test_a_run_that_fails_is_a_difference_and_not_kept(sides: Sides, capsys: pyt
     assert "before fails: it broke" in capsys.readouterr().out
 
 
+def test_two_empty_folders_are_not_the_same_results(sides: Sides, capsys: pytest.CaptureFixture[str]) -> None:
+    everything = ("submaps", "log.jsonl", "metrics.json", "run.json", "trajectory.txt", "map.ply", SUBMAP)
+    assert same_bytes.main(options("sigma", rename=tuple(f"{name}=" for name in everything))) == 1
+    assert "no results" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("more", "said"),
     [

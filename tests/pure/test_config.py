@@ -11,7 +11,7 @@ import pytest
 
 from sigmasplat import env
 from sigmasplat.config import SECTIONS, Config
-from sigmasplat.config.presets import list_presets, preset
+from sigmasplat.config.presets import preset
 from sigmasplat.config.ranges import kinds_of, problem_of, unpacked
 from sigmasplat.config.text import override, split_settings
 from sigmasplat.errors import ConfigError
@@ -141,18 +141,6 @@ def test_limits_that_depend_on_each_other_are_set_together() -> None:
         override(config, {"input.start_s": "20"})
     with pytest.raises(ConfigError, match=r"input\.max_depth_m must be above input\.min_depth_m"):
         override(config, {"input.min_depth_m": "9"})
-
-
-def test_settings_that_exclude_each_other_are_refused_before_a_run() -> None:
-    """The default preset has a term that full colour covariances have no map for; the error line says how to go on."""
-    full = {"mapping.color_covariance": "full"}
-    with pytest.raises(ConfigError, match=r"--set mapping\.weight_moment=0 --set render\.depth=center$") as refused:
-        override(preset("sigma"), full).checked()
-    assert "\n" not in str(refused.value)
-    with pytest.raises(ConfigError, match=r"add --set render\.depth=center$"):
-        override(preset("sigma"), full | {"mapping.weight_moment": "0"}).checked()
-    override(preset("sigma"), full | {"mapping.weight_moment": "0", "render.depth": "center"}).checked()
-    assert all(preset(name).checked() == preset(name) for name in list_presets())
 
 
 @pytest.mark.parametrize("text", ["big", "-3", "1.5", ""])

@@ -16,11 +16,11 @@ from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference
 from sigmasplat.fit.target import Target
 from sigmasplat.tracking.moving.drawn import free_standing, has_drawn, is_still, shift_px, suspected
-from sigmasplat.tracking.moving.foreground import Foreground, thinned
+from sigmasplat.tracking.moving.dynamic_detector import DynamicDetector
+from sigmasplat.tracking.moving.dynamic_mask import DynamicMask, thinned
 from sigmasplat.tracking.moving.two_motions import two_motions
-from sigmasplat.tracking.moving.watch import Watch
-from sigmasplat.tracking.sight import Sight
-from sigmasplat.tracking.verdict import is_missed
+from sigmasplat.tracking.pose_validation import is_missed
+from sigmasplat.tracking.prepared_frame import PreparedImages
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 CAMERA = Camera(160, 120, 140.0, 140.0, 79.5, 59.5)
@@ -34,7 +34,7 @@ def stripes(x: NDArray[np.float64], y: NDArray[np.float64], length_m: float) -> 
     return 0.5 + 0.2 * np.sin(2 * np.pi * x / length_m) + 0.2 * np.sin(2 * np.pi * (y + 0.3 * x) / length_m)
 
 
-def sight(camera_m: float, box_m: float, paint_m: float = 0.0, block: bool = False) -> Sight:
+def sight(camera_m: float, box_m: float, paint_m: float = 0.0, block: bool = False) -> PreparedImages:
     """Return a frame of a striped wall with a striped box in front of it: x of camera and box; the stripes of the box
     are shifted on it by paint_m; block: a still block stands under the box, at the same distance."""
     rays = CAMERA.rays().astype(np.float64)
@@ -48,7 +48,7 @@ def sight(camera_m: float, box_m: float, paint_m: float = 0.0, block: bool = Fal
     depth_m = np.where(box | under, BOX_M, WALL_M).astype(np.float32)
     color = np.repeat(gray[..., None], 3, -1)
     target = Target.of(Frame(0, 0.0, color, depth_m, CAMERA), depth_m.shape)
-    return Sight(target, Pyramid.of(gray, depth_m, CAMERA))
+    return PreparedImages(target, Pyramid.of(gray, depth_m, CAMERA))
 
 
 def pose(camera_m: float) -> NDArray[np.float64]:
@@ -57,7 +57,11 @@ def pose(camera_m: float) -> NDArray[np.float64]:
 
 
 def fitted(
-    seen: Sight, camera_m: float, without: Foreground | None = None, turned_rad: float = 0.0, block: bool = False
+    seen: PreparedImages,
+    camera_m: float,
+    without: DynamicMask | None = None,
+    turned_rad: float = 0.0,
+    block: bool = False,
 ) -> PoseFit:
     """Return the fit of a frame at a pose, relative to a keyframe that shows the box at x = 0."""
     live = seen.live if without is None else seen.live.hiding(without.hidden)
@@ -70,12 +74,12 @@ def keyframe(block: bool = False) -> Reference:
     return Reference(sight(0.0, 0.0, block=block).live, np.eye(4))
 
 
-def box_of(seen: Sight) -> Foreground:
+def box_of(seen: PreparedImages) -> DynamicMask:
     (found,) = suspected(keyframe(), seen, fitted(seen, BETWEEN_M), CONFIG, every=True)
     return found
 
 
-def judged(seen: Sight, drawn_m: float, turned_rad: float = 0.0) -> bool:
+def judged(seen: PreparedImages, drawn_m: float, turned_rad: float = 0.0) -> bool:
     """Return whether the box has drawn a pose, if the pose without it is right."""
     box, drawn = box_of(seen), fitted(seen, drawn_m, turned_rad=turned_rad)
     return has_drawn(box, keyframe(), seen, drawn, fitted(seen, MOVED_M, box), contradicted=False)
@@ -165,7 +169,7 @@ def test_what_another_thing_hides_in_part_does_not_stand_free() -> None:
     assert not any(inside[25:35, 35:45].any() for inside in free_standing(thinned(depth_m, 2)))
 
 
-def look(watch: Watch, contradicted: bool = False, urgent: bool = False) -> tuple[Watch, bool]:
+def look(watch: DynamicDetector, contradicted: bool = False, urgent: bool = False) -> tuple[DynamicDetector, bool]:
     """Return the watch after a look for the box that has drawn a pose, and whether it finds it."""
     seen = sight(MOVED_M, MOVED_M)
     later, things = watch.suspected(keyframe(), seen, fitted(seen, BETWEEN_M), CONFIG, contradicted, urgent)
@@ -173,7 +177,7 @@ def look(watch: Watch, contradicted: bool = False, urgent: bool = False) -> tupl
 
 
 def test_what_draws_the_pose_is_looked_for_less_often_after_looks_in_vain() -> None:
-    seen, watch = sight(0.0, 0.0), Watch(MovingConfig(find=True))
+    seen, watch = sight(0.0, 0.0), DynamicDetector(MovingConfig(find=True))
     box, found, urgent = box_of(sight(MOVED_M, MOVED_M)), list[bool](), list[bool]()
     for _ in range(16):
         assert look(watch, contradicted=True)[1]

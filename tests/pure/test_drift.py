@@ -97,11 +97,10 @@ def test_each_rule_alone_ends_a_submap_unless_it_is_off() -> None:
         ("angle", SubmapConfig(angle_deg=25.0)),
         ("frames", SubmapConfig(frames=10)),
         ("uncertainty", SubmapConfig(uncertainty_m=0.015)),
-        ("variance", SubmapConfig(variance_sum=0.05)),
-        ("", SubmapConfig(distance_m=0.6, angle_deg=35.0, frames=11, uncertainty_m=0.025, variance_sum=0.07)),
+        ("", SubmapConfig(distance_m=0.6, angle_deg=35.0, frames=11, uncertainty_m=0.025)),
         ("", SubmapConfig()),
     ):
-        assert ends_submap(T, 10, 0.02, config, 0.06) == rule
+        assert ends_submap(T, 10, 0.02, config) == rule
 
 
 def test_constant_errors_in_metres_follow_the_scale_of_the_scene() -> None:

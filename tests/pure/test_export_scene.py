@@ -22,8 +22,8 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_the_name_selects_the_format_of_a_path(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert exit_code("export", "kitchen", "--out", "a.kitti.txt") == 0
-    written, believed = np.loadtxt("a.kitti.txt").reshape(-1, 3, 4), np.arange(FRAMES) != LOST
-    np.testing.assert_allclose(written[believed], PATH.T_world_camera[believed, :3], atol=1e-9)
+    written, valid = np.loadtxt("a.kitti.txt").reshape(-1, 3, 4), np.arange(FRAMES) != LOST
+    np.testing.assert_allclose(written[valid], PATH.T_world_camera[valid, :3], atol=1e-9)
     assert np.isnan(written[LOST]).all()
     assert exit_code("export", "kitchen", "--out", "transforms.json") == 0
     assert len(json.loads((here / "transforms.json").read_text())["frames"]) == 5

@@ -211,7 +211,7 @@ def test_film_options_out_of_range_are_refused() -> None:
 
 
 def test_the_plan_is_an_image_and_a_json_file(reader: RunReader, tmp_path: Path) -> None:
-    plan = floor_plan(reader.run.read_map(), reader.believed_path(), reader.camera, renderer=seer(WORLD))
+    plan = floor_plan(reader.run.read_map(), reader.valid_path(), reader.camera, renderer=seer(WORLD))
     write_plan(plan, tmp_path / "plan.png")
     with Image.open(tmp_path / "plan.png") as drawn:
         assert drawn.format == "PNG" and drawn.size[0] > 700
@@ -242,8 +242,8 @@ def test_frames_apart_are_not_exported(reader_apart: RunReader, tmp_path: Path) 
     assert sorted(p.name for p in (out / "images").iterdir()) == ["frame-000000.png", "frame-000002.png"]
     _, keyframes = FusionInput.at(reader.run, reader.camera).views()
     assert keyframes == 2, "those of the first submap"
-    assert len(reader.believed_path()) == 3
-    with pytest.raises(RunError, match="no believed pose of frame 4"):
+    assert len(reader.valid_path()) == 3
+    with pytest.raises(RunError, match="no valid pose of frame 4"):
         reader.poses_of([0, 4])
 
 

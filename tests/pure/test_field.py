@@ -152,7 +152,7 @@ def test_fields_side_by_side_are_those_appended_one_after_another(count: int) ->
     fields = [GaussianField(torch.randn(n % 4, WIDTH, generator=generator)) for n in range(count)]
     for n, field in enumerate(fields):
         if n % 3 == 0:
-            field.get_or_create("correlations").params[:] = float(n)
+            field.get_or_create("harmonics").params[:] = float(n)
     one_by_one = GaussianField.empty()
     for field in fields:
         one_by_one.append(field)

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from sigmasplat.config import Config, MappingConfig
 from sigmasplat.data import se3
 from sigmasplat.data.field import COLUMNS, GaussianField, Rows
-from sigmasplat.data.submap import MemoryStore, StorePart, Submap
+from sigmasplat.data.submap import MemoryStore, Submap
 from sigmasplat.errors import ConfigError, SigmaSplatError
 from sigmasplat.final import final_map as final
 from sigmasplat.final.final_map import final_map, merged, survivors, z_order
@@ -22,7 +22,6 @@ from sigmasplat.final.refinement import KeyframeReader, refine
 from sigmasplat.fit.adam import ATTRIBUTE_RATES
 from sigmasplat.mapping.pruning import largest_weights, prune_by_weight
 from sigmasplat.render.reference.view import ReferenceView
-from sigmasplat.uncertainty.predicted_submaps import PredictedSubmaps
 from two_submaps import (
     ANCHORS,
     CAMERA,
@@ -95,25 +94,6 @@ def test_a_room_that_many_submaps_show_is_merged_in_parts_with_the_same_result(
     monkeypatch.setattr(final, "survivors", counted)
     assert torch.equal(merged(store, anchors, config(uncertainty=uncertainty)).params, whole.params)
     assert len(joined) > 3 and max(joined) < most / 2
-
-
-@pytest.mark.parametrize("variance", ["published", "predicted"])
-def test_the_predicted_variance_keeps_the_submap_whose_colors_agree_with_its_keyframes(variance: str) -> None:
-    store = make_store()
-    second = store.submaps[1].field.params
-    second[:, COLUMNS["colors"]] = 1.0 - second[:, COLUMNS["colors"]]  # its σ² are the lower ones all the same
-    field = merged(store, ANCHORS, config(variance=variance))
-    kept_second = field.params[:, COLUMNS["log_variances"]].mean(1) == LOG_VARIANCES[1]
-    both = (field.means[:, 0] > -0.05) & (field.means[:, 0] < 0.25)
-    assert bool(kept_second[both].all()) is (variance == "published")
-    assert bool(kept_second[both].any()) is (variance == "published")
-
-
-def test_the_predicted_variance_of_some_submaps_is_that_of_the_same_submaps_in_their_store() -> None:
-    whole, settings = make_store(0.1), config(variance="predicted")
-    some = PredictedSubmaps(settings, StorePart(whole, [1]))
-    assert torch.equal(some.rows(0), PredictedSubmaps(settings, whole).rows(1))
-    assert some.background(0) == PredictedSubmaps(settings, whole).background(1)
 
 
 def test_every_voxel_keeps_exactly_one_submap() -> None:

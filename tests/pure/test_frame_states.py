@@ -53,7 +53,7 @@ def test_equal_and_unsorted_times_are_told_apart_by_their_order() -> None:
     assert frames.rows.tolist() == [0, 2, 3, 4] and frames.path.T_world_camera[:, 0, 3].tolist() == [0, 1, 2, 3]
 
 
-def test_old_logs_have_no_states_and_their_lost_poses_are_not_believed() -> None:
+def test_old_logs_have_no_states_and_their_lost_poses_are_not_valid() -> None:
     frames = RunFrames.of(log_of("ttlttt", old=True), path(0, 1, 2, 3))
     assert frames.states == ("tracked", "tracked", "lost", "tracked") and len(frames) == 4
     assert frames.rows.tolist() == [0, 1, 3] and frames.path.timestamps_s.tolist() == [0, 1, 3]
@@ -84,7 +84,7 @@ def test_calibration_compares_predicted_and_observed_shares() -> None:
     ]  # fmt: skip
 
 
-def test_only_believed_frames_fail_silently() -> None:
+def test_only_valid_frames_fail_silently() -> None:
     error_m = np.array([0.01, 0.2, 0.2, 0.07, np.nan])
     found = score_failures(error_m, np.array([0.1, 0.2, 0.9, np.nan, 0.5]), np.array([True, True, False, True, True]))
     assert found["silent_rows"] == [1] and (found["frames"], found["off"], found["silent"]) == (4, 3, 1)

@@ -123,7 +123,6 @@ def shiny_field(n: int = 40, seed: int = 0) -> GaussianField:
     )
     field = GaussianField.from_values(means, scales, colors, opacities=0.7)
     field.attributes["harmonics"] = Rows(torch.as_tensor(rng.normal(0, 0.3, (n, 45))).float(), steps=4)
-    field.attributes["correlations"] = Rows(torch.as_tensor(rng.normal(0, 0.3, (n, 3))).float())
     return field
 
 
@@ -156,13 +155,13 @@ def test_turning_does_not_depend_on_where_memory_lies() -> None:
 def test_what_is_moved_shares_no_memory_and_keeps_every_extra() -> None:
     field = shiny_field()
     moved = field.moved(torch.eye(4))
-    assert set(moved.attributes) == {"harmonics", "correlations"} and moved.attributes["harmonics"].steps == 4
-    assert torch.equal(moved.attributes["correlations"].params, field.attributes["correlations"].params)
+    assert set(moved.attributes) == {"harmonics"} and moved.attributes["harmonics"].steps == 4
+    torch.testing.assert_close(moved.attributes["harmonics"].params, field.attributes["harmonics"].params)
     for attribute in moved.attributes.values():
         attribute.params += 1.0
         attribute.moment1 += 1.0
-    assert float(field.attributes["correlations"].params.max()) < 3.0
-    assert torch.count_nonzero(field.attributes["correlations"].moment1) == 0
+    assert torch.equal(field.attributes["harmonics"].params, shiny_field().attributes["harmonics"].params)
+    assert torch.count_nonzero(field.attributes["harmonics"].moment1) == 0
 
 
 def test_a_render_shows_what_the_camera_sees() -> None:
@@ -171,7 +170,6 @@ def test_a_render_shows_what_the_camera_sees() -> None:
     position = torch.as_tensor(se3.inverse(T)[:3, 3]).float()
     painted = GaussianField(field.params.clone())
     painted.params[:, 11:14] = view_colors(field.colors, field.attributes["harmonics"].params, field.means, position)
-    field.attributes.pop("correlations")
     leaf = field.attributes["harmonics"].params.requires_grad_()
     seen, want = (render(f, CAMERA, torch.as_tensor(T), backend="reference") for f in (field, painted))
     torch.testing.assert_close(seen.color, want.color, rtol=0, atol=1e-6)

@@ -35,16 +35,6 @@ def test_a_map_is_read_back_unchanged(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["map.ply"], "no temporary file remains"
 
 
-def test_full_colour_covariances_are_read_back(tmp_path: Path) -> None:
-    field = random_field(6)
-    field.attributes["correlations"] = Rows(torch.randn(6, 3, generator=torch.Generator().manual_seed(1)))
-    write_field(tmp_path / "map.ply", field)
-    back = read_field(tmp_path / "map.ply")
-    assert torch.equal(back.attributes["correlations"].params, field.attributes["correlations"].params)
-    write_field(tmp_path / "plain.ply", field, plain=True)
-    assert not read_field(tmp_path / "plain.ply").attributes.get("correlations")
-
-
 def test_layout_is_that_of_3dgs(tmp_path: Path) -> None:
     """The bytes of one splat: names, order, and the values that a viewer expects."""
     field = GaussianField.from_values(
@@ -254,8 +244,7 @@ def test_a_map_that_is_converted_in_parts_has_the_same_bytes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, plain: bool
 ) -> None:
     field = random_field(23)
-    for name in ("harmonics", "correlations"):
-        field.get_or_create(name).params[:] = torch.randn(23, ATTRIBUTES[name], generator=torch.Generator())
+    field.get_or_create("harmonics").params[:] = torch.randn(23, ATTRIBUTES["harmonics"], generator=torch.Generator())
     std = SplatStd(*torch.rand(2, 23, generator=torch.Generator()))
     write_field(tmp_path / "whole.ply", field, plain=plain, std=std)
     monkeypatch.setattr(ply, "AT_ONCE", 5)

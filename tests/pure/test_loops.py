@@ -20,7 +20,7 @@ from sigmasplat.graph.neighbourhood import Incidence, Neighbourhood
 from sigmasplat.graph.pose_graph import Edge
 from sigmasplat.graph.registration import Registration
 from sigmasplat.tracking.descriptors import OrientationGrid
-from sigmasplat.types import Slices
+from sigmasplat.types import Task
 
 CAMERA = Camera(4, 3, 4.0, 4.0, 1.5, 1.0)
 STEP = se3.exp(np.array([1.0, 0, 0, 0, 0, 0.0]))
@@ -41,7 +41,7 @@ class Registered:
         T_a_b = self.lies.get((a.index, b.index), se3.inverse(self.truth[a.index]) @ self.truth[b.index])
         return Registration(T_a_b, SURE, 0.1, 4, 0.9, True, "accepted")
 
-    def register(self, pair: SubmapPair, a: Submap, b: Submap, known: np.ndarray) -> Slices[Registration]:
+    def register(self, pair: SubmapPair, a: Submap, b: Submap, known: np.ndarray) -> Task[Registration]:
         yield
         return self.registered(pair, a, b, known)
 

@@ -12,8 +12,8 @@ from sigmasplat.errors import ConfigError
 from sigmasplat.fit import losses
 
 H, W = 24, 31
-IMAGE_TERMS = ("l1", "ssim", "depth", "nll_color", "nll_color_full", "nll_depth", "moment", "mean_depth")
-RENDERED = ("color", "depth", "alpha", "variance", "covariance", "moment")
+IMAGE_TERMS = ("l1", "ssim", "depth", "nll_color", "nll_depth", "moment", "mean_depth")
+RENDERED = ("color", "depth", "alpha", "variance", "moment")
 
 
 def maps(seed: int = 0, valid: Tensor | None = None) -> dict[str, Tensor]:
@@ -146,63 +146,6 @@ def test_nll_accepts_variance_slightly_below_zero() -> None:
     assert torch.equal(m["variance"], before)
 
 
-def test_full_nll_is_the_gaussian_one_and_trains_covariance_only() -> None:
-    m = maps(valid=half())
-    value = losses.total({"nll_color_full": 1.0}, m)
-    r, v = ((m[k].detach()[half()]) for k in ("color", "covariance"))
-    r = r - m["color_target"][half()]
-    V = v[:, [0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(-1, 3, 3) + losses.NLL_EPS * torch.eye(3, dtype=torch.float64)
-    normal = torch.distributions.MultivariateNormal(torch.zeros_like(r), V).log_prob(r)
-    want = -normal.mean().item() / 3 - 0.5 * np.log(2 * np.pi)
-    assert value.item() == pytest.approx(want, rel=1e-9)
-    value.backward()
-    assert m["color"].grad is None and m["covariance"].grad is not None
-
-
-def test_full_nll_of_a_diagonal_is_the_diagonal_one() -> None:
-    """Value and gradient by the variances, with V below 0 by rounding among them."""
-    m = maps(valid=half())
-    with torch.no_grad():
-        m["variance"][0, -5:] = torch.tensor([-1e-7, 0.3, 0.2])
-        m["covariance"].zero_()[..., :3] = m["variance"]
-    values = [losses.total({name: 1.0}, m) for name in ("nll_color", "nll_color_full")]
-    assert values[0].item() == pytest.approx(values[1].item(), rel=1e-12)
-    (values[0] + values[1]).backward()
-    assert m["variance"].grad is not None and m["covariance"].grad is not None
-    torch.testing.assert_close(m["covariance"].grad[..., :3], m["variance"].grad, rtol=1e-9, atol=1e-15)
-
-
-def test_full_nll_is_least_where_the_covariance_is_that_of_the_residuals() -> None:
-    rng = np.random.default_rng(3)
-    residuals = torch.as_tensor(0.2 * rng.normal(size=(H, W, 3)) @ (np.eye(3) + 0.5 * rng.uniform(size=(3, 3))))
-    own = (residuals[..., :, None] * residuals[..., None, :]).mean((0, 1)) - losses.NLL_EPS * torch.eye(
-        3, dtype=torch.float64
-    )
-    V = own[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]].requires_grad_()
-    target, valid = torch.zeros(H, W, 3, dtype=torch.float64), torch.ones(H, W, dtype=torch.bool)
-    losses.nll_color_full(residuals, target, V.expand(H, W, 6), valid).backward()
-    assert V.grad is not None and float(V.grad.abs().max()) < 1e-12
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_full_nll_stays_finite_for_a_covariance_with_rounding_errors(dtype: torch.dtype) -> None:
-    """Nothing at all, one direction only, and indefinite by a rounding error: finite, with finite gradients."""
-    m = {name: x.detach().to(dtype) if name != "valid" else x for name, x in maps().items()}
-    line = torch.rand(W, 3, dtype=dtype)
-    odd = torch.stack([line[:, i] * line[:, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))], -1)
-    with torch.no_grad():
-        m["covariance"][0] = 0.0
-        m["covariance"][1] = odd
-        m["covariance"][2] = odd + 1e-6 * torch.randn(W, 6, dtype=dtype)
-        m["covariance"][3] = 1e-7 * torch.randn(W, 6, dtype=dtype)
-        m["covariance"][4] = torch.tensor([1e-4, -1e-7, 1e-4, 1e-5, 1e-4, 1e-5])
-    before = m["covariance"].clone()
-    value = losses.total({"nll_color_full": 1.0}, m | {"covariance": m["covariance"].requires_grad_()})
-    value.backward()
-    assert torch.isfinite(value) and m["covariance"].grad is not None and torch.isfinite(m["covariance"].grad).all()
-    assert torch.equal(m["covariance"], before)
-
-
 @pytest.mark.parametrize("name", IMAGE_TERMS)
 def test_gradients_equal_finite_differences(name: str) -> None:
     m = maps(valid=half())
@@ -212,7 +155,6 @@ def test_gradients_equal_finite_differences(name: str) -> None:
         "depth": "depth",
         "mean_depth": "depth",
         "moment": "moment",
-        "nll_color_full": "covariance",
     }
     trained = trains.get(name, "variance")
     direction = torch.tensor(np.random.default_rng(1).normal(size=tuple(m[trained].shape)))

@@ -79,7 +79,7 @@ def test_half_of_the_steps_of_a_keyframe_are_divided_over_the_next_frames_where_
     def frames(count: int) -> None:
         for _ in range(count):
             before = made.field.steps
-            completed(made.refining(view(), made.due, never))
+            completed(made.refining(view(), made.pending_now, never))
             taken.append(made.field.steps - before)
 
     assert len(completed(made.mapping(view(), keyframe(0))).losses) == 4
@@ -96,9 +96,9 @@ def test_half_of_the_steps_of_a_keyframe_are_divided_over_the_next_frames_where_
 def test_a_keyframe_that_comes_early_finds_the_steps_of_the_one_before_made() -> None:
     made = mapper(mapping=replace(DIVIDED, first_iterations=8))
     completed(made.mapping(view(), keyframe(0)))
-    completed(made.refining(view(), made.due, never))
+    completed(made.refining(view(), made.pending_now, never))
     completed(made.mapping(view(), keyframe(1)))
-    assert (made.field.steps, made.owed) == (8 + 4, 4)
+    assert (made.field.steps, made.pending) == (8 + 4, 4)
     assert len(made.map(view(), 2, target(), np.eye(4)).losses) == 8 and made.field.steps == 8 + 8 + 8
 
 
@@ -117,7 +117,7 @@ def test_splats_that_contradict_readings_are_removed_when_the_last_step_is_made(
         completed(made.mapping(view(), keyframe(1)))
         if divided:
             assert int((made.field.means[:, 2] < 1.5).sum()) == near
-            completed(made.refining(view(), made.owed, never))
+            completed(made.refining(view(), made.pending, never))
         counts.append(int((made.field.means[:, 2] < 1.5).sum()))
         assert near == PIXELS and made.half is None
     assert counts[0] == counts[1] < PIXELS / 4
@@ -176,4 +176,4 @@ def test_a_keyframe_whose_pose_mapping_moves_is_not_divided() -> None:
     """Frames are tracked from its pose at once, so it must be final."""
     made = mapper(mapping=replace(DIVIDED, first_iterations=0, iterations=4, lr_pose_translation=1e-3))
     completed(made.mapping(view(), keyframe(0)))
-    assert len(completed(made.mapping(view(), keyframe(1))).losses) == 4 and made.owed == 0
+    assert len(completed(made.mapping(view(), keyframe(1))).losses) == 4 and made.pending == 0

@@ -99,11 +99,11 @@ def test_one_of_the_window_a_step(looked_at: list[list[int]]) -> None:
 
 
 def test_several_drawn_together_are_different_ones() -> None:
-    drawn = list(draw_keyframes(range(6), 200, 0.3, 0, np.random.default_rng(0), together=3))
+    drawn = list(draw_keyframes(range(6), 200, 0.3, np.random.default_rng(0), together=3))
     assert all(len(set(batch)) == 3 for batch in drawn) and {k for batch in drawn for k in batch} == set(range(6))
     led = sum(batch[0] == 5 for batch in drawn) / 200
     assert 0.2 < led < 0.4, "the newest leads with its probability"
-    everything = list(draw_keyframes(range(3), 4, 0.3, 0, np.random.default_rng(0), together=9))
+    everything = list(draw_keyframes(range(3), 4, 0.3, np.random.default_rng(0), together=9))
     assert everything == [[0, 1, 2]] * 4
 
 

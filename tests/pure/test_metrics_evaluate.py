@@ -167,7 +167,7 @@ STATES = {6: "lost", 7: "relocalised", 12: "lost", 13: "apart", 14: "apart", 15:
 
 
 def test_states_and_silent_failures_are_scored(run: RunFolder) -> None:
-    """Frame 10 is off by 30 cm and believed; lost frame 6 is off by 20 cm in the checkpoint, frame 12 is not off."""
+    """Frame 10 is off by 30 cm and valid; lost frame 6 is off by 20 cm in the checkpoint, frame 12 is not off."""
     p_off = {6: 0.9, 10: 0.75, 12: 0.3, 16: 0.8}
     rewritten_log(
         run,
@@ -179,8 +179,8 @@ def test_states_and_silent_failures_are_scored(run: RunFolder) -> None:
     estimate = poses()
     estimate[10, 1, 3] += 0.3
     estimate[6, 1, 3] += 0.2
-    believed = [i for i in range(FRAMES) if STATES.get(i) not in ("lost", "apart")]
-    run.write_trajectory(Trajectory(TIMES[believed], estimate[believed]))
+    valid = [i for i in range(FRAMES) if STATES.get(i) not in ("lost", "apart")]
+    run.write_trajectory(Trajectory(TIMES[valid], estimate[valid]))
     run.write_checkpoint({"T_world_camera": torch.from_numpy(estimate)}, {})
     run.write_components([Component(1, GaussianField(torch.ones(2, 17)), Trajectory(TIMES[13:15], poses()[:2]))])
     metrics = score(
@@ -194,7 +194,7 @@ def test_states_and_silent_failures_are_scored(run: RunFolder) -> None:
     assert component["start_s"] == pytest.approx(TIMES[13]) and component["end_s"] == pytest.approx(TIMES[14])
     failures = metrics["failures"]
     assert failures["silent_frames"] == [10] and failures["silent"] == 1 and failures["off"] == 2
-    assert failures["frames"] == 17, "believed ones, and lost ones in the world"
+    assert failures["frames"] == 17, "valid ones, and lost ones in the world"
     assert failures["auroc"] == pytest.approx((15 + 14) / 30), "one frame that is not off has p = 0.8, above 0.75"
     wrong = [(1 - 0.9) ** 2, (1 - 0.75) ** 2, 0.3**2, 0.8**2, *[0.01] * 13]
     assert failures["brier"] == pytest.approx(sum(wrong) / 17)
@@ -493,8 +493,8 @@ def test_the_path_is_scored_on_keyframes_and_on_all_frames(run: RunFolder) -> No
     estimate[1::4, 1, 3] += 0.2
     estimate[3::4, 1, 3] -= 0.2
     estimate[6, 1, 3] += 1.0
-    believed = [i for i in range(FRAMES) if i != 6]
-    run.write_trajectory(Trajectory(TIMES[believed], estimate[believed]))
+    valid = [i for i in range(FRAMES) if i != 6]
+    run.write_trajectory(Trajectory(TIMES[valid], estimate[valid]))
     run.write_checkpoint({"T_world_camera": torch.from_numpy(estimate)}, {})
     metrics = score(
         run, HandMade(truth_of()), renderer=lambda field, camera, T: KnownErrors()(field, camera, nearest(T))

@@ -16,8 +16,8 @@ from sigmasplat.errors import SourceError
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.mapping.moving import carve, mask_keyframes
 from sigmasplat.plugins.sources import SyntheticRoom, open_source
-from sigmasplat.tracking.moving.foreground import Foreground
-from sigmasplat.tracking.moving.memory import Memory
+from sigmasplat.tracking.moving.depth_history import DepthHistory
+from sigmasplat.tracking.moving.dynamic_mask import DynamicMask
 
 CAMERA = Camera(160, 120, 140.0, 140.0, 79.5, 59.5)
 WALL_M, BOX_M, FRAMES = 3.0, 1.0, 30
@@ -63,7 +63,7 @@ def test_splats_in_free_space_are_carved_but_not_those_that_a_keyframe_shows() -
 
 
 def test_slow_motion_shows_against_older_frames_and_rest_ends_it() -> None:
-    memory, found = Memory(), list[bool]()
+    memory, found = DepthHistory(), list[bool]()
     for n in range(80):
         depth_m = with_box(min(20 + n, 60))
         front = memory.in_front(depth_m, np.eye(4), CAMERA, FRAMES)
@@ -75,11 +75,11 @@ def test_slow_motion_shows_against_older_frames_and_rest_ends_it() -> None:
 
 
 def test_what_comes_back_to_an_earlier_place_is_not_at_rest() -> None:
-    memory, left = Memory(), [60] * 11 + [110] * 10 + [60] * 20
+    memory, left = DepthHistory(), [60] * 11 + [110] * 10 + [60] * 20
     moved, found = with_box(60) == BOX_M, None
     for n, column in enumerate(left):
         depth_m = with_box(column)
-        front = Foreground(depth_m == BOX_M, np.where(depth_m == BOX_M, depth_m, 0), np.full_like(depth_m, WALL_M))
+        front = DynamicMask(depth_m == BOX_M, np.where(depth_m == BOX_M, depth_m, 0), np.full_like(depth_m, WALL_M))
         found = memory.still_moving(front, depth_m, np.eye(4), CAMERA, FRAMES)
         assert found is not None, f"frame {n} is taken for at rest"
         memory = memory.after(depth_m, found, np.eye(4), FRAMES)

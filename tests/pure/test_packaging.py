@@ -129,8 +129,8 @@ def checkout(tmp_path: Path) -> Path:
     """Make a repository of one commit with the module that returns the version of the code."""
     if not shutil.which("git"):
         pytest.skip("no git here")
-    (tmp_path / "src/sigmasplat/io").mkdir(parents=True)
-    shutil.copy(ROOT / "src/sigmasplat/files/machine.py", tmp_path / "src/sigmasplat/io")
+    (tmp_path / "src/sigmasplat/files").mkdir(parents=True)
+    shutil.copy(ROOT / "src/sigmasplat/files/machine.py", tmp_path / "src/sigmasplat/files")
     git(tmp_path, "init", "--quiet")
     git(tmp_path, "add", ".")
     git(tmp_path, "commit", "--quiet", "--message", "one")

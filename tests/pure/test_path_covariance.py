@@ -11,7 +11,7 @@ from sigmasplat.config import FinalConfig
 from sigmasplat.data import se3
 from sigmasplat.data.atlas import Atlas
 from sigmasplat.data.hops import UNKNOWN_HOP, Hop, TrackedHops
-from sigmasplat.final.pose_reach import reaching
+from sigmasplat.final.pose_trust_region import reaching
 from sigmasplat.fit.align import BIAS_PX
 from sigmasplat.graph.path_covariance import PathCovariance, recorded
 from sigmasplat.graph.pose_graph import Edge, PoseGraph, Sensitivity, optimise

@@ -123,7 +123,7 @@ def with_errors(folder: Path) -> tuple[RunFolder, PathCovariance]:
     return run, errors
 
 
-def test_a_run_is_exported_with_the_covariance_of_its_believed_poses(
+def test_a_run_is_exported_with_the_covariance_of_its_valid_poses(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run, errors = with_errors(tmp_path / "kitchen")
@@ -132,12 +132,12 @@ def test_a_run_is_exported_with_the_covariance_of_its_believed_poses(
     said = capsys.readouterr().out
     assert "path.cov.txt: 5 poses with their covariance; left out: 1 lost" in said
     rows, ros = np.loadtxt(tmp_path / "path.cov.txt"), np.loadtxt(tmp_path / "path.ros.txt")
-    believed = np.delete(np.arange(len(PATH)), LOST)
+    valid = np.delete(np.arange(len(PATH)), LOST)
     assert rows.shape == (5, 29) and ros.shape == (5, 44)
-    np.testing.assert_allclose(rows[:, 1:4], PATH.T_world_camera[believed, :3, 3], atol=1e-9)
+    np.testing.assert_allclose(rows[:, 1:4], PATH.T_world_camera[valid, :3, 3], atol=1e-9)
     np.testing.assert_allclose(ros[0, 8:].reshape(6, 6), KNOWN, atol=1e-20)
     np.testing.assert_allclose(rows[0, 8:], KNOWN[np.tril_indices(6)], atol=1e-20)
-    for row, frame in zip(ros[1:], believed[1:], strict=True):
+    for row, frame in zip(ros[1:], valid[1:], strict=True):
         J = se3.displacement(PATH.T_world_camera[frame])
         np.testing.assert_allclose(row[8:].reshape(6, 6), J @ errors.of_frame(int(frame)) @ J.T, rtol=1e-6, atol=1e-14)
 

@@ -108,7 +108,7 @@ def test_false_loops_alone_leave_the_odometry() -> None:
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_true_loops_are_believed_and_help_long_chains(seed: int) -> None:
+def test_true_loops_are_valid_and_help_long_chains(seed: int) -> None:
     truth, drifted, edges = scene(seed, nodes=200, true_loops=15, false_loops=5)
     found = optimise(drifted, edges)
     assert [v.accepted for v in found.verdicts] == [True] * 15 + [False] * 5
@@ -116,7 +116,7 @@ def test_true_loops_are_believed_and_help_long_chains(seed: int) -> None:
     assert found.cost_after < found.cost_before
 
 
-def test_a_loop_is_believed_up_to_the_quantile_of_chi_squared() -> None:
+def test_a_loop_is_valid_up_to_the_quantile_of_chi_squared() -> None:
     """Odometry as stiff as a beam: the loop's χ² is what it was made with, and its weight at the limit is ¼."""
     for inside, confidence in itertools.product([True, False], [0.95, 0.99]):
         limit = chi2.ppf(confidence, 6)

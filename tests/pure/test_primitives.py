@@ -15,7 +15,7 @@ from sigmasplat.data.field import COLUMNS, GaussianField
 from sigmasplat.data.frame import Frame
 from sigmasplat.fit.field import fit_field
 from sigmasplat.fit.target import Keyframe, Target
-from sigmasplat.mapping.pruning import depths, fade, splat_depth_residuals, splat_uncertainty, still_uncertain
+from sigmasplat.mapping.pruning import depths, fade, splat_uncertainty, still_uncertain
 from sigmasplat.render.backend import make_view
 from sigmasplat.render.channels import features_of
 from sigmasplat.render.reference import operators as reference
@@ -230,16 +230,3 @@ def test_a_faded_splat_of_the_wall_comes_back_and_a_floater_does_not(view: View)
     assert float(opacity[lonely]) > 0.07 > float(opacity[-1]), "the images decide"
     gone = still_uncertain(field, faded, uncertainty, UNCERTAIN_M2, 15 / 255)
     assert gone.nonzero().squeeze(1).tolist() == [PIXELS]
-
-
-def test_the_depth_residual_of_a_splat_is_the_mean_squared_error_of_its_pixels(view: View) -> None:
-    field, height, width = wall_and_floater(), CAMERA.height, CAMERA.width
-    field.keep(torch.arange(len(field)) < len(field) - 1)  # the wall alone
-    depth = np.full((height, width), 2.0, np.float32)
-    depth[:, width // 2 :] += 0.2
-    depth[0] = 0.0
-    found = splat_depth_residuals(field, view, [keyframe(view, np.eye(4), depth)] * 2).numpy().reshape(height, width)
-    np.testing.assert_allclose(found[4:-2, 2:6], 0.0, atol=1e-4)
-    np.testing.assert_allclose(found[4:-2, -6:-2], 0.04, rtol=0.1)
-    nothing = splat_depth_residuals(field, view, [keyframe(view, np.eye(4), 0.0)])
-    assert float(nothing.abs().max()) == 0.0

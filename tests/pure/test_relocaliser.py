@@ -25,8 +25,8 @@ from sigmasplat.run_folder.submaps import DiskStore
 from sigmasplat.tracking.feature_image import FeatureImage, detail_of, gray_levels, pose_by_features
 from sigmasplat.tracking.features import Extractor, make_extractor
 from sigmasplat.tracking.known_map import KnownMap
+from sigmasplat.tracking.prepared_frame import PreparedImages
 from sigmasplat.tracking.relocaliser import Relocaliser, Relocation
-from sigmasplat.tracking.sight import Sight
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
@@ -55,7 +55,7 @@ def extractor() -> Extractor:
 
 
 @cache
-def seen(i: int, mirrored: bool = False) -> Sight:
+def seen(i: int, mirrored: bool = False) -> PreparedImages:
     """Return a frame of the walk, or of the same walk in a mirrored room: like the first one, but another place."""
     whole = room().frame(i)
     if mirrored:
@@ -64,7 +64,7 @@ def seen(i: int, mirrored: bool = False) -> Sight:
     frame = whole.prepared(160, 0.1, 8.0)
     target = Target.of(frame, (view().sums.shape[1], view().sums.shape[2]))
     image = FeatureImage(detail_of(whole, 640), frame.depth_m, frame.camera)
-    return Sight(target, live_image(view(), frame.color, frame.depth_m, target), image)
+    return PreparedImages(target, live_image(view(), frame.color, frame.depth_m, target), image)
 
 
 def anchor(part: int) -> NDArray[np.float64]:

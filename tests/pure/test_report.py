@@ -12,6 +12,8 @@ from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.plugins.evaluation.metrics.scored_view import PredictedErrors, ScoredView
 from sigmasplat.plugins.evaluation.report import charts
 from sigmasplat.plugins.evaluation.report.html import Contents, build_report
+from sigmasplat.plugins.evaluation.report.summary import Verdict
+from sigmasplat.plugins.evaluation.report.tables import key_figures
 from sigmasplat.plugins.evaluation.report.view_strips import PanelFigure
 from sigmasplat.plugins.outputs.drawing import colormap, plot
 from sigmasplat.plugins.outputs.drawing.view_panels import (
@@ -23,7 +25,7 @@ from sigmasplat.plugins.outputs.drawing.view_panels import (
     view_panels,
 )
 from sigmasplat.plugins.outputs.floorplan.rescan import RescanMaps, RescanRegion, find_rescan_regions, unsure_rule
-from sigmasplat.run.figures import headline, number
+from sigmasplat.run.figures import number, rate
 from sigmasplat.run_folder.frames import RunFrames
 
 STRIPS = {"held-out views": [[PanelFigure("input", "images/a.png")]]}
@@ -244,8 +246,8 @@ def test_the_strip_shows_each_range_of_frames_in_one_state() -> None:
     states = ["tracked", "tracked", "lost", "relocalised", "tracked", "lost", "lost", "apart"]
     log = [{"index": 2 * i, "timestamp_s": float(i), "lost": s == "lost", "state": s, "p_off": 0.1 * i}
            for i, s in enumerate(states)]  # fmt: skip
-    believed = [0, 1, 3, 4]
-    path = Trajectory(np.array(believed, np.float64), np.tile(np.eye(4), (4, 1, 1)))
+    valid = [0, 1, 3, 4]
+    path = Trajectory(np.array(valid, np.float64), np.tile(np.eye(4), (4, 1, 1)))
     found = charts.run_charts(RunFrames.of(log, path), None)
     strip, along = found["states"][0]
     ranges = [(c.colour, *c.points[:, 0]) for c in strip.curves[1:]]
@@ -255,7 +257,7 @@ def test_the_strip_shows_each_range_of_frames_in_one_state() -> None:
         (colours["tracked"], 7.5, 8.5), (colours["lost"], 9.5, 12.5), (colours["apart"], 13.5, 14.5),
     ]  # fmt: skip
     assert {c.name for c in strip.curves if c.name} == {"tracked", "relocalised", "lost", "apart"}
-    assert sum(len(c.points) for c in along.curves if c.dots) == 4, "only believed frames have a place"
+    assert sum(len(c.points) for c in along.curves if c.dots) == 4, "only valid frames have a place"
     for theme in (plot.LIGHT, plot.DARK):
         plot.draw_charts([strip, along], theme)
 
@@ -381,7 +383,7 @@ def test_submaps_and_loops_have_a_section() -> None:
     assert "7 → 0 412 → 3 0.875 0.0213 61 4.3 1.50 accepted" in text
     assert "6 → 0 412 → 3 0.875 – 61 4.3 1.50 refused no overlap &amp; &lt;nothing&gt;" in text
     assert "2 loops tried and refused" in text and text.index("7 → 0") < text.index("6 → 0")
-    for figure in ("27.75", "26.50", "0.222", "Submaps", "1 of 3 tried"):
+    for figure in ("27.75", "26.50", "0.222", "3 tried, 1 accepted"):
         assert figure in text, figure
 
 
@@ -397,26 +399,53 @@ def test_the_section_of_submaps_has_no_tables_without_loops() -> None:
 
 def test_absent_figures_are_dashes() -> None:
     assert number(None, 2) == number(float("nan"), 1) == "–" and number(-1234.5, 1) == "−1\u202f234.5"
-    assert dict((name, value) for name, value, _ in headline({"held_out": None}))["PSNR, held-out"] == "–"
+    assert dict((name, value) for name, value, _ in key_figures({"held_out": None}))["PSNR, held-out images"] == "–"
 
 
 def test_the_path_has_no_error_without_ground_truth() -> None:
-    assert "ATE RMSE" in {name for name, _, _ in headline(METRICS)}
-    assert not [name for name, _, _ in headline(METRICS | {"ate": None}) if name.startswith("ATE")]
+    assert "ATE RMSE" in {name for name, _, _ in key_figures(METRICS)}
+    assert not [name for name, _, _ in key_figures(METRICS | {"ate": None}) if name.startswith("ATE")]
+
+
+def test_the_terminal_shows_at_most_six_figures() -> None:
+    found = {name: f"{value} {unit}" for name, value, unit in key_figures(IN_SUBMAPS | {"apart": 3, "lost": 2})}
+    assert len(found) == 6 and found["Images with a pose"] == "195 of 200"
+    assert found["Map"] == "123\u202f456 splats, – MB"
+    every_frame_mapped = key_figures(METRICS | {"held_out": None})
+    assert ("PSNR, training images", "31.25", "dB") in every_frame_mapped
+
+
+def test_a_slow_speed_is_given_in_seconds_per_image() -> None:
+    assert [rate(v) for v in (None, 12.34, 1.0, 0.04)] == [
+        "– images per second", "12.3 images per second", "1.0 images per second", "25.0 s per image",
+    ]  # fmt: skip
 
 
 def test_the_time_of_the_final_map_is_shown() -> None:
-    """It is a headline figure, and a stage with its share: 30 of 40 s."""
-    waited = {"Final map": ("30.0", "s"), "Frames and final map": ("40.0", "s")}
-    figures = headline(METRICS | {"finish_s": 30.0, "total_s": 40.0})
-    assert waited.items() <= {name: (value, unit) for name, value, unit in figures}.items()
-    assert not waited.keys() & {name for name, _, _ in headline(METRICS | {"finish_s": None})}
+    """It is in the scores, and a stage with its share: 30 of 40 s."""
+    figures = re.sub("<[^>]+>", " ", build_report(Contents("t", "s", METRICS | {"finish_s": 30.0, "total_s": 40.0})))
+    assert "Final map  30.0 s" in figures and "Frames and final map  40.0 s" in figures
+    assert "Final map" not in re.sub("<[^>]+>", " ", build_report(Contents("t", "s", METRICS | {"finish_s": None})))
     page = build_report(Contents("t", "s", METRICS | {"finish_s": 30.0}, seconds={"align": 8.0, "io": 2.0}))
     text = " ".join(re.sub("<[^>]+>", " ", page).split())
     assert "final map 30.0 75 align 8.0 20 io 2.0 5" in text
     assert "final map" not in build_report(Contents("t", "s", METRICS, seconds={"align": 8.0}))
 
 
-def test_the_path_comes_before_the_views() -> None:
-    page = build_report(Contents("t", "s", METRICS, STRIPS, {"trajectory": "a path"}))
-    assert page.index("<h2>Trajectory") < page.index("<h2>Views")
+def test_the_map_and_the_verdicts_come_first_and_the_rest_is_folded() -> None:
+    views = [[PanelFigure(f"panel {k}", f"images/{view}{k}.png", "<frame>") for k in range(5)] for view in "abc"]
+    verdicts = [Verdict("Path", "All 3 images", "No image is <lost>."), Verdict("Next", "Try", "Smaller:", "run --x")]
+    page = build_report(
+        Contents("t", "s", METRICS, {"held-out views": [STRIPS["held-out views"][0], *views]}, {"trajectory": "a path"},
+                 '{"a": 1}', ["careful"], verdicts=verdicts, commands=[("View it:", "sigmasplat view r")])
+    )  # fmt: skip
+    opened = page[page.index("<main>") : page.index("<details")]
+    assert re.findall(r"images/\w+\.png", opened) == ["images/b1.png", "images/b0.png"], "the map, then the photo"
+    places = [opened.index(words) for words in ("careful", "images/b1", "All 3 images", "run --x", "sigmasplat view")]
+    assert places == sorted(places) and "No image is &lt;lost&gt;." in opened and "&lt;frame&gt;" in opened
+    folded = page[page.index("<details") :]
+    titles = re.findall(r"<details class=part><summary><h2>(.*?)</h2>", folded)
+    assert titles == ["Trajectory", "Views", "Scores", "Settings (config.json)"]
+    assert page.count("<h2>") == len(titles)
+    plain = build_report(Contents("t", "s", METRICS, plots={"plan": "a plan"}))
+    assert "images/plan-light.png" in plain[: plain.index("<details")], "without a view the floor plan is shown"

@@ -4,7 +4,6 @@ from collections import Counter
 from collections.abc import Iterator
 
 import numpy as np
-import pytest
 
 from sigmasplat.fit.pose import PoseFit
 from sigmasplat.tracking.rules import draw_keyframes, is_held_back, is_keyframe, is_lost, jumped, never, unless
@@ -52,8 +51,8 @@ def test_a_loss_jumps_against_the_median_of_its_recent_past() -> None:
     assert not jumped(NAN, [NAN] * 9, 5.0), "aligning has no first loss: the rule is silent"
 
 
-def shares(keyframes: int, newest_probability: float, history: int = 0, draws: int = 20_000) -> dict[int, float]:
-    drawn = draw_keyframes(range(keyframes), draws, newest_probability, history, np.random.default_rng(0))
+def shares(keyframes: int, newest_probability: float, draws: int = 20_000) -> dict[int, float]:
+    drawn = draw_keyframes(range(keyframes), draws, newest_probability, np.random.default_rng(0))
     found = Counter(keyframe for (keyframe,) in drawn)
     return {keyframe: count / draws for keyframe, count in found.items()}
 
@@ -67,12 +66,6 @@ def test_the_newest_keyframe_is_drawn_with_its_probability_and_the_others_alike(
         assert abs(found[keyframe] - share) < 4 * error, f"keyframe {keyframe}: {found[keyframe]} for {share}"
 
 
-def test_history_leaves_out_what_is_older() -> None:
-    assert set(shares(9, 0.4, history=3)) == {5, 6, 7, 8}
-    assert set(shares(3, 0.4, history=5)) == {0, 1, 2}
-    assert shares(9, 0.4, history=3)[8] == pytest.approx(0.4, abs=0.02)
-
-
 def test_only_the_newest_is_drawn_if_it_is_alone_or_certain() -> None:
     for keyframes, probability in [(1, 0.0), (1, 0.4), (6, 1.0)]:
         assert shares(keyframes, probability, draws=200) == {keyframes - 1: 1.0}
@@ -84,11 +77,11 @@ def test_never_the_newest_at_probability_zero() -> None:
 
 def test_draws_follow_from_the_seed() -> None:
     def drawn(seed: int) -> list[int]:
-        return list(draw_keyframes(range(7), 50, 0.4, 0, np.random.default_rng(seed)))
+        return list(draw_keyframes(range(7), 50, 0.4, np.random.default_rng(seed)))
 
     assert drawn(3) == drawn(3) != drawn(4)
     assert len(drawn(3)) == 50
-    assert list(draw_keyframes(range(7), 0, 0.4, 0, np.random.default_rng(0))) == []
+    assert list(draw_keyframes(range(7), 0, 0.4, np.random.default_rng(0))) == []
 
 
 def test_guesses_end_when_the_next_frame_waits_but_the_least_number_is_made() -> None:

@@ -15,7 +15,7 @@ from sigmasplat.data.field import GaussianField
 from sigmasplat.data.frame import Frame
 from sigmasplat.fit.target import Target
 from sigmasplat.fit.tracking_loss import PoseMaps
-from sigmasplat.mapping.seeding import first_pixels, later_pixels, make_splats, thin_out, with_room
+from sigmasplat.mapping.seeding import first_pixels, later_pixels, make_splats, thin_out
 from sigmasplat.render.reference.operators import rotations
 
 Array = NDArray[np.float32]
@@ -225,23 +225,6 @@ def test_a_splats_size_is_the_mean_distance_of_three_neighbours_old_and_new() ->
     found = sizes([beside_the_first])
     assert found[0] == pytest.approx(np.sqrt((0.25 + 1 + 4) / 3), rel=1e-4)
     assert found[3] == pytest.approx(end, rel=1e-4), "the others keep theirs"
-
-
-def test_no_seed_is_placed_in_a_full_voxel() -> None:
-    points = np.array([[0.01, 0, 0], [0.02, 0, 0], [0.03, 0, 0], [0.31, 0, 0], [0.32, 0, 0], [-0.01, 0, 0]])
-    old = torch.tensor([[0.05, 0.05, 0.05], [0.35, 0.0, 0.0], [0.36, 0.0, 0.0]])
-    assert with_room(points, old, 0.1, 2).tolist() == [True, False, False, False, False, True]
-    assert with_room(points, old[:0], 0.1, 2).tolist() == [True, True, False, True, True, True]
-    assert with_room(points[:0], old, 0.1, 2).tolist() == []
-
-
-def test_a_map_that_is_dense_enough_gets_no_seeds() -> None:
-    depth = np.full(SIZE, 2.0, np.float32)
-    dense, _ = made(np.ones(SIZE, bool), depth, scale_from="pixel")
-    assert len(made(SOME, depth, field=dense, scale_from="pixel")[0]) == SOME.sum()
-    assert len(made(SOME, depth, field=dense, scale_from="pixel", voxel_m=0.2, voxel_most=1)[0]) == 0
-    some = made(SOME, depth, scale_from="pixel", voxel_m=0.5, voxel_most=3)[0]
-    assert 0 < len(some) < SOME.sum()
 
 
 def slanted(normal: tuple[float, float, float], through_m: float = 2.0) -> Array:

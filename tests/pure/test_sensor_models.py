@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from command_line import exit_code
-from sigmasplat.config import Config, InputConfig, SeedConfig
+from sigmasplat.config import Config, InputConfig
 from sigmasplat.config.presets import preset
 from sigmasplat.config.scale import for_scene
 from sigmasplat.config.sensors import SENSORS, SensorModel, sensor_model
@@ -20,14 +20,13 @@ from sigmasplat.data.frame import Frame
 from sigmasplat.data.frame_arrays import frame_from_arrays
 from sigmasplat.data.submap import Picture
 from sigmasplat.errors import ConfigError, SourceError
-from sigmasplat.final.fusion import with_readings
 from sigmasplat.fit.align import align, balanced
-from sigmasplat.fit.references import Reference, live_image, map_reference, picture_images, sureness_of
+from sigmasplat.fit.references import Reference, confidence_of, live_image, map_reference, picture_images
 from sigmasplat.fit.target import Target
 from sigmasplat.input.calibration import read_calibration
-from sigmasplat.mapping.seeding import first_pixels, make_splats
+from sigmasplat.mapping.seeding import make_splats
 from sigmasplat.plugins.checks.sensor_noise import measure_noise
-from sigmasplat.tracking.sight import view_of, working_frame
+from sigmasplat.tracking.prepared_frame import view_of, working_frame
 
 CAMERA = Camera(160, 120, 140.0, 140.0, 79.5, 59.5)
 Floats = NDArray[np.float32]
@@ -158,9 +157,10 @@ def test_every_alignment_uses_the_model() -> None:
 
 
 def test_gray_counts_more_where_depth_is_sure() -> None:
-    assert sureness_of(SensorModel(z2=0.003)) == 1.0 and sureness_of(SensorModel(z2=0.001)) == pytest.approx(3.0)
+    assert confidence_of(SensorModel(z2=0.003)) == 1.0 and confidence_of(SensorModel(z2=0.001)) == pytest.approx(3.0)
     assert (
-        sureness_of(SENSORS["kinect-v1"]) == pytest.approx(1.0, abs=0.05) and sureness_of(SENSORS["time-of-flight"]) > 5
+        confidence_of(SENSORS["kinect-v1"]) == pytest.approx(1.0, abs=0.05)
+        and confidence_of(SENSORS["time-of-flight"]) > 5
     )
     assert balanced(0.1, 1.0) == 0.1 and balanced(0.1, 4.0) == pytest.approx(2 / 11), "odds 1:9 become 2:9"
     assert balanced(0.1, 1e6) == 0.5 and balanced(0.8, 4.0) == pytest.approx(0.8), "at most as much as depth"
@@ -174,22 +174,7 @@ def test_errors_that_readings_share_count_in_alignment_only() -> None:
     assert sensor_model(str(shared)) == shared
 
 
-def test_unsure_pixels_are_seeded_last() -> None:
-    depth_m = wall(0.0)
-    std_m = generic_std(depth_m, 0.003)
-    std_m[:, :80] *= 10
-    target = Target.of(framed(depth_m, std_m), (120, 160))
-    config = SeedConfig(first_uniform=4000, first_gradient=0, first_edges=False)
-    shares = [
-        first_pixels(target, replace(config, sensor_noise=sure), np.random.default_rng(0))[:, :80].mean()
-        for sure in (False, True)
-    ]
-    assert shares[0] == pytest.approx(0.21, abs=0.02) and shares[1] < 0.01
-    every = replace(config, sensor_noise=True, first_uniform=19200)
-    assert first_pixels(target, every, np.random.default_rng(0)).all(), "nothing better is left"
-
-
-def test_losses_and_fusion_prefer_sure_readings() -> None:
+def test_losses_prefer_sure_readings() -> None:
     depth_m = wall(0.0)
     depth_m[:10] = 0.0
     std_m = generic_std(depth_m, 0.003)
@@ -197,10 +182,6 @@ def test_losses_and_fusion_prefer_sure_readings() -> None:
     weight = relative_weights(std_m, generic_std(depth_m, 0.003))
     assert weight[60, 0] == pytest.approx(1.0) and weight[60, 100] == pytest.approx(0.25) and not weight[:10].any()
     assert (relative_weights(std_m / 100, generic_std(depth_m, 0.003))[10:] == 4.0).all(), "no reading rules the map"
-    picture = Picture(np.zeros((120, 160, 3), np.uint8), depth_m)
-    fused, _, _ = with_readings(depth_m * np.float32(1.01), np.zeros((120, 160, 3), np.float32), picture, std_m)
-    off = fused[60] / 2.0 - 1.0
-    assert 0 < off[20] < off[120] < 0.01, "the render counts for more where the reading is unsure"
 
 
 def test_the_noise_of_a_recording_is_measured(tmp_path: Path) -> None:

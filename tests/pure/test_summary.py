@@ -13,12 +13,17 @@ from sigmasplat.config import Config
 from sigmasplat.config.presets import preset
 from sigmasplat.config.text import override, split_settings
 from sigmasplat.errors import RunError
+from sigmasplat.plugins.evaluation.report.advice import advice, next_commands
 from sigmasplat.plugins.evaluation.report.page import rerun_command, write_page
-from sigmasplat.plugins.evaluation.report.summary import advice, rescan_sentences, summary_sentences
+from sigmasplat.plugins.evaluation.report.summary import (
+    rescan_sentences,
+    result_sentence,
+    summary_sentences,
+    verdicts,
+)
 from sigmasplat.plugins.evaluation.report.tables import score_tables, state_rows
 from sigmasplat.plugins.evaluation.report.view_strips import PanelFigure, data_uri, file_data_uri
 from sigmasplat.plugins.outputs.floorplan.rescan import RescanRegion
-from sigmasplat.run.figures import headline
 from sigmasplat.run_folder.runs import RunFolder
 
 GOOD = {
@@ -32,14 +37,18 @@ RUN = "sigmasplat run data/k"
 
 
 def summary(**changes) -> str:
-    return " ".join(summary_sentences(GOOD | changes, "a laptop"))
+    """Return the verdicts and the summary in one text."""
+    found = GOOD | changes
+    judged = " ".join(words for verdict in verdicts(found, (), []) for words in verdict)
+    return " ".join([judged, *summary_sentences(found, "a laptop")])
 
 
 def test_a_good_run_in_words() -> None:
     text = summary()
     for words in (
         "500 colour and depth images of kitchen", "13.5 images per second on a laptop", "never lost", "path is 2.6 cm",
-        "error is 9.0 cm", "Without loop closure the RMS error is 3.5 cm", "31.0 dB PSNR: very close",
+        "error is 9.0 cm", "Without loop closure the RMS error is 3.5 cm",
+        "Very close to the camera images: 31.0 dB PSNR", "that the map was not made from",
         "1.9 cm on average: good", "V predicts well where",
     ):  # fmt: skip
         assert words in text, words
@@ -49,12 +58,15 @@ def test_a_good_run_in_words() -> None:
     "changes, words",
     [
         ({"lost": 52}, "lost on 52 of 500 images"),
+        ({"lost": 2, "lost_frames": [8, 9]}, "2 of 500 images have no pose (8–9)"),
+        ({"relocalised": 1, "relocalised_frames": [57]}, "found its place in the map again at image 57"),
         ({"apart": 41, "components": [{}]}, "41 images are in a map of their own"),
         ({"apart": 41, "components": [{}, {}]}, "41 images are in 2 maps of their own"),
         ({"failures": {"silent": 7}}, "7 poses are off by more than 10 cm"),
         ({"ate": None}, "no ground truth"),
         ({"status": "interrupted"}, "The run is interrupted"),
-        ({"held_out": {"psnr_db": 17.0}}, "17.0 dB PSNR: poor"),
+        ({"held_out": {"psnr_db": 17.0}}, "Poor: 17.0 dB PSNR"),
+        ({"held_out": None}, "because none was held back"),
         (
             {"predictive": {"views": 9, "color": {"coverage_68": 0.713}, "depth": {"coverage_68": 0.64}}},
             "measured 71 % (colour), 64 % (depth)",
@@ -87,13 +99,40 @@ def test_the_summary_names_what_is_wrong(changes: dict, words: str) -> None:
     assert words in summary(**changes)
 
 
+def test_an_image_that_was_relocalised_was_not_never_lost() -> None:
+    assert "never lost" not in summary(relocalised=1, relocalised_frames=[57])
+    assert "never lost" not in summary(lost=3, relocalised=1, relocalised_frames=[57])
+
+
+def test_the_verdicts_say_where_the_path_is_not_sure_how_good_the_map_is_and_what_to_do() -> None:
+    path, of_map, todo = verdicts(GOOD, [3, 4, 9], [("Blurred:", "sigmasplat run x"), ("Slow:", "")])
+    assert (path.about, path.words) == ("Path", "All 500 images have a pose, 3 of them doubtful")
+    assert "Probably off by more than 5 cm: images 3–4, 9." in path.meaning
+    assert (of_map.about, of_map.words) == ("Map", "Very close to the camera images: 31.0 dB PSNR")
+    assert "1.9 cm on average: good" in of_map.meaning
+    assert (todo.about, todo.meaning, todo.command) == ("Next", "Blurred:", "sigmasplat run x")
+    assert "nothing to repair" in verdicts(GOOD, [], [])[2].meaning
+    assert verdicts({"frames": 1}, [], [])[1].words == "Not compared with images"
+
+
+def test_the_result_is_one_sentence() -> None:
+    sentence = result_sentence(GOOD)
+    assert sentence == (
+        "All 500 images have a pose, the RMS error of the path is 2.6 cm; "
+        "the map is very close to the camera images: 31.0 dB PSNR."
+    )
+    apart = result_sentence(GOOD | {"ate": None, "lost": 1, "lost_frames": [9], "apart": 2, "apart_frames": [4, 5]})
+    assert apart.startswith("3 of 500 images have no pose (4–5, 9), of which 2 are in components/; the map is")
+
+
 def test_loops_with_hardly_any_effect_are_left_out() -> None:
     for off_m, without_m in [(0.026, 0.028), (0.002, 0.0028), (0.026, None)]:
         assert "Without loop closure" not in summary(ate={"rmse_m": off_m}, ate_odometry={"rmse_m": without_m})
 
 
 def test_unknown_figures_are_left_out() -> None:
-    text = " ".join(summary_sentences({"source": "x", "frames": 1, "splats": 0, "lost": 0}))
+    found = {"source": "x", "frames": 1, "splats": 0, "lost": 0}
+    text = " ".join([*summary_sentences(found), *verdicts(found, (), [])[0][1:], verdicts(found, (), [])[1].meaning])
     assert "dB" not in text and " V " not in text and "None" not in text
 
 
@@ -117,17 +156,18 @@ def test_unknown_figures_are_left_out() -> None:
 )
 def test_commands_of_the_advice_can_be_run(changes: dict, settings: dict, words: str, command: str) -> None:
     config = override(preset("sigma"), settings)
-    found = [item for item in advice(GOOD | changes, "runs/k", RUN, config.to_dict()) if words in item[0]]
+    found = [item for item in advice(GOOD | changes, RUN, config.to_dict()) if words in item[0]]
     assert len(found) == 1 and command in found[0][1]
     given = shlex.split(found[0][1])
     override(config, split_settings(value for flag, value in pairwise(given) if flag == "--set"))
 
 
 def test_after_a_good_run_the_advice_is_to_view_and_to_export() -> None:
-    assert [command.split()[1] for _, command in advice(GOOD, "runs/k", RUN, SETTINGS)] == [
-        "view",
-        "mesh",
-    ]
+    assert advice(GOOD, RUN, SETTINGS) == []
+    commands = [shlex.split(command) for _, command in next_commands("runs/my k")]
+    assert [(words[1], words[2]) for words in commands] == [
+        ("view", "runs/my k"), ("export", "runs/my k"), ("mesh", "runs/my k"),
+    ]  # fmt: skip
 
 
 def test_the_command_to_run_again_keeps_the_settings_of_the_run() -> None:
@@ -146,8 +186,7 @@ def test_the_command_to_run_again_keeps_the_settings_of_the_run() -> None:
 def test_a_fast_final_map_and_one_without_iterations_are_not_shortened() -> None:
     for finish_s, iterations in [(50.0, "1500"), (900.0, "0")]:
         config = override(preset("sigma"), {"final.iterations": iterations})
-        found = advice(GOOD | {"finish_s": finish_s}, "runs/k", "data/k", config.to_dict())
-        assert [command.split()[1] for _, command in found] == ["view", "mesh"]
+        assert advice(GOOD | {"finish_s": finish_s}, "data/k", config.to_dict()) == []
 
 
 def test_regions_to_scan_again_are_summed_up() -> None:
@@ -170,7 +209,6 @@ def test_tables_count_the_states() -> None:
     rows = {row[0]: row[1:] for row in state_rows(found)}
     assert [rows[state][0] for state in ("tracked", "relocalised", "lost", "apart")] == ["496", "1", "2", "1"]
     assert rows["lost"][2] == "3–4"
-    assert {"Frames apart", "Silent failures"} <= {row[0] for row in headline(found | {"failures": {"silent": 3}})}
     assert len(state_rows(GOOD)) == 2
 
 
@@ -180,14 +218,14 @@ def test_tables_show_coverage_and_calibration_or_that_there_are_no_predicted_err
         "predictive": {"views": 9, "color": {"coverage_68": 0.7}, "depth": {"coverage_68": 0.61}},
     }
     known = GOOD | known | {"uncertainty": None}
-    figures = {name: (value, unit) for name, value, unit in headline(known)}
-    assert figures["Within the predicted error, depth"] == ("61", "% (ideal 68)")
+    (rows,) = [rows for title, rows in score_tables(known) if title.startswith("Predicted errors")]
+    assert ["Within 1 standard deviation, % (ideal 68)", "70.0", "61.0"] in rows
     (rows,) = [rows for title, rows in score_tables(known) if title.startswith("Calibration of predicted")]
     cells = {row[0]: row[1:] for row in rows[1:]}
     assert "7 probe views" in rows[0][0] and (cells["residual"][0], cells["residual"][2]) == ("1.5", "0.25")
     assert cells["sensor"][:2] == ["", ""] and cells["sensor"][2] == "3e-06"
-    assert "none" in {value for _, value, _ in headline(GOOD | {"calibration": None})}
-    assert "none" not in {value for _, value, _ in headline(GOOD)}, "files of older versions do not say"
+    assert "no predicted errors" in summary(calibration=None)
+    assert "no predicted errors" not in summary(), "files of older versions do not say"
 
 
 def test_the_page_is_one_file(tmp_path) -> None:
@@ -204,9 +242,9 @@ def test_the_page_is_one_file(tmp_path) -> None:
         ["careful"],
     )
     page = (run.path / "report.html").read_text()
-    for words in ("Summary", "What to try next", "careful", "sigmasplat view", "75", "all settings (config.json)"):
+    for words in ("All 500 images have a pose", "careful", "sigmasplat view", "75", "Settings (config.json)"):
         assert words in page
-    assert [page.count(f"data:image/{kind};base64,") for kind in ("webp", "png")] == [1, 4]
+    assert [page.count(f"data:image/{kind};base64,") for kind in ("webp", "png")] == [2, 4]
     assert "images/" not in page and "http" not in page
 
 

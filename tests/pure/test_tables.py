@@ -10,9 +10,9 @@ from command_line import exit_code
 from sigmasplat.config import Config
 from sigmasplat.errors import ConfigError, SourceError
 from sigmasplat.plugins.batch.definition import MEAN, Cell, Score, Table
+from sigmasplat.plugins.batch.executor import DataRoots
 from sigmasplat.plugins.batch.job import Job
 from sigmasplat.plugins.batch.progress import Estimate, duration
-from sigmasplat.plugins.batch.road import DataRoots
 from sigmasplat.plugins.batch.scores import OURS, PAPER, rows
 from sigmasplat.plugins.batch.written import Written
 from sigmasplat.plugins.papers.table_files import list_tables

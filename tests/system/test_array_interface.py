@@ -345,4 +345,4 @@ def test_in_real_time_a_function_that_fails_leaves_the_state_valid() -> None:
             assert str(problem) == f"at {i}"
         assert system.newest_step().index == i  # type: ignore[union-attr]
     system.finish()
-    assert len(system.trajectory()) == 8 and system.believed().all()
+    assert len(system.trajectory()) == 8 and system.valid().all()

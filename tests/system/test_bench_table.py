@@ -19,9 +19,9 @@ from command_line import exit_code
 from lpips_weights import write_weights
 from sigmasplat.plugins.batch import dispatch
 from sigmasplat.plugins.batch.definition import Table
-from sigmasplat.plugins.batch.local import LocalRoad
+from sigmasplat.plugins.batch.executor import Outcome
+from sigmasplat.plugins.batch.local import LocalExecutor
 from sigmasplat.plugins.batch.make_run import make_run
-from sigmasplat.plugins.batch.road import Outcome
 from sigmasplat.plugins.batch.scores import run_record
 from sigmasplat.plugins.evaluation import reconstruct
 from sigmasplat.run.terminal import Screen
@@ -74,13 +74,13 @@ def frames_logged(out: Path, run: str) -> int:
 def one_process() -> Iterator[None]:
     """Make runs without a process of their own, which costs more than a tiny run."""
 
-    def made(road: LocalRoad, jobs: list, out: Path) -> Iterator[Outcome]:
+    def made(executor: LocalExecutor, jobs: list, out: Path) -> Iterator[Outcome]:
         for job in jobs:
-            make_run(job, out / job.name, road.data, road.save_every_s)
+            make_run(job, out / job.name, executor.data, executor.save_every_s)
             yield Outcome(job)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(LocalRoad, "make", made)
+        patch.setattr(LocalExecutor, "make", made)
         yield
 
 

@@ -195,7 +195,7 @@ def test_scored_views_are_not_in_the_map(run: FinishedRun) -> None:
     assert run.held_back == [3, 7, 11] and not mapped & set(run.held_back)
     source = open_source(quick_job().path, quick_job().config.input)
     views = held_back_views(run, source, 24)
-    assert [view.frame.index for view in views] == [i for i in run.held_back if run.believed[i]] and views
+    assert [view.frame.index for view in views] == [i for i in run.held_back if run.valid[i]] and views
     for view in views:
         assert view.exact
         np.testing.assert_array_equal(view.T_world_camera, run.path.T_world_camera[view.frame.index])

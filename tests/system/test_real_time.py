@@ -25,8 +25,8 @@ from sigmasplat.plugins.evaluation.metrics.trajectory import ate
 from sigmasplat.realtime.schedule import MappingThread
 from sigmasplat.realtime.system import RealTime
 from sigmasplat.run_folder.runs import RunFolder
+from sigmasplat.slam.saved_state import restore, state_of
 from sigmasplat.slam.slam import Slam
-from sigmasplat.slam.state import restore, state_of
 from small_room import SMALL, frames, walk
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
@@ -188,15 +188,15 @@ def test_too_many_waiting_keyframes_are_refused_and_counted() -> None:
 
 
 @pytest.mark.parametrize("hurried", [0, 8])
-def test_a_hurried_frame_tries_no_further_guesses_and_tracking_recovers_afterwards(hurried: int) -> None:
+def test_a_hurried_frame_tries_no_further_guesses_and_tracking_recovers_afterwards(should_stop: int) -> None:
     """After a jump the first guess fails. While frames wait, it is the only one; then features find the camera."""
     seen, lost = frames(80), list[bool]()
-    system = RealTime(Slam(config(recovery__relocalise="off")), AtOnce(), hurried=lambda: len(lost) < hurried)
+    system = RealTime(Slam(config(recovery__relocalise="off")), AtOnce(), should_stop=lambda: len(lost) < should_stop)
     for number, frame in enumerate([*seen[40:46], *seen[58:62]]):
         lost.append(system.step(replace(frame, index=number, timestamp_s=number / 30)).lost)
     system.settle()
     assert np.isfinite(system.trajectory().T_world_camera).all()
-    assert lost == [False] * 6 + [bool(hurried)] * 2 + [False] * 2
+    assert lost == [False] * 6 + [bool(should_stop)] * 2 + [False] * 2
 
 
 # ---- the thread ----

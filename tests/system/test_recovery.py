@@ -21,8 +21,8 @@ from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.input.source import Source
 from sigmasplat.run.session import Session, new_folder
 from sigmasplat.run_folder.state import read_state, write_state
+from sigmasplat.slam.saved_state import CLASSES, fixed, restore, state_of
 from sigmasplat.slam.slam import Slam
-from sigmasplat.slam.state import CLASSES, fixed, restore, state_of
 from small_room import frame_at, walk
 
 _core = pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
@@ -33,7 +33,7 @@ SMALL = {
     "submaps.frames": "5", "final.iterations": "0", "recovery.new_map_after": "3",
 }  # fmt: skip
 OFF_M = 0.1
-"""A believed pose that is off by more than this is a silent failure."""
+"""A valid pose that is off by more than this is a silent failure."""
 
 Order = Sequence[int]
 
@@ -126,14 +126,14 @@ def test_a_covered_camera_is_lost_at_once_and_found_where_it_is_uncovered(kidnap
     assert set(now[: len(AHEAD)]) == {"tracked"}
     assert set(now[len(AHEAD) : -len(BACK)]) == {"lost"}
     assert "relocalised" in now[-len(BACK) :][:3] and now[-1] in ("tracked", "relocalised")
-    assert slam.believed()[-1] and set(slam.atlas.components) == {0}
+    assert slam.valid()[-1] and set(slam.atlas.components) == {0}
 
 
-def test_no_believed_pose_is_wrong(kidnapped: Recorded) -> None:
+def test_no_valid_pose_is_wrong(kidnapped: Recorded) -> None:
     slam = kidnapped[0]
     off, ahead = errors_m(slam, KIDNAPPED), slice(len(AHEAD))
-    assert np.nanmax(off[slam.believed()]) < OFF_M
-    undisturbed, all_of_it = (np.sqrt(np.mean(e**2)) for e in (off[ahead], off[slam.believed()]))
+    assert np.nanmax(off[slam.valid()]) < OFF_M
+    undisturbed, all_of_it = (np.sqrt(np.mean(e**2)) for e in (off[ahead], off[slam.valid()]))
     assert all_of_it <= 1.5 * undisturbed + 1e-3
 
 
@@ -156,7 +156,7 @@ def test_a_run_resumes_with_the_same_bytes_after_a_relocalisation(kidnapped: Rec
     whole, found = kidnapped[0], states(kidnapped[0]).index("relocalised")
     slam = resumed(kidnapped, found, KIDNAPPED)
     assert contents(slam) == contents(whole)
-    assert dataclasses.asdict(slam.tracker.usual) == dataclasses.asdict(whole.tracker.usual)
+    assert dataclasses.asdict(slam.tracker.statistics) == dataclasses.asdict(whole.tracker.statistics)
     assert slam.relocaliser.indexed == whole.relocaliser.indexed
 
 
@@ -184,8 +184,8 @@ def test_a_new_map_begins_apart_and_joins_where_the_world_is_recognised(joined: 
     assert now[begun - 2 : begun] == ["lost", "lost"] and set(now[begun:ends]) == {"apart"}
     assert set(parts[ends:]) == {0} and set(now[ends:]) <= {"tracked", "relocalised"} and ends < len(parts)
     assert set(slam.atlas.components) == {0} and slam.components() == []
-    assert slam.believed().tolist() == [state != "lost" for state in now], "the frames that were apart are believed"
-    assert np.nanmax(errors_m(slam, JOINING)[slam.believed()]) < 0.02
+    assert slam.valid().tolist() == [state != "lost" for state in now], "the frames that were apart are valid"
+    assert np.nanmax(errors_m(slam, JOINING)[slam.valid()]) < 0.02
 
 
 @pytest.mark.parametrize("after", [11, 18, 31], ids=lambda n: f"frame {n}")

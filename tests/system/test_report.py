@@ -24,16 +24,20 @@ SETTINGS = {
     "input.width": "64", "mapping.first_iterations": "20", "mapping.iterations": "5", "final.iterations": "5",
     "submaps.distance_m": "0", "submaps.angle_deg": "0", "submaps.uncertainty_m": "0", "submaps.frames": "6",
 }  # fmt: skip
-PHONE_PX = 400
-# Shows the page in a frame as wide as a phone. Writes the width of its content, and elements whose content is cut off.
+PHONE_PX, SCREENS = 400, {400: 844, 1280: 800}
+"""Width of a phone, and the height of the screen for each width, pixels."""
+MOST_SCREENS = 4
+# Shows the page in a frame of the size of a screen. Writes its height and where its first picture ends; then, with all
+# parts unfolded, the width of its content, and elements whose content is cut off.
 FRAME = """<!doctype html>
-<iframe id=frame width={width} height=3000 style="border: 0" srcdoc="{page}"></iframe><p id=out>
+<iframe id=frame width={width} height={height} style="border: 0" srcdoc="{page}"></iframe><p id=out>
 <script>frame.onload = () => {{
-  const page = frame.contentDocument;
+  const page = frame.contentDocument, tall = page.documentElement.scrollHeight;
+  const picture = page.querySelector("img").getBoundingClientRect().bottom;
   for (const details of page.querySelectorAll("details")) details.open = true;
   const cut = [...page.querySelectorAll("pre, figure, li, p, h1")]
     .filter(element => element.scrollWidth > element.clientWidth + 1).map(element => element.outerHTML.slice(0, 200));
-  out.textContent = JSON.stringify({{width: page.documentElement.scrollWidth, cut}});
+  out.textContent = JSON.stringify({{tall, picture, width: page.documentElement.scrollWidth, cut}});
 }}</script>"""
 
 
@@ -55,15 +59,20 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium (apt-get install chromium)")
-def test_the_report_fits_a_phone(run: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("width", SCREENS)
+def test_the_report_fits_a_phone_and_a_screen(run: Path, tmp_path: Path, width: int) -> None:
     assert CHROMIUM is not None
-    frame = tmp_path / "frame.html"
-    frame.write_text(FRAME.format(width=PHONE_PX, page=html.escape((run / "report.html").read_text())))
+    frame, height = tmp_path / "frame.html", SCREENS[width]
+    page = html.escape((run / "report.html").read_text())
+    frame.write_text(FRAME.format(width=width, height=height, page=page))
     command = [CHROMIUM, *FLAGS, f"--user-data-dir={tmp_path / 'profile'}", frame.as_uri()]
     shown = subprocess.run(command, capture_output=True, text=True, timeout=120).stdout
     measured = re.search(r"<p id=\"out\">(\{.*\})", shown)
     assert measured, shown[-500:]
-    assert json.loads(html.unescape(measured[1])) == {"width": PHONE_PX, "cut": []}
+    found = json.loads(html.unescape(measured[1]))
+    assert height < found["tall"] <= MOST_SCREENS * height
+    assert 100 < found["picture"] <= height, "the picture of the map is on the first screen"
+    assert (found["width"], found["cut"]) == (width, [])
 
 
 def test_the_report_and_the_exported_plan_have_the_same_regions(run: Path, tmp_path: Path) -> None:

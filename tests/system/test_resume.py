@@ -29,8 +29,8 @@ from sigmasplat.run.resume import REFINEMENT_CLASSES
 from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.run_folder.state import read_state, write_state
 from sigmasplat.run_folder.submaps import DiskStore
+from sigmasplat.slam.saved_state import CLASSES, fixed, restore, state_of
 from sigmasplat.slam.slam import Slam
-from sigmasplat.slam.state import CLASSES, fixed, restore, state_of
 from sigmasplat.slam.steps import Steps
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
@@ -220,8 +220,8 @@ def test_a_search_for_loops_that_is_divided_over_frames_resumes_and_finds_what_a
         at_once, step = whole.step(frame), slam.step(frame)
         assert at_once.is_keyframe or not at_once.loops
         reported += [step.index] * len(step.loops)
-        owed = slam.closer.owed
-        if not saved.exists() and len(owed) >= waiting and owed[0].slices > 2:
+        pending = slam.closer.pending
+        if not saved.exists() and len(pending) >= waiting and pending[0].slices > 2:
             write_state(saved, state_of(slam), CLASSES, fixed(slam))
     assert reported
     resumed = Slam(config, DiskStore(tmp_path / "slam"))
@@ -229,7 +229,7 @@ def test_a_search_for_loops_that_is_divided_over_frames_resumes_and_finds_what_a
     tree = read_state(saved, CLASSES, fixed(resumed))
     resumed.store.truncate(tree["submaps"])
     restore(resumed, tree)
-    assert len(resumed.closer.owed) >= waiting and len(resumed.steps) < reported[0]
+    assert len(resumed.closer.pending) >= waiting and len(resumed.steps) < reported[0]
     for frame in frames[len(resumed.steps) :]:
         resumed.step(frame)
     assert np.array_equal(resumed.trajectory().T_world_camera, slam.trajectory().T_world_camera)

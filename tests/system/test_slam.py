@@ -210,9 +210,8 @@ def test_gradient_descent_tracks_too() -> None:
     assert {step.tracking["iterations"] for step in slam.steps[1:]} == {20.0}
 
 
-@pytest.mark.parametrize("to", ["keyframe", "map"])
-def test_aligning_tracks_to_the_keyframe_and_to_the_map(to: str) -> None:
-    slam = follow(frames(12), settings(tracking__method="align", tracking__align_to=to))
+def test_aligning_tracks() -> None:
+    slam = follow(frames(12), settings(tracking__method="align"))
     assert lost(slam) == [] and error_m(slam) < 0.01
 
 

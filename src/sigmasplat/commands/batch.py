@@ -37,7 +37,7 @@ def batch(
 
     Finished runs are kept, stopped ones resume. example: sigmasplat batch data/kitchen data/hall --jobs 2
     """
-    from sigmasplat.plugins.batch.batch import Batch, open_road
+    from sigmasplat.plugins.batch.batch import Batch, open_executor
     from sigmasplat.plugins.batch.job import Job
     from sigmasplat.run.terminal import Screen
 
@@ -49,7 +49,7 @@ def batch(
     screen, made = Screen(), Batch(planned, out or OUT)
     made.refuse_other_runs(overwrite)
     try:
-        made.make(open_road(data, jobs, scheduler, save_every, screen.say), screen, lambda: None)
+        made.make(open_executor(data, jobs, scheduler, save_every, screen.say), screen, lambda: None)
     except KeyboardInterrupt:
         screen.say(f"stopped; repeat the command to make the other runs in {made.out}")
         raise

@@ -49,7 +49,7 @@ class PaperTable:
         if self.table == LIST:
             print("\n".join(f"{name:20} {read_table(name)['title']}" for name in list_tables()))
             return OK
-        from sigmasplat.plugins.batch.batch import Batch, open_road
+        from sigmasplat.plugins.batch.batch import Batch, open_executor
         from sigmasplat.plugins.batch.definition import Table
         from sigmasplat.run.terminal import Screen
 
@@ -62,9 +62,9 @@ class PaperTable:
         out = self.out or Path("runs") / table.name
         batch = Batch([cell.job for cell in cells], out / "runs")
         batch.refuse_other_runs(self.overwrite)
-        road = open_road(self.data, self.jobs, self.scheduler, self.save_every, screen.say)
+        executor = open_executor(self.data, self.jobs, self.scheduler, self.save_every, screen.say)
         try:
-            batch.make(road, screen, lambda: self._write(table, cells, batch, settings, out))
+            batch.make(executor, screen, lambda: self._write(table, cells, batch, settings, out))
         except KeyboardInterrupt:
             screen.say(f"stopped; repeat the command to finish the table in {out}")
             raise

@@ -81,7 +81,7 @@ class Uncertainty:
                 found = run_job(job, study.views, screen)
                 folder.save(job, found)
             if not found.facts["views"][HELD_BACK]:
-                screen.warn(f"{job.source}, seed {job.seed}: no frame that was held back has a believed pose")
+                screen.warn(f"{job.source}, seed {job.seed}: no frame that was held back has a valid pose")
             measured.append(found)
         runs = folder.write(jobs, measured)
         if not screen.out.is_terminal:

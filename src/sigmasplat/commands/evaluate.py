@@ -95,11 +95,15 @@ def score(
     mesh: bool = False,
     eval_options: EvalOptions = DEFAULT_EVAL_OPTIONS,
 ) -> str:
-    """Score the run; print the scores and the path of the report, which exists even if the truth does not match.
+    """Score the run; print the result, the path of the report, which exists even if the truth does not match, and the
+    next commands.
 
     Returns the line that says why LPIPS is not scored, or "".
     """
     from sigmasplat.plugins.evaluation.evaluate import evaluate
+    from sigmasplat.plugins.evaluation.report.advice import next_commands
+    from sigmasplat.plugins.evaluation.report.summary import result_sentence
+    from sigmasplat.plugins.evaluation.report.tables import key_figures
     from sigmasplat.plugins.outputs.meshes.mesh_files import read_mesh
 
     try:
@@ -112,8 +116,7 @@ def score(
                 random_views=eval_options.random_views, full_resolution=eval_options.full_resolution,
                 fill_gaps_m=eval_options.fill_gaps, lpips=lpips, progress=progress,
             )  # fmt: skip
-        screen.results(metrics)
-        return unscored
+        screen.results(result_sentence(metrics), key_figures(metrics))
     except Exception as problem:
         problem.add_note(f"the run is in {folder.path}")
         raise
@@ -121,3 +124,5 @@ def score(
         report = folder.path / "report.html"
         if report.exists():
             screen.say(f"report: {report.resolve()}")
+    screen.next_commands(command for _, command in next_commands(str(folder.path)))
+    return unscored

@@ -263,7 +263,7 @@ def _run_and_score(
     state = StateFile(start.slam, folder, run_options.save_every)
     start.slam.saved_refinement = RefinementFile(start.slam, folder, run_options.save_every)
     read = Arrivals(source) if realtime else source
-    system = RealTime(start.slam, covariances=False, hurried=read.hurries) if isinstance(read, Arrivals) else None
+    system = RealTime(start.slam, covariances=False, should_stop=read.hurries) if isinstance(read, Arrivals) else None
     if system:
         state.run_save = system.save
         folder.note(realtime=True)
@@ -292,6 +292,7 @@ def _run_and_score(
         score(screen, folder, source)
     else:
         screen.say(f"{outcome.summary()}: {folder.path}")
+        screen.next_commands([f"sigmasplat eval {folder.path}"])
     if viewer:
         keep_showing(screen, viewer, folder, source)
     return OK

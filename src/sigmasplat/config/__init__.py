@@ -70,25 +70,6 @@ class Config:
 
     def checked(self) -> "Config":
         """Return the settings. Raises ConfigError if some of them exclude each other."""
-        m = self.mapping
-        if m.color_covariance == "full":
-            needed: dict[str, tuple[object, object]] = {  # its render has no maps for the others
-                "mapping.weight_alignment": (m.weight_alignment, 0),
-                "mapping.weight_moment": (m.weight_moment, 0),
-                "mapping.frames_per_step": (m.frames_per_step, 1),
-                "render.depth": (self.render.depth, "center"),
-                "render.depth_gate_m": (self.render.depth_gate_m, 0),
-            }
-            wrong = {name: pair for name, pair in needed.items() if pair[0] != pair[1]}
-            if wrong:
-                found = ", ".join(f"{name}={value}" for name, (value, _) in wrong.items())
-                remedy = " ".join(f"--set {name}={value}" for name, (_, value) in wrong.items())
-                raise ConfigError(f"mapping.color_covariance=full does not support {found}; add {remedy}")
-        if self.submaps.variance_sum and not (m.weight_nll_color or m.weight_nll_depth):
-            raise ConfigError(
-                "submaps.variance_sum needs variances that mapping learns; set mapping.weight_nll_color above 0, or "
-                "submaps.variance_sum=0"
-            )
         return self
 
     def to_dict(self) -> dict[str, Any]:

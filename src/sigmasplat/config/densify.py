@@ -15,9 +15,6 @@ class DensifyConfig(Section, name="primitives"):
     """A splat is uncertain if the mean squared difference between its depth and the depth readings at its pixels, over
     the window, is above this (ν > τ, CG-SLAM eq. 13). It fades halfway through the steps of a keyframe, and is removed
     at the end unless it has recovered; 0 = off."""
-    uncertain_by: Literal["centre", "residual"] = "centre"
-    """What is compared with the depth readings: centre = the depth of the splat's centre at the pixels it owns (paper);
-    residual = the rendered depth at all pixels that the splat contributes to, weighted by its share (ours)."""
     owner: Literal["dominant", "median"] = "dominant"
     """Which splat of a pixel is compared with its depth reading: the one with the largest weight (paper), or the one at
     the median depth (CG-SLAM's code)."""
@@ -38,6 +35,3 @@ class DensifyConfig(Section, name="primitives"):
     """Whether a densified splat that is too small to be split is cloned (3DGS; not in CG-SLAM's code)."""
     most_scale_m: NotNegative = 0.0
     """Splats larger than this are removed; 0 = off."""
-    most_radius_px: NotNegative = 0.0
-    """Splats whose radius (three standard deviations) in the newest keyframe's image exceeds this are removed; 0 =
-    off."""

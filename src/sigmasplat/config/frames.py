@@ -26,10 +26,6 @@ class RenderConfig(Section, name="render"):
     depth: Literal["center", "ray"] = "center"
     """Depth of a splat at a pixel: center = that of its centre (papers); ray = where the ray meets it most densely, so
     that a flat splat can show a slanted surface (RaDe-GS). On CUDA it is center, with a warning."""
-    depth_gate_m: NotNegative = 0.0
-    """Scale s of the median gate, in metres; 0 = off (papers). In the rendered depth a splat at a distance δ behind the
-    median depth counts as at δ·exp(−(δ/s)²) behind it, so that splats far behind the surface do not change the depth
-    (GauS-SLAM). Not supported on CUDA."""
     scene_scale: Above0 = 1.0
     """Size of the scene relative to a room. Fixed limits in metres, such as the gates of alignment, are multiplied by
     it. `run` sets it for stereo recordings, together with all settings that are lengths (`config.scale.scaled`)."""
@@ -38,13 +34,6 @@ class RenderConfig(Section, name="render"):
     sensor (Khoshelham & Elberink 2012). `run` sets σ_d/(f·b) for stereo recordings."""
     covariance_pose_gradient: bool = True
     """Whether the pose gradient includes the path through the 2D covariance."""
-    mean_pose_gradient: bool = True
-    """Whether the pose gradient includes the path through the 2D mean. Off for experiments only: tracking by Adam needs
-    it."""
-    depth_pose_gradient: bool = True
-    """Whether the pose gradient includes the path through the splats' depths; the depth loss needs it."""
-    color_pose_gradient: bool = True
-    """Whether the pose gradient includes the path through view-dependent colours."""
 
 
 @dataclass(frozen=True)
@@ -91,15 +80,8 @@ class SeedConfig(Section, name="seeding"):
     """Number of neighbours for statistical outlier removal; 0 = off."""
     outlier_first: bool = True
     """Whether outliers are also removed from the seeds of an empty map; off = VarSplat's code."""
-    voxel_m: NotNegative = 0.0
-    """Edge of the voxels in which splats are counted before seeding, in metres; 0 = off (papers)."""
-    voxel_most: AtLeastOne = 8
-    """With `voxel_m`: no seed is placed in a voxel that has this many splats."""
     max_splats: Count = 0
     """Maximum number of splats in a submap; 0 = no limit."""
-    sensor_noise: bool = False
-    """Whether pixels whose depth is unsure for their distance, at edges and grazing surfaces, become splats last; it
-    needs the σ of readings (`input.sensor`)."""
 
 
 @dataclass(frozen=True)
@@ -171,8 +153,6 @@ class MappingConfig(Section, name="mapping"):
     code)."""
     poses_from: Literal["start", "half"] = "start"
     """When mapping optimises poses: in all steps of a keyframe, or only in the second half (CG-SLAM)."""
-    color_covariance: Literal["diagonal", "full"] = "diagonal"
-    """Whether a splat has one colour variance per channel (paper) or a full 3×3 covariance."""
     freeze_old_colors: bool = False
     """Whether splats older than the keyframe keep their colours."""
     freeze_new_colors: bool = False
@@ -188,8 +168,6 @@ class MappingConfig(Section, name="mapping"):
     prune_opacity: Share = 0.5
     """Splats with at most this opacity are removed after the steps of a keyframe. A lower value keeps faint splats, a
     higher one makes holes."""
-    keyframe_history: Count = 0
-    """Steps on older keyframes use only this many of the latest keyframes; 0 = all keyframes."""
     window: Count = 0
     """Use only this many keyframes: the newest two, and those that overlap most with the newest (CG-SLAM's
     sliding-window bundle adjustment). 0 = all, drawn at random (VarSplat)."""
@@ -230,9 +208,6 @@ class TrackingConfig(Section, name="tracking"):
     """Maximum number of Adam steps per frame. Use more for fast or shaky motion, fewer for speed."""
     align_iterations: Count = 15
     """Maximum number of Gauss–Newton steps per pyramid level."""
-    align_to: Literal["keyframe", "map"] = "keyframe"
-    """keyframe: align to the newest keyframe's own image, weighted by V; map: to the map rendered at the predicted
-    pose."""
     align_depth_by: Literal["V", "U"] = "V"
     """Whether alignment weights depth residuals by V, like gray residuals, or in the same way by the depth variance U
     of the map (CG-SLAM eq. 10)."""
@@ -263,10 +238,6 @@ class TrackingConfig(Section, name="tracking"):
     """λ_c, the weight of the colour loss; the depth loss has 1 − λ_c."""
     uncertainty: bool = True
     """Whether pixels are weighted by exp(−(log V − median)/τ); off = LoopSplat."""
-    variance: Literal["published", "predicted"] = "published"
-    """The variance in the weights of the newest keyframe: published = V and U of the papers; predicted = the variance
-    of colour, and with `align_depth_by` U that of depth, which the map predicts there (ours). predicted needs `method`
-    align."""
     tau: Above0 = 50.0
     """τ of the pixel weights, in units of log V: at 50, a V of ten times the median lowers the weight by 5 %. A smaller
     τ gives V more influence."""
@@ -308,8 +279,6 @@ class TrackingConfig(Section, name="tracking"):
     fit_depth: bool = False
     """Whether the depth of each frame is fitted to the map and to other views before it is used, because its scale is
     arbitrary. `run` sets it for depth that a network predicted."""
-    update_stop: NotNegative = 0.0
-    """Adam stops when a step is smaller than this (metres and radians); 0 = run every iteration."""
     plateau_stop: NotNegative = 0.0
     """Adam stops when `plateau_window` steps have not lowered the loss by this share; a level of alignment stops when
     one step changes the loss by less than this share; 0 = off."""

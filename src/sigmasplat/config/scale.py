@@ -8,8 +8,8 @@ from sigmasplat.config.sensors import AUTO
 
 POWERS = {
     "input": {"min_depth_m": 1, "max_depth_m": 1},
-    "render": {"scene_scale": 1, "near_m": 1, "depth_gate_m": 1},
-    "seeding": {"depth_error_least_m": 1, "min_distance_m": 1, "voxel_m": 1},
+    "render": {"scene_scale": 1, "near_m": 1},
+    "seeding": {"depth_error_least_m": 1, "min_distance_m": 1},
     "mapping": {
         "weight_depth": -1, "weight_mean_depth": -1, "weight_alignment": -1, "weight_isotropy": -1,
         "weight_moment": -2, "lr_means": 1, "lr_means_first": 1, "lr_pose_translation": 1,

@@ -34,10 +34,6 @@ class SubmapConfig(Section, name="submaps"):
     uncertainty_m: NotNegative = 0.0
     """A new submap starts if the standard deviation of the camera's position in the submap, accumulated from keyframe
     to keyframe, exceeds this (`slam.drift`); 0 = off."""
-    variance_sum: NotNegative = 0.0
-    """A new submap starts if the mean V rendered at each tracked frame, summed since the submap began, exceeds this
-    (colours 0 to 1, squared); 0 = off. It reads the paper's accumulated uncertainty as V, and costs a render per
-    frame."""
     inherit: bool = False
     """Whether a new submap starts with copies of the splats in view, which are then mapped like any others; off = it
     starts empty (paper)."""
@@ -74,9 +70,6 @@ class LoopConfig(Section, name="loops"):
     makes the whole search."""
     uncertainty: bool = True
     """Whether similarity is multiplied by a gate from the variance-weighted opacity ratio; off = LoopSplat."""
-    variance: Literal["published", "predicted"] = "published"
-    """The variance of a splat in that ratio: published = σ²; predicted = σ² and its residuals at the keyframes of the
-    submap, weighted as in the predicted variance (ours)."""
     tau: Above0 = 10.0
     """τ of the splat weights in that opacity ratio, computed from σ². A smaller τ separates certain from uncertain
     splats more sharply."""
@@ -117,9 +110,6 @@ class RegistrationConfig(Section, name="registration"):
     pixels, with the sum over the three channels, which weights colour three times as much."""
     uncertainty: bool = True
     """Whether pixels are weighted by the V of the other submap; off = LoopSplat."""
-    variance: Literal["published", "predicted"] = "published"
-    """The variance in these weights: published = V (VarSplat §1); predicted = the variance of colour that the other
-    submap predicts, from the residuals of its splats at its keyframes (ours)."""
     tau: Above0 = 50.0
     """τ of the pixel weights in registration, as `tracking.tau`."""
     weight_max: WeightBound = 3.0
@@ -219,9 +209,6 @@ class FinalConfig(Section, name="final"):
     """Largest ratio of a splat's longest axis to its second longest; refinement shortens the longest. 0 = no limit."""
     uncertainty: bool = True
     """Whether variance is used to merge submaps and still learned during refinement; off = paper."""
-    variance: Literal["published", "predicted"] = "published"
-    """The variance of a splat that merging compares: published = σ²; predicted = σ² and its residuals at the keyframes
-    of its submap, weighted as in the predicted variance (ours)."""
 
     @property
     def width_px(self) -> int:

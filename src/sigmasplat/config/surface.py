@@ -13,6 +13,3 @@ class SurfaceConfig(Section, name="surface"):
     depth: Literal["map", "map+sensor"] = "map"
     """Depth that is fused at each keyframe: map = rendered from its submap (VarSplat §7); map+sensor = rendered from
     the final map, and the readings of the keyframe, weighted by their variances (ours)."""
-    sensor_noise: bool = False
-    """Whether the readings that are fused are weighted by 1/σ² of the sensor's model (`input.sensor`); otherwise by
-    that of structured light without edges and angles."""

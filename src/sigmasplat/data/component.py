@@ -26,13 +26,13 @@ class Component:
     trajectory: Trajectory
 
 
-def states_at_end(states: Sequence[str], believed: NDArray[np.bool_]) -> NDArray[np.str_]:
-    """Return the states [F] at the end: a frame that is not lost is apart exactly if its pose is not believed.
+def states_at_end(states: Sequence[str], valid: NDArray[np.bool_]) -> NDArray[np.str_]:
+    """Return the states [F] at the end: a frame that is not lost is apart exactly if its pose is not valid.
 
-    states [F]: as of each step, when a component may not have joined the world yet; believed [F]: at the end.
+    states [F]: as of each step, when a component may not have joined the world yet; valid [F]: at the end.
     """
     at_step = np.array(states, dtype="<U11")
-    found = np.where(believed, np.where(at_step == RELOCALISED, RELOCALISED, TRACKED), APART)
+    found = np.where(valid, np.where(at_step == RELOCALISED, RELOCALISED, TRACKED), APART)
     return np.where(at_step == LOST, LOST, found)
 
 

@@ -21,12 +21,11 @@ COLUMNS: dict[str, slice] = {
 WIDTH = 17
 INITIAL_LOG_VARIANCE = -7.0
 """s₀ (VarSplat §1)."""
-ATTRIBUTES = {"correlations": 3, "harmonics": 45}
+ATTRIBUTES = {"harmonics": 45}
 """Optional attributes of splats, with their number of columns.
 
-correlations: unbounded, 0 = none; their tanh are the partial correlations of the colour channels red–green, red–blue,
-green–blue (`model.color_covariance`). harmonics: spherical harmonics of degrees 1 to 3, in the order of
-`model.harmonics.basis`, with red, green and blue of each: columns 3·i + channel.
+harmonics: spherical harmonics of degrees 1 to 3, in the order of `data.harmonics.basis`, with red, green and blue of
+each: columns 3·i + channel.
 """
 
 

@@ -17,6 +17,9 @@ from sigmasplat.data.photo import Photo
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.types import Matrix
 
+KeyframeId = tuple[int, int]
+"""Number of the submap, and number of the keyframe in it; both count from 0."""
+
 
 @dataclass(frozen=True, eq=False)
 class Picture:

@@ -22,7 +22,6 @@ from sigmasplat.final.refinement import Clock, KeyframeReader, SavedRefinement, 
 from sigmasplat.final.still_store import carved, without_moving
 from sigmasplat.render.view import View
 from sigmasplat.types import Matrix, Progress, no_progress
-from sigmasplat.uncertainty.predicted_submaps import PredictedSubmaps
 
 CELL_M, BITS = 0.01, 16
 """Size of the cells of `z_order`, and the bits of a cell's number along each axis."""
@@ -114,12 +113,10 @@ def merged(store: SubmapStore, anchors: Sequence[Matrix], config: Config) -> Gau
     If there are more than `AT_ONCE` splats, duplicates are removed before all submaps are read. The result is the same:
     the splats that win a voxel stay complete, and so does their mean.
     """
-    predicted, kept, waiting = PredictedSubmaps(config, store), list[OwnedSplats](), list[OwnedSplats]()
+    kept, waiting = list[OwnedSplats](), list[OwnedSplats]()
     for index in range(len(store)):
         part = _in_world(store, anchors, index)
-        is_predicted = config.final.uncertainty and config.final.variance == "predicted"
-        log_variance = _log_variance(predicted.rows(index) if is_predicted else part.params)
-        waiting.append(OwnedSplats(part, np.full(len(part), index), log_variance))
+        waiting.append(OwnedSplats(part, np.full(len(part), index), _log_variance(part.params)))
         if _count(waiting) >= max(AT_ONCE, _count(kept)):
             kept, waiting = [_without_duplicates([*kept, *waiting], config.final)], []
     return _without_duplicates([*kept, *waiting], config.final).field

@@ -15,7 +15,6 @@ from torch import Tensor
 from sigmasplat.config import Config
 from sigmasplat.data import isosurface, se3
 from sigmasplat.data.camera import Camera
-from sigmasplat.data.depth_std import std_by_model
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.mesh import Mesh
 from sigmasplat.data.submap import Picture, SubmapStore
@@ -127,8 +126,7 @@ def fuse(
         depth_m, color = surface_of(seen, config)
         weight = certainty(seen, config) if weigh else None
         if at.picture is not None:
-            std_m = reading_std(at.picture.depth_m, at.camera, config)
-            depth_m, color, weight = with_readings(depth_m, color, at.picture, std_m)
+            depth_m, color, weight = with_readings(depth_m, color, at.picture)
         volume.integrate(depth_m, color, at.camera, at.T_world_camera, weight)
         progress(done, total)
     mesh = isosurface.surface(volume)
@@ -145,14 +143,7 @@ def surface_of(seen: Render, config: Config) -> tuple[Floats, Floats]:
     return depth_m, np.clip(_array(seen.color) / opaque[..., None], 0.0, 1.0)
 
 
-def reading_std(depth_m: Floats, camera: Camera, config: Config) -> Floats | None:
-    """Return the standard deviation of readings [H, W], m, by the model of the sensor; None if it is not used."""
-    return std_by_model(depth_m, camera, config.input.sensor) if config.surface.sensor_noise else None
-
-
-def with_readings(
-    depth_m: Floats, color: Floats, picture: Picture, std_m: Floats | None = None
-) -> tuple[Floats, Floats, Floats]:
+def with_readings(depth_m: Floats, color: Floats, picture: Picture) -> tuple[Floats, Floats, Floats]:
     """Combine rendered depth [H, W] and colour [H, W, 3] with a keyframe's readings; return both and the weight [H, W].
 
     Depth is the mean of the render and the reading, weighted by the inverse of their variances. Where they differ by
@@ -162,9 +153,6 @@ def with_readings(
     reading_m = picture.depth_m
     rendered_m = np.where(silhouettes(depth_m), np.float32(0.0), depth_m)
     of_reading = _inverse_variance(reading_m)
-    if std_m is not None and (reading_m > 0).any():  # the same weight as without σ, in the median
-        usual = np.median((of_reading * std_m * std_m)[reading_m > 0])
-        of_reading = np.divide(usual, std_m * std_m, out=np.zeros_like(std_m), where=std_m > 0, dtype=np.float32)
     agree = np.abs(rendered_m - reading_m) < AGREE_SHARE * reading_m
     of_render = np.where((reading_m > 0) & ~agree, np.float32(0.0), RENDER_WEIGHT * _inverse_variance(rendered_m))
     weight = of_reading + of_render

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from sigmasplat.config import MovingConfig
 from sigmasplat.data import se3
 from sigmasplat.data.field import GaussianField
-from sigmasplat.data.submap import Picture, Submap, SubmapStore
+from sigmasplat.data.submap import KeyframeId, Picture, Submap, SubmapStore
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.mapping.moving import carve_everywhere, contradicted
 from sigmasplat.types import Matrix
@@ -20,8 +20,6 @@ REVISITS = 2
 TURN_M = 1.0
 """Keyframes are near each other by the distance of their cameras, and by so many metres per radian of turn."""
 
-Place = tuple[int, int]
-
 
 @dataclass(frozen=True, eq=False)
 class StillStore:
@@ -31,7 +29,7 @@ class StillStore:
     """
 
     store: SubmapStore
-    hidden: dict[Place, NDArray[np.uint8]] = dataclass_field(default_factory=dict)
+    hidden: dict[KeyframeId, NDArray[np.uint8]] = dataclass_field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.store)
@@ -56,7 +54,7 @@ class StillStore:
         """Return the images of one probe view of a submap."""
         return self.store.probe(index, probe)
 
-    def hide(self, place: Place, pixels: NDArray[np.bool_]) -> None:
+    def hide(self, place: KeyframeId, pixels: NDArray[np.bool_]) -> None:
         """Mask more pixels [H, W] of a keyframe."""
         bits = np.packbits(pixels)
         self.hidden[place] = bits | self.hidden.get(place, bits)
@@ -79,7 +77,7 @@ def without_moving(store: SubmapStore, anchors: Sequence[Matrix], config: Moving
     return still
 
 
-def _places(store: SubmapStore) -> list[Place]:
+def _places(store: SubmapStore) -> list[KeyframeId]:
     return [(s, k) for s in range(len(store)) for k in range(len(store.load(s).frames))]
 
 

@@ -13,9 +13,8 @@ from sigmasplat.config import MappingConfig
 from sigmasplat.data.field import ATTRIBUTES, COLUMNS, WIDTH, Rows
 
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
-ATTRIBUTE_RATES = {"correlations": ("log_variances", 0.03), "harmonics": ("colors", 1.0 / 20.0)}
-"""Learning rate of an attribute, relative to the rate of the named columns. Harmonics: the value of 3DGS. Correlations:
-our value; from 0.1 on they fit the errors of single pixels, and the likelihood on held-out frames falls."""
+ATTRIBUTE_RATES = {"harmonics": ("colors", 1.0 / 20.0)}
+"""Learning rate of an attribute, relative to the rate of the named columns. Harmonics: the value of 3DGS."""
 ROWS_AT_ONCE = 8192
 """This many rows and their intermediate results fit in the processor's cache."""
 

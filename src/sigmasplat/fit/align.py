@@ -109,7 +109,7 @@ class Pair:
         """Return one pyramid level of both images in the layout of the kernels."""
         r, live, width = self.reference, self.live, min(k, LEVELS - 1)
         c, scale, noise = r.cameras[k], r.scene_scale, live.noise_per_m / NOISE_PER_M
-        weight_gray = balanced(self.weight_color, r.sureness)
+        weight_gray = balanced(self.weight_color, r.confidence)
         options = [weight_gray, 1.0 - weight_gray]
         options += [HUBER_GRAY[width], HUBER_DEPTH_RELATIVE[width] * noise, DEPTH_GATES_M[width] * scale]
         return LevelPlanes(
@@ -118,17 +118,17 @@ class Pair:
         )  # fmt: skip
 
 
-def balanced(weight_color: float, sureness: float) -> float:
-    """Return the weight of gray, 0 to 1, for readings that are `sureness` times as sure as usual.
+def balanced(weight_color: float, confidence: float) -> float:
+    """Return the weight of gray, 0 to 1, for readings that are `confidence` times as sure as usual.
 
     Narrower widths alone give depth this many times as much weight, as if nothing but noise were wrong with it. The
     error of an alignment has other parts, which do not become smaller: so gray's share grows with the square root, up
     to that of depth.
     """
-    if sureness == 1.0 or weight_color in (0.0, 1.0):
+    if confidence == 1.0 or weight_color in (0.0, 1.0):
         return weight_color
     usual = weight_color / (1.0 - weight_color)
-    odds = min(usual * math.sqrt(sureness), max(usual, 1.0))
+    odds = min(usual * math.sqrt(confidence), max(usual, 1.0))
     return odds / (1.0 + odds)
 
 

@@ -8,16 +8,13 @@ from typing import Protocol
 import numpy as np
 from torch import Tensor
 
-from sigmasplat.data.field import GaussianField
-from sigmasplat.errors import ConfigError
 from sigmasplat.fit import adam, tracking_loss
-from sigmasplat.fit.color_covariance import FullCovarianceStep
 from sigmasplat.fit.cpu import adam as cpu_adam, images as cpu_images, tracking_loss as cpu_tracking_loss
-from sigmasplat.fit.cpu.mapping_step import CompiledImages, CompiledStep
+from sigmasplat.fit.cpu.mapping_step import CompiledStep
 from sigmasplat.fit.cpu.reference_maps import reference_maps as cpu_reference_maps
 from sigmasplat.fit.cpu.view_dependent import CompiledViewDependentStep
 from sigmasplat.fit.cuda import descent as cuda_descent, images as cuda_images, rows as cuda_rows
-from sigmasplat.fit.cuda.mapping_step import CudaStep, covariance_step
+from sigmasplat.fit.cuda.mapping_step import CudaStep
 from sigmasplat.fit.cuda.view_dependent import CudaViewDependentStep
 from sigmasplat.fit.descent import descend
 from sigmasplat.fit.fused_terms import fused_terms
@@ -25,22 +22,13 @@ from sigmasplat.fit.interface import DeviceFits, MappingStep, Twist, Weights
 from sigmasplat.fit.mapping_step import OwnTermsStep, TorchStep
 from sigmasplat.fit.reference_maps import reference_arrays, reference_maps
 from sigmasplat.fit.view_dependent import ImageStep, ViewDependentStep
-from sigmasplat.render.backend import make_covariance_view
 from sigmasplat.render.cpu.view import CpuView
-from sigmasplat.render.view import CorrelationView, View
+from sigmasplat.render.view import View
 from sigmasplat.types import Matrix
 
 
 def _on_host(twists: Sequence[Twist], costs: Sequence[float | Tensor]) -> tuple[list[Matrix], list[float]]:
     return [np.asarray(twist) for twist in twists], [float(cost) for cost in costs]
-
-
-def _torch_covariance_step(view: CorrelationView) -> FullCovarianceStep:
-    return FullCovarianceStep(view, TorchStep(view))
-
-
-def _cpu_covariance_step(view: CorrelationView) -> FullCovarianceStep:
-    return FullCovarianceStep(view, CompiledImages(view))
 
 
 def _cpu_view_dependent_step(base: ImageStep, degree: int) -> MappingStep:
@@ -53,7 +41,6 @@ def _cpu_view_dependent_step(base: ImageStep, degree: int) -> MappingStep:
 
 TORCH = DeviceFits(
     mapping_step=TorchStep,
-    covariance_step=_torch_covariance_step,
     view_dependent_step=ViewDependentStep,
     settle=adam.settle,
     to_host=_on_host,
@@ -67,7 +54,6 @@ TORCH = DeviceFits(
 CPU = replace(
     TORCH,
     mapping_step=CompiledStep,
-    covariance_step=_cpu_covariance_step,
     view_dependent_step=_cpu_view_dependent_step,
     settle=cpu_adam.settle,
     tracking_loss=cpu_tracking_loss.tracking_gradient,
@@ -78,7 +64,6 @@ CPU = replace(
 CUDA = replace(
     TORCH,
     mapping_step=CudaStep,
-    covariance_step=covariance_step,
     view_dependent_step=CudaViewDependentStep,
     to_host=cuda_rows.to_host,
     descend=cuda_descent.descend_on_device,
@@ -102,27 +87,14 @@ def fits_of(on: OnBackend) -> DeviceFits:
     return DEVICES[on.backend]
 
 
-def step_for(field: GaussianField, view: View, weights: Weights, degree: int) -> MappingStep:
+def step_for(view: View, weights: Weights, degree: int) -> MappingStep:
     """Make the step that fits a field on a view; degree: of view-dependent colour.
 
     The device's kernels compute the loss terms that they support; autograd computes the others.
-    Raises ConfigError if full colour covariance is combined with terms that its view has no maps for.
     """
-    full = bool(weights["nll_color_full"])
-    if full and (weights["median_depth"] or weights["moment"]):
-        raise ConfigError(
-            "mapping.color_covariance=full does not support weight_alignment or weight_moment; set both to 0"
-        )
-    if full and view.options.depth == "ray":
-        raise ConfigError("mapping.color_covariance=full does not support render.depth=ray; set it to center")
-    if full and view.options.depth_gate_m:
-        raise ConfigError("mapping.color_covariance=full does not support render.depth_gate_m; set it to 0")
     fits = fits_of(view)
-    if full:
-        step = fits.covariance_step(make_covariance_view(view, field.get_or_create("correlations")))
-    else:
-        step = fits.mapping_step(view)
-    used = frozenset(name for name, weight in weights.items() if weight) - {"nll_color_full"}
+    step = fits.mapping_step(view)
+    used = frozenset(name for name, weight in weights.items() if weight)
     own = used - fused_terms(view.backend)
     if own and fits is not TORCH:
         step = OwnTermsStep(step, own)

@@ -32,9 +32,8 @@ def descend(
     """Minimise L_track over the parameters that `parametrisation` makes of the pose; return the best iterate.
 
     params [N, 17] and target are on the view's device; `tracking_loss` computes the loss on that device. The descent
-    stops early when a step is below `update_stop`, or when `plateau_window` steps have not lowered the loss by the
-    share `plateau_stop`. One step is not enough: the loss of Adam is not monotone. Without common pixels the guess is
-    returned.
+    stops early when `plateau_window` steps have not lowered the loss by the share `plateau_stop`. One step is not
+    enough: the loss of Adam is not monotone. Without common pixels the guess is returned.
     """
     way = parametrisation(config, T_camera_world)
     numbers, exposure = way.start, np.zeros(2)
@@ -52,12 +51,10 @@ def descend(
         blind = loss == 0.0  # no common pixels: must not replace a pose that has some
         if loss < best and not (blind and steps > 1):
             best, best_T, best_exposure = loss, T, exposure.copy()
-        moved = adam.step(way.gradient(numbers, view.backward_pose(params)), rates)
-        numbers += moved
+        numbers += adam.step(way.gradient(numbers, view.backward_pose(params)), rates)
         exposure += adam_exposure.step(g_exposure.double().cpu().numpy(), rate_exposure)
         lowered, waited = (loss, 0) if loss < (1.0 - config.plateau_stop) * lowered else (lowered, waited + 1)
-        on_plateau = config.plateau_stop > 0 and waited >= config.plateau_window
-        if np.abs(moved).max() < config.update_stop or on_plateau:
+        if config.plateau_stop > 0 and waited >= config.plateau_window:
             break
     a, b = best_exposure.tolist()
     return Descent(best_T, (a, b), first, best, steps)

@@ -18,7 +18,7 @@ from sigmasplat.fit.backends import fits_of, step_for
 from sigmasplat.fit.interface import FitStats, Twist
 from sigmasplat.fit.target import Keyframe
 from sigmasplat.render.view import View
-from sigmasplat.types import Matrix, Slices, completed
+from sigmasplat.types import Matrix, Task, completed
 
 
 @dataclass
@@ -45,13 +45,11 @@ def loss_weights(config: MappingConfig) -> dict[str, float]:
     VarSplat §2: 0.8 L1 + 0.2 (1 − SSIM) + depth + L_reg + NLL. CG-SLAM eq. 18: with median depth, isotropy as a ratio,
     and U. Any other term of `fit.losses` has the weight `weight_<term>` if the settings have such a field.
     """
-    full = config.color_covariance == "full"
     weights = {
         "l1": config.weight_l1,
         "ssim": config.weight_ssim,
         "depth": config.weight_depth,
-        "nll_color": 0.0 if full else config.weight_nll_color,
-        "nll_color_full": config.weight_nll_color if full else 0.0,
+        "nll_color": config.weight_nll_color,
         "nll_depth": config.weight_nll_depth,
         "isotropy": config.weight_isotropy,
         "isotropy_ratio": config.weight_isotropy_ratio,
@@ -99,7 +97,7 @@ def fitting(
     frozen_colors: int = 0,
     degree: int = 0,
     stats: FitStats | None = None,
-) -> Slices[FieldFit]:
+) -> Task[FieldFit]:
     """Fit as `fit_field` does, in slices of one step."""
     if field.params.device != view.sums.device:
         where = f"the field is on {field.params.device}, the view on {view.sums.device}"
@@ -134,7 +132,7 @@ class _Steps:
     ) -> None:
         self.field, self.weights, self.frozen_colors, self.stats = field, weights, frozen_colors, stats
         field.moment1[:frozen_colors, COLUMNS["colors"]] = 0.0  # otherwise Adam would keep moving them
-        self.step, self.to_host = step_for(field, view, weights, degree), fits_of(view).to_host
+        self.step, self.to_host = step_for(view, weights, degree), fits_of(view).to_host
         self.grad2d = None if stats is None else field.params.new_zeros(len(field))
 
     def take(self, batch: Sequence[Keyframe], rates: Rates, stopwatch: Stopwatch) -> tuple[float, list[Matrix]]:

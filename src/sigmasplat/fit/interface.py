@@ -14,7 +14,7 @@ from sigmasplat.data.field import GaussianField, Rows
 from sigmasplat.errors import ConfigError
 from sigmasplat.fit.adam import Rates
 from sigmasplat.fit.target import Keyframe, Target
-from sigmasplat.render.view import CorrelationView, View
+from sigmasplat.render.view import View
 from sigmasplat.types import Matrix
 
 Weights = Mapping[str, float]
@@ -83,7 +83,7 @@ class MappingStep(Protocol):
 
 def one_image_only() -> ConfigError:
     """Return the error of steps that cannot sum several images."""
-    return ConfigError("mapping.frames_per_step must be 1 with full colour covariance or view-dependent colour")
+    return ConfigError("mapping.frames_per_step must be 1 with view-dependent colour")
 
 
 # ---- tracking ----
@@ -196,10 +196,8 @@ class DeviceFits:
 
     mapping_step: Callable[[Any], MappingStep]
     """Make the mapping step of a view; it computes the terms that fit/fused_terms.py lists for its backend."""
-    covariance_step: Callable[[CorrelationView], MappingStep]
-    """Make the step that also fits the full colour covariance."""
     view_dependent_step: Callable[[Any, int], MappingStep]
-    """Make the step of view-dependent colour up to a degree, from one of the two other steps."""
+    """Make the step of view-dependent colour up to a degree, from the mapping step."""
     settle: Callable[[Rows, Rates], None]
     """Apply Adam's missed motion to every row of a field when a fit ends."""
     to_host: Callable[[Sequence[Twist], Sequence[float | Tensor]], tuple[list[Matrix], list[float]]]

@@ -5,9 +5,9 @@ parameters are the maps it takes. `total` passes each term its maps by name, so 
 weight.
 
 Maps: color, color_target [H, W, 3] in [0, 1]; depth D̂ = Σwz, depth_target [H, W] m; alpha A = Σw [H, W];
-variance [H, W, 3] (V, VarSplat §1); covariance [H, W, 6] (V with its off-diagonal: rr, gg, bb, rg, rb, gb); moment
-[H, W] m² (U, CG-SLAM eq. 10); median_depth [H, W] m, 0 = none (CG-SLAM eq. 8); valid [H, W] bool, pixels with a depth
-reading; depth_weight [H, W]: how sure each reading is, 1 on average, optional; scales [N, 3] m.
+variance [H, W, 3] (V, VarSplat §1); moment [H, W] m² (U, CG-SLAM eq. 10); median_depth [H, W] m, 0 = none (CG-SLAM
+eq. 8); valid [H, W] bool, pixels with a depth reading; depth_weight [H, W]: how sure each reading is, 1 on average,
+optional; scales [N, 3] m.
 
 Every image term is a mean over valid pixels (and channels), except SSIM, which is a mean over all pixels of the masked
 images. Without valid pixels a term is 0 with zero gradient, never NaN.
@@ -166,27 +166,6 @@ def gaussian_nll(residual: Tensor, variance: Tensor, valid: Tensor) -> Tensor:
     r = masked(residual.detach(), valid)
     v = masked(variance, valid, fill=1.0).clamp(min=0.0) + NLL_EPS
     return mean_over(0.5 * r * r / v + 0.5 * v.log(), valid)
-
-
-@term
-def nll_color_full(color: Tensor, color_target: Tensor, covariance: Tensor, valid: Tensor) -> Tensor:
-    """Return the Gaussian NLL of colours [H, W, 3] under the full V [H, W, 6]; it trains what `nll_color` does.
-
-    The mean over valid pixels × 3 of ½ rᵀ (V+εI)⁻¹ r + ½ log det (V+εI). For a diagonal V it equals `nll_color`. With
-    V+εI = L diag(d) Lᵀ, where L has a unit diagonal, it is ½ y²/d + ½ log d with L y = r. For a true covariance no d is
-    below ε; if rounding makes one smaller, it is clamped to ε.
-    """
-    r1, r2, r3 = masked((color - color_target).detach(), valid).unbind(-1)
-    d1, v2, v3 = (masked(covariance[..., :3], valid, fill=1.0).clamp(min=0.0) + NLL_EPS).unbind(-1)
-    v12, v13, v23 = masked(covariance[..., 3:], valid).unbind(-1)
-    l21, l31 = v12 / d1, v13 / d1
-    d2, v23_left = (v2 - l21 * v12).clamp(min=NLL_EPS), v23 - l31 * v12
-    l32 = v23_left / d2
-    d3 = (v3 - l31 * v13 - l32 * v23_left).clamp(min=NLL_EPS)
-    y2 = r2 - l21 * r1
-    y3 = r3 - l31 * r1 - l32 * y2
-    squares = r1 * r1 / d1 + y2 * y2 / d2 + y3 * y3 / d3
-    return mean_over(0.5 * (squares + d1.log() + d2.log() + d3.log()), valid) / 3.0
 
 
 @term

@@ -51,7 +51,7 @@ def fit_pose_adam(
     """Minimise L_track by Adam (`fit.descent`) and return the best iterate. On a CUDA device the loop runs without the
     host.
 
-    params [N, 17] and σ² are fixed (VarSplat §3). The descent stops early when a step is below `update_stop`, or when
+    params [N, 17] and σ² are fixed (VarSplat §3). The descent stops early when
     `plateau_window` steps have not lowered the loss by the share `plateau_stop`. Without common pixels the guess is
     returned. Raises BackendError if a CUDA device has too many pairs of splats and tiles.
     """

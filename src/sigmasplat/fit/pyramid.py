@@ -25,7 +25,7 @@ class Pyramid:
     backend: its image kernels halve and align the planes. Only the planes of CUDA are not in host memory.
     scene_scale: size of the scene relative to a room (`render.scene_scale`); noise_per_m: standard deviation of depth
     readings, times z² (`render.depth_noise_per_m`); noise: σ of each reading relative to that law, None: all follow it;
-    sureness: how many times as sure readings are as that law, at the distance of a wall.
+    confidence: how many times as sure readings are as that law, at the distance of a wall.
     """
 
     gray: list[Plane]
@@ -37,7 +37,7 @@ class Pyramid:
     backend: str = "cpu"
     scene_scale: float = 1.0
     noise_per_m: float = NOISE_PER_M
-    sureness: float = 1.0
+    confidence: float = 1.0
 
     @property
     def kernels(self) -> ImageKernels:
@@ -100,11 +100,11 @@ class Pyramid:
         scene_scale: float = 1.0,
         noise_per_m: float = NOISE_PER_M,
         noise: Plane | None = None,
-        sureness: float = 1.0,
+        confidence: float = 1.0,
     ) -> "Pyramid":
         """Build a pyramid of at most `levels` sizes from gray [H, W], depth [H, W] and an optional weight [H, W] and
         noise [H, W]."""
-        p = Pyramid([], [], [None], [None], [camera], [noise], backend, scene_scale, noise_per_m, sureness)
+        p = Pyramid([], [], [None], [None], [camera], [noise], backend, scene_scale, noise_per_m, confidence)
         p.gray.append(p.kernels.contiguous(gray))
         p.depth.append(p.kernels.contiguous(depth_m))
         for _ in range(levels - 1):

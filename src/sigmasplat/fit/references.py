@@ -11,13 +11,11 @@ from sigmasplat.config.sensors import SensorModel
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.depth_std import alignment_std, generic_std
-from sigmasplat.data.map_uncertainty import Background
 from sigmasplat.data.submap import Picture
 from sigmasplat.fit.backends import fits_of
 from sigmasplat.fit.compare import Comparison, compare
 from sigmasplat.fit.gray import Image
 from sigmasplat.fit.interface import Plane
-from sigmasplat.fit.predicted_variance import predicted_at, use_predicted_depth_variance, use_predicted_variance
 from sigmasplat.fit.pyramid import NOISE_PER_M, Pyramid
 from sigmasplat.fit.target import Target
 from sigmasplat.render.view import View
@@ -46,7 +44,7 @@ class Reference:
         shown = p.depth[0] * p.kernels.beside((~hidden).astype(np.float32), p.depth[0])
         made = Pyramid.of(
             p.gray[0], shown, p.cameras[0], backend=p.backend, scene_scale=p.scene_scale, noise_per_m=p.noise_per_m,
-            noise=p.noise[0], sureness=p.sureness,
+            noise=p.noise[0], confidence=p.confidence,
         )  # fmt: skip
         pyramid = replace(made, weight=p.weight, weight_depth=p.weight_depth)
         return Reference(pyramid, self.T_camera_world)
@@ -72,7 +70,7 @@ def relative_noise(depth_m: Image, sensor: SensorModel, noise_per_m: float = NOI
     return np.divide(std_m, law_m, out=np.ones_like(law_m), where=law_m > 0)
 
 
-def sureness_of(sensor: SensorModel, noise_per_m: float = NOISE_PER_M, scene_scale: float = 1.0) -> float:
+def confidence_of(sensor: SensorModel, noise_per_m: float = NOISE_PER_M, scene_scale: float = 1.0) -> float:
     """Return how many times as sure as the law noise_per_m · z² a sensor's readings are in alignment, at the distance
     of a wall."""
     wall_m = np.full(1, USUAL_M * scene_scale, np.float32)
@@ -85,14 +83,14 @@ def _pyramid(view: View, gray: Plane, depth: Plane, camera: Camera, depth_m: Ima
 
     All depth is aligned to readings, also that of a rendered map. So all has the noise of a reading at its distance.
     """
-    o, images, noise, sureness = view.options, fits_of(view).images, None, 1.0
+    o, images, noise, confidence = view.options, fits_of(view).images, None, 1.0
     if view.sensor is not None:
         host_m = images.to_host(depth) if depth_m is None else depth_m
         noise = images.beside(relative_noise(host_m, view.sensor, o.depth_noise_per_m), depth)
-        sureness = sureness_of(view.sensor, o.depth_noise_per_m, o.scene_scale)
+        confidence = confidence_of(view.sensor, o.depth_noise_per_m, o.scene_scale)
     return Pyramid.of(
         gray, depth, camera, backend=view.backend, scene_scale=o.scene_scale, noise_per_m=o.depth_noise_per_m,
-        noise=noise, sureness=sureness,
+        noise=noise, confidence=confidence,
     )  # fmt: skip
 
 
@@ -107,19 +105,17 @@ def map_reference(
     view: View,
     T_camera_world: Matrix,
     config: TrackingConfig,
-    background: Background | None = None,
 ) -> Reference:
     """Render the map as a reference: gray C/A and depth D/A in m where it is opaque, weighted by w̃ (VarSplat §3).
 
     params: rows [N, 17]; T_camera_world [4, 4]: the pose to render from. To weight depth by U the map is rendered
-    twice, because U refers to the surface that the first render finds. With a background, V is replaced by the
-    predicted variance; params are then rows of `with_residuals`.
+    twice, because U refers to the surface that the first render finds.
     """
     fits = fits_of(view)
-    _render(view, params, T_camera_world, None, background)
+    view.forward(params, T_camera_world)
     maps = fits.reference_maps(view, config, None)
     if config.align_depth_by == "U":
-        _render(view, params, T_camera_world, fits.images.as_tensor(maps.depth), background)
+        view.forward(params, T_camera_world, fits.images.as_tensor(maps.depth))
         maps = fits.reference_maps(view, config, view.moment)
     image = _pyramid(view, maps.gray, maps.depth, view.camera)
     return Reference(image.weighed(*maps.weights), T_camera_world)
@@ -131,31 +127,16 @@ def keyframe_reference(
     image: Pyramid,
     T_camera_world: Matrix,
     config: TrackingConfig,
-    target: Target | None = None,
 ) -> Reference:
     """Make a reference from a keyframe's own image; each pixel is weighted by w̃ of the map at its pose (VarSplat §3).
 
     params: rows [N, 17]; image: its gray and depth (m) pyramid; T_camera_world [4, 4]: its pose. The sensor's surface
     is unbiased, while a young map still renders surfaces too close; the map only supplies the pixel weights. Depth can
-    be weighted by U about the sensor's depth instead (CG-SLAM eq. 10). With `config.variance` predicted and the
-    keyframe's `target`, V and U are replaced by the predicted variances.
+    be weighted by U about the sensor's depth instead (CG-SLAM eq. 10).
     """
     if not config.uncertainty:
         return Reference(image, T_camera_world)
-    by_U, fits, background = config.align_depth_by == "U", fits_of(view), None
-    if config.variance == "predicted" and target is not None:
-        params, background = predicted_at(params, view, target, T_camera_world)
-    _render(view, params, T_camera_world, fits.images.as_tensor(image.depth[0]) if by_U else None, background)
-    if by_U and background is not None:
-        use_predicted_depth_variance(view)
+    by_U, fits = config.align_depth_by == "U", fits_of(view)
+    view.forward(params, T_camera_world, fits.images.as_tensor(image.depth[0]) if by_U else None)
     maps = fits.reference_maps(view, config, view.moment if by_U else None)
     return Reference(image.weighed(*maps.weights), T_camera_world)
-
-
-def _render(
-    view: View, params: Tensor, T_camera_world: Matrix, depth_m: Tensor | None, background: Background | None
-) -> None:
-    """Render the map, with U about a depth [H, W] if given; with a background, V becomes the predicted variance."""
-    view.forward(params, T_camera_world, depth_m)
-    if background is not None:
-        use_predicted_variance(view, background)

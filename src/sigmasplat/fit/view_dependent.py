@@ -76,8 +76,7 @@ class ViewDependentStep:
             )
             g[:, MEANS] += g_means
             g[:, SCALES] += g_scales
-            if self.view.options.color_pose_gradient:  # a camera motion ρ acts like a splat motion −ρ
-                twist[:3] += (self._R @ g_means.sum(0)).cpu().numpy()
+            twist[:3] += (self._R @ g_means.sum(0)).cpu().numpy()  # a camera motion ρ acts like a splat motion −ρ
             cost += term
             adam_rows(field, rows, g, rates)
             adam_rows(harmonics, rows, g_harmonics, harmonic_rates)

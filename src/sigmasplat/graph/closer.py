@@ -23,8 +23,7 @@ from sigmasplat.graph.registration import Registrar
 from sigmasplat.render.view import View
 from sigmasplat.tracking.descriptors import Descriptor, OrientationGrid
 from sigmasplat.tracking.features import Extractor
-from sigmasplat.types import Matrix, Slices, completed
-from sigmasplat.uncertainty.predicted_submaps import PredictedSubmaps
+from sigmasplat.types import Matrix, Task, completed
 
 RIGID = np.diag(np.repeat([1e-4, 1e-5], 3) ** -2.0)
 """Information of the edge to a submap of an earlier session: 0.1 mm and 0.0006°. Its map is finished, and poses in its
@@ -57,7 +56,7 @@ def lacks_weights(config: LoopConfig) -> bool:
 
 
 @dataclass(eq=False)
-class OwedSearch:
+class PendingSearch:
     """The search for the loops of a finished submap that is not complete: the submap, the descriptors [D] of its
     keyframes, and the slices of `LoopCloser.closing` that are done."""
 
@@ -83,10 +82,9 @@ class LoopCloser:
     edges: Edges = field(default_factory=Edges)
     loops: Loops = field(default_factory=Loops)
     solved: int = 0
-    owed: list[OwedSearch] = field(default_factory=list)
+    pending: list[PendingSearch] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.predicted = PredictedSubmaps(self.config, self.store)
         self.graph = Incidence(self.edges)
 
     def connect(self, a: int, b: int, T_a_b: Matrix, information: Matrix) -> None:
@@ -106,12 +104,12 @@ class LoopCloser:
             self.connect(0, submap.index, T_first_submap, RIGID)
 
     @property
-    def believed(self) -> Edges:
+    def valid(self) -> Edges:
         """Return the trusted edges and the accepted loops."""
         rows = self.edges.loop_rows(range(len(self.edges)))
-        believed = rows < 0
-        believed[~believed] = self.loops.accepted[rows[~believed]]
-        return self.edges.taken(believed)
+        valid = rows < 0
+        valid[~valid] = self.loops.accepted[rows[~valid]]
+        return self.edges.taken(valid)
 
     def _described(self, submap: Submap, descriptors: Sequence[NDArray[np.float32]]) -> SubmapDescriptor:
         reach_m = float(np.linalg.norm(submap.T_submap_camera[:, :3, 3], axis=1).max())
@@ -119,10 +117,7 @@ class LoopCloser:
 
     def opacity_ratio(self, submap: Submap) -> float:
         """Return the variance-weighted opacity ratio of a submap (VarSplat §4)."""
-        c, rows = self.config.loops, submap.field.params
-        if c.uncertainty and c.variance == "predicted":
-            rows = self.predicted.rows(submap.index)
-        log_variances = rows[:, COLUMNS["log_variances"]].numpy()
+        c, log_variances = self.config.loops, submap.field.params[:, COLUMNS["log_variances"]].numpy()
         return opacity_ratio(submap.field.opacities.numpy(), log_variances, c.tau, c.weight_max)
 
     def submap_finished(
@@ -137,7 +132,7 @@ class LoopCloser:
 
     def closing(
         self, submap: Submap, descriptors: Sequence[NDArray[np.float32]], atlas: Atlas, view: View
-    ) -> Slices[list[Loop]]:
+    ) -> Task[list[Loop]]:
         """Look for loops as `submap_finished` does, in slices of one alignment.
 
         Nothing changes before the last slice: a search that was begun can be made again from its first slice, as long
@@ -146,7 +141,7 @@ class LoopCloser:
         if not self.config.loops.close or not descriptors:
             return []
         query = self._described(submap, descriptors)
-        registrar = Registrar(self.config, self.store, view, self.extractor, self.predicted)
+        registrar = Registrar(self.config, self.store, view, self.extractor)
         tried = list[tuple[Loop, Edge | None]]()
         for pair in self._pairs(query, atlas):
             yield
@@ -198,7 +193,7 @@ class LoopCloser:
         apart_m = np.linalg.norm(anchors[known.numbers][:, :3, 3] - anchors[query.index][:3, 3], axis=1)
         return np.asarray(apart_m <= self.config.loops.near_m + query.reach_m + known.reach_m)
 
-    def _try(self, pair: SubmapPair, a: Submap, atlas: Atlas, registrar: Registrar) -> Slices[tuple[Loop, Edge | None]]:
+    def _try(self, pair: SubmapPair, a: Submap, atlas: Atlas, registrar: Registrar) -> Task[tuple[Loop, Edge | None]]:
         """Register a pair in slices, with `a` as the query; return the result, and its edge if it was accepted."""
         b = self.store.load(pair.best.database_submap)
         known = se3.inverse(atlas.anchors[a.index]) @ atlas.anchors[b.index]

@@ -7,7 +7,7 @@ from sigmasplat.data.submap import Submap, SubmapStore
 from sigmasplat.tracking.feature_image import FeatureImage, pose_by_features
 from sigmasplat.tracking.features import Extractor
 from sigmasplat.tracking.known_map import KnownKeyframe
-from sigmasplat.types import Matrix, Slices, long_slice
+from sigmasplat.types import Matrix, Task, long_slice
 
 
 class FeatureGuesses:
@@ -18,7 +18,7 @@ class FeatureGuesses:
         self.store, self.extractor, self.seed = store, extractor, seed
         self._images: dict[tuple[int, int], FeatureImage] = {}
 
-    def of(self, own: Submap, keyframe: int, other: Submap, alike: Sequence[int]) -> Slices[list[Matrix]]:
+    def of(self, own: Submap, keyframe: int, other: Submap, alike: Sequence[int]) -> Task[list[Matrix]]:
         """Return T_camera_other [4, 4] of a keyframe of `own` by each keyframe of `other` in `alike` whose features
         give a pose. A long slice ends after each image whose features are found."""
         guesses = list[Matrix]()
@@ -32,7 +32,7 @@ class FeatureGuesses:
                 guesses.append(found.T_live_reference @ se3.inverse(other.T_submap_camera[k]))
         return guesses
 
-    def _with_features(self, submap: Submap, keyframe: int, extractor: Extractor) -> Slices[FeatureImage]:
+    def _with_features(self, submap: Submap, keyframe: int, extractor: Extractor) -> Task[FeatureImage]:
         """Return the image of a keyframe when its features are found."""
         where = submap.index, keyframe
         if where not in self._images:

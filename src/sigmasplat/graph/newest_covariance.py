@@ -51,7 +51,7 @@ class NewestCovariance:
         counts = np.array([submap, keyframe, atlas.keyframe_poses.total, *atlas.components])
         state = counts.tobytes() + (atlas.anchors[-1] @ atlas.keyframe_poses.last[-1]).tobytes()
         if state != self._state:
-            edges = closer.believed
+            edges = closer.valid
             loops = int(edges.is_loop.sum())
             known = self._factors if loops == self._loops else None
             path = PathCovariance.of_keyframes(atlas, edges, known)

@@ -119,17 +119,17 @@ def optimise(
     chi2_limit = most_chi2(confidence)
     judged_first = graph.loop & ~np.array(rejected, bool) if len(rejected) else graph.loop
     T, weights, graduating = _graduate(graph, start, chi2_limit, judged_first)
-    believed = np.where(graph.loop, weights >= PRUNE_WEIGHT, True)
-    T, finishing = _minimise(graph, T, believed.astype(np.float64), max_iterations)
+    valid = np.where(graph.loop, weights >= PRUNE_WEIGHT, True)
+    T, finishing = _minimise(graph, T, valid.astype(np.float64), max_iterations)
     chi2 = graph.chi2(T)
     verdicts = tuple(
-        LoopVerdict(edge.a, edge.b, float(weights[i]), float(chi2[i]), bool(believed[i]))
+        LoopVerdict(edge.a, edge.b, float(weights[i]), float(chi2[i]), bool(valid[i]))
         for i, edge in enumerate(edges)
         if edge.loop
     )
     solved = se3.orthonormalise(poses[0] @ T)
     solved[:fixed] = poses[:fixed]
-    cost_before, cost_after = float(graph.chi2(start)[believed].sum()), float(chi2[believed].sum())
+    cost_before, cost_after = float(graph.chi2(start)[valid].sum()), float(chi2[valid].sum())
     return PoseGraphSolution(solved, verdicts, graduating + finishing, cost_before, cost_after)
 
 

@@ -3,7 +3,6 @@
 import dataclasses
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -12,7 +11,6 @@ from torch import Tensor
 
 from sigmasplat.config import Config, RegistrationConfig, TrackingConfig
 from sigmasplat.data import se3
-from sigmasplat.data.map_uncertainty import Background
 from sigmasplat.data.submap import Picture, Submap, SubmapStore
 from sigmasplat.fit.align import align
 from sigmasplat.fit.backends import fits_of
@@ -28,10 +26,9 @@ from sigmasplat.graph.localisations import Localisation, combined, consensus, in
 from sigmasplat.render.view import View
 from sigmasplat.tracking.drift import drift_to, symmetric, systematic_errors
 from sigmasplat.tracking.features import Extractor
+from sigmasplat.tracking.pose_validation import confirmed
 from sigmasplat.tracking.rules import angle_between
-from sigmasplat.tracking.verdict import confirmed
-from sigmasplat.types import Matrix, Slices, long_slice
-from sigmasplat.uncertainty.predicted_submaps import PredictedSubmaps
+from sigmasplat.types import Matrix, Task, long_slice
 
 HOPELESS = 0.5
 """If alignment explains less than this share of `share_least`, the keyframe is not refined further."""
@@ -40,13 +37,6 @@ DOUBTFUL = 0.6
 OVERLAP_SAMPLE = 5000
 OPAQUE = 0.95
 """Pixels count if the other submap's alpha is above this (VarSplat §5 uses it for depth; here for colour too)."""
-
-
-class WeighedMap(NamedTuple):
-    """The rows [N, 17] of a submap whose variance weighs pixels; background: of the predicted variance, None = V."""
-
-    params: Tensor
-    background: Background | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,22 +64,14 @@ class Registrar:
     another guess where alignment from the known poses fits poorly, such as between wide angles. It remembers images of
     keyframes: make one for each search."""
 
-    def __init__(
-        self,
-        config: Config,
-        store: SubmapStore,
-        view: View,
-        extractor: Extractor | None = None,
-        predicted: PredictedSubmaps | None = None,
-    ) -> None:
+    def __init__(self, config: Config, store: SubmapStore, view: View, extractor: Extractor | None = None) -> None:
         self.config, self.store, self.view, self.verify = config.registration, store, view, config.tracking.verify
-        self.predicted = predicted or PredictedSubmaps(config, store)
         self.by_features = FeatureGuesses(store, extractor, config.seed)
         self.tracking = tracking_of(config.registration, config.tracking)
         self._images: dict[tuple[int, int], tuple[Target, Pyramid]] = {}
         self._references: dict[tuple[int, int], Reference] = {}
 
-    def register(self, pair: SubmapPair, a: Submap, b: Submap, T_a_b: Matrix) -> Slices[Registration]:
+    def register(self, pair: SubmapPair, a: Submap, b: Submap, T_a_b: Matrix) -> Task[Registration]:
         """Register the submaps a (query) and b (database) of a pair, in slices of one alignment; T_a_b [4, 4] is the
         current estimate."""
         found = list[Localisation]()
@@ -102,21 +84,21 @@ class Registrar:
 
     def _localise(
         self, own: Submap, keyframe: int, other: Submap, alike: Sequence[int], T_own_other: Matrix
-    ) -> Slices[Localisation]:
+    ) -> Task[Localisation]:
         """Localise a keyframe of `own` in `other`, in slices: align from the expected pose, and from those of similar
         keyframes and by features if that explains too little; then refine the best pose."""
-        T_own_camera, other_map = own.T_submap_camera[keyframe], self._map_of(other)
+        T_own_camera, other_rows = own.T_submap_camera[keyframe], other.field.params.to(self.view.sums.device)
         target, live = self._images_of(own, keyframe)
         expected = se3.inverse(T_own_camera) @ T_own_other
-        fits = yield from self._all_aligned(other_map, live, [expected])
+        fits = yield from self._all_aligned(other_rows, live, [expected])
         if score(fits[0]) < DOUBTFUL:
-            fits += yield from self._all_aligned(other_map, live, map(se3.inverse, other.T_submap_camera[[*alike]]))
+            fits += yield from self._all_aligned(other_rows, live, map(se3.inverse, other.T_submap_camera[[*alike]]))
         if max(map(score, fits)) < DOUBTFUL:
             by_features = yield from self.by_features.of(own, keyframe, other, alike)
-            fits += yield from self._all_aligned(other_map, live, by_features)
-        fit, at_keyframe = yield from self._refined(other, other_map, target, live, max(fits, key=score))
+            fits += yield from self._all_aligned(other_rows, live, by_features)
+        fit, at_keyframe = yield from self._refined(other, other_rows, target, live, max(fits, key=score))
         A = se3.adjoint(T_own_camera)
-        covariance, comparison = self._checked(other_map, live, fit.T_camera_world)
+        covariance, comparison = self._checked(other_rows, live, fit.T_camera_world)
         nearest = _nearest_keyframe(other, fit.T_camera_world, target)
         covariance = covariance + _errors_of_motion(fit.T_camera_world @ other.T_submap_camera[nearest])
         T_own_other, covariance = T_own_camera @ fit.T_camera_world, A @ covariance @ A.T
@@ -125,8 +107,8 @@ class Registrar:
         )
 
     def _refined(
-        self, other: Submap, other_map: WeighedMap, target: Target, live: Pyramid, found: PoseFit
-    ) -> Slices[tuple[PoseFit, bool]]:
+        self, other: Submap, other_rows: Tensor, target: Target, live: Pyramid, found: PoseFit
+    ) -> Task[tuple[PoseFit, bool]]:
         """Refine a keyframe's pose in a submap, in slices; return it, and whether a keyframe of the submap gave it.
 
         First the keyframe is aligned to the submap's nearest one, if that is wanted. Without a valid result,
@@ -140,7 +122,7 @@ class Registrar:
         steps, hopeless = self.config.iterations, score(found) <= HOPELESS * self.config.share_least
         if found.alignment is not None and (hopeless or not steps):
             return found, False
-        found = fit_pose_adam(other_map.params, self.view, target, found.T_camera_world, self.tracking, steps)
+        found = fit_pose_adam(other_rows, self.view, target, found.T_camera_world, self.tracking, steps)
         yield from long_slice()
         at_keyframe = self._at_keyframe(other, target, live, found)
         return at_keyframe or found, at_keyframe is not None
@@ -159,27 +141,20 @@ class Registrar:
             self._images[where] = picture_images(self.view, self.store.picture(*where), submap.camera)
         return self._images[where]
 
-    def _map_of(self, submap: Submap) -> WeighedMap:
-        """Return a submap as the weights read it: with V as published, or with the predicted variance."""
-        c, device = self.config, self.view.sums.device
-        if not c.uncertainty or c.variance == "published":
-            return WeighedMap(submap.field.params.to(device))
-        return WeighedMap(self.predicted.rows(submap.index).to(device), self.predicted.background(submap.index))
-
-    def _all_aligned(self, other: WeighedMap, live: Pyramid, guesses: Iterable[Matrix]) -> Slices[list[PoseFit]]:
-        """Align a keyframe from each guess, in slices."""
+    def _all_aligned(self, other: Tensor, live: Pyramid, guesses: Iterable[Matrix]) -> Task[list[PoseFit]]:
+        """Align a keyframe to a map with rows `other` [N, 17] from each guess, in slices."""
         fits = list[PoseFit]()
         for guess in guesses:
             fits.append(self._aligned(other, live, guess))
             yield
         return fits
 
-    def _aligned(self, other: WeighedMap, live: Pyramid, guess: Matrix) -> PoseFit:
+    def _aligned(self, other: Tensor, live: Pyramid, guess: Matrix) -> PoseFit:
         """Align a keyframe to the map rendered at a guess, then again to the map rendered at the result."""
         if not fits_of(self.view).aligns:
             return PoseFit(guess, 0.0, 0.0, np.nan, np.nan, 0)  # alignment needs the compiled kernels
         for _ in range(2):
-            reference = map_reference(other.params, self.view, guess, self.tracking, other.background)
+            reference = map_reference(other, self.view, guess, self.tracking)
             fit = fit_pose_align(reference, live, guess, self.tracking)
             guess = fit.T_camera_world
         return fit
@@ -213,12 +188,12 @@ class Registrar:
             self._references[where] = keyframe_reference(params, self.view, image, T_camera_submap, self.tracking)
         return self._references[where]
 
-    def _checked(self, other: WeighedMap, live: Pyramid, T_camera_map: Matrix) -> tuple[Matrix, Comparison | None]:
+    def _checked(self, other: Tensor, live: Pyramid, T_camera_map: Matrix) -> tuple[Matrix, Comparison | None]:
         """Return the covariance [6, 6] of T_camera_map's left twist, estimated by alignment to the map at that pose,
         and, if poses are verified, the comparison with the map there."""
         if not fits_of(self.view).aligns:
             return np.zeros((6, 6)), None
-        reference = map_reference(other.params, self.view, T_camera_map, self.tracking, other.background)
+        reference = map_reference(other, self.view, T_camera_map, self.tracking)
         covariance = align(reference.pyramid, live, np.eye(4), 0, self.tracking.align_weight_color).covariance
         comparison = compare(reference.pyramid, live, np.eye(4)) if self.verify else None
         return covariance if np.isfinite(covariance).all() else np.eye(6), comparison

@@ -63,27 +63,23 @@ def clone(field: GaussianField, rows: Tensor) -> None:
     field.append(_copies(field, rows))
 
 
-def too_large(
-    field: GaussianField,
-    T_camera_world: NDArray[np.float64],
-    camera: Camera,
-    most_scale_m: float,
-    most_radius_px: float,
-) -> Tensor:
-    """Return which splats [N] are larger than `most_scale_m`, or than `most_radius_px` in the image (3 σ); 0 = off.
-
-    The second limit applies to splats in front of the camera whose centres are inside the image.
-    """
-    if not (most_scale_m > 0 or most_radius_px > 0):
+def too_large(field: GaussianField, most_scale_m: float) -> Tensor:
+    """Return which splats [N] are larger than `most_scale_m`; 0 = none."""
+    if not most_scale_m:
         return torch.zeros(len(field), dtype=torch.bool, device=field.params.device)
-    widest, T = _widest(field), torch.from_numpy(T_camera_world).to(field.params)
-    large = (widest > most_scale_m) & (most_scale_m > 0)
-    if most_radius_px > 0:
-        x, y, z = (sum((field.means[:, k] * T[i, k] for k in range(3)), T[i, 3]) for i in range(3))
-        u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-        inside = (u >= -0.5) & (u <= camera.width - 0.5) & (v >= -0.5) & (v <= camera.height - 0.5)
-        large |= (z > 0) & inside & (RADIUS_SIGMAS * widest * camera.fx / z > most_radius_px)
-    return large
+    return _widest(field) > most_scale_m
+
+
+def too_wide(
+    field: GaussianField, T_camera_world: NDArray[np.float64], camera: Camera, most_radius_px: float
+) -> Tensor:
+    """Return which splats [N] in front of the camera, with their centres inside the image, have a radius there (3 σ)
+    above `most_radius_px`."""
+    T = torch.from_numpy(T_camera_world).to(field.params)
+    x, y, z = (sum((field.means[:, k] * T[i, k] for k in range(3)), T[i, 3]) for i in range(3))
+    u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+    inside = (u >= -0.5) & (u <= camera.width - 0.5) & (v >= -0.5) & (v <= camera.height - 0.5)
+    return (z > 0) & inside & (RADIUS_SIGMAS * _widest(field) * camera.fx / z > most_radius_px)
 
 
 def _widest(field: GaussianField) -> Tensor:

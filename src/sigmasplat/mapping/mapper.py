@@ -21,14 +21,14 @@ from sigmasplat.fit.densify_stats import DensifyStats
 from sigmasplat.fit.field import FieldFit, fitting
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.fit.tracking_loss import PoseMaps
-from sigmasplat.mapping.densify import densify_mask, multiply, split, too_large
+from sigmasplat.mapping.densify import densify_mask, multiply, split, too_large, too_wide
 from sigmasplat.mapping.moving import carve, mask_keyframes
-from sigmasplat.mapping.pruning import fade, splat_depth_residuals, splat_uncertainty, still_uncertain
-from sigmasplat.mapping.seeding import first_pixels, later_pixels, make_splats, sureness, thin_out
+from sigmasplat.mapping.pruning import fade, splat_uncertainty, still_uncertain
+from sigmasplat.mapping.seeding import first_pixels, later_pixels, make_splats, thin_out
 from sigmasplat.mapping.window import choose_window, dominating
 from sigmasplat.render.view import View
 from sigmasplat.tracking.rules import draw_keyframes, never
-from sigmasplat.types import Slices, completed
+from sigmasplat.types import Task, completed
 
 RECENT = 10
 """Splats are carved away by the newest keyframes, at most this many."""
@@ -60,19 +60,19 @@ class Mapper:
     random: np.random.Generator
     field: GaussianField = dataclass_field(default_factory=GaussianField.empty)
     keyframes: list[Keyframe] = dataclass_field(default_factory=list)
-    first_owed: int = 0
+    first_pending: int = 0
     half: SecondHalf | None = None
 
     @property
-    def owed(self) -> int:
+    def pending(self) -> int:
         """Return how many steps are still to be made."""
-        return self.first_owed + (self.half.steps if self.half else 0)
+        return self.first_pending + (self.half.steps if self.half else 0)
 
     @property
-    def due(self) -> int:
+    def pending_now(self) -> int:
         """Return how many of these steps the next frame makes, if it is not mapped."""
         c = self.config.mapping
-        return min(self.owed, c.first_per_frame if self.first_owed else c.half_per_frame)
+        return min(self.pending, c.first_per_frame if self.first_pending else c.half_per_frame)
 
     def map(
         self,
@@ -93,11 +93,11 @@ class Mapper:
         fit.join(completed(self._left_of_half(view, never)))
         return fit
 
-    def mapping(self, view: View, newest: Keyframe, hurried: Callable[[], bool] = never) -> Slices[FieldFit]:
+    def mapping(self, view: View, newest: Keyframe, should_stop: Callable[[], bool] = never) -> Task[FieldFit]:
         """Map a keyframe as `map` does, in slices of one iteration. With `mapping.in_halves` the second half of
         the iterations is left to `refining`, and what `refining` has not made is made before the next keyframe.
 
-        hurried: asked before each iteration; if it returns True, the rest of a part's iterations is left out after
+        should_stop: asked before each iteration; if it returns True, the rest of a part's iterations is left out after
         `LEAST_SHARE` of them.
         """
         self.field = self.field.to(view.sums.device)  # the active field stays on the view's device
@@ -106,7 +106,7 @@ class Mapper:
             self._append(newest)
             self._note_visible(view)
             return FieldFit()
-        yield from self._left_of_half(view, hurried)
+        yield from self._left_of_half(view, should_stop)
         first_new = self.field.next_id
         self._append(newest)
         self._leave_out_moving()
@@ -118,12 +118,12 @@ class Mapper:
         rates = iter([Rates.of(c)] * steps if begun else Rates.falling(c, steps))
         if c.divided and not begun:
             steps = min(c.iterations, steps)
-            self.first_owed = c.first_iterations - steps
+            self.first_pending = c.first_iterations - steps
         window = self._window(view)
         stats = DensifyStats.of(self.keyframes[-1], len(self.field), self.field.params.device)
         self._choose_movable(c.poses_from == "start")
         frozen_below = self._frozen_below(first_new, "half")
-        fit = yield from self._fit(view, window, steps // 2, rates, frozen_below, stats, hurried)
+        fit = yield from self._fit(view, window, steps // 2, rates, frozen_below, stats, should_stop)
         self._densify(view, stats)
         self._prune(view)
         yield
@@ -133,7 +133,7 @@ class Mapper:
         yield
         if not c.in_halves:
             self._choose_movable(True)
-            fit.join((yield from self._second_half(view, window, self.half, rates, hurried)))
+            fit.join((yield from self._second_half(view, window, self.half, rates, should_stop)))
         return fit
 
     def _second_half(
@@ -142,24 +142,24 @@ class Mapper:
         window: list[Keyframe],
         half: SecondHalf,
         rates: Iterator[Rates],
-        hurried: Callable[[], bool],
+        should_stop: Callable[[], bool],
         at_most: int | None = None,
-    ) -> Slices[FieldFit]:
+    ) -> Task[FieldFit]:
         """Make the steps of the second half that are left, or some of them; after the last one, prune."""
         steps, share = (half.steps, LEAST_SHARE) if at_most is None else (min(at_most, half.steps), 0.0)
-        fit = yield from self._fit(view, window, steps, rates, half.frozen_below, None, hurried, share)
+        fit = yield from self._fit(view, window, steps, rates, half.frozen_below, None, should_stop, share)
         half.steps -= len(fit.losses)
         if at_most is None or not half.steps:
             self._prune(view, self._still_uncertain(view, window, half.faded))
             self.half = None
         return fit
 
-    def _left_of_half(self, view: View, hurried: Callable[[], bool], at_most: int | None = None) -> Slices[FieldFit]:
+    def _left_of_half(self, view: View, should_stop: Callable[[], bool], at_most: int | None = None) -> Task[FieldFit]:
         """Make steps that are left of the second half, if there is one."""
         if self.half is None:
             return FieldFit()
         rates = repeat(Rates.of(self.config.mapping))
-        return (yield from self._second_half(view, self._window(view), self.half, rates, hurried, at_most))
+        return (yield from self._second_half(view, self._window(view), self.half, rates, should_stop, at_most))
 
     def add(self, view: View, keyframe: Keyframe) -> None:
         """Add a keyframe and seed splats at it, without fitting them. The submap must have a keyframe."""
@@ -168,16 +168,16 @@ class Mapper:
         self._note_visible(view)
         self._seed(view, keyframe.target, keyframe.T_world_camera)
 
-    def refining(self, view: View, steps: int, hurried: Callable[[], bool]) -> Slices[None]:
-        """Fit the map to its keyframes for more steps, in slices of one, until `hurried` returns True; the keyframes
-        keep their poses. Steps that are owed count as made."""
-        steps -= len((yield from self._left_of_half(view, hurried, steps)).losses)
+    def refining(self, view: View, steps: int, should_stop: Callable[[], bool]) -> Task[None]:
+        """Fit the map to its keyframes for more steps, in slices of one, until `should_stop` returns True; the
+        keyframes keep their poses. Pending steps count as made."""
+        steps -= len((yield from self._left_of_half(view, should_stop, steps)).losses)
         if not steps:
             return
         self._choose_movable(False)
         rates = repeat(Rates.of(self.config.mapping))
-        for _ in self._fit(view, self._window(view), steps, rates, 0, None, hurried, least_share=0.0):
-            self.first_owed = max(self.first_owed - 1, 0)
+        for _ in self._fit(view, self._window(view), steps, rates, 0, None, should_stop, least_share=0.0):
+            self.first_pending = max(self.first_pending - 1, 0)
             yield
 
     def _append(self, keyframe: Keyframe) -> None:
@@ -215,16 +215,16 @@ class Mapper:
         rates: Iterator[Rates],
         frozen_below: int,
         stats: DensifyStats | None,
-        hurried: Callable[[], bool],
+        should_stop: Callable[[], bool],
         least_share: float = LEAST_SHARE,
-    ) -> Slices[FieldFit]:
+    ) -> Task[FieldFit]:
         """Fit the field to the window, in slices; splats with ids below `frozen_below` keep their colours."""
         c = self.config.mapping
-        together, history = c.frames_per_step or len(window), c.keyframe_history
-        batches = draw_keyframes(window[::-1], steps, c.newest_probability, history, self.random, together)
+        together = c.frames_per_step or len(window)
+        batches = draw_keyframes(window[::-1], steps, c.newest_probability, self.random, together)
         frozen = int((self.field.ids < frozen_below).sum())
         wanted = stats if self.config.primitives.split_gradient > 0 else None
-        shortened = _shortened(batches, round(steps * least_share), hurried)
+        shortened = _shortened(batches, round(steps * least_share), should_stop)
         return (yield from fitting(self.field, view, shortened, c, rates, frozen, stats=wanted))
 
     def _frozen_below(self, first_new: int, until: str) -> int:
@@ -274,7 +274,7 @@ class Mapper:
         else:
             view.forward(self.field.params, se3.inverse(T_world_camera))
             wanted = later_pixels(PoseMaps.of(view), target, c)
-            pixels = thin_out(wanted, c, self.random, sureness(target, c))
+            pixels = thin_out(wanted, c, self.random)
         spacing_px = float(np.sqrt(wanted.sum() / max(pixels.sum(), 1)))
         new = make_splats(target, T_world_camera, pixels, spacing_px, self.field, c)
         room = c.max_splats - len(self.field) if c.max_splats else len(new)
@@ -290,7 +290,7 @@ class Mapper:
         multiply(self.field, densify_mask(stats, p.split_gradient, room), p, self.random)
         if p.split_radius_px:
             T_camera_world = se3.inverse(self.keyframes[-1].T_world_camera)
-            coarse = too_large(self.field, T_camera_world, view.camera, 0.0, p.split_radius_px)
+            coarse = too_wide(self.field, T_camera_world, view.camera, p.split_radius_px)
             coarse[coarse.nonzero()[max(most - len(self.field), 0) if most else len(coarse) :]] = False
             split(self.field, coarse, self.random)
 
@@ -316,22 +316,21 @@ class Mapper:
 
     def _uncertainty_m2(self, view: View, window: list[Keyframe]) -> Tensor:
         """Return how far each splat [N] is from the depth readings, m²."""
-        p, keyframes = self.config.primitives, self._judging_keyframes(window)
-        if p.uncertain_by == "residual":
-            return splat_depth_residuals(self.field, view, keyframes)
-        return splat_uncertainty(self.field, view, keyframes, p.owner)[0]
+        keyframes = self._judging_keyframes(window)
+        return splat_uncertainty(self.field, view, keyframes, self.config.primitives.owner)[0]
 
     def _prune(self, view: View, also: Tensor | None = None) -> None:
         """Remove splats that are too faint or too large, and those marked in `also` [N]."""
-        p, T_camera_world = self.config.primitives, se3.inverse(self.keyframes[-1].T_world_camera)
         gone = self.field.opacities <= self.config.mapping.prune_opacity
-        gone |= too_large(self.field, T_camera_world, view.camera, p.most_scale_m, p.most_radius_px)
+        gone |= too_large(self.field, self.config.primitives.most_scale_m)
         self.field.keep(~(gone if also is None else gone | also))
 
 
-def _shortened(batches: Iterable[list[Keyframe]], least: int, hurried: Callable[[], bool]) -> Iterator[list[Keyframe]]:
-    """Yield batches, but none after the first `least` ones as soon as `hurried` returns True."""
+def _shortened(
+    batches: Iterable[list[Keyframe]], least: int, should_stop: Callable[[], bool]
+) -> Iterator[list[Keyframe]]:
+    """Yield batches, but none after the first `least` ones as soon as `should_stop` returns True."""
     for done, batch in enumerate(batches):
-        if done >= least and hurried():
+        if done >= least and should_stop():
             return
         yield batch

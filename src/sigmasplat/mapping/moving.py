@@ -16,7 +16,7 @@ from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
 from sigmasplat.fit.target import Keyframe
-from sigmasplat.tracking.moving.foreground import Earlier, foreground
+from sigmasplat.tracking.moving.dynamic_mask import Earlier, dynamic_mask
 from sigmasplat.tracking.moving.free_space import CLEAR_M, CLEAR_RELATIVE, Depth, Mask, free_places, on_image
 from sigmasplat.types import Matrix
 
@@ -35,7 +35,7 @@ def contradicted(own_m: Depth, other_m: Depth, T_other_own: Matrix, camera: Came
     """Return the pixels [H, W] of a depth image, m, that show something in space which another image sees to be free;
     None without any."""
     step = max(2, camera.width // COLUMNS_TESTED)
-    found = foreground(Earlier(other_m, T_other_own), None, own_m, camera, whole_objects=True, step=step)
+    found = dynamic_mask(Earlier(other_m, T_other_own), None, own_m, camera, whole_objects=True, step=step)
     return None if found is None else found.hidden
 
 

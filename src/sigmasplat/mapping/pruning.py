@@ -10,7 +10,6 @@ from torch import Tensor
 from sigmasplat.data import se3
 from sigmasplat.data.field import COLUMNS, GaussianField
 from sigmasplat.fit.target import Keyframe
-from sigmasplat.render.predictive import COVERED
 from sigmasplat.render.splat_sums import CHANNELS, gather
 from sigmasplat.render.view import View
 from sigmasplat.types import Matrix
@@ -36,25 +35,6 @@ def splat_uncertainty(
         spread += torch.zeros_like(spread).index_put_((rows,), weights * (off * off), accumulate=True)
         count.index_put_((rows,), torch.ones_like(rows), accumulate=True)
     return spread / count.clamp(min=1), count
-
-
-def splat_depth_residuals(field: GaussianField, view: View, keyframes: Sequence[Keyframe]) -> Tensor:
-    """Return the mean squared difference between rendered depth and readings at the pixels of each splat [N], m².
-
-    Pixels count with the weight w of the splat: Σ w (D̂/A − D)² / Σ w over the pixels with a reading, in all keyframes;
-    0 for a splat without any. Renders each keyframe once, forwards and backwards.
-    """
-    sums = torch.zeros(len(field), 2, dtype=torch.float64, device=field.params.device)
-    height, width = view.camera.height, view.camera.width
-    for keyframe in keyframes:
-        view.forward(field.params, se3.inverse(keyframe.T_world_camera))
-        depth, alpha = view.sums[3, :height, :width], view.alpha[:height, :width]
-        reading = keyframe.target.to(depth.device).depth_image
-        known = ((reading > 0) & (alpha > COVERED)).to(depth)
-        squared = known * (depth / alpha.clamp(min=COVERED) - reading).square()
-        planes = torch.stack([squared, known, torch.zeros_like(known)])
-        sums += gather(view, field.params, planes)[:, :2].double()
-    return sums[:, 0] / sums[:, 1].clamp(min=1.0)
 
 
 def largest_weights(field: GaussianField, view: View, keyframes: Iterable[Keyframe]) -> Tensor:

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from sigmasplat.config import SeedConfig
 from sigmasplat.data.field import GaussianField
-from sigmasplat.data.tsdf import packed
 from sigmasplat.fit.gray import gradient_magnitude, gray_of
 from sigmasplat.fit.target import Target
 from sigmasplat.fit.tracking_loss import PoseMaps
@@ -24,10 +23,9 @@ STRETCH_MOST = 3.0
 
 def first_pixels(target: Target, config: SeedConfig, random: np.random.Generator) -> Mask:
     """Choose pixels for an empty map, bool [H, W]: uniform, by gradient, and on Canny edges; only with depth."""
-    valid, sure = target.depth_image.numpy() > 0, sureness(target, config)
-    gray = gray_of(target.image.numpy())
-    chosen = _draw(valid * sure, config.first_uniform, random)
-    chosen |= _draw(gradient_magnitude(gray) * valid * sure, config.first_gradient, random)
+    valid, gray = target.depth_image.numpy() > 0, gray_of(target.image.numpy())
+    chosen = _draw(valid * 1.0, config.first_uniform, random)
+    chosen |= _draw(gradient_magnitude(gray).astype(np.float64) * valid, config.first_gradient, random)
     if config.first_edges:
         edges = canny(gray, low_threshold=100 / 255, high_threshold=200 / 255)  # type: ignore[no-untyped-call]
         chosen |= binary_dilation(edges, np.ones((2, 2), bool))
@@ -50,25 +48,11 @@ def later_pixels(maps: PoseMaps, target: Target, config: SeedConfig) -> Mask:
     return chosen
 
 
-def sureness(target: Target, config: SeedConfig) -> NDArray[np.float64]:
-    """Return with which weight pixels are drawn [H, W]: 1/σ² of their readings relative to others at the same depth, so
-    that edges and grazing surfaces are seeded last, but far surfaces are not; 1 without σ or `sensor_noise`."""
-    std_m = target.depth_std_image if config.sensor_noise else None
-    if std_m is None:
-        return np.ones(target.depth_image.shape)
-    depth_m = target.depth_image.numpy().astype(np.float64)
-    relative = np.divide(std_m, depth_m * depth_m, out=np.ones_like(depth_m), where=depth_m > 0)
-    return relative**-2.0
-
-
-def thin_out(
-    pixels: Mask, config: SeedConfig, random: np.random.Generator, sure: NDArray[np.float64] | None = None
-) -> Mask:
-    """Keep a random share of the pixels, bool [H, W]: `density` of them, at most `later_max`; sure [H, W]: their
-    weights (`sureness`)."""
+def thin_out(pixels: Mask, config: SeedConfig, random: np.random.Generator) -> Mask:
+    """Keep a random share of the pixels, bool [H, W]: `density` of them, at most `later_max`."""
     count = round(config.density * int(pixels.sum()))
     most = min(count, config.later_max) if config.later_max else count
-    return _draw(pixels * (1.0 if sure is None else sure), most, random)
+    return _draw(pixels * 1.0, most, random)
 
 
 def _draw(weight: NDArray[np.floating], count: int, random: np.random.Generator) -> Mask:
@@ -109,8 +93,6 @@ def make_splats(
         keep = np.ones(len(world), bool)
     else:
         keep, spread = _neighbour_spread(world, field.means, config)
-    if config.voxel_m > 0:
-        keep &= with_room(world, field.means, config.voxel_m, config.voxel_most)
     scales, quats = np.repeat(np.maximum(spread * config.scale_factor, 1e-4)[:, None], 3, 1), None
     if config.thickness != 1.0:
         axes, stretch = discs(target, pixels)
@@ -158,24 +140,6 @@ def discs(target: Target, pixels: Mask) -> tuple[NDArray[np.float64], NDArray[np
     disc = known & (length > 0)
     stretch = np.where(disc, np.minimum(1.0 / np.maximum(np.abs(cosine), 1e-6), STRETCH_MOST), 0.0)
     return np.where(disc[:, None, None], axes, np.eye(3)), stretch
-
-
-def with_room(points: NDArray[np.float64], means: Tensor, voxel_m: float, most: int) -> Mask:
-    """Return which points [P, 3] m are among the first `most` splats of their voxel, bool [P]; the splats of the map
-    (means [N, 3]) come first, then the points in their order."""
-    own, old = (_voxels(x, voxel_m) for x in (points, means.cpu().numpy()))
-    occupied, counts = np.unique(old, return_counts=True)
-    place = np.searchsorted(occupied, own).clip(max=max(len(occupied) - 1, 0))
-    before = np.where(occupied[place] == own, counts[place], 0) if len(occupied) else np.zeros(len(own), np.int64)
-    order = np.argsort(own, kind="stable")
-    starts = np.flatnonzero(np.diff(own[order], prepend=own[order][:1] - 1))
-    rank = np.empty(len(own), np.int64)
-    rank[order] = np.arange(len(own)) - np.repeat(starts, np.diff(starts, append=len(own)))
-    return np.asarray(before + rank < most)
-
-
-def _voxels(points: NDArray[np.floating], voxel_m: float) -> NDArray[np.int64]:
-    return packed(np.floor(points / voxel_m).astype(np.int64))
 
 
 def _neighbour_spread(

@@ -16,8 +16,8 @@ from sigmasplat.graph.newest_covariance import NO_ERRORS, PoseErrors
 from sigmasplat.slam.listeners import Correction
 from sigmasplat.slam.step_result import Step
 from sigmasplat.tracking.drift import Drift
-from sigmasplat.tracking.moving.foreground import Foreground
-from sigmasplat.tracking.sight import Observation
+from sigmasplat.tracking.moving.dynamic_mask import DynamicMask
+from sigmasplat.tracking.prepared_frame import PreparedFrame
 from sigmasplat.tracking.tracked_keyframe import TrackedKeyframe
 from sigmasplat.types import Matrix
 
@@ -60,7 +60,7 @@ class Search:
     """A frame to be found in the whole map; comparison: of its doubtful pose, None if it is lost; apart: whether a new
     map begins if it is not found."""
 
-    seen: Observation
+    seen: PreparedFrame
     comparison: Comparison | None = None
     apart: bool = False
 
@@ -69,9 +69,9 @@ class Search:
 class Offer:
     """A keyframe for the map; alignment: to the keyframe before it; front: what is in front of the scene."""
 
-    seen: Observation
+    seen: PreparedFrame
     alignment: Alignment | None = None
-    front: Foreground | None = None
+    front: DynamicMask | None = None
     exposure: tuple[float, float] = (0.0, 0.0)
 
 
@@ -95,7 +95,7 @@ class TrackedFrame:
 
 
 @dataclass(frozen=True, eq=False)
-class Task:
+class BetweenFrames:
     """Work that is done between two frames, when all earlier frames are in the map."""
 
     run: Callable[[], None] = field(default=lambda: None)

@@ -39,7 +39,7 @@ class MappingThread:
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
-        self._due, self._idle, self._stopped = False, True, False
+        self._pending, self._idle, self._stopped = False, True, False
         self._error: BaseException | None = None
         self._thread: threading.Thread | None = None
         self._switch_s = sys.getswitchinterval()
@@ -55,14 +55,16 @@ class MappingThread:
     def wake(self) -> None:
         """Let the thread continue. Raises what a slice has raised."""
         with self._changed:
-            self._due = True
+            self._pending = True
             self._changed.notify_all()
             self._raise()
 
     def settle(self) -> None:
         """Wait until nothing is left to do. Raises what a slice has raised."""
         with self._changed:
-            self._changed.wait_for(lambda: self._error is not None or self._stopped or (self._idle and not self._due))
+            self._changed.wait_for(
+                lambda: self._error is not None or self._stopped or (self._idle and not self._pending)
+            )
             self._raise()
 
     def stop(self) -> None:
@@ -99,6 +101,6 @@ class MappingThread:
         with self._changed:
             self._idle = True
             self._changed.notify_all()
-            self._changed.wait_for(lambda: self._due or self._stopped)
-            self._due = self._idle = False
+            self._changed.wait_for(lambda: self._pending or self._stopped)
+            self._pending = self._idle = False
             return not self._stopped

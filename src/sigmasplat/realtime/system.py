@@ -15,19 +15,19 @@ from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SourceError
 from sigmasplat.graph.loops import Loops
 from sigmasplat.native.threads import set_kernel_threads
-from sigmasplat.realtime.messages import Snapshot, Task
+from sigmasplat.realtime.back_end import BackEnd
+from sigmasplat.realtime.front_end import FrontEnd
+from sigmasplat.realtime.messages import BetweenFrames, Snapshot
 from sigmasplat.realtime.schedule import MappingThread, Schedule
-from sigmasplat.realtime.tracking import CameraClock
-from sigmasplat.realtime.work import MapClock
 from sigmasplat.render.view import View
 from sigmasplat.slam.array_interface import ArrayInterface
 from sigmasplat.slam.listeners import Events
 from sigmasplat.slam.slam import Slam
 from sigmasplat.slam.step_result import Step, StepTimer
 from sigmasplat.tracking.features import make_extractor
-from sigmasplat.tracking.moving.watch import Watch
+from sigmasplat.tracking.moving.dynamic_detector import DynamicDetector
+from sigmasplat.tracking.prepared_frame import view_of, working_frame
 from sigmasplat.tracking.recovery import Recovery
-from sigmasplat.tracking.sight import view_of, working_frame
 from sigmasplat.tracking.tracker import Tracker
 from sigmasplat.types import Matrix, Progress, no_progress
 
@@ -39,7 +39,7 @@ class RealTime(ArrayInterface):
     Between `step` calls the state of `slam` belongs to the mapping thread: read it in a task (`between_frames`), or
     after `settle`. The results depend on how fast the machine is, so they are not reproducible. schedule: when the work
     on the map runs, by default on a thread; covariances: whether `track` and `covariance` return covariances, which
-    cost some milliseconds of work per keyframe; hurried: returns whether the next frame waits or is due soon, then no
+    cost some milliseconds of work per keyframe; should_stop: whether the next frame waits or is due soon, then no
     further guess of a doubtful pose is tried. Functions of `on_keyframe`, `on_loop` and `on_correction` are called by
     the thread that calls `step`, when it learns of the event.
     """
@@ -49,16 +49,18 @@ class RealTime(ArrayInterface):
         slam: Slam,
         schedule: Schedule | None = None,
         covariances: bool = True,
-        hurried: Callable[[], bool] = lambda: False,
+        should_stop: Callable[[], bool] = lambda: False,
     ) -> None:
-        self.slam, self._hurried, c = slam, hurried, slam.config
+        self.slam, self._hurried, c = slam, should_stop, slam.config
         wanted = c.tracking.features or c.recovery.relocalise
         self._extractor = make_extractor(c.features) if wanted else None  # not shared with the mapping thread
-        tracker = Tracker(c.tracking, self._extractor if c.tracking.features else None, watch=Watch(c.moving))
-        self._camera = CameraClock(c, tracker, Recovery(c.recovery))
+        tracker = Tracker(
+            c.tracking, self._extractor if c.tracking.features else None, detector=DynamicDetector(c.moving)
+        )
+        self._front_end = FrontEnd(c, tracker, Recovery(c.recovery))
         self._snapshots: queue.SimpleQueue[Snapshot] = queue.SimpleQueue()
-        self._map = MapClock(slam, self._snapshots.put)
-        self._map.with_errors = covariances
+        self._back_end = BackEnd(slam, self._snapshots.put)
+        self._back_end.with_errors = covariances
         self.listeners = slam.listeners
         self._newest, self._events = slam.newest_step(), Events(slam.loops)
         self._schedule = MappingThread() if schedule is None else schedule
@@ -79,8 +81,8 @@ class RealTime(ArrayInterface):
             seen = self.slam.observed(frame, self._view, self._extractor)
         if mapping_s:
             timer.add({"mapping": mapping_s})
-        tracked = self._camera.track(seen, self._view, timer, self._hurried)
-        self._map.given.put(tracked)
+        tracked = self._front_end.track(seen, self._view, timer, self._hurried)
+        self._back_end.given.put(tracked)
         self._schedule.wake()
         self._newest = tracked.step
         self._events.tell(self.listeners, [tracked.step] if tracked.step.is_keyframe else [])
@@ -98,9 +100,9 @@ class RealTime(ArrayInterface):
         """
         if self._newest is None:
             raise SourceError("no pose yet: give a frame to `track` or `step` first")
-        if self._newest.state == LOST or not self._map.with_errors:
+        if self._newest.state == LOST or not self._back_end.with_errors:
             return None
-        return self._camera.covariance(self._newest)
+        return self._front_end.covariance(self._newest)
 
     def _start(self, frame: Frame) -> View:
         """Make the two views of the camera, and start the mapping thread."""
@@ -110,7 +112,7 @@ class RealTime(ArrayInterface):
             camera = working_frame(frame, self.slam.config).camera
             self.slam.prepare(camera)
         self._threads = set_kernel_threads(1)
-        self._schedule.start(self._map.slices())
+        self._schedule.start(self._back_end.slices())
         self._runs = True
         return view_of(camera, self.slam.config)
 
@@ -123,33 +125,33 @@ class RealTime(ArrayInterface):
             except queue.Empty:
                 return mapping_s
             mapping_s += snapshot.seconds
-            self._camera.adopt(snapshot)
+            self._front_end.adopt(snapshot)
             self._events.add(snapshot.loops, snapshot.correction)
 
     @property
     def snapshot(self) -> Snapshot | None:
         """Return the snapshot that tracking uses; None before the first one."""
-        return self._camera.snapshot
+        return self._front_end.snapshot
 
     @property
     def keyframes_refused(self) -> int:
         """Return the number of frames that did not become keyframes because too many waited."""
-        return self._camera.refused
+        return self._front_end.refused
 
     # ---- between frames ----
 
     def between_frames(self, task: Callable[[], None]) -> None:
         """Run a task on the mapping thread as soon as all frames so far are in the map. It may read `slam`."""
-        self._map.given.put(Task(task))
+        self._back_end.given.put(BetweenFrames(task))
         self._schedule.wake()
 
     def save(self, write: Callable[[], None]) -> None:
         """Run a task as `between_frames` does, with the whole state in `slam`, as after `Slam.step`."""
-        camera = self._camera.copied()
+        camera = self._front_end.copied()
 
         def save() -> None:
-            if self._map.last is not None and self._map.last is not camera.snapshot:
-                camera.adopt_newest(self._map.last)
+            if self._back_end.last is not None and self._back_end.last is not camera.snapshot:
+                camera.adopt_newest(self._back_end.last)
             self._give_back(camera)
             write()
 
@@ -168,12 +170,12 @@ class RealTime(ArrayInterface):
             self._schedule.stop()
             set_kernel_threads(self._threads)
             self._adopt()
-            self._give_back(self._camera.copied())
+            self._give_back(self._front_end.copied())
         self.slam.settle()
-        self._events.add(*self._map.unreported())  # the last frames may have closed loops
+        self._events.add(*self._back_end.unreported())  # the last frames may have closed loops
         self._events.tell(self.listeners)
 
-    def _give_back(self, camera: CameraClock) -> None:
+    def _give_back(self, camera: FrontEnd) -> None:
         """Put the state of tracking into `slam`."""
         slam, tracker = self.slam, camera.tracker
         tracker.extractor = slam.tracker.extractor
@@ -192,7 +194,7 @@ class RealTime(ArrayInterface):
     def loops(self) -> Loops:
         """Return every pair of submaps that was tried as a loop, as of the newest snapshot while frames arrive."""
         if self._runs:
-            return Loops() if self._camera.snapshot is None else self._camera.snapshot.loops
+            return Loops() if self._front_end.snapshot is None else self._front_end.snapshot.loops
         return self.slam.loops
 
     @property
@@ -214,9 +216,9 @@ class RealTime(ArrayInterface):
         """Return the poses of all frames, as `Slam.trajectory`, after `settle`."""
         return self.slam.trajectory()
 
-    def believed(self) -> NDArray[np.bool_]:
-        """Return which poses are believed [F], as `Slam.believed`, after `settle`."""
-        return self.slam.believed()
+    def valid(self) -> NDArray[np.bool_]:
+        """Return which poses are valid [F], as `Slam.valid`, after `settle`."""
+        return self.slam.valid()
 
     def components(self) -> Sequence[Component]:
         """Return the components that are not connected to the world, as `Slam.components`, after `settle`."""

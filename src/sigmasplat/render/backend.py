@@ -13,14 +13,10 @@ import torch
 from sigmasplat import env
 from sigmasplat.config import RenderConfig
 from sigmasplat.data.camera import Camera
-from sigmasplat.data.field import Rows
 from sigmasplat.errors import BackendError
-from sigmasplat.render.view import CorrelationView, View
+from sigmasplat.render.view import View
 
 BACKENDS = ("auto", "cpu", "cuda", "reference")
-NO_GATE_ON_CUDA = (
-    "render.depth_gate_m does not run on CUDA; add --set render.depth_gate_m=0, or render with --set backend=cpu"
-)
 
 
 def backend_name(asked: str, device: torch.device | None = None) -> str:
@@ -62,15 +58,8 @@ def backend_module(asked: str, device: torch.device | None = None) -> ModuleType
 
 
 def options_on(backend: str, options: RenderConfig) -> RenderConfig:
-    """Return the options that a backend (by name) renders with: CUDA has only `render.depth=center`, and warns.
-
-    Raises BackendError if the backend does not support `render.depth_gate_m`.
-    """
-    if backend != "cuda":
-        return options
-    if options.depth_gate_m:
-        raise BackendError(NO_GATE_ON_CUDA)
-    if options.depth == "center":
+    """Return the options that a backend (by name) renders with: CUDA has only `render.depth=center`, and warns."""
+    if backend != "cuda" or options.depth == "center":
         return options
     warnings.warn("render.depth=ray does not run on CUDA yet; depth is that of the splats' centres", stacklevel=3)
     return replace(options, depth="center")
@@ -91,20 +80,3 @@ def make_view(backend: str, camera: Camera, options: RenderConfig, variance: boo
     from sigmasplat.render.cpu.view import CpuView
 
     return CpuView(camera, options, variance)
-
-
-def make_covariance_view(view: View, correlations: Rows) -> CorrelationView:
-    """Make the view of ten planes that belongs to a view of seven planes, on the same backend."""
-    if view.backend == "reference":
-        from sigmasplat.render.reference.covariance_view import CovarianceView
-
-        return CovarianceView(view, correlations)
-    if view.backend == "cuda":
-        from sigmasplat.render.cuda.covariance_view import CudaCovarianceView
-        from sigmasplat.render.cuda.view import CudaView
-
-        assert isinstance(view, CudaView)
-        return CudaCovarianceView(view, correlations)
-    from sigmasplat.render.cpu.covariance_view import CpuCovarianceView
-
-    return CpuCovarianceView(view, correlations)

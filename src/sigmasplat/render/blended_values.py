@@ -16,7 +16,6 @@ from sigmasplat.config import RenderConfig
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import COLUMNS, GaussianField
 from sigmasplat.render.backend import backend_module, backend_name, options_on
-from sigmasplat.render.gated_depth import gated_depth
 from sigmasplat.render.ray_depth import depth_of, plane_features
 from sigmasplat.render.reference.operators import Projection
 from sigmasplat.render.render import colors_from
@@ -29,7 +28,7 @@ OWN = 6
 @dataclass(frozen=True, eq=False)
 class BlendedValues:
     """Sums over the splats of each pixel: color Σwc [H, W, 3], depth Σwz [H, W] m (z along the ray with
-    `render.depth=ray`, behind the median gate with `render.depth_gate_m`), second Σw(σ²+c²) [H, W] mean over the
+    `render.depth=ray`), second Σw(σ²+c²) [H, W] mean over the
     channels, values Σwv [H, W, K], alpha Σw [H, W]; rows [n]: the splats that can reach the image."""
 
     color: Tensor
@@ -108,8 +107,6 @@ def blend_values(
         b = kernels.blend(*p, opacities, features, None, camera, options)
     sums = b.sums.detach()
     depth = depth_of(sums[..., end:], camera) if options.depth == "ray" else sums[..., 3]
-    if options.depth_gate_m:
-        depth = gated_depth(field.params.detach(), T, camera, options, name)
     return BlendedValues(
         sums[..., :3], depth, sums[..., 4], sums[..., OWN:end], b.alpha.detach(), sums[..., 3], sums[..., 5],
         center_m, b.sums, features, rows, len(field),

@@ -20,7 +20,7 @@ def view_params(
         -(camera.cy + margin_v) / camera.fy,
         (camera.height - camera.cy + margin_v) / camera.fy,
     ]
-    switches = [options.mean_pose_gradient, options.covariance_pose_gradient, options.depth_pose_gradient]
+    switches = [True, options.covariance_pose_gradient, True]  # pose gradient through 2D mean, 2D covariance, depth
     numbers = [camera.fx, camera.fy, camera.cx, camera.cy, *T[:3, :3].ravel(), *T[:3, 3]]
     numbers += [options.near_m, options.low_pass_px2, *limits, camera.width, camera.height, *map(float, switches)]
     return np.array(numbers, dtype)

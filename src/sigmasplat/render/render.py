@@ -13,9 +13,8 @@ from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import COLUMNS, GaussianField, Rows
 from sigmasplat.data.harmonics import view_colors
 from sigmasplat.render.backend import backend_module, backend_name, options_on
-from sigmasplat.render.channels import covariance_features, covariance_of, features_of, variance_of
+from sigmasplat.render.channels import features_of, variance_of
 from sigmasplat.render.cuda import launch as cuda_launch
-from sigmasplat.render.gated_depth import gated_depth
 from sigmasplat.render.low_pass import as_refined
 from sigmasplat.render.ray_depth import depth_at, depth_of, plane_features
 from sigmasplat.render.reference.operators import depth_slopes
@@ -23,15 +22,14 @@ from sigmasplat.render.reference.operators import depth_slopes
 
 @dataclass(frozen=True, eq=False)
 class Render:
-    """The maps that a camera sees of a field, all [H, W] or [H, W, 3], covariance [H, W, 6].
+    """The maps that a camera sees of a field, all [H, W] or [H, W, 3].
 
-    color Ĉ = Σ w c; depth D̂ = Σ w z (m, not divided by alpha), with `render.depth=ray` z along the ray, with
-    `render.depth_gate_m` behind the median gate; alpha A = Σ w;
+    color Ĉ = Σ w c; depth D̂ = Σ w z (m, not divided by alpha), with `render.depth=ray` z along the ray;
+    alpha A = Σ w;
     variance V = Σ w (σ² + c²) − Ĉ², the law of total variance (VarSplat §1); uncertainty U = Σ w (z − D)² of the
     splats' centres about a reference depth D (m², CG-SLAM eq. 10), None without a reference; median_depth: z where half
     of the light is absorbed, 0 if it never is (CG-SLAM eq. 8); median_id, dominant_id: the splat at that depth, and the
-    splat of largest weight, −1 = none; covariance: V with its off-diagonal, in the order rr, gg, bb, rg, rb, gb, None
-    if the field has no `correlations`.
+    splat of largest weight, −1 = none.
     """
 
     color: Tensor
@@ -43,7 +41,6 @@ class Render:
     median_id: Tensor
     dominant_id: Tensor
     dominant_weight: Tensor
-    covariance: Tensor | None = None
 
 
 def colors_from(field: GaussianField, T_camera_world: Tensor, rows: Tensor | None = None) -> Tensor:
@@ -55,14 +52,6 @@ def colors_from(field: GaussianField, T_camera_world: Tensor, rows: Tensor | Non
     T, harmonics = T_camera_world.to(field.params), field.attributes["harmonics"].params
     position = -(T[:3, :3] * T[:3, 3:]).sum(0)
     return view_colors(colors, harmonics if rows is None else harmonics[rows], params[:, COLUMNS["means"]], position)
-
-
-def _features_from(field: GaussianField, z: Tensor, T_camera_world: Tensor) -> Tensor:
-    """Return the values of each splat that are summed per pixel, [N, 7], or [N, 10] with full colour covariance."""
-    colors = colors_from(field, T_camera_world)
-    if "correlations" not in field.attributes:
-        return features_of(colors, z, field.variances)
-    return covariance_features(colors, z, field.variances, field.attributes["correlations"].params)
 
 
 def on_device(field: GaussianField, backend: str) -> GaussianField:
@@ -84,15 +73,15 @@ def render(
 ) -> Render:
     """Render a field at a pose (4×4, world to camera); differentiable in `field.params` and in a tensor pose.
 
-    The pose gradient is the sum of the paths that `options` enables: through 2D means, 2D covariances, depths, and the
-    viewing directions of `harmonics`. Raises BackendError if the backend is not available.
+    The pose gradient is the sum of the paths through 2D means, 2D covariances (unless `options` leaves them out),
+    depths, and the viewing directions of `harmonics`. Raises BackendError if the backend is not available.
     """
     kernels, name = backend_module(backend, field.params.device), backend_name(backend, field.params.device)
     options = options_on(name, options or RenderConfig())
     field = on_device(field, backend)
     T = torch.as_tensor(T_camera_world)
     p = kernels.project(field.means, field.quats, field.scales, T, camera, options)
-    features = _features_from(field, p.z, T if options.color_pose_gradient else T.detach())
+    features = features_of(colors_from(field, T), p.z, field.variances)
     channels, rays = features.shape[1], options.depth == "ray" and len(field) > 0
     if rays:
         slopes = depth_slopes(field.means, field.quats, field.scales, T, camera, options)
@@ -103,8 +92,6 @@ def render(
     nearest = p.z[rows] if len(field) else torch.zeros_like(b.alpha)
     if rays:
         depth, nearest = depth_of(b.sums[..., channels:], camera), depth_at(rows, p, slopes, camera)
-    if options.depth_gate_m:
-        depth = gated_depth(field.params, T, camera, options, name)
     return Render(
         sums[..., 0:3],
         depth,
@@ -115,7 +102,6 @@ def render(
         b.median_id,
         b.dominant_id,
         b.dominant_weight,
-        covariance_of(sums[..., :3], sums[..., 4:]) if "correlations" in field.attributes else None,
     )
 
 

@@ -14,7 +14,6 @@ from torch import Tensor
 from sigmasplat.config import RenderConfig
 from sigmasplat.config.sensors import SensorModel
 from sigmasplat.data.camera import Camera
-from sigmasplat.data.field import Rows
 from sigmasplat.render.reference import operators as reference
 from sigmasplat.types import Matrix
 
@@ -92,11 +91,3 @@ class View(Protocol):
 
     def visible(self, n: int) -> Tensor:
         """Return which of the n splats of the last forward pass reach the image, bool [n]."""
-
-
-class CorrelationView(View, Protocol):
-    """A view of ten planes (r, g, b, z, Σ + c cᵀ ×6), which also reads a field's `correlations`."""
-
-    correlations: Rows
-    g_correlations: Tensor
-    """[N, 3], the gradient of the last backward pass."""

@@ -88,8 +88,8 @@ class SlamSystem(Protocol):
         """Return the poses of all frames, including lost ones."""
         ...
 
-    def believed(self) -> NDArray[np.bool_]:
-        """Return whether the pose of each frame is believed [F]: tracked or relocalised, and connected to the world."""
+    def valid(self) -> NDArray[np.bool_]:
+        """Return whether the pose of each frame is valid [F]: tracked or relocalised, and connected to the world."""
         ...
 
     def components(self) -> Sequence[Component]:

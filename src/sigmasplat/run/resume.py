@@ -17,8 +17,8 @@ from sigmasplat.run.session import run_now
 from sigmasplat.run_folder.run_values import STATE_FIELDS, check_fields
 from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.run_folder.state import read_state, write_state
+from sigmasplat.slam.saved_state import CLASSES, fixed, restore, state_of
 from sigmasplat.slam.slam import Slam
-from sigmasplat.slam.state import CLASSES, fixed, restore, state_of
 
 REFINEMENT_CLASSES: tuple[type, ...] = (GaussianField, Refined, Rows, VectorAdam)
 """The classes that a partly refined final map contains."""

@@ -303,15 +303,15 @@ class Session:
         self.run.sync_log()
         path, components = self.slam.trajectory(), self.slam.components()
         self.apart = tuple(len(component.trajectory) for component in components)
-        believed = path.at(self.slam.believed())
-        self.run.write_trajectory(believed)
+        valid = path.at(self.slam.valid())
+        self.run.write_trajectory(valid)
         if self.all_poses or (self.run.path / ALL_POSES).exists():
             self.run.write_all_poses(path)
         self._write_loops()
         self.run.write_checkpoint(self.slam.checkpoint(), {"frames": str(self.frames)})
         log = self.run.read_log()
         self.run.write_profile(profile(log, self.wall_s))
-        if (up := RunFrames.of(log, believed).measured_up()) is not None:
+        if (up := RunFrames.of(log, valid).measured_up()) is not None:
             self.run.note(up_world=up.tolist())
         self.run.write_components(components)
         self.run.write_map(self.slam.field)

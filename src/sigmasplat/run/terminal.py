@@ -1,10 +1,9 @@
 """Show a run on a terminal, or as plain lines if the output is not a terminal."""
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
-from typing import Any
 
 from rich.console import Console
 from rich.filesize import decimal
@@ -19,7 +18,6 @@ from rich.progress import (
 from rich.table import Table
 
 from sigmasplat.data.component import APART, RELOCALISED
-from sigmasplat.run.figures import format_ranges, headline, number
 from sigmasplat.run.profile import shares
 from sigmasplat.run.protocols import LoopResult, StepResult
 from sigmasplat.types import Progress
@@ -87,20 +85,19 @@ class Screen:
         with Bars(*columns, TimeRemainingColumn(), console=self.out) as bars:
             yield partial(_bar, bars)
 
-    def results(self, metrics: dict[str, Any]) -> None:
-        """Print the main figures as a table, and the frames that have no pose in the world."""
-        table = Table("", "value", "")
+    def results(self, sentence: str, figures: Iterable[tuple[str, str, str]]) -> None:
+        """Print the result in a sentence, and figures (name, value, unit) below."""
+        self.say(sentence)
+        table = Table("", "value", "", box=None, show_header=False)
         table.columns[1].justify = "right"
-        for name, value, unit in _figures(metrics):
-            table.add_row(name, value, unit)
+        for row in figures:
+            table.add_row(*row)
         self.out.print(table)
-        lost, apart = metrics.get("lost_frames") or [], metrics.get("apart_frames") or []
-        frames = metrics.get("frames")
-        if lost:
-            self.say(f"tracking was LOST on {len(lost)} of {frames} frames: {format_ranges(lost)}; they have no pose")
-        if apart:
-            where = format_ranges(apart)
-            self.say(f"{len(apart)} of {frames} frames are APART: {where}; their maps are in components/")
+
+    def next_commands(self, commands: Iterable[str]) -> None:
+        """Print what to do next, one command a line."""
+        for number, command in enumerate(commands):
+            self.say(f"{'      ' if number else 'next: '}{command}")
 
     def profile(self, seconds: Mapping[str, float]) -> None:
         """Print the time of each stage."""
@@ -114,17 +111,6 @@ class Screen:
 
 def _console(stderr: bool) -> Console:
     return Console(stderr=stderr, highlight=False, markup=False, emoji=False, soft_wrap=True)
-
-
-def _figures(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
-    """Return the main figures of the report, with the PSNR of training views added after that of held-out views."""
-    rows = headline(metrics)
-    kinds = {"PSNR, training": metrics.get("training") or {}}
-    if metrics.get("training_submaps"):
-        kinds["PSNR, training, in submaps"] = metrics["training_submaps"]
-    training = [(name, number(scores.get("psnr_db"), 2), "dB") for name, scores in kinds.items()]
-    place = 1 + max(i for i, row in enumerate(rows) if row[0].startswith("PSNR"))
-    return [*rows[:place], *training, *rows[place:]]
 
 
 def _bar(bars: Bars, title: str, total: int | None) -> Show:

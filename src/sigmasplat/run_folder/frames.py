@@ -1,4 +1,4 @@
-"""Combine the log and the path of a run: the state of each frame at the end of the run, and its pose if believed."""
+"""Combine the log and the path of a run: the state of each frame at the end of the run, and its pose if valid."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ SAME_TIME_S = 1e-4
 class RunFrames:
     """The frames of a run in the order of its log.
 
-    log [F]: the records of log.jsonl; states [F]: the states at the end of the run; rows [B]: the rows of the believed
+    log [F]: the records of log.jsonl; states [F]: the states at the end of the run; rows [B]: the rows of the valid
     frames (tracked or relocalised, and connected to the world), in ascending order; path: their poses.
 
     A component can join the world after its frames were logged, so a state can differ from the one in the log: a frame
@@ -39,19 +39,19 @@ class RunFrames:
         """Combine a log and the poses of trajectory.txt.
 
         In runs of old releases the log has no states and the trajectory contains the lost frames too. Their poses are
-        not believed. If their trajectory is shorter than the log, only the frames before its end count.
+        not valid. If their trajectory is shorter than the log, only the frames before its end count.
         """
         rows, poses = _common(log, trajectory.timestamps_s)
         if not any("state" in record for record in log):
             log = log[: rows[-1] + 1] if len(rows) else []
         kept = np.array([not _is_lost(log[row]) for row in rows], np.bool_)
         rows, poses = rows[kept], poses[kept]
-        believed = np.isin(np.arange(len(log)), rows)
+        valid = np.isin(np.arange(len(log)), rows)
         logged = [
             LOST if _is_lost(record) or ("state" not in record and not posed) else record.get("state", TRACKED)
-            for record, posed in zip(log, believed, strict=True)
+            for record, posed in zip(log, valid, strict=True)
         ]
-        states = states_at_end(logged, believed)
+        states = states_at_end(logged, valid)
         return RunFrames(log, tuple(states.tolist()), rows, trajectory.at(poses))
 
     def __len__(self) -> int:
@@ -62,8 +62,8 @@ class RunFrames:
         return [record["index"] for record, found in zip(self.log, self.states, strict=True) if found == state]
 
     @cached_property
-    def believed(self) -> NDArray[np.bool_]:
-        """Return whether the pose of each frame is believed [F]."""
+    def valid(self) -> NDArray[np.bool_]:
+        """Return whether the pose of each frame is valid [F]."""
         return np.isin(np.arange(len(self)), self.rows)
 
     @cached_property
@@ -73,13 +73,13 @@ class RunFrames:
 
     def measured_up(self) -> NDArray[np.float64] | None:
         """Return the unit vector [3] that points up in the world, from the forces that an accelerometer measured on the
-        believed frames; None if it did not."""
+        valid frames; None if it did not."""
         forces = [self.log[row].get("specific_force_m_s2") for row in self.rows]
         known = [i for i, force in enumerate(forces) if force is not None]
         return up_of_path(self.path.T_world_camera[known], np.array([forces[i] for i in known]).reshape(-1, 3))
 
     def posed_log(self) -> Log:
-        """Return the records of the believed frames, each with `T_world_camera` [4, 4], its `state` at the end, and
+        """Return the records of the valid frames, each with `T_world_camera` [4, 4], its `state` at the end, and
         its `row` in the log."""
         return [
             self.log[row] | {"T_world_camera": T, "row": int(row), "state": self.states[row]}

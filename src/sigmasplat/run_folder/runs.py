@@ -215,11 +215,11 @@ class RunFolder:
         return loops
 
     def write_trajectory(self, trajectory: Trajectory) -> None:
-        """Write trajectory.txt: the believed poses (TUM text, T_world_camera)."""
+        """Write trajectory.txt: the valid poses (TUM text, T_world_camera)."""
         tum.write_trajectory(self.path / "trajectory.txt", trajectory)
 
     def read_trajectory(self) -> Trajectory:
-        """Read trajectory.txt; it is empty if no pose is believed.
+        """Read trajectory.txt; it is empty if no pose is valid.
 
         Raises RunError if it is missing, SourceError if it is damaged.
         """

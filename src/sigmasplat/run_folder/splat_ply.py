@@ -2,7 +2,7 @@
 
 Columns: x y z, nx ny nz (0), f_dc_0..2 = (colour − ½)/C0, f_rest_0..44 for view-dependent colours (all harmonics of
 red, then green, then blue), opacity (logit), scale_0..2 (log metres), rot_0..3 (wxyz), and our own at the end:
-log_variance_0..2, correlation_0..2 if the map has full colour covariances, then depth_std_m and color_std if they are
+log_variance_0..2, then depth_std_m and color_std if they are
 known. Our reader ignores the last two. Readers that find columns by name skip ours: SuperSplat and splat-transform
 (PlayCanvas), antimatter15/splat, nianticlabs/spz. Readers that assume the fixed 62-float layout and ignore the names
 would read garbage: the original 3DGS viewer (SIBR), 3DGS.cpp, older Unity importers. `plain` writes exactly these 62
@@ -37,7 +37,6 @@ PLY_COLUMNS: dict[str, list[str]] = {
 BEFORE_HARMONICS = [*PLY_COLUMNS["means"], "nx", "ny", "nz", *PLY_COLUMNS["colors"]]
 AFTER_HARMONICS = ["opacity", *PLY_COLUMNS["log_scales"], *PLY_COLUMNS["quats"]]
 REST = "f_rest_"
-CORRELATIONS = [f"correlation_{i}" for i in range(ATTRIBUTES["correlations"])]
 STD_COLUMNS = ("depth_std_m", "color_std")
 AT_ONCE = 1 << 18
 """Splats that are converted at once: the file may be larger than the memory."""
@@ -62,8 +61,7 @@ def _columns(field: GaussianField, plain: bool, std: SplatStd | None) -> list[st
     """Return the names of a file's columns in their order."""
     with_harmonics = plain or "harmonics" in field.attributes
     rest = [f"{REST}{i}" for i in range(ATTRIBUTES["harmonics"] if with_harmonics else 0)]
-    correlations = CORRELATIONS if "correlations" in field.attributes else []
-    ours = [] if plain else [*PLY_COLUMNS["log_variances"], *correlations, *(() if std is None else STD_COLUMNS)]
+    ours = [] if plain else [*PLY_COLUMNS["log_variances"], *(() if std is None else STD_COLUMNS)]
     return [*BEFORE_HARMONICS, *rest, *AFTER_HARMONICS, *ours]
 
 
@@ -79,8 +77,6 @@ def _rows(field: GaussianField, std: SplatStd | None, columns: list[str], part: 
     if "harmonics" in field.attributes:
         harmonics = field.attributes["harmonics"].params[part].detach().cpu().numpy()
         _fill(rows, [f"{REST}{i}" for i in range(harmonics.shape[1])], by_channel(harmonics.astype(np.float32)))
-    if CORRELATIONS[0] in columns:
-        _fill(rows, CORRELATIONS, field.attributes["correlations"].params[part].detach().cpu().numpy())
     if std is not None:
         _fill(rows, STD_COLUMNS, np.stack([getattr(std, name)[part].numpy() for name in STD_COLUMNS], 1))
     return rows
@@ -106,10 +102,6 @@ def read_field(path: Path) -> GaussianField:
     field, harmonics = GaussianField(torch.from_numpy(_params(rows, path))), _harmonics(rows, path)
     if harmonics is not None:
         field.attributes["harmonics"] = Rows(torch.from_numpy(harmonics))
-    if set(CORRELATIONS) <= set(rows.dtype.names or ()):
-        correlations = np.stack([rows[name] for name in CORRELATIONS], 1).astype(np.float32)
-        check_finite(correlations, path)
-        field.attributes["correlations"] = Rows(torch.from_numpy(correlations))
     return field
 
 

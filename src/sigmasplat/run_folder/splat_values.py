@@ -26,7 +26,7 @@ MOST_REPEATED = 1_000_000
 
 @dataclass(frozen=True)
 class SplatValues:
-    """N splats as float64 arrays, without σ² and correlations, which other programs' formats cannot hold.
+    """N splats as float64 arrays, without σ², which other programs' formats cannot hold.
 
     means [N, 3] m; quats [N, 4] wxyz, unit length; log_scales [N, 3] log metres; opacities [N] in [0, 1];
     colors [N, 3]; harmonics [N, 3·k] of the lowest sufficient degree: k = 0, 3, 8 or 15 per channel, columns

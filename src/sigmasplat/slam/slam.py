@@ -11,7 +11,7 @@ from sigmasplat.data.frame import Frame
 from sigmasplat.data.hops import UNKNOWN_HOP, Hop
 from sigmasplat.data.submap import RefinedStore, StorePart
 from sigmasplat.final.final_map import final_map
-from sigmasplat.final.pose_reach import reaching
+from sigmasplat.final.pose_trust_region import reaching
 from sigmasplat.final.uncertainty import final_uncertainty
 from sigmasplat.fit.pose import PoseFit
 from sigmasplat.graph.loops import Loop
@@ -19,21 +19,20 @@ from sigmasplat.graph.path_covariance import PathCovariance
 from sigmasplat.render.low_pass import as_refined
 from sigmasplat.slam.array_interface import ArrayInterface
 from sigmasplat.slam.listeners import notifying
-from sigmasplat.slam.mapping import MapWork
+from sigmasplat.slam.mapping_backend import MappingBackend
 from sigmasplat.slam.step_result import Step, StepTimer
-from sigmasplat.tracking.drift import mean_variance
 from sigmasplat.tracking.fitted_depth import fitted_keyframe, fitted_to_map
-from sigmasplat.tracking.found import Found
-from sigmasplat.tracking.moving.foreground import share_of
+from sigmasplat.tracking.frame_estimate import FrameEstimate
+from sigmasplat.tracking.moving.dynamic_mask import share_of
+from sigmasplat.tracking.pose_validation import is_better, is_questionable
+from sigmasplat.tracking.prepared_frame import PreparedFrame, refuse_first_without_depth, working_frame
 from sigmasplat.tracking.recovery import usable
 from sigmasplat.tracking.relocaliser import Relocation
 from sigmasplat.tracking.rules import is_held_back, is_keyframe
-from sigmasplat.tracking.sight import Observation, refuse_first_without_depth, working_frame
-from sigmasplat.tracking.verdict import is_better, is_questionable
 from sigmasplat.types import Matrix, completed, no_progress, part_of
 
 
-class Slam(MapWork, ArrayInterface):
+class Slam(MappingBackend, ArrayInterface):
     """Simultaneous localisation and mapping: give frames to `step`, or arrays to `track`, then call `finish`; read
     `field` and `trajectory()` at any time.
 
@@ -63,8 +62,8 @@ class Slam(MapWork, ArrayInterface):
             self._map(seen, found)
             completed(self.seek_component(seen, found.T_submap_camera))
         else:
-            self._offer_probe(seen, found)
-            completed(self.refining(self.mapper.due))
+            self._offer_validation_view(seen, found)
+            completed(self.refining(self.mapper.pending_now))
             self._look_for_loops()
         self.atlas.place_frame(found.T_submap_camera)
         self.steps.append(self._step_result(seen.frame, found, self.closer.loops[loops_before:]))
@@ -78,7 +77,7 @@ class Slam(MapWork, ArrayInterface):
         the uncertainty is measured at; without both the total is 1. Does nothing when no rule cuts submaps and
         `final.iterations` is 0. Components that are not connected to the world are left out of the final map.
         """
-        completed(self.refining(self.mapper.owed))
+        completed(self.refining(self.mapper.pending))
         if not self.steps or not (len(self.store) or self.cuts or self.config.final.iterations):
             return
         steps, measures = self._refinement_steps(), self.config.uncertainty.probes > 0
@@ -92,7 +91,7 @@ class Slam(MapWork, ArrayInterface):
         members = self.atlas.members(0)
         store, anchors = StorePart(self.store, members), [self.atlas.anchors[s] for s in members]
         refining, measuring = (part_of(progress, first, total) for first in (0, steps))
-        known = PathCovariance.of_keyframes(self.atlas, self.closer.believed)
+        known = PathCovariance.of_keyframes(self.atlas, self.closer.valid)
         config = replace(self.config, final=reaching(self.config.final, known))
         final = final_map(store, anchors, config, self.view, self.random, refining, self.saved_refinement)
         self._final, self.refinement_steps = final.field, final.steps
@@ -110,33 +109,30 @@ class Slam(MapWork, ArrayInterface):
         final, photos = self.config.final, any(keyframe.photo for keyframe in self.mapper.keyframes)
         return final.iterations + final.width_iterations * (photos and final.iterations > 0)
 
-    def _observe(self, frame: Frame) -> Observation:
+    def _observe(self, frame: Frame) -> PreparedFrame:
         """Resize a frame to working size and prepare it for the fits."""
         with self._timer.stage("prepare"):
             view = self._view or self.prepare(working_frame(frame, self.config).camera)
             self._timer.start_kernels(view)
             return self.observed(frame, view, self.extractor)
 
-    def _begin(self, seen: Observation) -> Found:
+    def _begin(self, seen: PreparedFrame) -> FrameEstimate:
         """Start the first submap at the first frame. Its camera is the world, unless there are earlier submaps: then
         it is connected to the place where it is found, or begins a new component."""
         refuse_first_without_depth(seen.frame, self.config)
         self.tracker.start(seen, seen.frame.prior)
         place = self.begin_first(seen)
         if place is None:
-            return Found(np.eye(4), TRACKED, mapped=True)
-        return Found(np.eye(4), RELOCALISED, place.values(), mapped=True)
+            return FrameEstimate(np.eye(4), TRACKED, mapped=True)
+        return FrameEstimate(np.eye(4), RELOCALISED, place.values(), mapped=True)
 
-    def _localise(self, seen: Observation) -> Found:
+    def _localise(self, seen: PreparedFrame) -> FrameEstimate:
         """Track a frame; if it is lost, search the whole map for it; if that fails too often, begin a new map."""
         fit = self._track(seen)
         lost, held_back = self.tracker.lost, is_held_back(len(self.steps), self.config.input.hold_every)
         self.recovery.count(lost, self.tracker.doubtful > 0, seen)
-        found = Found.of(fit, se3.inverse(fit.T_camera_world), lost)
+        found = FrameEstimate.of(fit, se3.inverse(fit.T_camera_world), lost)
         if not lost:
-            if self.config.submaps.variance_sum:
-                self.drift.variance_sum += mean_variance(self.mapper.field, self.view, fit.T_camera_world)
-                found.tracking["variance_sum"] = self.drift.variance_sum
             certain = self.recovery.is_steady and self.tracker.is_certain(fit)
             found.mapped = certain and not held_back and self._is_keyframe(fit)
             if found.mapped:
@@ -153,17 +149,17 @@ class Slam(MapWork, ArrayInterface):
             self._begin_apart(seen, found)
         return found
 
-    def _track(self, seen: Observation) -> PoseFit:
+    def _track(self, seen: PreparedFrame) -> PoseFit:
         """Fit the frame's pose to the active submap."""
         with self._timer.stage("track"), self._timer.kernels_of(self.view, "track_kernels"):
             return self.tracker.track(self.mapper.field, self.view, seen, seen.frame.prior)
 
     def _is_keyframe(self, fit: PoseFit) -> bool:
         c, since = self.config.mapping, len(self.steps) - self.mapper.keyframes[-1].index
-        renews = self.tracker.watch.renews(fit.comparison, self.tracker.front)
+        renews = self.tracker.detector.renews(fit.comparison, self.tracker.front)
         return renews or is_keyframe(since, c.every, fit.overlap, c.overlap_below)
 
-    def _map(self, seen: Observation, found: Found) -> None:
+    def _map(self, seen: PreparedFrame, found: FrameEstimate) -> None:
         """Map a keyframe, and cut the submap if a rule ends it here."""
         found.T_submap_camera = self._mapped(seen, found.T_submap_camera, found.hop)
         if self.submap_ends(len(self.steps), found.T_submap_camera):
@@ -175,24 +171,24 @@ class Slam(MapWork, ArrayInterface):
         with self._timer.stage("loops"):
             completed(self.closing(self.config.loops.slices_per_frame))
 
-    def _mapped(self, seen: Observation, T_submap_camera: Matrix, hop: Hop = UNKNOWN_HOP) -> Matrix:
+    def _mapped(self, seen: PreparedFrame, T_submap_camera: Matrix, hop: Hop = UNKNOWN_HOP) -> Matrix:
         """Map a keyframe, and track the next frames relative to it; return its pose."""
         T_submap_camera = completed(self.map_keyframe(seen, len(self.steps), T_submap_camera, hop))
         self.tracker.keep_keyframe(self.mapper.field, self.view, seen, T_submap_camera)
         return T_submap_camera
 
-    def _offer_probe(self, seen: Observation, found: Found) -> None:
+    def _offer_validation_view(self, seen: PreparedFrame, found: FrameEstimate) -> None:
         """Offer a frame as a probe view if it was tracked without doubt and is not held back."""
         index, newest = len(self.steps), self.mapper.keyframes[-1]
         held_back = is_held_back(index, self.config.input.hold_every)
         if found.state == TRACKED and self.recovery.is_steady and not self.tracker.doubtful and not held_back:
             T_keyframe_camera = se3.inverse(newest.T_world_camera) @ found.T_submap_camera
             last = len(self.mapper.keyframes) - 1
-            self.probes.offer(index, last, index - newest.index, T_keyframe_camera, seen.target)
+            self.validation_views.offer(index, last, index - newest.index, T_keyframe_camera, seen.target)
 
     # ---- lost and found ----
 
-    def _question(self, fit: PoseFit, seen: Observation, found: Found) -> None:
+    def _question(self, fit: PoseFit, seen: PreparedFrame, found: FrameEstimate) -> None:
         """After some doubtful frames, search the whole map for a pose that explains the frame much better."""
         if fit.comparison is None or not is_questionable(self.tracker.doubtful):
             return
@@ -200,7 +196,7 @@ class Slam(MapWork, ArrayInterface):
         if place is not None and is_better(place.comparison, fit.comparison):
             self._go_to(place, seen, found)
 
-    def _go_to(self, place: Relocation, seen: Observation, found: Found) -> None:
+    def _go_to(self, place: Relocation, seen: PreparedFrame, found: FrameEstimate) -> None:
         """Continue where the camera was found: in the active submap, or in a new one that is connected to the place."""
         found.state, submap = RELOCALISED, place.where[0]
         found.tracking |= place.values()
@@ -208,24 +204,24 @@ class Slam(MapWork, ArrayInterface):
             found.T_submap_camera = place.T_submap_camera
             self.tracker.move_to(self.mapper.field, self.view, place.keyframe, place.T_submap_camera)
         else:
-            self.tracker.watch = self.tracker.watch.cleared()
+            self.tracker.detector = self.tracker.detector.cleared()
             completed(self.branch_at(place))
             found.T_submap_camera, found.mapped = np.eye(4), True
         self.recovery.found()
 
-    def _begin_apart(self, seen: Observation, found: Found) -> None:
+    def _begin_apart(self, seen: PreparedFrame, found: FrameEstimate) -> None:
         """Begin a new map at the camera, whose place in the world is not known yet."""
         completed(self.begin_apart())
         self.tracker.forget()
         self.recovery.found()
         found.T_submap_camera, found.state, found.mapped = np.eye(4), APART, True
 
-    def _step_result(self, frame: Frame, found: Found, loops: Sequence[Loop]) -> Step:
+    def _step_result(self, frame: Frame, found: FrameEstimate, loops: Sequence[Loop]) -> Step:
         component, in_submap_m = self.atlas.components[-1], self.drift.position_m(found.T_submap_camera)
         state = APART if component and found.state != LOST else found.state
         found.tracking |= {
             "position_std_m": self.confidence.position_std_m(in_submap_m), "doubtful": float(self.tracker.doubtful),
-            "usual_residual": self.tracker.usual.residual, "moving": share_of(self.tracker.front),
+            "usual_residual": self.tracker.statistics.residual, "moving": share_of(self.tracker.front),
         }  # fmt: skip
         p_off = self.confidence.probability(state, found.tracking)
         return Step(

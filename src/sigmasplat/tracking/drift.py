@@ -7,9 +7,6 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sigmasplat.data import se3
-from sigmasplat.data.field import GaussianField
-from sigmasplat.fit.tracking_loss import PoseMaps
-from sigmasplat.render.view import View
 from sigmasplat.types import Matrix
 
 HOP_M, HOP_RAD = 0.002, 0.002
@@ -17,8 +14,6 @@ HOP_M, HOP_RAD = 0.002, 0.002
 FLOOR_M, FLOOR_RAD = 0.005, 0.003
 """Least standard deviation of a pose between two maps, or in another map: two maps of the same wall differ by about
 this much."""
-OPAQUE = 0.95
-"""V is averaged where the rendered alpha is above this; elsewhere V has no meaning."""
 UNKNOWN = np.diag([1.0] * 6)
 """Covariance of a hop between images without overlap, m² and rad²."""
 BIAS = 0.02
@@ -32,9 +27,8 @@ class Drift:
 
     Each frame is tracked against the newest keyframe, so errors accumulate per keyframe, not per frame. First order:
     hops are independent, and their covariances add after transformation to the submap's frame. `covariance` sums the
-    estimates of alignment; `usual` sums the constant errors that alignment cannot estimate. `variance_sum` sums the
-    mean V of tracked frames, if a rule reads it. scene_scale: size of the scene relative to a room; constant errors in
-    metres grow with it.
+    estimates of alignment; `usual` sums the constant errors that alignment cannot estimate. scene_scale: size of
+    the scene relative to a room; constant errors in metres grow with it.
     """
 
     covariance: Matrix = field(default_factory=lambda: np.zeros((6, 6)))
@@ -42,7 +36,6 @@ class Drift:
     travelled_m: float = 0.0
     turned_rad: float = 0.0
     last: Matrix = field(default_factory=lambda: np.eye(4))
-    variance_sum: float = 0.0
     scene_scale: float = 1.0
 
     def hop(self, T_submap_camera: Matrix, covariance: Matrix | None) -> None:
@@ -106,16 +99,6 @@ def systematic_errors(moved_m: float, turned_rad: float) -> Matrix:
 def floor(scene_scale: float = 1.0) -> Matrix:
     """Return the least covariance [6, 6] of a pose between two maps, m² and rad²."""
     return np.diag(np.repeat([(FLOOR_M * scene_scale) ** 2, FLOOR_RAD**2], 3))
-
-
-def mean_variance(field: GaussianField, view: View, T_camera_submap: Matrix) -> float:
-    """Return the mean of V over the channels and the pixels that the map covers, rendered at a pose [4, 4]; 0 if it
-    covers none. The view must have planes for σ²."""
-    view.forward(field.params, T_camera_submap)
-    maps = PoseMaps.of(view)
-    assert maps.variance is not None
-    covered = maps.alpha > OPAQUE
-    return float(maps.variance.clamp(min=0.0)[covered].double().mean()) if bool(covered.any()) else 0.0
 
 
 def symmetric(matrix: Matrix) -> Matrix:

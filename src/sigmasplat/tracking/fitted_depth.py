@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from sigmasplat.data import se3
 from sigmasplat.render.view import View
 from sigmasplat.tracking.depth_fit import DepthFit
-from sigmasplat.tracking.sight import Observation
+from sigmasplat.tracking.prepared_frame import PreparedFrame
 from sigmasplat.tracking.tracked_keyframe import Splats
 from sigmasplat.tracking.tracker import Tracker
 from sigmasplat.types import Matrix
@@ -17,19 +17,19 @@ OPAQUE = 0.9
 """The map shows a surface where its alpha is above this."""
 
 
-def fitted_to_map(tracker: Tracker, field: Splats, view: View, seen: Observation) -> Observation:
+def fitted_to_map(tracker: Tracker, field: Splats, view: View, seen: PreparedFrame) -> PreparedFrame:
     """Return a frame whose depth agrees with the map at the pose where it is expected, and remember the fit; the same
     frame without `tracking.fit_depth`."""
     if not tracker.config.fit_depth:
         return seen
-    T_world_camera = tracker.expected(seen.frame.prior).predicted
+    T_world_camera = tracker.prediction(seen.frame.prior).predicted
     tracker.depth = _fitted(tracker.depth, field, view, seen, T_world_camera)
     return _with_fit(tracker.depth, seen)
 
 
 def fitted_keyframe(
-    tracker: Tracker, field: Splats, view: View, seen: Observation, T_world_camera: Matrix, connected: bool
-) -> Observation:
+    tracker: Tracker, field: Splats, view: View, seen: PreparedFrame, T_world_camera: Matrix, connected: bool
+) -> PreparedFrame:
     """Return a frame that is to be mapped with the depth that its tracked pose and the views of earlier keyframes
     show, and remember the fit; the same frame without `tracking.fit_depth`.
 
@@ -49,7 +49,7 @@ def fitted_keyframe(
     return _with_fit(depth, seen)
 
 
-def _fitted(depth: DepthFit, field: Splats, view: View, seen: Observation, T_world_camera: Matrix) -> DepthFit:
+def _fitted(depth: DepthFit, field: Splats, view: View, seen: PreparedFrame, T_world_camera: Matrix) -> DepthFit:
     if not len(field.params):
         return depth
     return depth.fitted(seen.frame.depth_m, _depth_of_map(field, view, T_world_camera))
@@ -63,5 +63,5 @@ def _depth_of_map(field: Splats, view: View, T_world_camera: Matrix) -> NDArray[
     return np.where(alpha > OPAQUE, depth / np.maximum(alpha, np.float32(OPAQUE)), np.float32(0.0))
 
 
-def _with_fit(depth: DepthFit, seen: Observation) -> Observation:
+def _with_fit(depth: DepthFit, seen: PreparedFrame) -> PreparedFrame:
     return seen.with_depth(depth.applied(seen.frame.depth_m))

@@ -6,13 +6,10 @@ from dataclasses import dataclass
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.frame import Detail
-from sigmasplat.data.submap import Picture, SubmapStore
+from sigmasplat.data.submap import KeyframeId, Picture, SubmapStore
 from sigmasplat.fit.target import Keyframe
 from sigmasplat.tracking.feature_image import FeatureImage, gray_levels
 from sigmasplat.types import Matrix
-
-Where = tuple[int, int]
-"""Submap and keyframe; both count from 0."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,12 +39,12 @@ class KnownMap:
     field: GaussianField
     wanted: Callable[[int], bool] = lambda submap: True
 
-    def keyframes(self) -> list[Where]:
+    def keyframes(self) -> list[KeyframeId]:
         """Return all keyframes to search, the newest first."""
         found = [(s, k) for s, poses in enumerate(self.keyframe_poses) if self.wanted(s) for k in range(len(poses))]
         return found[::-1]
 
-    def keyframe(self, where: Where) -> KnownKeyframe:
+    def keyframe(self, where: KeyframeId) -> KnownKeyframe:
         """Return one keyframe."""
         submap, k = where
         stored = submap < len(self.store)

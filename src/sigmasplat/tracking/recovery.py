@@ -7,7 +7,7 @@ import numpy as np
 from sigmasplat.config import RecoveryConfig
 from sigmasplat.data import se3
 from sigmasplat.data.atlas import Atlas
-from sigmasplat.tracking.sight import Sight
+from sigmasplat.tracking.prepared_frame import PreparedImages
 from sigmasplat.types import Matrix
 
 LEAST_READINGS = 0.05
@@ -18,7 +18,7 @@ SAME_M, SAME_RAD = 0.1, np.deg2rad(5.0)
 """Two observations of the pose between two components agree if they differ by less than this, in a room."""
 
 
-def usable(seen: Sight) -> bool:
+def usable(seen: PreparedImages) -> bool:
     """Return whether a frame shows enough to be recognised or to begin a map."""
     readings = seen.target.valid_pixels / (seen.target.camera.width * seen.target.camera.height)
     return readings >= LEAST_READINGS and (seen.image is None or float(seen.image.detail.gray.std()) >= LEAST_CONTRAST)
@@ -44,7 +44,7 @@ class Recovery:
     steady: int = 1_000_000
     link: Link | None = None
 
-    def count(self, lost: bool, doubtful: bool, seen: Sight) -> None:
+    def count(self, lost: bool, doubtful: bool, seen: PreparedImages) -> None:
         """Count a frame."""
         if lost:
             self.lost += usable(seen)
@@ -77,7 +77,7 @@ class Recovery:
         if atlas.components[before.a] != atlas.components[link.a]:
             before = Link(before.b, before.a, se3.inverse(before.T_a_b), before.information)
         between = atlas.anchors[before.a] @ before.T_a_b @ se3.inverse(atlas.anchors[before.b])
-        expected = se3.inverse(atlas.anchors[link.a]) @ between @ atlas.anchors[link.b]
-        apart = se3.inverse(expected) @ link.T_a_b
+        prediction = se3.inverse(atlas.anchors[link.a]) @ between @ atlas.anchors[link.b]
+        apart = se3.inverse(prediction) @ link.T_a_b
         near = float(np.linalg.norm(apart[:3, 3])) < SAME_M * scene_scale
         return near and se3.rotation_angle(apart[:3, :3]) < SAME_RAD

@@ -12,6 +12,7 @@ import numpy as np
 
 from sigmasplat.config import Config, TrackingConfig
 from sigmasplat.data import se3
+from sigmasplat.data.submap import KeyframeId
 from sigmasplat.fit.compare import Comparison
 from sigmasplat.fit.pose import PoseFit, fit_pose_align
 from sigmasplat.fit.references import Reference, map_reference, picture_images
@@ -19,10 +20,10 @@ from sigmasplat.render.view import View
 from sigmasplat.tracking.drift import floor, symmetric
 from sigmasplat.tracking.feature_image import pose_by_features
 from sigmasplat.tracking.features import Extractor, Features, Landmarks, matches_by_descriptor
-from sigmasplat.tracking.known_map import KnownKeyframe, KnownMap, Where
-from sigmasplat.tracking.sight import FoundKeyframe, Sight
-from sigmasplat.tracking.verdict import MOST_SPREAD_M, recognised, score
-from sigmasplat.types import Matrix, Slices, completed
+from sigmasplat.tracking.known_map import KnownKeyframe, KnownMap
+from sigmasplat.tracking.pose_validation import MOST_SPREAD_M, recognised, score
+from sigmasplat.tracking.prepared_frame import FoundKeyframe, PreparedImages
+from sigmasplat.types import Matrix, Task, completed
 
 STRONGEST = 400
 """Number of features of each image that are compared to choose candidates."""
@@ -42,7 +43,7 @@ class Relocation:
     """Where the camera was found: submap and keyframe by number, the keyframe, the number of matches that support the
     pose, the fit whose T_camera_world is T_camera_submap [4, 4], and its comparison with the map."""
 
-    where: Where
+    where: KeyframeId
     keyframe: FoundKeyframe
     inliers: int
     fit: PoseFit
@@ -104,12 +105,12 @@ class Relocaliser:
 
     config: Config
     extractor: Extractor | None
-    indexed: list[Where] = field(default_factory=list)
-    _strongest: dict[Where, Features] = field(default_factory=dict, init=False)
-    _landmarks: "OrderedDict[Where, Landmarks]" = field(default_factory=OrderedDict, init=False)
+    indexed: list[KeyframeId] = field(default_factory=list)
+    _strongest: dict[KeyframeId, Features] = field(default_factory=dict, init=False)
+    _landmarks: "OrderedDict[KeyframeId, Landmarks]" = field(default_factory=OrderedDict, init=False)
 
     def find(
-        self, known: KnownMap, view: View, seen: Sight, index_at_most: int | None = INDEX_AT_MOST
+        self, known: KnownMap, view: View, seen: PreparedImages, index_at_most: int | None = INDEX_AT_MOST
     ) -> Relocation | None:
         """Return where the camera is, or None if no keyframe leads to a pose that the map confirms.
 
@@ -118,14 +119,14 @@ class Relocaliser:
         return self.search(known, view, seen, index_at_most).found
 
     def search(
-        self, known: KnownMap, view: View, seen: Sight, index_at_most: int | None = INDEX_AT_MOST
+        self, known: KnownMap, view: View, seen: PreparedImages, index_at_most: int | None = INDEX_AT_MOST
     ) -> SearchResult:
         """Search as `find` does, and also return what was refused."""
         return completed(self.searching(known, view, seen, index_at_most))
 
     def searching(
-        self, known: KnownMap, view: View, seen: Sight, index_at_most: int | None = INDEX_AT_MOST
-    ) -> Slices[SearchResult]:
+        self, known: KnownMap, view: View, seen: PreparedImages, index_at_most: int | None = INDEX_AT_MOST
+    ) -> Task[SearchResult]:
         """Search as `search` does, in slices: the features of one keyframe, one pose. `known` must not change."""
         wanted = known.keyframes()
         yield from self._index(known, view, wanted, index_at_most)
@@ -141,7 +142,7 @@ class Relocaliser:
             yield
         return SearchResult(best.get(True), len(candidates), best.get(False))
 
-    def _index(self, known: KnownMap, view: View, wanted: Sequence[Where], at_most: int | None) -> Slices[None]:
+    def _index(self, known: KnownMap, view: View, wanted: Sequence[KeyframeId], at_most: int | None) -> Task[None]:
         """Add keyframes to the search, and find the features that are missing, also those of a resumed run."""
         have = set(self.indexed)
         self.indexed += [where for where in wanted if where not in have][:at_most]
@@ -150,7 +151,7 @@ class Relocaliser:
                 self._landmarks_of(known, view, where)
                 yield
 
-    def _landmarks_of(self, known: KnownMap, view: View, where: Where) -> Landmarks:
+    def _landmarks_of(self, known: KnownMap, view: View, where: KeyframeId) -> Landmarks:
         """Return the landmarks of a keyframe; those used last stay in memory."""
         if where not in self._landmarks:
             assert self.extractor is not None
@@ -163,7 +164,7 @@ class Relocaliser:
         self._landmarks.move_to_end(where)
         return self._landmarks[where]
 
-    def _candidates(self, wanted: Sequence[Where], seen: Sight) -> list[Where]:
+    def _candidates(self, wanted: Sequence[KeyframeId], seen: PreparedImages) -> list[KeyframeId]:
         """Return the keyframes with the most matches, best first."""
         assert seen.image is not None and self.extractor is not None
         live = seen.image.features(self.extractor)
@@ -176,7 +177,7 @@ class Relocaliser:
         best = sorted((vote for vote in votes if vote[0] >= LEAST_MATCHES), key=lambda vote: -vote[0])
         return [where for _, where in best[: self.config.recovery.candidates]]
 
-    def _poses(self, known: KnownMap, view: View, seen: Sight, where: Where) -> Iterator[Relocation]:
+    def _poses(self, known: KnownMap, view: View, seen: PreparedImages, where: KeyframeId) -> Iterator[Relocation]:
         """Yield the pose of a candidate, aligned to the keyframe's own image, then to the map rendered there."""
         assert seen.image is not None and self.extractor is not None
         keyframe, landmarks = known.keyframe(where), self._landmarks_of(known, view, where)
@@ -194,7 +195,7 @@ class Relocaliser:
 
 
 def aligned(
-    reference: Reference, seen: Sight, T_camera_world: Matrix, config: TrackingConfig
+    reference: Reference, seen: PreparedImages, T_camera_world: Matrix, config: TrackingConfig
 ) -> tuple[PoseFit, Comparison]:
     """Align a frame to a reference from a guess; return the fit, and the comparison of both images at it.
 
@@ -213,6 +214,6 @@ def _compact(descriptors: Matrix) -> Matrix:
     return descriptors.astype(np.float16) if descriptors.dtype == np.float32 else descriptors
 
 
-def sight_of(keyframe: KnownKeyframe, view: View) -> Sight:
+def sight_of(keyframe: KnownKeyframe, view: View) -> PreparedImages:
     """Return a keyframe of the map in the form of a frame to be found."""
-    return Sight(*picture_images(view, keyframe.picture, view.camera), keyframe.image(view.camera))
+    return PreparedImages(*picture_images(view, keyframe.picture, view.camera), keyframe.image(view.camera))

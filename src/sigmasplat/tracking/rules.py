@@ -13,7 +13,7 @@ from sigmasplat.data.camera import Camera
 from sigmasplat.fit.pose import PoseFit
 
 Item = TypeVar("Item")
-Asked = Callable[[], bool]
+ShouldStop = Callable[[], bool]
 """Asked again and again during long work."""
 WIDE = 0.065
 """A motion between two frames is wide if it moves the image by more than this share of its width: the basin of
@@ -49,16 +49,11 @@ def is_held_back(index: int, every: int) -> bool:
 
 
 def ends_submap(
-    T_submap_camera: NDArray[np.float64],
-    frames_since: int,
-    uncertainty_m: float,
-    config: SubmapConfig,
-    variance_sum: float = 0.0,
+    T_submap_camera: NDArray[np.float64], frames_since: int, uncertainty_m: float, config: SubmapConfig
 ) -> str:
     """Return the name of the rule that ends the active submap at this keyframe, or "" if none does (VarSplat §2).
 
-    frames_since: frames since the submap began; uncertainty_m: `Drift.position_m` of the keyframe; variance_sum:
-    `Drift.variance_sum` of the submap.
+    frames_since: frames since the submap began; uncertainty_m: `Drift.position_m` of the keyframe.
     """
     c = config
     found = {
@@ -66,7 +61,6 @@ def ends_submap(
         "angle": (float(np.rad2deg(se3.rotation_angle(T_submap_camera[:3, :3]))), c.angle_deg),
         "frames": (float(frames_since), c.frames - 1e-9 if c.frames else 0.0),
         "uncertainty": (uncertainty_m, c.uncertainty_m),
-        "variance": (variance_sum, c.variance_sum),
     }
     return next((rule for rule, (value, limit) in found.items() if limit and value > limit), "")
 
@@ -93,17 +87,16 @@ def draw_keyframes(
     keyframes: Sequence[Item],
     iterations: int,
     newest_probability: float,
-    history: int,
     random: np.random.Generator,
     together: int = 1,
 ) -> Iterator[list[Item]]:
     """Draw keyframes for each iteration: the newest with the given probability, else a random older one (VarSplat §2).
 
-    history > 0: only the latest `history` older keyframes take part. together > 1: draw that many different keyframes,
+    together > 1: draw that many different keyframes,
     or all of them if there are fewer (CG-SLAM §7).
     """
-    older = list(keyframes[:-1])[-history:] if history else list(keyframes[:-1])
-    everything = [*older, keyframes[-1]]
+    everything = list(keyframes)
+    older = everything[:-1]
     for _ in range(iterations):
         if together >= len(everything) > 1:
             yield everything
@@ -116,12 +109,12 @@ def draw_keyframes(
         yield [everything[i] for i in drawn]
 
 
-def unless(hurried: Asked, guesses: Iterable[Item], least: int = 0) -> Iterator[Item]:
-    """Yield guesses while `hurried` returns False, at least the first `least` ones; a guess is not made before it is
-    asked."""
+def unless(should_stop: ShouldStop, guesses: Iterable[Item], least: int = 0) -> Iterator[Item]:
+    """Yield guesses while `should_stop` returns False, at least the first `least` ones; a guess is not made before it
+    is asked."""
     waiting = iter(guesses)
     yield from islice(waiting, least)
-    while not hurried():
+    while not should_stop():
         try:
             yield next(waiting)
         except StopIteration:

@@ -11,8 +11,8 @@ from sigmasplat.fit.backends import fits_of
 from sigmasplat.fit.references import Reference, keyframe_reference
 from sigmasplat.render.view import View
 from sigmasplat.tracking.feature_image import FeatureImage
-from sigmasplat.tracking.moving.foreground import Foreground
-from sigmasplat.tracking.sight import FoundKeyframe, Sight
+from sigmasplat.tracking.moving.dynamic_mask import DynamicMask
+from sigmasplat.tracking.prepared_frame import FoundKeyframe, PreparedImages
 from sigmasplat.types import Matrix
 
 
@@ -30,17 +30,22 @@ class TrackedKeyframe:
 
     reference: Reference | None
     image: FeatureImage | None
-    front: Foreground | None = None
+    front: DynamicMask | None = None
 
 
 def mapped_keyframe(
-    params: Tensor, view: View, seen: Sight, T_world_camera: Matrix, config: TrackingConfig, front: Foreground | None
+    params: Tensor,
+    view: View,
+    seen: PreparedImages,
+    T_world_camera: Matrix,
+    config: TrackingConfig,
+    front: DynamicMask | None,
 ) -> TrackedKeyframe:
     """Return a keyframe that was just mapped, weighed by the map with rows `params` [N, 17]."""
     if config.method != "align" and not fits_of(view).aligns:
         return TrackedKeyframe(None, seen.image, front)  # nothing aligns to it
     T_camera_world = se3.inverse(T_world_camera)
-    reference = keyframe_reference(params, view, seen.live, T_camera_world, config, seen.target)
+    reference = keyframe_reference(params, view, seen.live, T_camera_world, config)
     return TrackedKeyframe(reference, seen.image and seen.image.weighed(reference.weights), front)
 
 

@@ -8,7 +8,6 @@ import numpy as np
 from sigmasplat.config import TrackingConfig
 from sigmasplat.data import se3
 from sigmasplat.data.frame import NO_PRIOR, PosePrior
-from sigmasplat.errors import ConfigError
 from sigmasplat.fit.align import Alignment, align
 from sigmasplat.fit.backends import fits_of
 from sigmasplat.fit.compare import Comparison
@@ -17,17 +16,25 @@ from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference, map_reference
 from sigmasplat.render.view import View
 from sigmasplat.tracking.depth_fit import NOTHING_FITTED, DepthFit
-from sigmasplat.tracking.expected import Expected, expect, odometry
 from sigmasplat.tracking.feature_image import FeatureImage, motion_by_features
 from sigmasplat.tracking.features import Extractor
+from sigmasplat.tracking.moving.depth_history import together
 from sigmasplat.tracking.moving.drawn import has_drawn
-from sigmasplat.tracking.moving.foreground import Foreground
-from sigmasplat.tracking.moving.memory import together
-from sigmasplat.tracking.moving.watch import Watch
-from sigmasplat.tracking.rules import Asked, is_lost, is_wide, jumped, never, unless
-from sigmasplat.tracking.sight import FoundKeyframe, Sight
+from sigmasplat.tracking.moving.dynamic_detector import DynamicDetector
+from sigmasplat.tracking.moving.dynamic_mask import DynamicMask
+from sigmasplat.tracking.pose_prediction import PosePrediction, odometry, predict
+from sigmasplat.tracking.pose_validation import (
+    LEAST_COMMON,
+    RECENT,
+    TrackingStatistics,
+    confirmed,
+    is_missed,
+    score,
+    stands,
+)
+from sigmasplat.tracking.prepared_frame import FoundKeyframe, PreparedImages
+from sigmasplat.tracking.rules import ShouldStop, is_lost, is_wide, jumped, never, unless
 from sigmasplat.tracking.tracked_keyframe import Splats, TrackedKeyframe, found_keyframe, mapped_keyframe
-from sigmasplat.tracking.verdict import LEAST_COMMON, RECENT, Usual, confirmed, is_missed, score, stands
 from sigmasplat.types import Matrix
 
 DOUBT = 0.7
@@ -53,50 +60,50 @@ class Tracker:
     last_features: FeatureImage | None = None
     keyframe: Reference | None = None
     keyframe_features: FeatureImage | None = None
-    keyframe_front: Foreground | None = None
-    front: Foreground | None = None
-    watch: Watch = dataclass_field(default_factory=Watch)
+    keyframe_front: DynamicMask | None = None
+    front: DynamicMask | None = None
+    detector: DynamicDetector = dataclass_field(default_factory=DynamicDetector)
     depth: DepthFit = NOTHING_FITTED
     agreements: list[float] = dataclass_field(default_factory=list)
     first_losses: list[float] = dataclass_field(default_factory=list)
-    usual: Usual = dataclass_field(default_factory=Usual)
+    statistics: TrackingStatistics = dataclass_field(default_factory=TrackingStatistics)
     prior: PosePrior = NO_PRIOR
     lost: bool = False
     doubtful: int = 0
     started: bool = False
     """Whether a frame has been tracked yet."""
 
-    def __post_init__(self) -> None:
-        c = self.config
-        if c.uncertainty and c.variance == "predicted" and c.method == "adam":
-            raise ConfigError("tracking.variance=predicted needs tracking.method=align; set it, or variance=published")
-
-    def start(self, seen: Sight, prior: PosePrior = NO_PRIOR) -> None:
+    def start(self, seen: PreparedImages, prior: PosePrior = NO_PRIOR) -> None:
         """Fix the gauge: the first camera is the world."""
         self.last_image, self.last_features, self.prior = seen.live, seen.image, prior
 
     def track(
-        self, field: Splats, view: View, seen: Sight, prior: PosePrior = NO_PRIOR, hurried: Asked = never
+        self,
+        field: Splats,
+        view: View,
+        seen: PreparedImages,
+        prior: PosePrior = NO_PRIOR,
+        should_stop: ShouldStop = never,
     ) -> PoseFit:
         """Estimate T_camera_world of a frame; `self.lost` then says whether tracking failed. A given pose is taken as
         it is, and judged by the images.
 
-        prior: what is known of the pose apart from the images. hurried: asked before each further guess; if it returns
-        True, that guess and the later ones are left out. A lost frame gets the best available guess (odometry, else the
-        last pose), and the velocity is reset.
+        prior: what is known of the pose apart from the images. should_stop: asked before each further guess; if it
+        returns True, that guess and the later ones are left out. A lost frame gets the best available guess (odometry,
+        else the last pose), and the velocity is reset.
         """
-        expected, shown = self.expected(prior), seen.shown
-        if expected.given:
-            best = self._fit(field, view, shown, expected.predicted, patience=0)
-            best.T_camera_world = se3.inverse(expected.predicted)
+        prediction, shown = self.prediction(prior), seen.shown
+        if prediction.given:
+            best = self._fit(field, view, shown, prediction.predicted, patience=0)
+            best.T_camera_world = se3.inverse(prediction.predicted)
             self.front, self.lost, self.doubtful = None, False, 0
         else:
-            best = self._estimated(field, view, seen, shown, expected, hurried)
-            self.lost = self._is_lost(best) or self._leaps(best, expected.predicted)
+            best = self._estimated(field, view, seen, shown, prediction, should_stop)
+            self.lost = self._is_lost(best) or self._leaps(best, prediction.predicted)
             self.doubtful = self.doubtful + 1 if self._contradicted(best) else 0
         self.prior = prior
         if self.lost:  # poses of earlier frames do not agree with later ones
-            self.front, self.watch = None, self.watch.cleared()
+            self.front, self.detector = None, self.detector.cleared()
         best.T_camera_world = se3.orthonormalise(best.T_camera_world)
         if not self.lost:
             self._notice_rest(seen, se3.inverse(best.T_camera_world))
@@ -104,92 +111,112 @@ class Tracker:
         return best
 
     def _estimated(
-        self, field: Splats, view: View, seen: Sight, shown: Sight, expected: Expected, hurried: Asked
+        self,
+        field: Splats,
+        view: View,
+        seen: PreparedImages,
+        shown: PreparedImages,
+        prediction: PosePrediction,
+        should_stop: ShouldStop,
     ) -> PoseFit:
         """Return the best of the fits from all guesses; shown: the frame as it is fitted first."""
-        best = self._fit(field, view, shown, expected.predicted)
-        best, shown = self._uncovered(field, view, seen, shown, expected, best, hurried)
+        best = self._fit(field, view, shown, prediction.predicted)
+        best, shown = self._uncovered(field, view, seen, shown, prediction, best, should_stop)
         if is_wide(self.previous, best, view.camera, self.extractor is not None) or self._doubts(best):
-            guesses = unless(hurried, self._other_guesses(shown, expected))
+            guesses = unless(should_stop, self._other_guesses(shown, prediction))
             best = max([best, *(self._fit(field, view, shown, guess) for guess in guesses)], key=self._score)
-        return self._retry(field, view, shown, best, expected, hurried) if self._doubts(best) else best
+        return self._retry(field, view, shown, best, prediction, should_stop) if self._doubts(best) else best
 
     def _uncovered(
-        self, field: Splats, view: View, seen: Sight, first: Sight, expected: Expected, fit: PoseFit, hurried: Asked
-    ) -> tuple[PoseFit, Sight]:
+        self,
+        field: Splats,
+        view: View,
+        seen: PreparedImages,
+        first: PreparedImages,
+        prediction: PosePrediction,
+        fit: PoseFit,
+        should_stop: ShouldStop,
+    ) -> tuple[PoseFit, PreparedImages]:
         """Find what is in front of the scene, and fit the pose without it; return the fit and the frame without it. If
         nothing is, or the images contradict that pose: the same fit, and the frame as it was fitted (`first`)."""
         before, self.front = self.front, None
         if fit.comparison is None or self.lost:
             return fit, first
-        found = self._without_front(field, view, seen, first, expected, fit, before, hurried)
-        if found is None and self.watch.config.find and not hurried():
-            found = self._without_object(field, view, seen, expected.predicted, fit, before is not None, hurried)
+        found = self._without_front(field, view, seen, first, prediction, fit, before, should_stop)
+        if found is None and self.detector.config.find and not should_stop():
+            found = self._without_object(field, view, seen, prediction.predicted, fit, before is not None, should_stop)
         return (fit, first) if found is None else found
 
     def _without_front(
-        self, field: Splats, view: View, seen: Sight, first: Sight, expected: Expected, fit: PoseFit,
-        before: Foreground | None, hurried: Asked,
-    ) -> tuple[PoseFit, Sight] | None:  # fmt: skip
+        self, field: Splats, view: View, seen: PreparedImages, first: PreparedImages, prediction: PosePrediction,
+        fit: PoseFit, before: DynamicMask | None, should_stop: ShouldStop,
+    ) -> tuple[PoseFit, PreparedImages] | None:  # fmt: skip
         """Return the fit and the frame without what is in space that was free, or None; before: in front in the last
         frame. The newest keyframe loses what has left it. If it is hidden, the last image and the map give the pose."""
-        slow, known = self.watch.slow(seen, se3.inverse(fit.T_camera_world)), before or self.keyframe_front
-        if fit.comparison is None or (slow is None and not self.watch.suspects(fit.comparison, known, hurried)):
+        slow, known = self.detector.slow(seen, se3.inverse(fit.T_camera_world)), before or self.keyframe_front
+        if fit.comparison is None or (slow is None and not self.detector.suspects(fit.comparison, known, should_stop)):
             return None
-        keyframe, predicted, expected_front = self.keyframe, expected.predicted, None
-        for guess in unless(hurried, (predicted, se3.inverse(fit.T_camera_world)), least=1):
-            for _ in unless(hurried, range(2), least=1):  # a better pose shows better what is in front
+        keyframe, predicted, expected_front = self.keyframe, prediction.predicted, None
+        for guess in unless(should_stop, (predicted, se3.inverse(fit.T_camera_world)), least=1):
+            for _ in unless(should_stop, range(2), least=1):  # a better pose shows better what is in front
                 front = together(
-                    self.watch.in_front(keyframe, self.keyframe_front, before, self.previous, seen, guess), slow
+                    self.detector.in_front(keyframe, self.keyframe_front, before, self.previous, seen, guess), slow
                 )
                 expected_front = front if expected_front is None else expected_front
-                self.keyframe = self.watch.without_gone(keyframe, seen, guess)
+                self.keyframe = self.detector.without_gone(keyframe, seen, guess)
                 if front is None and self.keyframe is keyframe:
                     break
                 shown = first if front is None else seen.aside(front)
                 found = self._fit(field, view, shown, guess)
-                found = self.watch.fitted_to_all(self.keyframe, shown.live, found, self.config, hurried)
+                found = self.detector.fitted_to_all(self.keyframe, shown.live, found, self.config, should_stop)
                 guess = se3.inverse(found.T_camera_world)
             else:
-                moves = self.watch.takes_for_moving(front, self.keyframe, seen, found)
+                moves = self.detector.takes_for_moving(front, self.keyframe, seen, found)
                 if moves and self._stands(found, predicted, fit.comparison):
                     self.front = front
                     return found, shown
         self.keyframe = keyframe
-        if expected_front is None or hurried():
+        if expected_front is None or should_stop():
             return None
         shown = seen.aside(expected_front)
         judged = self._fit(field, view, shown, se3.inverse(fit.T_camera_world), patience=0)
-        found = self._retry(field, view, shown, judged, expected, hurried)
-        moves = self.watch.takes_for_moving(expected_front, keyframe, seen, found)
+        found = self._retry(field, view, shown, judged, prediction, should_stop)
+        moves = self.detector.takes_for_moving(expected_front, keyframe, seen, found)
         self.front = expected_front if moves and self._stands(found, predicted, fit.comparison) else None
         return None if self.front is None else (found, shown)
 
     def _without_object(
-        self, field: Splats, view: View, seen: Sight, predicted: Matrix, drawn: PoseFit, known: bool, hurried: Asked
-    ) -> tuple[PoseFit, Sight] | None:
+        self,
+        field: Splats,
+        view: View,
+        seen: PreparedImages,
+        predicted: Matrix,
+        drawn: PoseFit,
+        known: bool,
+        should_stop: ShouldStop,
+    ) -> tuple[PoseFit, PreparedImages] | None:
         """Return the fit and the frame without the thing that moves and has drawn the pose with it; None if there is
         none. known: the last frame had something in front."""
-        contradicted, urgent = self._contradicted(drawn), known or self.usual.agrees_less(drawn.comparison)
-        self.watch, things = self.watch.suspected(self.keyframe, seen, drawn, self.config, contradicted, urgent)
-        for front in unless(hurried, things):
+        contradicted, urgent = self._contradicted(drawn), known or self.statistics.agrees_less(drawn.comparison)
+        self.detector, things = self.detector.suspected(self.keyframe, seen, drawn, self.config, contradicted, urgent)
+        for front in unless(should_stop, things):
             found = self._fit(field, view, shown := seen.aside(front), predicted)
             if self._stands(found, predicted) and has_drawn(front, self.keyframe, seen, drawn, found, contradicted):
                 self.front = front
                 return found, shown
         return None
 
-    def _notice_rest(self, seen: Sight, T_world_camera: Matrix) -> None:
+    def _notice_rest(self, seen: PreparedImages, T_world_camera: Matrix) -> None:
         """Take what has come to rest for a part of the scene, and remember the frame."""
-        front = self.watch.still_moving(self.front, seen, T_world_camera)
+        front = self.detector.still_moving(self.front, seen, T_world_camera)
         self.keyframe_front = None if self.front is not None and front is None else self.keyframe_front
-        self.front, self.watch = front, self.watch.after(seen, front, T_world_camera)
+        self.front, self.detector = front, self.detector.after(seen, front, T_world_camera)
 
     def _stands(self, fit: PoseFit, predicted: Matrix, whole: Comparison | None = None) -> bool:
         lost = self._is_lost(fit) or self._contradicted(fit) or self._leaps(fit, predicted)
         return not (lost or is_missed(fit.comparison, whole))
 
-    def _remember(self, fit: PoseFit, seen: Sight) -> None:
+    def _remember(self, fit: PoseFit, seen: PreparedImages) -> None:
         """Keep what the next frame needs."""
         T_world_camera = se3.inverse(fit.T_camera_world)
         if self.lost:
@@ -199,25 +226,24 @@ class Tracker:
             self.agreements = [*self.agreements, fit.agreement * fit.overlap][-RECENT:]
             self.first_losses = [*self.first_losses, fit.first_loss][-RECENT:]
             if fit.comparison is not None:
-                self.usual.add(fit.comparison, float(np.linalg.norm(self.velocity[:3, 3])))
+                self.statistics.add(fit.comparison, float(np.linalg.norm(self.velocity[:3, 3])))
         self.previous = T_world_camera
         self.last_image, self.last_features, self.started = seen.live, seen.image, True
 
     # ---- guesses ----
 
-    def expected(self, prior: PosePrior) -> Expected:
+    def prediction(self, prior: PosePrior) -> PosePrediction:
         """Return where the camera of the next frame is expected."""
-        return expect(self.previous, self.velocity, self.prior, prior, self.config.motion_model)
+        return predict(self.previous, self.velocity, self.prior, prior, self.config.motion_model)
 
-    def _fit(self, field: Splats, view: View, seen: Sight, guess: Matrix, patience: int = 1) -> PoseFit:
+    def _fit(self, field: Splats, view: View, seen: PreparedImages, guess: Matrix, patience: int = 1) -> PoseFit:
         """Fit from an initial T_world_camera; patience: factor on the number of iterations of gradient descent; with 0,
         the pose stays as it is, and is only judged."""
         T_camera_world, c = se3.inverse(guess), self.config
         if c.method == "adam":
             config = c if self.started else c.without_motion()
             return fit_pose_adam(field.params, view, seen.target, T_camera_world, config, patience * config.iterations)
-        reference = self.keyframe if c.align_to == "keyframe" else None
-        reference = reference or map_reference(field.params, view, T_camera_world, c)
+        reference = self.keyframe or map_reference(field.params, view, T_camera_world, c)
         return self._aligned(reference, seen.live, T_camera_world, patience > 0)
 
     def _aligned(self, reference: Reference, live: Pyramid, T_camera_world: Matrix, moves: bool = True) -> PoseFit:
@@ -236,7 +262,7 @@ class Tracker:
                 return found
         return reference.compared(live, T_camera_world)
 
-    def _other_guesses(self, seen: Sight, expected: Expected) -> Iterator[Matrix]:
+    def _other_guesses(self, seen: PreparedImages, prediction: PosePrediction) -> Iterator[Matrix]:
         """Yield T_world_camera by features, and by constant velocity alone if a gyroscope changed the first guess."""
         if self.extractor is not None and seen.image is not None:
             known = None if self.keyframe is None else self.keyframe_features
@@ -246,21 +272,26 @@ class Tracker:
             motion = motion_by_features(self.last_features, seen.image, self.extractor)
             if motion is not None:
                 yield self.previous @ se3.inverse(motion)
-        if expected.measured:
+        if prediction.measured:
             yield self.previous @ self.velocity if self.config.motion_model else self.previous
 
     def _retry(
-        self, field: Splats, view: View, seen: Sight, fit: PoseFit, expected: Expected, hurried: Asked
+        self,
+        field: Splats,
+        view: View,
+        seen: PreparedImages,
+        fit: PoseFit,
+        prediction: PosePrediction,
+        should_stop: ShouldStop,
     ) -> PoseFit:
         """Retry from odometry with twice the iterations (VarSplat §3), and from the last pose; return the best fit.
 
         With alignment, also try the map rendered at these poses: it contains more than the newest keyframe.
         """
-        odometry = None if hurried() else self._odometry(view, seen.live, expected)
-        starts = [expected.last] if odometry is None else [odometry, expected.last]
-        fits = [fit, *(self._fit(field, view, seen, start, 2) for start in unless(hurried, starts))]
-        by_map = self.config.method == "align" and self.config.align_to == "keyframe"  # with "map", `_fit` has tried it
-        for start in unless(hurried, starts if by_map else ()):
+        odometry = None if should_stop() else self._odometry(view, seen.live, prediction)
+        starts = [prediction.last] if odometry is None else [odometry, prediction.last]
+        fits = [fit, *(self._fit(field, view, seen, start, 2) for start in unless(should_stop, starts))]
+        for start in unless(should_stop, starts if self.config.method == "align" else ()):
             reference = map_reference(field.params, view, se3.inverse(start), self.config)
             fits.append(self._aligned(reference, seen.live, se3.inverse(start)))
         best = max(fits, key=self._score)
@@ -268,11 +299,11 @@ class Tracker:
             best.T_camera_world = se3.inverse(starts[0])
         return best
 
-    def _odometry(self, view: View, live: Pyramid, expected: Expected) -> Matrix | None:
+    def _odometry(self, view: View, live: Pyramid, prediction: PosePrediction) -> Matrix | None:
         """Align the last image to this one and return T_world_camera; None if this fails too."""
         if self.last_image is None or (self.config.method == "adam" and not fits_of(view).aligns):
             return None  # alignment needs the compiled kernels
-        found = odometry(self.last_image, live, expected, self.config)
+        found = odometry(self.last_image, live, prediction, self.config)
         return None if found is None else np.asarray(self.previous @ se3.inverse(found))
 
     # ---- verdicts ----
@@ -285,24 +316,24 @@ class Tracker:
             return is_lost(fit, self.config.lost_agreement, self.config.lost_share)
         if self.lost:  # after a lost frame the path of the camera does not support a pose
             return not confirmed(fit.comparison)
-        return self.usual.is_lost(fit.comparison, self.config.lost_share)
+        return self.statistics.is_lost(fit.comparison, self.config.lost_share)
 
     def _leaps(self, fit: PoseFit, predicted: Matrix) -> bool:
         """Return whether a verified pose is so far from the predicted one that the camera cannot have moved there."""
         if fit.comparison is None or self.lost or self.keyframe is None:
             return False
         apart = se3.inverse(fit.T_camera_world)[:3, 3] - predicted[:3, 3]
-        return self.usual.is_leap(float(np.linalg.norm(apart)), self.keyframe.pyramid.scene_scale)
+        return self.statistics.is_leap(float(np.linalg.norm(apart)), self.keyframe.pyramid.scene_scale)
 
     def _doubts(self, fit: PoseFit) -> bool:
         if fit.comparison is not None:
-            return self.usual.doubts(fit.comparison)
+            return self.statistics.doubts(fit.comparison)
         worse = fit.agreement * fit.overlap < DOUBT * (float(np.median(self.agreements)) if self.agreements else 1.0)
         return worse or jumped(fit.first_loss, self.first_losses, self.config.reinit_factor)
 
     def _contradicted(self, fit: PoseFit) -> bool:
         """Return whether a pose is doubtful for another reason than a small overlap, which a new keyframe mends."""
-        return self._doubts(fit) if fit.comparison is None else self.usual.contradicts(fit.comparison)
+        return self._doubts(fit) if fit.comparison is None else self.statistics.contradicts(fit.comparison)
 
     def is_certain(self, fit: PoseFit) -> bool:
         """Return whether the pose of the last frame may be used for mapping."""
@@ -311,7 +342,7 @@ class Tracker:
 
     # ---- keyframes ----
 
-    def keep_keyframe(self, field: Splats, view: View, seen: Sight, T_world_camera: Matrix) -> None:
+    def keep_keyframe(self, field: Splats, view: View, seen: PreparedImages, T_world_camera: Matrix) -> None:
         """Use a keyframe that was just mapped: its refined pose, and its image as the reference of the next frames."""
         self.move_by(T_world_camera @ se3.inverse(self.previous))  # at a cut, the coordinates change
         self.previous, self.lost = T_world_camera, False
@@ -320,26 +351,26 @@ class Tracker:
     def follow(self, keyframe: TrackedKeyframe) -> None:
         """Use a keyframe as the reference of the next frames."""
         if keyframe.reference is not None:
-            self.watch = self.watch.followed(self.keyframe, keyframe.reference)
+            self.detector = self.detector.followed(self.keyframe, keyframe.reference)
             self.keyframe = keyframe.reference
         self.keyframe_features, self.keyframe_front = keyframe.image, keyframe.front
 
     def move_to(self, field: Splats, view: View, keyframe: FoundKeyframe, T_world_camera: Matrix) -> None:
         """Continue at another pose, with a keyframe as the reference of the next frames."""
         self.previous, self.velocity, self.lost = T_world_camera, np.eye(4), False
-        self.watch = self.watch.cleared()
+        self.detector = self.detector.cleared()
         self.follow(found_keyframe(field.params, view, keyframe, self.config))
 
     def move_by(self, T_new_old: Matrix) -> None:
         """Express the last pose and the reference in other coordinates [4, 4]."""
         self.previous = T_new_old @ self.previous
         self.keyframe = None if self.keyframe is None else self.keyframe.moved_by(T_new_old)
-        self.watch = self.watch.moved_by(T_new_old)
+        self.detector = self.detector.moved_by(T_new_old)
 
     def forget(self) -> None:
         """Restart at the identity, as for the first frame."""
         self.previous, self.velocity, self.keyframe, self.keyframe_features = np.eye(4), np.eye(4), None, None
-        self.front, self.keyframe_front, self.watch = None, None, self.watch.cleared()
+        self.front, self.keyframe_front, self.detector = None, None, self.detector.cleared()
 
     def hop(self, fit: PoseFit, live: Pyramid) -> Alignment | None:
         """Return the alignment to the newest keyframe that gives the covariance of a fit; None without the kernels. For

@@ -16,7 +16,7 @@ static const emulation::Entry ENTRIES[] = {
     ENTRY(halve_images), ENTRY(normal_equations), ENTRY(begin_alignment), ENTRY(take_align_step),
 #elif !FEATURES
     ENTRY(mapping_losses), ENTRY(ssim), ENTRY(ssim_backward), ENTRY(shape_terms), ENTRY(adam),
-    ENTRY(nll_color_full), ENTRY(show_colors), ENTRY(carry_colors),
+    ENTRY(show_colors), ENTRY(carry_colors),
     ENTRY(count_errors), ENTRY(count_variances), ENTRY(count_kept), ENTRY(tracking_loss), ENTRY(drop_pairs), ENTRY(descend),
 #else
     ENTRY(project_splats), ENTRY(project_splats_backward), ENTRY(pack_given), ENTRY(list_pairs_short), ENTRY(list_pairs_int),

@@ -52,7 +52,4 @@ class CompiledViewDependentStep:
         from sigmasplat.native import _core
 
         h = field.get_or_create("harmonics")
-        return _core.Harmonics(
-            h.params, h.moment1, h.moment2, h.last_step, self.degree, h.steps, rate,
-            self.view.options.color_pose_gradient,
-        )  # fmt: skip
+        return _core.Harmonics(h.params, h.moment1, h.moment2, h.last_step, self.degree, h.steps, rate, True)

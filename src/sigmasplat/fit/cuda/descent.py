@@ -177,7 +177,7 @@ def _settings(T_camera_world: Matrix, config: TrackingConfig) -> Matrix:
     """Return the kernels' `DescentNumbers`."""
     c = config
     rates = [c.lr_rotation, c.lr_translation, exposure_rate(c)]
-    stops = [c.update_stop, c.plateau_stop, c.plateau_window]
+    stops = [0.0, c.plateau_stop, c.plateau_window]  # no step is so small that the descent ends
     return np.array([*T_camera_world[:3].ravel(), BETA1, BETA2, EPSILON, *rates, *stops], np.float64)
 
 

@@ -9,13 +9,11 @@ from sigmasplat.data.field import GaussianField
 from sigmasplat.fit.adam import Rates
 from sigmasplat.fit.cuda.rows import CudaAccumulator, add_shape_gradient, step_rows
 from sigmasplat.fit.fused_terms import pixel_weights
-from sigmasplat.fit.interface import Accumulator, Weights, one_image_only
+from sigmasplat.fit.interface import Accumulator, Weights
 from sigmasplat.fit.mapping_step import render_for
 from sigmasplat.fit.target import Target
-from sigmasplat.render.cuda.covariance_view import CudaCovarianceView
 from sigmasplat.render.cuda.launch import blocks_for
 from sigmasplat.render.cuda.view import CudaView
-from sigmasplat.render.view import CorrelationView
 from sigmasplat.types import Matrix
 
 TILE = 16
@@ -23,10 +21,7 @@ CHANNELS = 3
 
 
 class CudaStep:
-    """The image terms, the backward pass and Adam's step on a device. The host does not wait until `to_host`.
-
-    On a view of ten planes the step fits the full colour covariance, as `FullCovarianceStep` does.
-    """
+    """The image terms, the backward pass and Adam's step on a device. The host does not wait until `to_host`."""
 
     def __init__(self, view: CudaView) -> None:
         self.view = view
@@ -55,16 +50,7 @@ class CudaStep:
             "mapping_losses", blocks, planes, self._pixels, int(len(v.sums) >= 7), per_pixel, of_pixels, sums,
         )  # fmt: skip
         loss = sums.sum()
-        if isinstance(v, CudaCovarianceView):
-            loss = loss + self._full_covariance(target, weights.get("nll_color_full", 0.0) * per_pixel / CHANNELS)
         return loss + self._ssim(target, weights["ssim"]) if weights["ssim"] else loss
-
-    def _full_covariance(self, target: Target, weight: float) -> Tensor:
-        raster, blocks = self.view.raster, blocks_for(self._pixels)
-        costs = raster.empty(blocks, 1, dtype=torch.float64)
-        planes = (self.view.sums, target.color, target.depth)
-        raster.launch_fit("nll_color_full", blocks, *planes, self._pixels, weight, self.view.g_sums, costs)
-        return costs.sum()
 
     def _ssim(self, target: Target, weight: float) -> Tensor:
         v, (width, height) = self.view, self._size
@@ -79,28 +65,16 @@ class CudaStep:
     def splats(
         self, field: GaussianField, rates: Rates, weights: Weights, frozen_colors: int, grad2d: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Step the splats as `TorchStep.splats` or `FullCovarianceStep.splats` does; twist and cost stay on the
-        device."""
+        """Step the splats as `TorchStep.splats` does; twist and cost stay on the device."""
         view, gradient = self.view, torch.empty_like(field.params)
         twist, visible = view.backward_on_device(field.params, gradient, grad2d), view.raster.visible
         cost = add_shape_gradient(view, visible, field, gradient, weights, frozen_colors)
         step_rows(view, visible, field, gradient, rates)
-        if isinstance(view, CudaCovarianceView):
-            view.correlations.steps += 1
-            step_rows(view, visible, view.correlations, view.g_correlations, rates.of_attribute("correlations"))
         return twist, cost
 
     def accumulator(self, field: GaussianField) -> Accumulator:
-        """Allocate the gradient sum of several images. Raises ConfigError with full colour covariance."""
-        if isinstance(self.view, CudaCovarianceView):
-            raise one_image_only()
+        """Allocate the gradient sum of several images."""
         return CudaAccumulator(self.view, field)
-
-
-def covariance_step(view: CorrelationView) -> CudaStep:
-    """Make the step that also fits the full colour covariance."""
-    assert isinstance(view, CudaCovarianceView)
-    return CudaStep(view)
 
 
 def _gaussian_taps() -> NDArray[np.float32]:

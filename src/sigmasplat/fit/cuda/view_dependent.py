@@ -47,8 +47,7 @@ class CudaViewDependentStep:
         twist, visible = view.backward_on_device(self.rows, gradient, grad2d), view.raster.visible
         cost = add_shape_gradient(view, visible, field, gradient, weights, frozen_colors)
         on_harmonics, on_camera = self._through_colors(field, visible, gradient)
-        if view.options.color_pose_gradient:
-            twist[:3] += on_camera
+        twist[:3] += on_camera
         step_rows(view, visible, field, gradient, rates)
         harmonics.steps += 1
         of_harmonics = Rates(rates.of_attribute("harmonics").per_column[: self.width], rates.beta2)

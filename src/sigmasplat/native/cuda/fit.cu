@@ -73,50 +73,6 @@ KERNEL mapping_losses(LossPlanes p, int pixels, int variance, float per_pixel, L
     store_sums<1>(&cost, sums);
 }
 
-// Store, per block, the sum of `nll_color_full` over valid pixels. Its gradient is added to the planes of the colours
-// and of the variances' second moments, and written to the three off-diagonal planes. sums [10, H, W]; `weight` is
-// divided by the number of values. V + εI = L diag(d) Lᵀ as in fit/losses.py, then backwards line by line; r is
-// detached.
-KERNEL nll_color_full(const float* sums, const float* target, const float* depth, int pixels, float weight, float* on_sums, double* costs) {
-    const int at = thread_number();
-    const size_t plane = size_t(pixels);
-    float cost = 0.f;
-    if (at < pixels) {
-        float on_v[6] = {}, color[3];
-        for (int c = 0; c < 3; c++) color[c] = sums[c * plane + at];
-        if (depth[at] > 0.f) {
-            float r[3], v[6];
-            const int row[6] = {0, 1, 2, 0, 0, 1}, column[6] = {0, 1, 2, 1, 2, 2};
-            for (int q = 0; q < 6; q++) v[q] = fmaf(-color[row[q]], color[column[q]], sums[(4 + q) * plane + at]);
-            for (int c = 0; c < 3; c++) r[c] = color[c] - target[c * plane + at];
-            const float d1 = fmaxf(v[0], 0.f) + NLL_EPSILON, v2 = fmaxf(v[1], 0.f) + NLL_EPSILON, v3 = fmaxf(v[2], 0.f) + NLL_EPSILON;
-            const float l21 = v[3] / d1, l31 = v[4] / d1, raw2 = v2 - l21 * v[3], d2 = fmaxf(raw2, NLL_EPSILON);
-            const float left = v[5] - l31 * v[3], l32 = left / d2, raw3 = v3 - l31 * v[4] - l32 * left, d3 = fmaxf(raw3, NLL_EPSILON);
-            const float y1 = r[0], y2 = r[1] - l21 * y1, y3 = r[2] - l31 * y1 - l32 * y2;
-            const float k1 = y1 / d1, k2 = y2 / d2, k3 = y3 / d3;
-            cost = weight * 0.5f * (y1 * k1 + y2 * k2 + y3 * k3 + logf(d1) + logf(d2) + logf(d3));
-
-            const float on_d3 = raw3 >= NLL_EPSILON ? 0.5f * (1.f / d3 - k3 * k3) : 0.f, on_y2 = k2 - l32 * k3;
-            const float on_l32 = -k3 * y2 - on_d3 * left, on_left = on_l32 / d2 - on_d3 * l32;
-            const float on_d2 = raw2 >= NLL_EPSILON ? 0.5f * (1.f / d2 - k2 * k2) - on_l32 * l32 / d2 : 0.f;
-            const float on_l31 = -k3 * y1 - on_d3 * v[4] - on_left * v[3], on_l21 = -on_y2 * y1 - on_d2 * v[3];
-            const float on_d1 = 0.5f * (1.f / d1 - k1 * k1) - on_l31 * l31 / d1 - on_l21 * l21 / d1;
-            const float by[6] = {v[0] >= 0.f ? on_d1 : 0.f, v[1] >= 0.f ? on_d2 : 0.f, v[2] >= 0.f ? on_d3 : 0.f,
-                                 on_l21 / d1 - on_left * l31 - on_d2 * l21, on_l31 / d1 - on_d3 * l31, on_left};
-            for (int q = 0; q < 6; q++) on_v[q] = weight * by[q];
-        }
-        const float on_color[3] = {-2.f * color[0] * on_v[0] - color[1] * on_v[3] - color[2] * on_v[4],
-                                   -2.f * color[1] * on_v[1] - color[0] * on_v[3] - color[2] * on_v[5],
-                                   -2.f * color[2] * on_v[2] - color[0] * on_v[4] - color[1] * on_v[5]};
-        for (int c = 0; c < 3; c++) {
-            on_sums[c * plane + at] += on_color[c];
-            on_sums[(4 + c) * plane + at] += on_v[c];
-            on_sums[(7 + c) * plane + at] = on_v[3 + c];
-        }
-    }
-    store_sums<1>(&cost, costs);
-}
-
 // ---- SSIM: 11×11 Gaussian; images are 0 outside the border and without a reading ----------------------------------
 
 constexpr int TILE = 16, RADIUS = 5, HALO = TILE + 2 * RADIUS;

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sigmasplat.errors import ConfigError, RunError
+from sigmasplat.plugins.batch.executor import DataRoots, Executor, Outcome, Sequences
 from sigmasplat.plugins.batch.job import FACT, Job, has_other_run
-from sigmasplat.plugins.batch.local import LocalRoad
+from sigmasplat.plugins.batch.local import LocalExecutor
 from sigmasplat.plugins.batch.progress import Estimate, duration, frames_counted
-from sigmasplat.plugins.batch.road import DataRoots, Outcome, Road, Sequences
 from sigmasplat.run_folder.runs import RunFolder
 
 if TYPE_CHECKING:
@@ -42,17 +42,17 @@ class Batch:
         """List the jobs whose run is complete and scored."""
         return [job for job in self.jobs if job.finished_in(self.out / job.name)]
 
-    def make(self, road: Road, screen: "Screen", ended: Callable[[], object]) -> None:
+    def make(self, executor: Executor, screen: "Screen", ended: Callable[[], object]) -> None:
         """Make the missing runs; `ended` is called after each one. A missing sequence or a failed run is one line."""
         done = self.finished()
         left = [job for job in self.jobs if job not in done]
         if done:
             screen.say(f"{len(done)} of {len(self.jobs)} runs are finished in {self.out}")
-        frames = self._find_sequences(road.survey(left) if left else {}, left, screen)
+        frames = self._find_sequences(executor.survey(left) if left else {}, left, screen)
         left = [job for job in left if job.name in frames]
         if not left:
             return
-        estimate = Estimate(frames | {job.name: self._frames(job) for job in done}, road.slots)
+        estimate = Estimate(frames | {job.name: self._frames(job) for job in done}, executor.slots)
         for job in done:
             estimate.add(job, self._seconds(job))
         with (
@@ -60,7 +60,7 @@ class Batch:
             frames_counted(left, frames, self.out, show),
         ):
             waiting, started_s = list(left), time.perf_counter()
-            for outcome in road.make(left, self.out):
+            for outcome in executor.make(left, self.out):
                 waiting.remove(outcome.job)
                 self._note(outcome, estimate, waiting, screen, time.perf_counter() - started_s)
                 ended()
@@ -108,21 +108,21 @@ class Batch:
         return float(sum(known or 0.0 for known in (facts["wall_s"], facts["finish_s"], facts[FACT]["scoring_s"])))
 
 
-def open_road(
+def open_executor(
     data: Sequence[str], jobs: int, scheduler: str | None, save_every_s: float, say: Callable[[str], None]
-) -> Road:
-    """Return the road to make runs by: `jobs` processes on this machine, or the Dask cluster of a scheduler.
+) -> Executor:
+    """Return the executor of a batch: `jobs` processes on this machine, or the Dask cluster of a scheduler.
 
     data: folders of the sequences, ROOT or WORKER=ROOT; save_every_s: time between two saved states of a run;
     say: prints a line. Raises ConfigError.
     """
     roots = DataRoots.read(data)
     if scheduler:
-        from sigmasplat.plugins.batch.cluster import ClusterRoad
+        from sigmasplat.plugins.batch.cluster import ClusterExecutor
 
-        return ClusterRoad(scheduler, roots, save_every_s, say)
+        return ClusterExecutor(scheduler, roots, save_every_s, say)
     if jobs < 1:
         raise ConfigError(f"--jobs must be at least 1, found {jobs}")
     if roots.by_worker:
         raise ConfigError(f"--data names the worker {next(iter(roots.by_worker))}, which needs --scheduler")
-    return LocalRoad(roots.everywhere, save_every_s, jobs)
+    return LocalExecutor(roots.everywhere, save_every_s, jobs)

@@ -20,9 +20,9 @@ from sigmasplat.env import install_extra
 from sigmasplat.errors import ConfigError, RunError
 from sigmasplat.files.atomic import write_text
 from sigmasplat.plugins.batch.dispatch import Dispatch, Worker
+from sigmasplat.plugins.batch.executor import DataRoots, Outcome, Sequences, sequences_of
 from sigmasplat.plugins.batch.job import Job, installed_code
 from sigmasplat.plugins.batch.process import RunProcesses
-from sigmasplat.plugins.batch.road import DataRoots, Outcome, Sequences, sequences_of
 
 TOKEN = ".batch"
 """File in the folder of the batch with a random text: a worker that reads the same text sees the same folder."""
@@ -33,7 +33,7 @@ LEFT_OUT = ("submaps", "state.safetensors")
 """Parts of a run folder that are not sent: they are large, and the scores need them on the worker only."""
 
 
-class ClusterRoad:
+class ClusterExecutor:
     """Makes runs on the workers of the scheduler at `address`, one at a time on each thread of a worker."""
 
     def __init__(self, address: str, data: DataRoots, save_every_s: float, say: Callable[[str], None]) -> None:

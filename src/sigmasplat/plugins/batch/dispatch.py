@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from sigmasplat.errors import RunError
+from sigmasplat.plugins.batch.executor import Outcome
 from sigmasplat.plugins.batch.job import Job
-from sigmasplat.plugins.batch.road import Outcome
 
 POLL_S = 1.0
 """Time between two looks at the list of workers."""

@@ -5,14 +5,14 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 
 from sigmasplat.files.machine import usable_cores
+from sigmasplat.plugins.batch.executor import Outcome, Sequences, sequences_of
 from sigmasplat.plugins.batch.job import Job
 from sigmasplat.plugins.batch.process import RunProcesses
-from sigmasplat.plugins.batch.road import Outcome, Sequences, sequences_of
 
 THIS_MACHINE = "this machine"
 
 
-class LocalRoad:
+class LocalExecutor:
     """Makes `slots` runs at a time, with the cores divided among them; `data` is the folder of the sequences."""
 
     def __init__(self, data: str | None, save_every_s: float, slots: int = 1) -> None:

@@ -37,6 +37,8 @@ from sigmasplat.run_folder.trajectory import write_trajectory
 from sigmasplat.types import Progress, no_progress
 
 Log = list[dict[str, Any]]
+LIKELY = 0.5
+"""The report names a believed frame whose `p_off` is larger."""
 
 
 def evaluate(
@@ -56,7 +58,7 @@ def evaluate(
 ) -> dict[str, Any]:
     """Score trajectory, map and uncertainty of a run against its source, and return the metrics written.
 
-    Path and views are scored on the frames whose pose is believed: those of trajectory.txt, without lost frames.
+    Path and views are scored on the frames whose pose is valid: those of trajectory.txt, without lost frames.
     Training views are the run's keyframes; held-out views are the frames that no map was fitted to. At most
     `views_per_kind` of each are scored, evenly spread. They are rendered from the final map at the estimated poses and
     the run's working resolution, with `renderer` or the run's render settings. If the run kept its submaps, each view
@@ -70,8 +72,8 @@ def evaluate(
     """
     frames, field = _read_frames(run), run.read_map()
     records, log = frames.log, frames.posed_log()
-    truth, scale = _truth(run, frames, source) if log else (None, None)  # without a believed pose nothing is aligned
-    path_scores, problem = score_path(frames.path, _believed_odometry(run, frames), truth)
+    truth, scale = _truth(run, frames, source) if log else (None, None)  # without a valid pose nothing is aligned
+    path_scores, problem = score_path(frames.path, _valid_odometry(run, frames), truth)
     known = None if problem else truth
     chosen = {kind: evenly_spread(views, views_per_kind) for kind, views in _kinds(log).items()}
     strips, config = ViewStrips(run, strips_per_kind), run.config()
@@ -95,7 +97,9 @@ def evaluate(
     show_moving(strips, source, config.input, run.submaps, records)
     run.write_metrics(metrics)
     plan = report_plan(run, frames.path, source.camera) if standard else None
-    write_page(run, metrics, strips.figures, _draw_plots(run, frames, known), [str(problem)] if problem else [], plan)
+    unsure = [frames.log[row]["index"] for row in frames.rows if frames.p_off[row] > LIKELY]
+    plots, problems = _draw_plots(run, frames, known), [str(problem)] if problem else []
+    write_page(run, metrics, strips.figures, plots, problems, plan, unsure)
     if problem:
         raise problem
     return metrics
@@ -191,8 +195,8 @@ def _submaps(log: Log) -> int:
     return 1 + max(int(record.get("submap", 0)) for record in log)
 
 
-def _believed_odometry(run: RunFolder, frames: RunFrames) -> Trajectory | None:
-    """Return the path of tracking alone at the believed frames; None if the run has no such path or no loop."""
+def _valid_odometry(run: RunFolder, frames: RunFrames) -> Trajectory | None:
+    """Return the path of tracking alone at the valid frames; None if the run has no such path or no loop."""
     odometry = run.read_odometry()
     return None if odometry is None else odometry.at(frames.rows[frames.rows < len(odometry)])
 

@@ -31,8 +31,8 @@ class FinishedRun:
     field: the final map in the world; store: its submaps; anchors: T_world_submap of each; members: the submaps that
     are connected to the world; refined: T_submap_camera of their keyframes as the final map has moved them, by submap;
     exposures: those of the same keyframes [K, 3, 2] relative to the final map; frame_exposures [F, 3, 2];
-    submap_of [F], T_submap_camera [F, 4, 4]: the submap of each frame and its pose there; believed [F]: whether its
-    pose is believed; indices [F]: its number in the source; p_off [F]; uncertainty: how sure the final map is, if it
+    submap_of [F], T_submap_camera [F, 4, 4]: the submap of each frame and its pose there; valid [F]: whether its
+    pose is valid; indices [F]: its number in the source; p_off [F]; uncertainty: how sure the final map is, if it
     was measured; errors: those of the path; keyframes: their rows.
     """
 
@@ -48,7 +48,7 @@ class FinishedRun:
     path: Trajectory
     submap_of: list[int]
     T_submap_camera: Matrix
-    believed: NDArray[np.bool_]
+    valid: NDArray[np.bool_]
     indices: list[int]
     p_off: NDArray[np.float64]
     counts: dict[str, int]
@@ -70,7 +70,7 @@ class FinishedRun:
         return FinishedRun(
             slam.config, slam.view.camera, slam.field, store, list(slam.atlas.anchors), slam.atlas.members(0),
             slam.atlas.refined, slam.atlas.exposures, slam.atlas.frame_exposures(), slam.trajectory(),
-            slam.atlas.places.submap.tolist(), slam.atlas.T_submap_camera, slam.believed(),
+            slam.atlas.places.submap.tolist(), slam.atlas.T_submap_camera, slam.valid(),
             slam.steps.source_index.tolist(), slam.steps.p_off, counts,
             slam.uncertainty, PathCovariance.of(slam.checkpoint()), slam.keyframe_indices,
         )  # fmt: skip
@@ -112,21 +112,21 @@ def run_facts(run: FinishedRun, source: Source) -> dict[str, Any]:
 def _path_scores(run: FinishedRun, source: Source) -> dict[str, Any]:
     """Return the ATE, the scores of `p_off` and of the covariance of poses; nothing without a truth that shares
     timestamps with the path."""
-    truth, believed = source.truth(), run.believed
-    if truth is None or not believed.any():
+    truth, valid = source.truth(), run.valid
+    if truth is None or not valid.any():
         return {}
     times, positions = run.path.timestamps_s, run.path.T_world_camera[:, :3, 3]
     rows, matched = associate(times, truth.timestamps_s)
-    if not believed[rows].any():
+    if not valid[rows].any():
         return {}
-    T_estimate_truth = truth_in_estimate(times[believed], positions[believed], truth)
+    T_estimate_truth = truth_in_estimate(times[valid], positions[valid], truth)
     true = (T_estimate_truth @ truth.T_world_camera[matched])[:, :3, 3]
     error_m = np.full(len(times), np.nan)
     error_m[rows] = np.linalg.norm(positions[rows] - true, axis=1)
-    at = np.isfinite(error_m) & believed
+    at = np.isfinite(error_m) & valid
     ate_m = float(np.sqrt(np.mean(error_m[at] ** 2)))
-    found = {"ate_m": ate_m, "failures": score_failures(error_m, run.p_off, believed)}
+    found = {"ate_m": ate_m, "failures": score_failures(error_m, run.p_off, valid)}
     if run.errors is not None:
-        at = np.flatnonzero(believed)
+        at = np.flatnonzero(valid)
         found["poses"] = score_path_covariance(run.errors, run.path.at(at), at, run.keyframes, truth)
     return found

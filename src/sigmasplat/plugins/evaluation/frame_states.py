@@ -32,7 +32,7 @@ def _components(run: RunFolder) -> list[dict[str, Any]]:
 
 
 def _failures(run: RunFolder, frames: RunFrames, truth: Trajectory | None) -> dict[str, Any] | None:
-    """Score the believed and the lost frames of the world; the alignment is that of the ATE, from believed frames."""
+    """Score the valid and the lost frames of the world; the alignment is that of the ATE, from valid frames."""
     if truth is None:
         return None
     times_s = np.array([record["timestamp_s"] for record in frames.log])
@@ -40,16 +40,16 @@ def _failures(run: RunFolder, frames: RunFrames, truth: Trajectory | None) -> di
     rows, truth_rows = associate(times_s, truth.timestamps_s)
     true_positions = np.full_like(positions, np.nan)
     true_positions[rows] = truth.T_world_camera[truth_rows, :3, 3]
-    fitted = frames.believed & np.isfinite(true_positions).all(1)
+    fitted = frames.valid & np.isfinite(true_positions).all(1)
     T = align_rigid(positions[fitted], true_positions[fitted])
     error_m = np.linalg.norm(positions @ T[:3, :3].T + T[:3, 3] - true_positions, axis=1)
-    scores = score_failures(error_m, frames.p_off, frames.believed)
+    scores = score_failures(error_m, frames.p_off, frames.valid)
     silent_rows = scores.pop("silent_rows")
     return scores | {"silent_frames": [frames.log[row]["index"] for row in silent_rows]}
 
 
 def final_positions(run: RunFolder, frames: RunFrames) -> NDArray[np.float64]:
-    """Return the final positions [F, 3], m, of believed frames and, from the checkpoint, of lost ones; else nan."""
+    """Return the final positions [F, 3], m, of valid frames and, from the checkpoint, of lost ones; else nan."""
     positions = np.full((len(frames), 3), np.nan)
     lost = np.flatnonzero((np.array(frames.states) == LOST) & ~frames.outside())
     if len(lost) and (run.path / "checkpoint.safetensors").is_file():

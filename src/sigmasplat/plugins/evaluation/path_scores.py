@@ -14,15 +14,15 @@ from sigmasplat.run_folder.runs import RunFolder
 
 
 def score_frame_sets(run: RunFolder, frames: RunFrames, truth: Trajectory | None) -> dict[str, Any]:
-    """Return the ATE on believed keyframes, and on all frames that have a position in the world.
+    """Return the ATE on valid keyframes, and on all frames that have a position in the world.
 
-    All frames are the believed ones, and lost ones at their last guess (checkpoint). Frames apart have no position in
+    All frames are the valid ones, and lost ones at their last guess (checkpoint). Frames apart have no position in
     the world. Each set has its own alignment. None without a truth, or without a frame that has a true position.
     """
     if truth is None:
         return {"ate_keyframes": None, "ate_all_frames": None}
     times_s = np.array([record["timestamp_s"] for record in frames.log])
-    keyframes = frames.believed & np.array([bool(record["is_keyframe"]) for record in frames.log], np.bool_)
+    keyframes = frames.valid & np.array([bool(record["is_keyframe"]) for record in frames.log], np.bool_)
     positions = final_positions(run, frames)
     return {
         "ate_keyframes": _error(times_s[keyframes], positions[keyframes], truth),

@@ -23,7 +23,7 @@ MOTIONS = {"hops": "keyframe to keyframe", "windows": f"{WINDOW_FRAMES} frames",
 
 
 def score_pose_covariance(run: RunFolder, frames: RunFrames, truth: Trajectory | None) -> dict[str, Any] | None:
-    """Score the motions of `score_motions` between believed frames of a run.
+    """Score the motions of `score_motions` between valid frames of a run.
 
     Returns None without a truth, or if the run did not record the errors of its path.
     """
@@ -39,9 +39,9 @@ def score_pose_covariance(run: RunFolder, frames: RunFrames, truth: Trajectory |
 def score_path_covariance(
     errors: PathCovariance, path: Trajectory, rows: NDArray[np.intp], keyframes: Iterable[int], truth: Trajectory
 ) -> dict[str, Any]:
-    """Score the motions of `score_motions` between the believed frames with a true pose.
+    """Score the motions of `score_motions` between the valid frames with a true pose.
 
-    path: poses of the believed frames; rows: their numbers [B]; keyframes: the numbers of all keyframes.
+    path: poses of the valid frames; rows: their numbers [B]; keyframes: the numbers of all keyframes.
     """
     matched, true_rows = associate(path.timestamps_s, truth.timestamps_s)
     true = dict(zip(rows[matched].tolist(), truth.T_world_camera[true_rows], strict=True))
@@ -53,7 +53,7 @@ def score_motions(
 ) -> dict[str, Any]:
     """Score motions from each keyframe to the next, over 50 frames, and from the first frame (`CovarianceScore`).
 
-    T_world_camera: true poses [4, 4] of believed frames, in order; keyframes: the keyframes among them. Motions do not
+    T_world_camera: true poses [4, 4] of valid frames, in order; keyframes: the keyframes among them. Motions do not
     depend on the world frame, so no alignment is needed.
     """
     known = list(T_world_camera)

@@ -161,7 +161,7 @@ def score(
     ours, theirs = pair_poses(frames.path, true_path)
     T_truth_world = align_rigid(ours[:, :3, 3], theirs[:, :3, 3])
     keyframes = tensors["keyframes"].numpy()
-    keyframes = keyframes[frames.believed[keyframes]]
+    keyframes = keyframes[frames.valid[keyframes]]
     _, rows = associate(tensors["timestamps_s"].numpy()[keyframes], true_path.timestamps_s)
     truth, found = true_surface.subdivided(LARGEST_EDGE_M), mesh.moved(T_truth_world)
     field = fusion_input.run.read_map()

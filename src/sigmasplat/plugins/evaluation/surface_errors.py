@@ -49,7 +49,7 @@ def surface_errors(
     pose, at most `BEHIND_M` behind the reference, and if the reference has a surface at this pixel. Calls
     `progress(keyframes done, total)`.
     """
-    truth, path = source.truth(), run.path.at(run.believed)
+    truth, path = source.truth(), run.path.at(run.valid)
     if truth is None:
         return None
     rows, true_rows = associate(path.timestamps_s, truth.timestamps_s)

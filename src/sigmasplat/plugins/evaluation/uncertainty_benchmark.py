@@ -180,7 +180,7 @@ def measure(
 ) -> Measured:
     """Collect errors and predictions of a finished run at views that its map was not fitted to, and of its surface.
 
-    Views: at most `most` of the frames held back (`input.hold_every`) whose pose is believed, and as many of the
+    Views: at most `most` of the frames held back (`input.hold_every`) whose pose is valid, and as many of the
     source's test views. Surface: `surface_errors`, if the true path is known. Calls `progress(views done, total)`.
     """
     maps, samples, random = RunMaps(run), dict[Kind, Samples](), np.random.default_rng(run.config.seed)

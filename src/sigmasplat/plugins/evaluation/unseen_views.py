@@ -30,8 +30,8 @@ class UnseenView:
 
 
 def held_back_views(run: FinishedRun, source: Source, most: int) -> list[UnseenView]:
-    """Return the frames that were held back and whose pose is believed, evenly spread, at the estimated poses."""
-    rows = [row for row in run.held_back if run.believed[row]]
+    """Return the frames that were held back and whose pose is valid, evenly spread, at the estimated poses."""
+    rows = [row for row in run.held_back if run.valid[row]]
     return [
         replace(
             _unseen_view(run.config, source, run.indices[row], run.path.T_world_camera[row], run.submap_of[row]),
@@ -46,9 +46,9 @@ def away_views(run: FinishedRun, source: Source, most: int) -> list[UnseenView]:
     """Return the source's test views at their true poses, moved to the world by `aligned_poses` of the path."""
     away, truth = source.test_views(), source.truth()
     poses = None if away is None else away.truth()
-    if away is None or poses is None or truth is None or not run.believed.any():
+    if away is None or poses is None or truth is None or not run.valid.any():
         return []
-    path = run.path.at(run.believed)
+    path = run.path.at(run.valid)
     matched, true_rows = associate(path.timestamps_s, truth.timestamps_s)
     if not len(matched):
         return []

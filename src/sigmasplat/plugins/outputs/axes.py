@@ -62,7 +62,7 @@ def levelled(reader: RunReader) -> Matrix:
     near the mean vertical direction of the cameras, which is used alone if no surface is visible.
     Raises RunError if the run has no map or no path.
     """
-    field, path, config = reader.run.read_map(), reader.believed_path(), reader.config
+    field, path, config = reader.run.read_map(), reader.valid_path(), reader.config
     up_world = noted_up(reader.run.facts())
     samples = sample_surfaces(field, path, reader.camera, FieldRenderer(config.render, config.backend))
     try:

@@ -15,9 +15,9 @@ from sigmasplat.data.component import LOST
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import RunError, SigmaSplatError
 from sigmasplat.graph.path_covariance import PathCovariance
-from sigmasplat.plugins.evaluation.report.plan import run_floor_plan
 from sigmasplat.plugins.outputs.axes import level_cameras
 from sigmasplat.plugins.outputs.floorplan.floor_plan import FloorPlan
+from sigmasplat.plugins.outputs.plan import run_floor_plan
 from sigmasplat.plugins.outputs.run_reader import RunReader
 from sigmasplat.plugins.robots.bag import BagSink
 from sigmasplat.plugins.robots.frames import (
@@ -88,7 +88,7 @@ def _remove_earlier(target: Path) -> None:
 
 @dataclass(frozen=True, eq=False)
 class _FinishedPath:
-    """The path of a finished run as ROS reads it. believed: frames with a known pose in the world."""
+    """The path of a finished run as ROS reads it. valid: frames with a known pose in the world."""
 
     reader: RunReader
     T_map_world: Matrix
@@ -99,10 +99,10 @@ class _FinishedPath:
         return self.reader.run.read_checkpoint()[0]
 
     @cached_property
-    def believed(self) -> dict[int, Matrix]:
-        """Return T_map_link [4, 4] of each believed frame."""
-        path = self.reader.believed_path()
-        return dict(zip(self.reader.believed_frames(), link_pose(self.T_map_world @ path.T_world_camera), strict=True))
+    def valid(self) -> dict[int, Matrix]:
+        """Return T_map_link [4, 4] of each valid frame."""
+        path = self.reader.valid_path()
+        return dict(zip(self.reader.valid_frames(), link_pose(self.T_map_world @ path.T_world_camera), strict=True))
 
     @cached_property
     def odometry(self) -> tuple[Matrix, NDArray[np.bool_]]:
@@ -126,10 +126,10 @@ class _FinishedPath:
         return None if errors is None else (errors, errors.without_loops())
 
     def in_map(self, row: int) -> Matrix | None:
-        """Return the covariance [6, 6] of a believed frame's pose in the map; None if it is not known."""
+        """Return the covariance [6, 6] of a valid frame's pose in the map; None if it is not known."""
         if self.errors is None:
             return None
-        return ros_covariance(self.errors[0].of_frame(row), self.T_map_world, self.believed[row])
+        return ros_covariance(self.errors[0].of_frame(row), self.T_map_world, self.valid[row])
 
     def in_odom(self, row: int) -> Matrix | None:
         """Return the covariance [6, 6] of a frame's pose in odom; None if it is not known."""
@@ -165,7 +165,7 @@ def _frames(reader: RunReader, messages: RosMessages, path: _FinishedPath, pictu
         if reader.frames.states[row] == LOST:
             continue
         T_odom_link = link_pose(T_LINK_OPTICAL @ path.odometry[0][row])
-        T_map_link = path.believed.get(row)
+        T_map_link = path.valid.get(row)
         yield messages.transforms(TF, stamp_ns, camera_links(T_odom_link, T_map_link))
         yield messages.odometry(stamp_ns, ODOM, LINK, T_odom_link, path.in_odom(row))
         if T_map_link is not None:
@@ -185,7 +185,7 @@ def _loop_frames(reader: RunReader) -> set[int]:
 
 def _floor(reader: RunReader, progress: Progress) -> tuple[FloorPlan | None, Matrix]:
     """Return the floor plan and T_floor_world; if no surface is visible, no plan, and axes levelled by the cameras."""
-    path: Trajectory = reader.believed_path()
+    path: Trajectory = reader.valid_path()
     with suppress(SigmaSplatError):
         plan = run_floor_plan(reader.run, path, reader.camera, progress=progress)
         return plan, plan.T_floor_world

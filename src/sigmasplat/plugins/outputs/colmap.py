@@ -28,11 +28,11 @@ Points = NDArray[np.floating]
 def export_colmap(reader: RunReader, target: Path, images: bool = False, progress: Progress = no_progress) -> int:
     """Write a sparse model to sparse/0 in a folder; return the number of views.
 
-    Views are all frames whose pose is believed; with `images` only the keyframes, whose images are written to images/.
+    Views are all frames whose pose is valid; with `images` only the keyframes, whose images are written to images/.
     Raises RunError.
     """
     make_folder(target / SPARSE)
-    frames = export_images(reader, target, False, progress) if images else reader.believed_frames()
+    frames = export_images(reader, target, False, progress) if images else reader.valid_frames()
     names = [image_name(frame) for frame in frames]
     poses = reader.poses_of(frames).T_world_camera
     write_model(target / SPARSE, reader.camera, names, poses, *splat_points(reader.run.read_map()))

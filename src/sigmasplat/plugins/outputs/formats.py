@@ -78,7 +78,7 @@ def _trajectory(source: ExportSource, target: Path) -> str:
 
     reader = source.reader()
     has_log = (reader.run.path / "log.jsonl").is_file()
-    path = reader.believed_path() if has_log else reader.run.read_trajectory()
+    path = reader.valid_path() if has_log else reader.run.read_trajectory()
     write_trajectory(target, path)
     return f"{len(path):,} poses{reader.left_out() if has_log else ''}"
 
@@ -97,20 +97,20 @@ def _ros_covariance(source: ExportSource, target: Path) -> str:
 
 def _write_covariances(source: ExportSource, target: Path, write: "Callable[[Path, Trajectory, Matrix], None]") -> str:
     reader = source.reader()
-    path = reader.believed_path()
+    path = reader.valid_path()
     write(target, path, reader.covariances())
     return f"{len(path):,} poses with their covariance{reader.left_out()}"
 
 
 def _kitti(source: ExportSource, target: Path) -> str:
-    """Write one line per frame, since the line number is the frame number; nan for frames without a believed pose."""
+    """Write one line per frame, since the line number is the frame number; nan for frames without a valid pose."""
     import numpy as np
 
     from sigmasplat.run_folder.trajectory import write_kitti_poses
 
     reader = source.reader()
     poses = np.full((len(reader.frames), 4, 4), np.nan)
-    poses[reader.believed_frames()] = reader.believed_path().T_world_camera
+    poses[reader.valid_frames()] = reader.valid_path().T_world_camera
     write_kitti_poses(target, poses)
     left_out = reader.left_out()
     return f"{len(reader.frames.rows):,} poses{left_out}{' (written as nan)' if left_out else ''}"

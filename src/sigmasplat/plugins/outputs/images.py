@@ -24,12 +24,12 @@ def image_name(frame: int) -> str:
 def export_images(reader: RunReader, folder: Path, depth: bool, progress: Progress) -> Sequence[int]:
     """Write the colour of the keyframes to images/, and their depth to depths/ if requested.
 
-    Keyframes without a believed pose are left out. Returns their frame numbers. Raises RunError if no keyframe is left.
+    Keyframes without a valid pose are left out. Returns their frame numbers. Raises RunError if no keyframe is left.
     """
-    believed, written = set(reader.believed_frames()), []
+    valid, written = set(reader.valid_frames()), []
     total = reader.count_keyframes()
     for done, (frame, picture) in enumerate(reader.keyframes(), 1):
-        if frame in believed:
+        if frame in valid:
             write_color(folder / IMAGES / image_name(frame), picture)
             if depth:
                 write_depth(folder / DEPTHS / image_name(frame), picture)

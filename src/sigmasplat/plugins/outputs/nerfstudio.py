@@ -27,10 +27,10 @@ MILLIMETRES = 0.001
 def export_nerfstudio(reader: RunReader, target: Path, images: bool = False, progress: Progress = no_progress) -> int:
     """Write transforms.json; return the number of views.
 
-    Views are all frames whose pose is believed; with `images` only the keyframes, whose images are written to images/
+    Views are all frames whose pose is valid; with `images` only the keyframes, whose images are written to images/
     and depths/ beside the file, with points.ply. The images' names are the same in both cases. Raises RunError.
     """
-    frames = export_images(reader, target.parent, True, progress) if images else reader.believed_frames()
+    frames = export_images(reader, target.parent, True, progress) if images else reader.valid_frames()
     path = reader.poses_of(frames)
     if images:
         write_points(target.parent / POINTS, *splat_points(reader.run.read_map()))

@@ -34,7 +34,7 @@ def rendered_weights(reader: RunReader, field: GaussianField) -> Tensor:
     none = torch.zeros(len(field), 0)
     ones = torch.ones(camera.height, camera.width, 1)
     best = torch.zeros(len(field))
-    for T_world_camera in evenly_spread(list(reader.believed_path().T_world_camera), MOST_VIEWS):
+    for T_world_camera in evenly_spread(list(reader.valid_path().T_world_camera), MOST_VIEWS):
         seen = blend_values(
             shown, camera, se3.inverse(T_world_camera), none, config.render, config.backend, gather=True
         )

@@ -52,8 +52,8 @@ class RunReader:
             raise RunError(f"run {self.run.path}: its log has {len(log)} frames, its path {len(path)} poses")
         return RunFrames.of(log, path)
 
-    def believed_frames(self) -> list[int]:
-        """Return the frames whose pose is believed, counted from the run's start. Raises RunError if there is none."""
+    def valid_frames(self) -> list[int]:
+        """Return the frames whose pose is valid, counted from the run's start. Raises RunError if there is none."""
         if not len(self.frames.rows):
             raise RunError(
                 f"run {self.run.path} has no frame whose pose is known in its world, so it has no pose to export; "
@@ -61,23 +61,23 @@ class RunReader:
             )
         return [int(row) for row in self.frames.rows]
 
-    def believed_path(self) -> Trajectory:
-        """Return the poses of `believed_frames`. Raises RunError if there is none."""
-        self.believed_frames()
+    def valid_path(self) -> Trajectory:
+        """Return the poses of `valid_frames`. Raises RunError if there is none."""
+        self.valid_frames()
         return self.frames.path
 
     def poses_of(self, frames: Sequence[int]) -> Trajectory:
-        """Return the poses of some frames. Raises RunError if the pose of one is not believed."""
-        if unknown := sorted(set(frames) - set(self.believed_frames())):
-            raise RunError(f"run {self.run.path} has no believed pose of frame {unknown[0]}; choose another frame")
+        """Return the poses of some frames. Raises RunError if the pose of one is not valid."""
+        if unknown := sorted(set(frames) - set(self.valid_frames())):
+            raise RunError(f"run {self.run.path} has no valid pose of frame {unknown[0]}; choose another frame")
         return self.frames.path.at(np.searchsorted(self.frames.rows, frames))
 
     def covariances(self) -> Matrix:
-        """Return the covariance of the poses of `believed_path` [B, 6, 6], of left twists in the world, m and rad.
+        """Return the covariance of the poses of `valid_path` [B, 6, 6], of left twists in the world, m and rad.
 
         Raises RunError if the run did not record the errors of its path.
         """
-        rows = self.believed_frames()
+        rows = self.valid_frames()
         errors = PathCovariance.of(self.run.read_checkpoint()[0])
         if errors is None or len(errors) <= rows[-1]:
             raise RunError(
@@ -87,7 +87,7 @@ class RunReader:
         return np.stack([errors.of_frame(row) for row in rows])
 
     def left_out(self, keyframes: bool = False) -> str:
-        """Describe how many frames have no believed pose, of all or of the keyframes; empty if there are none."""
+        """Describe how many frames have no valid pose, of all or of the keyframes; empty if there are none."""
         log, states = self.frames.log, self.frames.states
         counted = [s for s, record in zip(states, log, strict=True) if not keyframes or record["is_keyframe"]]
         found = [f"{counted.count(state):,} {state}" for state in (LOST, APART) if state in counted]

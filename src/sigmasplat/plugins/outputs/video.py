@@ -87,7 +87,7 @@ def export_video(
     """
     options = options or VideoOptions()
     check_ending(target)
-    config, path = reader.config, reader.believed_path()
+    config, path = reader.config, reader.valid_path()
     renderer = renderer or FieldRenderer(config.render, config.backend)
     field, camera = reader.run.read_map(), film_camera(reader.camera, options.width_px)
     count = options.images(float(path.timestamps_s[-1] - path.timestamps_s[0]))

@@ -119,7 +119,6 @@ FAST = Config(
     primitives=DensifyConfig(split_radius_px=13.0),  # else an inherited map becomes coarser as the camera moves
     tracking=TrackingConfig(
         method="align",  # Gauss–Newton on images instead of 200 renders per frame
-        align_to="keyframe",
         align_weight_color=0.1,  # gray has the smaller basin of convergence; with 0.5, steps of 5° fail
         tau=10.0,
         weight_max=3.0,

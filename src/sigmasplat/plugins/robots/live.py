@@ -156,7 +156,7 @@ class LiveRobot:
         """Give the pose of a frame in the map with its covariance; this is computed on the outlet's thread."""
         slam = self.slam
         if slam.atlas.in_world[row]:
-            errors = path_errors(slam.atlas, slam.keyframe_indices, slam.closer.believed)
+            errors = path_errors(slam.atlas, slam.keyframe_indices, slam.closer.valid)
             self._offer(partial(_loop, self._stamp_ns, errors, row), LOOP)
 
     def _offer_submaps(self, finished: int) -> None:
@@ -189,8 +189,8 @@ class LiveRobot:
     def _floor_plan(self) -> FloorPlan | None:
         """Return the floor plan of the final map; None if no surface is visible."""
         slam, config, field, known = self.slam, self.slam.config, self.slam.field, self.slam.uncertainty
-        whole, believed = slam.trajectory(), slam.believed()
-        path, up_world = whole.at(believed), self._forces.up_of(whole, believed)
+        whole, valid = slam.trajectory(), slam.valid()
+        path, up_world = whole.at(valid), self._forces.up_of(whole, valid)
         predictor = None
         if known is not None:
             predictor = partial(predict, field, known, options=config.render, backend=config.backend)
@@ -259,11 +259,11 @@ class _Forces:
                 self._rows.append(row)
                 self._forces_m_s2.extend(force)
 
-    def up_of(self, path: Trajectory, believed: NDArray[np.bool_]) -> NDArray[np.float64] | None:
-        """Return the unit vector [3] that points up in the world, from the believed poses of a path; None if it was not
+    def up_of(self, path: Trajectory, valid: NDArray[np.bool_]) -> NDArray[np.float64] | None:
+        """Return the unit vector [3] that points up in the world, from the valid poses of a path; None if it was not
         measured."""
         rows, forces = np.array(self._rows, np.intp), np.array(self._forces_m_s2).reshape(-1, 3)
-        use = believed[rows]
+        use = valid[rows]
         return up_of_path(path.T_world_camera[rows[use]], forces[use])
 
 

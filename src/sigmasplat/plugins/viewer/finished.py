@@ -155,7 +155,7 @@ def _mesh(run: RunFolder) -> Mesh | None:
 
 
 def _final_path(frames: RunFrames, tensors: Mapping[str, Tensor]) -> CameraPath:
-    """Return the path of a finished run: believed poses from trajectory.txt, the others from the checkpoint."""
+    """Return the path of a finished run: valid poses from trajectory.txt, the others from the checkpoint."""
     poses = np.tile(np.eye(4), (len(frames), 1, 1))
     kept = np.asarray(tensors["T_world_camera"], np.float64)[: len(frames)]
     poses[: len(kept)] = kept

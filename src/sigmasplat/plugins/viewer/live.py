@@ -54,7 +54,7 @@ class LiveView:
         slam = self.slam
         lost, submaps = slam.steps.lost, slam.steps.submap
         known = [LOST if is_lost else state for is_lost, state in zip(lost, slam.steps.states, strict=True)]
-        states = states_at_end(known, slam.believed())
+        states = states_at_end(known, slam.valid())
         outside = submaps_outside(states, submaps)
         poses, keyframes = slam.atlas.T_world_camera(), tuple(slam.keyframe_indices)
         path = CameraPath(poses, lost, submaps, keyframes, outside_world(states))

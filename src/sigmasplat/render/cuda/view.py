@@ -31,8 +31,6 @@ class CudaView:
     ) -> None:
         if options.depth == "ray":
             raise BackendError("render.depth=ray does not run on CUDA yet; add --set render.depth=center")
-        if options.depth_gate_m:
-            raise BackendError("render.depth_gate_m does not run on CUDA; add --set render.depth_gate_m=0")
         device = device or cuda_launch.this_device()
         self.camera, self.options = camera, options
         self.raster = Raster(cuda_launch.launcher_for(device), device)

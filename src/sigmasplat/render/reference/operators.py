@@ -57,18 +57,16 @@ def project(
     """Project splats to the image (EWA splatting, 3DGS eq. 5; CG-SLAM eq. 2).
 
     means [N, 3] m, world; quats [N, 4] wxyz, any norm; scales [N, 3] m, activated; T_camera_world [4, 4]. The pose
-    gradient is the sum of three paths (CG-SLAM spec §2.1). A path is switched off by using a constant pose in it.
+    gradient is the sum of three paths: mean, covariance, depth (CG-SLAM spec §2.1). Without
+    `covariance_pose_gradient` the covariance has a constant pose.
     """
     T = T_camera_world.to(means)
     in_view = (means @ T[:3, :3].T + T[:3, 3])[:, 2].detach() > options.near_m
-    T_mean, T_covariance, T_depth = (
-        T if on else T.detach()
-        for on in (options.mean_pose_gradient, options.covariance_pose_gradient, options.depth_pose_gradient)
-    )
-    means2d = _pinhole(_to_camera(means, T_mean, in_view), camera)
+    T_covariance = T if options.covariance_pose_gradient else T.detach()
+    means2d = _pinhole(_to_camera(means, T, in_view), camera)
     A, _ = _footprints(means, quats, scales, T_covariance, in_view, camera)
     conics, radii = _whiten(A, options.low_pass_px2)
-    z = means @ T_depth[2, :3] + T_depth[2, 3]
+    z = means @ T[2, :3] + T[2, 3]
     seen = in_view[:, None]
     return Projection(
         torch.where(seen, means2d, 0.0),
@@ -195,40 +193,6 @@ def blend(
     sums, moment, *maps = (torch.cat(part) for part in zip(*parts, strict=True))
     images = [m.reshape(size) for m in maps]
     return Blended(sums.reshape(*size, -1), None if ref_depth is None else moment.reshape(size), *images)
-
-
-def blend_gated_depth(
-    means2d: Tensor,
-    conics: Tensor,
-    z: Tensor,
-    radii: Tensor,
-    opacities: Tensor,
-    camera: Camera,
-    options: RenderConfig,
-    slopes: Tensor | None = None,
-) -> Tensor:
-    """Sum the depths Σ w g(d) [H, W], m, behind the median gate of `options.depth_gate_m` > 0 (GauS-SLAM).
-
-    Arguments and weights w are those of `blend`; d is z, with slopes the depth along the ray. The median splat has
-    depth m at the pixel. A splat after it, front to back, with d > m has g(d) = βd + (1 − β)m, β = exp(−((d − m)/s)²);
-    all others have g(d) = d. m is a constant in the gradient.
-    """
-    order, size = _near_to_far(z, radii), (camera.height, camera.width)
-    if not len(order):
-        return z.new_zeros(size)
-    parts = []
-    for pixels in torch.split(_pixels(camera).to(means2d), max(1, PAIRS_AT_ONCE // (len(order) + 1))):
-        alphas = _alphas(pixels, means2d[order], conics[order], opacities[order], options)
-        along = means2d.new_zeros(len(order), 2) if slopes is None else slopes[order]
-        depths = _depths(pixels, means2d[order], z[order], along)
-        after = torch.cumprod(1.0 - alphas, 0)
-        before = torch.cat([torch.ones_like(after[:1]), after[:-1]])
-        w = torch.where(before >= options.transmittance_stop, alphas * before, 0.0)
-        at_median = ((before >= 0.5) & (after < 0.5)).int().argmax(0, keepdim=True)
-        m = depths.detach().gather(0, at_median)
-        gated = m + (depths - m) * (-(((depths - m) / options.depth_gate_m) ** 2)).exp()
-        parts.append((w * torch.where((before < 0.5) & (depths.detach() > m), gated, depths)).sum(0))
-    return torch.cat(parts).reshape(size)
 
 
 def _near_to_far(z: Tensor, radii: Tensor) -> Tensor:

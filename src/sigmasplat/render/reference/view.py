@@ -50,9 +50,6 @@ class ReferenceView:
         if slopes is not None:
             depth = depth_of(sums[..., -PLANES:], self.camera)[..., None]
             sums = torch.cat([sums[..., :3], depth, sums[..., 4:-PLANES]], -1)
-        if self.options.depth_gate_m:
-            depth = reference.blend_gated_depth(*p, f.opacities, self.camera, self.options, slopes)[..., None]
-            sums = torch.cat([sums[..., :3], depth, sums[..., 4:]], -1)
         self._maps, self._means2d = [(sums.movedim(-1, 0), self.g_sums), (b.alpha, self.g_alpha)], p.means2d
         self._visible = reaches(p, f.opacities.detach(), self.camera, self.options)
         self.sums.copy_(sums.detach().movedim(-1, 0))

@@ -13,10 +13,10 @@ from sigmasplat.fit.compare import STEP as COMPARE_STEP
 from sigmasplat.fit.pose import PoseFit
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference
-from sigmasplat.tracking.moving.foreground import (
+from sigmasplat.tracking.moving.dynamic_mask import (
     EDGE_RELATIVE,
     STEP,
-    Foreground,
+    DynamicMask,
     coarse_rays,
     enlarged,
     smooth,
@@ -26,8 +26,8 @@ from sigmasplat.tracking.moving.foreground import (
 from sigmasplat.tracking.moving.free_space import Depth, Mask
 from sigmasplat.tracking.moving.two_motions import two_motions
 from sigmasplat.tracking.moving.windows import boxed, upper_median, widened
-from sigmasplat.tracking.sight import Sight
-from sigmasplat.tracking.verdict import agrees_more, differs, disagrees, gray_gain, may_draw
+from sigmasplat.tracking.pose_validation import agrees_more, differs, disagrees, gray_gain, may_draw
+from sigmasplat.tracking.prepared_frame import PreparedImages
 from sigmasplat.types import Matrix
 
 OBJECT_SHARE, MOST_OBJECTS = (0.02, 0.7), 3
@@ -52,8 +52,8 @@ SHIFT_STEP = 4
 
 
 def suspected(
-    keyframe: Reference, seen: Sight, fit: PoseFit, config: TrackingConfig, every: bool
-) -> Iterator[Foreground]:
+    keyframe: Reference, seen: PreparedImages, fit: PoseFit, config: TrackingConfig, every: bool
+) -> Iterator[DynamicMask]:
     """Yield the things in front that may have pulled a pose; with `every`, all that stand free."""
     live_m = seen.target.depth_image.numpy()
     for inside in free_standing(thinned(live_m, STEP)):
@@ -61,7 +61,9 @@ def suspected(
             yield _front(*enlarged(inside, STEP, live_m), live_m)
 
 
-def _may_have_drawn(thing: Foreground, keyframe: Reference, seen: Sight, fit: PoseFit, config: TrackingConfig) -> bool:
+def _may_have_drawn(
+    thing: DynamicMask, keyframe: Reference, seen: PreparedImages, fit: PoseFit, config: TrackingConfig
+) -> bool:
     """Return whether the gray values agree better without a thing, at the same pose or at one that an alignment of
     small images finds, where the depth agrees as well."""
     rest = seen.hiding(thing)
@@ -82,9 +84,9 @@ def _may_have_drawn(thing: Foreground, keyframe: Reference, seen: Sight, fit: Po
     return shift >= SHIFTED and gain * shift >= QUICK_APART
 
 
-def _front(whole: Mask, hidden: Mask, live_m: Depth) -> Foreground:
+def _front(whole: Mask, hidden: Mask, live_m: Depth) -> DynamicMask:
     """Return a thing that stands free, from its pixels and those that it hides; what is behind it is not known."""
-    return Foreground(hidden, np.where(whole, live_m, np.float32(0.0)), np.where(hidden, np.float32(0.0), live_m))
+    return DynamicMask(hidden, np.where(whole, live_m, np.float32(0.0)), np.where(hidden, np.float32(0.0), live_m))
 
 
 def free_standing(depth: Depth) -> Iterator[Mask]:
@@ -111,7 +113,12 @@ def _stands_free(depth: Depth, regions: NDArray[np.int32], region: int, box: NDA
 
 
 def has_drawn(
-    thing: Foreground, keyframe: Reference | None, seen: Sight, drawn: PoseFit, found: PoseFit, contradicted: bool
+    thing: DynamicMask,
+    keyframe: Reference | None,
+    seen: PreparedImages,
+    drawn: PoseFit,
+    found: PoseFit,
+    contradicted: bool,
 ) -> bool:
     """Return whether a thing has pulled a pose, by the pose that was fitted without it, which shows it elsewhere.
 
@@ -127,13 +134,13 @@ def has_drawn(
     return motions is not None and motions.apart and (motions.rest_gains - 1.0) * shift >= APART
 
 
-def _shift(thing: Foreground, seen: Sight, T_first: Matrix, T_second: Matrix) -> float:
+def _shift(thing: DynamicMask, seen: PreparedImages, T_first: Matrix, T_second: Matrix) -> float:
     """Return by how much a thing is shifted between two poses T_camera_world [4, 4], as a share of the image width."""
     return shift_px(thing, seen.target.camera, T_first @ se3.inverse(T_second)) / seen.target.camera.width
 
 
 def _disturbs(
-    thing: Foreground, keyframe: Reference, seen: Sight, drawn: PoseFit, found: PoseFit, contradicted: bool
+    thing: DynamicMask, keyframe: Reference, seen: PreparedImages, drawn: PoseFit, found: PoseFit, contradicted: bool
 ) -> bool:
     """Return whether the rest agrees much more without a thing, the thing does not agree with the rest, and the pulled
     pose is not only a poor fit."""
@@ -144,7 +151,7 @@ def _disturbs(
     return contradicted or not _fits_poorly(thing, keyframe, seen, drawn, found)
 
 
-def _fits_poorly(thing: Foreground, keyframe: Reference, seen: Sight, drawn: PoseFit, found: PoseFit) -> bool:
+def _fits_poorly(thing: DynamicMask, keyframe: Reference, seen: PreparedImages, drawn: PoseFit, found: PoseFit) -> bool:
     """Return whether the first pose is only a poor fit: the rest agrees hardly better there than with the thing, and
     the thing itself agrees better at the other pose."""
     alone = seen.live.hiding(thing.depth_m <= 0)
@@ -153,7 +160,7 @@ def _fits_poorly(thing: Foreground, keyframe: Reference, seen: Sight, drawn: Pos
     return at_found > at_drawn and not may_draw(rest, drawn.comparison)
 
 
-def is_still(thing: Foreground, keyframe: Reference | None, live: Pyramid, found: PoseFit) -> bool:
+def is_still(thing: DynamicMask, keyframe: Reference | None, live: Pyramid, found: PoseFit) -> bool:
     """Return whether what may be in front belongs to the scene: the keyframe shows most of it at the same place, with
     gray values that agree as well as those of the rest."""
     if keyframe is None or found.comparison is None:
@@ -164,7 +171,7 @@ def is_still(thing: Foreground, keyframe: Reference | None, live: Pyramid, found
     return in_place and not (differs(shown) and disagrees(shown, found.comparison))
 
 
-def shift_px(thing: Foreground, camera: Camera, T_b_a: Matrix) -> float:
+def shift_px(thing: DynamicMask, camera: Camera, T_b_a: Matrix) -> float:
     """Return by how many pixels a thing that camera a sees is shifted in camera b [4, 4]: the median of its pixels."""
     depth = thing.depth_m[::SHIFT_STEP, ::SHIFT_STEP]
     v, u = np.nonzero(depth > 0)

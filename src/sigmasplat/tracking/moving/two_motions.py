@@ -10,7 +10,7 @@ from sigmasplat.data import se3
 from sigmasplat.data.opencv import opencv
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference
-from sigmasplat.tracking.moving.foreground import coarse_rays
+from sigmasplat.tracking.moving.dynamic_mask import coarse_rays
 from sigmasplat.types import Matrix
 
 Image = NDArray[np.float32]

@@ -9,23 +9,23 @@ from scipy.stats import rankdata
 OFF_M = 0.05
 """`p_off` is the probability that a pose is off by more than this."""
 SILENT_M = 0.10
-"""A believed pose that is off by more than this is a silent failure."""
+"""A valid pose that is off by more than this is a silent failure."""
 BINS = 10
 
 Values = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 
-def score_failures(error_m: Values, p_off: Values, believed: Mask) -> dict[str, Any]:
+def score_failures(error_m: Values, p_off: Values, valid: Mask) -> dict[str, Any]:
     """Score the frames of a run.
 
     error_m [F]: distance from the true position after the alignment of the ATE, nan if it is not known; p_off [F]: the
-    predicted probability that it is above 5 cm, nan if it is not known; believed [F]: whether the pose is believed.
+    predicted probability that it is above 5 cm, nan if it is not known; valid [F]: whether the pose is valid.
 
-    `silent_rows` are the rows of the believed frames that are off by more than 10 cm. `auroc` and `brier` judge p_off
+    `silent_rows` are the rows of the valid frames that are off by more than 10 cm. `auroc` and `brier` judge p_off
     on all frames with both values; both are nan if there is no such frame, and auroc also if all or none are off.
     """
-    silent = believed & (error_m > SILENT_M)
+    silent = valid & (error_m > SILENT_M)
     known = np.isfinite(error_m) & np.isfinite(p_off)
     off, p = error_m[known] > OFF_M, p_off[known]
     return {

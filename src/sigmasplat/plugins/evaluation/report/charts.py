@@ -52,9 +52,9 @@ def run_charts(
     frames: RunFrames, truth: Matrix | None, loops: Sequence[dict[str, Any]] = ()
 ) -> dict[str, tuple[list[Chart], str]]:
     """Return the charts of a run with captions, by name: trajectory; states if known; submaps if there are several;
-    moving if anything moved; seconds if known. Without a believed frame there are only the seconds.
+    moving if anything moved; seconds if known. Without a valid frame there are only the seconds.
 
-    truth: [B, 3] of the believed frames, as in `trajectory_charts`.
+    truth: [B, 3] of the valid frames, as in `trajectory_charts`.
     """
     log = frames.log
     found = _path_charts(frames, truth, loops) if len(frames.rows) else {}
@@ -72,7 +72,7 @@ def run_charts(
 def _path_charts(
     frames: RunFrames, truth: Matrix | None, loops: Sequence[dict[str, Any]]
 ) -> dict[str, tuple[list[Chart], str]]:
-    """Return the charts of the believed poses."""
+    """Return the charts of the valid poses."""
     estimate, log = frames.path.T_world_camera[:, :3, 3], frames.log
     before_lost = np.array([row + 1 < len(frames) and frames.states[row + 1] == LOST for row in frames.rows], np.bool_)
     caption = "In the frame of the first camera." + ("" if truth is None else " The true path is rigidly aligned.")
@@ -149,7 +149,7 @@ def _strip(state: str, numbers: Matrix, at: NDArray[np.bool_]) -> list[Curve]:
 
 
 def _p_off_chart(frames: RunFrames) -> Chart:
-    """Return the chart of the believed path from above, in one colour per level of p_off."""
+    """Return the chart of the valid path from above, in one colour per level of p_off."""
     top, p = frames.path.T_world_camera[:, [0, 2], 3], frames.p_off[frames.rows]
     curves = [Curve("", top, FAINT, width=1.5)]
     for name, low, high, colour in P_LEVELS:

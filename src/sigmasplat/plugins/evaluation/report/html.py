@@ -1,4 +1,4 @@
-"""Build report.html: summary, figures, floor plan, views, scores, times, advice, settings. One file, no scripts."""
+"""Build report.html: a picture of the map, three verdicts and the next commands; the rest is folded. No scripts."""
 
 import html
 from collections.abc import Callable, Sequence
@@ -6,13 +6,16 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from sigmasplat.plugins.evaluation.report import tables
-from sigmasplat.plugins.evaluation.report.summary import Advice
+from sigmasplat.plugins.evaluation.report.advice import Advice
+from sigmasplat.plugins.evaluation.report.summary import Verdict
 from sigmasplat.plugins.evaluation.report.view_strips import PanelFigure
 from sigmasplat.plugins.outputs.floorplan.rescan import RescanRegion
-from sigmasplat.run.figures import headline, number
+from sigmasplat.run.figures import number
 
 NARROW = "(max-width: 640px)"
 """Pages this narrow show the narrow version of charts and plan."""
+VIEW_PANELS = 5
+"""Number of panels of a view; fewer are not of one view, or of its predicted errors."""
 
 STYLE = """
 :root { color-scheme: light dark; --page: #f6f7f9; --card: #ffffff; --ink: #1b1f24; --soft: #5c6670; --line: #e1e4e8;
@@ -23,19 +26,20 @@ STYLE = """
 * { box-sizing: border-box; }
 body { margin: 0; background: var(--page); color: var(--ink); overflow-wrap: break-word;
   font: 16px/1.55 system-ui, -apple-system, "Segoe UI", "Helvetica Neue", sans-serif; }
-main { max-width: 1180px; margin: 0 auto; padding: 40px 24px 80px; }
+main { max-width: 1180px; margin: 0 auto; padding: 28px 24px 60px; }
 h1 { font-size: 30px; line-height: 1.2; letter-spacing: -0.02em; margin: 0 0 4px; }
-h2 { font-size: 20px; letter-spacing: -0.01em; margin: 48px 0 12px; }
+h2 { font-size: 17px; margin: 0; }
 h3 { font-size: 15px; margin: 0 0 12px; }
 p { max-width: 74ch; margin: 0 0 12px; }
-.soft, figcaption, th, .unit { color: var(--soft); }
+.soft, figcaption, th { color: var(--soft); }
 .alarm { color: var(--accent); font-weight: 600; }
-.tiles { display: grid; grid-template-columns: repeat(auto-fit, minmax(148px, 1fr)); gap: 12px; margin: 24px 0; }
 .card { background: var(--card); border: 1px solid var(--line); border-radius: 10px; padding: 14px 16px;
   overflow-x: auto; }
-.tile b { display: block; font-size: 26px; line-height: 1.25; font-weight: 620; font-variant-numeric: tabular-nums; }
-.tile span { font-size: 13px; color: var(--soft); }
-.tile .unit { display: inline; font-size: 15px; font-weight: 400; }
+.map { display: grid; grid-template-columns: 1fr 1fr; gap: 12px; margin-top: 16px; }
+.map img { max-height: 430px; object-fit: contain; background: #15181d; }
+.judged { display: grid; grid-template-columns: repeat(3, 1fr); gap: 12px; margin-bottom: 12px; }
+.judged b { display: block; font-size: 19px; line-height: 1.3; margin-bottom: 6px; }
+.judged p { font-size: 14.5px; }
 .pair { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(420px, 100%), 1fr)); gap: 12px;
   align-items: start; }
 table { border-collapse: collapse; width: 100%; font-size: 14.5px; font-variant-numeric: tabular-nums; }
@@ -62,12 +66,13 @@ figcaption { font-size: 14px; margin-top: 6px; }
 ul { max-width: 74ch; padding-left: 20px; } li { margin-bottom: 10px; }
 li pre { background: var(--card); border: 1px solid var(--line); border-radius: 8px; padding: 8px 12px;
   margin-top: 4px; user-select: all; }
-details { margin-top: 12px; } summary { cursor: pointer; }
+details { margin-top: 12px; } summary { cursor: pointer; } summary h2 { display: inline; }
+.part { border-bottom: 1px solid var(--line); padding-bottom: 12px; } .part > summary + * { margin-top: 16px; }
+.part > pre { max-height: 60vh; overflow: auto; }
 pre { white-space: pre-wrap; overflow-wrap: anywhere; margin: 0;
   font: 13px/1.5 ui-monospace, "SF Mono", Menlo, Consolas, monospace; }
 @media NARROW {
-  main { padding: 24px 12px 56px; } h1 { font-size: 24px; } h2 { margin-top: 36px; }
-  .tiles { gap: 8px; grid-template-columns: 1fr 1fr; } .tile b { font-size: 22px; }
+  main { padding: 20px 12px 56px; } h1 { font-size: 24px; } .map, .judged { grid-template-columns: 1fr; }
   .view.large div, .view.large div:nth-child(-n+2) { grid-column: span 6; }
   th, td { padding: 6px; } .card { padding: 12px; } }
 """.replace("NARROW", NARROW)
@@ -83,11 +88,11 @@ PREDICTED_EXPLANATION = (
 class Contents:
     """What a report shows.
 
-    summary: sentences; advice: what to try next, with or without a command; rescan: sentences about what to scan again;
-    regions: the same numbered regions as in the floor plan; strips: panels of views by heading; plots: captions by
-    name; seconds: time per stage; loops: the records of loops.json. `picture` turns the name of a picture file into an
-    address for the page. Each plot has four files: images/<name>-light.png, <name>-dark.png, <name>-narrow-light.png
-    and <name>-narrow-dark.png.
+    verdicts: shown first; commands: what to do with the map; advice: what else to try; summary: sentences; rescan:
+    sentences about what to scan again; regions: the same numbered regions as in the floor plan; strips: panels of views
+    by heading; plots: captions by name; seconds: time per stage; loops: the records of loops.json. `picture` turns the
+    name of a picture file into an address for the page. Each plot has four files: images/<name>-light.png,
+    <name>-dark.png, <name>-narrow-light.png and <name>-narrow-dark.png.
     """
 
     title: str
@@ -98,6 +103,8 @@ class Contents:
     config: str = ""
     warnings: list[str] = field(default_factory=list)
     loops: list[dict[str, Any]] = field(default_factory=list)
+    verdicts: list[Verdict] = field(default_factory=list)
+    commands: list[Advice] = field(default_factory=list)
     summary: list[str] = field(default_factory=list)
     advice: list[Advice] = field(default_factory=list)
     rescan: list[str] = field(default_factory=list)
@@ -111,18 +118,19 @@ def build_report(contents: Contents) -> str:
     parts = [
         f"<h1>{html.escape(contents.title)}</h1><p class=soft>{html.escape(contents.subtitle)}</p>",
         "".join(f"<p class=alarm>{html.escape(warning)}</p>" for warning in contents.warnings),
-        _summary(contents.summary),
-        _tiles(contents.metrics),
-        _rescan(contents),
-        _plot(contents, "trajectory", "Trajectory"),
-        _states(contents),
-        _plot(contents, "moving", "What moved"),
-        _strips(contents),
-        _submaps(contents),
-        _tables(contents.metrics),
-        _time(contents),
-        _advice(contents.advice),
-        _settings(contents),
+        _map(contents),
+        f"<div class=judged>{''.join(map(_verdict, contents.verdicts))}</div>",
+        _advice(contents.commands),
+        _part("What else to try", _advice(contents.advice)),
+        _part("Where to scan again", _rescan(contents)),
+        _part("Trajectory", _figure(contents, "trajectory", "Trajectory")),
+        _part("States of the frames", _states(contents)),
+        _part("What moved", _figure(contents, "moving", "What moved")),
+        _part("Views", _strips(contents)),
+        _part("Submaps and loops", _submaps(contents)),
+        _part("Scores", _scores(contents)),
+        _part("Time", _time(contents)),
+        _part("Settings (config.json)", contents.config and f"<pre>{html.escape(contents.config)}</pre>"),
     ]
     head = "<meta charset=utf-8><meta name=viewport content='width=device-width, initial-scale=1'>"
     title, body = html.escape(contents.title), "\n".join(parts)
@@ -132,18 +140,42 @@ def build_report(contents: Contents) -> str:
     )
 
 
-def _tiles(metrics: dict[str, Any]) -> str:
-    """Show the headline figures as tiles."""
-    tiles = [
-        f"<div class='card tile'><b>{value} <span class=unit>{unit}</span></b><span>{html.escape(name)}</span></div>"
-        for name, value, unit in headline(metrics)
-    ]
-    return f"<div class=tiles>{''.join(tiles)}</div>"
+def _part(title: str, body: str) -> str:
+    """Return a folded part of the page; nothing if it is empty."""
+    return f"<details class=part><summary><h2>{title}</h2></summary>{body}</details>" if body else ""
 
 
-def _summary(sentences: list[str]) -> str:
-    """Show the summary sentences."""
-    return f"<h2>Summary</h2><p>{html.escape(' '.join(sentences))}</p>" if sentences else ""
+def _map(contents: Contents) -> str:
+    """Show the map from the place of a recorded image, and that image; without one, the floor plan."""
+    views = next((found for found in contents.strips.values() if found), [])
+    views = [panels for panels in views if len(panels) == VIEW_PANELS] or views
+    if not views:
+        return _figure(contents, "plan", "Floor plan")
+    recorded, *rendered = views[len(views) // 2][:2]
+    shown = [(panel, "The map") for panel in rendered] + [(recorded, "The recorded image")]
+    figures = (
+        f"<figure><img src='{html.escape(panel.address)}' alt='{words}'>"
+        f"<figcaption>{words}: {html.escape(panel.caption)}</figcaption></figure>"
+        for panel, words in shown
+    )
+    return f"<div class=map>{''.join(figures)}</div>"
+
+
+def _verdict(verdict: Verdict) -> str:
+    about, words, meaning, command = map(html.escape, verdict)
+    shown = f"<pre>{command}</pre>" if command else ""
+    return f"<div class=card><span class=soft>{about}</span><b>{words}</b><p>{meaning}</p>{shown}</div>"
+
+
+def _scores(contents: Contents) -> str:
+    """Show the summary, and all scores of images, path, surface and uncertainty."""
+    body = "".join(
+        f"<div class=card><h3>{title}</h3>{_table(rows)}</div>"
+        for title, rows in tables.score_tables(contents.metrics)
+        if rows[1:]
+    )
+    summary = f"<p>{html.escape(' '.join(contents.summary))}</p>" if contents.summary else ""
+    return f"{summary}<div class=pair>{body}</div>"
 
 
 def _rescan(contents: Contents) -> str:
@@ -156,7 +188,7 @@ def _rescan(contents: Contents) -> str:
         for number, region in enumerate(contents.regions, 1)
     )
     listed = f"<ol class=regions>{items}</ol>" if items else ""
-    return f"<h2>Where to scan again</h2>{words}{_figure(contents, 'plan', 'Floor plan')}{listed}"
+    return f"{words}{_figure(contents, 'plan', 'Floor plan')}{listed}"
 
 
 def _time(contents: Contents) -> str:
@@ -169,18 +201,18 @@ def _time(contents: Contents) -> str:
     longest_first = sorted(seconds.items(), key=lambda item: -item[1])
     rows = [[stage, number(spent, 1), number(spent / total_s, 0, 100.0)] for stage, spent in longest_first]
     table = f"<div class=card>{_table([['stage', 'seconds', '%'], *rows])}</div>" if rows else ""
-    return f"<h2>Time</h2>{_figure(contents, 'seconds', 'Seconds per frame')}{table}"
+    return f"{_figure(contents, 'seconds', 'Seconds per frame')}{table}"
 
 
 def _advice(advice: list[Advice]) -> str:
-    """Show what to try next, with commands. A click on a command selects all of it."""
+    """Show what to do, with commands. A click on a command selects all of it."""
     if not advice:
         return ""
     items = [
         f"<li>{html.escape(words)}{f'<pre>{html.escape(command)}</pre>' if command else ''}</li>"
         for words, command in advice
     ]
-    return f"<h2>What to try next</h2><ul>{''.join(items)}</ul>"
+    return f"<ul>{''.join(items)}</ul>"
 
 
 def _strips(contents: Contents) -> str:
@@ -194,7 +226,7 @@ def _strips(contents: Contents) -> str:
     )
     if contents.metrics.get("calibration"):
         explanation += PREDICTED_EXPLANATION
-    parts = ["<h2>Views</h2>", explanation]
+    parts = [explanation]
     for kind, strips in contents.strips.items():
         if strips:
             parts.append(f"<h3>{html.escape(kind)}</h3>")
@@ -204,7 +236,7 @@ def _strips(contents: Contents) -> str:
 
 def _view(panels: list[PanelFigure]) -> str:
     """Show the panels of a view. With five of them, the image and its render are half as wide as the page."""
-    large = " large" if len(panels) == 5 else ""
+    large = " large" if len(panels) == VIEW_PANELS else ""
     return f"<figure class='view{large}'>{''.join(map(_panel, panels))}</figure>"
 
 
@@ -223,12 +255,7 @@ def _states(contents: Contents) -> str:
     if "states" not in contents.plots:
         return ""
     table = f"<div class=card>{_table(tables.state_rows(contents.metrics))}</div>"
-    return f"<h2>States of the frames</h2>{_figure(contents, 'states', 'States of the frames')}{table}"
-
-
-def _plot(contents: Contents, name: str, title: str) -> str:
-    """Show a plot below its own heading."""
-    return f"<h2>{title}</h2>{_figure(contents, name, title)}" if name in contents.plots else ""
+    return f"{_figure(contents, 'states', 'States of the frames')}{table}"
 
 
 def _figure(contents: Contents, name: str, title: str) -> str:
@@ -248,16 +275,6 @@ def _figure(contents: Contents, name: str, title: str) -> str:
     )
 
 
-def _tables(metrics: dict[str, Any]) -> str:
-    """Show all scores of images, path, surface and uncertainty."""
-    body = "".join(
-        f"<div class=card><h3>{title}</h3>{_table(rows)}</div>"
-        for title, rows in tables.score_tables(metrics)
-        if rows[1:]
-    )
-    return f"<h2>Scores</h2><div class=pair>{body}</div>"
-
-
 def _submaps(contents: Contents) -> str:
     """Show the submaps and the loops between them, if there are several submaps."""
     if (contents.metrics.get("submaps") or 1) < 2:
@@ -265,7 +282,6 @@ def _submaps(contents: Contents) -> str:
     accepted = [loop for loop in contents.loops if loop.get("accepted")]
     refused = [loop for loop in contents.loops if not loop.get("accepted")]
     parts = [
-        "<h2>Submaps and loops</h2>",
         f"<p class=soft>{html.escape(tables.submap_sentence(contents.metrics))}</p>",
         _figure(contents, "submaps", "Submaps and loops"),
     ]
@@ -282,13 +298,3 @@ def _table(rows: list[list[str]]) -> str:
     head = "".join(f"<th>{html.escape(cell)}</th>" for cell in rows[0])
     body = "".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows[1:])
     return f"<table><tr>{head}</tr>{body}</table>"
-
-
-def _settings(contents: Contents) -> str:
-    """Show the settings of the run, folded."""
-    if not contents.config:
-        return ""
-    return (
-        "<h2>Settings</h2><details class=card><summary>all settings (config.json)</summary>"
-        f"<pre>{html.escape(contents.config)}</pre></details>"
-    )

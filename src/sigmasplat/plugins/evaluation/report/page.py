@@ -2,7 +2,7 @@
 
 import json
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from sigmasplat.config import Config
@@ -11,13 +11,14 @@ from sigmasplat.config.text import differences
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import RunError, SigmaSplatError
+from sigmasplat.plugins.evaluation.report.advice import advice, next_commands
 from sigmasplat.plugins.evaluation.report.html import Contents, build_report
-from sigmasplat.plugins.evaluation.report.plan import run_floor_plan
-from sigmasplat.plugins.evaluation.report.summary import advice, rescan_sentences, summary_sentences
+from sigmasplat.plugins.evaluation.report.summary import rescan_sentences, summary_sentences, verdicts
 from sigmasplat.plugins.evaluation.report.view_strips import PanelFigure, file_data_uri
 from sigmasplat.plugins.outputs.drawing import plot
 from sigmasplat.plugins.outputs.floorplan.floor_plan import FloorPlan
 from sigmasplat.plugins.outputs.floorplan.picture import draw_floor_plan, draw_narrow_floor_plan
+from sigmasplat.plugins.outputs.plan import run_floor_plan
 from sigmasplat.run_folder.runs import RunFolder
 
 SECONDS_SIZE = (plot.SIZE[0], 300)
@@ -30,8 +31,10 @@ def write_page(
     plots: dict[str, str],
     warnings: list[str],
     plan: FloorPlan | None = None,
+    unsure: Sequence[int] = (),
 ) -> None:
-    """Write report.html from metrics and pictures; `strips`: panels of views by heading, `plots`: captions by name.
+    """Write report.html from metrics and pictures; `strips`: panels of views by heading, `plots`: captions by name,
+    `unsure`: believed images that are probably off by more than 5 cm.
 
     Raises RunError if a picture cannot be read or the page cannot be written.
     """
@@ -39,6 +42,7 @@ def write_page(
     if plan is not None:
         _write_plan(run, plan)
         plots = plots | {"plan": "The map from above. Numbered circles are regions to scan again, the largest first."}
+    found = advice(metrics, rerun_command(config, facts), config.to_dict())
     contents = Contents(
         title=f"SigmaSplat · {metrics.get('source')}",
         subtitle=" · ".join([config.name, f"version {facts.get('version')}", _machine(run), str(facts.get("status"))]),
@@ -49,7 +53,9 @@ def write_page(
         warnings=warnings,
         loops=run.read_loops(),
         summary=summary_sentences(metrics, _machine(run)),
-        advice=advice(metrics, str(run.path), rerun_command(config, facts), config.to_dict()),
+        verdicts=verdicts(metrics, unsure, found),
+        commands=next_commands(str(run.path)),
+        advice=found[1:],
         rescan=rescan_sentences(metrics, plan),
         regions=plan.regions if plan else (),
         seconds=_seconds(run),
@@ -76,9 +82,9 @@ def _write_plan(run: RunFolder, plan: FloorPlan) -> None:
 
 
 def report_plan(run: RunFolder, path: Trajectory, camera: Camera) -> FloorPlan | None:
-    """Return the floor plan of a run, seen from its believed poses; None if no surface is visible.
+    """Return the floor plan of a run, seen from its valid poses; None if no surface is visible.
 
-    path: the believed poses; camera: that of the source.
+    path: the valid poses; camera: that of the source.
     """
     settings = run.config().input
     try:

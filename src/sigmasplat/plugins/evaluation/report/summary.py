@@ -1,35 +1,74 @@
-"""Describe the scores of a run in sentences: what was made, how good it is, where to scan again, what to try next."""
+"""Describe the scores of a run in sentences: three verdicts, what was made, where to scan again."""
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
 
+from sigmasplat.plugins.evaluation.report.advice import PSNR_WORDS, Advice, Metrics
 from sigmasplat.plugins.outputs.floorplan.rescan import unsure_rule
-from sigmasplat.run.figures import format_ranges, number
+from sigmasplat.run.figures import format_ranges, number, rate
 
 if TYPE_CHECKING:
     from sigmasplat.plugins.outputs.floorplan.floor_plan import FloorPlan
 
-Metrics = dict[str, Any]
-Advice = tuple[str, str]
-"""What was found and what it means, and a command to try; the command may be empty."""
-
-PSNR_WORDS = ((30.0, "very close to the camera images"), (25.0, "good"), (20.0, "recognisable, fine detail is blurred"))
 RANK_WORDS = ((0.5, "well"), (0.3, "fairly well"), (0.1, "weakly"))
 DEPTH_WORDS = ((0.01, "very accurate"), (0.03, "good"))
-OVERFIT_DB = 3.0
-"""If training views are better than held-out views by this much, there are too few keyframes."""
 NOMINAL, CALIBRATED = 0.683, 0.05
 """Coverage of one standard deviation, and the largest difference from it that counts as calibrated."""
-SLOW_PER_S = 5.0
-"""Below this number of images per second a run is slow."""
+
+
+class Verdict(NamedTuple):
+    """What is judged, how it is in a few words with the figure, and what that means; then a command to try, if any."""
+
+    about: str
+    words: str
+    meaning: str
+    command: str = ""
+
+
+def verdicts(metrics: Metrics, unsure: Sequence[int], advice: Sequence[Advice]) -> list[Verdict]:
+    """Return where the path is not sure, how good the map is, and what to do next.
+
+    unsure: believed images that are probably off by more than 5 cm; advice: what to repair, the most important first.
+    """
+    words, command = advice[0] if advice else ("The checks of the report found nothing to repair.", "")
+    todo = Verdict("Next", "Try this" if advice else "Use the map", words, command)
+    meaning = " ".join([*_images(metrics), *_depth(metrics)])
+    known = f"{path_words(metrics)}, {len(unsure)} of them doubtful" if unsure else path_words(metrics)
+    return [Verdict("Path", known, _path(metrics, unsure)), Verdict("Map", map_words(metrics), meaning), todo]
+
+
+def path_words(metrics: Metrics) -> str:
+    """Return how many images have a pose, and which ones do not."""
+    frames, lost, apart = metrics.get("frames") or 0, metrics.get("lost") or 0, metrics.get("apart") or 0
+    if not lost and not apart:
+        return f"All {frames} images have a pose"
+    where = format_ranges(sorted([*(metrics.get("lost_frames") or []), *(metrics.get("apart_frames") or [])]))
+    return f"{lost + apart} of {frames} images have no pose{f' ({where})' if where else ''}"
+
+
+def map_words(metrics: Metrics) -> str:
+    """Return how good rendered images are."""
+    found = (metrics.get(name) or {} for name in ("held_out", "training"))
+    psnr_db = next((scores["psnr_db"] for scores in found if scores.get("psnr_db") is not None), None)
+    if psnr_db is None:
+        return "Not compared with images"
+    rating = next((words for least, words in PSNR_WORDS if psnr_db >= least), "poor")
+    return f"{rating.capitalize()}: {number(psnr_db, 1)} dB PSNR"
+
+
+def result_sentence(metrics: Metrics) -> str:
+    """Return the result of a run as one sentence, for the terminal."""
+    error_m = (metrics.get("ate") or {}).get("rmse_m")
+    error = "" if error_m is None else f", the RMS error of the path is {number(error_m, 1, 100.0)} cm"
+    apart = f", of which {metrics['apart']} are in components/" if metrics.get("apart") else ""
+    words = map_words(metrics)
+    return f"{path_words(metrics)}{apart}{error}; the map is {words[0].lower()}{words[1:]}."
 
 
 def summary_sentences(metrics: Metrics, machine: str = "") -> list[str]:
-    """Return sentences about the whole run, the most important first."""
+    """Return what the verdicts do not say: what was made, and whether the uncertainty is right."""
     return [
         _overview(metrics, machine),
-        _path(metrics),
-        *_images(metrics),
-        *_depth(metrics),
         *_uncertainty(metrics),
         *_predicted_errors(metrics),
         *_pose_covariance(metrics),
@@ -38,7 +77,7 @@ def summary_sentences(metrics: Metrics, machine: str = "") -> list[str]:
 
 def _overview(metrics: Metrics, machine: str) -> str:
     speed = metrics.get("frames_per_s")
-    how = f" at {number(speed, 1)} images per second" if speed else ""
+    how = f" at {rate(speed)}" if speed else ""
     status = metrics.get("status")
     unfinished = (
         "" if status in (None, "complete") else f" The run is {status}: this report covers the frames up to that point."
@@ -59,14 +98,11 @@ def _continued(metrics: Metrics) -> str:
     return f" It continues the map of {metrics['onto']}: poses are in the world of that run."
 
 
-def _path(metrics: Metrics) -> str:
-    lost, ate = metrics.get("lost") or 0, metrics.get("ate") or {}
-    tracked = (
-        f"Tracking was lost on {lost} of {metrics.get('frames')} images, which have no pose."
-        if lost
-        else "Tracking was never lost."
-    )
-    tracked += _apart_sentence(metrics)
+def _path(metrics: Metrics, unsure: Sequence[int]) -> str:
+    """Return where the path is not sure, and its error if the true path is known."""
+    ate = metrics.get("ate") or {}
+    doubtful = f" Probably off by more than 5 cm: images {format_ranges([*unsure])}." if unsure else ""
+    tracked = f"{_tracked(metrics)}{_apart_sentence(metrics)}{doubtful}"
     if ate.get("rmse_m") is None:
         return f"{tracked} The error of the path is unknown, because the recording has no ground truth."
     before = (metrics.get("ate_odometry") or {}).get("rmse_m")
@@ -83,6 +119,15 @@ def _path(metrics: Metrics) -> str:
     )
 
 
+def _tracked(metrics: Metrics) -> str:
+    """Return whether tracking was lost, and where it found its place again in the map."""
+    lost, again = metrics.get("lost") or 0, metrics.get("relocalised_frames") or []
+    found = f" It found its place in the map again at image {format_ranges(again)}." if again else ""
+    if lost:
+        return f"Tracking was lost on {lost} of {metrics.get('frames')} images, which have no pose.{found}"
+    return f"Tracking stopped for no image.{found}" if found else "Tracking was never lost."
+
+
 def _apart_sentence(metrics: Metrics) -> str:
     apart, components = metrics.get("apart") or 0, len(metrics.get("components") or [])
     if not apart:
@@ -92,11 +137,11 @@ def _apart_sentence(metrics: Metrics) -> str:
 
 
 def _images(metrics: Metrics) -> list[str]:
-    psnr_db = (metrics.get("held_out") or {}).get("psnr_db")
-    if psnr_db is None:
-        return []
-    rating = next((words for least, words in PSNR_WORDS if psnr_db >= least), "poor")
-    return [f"Rendered images of held-out frames reach {number(psnr_db, 1)} dB PSNR: {rating}."]
+    """Return which images the words about the map are from."""
+    if (metrics.get("held_out") or {}).get("psnr_db") is not None:
+        return ["Compared with images that the map was not made from."]
+    known = (metrics.get("training") or {}).get("psnr_db") is not None
+    return ["Compared with images that the map was made from, because none was held back."] if known else []
 
 
 def _depth(metrics: Metrics) -> list[str]:
@@ -190,125 +235,3 @@ def rescan_sentences(metrics: Metrics, plan: "FloorPlan | None") -> list[str]:
     if parts:
         sentences.append(f"Regions near the path to scan again: {', '.join(parts)}.")
     return [*sentences, unsure_rule(plan.predicted_errors)]
-
-
-def advice(metrics: Metrics, run: str, again: str, settings: dict[str, Any]) -> list[Advice]:
-    """Return what to try next.
-
-    run: the run folder; again: the command that makes the run again; settings: the values of its config.json.
-    """
-    found = [rule(metrics, again, settings) for rule in RULES]
-    view = ("View the map in 3D, and hide uncertain splats:", f"sigmasplat view {run}")
-    mesh = ("Export a mesh for other programs:", f"sigmasplat mesh {run} --out room.glb")
-    return [*filter(None, found), view, mesh]
-
-
-def _lost(metrics: Metrics, again: str, settings: dict[str, Any]) -> Advice | None:
-    if not metrics.get("lost"):
-        return None
-    stride = (settings.get("input") or {}).get("stride", 1)
-    if stride > 1:
-        words = f"Tracking was lost, and the run used one image in {stride}. Use all images:"
-        return words, f"{again} --stride 1"
-    tracking = settings.get("tracking") or {}
-    if not tracking.get("features", True):
-        words = "Tracking was lost, and sparse features are off. They help where the camera moves fast:"
-        return words, f"{again} --set tracking.features=true"
-    every = max((settings.get("mapping") or {}).get("every", 1) // 2, 1)
-    return (
-        "Tracking was lost: the camera moved too fast, or saw only a bare wall. Map more often; if this does not help, "
-        "record that part again and move more slowly.",
-        f"{again} --set mapping.every={every}",
-    )
-
-
-def _apart(metrics: Metrics, again: str, settings: dict[str, Any]) -> Advice | None:
-    if not metrics.get("apart"):
-        return None
-    where = format_ranges(metrics.get("apart_frames") or [])
-    return (
-        f"Images {where} are in separate maps, in components/. To connect them, record again, and after each "
-        "interruption return to a place that was recorded before.",
-        "",
-    )
-
-
-def _few_keyframes(metrics: Metrics, again: str, settings: dict[str, Any]) -> Advice | None:
-    training, held_out = (((metrics.get(kind) or {}).get("psnr_db")) for kind in ("training", "held_out"))
-    every = (settings.get("mapping") or {}).get("every", 1)
-    if training is None or held_out is None or training - held_out < OVERFIT_DB or every < 2:
-        return None
-    return (
-        f"Training views are {number(training - held_out, 1)} dB better than held-out views. Use more keyframes:",
-        f"{again} --set mapping.every={every // 2}",
-    )
-
-
-def _blurred(metrics: Metrics, again: str, settings: dict[str, Any]) -> Advice | None:
-    psnr_db = (metrics.get("held_out") or {}).get("psnr_db")
-    width = (settings.get("input") or {}).get("width", 0)
-    if psnr_db is None or psnr_db >= PSNR_WORDS[1][0] or not width:
-        return None
-    return (
-        f"Rendered images are blurred. The map was made from images {width} pixels wide; larger images give a sharper "
-        "map, but take longer:",
-        f"{again} --set input.width={2 * width}",
-    )
-
-
-def _holes(metrics: Metrics, again: str, settings: dict[str, Any]) -> Advice | None:
-    covered = (metrics.get("held_out") or {}).get("depth_coverage")
-    if covered is None or covered > 0.9:
-        return None
-    missing = number(1 - covered, 0, 100.0)
-    return f"{missing} % of the depth readings have no surface in the map. Scan these places again, more slowly.", ""
-
-
-def _slow(metrics: Metrics, again: str, settings: dict[str, Any]) -> Advice | None:
-    speed, width = metrics.get("frames_per_s"), (settings.get("input") or {}).get("width", 0)
-    finish_s = metrics.get("finish_s") or 0.0
-    if speed and finish_s > (frames_s := metrics["frames"] / speed):
-        return _slow_to_finish(metrics["frames"], frames_s, finish_s, again, settings)
-    if not speed or speed >= SLOW_PER_S:
-        return None
-    smaller = max((width or 640) * 3 // 4 // 16 * 16, 160)
-    return (
-        f"The run is slow: {number(speed, 1)} images per second. Smaller images are faster:",
-        f"{again} --set input.width={smaller}",
-    )
-
-
-def _slow_to_finish(
-    frames: int, frames_s: float, finish_s: float, again: str, settings: dict[str, Any]
-) -> Advice | None:
-    """Advise fewer iterations of the final map if it took longer than all frames, and the run was slow in total."""
-    steps = (settings.get("final") or {}).get("iterations", 0)
-    if steps < 2 or frames / (frames_s + finish_s) >= SLOW_PER_S:
-        return None
-    return (
-        f"The final map took {number(finish_s, 0)} s, all frames took {number(frames_s, 0)} s. "
-        "Fewer iterations are faster:",
-        f"{again} --set final.iterations={steps // 2}",
-    )
-
-
-def _no_loop(metrics: Metrics, again: str, settings: dict[str, Any]) -> Advice | None:
-    if (metrics.get("submaps") or 1) < 3 or (metrics.get("loops") or {}).get("accepted"):
-        return None
-    return "No loop was closed, so drift could not be corrected. End a scan where it started.", ""
-
-
-def _no_prediction(metrics: Metrics, again: str, settings: dict[str, Any]) -> Advice | None:
-    if "calibration" not in metrics or metrics["calibration"] is not None:
-        return None
-    if (settings.get("uncertainty") or {}).get("probes"):
-        return "The run has no predicted errors, because it did not make its final map. Make it again:", again
-    return (
-        "The run has no predicted errors of colour and depth, because it kept no probe views. Keep four in each "
-        "submap; this does not change the map:",
-        f"{again} --set uncertainty.probes=4",
-    )
-
-
-RULES = (_lost, _apart, _few_keyframes, _blurred, _holes, _slow, _no_loop, _no_prediction)
-"""What to check, the most important first."""

@@ -1,10 +1,28 @@
-"""Turn metrics into rows of text: headline figures, and the tables of the report, whose first row is the head."""
+"""Turn metrics into rows of text: the key figures, and the tables of the report, whose first row is the head."""
 
 from typing import Any
 
 from sigmasplat.data.component import APART, LOST, RELOCALISED, TRACKED
 from sigmasplat.data.map_uncertainty import SHIPPED
-from sigmasplat.run.figures import format_ranges, number
+from sigmasplat.run.figures import format_ranges, number, rate
+
+
+def key_figures(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
+    """Return the figures that the terminal shows, as (name, value, unit); at most six."""
+    views = next((kind for kind in ("held_out", "training") if metrics.get(kind)), "held_out")
+    scores, kind = metrics.get(views) or {}, views.replace("_", "-")
+    frames = metrics.get("frames") or 0
+    posed = frames - (metrics.get("lost") or 0) - (metrics.get("apart") or 0)
+    path = [("ATE RMSE", number(metrics["ate"]["rmse_m"], 2, 100.0), "cm")] if metrics.get("ate") else []
+    speed, unit = rate(metrics.get("frames_per_s")).split(" ", 1)
+    return [
+        ("Images with a pose", number(posed, 0), f"of {frames}"),
+        *path,
+        (f"PSNR, {kind} images", number(scores.get("psnr_db"), 2), "dB"),
+        (f"Depth L1, {kind} images", number(scores.get("depth_l1_m"), 2, 100.0), "cm"),
+        ("Speed", speed, unit),
+        ("Map", number(metrics.get("splats"), 0), f"splats, {number(metrics.get('map_bytes'), 1, 1e-6)} MB"),
+    ]
 
 
 def state_rows(metrics: dict[str, Any]) -> list[list[str]]:
@@ -23,6 +41,7 @@ def score_tables(metrics: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
     kind = (metrics.get("uncertainty") or {}).get("judged_on", "held-out")
     views = f"{kind}, in submaps" if metrics.get("held_out_submaps") else kind
     return [
+        ("Run", _run_rows(metrics)),
         ("Rendered images", _image_rows(metrics)),
         _full_resolution_table(metrics),
         ("Path", _path_rows(metrics)),
@@ -34,6 +53,18 @@ def score_tables(metrics: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
         ("Predicted errors, held-out, final map", _predictive_rows(metrics.get("predictive"))),
         ("Calibration of predicted errors", _weight_rows(metrics.get("calibration"))),
         ("Covariance of poses", _covariance_rows(metrics.get("pose_covariance"))),
+    ]
+
+
+def _run_rows(metrics: dict[str, Any]) -> list[list[str]]:
+    lines = [("Speed", "frames_per_s", 2, 1.0, "frames/s"),
+             ("Longest frame after the first", "worst_frame_s", 0, 1e3, "ms"),
+             ("Final map", "finish_s", 1, 1.0, "s"), ("Frames and final map", "total_s", 1, 1.0, "s"),
+             ("Splats", "splats", 0, 1.0, ""), ("Map file", "map_bytes", 1, 1e-6, "MB")]  # fmt: skip
+    return [["size and time", ""]] + [
+        [name, f"{number(metrics[key], digits, scale)} {unit}"]
+        for name, key, digits, scale, unit in lines
+        if metrics.get(key) is not None
     ]
 
 
@@ -115,7 +146,7 @@ def _path_rows(metrics: dict[str, Any]) -> list[list[str]]:
     if without:
         rows.append(["ATE rmse without loop closure, cm", number(without["rmse_m"], 3, 100.0)])
     return [
-        [f"believed frames, {alignment}", f"{ate['pairs']} poses"],
+        [f"valid frames, {alignment}", f"{ate['pairs']} poses"],
         *rows,
         ["RPE translation, cm per frame", number(rpe["translation_rmse_m"], 3, 100.0)],
         ["RPE rotation, ° per frame", number(rpe["rotation_rmse_deg"], 3)],
@@ -129,7 +160,7 @@ def _failure_rows(metrics: dict[str, Any]) -> list[list[str]]:
     if not found:
         return []
     return [
-        ["silent failures: believed, but off by > 10 cm", number(found["silent"], 0)],
+        ["silent failures: valid, but off by > 10 cm", number(found["silent"], 0)],
         ["frames off by > 5 cm, with lost ones", f"{number(found['off'], 0)} of {number(found['frames'], 0)}"],
         ["AUROC of the probability of > 5 cm", number(found["auroc"], 3)],
         ["Brier score of it", number(found["brier"], 4)],

@@ -5,7 +5,7 @@ splat's values relative to these limits; `sh`, only for view-dependent colours, 
 order of 3DGS's PLY. Bits from the highest: packed_position and packed_scale 11, 10, 11; packed_rotation 2 for the index
 of the largest of w, x, y, z and 10 for each other one; packed_color 8 each for red, green, blue and opacity, which is
 stored directly. Chunks of early files have no colour limits; they are 0 and 1. Splats are in Morton order, so that
-chunks are small. The format cannot hold σ² and correlations. Layout: PlayCanvas's splat-transform,
+chunks are small. The format cannot hold σ². Layout: PlayCanvas's splat-transform,
 write-compressed-ply.ts, compressed-chunk.ts and decompress-ply.ts.
 """
 

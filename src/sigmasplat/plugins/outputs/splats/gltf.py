@@ -19,14 +19,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from sigmasplat.data.field import COLUMNS, INITIAL_LOG_VARIANCE, GaussianField, Rows
+from sigmasplat.data.field import COLUMNS, INITIAL_LOG_VARIANCE, GaussianField
 from sigmasplat.data.harmonics import DEGREES, count
 from sigmasplat.data.map_uncertainty import SplatStd
 from sigmasplat.errors import SourceError
 from sigmasplat.files.atomic import replacing
 from sigmasplat.plugins.outputs.splats.gltf_buffers import FLOAT, GltfFile
 from sigmasplat.run_folder.quaternions import Doubles, unit
-from sigmasplat.run_folder.splat_values import SH_C0, SplatValues, check_finite
+from sigmasplat.run_folder.splat_values import SH_C0, SplatValues
 
 NAME = "KHR_gaussian_splatting"
 MAGIC = b"glTF"
@@ -112,10 +112,6 @@ def read_field(path: Path) -> GaussianField:
         sigmas = attribute("_SIGMA", 3, "")
         log_variances = np.where(sigmas > 0.0, 2.0 * np.log(np.maximum(sigmas, 1e-18)), INITIAL_LOG_VARIANCE)
         field.params[:, COLUMNS["log_variances"]] = torch.from_numpy(log_variances.astype(np.float32))
-    if file.has(primitive, "_CORRELATION"):
-        correlations = attribute("_CORRELATION", 3, "").astype(np.float32)
-        check_finite(correlations, path)
-        field.attributes["correlations"] = Rows(torch.from_numpy(correlations))
     return field
 
 
@@ -134,8 +130,6 @@ def _attributes(field: GaussianField, std: SplatStd | None) -> Iterator[tuple[st
             at = 3 * (count(degree - 1) + n)
             own[f"{NAME}:SH_DEGREE_{degree}_COEF_{n}"] = values.harmonics[:, at : at + 3]
     own["_SIGMA"] = field.variances.detach().cpu().double().sqrt().numpy()
-    if "correlations" in field.attributes:
-        own["_CORRELATION"] = field.attributes["correlations"].params.detach().cpu().double().numpy()
     if std is not None:
         own["_DEPTH_STD_M"] = std.depth_std_m.cpu().double().numpy()[:, None]
         own["_COLOR_STD"] = std.color_std.cpu().double().numpy()[:, None]

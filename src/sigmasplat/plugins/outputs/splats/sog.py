@@ -6,7 +6,7 @@ sign(x) · log(|x| + 1)); quats, the three smallest components (0 to 255 for ∓
 w, x, y, z; scales, an index into a codebook of log scales for each axis; sh0, an index into a codebook of f_dc for each
 channel, and the opacity; for view-dependent colours shN_labels, the row of a palette of harmonics (low and high byte in
 red and green), and shN_centroids, the palette: 64 rows per line, one pixel per harmonic, an index into a codebook for
-each channel. Axes as in 3DGS's PLY. The format cannot hold σ² and correlations. Layout: PlayCanvas's developer site,
+each channel. Axes as in 3DGS's PLY. The format cannot hold σ². Layout: PlayCanvas's developer site,
 "SOG format", and splat-transform, read-sog.ts.
 """
 

@@ -3,7 +3,7 @@
 Three float32 of position (metres), three of scale (metres, not logarithms), one byte each of red, green, blue and
 opacity (0 to 255), one byte each of the unit quaternion wxyz (128 = 0, ±128 = ±1). The splats that cover most come
 first, so that viewers show an image before the download is complete. Colours are clipped to [0, 1]. The format cannot
-hold harmonics, σ² and correlations. Layout: antimatter15/splat, convert.py and main.js.
+hold harmonics or σ². Layout: antimatter15/splat, convert.py and main.js.
 
 Such a file can be recognised only by its length and by its unit quaternions, which other data rarely contain.
 """

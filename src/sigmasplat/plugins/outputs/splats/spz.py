@@ -6,7 +6,7 @@ Rotations in version 2: one byte each of x, y, z, while w ≥ 0 follows from the
 index of the largest of x, y, z, w, then sign and 9 bits of each other one. Versions 2 and 3 are compressed with gzip,
 version 4 with Zstandard (`spz_container`).
 Axes are x right, y up, z back: the writer rotates maps by 180° about x, the reader rotates them back. Splats are in
-Morton order, because similar neighbours compress better. The format cannot hold σ² and correlations. Layout:
+Morton order, because similar neighbours compress better. The format cannot hold σ². Layout:
 nianticlabs/spz, README.md and load-spz.cc.
 """
 

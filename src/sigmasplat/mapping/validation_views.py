@@ -10,7 +10,7 @@ from sigmasplat.types import Matrix
 
 
 @dataclass(frozen=True, eq=False)
-class Probe:
+class ValidationView:
     """A frame that is not a keyframe: its number, its pose relative to the keyframe with number `keyframe` in the
     submap (T_keyframe_camera [4, 4]), and its images."""
 
@@ -21,7 +21,7 @@ class Probe:
 
 
 @dataclass(eq=False)
-class Probes:
+class ValidationViews:
     """The probe views of the active submap: at most `most`, one per keyframe, spread over the submap.
 
     every: frames between keyframes. The number of frames from a keyframe to its probe varies, so that probes are as
@@ -30,7 +30,7 @@ class Probes:
 
     most: int
     every: int
-    kept: list[Probe] = field(default_factory=list)
+    kept: list[ValidationView] = field(default_factory=list)
 
     def offer(self, index: int, keyframe: int, since: int, T_keyframe_camera: Matrix, target: Target) -> None:
         """Keep a frame if it is nearer to the wanted distance from its keyframe than the one kept; since: frames since
@@ -38,7 +38,7 @@ class Probes:
         if not self.wants(keyframe, since):
             return
         self.kept = [probe for probe in self.kept if probe.keyframe != keyframe]
-        self.kept.append(Probe(index, keyframe, T_keyframe_camera, target.picture()))
+        self.kept.append(ValidationView(index, keyframe, T_keyframe_camera, target.picture()))
         if len(self.kept) > self.most:
             self.kept.pop(self._most_crowded())
 

@@ -18,7 +18,7 @@ def metrics_of(fit: PoseFit) -> dict[str, float]:
 
 
 @dataclass(eq=False)
-class Found:
+class FrameEstimate:
     """Where a frame is: T_submap_camera [4, 4] in the active submap, its state, values of tracking, whether it is to be
     mapped, the hop to it from the last keyframe, and its exposure (a, b) relative to the map."""
 
@@ -30,6 +30,6 @@ class Found:
     exposure: tuple[float, float] = (0.0, 0.0)
 
     @staticmethod
-    def of(fit: PoseFit, T_submap_camera: Matrix, lost: bool) -> "Found":
+    def of(fit: PoseFit, T_submap_camera: Matrix, lost: bool) -> "FrameEstimate":
         """Return the result of tracking."""
-        return Found(T_submap_camera, LOST if lost else TRACKED, metrics_of(fit), exposure=fit.exposure)
+        return FrameEstimate(T_submap_camera, LOST if lost else TRACKED, metrics_of(fit), exposure=fit.exposure)

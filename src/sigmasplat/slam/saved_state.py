@@ -17,13 +17,13 @@ from sigmasplat.fit.adam import VectorAdam
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference
 from sigmasplat.fit.target import Keyframe, Target
-from sigmasplat.graph.closer import LoopCloser, OwedSearch
+from sigmasplat.graph.closer import LoopCloser, PendingSearch
 from sigmasplat.graph.confidence import Confidence
 from sigmasplat.graph.described_submaps import DescribedSubmaps
 from sigmasplat.graph.edges import Edges
 from sigmasplat.graph.loops import Loop, Loops
 from sigmasplat.mapping.mapper import Mapper, SecondHalf
-from sigmasplat.mapping.probes import Probe, Probes
+from sigmasplat.mapping.validation_views import ValidationView, ValidationViews
 from sigmasplat.slam.slam import Slam
 from sigmasplat.slam.step_result import Step
 from sigmasplat.slam.steps import Steps
@@ -31,26 +31,27 @@ from sigmasplat.tracking.depth_fit import DepthFit
 from sigmasplat.tracking.depth_shape import DepthShape, SeenKeyframe
 from sigmasplat.tracking.drift import Drift
 from sigmasplat.tracking.feature_image import FeatureImage
-from sigmasplat.tracking.moving.foreground import Foreground
-from sigmasplat.tracking.moving.memory import Memory, Seen
-from sigmasplat.tracking.moving.watch import Watch
+from sigmasplat.tracking.moving.depth_history import DepthHistory, RememberedDepth
+from sigmasplat.tracking.moving.dynamic_detector import DynamicDetector
+from sigmasplat.tracking.moving.dynamic_mask import DynamicMask
+from sigmasplat.tracking.pose_validation import TrackingStatistics
 from sigmasplat.tracking.recovery import Link, Recovery
 from sigmasplat.tracking.relocaliser import Relocaliser
 from sigmasplat.tracking.tracker import Tracker
-from sigmasplat.tracking.verdict import Usual
 
 CLASSES: tuple[type, ...] = (
-    Atlas, Camera, Column, Confidence, DepthFit, DepthShape, DescribedSubmaps, Detail, Drift, Edges, FeatureImage,
-    Foreground, GaussianField, Keyframe, KeyframePoses, Link, Loop, LoopCloser, Loops, Mapper, Memory, OwedSearch,
-    Photo, Picture, Places, PosePrior, Poses, Probe, Probes, Pyramid, Recovery, Reference, Relocaliser, Rows,
-    SecondHalf, Seen, SeenKeyframe, Step, Steps, Target, TrackedHops, Tracker, Usual, VectorAdam, Watch,
+    Atlas, Camera, Column, Confidence, DepthFit, DepthHistory, DepthShape, DescribedSubmaps, Detail, Drift,
+    DynamicDetector, DynamicMask, Edges, FeatureImage, GaussianField, Keyframe, KeyframePoses, Link, Loop, LoopCloser,
+    Loops, Mapper, PendingSearch, Photo, Picture, Places, PosePrior, Poses, Pyramid, Recovery, Reference, Relocaliser,
+    RememberedDepth, Rows, SecondHalf, SeenKeyframe, Step, Steps, Target, TrackedHops, Tracker, TrackingStatistics,
+    ValidationView, ValidationViews, VectorAdam,
 )  # fmt: skip
 """The classes that a state may contain."""
 
 
 REMEMBERED = (
     "atlas", "mapper", "tracker", "drift", "steps", "keyframe_indices", "closer", "recovery", "relocaliser",
-    "confidence", "probes",
+    "confidence", "validation_views",
 )  # fmt: skip
 """The attributes of `Slam` that change from frame to frame, except its random numbers."""
 

@@ -13,58 +13,58 @@ from sigmasplat.data.field import GaussianField
 from sigmasplat.data.hops import UNKNOWN_HOP, Hop
 from sigmasplat.fit.align import Alignment
 from sigmasplat.fit.target import Keyframe
-from sigmasplat.graph.closer import OwedSearch
+from sigmasplat.graph.closer import PendingSearch
 from sigmasplat.graph.confidence import std_of
 from sigmasplat.mapping.mapper import Mapper
-from sigmasplat.slam.world import World
+from sigmasplat.slam.slam_state import SlamState
 from sigmasplat.tracking.drift import Drift
 from sigmasplat.tracking.known_map import KnownMap
+from sigmasplat.tracking.prepared_frame import PreparedFrame, PreparedImages
 from sigmasplat.tracking.recovery import Link, usable
 from sigmasplat.tracking.relocaliser import INDEX_AT_MOST, Relocation, sight_of
 from sigmasplat.tracking.rules import ends_submap, never
-from sigmasplat.tracking.sight import Observation, Sight
-from sigmasplat.types import Matrix, Slices, completed
+from sigmasplat.types import Matrix, Task, completed
 
 LAST_TRIES = 3
 """Number of keyframes per submap that is apart with which other components are searched at the end."""
 
 
-class MapWork(World):
+class MappingBackend(SlamState):
     """What changes the map, the atlas and the store. None of it changes the tracker."""
 
     # ---- keyframes ----
 
     def map_keyframe(
         self,
-        seen: Observation,
+        seen: PreparedFrame,
         index: int,
         T_submap_camera: Matrix,
         hop: Hop = UNKNOWN_HOP,
-        hurried: Callable[[], bool] = lambda: False,
-    ) -> Slices[Matrix]:
+        should_stop: Callable[[], bool] = lambda: False,
+    ) -> Task[Matrix]:
         """Map frame number `index`, which `hop` leads to, in slices; return its pose, which mapping may have moved.
 
-        hurried: as in `Mapper.mapping`.
+        should_stop: as in `Mapper.mapping`.
         """
         keyframe = self._keyframe(seen, index, T_submap_camera)
         with self._timer.stage("map"):
-            fit = yield from self.mapper.mapping(self.view, keyframe, hurried)
+            fit = yield from self.mapper.mapping(self.view, keyframe, should_stop)
         self._timer.add(fit.seconds, prefix="map_")
         return self._placed(index, hop)
 
-    def add_keyframe(self, seen: Observation, index: int, T_submap_camera: Matrix, hop: Hop) -> Matrix:
+    def add_keyframe(self, seen: PreparedFrame, index: int, T_submap_camera: Matrix, hop: Hop) -> Matrix:
         """Add frame number `index` to the keyframes of the active submap without fitting the map; return its pose."""
         self.mapper.add(self.view, self._keyframe(seen, index, T_submap_camera))
         return self._placed(index, hop)
 
-    def refining(self, steps: int, hurried: Callable[[], bool] = never) -> Slices[None]:
-        """Make this many of the steps that the active submap's keyframes are owed, in slices, until `hurried` returns
-        True."""
+    def refining(self, steps: int, should_stop: Callable[[], bool] = never) -> Task[None]:
+        """Make this many of the pending steps of the active submap's keyframes, in slices, until `should_stop`
+        returns True."""
         if steps:
             with self._timer.stage("map"):
-                yield from self.mapper.refining(self.view, steps, hurried)
+                yield from self.mapper.refining(self.view, steps, should_stop)
 
-    def _keyframe(self, seen: Observation, index: int, T_submap_camera: Matrix) -> Keyframe:
+    def _keyframe(self, seen: PreparedFrame, index: int, T_submap_camera: Matrix) -> Keyframe:
         frame = seen.frame
         with self._timer.stage("describe"):
             descriptor = self.descriptor.describe(frame.color, frame.depth_m) if self._describes else None
@@ -97,15 +97,15 @@ class MapWork(World):
     def submap_ends(self, index: int, T_submap_camera: Matrix) -> bool:
         """Return whether a rule ends the active submap at frame number `index`."""
         since, moved_m = index - self.mapper.keyframes[0].index, self.drift.position_m(T_submap_camera)
-        return bool(ends_submap(T_submap_camera, since, moved_m, self.config.submaps, self.drift.variance_sum))
+        return bool(ends_submap(T_submap_camera, since, moved_m, self.config.submaps))
 
-    def cut(self, T_submap_camera: Matrix, hurried: Callable[[], bool] = never) -> Slices[None]:
+    def cut(self, T_submap_camera: Matrix, should_stop: Callable[[], bool] = never) -> Task[None]:
         """Finish the active submap (`finish_submap`) and start the next one at its newest keyframe, in slices. A next
-        submap that inherits splats also makes the steps that this keyframe is still owed."""
+        submap that inherits splats also makes the pending steps of this keyframe."""
         inherited = None
         if self.config.submaps.inherit:
             inherited, self.mapper.half = self.mapper.half, None
-        yield from self.branch(len(self.store), T_submap_camera, self.drift.information, self.mapper.field, hurried)
+        yield from self.branch(len(self.store), T_submap_camera, self.drift.information, self.mapper.field, should_stop)
         self.mapper.half = inherited
 
     def branch(
@@ -114,8 +114,8 @@ class MapWork(World):
         T_parent_camera: Matrix,
         information: Matrix,
         field: GaussianField,
-        hurried: Callable[[], bool] = never,
-    ) -> Slices[None]:
+        should_stop: Callable[[], bool] = never,
+    ) -> Task[None]:
         """Finish the active submap (`finish_submap`) and start the next one at the camera, connected to a parent
         submap, in slices.
 
@@ -123,10 +123,10 @@ class MapWork(World):
         inherit.
         """
         with self._timer.stage("cut"):
-            yield from self.finish_submap(hurried)
+            yield from self.finish_submap(should_stop)
             self.begin_at(parent, T_parent_camera, information, field)
 
-    def branch_at(self, place: Relocation) -> Slices[None]:
+    def branch_at(self, place: Relocation) -> Task[None]:
         """Finish the active submap and start the next one where the camera was found, in slices."""
         return self.branch(place.where[0], place.T_submap_camera, place.information, self._splats_of(place))
 
@@ -138,7 +138,7 @@ class MapWork(World):
         self.mapper = Mapper(self.config, self.random, field).successor(self.view, T_parent_camera)
         self.drift = Drift(scene_scale=self.config.render.scene_scale)
 
-    def begin_first(self, seen: Sight) -> Relocation | None:
+    def begin_first(self, seen: PreparedImages) -> Relocation | None:
         """Start the first submap of a session; return where the map of an earlier session shows the camera, if it
         does: the submap is connected to this place, else it begins a component."""
         place = self.relocalise(seen, index_at_most=None) if self.atlas.anchors else None
@@ -148,7 +148,7 @@ class MapWork(World):
             self.begin_at(place.where[0], place.T_submap_camera, place.information, self._splats_of(place))
         return place
 
-    def begin_apart(self) -> Slices[None]:
+    def begin_apart(self) -> Task[None]:
         """Finish the active submap and begin a component at the camera, in slices."""
         yield from self.finish_submap()
         self._begin_component()
@@ -160,55 +160,55 @@ class MapWork(World):
         self.atlas.begin_submap()
         self.confidence.begun(None, 0.0)
 
-    def finish_submap(self, hurried: Callable[[], bool] = never) -> Slices[None]:
+    def finish_submap(self, should_stop: Callable[[], bool] = never) -> Task[None]:
         """Move the active submap to the store, in slices, and look for its loops, or leave that to the next frames
-        (`loops.slices_per_frame`). Steps that are still owed are made before, unless `hurried` returns True."""
-        yield from self.refining(self.mapper.owed, hurried)
+        (`loops.slices_per_frame`). Pending steps are made before, unless `should_stop` returns True."""
+        yield from self.refining(self.mapper.pending, should_stop)
         submap, pictures = self.mapper.finished(len(self.store))
-        submap, probes = self.probes.of(submap)
+        submap, probes = self.validation_views.of(submap)
         yield
         self.store.save(submap, pictures, probes)
-        self.probes.kept = []
+        self.validation_views.kept = []
         descriptors = [keyframe.descriptor for keyframe in self.mapper.keyframes]
         known = [descriptor for descriptor in descriptors if descriptor is not None]
         yield
-        self.closer.owed.append(OwedSearch(submap.index, known))
+        self.closer.pending.append(PendingSearch(submap.index, known))
         if not self.config.loops.slices_per_frame:
             yield from self.closing()
 
-    def closing(self, at_most: int | None = None) -> Slices[None]:
-        """Look for the loops of finished submaps, as far as this is owed, one submap after the other; at most so many
-        slices are made for each search that is owed. At the end of a search anchors may move."""
-        left = inf if at_most is None else at_most * len(self.closer.owed)
-        while self.closer.owed and left > 0:
-            owed = self.closer.owed[0]
+    def closing(self, at_most: int | None = None) -> Task[None]:
+        """Look for the loops of finished submaps, one submap after the other; at most so many
+        slices are made for each pending search. At the end of a search anchors may move."""
+        left = inf if at_most is None else at_most * len(self.closer.pending)
+        while self.closer.pending and left > 0:
+            pending = self.closer.pending[0]
             if self._search is None:
-                submap = self.store.load(owed.submap)
-                self._search = self.closer.closing(submap, owed.descriptors, self.atlas, self.view)
-                for _ in range(owed.slices):  # after a resume: what was done before
+                submap = self.store.load(pending.submap)
+                self._search = self.closer.closing(submap, pending.descriptors, self.atlas, self.view)
+                for _ in range(pending.slices):  # after a resume: what was done before
                     next(self._search)
             try:
                 next(self._search)
             except StopIteration as end:
                 self.confidence.closed(end.value, self.config.render.scene_scale)
-                self.closer.owed.pop(0)
+                self.closer.pending.pop(0)
                 self._search = None
                 continue
-            owed.slices += 1
+            pending.slices += 1
             left -= 1
             yield
 
     # ---- search and join ----
 
     def relocalise(
-        self, seen: Sight, apart_from: int | None = None, index_at_most: int | None = INDEX_AT_MOST
+        self, seen: PreparedImages, apart_from: int | None = None, index_at_most: int | None = INDEX_AT_MOST
     ) -> Relocation | None:
         """Search the map for the camera; apart_from: only in components that are not that of this submap."""
         return completed(self.relocalising(seen, apart_from, index_at_most))
 
     def relocalising(
-        self, seen: Sight, apart_from: int | None = None, index_at_most: int | None = INDEX_AT_MOST
-    ) -> Slices[Relocation | None]:
+        self, seen: PreparedImages, apart_from: int | None = None, index_at_most: int | None = INDEX_AT_MOST
+    ) -> Task[Relocation | None]:
         """Search the map as `relocalise` does, in slices."""
         if not self.config.recovery.relocalise or not usable(seen):
             return None
@@ -226,7 +226,7 @@ class MapWork(World):
     def _splats_of(self, place: Relocation) -> GaussianField:
         return self.store.load(place.where[0]).field.to(self.view.sums.device)
 
-    def seek_component(self, seen: Sight, T_submap_camera: Matrix) -> Slices[None]:
+    def seek_component(self, seen: PreparedImages, T_submap_camera: Matrix) -> Task[None]:
         """Look for a place of another component, in slices; two observations that agree join the components."""
         if len(set(self.atlas.components)) > 1:
             yield from self._seek_link(seen, len(self.store), T_submap_camera)
@@ -239,7 +239,7 @@ class MapWork(World):
                     keyframe = self._known([True] * len(self.atlas.components)).keyframe((s, k))
                     completed(self._seek_link(sight_of(keyframe, self.view), s, keyframe.T_submap_camera))
 
-    def _seek_link(self, seen: Sight, submap: int, T_submap_camera: Matrix) -> Slices[None]:
+    def _seek_link(self, seen: PreparedImages, submap: int, T_submap_camera: Matrix) -> Task[None]:
         """Search other components for a camera of a submap, in slices; if a second observation agrees, join them."""
         place = yield from self.relocalising(seen, apart_from=submap)
         if place is None:

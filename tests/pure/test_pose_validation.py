@@ -6,10 +6,10 @@ from typing import Any
 import pytest
 
 from sigmasplat.fit.compare import NOTHING, Comparison
-from sigmasplat.tracking.verdict import (
+from sigmasplat.tracking.pose_validation import (
     PATIENCE,
     RECENT,
-    Usual,
+    TrackingStatistics,
     confirmed,
     explained,
     is_better,
@@ -27,8 +27,8 @@ THROUGH = replace(GOOD, close=0.6, front=0.0, behind=0.4)
 """Known surfaces are seen through."""
 
 
-def usual(c: Comparison = GOOD, times: int = 10, hop_m: float = 0.02) -> Usual:
-    history = Usual()
+def usual(c: Comparison = GOOD, times: int = 10, hop_m: float = 0.02) -> TrackingStatistics:
+    history = TrackingStatistics()
     for _ in range(times):
         history.add(c, hop_m)
     return history
@@ -40,8 +40,8 @@ def test_new_objects_are_not_counted_against_a_pose() -> None:
     assert score(THROUGH) < score(OBJECT) * 1.2 < score(GOOD)
 
 
-@pytest.mark.parametrize("history", [Usual(), usual()], ids=["first frame", "later"])
-def test_a_good_pose_is_believed_without_doubt(history: Usual) -> None:
+@pytest.mark.parametrize("history", [TrackingStatistics(), usual()], ids=["first frame", "later"])
+def test_a_good_pose_is_valid_without_doubt(history: TrackingStatistics) -> None:
     for c in (GOOD, FLAT):
         assert not history.is_lost(c, 0.2) and not history.doubts(c)
 
@@ -52,8 +52,8 @@ def test_a_good_pose_is_believed_without_doubt(history: Usual) -> None:
      {"common": 0.1}],
     ids=["all in front", "seen through", "wrong depth", "other texture", "hardly any overlap"],
 )  # fmt: skip
-@pytest.mark.parametrize("history", [Usual(), usual()], ids=["first frame", "later"])
-def test_a_contradicted_pose_is_lost_and_doubted(history: Usual, wrong: dict[str, Any]) -> None:
+@pytest.mark.parametrize("history", [TrackingStatistics(), usual()], ids=["first frame", "later"])
+def test_a_contradicted_pose_is_lost_and_doubted(history: TrackingStatistics, wrong: dict[str, Any]) -> None:
     c = replace(GOOD, **wrong)
     assert history.is_lost(c, 0.2) and history.doubts(c) and not confirmed(c)
 
@@ -81,14 +81,14 @@ def test_a_noisy_recording_is_judged_by_its_own_usual_values() -> None:
 
 def test_few_frames_do_not_define_what_is_usual() -> None:
     worse = replace(GOOD, common=0.5)
-    assert usual(GOOD, 1).doubts(worse) == Usual().doubts(worse)
+    assert usual(GOOD, 1).doubts(worse) == TrackingStatistics().doubts(worse)
     assert not usual(worse, 10).doubts(worse)
 
 
 def test_a_camera_that_turns_from_the_start_is_not_doubted() -> None:
     turned = replace(GOOD, common=0.65)
-    assert not Usual().doubts(turned) and not usual(GOOD, 3).doubts(turned)
-    assert Usual().doubts(replace(turned, correlation=0.75))
+    assert not TrackingStatistics().doubts(turned) and not usual(GOOD, 3).doubts(turned)
+    assert TrackingStatistics().doubts(replace(turned, correlation=0.75))
 
 
 def test_what_is_usual_follows_the_latest_frames() -> None:
@@ -126,7 +126,7 @@ def test_a_pose_from_the_whole_map_must_be_clearly_better() -> None:
 def test_a_leap_is_far_from_where_a_camera_that_moves_as_usual_can_be() -> None:
     slow, fast = usual(hop_m=0.01), usual(hop_m=0.3)
     assert slow.is_leap(1.0) and not fast.is_leap(1.0) and fast.is_leap(5.0)
-    assert not slow.is_leap(0.02) and not Usual().is_leap(0.02)
+    assert not slow.is_leap(0.02) and not TrackingStatistics().is_leap(0.02)
 
 
 def test_texture_counts_in_the_score_where_there_is_texture() -> None:

@@ -8,7 +8,7 @@ from scipy.ndimage import label
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.plugins.sources import SyntheticRoom
-from sigmasplat.tracking.moving.foreground import Earlier, Foreground, foreground
+from sigmasplat.tracking.moving.dynamic_mask import DynamicMask, Earlier, dynamic_mask
 from sigmasplat.tracking.moving.windows import labelled
 
 cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed (pip install opencv-python-headless)")
@@ -36,9 +36,9 @@ def share(mask: NDArray[np.bool_]) -> tuple[float, float]:
     return float(mask[box].mean()), float(mask[~box].mean())
 
 
-def found(scene_m: Depth, live_m: Depth, before: Foreground | None = None) -> Foreground | None:
+def found(scene_m: Depth, live_m: Depth, before: DynamicMask | None = None) -> DynamicMask | None:
     last = None if before is None else Earlier(before.depth_m, np.eye(4))
-    return foreground(Earlier(scene_m, np.eye(4)), last, live_m, CAMERA)
+    return dynamic_mask(Earlier(scene_m, np.eye(4)), last, live_m, CAMERA)
 
 
 @pytest.mark.parametrize("threads", [1, 4])
@@ -115,7 +115,7 @@ def test_a_still_surface_that_comes_into_view_is_not_in_front(moved: tuple[float
     was seen before."""
     live_T = se3.exp(np.array([*moved, 0.0, 0.0, 0.0]))
     scene_m, live_m = screen_and_wall(np.eye(4)), screen_and_wall(live_T)
-    assert foreground(Earlier(scene_m, live_T), None, live_m, CAMERA) is None
+    assert dynamic_mask(Earlier(scene_m, live_T), None, live_m, CAMERA) is None
 
 
 def screen_and_wall(T_world_camera: NDArray[np.float64], camera: Camera = CAMERA, wide_m: float = 9.0) -> Depth:
@@ -138,9 +138,9 @@ def test_an_edge_at_a_pose_that_is_wrong_by_a_share_of_a_wide_motion_is_not_in_f
     T_world_earlier, T_earlier_live, estimate = (turned(rad) for rad in (0.25, 0.35, 0.35 * (1.0 + error)))
     scene = Earlier(screen_and_wall(T_world_earlier, large, wide_m=0.25), estimate)
     live_m = screen_and_wall(T_world_earlier @ T_earlier_live, large, wide_m=0.25)
-    assert foreground(scene, None, live_m, large, whole_objects=True) is None
+    assert dynamic_mask(scene, None, live_m, large, whole_objects=True) is None
     live_m[80:180, 60:140] = OBJECT_M
-    front = foreground(scene, None, live_m, large, whole_objects=True)
+    front = dynamic_mask(scene, None, live_m, large, whole_objects=True)
     assert front is not None and front.hidden[80:180, 60:140].mean() > 0.95 and front.hidden.mean() < 0.15
 
 
@@ -149,7 +149,7 @@ def test_in_a_walk_through_a_still_room_nothing_is_in_front() -> None:
     T = room.truth().T_world_camera
     for first in range(0, 110, 10):
         scene = Earlier(room.frame(first).depth_m, se3.inverse(T[first]) @ T[first + 5])
-        assert foreground(scene, None, room.frame(first + 5).depth_m, room.camera) is None
+        assert dynamic_mask(scene, None, room.frame(first + 5).depth_m, room.camera) is None
 
 
 @pytest.mark.parametrize("rows", [np.s_[55:75], np.s_[80:120]])
@@ -172,7 +172,7 @@ def near_hole() -> Depth:
 def test_a_hole_in_a_thing_belongs_to_it_although_an_outline_joins_it_to_others() -> None:
     depth_m = near_hole()
     depth_m[60:62, :62] = depth_m[20:100, 20:22] = depth_m[20:22, 20:150] = 0.0  # outlines have no readings
-    front = foreground(Earlier(wall(), np.eye(4)), None, depth_m, CAMERA, whole_objects=True)
+    front = dynamic_mask(Earlier(wall(), np.eye(4)), None, depth_m, CAMERA, whole_objects=True)
     assert front is not None and front.hidden[50:80, 62:98].all()
     assert not front.hidden[20:36, 20:150].any()
 
@@ -183,5 +183,5 @@ def test_a_thin_rim_of_a_hole_that_is_as_far_as_the_thing_belongs_to_it() -> Non
     depth_m[50:80, 109:] = 0.0  # the rim lies between two holes: its place is not known
     scene_m = wall()
     scene_m[:, 105:] = 0.0
-    front = foreground(Earlier(scene_m, np.eye(4)), None, depth_m, CAMERA, whole_objects=True)
+    front = dynamic_mask(Earlier(scene_m, np.eye(4)), None, depth_m, CAMERA, whole_objects=True)
     assert front is not None and front.hidden[50:80, 64:100].all() and not front.hidden[50:80, 125:].any()

@@ -9,20 +9,19 @@ import numpy as np
 
 from sigmasplat.data import se3
 from sigmasplat.data.component import APART, RELOCALISED
-from sigmasplat.data.hops import UNKNOWN_HOP, Hop
+from sigmasplat.data.hops import UNKNOWN_HOP
 from sigmasplat.fit.align import Alignment
 from sigmasplat.fit.pose import fit_pose_align
 from sigmasplat.graph.loops import Loops
 from sigmasplat.graph.newest_covariance import NO_ERRORS
-from sigmasplat.realtime.messages import Offer, Search, Snapshot, Task, TrackedFrame
+from sigmasplat.realtime.messages import BetweenFrames, Offer, Search, Snapshot, TrackedFrame
 from sigmasplat.slam.listeners import Before, Correction, correction_since
-from sigmasplat.slam.mapping import MapWork
+from sigmasplat.slam.mapping_backend import MappingBackend
 from sigmasplat.slam.step_result import StepTimer
-from sigmasplat.tracking.drift import mean_variance
+from sigmasplat.tracking.pose_validation import is_better
+from sigmasplat.tracking.prepared_frame import PreparedFrame
 from sigmasplat.tracking.relocaliser import Relocation
-from sigmasplat.tracking.sight import Observation
 from sigmasplat.tracking.tracked_keyframe import TrackedKeyframe, found_keyframe, mapped_keyframe
-from sigmasplat.tracking.verdict import is_better
 from sigmasplat.types import Matrix
 
 AS_GOOD = 0.99
@@ -33,19 +32,19 @@ MOST_ADDED = 4
 catches up, because tracking gets no newer reference."""
 
 
-class MapClock:
+class BackEnd:
     """Does the work that tracking hands over, in the order of the frames. It owns the map, the atlas and the store.
 
     with_errors: whether snapshots contain the errors of poses.
     """
 
-    def __init__(self, system: MapWork, publish: Callable[[Snapshot], None]) -> None:
+    def __init__(self, system: MappingBackend, publish: Callable[[Snapshot], None]) -> None:
         self.system, self.publish = system, publish
-        self.given: queue.SimpleQueue[TrackedFrame | Task] = queue.SimpleQueue()
+        self.given: queue.SimpleQueue[TrackedFrame | BetweenFrames] = queue.SimpleQueue()
         self.last: Snapshot | None = None
         self.with_errors = False
         self._before = Before.of(system)
-        self._pending: deque[TrackedFrame | Task] = deque()
+        self._pending: deque[TrackedFrame | BetweenFrames] = deque()
         self._spare, self._added = 0, 0
         self._undescribed: TrackedKeyframe | None = None
         self._found = -1
@@ -56,7 +55,7 @@ class MapClock:
         while True:
             while self._take():
                 each = self._pending.popleft()
-                if isinstance(each, Task):
+                if isinstance(each, BetweenFrames):
                     each.run()
                 else:
                     for _ in self._handled(each):
@@ -94,7 +93,7 @@ class MapClock:
         self._place(each)
         if each.search is not None:
             yield from self._search(each, each.search)
-        yield from self.system.refining(self.system.mapper.due, self._keyframe_waits)
+        yield from self.system.refining(self.system.mapper.pending_now, self._keyframe_waits)
         yield from self.system.closing(self.system.config.loops.slices_per_frame)
 
     def _place(self, each: TrackedFrame) -> None:
@@ -105,7 +104,7 @@ class MapClock:
         system.steps.append(each.step)
         if each.probe is not None:
             last = len(system.mapper.keyframes) - 1
-            system.probes.offer(each.number, last, each.number - number, T_keyframe_camera, each.probe)
+            system.validation_views.offer(each.number, last, each.number - number, T_keyframe_camera, each.probe)
 
     @property
     def _newest(self) -> int:
@@ -147,7 +146,8 @@ class MapClock:
         else:
             state, (T, alignment) = "", self._realigned(each, offer)
             hop = system.hop_to(se3.inverse(T), alignment)
-            self._add_drift(number, T, hop)
+            if system.cuts:
+                system.add_drift(T, hop)
         may_wait = not first and self._added < MOST_ADDED and not system.submap_ends(number, T)
         if may_wait and self._keyframe_waits():
             system.add_keyframe(seen, number, T, hop)
@@ -158,7 +158,7 @@ class MapClock:
         T = yield from system.map_keyframe(seen, number, T, hop, self._keyframe_waits)
         if system.submap_ends(number, T):
             yield from system.cut(T, self._keyframe_waits)
-            T = yield from system.map_keyframe(seen, number, np.eye(4), hurried=self._keyframe_waits)
+            T = yield from system.map_keyframe(seen, number, np.eye(4), should_stop=self._keyframe_waits)
         yield from system.seek_component(seen, T)
         self._done(each)
         self._spare = system.config.realtime.spare_iterations
@@ -169,15 +169,7 @@ class MapClock:
         self.system.atlas.place_frame(self.system.atlas.keyframe_poses.last[-1])
         self.system.steps.append(each.step)
 
-    def _add_drift(self, number: int, T_submap_camera: Matrix, hop: Hop) -> None:
-        system = self.system
-        if system.config.submaps.variance_sum:  # V of the frames in between is taken to be that of the keyframe
-            mean = mean_variance(system.mapper.field, system.view, se3.inverse(T_submap_camera))
-            system.drift.variance_sum += mean * (number - self._newest)
-        if system.cuts:
-            system.add_drift(T_submap_camera, hop)
-
-    def _reference(self, seen: Observation, T_submap_camera: Matrix, offer: Offer | None) -> TrackedKeyframe:
+    def _reference(self, seen: PreparedFrame, T_submap_camera: Matrix, offer: Offer | None) -> TrackedKeyframe:
         system, front = self.system, None if offer is None else offer.front
         c = system.config.tracking
         self._undescribed = mapped_keyframe(system.mapper.field.params, system.view, seen, T_submap_camera, c, front)
@@ -224,7 +216,7 @@ class MapClock:
         frames = (each for each in self._pending if isinstance(each, TrackedFrame))
         return search.comparison is None and self._take() and any(not each.step.lost for each in frames)
 
-    def _go_to(self, place: Relocation, number: int, seen: Observation) -> Iterator[None]:
+    def _go_to(self, place: Relocation, number: int, seen: PreparedFrame) -> Iterator[None]:
         system = self.system
         if place.where[0] == len(system.store):
             c, params = system.config.tracking, system.mapper.field.params
@@ -235,9 +227,9 @@ class MapClock:
         yield from system.branch_at(place)
         yield from self._map_found(number, seen, RELOCALISED)
 
-    def _map_found(self, number: int, seen: Observation, state: str) -> Iterator[None]:
+    def _map_found(self, number: int, seen: PreparedFrame, state: str) -> Iterator[None]:
         """Begin a submap with a frame that was placed already, and publish it."""
-        T = yield from self.system.map_keyframe(seen, number, np.eye(4), hurried=self._keyframe_waits)
+        T = yield from self.system.map_keyframe(seen, number, np.eye(4), should_stop=self._keyframe_waits)
         self._publish(number, self._reference(seen, T, None), {number: T}, state)
 
     # ---- snapshots ----

@@ -13,7 +13,7 @@ from sigmasplat.types import Matrix
 
 
 @dataclass(frozen=True, eq=False)
-class Expected:
+class PosePrediction:
     """Expected motion and pose of the camera, known before its image is used.
 
     motion: T_previous_camera with constant velocity; turn: T_previous_camera without translation; predicted:
@@ -30,7 +30,9 @@ class Expected:
     given: bool = False
 
 
-def expect(previous: Matrix, velocity: Matrix, before: PosePrior, now: PosePrior, motion_model: bool) -> Expected:
+def predict(
+    previous: Matrix, velocity: Matrix, before: PosePrior, now: PosePrior, motion_model: bool
+) -> PosePrediction:
     """Predict the pose by constant velocity; with a gyroscope, its rotation replaces that of the velocity; given poses
     replace the whole motion.
 
@@ -39,19 +41,19 @@ def expect(previous: Matrix, velocity: Matrix, before: PosePrior, now: PosePrior
     """
     if before.T_given_camera is not None and now.T_given_camera is not None:
         motion = se3.inverse(before.T_given_camera) @ now.T_given_camera
-        return Expected(motion, np.eye(4), previous @ motion, previous, measured=False, given=True)
+        return PosePrediction(motion, np.eye(4), previous @ motion, previous, measured=False, given=True)
     R_before, R_now = before.R_inertial_camera, now.R_inertial_camera
     motion, turn, last, measured = velocity, np.eye(4), previous, False
     if R_before is not None and R_now is not None:
         motion, measured = motion.copy(), True
         motion[:3, :3] = turn[:3, :3] = R_before.T @ R_now
         last = last @ turn
-    return Expected(motion, turn, previous @ motion if motion_model else last, last, measured)
+    return PosePrediction(motion, turn, previous @ motion if motion_model else last, last, measured)
 
 
-def odometry(last: Pyramid, live: Pyramid, expected: Expected, config: TrackingConfig) -> Matrix | None:
+def odometry(last: Pyramid, live: Pyramid, prediction: PosePrediction, config: TrackingConfig) -> Matrix | None:
     """Align the last image to this one and return T_live_last [4, 4]; None if it fails."""
-    guesses = (se3.inverse(expected.motion), expected.turn.T.copy())  # the inverse, because it has no translation
+    guesses = (se3.inverse(prediction.motion), prediction.turn.T.copy())  # the inverse, because it has no translation
     found = [align(last, live, g, 2 * config.align_iterations, config.align_weight_color) for g in guesses]
     best = max(found, key=lambda a: a.agreement * a.overlap)
     return None if best.agreement * best.overlap < config.lost_share else best.T_live_reference

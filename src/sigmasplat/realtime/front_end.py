@@ -15,27 +15,27 @@ from sigmasplat.fit.references import Reference
 from sigmasplat.fit.target import Target
 from sigmasplat.graph.confidence import Confidence
 from sigmasplat.graph.newest_covariance import NO_ERRORS
-from sigmasplat.mapping.probes import Probes
+from sigmasplat.mapping.validation_views import ValidationViews
 from sigmasplat.realtime.messages import Offer, Search, Snapshot, TrackedFrame
 from sigmasplat.render.view import View
 from sigmasplat.slam.step_result import Step, StepTimer
 from sigmasplat.tracking.drift import Drift
 from sigmasplat.tracking.fitted_depth import fitted_keyframe, fitted_to_map
-from sigmasplat.tracking.found import Found
-from sigmasplat.tracking.moving.foreground import share_of
+from sigmasplat.tracking.frame_estimate import FrameEstimate
+from sigmasplat.tracking.moving.dynamic_mask import share_of
+from sigmasplat.tracking.pose_validation import is_questionable
+from sigmasplat.tracking.prepared_frame import PreparedFrame, refuse_first_without_depth
 from sigmasplat.tracking.recovery import Recovery, usable
 from sigmasplat.tracking.rules import has_moved, is_held_back, is_keyframe
-from sigmasplat.tracking.sight import Observation, refuse_first_without_depth
 from sigmasplat.tracking.tracked_keyframe import TrackedKeyframe
 from sigmasplat.tracking.tracker import Tracker
-from sigmasplat.tracking.verdict import is_questionable
 from sigmasplat.types import Matrix
 
 NOTHING = GaussianField.empty()
 
 
 @dataclass(eq=False)
-class CameraClock:
+class FrontEnd:
     """Everything that changes at the rate of the camera.
 
     poses: T_submap_camera [4, 4] of the newest mapped keyframe and of later keyframes and searched frames, in the
@@ -60,9 +60,9 @@ class CameraClock:
     found: str = ""
     loops: int = 0
 
-    def copied(self) -> "CameraClock":
+    def copied(self) -> "FrontEnd":
         """Return a copy that later frames do not change."""
-        tracker = replace(self.tracker, usual=copy.deepcopy(self.tracker.usual))
+        tracker = replace(self.tracker, statistics=copy.deepcopy(self.tracker.statistics))
         return replace(self, tracker=tracker, recovery=copy.copy(self.recovery), confidence=copy.copy(self.confidence))
 
     # ---- a new snapshot ----
@@ -93,7 +93,7 @@ class CameraClock:
         """Continue where the camera was found, or in a new map."""
         self.recovery.found()
         self.found = snapshot.state
-        self.tracker.velocity, self.tracker.watch = np.eye(4), self.tracker.watch.cleared()
+        self.tracker.velocity, self.tracker.detector = np.eye(4), self.tracker.detector.cleared()
         if snapshot.state == APART:
             self.tracker.lost = False
 
@@ -103,7 +103,7 @@ class CameraClock:
             self.adopt(snapshot)
 
     def covariance(self, step: Step) -> Matrix:
-        """Return the covariance [6, 6] of the newest step's pose, as `World.covariance`. Keyframes that are not mapped
+        """Return the covariance [6, 6] of the newest step's pose, as `Slam.covariance`. Keyframes that are not mapped
         yet each add one motion."""
         s = self.snapshot
         if s is None:  # then the first frame waits too, whose pose is known
@@ -113,9 +113,9 @@ class CameraClock:
     # ---- a frame ----
 
     def track(
-        self, seen: Observation, view: View, timer: StepTimer, hurried: Callable[[], bool] = lambda: False
+        self, seen: PreparedFrame, view: View, timer: StepTimer, should_stop: Callable[[], bool] = lambda: False
     ) -> TrackedFrame:
-        """Track a frame, and decide whether it becomes a keyframe; hurried: as in `Tracker.track`."""
+        """Track a frame, and decide whether it becomes a keyframe; should_stop: as in `Tracker.track`."""
         number, offer, search = self.frames, None, None
         if number == 0:
             found, offer = self._begin(seen, view)
@@ -123,8 +123,8 @@ class CameraClock:
             with timer.stage("track"), timer.kernels_of(view, "track_kernels"):
                 splats = NOTHING if self.snapshot is None else self.snapshot
                 seen = fitted_to_map(self.tracker, splats, view, seen)
-                fit = self.tracker.track(splats, view, seen, seen.frame.prior, hurried)
-            found = Found.of(fit, se3.inverse(fit.T_camera_world), self.tracker.lost)
+                fit = self.tracker.track(splats, view, seen, seen.frame.prior, should_stop)
+            found = FrameEstimate.of(fit, se3.inverse(fit.T_camera_world), self.tracker.lost)
             self.recovery.count(self.tracker.lost, self.tracker.doubtful > 0, seen)
             held_back = is_held_back(number, self.config.input.hold_every)
             offer = None if held_back else self._offer(fit, seen, view, found)
@@ -137,16 +137,16 @@ class CameraClock:
         probe = self._probe(number, seen, found)
         return TrackedFrame(number, step, found.T_submap_camera, self.poses, based_on, offer, search, probe)
 
-    def _begin(self, seen: Observation, view: View) -> tuple[Found, Offer]:
+    def _begin(self, seen: PreparedFrame, view: View) -> tuple[FrameEstimate, Offer]:
         """Start at the first frame, whose camera is the world until the map says otherwise."""
         refuse_first_without_depth(seen.frame, self.config)
         self.tracker.start(seen, seen.frame.prior)
         seen = fitted_keyframe(self.tracker, NOTHING, view, seen, np.eye(4), connected=False)
         self._follow(0, seen, np.eye(4))
         self.offered, self.waits = 1, (0,)
-        return Found(np.eye(4), TRACKED, mapped=True), Offer(seen.separate())
+        return FrameEstimate(np.eye(4), TRACKED, mapped=True), Offer(seen.separate())
 
-    def _offer(self, fit: PoseFit, seen: Observation, view: View, found: Found) -> Offer | None:
+    def _offer(self, fit: PoseFit, seen: PreparedFrame, view: View, found: FrameEstimate) -> Offer | None:
         """Return the frame as a keyframe, if it becomes one; track the next frames relative to it."""
         certain = not self.tracker.lost and self.recovery.is_steady and self.tracker.is_certain(fit)
         if not certain or not self._is_keyframe(fit, found.T_submap_camera):
@@ -162,7 +162,7 @@ class CameraClock:
         found.mapped, self.offered, self.waits = True, self.offered + 1, (*self.waits, self.frames)
         return Offer(shown.separate(), alignment, self.tracker.front, found.exposure)
 
-    def _follow(self, number: int, seen: Observation, T_submap_camera: Matrix) -> None:
+    def _follow(self, number: int, seen: PreparedFrame, T_submap_camera: Matrix) -> None:
         """Track the next frames relative to a frame, before the map has weights for its pixels."""
         reference = Reference(seen.live, se3.inverse(T_submap_camera))
         self.tracker.follow(TrackedKeyframe(reference, seen.image, self.tracker.front))
@@ -171,7 +171,7 @@ class CameraClock:
     def _is_keyframe(self, fit: PoseFit, T_submap_camera: Matrix) -> bool:
         c, since, most_deg = self.config.mapping, self.frames - self.newest, self.config.realtime.keyframe_deg
         reference = self.tracker.keyframe
-        if self.tracker.watch.renews(fit.comparison, self.tracker.front):
+        if self.tracker.detector.renews(fit.comparison, self.tracker.front):
             return True
         if not most_deg or reference is None:
             return is_keyframe(since, c.every, fit.overlap, c.overlap_below)
@@ -179,7 +179,7 @@ class CameraClock:
         moved = since >= c.every and has_moved(reference.T_camera_world @ T_submap_camera, depth_m, most_deg)
         return moved or fit.overlap < c.overlap_below
 
-    def _search(self, fit: PoseFit, seen: Observation, offer: Offer | None) -> Search | None:
+    def _search(self, fit: PoseFit, seen: PreparedFrame, offer: Offer | None) -> Search | None:
         """Return the frame to be searched for in the whole map, if it is lost or doubtful and no other is searched."""
         if self.searching >= 0 or offer is not None:
             return None
@@ -190,16 +190,18 @@ class CameraClock:
         self.searching = self.frames
         return Search(seen.separate(), apart=apart) if lost else Search(seen.separate(), fit.comparison)
 
-    def _probe(self, number: int, seen: Observation, found: Found) -> Target | None:
+    def _probe(self, number: int, seen: PreparedFrame, found: FrameEstimate) -> Target | None:
         """Return the images of a frame that may become a probe view."""
-        usual = found.state == TRACKED and not found.mapped and self.recovery.is_steady and not self.tracker.doubtful
+        statistics = (
+            found.state == TRACKED and not found.mapped and self.recovery.is_steady and not self.tracker.doubtful
+        )
         full = len(self.waits) >= self.config.realtime.waiting_most
-        if not usual or full or is_held_back(number, self.config.input.hold_every):
+        if not statistics or full or is_held_back(number, self.config.input.hold_every):
             return None
-        probes = Probes(self.config.uncertainty.probes, self.config.mapping.every)
+        probes = ValidationViews(self.config.uncertainty.probes, self.config.mapping.every)
         return seen.target if probes.wants(self.offered - 1, number - self.newest) else None
 
-    def _step(self, seen: Observation, found: Found, timer: StepTimer, view: View) -> Step:
+    def _step(self, seen: PreparedFrame, found: FrameEstimate, timer: StepTimer, view: View) -> Step:
         s = self.snapshot
         drift, submap, component = (Drift(), 0, 0) if s is None else (s.drift, s.submap, s.component)
         if found.state == TRACKED and self.found:
@@ -210,7 +212,7 @@ class CameraClock:
         in_submap_m = drift.position_m(found.T_submap_camera)
         found.tracking |= {
             "position_std_m": self.confidence.position_std_m(in_submap_m), "doubtful": float(self.tracker.doubtful),
-            "usual_residual": self.tracker.usual.residual, "waiting": float(len(self.waits)),
+            "usual_residual": self.tracker.statistics.residual, "waiting": float(len(self.waits)),
             "moving": share_of(self.tracker.front),
         }  # fmt: skip
         p_off = self.confidence.probability(state, found.tracking)

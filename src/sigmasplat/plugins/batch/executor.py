@@ -1,4 +1,4 @@
-"""Define where the runs of a batch are made: a road. `local` and `cluster` are the two roads."""
+"""Define an executor, which makes the runs of a batch. `local` and `cluster` are the two executors."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -19,7 +19,7 @@ class Outcome:
     missing: bool = False
 
 
-class Road(Protocol):
+class Executor(Protocol):
     """Makes runs in the folder of a batch."""
 
     @property

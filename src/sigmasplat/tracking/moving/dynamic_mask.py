@@ -45,7 +45,7 @@ MARGIN_PX = 3
 
 
 @dataclass(frozen=True, eq=False)
-class Foreground:
+class DynamicMask:
     """What is in front in an image.
 
     hidden [H, W]: the pixels that show it, with a margin; depth_m [H, W]: its depth, 0 elsewhere; scene_m [H, W]: depth
@@ -57,7 +57,7 @@ class Foreground:
     scene_m: Depth
 
 
-def share_of(front: Foreground | None) -> float:
+def share_of(front: DynamicMask | None) -> float:
     """Return the share of the image that is in front."""
     return 0.0 if front is None else float(front.hidden.mean())
 
@@ -110,7 +110,7 @@ def thinned(live_m: Depth, step: int) -> Depth:
     return np.where(depth > 0, depth, largest_around(depth, 3))
 
 
-def foreground(
+def dynamic_mask(
     scene: Earlier,
     before: Earlier | None,
     live_m: Depth,
@@ -118,7 +118,7 @@ def foreground(
     whole_objects: bool = False,
     step: int = STEP,
     scene_scale: float = 1.0,
-) -> Foreground | None:
+) -> DynamicMask | None:
     """Find what has moved in front of the camera; None without.
 
     scene: the reference; before: what was in front in the last image; live_m [H, W]: live depth, m. A whole region
@@ -142,7 +142,7 @@ def foreground(
     if not moved.any():
         return None
     whole, hidden = enlarged(moved, step, live_m, whole_objects)
-    return Foreground(
+    return DynamicMask(
         hidden, np.where(whole, live_m, np.float32(0.0)), np.where(hidden, _behind(scene, camera, hidden), live_m)
     )
 

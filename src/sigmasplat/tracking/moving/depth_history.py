@@ -6,12 +6,12 @@ import numpy as np
 
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
-from sigmasplat.tracking.moving.foreground import (
+from sigmasplat.tracking.moving.dynamic_mask import (
     LEAST_REGION,
+    DynamicMask,
     Earlier,
-    Foreground,
+    dynamic_mask,
     enlarged,
-    foreground,
     seen_again,
     smooth,
 )
@@ -31,7 +31,7 @@ AT_REST, KNOWN = 0.85, 0.3
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class RememberedDepth:
     """A remembered frame: its number, its depth [H, W] m, the same with what is behind moving things (0 = unknown), and
     T_world_camera [4, 4]."""
 
@@ -42,26 +42,28 @@ class Seen:
 
 
 @dataclass(frozen=True, eq=False)
-class Memory:
+class DepthHistory:
     """The number of frames so far, and what some recent ones saw, the newest last."""
 
     frames: int = 0
-    seen: tuple[Seen, ...] = ()
+    seen: tuple[RememberedDepth, ...] = ()
 
-    def after(self, depth_m: Depth, front: Foreground | None, T_world_camera: Matrix, most_frames: int) -> "Memory":
-        """Return the memory after one more frame, of at most `most_frames`."""
+    def after(
+        self, depth_m: Depth, front: DynamicMask | None, T_world_camera: Matrix, most_frames: int
+    ) -> "DepthHistory":
+        """Return the history after one more frame, of at most `most_frames`."""
         if self.frames % EVERY:
             return replace(self, frames=self.frames + 1)
         scene_m = depth_m if front is None else np.where(front.hidden, front.scene_m, depth_m)
         kept = max(AGES[-1], most_frames // EVERY + 1)
-        seen = (*self.seen, Seen(self.frames, depth_m, scene_m, T_world_camera))[-kept:]
-        return Memory(self.frames + 1, seen)
+        seen = (*self.seen, RememberedDepth(self.frames, depth_m, scene_m, T_world_camera))[-kept:]
+        return DepthHistory(self.frames + 1, seen)
 
-    def moved_by(self, T_new_old: Matrix) -> "Memory":
-        """Return the memory in other coordinates [4, 4]."""
+    def moved_by(self, T_new_old: Matrix) -> "DepthHistory":
+        """Return the history in other coordinates [4, 4]."""
         return replace(self, seen=tuple(replace(s, T_world_camera=T_new_old @ s.T_world_camera) for s in self.seen))
 
-    def in_front(self, depth_m: Depth, T_world_camera: Matrix, camera: Camera, most_frames: int) -> Foreground | None:
+    def in_front(self, depth_m: Depth, T_world_camera: Matrix, camera: Camera, most_frames: int) -> DynamicMask | None:
         """Find what is in places that a remembered frame, at most `most_frames` old (0 = any), saw to be free; None in
         the frames that are not compared."""
         turn, rest = divmod(self.frames, LOOK_EVERY)
@@ -71,11 +73,11 @@ class Memory:
         if most_frames and self.frames - earlier.number > most_frames:
             return None
         scene = Earlier(earlier.scene_m, se3.inverse(earlier.T_world_camera) @ T_world_camera)
-        return foreground(scene, None, depth_m, camera, whole_objects=True, step=_step(camera))
+        return dynamic_mask(scene, None, depth_m, camera, whole_objects=True, step=_step(camera))
 
     def still_moving(
-        self, front: Foreground, depth_m: Depth, T_world_camera: Matrix, camera: Camera, frames: int
-    ) -> Foreground | None:
+        self, front: DynamicMask, depth_m: Depth, T_world_camera: Matrix, camera: Camera, frames: int
+    ) -> DynamicMask | None:
         """Return what is in front without the things that have stayed in place for this number of frames (0 = any)."""
         before = [k for k, earlier in enumerate(self.seen) if self.frames - earlier.number >= frames]
         if not frames or not before:
@@ -100,16 +102,16 @@ class Memory:
         whole, hidden = enlarged(moving, step, depth_m)
         whole, hidden = whole & (front.depth_m > 0), hidden & front.hidden
         depths = np.where(whole, front.depth_m, np.float32(0.0)), np.where(hidden, front.scene_m, depth_m)
-        return Foreground(hidden, *depths)
+        return DynamicMask(hidden, *depths)
 
 
 def _step(camera: Camera) -> int:
     return max(2, camera.width // COLUMNS_TESTED)
 
 
-def together(a: Foreground | None, b: Foreground | None) -> Foreground | None:
+def together(a: DynamicMask | None, b: DynamicMask | None) -> DynamicMask | None:
     """Return all that is in front by one finding or the other."""
     if a is None or b is None:
         return b if a is None else a
     scene_m = np.where(a.hidden & b.hidden, np.maximum(a.scene_m, b.scene_m), np.where(b.hidden, b.scene_m, a.scene_m))
-    return Foreground(a.hidden | b.hidden, np.maximum(a.depth_m, b.depth_m), scene_m)
+    return DynamicMask(a.hidden | b.hidden, np.maximum(a.depth_m, b.depth_m), scene_m)

@@ -1,4 +1,4 @@
-"""Judge a pose by comparing surfaces: believe it, doubt it, or call the camera lost."""
+"""Judge a pose by comparing surfaces: accept it, doubt it, or call the camera lost."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -150,7 +150,7 @@ def is_better(c: Comparison, doubtful: Comparison) -> bool:
 
 
 @dataclass(eq=False)
-class Usual:
+class TrackingStatistics:
     """Values of recent frames that were not lost; their medians are what is usual."""
 
     scores: list[float] = field(default_factory=list)

@@ -27,7 +27,7 @@ from sigmasplat.graph.confidence import Confidence
 from sigmasplat.graph.loops import Loop, Loops
 from sigmasplat.graph.newest_covariance import NewestCovariance, PoseErrors
 from sigmasplat.mapping.mapper import Mapper
-from sigmasplat.mapping.probes import Probes
+from sigmasplat.mapping.validation_views import ValidationViews
 from sigmasplat.render.view import View
 from sigmasplat.slam.checkpoint import checkpoint_of
 from sigmasplat.slam.listeners import Listeners
@@ -35,17 +35,17 @@ from sigmasplat.slam.step_result import Step, StepTimer
 from sigmasplat.slam.steps import Steps
 from sigmasplat.tracking.drift import Drift
 from sigmasplat.tracking.features import Extractor, make_extractor
-from sigmasplat.tracking.moving.watch import Watch
+from sigmasplat.tracking.moving.dynamic_detector import DynamicDetector
+from sigmasplat.tracking.prepared_frame import PreparedFrame, observe, view_of, working_frame
 from sigmasplat.tracking.recovery import Recovery
 from sigmasplat.tracking.relocaliser import Relocaliser
-from sigmasplat.tracking.sight import Observation, observe, view_of, working_frame
 from sigmasplat.tracking.tracker import Tracker
-from sigmasplat.types import Matrix, Slices
+from sigmasplat.types import Matrix, Task
 
 HOST = torch.device("cpu")
 
 
-class World:
+class SlamState:
     """The state of SLAM between two frames; `Slam` changes it.
 
     Frame 0 fixes the gauge: the world is the first camera, or that of the map that is continued. Finished submaps go to
@@ -70,10 +70,10 @@ class World:
         wanted = self.config.tracking.features or self.config.recovery.relocalise
         self.extractor = make_extractor(self.config.features) if wanted else None
         features = self.extractor if self.config.tracking.features else None
-        self.tracker = Tracker(self.config.tracking, features, watch=Watch(self.config.moving))
+        self.tracker = Tracker(self.config.tracking, features, detector=DynamicDetector(self.config.moving))
         self.mapper = Mapper(self.config, self.random)
         self.drift = Drift(scene_scale=self.config.render.scene_scale)
-        self.probes = Probes(self.config.uncertainty.probes, self.config.mapping.every)
+        self.validation_views = ValidationViews(self.config.uncertainty.probes, self.config.mapping.every)
         self.descriptor = make_descriptor(self.config.loops)
         self.closer = LoopCloser(self.config, self.store, self.extractor if self.config.tracking.features else None)
         self.recovery = Recovery(self.config.recovery)
@@ -91,7 +91,7 @@ class World:
         self.uncertainty: MapUncertainty | None = None
         """How sure the final map is; None before `finish`, or without probe views (`uncertainty.probes`)."""
         self._timer = StepTimer()
-        self._search: Slices[list[Loop]] | None = None
+        self._search: Task[list[Loop]] | None = None
         self.listeners = Listeners()
         self._newest_covariance = NewestCovariance()
         self.keep_on_disk()
@@ -139,8 +139,8 @@ class World:
         """
         return Trajectory(self.steps.timestamps_s, self.atlas.T_world_camera())
 
-    def believed(self) -> NDArray[np.bool_]:
-        """Return whether the pose of each frame so far is believed [F]: not lost, and connected to the world."""
+    def valid(self) -> NDArray[np.bool_]:
+        """Return whether the pose of each frame so far is valid [F]: not lost, and connected to the world."""
         return self.atlas.in_world & ~self.steps.lost
 
     def newest_step(self) -> Step | None:
@@ -173,7 +173,7 @@ class World:
     def checkpoint(self) -> dict[str, Tensor]:
         """Return what is needed to read a run back, in host memory: the active submap's field with its optimiser state,
         poses, times, keyframes, anchors, the submap of each frame, and the errors of the path (`path_covariance`)."""
-        path, edges = self.trajectory(), self.closer.believed
+        path, edges = self.trajectory(), self.closer.valid
         return checkpoint_of(self.mapper.field, path, self.atlas, self.keyframe_indices, edges)
 
     @property
@@ -194,7 +194,7 @@ class World:
         """Return whether there is a view yet."""
         return self._view is not None
 
-    def observed(self, frame: Frame, view: View, extractor: Extractor | None) -> Observation:
+    def observed(self, frame: Frame, view: View, extractor: Extractor | None) -> PreparedFrame:
         """Resize a frame to working size and prepare it for the fits. Raises SourceError if it comes from another
         camera than the first."""
         frame = self.filtered(frame)
@@ -219,7 +219,7 @@ class World:
     def cuts(self) -> bool:
         """Return whether any rule may end a submap."""
         s = self.config.submaps
-        return bool(s.distance_m or s.angle_deg or s.frames or s.uncertainty_m or s.variance_sum)
+        return bool(s.distance_m or s.angle_deg or s.frames or s.uncertainty_m)
 
     @property
     def _describes(self) -> bool:

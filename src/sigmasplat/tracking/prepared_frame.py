@@ -23,11 +23,11 @@ from sigmasplat.tracking.denoise import denoised
 from sigmasplat.tracking.depth_fit import smoothed
 from sigmasplat.tracking.feature_image import FeatureImage, LateDetail
 from sigmasplat.tracking.features import Extractor
-from sigmasplat.tracking.moving.foreground import Foreground
+from sigmasplat.tracking.moving.dynamic_mask import DynamicMask
 
 
 @dataclass(eq=False)
-class Sight:
+class PreparedImages:
     """A frame in the forms that tracking needs: the target of the fits, its pyramid, the image for features, and the
     pixels [H, W] that the user wants to be ignored, which have no depth."""
 
@@ -41,7 +41,7 @@ class Sight:
         """Return the frame for fits of its pose, which do not use the pixels that are to be ignored."""
         return self if self.ignored is None else self.aside(None)
 
-    def without(self, front: Foreground | None) -> Self:
+    def without(self, front: DynamicMask | None) -> Self:
         """Return the frame without depth where something is in front: it is neither mapped nor a reference there."""
         if front is None:
             return self
@@ -51,7 +51,7 @@ class Sight:
         """Return the frame with other depth [H, W], m."""
         return replace(self._read_as(depth_m), live=self.live.with_depth(depth_m))
 
-    def aside(self, front: Foreground | None) -> Self:
+    def aside(self, front: DynamicMask | None) -> Self:
         """Return the frame for fits of its pose, which are to use neither depth nor colour of what is in front or
         ignored."""
         depth_m = self.target.depth_image.numpy()
@@ -59,11 +59,11 @@ class Sight:
         hidden_m = np.where(self._unused(front), np.float32(HIDDEN_M), depth_m)
         return replace(unread, live=self.live.with_depth(hidden_m))
 
-    def hiding(self, front: Foreground) -> Pyramid:
+    def hiding(self, front: DynamicMask) -> Pyramid:
         """Return the images for comparisons and quick fits without what is in front or ignored."""
         return self.live.hiding(self._unused(front))
 
-    def _unused(self, front: Foreground | None) -> NDArray[np.bool_]:
+    def _unused(self, front: DynamicMask | None) -> NDArray[np.bool_]:
         """Return the pixels [H, W] of what is in front or ignored; without both, a single False."""
         hidden = np.zeros((), np.bool_) if front is None else front.hidden
         return hidden if self.ignored is None else hidden | self.ignored
@@ -83,13 +83,13 @@ class Sight:
 
 
 @dataclass(eq=False)
-class Observation(Sight):
+class PreparedFrame(PreparedImages):
     """A frame in the forms that tracking and mapping need: also the working frame, and the whole one as it was read."""
 
     frame: Frame = field(kw_only=True)
     whole: Frame = field(kw_only=True)
 
-    def without_exposure(self, exposure: tuple[float, float]) -> "Observation":
+    def without_exposure(self, exposure: tuple[float, float]) -> "PreparedFrame":
         """Return the frame with the exposure (a, b) of exp(a) · colour + b removed from its target and its photo."""
         whole = replace(self.whole, color=unexposed(self.whole.color, gray_exposure(*exposure)))
         return replace(super().without_exposure(exposure), whole=whole)
@@ -103,11 +103,10 @@ class Observation(Sight):
 def view_of(camera: Camera, config: Config) -> View:
     """Make the view for working images of a camera, with planes for σ² if the run learns it or weighs by it, and with
     the noise of readings if alignment uses it."""
-    mapping, tracking, registration = config.mapping, config.tracking, config.registration
+    mapping, tracking = config.mapping, config.tracking
     learned = bool(mapping.weight_nll_color or mapping.weight_nll_depth)
     read = tracking.uncertainty and tracking.align_depth_by == "V"
-    predicted = any(c.uncertainty and c.variance == "predicted" for c in (tracking, registration))
-    view = make_view(config.backend, camera, config.render, variance=learned or read or predicted)
+    view = make_view(config.backend, camera, config.render, variance=learned or read)
     view.sensor = sensor_model(config.input.sensor) if tracking.sensor_noise else None
     return view
 
@@ -128,7 +127,7 @@ def working_frame(frame: Frame, config: Config, camera: Camera | None = None) ->
     return working.with_depth(depth_m, std_m if modelled is None else modelled)
 
 
-def observe(whole: Frame, working: Frame, view: View, config: Config, extractor: Extractor | None) -> Observation:
+def observe(whole: Frame, working: Frame, view: View, config: Config, extractor: Extractor | None) -> PreparedFrame:
     """Return a frame in the forms that tracking needs: features are found in the whole frame, everything else is made
     from the working frame."""
     ignored = whole.ignored_by(working.camera)
@@ -140,7 +139,7 @@ def observe(whole: Frame, working: Frame, view: View, config: Config, extractor:
     live, image = live_image(view, working.color, working.depth_m, target), None
     if extractor is not None:
         image = FeatureImage(LateDetail(whole, config.features.width), working.depth_m, working.camera)
-    return Observation(target, live, image, ignored, frame=working, whole=whole)
+    return PreparedFrame(target, live, image, ignored, frame=working, whole=whole)
 
 
 @dataclass(eq=False)
