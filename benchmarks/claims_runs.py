@@ -6,10 +6,9 @@ from typing import Any
 import numpy as np
 import torch
 from claims import Job
-from drift_rule import ADDED, hops_of
+from drift_rule import hops_of
 from finished_run import FinishedRun
 from localise import Search, disturbed
-from sigmasplat.uncertainty.predicted_submaps import PredictedSubmaps
 from unseen_views import UnseenView, held_back_views
 from weights_runs import VIEWS, mean, registrations, rendered, true_submaps
 
@@ -49,9 +48,8 @@ def rows(job: Job, registered: Settings, plateaus: Settings) -> Rows:
     figures = path_figures(slam, done, source, views) | {"cpu_s": cpu_s / len(slam.steps)}
     found = [{"group": job.group, "variant": job.variant, "figures": figures}]
     if job.group == SUBMAPS:
-        truth, predicted = true_submaps(slam, source), PredictedSubmaps(slam.config, slam.store)
         found += hop_ranks(slam, source)
-        found += registrations(job, slam, truth, predicted, registered)
+        found += registrations(job, slam, true_submaps(slam, source), registered)
         found += localisations(job, slam, done, views, plateaus)
     return found
 
@@ -98,18 +96,15 @@ def surface_figures(slam: Slam, done: FinishedRun, source: Source) -> dict[str, 
 
 
 def hop_ranks(slam: Slam, source: Source) -> Rows:
-    """Return the rank correlation of the true errors of hops with what they add to each rule's value."""
+    """Return the rank correlation of the true errors of hops with what they add to the accumulated covariance."""
     truth = source.truth()
     assert truth is not None, "every sequence of this benchmark has a true path"
     own, theirs = associate(np.array([step.timestamp_s for step in slam.steps]), truth.timestamps_s)
     known = dict(zip(own.tolist(), truth.T_world_camera[theirs], strict=True))
     hops = hops_of(slam, slam.trajectory().T_world_camera, known)["hops"]
-    found = Rows()
-    for rule, added in ADDED.items():
-        pairs = np.array([(hop[added], hop["error_m"]) for hop in hops if np.isfinite(hop[added])]).reshape(-1, 2)
-        rank = float(spearman(*pairs.T)) if len(pairs) > 2 else None
-        found.append({"group": "hops", "variant": rule, "figures": {"rank": rank, "hops": len(pairs)}})
-    return found
+    pairs = np.array([(hop["added_m2"], hop["error_m"]) for hop in hops]).reshape(-1, 2)
+    rank = float(spearman(*pairs.T)) if len(pairs) > 2 else None
+    return [{"group": "hops", "variant": "covariance", "figures": {"rank": rank, "hops": len(pairs)}}]
 
 
 def localisations(job: Job, slam: Slam, done: FinishedRun, views: list[UnseenView], ways: Settings) -> Rows:
