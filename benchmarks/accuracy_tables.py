@@ -1,7 +1,7 @@
 """Tabulate the figures of the accuracy benchmark: mean ± standard deviation over seeds, and the goals."""
 
 import statistics
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -96,24 +96,6 @@ def sections(measured: dict[str, Any]) -> list[Section]:
     results = measured["figures"]["jobs"]
     made = [_figures("Path and speed", PLACE, results), _figures("Map and uncertainty", PICTURES, results)]
     return [s for s in [*made, goals(measured), failures(results)] if s.rows]
-
-
-COMPARED = (*(f for f in PLACE if f[1] in ("frames_per_s", "ate_m", "splats")), *PICTURES[:2], PICTURES[4])
-
-
-def compared(measured: Sequence[dict[str, Any]], source: str) -> Section:
-    """Compare results of different settings on one source: one row each, fastest first."""
-    rows = []
-    for results in measured:
-        runs = [r for r in results["figures"]["jobs"] if r["problem"] is None and r["job"]["source"] == source]
-        speed = statistics.fmean(values_of(runs, "frames_per_s") or [0.0])
-        figures = [spread([factor * value for value in values_of(runs, name)]) for _, name, factor in COMPARED]
-        settings = ", ".join(results["config"].get("settings") or ()) or "preset unchanged"
-        rows.append((speed, [settings, str(results["machine"]["cores"]), str(len(runs)), *figures]))
-    ordered = [row for _, row in sorted(rows, key=lambda pair: -pair[0])]
-    return Section(
-        f"Settings compared on {source}", ["settings", "cores", "runs", *(title for title, *_ in COMPARED)], ordered
-    )
 
 
 def _figures(title: str, figures: tuple[tuple[str, str, float], ...], results: list[Result]) -> Section:

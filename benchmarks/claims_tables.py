@@ -1,6 +1,6 @@
 """Compare the claims of both papers with what was measured here: one table over several results, with verdicts.
 
-`tables.py` writes it where a document has <!-- bench:verdicts -->. No verdict is typed: each follows from the
+`tables.py` writes it into docs/results/claims.md. No verdict is typed: each follows from the
 differences at equal seeds by the rule of `verdict`.
 """
 
@@ -13,6 +13,7 @@ from typing import Any
 import record
 from claims_evidence import Claim, Evidence
 from claims_papers import ATE, CHAMFER, CPU, DEPTH, ERROR, FLOATERS, HOPS, PAPERS, PSNR, RANK, SPLATS, STEPS
+from result_pages import link
 from tables import Section
 
 from sigmasplat.plugins.evaluation.paired_comparison import (
@@ -81,14 +82,11 @@ def verdict(claim: Claim, found: Sequence[PairedDifference]) -> str:
 
 
 def counted(claim: Claim, found: Sequence[PairedDifference]) -> str:
-    """Count the sequences as claimed, the opposite, and within one deviation."""
+    """Count the sequences as claimed and those with the opposite; the others are within one deviation."""
     held, opposite = agreement(claim, found)
     if claim.claimed == "no worse":
         return f"worse on {opposite} of {len(found)}"
-    parts = [f"as claimed on {held} of {len(found)}"]
-    parts += [f"the opposite on {opposite}"] if opposite else []
-    within = len(found) - held - opposite
-    return ", ".join([*parts, *([f"within one deviation on {within}"] if within else [])])
+    return f"as claimed on {held} of {len(found)}" + (f", the opposite on {opposite}" if opposite else "")
 
 
 def verdict_counts(paper: str, folder: Path = record.RESULTS) -> Counter[str]:
@@ -120,7 +118,7 @@ def row(claim: Claim, folder: Path) -> list[str]:
     evidence, (judgement, found) = claim.evidence, judged(claim, folder)
     if evidence is None:
         return [claim.said, claim.published, f"– ({claim.remark})", judgement, "–"]
-    results = f"[{evidence.results}](benchmarks.md#{evidence.results})"
+    results = link(evidence.results)
     if not found:
         why = f"{evidence.figure.title}: 0 in all runs" if judgement == NOT_MEASURABLE else "–"
         return [claim.said, claim.published, why, judgement, results]
@@ -173,7 +171,8 @@ def note() -> str:
         "difference has the claimed sign and is larger than one standard deviation on more than half of the sequences. "
         "*The opposite*: the same with the opposite sign. Otherwise *not reproduced*. A claim that something is not "
         "worse is reproduced if the difference is not worse by more than one standard deviation on more than half of "
-        f"the sequences. A sequence with fewer than {LEAST_SEEDS} seeds does not count."
+        f"the sequences. A sequence with fewer than {LEAST_SEEDS} seeds does not count. Results without a link are in "
+        "`benchmarks/results/` only."
     )
 
 

@@ -175,8 +175,8 @@ def sections(measured: dict[str, Any]) -> list[Section]:
         f"≤ {GOAL_MB:g} MB, ≥ {GOAL_SHARE:.0%}",
     )  # fmt: skip
     note = (
-        f"Map of {found['source']}: {found['splats']:,} splats, {found['area_m2']:.0f} m² of surface, PSNR "
-        f"{found['psnr_db']:.2f} dB over {found['views']} held-out views."
+        f"Map of {found['source']}: {found['splats']:,} splats, {found['area_m2']:.0f} m² of surface, "
+        f"{found['views']} held-out views."
     )
     return [Section("Size of exported maps", head, rows, note)]
 

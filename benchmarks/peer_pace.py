@@ -49,7 +49,7 @@ PEERS = (
 SYSTEMS = (IN_TURN, TRACKING, REALTIME, *(peer.name for peer in PEERS))
 MAPS = {
     IN_TURN: "splats", TRACKING: "none", REALTIME: "splats", SLOW_PEER: "sparse points", CAMERA_PEER: "sparse points",
-    **{peer.name: peers.PROPERTIES[peer.name][0] for peer in PEERS if peer.package == "open3d"},
+    **{peer.name: "TSDF" if "dense" in peer.name else "none" for peer in PEERS if peer.package == "open3d"},
 }  # fmt: skip
 QUOTED: tuple[Result, ...] = tuple(
     {"system": "RTAB-Map †", "sequence": name, "frames_per_s": "15–23", "cores": "1", "map": "point cloud, grid"}

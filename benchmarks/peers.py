@@ -30,7 +30,6 @@ from sigmasplat.config.presets import default_preset, preset as preset_of
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import ConfigError, SigmaSplatError, SourceError
 from sigmasplat.files.atomic import write_text
-from sigmasplat.files.machine import describe
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.evaluation.metrics.trajectory import ate, pair_poses
 from sigmasplat.plugins.sources import open_source
@@ -40,7 +39,7 @@ arg = tyro.conf.arg
 Result = dict[str, Any]
 FOLDER = Path(__file__).parent
 SOURCES = ("redkitchen", "livingroom", "cubicles", "hololens")
-OURS, OURS_BEFORE_LOOPS = "SigmaSplat, `sigma`", "… before loops are closed"
+OURS = "SigmaSplat, `sigma`"
 
 
 @dataclass(frozen=True)
@@ -64,19 +63,8 @@ QUOTED: tuple[Result, ...] = (
     {"system": "RTAB-Map 0.23 †", "source": "livingroom", "ate_m": 0.023},
     {"system": "RTAB-Map 0.23 †", "source": "cubicles", "ate_m": 0.015},
     {"system": "RTAB-Map 0.23 †", "source": "hololens", "ate_m": 0.102, "with_pose": 0.37},
-    {"system": "RTAB-Map 0.23, odometry †", "source": "hololens", "ate_m": 0.164},
 )
 """Figures that are not measured by this program."""
-PROPERTIES = {
-    OURS: ("splats", "yes"),
-    OURS_BEFORE_LOOPS: ("splats", "no"),
-    **{peer.name: ("none", "no") for peer in PEERS if peer.package == "open3d"},
-    "Open3D, dense SLAM": ("TSDF", "no"),
-    "ORB-SLAM3": ("sparse points", "yes"),
-    "RTAB-Map 0.23 †": ("point cloud, grid", "yes"),
-    "RTAB-Map 0.23, odometry †": ("none", "no"),
-}
-"""Kind of map, and whether loops are closed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,7 +94,7 @@ class Options(OtherSystems):
         tuple[str, ...],
         arg(help="SYSTEM=SEQUENCE=FILE: also score a TUM text file that another system has written", metavar="PATHS"),
     ] = ()
-    keep: Annotated[bool, arg(help="keep the rows of other systems in the earlier results")] = False
+    keep: Annotated[bool, arg(help="keep the earlier results of other systems and sequences")] = False
     name: Annotated[str, arg(help="name of the results")] = "peers"
     fresh: Annotated[bool, arg(help="run also what has been run before")] = False
     runs: Annotated[Path, arg(help="folder of the run folders")] = accuracy.RUNS
@@ -159,17 +147,15 @@ def score(path: Trajectory, source: Source, limit: int | None) -> dict[str, Any]
 
 
 def run_ours(options: Options) -> list[Result]:
-    """Run SigmaSplat as `accuracy.py` does; return two results per run: with loops, and the path without loops."""
+    """Run SigmaSplat as `accuracy.py` does; return a result per run."""
     # Poses are final when the refinement of the map begins, so it is left out.
     settings = ("final.iterations=0",)
     wanted = accuracy.Options(options.sources, seeds=options.seeds, settings=settings, limit=options.limit)
     made = []
     for result in accuracy.run_all(accuracy.jobs_of(wanted), options):  # type: ignore[arg-type]
-        figures = result["figures"]
-        for system, name in ((OURS, "ate_m"), (OURS_BEFORE_LOOPS, "ate_odometry_m")):
-            error_m = figures.get(name) or figures.get("ate_m")  # without loops both paths are the same
-            kept = {"frames": figures.get("frames"), "without_pose": figures.get("lost"), "ate_m": error_m}
-            made.append({"system": system, "source": result["job"]["source"], "problem": result["problem"], **kept})
+        figures, found = result["figures"], {"system": OURS, "source": result["job"]["source"]}
+        kept = {"frames": figures.get("frames"), "without_pose": figures.get("lost"), "ate_m": figures.get("ate_m")}
+        made.append({**found, "problem": result["problem"], **kept})
     return made
 
 
@@ -247,16 +233,16 @@ def sections(measured: dict[str, Any]) -> list[Section]:
     sources = list(dict.fromkeys(run["source"] for run in runs))
     systems = dict.fromkeys(run["system"] for run in [*runs, *quoted])
     rows = [row for system in systems if (row := _row(system, [*runs, *quoted], sources))]
-    made = [Section("ATE in cm", ["system", *sources, "frames without a pose", "map", "closes loops"], rows, NOTE)]
+    commits = sorted({run["commit"][:9] for run in runs if run.get("commit")})
+    note = NOTE + (f" Some results were kept from earlier runs, of commits {', '.join(commits)}." if commits else "")
+    made = [Section("ATE in cm", ["system", *sources, "frames without a pose"], rows, note)]
     failed = [[f"{run['source']}, {run['system']}", str(run["problem"])] for run in runs if run["problem"]]
     return [*made, Section("Failed", ["run", "last words"], failed)] if failed else made
 
 
 NOTE = (
-    "ATE: root mean square over the frames that have a pose, after a rigid fit without scale; mean ± deviation over "
-    "several seeds. Without a pose: the system declares itself lost or writes no pose. All systems get the same "
-    "frames; SigmaSplat works at 320 pixels width, the others at full size. † Not measured by this command, but "
-    "earlier by the project's founders: same frames, CPU, RTAB-Map's settings for TUM RGB-D."
+    "ATE: root mean square over the frames that have a pose, after a rigid fit without scale. All systems get the same "
+    "frames; SigmaSplat works at 320 pixels width, the others at full size. † Quoted, not measured by this command."
 )
 
 
@@ -272,14 +258,15 @@ def _row(system: str, runs: list[Result], sources: list[str]) -> list[str]:
             without.append(f"{source} {spread(counts)} of {found[0]['frames']}")
         without += [f"{source} {100 * (1 - share):.0f} %" for share in shares]
     known = any("without_pose" in run for run in runs if run["system"] == system)
-    return [system, *cells, ", ".join(without) or ("0" if known else "–"), *PROPERTIES.get(system, ("–", "–"))]
+    return [system, *cells, ", ".join(without) or ("0" if known else "–")]
 
 
-def kept_rows(options: Options, measured: set[str]) -> list[Result]:
-    """Return the earlier results of systems that were not measured now, with the commit at which they were measured."""
-    path = options.out / f"{record.slug(options.name)}-{record.machine_slug(describe())}.json"
-    earlier = record.read(path)
-    rows = [row for row in earlier["figures"]["runs"] if row["system"] not in measured]
+def kept_rows(options: Options, measured: set[tuple[str, str]]) -> list[Result]:
+    """Return the earlier results of systems and sequences that were not measured now, with their commit."""
+    earlier = record.latest(options.name, options.out)
+    if earlier is None:
+        raise ConfigError(f"--keep: {options.out} has no results {options.name!r}")
+    rows = [row for row in earlier["figures"]["runs"] if (row["system"], row["source"]) not in measured]
     return [{"commit": earlier["commit"], **row} for row in rows]
 
 
@@ -288,11 +275,11 @@ def main(options: Options) -> int:
     try:
         extra = read_paths(options)
         runs = [*run_ours(options), *run_peers(options), *extra]
-        runs += kept_rows(options, {run["system"] for run in runs}) if options.keep else []
+        runs += kept_rows(options, {(run["system"], run["source"]) for run in runs}) if options.keep else []
     except SigmaSplatError as problem:
         print(f"peers.py: {problem}", file=sys.stderr)
         return 2
-    names = {Path(name).name for name in options.sources}
+    names = {run["source"] for run in runs}
     figures = {"runs": runs, "quoted": [figure for figure in QUOTED if figure["source"] in names]}
     config = {n: v for n, v in asdict(options).items() if n in ("sources", "systems", "limit", "paths")}
     measured = record.results("peers", figures, name=options.name, seeds=options.seeds, config=config)

@@ -1,9 +1,9 @@
 """Draw the picture of a real scan that README.md shows: sensor, map, uncertainty, and the map seen from above.
 
-Reads a finished run of an RGB-D sequence and measures nothing. The last panel leaves out what is higher than the
-camera: mostly the ceiling.
+Reads a finished run of an RGB-D sequence and measures nothing. The recording of the committed picture is fr1/xyz of TUM
+RGB-D (J. Sturm et al., IROS 2012; CC BY 4.0).
 
-example: sigmasplat run DATA/redkitchen --out runs/kitchen && python benchmarks/picture.py runs/kitchen
+example: sigmasplat run DATA/fr1_xyz --out runs/desk && python benchmarks/picture.py runs/desk
 """
 
 import sys
@@ -57,7 +57,7 @@ def panels(run: RunFolder, index: int, direction: int) -> list[ViewPanel]:
         replace(sensor, title="sensor", caption=f"{run.facts()['source']}, frame {index}"),
         replace(rendered, title="map, same view", caption=f"{len(field):,} splats"),
         replace(uncertainty, title="uncertainty of the colour"),
-        ViewPanel("map, from above", pixels, "without the ceiling"),
+        ViewPanel("map, from above", pixels),
     ]
 
 

@@ -1,4 +1,4 @@
-"""Tabulate runs on disturbed recordings: the whole suite, each disturbance, and one checkout beside another."""
+"""Tabulate runs on disturbed recordings: the whole suite, and each disturbance."""
 
 import statistics
 from collections.abc import Callable, Sequence
@@ -28,36 +28,10 @@ def sections(measured: dict[str, Any]) -> list[Section]:
     return [section for section in made if section.rows]
 
 
-def compared(measured: Sequence[dict[str, Any]], source: str) -> Section:
-    """Compare results of several checkouts, oldest first, on one sequence, or on all of them if `source` is "all".
-
-    With "suite" there is one row for each checkout, otherwise one for each disturbance and severity.
-    """
-    if source == "suite":
-        rows = [[_code(results), *_whole(results["figures"])] for results in measured]
-        titles = [f"ATE < {bound} cm" for bound in BOUNDS_CM]
-        return Section("Checkouts compared", ["code", *titles, "lost", "silent", "AUROC of p_off"], rows, NOTE)
-    chosen = {"sequence": source} if source != "all" else {}
-    all_runs = [_of(results["figures"]["runs"], **chosen) for results in measured]
-    rows = [
-        [title, label, *(" → ".join(write(runs) for runs in at) for write in (_median_ate, _lost, _silent, _success))]
-        for title, label, at in _rows(all_runs)
-    ]
-    head = [*HEAD, "ATE, cm (median)", "lost, %", "silent, %", "ATE < 5 cm, % of runs"]
-    where = "all sequences" if source == "all" else source
-    note = f"{' → '.join(map(_code, measured))}. {NOTE}"
-    return Section(f"Disturbances, before and now: {where}", head, rows, note)
-
-
 NOTE = (
     "ATE of the valid frames; a run that believes less than half of the frames outside the event does not count as "
     "below a bound. Lost: not valid. Silent: valid and off by more than 10 cm."
 )
-
-
-def _code(results: dict[str, Any]) -> str:
-    """Return the commit that was measured, as run.json has it."""
-    return str(results["figures"]["measured"])[:9] or "unknown"
 
 
 def _of(runs: Sequence[Run], **wanted: Any) -> list[Run]:
@@ -70,15 +44,14 @@ def _names(figures: dict[str, Any]) -> list[str]:
     return list(dict.fromkeys(run["sequence"] for run in figures["runs"]))
 
 
-def _rows(all_runs: Sequence[Sequence[Run]]) -> list[tuple[str, str, list[list[Run]]]]:
-    """Return title and severity of each disturbance that was run, and its runs in each list; at the end all runs."""
+def _rows(runs: Sequence[Run]) -> list[tuple[str, str, list[Run]]]:
+    """Return title and severity of each disturbance that was run, and its runs."""
     found = []
     for name, disturbance in DISTURBANCES.items():
         for severity, label in enumerate(disturbance.labels, 1):
-            at = [_of(runs, disturbance=name, severity=severity) for runs in all_runs]
-            if any(at):
+            if at := _of(runs, disturbance=name, severity=severity):
                 found.append((disturbance.title, label, at))
-    return [*found, ("**all**", "", [list(runs) for runs in all_runs])]
+    return found
 
 
 # ---- figures ----
@@ -117,22 +90,8 @@ def _ates_cm(runs: Sequence[Run]) -> list[float]:
     return [100 * run["ate_m"] for run in runs if run["ate_m"] is not None]
 
 
-def _median_ate(runs: Sequence[Run]) -> str:
-    return significant(statistics.median(_ates_cm(runs))) if _ates_cm(runs) else "–"
-
-
 def _auroc(p_off: dict[str, Any] | None) -> str:
     return significant(p_off["auroc"]) if p_off else "–"
-
-
-def _whole(figures: dict[str, Any]) -> list[str]:
-    """Return the cells of a suite: success at each bound, lost, silent, AUROC."""
-    runs = _of(figures["runs"])
-    curve = [f"{_success(runs, bound)} %" for bound in BOUNDS_CM]
-    return [*curve, f"{_lost(runs)} %", f"{_silent(runs)} %", _auroc(figures["p_off"])]
-
-
-# ---- tables ----
 
 
 def _suite(figures: dict[str, Any]) -> Section:
@@ -162,7 +121,7 @@ def _suite(figures: dict[str, Any]) -> Section:
 def _sequence(name: str, all_runs: list[Run]) -> Section:
     """Tabulate the disturbances of a sequence: means ± standard deviation over the seeds."""
     rows = []
-    for title, label, (runs,) in _rows([all_runs])[:-1]:
+    for title, label, runs in _rows(all_runs):
         counts = (
             [run["frames"] for run in runs],
             [run["frames"] - run["believed"] for run in runs],

@@ -1,13 +1,11 @@
-"""Write committed results as markdown tables into the documents, and check that the documents are up to date.
+"""Write committed results as markdown: the pages in docs/results/, and blocks in README.md and docs/*.md.
 
-A document holds <!-- bench:NAME --> … <!-- /bench -->, or bench:NAME/SECTION for one table of several;
-`python benchmarks/tables.py` replaces the text between them, in README.md and docs/*.md. NAME is the name of results
-(the newest from any machine) or a file name without .json; SECTION is the title of a table, as in path-and-speed.
-bench:* shows all results, each under its own heading, and bench:contents lists these headings; bench:summary is the
-table of summary.py, bench:verdicts those of claims_tables.py.
+result_pages.py says what each page shows. A document holds <!-- bench:NAME --> … <!-- /bench -->, or bench:NAME/SECTION
+for one table of several; `python benchmarks/tables.py` replaces the text between them. NAME is the name of results (the
+newest from any machine) or a file name without .json; SECTION is the title of a table, as in path-and-speed.
+bench:pages lists the pages, bench:summary is the table of summary.py, bench:verdicts that of claims_tables.py.
 """
 
-import ast
 import importlib
 import math
 import re
@@ -20,33 +18,12 @@ from typing import Annotated, Any
 
 import record
 import tyro
+from result_pages import PAGES, Page, Shown, link
 
-SUBJECTS = {
-    "A change": ("board",),
-    "Whole runs": ("accuracy", "pace", "systems", "map_quality", "full_resolution", "every_preset", "paper_presets"),
-    "Other systems": ("peers", "peer_pace", "mesh_quality"),
-    "Claims of the papers": ("claims",),
-    "Effect of σ²": ("ablation", "weights"),
-    "Uncertainty": ("uncertainty", "uncertainty_weights", "pose_covariance"),
-    "Camera tracking": ("tracking", "pose_gradient", "relocalisation"),
-    "Robustness": ("robustness", "failure_probability", "fuzz"),
-    "Loops and submaps": ("loops", "drift_rule"),
-    "Consistent maps": ("consistency",),
-    "Exported maps": ("export_sizes",),
-    "Geometry": ("four_frames", "away_from_path"),
-    "Kernels": ("cpu", "roofline", "versus", "gpu", "kernels"),
-    "Real time": ("realtime", "long_live"),
-    "Depth noise": ("sensor_models",),
-    "Stereo": ("stereo",),
-    "RGB only": ("predicted",),
-    "Known poses": ("given_poses",),
-    "Moving things": ("moving", "composites", "search_cost"),
-    "Long runs": ("long_run", "endurance", "viewer_memory"),
-    "Start-up": ("startup",),
-    "Killed runs": ("crashes",),
-}
-"""Benchmarks by the subject under which their results are listed, in this order; all others follow at the end."""
-BLOCK = re.compile(r"(<!-- bench:(?P<what>[\w./+-]+|\*) -->\n)(?P<body>.*?)(<!-- /bench -->)", re.DOTALL)
+BLOCK = re.compile(r"(<!-- bench:(?P<what>[\w./-]+) -->\n)(?P<body>.*?)(<!-- /bench -->)", re.DOTALL)
+FOLDER = re.compile(r" --(?:runs|out|scratch|keep) /[^\s']*")
+"""Options of a command that only name a folder of the machine on which it ran."""
+ABSOLUTE = re.compile(r"(?<![\w.…/-])/[\w./-]+/([\w.-]+)")
 
 
 @dataclass(frozen=True)
@@ -74,10 +51,11 @@ def significant(value: float | None, digits: int = 3) -> str:
 
 
 def headline(measured: dict[str, Any]) -> str:
-    """Return machine, commit, date and command of results as one line."""
+    """Return machine, commit, date and command of results as one line; PATH stands for folders of that machine."""
     made_on, commit = measured["machine"], measured["commit"]
+    command = ABSOLUTE.sub(r"PATH/\1", FOLDER.sub("", measured["command"]))
     code = f"commit {commit[:9]}{' with changes' if measured['dirty'] else ''}" if commit else "no commit"
-    return f"{made_on['cpu']}, {made_on['cores']} cores · {code} · {measured['date'][:10]} · `{measured['command']}`"
+    return f"{made_on['cpu']}, {made_on['cores']} cores · {code} · {measured['date'][:10]} · `{command}`"
 
 
 def sections(measured: dict[str, Any]) -> list[Section]:
@@ -101,57 +79,46 @@ def table(measured: dict[str, Any], section: str | None = None) -> str:
     return "\n".join([f"{headline(measured)}\n", *(s.markdown() for s in chosen)])
 
 
-def compared(measured: Sequence[dict[str, Any]], source: str) -> str:
-    """Write results of one benchmark with different settings as one table: one row each, for the runs of one source."""
-    section: Section = layout(measured[0]["benchmark"]).compared(measured, source)
-    made_on, commits = measured[0]["machine"], sorted({(m["commit"] or "no commit")[:9] for m in measured})
-    dates = sorted({m["date"][:10] for m in measured})
-    head = f"{made_on['cpu']}, {made_on['cores']} cores · commit {', '.join(commits)} · {', '.join(dates)}"
-    return f"{head}\n\n{section.markdown()}"
+def part_of(section: Section, shown: Shown) -> Section:
+    """Return the columns and rows of a table that a page shows."""
+    kept = [i for i, column in enumerate(section.columns) if column not in shown.without]
+    chosen = [row for row in section.rows if not shown.only or {*row[:2]} & {*shown.only}]
+    rows = [[row[i] for i in kept] for row in chosen if row[0] not in shown.without]
+    return Section(section.title, [section.columns[i] for i in kept], rows, section.note)
 
 
-def by_subject(folder: Path = record.RESULTS) -> dict[str, dict[str, dict[str, Any]]]:
-    """Return every result of a folder by subject and heading: in the order of SUBJECTS, then by name."""
-    found = [(record.read(path), path.stem) for path in sorted(folder.glob("*.json"))]
-    names = [measured["name"] for measured, _ in found]
-    order = [benchmark for benchmarks in SUBJECTS.values() for benchmark in benchmarks]
-
-    def rank(pair: tuple[dict[str, Any], str]) -> tuple[int, str, bool, str]:
-        benchmark = pair[0]["benchmark"]
-        known = order.index(benchmark) if benchmark in order else len(order)
-        return known, benchmark, pair[0]["name"] != benchmark, pair[1]
-
-    listed: dict[str, dict[str, dict[str, Any]]] = {}
-    for measured, stem in sorted(found, key=rank):
-        subject = next((s for s, members in SUBJECTS.items() if measured["benchmark"] in members), "Other results")
-        heading = measured["name"] if names.count(measured["name"]) == 1 else stem
-        listed.setdefault(subject, {})[heading] = measured
-    return listed
+def shown_on_page(shown: Shown, folder: Path) -> str:
+    """Write results on a page: heading, meaning, provenance and tables. Raises KeyError for what is not there."""
+    measured = record.latest(shown.name, folder)
+    if measured is None:
+        raise KeyError(f"a page shows the results {shown.name!r}, which are not there")
+    made = [s for s in sections(measured) if not shown.tables or s.title in shown.tables]
+    there = {name for s in made for name in (*s.columns, *(cell for row in s.rows for cell in row[:2]))}
+    unknown = [*({*shown.tables} - {s.title for s in made}), *({*shown.without, *shown.only} - there)]
+    if unknown or not made:
+        raise KeyError(f"results {shown.name!r} have no {', '.join(map(repr, unknown)) or 'table'}")
+    parts = [f"## {shown.name}\n", f"{shown.meaning}\n", f"{headline(measured)}\n"]
+    return "\n".join([*parts, *(part_of(s, shown).markdown() for s in made)])
 
 
-def everything(folder: Path = record.RESULTS) -> str:
-    """Write every result of a folder: a heading by subject, then for each result a heading and its tables."""
-    written = []
-    for subject, listed in by_subject(folder).items():
-        written.append(f"## {subject}\n")
-        written += [f"### {name}\n\n{question(m['benchmark'])}\n\n{table(m)}" for name, m in listed.items()]
-    return "\n" + "\n".join(written)
+def page(made: Page, folder: Path = record.RESULTS) -> str:
+    """Write a page of results. Raises KeyError if a result or a table is missing."""
+    head = [f"# {made.title}\n", HEAD, *([f"## {made.first}\n{WHOLE[made.first](folder)}"] if made.first else ())]
+    return "\n".join([*head, *(shown_on_page(shown, folder) for shown in made.shown)])
 
 
-def contents(folder: Path = record.RESULTS) -> str:
-    """Write the list of contents of `everything`: a line for each subject, with links to its results."""
-    links = {
-        subject: ", ".join(f"[{name}](#{name.lower()})" for name in m) for subject, m in by_subject(folder).items()
-    }
-    return "".join(f"- **{subject}**: {line}\n" for subject, line in links.items())
+HEAD = """Written by `python benchmarks/tables.py` from `benchmarks/results/`; ± is one standard deviation over seeds.
+[How to read the figures](../benchmarks.md) · [what each column means](../../benchmarks/README.md)
+"""
 
 
-def question(benchmark: str) -> str:
-    """Return the first line of a benchmark's docstring, and a link to the meaning of its figures."""
-    program = f"{benchmark}.py"
-    source = (record.ROOT / "benchmarks" / program).read_text(encoding="utf-8")
-    asked = (ast.get_docstring(ast.parse(source)) or "").partition("\n")[0]
-    return f"{asked} Figures: [{program}](../benchmarks/README.md#{program.replace('.', '')})."
+def list_of_pages(folder: Path = record.RESULTS) -> str:
+    """Write the list of the pages of results, with a link to each result."""
+    lines = []
+    for name, made in PAGES.items():
+        results = ", ".join(link(shown.name, "results/") for shown in made.shown)
+        lines.append(f"- **[{made.title}](results/{name}.md)**: {results}\n")
+    return "".join(lines)
 
 
 def summary(folder: Path = record.RESULTS) -> str:
@@ -166,17 +133,14 @@ def verdicts(folder: Path = record.RESULTS) -> str:
     return made
 
 
-WHOLE: dict[str, Callable[[Path], str]] = {
-    "*": everything, "contents": contents, "summary": summary, "verdicts": verdicts,
-}  # fmt: skip
+WHOLE: dict[str, Callable[[Path], str]] = {"pages": list_of_pages, "summary": summary, "verdicts": verdicts}
 """Blocks that show more than the results of one name."""
 
 
 def rewritten(text: str, folder: Path = record.RESULTS) -> tuple[str, list[str]]:
     """Return a document with every block replaced by its table, and the names of missing results.
 
-    Blocks without results are not changed. `bench:NAME+NAME/SOURCE` compares several results.
-    Raises KeyError for a table that the results do not have.
+    Blocks without results are not changed. Raises KeyError for a table that the results do not have.
     """
     missing: list[str] = []
 
@@ -184,40 +148,60 @@ def rewritten(text: str, folder: Path = record.RESULTS) -> tuple[str, list[str]]
         if match["what"] in WHOLE:
             return f"{match[1]}{WHOLE[match['what']](folder)}{match[4]}"
         name, _, section = match["what"].partition("/")
-        found = {part: record.latest(part, folder) for part in name.split("+")}
-        missing.extend(part for part, results in found.items() if results is None)
-        known = [results for results in found.values() if results is not None]
-        if len(known) < len(found):
+        measured = record.latest(name, folder)
+        if measured is None:
+            missing.append(name)
             return match[0]
-        if len(known) > 1:
-            return f"{match[1]}{compared(known, section)}{match[4]}"
-        measured = known[0]
         return f"{match[1]}{table(measured, section or None)}{match[4]}"
 
     return BLOCK.sub(block, text), missing
+
+
+def documents(root: Path = record.ROOT, folder: Path = record.RESULTS) -> tuple[dict[Path, str | None], list[str]]:
+    """Return what each document should say, and the names of missing results; None for a page that should not be there.
+
+    Raises KeyError for results or tables that a page or a block shows and that are not there.
+    """
+    wanted: dict[Path, str | None] = dict.fromkeys((root / "docs" / "results").glob("*.md"))
+    wanted |= {root / "docs" / "results" / f"{name}.md": page(made, folder) for name, made in PAGES.items()}
+    lacking = []
+    for path in [root / "README.md", *sorted((root / "docs").glob("*.md"))]:
+        wanted[path], missing = rewritten(path.read_text(encoding="utf-8"), folder)
+        lacking += [f"{path.name}: no results {name!r} yet, the block is not changed" for name in missing]
+    return wanted, lacking
 
 
 Check = Annotated[bool, tyro.conf.arg(help="change nothing; exit 1 if a document is out of date")]
 
 
 def main(check: Check = False) -> int:
-    """Rewrite the benchmark tables of README.md and docs/*.md from benchmarks/results/*.json."""
-    wrong = 0
-    for path in [record.ROOT / "README.md", *sorted((record.ROOT / "docs").glob("*.md"))]:
-        before = path.read_text(encoding="utf-8") if path.exists() else ""
-        try:
-            after, missing = rewritten(before)
-        except KeyError as problem:
-            print(f"{path.name}: {problem.args[0]}", file=sys.stderr)
-            return 2
-        for name in missing:
-            print(f"{path.name}: no results {name!r} yet, the block is not changed", file=sys.stderr)
-        wrong += len(missing) + (after != before)
-        if after != before:
-            print(f"{'out of date' if check else 'rewritten'}: {path.relative_to(record.ROOT)}")
-            if not check:
-                path.write_text(after, encoding="utf-8")
-    return int(check and wrong > 0)
+    """Rewrite docs/results/*.md, and the tables in README.md and docs/*.md, from benchmarks/results/*.json."""
+    try:
+        wanted, lacking = documents()
+    except KeyError as problem:
+        print(f"tables.py: {problem.args[0]}", file=sys.stderr)
+        return 2
+    print(*lacking, sep="\n", end="\n" if lacking else "", file=sys.stderr)
+    outdated = {path: text for path, text in wanted.items() if said(path) != text}
+    for path, text in outdated.items():
+        print(f"{'out of date' if check else 'rewritten'}: {path.relative_to(record.ROOT)}")
+        if not check:
+            write(path, text)
+    return int(check and bool(lacking or outdated))
+
+
+def said(path: Path) -> str | None:
+    """Return what a document says now; None if it is not there."""
+    return path.read_text(encoding="utf-8") if path.exists() else None
+
+
+def write(path: Path, text: str | None) -> None:
+    """Write a document, or remove it if there should be none."""
+    if text is None:
+        path.unlink()
+        return
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -4,8 +4,10 @@ import ast
 import dataclasses
 import importlib
 import re
+from collections.abc import Callable
 from operator import attrgetter
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -16,6 +18,7 @@ from sigmasplat.config.presets import list_presets, preset
 from sigmasplat.fit.compare import Comparison
 from sigmasplat.plugins.papers.table_files import list_tables
 
+README = ROOT / "README.md"
 PACKAGE = ROOT / "src" / "sigmasplat"
 SECTIONS = [f.name for f in dataclasses.fields(Config) if dataclasses.is_dataclass(getattr(Config(), f.name))]
 FOLDERS = sorted(path.parent.name for path in PACKAGE.glob("*/__init__.py"))
@@ -137,32 +140,43 @@ def test_every_warning_of_a_command_has_its_row() -> None:
         assert any(words in row for row in rows), f"errors.md: no row of a warning says {words!r}"
 
 
-def test_measured_tables_are_those_of_the_results(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def programs(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], ModuleType]:
+    """Import a program of benchmarks/."""
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
-    tables, record = map(importlib.import_module, ("tables", "record"))
-    for path in DOCUMENTS:
-        text = path.read_text(encoding="utf-8")
-        assert tables.rewritten(text)[0] == text, f"{path.name}: run python benchmarks/tables.py"
-    shown = tables.everything()
-    for results in record.RESULTS.glob("*.json"):
-        assert record.read(results)["commit"][:9] in shown
+    return importlib.import_module
+
+
+def test_measured_tables_are_those_of_the_results(programs: Callable[[str], ModuleType]) -> None:
+    tables = programs("tables")
+    wanted, lacking = tables.documents()
+    assert {*wanted} >= {ROOT / "README.md", *(ROOT / "docs").glob("*.md"), *(ROOT / "docs" / "results").iterdir()}
+    outdated = [path.name for path, text in wanted.items() if tables.said(path) != text]
+    assert outdated == lacking == [], "run python benchmarks/tables.py"
+    assert not any(tables.BLOCK.search(path.read_text(encoding="utf-8")) for path in DOCUMENTS if path not in wanted)
+
+
+def test_every_committed_result_is_shown_or_judged(programs: Callable[[str], ModuleType]) -> None:
+    tables, record, pages, papers = map(programs, ("tables", "record", "result_pages", "claims_papers"))
+    shown = {s.name for page in pages.PAGES.values() for s in page.shown}
+    shown |= {match["what"].partition("/")[0] for match in tables.BLOCK.finditer(README.read_text(encoding="utf-8"))}
+    judged = {claim.evidence.results for claims in papers.PAPERS.values() for claim in claims if claim.evidence}
+    committed = [record.read(path)["name"] for path in record.RESULTS.glob("*.json")]
+    assert sorted(committed) == sorted(shown | judged)
 
 
 def test_measured_tables_have_their_places() -> None:
-    places = {
-        "README.md": ("accuracy", "cpu"),
-        "docs/varsplat.md": (
-            "accuracy",
-            "loops",
-            "loops-real",
-            "drift-rule",
-            "long-run",
-            "ablation",
-        ),
-        "docs/cgslam.md": ("systems", "consistency", "pose-gradient"),
-        "docs/claims.md": ("verdicts",),
-    }
+    places = {"README.md": ("peers/ate-in-cm",), "docs/benchmarks.md": ("pages", "summary")}
     for document, names in places.items():
         text = (ROOT / document).read_text(encoding="utf-8")
         for name in names:
-            assert re.search(rf"<!-- bench:{name}[\w./-]* -->\n(.*\n)*?<!-- /bench -->", text), f"{document}: {name}"
+            assert re.search(rf"<!-- bench:{name} -->\n(.*\n)+?<!-- /bench -->", text), f"{document}: {name}"
+    assert "\n| claim | paper |" in (ROOT / "docs" / "results" / "claims.md").read_text(encoding="utf-8")
+
+
+def test_documents_with_figures_are_short_and_show_no_folders_of_a_machine() -> None:
+    results = [*(ROOT / "docs" / "results").iterdir(), ROOT / "docs" / "benchmarks.md"]
+    words = {path: len(path.read_text(encoding="utf-8").split()) for path in (*results, README)}
+    assert words.pop(README) <= 1000 and sum(words.values()) <= 14_000, words
+    for path in (*results, README):
+        assert not re.search(r"/tmp/|/work/|/home/|/root/", path.read_text(encoding="utf-8")), path.name

@@ -111,10 +111,6 @@ def test_the_api_pages_hold_every_module_and_every_public_name() -> None:
         assert getattr(importlib.import_module(module), name).__name__ == name, f"api/index.md: {target}"
 
 
-def test_the_page_of_results_holds_all_of_them() -> None:
-    assert "<!-- bench:* -->" in (DOCS / "benchmarks.md").read_text(encoding="utf-8")
-
-
 def test_every_setting_has_a_sentence_of_its_own() -> None:
     settings, whole = theme("settings"), Config()
     sections = [whole, *(value for value in vars(whole).values() if dataclasses.is_dataclass(value))]

@@ -153,20 +153,6 @@ def test_blocks_are_rewritten_and_nothing_else(tmp_path: Path) -> None:
         tables.rewritten("<!-- bench:accuracy/nothing -->\n<!-- /bench -->", tmp_path)
 
 
-def test_results_of_several_settings_are_compared_fastest_first(tmp_path: Path) -> None:
-    for name, settings, speed in (("accuracy", [], 12.0), ("iterations-5", ["mapping.iterations=5"], 20.0)):
-        jobs = [job_result("synthetic", 0, frames_per_s=speed, ate_m=0.004), job_result("livingroom", 0, ate_m=0.9)]
-        measured = results("accuracy", {"jobs": jobs}, name=name)
-        record.write({**measured, "config": {"settings": settings}}, tmp_path)
-    text = "<!-- bench:accuracy+iterations-5/synthetic -->\n<!-- /bench -->"
-    new, missing = tables.rewritten(text, tmp_path)
-    rows = [line for line in new.splitlines() if line.startswith("| mapping") or line.startswith("| preset")]
-    assert missing == [] and [row.split(" | ")[0] for row in rows] == ["| mapping.iterations=5", "| preset unchanged"]
-    assert "20" in rows[0] and "0.400" in rows[0] and "90" not in new
-    absent = text.replace("iterations-5", "iterations-7")
-    assert tables.rewritten(absent, tmp_path) == (absent, ["iterations-7"])
-
-
 def timing(**works_ms: float) -> dict[str, dict[str, float]]:
     return {name: {"median_ms": ms, "min_ms": 0.9 * ms, "runs": 7} for name, ms in works_ms.items()}
 
@@ -539,13 +525,3 @@ def test_the_summary_copies_cells_of_tables_and_names_what_is_missing(tmp_path: 
         found.cell("accuracy", "Path and speed", ("redkitchen", "sigma"), "ATE, cm")
     with pytest.raises(KeyError, match="systems"):
         found.cell("systems", "synthetic", ("finish, s",), "sigma")
-    assert found.goals() == (1, 1)  # synthetic: ATE
-
-
-def test_results_are_listed_by_subject_and_unknown_benchmarks_come_last(tmp_path: Path) -> None:
-    for benchmark, name in (("unheard", "a"), ("versus", "versus"), ("accuracy", "b"), ("accuracy", "accuracy")):
-        record.write(results(benchmark, {}, name=name), tmp_path)
-    listed = {subject: list(names) for subject, names in tables.by_subject(tmp_path).items()}
-    assert listed == {"Whole runs": ["accuracy", "b"], "Kernels": ["versus"], "Other results": ["a"]}
-    assert list(listed) == ["Whole runs", "Kernels", "Other results"]
-    assert "[accuracy](#accuracy), [b](#b)" in tables.contents(tmp_path)

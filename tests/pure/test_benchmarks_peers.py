@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmark_results import results
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import ConfigError
 from sigmasplat.plugins.sources import open_source
@@ -17,7 +18,7 @@ from sigmasplat.run_folder.trajectory import write_trajectory
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 sys.path.append(str(BENCHMARKS))
-peers = importlib.import_module("peers")
+peers, record = map(importlib.import_module, ("peers", "record"))
 ROOM = "synthetic:frames=6,width=64,height=48"
 
 
@@ -83,3 +84,16 @@ def test_the_table_marks_what_is_quoted_and_where_poses_are_missing() -> None:
     assert rows[peers.OURS][1].startswith("3.00 ± ") and rows[peers.OURS][3] == "hololens 2 of 6"
     assert rows["RTAB-Map 0.23 †"][1:4] == ["5.20", "10.2", "hololens 63 %"]
     assert failed.rows == [["redkitchen, Open3D, dense SLAM", "no memory"]]
+
+
+def test_earlier_results_of_other_systems_and_sequences_are_kept(tmp_path: Path) -> None:
+    runs = [run(peers.OURS, name, 0.02) for name in ("redkitchen", "desk")] + [run("ORB-SLAM3", "desk", 0.01)]
+    options = peers.Options(out=tmp_path)
+    with pytest.raises(ConfigError, match="no results 'peers'"):
+        peers.kept_rows(options, set())
+    record.write(results("peers", {"runs": runs, "quoted": []}), tmp_path)
+    kept = peers.kept_rows(options, {(peers.OURS, "desk")})
+    assert [(row["system"], row["source"]) for row in kept] == [(peers.OURS, "redkitchen"), ("ORB-SLAM3", "desk")]
+    assert all(row["commit"] == "0123456789ab" for row in kept)
+    (table,) = peers.sections({"figures": {"runs": kept, "quoted": []}})
+    assert table.note.endswith("of commits 012345678.")

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from benchmark_results import laid_out, results
+from benchmark_results import laid_out
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.run_folder.trajectory import write_trajectory
@@ -426,16 +426,3 @@ def test_tables_show_each_disturbance_and_the_suite() -> None:
     assert goals["kidnapped: a wrong pose is declared lost within 3 frames"] == "**no**"
     assert goals["kidnapped: found within 10 frames of a known view"] == "**no**"
     assert made["Failed"].rows == [["room, black 1, seed 0", "out of / memory"]]
-
-
-def test_two_checkouts_are_compared_row_by_row() -> None:
-    before = results("robustness", {"measured": "b" * 40, "runs": RUNS[:3], "p_off": None})
-    better = [run | {"silent": 0, "ate_m": 0.005} for run in RUNS[:3]]
-    now = results("robustness", {"measured": "c" * 40, "runs": better, "p_off": P_OFF})
-    section = tables.compared([before, now], "all")
-    rows = {row[0]: row[1:] for row in section.rows}
-    assert rows["none"] == ["–", "1.00 → 0.500", "0 → 0", "0 → 0", "100 → 100"]
-    assert rows["**all**"][3] == "3.3 → 0" and all(len(row) == len(section.columns) for row in section.rows)
-    suite = tables.compared([before, now], "suite")
-    assert [row[0] for row in suite.rows] == ["b" * 9, "c" * 9] and [row[-1] for row in suite.rows] == ["–", "1.00"]
-    assert all(len(row) == len(suite.columns) for row in suite.rows)

@@ -1,4 +1,4 @@
-"""Find the definitions of the tables of papers: one TOML file per table in presets/tables (docs/tables.md)."""
+"""Find the definitions of the tables of papers: one TOML file per table in `tables/` (docs/tables.md)."""
 
 import tomllib
 from pathlib import Path
