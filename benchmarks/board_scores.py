@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.config import Config
+from sigmasplat.config.presets import default_preset, preset
 from sigmasplat.data import se3
 from sigmasplat.data.selection import evenly_spread
 from sigmasplat.errors import SigmaSplatError, SourceError
@@ -20,7 +21,6 @@ from sigmasplat.plugins.evaluation.metrics.trajectory import associate, ate
 from sigmasplat.plugins.evaluation.metrics.views import scored_view
 from sigmasplat.plugins.evaluation.pose_covariance import WINDOW_FRAMES, score_pose_covariance
 from sigmasplat.plugins.evaluation.view_selection import working_frame
-from sigmasplat.plugins.papers import default_preset, preset
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.render import FieldRenderer
 from sigmasplat.run_folder.frames import RunFrames

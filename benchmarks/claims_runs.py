@@ -7,7 +7,9 @@ import numpy as np
 import torch
 from claims import Job
 from drift_rule import hops_of
+from finished_run import FinishedRun
 from localise import Search, disturbed
+from unseen_views import UnseenView, held_back_views
 from weights_runs import VIEWS, mean, registrations, rendered, true_submaps
 
 from sigmasplat.data import se3
@@ -15,13 +17,11 @@ from sigmasplat.fit.pose import fit_pose_adam
 from sigmasplat.fit.target import Target
 from sigmasplat.graph.registration import tracking_of
 from sigmasplat.input.source import Source
-from sigmasplat.plugins.evaluation.finished_run import FinishedRun
 from sigmasplat.plugins.evaluation.metrics.scored_view import ScoredView
 from sigmasplat.plugins.evaluation.metrics.splats import score_splats
 from sigmasplat.plugins.evaluation.metrics.trajectory import align_rigid, associate, score_path
 from sigmasplat.plugins.evaluation.metrics.uncertainty import spearman
 from sigmasplat.plugins.evaluation.metrics.views import sample_pixels, score_uncertainty
-from sigmasplat.plugins.evaluation.unseen_views import UnseenView, held_back_views
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.slam.slam import Slam
 

@@ -20,10 +20,10 @@ from sigmasplat.errors import BackendError
 from sigmasplat.fit.field import fit_field
 from sigmasplat.fit.pose import fit_pose_adam
 from sigmasplat.fit.target import Keyframe, Target
+from sigmasplat.plugins.cuda import launch as cuda_launch
+from sigmasplat.plugins.cuda.view import CudaView
 from sigmasplat.plugins.evaluation.metrics.trajectory import ate
 from sigmasplat.plugins.sources import SyntheticRoom
-from sigmasplat.render.cuda import launch as cuda_launch
-from sigmasplat.render.cuda.view import CudaView
 from sigmasplat.slam.slam import Slam
 
 FRAME = 100

@@ -17,7 +17,7 @@ import tyro
 from tables import Section
 
 from sigmasplat.errors import SigmaSplatError
-from sigmasplat.native.cuda import cubins
+from sigmasplat.plugins.cuda import cubins
 
 arg = tyro.conf.arg
 THREADS = 256

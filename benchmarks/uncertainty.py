@@ -1,11 +1,15 @@
-"""Score predicted variances at views held back from the map, on six sequences, with `sigmasplat bench uncertainty`.
+"""Score how well predicted variances match the errors of views held back from the map, and of the surface, on six
+sequences, beside simple baselines; score the covariance of poses and the probability of a wrong pose, too.
 
+Frames are held back from the map (input.hold_every) and rendered afterwards. Temperatures come from other sequences.
 Finished runs are kept in runs/bench/uncertainty/NAME and are not repeated while code and settings are unchanged.
 Writes benchmarks/results/<name>-<machine>.json; `python benchmarks/tables.py` writes its tables into the documents.
 
 example: python benchmarks/uncertainty.py --sources redkitchen livingroom --seeds 1 --limit 120 --set input.width=240
 """
 
+import statistics
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,23 +19,26 @@ import record
 import tables
 import tyro
 from ablation import short
+from finished_run import run_slam
 from tables import Section
+from uncertainty_files import SCORES, StudyFolder
+from uncertainty_samples import HELD_BACK, Job, Measured, Study, measure, study_config
 
 from sigmasplat.commands import options as described
-from sigmasplat.commands.bench_uncertainty import (
-    COLUMNS,
-    DEFAULT_PRESET,
-    FAILURE_COLUMNS,
-    POSE_COLUMNS,
-    Uncertainty,
-    failure_rows,
-    pose_rows,
-    written,
-)
 from sigmasplat.commands.input_options import Limit
-from sigmasplat.errors import SigmaSplatError
+from sigmasplat.commands.options import prepare_torch
+from sigmasplat.config.presets import default_preset
+from sigmasplat.config.ranges import Range
+from sigmasplat.config.text import split_settings
+from sigmasplat.errors import ConfigError, SigmaSplatError
+from sigmasplat.plugins.evaluation.pose_covariance import MOTIONS
+from sigmasplat.plugins.sources import open_source
+from sigmasplat.run.figures import number
+from sigmasplat.run.scene import open_scene
+from sigmasplat.run.terminal import Screen
 
 arg = tyro.conf.arg
+DEFAULT_PRESET = default_preset()
 ROOM = "synthetic:frames=240,noise=1,test_views=24,seed={seed}"
 SYNTHETIC = {"synthetic": ROOM, "synthetic, steady exposure": f"{ROOM},exposure_change=0"}
 """A different room for each seed. The test views have exposure gain 1; the frames do only if the exposure is steady."""
@@ -49,6 +56,8 @@ KEPT = (
     "best_scale",
     "nll_at_best_scale",
 )
+HoldEvery = Annotated[int, Range(2), arg(help="hold back every N-th frame from the map")]
+MostViews = Annotated[int, Range(1), arg(help="largest number of views that are scored, of each kind")]
 
 
 @dataclass(frozen=True)
@@ -60,8 +69,8 @@ class Options:
     settings: described.Settings = ()
     seeds: described.Runs = 3
     limit: Limit = None
-    hold_every: described.HoldEvery = 8
-    views: described.MostViews = 24
+    hold_every: HoldEvery = 8
+    views: MostViews = 24
     name: Annotated[str, arg(help="name of the results; use another name with other --set")] = "uncertainty"
     runs: Annotated[Path, arg(help="folder of finished runs")] = RUNS
     out: Annotated[Path, arg(help="folder of the results")] = record.RESULTS
@@ -70,12 +79,41 @@ class Options:
         """Return the folder of the samples."""
         return self.runs / record.slug(self.name)
 
-    def command(self) -> Uncertainty:
-        """Return the command to run."""
-        return Uncertainty(
-            tuple(map(located, self.sources)), self.preset, self.settings, self.seeds, self.limit, self.hold_every,
-            self.views, self.folder(), overwrite=True,
-        )  # fmt: skip
+    def study(self) -> Study:
+        """Return what to measure. Raises ConfigError on invalid values."""
+        if not self.sources:
+            raise ConfigError("no source given; give --sources")
+        config, given = study_config(self.preset, self.settings), tuple(split_settings(self.settings))
+        sources = tuple(dict.fromkeys(map(located, self.sources)))
+        return Study(sources, config, self.seeds, self.limit, self.hold_every, self.views, given)
+
+    def run(self, screen: Screen) -> None:
+        """Make the missing runs, and score all of them. Raises SigmaSplatError."""
+        study = self.study()
+        jobs, folder = study.jobs(), StudyFolder.create(self.folder(), study)
+        for job in jobs:
+            open_source(job.path, job.config.input)  # a wrong path fails now and not after hours
+        prepare_torch()
+        measured = []
+        for place, job in enumerate(jobs, 1):
+            found = folder.load(job)
+            if found is None:
+                screen.say(f"[{place}/{len(jobs)}] {job.source}, seed {job.seed}")
+                found = run_job(job, study.views, screen)
+                folder.save(job, found)
+            if not found.facts["views"][HELD_BACK]:
+                screen.warn(f"{job.source}, seed {job.seed}: no frame that was held back has a valid pose")
+            measured.append(found)
+        folder.write(jobs, measured)
+
+
+def run_job(job: Job, views: int, screen: Screen) -> Measured:
+    """Run SLAM with a job's settings and collect its samples."""
+    source, config = open_scene(job.path, job.config, job.given)
+    with screen.steps(len(source)) as show:
+        run = run_slam(config, source, show)
+    with screen.counting("views") as progress:
+        return measure(run, source, views, progress=progress)
 
 
 def located(name: str) -> str:
@@ -106,6 +144,72 @@ def _thinned(scores: dict[str, Any]) -> dict[str, Any]:
 
 
 # ---- tables ----
+
+
+MANY = 100.0
+"""A larger figure is shown without decimals."""
+
+
+def pose_rows(runs: Sequence[dict[str, Any]]) -> list[list[str]]:
+    """Return a row for each kind of motion that was scored: its name, and the cells of `POSE_COLUMNS`."""
+    rows = []
+    for kind, name in MOTIONS.items():
+        scores = [run["poses"][kind] for run in runs if run.get("poses") and run["poses"][kind]]
+        if scores:
+            rows.append([name, *(written([value(row) for row in scores], n) for _, n, value in POSE_COLUMNS)])
+    return rows
+
+
+def failure_rows(runs: Sequence[dict[str, Any]]) -> list[list[str]]:
+    """Return one row if the truth is known: the mean number of frames, and the cells of `FAILURE_COLUMNS`."""
+    scores = [run["failures"] for run in runs if run.get("failures")]
+    if not scores:
+        return []
+    frames = written([row["frames"] for row in scores], 0)
+    return [[frames, *(written([value(row) for row in scores], digits) for _, digits, value in FAILURE_COLUMNS)]]
+
+
+POSE_COLUMNS: tuple[tuple[str, int, Callable[[dict[str, Any]], Any]], ...] = (
+    ("motions", 0, lambda row: row["count"]),
+    ("NEES, mean", 2, lambda row: row["nees_mean"]),
+    ("NEES, median", 2, lambda row: row["nees_median"]),
+    ("in 90 %, %", 1, lambda row: _percent(row["coverage_90"])),
+    ("position in 90 %, %", 1, lambda row: _percent(row["position_coverage_90"])),
+    ("k of position", 2, lambda row: row["position_k"]),
+)
+FAILURE_COLUMNS: tuple[tuple[str, int, Callable[[dict[str, Any]], Any]], ...] = (
+    ("off by > 5 cm", 0, lambda row: row["off"]),
+    ("AUROC of p_off", 3, lambda row: row["auroc"]),
+    ("Brier", 4, lambda row: row["brier"]),
+)
+COLUMNS: tuple[tuple[str, int, Callable[[dict[str, Any]], Any]], ...] = (
+    ("NLL", 2, lambda row: row["before"]["nll"]),
+    ("T", 2, lambda row: row["temperature"]),
+    ("NLL after", 2, lambda row: row["after"]["nll"]),
+    ("AUCE", 3, lambda row: row["before"]["auce"]),
+    ("AUCE after", 3, lambda row: row["after"]["auce"]),
+    ("68 % after", 0, lambda row: _percent(row["after"]["coverage_68"])),
+    ("95 % after", 0, lambda row: _percent(row["after"]["coverage_95"])),
+    ("AUSE", 2, lambda row: row["ause"]),
+    ("Spearman", 2, lambda row: row["spearman"]),
+)
+"""Heads, digits and values of the columns."""
+
+
+def _percent(share: float | None) -> float | None:
+    return None if share is None else 100.0 * share
+
+
+def written(values: Sequence[float | None], digits: int) -> str:
+    """Write the mean of the known values, ± their standard deviation if there are several."""
+    known = [value for value in values if value is not None and value == value]
+    if not known:
+        return number(None, 0)
+    mean = statistics.fmean(known)
+    shown = number(mean, digits if abs(mean) < MANY else 0)
+    return (
+        shown if len(known) < 2 else f"{shown} ± {number(statistics.stdev(known), digits if abs(mean) < MANY else 0)}"
+    )
 
 
 def sections(measured: dict[str, Any]) -> list[Section]:
@@ -186,10 +290,10 @@ def main(options: Options) -> int:
     """Run, write the results, print them; exit code 2 if the options are invalid."""
     options.runs.mkdir(parents=True, exist_ok=True)
     try:
-        options.command().run()
+        options.run(Screen())
     except SigmaSplatError as problem:
         return program.refuse("uncertainty", problem)
-    figures = kept(record.read(options.folder() / "uncertainty.json"))
+    figures = kept(record.read(options.folder() / SCORES))
     print(tables.table(program.keep("uncertainty", figures, options, range(options.seeds))))
     return 0
 

@@ -19,9 +19,12 @@ import program
 import record
 import tyro
 from ablation import short
+from finished_run import FinishedRun, run_slam
 from numpy.typing import NDArray
 from tables import Section, significant
-from uncertainty import SOURCES, located
+from uncertainty import SOURCES, HoldEvery, MostViews, located
+from uncertainty_samples import Study, study_config
+from unseen_views import held_back_views
 
 from sigmasplat.commands import options as described
 from sigmasplat.commands.input_options import Limit
@@ -33,10 +36,7 @@ from sigmasplat.final.refinement import KeyframeReader
 from sigmasplat.final.uncertainty import FIRM, LIMIT, Samples, probe_samples, probe_views
 from sigmasplat.fit.splat_residuals import background_of, splat_residuals
 from sigmasplat.fit.target import Keyframe, Target
-from sigmasplat.plugins.evaluation.finished_run import FinishedRun, run_slam
 from sigmasplat.plugins.evaluation.metrics.uncertainty import calibration_scores, z_scores
-from sigmasplat.plugins.evaluation.uncertainty_benchmark import Study, study_config
-from sigmasplat.plugins.evaluation.unseen_views import held_back_views
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.render.backend import make_view
 from sigmasplat.uncertainty.calibration import fit_weights
@@ -67,8 +67,8 @@ class Options:
     sources: Annotated[tuple[str, ...], arg(help="sequences: names in the data folder, or paths")] = TAUGHT_BY
     settings: described.Settings = ("input.width=240",)
     limit: Limit = 100
-    hold_every: described.HoldEvery = 8
-    views: described.MostViews = 24
+    hold_every: HoldEvery = 8
+    views: MostViews = 24
     name: Annotated[str, arg(help="name of the results")] = "uncertainty-weights"
     fresh: Annotated[bool, arg(help="make all samples again")] = False
     runs: Annotated[Path, arg(help="folder of samples of finished runs")] = RUNS

@@ -4,7 +4,9 @@ from typing import Any
 
 import numpy as np
 import torch
+from finished_run import FinishedRun
 from numpy.typing import NDArray
+from unseen_views import UnseenView, held_back_views
 from weights import Job
 
 from sigmasplat.data import se3
@@ -16,11 +18,9 @@ from sigmasplat.graph.closer import LoopCloser
 from sigmasplat.graph.localisations import differs
 from sigmasplat.graph.registration import Registrar
 from sigmasplat.input.source import Source
-from sigmasplat.plugins.evaluation.finished_run import FinishedRun
 from sigmasplat.plugins.evaluation.metrics.scored_view import ScoredView
 from sigmasplat.plugins.evaluation.metrics.trajectory import associate, score_path
 from sigmasplat.plugins.evaluation.metrics.views import scored_view
-from sigmasplat.plugins.evaluation.unseen_views import UnseenView, held_back_views
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.render import FieldRenderer
 from sigmasplat.slam.slam import Slam

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from types import ModuleType
 
     import numpy as np
+    import torch
     from numpy.typing import NDArray
 
     from sigmasplat.config import Config, InputConfig, RenderConfig
@@ -100,12 +101,19 @@ class Output:
 
 @dataclass(frozen=True)
 class Backend:
-    """A device that renders and fits: its module with `project` and `blend`, its views, what it offers to the fits."""
+    """A device that renders and fits; `backend` and SIGMASPLAT_BACKEND name it.
+
+    operators(): the module with its `project` and `blend`; view(camera, options, variance): a view (`render/view.py`);
+    fits(): what it offers to the fits; options(options): those that it renders with, if it has not all of them;
+    device(): the device that holds its tensors, None = host memory.
+    """
 
     name: str
     operators: "Callable[[], ModuleType]"
     view: "Callable[[Camera, RenderConfig, bool], View]"
     fits: "Callable[[], DeviceFits]"
+    options: "Callable[[RenderConfig], RenderConfig] | None" = None
+    device: "Callable[[], torch.device] | None" = None
 
 
 @dataclass(frozen=True)
@@ -119,7 +127,8 @@ class Preset:
 Row = SourceFormat | Mask | DepthFilter | Output | Backend | Preset
 Kind = TypeVar("Kind", SourceFormat, Mask, DepthFilter, Output, Backend, Preset)
 BUILT_IN: dict[type, str] = {
-    SourceFormat: "sources", Output: "outputs.formats", Preset: "papers", Backend: "cuda", Mask: "", DepthFilter: "",
+    SourceFormat: "sources", Output: "outputs.formats", Preset: "papers", Backend: "cuda.backend", Mask: "",
+    DepthFilter: "",
 }  # fmt: skip
 """Where in `sigmasplat.plugins` the rows of each kind are: in a module, or in all modules of a package."""
 WORDS = {

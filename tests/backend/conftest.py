@@ -14,9 +14,9 @@ import torch
 
 from emulated_cuda import Emulator, rubbish, why_not
 from sigmasplat.errors import BackendError
+from sigmasplat.plugins.cuda import launch as cuda_launch
+from sigmasplat.plugins.cuda.raster import Raster
 from sigmasplat.render import Render, render
-from sigmasplat.render.cuda import launch as cuda_launch
-from sigmasplat.render.cuda.raster import Raster
 from stand_in import StandIn, library_in, standing_in
 
 LIBRARY = pytest.StashKey[Any]()
@@ -105,7 +105,7 @@ def _cpu(request: pytest.FixtureRequest) -> Backend:
 
 
 def _emulated(request: pytest.FixtureRequest) -> Backend:
-    from sigmasplat.render.cuda import operators as cuda
+    from sigmasplat.plugins.cuda import operators as cuda
 
     emulator: Emulator = request.getfixturevalue("emulator")
 
@@ -121,7 +121,7 @@ def _emulated(request: pytest.FixtureRequest) -> Backend:
 
 
 def _cuda(request: pytest.FixtureRequest) -> Backend:
-    from sigmasplat.render.cuda import operators as cuda
+    from sigmasplat.plugins.cuda import operators as cuda
 
     reason = cuda_launch.missing()
     if reason:

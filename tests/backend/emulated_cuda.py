@@ -14,10 +14,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from sigmasplat.native.cuda import cubins
-from sigmasplat.render.cuda import launch as cuda_launch
-from sigmasplat.render.cuda.launch import THREADS, Argument, laid_out
-from sigmasplat.render.cuda.raster import Raster
+from sigmasplat.plugins.cuda import cubins, launch as cuda_launch
+from sigmasplat.plugins.cuda.launch import THREADS, Argument, laid_out
+from sigmasplat.plugins.cuda.raster import Raster
 
 HERE = Path(__file__).parent / "emulation"
 FLAGS = [

@@ -10,8 +10,8 @@ from sigmasplat.config import RenderConfig
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
 from sigmasplat.fit.target import Keyframe
+from sigmasplat.plugins.cuda.view import CudaView
 from sigmasplat.render.cpu.view import CpuView
-from sigmasplat.render.cuda.view import CudaView
 from sigmasplat.render.reference.view import ReferenceView
 from splat_scenes import Scene, make
 

@@ -23,8 +23,8 @@ from torch.utils._pytree import tree_leaves, tree_map_only
 
 import sigmasplat
 from emulated_cuda import FLAGS, HERE, Emulator
-from sigmasplat.render.cuda import launch as cuda_launch
-from sigmasplat.render.cuda.launch import Argument
+from sigmasplat.plugins.cuda import launch as cuda_launch
+from sigmasplat.plugins.cuda.launch import Argument
 
 DEVICE, HOST = torch.device("cuda", 0), torch.device("cpu")
 SCALARS = {

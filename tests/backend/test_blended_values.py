@@ -6,9 +6,8 @@ from torch import Tensor
 
 from sigmasplat.config import RenderConfig
 from sigmasplat.data.field import COLUMNS, GaussianField
-from sigmasplat.render.backend import make_view
+from sigmasplat.render.backend import make_view, on_device
 from sigmasplat.render.blended_values import BlendedValues, blend_values
-from sigmasplat.render.render import on_device
 from sigmasplat.render.splat_sums import gather
 from splat_fields import params_of
 from splat_scenes import KINDS, WIDE, Scene, assert_same_vector, scene

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from sigmasplat.errors import BackendError
-from sigmasplat.native.cuda import cubins
+from sigmasplat.plugins.cuda import cubins
 
 pytest.importorskip("cuda.bindings.nvrtc", reason="cuda-bindings is not installed: pip install 'sigmasplat[gpu]'")
 

@@ -18,16 +18,16 @@ from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import COLUMNS, GaussianField
 from sigmasplat.fit.backends import step_for
-from sigmasplat.fit.cuda.descent import CudaTrackingLoss, descend_on_device
-from sigmasplat.fit.cuda.mapping_step import CudaStep
-from sigmasplat.fit.cuda.rows import CudaAccumulator
 from sigmasplat.fit.descent import Descent, descend
 from sigmasplat.fit.tracking_loss import tracking_gradient
+from sigmasplat.plugins.cuda import launch as cuda_launch, stages as cuda_stages
+from sigmasplat.plugins.cuda.descent import CudaTrackingLoss, descend_on_device
+from sigmasplat.plugins.cuda.mapping_step import CudaStep
+from sigmasplat.plugins.cuda.rows import CudaAccumulator
+from sigmasplat.plugins.cuda.view import CudaView
 from sigmasplat.render import render
 from sigmasplat.render.backend import make_view
 from sigmasplat.render.cpu.view import CpuView
-from sigmasplat.render.cuda import launch as cuda_launch, stages as cuda_stages
-from sigmasplat.render.cuda.view import CudaView
 from splat_fields import OPTIONS, crowd, exact_view, params_of, there_and_back
 from splat_fits import RATES, WEIGHTS, target_of
 from splat_scenes import KINDS, WIDE, assert_same_vector, scene

@@ -19,10 +19,10 @@ from sigmasplat.data.field import GaussianField
 from sigmasplat.fit.field import fit_field
 from sigmasplat.fit.pose import fit_pose_adam
 from sigmasplat.fit.target import Keyframe
+from sigmasplat.plugins.cuda import view as cuda_view
+from sigmasplat.plugins.cuda.view import CudaView
 from sigmasplat.plugins.sources import SyntheticRoom
 from sigmasplat.render.cpu.view import CpuView
-from sigmasplat.render.cuda import view as cuda_view
-from sigmasplat.render.cuda.view import CudaView
 from sigmasplat.slam.slam import Slam
 from splat_fields import OPTIONS, params_of
 from splat_fits import target_of

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from sigmasplat.errors import BackendError
-from sigmasplat.render.cuda.graph import Recorder, repeatable
+from sigmasplat.plugins.cuda.graph import Recorder, repeatable
 
 
 class Graph:

@@ -13,9 +13,8 @@ import torch
 
 from emulated_cuda import Emulator
 from sigmasplat.errors import BackendError
-from sigmasplat.native.cuda import cubins
-from sigmasplat.render.cuda import launch as cuda_launch, operators as cuda
-from sigmasplat.render.cuda.launch import THREADS, Device
+from sigmasplat.plugins.cuda import cubins, launch as cuda_launch, operators as cuda
+from sigmasplat.plugins.cuda.launch import THREADS, Device
 from splat_scenes import gradients, scene
 
 # Both before a test puts another driver in its place, or the import of one would put it back.

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from emulated_cuda import Emulator
-from sigmasplat.render.cuda.view import CudaView
+from sigmasplat.plugins.cuda.view import CudaView
 from splat_fields import CPU, OPTIONS, params_of, there_and_back
 from splat_scenes import Scene, scene
 from test_view import everything

@@ -10,10 +10,10 @@ import torch
 
 from emulated_cuda import Emulator
 from sigmasplat.data.field import GaussianField
-from sigmasplat.fit.cuda.mapping_step import CudaStep
-from sigmasplat.render.cuda import stages as cuda_stages
-from sigmasplat.render.cuda.stages import STAGES, Stages
-from sigmasplat.render.cuda.view import CudaView
+from sigmasplat.plugins.cuda import stages as cuda_stages
+from sigmasplat.plugins.cuda.mapping_step import CudaStep
+from sigmasplat.plugins.cuda.stages import STAGES, Stages
+from sigmasplat.plugins.cuda.view import CudaView
 from sigmasplat.slam.step_result import KERNELS
 from splat_fields import OPTIONS, params_of, there_and_back
 from splat_scenes import scene

@@ -16,16 +16,16 @@ from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.frame import Frame
 from sigmasplat.errors import BackendError
-from sigmasplat.fit.cuda import descent as cuda_descent
-from sigmasplat.fit.cuda.descent import CudaDescent, CudaTrackingLoss, descend_on_device
 from sigmasplat.fit.descent import Descent, descend
 from sigmasplat.fit.pose import fit_pose_adam
 from sigmasplat.fit.target import Target
 from sigmasplat.fit.tracking_loss import tracking_gradient
+from sigmasplat.plugins.cuda import descent as cuda_descent
+from sigmasplat.plugins.cuda.descent import CudaDescent, CudaTrackingLoss, descend_on_device
+from sigmasplat.plugins.cuda.view import CudaView
 from sigmasplat.render.cpu.view import CpuView
-from sigmasplat.render.cuda.view import CudaView
 from splat_fields import OPTIONS
-from splat_fits import DynamicDetector
+from splat_fits import Watch
 from splat_scenes import assert_same_vector
 from splat_wall import CAMERA, TRUTH, Array, lower_median, seen_from, wall
 from test_tracking_options import OFF, PAPER, damaged
@@ -354,7 +354,7 @@ def pairs_at(T_camera_world: Array) -> int:
 
 
 def test_pairs_that_cannot_be_numbered_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sigmasplat.render.cuda.raster.MOST_PAIRS", 100)
+    monkeypatch.setattr("sigmasplat.plugins.cuda.raster.MOST_PAIRS", 100)
     with pytest.raises(BackendError, match=r"\d+ pairs of splats and tiles are too many"):
         descended(3, 7)
 
@@ -366,7 +366,7 @@ def test_no_iteration_makes_the_host_wait() -> None:
     view = view_of()
     view.forward(wall(), TRUTH)
     descent = CudaDescent(wall(), view, shown(), TRUTH, dataclasses.replace(PAPER, uncertainty=True))
-    with DynamicDetector() as watch:
+    with Watch() as watch:
         descent.iterate()
     assert watch.reads == 0
 

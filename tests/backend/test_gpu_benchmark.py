@@ -11,7 +11,7 @@ import torch
 
 from emulated_cuda import Emulator
 from sigmasplat.errors import BackendError
-from sigmasplat.render.cuda import launch as cuda_launch
+from sigmasplat.plugins.cuda import launch as cuda_launch
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 

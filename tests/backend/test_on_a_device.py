@@ -22,13 +22,13 @@ from sigmasplat.fit.field import fit_field
 from sigmasplat.fit.pose import fit_pose_adam
 from sigmasplat.fit.target import Keyframe
 from sigmasplat.plugins.checks import installation
+from sigmasplat.plugins.cuda.view import CudaView
 from sigmasplat.plugins.sources import SyntheticRoom
 from sigmasplat.plugins.viewer.layers import render_layer
 from sigmasplat.plugins.viewer.live import LiveView
 from sigmasplat.plugins.viewer.snapshot import Snapshot
 from sigmasplat.render import FieldRenderer, render
 from sigmasplat.render.cpu.view import CpuView
-from sigmasplat.render.cuda.view import CudaView
 from sigmasplat.run_folder.state import read_state, write_state
 from sigmasplat.slam.saved_state import CLASSES, fixed, restore, state_of
 from sigmasplat.slam.slam import Slam

@@ -11,11 +11,11 @@ from sigmasplat.config import RenderConfig
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import COLUMNS, GaussianField
 from sigmasplat.errors import BackendError
+from sigmasplat.plugins.cuda.view import CudaView
 from sigmasplat.render import render
 from sigmasplat.render.backend import options_on
 from sigmasplat.render.blended_values import blend_values
 from sigmasplat.render.cpu.view import CpuView
-from sigmasplat.render.cuda.view import CudaView
 from sigmasplat.render.reference import operators as reference
 from splat_fields import CPU, crowd, exact_view, params_of, plane_gradients
 from splat_scenes import KINDS, WIDE, Scene, assert_same_vector, scene

@@ -57,7 +57,7 @@ def test_an_instruction_set_this_machine_has_not_is_refused(monkeypatch: pytest.
     ],
 )  # fmt: skip
 def test_the_environment_chooses_the_renderer_where_the_settings_say_auto(
-    monkeypatch: pytest.MonkeyPatch, switch: env.Backend, asked: str, expected: str
+    monkeypatch: pytest.MonkeyPatch, switch: str, asked: str, expected: str
 ) -> None:
     monkeypatch.setattr(env, "switches", lambda: env.Switches(backend=switch))
     wanted = {"cpu": (cpu, CpuView), "reference": (reference, ReferenceView)}[expected]

@@ -76,7 +76,7 @@ def test_a_preset_is_values_and_a_setting_is_a_field(package: Path, run: Callabl
 
 def test_a_rule_is_a_function_and_a_descriptor_a_class(package: Path, run: Callable[[str], None]) -> None:
     pytest.importorskip("sigmasplat.native._core", reason="sigmasplat.native._core is not built")
-    with (package / "tracking" / "rules.py").open("a", encoding="utf-8") as rules:
+    with (package / "tracking" / "keyframe_rule.py").open("a", encoding="utf-8") as rules:
         rules.write("\n\ndef is_keyframe(*arguments):\n    return True\n")
     loops = package / "graph"
     with (package / "tracking" / "descriptors.py").open("a", encoding="utf-8") as descriptors:

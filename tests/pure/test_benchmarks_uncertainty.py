@@ -77,8 +77,10 @@ def test_poses_and_failures_have_tables_of_their_own() -> None:
     assert all(len(section.columns) == len(row) for section in (of_poses, of_failures) for row in section.rows)
 
 
-def test_options_are_those_of_the_command(tmp_path: Path) -> None:
+def test_options_say_what_to_measure(tmp_path: Path) -> None:
     options = uncertainty.Options(sources=("synthetic",), seeds=2, limit=30, runs=tmp_path)
-    command = options.command()
-    assert "{seed}" in command.sources[0] and command.limit == 30 and command.seeds == 2
-    assert command.out == tmp_path / "uncertainty" and command.overwrite
+    jobs = options.study().jobs()
+    assert [(job.seed, f"seed={job.seed}" in job.path, job.config.input.limit) for job in jobs] == [
+        (0, True, 30), (1, True, 30),
+    ]  # fmt: skip
+    assert options.folder() == tmp_path / "uncertainty"

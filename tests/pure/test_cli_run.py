@@ -31,8 +31,8 @@ from sigmasplat.data.submap import SubmapStore
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SigmaSplatError, SourceError
 from sigmasplat.input.source import Source
+from sigmasplat.plugins.cuda import stages as cuda_stages
 from sigmasplat.plugins.outputs.meshes.mesh_files import write_mesh
-from sigmasplat.render.cuda import stages as cuda_stages
 from sigmasplat.run.session import Session
 from sigmasplat.run.terminal import Screen
 from sigmasplat.run_folder.frames import noted_up

@@ -178,10 +178,15 @@ def test_environment_values_that_mean_nothing_are_refused() -> None:
         ("SIGMASPLAT_THREADS", "1.5"),
         ("SIGMASPLAT_THREADS", "²"),
         ("SIGMASPLAT_ISA", "sse9"),
-        ("SIGMASPLAT_BACKEND", "gpu"),
     ]:
         with pytest.raises(ConfigError, match=f"{name} is {text!r}; give"):
             env.read({name: text})
+
+
+def test_a_backend_of_another_name_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"no backend 'cpuu' \(did you mean cuda|no backend 'cpuu'"):
+        Config(backend="cpuu").checked()
+    assert Config(backend="cuda").checked().backend == "cuda"
 
 
 def _python(code: str, **environment: str) -> str:

@@ -4,14 +4,15 @@ import ast
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 from sigmasplat.fit import losses
-from sigmasplat.fit.backends import DEVICES
+from sigmasplat.fit.backends import fits_of
 from sigmasplat.fit.fused_terms import PIXEL_TERMS, SHAPE_TERMS, fused_terms, pixel_weights
-from sigmasplat.render.backend import BACKENDS
+from sigmasplat.render.backend import backend_names
 
 PACKAGE = Path(__file__).parents[2] / "src" / "sigmasplat"
-MAY_CHOOSE = ("render/", "native/", "fit/cpu/", "fit/cuda/", "fit/backends.py", "fit/fused_terms.py")
+MAY_CHOOSE = ("render/", "native/", "fit/cpu/", "plugins/cuda/", "fit/backends.py", "fit/fused_terms.py")
 """Where code may depend on the device."""
 MAY_NAME = (*MAY_CHOOSE, "config/__init__.py", "env.py", "plugins/checks/installation.py", "run_folder/state.py")
 """Those, and what reads the setting, describes the machine, or puts tensors back where they were."""
@@ -99,7 +100,9 @@ def test_the_checks_notice_what_they_are_for() -> None:
 
 
 def test_every_backend_has_a_row() -> None:
-    assert set(DEVICES) == set(BACKENDS) - {"auto"}
+    assert backend_names() == ["cpu", "reference", "cuda"]
+    offered = [fits_of(SimpleNamespace(backend=name)) for name in backend_names()]
+    assert len({id(fits) for fits in offered}) == 3 and [fits.aligns for fits in offered] == [True, False, True]
 
 
 def test_fused_terms_are_in_the_order_of_the_kernels_struct() -> None:

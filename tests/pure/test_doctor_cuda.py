@@ -3,9 +3,8 @@
 import pytest
 
 from sigmasplat.errors import BackendError
-from sigmasplat.native.cuda import cubins
 from sigmasplat.plugins.checks import installation
-from sigmasplat.render.cuda import launch as cuda_launch
+from sigmasplat.plugins.cuda import cubins, launch as cuda_launch
 
 
 def cuda_findings() -> dict[str, installation.Finding]:

@@ -10,7 +10,6 @@ import tyro
 
 from sigmasplat.commands import options
 from sigmasplat.commands.bench_table import PaperTable
-from sigmasplat.commands.bench_uncertainty import Uncertainty
 from sigmasplat.commands.input_options import Limit
 from sigmasplat.commands.options import prepare_torch
 from sigmasplat.config.presets import default_preset
@@ -96,13 +95,11 @@ class Ablation:
 
 def bench(
     which: Annotated[
-        Annotated[Ablation, tyro.conf.subcommand("ablation")]
-        | Annotated[Uncertainty, tyro.conf.subcommand("uncertainty")]
-        | Annotated[PaperTable, tyro.conf.subcommand("table")],
+        Annotated[Ablation, tyro.conf.subcommand("ablation")] | Annotated[PaperTable, tyro.conf.subcommand("table")],
         tyro.conf.arg(name="", prefix_name=False),
     ],
 ) -> int:
-    """Measure over many runs: what each use of uncertainty contributes, how good it is, and the tables of papers.
+    """Measure over many runs: what each use of uncertainty contributes, and the tables of papers.
 
     example: sigmasplat bench ablation data/kitchen --seeds 5
     """

@@ -56,9 +56,6 @@ SourcePaths = Annotated[
 ]
 Seeds = Annotated[From1, arg(metavar="N", help="number of runs of each variant, with seeds 0 to N − 1")]
 Runs = Annotated[From1, arg(metavar="N", help="number of runs of each sequence, with seeds 0 to N − 1")]
-HoldEvery = Annotated[int, Range(2), arg(metavar="N", help="hold back every N-th frame from the map")]
-MostViews = Annotated[From1, arg(metavar="N", help="largest number of views that are scored, of each kind")]
-StudyFolder = Annotated[Path, arg(metavar="DIR", help="folder of the results; finished runs in it are reused")]
 Tau = Annotated[float, Range(0, open_below=True), arg(metavar="T", help="τ, the same for every weight and sequence")]
 WithoutVariance = Annotated[
     bool, arg(help="also run without learning any variance, as a reference", help_behavior_hint="")

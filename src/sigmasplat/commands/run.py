@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from sigmasplat.run.finished_map import FinishedMap
     from sigmasplat.run.protocols import Callback
     from sigmasplat.run.resume import StartPoint
-    from sigmasplat.run.session import Outcome
     from sigmasplat.run.terminal import Screen
     from sigmasplat.run_folder.runs import RunFolder
 
@@ -247,15 +246,13 @@ def _run_and_score(
 ) -> int:
     """Run the session, then score it, and keep showing it in the viewer until Ctrl-C; return the exit code.
 
-    realtime: whether frames are tracked when they arrive, on two clocks.
-
-    Raises KeyboardInterrupt if Ctrl-C came before the first frame was done.
+    realtime: track frames when they arrive. Raises KeyboardInterrupt if Ctrl-C came before the first frame was done.
     """
     from sigmasplat.plugins.checks.motion import MotionWatch
+    from sigmasplat.plugins.cuda import stages as cuda_stages
     from sigmasplat.plugins.sources.arrivals import Arrivals
     from sigmasplat.plugins.sources.live import LiveSource
     from sigmasplat.realtime.system import RealTime
-    from sigmasplat.render.cuda import stages as cuda_stages
     from sigmasplat.run.resume import RefinementFile, StateFile
     from sigmasplat.run.session import Session
 
@@ -278,21 +275,22 @@ def _run_and_score(
         session.watch = robot.watch if robot else motion if not (system or source.live) else session.watch
         session.later = system.between_frames if system else session.later
         outcome = session.execute()
-    if outcome.status == "interrupted" and not outcome.frames:
+    stopped = outcome.status == "interrupted"
+    if stopped and not outcome.frames:
         raise KeyboardInterrupt  # the folder has no results, and no state to resume from
     if run_options.profile:
         screen.profile(folder.read_profile())
     warn_at_the_end(screen, source, read, folder, motion)
-    if outcome.status == "interrupted":
-        _say_interrupted(screen, outcome, folder)
+    if stopped:
+        kept = f"interrupted after {outcome.summary()}; the trajectory, map and checkpoint so far are in {folder.path}"
+        screen.next_commands([f"sigmasplat resume {folder.path}"], kept)
         return INTERRUPTED
     if isinstance(source, LiveSource):
         source = source_of(folder, None)  # the steps below read the recording
     if run_options.evaluate:
         score(screen, folder, source)
     else:
-        screen.say(f"{outcome.summary()}: {folder.path}")
-        screen.next_commands([f"sigmasplat eval {folder.path}"])
+        screen.next_commands([f"sigmasplat eval {folder.path}"], f"{outcome.summary()}: {folder.path}")
     if viewer:
         keep_showing(screen, viewer, folder, source)
     return OK
@@ -320,11 +318,3 @@ def _progress(
         if system:
             readers = [BetweenFrames(reader, system.between_frames) for reader in readers]
         yield CallbackList(steps, *logs, *readers)
-
-
-def _say_interrupted(screen: "Screen", outcome: "Outcome", folder: "RunFolder") -> None:
-    """Print what an interrupted run has kept, and how to resume it."""
-    screen.say(
-        f"interrupted after {outcome.summary()}; the trajectory, map and checkpoint so far are in {folder.path}; "
-        f"to resume: sigmasplat resume {folder.path}"
-    )

@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from sigmasplat.config.densify import DensifyConfig
 from sigmasplat.config.features import FeatureConfig
@@ -21,12 +21,17 @@ from sigmasplat.config.surface import SurfaceConfig
 from sigmasplat.config.uncertainty import UncertaintyConfig
 from sigmasplat.errors import ConfigError
 from sigmasplat.files.structured import read_json
+from sigmasplat.registry import Backend, named
 
 __all__ = [
     "RECORDED_POSES", "Config", "DensifyConfig", "FeatureConfig", "FinalConfig", "InputConfig", "LoopConfig",
     "MappingConfig", "MovingConfig", "RealTimeConfig", "RecoveryConfig", "RegistrationConfig", "RenderConfig",
     "SeedConfig", "SubmapConfig", "SurfaceConfig", "TrackingConfig", "UncertaintyConfig",
 ]  # fmt: skip
+
+
+OWN_BACKENDS = ("auto", "cpu", "cuda", "reference")
+"""The values of `backend` that need no plug-in of others."""
 
 
 @dataclass(frozen=True)
@@ -38,9 +43,9 @@ class Config:
     """Name of these settings in reports and folder names: the name of the preset."""
     seed: Count = 0
     """Seed of all random numbers. Runs with other seeds show how much a result depends on chance."""
-    backend: Literal["auto", "cpu", "cuda", "reference"] = "auto"
+    backend: str = "auto"
     """Renderer: auto = the value of SIGMASPLAT_BACKEND if it is set, else cpu; cuda needs an NVIDIA GPU; reference is
-    slow plain torch, for machines without the compiled kernels."""
+    slow plain torch, for machines without the compiled kernels; or the name of a plug-in."""
     input: InputConfig = field(default_factory=InputConfig)
     render: RenderConfig = field(default_factory=RenderConfig)
     seeding: SeedConfig = field(default_factory=SeedConfig)
@@ -69,7 +74,10 @@ class Config:
         return dataclasses.replace(self, **new)
 
     def checked(self) -> "Config":
-        """Return the settings. Raises ConfigError if some of them exclude each other."""
+        """Return the settings. Raises ConfigError if no backend has the name that they ask for."""
+        asked = self.backend
+        if asked not in OWN_BACKENDS:
+            named((Backend,), asked)
         return self
 
     def to_dict(self) -> dict[str, Any]:

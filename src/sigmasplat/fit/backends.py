@@ -1,8 +1,9 @@
-"""List what each backend offers to the fits. In `fit` and the layers above, only this module chooses by device."""
+"""List what each backend offers to the fits. In `fit` and the layers above, only this module chooses by device.
+Plug-ins add other devices."""
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from typing import Protocol
 
 import numpy as np
@@ -13,15 +14,13 @@ from sigmasplat.fit.cpu import adam as cpu_adam, images as cpu_images, tracking_
 from sigmasplat.fit.cpu.mapping_step import CompiledStep
 from sigmasplat.fit.cpu.reference_maps import reference_maps as cpu_reference_maps
 from sigmasplat.fit.cpu.view_dependent import CompiledViewDependentStep
-from sigmasplat.fit.cuda import descent as cuda_descent, images as cuda_images, rows as cuda_rows
-from sigmasplat.fit.cuda.mapping_step import CudaStep
-from sigmasplat.fit.cuda.view_dependent import CudaViewDependentStep
 from sigmasplat.fit.descent import descend
 from sigmasplat.fit.fused_terms import fused_terms
 from sigmasplat.fit.interface import DeviceFits, MappingStep, Twist, Weights
 from sigmasplat.fit.mapping_step import OwnTermsStep, TorchStep
-from sigmasplat.fit.reference_maps import reference_arrays, reference_maps
+from sigmasplat.fit.reference_maps import reference_arrays
 from sigmasplat.fit.view_dependent import ImageStep, ViewDependentStep
+from sigmasplat.registry import Backend, rows
 from sigmasplat.render.cpu.view import CpuView
 from sigmasplat.render.view import View
 from sigmasplat.types import Matrix
@@ -61,18 +60,7 @@ CPU = replace(
     reference_maps=cpu_reference_maps,
     aligns=True,
 )
-CUDA = replace(
-    TORCH,
-    mapping_step=CudaStep,
-    view_dependent_step=CudaViewDependentStep,
-    to_host=cuda_rows.to_host,
-    descend=cuda_descent.descend_on_device,
-    reference_maps=reference_maps,
-    live_planes=cuda_images.live_planes,
-    images=cuda_images.CUDA_IMAGES,
-    aligns=True,
-)
-DEVICES = {"reference": TORCH, "cpu": CPU, "cuda": CUDA}
+OWN = {"reference": TORCH, "cpu": CPU}
 
 
 class OnBackend(Protocol):
@@ -84,7 +72,14 @@ class OnBackend(Protocol):
 
 def fits_of(on: OnBackend) -> DeviceFits:
     """Return the functions that the backend of a view or a pyramid offers to the fits."""
-    return DEVICES[on.backend]
+    return OWN[on.backend] if on.backend in OWN else _added(on.backend)
+
+
+@cache
+def _added(name: str) -> DeviceFits:
+    """Return what the backend of a plug-in offers."""
+    fits: DeviceFits = next(row for row in rows(Backend) if row.name == name).fits()
+    return fits
 
 
 def step_for(view: View, weights: Weights, degree: int) -> MappingStep:

@@ -1,11 +1,9 @@
 """Choose the renderer: the kernels of a device, or their definition in plain torch.
 
 Only this module and the table of the fits (fit/backends.py) choose by device. The table uses the backend name that a
-view gets here.
+view gets here. Other devices are plug-ins (`registry.Backend`), CUDA among them.
 """
 
-import warnings
-from dataclasses import replace
 from types import ModuleType
 
 import torch
@@ -13,23 +11,36 @@ import torch
 from sigmasplat import env
 from sigmasplat.config import RenderConfig
 from sigmasplat.data.camera import Camera
+from sigmasplat.data.field import GaussianField, Rows
 from sigmasplat.errors import BackendError
+from sigmasplat.registry import Backend, rows
 from sigmasplat.render.view import View
 
-BACKENDS = ("auto", "cpu", "cuda", "reference")
+OWN = ("cpu", "reference")
+"""The backends that are no plug-ins."""
+
+
+def backend_names() -> list[str]:
+    """List the names of all backends."""
+    return [*OWN, *(row.name for row in rows(Backend))]
+
+
+def backend_row(name: str) -> Backend | None:
+    """Return the plug-in of a backend by name; None for those of this package's core."""
+    return None if name in OWN else next(row for row in rows(Backend) if row.name == name)
 
 
 def backend_name(asked: str, device: torch.device | None = None) -> str:
-    """Return "cpu", "cuda" or "reference" for a requested backend.
+    """Return the name of the backend that is used for a requested one.
 
     "auto" means the value of SIGMASPLAT_BACKEND if it is set, else the kernels of the device that holds the tensors,
     else those of the CPU. Raises BackendError if the name is unknown.
     """
     name = env.switches().backend if asked == "auto" else asked
-    if name not in BACKENDS:
-        raise BackendError(f"unknown backend {name!r} (known: {', '.join(BACKENDS)})")
     if name == "auto":
-        return "cuda" if device is not None and device.type == "cuda" else "cpu"
+        return "cpu" if device is None or device.type == "cpu" else device.type
+    if name not in OWN and name not in backend_names():
+        raise BackendError(f"unknown backend {name!r} (known: auto, {', '.join(backend_names())})")
     return name
 
 
@@ -39,14 +50,12 @@ def backend_module(asked: str, device: torch.device | None = None) -> ModuleType
     Raises BackendError if it is unknown or not built.
     """
     name = backend_name(asked, device)
+    if row := backend_row(name):
+        return row.operators()
     if name == "reference":
         from sigmasplat.render.reference import operators as reference
 
         return reference
-    if name == "cuda":
-        from sigmasplat.render.cuda import operators as cuda
-
-        return cuda
     try:
         from sigmasplat.render.cpu import operators as cpu
     except ImportError as problem:
@@ -58,25 +67,31 @@ def backend_module(asked: str, device: torch.device | None = None) -> ModuleType
 
 
 def options_on(backend: str, options: RenderConfig) -> RenderConfig:
-    """Return the options that a backend (by name) renders with: CUDA has only `render.depth=center`, and warns."""
-    if backend != "cuda" or options.depth == "center":
-        return options
-    warnings.warn("render.depth=ray does not run on CUDA yet; depth is that of the splats' centres", stacklevel=3)
-    return replace(options, depth="center")
+    """Return the options that a backend (by name) renders with; a device that has not all of them warns."""
+    row = backend_row(backend)
+    return options if row is None or row.options is None else row.options(options)
 
 
 def make_view(backend: str, camera: Camera, options: RenderConfig, variance: bool = True) -> View:
-    """Make a view on a backend by name (one of `BACKENDS`). Raises BackendError as `backend_module` does."""
+    """Make a view on a backend by name, or "auto". Raises BackendError as `backend_module` does."""
     backend_module(backend)  # raises BackendError if the kernels are missing
     name = backend_name(backend)
+    if row := backend_row(name):
+        return row.view(camera, options, variance)
     if name == "reference":
         from sigmasplat.render.reference.view import ReferenceView
 
         return ReferenceView(camera, options, variance)
-    if name == "cuda":
-        from sigmasplat.render.cuda.view import CudaView
-
-        return CudaView(camera, options_on(name, options), variance)
     from sigmasplat.render.cpu.view import CpuView
 
     return CpuView(camera, options, variance)
+
+
+def on_device(field: GaussianField, backend: str) -> GaussianField:
+    """Return the parts of a field that a render needs, in memory that the backend can read, without optimiser state."""
+    row = backend_row(backend_name(backend, field.params.device))
+    if row is None or row.device is None or field.params.device.type != "cpu":
+        return field
+    device = row.device()
+    attributes = {name: Rows(attribute.params.to(device)) for name, attribute in field.attributes.items()}
+    return GaussianField(field.params.to(device), attributes=attributes)

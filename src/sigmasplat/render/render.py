@@ -10,11 +10,10 @@ from torch import Tensor
 
 from sigmasplat.config import RenderConfig
 from sigmasplat.data.camera import Camera
-from sigmasplat.data.field import COLUMNS, GaussianField, Rows
+from sigmasplat.data.field import COLUMNS, GaussianField
 from sigmasplat.data.harmonics import view_colors
-from sigmasplat.render.backend import backend_module, backend_name, options_on
+from sigmasplat.render.backend import backend_module, backend_name, on_device, options_on
 from sigmasplat.render.channels import features_of, variance_of
-from sigmasplat.render.cuda import launch as cuda_launch
 from sigmasplat.render.low_pass import as_refined
 from sigmasplat.render.ray_depth import depth_at, depth_of, plane_features
 from sigmasplat.render.reference.operators import depth_slopes
@@ -52,15 +51,6 @@ def colors_from(field: GaussianField, T_camera_world: Tensor, rows: Tensor | Non
     T, harmonics = T_camera_world.to(field.params), field.attributes["harmonics"].params
     position = -(T[:3, :3] * T[:3, 3:]).sum(0)
     return view_colors(colors, harmonics if rows is None else harmonics[rows], params[:, COLUMNS["means"]], position)
-
-
-def on_device(field: GaussianField, backend: str) -> GaussianField:
-    """Return the parts of a field that a render needs, in memory that the backend can read, without optimiser state."""
-    if backend_name(backend, field.params.device) != "cuda" or field.params.device.type != "cpu":
-        return field
-    device = cuda_launch.this_device()
-    attributes = {name: Rows(attribute.params.to(device)) for name, attribute in field.attributes.items()}
-    return GaussianField(field.params.to(device), attributes=attributes)
 
 
 def render(

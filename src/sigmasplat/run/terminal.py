@@ -94,8 +94,10 @@ class Screen:
             table.add_row(*row)
         self.out.print(table)
 
-    def next_commands(self, commands: Iterable[str]) -> None:
-        """Print what to do next, one command a line."""
+    def next_commands(self, commands: Iterable[str], result: str = "") -> None:
+        """Print a result in one line, and what to do next, one command a line."""
+        if result:
+            self.say(result)
         for number, command in enumerate(commands):
             self.say(f"{'      ' if number else 'next: '}{command}")
 

@@ -12,7 +12,7 @@ KERNEL drop_pairs(Pairs pairs, int n, int* counts) {
     if (i < n && *pairs.total > pairs.room) counts[i] = 0;
 }
 
-struct Descending {                        // layout: fit/cuda/descent.py
+struct Descending {                        // layout: plugins/cuda/descent.py
     double numbers[7], moment1[9], moment2[9];        // pose parameters, rotation first; Adam's moments, exposure's last
     double exposure[2], best_exposure[2];             // (a, b)
     double T[12], best_T[12];                         // T_camera_world, rows of [R | t]: now, and at the smallest loss

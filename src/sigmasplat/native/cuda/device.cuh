@@ -1,5 +1,5 @@
 // The functions that splat.h needs from its number type, for one float of a GPU thread, and the layouts shared by the
-// CUDA kernels. There is one program per feature count: FEATURES is defined on compilation (native/cuda/cubins.py lists
+// CUDA kernels. There is one program per feature count: FEATURES is defined on compilation (plugins/cuda/cubins.py lists
 // the counts).
 #pragma once
 #include "sums.cuh"

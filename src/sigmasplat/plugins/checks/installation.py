@@ -73,8 +73,7 @@ def check_cuda() -> Iterator[Finding]:
     import torch
 
     from sigmasplat.errors import BackendError
-    from sigmasplat.native.cuda import cubins
-    from sigmasplat.render.cuda import launch as cuda_launch
+    from sigmasplat.plugins.cuda import cubins, launch as cuda_launch
 
     try:
         compiler = cubins.compiler_version()
@@ -95,7 +94,7 @@ def check_driver(compiler: str) -> Finding:
     """Compare the versions of driver and compiler: the driver must have the same major version, or a newer one."""
     from cuda.bindings import driver
 
-    from sigmasplat.native.cuda import cubins
+    from sigmasplat.plugins.cuda import cubins
 
     version = driver.cuDriverGetVersion()[1]
     enough = version // 1000 >= int(compiler.split(".")[0])
@@ -108,7 +107,7 @@ def _device(device: Any) -> Iterator[Finding]:
     import torch
 
     from sigmasplat.errors import BackendError
-    from sigmasplat.native.cuda import cubins
+    from sigmasplat.plugins.cuda import cubins
 
     about = torch.cuda.get_device_properties(device)
     architecture = cubins.architecture_of((about.major, about.minor))

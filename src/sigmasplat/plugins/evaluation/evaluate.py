@@ -37,8 +37,6 @@ from sigmasplat.run_folder.trajectory import write_trajectory
 from sigmasplat.types import Progress, no_progress
 
 Log = list[dict[str, Any]]
-LIKELY = 0.5
-"""The report names a believed frame whose `p_off` is larger."""
 
 
 def evaluate(
@@ -59,16 +57,15 @@ def evaluate(
     """Score trajectory, map and uncertainty of a run against its source, and return the metrics written.
 
     Path and views are scored on the frames whose pose is valid: those of trajectory.txt, without lost frames.
-    Training views are the run's keyframes; held-out views are the frames that no map was fitted to. At most
-    `views_per_kind` of each are scored, evenly spread. They are rendered from the final map at the estimated poses and
-    the run's working resolution, with `renderer` or the run's render settings. If the run kept its submaps, each view
-    is also rendered from the submap of its frame. If the run has uncertainty.json and no `renderer` is given, the
-    predictive variances are scored too. LPIPS needs its network. With `full_resolution` the views are also scored at
-    the size of the recording, else at that of the final map's last stage. Calls `progress(done, total)` with views.
-    With `mesh` the keyframes are fused into mesh.ply, which is scored against `true_mesh`, in the world frame of the
-    truth, or the source's true surface, with `random_views` for its depth, and also with gaps up to `fill_gaps_m`
-    closed. Raises RunError if the run stopped before it had a map; SourceError if truth and run share no timestamps,
-    after everything else has been written.
+    Training views are keyframes; no map was fitted to held-out views. At most `views_per_kind` of each are scored,
+    evenly spread. They are rendered from the final map at the estimated poses and the run's working resolution, with
+    `renderer` or the run's render settings. If the run kept its submaps, each view is also rendered from the submap of
+    its frame. If the run has uncertainty.json and no `renderer` is given, the predictive variances are scored too. With
+    `full_resolution` the views are also scored at the size of the recording, else at that of the final map's last
+    stage. Calls `progress(done, total)` with views. With `mesh` the keyframes are fused into mesh.ply, which is scored
+    against `true_mesh`, in the world frame of the truth, or the source's true surface, with `random_views` for its
+    depth, and also with gaps up to `fill_gaps_m` closed. Raises RunError if the run stopped before it had a map;
+    SourceError if truth and run share no timestamps, after everything else has been written.
     """
     frames, field = _read_frames(run), run.read_map()
     records, log = frames.log, frames.posed_log()
@@ -97,9 +94,8 @@ def evaluate(
     show_moving(strips, source, config.input, run.submaps, records)
     run.write_metrics(metrics)
     plan = report_plan(run, frames.path, source.camera) if standard else None
-    unsure = [frames.log[row]["index"] for row in frames.rows if frames.p_off[row] > LIKELY]
-    plots, problems = _draw_plots(run, frames, known), [str(problem)] if problem else []
-    write_page(run, metrics, strips.figures, plots, problems, plan, unsure)
+    figures, warnings = strips.figures, [str(problem)] if problem else []
+    write_page(run, metrics, figures, _draw_plots(run, frames, known), warnings, plan, frames)
     if problem:
         raise problem
     return metrics

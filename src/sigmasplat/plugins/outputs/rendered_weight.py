@@ -8,8 +8,8 @@ from sigmasplat.data import se3
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.selection import evenly_spread
 from sigmasplat.plugins.outputs.run_reader import RunReader
+from sigmasplat.render.backend import on_device
 from sigmasplat.render.blended_values import blend_values
-from sigmasplat.render.render import on_device
 
 MOST_VIEWS = 60
 """At most this many poses of the path, evenly spread, are rendered."""

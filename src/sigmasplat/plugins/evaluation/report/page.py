@@ -2,7 +2,7 @@
 
 import json
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 from sigmasplat.config import Config
@@ -19,8 +19,11 @@ from sigmasplat.plugins.outputs.drawing import plot
 from sigmasplat.plugins.outputs.floorplan.floor_plan import FloorPlan
 from sigmasplat.plugins.outputs.floorplan.picture import draw_floor_plan, draw_narrow_floor_plan
 from sigmasplat.plugins.outputs.plan import run_floor_plan
+from sigmasplat.run_folder.frames import RunFrames
 from sigmasplat.run_folder.runs import RunFolder
 
+LIKELY = 0.5
+"""The page names valid frames whose `p_off` is larger."""
 SECONDS_SIZE = (plot.SIZE[0], 300)
 
 
@@ -31,10 +34,10 @@ def write_page(
     plots: dict[str, str],
     warnings: list[str],
     plan: FloorPlan | None = None,
-    unsure: Sequence[int] = (),
+    frames: RunFrames | None = None,
 ) -> None:
     """Write report.html from metrics and pictures; `strips`: panels of views by heading, `plots`: captions by name,
-    `unsure`: believed images that are probably off by more than 5 cm.
+    `frames`: to name those whose pose is doubtful.
 
     Raises RunError if a picture cannot be read or the page cannot be written.
     """
@@ -42,6 +45,7 @@ def write_page(
     if plan is not None:
         _write_plan(run, plan)
         plots = plots | {"plan": "The map from above. Numbered circles are regions to scan again, the largest first."}
+    unsure = [] if frames is None else [frames.log[i]["index"] for i in frames.rows if frames.p_off[i] > LIKELY]
     found = advice(metrics, rerun_command(config, facts), config.to_dict())
     contents = Contents(
         title=f"SigmaSplat · {metrics.get('source')}",

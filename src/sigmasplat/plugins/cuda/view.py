@@ -8,9 +8,9 @@ from sigmasplat.config import RenderConfig
 from sigmasplat.config.sensors import SensorModel
 from sigmasplat.data.camera import Camera
 from sigmasplat.errors import BackendError
-from sigmasplat.render.cuda import launch as cuda_launch
-from sigmasplat.render.cuda.raster import Planes, Raster
-from sigmasplat.render.cuda.stages import Stages
+from sigmasplat.plugins.cuda import launch as cuda_launch
+from sigmasplat.plugins.cuda.raster import Planes, Raster
+from sigmasplat.plugins.cuda.stages import Stages
 from sigmasplat.render.kernel_params import view_params
 from sigmasplat.render.view import Layers
 from sigmasplat.types import Matrix
@@ -20,7 +20,7 @@ class CudaView:
     """A view on the CUDA kernels: `View` with planes of exactly the image's size, on a device.
 
     The host waits for the device only at the end of a backward pass, when it reads the twist. `seconds` stay 0 unless
-    `measure` (render/cuda/stages.py) was called; reading them waits for the device.
+    `measure` (plugins/cuda/stages.py) was called; reading them waits for the device.
     """
 
     backend = "cuda"

@@ -1,4 +1,4 @@
-"""bench uncertainty: statistics of splats, predictors, temperatures, and the command on a tiny room."""
+"""benchmarks/uncertainty.py: statistics of splats, predictors, temperatures, and the command on a tiny room."""
 
 import json
 from dataclasses import replace
@@ -7,19 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-
-from sigmasplat.commands.bench_uncertainty import Uncertainty
-from sigmasplat.config import RenderConfig
-from sigmasplat.config.presets import preset
-from sigmasplat.config.text import override
-from sigmasplat.data import se3
-from sigmasplat.data.field import GaussianField
-from sigmasplat.errors import ConfigError, RunError
-from sigmasplat.fit.target import Keyframe, Target
-from sigmasplat.plugins.evaluation.finished_run import FinishedRun, run_slam
-from sigmasplat.plugins.evaluation.metrics.trajectory import aligned_poses
-from sigmasplat.plugins.evaluation.metrics.uncertainty import sparsification
-from sigmasplat.plugins.evaluation.splat_statistics import (
+import uncertainty
+from finished_run import FinishedRun, run_slam
+from splat_statistics import (
     MapFacts,
     TrainingView,
     fisher,
@@ -27,9 +17,9 @@ from sigmasplat.plugins.evaluation.splat_statistics import (
     ridge,
     splat_values,
 )
-from sigmasplat.plugins.evaluation.surface_errors import surface_errors
-from sigmasplat.plugins.evaluation.surface_predictors import SURFACE_PREDICTORS
-from sigmasplat.plugins.evaluation.uncertainty_benchmark import (
+from surface_errors import surface_errors
+from surface_predictors import SURFACE_PREDICTORS
+from uncertainty_samples import (
     EXACT,
     FUSED,
     HELD_BACK,
@@ -40,7 +30,7 @@ from sigmasplat.plugins.evaluation.uncertainty_benchmark import (
     Study,
     measure,
 )
-from sigmasplat.plugins.evaluation.uncertainty_scores import (
+from uncertainty_scores import (
     ALL,
     COVERED,
     VISIBLE,
@@ -48,8 +38,17 @@ from sigmasplat.plugins.evaluation.uncertainty_scores import (
     score_runs,
     sparsification_charts,
 )
-from sigmasplat.plugins.evaluation.unseen_views import held_back_views
-from sigmasplat.plugins.evaluation.view_predictors import PREDICTORS, see
+from unseen_views import held_back_views
+from view_predictors import PREDICTORS, see
+
+from sigmasplat.config import RenderConfig
+from sigmasplat.config.presets import preset
+from sigmasplat.config.text import override
+from sigmasplat.data import se3
+from sigmasplat.data.field import GaussianField
+from sigmasplat.fit.target import Keyframe, Target
+from sigmasplat.plugins.evaluation.metrics.trajectory import aligned_poses
+from sigmasplat.plugins.evaluation.metrics.uncertainty import sparsification
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.render import FieldRenderer
 from sigmasplat.render.backend import make_view
@@ -224,13 +223,15 @@ def test_samples_have_every_predictor_and_both_maps(run: FinishedRun) -> None:
     assert failures["frames"] == 13 and failures["off"] == 0
 
 
-def test_the_command_writes_scores_tables_and_pictures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / "study"
-    command = Uncertainty((ROOM,), settings=QUICK, limit=13, hold_every=4, views=3, out=out)
-    assert command.run() == 0
+def test_the_benchmark_writes_scores_tables_and_pictures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    options = uncertainty.Options(
+        (ROOM,), settings=QUICK, seeds=1, limit=13, hold_every=4, views=3, name="tiny", runs=tmp_path, out=tmp_path
+    )
+    assert uncertainty.main(options) == 0
     text = capsys.readouterr().out
-    assert "AUSE" in text and "V" in text and "in-sample" in text
+    assert "AUSE" in text and "V" in text and "The temperature T is that of the sequence itself" in text
     assert "keyframe to keyframe" in text and "AUROC" in text
+    out = options.folder()
     (scored,) = json.loads((out / "uncertainty.json").read_text())["runs"]
     assert {"nees_mean", "coverage_90", "position_k"} <= scored["poses"]["from_start"].keys()
     row = scored["scores"]["color"]["final"][HELD_BACK]["all pixels"]["predictors"]["V + T prior"]
@@ -238,18 +239,20 @@ def test_the_command_writes_scores_tables_and_pictures(tmp_path: Path, capsys: p
     assert len(list(out.glob("*.png"))) >= 4
     (samples_file,) = (out / "samples").iterdir()
     written = samples_file.stat().st_mtime_ns
-    assert command.run() == 0
+    assert uncertainty.main(options) == 0
     assert samples_file.stat().st_mtime_ns == written, "a finished run is reused"
 
 
-def test_mistakes_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="no SOURCE"):
-        Uncertainty(()).study()
-    with pytest.raises(ConfigError, match=r"input\.hold_every"):
-        Uncertainty(("x",), settings=("input.hold_every=5",)).study()
-    (tmp_path / "letter.txt").write_text("not ours")
-    with pytest.raises(RunError, match="not empty"):
-        Uncertainty((ROOM,), out=tmp_path).run()
+def test_mistakes_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def refused(**given: object) -> str:
+        assert uncertainty.main(uncertainty.Options(**{"runs": tmp_path, "name": "mine"} | given)) == 2
+        return capsys.readouterr().err
+
+    assert "no source" in refused(sources=())
+    assert "input.hold_every" in refused(sources=("x",), settings=("input.hold_every=5",))
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "letter.txt").write_text("not ours")
+    assert "not empty" in refused(sources=(ROOM,))
 
 
 def test_pixels_of_all_views_are_mixed() -> None:

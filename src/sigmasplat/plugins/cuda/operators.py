@@ -1,6 +1,6 @@
 """Call the CUDA kernels: `project` and `blend` as autograd operators in float32, as defined in `reference`.
 
-NVRTC compiles the kernels at first use for the current device (native/cuda/cubins.py). torch provides memory, sorting
+NVRTC compiles the kernels at first use for the current device (plugins/cuda/cubins.py). torch provides memory, sorting
 and the stream.
 """
 
@@ -12,10 +12,10 @@ from torch import Tensor
 from sigmasplat.config import RenderConfig
 from sigmasplat.data.camera import Camera
 from sigmasplat.errors import BackendError
-from sigmasplat.native.cuda.cubins import FEATURE_COUNTS
-from sigmasplat.render.cuda import launch as cuda_launch
-from sigmasplat.render.cuda.launch import blocks_for
-from sigmasplat.render.cuda.raster import Planes, Raster
+from sigmasplat.plugins.cuda import launch as cuda_launch
+from sigmasplat.plugins.cuda.cubins import FEATURE_COUNTS
+from sigmasplat.plugins.cuda.launch import blocks_for
+from sigmasplat.plugins.cuda.raster import Planes, Raster
 from sigmasplat.render.kernel_operators import blend_with, project_with
 from sigmasplat.render.kernel_params import view_params
 from sigmasplat.render.pose_gradient import pose_gradient

@@ -10,8 +10,14 @@ from typing import Any
 
 import numpy as np
 import torch
+from finished_run import FinishedRun, run_facts
 from numpy.typing import NDArray
+from splat_statistics import MapFacts, map_facts, splat_values
+from surface_errors import surface_errors
+from surface_predictors import surface_columns
 from torch import Tensor
+from unseen_views import UnseenView, away_views, held_back_views
+from view_predictors import PREDICTORS, Predictor, SeenView, see
 
 from sigmasplat.config import Config
 from sigmasplat.config.presets import preset as preset_of
@@ -26,13 +32,7 @@ from sigmasplat.errors import ConfigError
 from sigmasplat.final.refinement import KeyframeReader
 from sigmasplat.final.uncertainty import map_uncertainty
 from sigmasplat.input.source import Source
-from sigmasplat.plugins.evaluation.finished_run import FinishedRun, run_facts
 from sigmasplat.plugins.evaluation.metrics.scored_view import COVERED_ALPHA
-from sigmasplat.plugins.evaluation.splat_statistics import MapFacts, map_facts, splat_values
-from sigmasplat.plugins.evaluation.surface_errors import surface_errors
-from sigmasplat.plugins.evaluation.surface_predictors import surface_columns
-from sigmasplat.plugins.evaluation.unseen_views import UnseenView, away_views, held_back_views
-from sigmasplat.plugins.evaluation.view_predictors import PREDICTORS, Predictor, SeenView, see
 from sigmasplat.render import FieldRenderer
 from sigmasplat.render.backend import make_view
 from sigmasplat.types import Matrix, Progress, no_progress
@@ -92,7 +92,7 @@ def study_config(preset: str, settings: Sequence[str]) -> Config:
     """Return a preset's settings, changed by --set. Raises ConfigError for a setting that the benchmark itself sets."""
     given = split_settings(settings)
     for name in sorted(given.keys() & set(RESERVED)):
-        raise ConfigError(f"bench uncertainty itself sets {name}; remove it (use --seeds, --limit or --hold-every)")
+        raise ConfigError(f"the benchmark itself sets {name}; remove it (use --seeds, --limit or --hold-every)")
     return override(preset_of(preset), given)
 
 

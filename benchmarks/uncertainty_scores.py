@@ -6,6 +6,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from surface_predictors import SURFACE_PREDICTORS, SurfacePredictor
+from uncertainty_samples import AWAY, HELD_BACK, Kind
+from view_predictors import PREDICTORS, Predictor
 
 from sigmasplat.plugins.evaluation.metrics.scored_view import COVERED_ALPHA
 from sigmasplat.plugins.evaluation.metrics.uncertainty import (
@@ -18,9 +21,6 @@ from sigmasplat.plugins.evaluation.metrics.uncertainty import (
     sparsification,
     z_scores,
 )
-from sigmasplat.plugins.evaluation.surface_predictors import SURFACE_PREDICTORS, SurfacePredictor
-from sigmasplat.plugins.evaluation.uncertainty_benchmark import AWAY, HELD_BACK, Kind
-from sigmasplat.plugins.evaluation.view_predictors import PREDICTORS, Predictor
 from sigmasplat.plugins.outputs.drawing.plot import ACCENT, BLUE, FAINT, GREEN, PURPLE, Chart, Curve
 
 Arrays = Mapping[str, NDArray[np.float32]]

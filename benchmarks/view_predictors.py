@@ -1,4 +1,4 @@
-"""Predict the squared error of a rendered view: the baselines of `bench uncertainty`, one function each.
+"""Predict the squared error of a rendered view: the baselines of `uncertainty.py`, one function each.
 
 A predictor takes a `SeenView` and returns a plane [H, W] of variances, colour² (mean over channels) or m². To add one,
 append a row to `PREDICTORS`; values per splat come from `splat_statistics.STATISTICS`.
@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
+from splat_statistics import MapFacts, on_host
 from torch import Tensor
 
 from sigmasplat.data.camera import Camera
 from sigmasplat.plugins.evaluation.metrics.scored_view import COVERED_ALPHA
-from sigmasplat.plugins.evaluation.splat_statistics import MapFacts, on_host
 from sigmasplat.render import FieldRenderer, Render
 from sigmasplat.render.predictive import Predicted, predict
 from sigmasplat.types import Matrix

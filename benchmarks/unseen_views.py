@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from finished_run import FinishedRun
 
 from sigmasplat.config import Config
 from sigmasplat.data.exposure import NEUTRAL
@@ -10,7 +11,6 @@ from sigmasplat.data.frame import Frame
 from sigmasplat.data.resizing import resized_depth
 from sigmasplat.data.selection import evenly_spread
 from sigmasplat.input.source import Source
-from sigmasplat.plugins.evaluation.finished_run import FinishedRun
 from sigmasplat.plugins.evaluation.metrics.trajectory import aligned_poses, associate
 from sigmasplat.plugins.evaluation.view_selection import working_frame
 from sigmasplat.types import Matrix

@@ -10,8 +10,8 @@ from sigmasplat.data.field import ATTRIBUTES, GaussianField, Rows
 from sigmasplat.fit.adam import BETA1, EPSILON, Rates
 from sigmasplat.fit.fused_terms import SHAPE_TERMS, kernel_weights
 from sigmasplat.fit.interface import Twist, Weights
-from sigmasplat.render.cuda.launch import blocks_for
-from sigmasplat.render.cuda.view import CudaView
+from sigmasplat.plugins.cuda.launch import blocks_for
+from sigmasplat.plugins.cuda.view import CudaView
 from sigmasplat.types import Matrix
 
 MOST_COLUMNS = max(ATTRIBUTES.values())

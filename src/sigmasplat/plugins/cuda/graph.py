@@ -11,7 +11,7 @@ from functools import cache
 import torch
 
 from sigmasplat.errors import BackendError
-from sigmasplat.render.cuda.stages import measured
+from sigmasplat.plugins.cuda.stages import measured
 
 Work = Callable[[], None]
 

@@ -18,9 +18,9 @@ from sigmasplat.fit.interface import Descent
 from sigmasplat.fit.motion import parametrisation
 from sigmasplat.fit.target import Target
 from sigmasplat.fit.tracking_loss import tracking_params
-from sigmasplat.render.cuda.graph import Work, repeatable
-from sigmasplat.render.cuda.launch import THREADS, blocks_for
-from sigmasplat.render.cuda.view import CudaView
+from sigmasplat.plugins.cuda.graph import Work, repeatable
+from sigmasplat.plugins.cuda.launch import THREADS, blocks_for
+from sigmasplat.plugins.cuda.view import CudaView
 from sigmasplat.types import Matrix
 
 MEDIANS, PASSES, DIGITS = 5, 3, 2048

@@ -18,8 +18,8 @@ from torch import Tensor
 from sigmasplat.config import RenderConfig
 from sigmasplat.data.camera import Camera
 from sigmasplat.errors import BackendError
-from sigmasplat.native.cuda.cubins import FEATURE_COUNTS, FITTING
-from sigmasplat.render.cuda.launch import Argument, Launcher, Struct, blocks_for
+from sigmasplat.plugins.cuda.cubins import FEATURE_COUNTS, FITTING
+from sigmasplat.plugins.cuda.launch import Argument, Launcher, Struct, blocks_for
 
 TILE = 16
 GEOMETRY = 8

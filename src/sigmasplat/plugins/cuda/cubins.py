@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 from sigmasplat.env import install_extra
 from sigmasplat.errors import BackendError
 
-FOLDER = Path(__file__).parents[1]
+FOLDER = Path(__file__).parents[2] / "native"
 """Folder of the sources: headers shared with the CPU kernels, and the CUDA kernels in its subfolder `cuda`."""
 RASTER, FIT, ALIGN = "cuda/raster.cu", "cuda/fit.cu", "cuda/align.cu"
 TEXTS = {

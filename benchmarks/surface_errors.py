@@ -4,6 +4,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
+from finished_run import FinishedRun
 
 from sigmasplat.config import Config
 from sigmasplat.data import isosurface, se3
@@ -14,7 +15,6 @@ from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.data.tsdf import Tsdf
 from sigmasplat.final.fusion import TRUNCATION_VOXELS, VOXEL_M, count_keyframes, fuse, surface_views
 from sigmasplat.input.source import Source
-from sigmasplat.plugins.evaluation.finished_run import FinishedRun
 from sigmasplat.plugins.evaluation.metrics.reconstruction import BEHIND_M, Mask, distances, visible_points
 from sigmasplat.plugins.evaluation.metrics.trajectory import aligned_poses, associate
 from sigmasplat.plugins.evaluation.view_selection import working_frame

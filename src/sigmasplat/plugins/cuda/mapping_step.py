@@ -7,13 +7,13 @@ from torch import Tensor
 
 from sigmasplat.data.field import GaussianField
 from sigmasplat.fit.adam import Rates
-from sigmasplat.fit.cuda.rows import CudaAccumulator, add_shape_gradient, step_rows
 from sigmasplat.fit.fused_terms import pixel_weights
 from sigmasplat.fit.interface import Accumulator, Weights
 from sigmasplat.fit.mapping_step import render_for
 from sigmasplat.fit.target import Target
-from sigmasplat.render.cuda.launch import blocks_for
-from sigmasplat.render.cuda.view import CudaView
+from sigmasplat.plugins.cuda.launch import blocks_for
+from sigmasplat.plugins.cuda.rows import CudaAccumulator, add_shape_gradient, step_rows
+from sigmasplat.plugins.cuda.view import CudaView
 from sigmasplat.types import Matrix
 
 TILE = 16

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.errors import BackendError
-from sigmasplat.native.cuda import cubins
+from sigmasplat.plugins.cuda import cubins
 
 THREADS = 256
 """Number of threads per block (native/cuda/device.cuh)."""

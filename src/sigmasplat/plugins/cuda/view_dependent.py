@@ -8,12 +8,12 @@ from torch import Tensor
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.harmonics import count
 from sigmasplat.fit.adam import Rates
-from sigmasplat.fit.cuda.mapping_step import CudaStep
-from sigmasplat.fit.cuda.rows import add_shape_gradient, step_rows
 from sigmasplat.fit.interface import Accumulator, Weights, one_image_only
 from sigmasplat.fit.mapping_step import render_for
 from sigmasplat.fit.target import Target
-from sigmasplat.render.cuda.launch import blocks_for
+from sigmasplat.plugins.cuda.launch import blocks_for
+from sigmasplat.plugins.cuda.mapping_step import CudaStep
+from sigmasplat.plugins.cuda.rows import add_shape_gradient, step_rows
 from sigmasplat.types import Matrix
 
 

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from sigmasplat.fit.interface import NORMAL_TERMS, AlignedPose, AlignRules, LevelPlanes
-from sigmasplat.native.cuda.cubins import ALIGNING
-from sigmasplat.render.cuda import launch as cuda_launch
+from sigmasplat.plugins.cuda import launch as cuda_launch
+from sigmasplat.plugins.cuda.cubins import ALIGNING
 from sigmasplat.types import Matrix
 
 CELL = 16

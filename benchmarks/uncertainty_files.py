@@ -1,5 +1,6 @@
-"""The folder of `bench uncertainty`: samples of each run, scores of all runs, pictures."""
+"""The folder of `uncertainty.py`: samples of each run, scores of all runs, pictures."""
 
+import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,19 +9,23 @@ from typing import Any
 
 import numpy as np
 import torch
+from uncertainty_samples import AWAY, Job, Kind, Measured, Study
+from uncertainty_scores import Run, score_runs, sparsification_charts
 
 import sigmasplat
 from sigmasplat.errors import RunError
 from sigmasplat.files import machine
 from sigmasplat.files.atomic import make_folder, replacing
-from sigmasplat.files.json_files import read_json, to_json, write_json
+from sigmasplat.files.json_files import to_json, write_json
 from sigmasplat.files.machine import INSTALLED, code_digest
 from sigmasplat.files.tensors import open_tensors, write_tensors
-from sigmasplat.plugins.evaluation.uncertainty_benchmark import AWAY, Job, Kind, Measured, Study
-from sigmasplat.plugins.evaluation.uncertainty_scores import Run, score_runs, sparsification_charts
 from sigmasplat.plugins.outputs.drawing.plot import LIGHT, SIZE, draw_charts
 
-MADE_BY = "sigmasplat bench uncertainty"
+MEASURED_BY = (
+    "finished_run", "splat_statistics", "surface_errors", "surface_predictors", "uncertainty_samples", "unseen_views",
+    "view_predictors",
+)  # fmt: skip
+"""The modules of this folder that decide the samples of a run."""
 SCORES, SAMPLES = "uncertainty.json", "samples"
 CHART_WIDTH = 600
 """Width of one chart in a picture, pixels."""
@@ -34,12 +39,10 @@ class StudyFolder:
     study: Study
 
     @staticmethod
-    def create(path: Path, study: Study, overwrite: bool) -> "StudyFolder":
-        """Create the folder. Raises RunError if it cannot be written, or has other files and may not be changed."""
-        if path.is_dir() and any(path.iterdir()) and not overwrite:
-            made_by = read_json(path / SCORES).get("made_by") if (path / SCORES).exists() else None
-            if made_by != MADE_BY and not (path / SAMPLES).is_dir():
-                raise RunError(f"{path} is not empty and not a folder of {MADE_BY}; give another --out, or --overwrite")
+    def create(path: Path, study: Study) -> "StudyFolder":
+        """Create the folder. Raises RunError if it cannot be written, or has files of something else."""
+        if path.is_dir() and any(path.iterdir()) and not (path / SAMPLES).is_dir():
+            raise RunError(f"{path} is not empty and not a folder of benchmarks/uncertainty.py; give another --runs")
         make_folder(path / SAMPLES)
         return StudyFolder(path, study)
 
@@ -50,7 +53,7 @@ class StudyFolder:
             "config": job.config.to_dict(),
             "given": sorted(job.given),
             "views": self.study.views,
-            "code": code_digest(Path(sigmasplat.__file__).parent, INSTALLED),
+            "code": [code_digest(Path(sigmasplat.__file__).parent, INSTALLED), *map(_digest, MEASURED_BY)],
             "machine": machine.describe(),
         }
         return json.dumps(to_json(facts), sort_keys=True)
@@ -88,7 +91,6 @@ class StudyFolder:
             for job, found, of_kind in zip(jobs, measured, scores, strict=True)
         ]
         head = {
-            "made_by": MADE_BY,
             "config": self.study.config.to_dict(),
             "hold_every": self.study.hold_every,
             "limit": self.study.limit,
@@ -124,3 +126,7 @@ def _plain(job: Job) -> str:
     """Return a name for the files of a run."""
     words = "".join(c if c.isalnum() else "-" for c in f"{job.source.rstrip('/').rpartition('/')[2]} seed{job.seed}")
     return "-".join(filter(None, words.lower().split("-")))
+
+
+def _digest(module: str) -> str:
+    return hashlib.sha256((Path(__file__).parent / f"{module}.py").read_bytes()).hexdigest()[:16]

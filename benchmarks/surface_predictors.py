@@ -1,4 +1,4 @@
-"""Predict the squared distance of the vertices of a mesh to the true surface: rows of the table of `bench uncertainty`.
+"""Predict the squared distance of the vertices of a mesh to the true surface: rows of the table of `uncertainty.py`.
 
 A predictor takes a `SeenSurface` and returns a variance [V], m². To add one, append a row to `SURFACE_PREDICTORS`.
 """
@@ -10,12 +10,12 @@ from typing import Literal
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from splat_statistics import MapFacts
+from surface_errors import SurfaceErrors
 from torch import Tensor
 
 from sigmasplat.data.map_uncertainty import SplatStd
 from sigmasplat.plugins.evaluation.reconstruct import nearest_opaque
-from sigmasplat.plugins.evaluation.splat_statistics import MapFacts
-from sigmasplat.plugins.evaluation.surface_errors import SurfaceErrors
 
 Floats = NDArray[np.float32]
 
@@ -88,7 +88,7 @@ SURFACE_PREDICTORS: tuple[SurfacePredictor, ...] = (
 
 
 def surface_columns(errors: SurfaceErrors, facts: MapFacts, values: Mapping[str, Tensor]) -> dict[str, Floats] | None:
-    """Return squared error and variances of the vertices with the columns of `uncertainty_benchmark.Samples`.
+    """Return squared error and variances of the vertices with the columns of `uncertainty_samples.Samples`.
 
     facts, values: of the final map. Returns None if no splat is opaque.
     """

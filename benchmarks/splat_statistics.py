@@ -17,8 +17,8 @@ from sigmasplat.data.map_uncertainty import MapUncertainty
 from sigmasplat.fit.splat_residuals import squared_errors
 from sigmasplat.fit.target import Keyframe
 from sigmasplat.render import FieldRenderer, Render
+from sigmasplat.render.backend import on_device
 from sigmasplat.render.blended_values import BlendedValues, blend_values
-from sigmasplat.render.render import on_device
 from sigmasplat.types import Matrix
 
 GRADIENT_STEPS = 6

@@ -1,0 +1,57 @@
+"""Offer CUDA as a backend: how it renders, and what it does of the fits."""
+
+import warnings
+from dataclasses import replace
+from types import ModuleType
+
+import torch
+
+from sigmasplat.config import RenderConfig
+from sigmasplat.data.camera import Camera
+from sigmasplat.fit.backends import TORCH
+from sigmasplat.fit.interface import DeviceFits
+from sigmasplat.fit.reference_maps import reference_maps
+from sigmasplat.plugins.cuda import descent, images, launch, rows
+from sigmasplat.plugins.cuda.mapping_step import CudaStep
+from sigmasplat.plugins.cuda.view import CudaView
+from sigmasplat.plugins.cuda.view_dependent import CudaViewDependentStep
+from sigmasplat.registry import Backend
+
+
+def _operators() -> ModuleType:
+    from sigmasplat.plugins.cuda import operators
+
+    return operators
+
+
+def _options(options: RenderConfig) -> RenderConfig:
+    """Return the options that CUDA renders with: it has only `render.depth=center`, and warns."""
+    if options.depth == "center":
+        return options
+    warnings.warn("render.depth=ray does not run on CUDA yet; depth is that of the splats' centres", stacklevel=4)
+    return replace(options, depth="center")
+
+
+def _view(camera: Camera, options: RenderConfig, variance: bool) -> CudaView:
+    return CudaView(camera, _options(options), variance)
+
+
+def _fits() -> DeviceFits:
+    return replace(
+        TORCH,
+        mapping_step=CudaStep,
+        view_dependent_step=CudaViewDependentStep,
+        to_host=rows.to_host,
+        descend=descent.descend_on_device,
+        reference_maps=reference_maps,
+        live_planes=images.live_planes,
+        images=images.CUDA_IMAGES,
+        aligns=True,
+    )
+
+
+def _device() -> torch.device:
+    return launch.this_device()
+
+
+PLUGIN = Backend("cuda", _operators, _view, _fits, _options, _device)
