@@ -38,7 +38,7 @@ from sigmasplat.run_folder.trajectory import read_trajectory
 arg = tyro.conf.arg
 Result = dict[str, Any]
 FOLDER = Path(__file__).parent
-SOURCES = ("redkitchen", "livingroom", "cubicles", "hololens")
+SOURCES = ("redkitchen", "livingroom", "cubicles", "hololens", "fr1_xyz", "cabinet58")
 OURS = "SigmaSplat, `sigma`"
 
 
@@ -135,11 +135,13 @@ def path_of(times_s: NDArray[np.float64], poses: NDArray[np.float64]) -> Traject
 
 
 def score(path: Trajectory, source: Source, limit: int | None) -> dict[str, Any]:
-    """Return frames, frames without a pose and ATE of a path. Raises SourceError without matching truth."""
+    """Return frames, frames without a pose and ATE of a path, None without poses. Raises SourceError without true poses."""
     truth = source.truth()
     if truth is None:
         raise SourceError(f"{source.name} has no true poses")
     frames = frames_in(source, limit)
+    if not len(path):
+        return {"frames": frames, "without_pose": frames, "ate_m": None}
     times_s = np.array([source.timestamp_s(i) for i in range(frames)])
     known, _ = pair_poses(Trajectory(times_s, np.tile(np.eye(4), (frames, 1, 1))), path)
     found = ate(path, truth)
@@ -208,7 +210,7 @@ def run_peers(options: Options) -> list[Result]:
                 result = earlier or run_peer(peer, Path(name).name, path, Path(folder), options, python)
                 if result["problem"] is None:
                     write_text(kept, json.dumps({"key": key, "result": result}, indent=1) + "\n")
-                shown = result["problem"] or f"ATE {100 * result['ate_m']:.2f} cm"
+                shown = result["problem"] or f"ATE {spread(_errors_cm([result]))} cm"
                 print(f"{name}, {peer.name}: {shown}", file=sys.stderr, flush=True)
                 made.append(result)
     return made
@@ -230,9 +232,12 @@ def read_paths(options: Options) -> list[Result]:
 def sections(measured: dict[str, Any]) -> list[Section]:
     """Return the tables of results: errors by system and sequence, and every run."""
     runs, quoted = measured["figures"]["runs"], measured["figures"]["quoted"]
-    sources = list(dict.fromkeys(run["source"] for run in runs))
-    systems = dict.fromkeys(run["system"] for run in [*runs, *quoted])
-    rows = [row for system in systems if (row := _row(system, [*runs, *quoted], sources))]
+    names = dict.fromkeys(run["source"] for run in runs)
+    sources = [*(name for name in SOURCES if name in names), *(name for name in names if name not in SOURCES)]
+    order = (OURS, *(peer.name for peer in PEERS))
+    there = dict.fromkeys(run["system"] for run in [*runs, *quoted])
+    systems = [*(name for name in order if name in there), *(name for name in there if name not in order)]
+    rows = [_row(system, [*runs, *quoted], sources) for system in systems]
     commits = sorted({run["commit"][:9] for run in runs if run.get("commit")})
     note = NOTE + (f" Some results were kept from earlier runs, of commits {', '.join(commits)}." if commits else "")
     made = [Section("ATE in cm", ["system", *sources, "frames without a pose"], rows, note)]
@@ -250,15 +255,19 @@ def _row(system: str, runs: list[Result], sources: list[str]) -> list[str]:
     """Return the row of one system: its error in each sequence, then the number of frames without a pose."""
     cells, without = [], []
     for source in sources:
-        found = [r for r in runs if (r["system"], r["source"]) == (system, source) and r.get("ate_m") is not None]
-        cells.append(spread([100.0 * run["ate_m"] for run in found]))
+        found = [r for r in runs if (r["system"], r["source"]) == (system, source)]
+        cells.append(spread(_errors_cm(found)))
         counts = [run["without_pose"] for run in found if "without_pose" in run]
         shares = [run["with_pose"] for run in found if "with_pose" in run]
         if any(counts):
-            without.append(f"{source} {spread(counts)} of {found[0]['frames']}")
+            without.append(f"{source} {spread(counts)} of {max(run.get('frames', 0) for run in found)}")
         without += [f"{source} {100 * (1 - share):.0f} %" for share in shares]
     known = any("without_pose" in run for run in runs if run["system"] == system)
     return [system, *cells, ", ".join(without) or ("0" if known else "–")]
+
+
+def _errors_cm(runs: list[Result]) -> list[float]:
+    return [100.0 * run["ate_m"] for run in runs if run.get("ate_m") is not None]
 
 
 def kept_rows(options: Options, measured: set[tuple[str, str]]) -> list[Result]:

@@ -62,7 +62,7 @@ def panels(run: RunFolder, index: int, direction: int) -> list[ViewPanel]:
 
 
 def main(
-    run: Run, frame: Index = 257, direction: Direction = 33, out: Out = record.ROOT / "docs" / "images" / "scan.jpg"
+    run: Run, frame: Index = 250, direction: Direction = 0, out: Out = record.ROOT / "docs" / "images" / "scan.jpg"
 ) -> int:
     """Draw the picture of a real scan; exit code 2 if the run or its sequence cannot be read."""
     try:

@@ -97,3 +97,13 @@ def test_earlier_results_of_other_systems_and_sequences_are_kept(tmp_path: Path)
     assert all(row["commit"] == "0123456789ab" for row in kept)
     (table,) = peers.sections({"figures": {"runs": kept, "quoted": []}})
     assert table.note.endswith("of commits 012345678.")
+
+
+def test_a_system_that_finds_no_pose_has_no_error_and_its_frames_are_counted() -> None:
+    nothing = peers.path_of(np.zeros(6), np.full((6, 4, 4), np.nan))
+    found = peers.score(nothing, open_source(ROOM), None)
+    assert found == {"frames": 6, "without_pose": 6, "ate_m": None}
+    runs = [run("ORB-SLAM3", "desk", None, without_pose=6), run("ours", "desk", 0.01), run("ours", "redkitchen", 0.02)]
+    (table,) = peers.sections({"figures": {"runs": runs, "quoted": []}})
+    assert list(table.columns) == ["system", "redkitchen", "desk", "frames without a pose"]
+    assert table.rows == [["ORB-SLAM3", "–", "–", "desk 6 of 6"], ["ours", "2.00", "1.00", "–"]]
