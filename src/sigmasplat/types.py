@@ -1,6 +1,7 @@
 """Define the types that many modules share, and the default for an optional callback."""
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterable, Iterator
+from itertools import islice
 from typing import TypeVar
 
 import numpy as np
@@ -10,6 +11,9 @@ Matrix = NDArray[np.float64]
 """A float64 array of any shape; the docstring of its function gives the shape, as in T_world_camera [4, 4]."""
 Progress = Callable[[int, int], None]
 """Called with (done, total) while a long task runs; a total of 0 is not known yet."""
+ShouldStop = Callable[[], bool]
+"""Asked again and again during long work."""
+Item = TypeVar("Item")
 Result = TypeVar("Result")
 Task = Generator[None, None, Result]
 """A long task in slices: it yields after each slice, and returns its result after the last one."""
@@ -38,3 +42,20 @@ def no_progress(done: int, total: int) -> None:
 def part_of(progress: Progress, first: int, total: int) -> Progress:
     """Return the progress of one part of a task: its steps are added to the `first` ones, of `total`."""
     return lambda done, _: progress(first + done, total)
+
+
+def never() -> bool:
+    """Return False."""
+    return False
+
+
+def unless(should_stop: ShouldStop, guesses: Iterable[Item], least: int = 0) -> Iterator[Item]:
+    """Yield guesses while `should_stop` returns False, at least the first `least` ones; a guess is not made before it
+    is asked."""
+    waiting = iter(guesses)
+    yield from islice(waiting, least)
+    while not should_stop():
+        try:
+            yield next(waiting)
+        except StopIteration:
+            return

@@ -75,7 +75,7 @@ WAITS = {
 """What makes the host wait for a tensor of a device."""
 
 
-class DynamicDetector(TorchFunctionMode):
+class Watch(TorchFunctionMode):
     """Counts how often the host reads a tensor."""
 
     def __init__(self) -> None:

@@ -25,12 +25,12 @@ from sigmasplat.render.view import View
 from sigmasplat.run_folder.state import read_state, write_state
 from sigmasplat.tracking.depth_fit import DepthFit
 from sigmasplat.tracking.depth_shape import DepthShape
-from sigmasplat.tracking.moving import memory, watch
+from sigmasplat.tracking.moving import depth_history, dynamic_detector
 from sigmasplat.tracking.pose_validation import TrackingStatistics
 from sigmasplat.tracking.prepared_frame import PreparedImages
 from sigmasplat.tracking.tracker import Tracker
 from splat_fields import CPU, OPTIONS
-from splat_fits import DynamicDetector
+from splat_fits import Watch
 from splat_wall import CAMERA, TRUTH, seen_from, wall
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
@@ -103,7 +103,7 @@ def test_the_host_waits_for_no_plane_of_a_reference(kind: str, config: TrackingC
     view, _ = views()
     params, image = thick(), live(view)
     view.forward(params, TRUTH)  # says how many pairs to expect
-    with DynamicDetector() as watch:
+    with Watch() as watch:
         if kind == "map":
             map_reference(params, view, TRUTH, config)
         else:
@@ -155,8 +155,8 @@ def test_what_a_tracker_remembers_is_kept_and_read_back(tmp_path: Path) -> None:
             Pyramid,
             Camera,
             TrackingStatistics,
-            watch.DynamicDetector,
-            memory.DepthHistory,
+            dynamic_detector.DynamicDetector,
+            depth_history.DepthHistory,
             DepthFit,
             DepthShape,
         ),

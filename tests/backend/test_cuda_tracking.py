@@ -25,7 +25,7 @@ from sigmasplat.fit.tracking_loss import tracking_gradient
 from sigmasplat.render.cpu.view import CpuView
 from sigmasplat.render.cuda.view import CudaView
 from splat_fields import OPTIONS
-from splat_fits import DynamicDetector
+from splat_fits import Watch
 from splat_scenes import assert_same_vector
 from splat_wall import CAMERA, TRUTH, Array, lower_median, seen_from, wall
 from test_tracking_options import OFF, PAPER, damaged
@@ -366,7 +366,7 @@ def test_no_iteration_makes_the_host_wait() -> None:
     view = view_of()
     view.forward(wall(), TRUTH)
     descent = CudaDescent(wall(), view, shown(), TRUTH, dataclasses.replace(PAPER, uncertainty=True))
-    with DynamicDetector() as watch:
+    with Watch() as watch:
         descent.iterate()
     assert watch.reads == 0
 

@@ -10,8 +10,8 @@ from sigmasplat.config import SubmapConfig
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.fit.pyramid import Pyramid
+from sigmasplat.slam.mapping_backend import ends_submap
 from sigmasplat.tracking.drift import BIAS, HOP_M, HOP_RAD, Drift
-from sigmasplat.tracking.rules import ends_submap
 
 Matrix = NDArray[np.float64]
 OWN = np.diag(np.repeat([HOP_M**2, HOP_RAD**2], 3))

@@ -6,7 +6,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from sigmasplat.fit.pose import PoseFit
-from sigmasplat.tracking.rules import draw_keyframes, is_held_back, is_keyframe, is_lost, jumped, never, unless
+from sigmasplat.mapping.window import draw_keyframes
+from sigmasplat.tracking.keyframe_rule import is_held_back, is_keyframe
+from sigmasplat.tracking.pose_validation import is_lost, jumped
+from sigmasplat.types import never, unless
 
 NAN = float("nan")
 

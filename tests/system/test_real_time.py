@@ -187,8 +187,8 @@ def test_too_many_waiting_keyframes_are_refused_and_counted() -> None:
     assert len(system.slam.keyframe_indices) == 3
 
 
-@pytest.mark.parametrize("hurried", [0, 8])
-def test_a_hurried_frame_tries_no_further_guesses_and_tracking_recovers_afterwards(should_stop: int) -> None:
+@pytest.mark.parametrize("should_stop", [0, 8])
+def test_a_frame_in_a_hurry_tries_no_further_guesses_and_tracking_recovers_afterwards(should_stop: int) -> None:
     """After a jump the first guess fails. While frames wait, it is the only one; then features find the camera."""
     seen, lost = frames(80), list[bool]()
     system = RealTime(Slam(config(recovery__relocalise="off")), AtOnce(), should_stop=lambda: len(lost) < should_stop)

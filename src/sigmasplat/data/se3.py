@@ -207,3 +207,10 @@ def _are_rotations(R: Matrix, tolerance: float) -> NDArray[np.bool_]:
     """Return which finite matrices [N, 3, 3] are orthonormal with determinant +1."""
     orthonormal = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max((1, 2)) < tolerance
     return np.asarray(orthonormal & (np.linalg.det(R) > 0))
+
+
+def angle_between(T_one: Matrix, T_other: Matrix, depth_m: float) -> float:
+    """Return by how much the image of one camera has moved in the other, rad: rotation plus translation divided by the
+    mean depth; T_one, T_other [4, 4]: poses of the cameras."""
+    moved_m = float(np.linalg.norm(T_other[:3, 3] - T_one[:3, 3]))
+    return rotation_angle(T_one[:3, :3].T @ T_other[:3, :3]) + moved_m / depth_m

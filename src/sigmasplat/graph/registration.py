@@ -27,7 +27,6 @@ from sigmasplat.render.view import View
 from sigmasplat.tracking.drift import drift_to, symmetric, systematic_errors
 from sigmasplat.tracking.features import Extractor
 from sigmasplat.tracking.pose_validation import confirmed
-from sigmasplat.tracking.rules import angle_between
 from sigmasplat.types import Matrix, Task, long_slice
 
 HOPELESS = 0.5
@@ -228,7 +227,7 @@ def _nearest_keyframe(submap: Submap, T_camera_submap: Matrix, target: Target) -
     """Return the number of the submap's keyframe whose image is the least moved one in a camera with this image."""
     depth_m, T_submap_camera = target.depth_image[target.depth_image > 0], se3.inverse(T_camera_submap)
     mean_m = float(depth_m.double().mean()) if len(depth_m) else np.inf
-    return int(np.argmin([angle_between(T, T_submap_camera, mean_m) for T in submap.T_submap_camera]))
+    return int(np.argmin([se3.angle_between(T, T_submap_camera, mean_m) for T in submap.T_submap_camera]))
 
 
 def _errors_of_motion(T_camera_keyframe: Matrix) -> Matrix:

@@ -1,7 +1,7 @@
 """Mapping at a keyframe: seed new splats, fit the field in two halves; densify, fade and prune splats in between
 (VarSplat §2; CG-SLAM §4, 5, 7)."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field as dataclass_field
 from itertools import repeat
 
@@ -25,10 +25,9 @@ from sigmasplat.mapping.densify import densify_mask, multiply, split, too_large,
 from sigmasplat.mapping.moving import carve, mask_keyframes
 from sigmasplat.mapping.pruning import fade, splat_uncertainty, still_uncertain
 from sigmasplat.mapping.seeding import first_pixels, later_pixels, make_splats, thin_out
-from sigmasplat.mapping.window import choose_window, dominating
+from sigmasplat.mapping.window import choose_window, dominating, draw_keyframes
 from sigmasplat.render.view import View
-from sigmasplat.tracking.rules import draw_keyframes, never
-from sigmasplat.types import Task, completed
+from sigmasplat.types import ShouldStop, Task, completed, never
 
 RECENT = 10
 """Splats are carved away by the newest keyframes, at most this many."""
@@ -93,7 +92,7 @@ class Mapper:
         fit.join(completed(self._left_of_half(view, never)))
         return fit
 
-    def mapping(self, view: View, newest: Keyframe, should_stop: Callable[[], bool] = never) -> Task[FieldFit]:
+    def mapping(self, view: View, newest: Keyframe, should_stop: ShouldStop = never) -> Task[FieldFit]:
         """Map a keyframe as `map` does, in slices of one iteration. With `mapping.in_halves` the second half of
         the iterations is left to `refining`, and what `refining` has not made is made before the next keyframe.
 
@@ -142,7 +141,7 @@ class Mapper:
         window: list[Keyframe],
         half: SecondHalf,
         rates: Iterator[Rates],
-        should_stop: Callable[[], bool],
+        should_stop: ShouldStop,
         at_most: int | None = None,
     ) -> Task[FieldFit]:
         """Make the steps of the second half that are left, or some of them; after the last one, prune."""
@@ -154,7 +153,7 @@ class Mapper:
             self.half = None
         return fit
 
-    def _left_of_half(self, view: View, should_stop: Callable[[], bool], at_most: int | None = None) -> Task[FieldFit]:
+    def _left_of_half(self, view: View, should_stop: ShouldStop, at_most: int | None = None) -> Task[FieldFit]:
         """Make steps that are left of the second half, if there is one."""
         if self.half is None:
             return FieldFit()
@@ -168,7 +167,7 @@ class Mapper:
         self._note_visible(view)
         self._seed(view, keyframe.target, keyframe.T_world_camera)
 
-    def refining(self, view: View, steps: int, should_stop: Callable[[], bool]) -> Task[None]:
+    def refining(self, view: View, steps: int, should_stop: ShouldStop) -> Task[None]:
         """Fit the map to its keyframes for more steps, in slices of one, until `should_stop` returns True; the
         keyframes keep their poses. Pending steps count as made."""
         steps -= len((yield from self._left_of_half(view, should_stop, steps)).losses)
@@ -215,7 +214,7 @@ class Mapper:
         rates: Iterator[Rates],
         frozen_below: int,
         stats: DensifyStats | None,
-        should_stop: Callable[[], bool],
+        should_stop: ShouldStop,
         least_share: float = LEAST_SHARE,
     ) -> Task[FieldFit]:
         """Fit the field to the window, in slices; splats with ids below `frozen_below` keep their colours."""
@@ -326,9 +325,7 @@ class Mapper:
         self.field.keep(~(gone if also is None else gone | also))
 
 
-def _shortened(
-    batches: Iterable[list[Keyframe]], least: int, should_stop: Callable[[], bool]
-) -> Iterator[list[Keyframe]]:
+def _shortened(batches: Iterable[list[Keyframe]], least: int, should_stop: ShouldStop) -> Iterator[list[Keyframe]]:
     """Yield batches, but none after the first `least` ones as soon as `should_stop` returns True."""
     for done, batch in enumerate(batches):
         if done >= least and should_stop():

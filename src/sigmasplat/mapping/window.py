@@ -1,7 +1,7 @@
 """Choose the keyframes that are fitted together: the newest, the one before, and the most co-visible others."""
 
-from collections.abc import Callable, Sequence
-from typing import Literal
+from collections.abc import Callable, Iterator, Sequence
+from typing import Literal, TypeVar
 
 import numpy as np
 import torch
@@ -13,6 +13,8 @@ from sigmasplat.errors import SigmaSplatError
 from sigmasplat.fit.target import Keyframe
 from sigmasplat.render.view import View
 from sigmasplat.tracking.descriptors import similarity
+
+Item = TypeVar("Item")
 
 Ids = NDArray[np.int64]
 Scores = NDArray[np.float64]
@@ -124,3 +126,29 @@ def _nothing(keyframe: Keyframe, missing: str, by: str) -> SigmaSplatError:
         f"keyframe {keyframe.index} has no {missing}, which mapping.covisibility={by} needs; "
         "use mapping.covisibility=frustum, which needs depth only"
     )
+
+
+def draw_keyframes(
+    keyframes: Sequence[Item],
+    iterations: int,
+    newest_probability: float,
+    random: np.random.Generator,
+    together: int = 1,
+) -> Iterator[list[Item]]:
+    """Draw keyframes for each iteration: the newest with the given probability, else a random older one (VarSplat §2).
+
+    together > 1: draw that many different keyframes, or all of them if there
+    are fewer (CG-SLAM §7).
+    """
+    everything = list(keyframes)
+    older = everything[:-1]
+    for _ in range(iterations):
+        if together >= len(everything) > 1:
+            yield everything
+            continue
+        newest = not older or random.random() < newest_probability
+        drawn = [len(older)] if newest else [int(random.integers(len(older)))]
+        if together > 1:
+            others = [i for i in range(len(everything)) if i != drawn[0]]
+            drawn += [int(i) for i in random.choice(others, min(together - 1, len(others)), replace=False)]
+        yield [everything[i] for i in drawn]

@@ -22,11 +22,11 @@ from sigmasplat.slam.step_result import Step, StepTimer
 from sigmasplat.tracking.drift import Drift
 from sigmasplat.tracking.fitted_depth import fitted_keyframe, fitted_to_map
 from sigmasplat.tracking.frame_estimate import FrameEstimate
+from sigmasplat.tracking.keyframe_rule import has_moved, is_held_back, is_keyframe
 from sigmasplat.tracking.moving.dynamic_mask import share_of
 from sigmasplat.tracking.pose_validation import is_questionable
 from sigmasplat.tracking.prepared_frame import PreparedFrame, refuse_first_without_depth
 from sigmasplat.tracking.recovery import Recovery, usable
-from sigmasplat.tracking.rules import has_moved, is_held_back, is_keyframe
 from sigmasplat.tracking.tracked_keyframe import TrackedKeyframe
 from sigmasplat.tracking.tracker import Tracker
 from sigmasplat.types import Matrix

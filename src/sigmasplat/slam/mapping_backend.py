@@ -3,11 +3,12 @@
 Both clocks do this work: `Slam.step` between two frames, `RealTime` beside them. Long work is done in slices.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from math import inf
 
 import numpy as np
 
+from sigmasplat.config import SubmapConfig
 from sigmasplat.data import se3
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.hops import UNKNOWN_HOP, Hop
@@ -22,8 +23,7 @@ from sigmasplat.tracking.known_map import KnownMap
 from sigmasplat.tracking.prepared_frame import PreparedFrame, PreparedImages
 from sigmasplat.tracking.recovery import Link, usable
 from sigmasplat.tracking.relocaliser import INDEX_AT_MOST, Relocation, sight_of
-from sigmasplat.tracking.rules import ends_submap, never
-from sigmasplat.types import Matrix, Task, completed
+from sigmasplat.types import Matrix, ShouldStop, Task, completed, never
 
 LAST_TRIES = 3
 """Number of keyframes per submap that is apart with which other components are searched at the end."""
@@ -40,7 +40,7 @@ class MappingBackend(SlamState):
         index: int,
         T_submap_camera: Matrix,
         hop: Hop = UNKNOWN_HOP,
-        should_stop: Callable[[], bool] = lambda: False,
+        should_stop: ShouldStop = never,
     ) -> Task[Matrix]:
         """Map frame number `index`, which `hop` leads to, in slices; return its pose, which mapping may have moved.
 
@@ -57,7 +57,7 @@ class MappingBackend(SlamState):
         self.mapper.add(self.view, self._keyframe(seen, index, T_submap_camera))
         return self._placed(index, hop)
 
-    def refining(self, steps: int, should_stop: Callable[[], bool] = never) -> Task[None]:
+    def refining(self, steps: int, should_stop: ShouldStop = never) -> Task[None]:
         """Make this many of the pending steps of the active submap's keyframes, in slices, until `should_stop`
         returns True."""
         if steps:
@@ -99,7 +99,7 @@ class MappingBackend(SlamState):
         since, moved_m = index - self.mapper.keyframes[0].index, self.drift.position_m(T_submap_camera)
         return bool(ends_submap(T_submap_camera, since, moved_m, self.config.submaps))
 
-    def cut(self, T_submap_camera: Matrix, should_stop: Callable[[], bool] = never) -> Task[None]:
+    def cut(self, T_submap_camera: Matrix, should_stop: ShouldStop = never) -> Task[None]:
         """Finish the active submap (`finish_submap`) and start the next one at its newest keyframe, in slices. A next
         submap that inherits splats also makes the pending steps of this keyframe."""
         inherited = None
@@ -114,7 +114,7 @@ class MappingBackend(SlamState):
         T_parent_camera: Matrix,
         information: Matrix,
         field: GaussianField,
-        should_stop: Callable[[], bool] = never,
+        should_stop: ShouldStop = never,
     ) -> Task[None]:
         """Finish the active submap (`finish_submap`) and start the next one at the camera, connected to a parent
         submap, in slices.
@@ -160,7 +160,7 @@ class MappingBackend(SlamState):
         self.atlas.begin_submap()
         self.confidence.begun(None, 0.0)
 
-    def finish_submap(self, should_stop: Callable[[], bool] = never) -> Task[None]:
+    def finish_submap(self, should_stop: ShouldStop = never) -> Task[None]:
         """Move the active submap to the store, in slices, and look for its loops, or leave that to the next frames
         (`loops.slices_per_frame`). Pending steps are made before, unless `should_stop` returns True."""
         yield from self.refining(self.mapper.pending, should_stop)
@@ -252,3 +252,20 @@ class MappingBackend(SlamState):
             self.confidence.joined(members, moved, kept, std_of(link.information))
             self.atlas.join(link.a, link.b, link.T_a_b)
             self.closer.connect(link.a, link.b, link.T_a_b, link.information)
+
+
+def ends_submap(
+    T_submap_camera: Matrix, frames_since: int, uncertainty_m: float, config: SubmapConfig
+) -> str:
+    """Return the name of the rule that ends the active submap at this keyframe, or "" if none does (VarSplat §2).
+
+    frames_since: frames since the submap began; uncertainty_m: `Drift.position_m` of the keyframe.
+    """
+    c = config
+    found = {
+        "distance": (float(np.linalg.norm(T_submap_camera[:3, 3])), c.distance_m),
+        "angle": (float(np.rad2deg(se3.rotation_angle(T_submap_camera[:3, :3]))), c.angle_deg),
+        "frames": (float(frames_since), c.frames - 1e-9 if c.frames else 0.0),
+        "uncertainty": (uncertainty_m, c.uncertainty_m),
+    }
+    return next((rule for rule, (value, limit) in found.items() if limit and value > limit), "")

@@ -23,12 +23,12 @@ from sigmasplat.slam.mapping_backend import MappingBackend
 from sigmasplat.slam.step_result import Step, StepTimer
 from sigmasplat.tracking.fitted_depth import fitted_keyframe, fitted_to_map
 from sigmasplat.tracking.frame_estimate import FrameEstimate
+from sigmasplat.tracking.keyframe_rule import is_held_back, is_keyframe
 from sigmasplat.tracking.moving.dynamic_mask import share_of
 from sigmasplat.tracking.pose_validation import is_better, is_questionable
 from sigmasplat.tracking.prepared_frame import PreparedFrame, refuse_first_without_depth, working_frame
 from sigmasplat.tracking.recovery import usable
 from sigmasplat.tracking.relocaliser import Relocation
-from sigmasplat.tracking.rules import is_held_back, is_keyframe
 from sigmasplat.types import Matrix, completed, no_progress, part_of
 
 

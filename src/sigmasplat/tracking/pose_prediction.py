@@ -1,6 +1,8 @@
 """Where the camera is expected before its image is used, and its motion since the last image."""
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
@@ -9,7 +11,11 @@ from sigmasplat.data import se3
 from sigmasplat.data.frame import PosePrior
 from sigmasplat.fit.align import align
 from sigmasplat.fit.pyramid import Pyramid
-from sigmasplat.types import Matrix
+from sigmasplat.render.view import View
+from sigmasplat.tracking.tracked_keyframe import Splats
+from sigmasplat.types import Matrix, ShouldStop, unless
+
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,3 +63,17 @@ def odometry(last: Pyramid, live: Pyramid, prediction: PosePrediction, config: T
     found = [align(last, live, g, 2 * config.align_iterations, config.align_weight_color) for g in guesses]
     best = max(found, key=lambda a: a.agreement * a.overlap)
     return None if best.agreement * best.overlap < config.lost_share else best.T_live_reference
+
+
+@dataclass(frozen=True, eq=False)
+class Given:
+    """What all fits of one frame share: the map, its view, where the camera is expected, and whether to stop."""
+
+    field: Splats
+    view: View
+    prediction: PosePrediction
+    should_stop: ShouldStop
+
+    def unless(self, guesses: Iterable[Item], least: int = 0) -> Iterator[Item]:
+        """Yield guesses, after the first `least` ones only while nothing asks to stop."""
+        return unless(self.should_stop, guesses, least)

@@ -6,8 +6,15 @@ from statistics import median
 
 import numpy as np
 
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
 from sigmasplat.fit.compare import Comparison
+from sigmasplat.fit.pose import PoseFit
+from sigmasplat.types import Matrix
 
+WIDE = 0.065
+"""A motion between two frames is wide if it moves the image by more than this share of its width: the basin of
+convergence of alignment ends near there."""
 RECENT = 50
 """What is usual is the median over this many recent frames that were not lost."""
 FEW = 5
@@ -15,6 +22,8 @@ FEW = 5
 LOST_CLOSE, LOST_EXPLAINED = 0.3, 0.85
 """Lost: `close`, or `explained`, is below this. Something large in front of the camera lowers the first; only a wrong
 pose lowers the second."""
+DOUBT = 0.7
+"""A pose is doubtful if its agreement × overlap falls below this share of the usual value."""
 DOUBT_CLOSE, DOUBT_EXPLAINED = 0.9, 0.95
 """Doubtful: `close` is below this share of its usual value, or `explained` is below this."""
 COVERED_CLOSE = 0.7
@@ -147,6 +156,24 @@ def stands(c: Comparison, doubtful: int) -> bool:
 def is_better(c: Comparison, doubtful: Comparison) -> bool:
     """Return whether a pose from the whole map replaces a doubtful one."""
     return score(c) > score(doubtful) + BETTER
+
+
+def is_wide(T_previous: Matrix, fit: PoseFit, camera: Camera, has_features: bool) -> bool:
+    """Return whether a frame is so far from the last one, at T_previous [4, 4], that a second guess by features is
+    worth its time."""
+    depth_m = fit.alignment.depth_m if fit.alignment is not None else 1.0
+    moved = se3.angle_between(T_previous, se3.inverse(fit.T_camera_world), depth_m) if has_features else 0.0
+    return moved * camera.fx > WIDE * camera.width
+
+
+def is_lost(fit: PoseFit, least_agreement: float, least_share: float) -> bool:
+    """Return whether tracking failed: the depths of map and sensor disagree, or too few pixels are in common."""
+    return fit.agreement < least_agreement or fit.agreement * fit.overlap < least_share
+
+
+def jumped(value: float, history: Sequence[float], factor: float) -> bool:
+    """Return whether a loss exceeds `factor` times the median of the recent losses (VarSplat §3, re-initialisation)."""
+    return len(history) >= 5 and value > factor * float(np.median(history[-50:]))
 
 
 @dataclass(eq=False)

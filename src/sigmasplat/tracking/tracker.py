@@ -15,6 +15,7 @@ from sigmasplat.fit.pose import PoseFit, fit_pose_adam, fit_pose_align
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference, map_reference
 from sigmasplat.render.view import View
+from sigmasplat.tracking import pose_validation as judge
 from sigmasplat.tracking.depth_fit import NOTHING_FITTED, DepthFit
 from sigmasplat.tracking.feature_image import FeatureImage, motion_by_features
 from sigmasplat.tracking.features import Extractor
@@ -22,34 +23,22 @@ from sigmasplat.tracking.moving.depth_history import together
 from sigmasplat.tracking.moving.drawn import has_drawn
 from sigmasplat.tracking.moving.dynamic_detector import DynamicDetector
 from sigmasplat.tracking.moving.dynamic_mask import DynamicMask
-from sigmasplat.tracking.pose_prediction import PosePrediction, odometry, predict
-from sigmasplat.tracking.pose_validation import (
-    LEAST_COMMON,
-    RECENT,
-    TrackingStatistics,
-    confirmed,
-    is_missed,
-    score,
-    stands,
-)
+from sigmasplat.tracking.pose_prediction import Given, PosePrediction, odometry, predict
+from sigmasplat.tracking.pose_validation import TrackingStatistics
 from sigmasplat.tracking.prepared_frame import FoundKeyframe, PreparedImages
-from sigmasplat.tracking.rules import ShouldStop, is_lost, is_wide, jumped, never, unless
 from sigmasplat.tracking.tracked_keyframe import Splats, TrackedKeyframe, found_keyframe, mapped_keyframe
-from sigmasplat.types import Matrix
-
-DOUBT = 0.7
-"""A pose is doubtful if its agreement × overlap falls below this share of the usual value."""
+from sigmasplat.types import Matrix, ShouldStop, never
 
 
 @dataclass(eq=False)
 class Tracker:
     """Keeps the last pose, the velocity, the last image, the reference keyframe, and statistics of recent fits.
 
-    prior: that of the last frame; lost: tracking of the last frame failed; doubtful: number of frames in a
-    row whose best pose the images contradict (`_contradicted`); front: what was in front of the scene in the last
-    frame, None if there was nothing or the frame was lost; keyframe_front: the same for the newest keyframe; watch:
-    what is known of moving things; depth: what is known of predicted depth (`tracking.fit_depth`).
-    Raises ConfigError on settings that do not fit together.
+    prior: that of the last frame; lost: tracking of the last frame failed; doubtful: number of frames in a row whose
+    best pose the images contradict (`_contradicted`); front: what was in front of the scene in the last frame, None if
+    there was nothing or the frame was lost; keyframe_front: the same for the newest keyframe; detector: of moving
+    things; depth: the fit of predicted depth; started: a frame was tracked. Raises ConfigError on settings that do not
+    fit together.
     """
 
     config: TrackingConfig
@@ -71,20 +60,15 @@ class Tracker:
     lost: bool = False
     doubtful: int = 0
     started: bool = False
-    """Whether a frame has been tracked yet."""
 
     def start(self, seen: PreparedImages, prior: PosePrior = NO_PRIOR) -> None:
         """Fix the gauge: the first camera is the world."""
         self.last_image, self.last_features, self.prior = seen.live, seen.image, prior
 
     def track(
-        self,
-        field: Splats,
-        view: View,
-        seen: PreparedImages,
-        prior: PosePrior = NO_PRIOR,
+        self, field: Splats, view: View, seen: PreparedImages, prior: PosePrior = NO_PRIOR,
         should_stop: ShouldStop = never,
-    ) -> PoseFit:
+    ) -> PoseFit:  # fmt: skip
         """Estimate T_camera_world of a frame; `self.lost` then says whether tracking failed. A given pose is taken as
         it is, and judged by the images.
 
@@ -92,14 +76,15 @@ class Tracker:
         returns True, that guess and the later ones are left out. A lost frame gets the best available guess (odometry,
         else the last pose), and the velocity is reset.
         """
-        prediction, shown = self.prediction(prior), seen.shown
-        if prediction.given:
-            best = self._fit(field, view, shown, prediction.predicted, patience=0)
-            best.T_camera_world = se3.inverse(prediction.predicted)
+        given, shown = Given(field, view, self.prediction(prior), should_stop), seen.shown
+        predicted = given.prediction.predicted
+        if given.prediction.given:
+            best = self._fit(given, shown, predicted, patience=0)
+            best.T_camera_world = se3.inverse(predicted)
             self.front, self.lost, self.doubtful = None, False, 0
         else:
-            best = self._estimated(field, view, seen, shown, prediction, should_stop)
-            self.lost = self._is_lost(best) or self._leaps(best, prediction.predicted)
+            best = self._estimated(given, seen, shown)
+            self.lost = self._is_lost(best) or self._leaps(best, predicted)
             self.doubtful = self.doubtful + 1 if self._contradicted(best) else 0
         self.prior = prior
         if self.lost:  # poses of earlier frames do not agree with later ones
@@ -110,55 +95,41 @@ class Tracker:
         self._remember(best, seen.without(self.front))
         return best
 
-    def _estimated(
-        self,
-        field: Splats,
-        view: View,
-        seen: PreparedImages,
-        shown: PreparedImages,
-        prediction: PosePrediction,
-        should_stop: ShouldStop,
-    ) -> PoseFit:
+    def _estimated(self, given: Given, seen: PreparedImages, shown: PreparedImages) -> PoseFit:
         """Return the best of the fits from all guesses; shown: the frame as it is fitted first."""
-        best = self._fit(field, view, shown, prediction.predicted)
-        best, shown = self._uncovered(field, view, seen, shown, prediction, best, should_stop)
-        if is_wide(self.previous, best, view.camera, self.extractor is not None) or self._doubts(best):
-            guesses = unless(should_stop, self._other_guesses(shown, prediction))
-            best = max([best, *(self._fit(field, view, shown, guess) for guess in guesses)], key=self._score)
-        return self._retry(field, view, shown, best, prediction, should_stop) if self._doubts(best) else best
+        best = self._fit(given, shown, given.prediction.predicted)
+        best, shown = self._uncovered(given, seen, shown, best)
+        if judge.is_wide(self.previous, best, given.view.camera, self.extractor is not None) or self._doubts(best):
+            guesses = given.unless(self._other_guesses(shown, given.prediction))
+            best = max([best, *(self._fit(given, shown, guess) for guess in guesses)], key=self._score)
+        return self._retry(given, shown, best) if self._doubts(best) else best
 
     def _uncovered(
-        self,
-        field: Splats,
-        view: View,
-        seen: PreparedImages,
-        first: PreparedImages,
-        prediction: PosePrediction,
-        fit: PoseFit,
-        should_stop: ShouldStop,
+        self, given: Given, seen: PreparedImages, first: PreparedImages, fit: PoseFit
     ) -> tuple[PoseFit, PreparedImages]:
         """Find what is in front of the scene, and fit the pose without it; return the fit and the frame without it. If
         nothing is, or the images contradict that pose: the same fit, and the frame as it was fitted (`first`)."""
         before, self.front = self.front, None
         if fit.comparison is None or self.lost:
             return fit, first
-        found = self._without_front(field, view, seen, first, prediction, fit, before, should_stop)
-        if found is None and self.detector.config.find and not should_stop():
-            found = self._without_object(field, view, seen, prediction.predicted, fit, before is not None, should_stop)
+        found = self._without_front(given, seen, first, fit, before)
+        if found is None and self.detector.config.find and not given.should_stop():
+            found = self._without_object(given, seen, fit, before is not None)
         return (fit, first) if found is None else found
 
     def _without_front(
-        self, field: Splats, view: View, seen: PreparedImages, first: PreparedImages, prediction: PosePrediction,
-        fit: PoseFit, before: DynamicMask | None, should_stop: ShouldStop,
-    ) -> tuple[PoseFit, PreparedImages] | None:  # fmt: skip
+        self, given: Given, seen: PreparedImages, first: PreparedImages, fit: PoseFit, before: DynamicMask | None
+    ) -> tuple[PoseFit, PreparedImages] | None:
         """Return the fit and the frame without what is in space that was free, or None; before: in front in the last
         frame. The newest keyframe loses what has left it. If it is hidden, the last image and the map give the pose."""
         slow, known = self.detector.slow(seen, se3.inverse(fit.T_camera_world)), before or self.keyframe_front
-        if fit.comparison is None or (slow is None and not self.detector.suspects(fit.comparison, known, should_stop)):
+        if fit.comparison is None or (
+            slow is None and not self.detector.suspects(fit.comparison, known, given.should_stop)
+        ):
             return None
-        keyframe, predicted, expected_front = self.keyframe, prediction.predicted, None
-        for guess in unless(should_stop, (predicted, se3.inverse(fit.T_camera_world)), least=1):
-            for _ in unless(should_stop, range(2), least=1):  # a better pose shows better what is in front
+        keyframe, predicted, expected_front = self.keyframe, given.prediction.predicted, None
+        for guess in given.unless((predicted, se3.inverse(fit.T_camera_world)), least=1):
+            for _ in given.unless(range(2), least=1):  # a better pose shows better what is in front
                 front = together(
                     self.detector.in_front(keyframe, self.keyframe_front, before, self.previous, seen, guess), slow
                 )
@@ -167,8 +138,8 @@ class Tracker:
                 if front is None and self.keyframe is keyframe:
                     break
                 shown = first if front is None else seen.aside(front)
-                found = self._fit(field, view, shown, guess)
-                found = self.detector.fitted_to_all(self.keyframe, shown.live, found, self.config, should_stop)
+                found = self._fit(given, shown, guess)
+                found = self.detector.fitted_to_all(self.keyframe, shown.live, found, self.config, given.should_stop)
                 guess = se3.inverse(found.T_camera_world)
             else:
                 moves = self.detector.takes_for_moving(front, self.keyframe, seen, found)
@@ -176,31 +147,25 @@ class Tracker:
                     self.front = front
                     return found, shown
         self.keyframe = keyframe
-        if expected_front is None or should_stop():
+        if expected_front is None or given.should_stop():
             return None
         shown = seen.aside(expected_front)
-        judged = self._fit(field, view, shown, se3.inverse(fit.T_camera_world), patience=0)
-        found = self._retry(field, view, shown, judged, prediction, should_stop)
+        judged = self._fit(given, shown, se3.inverse(fit.T_camera_world), patience=0)
+        found = self._retry(given, shown, judged)
         moves = self.detector.takes_for_moving(expected_front, keyframe, seen, found)
         self.front = expected_front if moves and self._stands(found, predicted, fit.comparison) else None
         return None if self.front is None else (found, shown)
 
     def _without_object(
-        self,
-        field: Splats,
-        view: View,
-        seen: PreparedImages,
-        predicted: Matrix,
-        drawn: PoseFit,
-        known: bool,
-        should_stop: ShouldStop,
+        self, given: Given, seen: PreparedImages, drawn: PoseFit, known: bool
     ) -> tuple[PoseFit, PreparedImages] | None:
         """Return the fit and the frame without the thing that moves and has drawn the pose with it; None if there is
         none. known: the last frame had something in front."""
+        predicted = given.prediction.predicted
         contradicted, urgent = self._contradicted(drawn), known or self.statistics.agrees_less(drawn.comparison)
         self.detector, things = self.detector.suspected(self.keyframe, seen, drawn, self.config, contradicted, urgent)
-        for front in unless(should_stop, things):
-            found = self._fit(field, view, shown := seen.aside(front), predicted)
+        for front in given.unless(things):
+            found = self._fit(given, shown := seen.aside(front), predicted)
             if self._stands(found, predicted) and has_drawn(front, self.keyframe, seen, drawn, found, contradicted):
                 self.front = front
                 return found, shown
@@ -214,7 +179,7 @@ class Tracker:
 
     def _stands(self, fit: PoseFit, predicted: Matrix, whole: Comparison | None = None) -> bool:
         lost = self._is_lost(fit) or self._contradicted(fit) or self._leaps(fit, predicted)
-        return not (lost or is_missed(fit.comparison, whole))
+        return not (lost or judge.is_missed(fit.comparison, whole))
 
     def _remember(self, fit: PoseFit, seen: PreparedImages) -> None:
         """Keep what the next frame needs."""
@@ -223,8 +188,8 @@ class Tracker:
             self.velocity = np.eye(4)
         else:
             self.velocity = se3.inverse(self.previous) @ T_world_camera
-            self.agreements = [*self.agreements, fit.agreement * fit.overlap][-RECENT:]
-            self.first_losses = [*self.first_losses, fit.first_loss][-RECENT:]
+            self.agreements = [*self.agreements, fit.agreement * fit.overlap][-judge.RECENT :]
+            self.first_losses = [*self.first_losses, fit.first_loss][-judge.RECENT :]
             if fit.comparison is not None:
                 self.statistics.add(fit.comparison, float(np.linalg.norm(self.velocity[:3, 3])))
         self.previous = T_world_camera
@@ -236,14 +201,15 @@ class Tracker:
         """Return where the camera of the next frame is expected."""
         return predict(self.previous, self.velocity, self.prior, prior, self.config.motion_model)
 
-    def _fit(self, field: Splats, view: View, seen: PreparedImages, guess: Matrix, patience: int = 1) -> PoseFit:
+    def _fit(self, given: Given, seen: PreparedImages, guess: Matrix, patience: int = 1) -> PoseFit:
         """Fit from an initial T_world_camera; patience: factor on the number of iterations of gradient descent; with 0,
         the pose stays as it is, and is only judged."""
         T_camera_world, c = se3.inverse(guess), self.config
         if c.method == "adam":
             config = c if self.started else c.without_motion()
-            return fit_pose_adam(field.params, view, seen.target, T_camera_world, config, patience * config.iterations)
-        reference = self.keyframe or map_reference(field.params, view, T_camera_world, c)
+            steps = patience * config.iterations
+            return fit_pose_adam(given.field.params, given.view, seen.target, T_camera_world, config, steps)
+        reference = self.keyframe or map_reference(given.field.params, given.view, T_camera_world, c)
         return self._aligned(reference, seen.live, T_camera_world, patience > 0)
 
     def _aligned(self, reference: Reference, live: Pyramid, T_camera_world: Matrix, moves: bool = True) -> PoseFit:
@@ -258,7 +224,7 @@ class Tracker:
         shows too little of the frame, with the reference of the alignment."""
         if self.keyframe is not None and self.keyframe is not reference:
             found = self.keyframe.compared(live, T_camera_world)
-            if found.common >= LEAST_COMMON:
+            if found.common >= judge.LEAST_COMMON:
                 return found
         return reference.compared(live, T_camera_world)
 
@@ -275,47 +241,39 @@ class Tracker:
         if prediction.measured:
             yield self.previous @ self.velocity if self.config.motion_model else self.previous
 
-    def _retry(
-        self,
-        field: Splats,
-        view: View,
-        seen: PreparedImages,
-        fit: PoseFit,
-        prediction: PosePrediction,
-        should_stop: ShouldStop,
-    ) -> PoseFit:
+    def _retry(self, given: Given, seen: PreparedImages, fit: PoseFit) -> PoseFit:
         """Retry from odometry with twice the iterations (VarSplat §3), and from the last pose; return the best fit.
 
         With alignment, also try the map rendered at these poses: it contains more than the newest keyframe.
         """
-        odometry = None if should_stop() else self._odometry(view, seen.live, prediction)
-        starts = [prediction.last] if odometry is None else [odometry, prediction.last]
-        fits = [fit, *(self._fit(field, view, seen, start, 2) for start in unless(should_stop, starts))]
-        for start in unless(should_stop, starts if self.config.method == "align" else ()):
-            reference = map_reference(field.params, view, se3.inverse(start), self.config)
+        odometry = None if given.should_stop() else self._odometry(given, seen.live)
+        starts = [given.prediction.last] if odometry is None else [odometry, given.prediction.last]
+        fits = [fit, *(self._fit(given, seen, start, 2) for start in given.unless(starts))]
+        for start in given.unless(starts if self.config.method == "align" else ()):
+            reference = map_reference(given.field.params, given.view, se3.inverse(start), self.config)
             fits.append(self._aligned(reference, seen.live, se3.inverse(start)))
         best = max(fits, key=self._score)
         if self._is_lost(best):
             best.T_camera_world = se3.inverse(starts[0])
         return best
 
-    def _odometry(self, view: View, live: Pyramid, prediction: PosePrediction) -> Matrix | None:
+    def _odometry(self, given: Given, live: Pyramid) -> Matrix | None:
         """Align the last image to this one and return T_world_camera; None if this fails too."""
-        if self.last_image is None or (self.config.method == "adam" and not fits_of(view).aligns):
+        if self.last_image is None or (self.config.method == "adam" and not fits_of(given.view).aligns):
             return None  # alignment needs the compiled kernels
-        found = odometry(self.last_image, live, prediction, self.config)
+        found = odometry(self.last_image, live, given.prediction, self.config)
         return None if found is None else np.asarray(self.previous @ se3.inverse(found))
 
     # ---- verdicts ----
 
     def _score(self, fit: PoseFit) -> float:
-        return fit.agreement * fit.overlap if fit.comparison is None else score(fit.comparison)
+        return fit.agreement * fit.overlap if fit.comparison is None else judge.score(fit.comparison)
 
     def _is_lost(self, fit: PoseFit) -> bool:
         if fit.comparison is None:
-            return is_lost(fit, self.config.lost_agreement, self.config.lost_share)
+            return judge.is_lost(fit, self.config.lost_agreement, self.config.lost_share)
         if self.lost:  # after a lost frame the path of the camera does not support a pose
-            return not confirmed(fit.comparison)
+            return not judge.confirmed(fit.comparison)
         return self.statistics.is_lost(fit.comparison, self.config.lost_share)
 
     def _leaps(self, fit: PoseFit, predicted: Matrix) -> bool:
@@ -328,8 +286,10 @@ class Tracker:
     def _doubts(self, fit: PoseFit) -> bool:
         if fit.comparison is not None:
             return self.statistics.doubts(fit.comparison)
-        worse = fit.agreement * fit.overlap < DOUBT * (float(np.median(self.agreements)) if self.agreements else 1.0)
-        return worse or jumped(fit.first_loss, self.first_losses, self.config.reinit_factor)
+        worse = fit.agreement * fit.overlap < judge.DOUBT * (
+            float(np.median(self.agreements)) if self.agreements else 1.0
+        )
+        return worse or judge.jumped(fit.first_loss, self.first_losses, self.config.reinit_factor)
 
     def _contradicted(self, fit: PoseFit) -> bool:
         """Return whether a pose is doubtful for another reason than a small overlap, which a new keyframe mends."""
@@ -338,7 +298,7 @@ class Tracker:
     def is_certain(self, fit: PoseFit) -> bool:
         """Return whether the pose of the last frame may be used for mapping."""
         doubtful = self.doubtful if self.config.verify else 0
-        return not doubtful or (fit.comparison is not None and stands(fit.comparison, doubtful))
+        return not doubtful or (fit.comparison is not None and judge.stands(fit.comparison, doubtful))
 
     # ---- keyframes ----
 

@@ -20,7 +20,7 @@ from sigmasplat.plugins.evaluation.metrics.trajectory import associate, truth_in
 from sigmasplat.plugins.evaluation.pose_covariance import score_path_covariance
 from sigmasplat.run.protocols import Callback
 from sigmasplat.slam.slam import Slam
-from sigmasplat.tracking.rules import is_held_back
+from sigmasplat.tracking.keyframe_rule import is_held_back
 from sigmasplat.types import Matrix, no_progress
 
 

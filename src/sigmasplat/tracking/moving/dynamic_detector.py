@@ -17,8 +17,7 @@ from sigmasplat.tracking.moving.drawn import is_still, suspected
 from sigmasplat.tracking.moving.dynamic_mask import DynamicMask, Earlier, dynamic_mask
 from sigmasplat.tracking.pose_validation import differs
 from sigmasplat.tracking.prepared_frame import PreparedImages
-from sigmasplat.tracking.rules import ShouldStop
-from sigmasplat.types import Matrix
+from sigmasplat.types import Matrix, ShouldStop
 
 FRONT = 0.03
 """What is in front is looked for if at least this share of the compared points is nearer than the reference."""

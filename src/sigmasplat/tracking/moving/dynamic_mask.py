@@ -22,7 +22,6 @@ from sigmasplat.tracking.moving.windows import (
     upper_median,
     widened,
 )
-from sigmasplat.tracking.rules import angle_between
 from sigmasplat.types import Matrix
 
 STEP = 2
@@ -88,7 +87,7 @@ class Earlier:
         read = live_m[live_m > 0]
         if not len(read):
             return self
-        moved_rad = angle_between(np.eye(4), self.T_earlier_live, float(upper_median(read)))
+        moved_rad = se3.angle_between(np.eye(4), self.T_earlier_live, float(upper_median(read)))
         return replace(self, further_px=int(POSE_ERROR * camera.fx * moved_rad))
 
 
