@@ -254,9 +254,7 @@ class MappingBackend(SlamState):
             self.closer.connect(link.a, link.b, link.T_a_b, link.information)
 
 
-def ends_submap(
-    T_submap_camera: Matrix, frames_since: int, uncertainty_m: float, config: SubmapConfig
-) -> str:
+def ends_submap(T_submap_camera: Matrix, frames_since: int, uncertainty_m: float, config: SubmapConfig) -> str:
     """Return the name of the rule that ends the active submap at this keyframe, or "" if none does (VarSplat §2).
 
     frames_since: frames since the submap began; uncertainty_m: `Drift.position_m` of the keyframe.

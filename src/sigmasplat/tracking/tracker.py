@@ -5,11 +5,10 @@ from dataclasses import dataclass, field as dataclass_field, replace
 
 import numpy as np
 
-from sigmasplat.config import TrackingConfig
+from sigmasplat.config import Config, TrackingConfig
 from sigmasplat.data import se3
 from sigmasplat.data.frame import NO_PRIOR, PosePrior
 from sigmasplat.fit.align import Alignment, align
-from sigmasplat.fit.backends import fits_of
 from sigmasplat.fit.compare import Comparison
 from sigmasplat.fit.pose import PoseFit, fit_pose_adam, fit_pose_align
 from sigmasplat.fit.pyramid import Pyramid
@@ -60,6 +59,12 @@ class Tracker:
     lost: bool = False
     doubtful: int = 0
     started: bool = False
+
+    @staticmethod
+    def of(config: Config, extractor: Extractor | None) -> "Tracker":
+        """Return the tracker of a run; the extractor is left out if tracking uses no features."""
+        features = extractor if config.tracking.features else None
+        return Tracker(config.tracking, features, detector=DynamicDetector(config.moving))
 
     def start(self, seen: PreparedImages, prior: PosePrior = NO_PRIOR) -> None:
         """Fix the gauge: the first camera is the world."""
@@ -246,8 +251,10 @@ class Tracker:
 
         With alignment, also try the map rendered at these poses: it contains more than the newest keyframe.
         """
-        odometry = None if given.should_stop() else self._odometry(given, seen.live)
-        starts = [given.prediction.last] if odometry is None else [odometry, given.prediction.last]
+        moved = None if given.should_stop() else odometry(self.last_image, seen.live, given, self.config)
+        starts = [given.prediction.last]
+        if moved is not None:
+            starts.insert(0, np.asarray(self.previous @ se3.inverse(moved)))
         fits = [fit, *(self._fit(given, seen, start, 2) for start in given.unless(starts))]
         for start in given.unless(starts if self.config.method == "align" else ()):
             reference = map_reference(given.field.params, given.view, se3.inverse(start), self.config)
@@ -256,13 +263,6 @@ class Tracker:
         if self._is_lost(best):
             best.T_camera_world = se3.inverse(starts[0])
         return best
-
-    def _odometry(self, given: Given, live: Pyramid) -> Matrix | None:
-        """Align the last image to this one and return T_world_camera; None if this fails too."""
-        if self.last_image is None or (self.config.method == "adam" and not fits_of(given.view).aligns):
-            return None  # alignment needs the compiled kernels
-        found = odometry(self.last_image, live, given.prediction, self.config)
-        return None if found is None else np.asarray(self.previous @ se3.inverse(found))
 
     # ---- verdicts ----
 
