@@ -21,7 +21,7 @@ from sigmasplat.slam.step_result import StepTimer
 from sigmasplat.tracking.pose_validation import is_better
 from sigmasplat.tracking.prepared_frame import PreparedFrame
 from sigmasplat.tracking.relocaliser import Relocation
-from sigmasplat.tracking.tracked_keyframe import TrackedKeyframe, found_keyframe, mapped_keyframe
+from sigmasplat.tracking.tracked_keyframe import TrackedKeyframe, mapped_keyframe
 from sigmasplat.types import Matrix
 
 AS_GOOD = 0.99
@@ -220,7 +220,7 @@ class BackEnd:
         system = self.system
         if place.where[0] == len(system.store):
             c, params = system.config.tracking, system.mapper.field.params
-            keyframe = self._described(found_keyframe(params, system.view, place.keyframe, c))
+            keyframe = self._described(place.keyframe.weighed(params, system.view, c))
             newest = {self._newest: system.atlas.keyframe_poses.last[-1]}
             self._publish(number, keyframe, newest | {number: place.T_submap_camera}, RELOCALISED)
             return
