@@ -13,8 +13,7 @@ from sigmasplat.config.sensors import sensor_problems
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.errors import ConfigError, SourceError
-from sigmasplat.files.reading import exists
-from sigmasplat.files.structured import read_json
+from sigmasplat.files.reading import exists, read_json
 
 Distortion = tuple[float, ...]
 """Radial and tangential distortion k1, k2, p1, p2, k3 [, k4, k5, k6 of the rational model's denominator]."""

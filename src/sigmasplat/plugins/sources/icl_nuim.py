@@ -18,7 +18,7 @@ from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SourceError
 from sigmasplat.files.reading import exists
 from sigmasplat.input.calibration import ICL_NUIM, TUM_UNITS_PER_METRE, freiburg_calibration, resolve_calibration
-from sigmasplat.input.folders import FRAMES_PER_SECOND
+from sigmasplat.input.images import FRAMES_PER_SECOND
 from sigmasplat.input.lists import parse_numbers, read_lines, read_poses
 from sigmasplat.input.recorded import ImagePair, RecordedSource, first_size
 from sigmasplat.registry import SourceFormat

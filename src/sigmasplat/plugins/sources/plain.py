@@ -13,8 +13,7 @@ from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.files.reading import exists
 from sigmasplat.input.calibration import MM_PER_METRE, resolve_calibration
-from sigmasplat.input.color_only import without_depth
-from sigmasplat.input.folders import (
+from sigmasplat.input.images import (
     COLOR_ENDINGS,
     COLOR_FOLDERS,
     DEPTH_ENDINGS,
@@ -26,6 +25,7 @@ from sigmasplat.input.folders import (
     times_of_names,
 )
 from sigmasplat.input.lists import read_poses
+from sigmasplat.input.opening import without_depth
 from sigmasplat.input.recorded import ImagePair, RecordedSource, first_size
 from sigmasplat.registry import SourceFormat
 

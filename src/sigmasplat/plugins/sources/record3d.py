@@ -9,6 +9,7 @@ issues 7 and 27; nerfstudio, record3d_utils.py. Depth has fewer pixels than colo
 0, 1 or 2, and readings with confidence 0 are ignored.
 """
 
+import re
 import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,19 +21,54 @@ from numpy.typing import NDArray
 
 from sigmasplat.config import InputConfig
 from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.env import import_optional
 from sigmasplat.errors import SourceError
-from sigmasplat.files.guard import DAMAGED
-from sigmasplat.files.optional import import_optional
 from sigmasplat.files.pictures import check_pixels
-from sigmasplat.files.reading import refuse_special
-from sigmasplat.files.structured import MOST_JSON_BYTES, parse_json
+from sigmasplat.files.reading import DAMAGED, MOST_JSON_BYTES, guarded, parse_json, read_bytes, refuse_special
 from sigmasplat.input.calibration import Calibration, build_camera, check_positive, json_number, resolve_calibration
 from sigmasplat.input.images import decode_color, depth_to_metres, image_size
-from sigmasplat.input.pose_files import FLIP_YZ, rigid_transform
+from sigmasplat.input.lists import FLIP_YZ, rigid_transform
 from sigmasplat.input.recorded import ImagePair, RecordedSource, Size, first_readable
-from sigmasplat.plugins.sources.files.archive import Archive
 from sigmasplat.plugins.sources.stray_scanner import with_coarser_depth
 from sigmasplat.registry import SourceFormat
+
+MOST_MEMBER_BYTES = 128 << 20
+"""Largest file of an archive after unzipping: an image, or its depth."""
+
+
+class Archive:
+    """The files of a zip archive or of its unpacked folder, by relative name; nothing is unpacked to disk."""
+
+    def __init__(self, path: Path) -> None:
+        """List the files. Raises SourceError if a file is not a complete zip archive."""
+        self.path, self._zip = path, None
+        if path.is_dir():
+            self.names = [str(entry.relative_to(path)) for part in ("*", "*/*") for entry in path.glob(part)]
+            return
+        with guarded(path, "copy it again", SourceError, "not a complete zip archive"):
+            self._zip = zipfile.ZipFile(path)
+        self.names = self._zip.namelist()
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.names
+
+    def read(self, name: str, most: int = MOST_MEMBER_BYTES) -> bytes:
+        """Return the bytes of a file. Raises SourceError naming it if it is missing, damaged, encrypted, or has more
+        than `most` bytes."""
+        where = self.path / name
+        if self._zip is None:
+            return read_bytes(where, SourceError, most)
+        failed = "cannot be read from its archive"
+        with guarded(where, "copy it again", SourceError, failed), self._zip.open(name) as member:
+            data = member.read(most + 1)
+        if len(data) > most:
+            raise SourceError(f"{where}: unzips to more than {most / 1e6:.0f} MB; is it the right file?")
+        return data
+
+    def by_number(self, folder: str, endings: str) -> dict[int, str]:
+        """Map N to each name folder/N.ending, in order of N; `endings` is a regular expression such as "jpg|png"."""
+        found = [(re.fullmatch(rf"{folder}/(\d+)\.({endings})", name), name) for name in self.names]
+        return dict(sorted((int(match.group(1)), name) for match, name in found if match))
 
 
 @dataclass(frozen=True)

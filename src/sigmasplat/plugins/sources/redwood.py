@@ -18,7 +18,6 @@ from sigmasplat.config import InputConfig
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SourceError
 from sigmasplat.files.reading import open_regular
-from sigmasplat.input.association import MAX_GAP_S, associate, no_pairs, refuse_other_units
 from sigmasplat.input.calibration import (
     MM_PER_METRE,
     PRIMESENSE,
@@ -29,7 +28,7 @@ from sigmasplat.input.calibration import (
     read_json_object,
     resolve_calibration,
 )
-from sigmasplat.input.folders import (
+from sigmasplat.input.images import (
     COLOR_ENDINGS,
     COLOR_FOLDERS,
     DEPTH_ENDINGS,
@@ -39,8 +38,17 @@ from sigmasplat.input.folders import (
     list_images,
     pair_images,
 )
-from sigmasplat.input.lists import parse_numbers, read_lines
-from sigmasplat.input.pose_files import build_trajectory, checked_pose, to_matrix
+from sigmasplat.input.lists import (
+    MAX_GAP_S,
+    associate,
+    build_trajectory,
+    checked_pose,
+    no_pairs,
+    parse_numbers,
+    read_lines,
+    refuse_other_units,
+    to_matrix,
+)
 from sigmasplat.input.recorded import ImagePair, RecordedSource, first_size
 from sigmasplat.registry import SourceFormat
 

@@ -16,7 +16,7 @@ from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SourceError
 from sigmasplat.files.reading import exists, read_text
 from sigmasplat.input.calibration import REPLICA, Calibration, read_replica_calibration, resolve_calibration
-from sigmasplat.input.folders import FRAMES_PER_SECOND, pair_images
+from sigmasplat.input.images import FRAMES_PER_SECOND, pair_images
 from sigmasplat.input.recorded import ImagePair, RecordedSource
 from sigmasplat.registry import SourceFormat
 

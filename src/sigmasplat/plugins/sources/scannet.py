@@ -1,4 +1,4 @@
-"""Read ScanNet scenes extracted from .sens files, in both layouts of SensReader.
+"""Read ScanNet scenes extracted from .sens files, in both layouts of SensReader, and ScanNet++ scenes.
 
 color/0.jpg  depth/0.png  pose/0.txt                         SensReader/python; also 000000.jpg
 intrinsic/intrinsic_color.txt  intrinsic_depth.txt  extrinsic_color.txt  extrinsic_depth.txt
@@ -8,6 +8,16 @@ frame-000000.color.jpg  .depth.pgm  .pose.txt  _info.txt     SensReader/c++; als
 Depth (640×480, mm) has its own camera. It is registered to colour (1296×968), and the working width is depth's.
 Extrinsics transform a common frame to each camera: T_color_depth = E_color · E_depth⁻¹ (as in BundleFusion).
 Poses are camera to world, and −inf where tracking was lost: these frames are kept, without ground truth.
+
+ScanNet++ has undistorted DSLR photographs, and depth rendered from the laser scan:
+
+dslr/nerfstudio/transforms_undistorted.json     `frames` and `test_frames` (see `input/transforms.py`)
+dslr/undistorted_images/DSC00001.JPG            from the data set's toolbox, `dslr.undistort`
+dslr/undistorted_depths/DSC00001.png            16 bits, mm, rendered, undistorted (Nik-V9/scannetpp)
+dslr/train_test_lists.json                      optional {"train": […], "test": […]}: names in order
+
+The sequence contains the training photographs. The test photographs are not taken along the path, so they cannot be
+tracked: `test_views()` returns them with their poses. SplaTAM and similar systems read the same layout.
 """
 
 from pathlib import Path
@@ -19,8 +29,15 @@ from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.errors import SourceError
 from sigmasplat.files.reading import read_text
-from sigmasplat.input.calibration import MM_PER_METRE, Calibration, build_camera, check_positive, resolve_calibration
-from sigmasplat.input.folders import (
+from sigmasplat.input.calibration import (
+    MM_PER_METRE,
+    Calibration,
+    build_camera,
+    check_positive,
+    read_json_object,
+    resolve_calibration,
+)
+from sigmasplat.input.images import (
     COLOR_ENDINGS,
     DEPTH_ENDINGS,
     FRAMES_PER_SECOND,
@@ -32,9 +49,9 @@ from sigmasplat.input.folders import (
     list_images,
     pair_images,
 )
-from sigmasplat.input.lists import parse_numbers
-from sigmasplat.input.pose_files import read_matrix, read_pose_files, to_matrix
+from sigmasplat.input.lists import build_trajectory, parse_numbers, read_matrix, read_pose_files, to_matrix
 from sigmasplat.input.recorded import ImagePair, RecordedSource, first_size
+from sigmasplat.input.transforms import Fields, read_camera, read_frames, read_pose
 from sigmasplat.registry import SourceFormat
 from sigmasplat.types import Matrix
 
@@ -130,10 +147,74 @@ def recognises(path: str) -> bool:
     return images is not None and (camera or (folder / "pose").is_dir())
 
 
-PLUGIN = SourceFormat(
+_SCANNET = SourceFormat(
     "ScanNet",
     "color/, depth/ and pose/",
     recognises,
     lambda path, settings: open_scannet(Path(path), settings),
     sensor="kinect-v1",
 )
+
+
+TRANSFORMS = Path("nerfstudio") / "transforms_undistorted.json"
+IMAGES, DEPTHS, LISTS = "undistorted_images", "undistorted_depths", "train_test_lists.json"
+
+
+def open_scannetpp(scene: Path, settings: InputConfig) -> RecordedSource:
+    """Open a scene's folder or its `dslr`. Raises SourceError if its JSON file, images or camera cannot be used."""
+    dslr = _dslr(scene)
+    fields = read_json_object(dslr / TRANSFORMS)
+    _refuse_missing_folders(dslr)
+    views = _chosen(dslr, fields, "test", "test_frames") if fields.get("test_frames") else []
+    views = [view for view in views if (dslr / IMAGES / view["file_path"]).is_file()]
+    test = _source(dslr, fields, views, settings) if views else None
+    return _source(dslr, fields, _chosen(dslr, fields, "train", "frames"), settings, test)
+
+
+def _source(
+    dslr: Path, fields: Fields, frames: list[Fields], settings: InputConfig, test: RecordedSource | None = None
+) -> RecordedSource:
+    path, scene = dslr / TRANSFORMS, dslr.resolve().parent
+    files = [(dslr / IMAGES / f["file_path"], (dslr / DEPTHS / f["file_path"]).with_suffix(".png")) for f in frames]
+    images = [ImagePair(i / FRAMES_PER_SECOND, *pair) for i, pair in enumerate(files)]
+    size = first_size([color for color, _ in files])
+    camera = read_camera(path, fields, frames, size, MM_PER_METRE)
+    calibration = resolve_calibration(scene, camera, size, settings, MM_PER_METRE)
+    truth = build_trajectory((i.timestamp_s, read_pose(path, frame)) for i, frame in zip(images, frames, strict=True))
+    return RecordedSource(scene.name, images, calibration, settings, truth, test=test)
+
+
+def _chosen(dslr: Path, fields: Fields, split: str, key: str) -> list[Fields]:
+    """Return the frames of a split, in the order of train_test_lists.json if it exists, else of their names."""
+    frames = {frame["file_path"]: frame for frame in read_frames(dslr / TRANSFORMS, fields, key)}
+    lists = read_json_object(dslr / LISTS) if (dslr / LISTS).is_file() else {}
+    names = lists.get(split, sorted(frames))
+    if not isinstance(names, list) or not names:
+        raise SourceError(f"{dslr / LISTS}: {split!r} is {str(names)[:60]}, expected a list of file names")
+    absent = [str(name) for name in names if str(name) not in frames]
+    if absent:
+        raise SourceError(f"{dslr / LISTS}: {absent[0]} of {split!r} is not among the {key} of {TRANSFORMS.name}")
+    return [frames[name] for name in names]
+
+
+def _refuse_missing_folders(dslr: Path) -> None:
+    for part, made_by in ((IMAGES, "the toolbox's `python -m dslr.undistort`"), (DEPTHS, "a depth renderer")):
+        if not (dslr / part).is_dir():
+            there = ", ".join(sorted(entry.name for entry in dslr.iterdir() if entry.is_dir()))
+            raise SourceError(
+                f"{dslr}: no {part}/ (found {there}); create it with {made_by}, for the undistorted camera"
+            )
+
+
+def _dslr(scene: Path) -> Path:
+    return scene if (scene / TRANSFORMS).is_file() else scene / "dslr"
+
+
+_SCANNETPP = SourceFormat(
+    "ScanNet++",
+    "dslr/nerfstudio/",
+    lambda path: (_dslr(Path(path)) / TRANSFORMS).is_file(),
+    lambda path, settings: open_scannetpp(Path(path), settings),
+)
+
+PLUGIN = (_SCANNET, _SCANNETPP)

@@ -22,8 +22,8 @@ from sigmasplat.input.calibration import (
     Calibration,
     resolve_calibration,
 )
-from sigmasplat.input.folders import FRAMES_PER_SECOND, frame_files, has_frame_files, pair_images
-from sigmasplat.input.pose_files import read_pose_files
+from sigmasplat.input.images import FRAMES_PER_SECOND, frame_files, has_frame_files, pair_images
+from sigmasplat.input.lists import read_pose_files
 from sigmasplat.input.recorded import ImagePair, RecordedSource, first_size
 from sigmasplat.input.rectification import registers_depth
 from sigmasplat.registry import SourceFormat

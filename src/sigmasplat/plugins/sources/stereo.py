@@ -6,7 +6,7 @@ TUM-like   rgb.txt right.txt [groundtruth.txt] calibration.json   lines of "t pa
 KITTI      image_2/ image_3/ (or image_0/ image_1/) calib.txt [times.txt] [poses.txt]   rectified, odometry benchmark
 EuRoC      mav0/cam0 mav0/cam1: data.csv, sensor.yaml, data/*.png; state_groundtruth_estimate0/data.csv
 
-Depth belongs to the left image. It is computed from both images when a frame is read (`sources.camera.stereo`).
+Depth belongs to the left image. It is computed from both images when a frame is read (`stereo_matching`).
 """
 
 import re
@@ -23,15 +23,27 @@ from sigmasplat.data.camera import Camera
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SourceError
 from sigmasplat.files.reading import read_text
-from sigmasplat.input.association import associate, no_pairs
 from sigmasplat.input.calibration import Calibration, build_camera, resolve_calibration
-from sigmasplat.input.folders import COLOR_ENDINGS, list_images
-from sigmasplat.input.images import read_color
-from sigmasplat.input.lists import parse_numbers, read_lines, read_poses
-from sigmasplat.input.pose_files import build_trajectory, checked_pose, rigid_transform, to_matrix
+from sigmasplat.input.images import COLOR_ENDINGS, list_images, read_color
+from sigmasplat.input.lists import (
+    associate,
+    build_trajectory,
+    checked_pose,
+    no_pairs,
+    parse_numbers,
+    read_lines,
+    read_poses,
+    rigid_transform,
+    to_matrix,
+)
 from sigmasplat.input.recorded import ImagePair, RecordedSource, Size, first_size
-from sigmasplat.plugins.sources.camera.stereo import StereoMatcher, StereoRectification, scene_scale
-from sigmasplat.plugins.sources.camera.stereo_cameras import StereoCameras, read_stereo_cameras
+from sigmasplat.plugins.sources.stereo_matching import (
+    StereoCameras,
+    StereoMatcher,
+    StereoRectification,
+    read_stereo_cameras,
+    scene_scale,
+)
 from sigmasplat.plugins.sources.tum import read_list
 from sigmasplat.registry import SourceFormat
 from sigmasplat.types import Matrix

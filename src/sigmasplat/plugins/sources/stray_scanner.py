@@ -20,16 +20,13 @@ from numpy.typing import NDArray
 
 from sigmasplat.config import InputConfig
 from sigmasplat.data import se3
-from sigmasplat.data.accelerometer import GRAVITY_M_S2, accelerometer_from_samples
-from sigmasplat.data.gyroscope import gyroscope_from_samples
+from sigmasplat.data.imu import GRAVITY_M_S2, accelerometer_from_samples, gyroscope_from_samples
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SourceError
-from sigmasplat.files.reading import read_text
-from sigmasplat.files.structured import csv_rows
+from sigmasplat.files.reading import csv_rows, read_text
 from sigmasplat.input.calibration import MM_PER_METRE, Calibration, build_camera, resolve_calibration
-from sigmasplat.input.images import image_size, read_depth, read_values
+from sigmasplat.input.images import Video, image_size, read_depth, read_values
 from sigmasplat.input.recorded import ImagePair, RecordedSource, Size, first_size
-from sigmasplat.input.video import Video
 from sigmasplat.registry import SourceFormat
 
 POSE = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")

@@ -14,13 +14,17 @@ from sigmasplat.data.mesh import Mesh
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SourceError
 from sigmasplat.input.source import Source
-from sigmasplat.plugins.sources.camera.stereo import StereoMatcher
-from sigmasplat.plugins.sources.room.furnish import furnish_rooms
-from sigmasplat.plugins.sources.room.mover import mask_of, mover as moving_ball
+from sigmasplat.plugins.sources.room.capture import (
+    camera_path,
+    drifted_depth,
+    measured_color,
+    measured_depth,
+    predicted_depth,
+)
+from sigmasplat.plugins.sources.room.furnish import furnish_rooms, mask_of, mover as moving_ball
 from sigmasplat.plugins.sources.room.render import RoomScene, build_scene, render_scene
-from sigmasplat.plugins.sources.room.sensor import drifted_depth, measured_color, measured_depth, predicted_depth
-from sigmasplat.plugins.sources.room.solid import triangulate
-from sigmasplat.plugins.sources.room.walk import camera_path
+from sigmasplat.plugins.sources.room.shapes import triangulate
+from sigmasplat.plugins.sources.stereo_matching import StereoMatcher
 from sigmasplat.registry import SourceFormat
 from sigmasplat.types import Matrix
 
@@ -42,11 +46,11 @@ class SyntheticRoom(Source):
     noise: whether depth and colour have sensor noise; loops: rounds of the path; exposure_change: whether the image
     gain varies by ±8 % over the sequence; rooms: number of rooms, joined by doorways; overrun: how far the path
     continues past its start, percent of a round; drift: standard deviation of the depth calibration's slow drift
-    (`room.sensor.drifted_depth`), tenths of a percent of the depth; test_views: number of exact views away from the
+    (`room.capture.drifted_depth`), tenths of a percent of the depth; test_views: number of exact views away from the
     path (`SyntheticRoom.test_views`); stereo: if above 0, depth is computed from a stereo pair with this baseline in cm
     instead of being exact (`right_image`); mover: the share of the image, in percent on average, that a ball covers
-    which moves through the room by itself (`room.mover`); scored views and the true surface show the room without it;
-    predicted: whether depth is that of an imagined network, with a smooth scale error (`room.sensor.predicted_depth`).
+    which moves through the room by itself (`room.furnish.Mover`); scored views and the true surface show the room without it;
+    predicted: whether depth is that of an imagined network, with a smooth scale error (`room.capture.predicted_depth`).
 
     A path with loops to close: frames=720,rooms=2,overrun=20,noise=1,drift=6. A round of 600 frames is a slow pace. The
     way back looks in other directions than the way out, so drift accumulates over a whole round; the last 120 frames

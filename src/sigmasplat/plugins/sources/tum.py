@@ -1,8 +1,13 @@
-"""Read and write sequences in the layout of the TUM RGB-D benchmark.
+"""Read and write sequences in the layout of the TUM RGB-D benchmark; read the Bonn RGB-D Dynamic Dataset.
 
 rgb.txt  depth.txt  groundtruth.txt     lines of "t path" or "t tx ty tz qx qy qz qw", comments after #
 calibration.json                        optional: fx fy cx cy width height depth_scale [distortion]
 gyroscope.txt                           optional: "t wx wy wz", rad/s about the camera's x, y, z (right, down, forward)
+
+Bonn (recognised by `bonn` in the folder's path) has the same lists, another camera, and ground truth of the motion
+capture's markers. Its page publishes the intrinsics, and how to convert the motion-capture poses T to camera poses:
+T_world_camera = T_ROS · T · T_ROS · T_m (used there for the first pose of a run, to align a model with the laser scan).
+The published T_m is not rigid: its axes have length 1.059. Here its rotation is orthonormalised, its offset unchanged.
 """
 
 import json
@@ -19,13 +24,27 @@ from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.frame_arrays import UINT16_MAX
-from sigmasplat.data.gyroscope import Gyroscope
+from sigmasplat.data.imu import Gyroscope
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import RunError, SourceError
 from sigmasplat.files.reading import exists
-from sigmasplat.input.association import MAX_GAP_S, associate, nearest_gaps_s, no_pairs, refuse_other_units
-from sigmasplat.input.calibration import TUM_UNITS_PER_METRE, Calibration, freiburg_calibration, resolve_calibration
-from sigmasplat.input.lists import parse_numbers, read_lines, read_poses
+from sigmasplat.input.calibration import (
+    BONN,
+    TUM_UNITS_PER_METRE,
+    Calibration,
+    freiburg_calibration,
+    resolve_calibration,
+)
+from sigmasplat.input.lists import (
+    MAX_GAP_S,
+    associate,
+    nearest_gaps_s,
+    no_pairs,
+    parse_numbers,
+    read_lines,
+    read_poses,
+    refuse_other_units,
+)
 from sigmasplat.input.recorded import ImagePair, RecordedSource, first_size
 from sigmasplat.input.source import Source
 from sigmasplat.registry import SourceFormat
@@ -187,10 +206,52 @@ def write_images(frame: Frame, folder: Path) -> str:
     return stem
 
 
-PLUGIN = SourceFormat(
+_TUM = SourceFormat(
     "TUM",
     "rgb.txt and depth.txt",
     lambda path: (Path(path) / "rgb.txt").is_file() or (Path(path) / "depth.txt").is_file(),
     lambda path, settings: open_tum(Path(path), settings),
     priority=1,
 )
+
+
+T_ROS = np.array([[-1.0, 0, 0, 0], [0, 0, 1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+T_MARKERS_CAMERA = se3.orthonormalise(
+    np.array(
+        [
+            [1.0157, 0.1828, -0.2389, 0.0113],
+            [0.0009, -0.8431, -0.6413, -0.0098],
+            [-0.3009, 0.6147, -0.8085, 0.0111],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )
+)
+
+
+def camera_trajectory(markers: Trajectory) -> Trajectory:
+    """Convert the recorded path of the markers to the path of the camera."""
+    return Trajectory(markers.timestamps_s, T_ROS @ markers.T_world_camera @ T_ROS @ T_MARKERS_CAMERA)
+
+
+def open_bonn(folder: Path, settings: InputConfig) -> RecordedSource:
+    """Open a folder. Raises SourceError as `open_tum`."""
+    return open_tum(folder, settings, camera=BONN, camera_path=camera_trajectory)
+
+
+def _is_bonn(path: str) -> bool:
+    """Return whether it is a TUM folder whose path contains "bonn"."""
+    folder = Path(path)
+    lists = (folder / "rgb.txt").is_file() or (folder / "depth.txt").is_file()
+    return lists and any("bonn" in part.lower() for part in folder.resolve().parts[-3:])
+
+
+_BONN = SourceFormat(
+    "Bonn dynamic",
+    "TUM's lists under rgbd_bonn_…",
+    _is_bonn,
+    lambda path, settings: open_bonn(Path(path), settings),
+    priority=2,
+    sensor="kinect-v1",
+)
+
+PLUGIN = (_TUM, _BONN)
