@@ -164,9 +164,7 @@ def _open_tum_like(folder: Path, settings: InputConfig) -> StereoSource:
 
 
 def _timed_pairs(
-    folder: Path,
-    left: tuple[NDArray[np.float64], list[Path]],
-    right: tuple[NDArray[np.float64], list[Path]],
+    folder: Path, left: tuple[NDArray[np.float64], list[Path]], right: tuple[NDArray[np.float64], list[Path]]
 ) -> tuple[list[Pair], list[str]]:
     """Pair left and right images by time; also return the left images without a right one."""
     indices = associate(left[0], right[0])

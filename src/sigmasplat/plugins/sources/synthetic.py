@@ -49,7 +49,7 @@ class SyntheticRoom(Source):
     (`room.capture.drifted_depth`), tenths of a percent of the depth; test_views: number of exact views away from the
     path (`SyntheticRoom.test_views`); stereo: if above 0, depth is computed from a stereo pair with this baseline in cm
     instead of being exact (`right_image`); mover: the share of the image, in percent on average, that a ball covers
-    which moves through the room by itself (`room.furnish.Mover`); scored views and the true surface show the room without it;
+    which moves through the room by itself (`Mover`); scored views and the true surface show the room without it;
     predicted: whether depth is that of an imagined network, with a smooth scale error (`room.capture.predicted_depth`).
 
     A path with loops to close: frames=720,rooms=2,overrun=20,noise=1,drift=6. A round of 600 frames is a slow pace. The
