@@ -147,6 +147,11 @@ def first_subfolder(folder: Path, names: Iterable[str]) -> Path | None:
     return next((folder / name for name in names if (folder / name).is_dir()), None)
 
 
+def first_file(folder: Path, names: Iterable[str | Path]) -> Path | None:
+    """Return the first of the named files (in the folder, or absolute) that exists, None if none does."""
+    return next((folder / name for name in names if (folder / name).is_file()), None)
+
+
 def list_images(folder: Path | None, endings: Sequence[str]) -> list[Path]:
     """Return the images of a folder in the order of the numbers in their names: 2.png before 10.png."""
     if folder is None or not folder.is_dir():

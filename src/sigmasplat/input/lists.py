@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from sigmasplat.data import se3
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SourceError
-from sigmasplat.files.reading import read_text
+from sigmasplat.files.reading import exists, read_text
 from sigmasplat.types import Matrix
 
 MOST_MATRIX_BYTES = 1 << 16
@@ -99,6 +99,13 @@ def read_poses(path: Path) -> Trajectory:
     return Trajectory(np.array(times), np.stack(poses))
 
 
+def read_groundtruth(folder: Path) -> Trajectory | None:
+    """Read groundtruth.txt of a folder as `read_poses` does, None without one. Formats read it on opening: damage must
+    stop the run before it starts, not its evaluation an hour later."""
+    path = folder / "groundtruth.txt"
+    return read_poses(path) if exists(path) else None
+
+
 def read_lines(path: Path) -> Iterator[tuple[int, list[str]]]:
     """Yield (line number from 1, words) of every line that is not empty or a comment."""
     for number, line in enumerate(read_text(path).splitlines(), 1):
@@ -150,6 +157,21 @@ def associate(first_s: Times, second_s: Times, tolerance_s: float = MAX_GAP_S) -
             pairs.append((i, j))
     pairs.sort(key=lambda pair: (first_s[pair[0]], pair[0]))
     return np.array(pairs, np.intp).reshape(-1, 2)
+
+
+def pair_times(path: Path, times_s: Mapping[str, Times]) -> tuple[list[tuple[int, int]], list[int]]:
+    """Pair two kinds of images of a recording by time; return the index pairs by time, and the first images left alone.
+
+    times_s: of colour and depth, or left and right, by name, seconds [N] and [M]. Raises SourceError if their units
+    differ, or nothing pairs.
+    """
+    first_s, second_s = times_s.values()
+    refuse_other_units(path, times_s)
+    pairs = [(int(i), int(j)) for i, j in associate(first_s, second_s)]
+    if not pairs:
+        raise no_pairs(path, times_s)
+    paired = {i for i, _ in pairs}
+    return pairs, [i for i in range(len(first_s)) if i not in paired]
 
 
 def no_pairs(path: Path, times_s: Mapping[str, Times]) -> SourceError:

@@ -4,7 +4,7 @@ checked before a run for a wrong unit or missing readings."""
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from sigmasplat.data.imu import Accelerometer, Gyroscope
 from sigmasplat.data.resizing import resized_color
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SourceError
-from sigmasplat.input.calibration import Calibration, refuse_impossible_camera
+from sigmasplat.input.calibration import Calibration, refuse_impossible_camera, resolve_calibration
 from sigmasplat.input.images import image_size, read_color, read_depth
 from sigmasplat.input.rectification import Rectification, check_image_sizes
 from sigmasplat.input.source import Source
@@ -237,6 +237,17 @@ class RecordedSource(Source):
                 f"{self.name}: the gyroscope measured from {first_s:.3f} to {last_s:.3f} s, but the images were taken "
                 f"from {self._images[0].timestamp_s:.3f} to {self._images[-1].timestamp_s:.3f} s; use the same clock"
             )
+
+
+def folder_source(
+    folder: Path, settings: InputConfig, images: Sequence[ImagePair], known: Calibration | None, units_per_metre: float,
+    truth: Trajectory | None = None, skipped: Sequence[str] = (), **more: Any,
+) -> RecordedSource:  # fmt: skip
+    """Build the source of a folder with images. Its camera is that of the settings, else of calibration.json, else
+    `known`; units_per_metre: default of depth_scale; more: as for RecordedSource. Raises SourceError as it does."""
+    size = first_size([image.color for image in images])
+    calibration = resolve_calibration(folder, known, size, settings, units_per_metre)
+    return RecordedSource(folder.resolve().name, images, calibration, settings, truth, skipped, **more)
 
 
 def first_size(paths: Sequence[Path]) -> tuple[int, int]:

@@ -84,20 +84,19 @@ class RestrictedSet:
 
 MB, GB = 10**6, 10**9
 
+_UNKNOWN_SIZES = (
+    "fr2/large_no_loop fr2/pioneer_360 fr2/pioneer_slam fr2/pioneer_slam2 fr2/pioneer_slam3 "
+    "fr3/nostructure_notexture_far fr3/nostructure_notexture_near_withloop fr3/nostructure_texture_far "
+    "fr3/nostructure_texture_near_withloop fr3/structure_notexture_far fr3/structure_notexture_near "
+    "fr3/structure_texture_far fr3/structure_texture_near fr2/coke fr2/dishes fr2/flowerbouquet "
+    "fr2/flowerbouquet_brownbackground fr2/metallic_sphere fr2/metallic_sphere2"
+)
 TUM_SIZES_MB: Mapping[str, int | None] = {
-    **{"fr1/xyz": 448, "fr1/rpy": 410, "fr2/xyz": 2270, "fr2/rpy": 2020},
-    **{"fr1/360": 430, "fr1/floor": 780, "fr1/desk": 344, "fr1/desk2": 349, "fr1/room": 782},
-    **{"fr2/360_hemisphere": 1430, "fr2/360_kidnap": 700, "fr2/desk": 1893, "fr2/large_no_loop": None},
-    **{"fr2/large_with_loop": 2690, "fr3/long_office_household": 1484},
-    **{"fr2/pioneer_360": None, "fr2/pioneer_slam": None, "fr2/pioneer_slam2": None, "fr2/pioneer_slam3": None},
-    **{"fr3/nostructure_notexture_far": None, "fr3/nostructure_notexture_near_withloop": None},
-    **{"fr3/nostructure_texture_far": None, "fr3/nostructure_texture_near_withloop": None},
-    **{"fr3/structure_notexture_far": None, "fr3/structure_notexture_near": None},
-    **{"fr3/structure_texture_far": None, "fr3/structure_texture_near": None},
-    **{"fr1/plant": 700, "fr1/teddy": 880, "fr2/coke": None, "fr2/dishes": None, "fr2/flowerbouquet": None},
-    **{"fr2/flowerbouquet_brownbackground": None, "fr2/metallic_sphere": None, "fr2/metallic_sphere2": None},
-    **{"fr3/cabinet": 490, "fr3/large_cabinet": 450, "fr3/teddy": 1230},
-}
+    "fr1/xyz": 448, "fr1/rpy": 410, "fr2/xyz": 2270, "fr2/rpy": 2020, "fr1/360": 430, "fr1/floor": 780, "fr1/desk": 344,
+    "fr1/desk2": 349, "fr1/room": 782, "fr2/360_hemisphere": 1430, "fr2/360_kidnap": 700, "fr2/desk": 1893,
+    "fr2/large_with_loop": 2690, "fr3/long_office_household": 1484, "fr1/plant": 700, "fr1/teddy": 880,
+    "fr3/cabinet": 490, "fr3/large_cabinet": 450, "fr3/teddy": 1230, **dict.fromkeys(_UNKNOWN_SIZES.split()),
+}  # fmt: skip
 """The static scenes with published ground truth, without the dynamic scenes."""
 
 TUM_EXACT = {
@@ -123,28 +122,13 @@ BONN_NAMES = (
 )
 
 REDWOOD_MD5 = {
-    "livingroom1": (
-        "c23481094ca3859b204d2fcbb4e435a4",
-        "2fec03a29258a29b9ffedde88fddd676",
-        "601ac4b51aba2455a90aed8aa1158c6a",
-    ),
-    "livingroom2": (
-        "34792f7aa35b6c8b62e394e9372b95d7",
-        "cbb4a36b8488448d79ec93c202c0c90e",
-        "193961c018f4c2a753458d5231544036",
-    ),
-    "office1": (
-        "6a58750880e83ac5948e0f28de294c04",
-        "7c7e479191d35c2ad1f8ac1c227f4f8d",
-        "3fac752ab38a4e8a96d1b5afa535f9f7",
-    ),
-    "office2": (
-        "487cdfacffc8fc8247a5b21e860a3794",
-        "13f1c5b7c4f44524fa91f7ba87e44bb5",
-        "698f2f09da7d2ed3fcb604889e6f8479",
-    ),
+    "livingroom1": "c23481094ca3859b204d2fcbb4e435a4 2fec03a29258a29b9ffedde88fddd676 601ac4b51aba2455a90aed8aa1158c6a",
+    "livingroom2": "34792f7aa35b6c8b62e394e9372b95d7 cbb4a36b8488448d79ec93c202c0c90e 193961c018f4c2a753458d5231544036",
+    "office1": "6a58750880e83ac5948e0f28de294c04 7c7e479191d35c2ad1f8ac1c227f4f8d 3fac752ab38a4e8a96d1b5afa535f9f7",
+    "office2": "487cdfacffc8fc8247a5b21e860a3794 13f1c5b7c4f44524fa91f7ba87e44bb5 698f2f09da7d2ed3fcb604889e6f8479",
 }
 """Contains colour, depth with Kinect noise, and the path."""
+REPLICA_URL = "https://cvg-data.inf.ethz.ch/nice-slam/data/Replica.zip"
 REDWOOD_URL = "https://github.com/isl-org/open3d_downloads/releases/download/augmented-icl-nuim"
 
 
@@ -198,7 +182,7 @@ def _bonn(name: str) -> PublicRecording:
 
 
 def _redwood(name: str) -> PublicRecording:
-    color, depth, path = (f"md5:{digest}" for digest in REDWOOD_MD5[name])
+    color, depth, path = (f"md5:{digest}" for digest in REDWOOD_MD5[name].split())
     return PublicRecording(
         name,
         (
@@ -211,85 +195,44 @@ def _redwood(name: str) -> PublicRecording:
 
 SETS: Mapping[str, PublicSet | RestrictedSet] = {
     "tum": PublicSet(
-        title="TUM RGB-D, static scenes",
-        page="https://cvg.cit.tum.de/data/datasets/rgbd-dataset",
-        licence="CC BY 4.0",
-        folder="tum",
-        recordings={name: _tum(name, size) for name, size in TUM_SIZES_MB.items()},
-        max_bytes=5 * GB,
-        max_files=50_000,
-        prefix="rgbd_dataset_",
+        "TUM RGB-D, static scenes", "https://cvg.cit.tum.de/data/datasets/rgbd-dataset", "CC BY 4.0", "tum",
+        {name: _tum(name, size) for name, size in TUM_SIZES_MB.items()}, 5 * GB, 50_000, prefix="rgbd_dataset_",
     ),
     "replica": PublicSet(
-        title="Replica, 8 rooms rendered for NICE-SLAM",
-        page="https://github.com/facebookresearch/Replica-Dataset",
-        licence="Replica research licence, not for commercial use",
-        folder="",
-        recordings={
-            "": PublicRecording(
-                "replica",
-                (RemoteFile("https://cvg-data.inf.ethz.ch/nice-slam/data/Replica.zip", 12_400 * MB),),
-                start="room0",
-            )
-        },
-        max_bytes=20 * GB,
-        max_files=100_000,
+        "Replica, 8 rooms rendered for NICE-SLAM", "https://github.com/facebookresearch/Replica-Dataset",
+        "Replica research licence, not for commercial use", "",
+        {"": PublicRecording("replica", (RemoteFile(REPLICA_URL, 12_400 * MB),), start="room0")}, 20 * GB, 100_000,
     ),
     "icl": PublicSet(
-        title="ICL-NUIM, synthetic, as TUM-compatible PNGs",
-        page="https://www.doc.ic.ac.uk/~ahanda/VaFRIC/iclnuim.html",
-        licence="terms and citation on its page",
-        folder="icl",
-        recordings={f"living_room{i}": _icl(f"living_room_traj{i}_frei_png") for i in range(4)}
-        | {f"office{i}": _icl(f"traj{i}_frei_png") for i in range(4)},
-        max_bytes=3 * GB,
-        max_files=20_000,
+        "ICL-NUIM, synthetic, as TUM-compatible PNGs", "https://www.doc.ic.ac.uk/~ahanda/VaFRIC/iclnuim.html",
+        "terms and citation on its page", "icl",
+        {f"living_room{i}": _icl(f"living_room_traj{i}_frei_png") for i in range(4)}
+        | {f"office{i}": _icl(f"traj{i}_frei_png") for i in range(4)}, 3 * GB, 20_000,
     ),
     "7scenes": PublicSet(
-        title="7-Scenes",
-        page="https://www.microsoft.com/en-us/research/project/rgb-d-dataset-7-scenes/",
-        licence="Microsoft Research licence, not for commercial use",
-        folder="7scenes",
-        recordings={name: _seven_scenes(name, size) for name, size in SEVEN_SCENES_SIZES.items()},
-        max_bytes=8 * GB,
-        max_files=100_000,
-        disk_ratio=2.4,
+        "7-Scenes", "https://www.microsoft.com/en-us/research/project/rgb-d-dataset-7-scenes/",
+        "Microsoft Research licence, not for commercial use", "7scenes",
+        {name: _seven_scenes(name, size) for name, size in SEVEN_SCENES_SIZES.items()}, 8 * GB, 100_000, disk_ratio=2.4,
     ),
     "bonn": PublicSet(
-        title="Bonn RGB-D Dynamic",
-        page="https://www.ipb.uni-bonn.de/data/rgbd-dynamic-dataset/",
-        licence="for research, terms and citation on its page",
-        folder="bonn",
-        recordings={name: _bonn(name) for name in BONN_NAMES},
-        max_bytes=5 * GB,
-        max_files=50_000,
-        prefix="rgbd_bonn_",
+        "Bonn RGB-D Dynamic", "https://www.ipb.uni-bonn.de/data/rgbd-dynamic-dataset/",
+        "for research, terms and citation on its page", "bonn",
+        {name: _bonn(name) for name in BONN_NAMES}, 5 * GB, 50_000, prefix="rgbd_bonn_",
     ),
     "redwood": PublicSet(
-        title="Redwood, ICL-NUIM rooms with longer paths and Kinect noise",
-        page="http://redwood-data.org/indoor/dataset.html",
-        licence="terms and citation on its page",
-        folder="redwood",
-        recordings={name: _redwood(name) for name in REDWOOD_MD5},
-        max_bytes=3 * GB,
-        max_files=20_000,
+        "Redwood, ICL-NUIM rooms with longer paths and Kinect noise", "http://redwood-data.org/indoor/dataset.html",
+        "terms and citation on its page", "redwood", {name: _redwood(name) for name in REDWOOD_MD5}, 3 * GB, 20_000,
     ),
     "lpips": PublicSet(
-        title="Weights of LPIPS: linear layers, and AlexNet or VGG16 of torchvision",
-        page="https://github.com/richzhang/PerceptualSimilarity",
-        licence="BSD 2-Clause (lpips), BSD 3-Clause (torchvision)",
-        folder="lpips",
-        recordings={net: _lpips(net) for net in LPIPS_FILES},
-        max_bytes=GB,
-        max_files=10,
-        disk_ratio=1.0,
-        sequences=False,
+        "Weights of LPIPS: linear layers, and AlexNet or VGG16 of torchvision",
+        "https://github.com/richzhang/PerceptualSimilarity", "BSD 2-Clause (lpips), BSD 3-Clause (torchvision)",
+        "lpips", {net: _lpips(net) for net in LPIPS_FILES}, GB, 10, disk_ratio=1.0, sequences=False,
     ),
     "scannet": RestrictedSet("ScanNet", "http://www.scan-net.org (terms of use to sign)"),
     "scannetpp": RestrictedSet(
         "ScanNet++", "https://scannetpp.mlsg.cit.tum.de/scannetpp/ (an account and an application)"
     ),
-}
+}  # fmt: skip
 
 
 def find_recording(set_name: str, recording: str = "") -> tuple[PublicSet, str]:

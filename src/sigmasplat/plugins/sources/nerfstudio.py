@@ -19,10 +19,10 @@ import numpy as np
 from sigmasplat.config import InputConfig
 from sigmasplat.data import se3
 from sigmasplat.errors import SourceError
-from sigmasplat.input.calibration import Calibration, check_positive, json_number, read_json_object, resolve_calibration
+from sigmasplat.input.calibration import Calibration, check_positive, json_number, read_json_object
 from sigmasplat.input.images import FRAMES_PER_SECOND, natural_key
 from sigmasplat.input.lists import build_trajectory
-from sigmasplat.input.recorded import ImagePair, RecordedSource, first_size
+from sigmasplat.input.recorded import ImagePair, RecordedSource, first_size, folder_source
 from sigmasplat.input.transforms import Fields, read_camera, read_frames, read_pose
 from sigmasplat.plugins.sources.stereo import StereoSource, given_intrinsics
 from sigmasplat.plugins.sources.stereo_matching import StereoCameras
@@ -34,9 +34,9 @@ METRES_PER_UNIT = 0.001
 """nerfstudio's default of depth_unit_scale_factor."""
 
 
-def open_nerfstudio(folder: Path, settings: InputConfig) -> RecordedSource:
-    """Open a folder. Raises SourceError if its JSON file, images or camera cannot be used."""
-    path = folder / NAME
+def open_nerfstudio(place: str, settings: InputConfig) -> RecordedSource:
+    """Open a folder with depth. Raises SourceError if its JSON file, images or camera cannot be used."""
+    folder, path = Path(place), Path(place) / NAME
     fields = read_json_object(path)
     named = sorted(read_frames(path, fields), key=lambda frame: natural_key(frame["file_path"]))
     frames = [frame for frame in named if isinstance(frame.get("depth_file_path"), str)]
@@ -50,9 +50,10 @@ def open_nerfstudio(folder: Path, settings: InputConfig) -> RecordedSource:
         if not isinstance(frame.get("depth_file_path"), str)
     ]
     images = [ImagePair(i / FRAMES_PER_SECOND, *_files(folder, frame)) for i, frame in enumerate(frames)]
-    calibration = _calibration(path, fields, frames, images, settings)
+    known = _calibration(path, fields, frames, images)
     truth = build_trajectory((i.timestamp_s, read_pose(path, frame)) for i, frame in zip(images, frames, strict=True))
-    return RecordedSource(folder.resolve().name, images, calibration, settings, truth, skipped, estimated=True)
+    units = known.depth_units_per_metre
+    return folder_source(folder, settings, images, known, units, truth, skipped, estimated=True)
 
 
 def _files(folder: Path, frame: Fields) -> tuple[Path, Path]:
@@ -62,25 +63,14 @@ def _files(folder: Path, frame: Fields) -> tuple[Path, Path]:
     return (color.with_suffix(".png") if bare else color), depth
 
 
-def _calibration(
-    path: Path, fields: Fields, frames: list[Fields], images: list[ImagePair], settings: InputConfig
-) -> Calibration:
+def _calibration(path: Path, fields: Fields, frames: list[Fields], images: list[ImagePair]) -> Calibration:
     size, depth_size = first_size([i.color for i in images]), first_size([i.depth for i in images])
     per_unit = json_number(path, fields, "depth_unit_scale_factor", METRES_PER_UNIT)
     units = round(1.0 / check_positive(path, "depth_unit_scale_factor", per_unit), 6)
     known = read_camera(path, fields, frames, size, units)
-    if depth_size != size:
-        depth_camera = known.camera.resized(*depth_size)
-        known = replace(known, depth_camera=depth_camera, depth_distortion=known.distortion)
-    return resolve_calibration(path.parent, known, size, settings, units)
-
-
-_DEPTH = SourceFormat(
-    "nerfstudio",
-    "transforms.json",
-    lambda path: (Path(path) / NAME).is_file(),
-    lambda path, settings: open_nerfstudio(Path(path), settings),
-)
+    if depth_size == size:
+        return known
+    return replace(known, depth_camera=known.camera.resized(*depth_size), depth_distortion=known.distortion)
 
 
 LEFT, RIGHT = "left", "right"
@@ -88,12 +78,12 @@ SAME_M, SAME_RAD = 0.002, 0.005
 """The pose of the right camera in the left one differs by less than this between two pairs."""
 
 
-def open_stereo_transforms(folder: Path, settings: InputConfig) -> StereoSource:
-    """Open a folder. Raises SourceError if its JSON file, images or cameras cannot be used."""
-    path = folder / NAME
+def open_stereo_transforms(place: str, settings: InputConfig) -> StereoSource:
+    """Open a folder with stereo pairs. Raises SourceError if its JSON file, images or cameras cannot be used."""
+    folder, path = Path(place), Path(place) / NAME
     fields = read_json_object(path)
     frames = sorted(read_frames(path, fields), key=lambda frame: natural_key(frame["file_path"]))
-    pairs, skipped = _pairs(frames)
+    pairs, alone = _pairs(frames)
     lefts = [left for left, _ in pairs]
     size = first_size([folder / left["file_path"] for left in lefts])
     left = _undistorted(read_camera(path, fields, lefts, size, 1.0), settings)
@@ -110,14 +100,8 @@ def open_stereo_transforms(folder: Path, settings: InputConfig) -> StereoSource:
     )
     timed = [(i / FRAMES_PER_SECOND, folder / left["file_path"], rights[i]) for i, left in enumerate(lefts)]
     truth = build_trajectory((t, read_pose(path, left)) for (t, _, _), left in zip(timed, lefts, strict=True))
-    return StereoSource(
-        folder.resolve().name,
-        timed,
-        cameras,
-        settings,
-        truth,
-        [f"{path}: {name} has no right image" for name in skipped],
-    )
+    skipped = [f"{path}: {name} has no right image" for name in alone]
+    return StereoSource(folder.resolve().name, timed, cameras, settings, truth, skipped)
 
 
 def _pairs(frames: Sequence[Fields]) -> tuple[list[tuple[Fields, Fields]], list[str]]:
@@ -172,12 +156,13 @@ def _is_stereo(path: str) -> bool:
     return not any("depth_file_path" in frame for frame in frames) and bool(_pairs(frames)[0])
 
 
-_STEREO = SourceFormat(
-    "nerfstudio stereo",
-    "transforms.json with right_file_path, or with left and right frames",
-    _is_stereo,
-    lambda path, settings: open_stereo_transforms(Path(path), settings),
-    priority=2,
+PLUGIN = (
+    SourceFormat("nerfstudio", NAME, lambda path: (Path(path) / NAME).is_file(), open_nerfstudio),
+    SourceFormat(
+        "nerfstudio stereo",
+        "transforms.json with right_file_path, or with left and right frames",
+        _is_stereo,
+        open_stereo_transforms,
+        priority=2,
+    ),
 )
-
-PLUGIN = (_DEPTH, _STEREO)

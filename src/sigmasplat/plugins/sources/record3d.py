@@ -140,8 +140,9 @@ class ExrImagePair(ImagePair):
             raise SourceError(f"{self.depth}: unreadable EXR file ({error}); export it again") from error
 
 
-def open_record3d(path: Path, settings: InputConfig) -> RecordedSource:
+def open_record3d(place: str, settings: InputConfig) -> RecordedSource:
     """Open a .r3d file, packed or unpacked, or an export. Raises SourceError if metadata or images cannot be used."""
+    path = Path(place)
     archive = Archive(path)
     name = "metadata.json" if "metadata.json" in archive else "metadata"
     metadata = _metadata(archive, name)
@@ -250,6 +251,6 @@ PLUGIN = SourceFormat(
     "Record3D",
     "a .r3d file, or metadata.json with rgb/ and depth/*.exr",
     _recognises,
-    lambda path, settings: open_record3d(Path(path), settings),
+    open_record3d,
     sensor="lidar-iphone",
 )

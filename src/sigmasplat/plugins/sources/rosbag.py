@@ -25,7 +25,7 @@ from sigmasplat.config import InputConfig
 from sigmasplat.data import se3
 from sigmasplat.data.imu import Accelerometer, Gyroscope, accelerometer_from_samples, gyroscope_from_samples
 from sigmasplat.errors import SourceError
-from sigmasplat.input.lists import MAX_GAP_S, associate, no_pairs, refuse_other_units
+from sigmasplat.input.lists import MAX_GAP_S, associate, no_pairs, pair_times, refuse_other_units
 from sigmasplat.input.recorded import ImagePair, RecordedSource, Size
 from sigmasplat.plugins.sources.bag_cameras import (
     ImageTopic,
@@ -197,9 +197,7 @@ def open_stereo_bag(bag: Bag, left: ImageTopic, right: ImageTopic, settings: Inp
     cameras = _stereo_cameras(bag, left, right, settings)
     found = bag.index(left.name, right.name)
     times = [np.array([entry.stamp_ns / 1e9 for entry in found[topic.name]]) for topic in (left, right)]
-    indices = associate(times[0], times[1])
-    if not len(indices):
-        raise no_pairs(bag.path, {"left": times[0], "right": times[1]})
+    indices, alone = pair_times(bag.path, {"left": times[0], "right": times[1]})
     paths = [
         [bag.path / f"{topic.name.lstrip('/')} at {t:.3f} s, {k}" for k, t in enumerate(of_topic)]
         for topic, of_topic in zip((left, right), times, strict=True)
@@ -214,7 +212,6 @@ def open_stereo_bag(bag: Bag, left: ImageTopic, right: ImageTopic, settings: Inp
         return BagStereoPair(time_s, one, other, rig, bag, messages)
 
     pairs = [(float(times[0][i]), paths[0][i], paths[1][j]) for i, j in indices]
-    alone = sorted(set(range(len(times[0]))) - set(indices[:, 0].tolist()))
     skipped = [f"{paths[0][i]}: no right image within {MAX_GAP_S:g} s" for i in alone]
     truth = read_truth(bag, left.frame, False)
     return StereoSource(bag.path.resolve().stem, pairs, cameras, settings, truth, skipped, pair_of)
@@ -278,8 +275,9 @@ class BagImagePair(ImagePair):
         return color, depth
 
 
-def open_bag(path: Path, settings: InputConfig) -> RecordedSource:
+def open_bag(place: str, settings: InputConfig) -> RecordedSource:
     """Open a bag. Raises SourceError if it is damaged, its topics are ambiguous, or its cameras are unknown."""
+    path = Path(place)
     bag = Bag(path)
     if pair := stereo_topics(bag, settings):
         return open_stereo_bag(bag, *pair, settings)
@@ -288,13 +286,11 @@ def open_bag(path: Path, settings: InputConfig) -> RecordedSource:
     found = bag.index(color.name, depth.name)
     entries = found[color.name], found[depth.name]
     pairs, recorded_time = _paired(entries)
-    named = {name: _times_s(found[name], recorded_time) for name in (color.name, depth.name)}
-    refuse_other_units(path, named)
+    topics, (color_s, depth_s) = (color.name, depth.name), (_times_s(part, recorded_time) for part in entries)
+    refuse_other_units(path, dict(zip(topics, (color_s, depth_s), strict=True)))
     if not len(pairs):
-        raise no_pairs(path, {name: _times_s(found[name], True) for name in (color.name, depth.name)})
+        raise no_pairs(path, {name: _times_s(found[name], True) for name in topics})
     truth = read_truth(bag, color.frame, recorded_time)
-    topics = (color.name, depth.name)
-    color_s, depth_s = (_times_s(part, recorded_time) for part in entries)
     colors = [_message_path(path, color.name, t) for t in color_s]
     depths = [_message_path(path, depth.name, t) for t in depth_s]
     images = [
@@ -304,8 +300,7 @@ def open_bag(path: Path, settings: InputConfig) -> RecordedSource:
     imu = read_bag_imu(bag, color, color_s)
     alone = sorted(set(range(len(entries[0]))) - set(pairs[:, 0].tolist()))
     skipped = [f"{colors[i]}: no depth within {MAX_GAP_S:g} s" for i in alone]
-    name = path.resolve().stem
-    return RecordedSource(name, images, calibration, settings, truth, skipped, **imu._asdict())
+    return RecordedSource(path.resolve().stem, images, calibration, settings, truth, skipped, **imu._asdict())
 
 
 def _paired(entries: tuple[Sequence[Entry], Sequence[Entry]]) -> tuple[NDArray[np.intp], bool]:
@@ -338,5 +333,5 @@ PLUGIN = SourceFormat(
     "ROS bag",
     "a .bag, .mcap or .db3 file, or a folder with metadata.yaml",
     lambda path: is_bag(Path(path)),
-    lambda path, settings: open_bag(Path(path), settings),
+    open_bag,
 )

@@ -35,13 +35,13 @@ from sigmasplat.input.calibration import (
     build_camera,
     check_positive,
     read_json_object,
-    resolve_calibration,
 )
 from sigmasplat.input.images import (
     COLOR_ENDINGS,
     DEPTH_ENDINGS,
     FRAMES_PER_SECOND,
     FrameFiles,
+    first_file,
     first_subfolder,
     frame_files,
     has_frame_files,
@@ -50,7 +50,7 @@ from sigmasplat.input.images import (
     pair_images,
 )
 from sigmasplat.input.lists import build_trajectory, parse_numbers, read_matrix, read_pose_files, to_matrix
-from sigmasplat.input.recorded import ImagePair, RecordedSource, first_size
+from sigmasplat.input.recorded import ImagePair, RecordedSource, first_size, folder_source
 from sigmasplat.input.transforms import Fields, read_camera, read_frames, read_pose
 from sigmasplat.registry import SourceFormat
 from sigmasplat.types import Matrix
@@ -61,8 +61,9 @@ COLOR_SIZE, DEPTH_SIZE = (1296, 968), (640, 480)
 INFO_NAMES = ("_info.txt", "info.txt")
 
 
-def open_scannet(folder: Path, settings: InputConfig) -> RecordedSource:
+def open_scannet(path: str, settings: InputConfig) -> RecordedSource:
     """Open a scene's folder. Raises SourceError if images, cameras or poses cannot be used."""
+    folder = Path(path)
     files = _files(folder)
     if not files["color"] and not files["depth"] and (packed := sorted(folder.glob("*.sens"))):
         raise SourceError(
@@ -71,10 +72,9 @@ def open_scannet(folder: Path, settings: InputConfig) -> RecordedSource:
     keys, skipped = pair_images(folder, files["color"], files["depth"], "color/*.jpg", "depth/*.png")
     images = [ImagePair(n / FRAMES_PER_SECOND, files["color"][n], files["depth"][n]) for n in keys]
     size, depth_size = first_size([i.color for i in images]), first_size([i.depth for i in images])
-    recorded = _recorded(folder, size, depth_size)
-    calibration = resolve_calibration(folder, recorded, size, settings, MM_PER_METRE)
+    known = _recorded(folder, size, depth_size)
     truth = read_pose_files((n / FRAMES_PER_SECOND, files["pose"][n]) for n in keys if n in files["pose"])
-    return RecordedSource(folder.resolve().name, images, calibration, settings, truth, skipped)
+    return folder_source(folder, settings, images, known, MM_PER_METRE, truth, skipped)
 
 
 def _files(folder: Path) -> FrameFiles:
@@ -107,7 +107,8 @@ def _matrices(folder: Path) -> tuple[dict[str, Path], dict[str, Matrix], float]:
     """Return file and value of each matrix by `{color|depth}_{intrinsic|extrinsic}`, and depth units per metre."""
     where, found, units = {}, {}, MM_PER_METRE
     for info in (folder / name for name in INFO_NAMES if (folder / name).is_file()):
-        entries = dict(_entry(line) for line in read_text(info, errors="replace").splitlines() if "=" in line)
+        lines = (line.split("=", 1) for line in read_text(info, errors="replace").splitlines() if "=" in line)
+        entries = {key.strip(): value.strip() for key, value in lines}
         if shift := entries.get("m_depthShift"):
             units = check_positive(info, "m_depthShift", parse_numbers(info, 1, [shift])[0])
         for key, kind in (("Color", "color"), ("Depth", "depth")):
@@ -119,15 +120,9 @@ def _matrices(folder: Path) -> tuple[dict[str, Path], dict[str, Matrix], float]:
     for kind in ("color", "depth"):
         for part in ("intrinsic", "extrinsic"):
             names = (f"intrinsic/{part}_{kind}.txt", f"{part}s_{kind}.txt", f"{part}_{kind}.txt")
-            path = next((folder / name for name in names if (folder / name).is_file()), None)
-            if path:
+            if path := first_file(folder, names):
                 where[f"{kind}_{part}"], found[f"{kind}_{part}"] = path, read_matrix(path)
     return where, found, units
-
-
-def _entry(line: str) -> tuple[str, str]:
-    key, _, value = line.partition("=")
-    return key.strip(), value.strip()
 
 
 def _camera(path: Path, K: Matrix, size: tuple[int, int], published: tuple[int, int]) -> Camera:
@@ -136,7 +131,7 @@ def _camera(path: Path, K: Matrix, size: tuple[int, int], published: tuple[int, 
     return build_camera(path, *own, [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]).resized(*size)
 
 
-def recognises(path: str) -> bool:
+def _recognises(path: str) -> bool:
     """Return whether it is a scene, extracted or not."""
     folder = Path(path)
     has_info = any((folder / name).is_file() for name in INFO_NAMES)
@@ -147,22 +142,13 @@ def recognises(path: str) -> bool:
     return images is not None and (camera or (folder / "pose").is_dir())
 
 
-_SCANNET = SourceFormat(
-    "ScanNet",
-    "color/, depth/ and pose/",
-    recognises,
-    lambda path, settings: open_scannet(Path(path), settings),
-    sensor="kinect-v1",
-)
-
-
 TRANSFORMS = Path("nerfstudio") / "transforms_undistorted.json"
 IMAGES, DEPTHS, LISTS = "undistorted_images", "undistorted_depths", "train_test_lists.json"
 
 
-def open_scannetpp(scene: Path, settings: InputConfig) -> RecordedSource:
+def open_scannetpp(path: str, settings: InputConfig) -> RecordedSource:
     """Open a scene's folder or its `dslr`. Raises SourceError if its JSON file, images or camera cannot be used."""
-    dslr = _dslr(scene)
+    dslr = _dslr(Path(path))
     fields = read_json_object(dslr / TRANSFORMS)
     _refuse_missing_folders(dslr)
     views = _chosen(dslr, fields, "test", "test_frames") if fields.get("test_frames") else []
@@ -178,10 +164,9 @@ def _source(
     files = [(dslr / IMAGES / f["file_path"], (dslr / DEPTHS / f["file_path"]).with_suffix(".png")) for f in frames]
     images = [ImagePair(i / FRAMES_PER_SECOND, *pair) for i, pair in enumerate(files)]
     size = first_size([color for color, _ in files])
-    camera = read_camera(path, fields, frames, size, MM_PER_METRE)
-    calibration = resolve_calibration(scene, camera, size, settings, MM_PER_METRE)
+    known = read_camera(path, fields, frames, size, MM_PER_METRE)
     truth = build_trajectory((i.timestamp_s, read_pose(path, frame)) for i, frame in zip(images, frames, strict=True))
-    return RecordedSource(scene.name, images, calibration, settings, truth, test=test)
+    return folder_source(scene, settings, images, known, MM_PER_METRE, truth, test=test)
 
 
 def _chosen(dslr: Path, fields: Fields, split: str, key: str) -> list[Fields]:
@@ -210,11 +195,9 @@ def _dslr(scene: Path) -> Path:
     return scene if (scene / TRANSFORMS).is_file() else scene / "dslr"
 
 
-_SCANNETPP = SourceFormat(
-    "ScanNet++",
-    "dslr/nerfstudio/",
-    lambda path: (_dslr(Path(path)) / TRANSFORMS).is_file(),
-    lambda path, settings: open_scannetpp(Path(path), settings),
+PLUGIN = (
+    SourceFormat("ScanNet", "color/, depth/ and pose/", _recognises, open_scannet, sensor="kinect-v1"),
+    SourceFormat(
+        "ScanNet++", "dslr/nerfstudio/", lambda path: (_dslr(Path(path)) / TRANSFORMS).is_file(), open_scannetpp
+    ),
 )
-
-PLUGIN = (_SCANNET, _SCANNETPP)

@@ -67,8 +67,9 @@ class StrayImagePair(ImagePair):
         return self.video.size, image_size(self.depth)
 
 
-def open_stray_scanner(folder: Path, settings: InputConfig) -> RecordedSource:
+def open_stray_scanner(path: str, settings: InputConfig) -> RecordedSource:
     """Open a folder. Raises SourceError if video, depth, camera or poses cannot be used."""
+    folder = Path(path)
     video_path, depths = folder / "rgb.mp4", _numbered(folder / "depth")
     if not video_path.is_file():
         raise SourceError(f"no video in {folder} (looked for rgb.mp4); copy the whole folder from the phone")
@@ -203,6 +204,6 @@ PLUGIN = SourceFormat(
     "Stray Scanner",
     "rgb.mp4, depth/ and odometry.csv",
     _recognises,
-    lambda path, settings: open_stray_scanner(Path(path), settings),
+    open_stray_scanner,
     sensor="lidar-iphone",
 )
