@@ -93,12 +93,10 @@ class Masked(Subset):
         self._masks = MaskFolder(folder, len(whole), whole.camera)
 
     def frame(self, i: int) -> Frame:
-        """Read frame i without depth at the ignored pixels."""
         frame, ignored = super().frame(i), self._masks.ignored(i)
         return replace(frame, depth_m=np.where(ignored, np.float32(0.0), frame.depth_m), ignored=ignored)
 
     def depth_of(self, i: int) -> NDArray[np.float32]:
-        """Read the depth of frame i, 0 at the ignored pixels."""
         return np.where(self._masks.ignored(i), np.float32(0.0), super().depth_of(i))
 
 
@@ -209,13 +207,11 @@ class Posed(Subset):
         self.skipped += [f"{whole.name}, frame {i}: no pose in {given}" for i, T in enumerate(found) if T is None]
 
     def frame(self, i: int) -> Frame:
-        """Read frame i with its pose, and predicted depth in the unit of the poses."""
         frame = super().frame(i)
         depth_m = frame.depth_m if self._depth_scale == 1.0 else frame.depth_m * self._depth_scale
         return replace(frame, depth_m=depth_m, T_given_camera=self._poses[i])
 
     def depth_of(self, i: int) -> NDArray[np.float32]:
-        """Read the depth of frame i, in the unit of the poses if it is predicted."""
         return super().depth_of(i) * self._depth_scale
 
 

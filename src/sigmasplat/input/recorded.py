@@ -178,7 +178,6 @@ class RecordedSource(Source):
         return len(self._images)
 
     def timestamp_s(self, i: int) -> float:
-        """Return the time of frame i without reading it."""
         return self._images[self._checked_index(i)].timestamp_s
 
     def frame(self, i: int) -> Frame:
@@ -196,18 +195,15 @@ class RecordedSource(Source):
         )
 
     def depth_of(self, i: int) -> NDArray[np.float32]:
-        """Read the depth of frame i as `frame` does, without reading colour."""
         files = self._images[self._checked_index(i)]
         depth_m, camera = files.read_depth(self.depth_units_per_metre), self._rectified.calibration.camera
         check_image_sizes(self._rectified, files.color, (camera.width, camera.height), files.depth, depth_m.shape[::-1])
         return self._rectified.depth(depth_m)
 
     def truth(self) -> Trajectory | None:
-        """Return the whole recorded path with its own timestamps."""
         return self._truth
 
     def image_name(self, i: int) -> str:
-        """Return the name of the file of colour image i."""
         return self._images[self._checked_index(i)].color.name
 
     def device_path(self) -> Trajectory | None:
@@ -215,11 +211,9 @@ class RecordedSource(Source):
         return self._truth if self._estimated else None
 
     def test_views(self) -> Source | None:
-        """Return the separate test views, None without them."""
         return self._test
 
     def true_surface_file(self) -> Path | None:
-        """Return the file of the true surface, None without one."""
         return self._surface
 
     def _refuse_sizes_of_first(self) -> None:

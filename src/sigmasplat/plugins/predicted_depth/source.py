@@ -141,7 +141,6 @@ class PredictedFolder(PredictedDepth):
         self._find_factor(0, no_color)
 
     def values(self, i: int, color: ReadColor) -> NDArray[Any]:
-        """Read the image of frame i."""
         path = self.paths[i]
         return read_npy(path) if path.suffix.lower() == ".npy" else read_values(path)
 
@@ -164,7 +163,6 @@ class PredictedByModel(PredictedDepth):
         self._find_factor(first, lambda: color)
 
     def values(self, i: int, color: ReadColor) -> Floats:
-        """Return the prediction for frame i."""
         with self._lock:
             if i not in self._kept:
                 self._kept[i] = self._model.predict(color())
@@ -197,12 +195,10 @@ class WithPredictedDepth(Subset):
         _say_predicted(self, self._predicted)
 
     def frame(self, i: int) -> Frame:
-        """Read frame i with its predicted depth."""
         frame = super().frame(i)
         return replace(frame, depth_m=self._depth_of(i, lambda: frame.color), depth_std_m=None)
 
     def depth_of(self, i: int) -> Floats:
-        """Read the predicted depth of frame i. Raises SourceError if it cannot be used."""
         return self._depth_of(self._checked_index(i), lambda: self._color_of(i))
 
     def depth_std_of(self, i: int) -> Floats | None:
@@ -226,11 +222,9 @@ class PredictedPair(ImagePair):
     video: Video | None
 
     def read_color(self) -> NDArray[np.uint8]:
-        """Read 8-bit RGB [H, W, 3]. Raises SourceError naming `color`."""
         return super().read_color() if self.video is None else self.video.frame(self.number)
 
     def read_depth(self, units_per_metre: float) -> Floats:
-        """Read the predicted depth [H, W]; its unit does not matter. Raises SourceError naming `depth`."""
         return self.predicted.depth_of(self.number, *self.size, lambda: color_from_bytes(self.read_color()))
 
     def read(self, units_per_metre: float) -> tuple[NDArray[np.uint8], Floats, None]:
@@ -239,7 +233,6 @@ class PredictedPair(ImagePair):
         return color, self.predicted.depth_of(self.number, *self.size, lambda: color_from_bytes(color)), None
 
     def sizes(self) -> tuple[Size, Size]:
-        """Return (width, height) of colour and of depth, which is resized to it."""
         return self.size, self.size
 
 

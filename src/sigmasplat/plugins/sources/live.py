@@ -17,7 +17,7 @@ from sigmasplat.data.camera import Camera
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SourceError
-from sigmasplat.input.source import Source, read_ahead
+from sigmasplat.input.source import Source, Wrapped, read_ahead
 from sigmasplat.plugins.sources.tum import TumWriter
 
 WAITING_MOST = 2
@@ -48,7 +48,7 @@ def wait_until(until_s: float, stop: threading.Event) -> None:
         stop.wait(remaining_s)
 
 
-class Arrivals(Source):
+class Arrivals(Wrapped):
     """A source whose frames do not wait for the consumer: a late consumer gets the newest ones.
 
     dropped: number of frames that were dropped because the consumer was late; arrived_s: when the last frame arrived,
@@ -58,12 +58,9 @@ class Arrivals(Source):
     def __init__(
         self, whole: Source, clock: Callable[[], float] = time.perf_counter, wait: Waiting = wait_until,
     ) -> None:  # fmt: skip
-        super().__init__(whole.name, whole.camera, whole.strict)
-        self.skipped, self.live, self.paced = whole.skipped, whole.live, not whole.live
-        self.depth_units_per_metre = whole.depth_units_per_metre
-        self.depth_registered, self.registrable = whole.depth_registered, whole.registrable
-        self.dropped = 0
-        self._whole, self._clock, self._wait = whole, clock, wait
+        super().__init__(whole)
+        self.live, self.paced = whole.live, not whole.live
+        self._clock, self._wait = clock, wait
         self._queue = _Newest()
 
     def __len__(self) -> int:
@@ -76,12 +73,7 @@ class Arrivals(Source):
         return late or self._queue.waits
 
     def frame(self, i: int) -> Frame:
-        """Read frame i at once."""
         return self._whole.frame(i)
-
-    def truth(self) -> Trajectory | None:
-        """Return the ground-truth path of the source."""
-        return self._whole.truth()
 
     def frames_from(self, first: int) -> Iterator[Frame]:
         """Yield frames as they arrive. Raises as the source does."""
@@ -197,7 +189,6 @@ class LiveSource(Source):
         raise SourceError(self._once())
 
     def truth(self) -> Trajectory | None:
-        """Return None: a live camera has no ground truth."""
         return None
 
     def frames_from(self, first: int) -> Iterator[Frame]:

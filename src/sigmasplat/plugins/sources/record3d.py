@@ -81,7 +81,6 @@ class R3dImagePair(ImagePair):
     lzfse: Any
 
     def read_color(self) -> NDArray[np.uint8]:
-        """Read 8-bit RGB [H, W, 3]. Raises SourceError naming the member."""
         return decode_color(self.color, self.archive.read(f"rgbd/{self.number}.jpg"))
 
     def read_depth(self, units_per_metre: float) -> NDArray[np.float32]:
@@ -94,7 +93,6 @@ class R3dImagePair(ImagePair):
         return depth_to_metres(self.depth, depth_m, units_per_metre)
 
     def sizes(self) -> tuple[Size, Size]:
-        """Return (width, height) of colour and depth. Raises SourceError naming the colour image."""
         height, width = self.read_color().shape[:2]
         return (width, height), self.depth_size
 
@@ -116,14 +114,12 @@ class ExrImagePair(ImagePair):
     openexr: Any
 
     def read_depth(self, units_per_metre: float) -> NDArray[np.float32]:
-        """Read depth in metres [H, W]. Raises SourceError naming the file."""
         channels = self._opened().channels()
         name = next((name for name in ("R", "Y", "Z") if name in channels), next(iter(channels)))
         depth_m = np.asarray(channels[name].pixels, np.float32)
         return depth_to_metres(self.depth, np.nan_to_num(depth_m, nan=0.0, posinf=0.0, neginf=0.0), units_per_metre)
 
     def sizes(self) -> tuple[Size, Size]:
-        """Return (width, height) of colour and depth. Raises SourceError naming the file."""
         return image_size(self.color), self._size()
 
     def _size(self) -> Size:

@@ -159,7 +159,6 @@ class BagStereoPair(StereoPair):
         return decode_any_color(path, self.bag.read(*self.messages[path]))
 
     def sizes(self) -> tuple[Size, Size]:
-        """Return (width, height) of both images. Raises SourceError naming topic and time."""
         left, right = (message_size(path, self.bag.read(*self.messages[path])) for path in (self.color, self.depth))
         return left, right
 
@@ -259,15 +258,12 @@ class BagImagePair(ImagePair):
     entries: tuple[Entry, Entry]
 
     def read_color(self) -> NDArray[np.uint8]:
-        """Read 8-bit RGB [H, W, 3]. Raises SourceError naming topic and time."""
         return decode_color_message(self.color, self.bag.read(self.topics[0], self.entries[0]))
 
     def read_depth(self, units_per_metre: float) -> NDArray[np.float32]:
-        """Read depth in metres [H, W]. Raises SourceError naming topic and time."""
         return decode_depth_message(self.depth, self.bag.read(self.topics[1], self.entries[1]), units_per_metre)
 
     def sizes(self) -> tuple[Size, Size]:
-        """Return (width, height) of colour and depth. Raises SourceError naming topic and time."""
         paths = (self.color, self.depth)
         color, depth = (
             message_size(p, self.bag.read(t, e)) for p, t, e in zip(paths, self.topics, self.entries, strict=True)

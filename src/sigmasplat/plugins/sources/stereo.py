@@ -139,7 +139,6 @@ class StereoSource(RecordedSource):
         self.scene_scale = scene_scale(self.depth_of, len(self))
 
     def depth_std_of(self, i: int) -> NDArray[np.float32]:
-        """Return the standard deviation of the depth of frame i, m [H, W]; 0 without a reading."""
         return self._pairs[self._checked_index(i)].depth_and_std_m()[1]
 
 

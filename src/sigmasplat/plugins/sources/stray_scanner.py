@@ -47,7 +47,6 @@ class StrayImagePair(ImagePair):
     confidence: Path
 
     def read_color(self) -> NDArray[np.uint8]:
-        """Read 8-bit RGB [H, W, 3]. Raises SourceError naming the video."""
         return self.video.frame(self.number)
 
     def read_depth(self, units_per_metre: float) -> NDArray[np.float32]:
@@ -63,7 +62,6 @@ class StrayImagePair(ImagePair):
         return np.where(confidence > 0, depth_m, np.float32(0.0))
 
     def sizes(self) -> tuple[Size, Size]:
-        """Return (width, height) of colour and depth. Raises SourceError naming the depth file."""
         return self.video.size, image_size(self.depth)
 
 

@@ -143,7 +143,6 @@ class SyntheticRoom(Source):
         return self._matcher.depth_and_std_m(left, self.right_image(i))[1]
 
     def timestamp_s(self, i: int) -> float:
-        """Return the time of frame i, without rendering it."""
         return self._checked_index(i) / FRAMES_PER_SECOND
 
     def exact_depth_of(self, i: int) -> NDArray[np.float32]:
