@@ -11,8 +11,7 @@ a folder                 0.txt, 1.txt, …: one matrix per frame      camera to 
 Cameras look along z, with x to the right and y down; transforms.json has its own axes (`input/transforms.py`).
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +20,6 @@ from PIL import Image
 
 from sigmasplat.config import RECORDED_POSES, InputConfig
 from sigmasplat.data import se3
-from sigmasplat.data.camera import Camera
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SourceError
@@ -32,6 +30,7 @@ from sigmasplat.input.lists import (
     MAX_GAP_S,
     associate,
     checked_pose,
+    parse_any_numbers,
     parse_numbers,
     read_lines,
     read_matrix,
@@ -47,78 +46,55 @@ SAME_SHAPE = 0.02
 """Masks may have another size than the images, but the same ratio of width and height, within this share."""
 
 
-class MaskFolder:
-    """Masks of all frames of a sequence, in the order of the numbers in their names.
-
-    Raises SourceError if there is not one mask for each frame, or one has another shape than the images.
-    """
-
-    def __init__(self, folder: Path, frames: int, camera: Camera) -> None:
-        if not folder.is_dir():
-            raise SourceError(f"no such folder: {folder}; give the folder of the masks, one image for each frame")
-        self._paths, self._camera = list_images(folder, COLOR_ENDINGS), camera
-        if len(self._paths) != frames:
-            raise SourceError(f"{folder}: found {len(self._paths)} masks for {frames} frames; give one for each frame")
-        for path in self._paths:
-            self._refuse_other_shape(path, image_size(path))
-
-    def ignored(self, i: int) -> NDArray[np.bool_]:
-        """Return the pixels [H, W] of frame i that are ignored. Raises SourceError if its mask cannot be used."""
-        path, c = self._paths[i], self._camera
-        values = read_values(path)
-        chosen = values != 0 if values.ndim == 2 else (values[..., :3] != 0).any(-1)
-        if chosen.shape != (c.height, c.width):
-            chosen = np.asarray(Image.fromarray(chosen).resize((c.width, c.height), Image.Resampling.NEAREST))
-        return np.asarray(chosen, np.bool_)
-
-    def _refuse_other_shape(self, path: Path, size: tuple[int, int]) -> None:
-        (width, height), c = size, self._camera
-        if abs(width * c.height - height * c.width) > SAME_SHAPE * width * c.height:
-            raise SourceError(
-                f"{path}: the mask is {width}×{height}, but the images are {c.width}×{c.height}; "
-                "make masks of the images' shape"
-            )
-
-
 class Masked(Subset):
-    """Another source with a folder of masks: ignored pixels have no depth, and their colour is not used.
+    """Another source with a folder of masks, by the numbers in their names: ignored pixels have no depth, and their
+    colour is not used.
 
-    Raises SourceError if the masks do not fit the frames, or the source is a live camera.
+    Raises SourceError if there is not one mask for each frame, one has another shape than the images, or the source is
+    a live camera.
     """
 
     def __init__(self, whole: Source, folder: Path) -> None:
         if whole.live:
             raise SourceError(f"{folder}: masks are for recordings only; record the camera, then run the recording")
         super().__init__(whole, InputConfig())
-        self._masks = MaskFolder(folder, len(whole), whole.camera)
+        if not folder.is_dir():
+            raise SourceError(f"no such folder: {folder}; give the folder of the masks, one image for each frame")
+        self._masks, c = list_images(folder, COLOR_ENDINGS), whole.camera
+        if len(self._masks) != len(whole):
+            found = f"found {len(self._masks)} masks for {len(whole)} frames"
+            raise SourceError(f"{folder}: {found}; give one for each frame")
+        for path in self._masks:
+            width, height = image_size(path)
+            if abs(width * c.height - height * c.width) > SAME_SHAPE * width * c.height:
+                raise SourceError(
+                    f"{path}: the mask is {width}×{height}, but the images are {c.width}×{c.height}; "
+                    "make masks of the images' shape"
+                )
 
     def frame(self, i: int) -> Frame:
-        frame, ignored = super().frame(i), self._masks.ignored(i)
+        frame, ignored = super().frame(i), self._ignored(i)
         return replace(frame, depth_m=np.where(ignored, np.float32(0.0), frame.depth_m), ignored=ignored)
 
     def depth_of(self, i: int) -> NDArray[np.float32]:
-        return np.where(self._masks.ignored(i), np.float32(0.0), super().depth_of(i))
+        return np.where(self._ignored(i), np.float32(0.0), super().depth_of(i))
+
+    def _ignored(self, i: int) -> NDArray[np.bool_]:
+        """Return the pixels [H, W] of frame i that are ignored. Raises SourceError if its mask cannot be used."""
+        values, c = read_values(self._masks[i]), self.camera
+        chosen = values != 0 if values.ndim == 2 else (values[..., :3] != 0).any(-1)
+        if chosen.shape != (c.height, c.width):
+            chosen = np.asarray(Image.fromarray(chosen).resize((c.width, c.height), Image.Resampling.NEAREST))
+        return np.asarray(chosen, np.bool_)
 
 
 TUM_WORDS, COLMAP_WORDS, MATRIX_WORDS = 8, 10, (12, 16)
 FORMATS = "give TUM or KITTI text, images.txt of COLMAP, transforms.json, or a folder with one matrix per frame"
 
 
-@dataclass(frozen=True, eq=False)
-class ByNumber:
-    """A pose for each frame in order; None = it has none."""
-
-    poses: Sequence[Matrix | None]
-
-
-@dataclass(frozen=True, eq=False)
-class ByName:
-    """Poses by the name of the image file, without folder and ending."""
-
-    poses: Mapping[str, Matrix]
-
-
-GivenPoses = Trajectory | ByNumber | ByName
+GivenPoses = Trajectory | list[Matrix | None] | dict[str, Matrix]
+"""Poses by time; for each frame in order, None = it has none; or by the name of the image file, without folder and
+ending."""
 
 
 def read_given_poses(path: Path) -> GivenPoses:
@@ -127,38 +103,25 @@ def read_given_poses(path: Path) -> GivenPoses:
     if not exists(path):
         raise SourceError(f"no such file or folder: {path}; {FORMATS}")
     if path.is_dir():
-        return _matrices(path)
+        paths = list_images(path, (".txt",))
+        if not paths:
+            raise SourceError(f"{path}: holds no .txt files with matrices; {FORMATS}")
+        return [checked_pose(str(file), read_matrix(file)) for file in paths]
     if path.suffix.lower() == ".json":
         return _named_poses(path)
-    first = next(read_lines(path), None)
-    words = [] if first is None else first[1]
+    _, words = next(read_lines(path), (0, []))
     if len(words) == TUM_WORDS:
         return read_poses(path)
     if len(words) in MATRIX_WORDS:
-        return ByNumber([_matrix(path, line, words) for line, words in read_lines(path)])
+        rows = ((f"{path}:{line}", parse_any_numbers(path, line, words)) for line, words in read_lines(path))
+        return [checked_pose(where, to_matrix(where, values)) for where, values in rows]
     if len(words) >= COLMAP_WORDS and not _is_number(words[COLMAP_WORDS - 1]):
         return _colmap_poses(path)
     found = f"a line of {len(words)} values" if words else "no poses"
     raise SourceError(f"{path}: poses of an unknown format ({found}); {FORMATS}")
 
 
-def _matrix(path: Path, line: int, words: list[str]) -> Matrix | None:
-    try:
-        values = [float(word) for word in words]
-    except ValueError as error:
-        raise SourceError(f"{path}:{line}: expected numbers, found {' '.join(words)[:60]!r}") from error
-    where = f"{path}:{line}"
-    return checked_pose(where, to_matrix(where, values))
-
-
-def _matrices(folder: Path) -> ByNumber:
-    paths = list_images(folder, (".txt",))
-    if not paths:
-        raise SourceError(f"{folder}: holds no .txt files with matrices; {FORMATS}")
-    return ByNumber([checked_pose(str(path), read_matrix(path)) for path in paths])
-
-
-def _colmap_poses(path: Path) -> ByName:
+def _colmap_poses(path: Path) -> dict[str, Matrix]:
     """Read the lines of images; each is followed by a line of points, which may be empty."""
     poses = dict[str, Matrix]()
     for line, words in read_lines(path):
@@ -167,17 +130,15 @@ def _colmap_poses(path: Path) -> ByName:
         qw, qx, qy, qz, x, y, z = parse_numbers(path, line, words[1 : COLMAP_WORDS - 2])
         T_camera_world = rigid_transform(f"{path}:{line}", [x, y, z], [qw, qx, qy, qz])
         poses[Path(" ".join(words[COLMAP_WORDS - 1 :])).stem] = se3.inverse(T_camera_world)
-    return ByName(poses)
+    return poses
 
 
-def _named_poses(path: Path) -> ByName:
-    found = {
-        Path(frame["file_path"]).stem: read_pose(path, frame) for frame in read_frames(path, read_json_object(path))
-    }
-    poses = {name: T for name, T in found.items() if T is not None}
+def _named_poses(path: Path) -> dict[str, Matrix]:
+    frames = read_frames(path, read_json_object(path))
+    poses = {Path(frame["file_path"]).stem: T for frame in frames if (T := read_pose(path, frame)) is not None}
     if not poses:
         raise SourceError(f'{path}: no frame has a "transform_matrix"; {FORMATS}')
-    return ByName(poses)
+    return poses
 
 
 def _is_number(word: str) -> bool:
@@ -224,55 +185,44 @@ def _scaled(T: Matrix, scale: float) -> Matrix:
 
 def _poses_of(whole: Source, given: str) -> list[Matrix | None]:
     """Return T_world_camera [4, 4] of each frame, None without one. Raises SourceError if no frame has one."""
-    poses = _recorded(whole) if given == RECORDED_POSES else read_given_poses(Path(given))
-    if isinstance(poses, Trajectory):
-        return _by_time(whole, given, poses)
-    if isinstance(poses, ByNumber):
-        return _by_number(whole, given, poses.poses)
-    return _by_name(whole, given, poses)
-
-
-def _recorded(whole: Source) -> Trajectory:
-    path = whole.device_path()
-    if path is None:
+    poses = whole.device_path() if given == RECORDED_POSES else read_given_poses(Path(given))
+    if poses is None:
         raise SourceError(
             f"{whole.name}: the recording has no poses that its device estimated; give a file of poses, or leave "
             "out input.poses: then poses are estimated"
         )
-    return path
+    if isinstance(poses, Trajectory):
+        found, why = _by_time(whole, poses)
+    elif isinstance(poses, list):
+        found, why = poses, "no pose is finite; give at least one finite pose"
+        if len(poses) != len(whole):
+            raise SourceError(
+                f"{given}: found {len(poses)} poses for {len(whole)} frames; give one for each frame, in order"
+            )
+    else:
+        found, why = _by_name(whole, poses)
+    if all(T is None for T in found):
+        raise SourceError(f"{given}: {why}")
+    return found
 
 
-def _by_time(whole: Source, given: str, path: Trajectory) -> list[Matrix | None]:
+def _by_time(whole: Source, path: Trajectory) -> tuple[list[Matrix | None], str]:
+    """Return the pose of each frame, and what is wrong if there is none; so does `_by_name`."""
     times_s = np.array([whole.timestamp_s(i) for i in range(len(whole))])
     found: list[Matrix | None] = [None] * len(whole)
     for i, row in associate(times_s, path.timestamps_s):
         found[i] = path.T_world_camera[row]
-    if not any(T is not None for T in found):
-        raise SourceError(
-            f"{given}: no pose is within {MAX_GAP_S:g} s of a frame (poses {path.timestamps_s.min():.3f} … "
-            f"{path.timestamps_s.max():.3f} s, frames {times_s.min():.3f} … {times_s.max():.3f} s); "
-            "use the clock of the recording, in seconds"
-        )
-    return found
+    return found, (
+        f"no pose is within {MAX_GAP_S:g} s of a frame (poses {path.timestamps_s.min():.3f} … "
+        f"{path.timestamps_s.max():.3f} s, frames {times_s.min():.3f} … {times_s.max():.3f} s); "
+        "use the clock of the recording, in seconds"
+    )
 
 
-def _by_number(whole: Source, given: str, poses: Sequence[Matrix | None]) -> list[Matrix | None]:
-    if len(poses) != len(whole):
-        raise SourceError(
-            f"{given}: found {len(poses)} poses for {len(whole)} frames; give one for each frame, in order"
-        )
-    if not any(T is not None for T in poses):
-        raise SourceError(f"{given}: no pose is finite; give at least one finite pose")
-    return list(poses)
-
-
-def _by_name(whole: Source, given: str, poses: ByName) -> list[Matrix | None]:
+def _by_name(whole: Source, poses: dict[str, Matrix]) -> tuple[list[Matrix | None], str]:
     names = [Path(whole.image_name(i)).stem for i in range(len(whole))]
-    found = [poses.poses.get(name) for name in names]
-    if not any(T is not None for T in found):
-        has = f"images are named as {names[0]}" if names[0] else "the recording has no names of images"
-        raise SourceError(
-            f"{given}: no pose has the name of an image (poses are named as {next(iter(poses.poses))}, {has}); "
-            "use the names of the recording's colour images, or give TUM text"
-        )
-    return found
+    has = f"images are named as {names[0]}" if names[0] else "the recording has no names of images"
+    return [poses.get(name) for name in names], (
+        f"no pose has the name of an image (poses are named as {next(iter(poses), 'nothing')}, {has}); "
+        "use the names of the recording's colour images, or give TUM text"
+    )

@@ -114,12 +114,17 @@ def read_lines(path: Path) -> Iterator[tuple[int, list[str]]]:
             yield number, words
 
 
+def parse_any_numbers(path: Path, line: int, words: list[str]) -> list[float]:
+    """Read numbers, which may be infinite or nan. Raises SourceError naming file and line."""
+    try:
+        return [float(word) for word in words]
+    except ValueError as error:
+        raise SourceError(f"{path}:{line}: expected numbers, found {' '.join(words)[:60]!r}") from error
+
+
 def parse_numbers(path: Path, line: int, words: list[str]) -> list[float]:
     """Read finite numbers. Raises SourceError naming file and line."""
-    try:
-        values = [float(word) for word in words]
-    except ValueError as error:
-        raise SourceError(f"{path}:{line}: expected numbers, found {' '.join(words)!r}") from error
+    values = parse_any_numbers(path, line, words)
     if not np.isfinite(values).all():
         raise SourceError(f"{path}:{line}: not finite: {' '.join(words)!r}; delete the line")
     return values

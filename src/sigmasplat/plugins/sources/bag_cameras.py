@@ -173,12 +173,8 @@ BROWN_CONRADY = ("", "plumb_bob", "brown conrady", "inverse brown conrady", "mod
 RATIONAL = "rational_polynomial"
 
 
-@dataclass(frozen=True)
-class Optics:
-    """Intrinsics and lens distortion, None for no distortion."""
-
-    camera: Camera
-    lens: Distortion | None
+Optics = tuple[Camera, Distortion | None]
+"""Intrinsics, and lens distortion or None."""
 
 
 def read_bag_calibration(bag: Bag, color: ImageTopic, depth: ImageTopic, settings: InputConfig) -> Calibration:
@@ -187,11 +183,11 @@ def read_bag_calibration(bag: Bag, color: ImageTopic, depth: ImageTopic, setting
     Raises SourceError if the colour camera is unknown, or if the pose of a separate depth camera is unknown.
     """
     optics = read_optics(bag, color)
-    units = depth_units(bag, depth)
-    recorded = Calibration(optics.camera, units, optics.lens) if optics else None
+    units = _depth_units(bag, depth)
+    recorded = Calibration(optics[0], units, optics[1]) if optics else None
     calibration = resolve_calibration(bag.path, recorded, color.size, settings, units)
     decided = settings.calibration or calibration.depth_camera or settings.register_depth == "off"
-    if decided or is_registered(color, depth):
+    if decided or _is_registered(color, depth):
         return calibration
     depth_optics = read_optics(bag, depth)
     if depth_optics is None and depth.size == color.size:
@@ -201,15 +197,13 @@ def read_bag_calibration(bag: Bag, color: ImageTopic, depth: ImageTopic, setting
             f"{bag.path}: {depth.name} has no camera_info, so it cannot be registered to {color.name}; record it too, "
             "or give --calibration FILE with depth_camera and T_color_depth"
         )
+    camera, lens = depth_optics
     return replace(
-        calibration,
-        depth_camera=depth_optics.camera,
-        depth_distortion=depth_optics.lens,
-        T_color_depth=_color_depth(bag, color, depth),
+        calibration, depth_camera=camera, depth_distortion=lens, T_color_depth=_color_depth(bag, color, depth)
     )
 
 
-def is_registered(color: ImageTopic, depth: ImageTopic) -> bool:
+def _is_registered(color: ImageTopic, depth: ImageTopic) -> bool:
     """Return whether depth is registered to colour: by its topic name, or by an equal optical frame."""
     return depth.registered or (bool(depth.frame) and depth.frame == color.frame and not sdk_stream(depth))
 
@@ -221,14 +215,14 @@ def read_optics(bag: Bag, topic: ImageTopic) -> Optics | None:
         return None
     info = bag.first_message(name)
     rectified, where = "rect" in topic.base.rpartition("/")[2], bag.path / name.lstrip("/")
-    k = np.asarray(_field(info, "p")).reshape(3, 4)[:, :3] if rectified else np.asarray(_field(info, "k")).reshape(3, 3)
-    if rectified and k[0, 0] <= 0:
+    k = np.asarray(_field(info, "p")).reshape(3, 4)[:, :3]
+    if not rectified or k[0, 0] <= 0:
         k = np.asarray(_field(info, "k")).reshape(3, 3)
     if k[0, 0] <= 0:
         return None
     width, height = int(info.width) or topic.size[0], int(info.height) or topic.size[1]
     camera = build_camera(where, width, height, [float(v) for v in (k[0, 0], k[1, 1], k[0, 2], k[1, 2])])
-    return Optics(camera, None if rectified else _lens(f"{bag.path}: {name}", info))
+    return camera, None if rectified else _lens(f"{bag.path}: {name}", info)
 
 
 def _info_name(bag: Bag, topic: ImageTopic) -> str | None:
@@ -245,7 +239,7 @@ def info_of(bag: Bag, topic: ImageTopic) -> Matrix | None:
     return np.asarray(_field(bag.first_message(name), "p"), np.float64).reshape(3, 4)
 
 
-def depth_units(bag: Bag, depth: ImageTopic) -> float:
+def _depth_units(bag: Bag, depth: ImageTopic) -> float:
     """Return the depth units per metre: from the SDK's option if it was recorded, else for millimetres."""
     sensor = "/".join(depth.name.split("/")[:3])
     name = f"{sensor}/option/Depth_Units/value"
@@ -256,7 +250,7 @@ def depth_units(bag: Bag, depth: ImageTopic) -> float:
 
 
 def _color_depth(bag: Bag, color: ImageTopic, depth: ImageTopic) -> Matrix:
-    found = _sdk_color_depth(bag, color, depth)
+    found = sdk_transform(bag, color, depth)
     if found is None and color.frame and depth.frame:
         found = lookup_transform(bag, color.frame, depth.frame)
     if found is None:
@@ -273,15 +267,16 @@ def sdk_stream(topic: ImageTopic) -> str:
     return topic.base.removesuffix("/image/data") if topic.base.startswith("/device_") else ""
 
 
-def _sdk_color_depth(bag: Bag, color: ImageTopic, depth: ImageTopic) -> Matrix | None:
-    poses = [sdk_pose(bag, sdk_stream(topic)) for topic in (color, depth)]
-    T_color_reference, T_depth_reference = poses
-    if T_color_reference is None or T_depth_reference is None:
+def sdk_transform(bag: Bag, target: ImageTopic, source: ImageTopic | str) -> Matrix | None:
+    """Return T_target_source between two streams, None if the bag is not from the SDK; source: a topic or a stream."""
+    stream = source if isinstance(source, str) else sdk_stream(source)
+    T_target_reference, T_source_reference = _sdk_pose(bag, sdk_stream(target)), _sdk_pose(bag, stream)
+    if T_target_reference is None or T_source_reference is None:
         return None
-    return T_color_reference @ se3.inverse(T_depth_reference)
+    return np.asarray(T_target_reference @ se3.inverse(T_source_reference))
 
 
-def sdk_pose(bag: Bag, stream: str) -> Matrix | None:
+def _sdk_pose(bag: Bag, stream: str) -> Matrix | None:
     """Return T_stream_reference, None if the bag is not from the SDK."""
     found = bag.topics_of_type("geometry_msgs/msg/Transform")
     names = [topic.name for topic in found if topic.name.startswith(f"{stream}/tf/")]

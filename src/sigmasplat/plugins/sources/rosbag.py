@@ -22,7 +22,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.config import InputConfig
-from sigmasplat.data import se3
 from sigmasplat.data.imu import Accelerometer, Gyroscope, accelerometer_from_samples, gyroscope_from_samples
 from sigmasplat.errors import SourceError
 from sigmasplat.input.lists import MAX_GAP_S, associate, no_pairs, pair_times, refuse_other_units
@@ -38,8 +37,7 @@ from sigmasplat.plugins.sources.bag_cameras import (
     read_bag_calibration,
     read_optics,
     read_truth,
-    sdk_pose,
-    sdk_stream,
+    sdk_transform,
     topic_by_name,
 )
 from sigmasplat.plugins.sources.bag_messages import (
@@ -128,12 +126,9 @@ def _clocks(bag: Bag, name: str) -> tuple[Values, Values]:
 
 def _axes(bag: Bag, color: ImageTopic, name: str) -> Matrix | None:
     """Return R_color_imu [3, 3], None if it is not known."""
-    stream = name.removesuffix("/imu/data")
     if name.startswith("/device_"):
-        T_color_reference, T_imu_reference = sdk_pose(bag, sdk_stream(color)), sdk_pose(bag, stream)
-        if T_color_reference is None or T_imu_reference is None:
-            return None
-        return (T_color_reference @ se3.inverse(T_imu_reference))[:3, :3]
+        T = sdk_transform(bag, color, name.removesuffix("/imu/data"))
+        return None if T is None else T[:3, :3]
     frame = bag.first_message(name).header.frame_id.lstrip("/")
     if not (frame and color.frame):
         return None
@@ -224,14 +219,14 @@ def _stereo_cameras(bag: Bag, left: ImageTopic, right: ImageTopic, settings: Inp
             raise SourceError(f"{bag.path}: {topic.name} has no camera_info; record it beside the images")
         optics.append(known)
     T_right_left = _rig(bag, left, right)
-    lenses = [known.lens if settings.undistort else None for known in optics]
-    return StereoCameras(given_intrinsics(optics[0].camera, settings), optics[1].camera, T_right_left, *lenses)
+    (left_camera, right_camera), lenses = zip(*optics, strict=True)
+    lenses = lenses if settings.undistort else (None, None)
+    return StereoCameras(given_intrinsics(left_camera, settings), right_camera, T_right_left, *lenses)
 
 
 def _rig(bag: Bag, left: ImageTopic, right: ImageTopic) -> Matrix:
-    poses = [sdk_pose(bag, sdk_stream(topic)) for topic in (left, right)]
-    if poses[0] is not None and poses[1] is not None:
-        return np.asarray(poses[1] @ se3.inverse(poses[0]))
+    if (found := sdk_transform(bag, right, left)) is not None:
+        return found
     P = np.zeros((3, 4)) if (info := info_of(bag, right)) is None else info
     T_right_left = np.eye(4)
     if P[0, 0] > 0 and P[0, 3] < 0:

@@ -1,5 +1,6 @@
 """Render the synthetic room: exact depth and poses, any length and size, the same bytes for the same seed."""
 
+from inspect import signature
 from typing import Any
 
 import numpy as np
@@ -60,31 +61,16 @@ class SyntheticRoom(Source):
     """
 
     def __init__(
-        self,
-        frames: int = 200,
-        width: int = 320,
-        height: int = 240,
-        seed: int = 0,
-        noise: bool = False,
-        loops: int = 1,
-        exposure_change: bool = True,
-        rooms: int = 1,
-        overrun: int = 0,
-        drift: int = 0,
-        test_views: int = 0,
-        stereo: int = 0,
-        mover: int = 0,
-        predicted: bool = False,
-    ) -> None:
+        self, frames: int = 200, width: int = 320, height: int = 240, seed: int = 0, noise: bool = False,
+        loops: int = 1, exposure_change: bool = True, rooms: int = 1, overrun: int = 0, drift: int = 0,
+        test_views: int = 0, stereo: int = 0, mover: int = 0, predicted: bool = False,
+    ) -> None:  # fmt: skip
         """Compute the camera path, no image yet. Raises SourceError unless counts and sizes are ≥ 1, the rest ≥ 0."""
         counts = {"frames": frames, "width": width, "height": height, "loops": loops, "rooms": rooms}
-        for key, value in counts.items():
-            if value < 1:
-                raise SourceError(f"synthetic room: {key} must be at least 1, found {value}")
         others = {"seed": seed, "overrun": overrun, "drift": drift, "test_views": test_views, "stereo": stereo}
-        for key, value in others.items():
-            if value < 0:
-                raise SourceError(f"synthetic room: {key} must be at least 0, found {value}")
+        for key, value in (counts | others).items():
+            if value < (key in counts):
+                raise SourceError(f"synthetic room: {key} must be at least {int(key in counts)}, found {value}")
         if not 0 <= mover <= MOST_MOVER or (mover and rooms > 1):
             found = f"{mover} and rooms={rooms}" if rooms > 1 else str(mover)
             raise SourceError(f"synthetic room: mover is 0 to {MOST_MOVER} percent and needs rooms=1, found {found}")
@@ -109,8 +95,7 @@ class SyntheticRoom(Source):
     def frame(self, i: int) -> Frame:
         """Render frame i; colour has steps of 1/255, as from a camera."""
         T_world_camera = self._T_world_camera[self._checked_index(i)]
-        color, depth_m = render_scene(self._scene(i), self.camera, T_world_camera)
-        color = np.clip(color * np.float32(self._gain(i)), 0.0, 1.0)
+        color, depth_m = self._exposed(i, T_world_camera)
         if self._drift:
             depth_m = drifted_depth(depth_m, i, self._seed, self._drift)
         if self._noise:
@@ -129,8 +114,7 @@ class SyntheticRoom(Source):
         T_left_right = np.eye(4)
         T_left_right[0, 3] = self._baseline_m
         T_world_right = self._T_world_camera[self._checked_index(i)] @ T_left_right
-        color = render_scene(self._scene(i), self.camera, T_world_right)[0]
-        color = np.clip(color * np.float32(self._gain(i)), 0.0, 1.0)
+        color = self._exposed(i, T_world_right)[0]
         if self._noise:
             color = measured_color(color, np.random.default_rng((self._seed, i, 9)))
         return np.asarray(np.rint(color * 255.0), np.uint8)
@@ -183,25 +167,21 @@ class SyntheticRoom(Source):
         """Return the surfaces of all shapes in the room's frame, including hidden parts."""
         return triangulate([shape for shapes in furnish_rooms(self._rooms, self._seed) for shape in shapes])
 
-    def _gain(self, i: int) -> float:
-        """Return the exposure gain of frame i: one sine period over the sequence."""
-        if not self._exposure_change:
-            return 1.0
-        return 1.0 + EXPOSURE_SWING * float(np.sin(2 * np.pi * i / max(len(self) - 1, 1)))
+    def _exposed(self, i: int, T_world_camera: Matrix) -> tuple[Floats, Floats]:
+        """Return colour and depth of frame i from a pose; the exposure gain makes one sine period over the sequence."""
+        color, depth_m = render_scene(self._scene(i), self.camera, T_world_camera)
+        swing = EXPOSURE_SWING if self._exposure_change else 0.0
+        gain = 1.0 + swing * float(np.sin(2 * np.pi * i / max(len(self) - 1, 1)))
+        return np.clip(color * np.float32(gain), 0.0, 1.0), depth_m
 
 
 class _ViewsAway(Source):
     """Exact views of the room away from a camera path, in free space: nothing is nearer than `CLEARANCE_M`."""
 
     def __init__(
-        self,
-        camera: Camera,
-        scene: RoomScene,
-        random: np.random.Generator,
-        T_world_path: Matrix,
-        count: int,
+        self, camera: Camera, scene: RoomScene, random: np.random.Generator, T_world_path: Matrix, count: int,
         away: tuple[Matrix, Matrix],
-    ) -> None:
+    ) -> None:  # fmt: skip
         super().__init__("synthetic test views", camera)
         self._scene, (self._away_m, self._away_rad) = scene, away
         on_path = T_world_path[np.linspace(0, len(T_world_path) - 1, count).round().astype(int)]
@@ -240,22 +220,13 @@ def open_synthetic(text: str) -> SyntheticRoom:
         key, _, value = (word.strip() for word in part.partition("="))
         if key not in _OPTIONS or not value.lstrip("-").isdecimal():
             raise SourceError(f"synthetic room: unknown option {part!r}; give whole numbers for {', '.join(_OPTIONS)}")
-        options[key] = int(value)
-    for key in ("noise", "exposure_change", "predicted"):
-        if key in options:
-            options[key] = bool(options[key])
+        options[key] = type(_OPTIONS[key].default)(int(value))
     return SyntheticRoom(**options)
 
 
-_OPTIONS = (
-    "frames", "width", "height", "seed", "noise", "loops", "exposure_change", "rooms", "overrun", "drift", "test_views",
-    "stereo", "mover", "predicted",
-)  # fmt: skip
+_OPTIONS = signature(SyntheticRoom).parameters
 
 PLUGIN = SourceFormat(
-    "synthetic",
-    "the word 'synthetic'",
-    lambda path: path.partition(":")[0] == "synthetic",
-    lambda path, settings: open_synthetic(path),
-    priority=3,
-)
+    "synthetic", "the word 'synthetic'", lambda path: path.partition(":")[0] == "synthetic",
+    lambda path, settings: open_synthetic(path), priority=3,
+)  # fmt: skip

@@ -30,6 +30,7 @@ from sigmasplat.plugins.sources.room.textures import (
 )
 from sigmasplat.types import Matrix
 
+Triple = tuple[float, float, float]
 HALF_X_M, HALF_Y_M, HEIGHT_M = 2.5, 2.0, 2.6
 WALL_M = 0.15
 PITCH_M = 2 * HALF_X_M + WALL_M
@@ -53,12 +54,7 @@ class Room:
     shapes: list[Shape] = field(default_factory=list)
 
     def place(
-        self,
-        kind: Kind,
-        center: tuple[float, float, float],
-        half: tuple[float, float, float],
-        material: Material | Texture,
-        yaw_rad: float = 0.0,
+        self, kind: Kind, center: Triple, half: Triple, material: Material | Texture, yaw_rad: float = 0.0
     ) -> None:
         """Add a shape: centre and half extents in metres; if `material` is only a texture, the material is matt."""
         side = -1.0 if self.number % 2 else 1.0
@@ -91,9 +87,8 @@ def _shell(room: Room, rooms: int) -> None:
     span_x, middle_z = PITCH_M / 2, HEIGHT_M / 2  # neighbouring rooms meet inside the shared wall
     place = room.place
     place("box", (0, 0, -half), (span_x, HALF_Y_M + WALL_M, half), wood((0.58, 0.42, 0.28), seed=seed))
-    place(
-        "box", (0, 0, HEIGHT_M + half), (span_x, HALF_Y_M + WALL_M, half), plain((0.90, 0.89, 0.86), 0.04, 0.25, seed)
-    )
+    ceiling = plain((0.90, 0.89, 0.86), 0.04, 0.25, seed)
+    place("box", (0, 0, HEIGHT_M + half), (span_x, HALF_Y_M + WALL_M, half), ceiling)
     place("box", (0, HALF_Y_M + half, middle_z), (span_x, half, middle_z), wallpaper(ground, figure, 0.34, seed))
     south = two_tone((0.86, 0.82, 0.72), (0.50, 0.58, 0.60), 0.95 - middle_z, seed)
     place("box", (0, -HALF_Y_M - half, middle_z), (span_x, half, middle_z), south)
@@ -161,21 +156,14 @@ def _south_wall(room: Room, seed: int) -> None:
     place("box", (-0.85, -1.985, 1.6), (0.72, 0.02, 0.5), Material(sky(0.5), glow=1.0))
     white = plain((0.93, 0.92, 0.89), 0.02)
     for x, z, half_x, half_z in (
-        (-0.85, 2.12, 0.78, 0.035),
-        (-0.85, 1.08, 0.82, 0.04),
-        (-1.6, 1.6, 0.035, 0.5),
-        (-0.1, 1.6, 0.035, 0.5),
+        (-0.85, 2.12, 0.78, 0.035), (-0.85, 1.08, 0.82, 0.04), (-1.6, 1.6, 0.035, 0.5), (-0.1, 1.6, 0.035, 0.5),
         (-0.85, 1.6, 0.022, 0.5),
-    ):
+    ):  # fmt: skip
         place("box", (x, -1.97, z), (half_x, 0.045, half_z), white)
     place("box", (-0.85, -1.74, 0.36), (0.7, 0.24, 0.3), wood((0.50, 0.30, 0.20), 0.2, seed + 5, 0.47))
     place("box", (-0.85, -1.74, 0.68), (0.73, 0.26, 0.02), wood((0.62, 0.42, 0.28), 0.13, seed + 6))
-    place(
-        "ball",
-        (-1.2, -1.72, 0.84),
-        (0.1, 0.1, 0.15),
-        Material(checks((0.2, 0.34, 0.6), (0.9, 0.9, 0.88), 0.04), gloss=0.3),
-    )
+    vase = Material(checks((0.2, 0.34, 0.6), (0.9, 0.9, 0.88), 0.04), gloss=0.3)
+    place("ball", (-1.2, -1.72, 0.84), (0.1, 0.1, 0.15), vase)
     place("box", (-0.5, -1.74, 0.76), (0.13, 0.1, 0.06), books(0.03, seed + 7), 0.35)
     place("box", (1.25, -1.985, 1.35), (0.5, 0.02, 0.68), wood((0.55, 0.42, 0.20), 0.08, seed + 8))
     place("box", (1.25, -1.965, 1.35), (0.45, 0.012, 0.63), Material(plain((0.62, 0.66, 0.68), 0.0), mirror=0.8))
@@ -202,12 +190,8 @@ def _corners(room: Room, seed: int) -> None:
 def _middle(room: Room, seed: int) -> None:
     """Add rug, table, chairs, objects on the table and the ceiling lamp in the middle."""
     place, turn = room.place, 0.25
-    place(
-        "drum",
-        (0.1, 0.0, 0.008),
-        (1.15, 1.15, 0.008),
-        rug(1.15, (0.58, 0.20, 0.18), (0.85, 0.76, 0.58), (0.22, 0.26, 0.40), seed),
-    )
+    carpet = rug(1.15, (0.58, 0.20, 0.18), (0.85, 0.76, 0.58), (0.22, 0.26, 0.40), seed)
+    place("drum", (0.1, 0.0, 0.008), (1.15, 1.15, 0.008), carpet)
     top = wood((0.68, 0.48, 0.30), 0.12, seed + 4, 2.0)
     place("box", (0.1, 0.0, 0.70), (0.58, 0.36, 0.022), top, turn)
     for sx in (-1, 1):
@@ -218,19 +202,13 @@ def _middle(room: Room, seed: int) -> None:
     chrome = Material(plain((0.42, 0.44, 0.48), 0.02), mirror=0.3, gloss=0.9)  # the specular sphere
     place("ball", (0.1 + x, y, 0.722 + 0.13), (0.13, 0.13, 0.13), chrome)
     x, y = _rotated(-0.3, 0.1, turn)
-    place(
-        "box",
-        (0.1 + x, y, 0.722 + 0.09),
-        (0.09, 0.09, 0.09),
-        checks((0.86, 0.62, 0.18), (0.22, 0.24, 0.30), 0.06, seed),
-        0.7,
-    )
+    cube = checks((0.86, 0.62, 0.18), (0.22, 0.24, 0.30), 0.06, seed)
+    place("box", (0.1 + x, y, 0.722 + 0.09), (0.09, 0.09, 0.09), cube, 0.7)
     x, y = _rotated(-0.12, -0.17, turn)
     place("box", (0.1 + x, y, 0.722 + 0.03), (0.14, 0.1, 0.03), books(0.06, seed + 9), 0.1)
     x, y = _rotated(0.4, -0.15, turn)
-    place(
-        "drum", (0.1 + x, y, 0.722 + 0.05), (0.042, 0.042, 0.05), Material(plain((0.75, 0.25, 0.2), 0.05), gloss=0.25)
-    )
+    cup = Material(plain((0.75, 0.25, 0.2), 0.05), gloss=0.25)
+    place("drum", (0.1 + x, y, 0.722 + 0.05), (0.042, 0.042, 0.05), cup)
     for x, y, yaw_rad in ((-0.75, -0.45, 0.5), (0.95, 0.5, 2.9)):
         _chair(room, x, y, yaw_rad, seed)
     shade = Material(plain((1.0, 0.97, 0.90), 0.01), glow=1.0)
@@ -239,9 +217,8 @@ def _middle(room: Room, seed: int) -> None:
 
 def _chair(room: Room, x: float, y: float, yaw_rad: float, seed: int) -> None:
     timber = wood((0.40, 0.27, 0.18), 0.06, seed + 12)
-    room.place(
-        "box", (x, y, 0.44), (0.2, 0.2, 0.025), weave((0.52, 0.20, 0.18), (0.72, 0.42, 0.34), 0.05, seed), yaw_rad
-    )
+    seat = weave((0.52, 0.20, 0.18), (0.72, 0.42, 0.34), 0.05, seed)
+    room.place("box", (x, y, 0.44), (0.2, 0.2, 0.025), seat, yaw_rad)
     back_x, back_y = _rotated(-0.19, 0.0, yaw_rad)
     room.place("box", (x + back_x, y + back_y, 0.72), (0.018, 0.2, 0.2), timber, yaw_rad)
     for sx in (-1, 1):
