@@ -19,7 +19,7 @@ from typing import Any, TextIO
 import sigmasplat
 from sigmasplat import env
 from sigmasplat.errors import ConfigError, SigmaSplatError, is_out_of_memory, out_of_memory
-from sigmasplat.files.guard import cause
+from sigmasplat.files.reading import cause
 
 REFUSED, INTERRUPTED, CLOSED = 2, 130, 141
 HELP = {"-h", "--help"}

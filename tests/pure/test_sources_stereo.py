@@ -21,8 +21,7 @@ from sigmasplat.plugins.checks.recording import inspect_source
 from sigmasplat.plugins.evaluation import ablation
 from sigmasplat.plugins.evaluation.ablation import run_job
 from sigmasplat.plugins.sources import open_source, stereo
-from sigmasplat.plugins.sources.camera.stereo import StereoRectification
-from sigmasplat.plugins.sources.camera.stereo_cameras import StereoCameras
+from sigmasplat.plugins.sources.stereo_matching import StereoCameras, StereoRectification
 from sigmasplat.run.scene import open_scene
 from sigmasplat.run.terminal import Screen
 from sigmasplat.run_folder.runs import RunFolder

@@ -111,7 +111,7 @@ def check_sources(study: Study, screen: "Screen") -> None:
 
     Raises SourceError.
     """
-    from sigmasplat.input.depth_units import depth_warning
+    from sigmasplat.input.recorded import depth_warning
     from sigmasplat.plugins.sources import open_source
 
     for source in study.sources:

@@ -61,7 +61,7 @@ def new_run(
     warn: Callable[[str], None] = no_warning,
     **facts: Any,
 ) -> Iterator[RunFolder]:
-    """Yield a new run folder as `new_folder` does, and hold its lock during the block (`io.lock`).
+    """Yield a new run folder as `new_folder` does, and hold its lock during the block (`files.lock`).
 
     A folder without results is removed if the block fails (`removed_on_early_failure`). Raises as `new_folder`.
     """

@@ -14,13 +14,11 @@ from sigmasplat.config.sensors import AUTO
 from sigmasplat.data.frame import Frame
 from sigmasplat.errors import SourceError
 from sigmasplat.input.calibration import CameraUnknown, unlikely_camera
-from sigmasplat.input.depth_units import depth_warning
 from sigmasplat.input.opening import format_name
+from sigmasplat.input.recorded import depth_warning
 from sigmasplat.input.source import Source
-from sigmasplat.plugins.checks.motion import Motion, motion_warnings
-from sigmasplat.plugins.checks.registration import EdgeAgreement, edge_agreement, overlay
-from sigmasplat.plugins.checks.sensor_noise import SensorNoise, measure_noise
-from sigmasplat.plugins.checks.timing import time_warnings, times_of
+from sigmasplat.plugins.checks.depth import EdgeAgreement, SensorNoise, edge_agreement, measure_noise, overlay
+from sigmasplat.plugins.checks.motion import Motion, motion_warnings, time_warnings, times_of
 from sigmasplat.plugins.outputs.drawing import colormap, contact_sheet
 from sigmasplat.plugins.sources import open_source
 

@@ -22,9 +22,8 @@ from sigmasplat.config.text import full_path, override, split_settings
 from sigmasplat.errors import ConfigError, RunError
 from sigmasplat.files import machine
 from sigmasplat.files.atomic import write_text
-from sigmasplat.files.guard import guarded
 from sigmasplat.files.machine import INSTALLED, code_digest
-from sigmasplat.files.reading import read_text
+from sigmasplat.files.reading import guarded, read_text
 
 if TYPE_CHECKING:
     from sigmasplat.run.terminal import Screen

@@ -5,8 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from sigmasplat.errors import ConfigError, nearest
-from sigmasplat.files.guard import guarded
-from sigmasplat.files.reading import read_text
+from sigmasplat.files.reading import guarded, read_text
 
 TABLES = Path(__file__).parent / "tables"
 
