@@ -12,8 +12,7 @@ import claims_tables
 import record
 import tables
 from ablation import verdict_counts
-
-from sigmasplat.plugins.evaluation.paired_comparison import passed_by_chance
+from paired_comparison import passed_by_chance
 
 SEQUENCES = ("livingroom", "synthetic", "redkitchen")
 
