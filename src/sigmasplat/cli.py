@@ -32,7 +32,8 @@ DESCRIPTION = """RGB-D SLAM on 3D Gaussian splats, with uncertainty.
 
 Start with: sigmasplat demo, then: sigmasplat run PATH.
 
-sigmasplat --version                   print the version and exit
+sigmasplat --version    print the version and exit
+
 sigmasplat --plugin FILE.py run PATH    use a file with plug-ins of yours; before or after any command"""
 
 COMMANDS = {
