@@ -19,7 +19,7 @@ from sigmasplat.data.frame import Frame
 from sigmasplat.errors import RunError
 from sigmasplat.files.lock import LOCK, locked, no_warning
 from sigmasplat.input.source import Source
-from sigmasplat.run.profile import profile
+from sigmasplat.run.figures import profile
 from sigmasplat.run.protocols import (
     Callback,
     Checkpointer,

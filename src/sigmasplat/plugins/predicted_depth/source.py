@@ -176,9 +176,6 @@ def no_color() -> Floats:
     return np.zeros((0, 0, 3), np.float32)
 
 
-Floats = NDArray[np.float32]
-
-
 class WithPredictedDepth(Subset):
     """Another source with predicted depth instead of its own.
 

@@ -149,8 +149,6 @@ def _window(image: Floats, powers_x: int = 0, powers_y: int = 0) -> Floats:
     return np.asarray(cv2.sepFilter2D(image, cv2.CV_32F, *along, borderType=cv2.BORDER_CONSTANT), np.float32)
 
 
-Bytes = NDArray[np.uint8]
-Floats = NDArray[np.float32]
 Maps = tuple[Floats, Floats]
 
 BLOCK_PX = 5
