@@ -120,11 +120,11 @@ def paper_table(system: str) -> str:
 
 def scene_table(system: str) -> str:
     """Return the released code's scenes: a row per set of values, a column per setting; all from the code."""
-    from sigmasplat.config.presets import list_presets, preset
+    from sigmasplat.config.presets import preset, presets_by_scene
 
     columns, prefix = SCENES[system], f"{system}-released-"
     scenes: dict[tuple[str, ...], list[str]] = {}
-    for name in (name for name in list_presets() if name.startswith(prefix)):
+    for name in (name for name in presets_by_scene() if name.startswith(prefix)):
         values = tuple(_value(preset(name), column) for column in columns)
         scenes.setdefault(values, []).append(f"`{name.removeprefix(prefix)}`")
     rows = [f"| scenes | {' | '.join(f'`{name}`' for name in columns)} |", "|---" * (len(columns) + 1) + "|"]
@@ -135,9 +135,9 @@ def scene_table(system: str) -> str:
 def method_table(system: str) -> str:
     """Return the table of what all presets of the released code change: the setting, the paper's value, the code's."""
     from sigmasplat.config import Config
-    from sigmasplat.config.presets import list_presets, preset
+    from sigmasplat.config.presets import preset, presets_by_scene
 
-    released = [preset(name) for name in list_presets() if name.startswith(f"{system}-released-")]
+    released = [preset(name) for name in presets_by_scene() if name.startswith(f"{system}-released-")]
     rows = ["| setting | paper's presets | released | from |", "|---|---|---|---|"]
     for name in changed_by_all(released, [preset(f"{system}-{column}") for column in DATA_SETS[system]], Config()):
         if name not in SCENES[system]:

@@ -16,10 +16,10 @@ PAGE = ROOT / "docs" / "settings.md"
 HEAD = """# Settings
 
 `--set SECTION.NAME=VALUE` changes a setting of `demo`, `run`, `inspect` and `bench`. The `config.json` of a run holds
-all settings that it used. *Default* is the value if the preset does not set one. *`{preset}`* is the value of the
-default preset, shown if it differs. Units are in the names: `_m` metres, `_deg` degrees, `_px` pixels, `_s` seconds.
-`lr_` is a learning rate, `weight_` the weight of a loss. "Ours" marks what is in neither paper. *Takes* is the type
-and the valid range. A run is refused if a value is out of range, infinite or not a number; the error names all of them.
+all settings that it used. The defaults are the preset `sigma`. Units are in the names: `_m` metres, `_deg` degrees,
+`_px` pixels, `_s` seconds. `lr_` is a learning rate, `weight_` the weight of a loss. "Ours" marks what is in neither
+paper. *Takes* is the type and the valid range. A run is refused if a value is out of range, infinite or not a number;
+the error names all of them.
 
 Generated from [`config/`](../src/sigmasplat/config/) by `docs/theme/settings.py`. Back to the [README](../README.md).
 """
@@ -37,33 +37,31 @@ def classes() -> dict[str, ast.ClassDef]:
     return {node.name: node for tree in trees for node in tree.body if isinstance(node, ast.ClassDef)}
 
 
-def table(defaults: Any, chosen: Any, preset_name: str, prefix: str = "") -> str:
+def table(defaults: Any, prefix: str = "") -> str:
     """Return the table of one section: a row per field that is not a section itself."""
     from sigmasplat.config.ranges import kinds_of
 
     said, kinds = sentences(classes()[type(defaults).__name__].body), kinds_of(type(defaults))
-    rows = [f"| setting | takes | default | `{preset_name}` | meaning |", "|---|---|---|---|---|"]
+    rows = ["| setting | takes | default | meaning |", "|---|---|---|---|"]
     for name in (field.name for field in dataclasses.fields(defaults)):
-        value, other = getattr(defaults, name), getattr(chosen, name)
+        value = getattr(defaults, name)
         if not dataclasses.is_dataclass(value):
-            differing = "" if other == value else _written(other)
             sentence = said.get(name, "").replace("|", "\\|")
-            rows.append(f"| `{prefix}{name}` | {_words(kinds[name])} | {_written(value)} | {differing} | {sentence} |")
+            rows.append(f"| `{prefix}{name}` | {_words(kinds[name])} | {_written(value)} | {sentence} |")
     return "\n".join(rows) + "\n"
 
 
 def page() -> str:
     """Return the whole page."""
     from sigmasplat.config import Config
-    from sigmasplat.config.presets import default_preset, preset
 
-    defaults, chosen = Config(), preset(default_preset())
-    parts = [HEAD.format(preset=default_preset()), f"## Whole run\n\n{table(defaults, chosen, default_preset())}"]
+    defaults = Config()
+    parts = [HEAD, f"## Whole run\n\n{table(defaults)}"]
     for field in dataclasses.fields(defaults):
         section = getattr(defaults, field.name)
         if dataclasses.is_dataclass(section):
             said = " ".join((ast.get_docstring(classes()[type(section).__name__]) or "").split())
-            rows = table(section, getattr(chosen, field.name), default_preset(), f"{field.name}.")
+            rows = table(section, f"{field.name}.")
             parts.append(f"## {field.name}\n\n{said.partition(' Raises ')[0]}\n\n{rows}")
     return "\n".join(parts)
 

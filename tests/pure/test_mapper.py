@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from sigmasplat.config import Config, DensifyConfig, MappingConfig, RenderConfig, SeedConfig
+from paper_settings import DensifyConfig, MappingConfig, RenderConfig, SeedConfig
+from sigmasplat.config import Config
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import COLUMNS
 from sigmasplat.data.frame import Frame

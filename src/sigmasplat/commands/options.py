@@ -188,7 +188,7 @@ def configured(
 def working_images(config: Config) -> dict[str, str]:
     """Return the default settings of the input, but with the size and depth range of the images of `config`."""
     kept = {name: getattr(config.input, name) for name in ("width", "crop_px", "min_depth_m", "max_depth_m")}
-    return {f"input.{name}": str(value) for name, value in (asdict(InputConfig()) | kept).items()}
+    return {f"input.{name}": str(value) for name, value in (asdict(InputConfig(denoise_depth=False)) | kept).items()}
 
 
 def source_of(folder: "RunFolder", moved_to: str | None) -> "Source":

@@ -11,7 +11,7 @@ class DensifyConfig(Section, name="primitives"):
     """Pruning, splitting and cloning of splats, halfway through the steps of a keyframe and after them (CG-SLAM §4,
     5)."""
 
-    uncertain_m2: NotNegative = 0.0
+    uncertain_m2: NotNegative = 0.025
     """A splat is uncertain if the mean squared difference between its depth and the depth readings at its pixels, over
     the window, is above this (ν > τ, CG-SLAM eq. 13). It fades halfway through the steps of a keyframe, and is removed
     at the end unless it has recovered; 0 = off."""
@@ -28,7 +28,7 @@ class DensifyConfig(Section, name="primitives"):
     at least this, per half image size (3DGS); 0 = no splat is split or cloned for its gradient."""
     split_scale_m: NotNegative = 0.05
     """A densified splat larger than this is split in two."""
-    split_radius_px: NotNegative = 0.0
+    split_radius_px: NotNegative = 13.0  # else an inherited map becomes coarser as the camera moves
     """A splat whose radius (three standard deviations) in the newest keyframe's image exceeds this is split in two as
     well: it was made for a view from farther away (ours). 0 = off."""
     clone: bool = False

@@ -9,7 +9,7 @@ from sigmasplat.config.ranges import AtLeastOne, Count, Section
 class MovingConfig(Section, name="moving"):
     """Things that move are left out of tracking and of the map (ours)."""
 
-    find: bool = False
+    find: bool = True  # up to 3 % of the time where nothing moves (benchmarks/search_cost.py)
     """Whether keyframes are compared with each other: what one shows in space that another has seen to be free is
     masked, and splats there are removed. Off = only what is nearer than the newest keyframe is masked, in tracking with
     `tracking.verify` (papers: nothing)."""

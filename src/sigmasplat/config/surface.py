@@ -10,6 +10,6 @@ from sigmasplat.config.ranges import Section
 class SurfaceConfig(Section, name="surface"):
     """The mesh of a finished run. Raises ConfigError on invalid values."""
 
-    depth: Literal["map", "map+sensor"] = "map"
+    depth: Literal["map", "map+sensor"] = "map+sensor"
     """Depth that is fused at each keyframe: map = rendered from its submap (VarSplat §7); map+sensor = rendered from
     the final map, and the readings of the keyframe, weighted by their variances (ours)."""

@@ -10,6 +10,6 @@ class UncertaintyConfig(Section, name="uncertainty"):
     """Calibration of the variance that a map predicts for its colour and depth (ours). Raises ConfigError on invalid
     values."""
 
-    probes: Count = 0
+    probes: Count = 4
     """Number of probe views that each submap keeps: well-tracked frames that are not keyframes. The map is not fitted
     to them; the predicted variance is calibrated on them after the last frame. 0 = no predicted variance."""
