@@ -67,7 +67,13 @@ def page() -> str:
 
 
 def _field(node: ast.stmt) -> str:
-    return node.target.id if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name) else ""
+    """Return the name of the setting that a statement declares, "" for a constant and any other statement."""
+    match node:
+        case ast.AnnAssign(annotation=ast.Subscript(value=ast.Name(id="ClassVar"))):
+            return ""
+        case ast.AnnAssign(target=ast.Name(id=name)):
+            return name
+    return ""
 
 
 def _text(node: ast.stmt) -> str:

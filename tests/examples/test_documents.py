@@ -56,7 +56,7 @@ def unknown_names(path: Path) -> list[str]:
     logged = fitted | compared if path.name == "runs.md" else set()
 
     def is_known(section: str, name: str) -> bool:
-        known = {*vars(getattr(Config(), section)), "py", "json", "safetensors"} | logged
+        known = {*dir(getattr(Config(), section)), "py", "json", "safetensors"} | logged  # settings and constants
         return name in known or (PACKAGE / section / f"{name}.py").is_file()
 
     return [

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from box_room import CAMERA, CHEST, HIGH, LOW, PILLAR, cast, pose, seer, splats
-from sigmasplat.config.surface import SurfaceConfig
+from sigmasplat.config import SurfaceConfig
 from sigmasplat.data import se3
 from sigmasplat.data.mesh import Mesh
 from sigmasplat.data.submap import Picture

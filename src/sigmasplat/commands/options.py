@@ -179,10 +179,10 @@ def configured(
     like: Config | None = None,
 ) -> Config:  # fmt: skip
     """Return a preset's settings, changed by --set, the input options and --seed; with `like`, working images are made
-    as in these settings unless --set says otherwise. Raises ConfigError, also if settings exclude each other."""
+    as in these settings unless --set says otherwise. Raises ConfigError."""
     given = (working_images(like) if like else {}) | split_settings(settings) | input_options.settings()
     config = override(preset_of(preset), given)
-    return (config if seed is None else override(config, {"seed": str(seed)})).checked()
+    return config if seed is None else override(config, {"seed": str(seed)})
 
 
 def working_images(config: Config) -> dict[str, str]:

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 from math import ceil
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from sigmasplat.config.ranges import Above0, AtLeastOne, Count, NotNegative, Range, Section, Share, WeightBound
 
@@ -16,7 +16,7 @@ class RenderConfig(Section, name="render"):
 
     alpha_min: Share = 1.0 / 255.0
     """A splat is ignored at pixels where its alpha is below this."""
-    transmittance_stop: Share = 1e-4
+    transmittance_stop: ClassVar[float] = 1e-4
     """A splat contributes to a pixel only if at least this share of light passes the splats in front of it."""
     near_m: Above0 = 0.05
     """Splats closer to the camera than this are not drawn, in metres. Use a smaller value for cameras very close to
@@ -201,6 +201,37 @@ class MappingConfig(Section, name="mapping"):
 
 
 @dataclass(frozen=True)
+class DensifyConfig(Section, name="primitives"):
+    """Pruning, splitting and cloning of splats, halfway through the steps of a keyframe and after them (CG-SLAM §4,
+    5)."""
+
+    uncertain_m2: NotNegative = 0.025
+    """A splat is uncertain if the mean squared difference between its depth and the depth readings at its pixels, over
+    the window, is above this (ν > τ, CG-SLAM eq. 13). It fades halfway through the steps of a keyframe, and is removed
+    at the end unless it has recovered; 0 = off."""
+    owner: Literal["dominant", "median"] = "dominant"
+    """Which splat of a pixel is compared with its depth reading: the one with the largest weight (paper), or the one at
+    the median depth (CG-SLAM's code)."""
+    faded_opacity: ClassVar[float] = 0.07
+    """Opacity of a faded splat. It is above `render.alpha_min`, so that the splat is still drawn and can recover
+    (ours)."""
+    least_opacity: ClassVar[float] = 15.0 / 255.0
+    """A faded splat has recovered if it is no longer uncertain and has at least this opacity (CG-SLAM's α_min)."""
+    split_gradient: NotNegative = 0.0
+    """A splat is densified if the mean gradient of the loss with respect to its 2D position in the newest keyframe is
+    at least this, per half image size (3DGS); 0 = no splat is split or cloned for its gradient."""
+    split_scale_m: NotNegative = 0.05
+    """A densified splat larger than this is split in two."""
+    split_radius_px: NotNegative = 13.0  # else an inherited map becomes coarser as the camera moves
+    """A splat whose radius (three standard deviations) in the newest keyframe's image exceeds this is split in two as
+    well: it was made for a view from farther away (ours). 0 = off."""
+    clone: bool = False
+    """Whether a densified splat that is too small to be split is cloned (3DGS; not in CG-SLAM's code)."""
+    most_scale_m: NotNegative = 0.0
+    """Splats larger than this are removed; 0 = off."""
+
+
+@dataclass(frozen=True)
 class TrackingConfig(Section, name="tracking"):
     """Fit of camera poses: method, iterations, masks, weights (VarSplat §3; CG-SLAM §6)."""
 
@@ -214,7 +245,7 @@ class TrackingConfig(Section, name="tracking"):
     align_depth_by: Literal["V", "U"] = "V"
     """Whether alignment weights depth residuals by V, like gray residuals, or in the same way by the depth variance U
     of the map (CG-SLAM eq. 10)."""
-    align_stop: NotNegative = 2e-4
+    align_stop: ClassVar[float] = 2e-4
     """Alignment ends the finest pyramid level when a step is smaller than this (metres and radians). The limit doubles
     from each level to the next coarser one."""
     sensor_noise: bool = True
@@ -273,10 +304,10 @@ class TrackingConfig(Section, name="tracking"):
     verify: bool = True
     """Whether a pose is judged by comparing surfaces at it (ours); off = by agreement and overlap only. It needs
     `method` align."""
-    lost_agreement: NotNegative = 0.6
+    lost_agreement: ClassVar[float] = 0.6
     """Tracking is lost if map and sensor agree in depth on less than this share of the pixels where both have a
     surface; not used with `verify`."""
-    lost_share: NotNegative = 0.2
+    lost_share: ClassVar[float] = 0.2
     """Tracking is lost if the map agrees with less than this share of the sensor's readings (agreement × overlap); with
     `verify`, if reference and frame have less than this share of the reference's readings in common."""
     fit_depth: bool = False

@@ -2,7 +2,7 @@
 
 import sys
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from sigmasplat.config.ranges import (
     WIDTHS_PX,
@@ -14,7 +14,6 @@ from sigmasplat.config.ranges import (
     RatioLimit,
     Section,
     Share,
-    WeightBound,
     shown,
 )
 from sigmasplat.errors import ConfigError
@@ -73,7 +72,7 @@ class LoopConfig(Section, name="loops"):
     tau: Above0 = 10.0
     """τ of the splat weights in that opacity ratio, computed from σ². A smaller τ separates certain from uncertain
     splats more sharply."""
-    weight_max: WeightBound = 3.0
+    weight_max: ClassVar[float] = 3.0
     """Bounds of the splat weights in the opacity ratio: at most this, at least 1 / this."""
 
 
@@ -81,7 +80,7 @@ class LoopConfig(Section, name="loops"):
 class RegistrationConfig(Section, name="registration"):
     """Registration of two submaps, and acceptance of the result (VarSplat §5)."""
 
-    keyframes: AtLeastOne = 2
+    keyframes: ClassVar[int] = 2
     """Number of keyframes of each submap that are localised in the other one."""
     iterations: Count = 0  # descent hardly ever finds what alignment does not, and takes half of a search
     """Maximum number of Adam steps per keyframe, after alignment; each step is a render. 0 = only alignment."""
@@ -101,9 +100,9 @@ class RegistrationConfig(Section, name="registration"):
     """Whether a localised keyframe is finally aligned to the recorded image of the other submap's nearest keyframe
     (ours): the surfaces of a young map are biased. A loop that only the maps show is rejected. off = the pose relative
     to the map is used (paper)."""
-    exposure: bool = True
+    exposure: ClassVar[bool] = True
     """Whether a factor and an offset of the colour are fitted too, because submaps may differ in exposure."""
-    weight_color: Share = 0.95
+    weight_color: ClassVar[float] = 0.95
     """λ_c, the weight of the colour loss in registration; the depth loss has 1 − λ_c."""
     color_mean: Literal["values", "pixels"] = "pixels"
     """How the colour errors of registration are averaged: values = over pixels and channels (paper); pixels = over
@@ -112,22 +111,22 @@ class RegistrationConfig(Section, name="registration"):
     """Whether pixels are weighted by the V of the other submap; off = LoopSplat."""
     tau: Above0 = 10.0
     """τ of the pixel weights in registration, as `tracking.tau`."""
-    weight_max: WeightBound = 3.0
+    weight_max: ClassVar[float] = 3.0
     """Bounds of the pixel weights in registration: at most this, at least 1 / this."""
-    overlap_least: NotNegative = 0.2
+    overlap_least: ClassVar[float] = 0.2
     """A loop is rejected if less than this share of the splats has a neighbour within `overlap_m` in the other
     submap."""
     overlap_m: NotNegative = 0.1
     """Maximum distance in metres between a splat and its neighbour in the other submap, for `overlap_least`: about the
     distance between two maps of the same wall."""
-    agreement_least: NotNegative = 0.8
+    agreement_least: ClassVar[float] = 0.8
     """A localisation is valid only if at least this share of the common surface agrees in depth."""
-    share_least: NotNegative = 0.3
+    share_least: ClassVar[float] = 0.3
     """A localisation is valid only if the other submap explains at least this share of its depth readings."""
     spread_m: NotNegative = 0.1
     """Localisations agree if they are within this distance of one of them, in metres. A loop is rejected if fewer than
     two agree."""
-    spread_deg: NotNegative = 5.0
+    spread_deg: ClassVar[float] = 5.0
     """Localisations agree if their rotations differ from one of them by at most this. A loop is rejected if fewer than
     two agree."""
 
@@ -193,7 +192,7 @@ class FinalConfig(Section, name="final"):
     pixels. 0 = none are removed."""
     prune_every: AtLeastOne = 500
     """Number of refinement steps between removals of splats with low opacity (`prune_opacity`)."""
-    prune_opacity: Share = 0.005
+    prune_opacity: ClassVar[float] = 0.005
     """Splats with at most this opacity, 0 to 1, are removed during refinement."""
     width: str = "working"
     """Width of the images in the last stage of refinement: working = no such stage, only working images are used;

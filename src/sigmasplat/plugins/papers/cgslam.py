@@ -50,8 +50,6 @@ PAPER = BASE.changed(
     },
     primitives={
         "uncertain_m2": 0.025,
-        "faded_opacity": 0.07,
-        "least_opacity": 15.0 / 255.0,
         "split_gradient": 0.002,
         "clone": True,
     },
@@ -135,7 +133,7 @@ FAST = dataclasses.replace(
             "weight_isotropy": 0.0, "weight_isotropy_ratio": 0.1, "weight_moment": 0.15, "poses": "all",
             "poses_from": "half", "window": 4, "covisibility": "splats", "frames_per_step": 1,
         },
-        primitives={"uncertain_m2": 0.025, "faded_opacity": 0.07},
+        primitives={"uncertain_m2": 0.025},
         tracking={"align_depth_by": "U", "uncertainty": True},
     ),
     submaps=PAPER.submaps, loops=PAPER.loops, registration=PAPER.registration, final=PAPER.final,

@@ -18,7 +18,6 @@ PAPER = BASE.changed(
     render={"near_m": 0.2},
     seeding={"first_gradient": 50_000, "alpha_below": 0.6, "depth_error_factor": 40.0, "opacity": 0.5},
     mapping={"iterations": 100, "weight_nll_color": 1e-4, "freeze_old_colors": True},
-    tracking={"weight_max": 3.0},
     submaps={"distance_m": 0.5, "angle_deg": 50.0, "uncertainty_m": UNCERTAIN_M},
     loops={"descriptor": "netvlad-or-grid"},
     final={"seed_from": "mesh", "iterations": 30_000, "sh_degree": 3, "uncertainty": False},  # §7 does not use V
@@ -110,7 +109,6 @@ FAST = BASE.changed(
         "method": "align",  # Gauss–Newton on images instead of 200 renders per frame
         "align_weight_color": 0.1,  # gray has the smaller basin of convergence; with 0.5, steps of 5° fail
         "tau": 10.0,
-        "weight_max": 3.0,
     },
     submaps={
         "distance_m": 0.5,
