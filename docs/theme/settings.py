@@ -8,6 +8,7 @@ import ast
 import dataclasses
 import itertools
 import sys
+from functools import cache
 from pathlib import Path
 from typing import Any, get_args
 
@@ -18,8 +19,8 @@ HEAD = """# Settings
 `--set SECTION.NAME=VALUE` changes a setting of `demo`, `run`, `inspect` and `bench`. The `config.json` of a run holds
 all settings that it used. The defaults are the preset `sigma`. Units are in the names: `_m` metres, `_deg` degrees,
 `_px` pixels, `_s` seconds. `lr_` is a learning rate, `weight_` the weight of a loss. "Ours" marks what is in neither
-paper. *Takes* is the type and the valid range. A run is refused if a value is out of range, infinite or not a number;
-the error names all of them.
+paper. *Takes* is the type and the valid range. *Changed by* names the systems with another value in some preset. A run
+is refused if a value is out of range, infinite or not a number; the error names all of them.
 
 Generated from [`config/`](../src/sigmasplat/config/) by `docs/theme/settings.py`. Back to the [README](../README.md).
 """
@@ -37,17 +38,38 @@ def classes() -> dict[str, ast.ClassDef]:
     return {node.name: node for tree in trees for node in tree.body if isinstance(node, ast.ClassDef)}
 
 
-def table(defaults: Any, prefix: str = "") -> str:
+def changed_by(section: str, name: str) -> str:
+    """Return the systems whose presets have another value than the default."""
+    values = {system: [getattr(getattr(c, section), name) for c in configs] for system, configs in presets().items()}
+    default = values.pop("sigma")[0]
+    return ", ".join(system for system, found in values.items() if any(value != default for value in found))
+
+
+@cache
+def presets() -> dict[str, list[Any]]:
+    """Return the settings of all presets by system: the first word of the name, or two for released code."""
+    from sigmasplat.config.presets import list_presets, preset, presets_by_scene
+
+    found: dict[str, list[Any]] = {}
+    for name in [*list_presets(), *presets_by_scene()]:
+        system, _, rest = name.partition("-")
+        found.setdefault(f"{system}-released" if rest.startswith("released") else system, []).append(preset(name))
+    return found
+
+
+def table(defaults: Any, section: str = "") -> str:
     """Return the table of one section: a row per field that is not a section itself."""
     from sigmasplat.config.ranges import kinds_of
 
     said, kinds = sentences(classes()[type(defaults).__name__].body), kinds_of(type(defaults))
-    rows = ["| setting | takes | default | meaning |", "|---|---|---|---|"]
+    rows = ["| setting | takes | default | changed by | meaning |", "|---|---|---|---|---|"]
+    prefix = f"{section}." if section else ""
     for name in (field.name for field in dataclasses.fields(defaults)):
         value = getattr(defaults, name)
         if not dataclasses.is_dataclass(value):
             sentence = said.get(name, "").replace("|", "\\|")
-            rows.append(f"| `{prefix}{name}` | {_words(kinds[name])} | {_written(value)} | {sentence} |")
+            systems = changed_by(section, name) if section else ""
+            rows.append(f"| `{prefix}{name}` | {_words(kinds[name])} | {_written(value)} | {systems} | {sentence} |")
     return "\n".join(rows) + "\n"
 
 
@@ -61,7 +83,7 @@ def page() -> str:
         section = getattr(defaults, field.name)
         if dataclasses.is_dataclass(section):
             said = " ".join((ast.get_docstring(classes()[type(section).__name__]) or "").split())
-            rows = table(section, f"{field.name}.")
+            rows = table(section, field.name)
             parts.append(f"## {field.name}\n\n{said.partition(' Raises ')[0]}\n\n{rows}")
     return "\n".join(parts)
 

@@ -130,7 +130,7 @@ def test_the_page_of_settings_is_that_of_the_sources() -> None:
     settings = theme("settings")
     page = settings.page()
     assert (DOCS / "settings.md").read_text(encoding="utf-8") == page, "run python docs/theme/settings.py"
-    rows = re.findall(r"^\| `([\w.]+)` \|(?:[^|]|\\\|)+(?:\|(?:[^|]|\\\|)*){3}$", page, re.MULTILINE)
+    rows = re.findall(r"^\| `([\w.]+)` \|(?:[^|]|\\\|)+(?:\|(?:[^|]|\\\|)*){4}$", page, re.MULTILINE)
     flat = {
         f"{name}.{inner}" for name, value in Config().to_dict().items() if isinstance(value, dict) for inner in value
     }

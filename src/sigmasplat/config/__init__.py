@@ -90,7 +90,7 @@ class Config:
             elif name in SECTIONS and isinstance(value, dict):
                 names = kinds_of(SECTIONS[name])
                 for key in sorted(set(value) - set(names)):
-                    problems += _unknown(f"{name}.{key}", value[key], names)
+                    problems += _unknown(f"{name}.{key}", value[key], names, _scale(values))
                 try:
                     found[name] = SECTIONS[name](**{key: item for key, item in value.items() if key in names})
                 except ConfigError as problem:
@@ -114,12 +114,21 @@ class Config:
             raise ConfigError(f"{path}: {problem}") from problem
 
 
-def _unknown(name: str, value: object, known: Iterable[str]) -> list[str]:
+def _unknown(name: str, value: object, known: Iterable[str], scale: float) -> list[str]:
     """Return what is wrong with a saved value of a setting that is not a setting: nothing if it is the value that
-    every run has now."""
+    every run has now, or this length in a scene of another scale."""
     if name not in gone():
         return [f"unknown setting {name} (known: {', '.join(sorted(known))})"]
-    return [] if value == gone()[name] else [f"{said_gone(name)}, found {shown(value)}"]
+    only = gone()[name]
+    same = value == only or (isinstance(only, float) and name.endswith("_m") and value == only * scale)
+    return [] if same else [f"{said_gone(name)}, found {shown(value)}"]
+
+
+def _scale(values: Mapping[str, Any]) -> float:
+    """Return the scale of the scene in saved settings."""
+    render = values.get("render")
+    scale = render.get("scene_scale") if isinstance(render, dict) else None
+    return scale if isinstance(scale, float) else 1.0
 
 
 def said_gone(name: str) -> str:

@@ -116,16 +116,16 @@ class RegistrationConfig(Section, name="registration"):
     overlap_least: ClassVar[float] = 0.2
     """A loop is rejected if less than this share of the splats has a neighbour within `overlap_m` in the other
     submap."""
-    overlap_m: NotNegative = 0.1
-    """Maximum distance in metres between a splat and its neighbour in the other submap, for `overlap_least`: about the
-    distance between two maps of the same wall."""
+    overlap_m: ClassVar[float] = 0.1
+    """Maximum distance in metres, times the scale of the scene, between a splat and its neighbour in the other submap,
+    for `overlap_least`: about the distance between two maps of the same wall."""
     agreement_least: ClassVar[float] = 0.8
     """A localisation is valid only if at least this share of the common surface agrees in depth."""
     share_least: ClassVar[float] = 0.3
     """A localisation is valid only if the other submap explains at least this share of its depth readings."""
-    spread_m: NotNegative = 0.1
-    """Localisations agree if they are within this distance of one of them, in metres. A loop is rejected if fewer than
-    two agree."""
+    spread_m: ClassVar[float] = 0.1
+    """Localisations agree if they are within this distance of one of them, in metres, times the scale of the scene. A
+    loop is rejected if fewer than two agree."""
     spread_deg: ClassVar[float] = 5.0
     """Localisations agree if their rotations differ from one of them by at most this. A loop is rejected if fewer than
     two agree."""
