@@ -1,10 +1,12 @@
 """Sections of settings that begin with the values of the papers (`BASE`) instead of the defaults: for tests of methods
 that the defaults do not use, such as tracking by descent."""
 
+import dataclasses
 from functools import partial
+from typing import Any
 
 from sigmasplat import config
-from sigmasplat.plugins.papers.base import BASE_VALUES
+from sigmasplat.plugins.papers.base import BASE, BASE_VALUES
 
 RenderConfig = partial(config.RenderConfig, **BASE_VALUES["render"])
 SeedConfig = partial(config.SeedConfig, **BASE_VALUES["seeding"])
@@ -19,3 +21,8 @@ RegistrationConfig = partial(config.RegistrationConfig, **BASE_VALUES["registrat
 FinalConfig = partial(config.FinalConfig, **BASE_VALUES["final"])
 SurfaceConfig = partial(config.SurfaceConfig, **BASE_VALUES["surface"])
 InputConfig = partial(config.InputConfig, **BASE_VALUES["input"])
+
+
+def paper_settings(**sections: Any) -> config.Config:
+    """Return the settings that the papers' presets build on, with some sections of their own."""
+    return dataclasses.replace(BASE, **sections)

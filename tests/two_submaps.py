@@ -6,7 +6,7 @@ from dataclasses import dataclass, field as dataclass_field, replace
 import numpy as np
 import torch
 
-from paper_settings import FinalConfig, MappingConfig, RenderConfig
+from paper_settings import FinalConfig, MappingConfig, RenderConfig, paper_settings
 from sigmasplat.config import Config
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
@@ -16,7 +16,7 @@ from sigmasplat.final.refinement import Refined
 from sigmasplat.render import render
 
 CAMERA = Camera(20, 15, 16.0, 16.0, 9.5, 7.0)
-CONFIG = Config(backend="reference", mapping=MappingConfig(weight_nll_color=1e-3, prune_opacity=0.1))
+CONFIG = paper_settings(backend="reference", mapping=MappingConfig(weight_nll_color=1e-3, prune_opacity=0.1))
 WALL_M, SPACING_M = 1.55, 0.1
 ANCHORS = [np.eye(4), se3.exp(np.array([0.5, 0.1, -0.2, 0.1, -0.3, 0.05]))]
 LOG_VARIANCES = (-3.0, -6.0)

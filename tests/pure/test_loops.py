@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from paper_settings import LoopConfig
-from sigmasplat.config import Config
+from paper_settings import LoopConfig, paper_settings
 from sigmasplat.data import se3
 from sigmasplat.data.atlas import Atlas
 from sigmasplat.data.camera import Camera
@@ -54,7 +53,7 @@ def make_closer(
     monkeypatch.setattr(closer, "Registrar", Registered)
     Registered.truth = [np.linalg.matrix_power(STEP, k % 4) for k in range(9)]
     Registered.lies = lies
-    config = Config(loops=LoopConfig(**{"min_interval": 2, "min_similarity": 1.0, **changes}))
+    config = paper_settings(loops=LoopConfig(**{"min_interval": 2, "min_similarity": 1.0, **changes}))
     return LoopCloser(config, MemoryStore())
 
 

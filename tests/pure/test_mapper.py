@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from paper_settings import DensifyConfig, MappingConfig, RenderConfig, SeedConfig
-from sigmasplat.config import Config
+from paper_settings import DensifyConfig, MappingConfig, RenderConfig, SeedConfig, paper_settings
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import COLUMNS
 from sigmasplat.data.frame import Frame
@@ -35,7 +34,7 @@ def target(object_columns: int = 0) -> Target:
 
 
 def mapper(seeding: SeedConfig = EVERY_PIXEL, mapping: MappingConfig = NO_FIT) -> Mapper:
-    return Mapper(Config(seeding=seeding, mapping=mapping), np.random.default_rng(0))
+    return Mapper(paper_settings(seeding=seeding, mapping=mapping), np.random.default_rng(0))
 
 
 def test_seeds_are_as_wide_as_they_lie_apart() -> None:
@@ -110,7 +109,7 @@ def test_splats_that_contradict_readings_are_removed_when_the_last_step_is_made(
     fit = replace(NO_FIT, iterations=2, every=5, prune_opacity=0.01, lr_means=0.0, lr_opacity_logits=0.0)
     counts = list[int]()
     for divided in (False, True):
-        config = Config(seeding=seeding, mapping=replace(fit, divided=divided), primitives=uncertain)
+        config = paper_settings(seeding=seeding, mapping=replace(fit, divided=divided), primitives=uncertain)
         made = Mapper(config, np.random.default_rng(0))
         made.map(view(), 0, target(object_columns=16), np.eye(4))
         near = len(made.field)

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from paper_settings import DensifyConfig, MappingConfig, RenderConfig, SeedConfig
-from sigmasplat.config import Config
+from paper_settings import DensifyConfig, MappingConfig, RenderConfig, SeedConfig, paper_settings
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import COLUMNS, GaussianField
@@ -51,7 +50,9 @@ def shifted(x_m: float) -> np.ndarray:
 
 
 def mapper(mapping: MappingConfig = FITTED, primitives: Any = None, **seeding: Any) -> Mapper:
-    config = Config(mapping=mapping, primitives=primitives or DensifyConfig(), seeding=replace(SEEDS, **seeding))
+    config = paper_settings(
+        mapping=mapping, primitives=primitives or DensifyConfig(), seeding=replace(SEEDS, **seeding)
+    )
     return Mapper(config, np.random.default_rng(0))
 
 

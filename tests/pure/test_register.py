@@ -10,7 +10,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from paper_settings import RegistrationConfig, RenderConfig, SeedConfig, TrackingConfig
+from paper_settings import RegistrationConfig, RenderConfig, SeedConfig, TrackingConfig, paper_settings
 from sigmasplat.config import Config
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
@@ -35,7 +35,7 @@ Matrix = NDArray[np.float64]
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
 SEEDS = SeedConfig(scale_from="pixel", opacity=0.8, scale_factor=0.8)
-CONFIG = Config(
+CONFIG = paper_settings(
     tracking=TrackingConfig(method="align", align_weight_color=0.1),
     registration=RegistrationConfig(iterations=10, lr_translation=1e-3, lr_rotation=1e-3, tau=10.0),
 )
