@@ -135,7 +135,7 @@ def spikes(field: GaussianField, camera: Camera, T_camera_world: Matrix, near_m:
     """Return which splats, bool [N], are spikes in a view: those with their centre in the image, a ratio of longest to
     shortest axis above `AXIS_RATIO`, and a footprint longer than `FOOTPRINT_PX`."""
     T = torch.as_tensor(T_camera_world).to(field.params)
-    p = project(field.means, field.quats, field.scales, T, camera, RenderConfig())
+    p = project(field.means, field.quats, field.scales, T, camera, RenderConfig(depth="center"))
     ratio = field.scales.amax(1) / field.scales.amin(1)
     l1, l2, l3 = (
         column.double().clamp(min=1e-12) if k != 1 else column.double() for k, column in enumerate(p.conics.T)

@@ -68,7 +68,7 @@ class Original:
 def with_truth(path: str, start_s: float, limit: int = 0) -> tuple[Source, Trajectory, int]:
     """Open a recording or a synthetic room from `start_s` seconds on, with its true path and the number of its frames
     that have a true pose. No image is decoded. Raises SourceError if it cannot be read or has no true pose."""
-    source = open_source(path, InputConfig(start_s=start_s, limit=limit))
+    source = open_source(path, InputConfig(start_s=start_s, limit=limit, width=0))
     truth = source.truth()
     if truth is None:
         raise SourceError(f"{path}: the true path is unknown, so nothing can be scored")

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from tables import Section, significant
 
 from sigmasplat.commands.options import Settings
-from sigmasplat.config import Config, SubmapConfig
+from sigmasplat.config import Config
 from sigmasplat.config.presets import default_preset, preset as preset_of
 from sigmasplat.config.text import override, split_settings
 from sigmasplat.data import se3
@@ -57,7 +57,7 @@ class Options:
 def measure(path: str, options: Options) -> list[dict[str, Any]]:
     """Run one sequence; return its hops and the number of submaps. Raises SourceError if it cannot be read."""
     config = override(preset_of(options.preset), split_settings(options.settings))
-    rule = SubmapConfig(uncertainty_m=options.uncertainty_m, inherit=config.submaps.inherit)
+    rule = replace(config.submaps, uncertainty_m=options.uncertainty_m, distance_m=0.0, angle_deg=0.0, frames=0)
     found = followed(path, replace(config, submaps=rule), options.limit)
     return [{"rule": "covariance", "limit": options.uncertainty_m, **found}]
 

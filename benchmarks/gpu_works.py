@@ -82,7 +82,7 @@ class GpuWorks:
             for plane in (view.g_sums, view.g_alpha, view.g_moment):
                 plane.fill_(1e-3)
         self.mapping = preset(default_preset()).mapping
-        self.tracking = TrackingConfig(method="adam", update_stop=0.0, plateau_stop=0.0)
+        self.tracking = TrackingConfig(method="adam", plateau_stop=0.0)
 
     def forward_all(self) -> None:
         """Render all: colour, depth, σ² + c², moment about the sensor's depth, alpha, median and dominant splat."""

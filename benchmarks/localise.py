@@ -17,7 +17,10 @@ from sigmasplat.render import Render, render
 from sigmasplat.render.pose_gradient import twist_matrix
 
 Matrix = NDArray[np.float64]
-WAYS = {"without covariance": RenderConfig(covariance_pose_gradient=False), "with covariance": RenderConfig()}
+WAYS = {
+    name: RenderConfig(depth="center", covariance_pose_gradient=on)
+    for name, on in (("without covariance", False), ("with covariance", True))
+}
 """Both include the paths through means, depths and colours."""
 COVERED_ALPHA = 0.95
 

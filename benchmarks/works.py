@@ -26,7 +26,7 @@ from sigmasplat.render.cpu import operators as _operators  # noqa: F401 # applie
 from sigmasplat.render.cpu.view import CpuView
 from sigmasplat.render.kernel_params import view_params
 
-RENDER = RenderConfig()
+RENDER = RenderConfig(depth="center")
 ADAM_ITERATIONS = 60
 STAGES = ("project", "sort", "blend", "blend backward", "project backward")
 

@@ -20,7 +20,7 @@ from sigmasplat.data import se3
 from sigmasplat.data.frame import Frame
 from sigmasplat.render.cpu import operators as cpu
 
-OPTIONS = RenderConfig()
+OPTIONS = RenderConfig(depth="center")
 
 
 def blended(

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from paper_settings import DensifyConfig, MappingConfig, RenderConfig, SeedConfig, paper_settings
+from sigmasplat import config as settings
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import COLUMNS
 from sigmasplat.data.frame import Frame
@@ -101,9 +102,12 @@ def test_a_keyframe_that_comes_early_finds_the_steps_of_the_one_before_made() ->
     assert len(made.map(view(), 2, target(), np.eye(4)).losses) == 8 and made.field.steps == 8 + 8 + 8
 
 
-def test_splats_that_contradict_readings_are_removed_when_the_last_step_is_made() -> None:
+def test_splats_that_contradict_readings_are_removed_when_the_last_step_is_made(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """A wall that is seen at 1 m is an error if all readings say 2 m. It is faded at once and goes after the last step,
     whether the steps are divided or not; what owns no pixel stays."""
+    monkeypatch.setattr(settings.DensifyConfig, "faded_opacity", 0.05)  # below the opacity that recovers
     seeding = replace(EVERY_PIXEL, opacity=0.95)
     uncertain = DensifyConfig(uncertain_m2=0.025)
     fit = replace(NO_FIT, iterations=2, every=5, prune_opacity=0.01, lr_means=0.0, lr_opacity_logits=0.0)
