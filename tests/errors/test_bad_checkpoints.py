@@ -12,11 +12,10 @@ from safetensors.torch import load_file, save_file
 from sigmasplat.data.atlas import Atlas
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
-from sigmasplat.data.hops import UNKNOWN_HOP
 from sigmasplat.data.places import Place, Places
+from sigmasplat.data.relative_pose import UNKNOWN_HOP, RelativePose
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import RunError, SigmaSplatError
-from sigmasplat.graph.pose_graph import Edge
 from sigmasplat.plugins.outputs.floorplan.floor_plan import floor_plan
 from sigmasplat.plugins.papers.base import BASE
 from sigmasplat.run_folder.runs import RunFolder
@@ -54,7 +53,7 @@ def run(tmp_path: Path) -> RunFolder:
         atlas.begin_submap(T if submap else None)
         for k in range(keyframes):
             atlas.set_keyframes([T] * (k + 1), UNKNOWN_HOP)
-    edges = [Edge(0, 1, T, np.eye(6), loop=True)]
+    edges = [RelativePose(0, 1, T, np.eye(6), kind="loop")]
     run = RunFolder.create(tmp_path / "run", BASE, "room")
     trajectory = Trajectory(np.arange(3.0), np.tile(np.eye(4), (3, 1, 1)))
     run.write_checkpoint(checkpoint_of(GaussianField.empty(), trajectory, atlas, [0, 1, 2], edges), {})

@@ -8,8 +8,8 @@ from sigmasplat.data.atlas import Atlas
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.column import Column
 from sigmasplat.data.field import GaussianField
-from sigmasplat.data.hops import UNKNOWN_HOP, Hop
 from sigmasplat.data.places import Place, Places
+from sigmasplat.data.relative_pose import UNKNOWN_HOP, RelativePose
 from sigmasplat.data.submap import MemoryStore, Picture, RefinedStore, StorePart, Submap
 from sigmasplat.errors import SigmaSplatError
 
@@ -59,20 +59,23 @@ def test_a_frame_follows_its_keyframe() -> None:
 
 def test_hops_to_keyframes_are_read_as_they_were_set() -> None:
     """Their number grows past the space that is first reserved; an earlier session's keyframes have none."""
-    atlas, rng, known = Atlas(), np.random.default_rng(0), list[Hop]()
+    atlas, rng, known = Atlas(), np.random.default_rng(0), list[RelativePose]()
     atlas.add_finished(np.eye(4), [np.eye(4)] * 2)
     for submap in range(1, 41):
         atlas.begin_submap(motion(submap))
         for k in range(3):
-            hop = Hop(motion(100 * submap + k), rng.normal(size=(6, 6)), rng.normal(size=6)) if k else UNKNOWN_HOP
+            measured = motion(100 * submap + k), rng.normal(size=(6, 6)), rng.normal(size=6)
+            hop = RelativePose.hop(*measured) if k else UNKNOWN_HOP
             atlas.set_keyframes([np.eye(4)] * (k + 1), hop)
             known.append(hop)
     hops = atlas.hops
     assert len(hops) == 122 and [k for k in range(8) if hops.begins_submap(k)] == [0, 2, 5]
     for found, set_before in zip(hops[2:], known, strict=True):
-        assert all(np.array_equal(a, b, equal_nan=True) for a, b in zip(found, set_before, strict=True))
+        assert found.kind == set_before.kind == "hop"
+        for name in ("T_a_b", "covariance", "bias"):
+            assert np.array_equal(getattr(found, name), getattr(set_before, name), equal_nan=True)
     np.testing.assert_array_equal(hops.covariance[-1], known[-1].covariance)
-    np.testing.assert_array_equal(hops.T_camera_before[3], known[1].T_camera_before)
+    np.testing.assert_array_equal(hops.T_camera_before[3], known[1].T_a_b)
     np.testing.assert_array_equal(hops.bias[-3:], [hop.bias for hop in known[-3:]])
     assert np.isnan(hops[0].covariance).all() and np.isnan(hops.covariance[1]).all()
 

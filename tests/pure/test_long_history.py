@@ -13,16 +13,16 @@ from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.column import Column
 from sigmasplat.data.field import GaussianField
-from sigmasplat.data.hops import UNKNOWN_HOP
 from sigmasplat.data.places import Place
 from sigmasplat.data.poses import KeyframePoses, Poses
+from sigmasplat.data.relative_pose import UNKNOWN_HOP, Kind, RelativePose
 from sigmasplat.data.submap import MemoryStore, Submap
 from sigmasplat.errors import RunError
 from sigmasplat.files.json_files import write_json
 from sigmasplat.graph.described_submaps import DescribedSubmaps, SubmapDescriptor
 from sigmasplat.graph.edges import Edges
 from sigmasplat.graph.loops import Loop, Loops
-from sigmasplat.graph.pose_graph import Edge, LoopVerdict
+from sigmasplat.graph.pose_graph import LoopVerdict
 from sigmasplat.run_folder.state import read_state, write_state
 from sigmasplat.run_folder.submaps import DiskStore
 from sigmasplat.slam.slam import Slam
@@ -154,13 +154,14 @@ def test_loops_are_read_as_they_were_tried_with_the_latest_verdict() -> None:
 
 def test_edges_are_read_as_they_were_added() -> None:
     edges, information = Edges(), np.diag(np.arange(1.0, 7.0))
-    known = [Edge(i, i + 1, motion(i), i * information, i % 2 == 1) for i in range(1, 5)]
+    kinds: list[Kind] = ["loop", "odometry", "loop", "join"]
+    known = [RelativePose(i, i + 1, motion(i), i * information, kind) for i, kind in enumerate(kinds, 1)]
     for row, edge in enumerate(known):
-        edges.append(edge, row if edge.loop else -1)
+        edges.append(edge, row)
     for found, edge in zip(edges, known, strict=True):
-        assert (found.a, found.b, found.loop) == (edge.a, edge.b, edge.loop)
+        assert (found.a, found.b, found.kind) == (edge.a, edge.b, edge.kind)
         assert np.array_equal(found.T_a_b, edge.T_a_b) and np.array_equal(found.information, edge.information)
-    assert edges.loop_rows(range(4)).tolist() == [0, -1, 2, -1] and edges.loop_rows([]).tolist() == []
+    assert edges.loop_rows(range(4)).tolist() == [0, -1, 2, -3] and edges.loop_rows([]).tolist() == []
     some = edges.taken(np.array([False, True, True, False]))
     for few in (some, Edges.of(known[1:3])):
         assert few.ends.tolist() == [[2, 3], [3, 4]] and few.is_loop.tolist() == [False, True]
@@ -208,7 +209,7 @@ def follow(slam: Slam, frames: range) -> None:
                 )
                 closer.add_finished(finished, described, T)
                 for _ in range(LOOPS):
-                    closer.connect(submap - 1, submap, T, np.eye(6))
+                    closer.edges.append(RelativePose(submap - 1, submap, T, np.eye(6)))
                     closer.loops.append(loop(i))
             atlas.begin_submap(T if submap else None)
             slam.confidence.begun(None, 0.0)

@@ -11,13 +11,13 @@ from sigmasplat.data import se3
 from sigmasplat.data.atlas import Atlas
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
+from sigmasplat.data.relative_pose import RelativePose
 from sigmasplat.data.submap import MemoryStore, Picture, Submap
 from sigmasplat.errors import ConfigError
 from sigmasplat.graph import closer
 from sigmasplat.graph.candidates import SubmapPair
 from sigmasplat.graph.closer import LoopCloser, make_descriptor
 from sigmasplat.graph.neighbourhood import Incidence, Neighbourhood
-from sigmasplat.graph.pose_graph import Edge
 from sigmasplat.graph.registration import Registration
 from sigmasplat.tracking.descriptors import OrientationGrid
 from sigmasplat.types import Task
@@ -64,7 +64,7 @@ def walked(closer: LoopCloser, alike: bool = True, atlas: Atlas | None = None) -
     first = len(atlas.anchors)
     for k, degrees in enumerate([0.0, 60.0, 120.0, 0.0 if alike else 180.0]):
         if k:
-            closer.connect(first + k - 1, first + k, drift, np.diag([1e4] * 6))
+            closer.edges.append(RelativePose(first + k - 1, first + k, drift, np.diag([1e4] * 6)))
         atlas.begin_submap(drift if k else None)
         finished(closer, atlas, degrees)
     return atlas
@@ -119,7 +119,7 @@ def test_a_submap_is_near_where_its_keyframes_are_not_where_it_begins(
     drift = se3.exp(np.array([1.02, 0, 0, 0, 0, 0.0]))
     for k in range(4):
         if k:
-            made.connect(k - 1, k, drift, np.diag([1e4] * 6))
+            made.edges.append(RelativePose(k - 1, k, drift, np.diag([1e4] * 6)))
         atlas.begin_submap(drift if k else None)
         finished(made, atlas, 60.0 * k, None if k else se3.exp(np.array([ends_at_m, 0, 0, 0, 0, 0.0])))
     assert [(loop.query, loop.database, loop.database_frame) for loop in made.loops] == [(3, 0, 1)] * tried
@@ -166,9 +166,9 @@ def test_components_that_have_joined_share_a_pose_graph(monkeypatch: pytest.Monk
     walked(made, atlas=atlas)
     link = se3.exp(np.array([0.05, 0, 0, 0, 0, 0.0]))
     atlas.join(0, 4, link)
-    made.connect(0, 4, link, np.diag([1e3] * 6))
+    made.edges.append(RelativePose(0, 4, link, np.diag([1e3] * 6)))
     drift = se3.exp(np.array([-3.0, 0, 0, 0, 0, 0.0]))
-    made.connect(7, 8, drift, np.diag([1e4] * 6))
+    made.edges.append(RelativePose(7, 8, drift, np.diag([1e4] * 6)))
     atlas.begin_submap(drift, 7)
     finished(made, atlas, 60.0)
     tried = {(loop.query, loop.database): loop for loop in made.loops}
@@ -187,7 +187,7 @@ def solved_parts(monkeypatch: pytest.MonkeyPatch, most_free: int) -> dict[int, l
         parts.setdefault(centre, []).append(size)
         return around(centre, graph, always_fixed, size)
 
-    def all_of(nodes: list[int], edges: list[Edge]) -> Neighbourhood:
+    def all_of(nodes: list[int], edges: list[RelativePose]) -> Neighbourhood:
         parts.setdefault(nodes[-1], []).append(None)
         return whole(nodes, edges)
 
@@ -206,7 +206,7 @@ def there_and_back(made: LoopCloser, last_m: float) -> Atlas:
         step = se3.inverse(Registered.truth[k - 1]) @ Registered.truth[k]
         step[0, 3] += last_m if k == 24 else 5e-4
         if k:
-            made.connect(k - 1, k, step, np.diag([1e4] * 6))
+            made.edges.append(RelativePose(k - 1, k, step, np.diag([1e4] * 6)))
         atlas.begin_submap(step if k else None)
         before = np.stack(atlas.anchors)
         finished(made, atlas, 25.0 * x)
@@ -241,7 +241,7 @@ def test_a_loop_that_still_disagrees_moves_ever_more_submaps_up_to_the_largest_p
     for k in range(25):
         step = se3.inverse(Registered.truth[k - 1]) @ Registered.truth[k] if k else None
         if step is not None:
-            made.connect(k - 1, k, step, np.diag([1e4] * 6))
+            made.edges.append(RelativePose(k - 1, k, step, np.diag([1e4] * 6)))
         atlas.begin_submap(step)
         finished(made, atlas, 25.0 * Registered.truth[k][0, 3])
     assert parts[24] == [6, 18], "not the whole graph of 25"

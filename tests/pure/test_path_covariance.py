@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 from paper_settings import FinalConfig
 from sigmasplat.data import se3
 from sigmasplat.data.atlas import Atlas
-from sigmasplat.data.hops import UNKNOWN_HOP, Hop, TrackedHops
+from sigmasplat.data.hops import TrackedHops
+from sigmasplat.data.relative_pose import UNKNOWN_HOP, Kind, RelativePose
 from sigmasplat.final.pose_trust_region import reaching
 from sigmasplat.fit.align import BIAS_PX
 from sigmasplat.graph.path_covariance import PathCovariance, recorded
-from sigmasplat.graph.pose_graph import Edge, PoseGraph, Sensitivity, optimise
+from sigmasplat.graph.pose_graph import PoseGraph, Sensitivity, optimise
 
 Array = NDArray[np.float64]
 LOOSE, STIFF = np.diag([400.0] * 3 + [900.0] * 3), np.diag([1e4] * 3 + [4e4] * 3)
@@ -52,15 +53,15 @@ class Loopy:
         for steps in self.steps[:-1]:
             for T_camera_before in steps:
                 ends = ends @ se3.inverse(T_camera_before)
-        self.loop = Edge(SUBMAPS - 1, 0, se3.inverse(ends), STIFF, loop=True)
+        self.loop = RelativePose(SUBMAPS - 1, 0, se3.inverse(ends), STIFF, kind="loop")
 
-    def loop_between(self, in_last: int, in_first: int) -> Edge:
+    def loop_between(self, in_last: int, in_first: int) -> RelativePose:
         """Return the loop as one that compares two other keyframes, with a drift that only its information contains."""
         drift = 1e-4 * np.eye(6)
         information = np.linalg.inv(np.linalg.inv(STIFF) + drift)
         return replace(self.loop, information=information, keyframes=(in_last, in_first), drift=drift)
 
-    def drifted(self, loop: Edge, keyframes: list[list[Array]]) -> Edge:
+    def drifted(self, loop: RelativePose, keyframes: list[list[Array]]) -> RelativePose:
         """Return a loop between keyframes that have moved in their submaps; the motion between the two is as before."""
         (last, first), (in_last, in_first) = (self.keyframes({})[s] for s in (-1, 0)), loop.keyframes
         T_last_first = se3.inverse(last[in_last]) @ loop.T_a_b @ first[in_first]
@@ -77,11 +78,13 @@ class Loopy:
             chains.append(chain)
         return chains
 
-    def edges(self, keyframes: list[list[Array]], loop: Edge | None) -> list[Edge]:
-        chain = [Edge(s, s + 1, keyframes[s][-1], LOOSE, loop=False) for s in range(SUBMAPS - 1)]
+    def edges(self, keyframes: list[list[Array]], loop: RelativePose | None) -> list[RelativePose]:
+        chain = [RelativePose(s, s + 1, keyframes[s][-1], LOOSE) for s in range(SUBMAPS - 1)]
         return chain if loop is None else [*chain, loop]
 
-    def solved(self, errors: dict[tuple[int, int], Array], loop: Edge | None) -> tuple[Atlas, list[Edge]]:
+    def solved(
+        self, errors: dict[tuple[int, int], Array], loop: RelativePose | None
+    ) -> tuple[Atlas, list[RelativePose]]:
         keyframes = self.keyframes(errors)
         edges = self.edges(keyframes, loop and self.drifted(loop, keyframes))
         start = [np.eye(4)]
@@ -89,11 +92,11 @@ class Loopy:
             start.append(start[-1] @ chain[-1])
         return world_of(optimise(np.stack(start), edges, confidence=1.0).T_world_node, keyframes), edges
 
-    def covariance(self, loop: Edge | None, hops: bool = True) -> PathCovariance:
+    def covariance(self, loop: RelativePose | None, hops: bool = True) -> PathCovariance:
         (atlas, edges), tracked = self.solved({}, loop), TrackedHops()
         for s in range(SUBMAPS):
             known = [
-                Hop(T, C, self.bias) for T, C in zip(self.steps[s], self.covariances[s], strict=True)
+                RelativePose.hop(T, C, self.bias) for T, C in zip(self.steps[s], self.covariances[s], strict=True)
             ] if hops else [UNKNOWN_HOP] * KEYFRAMES  # fmt: skip
             for hop in (UNKNOWN_HOP, *known):
                 tracked.append(s, hop)
@@ -103,7 +106,7 @@ class Loopy:
         return found
 
 
-def checkpoint(atlas: Atlas, edges: list[Edge]) -> dict[str, torch.Tensor]:
+def checkpoint(atlas: Atlas, edges: list[RelativePose]) -> dict[str, torch.Tensor]:
     return recorded(atlas, edges) | {
         "keyframes": torch.arange(len(atlas.places)),
         "T_world_submap": torch.from_numpy(np.stack(atlas.anchors)),
@@ -120,7 +123,8 @@ def test_marginals_are_the_blocks_of_the_dense_inverse() -> None:
     for a, b in chosen:
         information = np.linalg.inv(covariance_of(rng, 0.02))
         measured = se3.exp(0.01 * rng.normal(size=6)) @ se3.inverse(T[a]) @ T[b]
-        edges.append(Edge(a, b, measured, 0.5 * (information + information.T), loop=b != a + 1))
+        kind: Kind = "loop" if b != a + 1 else "odometry"
+        edges.append(RelativePose(a, b, measured, 0.5 * (information + information.T), kind))
     H, _ = PoseGraph(len(T), edges).normal_equations(T, np.ones(len(edges)))
     dense = np.linalg.inv(H.toarray())
     marginals = Sensitivity(T, edges)
@@ -191,7 +195,7 @@ def several_loops(off_m: float) -> PathCovariance:
     for a, b in pairs:
         error = np.concatenate([off_m * random.normal(size=3), np.zeros(3)])
         T_a_b = se3.exp(error) @ se3.inverse(path.anchors[a]) @ path.anchors[b]
-        loops.append(Edge(a, b, T_a_b, STIFF, loop=True))
+        loops.append(RelativePose(a, b, T_a_b, STIFF, kind="loop"))
     return replace(path, edges=(*path.edges, *loops))
 
 

@@ -12,7 +12,7 @@ from command_line import exit_code
 from room_run import LOST, PATH, made_run
 from sigmasplat.data import se3
 from sigmasplat.data.atlas import Atlas
-from sigmasplat.data.hops import Hop
+from sigmasplat.data.relative_pose import RelativePose
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.graph.path_covariance import PathCovariance, recorded
 from sigmasplat.plugins.evaluation.metrics.trajectory import score_covariances
@@ -108,7 +108,7 @@ def with_errors(folder: Path) -> tuple[RunFolder, PathCovariance]:
         if i in (0, 2, 4):
             before = keyframes[-1] if keyframes else T
             keyframes = [*keyframes, T]
-            hop = Hop(se3.inverse(T) @ before, np.diag([1e-6] * 3 + [1e-7] * 3), np.full(6, 1e-4))
+            hop = RelativePose.hop(se3.inverse(T) @ before, np.diag([1e-6] * 3 + [1e-7] * 3), np.full(6, 1e-4))
             atlas.set_keyframes(keyframes, hop)
         atlas.place_frame(T)
     tensors, _ = run.read_checkpoint()

@@ -14,10 +14,11 @@ from scipy.sparse.csgraph import shortest_path
 from scipy.stats import chi2
 
 from sigmasplat.data import se3
+from sigmasplat.data.relative_pose import Kind, RelativePose
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.graph import normal_equations, pose_graph
 from sigmasplat.graph.neighbourhood import Incidence, Neighbourhood
-from sigmasplat.graph.pose_graph import Edge, LoopVerdict, PoseGraph, optimise
+from sigmasplat.graph.pose_graph import LoopVerdict, PoseGraph, optimise
 
 Array = NDArray[np.float64]
 seeds = st.integers(0, 2**31)
@@ -31,8 +32,12 @@ def random_information(rng: np.random.Generator) -> Array:
     return A.T @ A + 10.0 * np.eye(6)
 
 
-def measured(truth: Array, a: int, b: int, error: Array, information: Array, loop: bool) -> Edge:
-    return Edge(a, b, se3.exp(-error) @ se3.inverse(truth[a]) @ truth[b], information, loop)
+def kind_of(loop: bool) -> Kind:
+    return "loop" if loop else "odometry"
+
+
+def measured(truth: Array, a: int, b: int, error: Array, information: Array, loop: bool) -> RelativePose:
+    return RelativePose(a, b, se3.exp(-error) @ se3.inverse(truth[a]) @ truth[b], information, kind_of(loop))
 
 
 def rounds(nodes: int, rng: np.random.Generator) -> Array:
@@ -44,7 +49,7 @@ def rounds(nodes: int, rng: np.random.Generator) -> Array:
     return np.stack(T)
 
 
-def chained(start: Array, edges: list[Edge]) -> Array:
+def chained(start: Array, edges: list[RelativePose]) -> Array:
     """Add odometry up: the poses that a tracker would have."""
     T = [start]
     for edge in edges:
@@ -52,7 +57,9 @@ def chained(start: Array, edges: list[Edge]) -> Array:
     return np.stack(T)
 
 
-def scene(seed: int, nodes: int = 50, true_loops: int = 4, false_loops: int = 2) -> tuple[Array, Array, list[Edge]]:
+def scene(
+    seed: int, nodes: int = 50, true_loops: int = 4, false_loops: int = 2
+) -> tuple[Array, Array, list[RelativePose]]:
     """Return the true poses, the drifted ones and the edges: odometry, then true loops, then false ones."""
     rng = np.random.default_rng(seed)
     truth = rounds(nodes, rng)
@@ -76,7 +83,7 @@ def node_error(truth: Array, T_world_node: Array) -> float:
     return float(np.linalg.norm(T_world_node[:, :3, 3] - truth[:, :3, 3], axis=1).mean())
 
 
-def small(seed: int) -> tuple[Array, list[Edge]]:
+def small(seed: int) -> tuple[Array, list[RelativePose]]:
     """Return drifted poses and edges of 20 nodes with full information matrices, three loops, one of them false."""
     _, drifted, edges = scene(seed, 20, 2, 1)
     rng = np.random.default_rng(seed)
@@ -213,7 +220,7 @@ def test_normal_equations_are_the_gradient_and_its_gauss_newton_matrix() -> None
 def test_plain_least_squares_finds_what_scipy_finds(seed: int) -> None:
     drifted, edges = small(seed)
     drifted, edges = drifted[:12], [edge for edge in edges if edge.b < 12]
-    edges.append(replace(edges[0], a=11, b=0, T_a_b=se3.inverse(drifted[11]) @ se3.exp(np.full(6, 0.05)), loop=True))
+    edges.append(replace(edges[0], a=11, b=0, T_a_b=se3.inverse(drifted[11]) @ se3.exp(np.full(6, 0.05)), kind="loop"))
     roots = [cholesky(edge.information) for edge in edges]
 
     def poses(x: Array) -> Array:
@@ -247,7 +254,7 @@ def test_without_noise_the_truth_comes_back_from_a_disturbed_start() -> None:
 def test_the_better_informed_edge_wins_by_its_share() -> None:
     """Odometry says 1 m, a loop with a hundred times its information 2 m: (1 + 200) / 101 m."""
     step, two = se3.exp(np.array([1.0, 0, 0, 0, 0, 0])), se3.exp(np.array([2.0, 0, 0, 0, 0, 0]))
-    edges = [Edge(0, 1, step, np.eye(6), False), Edge(0, 1, two, 100.0 * np.eye(6), True)]
+    edges = [RelativePose(0, 1, step, np.eye(6)), RelativePose(0, 1, two, 100.0 * np.eye(6), "loop")]
     found = optimise(np.stack([np.eye(4), step]), edges)
     np.testing.assert_allclose(found.T_world_node[1], se3.exp(np.array([201 / 101, 0, 0, 0, 0, 0])), atol=1e-9)
     assert found.verdicts == (LoopVerdict(0, 1, pytest.approx(1.0, rel=1e-2), pytest.approx(100 / 101**2), True),)
@@ -282,7 +289,7 @@ def test_direction_and_order_of_edges_and_names_of_nodes_do_not_matter(seed: int
         if rng.random() < 0.5:
             across = se3.adjoint(edge.T_a_b)
             information = across.T @ edge.information @ across
-            others.append(Edge(b, a, se3.inverse(edge.T_a_b), 0.5 * (information + information.T), edge.loop))
+            others.append(RelativePose(b, a, se3.inverse(edge.T_a_b), 0.5 * (information + information.T), edge.kind))
         else:
             others.append(replace(edge, a=a, b=b))
     renamed = np.empty_like(drifted)
@@ -351,7 +358,7 @@ def test_a_part_of_all_nodes_is_the_whole_graph() -> None:
 def test_a_part_of_a_graph_that_grows_is_that_of_the_grown_graph() -> None:
     """Edges are appended one by one between searches; the part has the fewest edges to the centre, as scipy finds."""
     _, _, edges = scene(5, nodes=60, true_loops=40, false_loops=0)
-    known: list[Edge] = []
+    known: list[RelativePose] = []
     graph = Incidence(known)
     for edge in edges:
         known.append(edge)
@@ -375,7 +382,7 @@ def test_a_part_of_a_graph_that_grows_is_that_of_the_grown_graph() -> None:
 
 def test_a_node_that_hangs_on_a_loop_only_is_named() -> None:
     _, drifted, edges = scene(0, nodes=12, true_loops=1, false_loops=0)
-    without = [edge for edge in edges if 7 not in (edge.a, edge.b)] + [replace(edges[6], loop=True)]
+    without = [edge for edge in edges if 7 not in (edge.a, edge.b)] + [replace(edges[6], kind="loop")]
     with pytest.raises(SigmaSplatError, match=r"no chain of odometry edges connects node 7 to node 0"):
         optimise(drifted, without)
     with pytest.raises(SigmaSplatError, match=r"node 1 "):

@@ -9,11 +9,12 @@ from sigmasplat.data import se3
 from sigmasplat.data.atlas import Atlas
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.frame import Detail, Frame
+from sigmasplat.data.relative_pose import RelativePose
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.target import Target
 from sigmasplat.tracking.feature_image import FeatureImage
 from sigmasplat.tracking.prepared_frame import PreparedFrame
-from sigmasplat.tracking.recovery import Link, Recovery, usable
+from sigmasplat.tracking.recovery import Recovery, usable
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
@@ -112,11 +113,11 @@ def atlas() -> Atlas:
     return made
 
 
-def link(atlas: Atlas, a: int, b: int, off: NDArray[np.float64] | None = None) -> Link:
+def link(atlas: Atlas, a: int, b: int, off: NDArray[np.float64] | None = None) -> RelativePose:
     """Return an observation of the true pose between two submaps of components 0 and 1, or one that is off."""
     world = [anchor if atlas.components[s] == 0 else TRUE @ anchor for s, anchor in enumerate(atlas.anchors)]
     T_a_b = se3.inverse(world[a]) @ world[b] @ (np.eye(4) if off is None else off)
-    return Link(a, b, T_a_b, SURE)
+    return RelativePose(a, b, T_a_b, SURE)
 
 
 def test_one_observation_joins_nothing_and_a_second_that_agrees_joins(atlas: Atlas) -> None:
@@ -153,5 +154,5 @@ def test_after_a_false_observation_two_true_ones_are_needed(atlas: Atlas) -> Non
 def test_observations_of_different_components_do_not_join(atlas: Atlas) -> None:
     r = recovery()
     assert not r.confirms(link(atlas, 1, 3), atlas)
-    assert not r.confirms(Link(1, 4, link(atlas, 1, 3).T_a_b, SURE), atlas)
+    assert not r.confirms(RelativePose(1, 4, link(atlas, 1, 3).T_a_b, SURE), atlas)
     assert not r.confirms(link(atlas, 1, 3), atlas), "the observation in between was of another component"

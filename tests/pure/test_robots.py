@@ -19,9 +19,8 @@ from sigmasplat.data import se3
 from sigmasplat.data.atlas import Atlas
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.component import LOST as LOST_STATE, RELOCALISED, TRACKED
-from sigmasplat.data.hops import UNKNOWN_HOP, Hop
+from sigmasplat.data.relative_pose import UNKNOWN_HOP, RelativePose
 from sigmasplat.graph.path_covariance import PathCovariance
-from sigmasplat.graph.pose_graph import Edge
 from sigmasplat.plugins.outputs.floorplan.floor_plan import FREE, OBJECT, UNOBSERVED, WALL, FloorPlan
 from sigmasplat.plugins.robots.frames import T_LINK_OPTICAL, levelled_map, link_pose, ros_covariance
 from sigmasplat.plugins.robots.map_messages import grids
@@ -81,7 +80,7 @@ def test_the_covariance_is_that_of_poses_drawn_in_the_outer_frame() -> None:
 # ---- odometry ----
 
 
-def grown(atlas: Atlas, T_submap_camera: Array, hop: Hop | None = None) -> None:
+def grown(atlas: Atlas, T_submap_camera: Array, hop: RelativePose | None = None) -> None:
     """Add a frame; with a hop it is a keyframe."""
     if hop is not None:
         atlas.set_keyframes([*atlas.keyframe_poses[-1], T_submap_camera], hop)
@@ -100,7 +99,7 @@ def walked(corrections: bool) -> tuple[list[Array], list[Array]]:
         is_keyframe = i % 3 == 0
         if i and i % 12 == 0:  # a cut: the submap ends with this keyframe, and the next one begins with it
             grown_keyframe = [*atlas.keyframe_poses[-1], T]
-            atlas.set_keyframes(grown_keyframe, Hop(np.eye(4), some_covariance(i), np.zeros(6)))
+            atlas.set_keyframes(grown_keyframe, RelativePose.hop(np.eye(4), some_covariance(i), np.zeros(6)))
             atlas.begin_submap(T)
             if corrections:
                 atlas.anchors[-1] = se3.exp(np.full(6, 0.1)) @ atlas.anchors[-1]
@@ -108,7 +107,7 @@ def walked(corrections: bool) -> tuple[list[Array], list[Array]]:
         if corrections and i == 20:
             atlas.keyframe_poses[-1][-1] = se3.exp(np.full(6, 1e-3)) @ atlas.keyframe_poses[-1][-1]
             T = se3.exp(np.full(6, 1e-3)) @ T  # tracking follows the keyframe
-        grown(atlas, T, Hop(np.eye(4), some_covariance(i), np.zeros(6)) if is_keyframe else None)
+        grown(atlas, T, RelativePose.hop(np.eye(4), some_covariance(i), np.zeros(6)) if is_keyframe else None)
         T_odom.append(odometry.step(True, False, is_keyframe).copy())
         T_world.append(atlas.anchors[-1] @ T)
     return T_odom, T_world
@@ -127,7 +126,7 @@ def test_motion_without_tracking_is_left_out_and_its_covariance_is_not_known() -
     atlas = Atlas()
     atlas.begin_submap()
     odometry = LiveOdometry(atlas)
-    hop = Hop(np.eye(4), some_covariance(0), np.zeros(6))
+    hop = RelativePose.hop(np.eye(4), some_covariance(0), np.zeros(6))
     known, at = [], []
     relocalised, tracked, gone = (False, False), (True, False), (False, True)
     for i, (moved, lost) in enumerate([tracked, tracked, gone, tracked, relocalised, tracked]):
@@ -162,12 +161,12 @@ def test_the_live_covariance_is_that_of_the_finished_path_if_mapping_agrees_with
     for i in range(9):
         motion = se3.exp(rng.normal(size=6) * 0.1)
         before, T = T, T @ motion
-        hop = UNKNOWN_HOP if i == 0 else Hop(se3.inverse(T) @ before, some_covariance(i), bias)
+        hop = UNKNOWN_HOP if i == 0 else RelativePose.hop(se3.inverse(T) @ before, some_covariance(i), bias)
         if i == 0:
             T = np.eye(4)
         atlas.set_keyframes([*atlas.keyframe_poses[-1], T], hop)
         if i == 4:
-            edges.append(Edge(0, 1, T, np.eye(6), loop=False))
+            edges.append(RelativePose(0, 1, T, np.eye(6)))
             atlas.begin_submap(T)
             T = np.eye(4)
             atlas.set_keyframes([T], UNKNOWN_HOP)
@@ -398,7 +397,7 @@ def test_the_exported_covariance_is_that_of_the_path(tmp_path: Path) -> None:
     atlas.begin_submap()
     for i in range(FRAMES):
         if i in (0, 2, 4):
-            hop = UNKNOWN_HOP if i == 0 else Hop(np.eye(4), some_covariance(i), np.zeros(6))
+            hop = UNKNOWN_HOP if i == 0 else RelativePose.hop(np.eye(4), some_covariance(i), np.zeros(6))
             atlas.set_keyframes([*atlas.keyframe_poses[-1], PATH.T_world_camera[i]], hop)
         atlas.place_frame(PATH.T_world_camera[i])
     tensors = run.read_checkpoint()[0] | path_errors(atlas, [0, 2, 4], [])

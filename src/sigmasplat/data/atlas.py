@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 from sigmasplat.data import se3
 from sigmasplat.data.column import Column
 from sigmasplat.data.exposure import between
-from sigmasplat.data.hops import UNKNOWN_HOP, Hop, TrackedHops
+from sigmasplat.data.hops import TrackedHops
 from sigmasplat.data.places import Place, Places
 from sigmasplat.data.poses import KeyframePoses, Poses
+from sigmasplat.data.relative_pose import UNKNOWN_HOP, RelativePose
 from sigmasplat.types import Matrix
 
 
@@ -58,7 +59,7 @@ class Atlas:
         for _ in keyframe_poses:
             self.hops.append(len(self.anchors) - 1, UNKNOWN_HOP)
 
-    def set_keyframes(self, keyframe_poses: list[Matrix], hop: Hop) -> None:
+    def set_keyframes(self, keyframe_poses: list[Matrix], hop: RelativePose) -> None:
         """Set T_submap_camera [4, 4] of the last submap's keyframes, with a new one at the end, and the hop to it."""
         self.keyframe_poses.newest = keyframe_poses
         self.hops.append(len(self.anchors) - 1, hop)

@@ -11,6 +11,7 @@ from sigmasplat.data import se3
 from sigmasplat.data.atlas import Atlas
 from sigmasplat.data.column import Column
 from sigmasplat.data.field import COLUMNS
+from sigmasplat.data.relative_pose import RelativePose
 from sigmasplat.data.submap import Submap, SubmapStore
 from sigmasplat.errors import ConfigError
 from sigmasplat.graph.candidates import SubmapPair, find_candidates, find_nearby, opacity_ratio, pairs_to_register
@@ -18,7 +19,7 @@ from sigmasplat.graph.described_submaps import DescribedSubmaps, SubmapDescripto
 from sigmasplat.graph.edges import Edges
 from sigmasplat.graph.loops import Loop, Loops, described
 from sigmasplat.graph.neighbourhood import MOST_FREE, Incidence, Neighbourhood, numbered
-from sigmasplat.graph.pose_graph import Edge, PoseGraph, most_chi2
+from sigmasplat.graph.pose_graph import PoseGraph, most_chi2
 from sigmasplat.graph.registration import Registrar
 from sigmasplat.render.view import View
 from sigmasplat.tracking.descriptors import Descriptor, OrientationGrid
@@ -87,11 +88,6 @@ class LoopCloser:
     def __post_init__(self) -> None:
         self.graph = Incidence(self.edges)
 
-    def connect(self, a: int, b: int, T_a_b: Matrix, information: Matrix) -> None:
-        """Add a trusted edge between two submaps, such as odometry to the next one or a relocalisation: T_a_b [4, 4],
-        and the information [6, 6] of its left twist (m, rad)."""
-        self.edges.append(Edge(a, b, T_a_b, information, loop=False))
-
     def add_finished(self, submap: Submap, descriptors: Sequence[NDArray[np.float32]], T_first_submap: Matrix) -> None:
         """Add a submap of an earlier session: loops to it are tried, but it stays where it is relative to the first
         submap.
@@ -101,7 +97,7 @@ class LoopCloser:
         if descriptors:
             self.descriptors.append(self._described(submap, descriptors))
         if submap.index:
-            self.connect(0, submap.index, T_first_submap, RIGID)
+            self.edges.append(RelativePose(0, submap.index, T_first_submap, RIGID))
 
     @property
     def valid(self) -> Edges:
@@ -142,7 +138,7 @@ class LoopCloser:
             return []
         query = self._described(submap, descriptors)
         registrar = Registrar(self.config, self.store, view, self.extractor)
-        tried = list[tuple[Loop, Edge | None]]()
+        tried = list[tuple[Loop, RelativePose | None]]()
         for pair in self._pairs(query, atlas):
             yield
             tried.append((yield from self._try(pair, submap, atlas, registrar)))
@@ -193,7 +189,9 @@ class LoopCloser:
         apart_m = np.linalg.norm(anchors[known.numbers][:, :3, 3] - anchors[query.index][:3, 3], axis=1)
         return np.asarray(apart_m <= self.config.loops.near_m + query.reach_m + known.reach_m)
 
-    def _try(self, pair: SubmapPair, a: Submap, atlas: Atlas, registrar: Registrar) -> Task[tuple[Loop, Edge | None]]:
+    def _try(
+        self, pair: SubmapPair, a: Submap, atlas: Atlas, registrar: Registrar
+    ) -> Task[tuple[Loop, RelativePose | None]]:
         """Register a pair in slices, with `a` as the query; return the result, and its edge if it was accepted."""
         b = self.store.load(pair.best.database_submap)
         known = se3.inverse(atlas.anchors[a.index]) @ atlas.anchors[b.index]
@@ -201,7 +199,8 @@ class LoopCloser:
         loop = described(pair.best, a, b, found, known)
         if not found.accepted:
             return loop, None
-        return loop, Edge(a.index, b.index, found.T_a_b, found.information, True, found.keyframes, found.drift)
+        edge = RelativePose(a.index, b.index, found.T_a_b, found.information, "loop", found.keyframes, found.drift)
+        return loop, edge
 
     def solve_all(self, atlas: Atlas) -> None:
         """Solve the pose graph of each component as a whole; call it once, after the last submap."""

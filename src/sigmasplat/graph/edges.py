@@ -8,20 +8,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.data.column import Column, Records
-from sigmasplat.graph.pose_graph import Edge
+from sigmasplat.data.relative_pose import Kind, RelativePose
 from sigmasplat.types import Matrix
 
 NUMBERS = 5
 """Columns before the motion, see `Edges.rows`."""
+TRUSTED: tuple[Kind, ...] = ("odometry", "relocalisation", "join")
+"""The kinds of edges that the pose graph does not judge."""
 INFORMATION = slice(NUMBERS + 16, NUMBERS + 16 + 36)
 DRIFT = slice(NUMBERS + 16 + 36, None)
 
 
 @dataclass(eq=False)
-class Edges(Records[Edge]):
+class Edges(Records[RelativePose]):
     """Edges in their order. An edge is made when it is read.
 
-    rows [E, 93]: a, b, row of the loop that the edge is, −1 for a trusted edge, both keyframes, T_a_b, information and
+    rows [E, 93]: a, b, row of the loop that the edge is, or −1 minus its place in
+    `TRUSTED`, both keyframes, T_a_b, information and
     drift by rows.
     """
 
@@ -31,17 +34,18 @@ class Edges(Records[Edge]):
     rows: Column = field(default_factory=lambda: Column.of(np.float64, NUMBERS + 16 + 2 * 36))
 
     @staticmethod
-    def of(known: Iterable[Edge]) -> "Edges":
+    def of(known: Iterable[RelativePose]) -> "Edges":
         """Return edges in their order; each loop has row 0."""
         if isinstance(known, Edges):
             return known
         edges = Edges()
         for edge in known:
-            edges.append(edge, 0 if edge.loop else -1)
+            edges.append(edge)
         return edges
 
-    def append(self, edge: Edge, loop_row: int = -1) -> None:
+    def append(self, edge: RelativePose, loop_row: int = 0) -> None:
         """Append an edge; loop_row: of a loop, its row among all pairs that were tried."""
+        loop_row = -1 - TRUSTED.index(edge.kind) if edge.kind in TRUSTED else loop_row
         numbers, matrices = (edge.a, edge.b, loop_row, *edge.keyframes), (edge.T_a_b, edge.information, edge.drift)
         self.rows.append(np.concatenate([numbers, *(matrix.ravel() for matrix in matrices)]))
 
@@ -81,11 +85,12 @@ class Edges(Records[Edge]):
         return Edges(Column(rows, len(rows)))
 
     def loop_rows(self, edges: Sequence[int]) -> NDArray[np.int64]:
-        """Return the row of the loop that each of some edges is [n], −1 for a trusted edge."""
+        """Return the row of the loop that each of some edges is [n], below 0 for a trusted edge."""
         return np.asarray(self.rows.used[np.array(edges, np.intp), 2].astype(np.int64))
 
-    def _record(self, i: int) -> Edge:
+    def _record(self, i: int) -> RelativePose:
         row = self.rows.used[i].copy()
         a, b, loop_row, in_a, in_b = (int(number) for number in row[:NUMBERS].tolist())
         information, drift = (row[columns].reshape(6, 6) for columns in (INFORMATION, DRIFT))
-        return Edge(a, b, row[self.POSE_COLUMNS].reshape(4, 4), information, loop_row >= 0, (in_a, in_b), drift)
+        kind = "loop" if loop_row >= 0 else TRUSTED[-1 - loop_row]
+        return RelativePose(a, b, row[self.POSE_COLUMNS].reshape(4, 4), information, kind, (in_a, in_b), drift)

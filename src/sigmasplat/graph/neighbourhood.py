@@ -6,7 +6,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from sigmasplat.graph.pose_graph import Edge, PoseGraphSolution, optimise
+from sigmasplat.data.relative_pose import RelativePose
+from sigmasplat.graph.pose_graph import PoseGraphSolution, optimise
 from sigmasplat.types import Matrix
 
 MOST_FREE = 100
@@ -18,7 +19,7 @@ class Incidence:
     """Which edges are at each node; kept up to date while edges are appended to a list, so that a part of a large graph
     is found without reading the whole one."""
 
-    edges: Sequence[Edge]
+    edges: Sequence[RelativePose]
     at: dict[int, "array[int]"] = field(default_factory=dict)
     ends: "array[int]" = field(default_factory=lambda: array("i"))
     """Both ends of each edge that was read."""
@@ -52,7 +53,7 @@ class Neighbourhood:
     edges: tuple[int, ...]
 
     @staticmethod
-    def whole(nodes: Sequence[int], edges: Sequence[Edge]) -> "Neighbourhood":
+    def whole(nodes: Sequence[int], edges: Sequence[RelativePose]) -> "Neighbourhood":
         """Return the whole graph of some nodes, the first of them fixed."""
         inside = set(nodes)
         return Neighbourhood(tuple(nodes), 1, tuple(row for row, edge in enumerate(edges) if edge.a in inside))
@@ -79,7 +80,7 @@ class Neighbourhood:
         return Neighbourhood((*fixed, *free), len(fixed), tuple(rows))
 
     def solve(
-        self, T_world_node: Sequence[Matrix], edges: Sequence[Edge], rejected: Sequence[bool] = ()
+        self, T_world_node: Sequence[Matrix], edges: Sequence[RelativePose], rejected: Sequence[bool] = ()
     ) -> PoseGraphSolution:
         """Solve this part of a graph, given the pose [4, 4] of each node and the edges; the solution has one pose for
         each of `nodes`. rejected: for each of this part's edges, as in `optimise`."""
@@ -88,7 +89,7 @@ class Neighbourhood:
         return optimise(poses, part, fixed=self.fixed, rejected=rejected)
 
 
-def numbered(edges: Sequence[Edge], nodes: Sequence[int]) -> list[Edge]:
+def numbered(edges: Sequence[RelativePose], nodes: Sequence[int]) -> list[RelativePose]:
     """Return edges with each node replaced by its place in `nodes`."""
     number = {node: i for i, node in enumerate(nodes)}
     return [replace(edge, a=number[edge.a], b=number[edge.b]) for edge in edges]

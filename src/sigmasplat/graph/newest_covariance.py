@@ -6,7 +6,7 @@ import numpy as np
 
 from sigmasplat.data import se3
 from sigmasplat.data.atlas import Atlas
-from sigmasplat.data.hops import Hop
+from sigmasplat.data.relative_pose import RelativePose
 from sigmasplat.graph.closer import LoopCloser
 from sigmasplat.graph.path_covariance import Factors, PathCovariance
 from sigmasplat.tracking.drift import hop_errors
@@ -66,5 +66,5 @@ def newest_hop(atlas: Atlas) -> Matrix:
     It stands for that of a frame from its keyframe, which is tracked in the same way.
     """
     known = (hop for hop in reversed(atlas.hops) if np.isfinite(hop.covariance).all())
-    hop: Hop | None = next(known, None)
+    hop: RelativePose | None = next(known, None)
     return FIRST_HOP if hop is None else np.asarray(hop.covariance + np.diag(hop.bias**2))

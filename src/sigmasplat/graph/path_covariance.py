@@ -26,10 +26,12 @@ from torch import Tensor
 
 from sigmasplat.data import se3
 from sigmasplat.data.atlas import Atlas
+from sigmasplat.data.hops import Hops
 from sigmasplat.data.places import Places
+from sigmasplat.data.relative_pose import RelativePose
 from sigmasplat.data.selection import evenly_spread
 from sigmasplat.graph.edges import Edges
-from sigmasplat.graph.pose_graph import Edge, Sensitivity
+from sigmasplat.graph.pose_graph import Sensitivity
 from sigmasplat.graph.variance_factors import variance_factors
 from sigmasplat.tracking.drift import UNKNOWN
 from sigmasplat.types import Matrix
@@ -41,7 +43,7 @@ LOOPS_MOST = 40
 """At most this many loops, evenly spread, determine `Factors`: a few already do, and the time grows with the cube."""
 
 
-def recorded(atlas: Atlas, edges: Sequence[Edge]) -> dict[str, Tensor]:
+def recorded(atlas: Atlas, edges: Sequence[RelativePose]) -> dict[str, Tensor]:
     """Return what a checkpoint keeps of the errors of a path; edges: the trusted ones and the accepted loops."""
     counts, known = atlas.keyframe_poses.counts, Edges.of(edges)
     arrays = {
@@ -60,21 +62,6 @@ def recorded(atlas: Atlas, edges: Sequence[Edge]) -> dict[str, Tensor]:
         "edge_drift": known.drift,
     }
     return {name: torch.from_numpy(array) for name, array in arrays.items()}
-
-
-@dataclass(frozen=True, eq=False)
-class Hops:
-    """The motion to each of K keyframes from the one before it in its submap, as tracking found it (`model.hops.Hop`):
-    T_camera_before [K, 4, 4], covariance [K, 6, 6], bias [K, 6]."""
-
-    T_camera_before: Matrix
-    covariance: Matrix
-    bias: Matrix
-
-    def known(self, row: int) -> Matrix | None:
-        """Return the covariance [6, 6] that tracking estimated for one hop, with its bias; None if it is not known."""
-        covariance = self.covariance[row]
-        return covariance + np.diag(self.bias[row] ** 2) if np.isfinite(covariance).all() else None
 
 
 class Factors(NamedTuple):
@@ -103,11 +90,11 @@ class PathCovariance:
     keyframe_submap: Numbers
     T_submap_keyframe: Matrix
     hops: Hops
-    edges: tuple[Edge, ...]
+    edges: tuple[RelativePose, ...]
     known_factors: Factors | None = None
 
     @staticmethod
-    def of_keyframes(atlas: Atlas, edges: Sequence[Edge], factors: Factors | None = None) -> "PathCovariance":
+    def of_keyframes(atlas: Atlas, edges: Sequence[RelativePose], factors: Factors | None = None) -> "PathCovariance":
         """Return the errors of the keyframes alone, without other frames; factors: known ones, so that they need not be
         computed."""
         read = {name: tensor.numpy() for name, tensor in recorded(replace(atlas, places=Places()), edges).items()}
@@ -133,7 +120,10 @@ class PathCovariance:
             read["T_keyframe_camera"], np.isin(np.arange(len(read["frame_keyframe"])), read["keyframes"]),
             read["keyframe_submap"], read["T_submap_keyframe"],
             Hops(read["hop_T_camera_before"], read["hop_covariance"], read["hop_bias"]),
-            tuple(Edge(a, b, T, information, bool(loop), *drift) for (a, b), T, information, loop, *drift in edges),
+            tuple(
+                RelativePose(a, b, T, information, "loop" if loop else "odometry", *drift)
+                for (a, b), T, information, loop, *drift in edges
+            ),
         )  # fmt: skip
 
     def __len__(self) -> int:
@@ -284,7 +274,7 @@ class PathCovariance:
         for shared, column in zip(self._shared, (BIAS, MEAN), strict=True):
             error[:, column] += A @ shared[rows].sum(0)
 
-    def _add_drift(self, error: Matrix, A: Matrix, edge: Edge) -> None:
+    def _add_drift(self, error: Matrix, A: Matrix, edge: RelativePose) -> None:
         """Add the errors of T_a_b of a loop that come from the hops to its two keyframes, transformed by A [6, 6]."""
         in_a, in_b = edge.keyframes
         self._add_hops(error, A, self._rows_of_hops(edge.a, int(self._first[edge.a]) + in_a))
@@ -329,7 +319,7 @@ class PathCovariance:
         poses = se3.inverse(self.anchors[submaps[:1]]) @ self.anchors[submaps]
         return _Graph(submaps, numbers, Sensitivity(poses, edges) if edges else None)
 
-    def _is_chain(self, edge: Edge) -> bool:
+    def _is_chain(self, edge: RelativePose) -> bool:
         """Return whether an edge leads to the last keyframe of its submap: then its error is that of the hops."""
         last = self._rows_of_hops(edge.a).stop - 1
         return not edge.loop and np.array_equal(edge.T_a_b, self.T_submap_keyframe[last])

@@ -6,7 +6,7 @@ agree with the rest of the graph have. Then accepted loops get weight 1 and the 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.special import gammaincinv
 
 from sigmasplat.data import se3
+from sigmasplat.data.relative_pose import RelativePose
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.graph.normal_equations import Solver, factorised
 from sigmasplat.types import Matrix
@@ -33,29 +34,6 @@ SETTLED = 1e-10
 """A solution is found when a step lowers the cost by less than this share."""
 ROUGHLY = 1e-3
 """The same before the last μ in a large graph: these solutions only lead to the next one."""
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Edge:
-    """A measurement T_a_b between nodes a and b, and the information [6, 6] (inverse covariance, 1/m² and 1/rad²) of
-    its left twist ξ = (ρ, φ): the true motion is exp(ξ) T_a_b. Odometry is trusted, a loop is judged.
-
-    A loop compares a keyframe of submap a with one of submap b: `keyframes`, counted in their submaps. drift [6, 6]:
-    the part of the covariance that is the drift from the submaps' first keyframes to these two.
-    """
-
-    a: int
-    b: int
-    T_a_b: Matrix
-    information: Matrix
-    loop: bool
-    keyframes: tuple[int, int] = (0, 0)
-    drift: Matrix = field(default_factory=lambda: np.zeros((6, 6)))
-
-    @property
-    def measured(self) -> Matrix:
-        """Return the covariance [6, 6] of the measurement alone, without drift."""
-        return np.asarray(np.linalg.inv(self.information) - self.drift)
 
 
 @dataclass(frozen=True)
@@ -84,7 +62,7 @@ class PoseGraphSolution:
 
 def optimise(
     T_world_node: Matrix,
-    edges: Sequence[Edge],
+    edges: Sequence[RelativePose],
     confidence: float = 0.99,
     max_iterations: int = 100,
     fixed: int = 1,
@@ -142,7 +120,7 @@ class PoseGraph:
     """The edges as arrays, and the position of their blocks in the normal equations. The first `fixed` nodes have no
     rows."""
 
-    def __init__(self, nodes: int, edges: Sequence[Edge], fixed: int = 1) -> None:
+    def __init__(self, nodes: int, edges: Sequence[RelativePose], fixed: int = 1) -> None:
         self.nodes, self.fixed = nodes, fixed
         self.is_large = nodes - fixed > LARGE
         self.solver = Solver(self.is_large)
@@ -243,7 +221,7 @@ class Sensitivity:
     six right-hand sides, and one product per edge.
     """
 
-    def __init__(self, T_world_node: Matrix, edges: Sequence[Edge]) -> None:
+    def __init__(self, T_world_node: Matrix, edges: Sequence[RelativePose]) -> None:
         self.graph = graph = PoseGraph(len(T_world_node), edges)
         e = graph.residuals(T_world_node)
         H, _ = graph.normal_equations(T_world_node, np.ones(len(edges)))
@@ -265,7 +243,7 @@ class Sensitivity:
         return np.asarray((G @ np.linalg.inv(self.graph.information) @ np.swapaxes(G, 1, 2)).sum(0))
 
 
-def _refuse_bad_input(poses: Matrix, edges: Sequence[Edge], fixed: int) -> None:
+def _refuse_bad_input(poses: Matrix, edges: Sequence[RelativePose], fixed: int) -> None:
     """Raise SigmaSplatError if the input is invalid; its message names the node or the edge."""
     if poses.ndim != 3 or poses.shape[1:] != (4, 4) or not len(poses):
         raise SigmaSplatError(
@@ -290,7 +268,7 @@ def _refuse_bad_input(poses: Matrix, edges: Sequence[Edge], fixed: int) -> None:
         )
 
 
-def _refuse_bad_measurements(edges: Sequence[Edge]) -> None:
+def _refuse_bad_measurements(edges: Sequence[RelativePose]) -> None:
     for i in np.flatnonzero(~se3.are_rigid(_stacked([edge.T_a_b for edge in edges], 4))).tolist():
         raise SigmaSplatError(f"{_name(edges[i])} does not have a rigid motion; orthonormalise it first")
     for i in np.flatnonzero(~_are_positive_definite(_stacked([edge.information for edge in edges], 6))).tolist():
@@ -299,7 +277,7 @@ def _refuse_bad_measurements(edges: Sequence[Edge]) -> None:
         )
 
 
-def _name(edge: Edge) -> str:
+def _name(edge: RelativePose) -> str:
     return f"pose graph: edge {edge.a} → {edge.b}"
 
 

@@ -44,7 +44,7 @@ class Registration:
 
     information [6, 6]: inverse covariance of T_a_b's left twist (m, rad); localised: the number of localisations that
     were used; residual: their mean loss; overlap: share of splats with a neighbour in the other submap; keyframes and
-    drift: as in `Edge`.
+    drift: as in `RelativePose`.
     """
 
     T_a_b: Matrix

@@ -9,7 +9,7 @@ import numpy as np
 
 from sigmasplat.data import se3
 from sigmasplat.data.component import APART, RELOCALISED
-from sigmasplat.data.hops import UNKNOWN_HOP
+from sigmasplat.data.relative_pose import UNKNOWN_HOP
 from sigmasplat.fit.align import Alignment
 from sigmasplat.fit.pose import fit_pose_align
 from sigmasplat.graph.loops import Loops

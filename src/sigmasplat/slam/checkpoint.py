@@ -8,13 +8,13 @@ from torch import Tensor
 
 from sigmasplat.data.atlas import Atlas
 from sigmasplat.data.field import GaussianField, Rows
+from sigmasplat.data.relative_pose import RelativePose
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.graph.path_covariance import recorded
-from sigmasplat.graph.pose_graph import Edge
 
 
 def checkpoint_of(
-    active: GaussianField, path: Trajectory, atlas: Atlas, keyframes: Sequence[int], edges: Sequence[Edge]
+    active: GaussianField, path: Trajectory, atlas: Atlas, keyframes: Sequence[int], edges: Sequence[RelativePose]
 ) -> dict[str, Tensor]:
     """Return the active submap's field with its attributes and its optimiser state, poses, times, keyframes, anchors,
     the submap of each frame, the exposures of frames if they are known, and the errors of the path, in host
@@ -31,7 +31,7 @@ def checkpoint_of(
     }
 
 
-def path_errors(atlas: Atlas, keyframes: Sequence[int], edges: Sequence[Edge]) -> dict[str, Tensor]:
+def path_errors(atlas: Atlas, keyframes: Sequence[int], edges: Sequence[RelativePose]) -> dict[str, Tensor]:
     """Return the part of a checkpoint that `PathCovariance.of` reads; arguments as for `checkpoint_of`."""
     return {
         "keyframes": torch.tensor(keyframes, dtype=torch.int64),

@@ -11,7 +11,7 @@ import numpy as np
 from sigmasplat.config import SubmapConfig
 from sigmasplat.data import se3
 from sigmasplat.data.field import GaussianField
-from sigmasplat.data.hops import UNKNOWN_HOP, Hop
+from sigmasplat.data.relative_pose import UNKNOWN_HOP, RelativePose
 from sigmasplat.fit.align import Alignment
 from sigmasplat.fit.target import Keyframe
 from sigmasplat.graph.closer import PendingSearch
@@ -21,7 +21,7 @@ from sigmasplat.slam.slam_state import SlamState
 from sigmasplat.tracking.drift import Drift
 from sigmasplat.tracking.known_map import KnownMap
 from sigmasplat.tracking.prepared_frame import PreparedFrame
-from sigmasplat.tracking.recovery import Link, usable
+from sigmasplat.tracking.recovery import usable
 from sigmasplat.tracking.relocaliser import INDEX_AT_MOST, Relocation
 from sigmasplat.types import Matrix, ShouldStop, Task, completed, never
 
@@ -39,7 +39,7 @@ class MappingBackend(SlamState):
         seen: PreparedFrame,
         index: int,
         T_submap_camera: Matrix,
-        hop: Hop = UNKNOWN_HOP,
+        hop: RelativePose = UNKNOWN_HOP,
         should_stop: ShouldStop = never,
     ) -> Task[Matrix]:
         """Map frame number `index`, which `hop` leads to, in slices; return its pose, which mapping may have moved.
@@ -52,7 +52,7 @@ class MappingBackend(SlamState):
         self._timer.add(fit.seconds, prefix="map_")
         return self._placed(index, hop)
 
-    def add_keyframe(self, seen: PreparedFrame, index: int, T_submap_camera: Matrix, hop: Hop) -> Matrix:
+    def add_keyframe(self, seen: PreparedFrame, index: int, T_submap_camera: Matrix, hop: RelativePose) -> Matrix:
         """Add frame number `index` to the keyframes of the active submap without fitting the map; return its pose."""
         self.mapper.add(self.view, self._keyframe(seen, index, T_submap_camera))
         return self._placed(index, hop)
@@ -73,21 +73,21 @@ class MappingBackend(SlamState):
             photo = seen.photo(self.config)
         return Keyframe(index, seen.target, T_submap_camera, descriptor=descriptor, detail=detail, photo=photo)
 
-    def _placed(self, index: int, hop: Hop) -> Matrix:
+    def _placed(self, index: int, hop: RelativePose) -> Matrix:
         """Write the poses of the active submap's keyframes to the atlas; return that of the newest."""
         if self.keyframe_indices[-1:] != [index]:  # a keyframe that two submaps share is counted once
             self.keyframe_indices.append(index)
         self.atlas.set_keyframes([keyframe.T_world_camera for keyframe in self.mapper.keyframes], hop)
         return self.atlas.keyframe_poses.last[-1]
 
-    def hop_to(self, T_camera_submap: Matrix, alignment: Alignment | None) -> Hop:
+    def hop_to(self, T_camera_submap: Matrix, alignment: Alignment | None) -> RelativePose:
         """Return the motion from the newest keyframe to a new one, with its errors; alignment: of the new one to it."""
         T_camera_before = T_camera_submap @ self.atlas.keyframe_poses.last[-1]
         if alignment is None:
-            return UNKNOWN_HOP._replace(T_camera_before=T_camera_before)
-        return Hop(T_camera_before, alignment.covariance, alignment.bias)
+            return RelativePose.hop(T_camera_before)
+        return RelativePose.hop(T_camera_before, alignment.covariance, alignment.bias)
 
-    def add_drift(self, T_submap_camera: Matrix, hop: Hop) -> float:
+    def add_drift(self, T_submap_camera: Matrix, hop: RelativePose) -> float:
         """Add the hop to a keyframe to the submap's drift; return the standard deviation of its position, metres."""
         self.drift.hop(T_submap_camera, None if np.isnan(hop.covariance).any() else hop.covariance)
         return self.drift.position_m(T_submap_camera)
@@ -105,37 +105,30 @@ class MappingBackend(SlamState):
         inherited = None
         if self.config.submaps.inherit:
             inherited, self.mapper.half = self.mapper.half, None
-        yield from self.branch(len(self.store), T_submap_camera, self.drift.information, self.mapper.field, should_stop)
+        start = RelativePose(len(self.store), len(self.store) + 1, T_submap_camera, self.drift.information)
+        yield from self.branch(start, self.mapper.field, should_stop)
         self.mapper.half = inherited
 
-    def branch(
-        self,
-        parent: int,
-        T_parent_camera: Matrix,
-        information: Matrix,
-        field: GaussianField,
-        should_stop: ShouldStop = never,
-    ) -> Task[None]:
-        """Finish the active submap (`finish_submap`) and start the next one at the camera, connected to a parent
-        submap, in slices.
+    def branch(self, start: RelativePose, field: GaussianField, should_stop: ShouldStop = never) -> Task[None]:
+        """Finish the active submap (`finish_submap`) and start the next one at the camera, in slices.
 
-        information [6, 6]: of T_parent_camera's left twist; field: the parent's splats, which the new submap may
-        inherit.
+        start: the pose of the next submap in the one that it is connected to; field: that one's splats, which the new
+        submap may inherit.
         """
         with self._timer.stage("cut"):
             yield from self.finish_submap(should_stop)
-            self.begin_at(parent, T_parent_camera, information, field)
+            self.begin_at(start, field)
 
     def branch_at(self, place: Relocation) -> Task[None]:
         """Finish the active submap and start the next one where the camera was found, in slices."""
-        return self.branch(place.where[0], place.T_submap_camera, place.information, self._splats_of(place))
+        return self.branch(place.relative_pose(len(self.store) + 1), self._splats_of(place))
 
-    def begin_at(self, parent: int, T_parent_camera: Matrix, information: Matrix, field: GaussianField) -> None:
-        """Start a submap at the camera, connected to a parent submap, as `branch` does."""
-        self.closer.connect(parent, len(self.store), T_parent_camera, information)
-        self.atlas.begin_submap(T_parent_camera, parent)
-        self.confidence.begun(parent, std_of(information))
-        self.mapper = Mapper(self.config, self.random, field).successor(self.view, T_parent_camera)
+    def begin_at(self, start: RelativePose, field: GaussianField) -> None:
+        """Start a submap at the camera, connected to another one, as `branch` does."""
+        self.closer.edges.append(start)
+        self.atlas.begin_submap(start.T_a_b, start.a)
+        self.confidence.begun(start.a, std_of(start.information))
+        self.mapper = Mapper(self.config, self.random, field).successor(self.view, start.T_a_b)
         self.drift = Drift(scene_scale=self.config.render.scene_scale)
 
     def begin_first(self, seen: PreparedFrame) -> Relocation | None:
@@ -145,7 +138,7 @@ class MappingBackend(SlamState):
         if place is None:
             self._begin_component()
         else:
-            self.begin_at(place.where[0], place.T_submap_camera, place.information, self._splats_of(place))
+            self.begin_at(place.relative_pose(len(self.store)), self._splats_of(place))
         return place
 
     def begin_apart(self) -> Task[None]:
@@ -245,14 +238,15 @@ class MappingBackend(SlamState):
         place = yield from self.relocalising(seen, apart_from=submap)
         if place is None:
             return
-        link = Link(place.where[0], submap, place.T_submap_camera @ se3.inverse(T_submap_camera), place.information)
+        T_other_submap = place.T_submap_camera @ se3.inverse(T_submap_camera)
+        link = RelativePose(place.where[0], submap, T_other_submap, place.information, "join")
         if self.recovery.confirms(link, self.atlas, self.config.render.scene_scale):
             yield from self.closing()
             kept, moved = sorted((link.a, link.b), key=self.atlas.components.__getitem__)
             members = self.atlas.members(self.atlas.components[moved])
             self.confidence.joined(members, moved, kept, std_of(link.information))
             self.atlas.join(link.a, link.b, link.T_a_b)
-            self.closer.connect(link.a, link.b, link.T_a_b, link.information)
+            self.closer.edges.append(link)
 
 
 def ends_submap(T_submap_camera: Matrix, frames_since: int, uncertainty_m: float, config: SubmapConfig) -> str:

@@ -11,6 +11,7 @@ from sigmasplat.data.hops import TrackedHops
 from sigmasplat.data.photo import Photo
 from sigmasplat.data.places import Places
 from sigmasplat.data.poses import KeyframePoses, Poses
+from sigmasplat.data.relative_pose import RelativePose
 from sigmasplat.data.submap import Picture
 from sigmasplat.errors import RunError
 from sigmasplat.fit.adam import VectorAdam
@@ -35,15 +36,15 @@ from sigmasplat.tracking.moving.depth_history import DepthHistory, RememberedDep
 from sigmasplat.tracking.moving.dynamic_detector import DynamicDetector
 from sigmasplat.tracking.moving.dynamic_mask import DynamicMask
 from sigmasplat.tracking.pose_validation import TrackingStatistics
-from sigmasplat.tracking.recovery import Link, Recovery
+from sigmasplat.tracking.recovery import Recovery
 from sigmasplat.tracking.relocaliser import Relocaliser
 from sigmasplat.tracking.tracker import Tracker
 
 CLASSES: tuple[type, ...] = (
     Atlas, Camera, Column, Confidence, DepthFit, DepthHistory, DepthShape, DescribedSubmaps, Detail, Drift,
-    DynamicDetector, DynamicMask, Edges, FeatureImage, GaussianField, Keyframe, KeyframePoses, Link, Loop, LoopCloser,
-    Loops, Mapper, PendingSearch, Photo, Picture, Places, PosePrior, Poses, Pyramid, Recovery, Reference, Relocaliser,
-    RememberedDepth, Rows, SecondHalf, Step, Steps, Target, TrackedHops, Tracker, TrackingStatistics,
+    DynamicDetector, DynamicMask, Edges, FeatureImage, GaussianField, Keyframe, KeyframePoses, Loop, LoopCloser, Loops,
+    Mapper, PendingSearch, Photo, Picture, Places, PosePrior, Poses, Pyramid, Recovery, Reference, RelativePose,
+    Relocaliser, RememberedDepth, Rows, SecondHalf, Step, Steps, Target, TrackedHops, Tracker, TrackingStatistics,
     ValidationView, ValidationViews, VectorAdam,
 )  # fmt: skip
 """The classes that a state may contain."""

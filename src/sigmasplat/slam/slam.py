@@ -8,7 +8,7 @@ import numpy as np
 from sigmasplat.data import se3
 from sigmasplat.data.component import APART, RELOCALISED, TRACKED
 from sigmasplat.data.frame import Frame
-from sigmasplat.data.hops import UNKNOWN_HOP, Hop
+from sigmasplat.data.relative_pose import UNKNOWN_HOP, RelativePose
 from sigmasplat.data.submap import RefinedStore, StorePart
 from sigmasplat.final.final_map import final_map
 from sigmasplat.final.pose_trust_region import reaching
@@ -173,7 +173,7 @@ class Slam(MappingBackend, ArrayInterface):
         with self._timer.stage("loops"):
             completed(self.closing(self.config.loops.slices_per_frame))
 
-    def _mapped(self, seen: PreparedFrame, T_submap_camera: Matrix, hop: Hop = UNKNOWN_HOP) -> Matrix:
+    def _mapped(self, seen: PreparedFrame, T_submap_camera: Matrix, hop: RelativePose = UNKNOWN_HOP) -> Matrix:
         """Map a keyframe, and track the next frames relative to it; return its pose."""
         T_submap_camera = completed(self.map_keyframe(seen, len(self.steps), T_submap_camera, hop))
         self.tracker.keep_keyframe(self.mapper.field, self.view, seen, T_submap_camera)

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from sigmasplat.data import se3
 from sigmasplat.data.component import LOST, TRACKED
-from sigmasplat.data.hops import UNKNOWN_HOP, Hop
+from sigmasplat.data.relative_pose import UNKNOWN_HOP, RelativePose
 from sigmasplat.fit.compare import Comparison
 from sigmasplat.fit.pose import PoseFit
 from sigmasplat.types import Matrix
@@ -23,7 +23,7 @@ class FrameEstimate:
     mapped: bool = False
     fit: PoseFit | None = None
     comparison: Comparison | None = None
-    hop: Hop = UNKNOWN_HOP
+    hop: RelativePose = UNKNOWN_HOP
     inliers: int | None = None
     drift_m: float | None = None
 

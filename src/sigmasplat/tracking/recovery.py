@@ -1,14 +1,14 @@
 """Count lost and steady frames, and decide what follows: map again, or begin a new map."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sigmasplat.config import RecoveryConfig
 from sigmasplat.data import se3
 from sigmasplat.data.atlas import Atlas
+from sigmasplat.data.relative_pose import RelativePose
 from sigmasplat.tracking.prepared_frame import PreparedFrame
-from sigmasplat.types import Matrix
 
 LEAST_READINGS = 0.05
 """A frame with depth on a smaller share of its pixels is not usable: it cannot be recognised or begin a map."""
@@ -24,16 +24,6 @@ def usable(seen: PreparedFrame) -> bool:
     return readings >= LEAST_READINGS and (seen.image is None or float(seen.image.detail.gray.std()) >= LEAST_CONTRAST)
 
 
-@dataclass(frozen=True, eq=False)
-class Link:
-    """An observation that connects two submaps of different components: T_a_b [4, 4] and its information [6, 6]."""
-
-    a: int
-    b: int
-    T_a_b: Matrix
-    information: Matrix
-
-
 @dataclass(eq=False)
 class Recovery:
     """lost: usable frames in a row in which the camera was not found; steady: frames in a row tracked without doubt
@@ -42,7 +32,7 @@ class Recovery:
     config: RecoveryConfig
     lost: int = 0
     steady: int = 1_000_000
-    link: Link | None = None
+    link: RelativePose | None = None
 
     def count(self, lost: bool, doubtful: bool, seen: PreparedFrame) -> None:
         """Count a frame."""
@@ -67,7 +57,7 @@ class Recovery:
         """Restart the counts: the camera has been found, or a new map has begun."""
         self.lost = self.steady = 0
 
-    def confirms(self, link: Link, atlas: Atlas, scene_scale: float = 1.0) -> bool:
+    def confirms(self, link: RelativePose, atlas: Atlas, scene_scale: float = 1.0) -> bool:
         """Return whether a new observation agrees with the last one; keep the new one for the next call."""
         before, self.link = self.link, link
         if before is None or {atlas.components[s] for s in (before.a, before.b)} != {
@@ -75,7 +65,7 @@ class Recovery:
         }:
             return False
         if atlas.components[before.a] != atlas.components[link.a]:
-            before = Link(before.b, before.a, se3.inverse(before.T_a_b), before.information)
+            before = replace(before, a=before.b, b=before.a, T_a_b=se3.inverse(before.T_a_b))
         between = atlas.anchors[before.a] @ before.T_a_b @ se3.inverse(atlas.anchors[before.b])
         prediction = se3.inverse(atlas.anchors[link.a]) @ between @ atlas.anchors[link.b]
         apart = se3.inverse(prediction) @ link.T_a_b

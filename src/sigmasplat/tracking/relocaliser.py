@@ -12,6 +12,7 @@ import numpy as np
 
 from sigmasplat.config import Config, TrackingConfig
 from sigmasplat.data import se3
+from sigmasplat.data.relative_pose import RelativePose
 from sigmasplat.data.submap import KeyframeId
 from sigmasplat.fit.compare import Comparison
 from sigmasplat.fit.pose import PoseFit, fit_pose_align
@@ -77,6 +78,10 @@ class Relocation:
         A = se3.adjoint(self.T_submap_camera)
         covariance = A @ self._estimated @ A.T + floor(self.scene_scale)
         return symmetric(np.asarray(np.linalg.inv(symmetric(covariance)), np.float64))
+
+    def relative_pose(self, submap: int) -> RelativePose:
+        """Return where a submap begins that starts at this camera."""
+        return RelativePose(self.where[0], submap, self.T_submap_camera, self.information, "relocalisation")
 
     def values(self) -> dict[str, float]:
         """Return the comparison with the map and the number of matches, as a step reports them."""
