@@ -21,7 +21,10 @@ MOST_SPILLED = {11: 16, 16: 24, cubins.ALIGNING: 72}
 where alignment solves for a step, to the one thread that does."""
 
 
-@pytest.mark.parametrize("architecture", cubins.ARCHITECTURES)
+@pytest.mark.parametrize(
+    "architecture",
+    [pytest.param(each, marks=() if each == "sm_90" else pytest.mark.slow) for each in cubins.ARCHITECTURES],
+)
 def test_every_kernel_compiles_without_a_warning_and_keeps_to_its_registers(architecture: str) -> None:
     with ThreadPoolExecutor(2) as pool:
         made = list(pool.map(lambda f: cubins.compiled(f, architecture, kernels.TELL), cubins.PROGRAMS))
