@@ -1,4 +1,4 @@
-"""Compare the weights of σ² on four sequences, with `sigmasplat bench ablation`.
+"""Enable the weights of σ² one by one (tracking, loops, registration, final map), on four sequences, and compare.
 
 Finished runs are kept in runs/bench/ablation/NAME.json and are not repeated while code and settings are unchanged.
 Writes benchmarks/results/<name>-<machine>.json; `python benchmarks/tables.py` writes its tables into the documents.
@@ -7,7 +7,9 @@ example: python benchmarks/ablation.py --sources redkitchen --seeds 1 --limit 20
 """
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,16 +17,33 @@ import program
 import record
 import tables
 import tyro
+from ablation_runs import (
+    COMPARED,
+    NAMES,
+    WITHOUT_VARIANCE,
+    Job,
+    Results,
+    Runner,
+    Study,
+    common_config,
+    run_job,
+    run_jobs,
+)  # fmt: skip
+from paired_comparison import FIGURES, columns, described, paired_differences, passed_by_chance, rows
+from sigmasplat.input.depth_units import depth_warning
 from tables import Section
 
-from sigmasplat.commands import options as described
-from sigmasplat.commands.bench import DEFAULT_PRESET, Ablation
+from sigmasplat.commands import options
 from sigmasplat.commands.input_options import Limit
-from sigmasplat.errors import SigmaSplatError
-from sigmasplat.plugins.evaluation.ablation import COMPARED, NAMES, WITHOUT_VARIANCE
-from sigmasplat.plugins.evaluation.paired_comparison import FIGURES, columns, paired_differences, passed_by_chance, rows
+from sigmasplat.commands.options import prepare_torch
+from sigmasplat.config.presets import default_preset
+from sigmasplat.config.text import split_settings
+from sigmasplat.errors import ConfigError, SigmaSplatError
+from sigmasplat.plugins.sources import open_source
+from sigmasplat.run.terminal import Screen
 
 arg = tyro.conf.arg
+DEFAULT_PRESET = default_preset()
 SYNTHETIC = "synthetic:frames=240,overrun=20,noise=1,drift=6,seed={seed}"
 """A different room for each seed, a sensor that drifts, and a path that ends where it began."""
 SOURCES = ("synthetic", "livingroom", "redkitchen", "hololens")
@@ -36,11 +55,12 @@ class Options:
     """Compare the weights of σ² on four sequences."""
 
     sources: Annotated[tuple[str, ...], arg(help="sequences: names in the data folder, or paths")] = SOURCES
-    preset: described.PresetName = DEFAULT_PRESET
-    settings: described.Settings = ()
-    seeds: described.Seeds = 3
-    tau: described.Tau = 10.0
+    preset: options.PresetName = DEFAULT_PRESET
+    settings: options.Settings = ()
+    seeds: options.Runs = 3
+    tau: Annotated[float, arg(help="τ, the same for every weight and sequence")] = 10.0
     limit: Limit = None
+    keep: Annotated[Path | None, arg(help="keep the run folders there", help_behavior_hint="(default: removed)")] = None
     reference: Annotated[bool, arg(help="leave out the runs without variance", help_behavior_hint="")] = True
     name: Annotated[str, arg(help="name of the results; use another name with other --set")] = "ablation"
     runs: Annotated[Path, arg(help="folder of finished runs")] = RUNS
@@ -50,13 +70,75 @@ class Options:
         """Return the file that finished runs are added to."""
         return self.runs / f"{record.slug(self.name)}.json"
 
-    def ablation(self) -> Ablation:
-        """Return the command to run; runs made with other settings or code are dropped."""
-        sources = tuple(map(located, self.sources))
-        return Ablation(
-            sources, self.preset, self.settings, self.seeds, self.tau, self.limit, self.reference,
-            self.working_file(), overwrite=True,
-        )  # fmt: skip
+    def study(self) -> Study:
+        """Return what to compare. Raises ConfigError on invalid values."""
+        if not self.sources:
+            raise ConfigError("no source given; give --sources")
+        config = common_config(self.preset, self.settings, self.tau)
+        sources = tuple(dict.fromkeys(map(located, self.sources)))
+        given = tuple(split_settings(self.settings))
+        return Study(sources, config, self.seeds, self.limit, self.reference, given)
+
+    def run(self, screen: Screen, runner: Runner | None = None) -> None:
+        """Make the missing runs; print the verdicts on each sequence. Runs of other settings or code are dropped.
+
+        `runner` replaces the SLAM run and its evaluation. Raises SigmaSplatError.
+        """
+        study, file = self.study(), self.working_file()
+        if runner is None:
+            check_sources(study, screen)
+            prepare_torch()
+            runner = partial(run_job, screen=screen)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        results = Results(file, study)
+        results.write()
+        jobs = [job for source in study.sources for job in study.jobs(source)]
+        try:
+            for source in study.sources:
+                run_jobs(study.jobs(source), results, runner, self.keep, partial(_announce, screen, jobs, results))
+                for line in verdict_lines(study.variants, results.of(source), study.seeds):
+                    screen.say(f"{short(source)}: {line}")
+        except BaseException:
+            screen.say(f"{len(results.runs)} of {len(jobs)} runs are in {file}; repeat the command to make the others")
+            raise
+
+
+def check_sources(study: Study, screen: Screen) -> None:
+    """Open every sequence once, so that a wrong path fails now and not after hours; warn of wrong depth units.
+
+    Raises SourceError.
+    """
+    for source in study.sources:
+        paths = dict.fromkeys(job.path for job in study.jobs(source))
+        opened = [open_source(path, limit=study.limit or 0) for path in paths]
+        warning = depth_warning(opened[0])
+        if warning:
+            screen.warn(f"{source}: {warning}")
+
+
+def verdict_lines(variants: Sequence[str], runs: Sequence[dict[str, Any]], seeds: int) -> list[str]:
+    """Return a line per pair of variants: which figures change, and how likely such a change is by chance."""
+    pairs = [(changed, against) for changed, against in COMPARED if {changed, against} <= set(variants)]
+    lines = [
+        f"{changed} against {against}: {described(paired_differences(runs, changed, against))}"
+        for changed, against in pairs
+    ]
+    if seeds < 2:
+        return lines
+    share = f"{passed_by_chance(seeds):.0%}"
+    return [
+        *lines,
+        f"helps, harms: the mean difference at equal seeds is larger than one standard deviation of the {seeds} "
+        f"differences. A change without any effect passes this threshold in {share} of cases by chance.",
+    ]
+
+
+def _announce(screen: Screen, jobs: Sequence[Job], results: Results, job: Job) -> None:
+    """Print which run starts, and the remaining time, estimated from the runs so far."""
+    durations_s = [run["wall_s"] for run in results.runs]
+    left_min = sum(durations_s) / len(durations_s) * (len(jobs) - len(durations_s)) / 60 if durations_s else None
+    rest = "" if left_min is None else f" (about {max(left_min, 1):.0f} min left)"
+    screen.say(f"[{len(durations_s) + 1}/{len(jobs)}] {job.source}, {job.variant}, seed {job.seed}{rest}")
 
 
 def located(name: str) -> str:
@@ -157,9 +239,8 @@ def compared(runs: Runs) -> list[tuple[str, str]]:
 
 def main(options: Options) -> int:
     """Run, write the results, print them; exit code 2 if the options are invalid."""
-    options.runs.mkdir(parents=True, exist_ok=True)
     try:
-        options.ablation().run()
+        options.run(Screen())
     except SigmaSplatError as problem:
         return program.refuse("ablation", problem)
     figures = kept(record.read(options.working_file()))

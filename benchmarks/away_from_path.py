@@ -31,7 +31,7 @@ from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.frame import Frame
 from sigmasplat.plugins.evaluation.metrics.trajectory import aligned_poses, associate
-from sigmasplat.plugins.evaluation.view_selection import working_frame
+from sigmasplat.plugins.evaluation.view_scoring import working_frame
 from sigmasplat.plugins.sources.synthetic import open_synthetic
 from sigmasplat.render import render
 from sigmasplat.render.reference.operators import project

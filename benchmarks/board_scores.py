@@ -15,12 +15,11 @@ from sigmasplat.data import se3
 from sigmasplat.data.selection import evenly_spread
 from sigmasplat.errors import SigmaSplatError, SourceError
 from sigmasplat.input.source import Source
-from sigmasplat.plugins.evaluation.frame_states import score_states
 from sigmasplat.plugins.evaluation.metrics.image import depth_l1, psnr
 from sigmasplat.plugins.evaluation.metrics.trajectory import associate, ate
 from sigmasplat.plugins.evaluation.metrics.views import scored_view
-from sigmasplat.plugins.evaluation.pose_covariance import WINDOW_FRAMES, score_pose_covariance
-from sigmasplat.plugins.evaluation.view_selection import working_frame
+from sigmasplat.plugins.evaluation.path_scores import WINDOW_FRAMES, score_pose_covariance, score_states
+from sigmasplat.plugins.evaluation.view_scoring import working_frame
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.render import FieldRenderer
 from sigmasplat.run_folder.frames import RunFrames

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from sigmasplat.plugins.evaluation.paired_comparison import Figure
+from paired_comparison import Figure
 
 Runs = list[dict[str, Any]]
 """Runs, each with `source`, `variant`, `seed` and `figures`."""

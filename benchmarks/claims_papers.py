@@ -14,8 +14,7 @@ from claims_evidence import (
     of_scores,
     of_ways,
 )
-
-from sigmasplat.plugins.evaluation.paired_comparison import Figure
+from paired_comparison import Figure
 
 ATE = Figure("ate_m", "ATE", "cm", -1, 100.0, digits=3)
 PSNR = Figure("psnr_db", "PSNR", "dB", +1)

@@ -17,11 +17,10 @@ from sigmasplat.fit.pose import fit_pose_adam
 from sigmasplat.fit.target import Target
 from sigmasplat.graph.registration import tracking_of
 from sigmasplat.input.source import Source
-from sigmasplat.plugins.evaluation.metrics.scored_view import ScoredView
-from sigmasplat.plugins.evaluation.metrics.splats import score_splats
+from sigmasplat.plugins.evaluation.metrics.reconstruction import score_splats
 from sigmasplat.plugins.evaluation.metrics.trajectory import align_rigid, associate, score_path
 from sigmasplat.plugins.evaluation.metrics.uncertainty import spearman
-from sigmasplat.plugins.evaluation.metrics.views import sample_pixels, score_uncertainty
+from sigmasplat.plugins.evaluation.metrics.views import ScoredView, sample_pixels, score_uncertainty
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.slam.slam import Slam
 

@@ -13,10 +13,7 @@ from typing import Any
 import record
 from claims_evidence import Claim, Evidence
 from claims_papers import ATE, CHAMFER, CPU, DEPTH, ERROR, FLOATERS, HOPS, PAPERS, PSNR, RANK, SPLATS, STEPS
-from result_pages import link
-from tables import Section
-
-from sigmasplat.plugins.evaluation.paired_comparison import (
+from paired_comparison import (
     Figure,
     PairedDifference,
     by_seed,
@@ -24,6 +21,8 @@ from sigmasplat.plugins.evaluation.paired_comparison import (
     passed_by_chance,
     rows,
 )
+from result_pages import link
+from tables import Section
 
 LEAST_SEEDS = 3
 NOT_MEASURABLE = "not measurable here"

@@ -1,7 +1,7 @@
 """Measure things that move in real recordings: a ball is drawn into colour and depth, and moves ahead of the camera.
 
 The recording itself stays the truth of everything but the ball: true masks, the path, and views without the ball are
-known. The ball moves as in the synthetic room (`room.mover`: slowly, fast, not at all, and on) around a place in front
+known. The ball moves as in the synthetic room (`Mover`: slowly, fast, not at all, and on) around a place in front
 of the camera's path; nearer surfaces hide it. Its depth has the noise of a structured-light sensor. For each share of
 the image, runs with `moving.find` on and off, beside the recording without the ball (share 0).
 Writes benchmarks/results/composites-<machine>.json and prints tables.
@@ -43,8 +43,8 @@ from sigmasplat.input.source import Source, Subset
 from sigmasplat.plugins.evaluation.metrics.image import psnr
 from sigmasplat.plugins.evaluation.metrics.trajectory import associate, ate
 from sigmasplat.plugins.sources import open_source
-from sigmasplat.plugins.sources.room.mover import CENTER_M, mover
-from sigmasplat.plugins.sources.room.sensor import measured_color, measured_depth
+from sigmasplat.plugins.sources.room.capture import measured_color, measured_depth
+from sigmasplat.plugins.sources.room.furnish import CENTER_M, mover
 from sigmasplat.render import render
 from sigmasplat.tracking.prepared_frame import working_frame
 

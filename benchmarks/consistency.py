@@ -20,13 +20,7 @@ import program
 import record
 import tyro
 from accuracy_tables import failures
-from systems import with_surface
-from tables import Section
-
-import sigmasplat
-from sigmasplat.errors import ConfigError, SigmaSplatError
-from sigmasplat.files.machine import INSTALLED, code_digest
-from sigmasplat.plugins.evaluation.paired_comparison import (
+from paired_comparison import (
     Figure,
     PairedDifference,
     best,
@@ -35,6 +29,12 @@ from sigmasplat.plugins.evaluation.paired_comparison import (
     passed_by_chance,
     rows,
 )
+from systems import with_surface
+from tables import Section
+
+import sigmasplat
+from sigmasplat.errors import ConfigError, SigmaSplatError
+from sigmasplat.files.machine import INSTALLED, code_digest
 from sigmasplat.run.figures import number
 
 arg = tyro.conf.arg

@@ -17,7 +17,7 @@ from sigmasplat.data.camera import Camera
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SourceError
 from sigmasplat.input.source import Source
-from sigmasplat.plugins.checks.timing import times_of
+from sigmasplat.plugins.checks.motion import times_of
 from sigmasplat.plugins.evaluation.metrics.trajectory import associate
 from sigmasplat.plugins.sources import open_source
 

@@ -33,7 +33,7 @@ from sigmasplat.errors import SigmaSplatError, SourceError
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.evaluation.metrics import views
 from sigmasplat.plugins.evaluation.reconstruct import FusionInput
-from sigmasplat.plugins.evaluation.view_selection import working_frame
+from sigmasplat.plugins.evaluation.view_scoring import working_frame
 from sigmasplat.plugins.outputs.formats import PLUGIN, ExportSource, choose
 from sigmasplat.plugins.outputs.splats.any_format import read_any
 from sigmasplat.render import FieldRenderer

@@ -25,7 +25,7 @@ from scipy.special import expit
 from tables import Section, significant
 
 from sigmasplat.graph.confidence import NEVER_LOST, WEIGHTS, evidence
-from sigmasplat.plugins.evaluation.metrics.failures import OFF_M, brier
+from sigmasplat.plugins.evaluation.metrics.trajectory import OFF_M, brier
 
 arg = tyro.conf.arg
 SHRINK = 1.0

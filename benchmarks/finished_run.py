@@ -15,9 +15,8 @@ from sigmasplat.data.submap import MemoryStore, RefinedStore, StorePart, SubmapS
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.graph.path_covariance import PathCovariance
 from sigmasplat.input.source import Source
-from sigmasplat.plugins.evaluation.metrics.failures import score_failures
-from sigmasplat.plugins.evaluation.metrics.trajectory import associate, truth_in_estimate
-from sigmasplat.plugins.evaluation.pose_covariance import score_path_covariance
+from sigmasplat.plugins.evaluation.metrics.trajectory import associate, score_failures, truth_in_estimate
+from sigmasplat.plugins.evaluation.path_scores import score_path_covariance
 from sigmasplat.run.protocols import Callback
 from sigmasplat.slam.slam import Slam
 from sigmasplat.tracking.keyframe_rule import is_held_back

@@ -20,7 +20,7 @@ from sigmasplat.render.backend import make_view
 from sigmasplat.tracking.feature_image import FeatureImage, detail_of
 from sigmasplat.tracking.features import make_extractor
 from sigmasplat.tracking.known_map import KnownMap
-from sigmasplat.tracking.prepared_frame import PreparedImages
+from sigmasplat.tracking.prepared_frame import PreparedFrame
 from sigmasplat.tracking.relocaliser import Relocaliser
 
 Matrix = NDArray[np.float64]
@@ -72,9 +72,10 @@ class TrueMap:
         i = self.config.input
         return frame.prepared(i.width, i.min_depth_m, i.max_depth_m, i.crop_px)
 
-    def _sight(self, frame: Frame) -> PreparedImages:
+    def _sight(self, frame: Frame) -> PreparedFrame:
         """Return a frame in the forms that the search needs."""
         small = self._working(frame)
         target = Target.of(small, (self.view.sums.shape[1], self.view.sums.shape[2]))
         image = FeatureImage(detail_of(frame, self.config.features.width), small.depth_m, small.camera)
-        return PreparedImages(target, live_image(self.view, small.color, small.depth_m, target), image)
+        live = live_image(self.view, small.color, small.depth_m, target)
+        return PreparedFrame(target, live, image, frame=small, whole=frame)

@@ -120,7 +120,7 @@ class Samples(NullCallback):
 def follow(path: str, scratch: Path, config: Config, frames: int, save_every_s: float) -> dict[str, Any]:
     """Run SLAM in real time on the frames in scratch/frames, repeated; return samples, and figures of each frame."""
     from sigmasplat.commands.options import prepare_torch
-    from sigmasplat.plugins.sources.arrivals import Arrivals
+    from sigmasplat.plugins.sources.live import Arrivals
     from sigmasplat.realtime.system import RealTime
     from sigmasplat.run.resume import StateFile
     from sigmasplat.run.session import Session

@@ -135,7 +135,7 @@ def path_of(times_s: NDArray[np.float64], poses: NDArray[np.float64]) -> Traject
 
 
 def score(path: Trajectory, source: Source, limit: int | None) -> dict[str, Any]:
-    """Return frames, frames without a pose and ATE of a path, None without poses. Raises SourceError without true poses."""
+    """Return frames, frames without a pose and ATE, None without poses. Raises SourceError without true poses."""
     truth = source.truth()
     if truth is None:
         raise SourceError(f"{source.name} has no true poses")

@@ -23,7 +23,7 @@ from sigmasplat.config.presets import default_preset, preset as preset_of
 from sigmasplat.config.text import override
 from sigmasplat.errors import SourceError
 from sigmasplat.graph.path_covariance import PathCovariance
-from sigmasplat.plugins.evaluation.pose_covariance import MOTIONS, score_path_covariance
+from sigmasplat.plugins.evaluation.path_scores import MOTIONS, score_path_covariance
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.slam.slam import Slam
 

@@ -12,9 +12,8 @@ from disturbed_recordings import FRAMES_PER_SECOND
 from numpy.typing import NDArray
 
 from sigmasplat.data import se3
-from sigmasplat.plugins.evaluation.metrics import failures
-from sigmasplat.plugins.evaluation.metrics.failures import OFF_M, SILENT_M
-from sigmasplat.plugins.evaluation.metrics.trajectory import align_rigid
+from sigmasplat.plugins.evaluation.metrics import trajectory as failures
+from sigmasplat.plugins.evaluation.metrics.trajectory import OFF_M, SILENT_M, align_rigid
 from sigmasplat.run_folder.trajectory import read_trajectory
 
 ANCHOR_FRAMES, ANCHOR_M = 20, 0.05
@@ -185,7 +184,7 @@ def _number(value: Any) -> float:
 
 
 def auroc(p: NDArray[np.float64], off: NDArray[np.bool_]) -> float | None:
-    """Return `metrics.failures.auroc`; None, which JSON can hold, if all frames are off or none is."""
+    """Return `metrics.trajectory.auroc`; None, which JSON can hold, if all frames are off or none is."""
     area = failures.auroc(p, off)
     return area if np.isfinite(area) else None
 

@@ -12,9 +12,8 @@ import claims_tables
 import record
 import tables
 from ablation import verdict_counts
+from paired_comparison import passed_by_chance
 from result_pages import link
-
-from sigmasplat.plugins.evaluation.paired_comparison import passed_by_chance
 
 SEQUENCES = ("livingroom", "synthetic", "redkitchen")
 

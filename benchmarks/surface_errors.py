@@ -17,7 +17,7 @@ from sigmasplat.final.fusion import TRUNCATION_VOXELS, VOXEL_M, count_keyframes,
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.evaluation.metrics.reconstruction import BEHIND_M, Mask, distances, visible_points
 from sigmasplat.plugins.evaluation.metrics.trajectory import aligned_poses, associate
-from sigmasplat.plugins.evaluation.view_selection import working_frame
+from sigmasplat.plugins.evaluation.view_scoring import working_frame
 from sigmasplat.render import FieldRenderer
 from sigmasplat.render.mesh import mesh_depth
 from sigmasplat.types import Matrix, Progress, no_progress

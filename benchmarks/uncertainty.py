@@ -31,7 +31,7 @@ from sigmasplat.config.presets import default_preset
 from sigmasplat.config.ranges import Range
 from sigmasplat.config.text import split_settings
 from sigmasplat.errors import ConfigError, SigmaSplatError
-from sigmasplat.plugins.evaluation.pose_covariance import MOTIONS
+from sigmasplat.plugins.evaluation.path_scores import MOTIONS
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.run.figures import number
 from sigmasplat.run.scene import open_scene

@@ -10,7 +10,6 @@ from surface_predictors import SURFACE_PREDICTORS, SurfacePredictor
 from uncertainty_samples import AWAY, HELD_BACK, Kind
 from view_predictors import PREDICTORS, Predictor
 
-from sigmasplat.plugins.evaluation.metrics.scored_view import COVERED_ALPHA
 from sigmasplat.plugins.evaluation.metrics.uncertainty import (
     EPSILON,
     best_scale,
@@ -21,6 +20,7 @@ from sigmasplat.plugins.evaluation.metrics.uncertainty import (
     sparsification,
     z_scores,
 )
+from sigmasplat.plugins.evaluation.metrics.views import COVERED_ALPHA
 from sigmasplat.plugins.outputs.drawing.plot import ACCENT, BLUE, FAINT, GREEN, PURPLE, Chart, Curve
 
 Arrays = Mapping[str, NDArray[np.float32]]

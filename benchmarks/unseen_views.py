@@ -12,7 +12,7 @@ from sigmasplat.data.resizing import resized_depth
 from sigmasplat.data.selection import evenly_spread
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.evaluation.metrics.trajectory import aligned_poses, associate
-from sigmasplat.plugins.evaluation.view_selection import working_frame
+from sigmasplat.plugins.evaluation.view_scoring import working_frame
 from sigmasplat.types import Matrix
 
 

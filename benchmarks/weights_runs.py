@@ -18,9 +18,8 @@ from sigmasplat.graph.closer import LoopCloser
 from sigmasplat.graph.localisations import differs
 from sigmasplat.graph.registration import Registrar
 from sigmasplat.input.source import Source
-from sigmasplat.plugins.evaluation.metrics.scored_view import ScoredView
 from sigmasplat.plugins.evaluation.metrics.trajectory import associate, score_path
-from sigmasplat.plugins.evaluation.metrics.views import scored_view
+from sigmasplat.plugins.evaluation.metrics.views import ScoredView, scored_view
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.render import FieldRenderer
 from sigmasplat.slam.slam import Slam

@@ -5,10 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from tables import Section
-from weights import DEFAULT
-
-from sigmasplat.plugins.evaluation.paired_comparison import (
+from paired_comparison import (
     Figure,
     PairedDifference,
     by_seed,
@@ -16,6 +13,8 @@ from sigmasplat.plugins.evaluation.paired_comparison import (
     passed_by_chance,
     rows,
 )
+from tables import Section
+from weights import DEFAULT
 
 Runs = list[dict[str, Any]]
 FIGURES: dict[str, tuple[Figure, ...]] = {

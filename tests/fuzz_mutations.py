@@ -13,7 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from sigmasplat.files.guard import DAMAGED
+from sigmasplat.files.reading import DAMAGED
 
 Files = dict[str, bytes]
 PIPE, FOLDER, LOOP, BROKEN, ZERO = (f"\0{kind}".encode() for kind in ("pipe", "folder", "loop", "broken", "zero"))

@@ -207,13 +207,7 @@ def _studies(folder: Path) -> Iterator[Sample]:
     layouts.save_text(place / "options.txt", OPTIONS)
     words = ("run", ROOM, "--out", OUT, "--no-eval", *QUICK, "@options.txt")
     yield _sample("options", place, place / "calibration.json", (words,))
-    place = folder / "ablation"
     metrics = {"ate": {"rmse_m": 0.01}, "held_out": {"psnr_db": 20.0}, "lost": 0, "frames_per_s": 9.0}
-    given = ("--seeds", "1", "--limit", "2", *QUICK, "--out")
-    place.mkdir()
-    with mock.patch("sigmasplat.commands.bench.run_job", lambda job, run, screen: metrics):
-        assert exit_code("bench", "ablation", ROOM, *given, str(place / "study.json")) == 0
-    yield _sample("ablation", place, place / "study.json", (("bench", "ablation", ROOM, *given, INPUT),), 0.5)
     place = folder / "table"
     text = (TABLES / "cgslam-ablation.toml").read_text(encoding="utf-8")
     layouts.save_text(place / "table.toml", text)

@@ -122,14 +122,17 @@ def scene_table(system: str) -> str:
     """Return the released code's scenes: a row per set of values, a column per setting; all from the code."""
     from sigmasplat.config.presets import list_presets, preset
 
-    columns, prefix = SCENES[system], f"{system}-released-"
+    prefix = f"{system}-released-"
+    released = {name.removeprefix(prefix): preset(name) for name in list_presets() if name.startswith(prefix)}
+    values = {column: [_value(config, column) for config in released.values()] for column in SCENES[system]}
+    same = [f"`{column}` {each[0]}" for column, each in values.items() if len(set(each)) == 1]
+    columns = [column for column, each in values.items() if len(set(each)) > 1]
     scenes: dict[tuple[str, ...], list[str]] = {}
-    for name in (name for name in list_presets() if name.startswith(prefix)):
-        values = tuple(_value(preset(name), column) for column in columns)
-        scenes.setdefault(values, []).append(f"`{name.removeprefix(prefix)}`")
-    rows = [f"| scenes | {' | '.join(f'`{name}`' for name in columns)} |", "|---" * (len(columns) + 1) + "|"]
-    rows += (f"| {', '.join(names)} | {' | '.join(values)} |" for values, names in scenes.items())
-    return "\n".join(rows)
+    for scene, row in zip(released, zip(*(values[column] for column in columns), strict=True), strict=True):
+        scenes.setdefault(row, []).append(f"`{scene}`")
+    rows = [f"| scenes | {' | '.join(f'`{column}`' for column in columns)} |", "|---" * (len(columns) + 1) + "|"]
+    rows += (f"| {', '.join(names)} | {' | '.join(row)} |" for row, names in scenes.items())
+    return "\n".join((f"In all scenes: {', '.join(same)}.", "", *rows))
 
 
 def method_table(system: str) -> str:

@@ -7,19 +7,20 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr, suppress
+from dataclasses import fields, is_dataclass
 from functools import partial, wraps
 from importlib import import_module
 from importlib.abc import InspectLoader
 from importlib.util import find_spec
-from inspect import cleandoc
+from inspect import cleandoc, signature
 from io import StringIO
 from types import CodeType
-from typing import Any, TextIO
+from typing import Annotated, Any, TextIO, get_args, get_origin
 
 import sigmasplat
 from sigmasplat import env
 from sigmasplat.errors import ConfigError, SigmaSplatError, is_out_of_memory, out_of_memory
-from sigmasplat.files.guard import cause
+from sigmasplat.files.reading import cause
 
 REFUSED, INTERRUPTED, CLOSED = 2, 130, 141
 HELP = {"-h", "--help"}
@@ -31,7 +32,8 @@ DESCRIPTION = """RGB-D SLAM on 3D Gaussian splats, with uncertainty.
 
 Start with: sigmasplat demo, then: sigmasplat run PATH.
 
-sigmasplat --version                   print the version and exit
+sigmasplat --version    print the version and exit
+
 sigmasplat --plugin FILE.py run PATH    use a file with plug-ins of yours; before or after any command"""
 
 COMMANDS = {
@@ -47,8 +49,8 @@ COMMANDS = {
     "export": ("export", "export"),
     "download": ("download", "download"),
     "bench": ("bench", "bench"),
-    "doctor": ("doctor", "doctor"),
-    "completion": ("completion", "completion"),
+    "doctor": ("installation", "doctor"),
+    "completion": ("installation", "completion"),
 }
 """Module in `sigmasplat.commands` and function of each command. Only the command that is used is imported."""
 
@@ -118,15 +120,48 @@ def _parsed(arguments: Sequence[str], with_options: bool) -> Callable[[], int]:
 
 def _postponed(name: str) -> Callable[..., Callable[[], int]]:
     """Return a function with the options of a command that returns its call."""
-    from sigmasplat.commands.option_ranges import checked
-
     function = command(name)
 
     @wraps(function)
     def postponed(*given: Any, **named: Any) -> Callable[[], int]:
-        return partial(checked(function), *given, **named)
+        return partial(_checked(function), *given, **named)
 
     return postponed
+
+
+def _checked(command: Callable[..., int]) -> Callable[..., int]:
+    """Return the command with a check of its options. Raises ConfigError with every number out of range."""
+    from sigmasplat.config.ranges import refuse
+
+    @wraps(command)
+    def run(*given: Any, **named: Any) -> int:
+        parameters = signature(command)
+        values = parameters.bind(*given, **named).arguments
+        kinds = {name: parameters.parameters[name].annotation for name in values}
+        refuse([problem for name, value in values.items() for problem in _problems(name, kinds[name], value)])
+        return command(*given, **named)
+
+    return run
+
+
+def _problems(name: str, kind: Any, value: Any) -> Iterator[str]:
+    """Yield a description of each number out of range, in an option or in a group of options (a dataclass)."""
+    from sigmasplat.config.ranges import out_of_range, unpacked
+
+    if is_dataclass(value):
+        for field in fields(value):
+            yield from _problems(field.name, field.type, getattr(value, field.name))
+        return
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    if number and (problem := out_of_range(unpacked(kind)[1], value)):
+        yield f"{_option(name, kind)} {problem}"
+
+
+def _option(name: str, kind: Any) -> str:
+    """Return the option's name on the command line."""
+    extras = get_args(kind)[1:] if get_origin(kind) is Annotated else ()
+    given = (getattr(extra, "name", None) for extra in extras)
+    return "--" + (next((own for own in given if own), None) or name).replace("_", "-")
 
 
 def _without_options(name: str) -> Callable[[], None]:

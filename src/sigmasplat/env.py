@@ -13,10 +13,11 @@ import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
+from importlib import import_module
 from pathlib import Path
-from typing import Literal, cast, get_args
+from typing import Any, Literal, cast, get_args
 
-from sigmasplat.errors import ConfigError
+from sigmasplat.errors import ConfigError, SourceError
 
 Isa = Literal["auto", "avx512", "avx2", "baseline"]
 
@@ -74,3 +75,15 @@ def install_package(requirement: str) -> str:
 def install_extra(extra: str) -> str:
     """Return the command that installs an optional dependency into the running Python."""
     return install_package(f"'sigmasplat[{extra}]'")
+
+
+def import_optional(module: str, extra: str, what: str) -> Any:
+    """Import a module. Raises SourceError naming what needs it and the extra that installs it."""
+    try:
+        return import_module(module)
+    except ModuleNotFoundError as error:
+        raise SourceError(f"{what} needs {module} ({error}): {install_extra(extra)}") from error
+    except ImportError as error:
+        raise SourceError(
+            f"{what} needs {module}, which is installed but does not load ({error}); install the missing system library"
+        ) from error

@@ -13,7 +13,7 @@ from sigmasplat.config import TrackingConfig
 from sigmasplat.config.presets import default_preset, preset
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
-from sigmasplat.data.frame import PosePrior
+from sigmasplat.data.frame import Frame, PosePrior
 from sigmasplat.fit.pose import fit_pose_align
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference, keyframe_reference, live_image, map_reference
@@ -27,7 +27,7 @@ from sigmasplat.tracking.depth_fit import DepthFit
 from sigmasplat.tracking.depth_shape import DepthShape
 from sigmasplat.tracking.moving import depth_history, dynamic_detector
 from sigmasplat.tracking.pose_validation import TrackingStatistics
-from sigmasplat.tracking.prepared_frame import PreparedImages
+from sigmasplat.tracking.prepared_frame import PreparedFrame
 from sigmasplat.tracking.tracker import Tracker
 from splat_fields import CPU, OPTIONS
 from splat_fits import Watch
@@ -161,7 +161,9 @@ def test_what_a_tracker_remembers_is_kept_and_read_back(tmp_path: Path) -> None:
             DepthShape,
         ),
     )
-    tracker.start(PreparedImages(seen_from(view, TRUTH), kept.pyramid))
+    target = seen_from(view, TRUTH)
+    frame = Frame(0, 0.0, target.image.numpy(), target.depth_image.numpy(), CAMERA)
+    tracker.start(PreparedFrame(target, kept.pyramid, frame=frame, whole=frame))
     fixed = {"tracking": CONFIGS["V"], "moving": tracker.detector.config}
     write_state(tmp_path / "state", tracker, classes, fixed)
     again = read_state(tmp_path / "state", classes, fixed)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from sigmasplat.input.prefetch import read_ahead
+from sigmasplat.input.source import read_ahead
 from sigmasplat.native.threads import NICENESS, idle_kernel_workers, set_kernel_threads, yield_to_others
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only Linux has a priority for each thread")

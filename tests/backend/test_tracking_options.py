@@ -21,7 +21,7 @@ from sigmasplat.fit.target import Target
 from sigmasplat.render.backend import make_view
 from sigmasplat.render.view import View
 from sigmasplat.tracking import tracker
-from sigmasplat.tracking.prepared_frame import PreparedImages
+from sigmasplat.tracking.prepared_frame import PreparedFrame
 from splat_fields import OPTIONS
 from splat_scenes import assert_same_vector
 from splat_wall import CAMERA, TRUTH, Array, assert_near, lower_median, seen_from, wall
@@ -233,8 +233,9 @@ def test_the_second_frame_may_take_longer_and_turn_faster(
     view, field = make_view("reference", CAMERA, OPTIONS), GaussianField(wall())
     target = seen_from(view, TRUTH)
     live = Pyramid.of(gray_of(target.image.numpy()), target.depth_image.numpy(), CAMERA)
+    frame = Frame(0, 0.0, target.image.numpy(), target.depth_image.numpy(), CAMERA)
     config = dataclasses.replace(PAPER, iterations=15, first_iterations=first[0], first_lr_rotation=first[1])
     follower = tracker.Tracker(config)
     for _ in range(2):
-        follower.track(field, view, PreparedImages(target, live))
+        follower.track(field, view, PreparedFrame(target, live, frame=frame, whole=frame))
     assert seen == asked

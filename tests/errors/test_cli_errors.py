@@ -48,7 +48,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
         (["export", "/no/such/run", "--fps", "-30"], "--fps must be between 1 and 120, found -30"),
         (["export", "/no/such/run", "--sigma-below", "-1"], "--sigma-below must be at least 0"),
         (["mesh", "/no/such/run", "--voxel-m", "nan"], "--voxel-m must be finite and above 0"),
-        (["bench", "uncertainty", "/no/such/place", "--hold-every", "1"], "--hold-every must be at least 2"),
+        (["bench", "table", "tum", "--seeds", "0"], "--seeds must be at least 1"),
         (["batch", "/no/such/place", "--jobs", "0"], "--jobs must be at least 1"),
         (["demo", "--frames", "3", "--set", "tracking.method=guess"], "must be one of adam, align"),
         (["eval", "/no/such/run"], "no run folder /no/such/run"),

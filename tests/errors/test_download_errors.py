@@ -11,7 +11,7 @@ import file_server as acts
 from archives import folder_content, tar_gz
 from file_server import Act, FileServer, serving
 from sigmasplat import cli
-from sigmasplat.plugins.download.entries import PublicRecording, PublicSet, RemoteFile
+from sigmasplat.plugins.download.catalogue import PublicRecording, PublicSet, RemoteFile
 from sigmasplat.plugins.download.fetch import RetryPolicy
 
 DESK = "rgbd_dataset_freiburg1_desk"
@@ -29,7 +29,7 @@ def server(monkeypatch: pytest.MonkeyPatch, tiny_tum: Path) -> Iterator[FileServ
             name: PublicRecording(name, (RemoteFile(server.url(f"/{name}.tgz")),)) for name in ("desk", "bare", "gone")
         }
         tiny = PublicSet("Tiny", "http://page", "free", "tiny", recordings, 2**20, 99)
-        monkeypatch.setattr("sigmasplat.plugins.download.lookup.SETS", {"tiny": tiny})
+        monkeypatch.setattr("sigmasplat.plugins.download.catalogue.SETS", {"tiny": tiny})
         wait(monkeypatch, RetryPolicy(max_attempts=2, first_wait_s=0.001))
         yield server
 

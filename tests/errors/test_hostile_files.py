@@ -20,7 +20,7 @@ from room_run import made_run
 from sigmasplat import cli
 from sigmasplat.config import Config
 from sigmasplat.errors import ConfigError, RunError, SourceError
-from sigmasplat.input.association import associate
+from sigmasplat.input.lists import associate
 from sigmasplat.plugins.outputs.splats.any_format import read_any
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.run_folder.runs import RunFolder

@@ -1,6 +1,5 @@
 """The ablation: variants differ by one weight, no run is repeated or lost, and verdicts follow from the figures."""
 
-import importlib
 import json
 import subprocess
 import sys
@@ -8,20 +7,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import ablation as bench_ablation
+import ablation_runs as ablation
 import numpy as np
 import pytest
-
-import sigmasplat
-from command_line import exit_code
-from sigmasplat.commands.bench import Ablation
-from sigmasplat.config import Config
-from sigmasplat.config.presets import preset
-from sigmasplat.config.text import override
-from sigmasplat.errors import ConfigError, RunError
-from sigmasplat.files.machine import INSTALLED, code_digest
-from sigmasplat.plugins.evaluation import ablation
-from sigmasplat.plugins.evaluation.ablation import COMPARED, NAMES, WITHOUT_VARIANCE, Job, Results, Study, run_jobs
-from sigmasplat.plugins.evaluation.paired_comparison import (
+import record
+import tables
+from ablation_runs import COMPARED, NAMES, WITHOUT_VARIANCE, Job, Results, Study, run_jobs
+from paired_comparison import (
     FIGURES,
     best,
     columns,
@@ -31,10 +24,16 @@ from sigmasplat.plugins.evaluation.paired_comparison import (
     passed_by_chance,
     spread,
 )
+
+import sigmasplat
+from sigmasplat.config import Config
+from sigmasplat.config.presets import preset
+from sigmasplat.config.text import override
+from sigmasplat.errors import RunError
+from sigmasplat.files.machine import INSTALLED, code_digest
+from sigmasplat.run.terminal import Screen
 from sigmasplat.run_folder.runs import RunFolder
 
-sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
-bench_ablation, record, tables = map(importlib.import_module, ("ablation", "record", "tables"))
 BASE = preset("varsplat-fast")
 
 
@@ -109,41 +108,29 @@ def test_tau_is_the_same_for_every_weight_and_settings_apply_to_all() -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("given", "says"),
     [
-        ([], "no SOURCE given"),
-        (["/no/such/place"], "/no/such/place"),
-        (["synthetic:seed={seed}", "/no/such/place"], "/no/such/place"),
-        (["synthetic", "--seeds", "0"], "--seeds must be at least 1, found 0"),
-        (["synthetic", "--limit", "0"], "--limit must be at least 1, found 0"),
-        (["synthetic", "--tau", "0"], "--tau must be above 0, found 0"),
-        (["synthetic", "--set", "loops.tau=5"], "the ablation itself sets loops.tau"),
-        (["synthetic", "--set", "tracking.uncertainty=off"], "the ablation itself sets tracking.uncertainty"),
-        (["synthetic", "--set", "seed=5"], "the ablation itself sets seed"),
-        (["synthetic", "--set", "mapping.weight_nll_color=0"], "learns no variance"),
-        (["synthetic", "--preset", "loopsplat-fast"], "loopsplat-fast learns no variance"),
-        (["synthetic", "--preset", "quick"], "no preset 'quick'"),
+        ({"sources": ()}, "no source given"),
+        ({"sources": ("synthetic", "/no/such/place")}, "/no/such/place"),
+        ({"tau": 0.0}, "--tau must be above 0, found 0"),
+        ({"settings": ("loops.tau=5",)}, "the ablation itself sets loops.tau"),
+        ({"settings": ("tracking.uncertainty=off",)}, "the ablation itself sets tracking.uncertainty"),
+        ({"settings": ("seed=5",)}, "the ablation itself sets seed"),
+        ({"settings": ("mapping.weight_nll_color=0",)}, "learns no variance"),
+        ({"preset": "loopsplat-fast"}, "loopsplat-fast learns no variance"),
+        ({"preset": "quick"}, "no preset 'quick'"),
     ],
-    ids=" ".join,
+    ids=str,
 )
 def test_refusals_are_one_line_and_leave_nothing(
-    arguments: list[str], says: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    given: dict[str, Any], says: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert exit_code("bench", "ablation", *arguments) == 2
+    options = bench_ablation.Options(**{"sources": ("synthetic",), "runs": tmp_path, "out": tmp_path} | given)
+    assert bench_ablation.main(options) == 2
     said = capsys.readouterr()
     assert said.out == ""
-    assert says in said.err and said.err.startswith("sigmasplat: ") and said.err.count("\n") == 1
+    assert says in said.err and said.err.startswith("ablation.py: ") and said.err.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("arguments", [["--help"], ["ablation", "--help"]], ids=" ".join)
-def test_help_has_an_example_and_loads_no_torch(arguments: list[str]) -> None:
-    code = "import sys, sigmasplat.cli as c\ntry: c.main(sys.argv[1:])\nfinally: assert 'torch' not in sys.modules"
-    command = [sys.executable, "-c", code, "bench", *arguments]
-    answer = subprocess.run(command, capture_output=True, text=True, timeout=60)
-    assert answer.returncode == 0, answer.stderr
-    assert "example: sigmasplat bench ablation" in answer.stdout
 
 
 def test_all_variants_of_a_seed_run_on_the_same_scene(tmp_path: Path) -> None:
@@ -158,25 +145,25 @@ def test_all_variants_of_a_seed_run_on_the_same_scene(tmp_path: Path) -> None:
     assert len({job.folder for job in [*made, *real]}) == len({job.key for job in [*made, *real]}) == 20
 
 
+def options_of(folder: Path, *sources: str, **given: Any) -> Any:
+    """Return the options of an ablation in a folder, without the runs without variance."""
+    return bench_ablation.Options(sources=sources, **{"runs": folder, "out": folder, "reference": False} | given)
+
+
 def test_printed_and_stored_results_are_those_measured(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / "ablation.json"
     runner = MadeUpRuns({"+loop": 0.005, "+registration": 0.005, "+final": 0.006})
-    assert Ablation(("room", "hall"), out=out, without_variance=True).run(runner) == 0
+    options = options_of(tmp_path, "room", "hall", reference=True)
+    options.run(Screen(), runner)
     assert len(runner.jobs) == 2 * 3 * 6 and not any(folder.exists() for folder in runner.folders)
     said = capsys.readouterr().out
     assert "[36/36] hall, +final, seed 2" in said
-    rows = [[cell.strip() for cell in line.strip("│").split("│")] for line in said.splitlines() if "│" in line]
-    laid_out = {row[0]: row[1:] for row in rows}
-    assert laid_out["none"] == ["1.01 ± 0.01", "24", "25", "2", "1", "0", "12.5 ± 0.0"]
-    assert laid_out["+loop"][0] == laid_out["+registration"][0] == "* 0.51 ± 0.01"
-    assert laid_out["+final"][0] == "0.61 ± 0.01"
-    assert "+tracking against none: no figure differs in any run\n" in said
+    assert "room: +tracking against none: no figure differs in any run\n" in said
     on_the_rest = "no effect beyond the spread over seeds on PSNR before, PSNR after and depth L1"
     assert f"+loop against +tracking: helps ATE (−0.50 ± 0.00 cm); {on_the_rest}\n" in said
-    assert f"+final against +registration: harms ATE (+0.10 ± 0.00 cm); {on_the_rest}\n" in said
+    assert f"hall: +final against +registration: harms ATE (+0.10 ± 0.00 cm); {on_the_rest}\n" in said
     assert "passes this threshold in 23% of cases" in said
 
-    written = json.loads(out.read_text())
+    written = json.loads(options.working_file().read_text())
     assert written["machine"]["cores"] and written["code"] == code_digest(Path(sigmasplat.__file__).parent, INSTALLED)
     assert Config.from_dict(written["config"]) == ablation.common_config("sigma", (), 10.0)
     run = next(r for r in written["runs"] if (r["source"], r["variant"], r["seed"]) == ("hall", "+loop", 2))
@@ -187,41 +174,37 @@ def test_printed_and_stored_results_are_those_measured(tmp_path: Path, capsys: p
 
 
 def test_an_interrupted_ablation_resumes_where_it_left_off(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    command, first, second = Ablation(("room",), out=tmp_path / "a.json"), MadeUpRuns(stop_at=4), MadeUpRuns()
+    options, first, second = options_of(tmp_path, "room"), MadeUpRuns(stop_at=4), MadeUpRuns()
     with pytest.raises(KeyboardInterrupt):
-        command.run(first)
+        options.run(Screen(), first)
     assert "4 of 15 runs are in" in capsys.readouterr().out
-    assert len(json.loads((tmp_path / "a.json").read_text())["runs"]) == 4
-    assert command.run(second) == 0
-    assert [job.key for job in first.jobs + second.jobs] == [job.key for job in command.study().jobs("room")]
-    assert Ablation(("room",), seeds=4, out=tmp_path / "a.json").run(more := MadeUpRuns()) == 0
+    assert len(json.loads(options.working_file().read_text())["runs"]) == 4
+    options.run(Screen(), second)
+    assert [job.key for job in first.jobs + second.jobs] == [job.key for job in options.study().jobs("room")]
+    options_of(tmp_path, "room", seeds=4).run(Screen(), more := MadeUpRuns())
     assert [job.seed for job in more.jobs] == [3] * 5
     assert not list(tmp_path.glob(".*"))
 
 
-def test_runs_are_dropped_only_with_overwrite(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    out = tmp_path / "a.json"
-    Ablation(("room",), seeds=1, out=out).run(MadeUpRuns())
-    before = out.read_text()
+def test_runs_of_other_settings_or_code_are_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def made(**given: Any) -> int:
+        options_of(tmp_path, "room", seeds=1, **given).run(Screen(), runner := MadeUpRuns())
+        return len(runner.jobs)
+
+    assert (made(), made()) == (5, 0)
     for other in ({"tau": 20.0}, {"limit": 5}, {"settings": ("mapping.iterations=3",)}):
-        with pytest.raises(RunError, match=r"contains 5 runs of other settings, other code.* --overwrite"):
-            Ablation(("room",), seeds=1, out=out, **other).run(MadeUpRuns())
-    with pytest.raises(RunError, match="that this command does not ask for"):
-        Ablation(("hall",), seeds=1, out=out).run(MadeUpRuns())
+        assert (made(**other), made(**other)) == (5, 0)
     monkeypatch.setattr(ablation, "code_digest", lambda folder, endings: "another")
-    with pytest.raises(RunError, match="of other settings, other code"):
-        Ablation(("room",), seeds=1, out=out).run(MadeUpRuns())
-    assert out.read_text() == before
-    assert Ablation(("room",), seeds=1, out=out, overwrite=True).run(again := MadeUpRuns()) == 0
-    assert len(again.jobs) == 5 and json.loads(out.read_text())["code"] == "another"
+    assert (made(**other), made(**other)) == (5, 0)
+    assert json.loads((tmp_path / "ablation.json").read_text())["code"] == "another"
 
 
 @pytest.mark.parametrize("text", ["ten years of work", "[]", '{"runs": []}'])
 def test_a_file_of_another_program_is_not_changed(text: str, tmp_path: Path) -> None:
-    (tmp_path / "a.json").write_text(text)
-    with pytest.raises(RunError, match=r"a\.json.*give another --out"):
-        Ablation(("room",), out=tmp_path / "a.json", overwrite=True).run(MadeUpRuns())
-    assert (tmp_path / "a.json").read_text() == text
+    (tmp_path / "ablation.json").write_text(text)
+    with pytest.raises(RunError, match=r"ablation\.json.*give another --name"):
+        options_of(tmp_path, "room").run(Screen(), MadeUpRuns())
+    assert (tmp_path / "ablation.json").read_text() == text
 
 
 def test_run_folders_stay_only_in_the_keep_folder(tmp_path: Path) -> None:
@@ -291,12 +274,11 @@ def test_the_best_printed_mean_is_marked() -> None:
 
 def test_real_runs_leave_figures_and_their_folders(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("sigmasplat.native._core", reason="sigmasplat.native._core is not built")
-    room, out = "synthetic:frames=120,width=64,height=48,seed={seed}", tmp_path / "a.json"
+    room = "synthetic:frames=120,width=64,height=48,seed={seed}"
     quick = ("input.width=64", "mapping.first_iterations=6", "mapping.iterations=4", "final.iterations=5")
-    settings = [word for setting in quick for word in ("--set", setting)]
-    arguments = [room, "--seeds", "1", "--limit", "4", "--out", str(out), "--keep", str(tmp_path / "kept"), *settings]
-    assert exit_code("bench", "ablation", *arguments) == 0
-    runs = json.loads(out.read_text())["runs"]
+    options = options_of(tmp_path, room, seeds=1, limit=4, settings=quick, keep=tmp_path / "kept")
+    options.run(Screen())
+    runs = json.loads(options.working_file().read_text())["runs"]
     assert [run["variant"] for run in runs] == list(NAMES)
     for run in runs:
         assert 0 < run["figures"]["ate_m"] < 0.05 and run["figures"]["psnr_db"] > 10 and run["figures"]["loops"] == 0
@@ -313,12 +295,10 @@ def test_committed_results_become_tables(tmp_path: Path, monkeypatch: pytest.Mon
     options = bench_ablation.Options(
         sources=("synthetic", "livingroom"), seeds=3, runs=tmp_path, out=tmp_path / "results"
     )
-    command = options.ablation()
-    assert command.sources == (bench_ablation.SYNTHETIC, str(tmp_path / "livingroom"))
-    monkeypatch.setattr(bench_ablation.Options, "ablation", lambda self: self)
-    monkeypatch.setattr(
-        bench_ablation.Options, "run", lambda self: command.run(MadeUpRuns({"+loop": 0.005})), raising=False
-    )
+    assert options.study().sources == (bench_ablation.SYNTHETIC, str(tmp_path / "livingroom"))
+    made_up = MadeUpRuns({"+loop": 0.005})
+    monkeypatch.setattr(bench_ablation, "check_sources", lambda study, screen: None)
+    monkeypatch.setattr(bench_ablation, "run_job", lambda job, folder, screen: made_up(job, folder))
     assert bench_ablation.main(options) == 0
     measured = record.latest("ablation", tmp_path / "results")
     assert (
@@ -347,5 +327,3 @@ def test_the_benchmark_has_help_and_refuses_in_one_line(capsys: pytest.CaptureFi
     options = bench_ablation.Options(sources=("/no/such/place",), runs=tmp_path, out=tmp_path)
     assert bench_ablation.main(options) == 2
     assert capsys.readouterr().err.startswith("ablation.py: no such folder") and not list(tmp_path.iterdir())
-    with pytest.raises(ConfigError):
-        bench_ablation.Options(tau=0.0).ablation().study()

@@ -11,9 +11,9 @@ from box_room import CAMERA, seer, splats, walk
 from recordings import scene, write_stray
 from sigmasplat.config.presets import preset
 from sigmasplat.data import se3
-from sigmasplat.data.accelerometer import Accelerometer, accelerometer_from_samples, up_of_path
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.frame import Frame
+from sigmasplat.data.imu import Accelerometer, accelerometer_from_samples, up_of_path
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import RunError, SourceError
 from sigmasplat.input.source import Source

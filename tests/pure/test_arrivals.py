@@ -12,7 +12,7 @@ from sigmasplat.data.frame import Frame
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SourceError
 from sigmasplat.input.source import Source
-from sigmasplat.plugins.sources.arrivals import Arrivals
+from sigmasplat.plugins.sources.live import Arrivals
 
 CAMERA = Camera(4, 3, 4.0, 4.0, 1.5, 1.0)
 FRAME = Frame(0, 0.0, np.zeros((3, 4, 3), np.float32), np.ones((3, 4), np.float32), CAMERA)

@@ -5,10 +5,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from paired_comparison import Figure, PairedDifference
 
 from benchmark_results import laid_out, results
 from sigmasplat.errors import ConfigError
-from sigmasplat.plugins.evaluation.paired_comparison import Figure, PairedDifference
 
 claims, evidence, tables, record = map(
     importlib.import_module, ("claims", "claims_evidence", "claims_tables", "record")

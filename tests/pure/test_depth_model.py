@@ -11,7 +11,7 @@ import pytest
 from depth_networks import BYTES, FLOAT, HALF, network, node, weighted
 from sigmasplat.config import InputConfig
 from sigmasplat.errors import ConfigError, SourceError
-from sigmasplat.plugins.predicted_depth import predicted_files as predicted
+from sigmasplat.plugins.predicted_depth import source as predicted
 from sigmasplat.plugins.predicted_depth.depth_model import DepthModel
 from sigmasplat.plugins.sources import open_source
 

@@ -15,9 +15,8 @@ from archives import folder_content, tar_gz, zipped
 from file_server import FileServer, serving
 from sigmasplat.errors import DownloadError
 from sigmasplat.plugins.download import describe_recordings, describe_sets, download_recording, find_recording
-from sigmasplat.plugins.download.catalogue import SETS
+from sigmasplat.plugins.download.catalogue import SETS, PublicRecording, PublicSet, RemoteFile
 from sigmasplat.plugins.download.downloader import MARKER
-from sigmasplat.plugins.download.entries import PublicRecording, PublicSet, RemoteFile
 from sigmasplat.plugins.download.fetch import RetryPolicy
 
 HASTY = RetryPolicy(max_attempts=2, first_wait_s=0.001)

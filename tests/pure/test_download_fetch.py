@@ -10,8 +10,7 @@ import pytest
 import file_server as acts
 from file_server import Act, FileServer, serving
 from sigmasplat.errors import DownloadError
-from sigmasplat.plugins.download.fetch import RetryPolicy, fetch
-from sigmasplat.plugins.download.partial import open_partial
+from sigmasplat.plugins.download.fetch import RetryPolicy, fetch, open_partial
 
 BODY = bytes(range(256)) * 40
 HASTY = RetryPolicy(max_attempts=3, progress_bytes=1000, first_wait_s=0.001)

@@ -13,8 +13,7 @@ from file_server import FileServer, serving
 from lpips_weights import TRUNK_FILES, write_weights
 from sigmasplat.errors import DownloadError
 from sigmasplat.plugins.download import download_recording
-from sigmasplat.plugins.download.catalogue import SETS
-from sigmasplat.plugins.download.entries import PublicSet, RemoteFile
+from sigmasplat.plugins.download.catalogue import SETS, PublicSet, RemoteFile
 from sigmasplat.plugins.download.fetch import RetryPolicy
 from sigmasplat.plugins.evaluation.metrics.lpips import Lpips, Net, find_lpips
 

@@ -20,7 +20,7 @@ from sigmasplat.tracking.moving.dynamic_detector import DynamicDetector
 from sigmasplat.tracking.moving.dynamic_mask import DynamicMask, thinned
 from sigmasplat.tracking.moving.two_motions import two_motions
 from sigmasplat.tracking.pose_validation import is_missed
-from sigmasplat.tracking.prepared_frame import PreparedImages
+from sigmasplat.tracking.prepared_frame import PreparedFrame
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 CAMERA = Camera(160, 120, 140.0, 140.0, 79.5, 59.5)
@@ -34,7 +34,7 @@ def stripes(x: NDArray[np.float64], y: NDArray[np.float64], length_m: float) -> 
     return 0.5 + 0.2 * np.sin(2 * np.pi * x / length_m) + 0.2 * np.sin(2 * np.pi * (y + 0.3 * x) / length_m)
 
 
-def sight(camera_m: float, box_m: float, paint_m: float = 0.0, block: bool = False) -> PreparedImages:
+def sight(camera_m: float, box_m: float, paint_m: float = 0.0, block: bool = False) -> PreparedFrame:
     """Return a frame of a striped wall with a striped box in front of it: x of camera and box; the stripes of the box
     are shifted on it by paint_m; block: a still block stands under the box, at the same distance."""
     rays = CAMERA.rays().astype(np.float64)
@@ -47,8 +47,9 @@ def sight(camera_m: float, box_m: float, paint_m: float = 0.0, block: bool = Fal
     gray = np.where(box, stripes(on_box[0] - paint_m, on_box[1], 0.2), wall).astype(np.float32)
     depth_m = np.where(box | under, BOX_M, WALL_M).astype(np.float32)
     color = np.repeat(gray[..., None], 3, -1)
-    target = Target.of(Frame(0, 0.0, color, depth_m, CAMERA), depth_m.shape)
-    return PreparedImages(target, Pyramid.of(gray, depth_m, CAMERA))
+    frame = Frame(0, 0.0, color, depth_m, CAMERA)
+    live = Pyramid.of(gray, depth_m, CAMERA)
+    return PreparedFrame(Target.of(frame, depth_m.shape), live, frame=frame, whole=frame)
 
 
 def pose(camera_m: float) -> NDArray[np.float64]:
@@ -57,7 +58,7 @@ def pose(camera_m: float) -> NDArray[np.float64]:
 
 
 def fitted(
-    seen: PreparedImages,
+    seen: PreparedFrame,
     camera_m: float,
     without: DynamicMask | None = None,
     turned_rad: float = 0.0,
@@ -74,12 +75,12 @@ def keyframe(block: bool = False) -> Reference:
     return Reference(sight(0.0, 0.0, block=block).live, np.eye(4))
 
 
-def box_of(seen: PreparedImages) -> DynamicMask:
+def box_of(seen: PreparedFrame) -> DynamicMask:
     (found,) = suspected(keyframe(), seen, fitted(seen, BETWEEN_M), CONFIG, every=True)
     return found
 
 
-def judged(seen: PreparedImages, drawn_m: float, turned_rad: float = 0.0) -> bool:
+def judged(seen: PreparedFrame, drawn_m: float, turned_rad: float = 0.0) -> bool:
     """Return whether the box has drawn a pose, if the pose without it is right."""
     box, drawn = box_of(seen), fitted(seen, drawn_m, turned_rad=turned_rad)
     return has_drawn(box, keyframe(), seen, drawn, fitted(seen, MOVED_M, box), contradicted=False)

@@ -5,7 +5,7 @@ import pytest
 
 from sigmasplat.data.component import outside_world, submaps_outside
 from sigmasplat.data.trajectory import Trajectory
-from sigmasplat.plugins.evaluation.metrics.failures import auroc, brier, calibration, score_failures
+from sigmasplat.plugins.evaluation.metrics.trajectory import auroc, brier, calibration, score_failures
 from sigmasplat.run_folder.frames import RunFrames
 
 

@@ -18,7 +18,7 @@ from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SourceError
-from sigmasplat.input.pose_files import FLIP_YZ
+from sigmasplat.input.lists import FLIP_YZ
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.run.pose_scale import measured_scale, scale_warning, triangulated

@@ -11,7 +11,7 @@ from sigmasplat.config import InputConfig
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.frame import Frame
-from sigmasplat.data.gyroscope import Gyroscope
+from sigmasplat.data.imu import Gyroscope
 from sigmasplat.errors import SourceError
 from sigmasplat.plugins.checks.recording import inspect_source
 from sigmasplat.plugins.sources import open_source

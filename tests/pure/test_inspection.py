@@ -10,9 +10,9 @@ from PIL import Image
 from command_line import exit_code
 from sigmasplat.config import InputConfig
 from sigmasplat.data.camera import Camera
-from sigmasplat.input.depth_registration import DepthRegistration
+from sigmasplat.input.rectification import DepthRegistration
+from sigmasplat.plugins.checks.depth import edge_agreement, outlines
 from sigmasplat.plugins.checks.recording import inspect_source
-from sigmasplat.plugins.checks.registration import edge_agreement, outlines
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.plugins.sources.tum import write_tum
 

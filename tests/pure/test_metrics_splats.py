@@ -6,7 +6,7 @@ import pytest
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.mesh import Mesh
-from sigmasplat.plugins.evaluation.metrics.splats import FLOATER_M, OPAQUE, SplatScores, score_splats
+from sigmasplat.plugins.evaluation.metrics.reconstruction import FLOATER_M, OPAQUE, SplatScores, score_splats
 
 CAMERA = Camera(80, 60, 60.0, 60.0, 39.5, 29.5)
 AHEAD = np.eye(4)[None]

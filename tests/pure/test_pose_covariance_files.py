@@ -15,7 +15,7 @@ from sigmasplat.data.atlas import Atlas
 from sigmasplat.data.hops import Hop
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.graph.path_covariance import PathCovariance, recorded
-from sigmasplat.plugins.evaluation.metrics.pose_covariance import score_covariances
+from sigmasplat.plugins.evaluation.metrics.trajectory import score_covariances
 from sigmasplat.run_folder.pose_covariance import KNOWN, write_ros, write_square
 from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.run_folder.trajectory import write_trajectory

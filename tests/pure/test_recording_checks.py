@@ -16,9 +16,8 @@ from sigmasplat.data.camera import Camera
 from sigmasplat.data.frame import Frame
 from sigmasplat.errors import SourceError
 from sigmasplat.input.calibration import refuse_impossible_camera, unlikely_camera
-from sigmasplat.plugins.checks.motion import Motion, MotionWatch, motion_warnings
+from sigmasplat.plugins.checks.motion import Motion, MotionWatch, motion_warnings, time_warnings
 from sigmasplat.plugins.checks.recording import inspect_source
-from sigmasplat.plugins.checks.timing import time_warnings
 from sigmasplat.plugins.sources import open_source
 
 TIMES = np.arange(30) / 30.0

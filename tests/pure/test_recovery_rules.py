@@ -12,7 +12,7 @@ from sigmasplat.data.frame import Detail, Frame
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.target import Target
 from sigmasplat.tracking.feature_image import FeatureImage
-from sigmasplat.tracking.prepared_frame import PreparedImages
+from sigmasplat.tracking.prepared_frame import PreparedFrame
 from sigmasplat.tracking.recovery import Link, Recovery, usable
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
@@ -21,14 +21,15 @@ CAMERA = Camera(40, 30, 32.0, 32.0, 19.5, 14.5)
 SURE = np.eye(6)
 
 
-def sight(share_with_depth: float = 1.0, contrast: float = 0.3) -> PreparedImages:
+def sight(share_with_depth: float = 1.0, contrast: float = 0.3) -> PreparedFrame:
     color = np.random.default_rng(0).uniform(0.5 - contrast, 0.5 + contrast, (30, 40, 3)).astype(np.float32)
     depth = np.full(30 * 40, 2.0, np.float32)
     depth[int(share_with_depth * depth.size) :] = 0.0
     frame = Frame(0, 0.0, color, depth.reshape(30, 40), CAMERA)
     gray = np.rint(255 * color[..., 0]).astype(np.uint8)
     live = Pyramid.of(color[..., 0], frame.depth_m, CAMERA)
-    return PreparedImages(Target.of(frame, (32, 48)), live, FeatureImage(Detail(gray, CAMERA), frame.depth_m, CAMERA))
+    image = FeatureImage(Detail(gray, CAMERA), frame.depth_m, CAMERA)
+    return PreparedFrame(Target.of(frame, (32, 48)), live, image, frame=frame, whole=frame)
 
 
 SEEN, BLACK = sight(), sight(0.0, 0.0)

@@ -8,7 +8,7 @@ from PIL import Image
 
 from sigmasplat.data.camera import Camera
 from sigmasplat.errors import ConfigError, SourceError
-from sigmasplat.input.depth_registration import MAX_HALF_FOOTPRINT_PX, OVERLAP, DepthRegistration
+from sigmasplat.input.rectification import MAX_HALF_FOOTPRINT_PX, OVERLAP, DepthRegistration
 from sigmasplat.plugins.sources import open_source
 
 DEPTH = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)

@@ -25,7 +25,7 @@ from sigmasplat.run_folder.submaps import DiskStore
 from sigmasplat.tracking.feature_image import FeatureImage, detail_of, gray_levels, pose_by_features
 from sigmasplat.tracking.features import Extractor, make_extractor
 from sigmasplat.tracking.known_map import KnownMap
-from sigmasplat.tracking.prepared_frame import PreparedImages
+from sigmasplat.tracking.prepared_frame import PreparedFrame
 from sigmasplat.tracking.relocaliser import Relocaliser, Relocation
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
@@ -55,7 +55,7 @@ def extractor() -> Extractor:
 
 
 @cache
-def seen(i: int, mirrored: bool = False) -> PreparedImages:
+def seen(i: int, mirrored: bool = False) -> PreparedFrame:
     """Return a frame of the walk, or of the same walk in a mirrored room: like the first one, but another place."""
     whole = room().frame(i)
     if mirrored:
@@ -64,7 +64,8 @@ def seen(i: int, mirrored: bool = False) -> PreparedImages:
     frame = whole.prepared(160, 0.1, 8.0)
     target = Target.of(frame, (view().sums.shape[1], view().sums.shape[2]))
     image = FeatureImage(detail_of(whole, 640), frame.depth_m, frame.camera)
-    return PreparedImages(target, live_image(view(), frame.color, frame.depth_m, target), image)
+    live = live_image(view(), frame.color, frame.depth_m, target)
+    return PreparedFrame(target, live, image, frame=frame, whole=whole)
 
 
 def anchor(part: int) -> NDArray[np.float64]:
@@ -128,7 +129,7 @@ def test_a_place_seen_a_round_ago_is_found_in_a_finished_submap(tmp_path: Path) 
     metres, degrees = off(on_disk, AGAIN)
     assert metres < 0.03 and degrees < 1.0
     assert np.array_equal(on_disk.T_submap_camera, in_memory.T_submap_camera) and on_disk.where == in_memory.where
-    assert np.linalg.norm(on_disk.keyframe.T_camera_world @ pose(*_frame(on_disk)) - np.eye(4)) < 1e-9
+    assert np.linalg.norm(on_disk.keyframe.reference.T_camera_world @ pose(*_frame(on_disk)) - np.eye(4)) < 1e-9
 
 
 def _frame(found: Relocation) -> tuple[int, int]:

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image, ImageFont
 
 from sigmasplat.data.trajectory import Trajectory
-from sigmasplat.plugins.evaluation.metrics.scored_view import PredictedErrors, ScoredView
+from sigmasplat.plugins.evaluation.metrics.views import PredictedErrors, ScoredView
 from sigmasplat.plugins.evaluation.report import charts
 from sigmasplat.plugins.evaluation.report.html import Contents, build_report
 from sigmasplat.plugins.evaluation.report.summary import Verdict

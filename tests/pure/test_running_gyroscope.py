@@ -7,10 +7,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sigmasplat.data import se3
-from sigmasplat.data.accelerometer import RunningAccelerometer
-from sigmasplat.data.gyroscope import Gyroscope, still_bias
-from sigmasplat.data.running_gyroscope import MOST_LATE_S, RunningGyroscope
-from sigmasplat.data.sensor_samples import KEPT_S, RecentSamples
+from sigmasplat.data.imu import (
+    KEPT_S,
+    MOST_LATE_S,
+    Gyroscope,
+    RecentSamples,
+    RunningAccelerometer,
+    RunningGyroscope,
+    still_bias,
+)
 
 VELOCITY = np.array([0.2, 1.5, -0.4])
 """rad/s"""

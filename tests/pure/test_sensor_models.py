@@ -25,7 +25,7 @@ from sigmasplat.fit.references import Reference, confidence_of, live_image, map_
 from sigmasplat.fit.target import Target
 from sigmasplat.input.calibration import read_calibration
 from sigmasplat.mapping.seeding import make_splats
-from sigmasplat.plugins.checks.sensor_noise import measure_noise
+from sigmasplat.plugins.checks.depth import measure_noise
 from sigmasplat.tracking.prepared_frame import view_of, working_frame
 
 CAMERA = Camera(160, 120, 140.0, 140.0, 79.5, 59.5)

@@ -12,9 +12,8 @@ from sigmasplat.data.camera import Camera
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import ConfigError, SourceError
-from sigmasplat.input.association import associate
-from sigmasplat.input.prefetch import read_ahead
-from sigmasplat.input.source import Source, Subset
+from sigmasplat.input.lists import associate
+from sigmasplat.input.source import Source, Subset, read_ahead
 
 
 class Counting(Source):

@@ -7,7 +7,7 @@ import pytest
 
 from recordings import FRAMES, r3d_members, scene, write_exr_export, write_stray, write_zip
 from sigmasplat.data.camera import Camera
-from sigmasplat.input.video import Video
+from sigmasplat.input.images import Video
 from sigmasplat.plugins.sources import open_source
 
 pytest.importorskip("lzfse", reason="Record3D needs the extra iphone")

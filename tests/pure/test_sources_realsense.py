@@ -9,7 +9,7 @@ import pytest
 from fake_realsense import Device, distortion
 from sigmasplat.config import InputConfig
 from sigmasplat.errors import RunError, SourceError
-from sigmasplat.input.depth_units import depth_warning
+from sigmasplat.input.recorded import depth_warning
 from sigmasplat.plugins.sources import SyntheticRoom, open_source
 from sigmasplat.plugins.sources.live import LiveSource, recording_settings
 from sigmasplat.plugins.sources.realsense import WARM_UP_FRAMES

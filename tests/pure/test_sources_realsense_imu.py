@@ -15,11 +15,10 @@ from fake_realsense import Device, MotionSensor, clock, format_, stream
 from sigmasplat.data import se3
 from sigmasplat.data.frame import Frame
 from sigmasplat.plugins.sources import SyntheticRoom, open_source
-from sigmasplat.plugins.sources.camera.stereo import StereoRectification
-from sigmasplat.plugins.sources.camera.stereo_cameras import StereoCameras
 from sigmasplat.plugins.sources.live import LiveSource
 from sigmasplat.plugins.sources.realsense import WARM_UP_FRAMES
 from sigmasplat.plugins.sources.realsense_imu import PATIENCE_S, WAITING_MOST, WaitingSamples
+from sigmasplat.plugins.sources.stereo_matching import StereoCameras, StereoRectification
 
 COLOR, LEFT = (stream.color, 0), (stream.infrared, 1)
 R_COLOR_IMU = Rotation.from_rotvec([1.2, -0.7, 2.0]).as_matrix()

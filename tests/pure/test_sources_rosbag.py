@@ -12,10 +12,9 @@ from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.resizing import resized_color
 from sigmasplat.errors import SourceError
-from sigmasplat.input.depth_registration import DepthRegistration
-from sigmasplat.input.distortion import Undistortion, distort
+from sigmasplat.input.rectification import DepthRegistration, Undistortion, distort
 from sigmasplat.plugins.sources import open_source
-from sigmasplat.plugins.sources.ros.bag import Bag
+from sigmasplat.plugins.sources.bag_messages import Bag
 
 pytest.importorskip("rosbags", reason="bags need the extra ros")
 

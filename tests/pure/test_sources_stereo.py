@@ -3,8 +3,10 @@
 import json
 from dataclasses import replace
 
+import ablation_runs as ablation
 import numpy as np
 import pytest
+from ablation_runs import run_job
 
 from bag_recordings import Recorder
 from command_line import exit_code
@@ -18,11 +20,8 @@ from sigmasplat.input.images import read_color
 from sigmasplat.plugins.batch.job import Job
 from sigmasplat.plugins.batch.make_run import make_run
 from sigmasplat.plugins.checks.recording import inspect_source
-from sigmasplat.plugins.evaluation import ablation
-from sigmasplat.plugins.evaluation.ablation import run_job
 from sigmasplat.plugins.sources import open_source, stereo
-from sigmasplat.plugins.sources.camera.stereo import StereoRectification
-from sigmasplat.plugins.sources.camera.stereo_cameras import StereoCameras
+from sigmasplat.plugins.sources.stereo_matching import StereoCameras, StereoRectification
 from sigmasplat.run.scene import open_scene
 from sigmasplat.run.terminal import Screen
 from sigmasplat.run_folder.runs import RunFolder

@@ -10,11 +10,16 @@ from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.errors import SourceError
 from sigmasplat.plugins.sources import SyntheticRoom, open_source, synthetic
+from sigmasplat.plugins.sources.room.capture import (
+    DRIFT_KNOT_FRAMES,
+    camera_path,
+    drifted_depth,
+    measured_depth,
+    noise_sigma_m,
+)
 from sigmasplat.plugins.sources.room.render import build_scene, render_scene
-from sigmasplat.plugins.sources.room.sensor import DRIFT_KNOT_FRAMES, drifted_depth, measured_depth, noise_sigma_m
 from sigmasplat.plugins.sources.room.shapes import Rays, Shape, cast_rays, image_windows, surface_at
 from sigmasplat.plugins.sources.room.textures import Material, noise, plain
-from sigmasplat.plugins.sources.room.walk import camera_path
 from view_agreement import agreement
 
 MATT = Material(plain((0.5, 0.5, 0.5)))

@@ -9,8 +9,8 @@ from PIL import Image
 from sigmasplat.data.camera import Camera
 from sigmasplat.errors import RunError
 from sigmasplat.input.calibration import FREIBURG, freiburg_calibration
-from sigmasplat.input.depth_units import depth_warning
-from sigmasplat.input.distortion import Undistortion, distort, undistort
+from sigmasplat.input.recorded import depth_warning
+from sigmasplat.input.rectification import Undistortion, distort, undistort
 from sigmasplat.plugins.sources import SyntheticRoom, open_source
 from sigmasplat.plugins.sources.tum import write_tum
 from view_agreement import agreement

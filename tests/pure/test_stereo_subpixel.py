@@ -5,7 +5,7 @@ import pytest
 
 from sigmasplat.data.opencv import opencv
 from sigmasplat.plugins.sources import open_source
-from sigmasplat.plugins.sources.camera.stereo_subpixel import refine
+from sigmasplat.plugins.sources.stereo_matching import refine
 
 SIZE = (120, 160)
 ROWS, COLUMNS = np.indices(SIZE, np.float32)

@@ -9,12 +9,11 @@ import pytest
 from command_line import exit_code
 from sigmasplat.config import Config
 from sigmasplat.errors import ConfigError, SourceError
+from sigmasplat.plugins.batch.batch import Estimate, duration
 from sigmasplat.plugins.batch.definition import MEAN, Cell, Score, Table
 from sigmasplat.plugins.batch.executor import DataRoots
 from sigmasplat.plugins.batch.job import Job
-from sigmasplat.plugins.batch.progress import Estimate, duration
-from sigmasplat.plugins.batch.scores import OURS, PAPER, rows
-from sigmasplat.plugins.batch.written import Written
+from sigmasplat.plugins.batch.scores import OURS, PAPER, Written, rows
 from sigmasplat.plugins.papers.table_files import list_tables
 
 WANTED = {

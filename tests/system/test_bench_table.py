@@ -17,10 +17,9 @@ import pytest
 import paper_data
 from command_line import exit_code
 from lpips_weights import write_weights
-from sigmasplat.plugins.batch import dispatch
+from sigmasplat.plugins.batch import cluster as dispatch
 from sigmasplat.plugins.batch.definition import Table
-from sigmasplat.plugins.batch.executor import Outcome
-from sigmasplat.plugins.batch.local import LocalExecutor
+from sigmasplat.plugins.batch.executor import LocalExecutor, Outcome
 from sigmasplat.plugins.batch.make_run import make_run
 from sigmasplat.plugins.batch.scores import run_record
 from sigmasplat.plugins.evaluation import reconstruct

@@ -121,7 +121,17 @@ def test_a_killed_run_can_be_repeated_with_overwrite(tmp_path: Path, moment: str
         wait_for(process, out.exists if moment == "folder" else lambda: lines(out) >= 1)
         process.kill()
         process.wait(timeout=PATIENCE_S)
-    short = ("--set", "input.width=80", "--set", "mapping.first_iterations=2", "--limit", "1", "--no-eval")
+    short = (
+        "--set",
+        "input.width=80",
+        "--set",
+        "mapping.first_iterations=2",
+        "--set",
+        "final.iterations=2",
+        "--limit",
+        "1",
+        "--no-eval",
+    )
     room = "synthetic:frames=2,width=80,height=60"
     assert exit_code("run", room, "--out", str(out), "--overwrite", *short) == 0
     assert RunFolder.open(out).facts()["status"] == "complete" and len(RunFolder.open(out).read_log()) == 1

@@ -21,7 +21,7 @@ pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built
 
 QUICK = [
     word
-    for setting in ("mapping.first_iterations=5", "mapping.iterations=3", "final.iterations=5")
+    for setting in ("input.width=80", "mapping.first_iterations=5", "mapping.iterations=3", "final.iterations=5")
     for word in ("--set", setting)
 ]
 

@@ -113,7 +113,7 @@ def test_too_little_address_space_is_refused_at_once(tmp_path: Path) -> None:
     assert ended.returncode == 2 and "700 MB" in refusal(ended.stderr)
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGHUP, marks=pytest.mark.slow)])
 def test_sigterm_and_sighup_keep_the_last_frame(tmp_path: Path, number: signal.Signals) -> None:
     out = tmp_path / "run"
     with running(out) as process:

@@ -61,6 +61,7 @@ def test_the_second_part_has_poses_in_the_first_world(place: Path) -> None:
     assert "continues the map of" in report
 
 
+@pytest.mark.slow
 def test_the_measured_unit_of_given_poses_is_kept(place: Path, tmp_path: Path) -> None:
     truth = open_source(WALK).truth()
     assert truth is not None
@@ -141,6 +142,7 @@ def test_a_recording_that_is_recognised_later_joins_with_all_its_frames(place: P
     assert np.linalg.norm((slam.trajectory().T_world_camera - expected)[:, :3, 3], axis=1).max() < 0.05
 
 
+@pytest.mark.slow
 def test_a_resumed_run_gives_the_same_bytes(place: Path, tmp_path: Path) -> None:
     asked = ["run", WALK, "--start", "0.5", "--limit", "14", "--onto", str(place / "first"), "--no-eval", *SHORT]
     assert exit_code(*asked, "--out", str(tmp_path / "whole")) == 0

@@ -69,6 +69,7 @@ def without_times(run: Path) -> list[dict]:
     return [{key: value for key, value in line.items() if key != "seconds"} for line in RunFolder(run).read_log()]
 
 
+@pytest.mark.slow
 def test_a_resumed_run_with_probe_views_gives_the_same_bytes(tmp_path: Path) -> None:
     probes = ("--set", "uncertainty.probes=2")
     assert exit_code(*arguments(tmp_path / "whole", "sigma"), *probes) == 0
@@ -80,6 +81,7 @@ def test_a_resumed_run_with_probe_views_gives_the_same_bytes(tmp_path: Path) -> 
     assert found is not None and found.probes > 0
 
 
+@pytest.mark.slow
 def test_a_run_killed_in_its_final_map_gives_the_same_bytes(tmp_path: Path) -> None:
     """The second start continues after the last saved step, here with view-dependent colours and poses that move."""
     steps = ["final.iterations=400", "final.prune_every=20", "final.sh_every=60", "final.sh_degree=2"]
@@ -107,7 +109,7 @@ def test_a_run_killed_in_its_final_map_gives_the_same_bytes(tmp_path: Path) -> N
     assert not run.refinement.exists()
 
 
-@pytest.mark.parametrize("name, after", [("sigma", 13), ("cgslam-fast", 7)])
+@pytest.mark.parametrize("name, after", [("sigma", 13), pytest.param("cgslam-fast", 7, marks=pytest.mark.slow)])
 def test_a_resumed_run_gives_the_same_bytes(tmp_path: Path, name: str, after: int) -> None:
     assert exit_code(*arguments(tmp_path / "whole", name)) == 0
     assert killed(tmp_path / "cut", name, after) < FRAMES
@@ -125,7 +127,7 @@ def tiny() -> Config:
     return override(preset("sigma"), SETTINGS)
 
 
-@pytest.mark.parametrize("fit_depth", [False, True])
+@pytest.mark.parametrize("fit_depth", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_slam_can_resume_from_every_frame(tmp_path: Path, fit_depth: bool) -> None:
     """Also directly after a new submap has started, when it has one keyframe."""
     source, config = open_source(ROOM, tiny().input), tiny().changed(tracking={"fit_depth": fit_depth})
@@ -205,7 +207,7 @@ def test_a_state_with_a_pose_that_is_not_finite_is_refused(owner: type, tmp_path
                 read_state(tmp_path / "s", classes, {})
 
 
-@pytest.mark.parametrize("slices, waiting", [(2, 1), (1, 2)])
+@pytest.mark.parametrize("slices, waiting", [(2, 1), pytest.param(1, 2, marks=pytest.mark.slow)])
 def test_a_search_for_loops_that_is_divided_over_frames_resumes_and_finds_what_a_whole_one_finds(
     slices: int, waiting: int, tmp_path: Path
 ) -> None:

@@ -306,7 +306,7 @@ def test_the_triangles_of_the_room_match_its_depth() -> None:
 @pytest.mark.parametrize("kind", ["box", "ball", "drum"])
 def test_the_shapes_of_the_room_are_closed_and_face_outwards(kind: str) -> None:
     from sigmasplat.plugins.sources.room.furnish import furnish_rooms
-    from sigmasplat.plugins.sources.room.solid import triangulate
+    from sigmasplat.plugins.sources.room.shapes import triangulate
 
     shape = next(s for s in furnish_rooms(1, 0)[0] if s.kind == kind)
     a, b, c = np.moveaxis(triangulate([shape]).corners - shape.center, 1, 0)

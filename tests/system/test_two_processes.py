@@ -23,7 +23,8 @@ from sigmasplat.run_folder.runs import RunFolder
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
 FRAMES = 16
-SHORT = ("--set", "input.width=80", "--set", "mapping.first_iterations=2", "--limit", "1", "--no-eval")
+SHORT = ("--set", "input.width=80", "--set", "mapping.first_iterations=2", "--set", "final.iterations=2",
+         "--limit", "1", "--no-eval")  # fmt: skip
 
 
 def refusal(capsys: pytest.CaptureFixture[str], *command: str) -> str:

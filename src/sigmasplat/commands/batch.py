@@ -2,10 +2,13 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
-from sigmasplat.commands import batch_options, options
-from sigmasplat.commands.input_options import DEFAULT_INPUT_OPTIONS, InputOptionsFlat
+import tyro
+
+from sigmasplat.commands import options
+from sigmasplat.commands.input_options import DEFAULT_INPUT_OPTIONS, From1, InputOptionsFlat
+from sigmasplat.commands.options import arg
 from sigmasplat.config.presets import default_preset
 from sigmasplat.config.text import full_path
 from sigmasplat.errors import ConfigError, SourceError
@@ -14,23 +17,74 @@ if TYPE_CHECKING:
     from sigmasplat.plugins.batch.batch import Batch
     from sigmasplat.run.terminal import Screen
 
+DataFolders = Annotated[
+    tuple[str, ...],
+    tyro.conf.UseAppendAction,
+    arg(
+        metavar="[WORKER=]ROOT",
+        help="folder of the sequences; WORKER= names the worker or host of a cluster that has another one",
+        help_behavior_hint="(repeatable)",
+    ),
+]
+Jobs = Annotated[From1, arg(metavar="N", help="number of runs at the same time on this machine")]
+Scheduler = Annotated[
+    str | None,
+    arg(
+        metavar="ADDRESS",
+        help="make the runs on the Dask cluster of this scheduler, for example tcp://10.0.0.1:8786",
+        help_behavior_hint="(default: on this machine)",
+    ),
+]
+BatchFolder = Annotated[
+    Path | None,
+    arg(metavar="DIR", help="folder of the results; finished runs in it are kept", help_behavior_hint=""),
+]
+ReplaceRuns = Annotated[
+    bool,
+    arg(name="overwrite", help="replace runs in DIR that have other settings or other code", help_behavior_hint=""),
+]
+Recordings = Annotated[
+    tuple[str, ...],
+    tyro.conf.Positional,
+    arg(metavar="FOLDER", help="recordings: folders or synthetic[:frames=N,…]", help_behavior_hint="(at least one)"),
+]
+TableName = Annotated[
+    str,
+    tyro.conf.Positional,
+    arg(metavar="TABLE", help="name of the table, path of a definition (.toml), or `list` to list all tables"),
+]
+TableScenes = Annotated[
+    tuple[str, ...],
+    arg(name="scenes", metavar="SCENE", help="scenes to run", help_behavior_hint="(default: all of the table)"),
+]
+TableSystems = Annotated[
+    tuple[str, ...],
+    arg(
+        name="systems",
+        metavar="SYSTEM",
+        help="systems of the table to run, or presets",
+        help_behavior_hint="(default: those of the table)",
+    ),
+]
+
+
 OK, FAILED = 0, 1
 DEFAULT_PRESET = default_preset()
 OUT = Path("runs/batch")
 
 
 def batch(
-    recordings: batch_options.Recordings,
+    recordings: Recordings,
     preset: options.PresetName = DEFAULT_PRESET,
     settings: options.Settings = (),
     seed: options.Seed = None,
     input_options: InputOptionsFlat = DEFAULT_INPUT_OPTIONS,
-    data: batch_options.DataFolders = (),
+    data: DataFolders = (),
     mesh: options.WithMesh = False,
-    out: batch_options.BatchFolder = None,
-    overwrite: batch_options.ReplaceRuns = False,
-    jobs: batch_options.Jobs = 1,
-    scheduler: batch_options.Scheduler = None,
+    out: BatchFolder = None,
+    overwrite: ReplaceRuns = False,
+    jobs: Jobs = 1,
+    scheduler: Scheduler = None,
     save_every: options.SaveEvery = 60.0,
 ) -> int:
     """Run SLAM on many recordings, each in a run folder in DIR (default: runs/batch), and score them.

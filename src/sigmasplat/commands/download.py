@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 if TYPE_CHECKING:
-    from sigmasplat.plugins.download.entries import PublicSet
+    from sigmasplat.plugins.download.catalogue import PublicSet
     from sigmasplat.run.terminal import Screen
 
 arg = tyro.conf.arg

@@ -2,36 +2,127 @@
 
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
-from sigmasplat.commands import export_options, options, picture_options
-from sigmasplat.commands.options import prepare_torch, refuse_existing, source_of
+from sigmasplat.commands import options
+from sigmasplat.commands.input_options import From0, Number, Whole
+from sigmasplat.commands.options import arg, prepare_torch, refuse_existing, source_of
+from sigmasplat.config.ranges import Range
 from sigmasplat.files.lock import output_locked
 from sigmasplat.plugins.outputs.formats import ExportSource, choose, listed, refuse_unused
 from sigmasplat.registry import Output, rows
+
+CellM = Annotated[float, Range(0.001, 1), arg(metavar="M", help="cell size of the floor plan in metres")]
+FilmSize = Annotated[
+    int,
+    Range(32, 4096, or_zero=True),
+    arg(
+        metavar="PX",
+        help="width of each panel of a video in pixels",
+        help_behavior_hint="(default: that of the run's images)",
+    ),
+]
+FilmRate = Annotated[float, Range(1, 120), arg(metavar="N", help="images per second of a video")]
+FilmSeconds = Annotated[
+    Number,
+    Range(0.04, 3600),
+    arg(
+        metavar="S",
+        help="length of a video in seconds",
+        help_behavior_hint="(default: that of the path, 4 to 20; orbit: 12)",
+    ),
+]
+FilmPath = Annotated[
+    Literal["run", "orbit"], arg(help="camera path of a video: along the run's path, or in a circle above the room")
+]
+FilmPanels = Annotated[
+    Literal["all", "color"], arg(help="panels of a video: colour, depth and uncertainty side by side, or colour alone")
+]
+
+
+arg = tyro.conf.arg
+
+FormatName = Annotated[
+    str | None,
+    arg(metavar="NAME", help="format to write", help_behavior_hint="(default: by the ending of FILE, else ply)"),
+]
+SigmaBelow = Annotated[
+    From0,
+    arg(
+        metavar="S",
+        help="keep only splats with σ below S, for colours 0 to 1; σ is learned, not calibrated",
+        help_behavior_hint="(default: all)",
+    ),
+]
+StdBelowM = Annotated[
+    From0,
+    arg(
+        metavar="M",
+        help="keep only splats whose surface has a standard deviation of depth below M metres (depth_std_m, "
+        "docs/exports.md); needs a run with uncertainty.json",
+        help_behavior_hint="(default: all)",
+    ),
+]
+OpacityAbove = Annotated[
+    From0,
+    arg(metavar="A", help="keep only splats with opacity above A", help_behavior_hint="(default: all)"),
+]
+Plain = Annotated[
+    bool,
+    arg(
+        help="write PLY with only the 62 columns of 3DGS, without σ², for readers that accept no others",
+        help_behavior_hint="",
+    ),
+]
+Pictures = Annotated[
+    bool, arg(help="also write the images of the keyframes, and export only keyframes as views", help_behavior_hint="")
+]
+MaxSplats = Annotated[
+    Whole,
+    Range(1),
+    arg(
+        metavar="N",
+        help="keep at most N splats, those that fill the most pixels of the run's views",
+        help_behavior_hint="(default: all)",
+    ),
+]
+MapAxes = Annotated[
+    Literal["y-up", "z-up", "y-down", "camera"] | None,
+    arg(
+        metavar="{y-up,z-up,y-down,camera}",
+        help="axes of a map or of points: y-up, z-up and y-down are levelled; camera: those of the run's path; y-up "
+        "and camera only for SPZ, glTF and OpenUSD",
+        help_behavior_hint="(default: y-up for points, SPZ, glTF and OpenUSD, else y-down)",
+    ),
+]
+SpzVersion = Annotated[
+    Whole,
+    Range(2, 4),
+    arg(metavar="{2,3,4}", help="version of SPZ", help_behavior_hint="(default: 3, which most viewers read)"),
+]
 
 
 @dataclass(frozen=True)
 class ExportOptions:
     """Options that only some formats accept, under their names on the command line (`Output.options`)."""
 
-    sigma_below: export_options.SigmaBelow = None
-    std_below_m: export_options.StdBelowM = None
-    opacity_above: export_options.OpacityAbove = None
-    max_splats: export_options.MaxSplats = None
-    axes: export_options.MapAxes = None
-    spz_version: export_options.SpzVersion = None
-    plain: export_options.Plain = False
-    pictures: export_options.Pictures = False
+    sigma_below: SigmaBelow = None
+    std_below_m: StdBelowM = None
+    opacity_above: OpacityAbove = None
+    max_splats: MaxSplats = None
+    axes: MapAxes = None
+    spz_version: SpzVersion = None
+    plain: Plain = False
+    pictures: Pictures = False
     voxel_m: options.VoxelM = None
-    size: picture_options.FilmSize = 0
-    fps: picture_options.FilmRate = 25.0
-    seconds: picture_options.FilmSeconds = None
-    path: picture_options.FilmPath = "run"
-    panels: picture_options.FilmPanels = "all"
-    cell_m: picture_options.CellM = 0.05
+    size: FilmSize = 0
+    fps: FilmRate = 25.0
+    seconds: FilmSeconds = None
+    path: FilmPath = "run"
+    panels: FilmPanels = "all"
+    cell_m: CellM = 0.05
     source: options.MovedSource = None
 
     def given(self) -> list[str]:
@@ -46,7 +137,7 @@ ExportOptionsFlat = Annotated[ExportOptions, tyro.conf.arg(name=""), tyro.conf.O
 def export(
     run: options.RunOrMap,
     out: options.OutFile = None,
-    format: export_options.FormatName = None,
+    format: FormatName = None,
     overwrite: options.Overwrite = False,
     asked: ExportOptionsFlat = DEFAULT_EXPORT_OPTIONS,
 ) -> int:

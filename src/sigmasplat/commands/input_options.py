@@ -1,16 +1,33 @@
-"""Define the options that select and calibrate the input, the same for all commands that open a sequence."""
+"""Define numbers as options, and the options that select and calibrate the input of all commands that open one."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
-from sigmasplat.commands.option_ranges import From0, Whole
 from sigmasplat.config import RECORDED_POSES
 from sigmasplat.config.ranges import Range
 
 arg = tyro.conf.arg
+
+
+def _number(read: Callable[[str], float]) -> tyro.constructors.PrimitiveConstructorSpec[float | None]:
+    """Describe an optional number: None if it is not given; a given text is always read as a number, never as None."""
+    return tyro.constructors.PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="NUMBER",
+        instance_from_str=lambda given: read(given[0]),
+        is_instance=lambda value: value is None or isinstance(value, int | float),
+        str_from_instance=lambda value: [str(value)],
+    )
+
+
+Whole = Annotated[int | None, _number(int)]
+Number = Annotated[float | None, _number(float)]
+From0 = Annotated[Number, Range(0)]
+From1 = Annotated[int, Range(1)]
 Limit = Annotated[Whole, Range(1), arg(metavar="N", help="use at most N frames", help_behavior_hint="(default: all)")]
 PredictedDepth = Annotated[
     Path | None,

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from sigmasplat import env
-from sigmasplat.commands.input_options import DEFAULT_INPUT_OPTIONS, InputOptions
-from sigmasplat.commands.option_ranges import From0, From1, Whole
+from sigmasplat.commands.input_options import DEFAULT_INPUT_OPTIONS, From0, From1, InputOptions, Whole
 from sigmasplat.config import Config, InputConfig
 from sigmasplat.config.presets import FAMILIES, preset as preset_of
 from sigmasplat.config.ranges import Range
@@ -45,30 +44,7 @@ SourcePath = Annotated[
     tyro.conf.Positional,
     arg(metavar="PATH", help="a recording, synthetic[:frames=N] for the synthetic room, or realsense for the camera"),
 ]
-SourcePaths = Annotated[
-    tuple[str, ...],
-    tyro.conf.Positional,
-    arg(
-        metavar="SOURCE",
-        help="sequences: folders or synthetic[:frames=N,…]; {seed} is replaced by the seed",
-        help_behavior_hint="(at least one)",
-    ),
-]
-Seeds = Annotated[From1, arg(metavar="N", help="number of runs of each variant, with seeds 0 to N − 1")]
 Runs = Annotated[From1, arg(metavar="N", help="number of runs of each sequence, with seeds 0 to N − 1")]
-Tau = Annotated[float, Range(0, open_below=True), arg(metavar="T", help="τ, the same for every weight and sequence")]
-WithoutVariance = Annotated[
-    bool, arg(help="also run without learning any variance, as a reference", help_behavior_hint="")
-]
-AblationFile = Annotated[Path, arg(metavar="FILE", help="JSON file of the results; an existing one is continued")]
-DropRuns = Annotated[
-    bool,
-    arg(name="overwrite", help="drop runs in FILE that have other settings, code or machine", help_behavior_hint=""),
-]
-Keep = Annotated[
-    Path | None,
-    arg(metavar="DIR", help="keep the run folders in DIR", help_behavior_hint="(default: they are removed)"),
-]
 Overwrite = Annotated[bool, arg(help="replace an earlier result", help_behavior_hint="")]
 Profile = Annotated[bool, arg(help="print the time spent in each stage", help_behavior_hint="")]
 SaveEvery = Annotated[

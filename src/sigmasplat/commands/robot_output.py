@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from sigmasplat.commands.option_ranges import Whole
+from sigmasplat.commands.input_options import Whole
 from sigmasplat.config.ranges import Range
 from sigmasplat.plugins.viewer.server import is_loopback
 

@@ -161,8 +161,8 @@ def _opened(
     earlier: "FinishedMap | None",
 ) -> tuple["Source", "Config"]:  # fmt: skip
     """Open the source and warn of doubtful depth; return it with the settings for its scene, or for the earlier map."""
-    from sigmasplat.input.depth_units import depth_warning
-    from sigmasplat.plugins.checks.timing import time_warnings, times_of
+    from sigmasplat.input.recorded import depth_warning
+    from sigmasplat.plugins.checks.motion import time_warnings, times_of
     from sigmasplat.plugins.sources.live import LiveSource, recording_settings
     from sigmasplat.run.scene import open_scene
 
@@ -250,8 +250,7 @@ def _run_and_score(
     """
     from sigmasplat.plugins.checks.motion import MotionWatch
     from sigmasplat.plugins.cuda import stages as cuda_stages
-    from sigmasplat.plugins.sources.arrivals import Arrivals
-    from sigmasplat.plugins.sources.live import LiveSource
+    from sigmasplat.plugins.sources.live import Arrivals, LiveSource
     from sigmasplat.realtime.system import RealTime
     from sigmasplat.run.resume import RefinementFile, StateFile
     from sigmasplat.run.session import Session

@@ -20,7 +20,7 @@ from sigmasplat.config.submaps import FinalConfig, LoopConfig, RegistrationConfi
 from sigmasplat.config.surface import SurfaceConfig
 from sigmasplat.config.uncertainty import UncertaintyConfig
 from sigmasplat.errors import ConfigError
-from sigmasplat.files.structured import read_json
+from sigmasplat.files.reading import read_json
 from sigmasplat.registry import Backend, named
 
 __all__ = [

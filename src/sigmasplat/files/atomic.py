@@ -1,8 +1,9 @@
 """Write files completely or not at all: Ctrl-C, a full disk or a power failure leave no partial file under its final
-name."""
+name. What a killed process left is found and removed."""
 
 import errno
 import os
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -110,3 +111,26 @@ def make_folder(path: Path) -> None:
         raise cannot_write(path, problem) from problem
     for folder in missing:
         sync_folder(folder.parent)
+
+
+ENDINGS = ("json", "jsonl", "txt", "ply", "html", "png", "safetensors")
+"""Endings of the files of a run."""
+OURS = re.compile(rf"\..+\.({'|'.join(ENDINGS)})\.part")
+"""Temporary names of `part_of`."""
+OF_SAFETENSORS = re.compile(r"\.tmp[A-Za-z0-9]{6}")
+"""Temporary names of the library safetensors, which writes under one and renames."""
+
+
+def leftovers(*folders: Path) -> Iterator[Path]:
+    """Yield the temporary files in these folders; call it only while no process writes there (`files.lock`)."""
+    for folder in folders:
+        for path in folder.iterdir() if folder.is_dir() else ():
+            named = OURS.fullmatch(path.name) or OF_SAFETENSORS.fullmatch(path.name)
+            if named and path.is_file() and not path.is_symlink():
+                yield path
+
+
+def remove_leftovers(*folders: Path) -> None:
+    """Remove the temporary files in these folders; other files are kept."""
+    for path in [*leftovers(*folders)]:
+        path.unlink(missing_ok=True)

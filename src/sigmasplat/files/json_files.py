@@ -10,9 +10,9 @@ import numpy as np
 from torch import Tensor
 
 from sigmasplat.errors import RunError
-from sigmasplat.files import reading, structured
+from sigmasplat.files import reading
 from sigmasplat.files.atomic import replacing, write_text, write_text_on_full_disk
-from sigmasplat.files.structured import MOST_OWN_JSON_BYTES, parse_json
+from sigmasplat.files.reading import MOST_OWN_JSON_BYTES, parse_json
 
 
 def to_json(value: Any) -> Any:
@@ -59,7 +59,7 @@ def _json_text(values: Any) -> str:
 
 def read_json(path: Path) -> Any:
     """Read a file. Raises RunError if it cannot be read or is not JSON."""
-    return structured.read_json(path, RunError, MOST_OWN_JSON_BYTES)
+    return reading.read_json(path, RunError, MOST_OWN_JSON_BYTES)
 
 
 def json_line(values: Any) -> str:

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from sigmasplat.errors import SigmaSplatError, SourceError
-from sigmasplat.files.guard import guarded
-from sigmasplat.files.reading import open_regular
+from sigmasplat.files.reading import guarded, open_regular
 
 FORMATS = ("JPEG", "PNG", "BMP", "PPM", "TIFF", "WEBP")
 """Formats of images in recordings. Others are refused: Pillow gives EPS, for example, to Ghostscript, which runs it."""

@@ -1,15 +1,59 @@
-"""Read whole files within a budget: only regular files, whose size is checked before they are read."""
+"""Read files that users give: only regular files, sizes before content, and every problem is an error of this package:
+one line with place and remedy."""
 
 import codecs
+import csv
+import json
 import os
 import stat
+import struct
+import tokenize
+import zipfile
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from sigmasplat.errors import SigmaSplatError, SourceError
-from sigmasplat.files.guard import cause
+
+DAMAGED: tuple[type[Exception], ...] = (
+    OSError, ValueError, ArithmeticError, LookupError, TypeError, AttributeError, AssertionError, SyntaxError, EOFError,
+    MemoryError, RuntimeError, StopIteration, tokenize.TokenError, csv.Error, struct.error, zlib.error,
+    zipfile.BadZipFile, zipfile.LargeZipFile,
+)  # fmt: skip
+"""What parsers raise on damaged or hostile content: the standard library, numpy, Pillow, safetensors and others.
+RuntimeError includes RecursionError and NotImplementedError, ValueError includes UnicodeDecodeError."""
+
+MOST_CHARACTERS = 160
+
+
+@contextmanager
+def guarded(where: object, remedy: str, error: type[SigmaSplatError], what: str = "unreadable") -> Iterator[None]:
+    """Raise `error` as "WHERE: WHAT (cause); REMEDY" for every exception of `DAMAGED` in the block.
+
+    Errors of this package pass unchanged: they already name place and remedy.
+    """
+    try:
+        yield
+    except DAMAGED as problem:
+        name = problem.filename if isinstance(problem, OSError) else None
+        file = "" if name is None or str(name) in str(where) else f": {str(name)[-MOST_CHARACTERS:]}"
+        raise error(f"{where}: {what} ({cause(problem)}{file}); {remedy}") from problem
+
+
+def cause(problem: BaseException) -> str:
+    """Describe an exception in one short line."""
+    if isinstance(problem, MemoryError):
+        return "it needs more memory than there is"
+    if isinstance(problem, RecursionError):
+        return "it is nested too deep"
+    text = (isinstance(problem, OSError) and problem.strerror) or " ".join(str(problem).split())
+    text = "".join(c if c.isprintable() else "?" for c in text or type(problem).__name__)
+    if isinstance(problem, LookupError):
+        text = f"{text} is missing" if isinstance(problem, KeyError) else text
+    return text if len(text) <= MOST_CHARACTERS else f"{text[:MOST_CHARACTERS]} …"
+
 
 MOST_TEXT_BYTES = 128 << 20
 """Largest text file: a list of images at 30 Hz has about 1 MB per ten minutes, measurements of a gyroscope ten times
@@ -72,3 +116,46 @@ def read_text(
         line = data.count(b"\n", 0, problem.start) + 1
         raise error(f"cannot read {path}:{line}: it is not text ({cause(problem)}); save it as UTF-8") from problem
     return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+@contextmanager
+def open_binary(path: Path, error: str) -> Iterator[BinaryIO]:
+    """Open a regular file for reading. If opening or reading fails, or the block cannot use its content, raises
+    SourceError; `error` begins the message about a file that cannot be opened."""
+    with open_regular(path, SourceError, failed=error) as file, guarded(path, "copy or download it again", SourceError):
+        yield file
+
+
+MOST_JSON_BYTES = 32 << 20
+"""Largest JSON file of a recording, about 60 000 frames of nerfstudio: parsed JSON needs up to 30 times its size."""
+MOST_OWN_JSON_BYTES = 512 << 20
+"""Largest JSON file of a run, whose size grows with the run."""
+
+
+def parse_json(text: str | bytes, where: object, error: type[SigmaSplatError] = SourceError) -> Any:
+    """Parse JSON. Raises `error` naming `where` if it is not JSON, is nested too deep, or has endless numbers."""
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as problem:  # ValueError: not UTF-8, or a whole number of 4300 digits, too
+        raise error(f"{where}: not readable as JSON ({cause(problem)}); correct it") from problem
+
+
+def read_json(path: Path, error: type[SigmaSplatError] = SourceError, most: int = MOST_JSON_BYTES) -> Any:
+    """Read a JSON file. Raises `error` as `read_text` and `parse_json` do."""
+    return parse_json(read_text(path, error, most), path, error)
+
+
+def csv_rows(
+    path: Path, error: type[SigmaSplatError] = SourceError, most: int = MOST_TEXT_BYTES, errors: str = "strict"
+) -> Iterator[tuple[int, list[str]]]:
+    """Yield (line number from 1, words without spaces around them) of every CSV line that is not empty.
+
+    Raises `error` as `read_text` does, or naming the line if it is not CSV or has a field above 131 kB.
+    """
+    lines = csv.reader(read_text(path, error, most, errors).split("\n"))
+    try:
+        for words in lines:
+            if words:
+                yield lines.line_num, [word.strip() for word in words]
+    except csv.Error as problem:
+        raise error(f"{path}:{lines.line_num}: not readable as CSV ({problem}); copy it again") from problem

@@ -12,8 +12,7 @@ from torch import Tensor
 
 from sigmasplat.errors import RunError
 from sigmasplat.files.atomic import replacing
-from sigmasplat.files.guard import DAMAGED, cause
-from sigmasplat.files.reading import refuse_special
+from sigmasplat.files.reading import DAMAGED, cause, refuse_special
 
 ERRORS: tuple[type[Exception], ...] = (SafetensorError, *DAMAGED)
 

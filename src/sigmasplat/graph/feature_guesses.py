@@ -6,7 +6,6 @@ from sigmasplat.data import se3
 from sigmasplat.data.submap import Submap, SubmapStore
 from sigmasplat.tracking.feature_image import FeatureImage, pose_by_features
 from sigmasplat.tracking.features import Extractor
-from sigmasplat.tracking.known_map import KnownKeyframe
 from sigmasplat.types import Matrix, Task, long_slice
 
 
@@ -36,8 +35,7 @@ class FeatureGuesses:
         """Return the image of a keyframe when its features are found."""
         where = submap.index, keyframe
         if where not in self._images:
-            known = KnownKeyframe(self.store.picture(*where), submap.T_submap_camera[keyframe])
-            image = self._images[where] = known.image(submap.camera)
+            image = self._images[where] = FeatureImage.of_picture(self.store.picture(*where), submap.camera)
             image.features(extractor)
             yield from long_slice()
         return self._images[where]

@@ -1,4 +1,4 @@
-"""List the cameras of the public data sets, and read the calibration of a recording."""
+"""Read the calibration of a recording, and check it."""
 
 import re
 from dataclasses import dataclass, field, replace
@@ -13,8 +13,7 @@ from sigmasplat.config.sensors import sensor_problems
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.errors import ConfigError, SourceError
-from sigmasplat.files.reading import exists
-from sigmasplat.files.structured import read_json
+from sigmasplat.files.reading import exists, read_json
 
 Distortion = tuple[float, ...]
 """Radial and tangential distortion k1, k2, p1, p2, k3 [, k4, k5, k6 of the rational model's denominator]."""
@@ -65,40 +64,7 @@ FREIBURG = {
     "3": Calibration(Camera(640, 480, 535.4, 539.2, 320.1, 247.6), TUM_UNITS_PER_METRE),
 }
 
-REPLICA = Calibration(Camera(1200, 680, 600.0, 600.0, 599.5, 339.5), 6553.5)
-
 MM_PER_METRE = 1000.0
-
-# 585, 320, 240 are the values of the 7-Scenes page. They belong to the depth camera, and so do the published poses. The
-# colour camera and its position were fitted to the RedKitchen sequence by maximising the agreement of neighbouring
-# images (andyzeng/tsdf-fusion-python, data/; the fit is in shared/data/redkitchen/calibration.json).
-SEVEN_SCENES = Calibration(Camera(640, 480, 585.0, 585.0, 320.0, 240.0), MM_PER_METRE)
-SEVEN_SCENES_COLOR = Calibration(
-    Camera(640, 480, 528.12, 528.12, 318.96, 232.91),
-    MM_PER_METRE,
-    depth_camera=SEVEN_SCENES.camera,
-    T_color_depth=np.array(
-        [
-            [0.999969, -0.007635, 0.001694, -0.02421],
-            [0.007625, 0.999954, 0.005732, 0.005946],
-            [-0.001738, -0.005719, 0.999982, 0.006997],
-            [0.0, 0.0, 0.0, 1.0],
-        ]
-    ),
-)
-
-# Published as fy = −480, for a camera whose y points up; ours points down (`plugins/sources/icl_nuim.py`).
-ICL_NUIM = Calibration(Camera(640, 480, 481.2, 480.0, 319.5, 239.5), TUM_UNITS_PER_METRE)
-
-# The values of the page of the Bonn RGB-D Dynamic Dataset.
-BONN = Calibration(
-    Camera(640, 480, 542.822841, 542.57687, 315.59352, 237.756098),
-    TUM_UNITS_PER_METRE,
-    (0.039903, -0.099343, -0.00073, -0.000144, 0.0),
-)
-
-# Factory values of the PrimeSense cameras, used for the Redwood recordings (Open3D's PrimeSenseDefault).
-PRIMESENSE = Calibration(Camera(640, 480, 525.0, 525.0, 319.5, 239.5), MM_PER_METRE)
 
 
 def freiburg_calibration(folder: Path) -> Calibration | None:
@@ -158,17 +124,6 @@ def resolve_calibration(
     given = {key: value for key in ("fx", "fy", "cx", "cy") if (value := getattr(settings, key))}
     units = settings.depth_scale or recorded.depth_units_per_metre
     return replace(recorded, camera=replace(recorded.camera, **given), depth_units_per_metre=units)
-
-
-def read_replica_calibration(path: Path) -> Calibration:
-    """Read Replica's `cam_params.json`: {"camera": {w, h, fx, fy, cx, cy, scale}}. Raises SourceError."""
-    fields = read_json_object(path).get("camera")
-    if not isinstance(fields, dict):
-        raise SourceError(f'{path}: no "camera" object with w, h, fx, fy, cx, cy, scale')
-    w, h, fx, fy, cx, cy, scale = (
-        json_number(path, fields, key) for key in ("w", "h", "fx", "fy", "cx", "cy", "scale")
-    )
-    return Calibration(build_camera(path, int(w), int(h), [fx, fy, cx, cy]), check_positive(path, "scale", scale))
 
 
 def read_json_object(path: Path) -> dict[str, Any]:

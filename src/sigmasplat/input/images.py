@@ -1,12 +1,18 @@
-"""Read colour and depth images; every problem becomes a SourceError that names the file."""
+"""Find the images of a recording, pair colour with depth, and read them; every problem becomes a SourceError that names
+the file."""
 
+import re
+import threading
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.data.frame_arrays import depth_from_integers
+from sigmasplat.env import import_optional
 from sigmasplat.errors import SourceError
 from sigmasplat.files.pictures import npy_shape, open_image, read_npy
 
@@ -76,3 +82,147 @@ def _checked_metres(path: Path, depth_m: NDArray[np.float32]) -> NDArray[np.floa
 def _refuse_missing(path: Path) -> None:
     if not path.is_file():
         raise SourceError(f"{path}: the image is missing; download it again or remove it from the list")
+
+
+class Video:
+    """An open video. Reading forwards is fast. Reading backwards restarts at the first frame, because seeking by frame
+    number is not exact in videos with a variable frame rate, as from phones. Safe to use from several threads.
+
+    size: (width, height); count: number of frames that the file states; frames_per_second: as stated, else 30.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Open the file. Raises SourceError if OpenCV is missing or cannot read it."""
+        self.path, self._lock = path, threading.Lock()
+        self._cv2 = import_optional("cv2", "iphone", f"{path}: a video")
+        self._open()
+        width, height = (
+            int(self._capture.get(p)) for p in (self._cv2.CAP_PROP_FRAME_WIDTH, self._cv2.CAP_PROP_FRAME_HEIGHT)
+        )
+        self.size = width, height
+        self.count = int(self._capture.get(self._cv2.CAP_PROP_FRAME_COUNT))
+        stated = float(self._capture.get(self._cv2.CAP_PROP_FPS))
+        self.frames_per_second = stated if 0.1 < stated < 1000.0 else FRAMES_PER_SECOND
+
+    def frame(self, i: int) -> NDArray[np.uint8]:
+        """Read frame i as 8-bit RGB [H, W, 3]. Raises SourceError if the video ends before it or is damaged."""
+        with self._lock:
+            if i < self._next:
+                self._open()
+            while self._next <= i:
+                if not self._capture.grab():
+                    raise SourceError(
+                        f"{self.path}: ends after {self._next} frames, but frame {i} was requested; copy it again"
+                    )
+                self._next += 1
+            read, bgr = self._capture.retrieve()
+        if not read:
+            raise SourceError(f"{self.path}: frame {i} cannot be decoded; copy the video again")
+        rgb: NDArray[np.uint8] = np.ascontiguousarray(bgr[..., ::-1])
+        return rgb
+
+    def _open(self) -> None:
+        self._next = 0
+        self._capture: Any = self._cv2.VideoCapture(str(self.path))
+        if not self._capture.isOpened():
+            raise SourceError(f"{self.path}: unreadable video; copy it again (OpenCV needs FFmpeg to read HEVC)")
+        self._capture.set(
+            self._cv2.CAP_PROP_ORIENTATION_AUTO, 0
+        )  # keep the recorded orientation: depth is not rotated either
+
+
+FRAMES_PER_SECOND = 30.0
+"""Frame rate of recordings without timestamps, by convention."""
+
+COLOR_FOLDERS = ("color", "colour", "rgb", "image", "images")
+DEPTH_FOLDERS = ("depth", "depths")
+COLOR_ENDINGS = (".jpg", ".jpeg", ".png", ".bmp", ".ppm", ".tif", ".tiff", ".webp")
+DEPTH_ENDINGS = (".png", ".pgm", ".tif", ".tiff", ".npy")
+
+Key = TypeVar("Key", int, str)
+
+
+def first_subfolder(folder: Path, names: Iterable[str]) -> Path | None:
+    """Return the first of the named subfolders that exists, None if none does."""
+    return next((folder / name for name in names if (folder / name).is_dir()), None)
+
+
+def first_file(folder: Path, names: Iterable[str | Path]) -> Path | None:
+    """Return the first of the named files (in the folder, or absolute) that exists, None if none does."""
+    return next((folder / name for name in names if (folder / name).is_file()), None)
+
+
+def list_images(folder: Path | None, endings: Sequence[str]) -> list[Path]:
+    """Return the images of a folder in the order of the numbers in their names: 2.png before 10.png."""
+    if folder is None or not folder.is_dir():
+        return []
+    found = (path for path in folder.iterdir() if path.suffix.lower() in endings and not path.name.startswith("."))
+    return sorted(found, key=natural_key)
+
+
+def natural_key(path: Path | str) -> list[tuple[int, str]]:
+    """Return a sort key that compares digits in a name as numbers and the rest as text."""
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"([0-9]+)", str(path)) if part]
+
+
+def times_of_names(paths: Sequence[Path]) -> list[float]:
+    """Return the times in the names if all have a decimal point and increase; else frames are 1/30 s apart."""
+    try:
+        times = [float(path.stem) for path in paths]
+    except ValueError:
+        times = []
+    rising = all(a < b for a, b in pairwise(times))
+    if times and rising and all("." in path.stem for path in paths):
+        return times
+    return [i / FRAMES_PER_SECOND for i in range(len(paths))]
+
+
+def index_by_number(paths: Iterable[Path]) -> dict[int, Path]:
+    """Map the last number in each file name to its path, ascending; names without a number are left out."""
+    numbers = ((re.findall(r"[0-9]+", path.stem), path) for path in paths)
+    return dict(sorted((int(found[-1]), path) for found, path in numbers if found))
+
+
+def pair_images(
+    folder: Path, colors: Mapping[Key, Path], depths: Mapping[Key, Path], color_name: str, depth_name: str
+) -> tuple[list[Key], list[str]]:
+    """Return the keys that colour and depth share, in the order of colour, and why the other images are left out.
+
+    color_name, depth_name: file patterns for messages. Raises SourceError if one kind is missing or no key is shared.
+    """
+    if not depths:
+        raise SourceError(
+            f"no depth images in {folder} (looked for {depth_name}); is this the RGB-only download? "
+            "see docs/data.md#without-depth"
+        )
+    if not colors:
+        raise SourceError(f"no colour images in {folder} (looked for {color_name}); is the download complete?")
+    keys = [key for key in colors if key in depths]
+    if not keys:
+        first = f"{next(iter(colors.values())).name} and {next(iter(depths.values())).name}"
+        raise SourceError(
+            f"{folder}: {color_name} and {depth_name} have no number in common (found {first}); "
+            "are both from one recording?"
+        )
+    return keys, [f"{colors[key]}: no {depth_name} with its number" for key in colors if key not in depths]
+
+
+FrameFiles = dict[str, dict[int, Path]]
+
+_NAME = re.compile(r"frame-([0-9]+)\.(?:(color)\.(?:png|jpe?g)|(depth)\.(?:png|pgm|tiff?)|(pose)\.txt)")
+
+
+def frame_files(folder: Path) -> FrameFiles:
+    """Map "color", "depth" and "pose" to the frame-N files of each kind by number, ascending."""
+    found: FrameFiles = {"color": {}, "depth": {}, "pose": {}}
+    for path in sorted(folder.glob("frame-*")):
+        match = _NAME.fullmatch(path.name.lower())
+        if match:
+            kind = next(group for group in match.groups()[1:] if group)
+            found[kind][int(match.group(1))] = path
+    return found
+
+
+def has_frame_files(folder: Path) -> bool:
+    """Return whether there is at least one frame-N file."""
+    return any(_NAME.fullmatch(path.name.lower()) for path in folder.glob("frame-*"))

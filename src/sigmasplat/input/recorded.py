@@ -1,26 +1,105 @@
-"""Read recorded sequences: a format lists the image pairs, this module reads and rectifies them."""
+"""Read recorded sequences: a format lists the image pairs, this module reads and rectifies them. A few depth images are
+checked before a run for a wrong unit or missing readings."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.config import InputConfig
-from sigmasplat.data.accelerometer import Accelerometer
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.frame_arrays import color_from_bytes
-from sigmasplat.data.gyroscope import Gyroscope
+from sigmasplat.data.imu import Accelerometer, Gyroscope
 from sigmasplat.data.resizing import resized_color
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SourceError
-from sigmasplat.input.calibration import Calibration, refuse_impossible_camera
-from sigmasplat.input.depth_units import refuse_without_depth
+from sigmasplat.input.calibration import Calibration, refuse_impossible_camera, resolve_calibration
 from sigmasplat.input.images import image_size, read_color, read_depth
 from sigmasplat.input.rectification import Rectification, check_image_sizes
 from sigmasplat.input.source import Source
+
+PLAUSIBLE_MEDIAN_M = (0.2, 15.0)
+"""The median depth of indoor sequences is well inside this range; with a wrong power of ten it is outside."""
+
+KNOWN_UNITS_PER_METRE = {1000.0: "millimetres", 5000.0: "TUM's unit", 6553.5: "Replica's unit", 1.0: "metres"}
+
+
+def depth_warning(source: Source, samples: int = 5) -> str | None:
+    """Return a warning if the depth scale looks wrong, with the median and a suggestion; None if it is plausible.
+
+    It is also None if the source computes depth in metres from a stereo pair, because streets are deeper than rooms,
+    and if a network predicts it while frames are read: the first frame has set its scale. The
+    median is over all readings of `samples` frames spread evenly; unreadable frames are left out.
+    """
+    if source.depth_model:
+        return None
+    medians = _frame_medians_m(source, _spread(len(source), samples))
+    if medians and source.computed_depth:
+        return None
+    if not medians:
+        return f"{source.name}: no depth reading in the frames sampled"
+    median_m = float(np.median(medians))
+    low, high = PLAUSIBLE_MEDIAN_M
+    if low <= median_m <= high:
+        return None
+    return (
+        f"{source.name}: median depth is {median_m:.4g} m over {len(medians)} frames, outside {low}–{high} m; "
+        f"the depth's scale looks wrong{_unit_guess(median_m, source.depth_units_per_metre)}"
+    )
+
+
+def refuse_without_depth(source: Source, samples: int = 5) -> None:
+    """Raise SourceError if no frame has a depth reading; reads a few frames, and all frames only if those are blank.
+    Nothing is read if a network predicts depth: it has predicted that of the first frame."""
+    if source.depth_model or _frame_medians_m(source, _spread(len(source), samples)):
+        return
+    if not _frame_medians_m(source, range(len(source)), stop_at=1):
+        raise SourceError(
+            f"{source.name}: depth is zero or unreadable in all {len(source)} frames; "
+            f"check the depth files (first problem: {_first_problem(source)})"
+        )
+
+
+def _first_problem(source: Source) -> str:
+    try:
+        source.depth_of(0)
+    except SourceError as error:
+        return str(error)
+    return "frame 0 has no pixel above 0"
+
+
+def _spread(count: int, samples: int) -> list[int]:
+    return sorted({int(i) for i in np.linspace(0, count - 1, min(samples, count)).round()})
+
+
+def _frame_medians_m(source: Source, indices: Iterable[int], stop_at: int | None = None) -> list[float]:
+    """Return the median reading of each frame that is readable and not blank."""
+    medians: list[float] = []
+    for i in indices:
+        if stop_at is not None and len(medians) >= stop_at:
+            break
+        try:
+            depth_m = source.depth_of(i)
+        except SourceError:
+            continue  # reported when the source is iterated
+        if (depth_m > 0).any():
+            medians.append(float(np.median(depth_m[depth_m > 0])))
+    return medians
+
+
+def _unit_guess(median_m: float, units_per_metre: float | None) -> str:
+    """Suggest the known unit whose median is nearest to 2 m, typical for indoors."""
+    raw = median_m * (units_per_metre or 1.0)
+    guesses = {units: raw / units for units in KNOWN_UNITS_PER_METRE if 0.4 <= raw / units <= 8.0}
+    if not guesses:
+        return "; set depth_scale (PNG units per metre) in calibration.json"
+    units = min(guesses, key=lambda u: abs(np.log(guesses[u] / 2.0)))
+    name, would_be_m = KNOWN_UNITS_PER_METRE[units], guesses[units]
+    return f"; depth_scale {units:g} ({name}) in calibration.json would make it {would_be_m:.2f} m"
+
 
 Size = tuple[int, int]
 File = TypeVar("File")
@@ -99,7 +178,6 @@ class RecordedSource(Source):
         return len(self._images)
 
     def timestamp_s(self, i: int) -> float:
-        """Return the time of frame i without reading it."""
         return self._images[self._checked_index(i)].timestamp_s
 
     def frame(self, i: int) -> Frame:
@@ -117,18 +195,15 @@ class RecordedSource(Source):
         )
 
     def depth_of(self, i: int) -> NDArray[np.float32]:
-        """Read the depth of frame i as `frame` does, without reading colour."""
         files = self._images[self._checked_index(i)]
         depth_m, camera = files.read_depth(self.depth_units_per_metre), self._rectified.calibration.camera
         check_image_sizes(self._rectified, files.color, (camera.width, camera.height), files.depth, depth_m.shape[::-1])
         return self._rectified.depth(depth_m)
 
     def truth(self) -> Trajectory | None:
-        """Return the whole recorded path with its own timestamps."""
         return self._truth
 
     def image_name(self, i: int) -> str:
-        """Return the name of the file of colour image i."""
         return self._images[self._checked_index(i)].color.name
 
     def device_path(self) -> Trajectory | None:
@@ -136,11 +211,9 @@ class RecordedSource(Source):
         return self._truth if self._estimated else None
 
     def test_views(self) -> Source | None:
-        """Return the separate test views, None without them."""
         return self._test
 
     def true_surface_file(self) -> Path | None:
-        """Return the file of the true surface, None without one."""
         return self._surface
 
     def _refuse_sizes_of_first(self) -> None:
@@ -158,6 +231,17 @@ class RecordedSource(Source):
                 f"{self.name}: the gyroscope measured from {first_s:.3f} to {last_s:.3f} s, but the images were taken "
                 f"from {self._images[0].timestamp_s:.3f} to {self._images[-1].timestamp_s:.3f} s; use the same clock"
             )
+
+
+def folder_source(
+    folder: Path, settings: InputConfig, images: Sequence[ImagePair], known: Calibration | None, units_per_metre: float,
+    truth: Trajectory | None = None, skipped: Sequence[str] = (), **more: Any,
+) -> RecordedSource:  # fmt: skip
+    """Build the source of a folder with images. Its camera is that of the settings, else of calibration.json, else
+    `known`; units_per_metre: default of depth_scale; more: as for RecordedSource. Raises SourceError as it does."""
+    size = first_size([image.color for image in images])
+    calibration = resolve_calibration(folder, known, size, settings, units_per_metre)
+    return RecordedSource(folder.resolve().name, images, calibration, settings, truth, skipped, **more)
 
 
 def first_size(paths: Sequence[Path]) -> tuple[int, int]:

@@ -1,5 +1,6 @@
-"""Rectify the images of a recording to one pinhole camera: lens distortion removed, depth registered to colour."""
+"""Rectify the images of a recording to one pinhole camera: remove lens distortion, register depth to colour."""
 
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +10,153 @@ from sigmasplat.config import InputConfig
 from sigmasplat.data.camera import Camera
 from sigmasplat.errors import SourceError
 from sigmasplat.input.calibration import Calibration
-from sigmasplat.input.depth_registration import DepthRegistration
-from sigmasplat.input.distortion import Undistortion
+
+Points = NDArray[np.float64]
+
+
+def distort(points: Points, coefficients: Points) -> Points:
+    """Map ideal image points [..., 2] (x/z, y/z) to distorted image points.
+
+    Coefficients k1, k2, p1, p2, k3 [, k4, k5, k6], the last three for the rational model (OpenCV's order).
+    """
+    k1, k2, p1, p2, k3, k4, k5, k6 = np.pad(coefficients, (0, 8 - len(coefficients)))
+    x, y = points[..., 0], points[..., 1]
+    r2 = x * x + y * y
+    radial = (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    return np.stack(
+        [
+            x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
+            y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
+        ],
+        -1,
+    )
+
+
+def undistort(points: Points, coefficients: Points, iterations: int = 50) -> Points:
+    """Invert `distort` by fixed-point iteration; it converges if the distortion is monotonic within the image."""
+    ideal = points.copy()
+    for _ in range(iterations):
+        ideal = ideal + (points - distort(ideal, coefficients))
+    return ideal
+
+
+class Undistortion:
+    """Resample distorted images to the pinhole camera with the same focal lengths and principal point.
+
+    Depth is resampled together with colour: TUM's depth is registered to the *distorted* colour image, so undistorting
+    colour alone would misalign them by up to 20 pixels in the corners (the CG-SLAM release undistorts colour only).
+    Colour is interpolated. Depth takes the nearest reading, because a mean of a near and a far surface is no surface.
+    """
+
+    def __init__(self, camera: Camera, coefficients: Points) -> None:
+        self.camera = camera
+        self.coefficients = coefficients
+
+    @cached_property
+    def _source_uv(self) -> NDArray[np.float32]:
+        """Position of each ideal pixel in the recorded image, [H·W, 2] pixels."""
+        c = self.camera
+        lens = distort(c.rays()[..., :2].astype(np.float64), self.coefficients)
+        return (lens * [c.fx, c.fy] + [c.cx, c.cy]).reshape(-1, 2).astype(np.float32)
+
+    @cached_property
+    def _corners(self) -> tuple[list[NDArray[np.intp]], list[NDArray[np.float32]]]:
+        """Flat indices and weights of the four recorded pixels around each ideal pixel; clamped to the image."""
+        width, height = self.camera.width, self.camera.height
+        u = self._source_uv[:, 0].clip(0, width - 1)
+        v = self._source_uv[:, 1].clip(0, height - 1)
+        u0, v0 = np.floor(u).astype(np.intp), np.floor(v).astype(np.intp)
+        u1, v1 = np.minimum(u0 + 1, width - 1), np.minimum(v0 + 1, height - 1)
+        a, b = (u - u0)[:, None], (v - v0)[:, None]
+        indices = [v0 * width + u0, v0 * width + u1, v1 * width + u0, v1 * width + u1]
+        return indices, [(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b]
+
+    @cached_property
+    def _nearest(self) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+        width, height = self.camera.width, self.camera.height
+        uv = np.rint(self._source_uv).astype(np.intp)
+        inside = np.asarray((uv >= 0).all(1) & (uv < [width, height]).all(1))
+        return np.where(inside, uv[:, 1] * width + uv[:, 0], 0), inside
+
+    def color(self, recorded: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Resample colour [H, W, 3] bilinearly; outside the recorded image edge pixels repeat (depth is 0)."""
+        flat = recorded.reshape(-1, 3)
+        indices, weights = self._corners
+        total = sum((flat[i] * w for i, w in zip(indices, weights, strict=True)), np.zeros_like(flat))
+        return np.clip(total, 0.0, 1.0).astype(np.float32).reshape(recorded.shape)
+
+    def depth(self, recorded_m: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Resample depth [H, W] by the nearest reading; 0 outside the recorded image."""
+        index, inside = self._nearest
+        return np.where(inside, recorded_m.reshape(-1)[index], 0.0).astype(np.float32).reshape(recorded_m.shape)
+
+
+OVERLAP = 1.1
+"""Footprints are enlarged by this factor, so that rotation leaves no gaps between neighbours."""
+MAX_HALF_FOOTPRINT_PX = 32.0
+"""Half of the largest footprint: a reading near the camera centre must not fill the image."""
+CHUNK_READINGS = 8192
+"""Readings processed together: few enough for the processor's cache."""
+
+Floats = NDArray[np.float64]
+
+
+class DepthRegistration:
+    """Draw each depth pixel as the square that it covers in the colour image; where squares overlap, the nearest wins.
+
+    A surface hidden from the colour camera therefore does not show through one in front of it, and a small depth image
+    fills a larger colour image. T_color_depth [4, 4] transforms depth camera points to the colour camera, metres.
+    """
+
+    def __init__(self, depth_camera: Camera, color_camera: Camera, T_color_depth: Floats) -> None:
+        self.depth_camera = depth_camera
+        self.color_camera = color_camera
+        self.T_color_depth = T_color_depth
+
+    @cached_property
+    def _rays(self) -> Floats:
+        """Return the ray of each depth pixel in the colour camera's axes [3, H·W]."""
+        rays = self.depth_camera.rays().reshape(-1, 3).astype(np.float64) @ self.T_color_depth[:3, :3].T
+        return np.ascontiguousarray(rays.T)
+
+    def __call__(self, depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return depth [H, W] for the colour camera from depth [h, w] of the depth camera, m; 0 = no reading."""
+        c, z_depth = self.color_camera, depth_m.reshape(-1)
+        nearest = np.full(c.height * c.width, np.inf)
+        for first in range(0, len(z_depth), CHUNK_READINGS):
+            valid = first + np.flatnonzero(z_depth[first : first + CHUNK_READINGS] > 0)
+            draw_footprints(nearest, c.width, *self._footprints(valid, z_depth[valid]))
+        nearest[np.isinf(nearest)] = 0.0
+        return nearest.astype(np.float32).reshape(c.height, c.width)
+
+    def _footprints(self, valid: NDArray[np.int64], z_depth: NDArray[np.float32]) -> tuple[Floats, Floats, Floats]:
+        """Return first and last column and row [2, N] covered by the depth pixels `valid`, and their depth [N] m."""
+        c, d, t = self.color_camera, self.depth_camera, self.T_color_depth[:3, 3]
+        x, y, z = (self._rays[axis].take(valid) * z_depth + t[axis] for axis in range(3))
+        if not (front := z > 1e-6).all():
+            x, y, z, z_depth = x[front], y[front], z[front], z_depth[front]
+        size = OVERLAP * z_depth / z
+        columns = _span(c.fx * x / z + c.cx, 0.5 * size * c.fx / d.fx, c.width)
+        rows = _span(c.fy * y / z + c.cy, 0.5 * size * c.fy / d.fy, c.height)
+        return columns, rows, z
+
+
+def draw_footprints(nearest: Floats, width: int, columns: Floats, rows: Floats, z: Floats) -> None:
+    """Write depths z [N] to pixels first … last [2, N] of an image `nearest` [rows · width]; the smallest wins."""
+    most = [int(np.fmax.reduce(ends[1] - ends[0], initial=-1.0)) for ends in (columns, rows)]
+    for dy in range(most[1] + 1):
+        for dx in range(most[0] + 1):
+            column, row = columns[0] + dx, rows[0] + dy
+            covered = np.flatnonzero((column <= columns[1]) & (row <= rows[1]))
+            pixels = (row * width + column).take(covered).astype(np.int64)
+            np.minimum.at(nearest, pixels, z.take(covered))
+
+
+def _span(centre: Floats, half: Floats, count: int) -> Floats:
+    """Return first and last pixel of `count` whose centre is within centre ± half, [2, N]; last < first if none."""
+    bounded = np.clip(half, 0.0, MAX_HALF_FOOTPRINT_PX)
+    return np.stack([np.maximum(np.ceil(centre - bounded), 0.0), np.minimum(np.floor(centre + bounded), count - 1.0)])
+
 
 Image = NDArray[np.float32]
 

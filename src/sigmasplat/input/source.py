@@ -1,9 +1,12 @@
-"""Define the interface of an input sequence, the same for every format."""
+"""Define the interface of an input sequence, the same for every format; a background thread reads ahead."""
 
+import queue
+import threading
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +17,71 @@ from sigmasplat.data.frame import Frame
 from sigmasplat.data.mesh import Mesh
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SourceError
-from sigmasplat.files.guard import guarded
-from sigmasplat.input.prefetch import read_ahead
+from sigmasplat.files.reading import guarded
+from sigmasplat.native.threads import yield_to_others
+
+Item = TypeVar("Item")
+
+
+@dataclass(frozen=True)
+class _Result(Generic[Item]):
+    """One item, or the exception that ended the producer, or neither at the end."""
+
+    item: Item | None = None
+    error: BaseException | None = None
+    last: bool = False
+
+
+def read_ahead(items: Iterable[Item], length: int = 4) -> Iterator[Item]:
+    """Yield `items` in order while a thread computes up to `length` of them in advance.
+
+    Decoding an image takes 10 to 50 ms and releases the interpreter lock, so it runs beside tracking, and yields to it.
+    An exception of the producer is raised here in place of the item. The thread ends after the last item,
+    or as soon as the consumer closes or deletes this generator.
+    """
+    results: queue.Queue[_Result[Item]] = queue.Queue(maxsize=length)
+    stop = threading.Event()
+    thread = threading.Thread(target=_produce, args=(items, results, stop), name="read-ahead", daemon=True)
+    thread.start()
+    try:
+        while not (result := results.get()).last:
+            yield result.item  # type: ignore[misc]
+        if result.error is not None:
+            raise result.error
+    finally:
+        stop.set()
+        _drain(results)  # frees space, so that a producer blocked in put() wakes up and sees `stop`
+        thread.join()
+
+
+def _produce(items: Iterable[Item], results: "queue.Queue[_Result[Item]]", stop: threading.Event) -> None:
+    yield_to_others()
+    try:
+        for item in items:
+            if stop.is_set():
+                return
+            results.put(_Result(item=item))
+            if stop.is_set():
+                return
+    except BaseException as error:  # passed to the consumer's thread, which raises it
+        results.put(_Result(error=error, last=True))
+    else:
+        results.put(_Result(last=True))
+
+
+def _drain(results: "queue.Queue[_Result[Item]]") -> None:
+    while True:
+        try:
+            results.get_nowait()
+        except queue.Empty:
+            return
+
+
+FACTS = (
+    "depth_units_per_metre", "depth_registered", "registrable", "computed_depth", "predicted_depth", "depth_model",
+    "scene_scale", "depth_noise_per_m", "sensor",
+)  # fmt: skip
+"""What a source that wraps another one has in common with it."""
 
 
 class Source(ABC):
@@ -156,19 +222,37 @@ class Source(ABC):
         return i
 
 
-class Subset(Source):
+class Wrapped(Source):
+    """Another source with the same facts and the same ground truth, which has its own timestamps."""
+
+    def __init__(self, whole: Source) -> None:
+        super().__init__(whole.name, whole.camera, whole.strict)
+        self._whole, self.skipped = whole, whole.skipped
+        for fact in FACTS:
+            setattr(self, fact, getattr(whole, fact))
+
+    def truth(self) -> Trajectory | None:
+        return self._whole.truth()
+
+    def device_path(self) -> Trajectory | None:
+        return self._whole.device_path()
+
+    def test_views(self) -> Source | None:
+        return self._whole.test_views()
+
+    def true_surface(self) -> Mesh | None:
+        return self._whole.true_surface()
+
+    def true_surface_file(self) -> Path | None:
+        return self._whole.true_surface_file()
+
+
+class Subset(Wrapped):
     """Part of another source: a time span, every `stride`-th frame, at most `limit`; frames are numbered from 0."""
 
     def __init__(self, whole: Source, settings: InputConfig) -> None:
         """Select the frames. Raises SourceError if no frame is left."""
-        super().__init__(whole.name, whole.camera, whole.strict)
-        self.skipped = whole.skipped
-        self.depth_units_per_metre = whole.depth_units_per_metre
-        self.depth_registered, self.registrable = whole.depth_registered, whole.registrable
-        self.computed_depth, self.scene_scale = whole.computed_depth, whole.scene_scale
-        self.predicted_depth, self.depth_model = whole.predicted_depth, whole.depth_model
-        self.depth_noise_per_m, self.sensor = whole.depth_noise_per_m, whole.sensor
-        self._whole = whole
+        super().__init__(whole)
         self._indices: Sequence[int] = _within(whole, settings)[:: settings.stride][: settings.limit or None]
         if not len(self._indices):
             raise SourceError(
@@ -179,49 +263,27 @@ class Subset(Source):
     def __len__(self) -> int:
         return len(self._indices)
 
+    def _at(self, i: int) -> int:
+        """Return the number of the i-th selected frame in the whole source."""
+        return self._indices[self._checked_index(i)]
+
     def frame(self, i: int) -> Frame:
-        """Read the i-th selected frame."""
-        return replace(self._whole.frame(self._indices[self._checked_index(i)]), index=i)
+        return replace(self._whole.frame(self._at(i)), index=i)
 
     def timestamp_s(self, i: int) -> float:
-        """Return the time of the i-th selected frame."""
-        return self._whole.timestamp_s(self._indices[self._checked_index(i)])
+        return self._whole.timestamp_s(self._at(i))
 
     def depth_of(self, i: int) -> NDArray[np.float32]:
-        """Read the depth of the i-th selected frame."""
-        return self._whole.depth_of(self._indices[self._checked_index(i)])
+        return self._whole.depth_of(self._at(i))
 
     def exact_depth_of(self, i: int) -> NDArray[np.float32] | None:
-        """Return the exact depth of the i-th selected frame, None if it is unknown."""
-        return self._whole.exact_depth_of(self._indices[self._checked_index(i)])
+        return self._whole.exact_depth_of(self._at(i))
 
     def depth_std_of(self, i: int) -> NDArray[np.float32] | None:
-        """Return the standard deviation of the depth of the i-th selected frame, None if it is unknown."""
-        return self._whole.depth_std_of(self._indices[self._checked_index(i)])
-
-    def truth(self) -> Trajectory | None:
-        """Return the ground-truth path of the whole source; it has its own timestamps."""
-        return self._whole.truth()
+        return self._whole.depth_std_of(self._at(i))
 
     def image_name(self, i: int) -> str:
-        """Return the name of the file of colour image i."""
-        return self._whole.image_name(self._indices[self._checked_index(i)])
-
-    def device_path(self) -> Trajectory | None:
-        """Return the path that the device of the whole source estimated; it has its own timestamps."""
-        return self._whole.device_path()
-
-    def test_views(self) -> Source | None:
-        """Return the test views of the whole source."""
-        return self._whole.test_views()
-
-    def true_surface(self) -> Mesh | None:
-        """Return the true surface of the whole source."""
-        return self._whole.true_surface()
-
-    def true_surface_file(self) -> Path | None:
-        """Return the file of the true surface of the whole source."""
-        return self._whole.true_surface_file()
+        return self._whole.image_name(self._at(i))
 
 
 def _within(whole: Source, settings: InputConfig) -> range:

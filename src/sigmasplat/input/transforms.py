@@ -14,7 +14,7 @@ import numpy as np
 
 from sigmasplat.errors import SourceError
 from sigmasplat.input.calibration import Calibration, Distortion, build_camera, json_number
-from sigmasplat.input.pose_files import FLIP_YZ, checked_pose, to_matrix
+from sigmasplat.input.lists import FLIP_YZ, checked_pose, to_matrix
 from sigmasplat.types import Matrix
 
 Fields = dict[str, Any]

@@ -137,7 +137,8 @@ def draw_keyframes(
 ) -> Iterator[list[Item]]:
     """Draw keyframes for each iteration: the newest with the given probability, else a random older one (VarSplat §2).
 
-    together > 1: draw that many different keyframes, or all of them if there are fewer (CG-SLAM §7).
+    together > 1: draw that many different keyframes, or all of them if there
+    are fewer (CG-SLAM §7).
     """
     everything = list(keyframes)
     older = everything[:-1]

@@ -14,14 +14,14 @@ from sigmasplat.fit.align import Alignment
 from sigmasplat.fit.pose import fit_pose_align
 from sigmasplat.graph.loops import Loops
 from sigmasplat.graph.newest_covariance import NO_ERRORS
-from sigmasplat.realtime.messages import BetweenFrames, Offer, Search, Snapshot, TrackedFrame
+from sigmasplat.realtime.messages import Call, Offer, Search, Snapshot, TrackedFrame
 from sigmasplat.slam.listeners import Before, Correction, correction_since
 from sigmasplat.slam.mapping_backend import MappingBackend
 from sigmasplat.slam.step_result import StepTimer
 from sigmasplat.tracking.pose_validation import is_better
 from sigmasplat.tracking.prepared_frame import PreparedFrame
 from sigmasplat.tracking.relocaliser import Relocation
-from sigmasplat.tracking.tracked_keyframe import TrackedKeyframe, found_keyframe, mapped_keyframe
+from sigmasplat.tracking.tracked_keyframe import TrackedKeyframe, mapped_keyframe
 from sigmasplat.types import Matrix
 
 AS_GOOD = 0.99
@@ -40,11 +40,11 @@ class BackEnd:
 
     def __init__(self, system: MappingBackend, publish: Callable[[Snapshot], None]) -> None:
         self.system, self.publish = system, publish
-        self.given: queue.SimpleQueue[TrackedFrame | BetweenFrames] = queue.SimpleQueue()
+        self.given: queue.SimpleQueue[TrackedFrame | Call] = queue.SimpleQueue()
         self.last: Snapshot | None = None
         self.with_errors = False
         self._before = Before.of(system)
-        self._pending: deque[TrackedFrame | BetweenFrames] = deque()
+        self._pending: deque[TrackedFrame | Call] = deque()
         self._spare, self._added = 0, 0
         self._undescribed: TrackedKeyframe | None = None
         self._found = -1
@@ -55,7 +55,7 @@ class BackEnd:
         while True:
             while self._take():
                 each = self._pending.popleft()
-                if isinstance(each, BetweenFrames):
+                if isinstance(each, Call):
                     each.run()
                 else:
                     for _ in self._handled(each):
@@ -102,9 +102,9 @@ class BackEnd:
         T_keyframe_camera = se3.inverse(each.poses[number]) @ each.T_submap_camera
         system.atlas.place_by_keyframe(T_keyframe_camera)
         system.steps.append(each.step)
-        if each.probe is not None:
+        if each.shown is not None:
             last = len(system.mapper.keyframes) - 1
-            system.validation_views.offer(each.number, last, each.number - number, T_keyframe_camera, each.probe)
+            system.validation_views.offer(each.number, last, each.number - number, T_keyframe_camera, each.shown)
 
     @property
     def _newest(self) -> int:
@@ -220,7 +220,7 @@ class BackEnd:
         system = self.system
         if place.where[0] == len(system.store):
             c, params = system.config.tracking, system.mapper.field.params
-            keyframe = self._described(found_keyframe(params, system.view, place.keyframe, c))
+            keyframe = self._described(place.keyframe.weighed(params, system.view, c))
             newest = {self._newest: system.atlas.keyframe_poses.last[-1]}
             self._publish(number, keyframe, newest | {number: place.T_submap_camera}, RELOCALISED)
             return
@@ -253,8 +253,7 @@ class BackEnd:
         self._hand_over(
             Snapshot(
                 number, self._newest, poses, state, system.mapper.field.params.clone(), keyframe,
-                len(system.atlas.anchors) - 1, system.atlas.components[-1], system.atlas.anchors[-1],
-                replace(system.drift), system.confidence.spread_m[-1], system.loops.copied(), number, seconds, errors,
+                system.active_submap(), system.confidence.spread_m[-1], system.loops.copied(), number, seconds, errors,
                 correction,
             )
         )  # fmt: skip

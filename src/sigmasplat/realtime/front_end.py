@@ -8,22 +8,21 @@ import numpy as np
 
 from sigmasplat.config import Config
 from sigmasplat.data import se3
-from sigmasplat.data.component import APART, LOST, RELOCALISED, TRACKED
+from sigmasplat.data.component import APART, RELOCALISED, TRACKED
 from sigmasplat.data.field import GaussianField
 from sigmasplat.fit.pose import PoseFit
 from sigmasplat.fit.references import Reference
 from sigmasplat.fit.target import Target
 from sigmasplat.graph.confidence import Confidence
+from sigmasplat.graph.loops import Loop
 from sigmasplat.graph.newest_covariance import NO_ERRORS
 from sigmasplat.mapping.validation_views import ValidationViews
 from sigmasplat.realtime.messages import Offer, Search, Snapshot, TrackedFrame
 from sigmasplat.render.view import View
-from sigmasplat.slam.step_result import Step, StepTimer
-from sigmasplat.tracking.drift import Drift
+from sigmasplat.slam.step_result import Step, StepTimer, SubmapState, make_step
 from sigmasplat.tracking.fitted_depth import fitted_keyframe, fitted_to_map
 from sigmasplat.tracking.frame_estimate import FrameEstimate
-from sigmasplat.tracking.keyframe_rule import has_moved, is_held_back, is_keyframe
-from sigmasplat.tracking.moving.dynamic_mask import share_of
+from sigmasplat.tracking.keyframe_rule import becomes_keyframe, is_held_back, is_mappable, may_validate
 from sigmasplat.tracking.pose_validation import is_questionable
 from sigmasplat.tracking.prepared_frame import PreparedFrame, refuse_first_without_depth
 from sigmasplat.tracking.recovery import Recovery, usable
@@ -90,7 +89,7 @@ class FrontEnd:
         self.confidence.spread_m, self.snapshot = [snapshot.spread_m], snapshot
 
     def _found(self, snapshot: Snapshot) -> None:
-        """Continue where the camera was found, or in a new map."""
+        """Continue where the camera was estimate, or in a new map."""
         self.recovery.found()
         self.found = snapshot.state
         self.tracker.velocity, self.tracker.detector = np.eye(4), self.tracker.detector.cleared()
@@ -118,24 +117,24 @@ class FrontEnd:
         """Track a frame, and decide whether it becomes a keyframe; should_stop: as in `Tracker.track`."""
         number, offer, search = self.frames, None, None
         if number == 0:
-            found, offer = self._begin(seen, view)
+            estimate, offer = self._begin(seen, view)
         else:
             with timer.stage("track"), timer.kernels_of(view, "track_kernels"):
                 splats = NOTHING if self.snapshot is None else self.snapshot
                 seen = fitted_to_map(self.tracker, splats, view, seen)
                 fit = self.tracker.track(splats, view, seen, seen.frame.prior, should_stop)
-            found = FrameEstimate.of(fit, se3.inverse(fit.T_camera_world), self.tracker.lost)
+            estimate = FrameEstimate.of(fit, self.tracker.lost)
             self.recovery.count(self.tracker.lost, self.tracker.doubtful > 0, seen)
             held_back = is_held_back(number, self.config.input.hold_every)
-            offer = None if held_back else self._offer(fit, seen, view, found)
+            offer = None if held_back else self._offer(fit, seen, view, estimate)
             search = None if held_back else self._search(fit, seen, offer)
         if offer is not None or search is not None:
-            self.poses = {**self.poses, number: found.T_submap_camera}
-        step = self._step(seen, found, timer, view)
+            self.poses = {**self.poses, number: estimate.T_submap_camera}
+        step = self._step(seen, estimate, timer, view)
         self.frames += 1
         based_on = -1 if self.snapshot is None else self.snapshot.frame
-        probe = self._probe(number, seen, found)
-        return TrackedFrame(number, step, found.T_submap_camera, self.poses, based_on, offer, search, probe)
+        shown = self._validation_view(number, seen, estimate)
+        return TrackedFrame(number, step, estimate.T_submap_camera, self.poses, based_on, offer, search, shown)
 
     def _begin(self, seen: PreparedFrame, view: View) -> tuple[FrameEstimate, Offer]:
         """Start at the first frame, whose camera is the world until the map says otherwise."""
@@ -146,38 +145,29 @@ class FrontEnd:
         self.offered, self.waits = 1, (0,)
         return FrameEstimate(np.eye(4), TRACKED, mapped=True), Offer(seen.separate())
 
-    def _offer(self, fit: PoseFit, seen: PreparedFrame, view: View, found: FrameEstimate) -> Offer | None:
+    def _offer(self, fit: PoseFit, seen: PreparedFrame, view: View, estimate: FrameEstimate) -> Offer | None:
         """Return the frame as a keyframe, if it becomes one; track the next frames relative to it."""
-        certain = not self.tracker.lost and self.recovery.is_steady and self.tracker.is_certain(fit)
-        if not certain or not self._is_keyframe(fit, found.T_submap_camera):
+        since, most_deg = self.frames - self.newest, self.config.realtime.keyframe_deg
+        if not is_mappable(fit, self.tracker, self.recovery) or not becomes_keyframe(
+            fit, self.tracker, since, self.config.mapping, most_deg
+        ):
             return None
         alignment = self.tracker.hop(fit, seen.live)
         splats = NOTHING if self.snapshot is None else self.snapshot
-        refitted = fitted_keyframe(self.tracker, splats, view, seen, found.T_submap_camera, connected=not self.found)
+        refitted = fitted_keyframe(self.tracker, splats, view, seen, estimate.T_submap_camera, connected=not self.found)
         shown = refitted.without(self.tracker.front)
-        self._follow(self.frames, shown, found.T_submap_camera)
+        self._follow(self.frames, shown, estimate.T_submap_camera)
         if len(self.waits) >= self.config.realtime.waiting_most:
             self.refused += 1
             return None
-        found.mapped, self.offered, self.waits = True, self.offered + 1, (*self.waits, self.frames)
-        return Offer(shown.separate(), alignment, self.tracker.front, found.exposure)
+        estimate.mapped, self.offered, self.waits = True, self.offered + 1, (*self.waits, self.frames)
+        return Offer(shown.separate(), alignment, self.tracker.front, estimate.exposure)
 
     def _follow(self, number: int, seen: PreparedFrame, T_submap_camera: Matrix) -> None:
         """Track the next frames relative to a frame, before the map has weights for its pixels."""
         reference = Reference(seen.live, se3.inverse(T_submap_camera))
         self.tracker.follow(TrackedKeyframe(reference, seen.image, self.tracker.front))
         self.newest = number
-
-    def _is_keyframe(self, fit: PoseFit, T_submap_camera: Matrix) -> bool:
-        c, since, most_deg = self.config.mapping, self.frames - self.newest, self.config.realtime.keyframe_deg
-        reference = self.tracker.keyframe
-        if self.tracker.detector.renews(fit.comparison, self.tracker.front):
-            return True
-        if not most_deg or reference is None:
-            return is_keyframe(since, c.every, fit.overlap, c.overlap_below)
-        depth_m = 1.0 if fit.alignment is None else fit.alignment.depth_m
-        moved = since >= c.every and has_moved(reference.T_camera_world @ T_submap_camera, depth_m, most_deg)
-        return moved or fit.overlap < c.overlap_below
 
     def _search(self, fit: PoseFit, seen: PreparedFrame, offer: Offer | None) -> Search | None:
         """Return the frame to be searched for in the whole map, if it is lost or doubtful and no other is searched."""
@@ -190,34 +180,21 @@ class FrontEnd:
         self.searching = self.frames
         return Search(seen.separate(), apart=apart) if lost else Search(seen.separate(), fit.comparison)
 
-    def _probe(self, number: int, seen: PreparedFrame, found: FrameEstimate) -> Target | None:
-        """Return the images of a frame that may become a probe view."""
-        statistics = (
-            found.state == TRACKED and not found.mapped and self.recovery.is_steady and not self.tracker.doubtful
-        )
+    def _validation_view(self, number: int, seen: PreparedFrame, estimate: FrameEstimate) -> Target | None:
+        """Return the images of a frame that may become a validation view."""
         full = len(self.waits) >= self.config.realtime.waiting_most
-        if not statistics or full or is_held_back(number, self.config.input.hold_every):
+        if full or not may_validate(estimate, self.tracker, self.recovery):
             return None
-        probes = ValidationViews(self.config.uncertainty.probes, self.config.mapping.every)
-        return seen.target if probes.wants(self.offered - 1, number - self.newest) else None
+        views = ValidationViews(self.config.uncertainty.probes, self.config.mapping.every)
+        wanted = not is_held_back(number, self.config.input.hold_every)
+        return seen.target if wanted and views.wants(self.offered - 1, number - self.newest) else None
 
-    def _step(self, seen: PreparedFrame, found: FrameEstimate, timer: StepTimer, view: View) -> Step:
-        s = self.snapshot
-        drift, submap, component = (Drift(), 0, 0) if s is None else (s.drift, s.submap, s.component)
-        if found.state == TRACKED and self.found:
-            found.state, self.found = (RELOCALISED if self.found == RELOCALISED else TRACKED), ""
-        state = APART if component and found.state != LOST else found.state
-        loops = () if s is None else tuple(s.loops[self.loops :])
+    def _step(self, seen: PreparedFrame, estimate: FrameEstimate, timer: StepTimer, view: View) -> Step:
+        if estimate.state == TRACKED and self.found:
+            estimate.state, self.found = (RELOCALISED if self.found == RELOCALISED else TRACKED), ""
+        active, loops = SubmapState(), tuple[Loop, ...]()
+        if self.snapshot is not None:
+            active, loops = self.snapshot.active, tuple(self.snapshot.loops[self.loops :])
         self.loops += len(loops)
-        in_submap_m = drift.position_m(found.T_submap_camera)
-        found.tracking |= {
-            "position_std_m": self.confidence.position_std_m(in_submap_m), "doubtful": float(self.tracker.doubtful),
-            "usual_residual": self.tracker.statistics.residual, "waiting": float(len(self.waits)),
-            "moving": share_of(self.tracker.front),
-        }  # fmt: skip
-        p_off = self.confidence.probability(state, found.tracking)
-        anchor, splats = (np.eye(4), 0) if s is None else (s.T_world_submap, len(s.params))
-        return Step(
-            seen.frame.index, seen.frame.timestamp_s, anchor @ found.T_submap_camera, found.mapped, state == LOST,
-            found.tracking, splats, submap, loops, timer.stop(view), state, component, p_off,
-        )  # fmt: skip
+        seconds, waiting = timer.stop(view), len(self.waits)
+        return make_step(seen, estimate, active, self.tracker, self.confidence, loops, seconds, waiting)

@@ -14,8 +14,7 @@ from sigmasplat.fit.target import Target
 from sigmasplat.graph.loops import Loops
 from sigmasplat.graph.newest_covariance import NO_ERRORS, PoseErrors
 from sigmasplat.slam.listeners import Correction
-from sigmasplat.slam.step_result import Step
-from sigmasplat.tracking.drift import Drift
+from sigmasplat.slam.step_result import Step, SubmapState
 from sigmasplat.tracking.moving.dynamic_mask import DynamicMask
 from sigmasplat.tracking.prepared_frame import PreparedFrame
 from sigmasplat.tracking.tracked_keyframe import TrackedKeyframe
@@ -31,7 +30,7 @@ class Snapshot:
 
     frame: number of the frame that was mapped or found; poses: of this frame and of the newest keyframe, in the active
     submap; state: how the frame came into the map, "" if it was tracked; params [N, 17]: rows of the splats; keyframe:
-    reference of the next frames; T_world_submap [4, 4]; spread_m: standard deviation of the submap's position; loops:
+    reference of the next frames; spread_m: standard deviation of the submap's position; loops:
     all pairs tried so far; searched: number of the last frame that was searched for in the whole map; seconds: of the
     work since the snapshot before; errors: of poses relative to the newest keyframe, if the system computes them;
     correction: of earlier poses since the snapshot before, if a function of the caller wants it.
@@ -43,10 +42,7 @@ class Snapshot:
     state: str
     params: Tensor
     keyframe: TrackedKeyframe
-    submap: int
-    component: int
-    T_world_submap: Matrix
-    drift: Drift
+    active: SubmapState
     spread_m: float
     loops: Loops = field(default_factory=Loops)
     searched: int = -1
@@ -81,7 +77,7 @@ class TrackedFrame:
     that it may be placed by, all in the coordinates of the tracker at that time.
 
     based_on: the frame of the snapshot that it was tracked with, −1 = none; offer: if it is a keyframe; search: if it
-    is searched for; probe: its images if it may become a probe view.
+    is searched for; shown: its images if it may become a validation view.
     """
 
     number: int
@@ -91,11 +87,11 @@ class TrackedFrame:
     based_on: int = -1
     offer: Offer | None = None
     search: Search | None = None
-    probe: Target | None = None
+    shown: Target | None = None
 
 
 @dataclass(frozen=True, eq=False)
-class BetweenFrames:
+class Call:
     """Work that is done between two frames, when all earlier frames are in the map."""
 
     run: Callable[[], None] = field(default=lambda: None)

@@ -17,15 +17,14 @@ from sigmasplat.graph.loops import Loops
 from sigmasplat.native.threads import set_kernel_threads
 from sigmasplat.realtime.back_end import BackEnd
 from sigmasplat.realtime.front_end import FrontEnd
-from sigmasplat.realtime.messages import BetweenFrames, Snapshot
+from sigmasplat.realtime.messages import Call, Snapshot
 from sigmasplat.realtime.schedule import MappingThread, Schedule
 from sigmasplat.render.view import View
 from sigmasplat.slam.array_interface import ArrayInterface
 from sigmasplat.slam.listeners import Events
 from sigmasplat.slam.slam import Slam
 from sigmasplat.slam.step_result import Step, StepTimer
-from sigmasplat.tracking.features import make_extractor
-from sigmasplat.tracking.moving.dynamic_detector import DynamicDetector
+from sigmasplat.tracking.features import extractor_of
 from sigmasplat.tracking.prepared_frame import view_of, working_frame
 from sigmasplat.tracking.recovery import Recovery
 from sigmasplat.tracking.tracker import Tracker
@@ -52,11 +51,8 @@ class RealTime(ArrayInterface):
         should_stop: Callable[[], bool] = lambda: False,
     ) -> None:
         self.slam, self._hurried, c = slam, should_stop, slam.config
-        wanted = c.tracking.features or c.recovery.relocalise
-        self._extractor = make_extractor(c.features) if wanted else None  # not shared with the mapping thread
-        tracker = Tracker(
-            c.tracking, self._extractor if c.tracking.features else None, detector=DynamicDetector(c.moving)
-        )
+        self._extractor = extractor_of(c)  # not shared with the mapping thread
+        tracker = Tracker.of(c, self._extractor)
         self._front_end = FrontEnd(c, tracker, Recovery(c.recovery))
         self._snapshots: queue.SimpleQueue[Snapshot] = queue.SimpleQueue()
         self._back_end = BackEnd(slam, self._snapshots.put)
@@ -142,7 +138,7 @@ class RealTime(ArrayInterface):
 
     def between_frames(self, task: Callable[[], None]) -> None:
         """Run a task on the mapping thread as soon as all frames so far are in the map. It may read `slam`."""
-        self._back_end.given.put(BetweenFrames(task))
+        self._back_end.given.put(Call(task))
         self._schedule.wake()
 
     def save(self, write: Callable[[], None]) -> None:

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from sigmasplat.data.field import GaussianField, Rows
 from sigmasplat.errors import RunError
 from sigmasplat.files.atomic import write_text
-from sigmasplat.files.guard import guarded
 from sigmasplat.files.json_files import read_text
+from sigmasplat.files.reading import guarded
 from sigmasplat.final.refinement import Refined
 from sigmasplat.fit.adam import VectorAdam
 from sigmasplat.input.source import Source

@@ -19,7 +19,7 @@ from sigmasplat.data.frame import Frame
 from sigmasplat.errors import RunError
 from sigmasplat.files.lock import LOCK, locked, no_warning
 from sigmasplat.input.source import Source
-from sigmasplat.run.profile import profile
+from sigmasplat.run.figures import profile
 from sigmasplat.run.protocols import (
     Callback,
     Checkpointer,
@@ -61,7 +61,7 @@ def new_run(
     warn: Callable[[str], None] = no_warning,
     **facts: Any,
 ) -> Iterator[RunFolder]:
-    """Yield a new run folder as `new_folder` does, and hold its lock during the block (`io.lock`).
+    """Yield a new run folder as `new_folder` does, and hold its lock during the block (`files.lock`).
 
     A folder without results is removed if the block fails (`removed_on_early_failure`). Raises as `new_folder`.
     """

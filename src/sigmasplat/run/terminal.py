@@ -18,7 +18,7 @@ from rich.progress import (
 from rich.table import Table
 
 from sigmasplat.data.component import APART, RELOCALISED
-from sigmasplat.run.profile import shares
+from sigmasplat.run.figures import shares
 from sigmasplat.run.protocols import LoopResult, StepResult
 from sigmasplat.types import Progress
 

@@ -17,9 +17,8 @@ from sigmasplat.data.map_uncertainty import MapUncertainty, SplatStd
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import RunError
 from sigmasplat.files import machine
-from sigmasplat.files.atomic import part_of, replacing, sync_file, write_text
+from sigmasplat.files.atomic import part_of, remove_leftovers, replacing, sync_file, write_text
 from sigmasplat.files.json_files import append_line, read_json, read_lines, write_json, write_json_on_full_disk
-from sigmasplat.files.leftovers import remove_leftovers
 from sigmasplat.files.lock import LOCK, locked, no_warning
 from sigmasplat.files.tensors import open_tensors, write_tensors
 from sigmasplat.run_folder import splat_ply as ply, trajectory as tum, uncertainty as uncertainty_files
@@ -178,7 +177,7 @@ class RunFolder:
         write_json_on_full_disk(self.path / "run.json", self.facts() | facts)
 
     def locked(self, warn: Callable[[str], None] = no_warning) -> AbstractContextManager[None]:
-        """Hold the run while a block writes to it. Raises RunError if another process holds it (`io.lock`)."""
+        """Hold the run while a block writes to it. Raises RunError if another process holds it (`files.lock`)."""
         return locked(self.path, warn)
 
     def remove_leftovers(self) -> None:

@@ -22,8 +22,8 @@ from sigmasplat.data.harmonics import DEGREES, count
 from sigmasplat.data.map_uncertainty import SplatStd
 from sigmasplat.errors import SourceError
 from sigmasplat.files.atomic import replacing
-from sigmasplat.files.binary import open_binary
 from sigmasplat.files.ply_elements import read_header
+from sigmasplat.files.reading import open_binary
 from sigmasplat.run_folder.splat_values import SH_C0, by_channel, check_finite, check_values
 
 PLY_COLUMNS: dict[str, list[str]] = {

@@ -20,9 +20,9 @@ from sigmasplat.mapping.mapper import Mapper
 from sigmasplat.slam.slam_state import SlamState
 from sigmasplat.tracking.drift import Drift
 from sigmasplat.tracking.known_map import KnownMap
-from sigmasplat.tracking.prepared_frame import PreparedFrame, PreparedImages
+from sigmasplat.tracking.prepared_frame import PreparedFrame
 from sigmasplat.tracking.recovery import Link, usable
-from sigmasplat.tracking.relocaliser import INDEX_AT_MOST, Relocation, sight_of
+from sigmasplat.tracking.relocaliser import INDEX_AT_MOST, Relocation
 from sigmasplat.types import Matrix, ShouldStop, Task, completed, never
 
 LAST_TRIES = 3
@@ -138,7 +138,7 @@ class MappingBackend(SlamState):
         self.mapper = Mapper(self.config, self.random, field).successor(self.view, T_parent_camera)
         self.drift = Drift(scene_scale=self.config.render.scene_scale)
 
-    def begin_first(self, seen: PreparedImages) -> Relocation | None:
+    def begin_first(self, seen: PreparedFrame) -> Relocation | None:
         """Start the first submap of a session; return where the map of an earlier session shows the camera, if it
         does: the submap is connected to this place, else it begins a component."""
         place = self.relocalise(seen, index_at_most=None) if self.atlas.anchors else None
@@ -201,13 +201,13 @@ class MappingBackend(SlamState):
     # ---- search and join ----
 
     def relocalise(
-        self, seen: PreparedImages, apart_from: int | None = None, index_at_most: int | None = INDEX_AT_MOST
+        self, seen: PreparedFrame, apart_from: int | None = None, index_at_most: int | None = INDEX_AT_MOST
     ) -> Relocation | None:
         """Search the map for the camera; apart_from: only in components that are not that of this submap."""
         return completed(self.relocalising(seen, apart_from, index_at_most))
 
     def relocalising(
-        self, seen: PreparedImages, apart_from: int | None = None, index_at_most: int | None = INDEX_AT_MOST
+        self, seen: PreparedFrame, apart_from: int | None = None, index_at_most: int | None = INDEX_AT_MOST
     ) -> Task[Relocation | None]:
         """Search the map as `relocalise` does, in slices."""
         if not self.config.recovery.relocalise or not usable(seen):
@@ -226,7 +226,7 @@ class MappingBackend(SlamState):
     def _splats_of(self, place: Relocation) -> GaussianField:
         return self.store.load(place.where[0]).field.to(self.view.sums.device)
 
-    def seek_component(self, seen: PreparedImages, T_submap_camera: Matrix) -> Task[None]:
+    def seek_component(self, seen: PreparedFrame, T_submap_camera: Matrix) -> Task[None]:
         """Look for a place of another component, in slices; two observations that agree join the components."""
         if len(set(self.atlas.components)) > 1:
             yield from self._seek_link(seen, len(self.store), T_submap_camera)
@@ -236,10 +236,11 @@ class MappingBackend(SlamState):
         for s, poses in enumerate(self.atlas.keyframe_poses):
             for k in sorted({round(i) for i in np.linspace(0, len(poses) - 1, LAST_TRIES)}):
                 if self.atlas.components[s]:
-                    keyframe = self._known([True] * len(self.atlas.components)).keyframe((s, k))
-                    completed(self._seek_link(sight_of(keyframe, self.view), s, keyframe.T_submap_camera))
+                    known = self._known([True] * len(self.atlas.components))
+                    seen = PreparedFrame.of_picture(known.picture((s, k)), self.view)
+                    completed(self._seek_link(seen, s, known.T_submap_camera((s, k))))
 
-    def _seek_link(self, seen: PreparedImages, submap: int, T_submap_camera: Matrix) -> Task[None]:
+    def _seek_link(self, seen: PreparedFrame, submap: int, T_submap_camera: Matrix) -> Task[None]:
         """Search other components for a camera of a submap, in slices; if a second observation agrees, join them."""
         place = yield from self.relocalising(seen, apart_from=submap)
         if place is None:

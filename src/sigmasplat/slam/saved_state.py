@@ -28,7 +28,7 @@ from sigmasplat.slam.slam import Slam
 from sigmasplat.slam.step_result import Step
 from sigmasplat.slam.steps import Steps
 from sigmasplat.tracking.depth_fit import DepthFit
-from sigmasplat.tracking.depth_shape import DepthShape, SeenKeyframe
+from sigmasplat.tracking.depth_shape import DepthShape
 from sigmasplat.tracking.drift import Drift
 from sigmasplat.tracking.feature_image import FeatureImage
 from sigmasplat.tracking.moving.depth_history import DepthHistory, RememberedDepth
@@ -43,7 +43,7 @@ CLASSES: tuple[type, ...] = (
     Atlas, Camera, Column, Confidence, DepthFit, DepthHistory, DepthShape, DescribedSubmaps, Detail, Drift,
     DynamicDetector, DynamicMask, Edges, FeatureImage, GaussianField, Keyframe, KeyframePoses, Link, Loop, LoopCloser,
     Loops, Mapper, PendingSearch, Photo, Picture, Places, PosePrior, Poses, Pyramid, Recovery, Reference, Relocaliser,
-    RememberedDepth, Rows, SecondHalf, SeenKeyframe, Step, Steps, Target, TrackedHops, Tracker, TrackingStatistics,
+    RememberedDepth, Rows, SecondHalf, Step, Steps, Target, TrackedHops, Tracker, TrackingStatistics,
     ValidationView, ValidationViews, VectorAdam,
 )  # fmt: skip
 """The classes that a state may contain."""

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from sigmasplat.data import se3
-from sigmasplat.data.component import APART, LOST, RELOCALISED, TRACKED
+from sigmasplat.data.component import APART, RELOCALISED, TRACKED
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.hops import UNKNOWN_HOP, Hop
 from sigmasplat.data.submap import RefinedStore, StorePart
@@ -20,11 +20,10 @@ from sigmasplat.render.low_pass import as_refined
 from sigmasplat.slam.array_interface import ArrayInterface
 from sigmasplat.slam.listeners import notifying
 from sigmasplat.slam.mapping_backend import MappingBackend
-from sigmasplat.slam.step_result import Step, StepTimer
+from sigmasplat.slam.step_result import Step, StepTimer, make_step
 from sigmasplat.tracking.fitted_depth import fitted_keyframe, fitted_to_map
 from sigmasplat.tracking.frame_estimate import FrameEstimate
-from sigmasplat.tracking.keyframe_rule import is_held_back, is_keyframe
-from sigmasplat.tracking.moving.dynamic_mask import share_of
+from sigmasplat.tracking.keyframe_rule import becomes_keyframe, is_held_back, is_mappable, may_validate
 from sigmasplat.tracking.pose_validation import is_better, is_questionable
 from sigmasplat.tracking.prepared_frame import PreparedFrame, refuse_first_without_depth, working_frame
 from sigmasplat.tracking.recovery import usable
@@ -47,26 +46,16 @@ class Slam(MappingBackend, ArrayInterface):
 
         Raises SourceError if the first frame has no depth or a later one comes from another camera.
         """
-        self._timer, loops_before = StepTimer(), len(self.closer.loops)
-        seen = self._observe(frame)
-        if self.steps:
-            seen = fitted_to_map(self.tracker, self.mapper.field, self.view, seen)
-        found = self._localise(seen) if self.steps else self._begin(seen)
-        if found.mapped:
-            connected = len(self.steps) > 0 and found.state == TRACKED
-            pose = found.T_submap_camera
-            seen = fitted_keyframe(self.tracker, self.mapper.field, self.view, seen, pose, connected)
-            seen = seen.without(self.tracker.front)
-            if self.config.mapping.exposure:
-                seen = seen.without_exposure(found.exposure)
-            self._map(seen, found)
-            completed(self.seek_component(seen, found.T_submap_camera))
+        self._timer, tried = StepTimer(), len(self.closer.loops)
+        seen = self._prepared(frame)
+        estimate = self._locate(seen) if self.steps else self._begin(seen)
+        if estimate.mapped:
+            self._map(self._masked(seen, estimate), estimate)
         else:
-            self._offer_validation_view(seen, found)
-            completed(self.refining(self.mapper.pending_now))
-            self._look_for_loops()
-        self.atlas.place_frame(found.T_submap_camera)
-        self.steps.append(self._step_result(seen.frame, found, self.closer.loops[loops_before:]))
+            self._offer_validation_view(seen, estimate)
+            self._run_pending()
+        self.atlas.place_frame(estimate.T_submap_camera)
+        self.steps.append(self._result(seen, estimate, self.closer.loops[tried:]))
         return self.steps[-1]
 
     @notifying
@@ -109,12 +98,20 @@ class Slam(MappingBackend, ArrayInterface):
         final, photos = self.config.final, any(keyframe.photo for keyframe in self.mapper.keyframes)
         return final.iterations + final.width_iterations * (photos and final.iterations > 0)
 
-    def _observe(self, frame: Frame) -> PreparedFrame:
+    def _prepared(self, frame: Frame) -> PreparedFrame:
         """Resize a frame to working size and prepare it for the fits."""
         with self._timer.stage("prepare"):
             view = self._view or self.prepare(working_frame(frame, self.config).camera)
             self._timer.start_kernels(view)
-            return self.observed(frame, view, self.extractor)
+            seen = self.observed(frame, view, self.extractor)
+        return fitted_to_map(self.tracker, self.mapper.field, view, seen) if self.steps else seen
+
+    def _masked(self, seen: PreparedFrame, estimate: FrameEstimate) -> PreparedFrame:
+        """Return a keyframe as it is mapped: without what moves in front, in the exposure of the map."""
+        connected, pose = len(self.steps) > 0 and estimate.state == TRACKED, estimate.T_submap_camera
+        seen = fitted_keyframe(self.tracker, self.mapper.field, self.view, seen, pose, connected)
+        seen = seen.without(self.tracker.front)
+        return seen.without_exposure(estimate.exposure) if self.config.mapping.exposure else seen
 
     def _begin(self, seen: PreparedFrame) -> FrameEstimate:
         """Start the first submap at the first frame. Its camera is the world, unless there are earlier submaps: then
@@ -124,50 +121,55 @@ class Slam(MappingBackend, ArrayInterface):
         place = self.begin_first(seen)
         if place is None:
             return FrameEstimate(np.eye(4), TRACKED, mapped=True)
-        return FrameEstimate(np.eye(4), RELOCALISED, place.values(), mapped=True)
+        return FrameEstimate(np.eye(4), RELOCALISED, mapped=True, comparison=place.comparison, inliers=place.inliers)
 
-    def _localise(self, seen: PreparedFrame) -> FrameEstimate:
+    def _locate(self, seen: PreparedFrame) -> FrameEstimate:
         """Track a frame; if it is lost, search the whole map for it; if that fails too often, begin a new map."""
         fit = self._track(seen)
-        lost, held_back = self.tracker.lost, is_held_back(len(self.steps), self.config.input.hold_every)
+        lost, held_back = self.tracker.lost, self._is_held_back
         self.recovery.count(lost, self.tracker.doubtful > 0, seen)
-        found = FrameEstimate.of(fit, se3.inverse(fit.T_camera_world), lost)
+        estimate = FrameEstimate.of(fit, lost)
         if not lost:
-            certain = self.recovery.is_steady and self.tracker.is_certain(fit)
-            found.mapped = certain and not held_back and self._is_keyframe(fit)
-            if found.mapped:
-                found.hop = self.hop_to(fit.T_camera_world, self.tracker.hop(fit, seen.live))
+            estimate.mapped = not held_back and self._is_keyframe(fit)
+            if estimate.mapped:
+                estimate.hop = self.hop_to(fit.T_camera_world, self.tracker.hop(fit, seen.live))
                 if self.cuts:
-                    found.tracking["drift_m"] = self.add_drift(found.T_submap_camera, found.hop)
+                    estimate.drift_m = self.add_drift(estimate.T_submap_camera, estimate.hop)
             if not held_back:
-                self._question(fit, seen, found)
+                self._question(fit, seen, estimate)
         elif held_back:
-            return found  # a search for the camera could make a keyframe of this frame
+            return estimate  # a search for the camera could make a keyframe of this frame
         elif (place := self.relocalise(seen)) is not None:
-            self._go_to(place, seen, found)
+            self._go_to(place, seen, estimate)
         elif self.recovery.gives_up and usable(seen):
-            self._begin_apart(seen, found)
-        return found
+            self._begin_apart(estimate)
+        return estimate
 
     def _track(self, seen: PreparedFrame) -> PoseFit:
         """Fit the frame's pose to the active submap."""
         with self._timer.stage("track"), self._timer.kernels_of(self.view, "track_kernels"):
             return self.tracker.track(self.mapper.field, self.view, seen, seen.frame.prior)
 
+    @property
+    def _is_held_back(self) -> bool:
+        return is_held_back(len(self.steps), self.config.input.hold_every)
+
     def _is_keyframe(self, fit: PoseFit) -> bool:
-        c, since = self.config.mapping, len(self.steps) - self.mapper.keyframes[-1].index
-        renews = self.tracker.detector.renews(fit.comparison, self.tracker.front)
-        return renews or is_keyframe(since, c.every, fit.overlap, c.overlap_below)
+        since = len(self.steps) - self.mapper.keyframes[-1].index
+        mappable = is_mappable(fit, self.tracker, self.recovery)
+        return mappable and becomes_keyframe(fit, self.tracker, since, self.config.mapping)
 
-    def _map(self, seen: PreparedFrame, found: FrameEstimate) -> None:
-        """Map a keyframe, and cut the submap if a rule ends it here."""
-        found.T_submap_camera = self._mapped(seen, found.T_submap_camera, found.hop)
-        if self.submap_ends(len(self.steps), found.T_submap_camera):
-            completed(self.cut(found.T_submap_camera))
-            found.T_submap_camera = self._mapped(seen, np.eye(4))  # the next submap begins with the same keyframe
+    def _map(self, seen: PreparedFrame, estimate: FrameEstimate) -> None:
+        """Map a keyframe, cut the submap if a rule ends it here, and look for the place in other components."""
+        estimate.T_submap_camera = self._mapped(seen, estimate.T_submap_camera, estimate.hop)
+        if self.submap_ends(len(self.steps), estimate.T_submap_camera):
+            completed(self.cut(estimate.T_submap_camera))
+            estimate.T_submap_camera = self._mapped(seen, np.eye(4))  # the next submap begins with the same keyframe
+        completed(self.seek_component(seen, estimate.T_submap_camera))
 
-    def _look_for_loops(self) -> None:
-        """Continue the pending search for loops by the number of slices that one frame does."""
+    def _run_pending(self) -> None:
+        """Make the steps that this frame does of the pending work: of the map, and of the search for loops."""
+        completed(self.refining(self.mapper.pending_now))
         with self._timer.stage("loops"):
             completed(self.closing(self.config.loops.slices_per_frame))
 
@@ -177,55 +179,43 @@ class Slam(MappingBackend, ArrayInterface):
         self.tracker.keep_keyframe(self.mapper.field, self.view, seen, T_submap_camera)
         return T_submap_camera
 
-    def _offer_validation_view(self, seen: PreparedFrame, found: FrameEstimate) -> None:
-        """Offer a frame as a probe view if it was tracked without doubt and is not held back."""
-        index, newest = len(self.steps), self.mapper.keyframes[-1]
-        held_back = is_held_back(index, self.config.input.hold_every)
-        if found.state == TRACKED and self.recovery.is_steady and not self.tracker.doubtful and not held_back:
-            T_keyframe_camera = se3.inverse(newest.T_world_camera) @ found.T_submap_camera
-            last = len(self.mapper.keyframes) - 1
+    def _offer_validation_view(self, seen: PreparedFrame, estimate: FrameEstimate) -> None:
+        """Offer a frame as a validation view if it was tracked without doubt and is not held back."""
+        if may_validate(estimate, self.tracker, self.recovery) and not self._is_held_back:
+            index, newest, last = len(self.steps), self.mapper.keyframes[-1], len(self.mapper.keyframes) - 1
+            T_keyframe_camera = se3.inverse(newest.T_world_camera) @ estimate.T_submap_camera
             self.validation_views.offer(index, last, index - newest.index, T_keyframe_camera, seen.target)
 
     # ---- lost and found ----
 
-    def _question(self, fit: PoseFit, seen: PreparedFrame, found: FrameEstimate) -> None:
+    def _question(self, fit: PoseFit, seen: PreparedFrame, estimate: FrameEstimate) -> None:
         """After some doubtful frames, search the whole map for a pose that explains the frame much better."""
         if fit.comparison is None or not is_questionable(self.tracker.doubtful):
             return
         place = self.relocalise(seen)
         if place is not None and is_better(place.comparison, fit.comparison):
-            self._go_to(place, seen, found)
+            self._go_to(place, seen, estimate)
 
-    def _go_to(self, place: Relocation, seen: PreparedFrame, found: FrameEstimate) -> None:
+    def _go_to(self, place: Relocation, seen: PreparedFrame, estimate: FrameEstimate) -> None:
         """Continue where the camera was found: in the active submap, or in a new one that is connected to the place."""
-        found.state, submap = RELOCALISED, place.where[0]
-        found.tracking |= place.values()
+        estimate.state, submap = RELOCALISED, place.where[0]
+        estimate.comparison, estimate.inliers = place.comparison, place.inliers
         if submap == len(self.store):
-            found.T_submap_camera = place.T_submap_camera
+            estimate.T_submap_camera = place.T_submap_camera
             self.tracker.move_to(self.mapper.field, self.view, place.keyframe, place.T_submap_camera)
         else:
             self.tracker.detector = self.tracker.detector.cleared()
             completed(self.branch_at(place))
-            found.T_submap_camera, found.mapped = np.eye(4), True
+            estimate.T_submap_camera, estimate.mapped = np.eye(4), True
         self.recovery.found()
 
-    def _begin_apart(self, seen: PreparedFrame, found: FrameEstimate) -> None:
+    def _begin_apart(self, estimate: FrameEstimate) -> None:
         """Begin a new map at the camera, whose place in the world is not known yet."""
         completed(self.begin_apart())
         self.tracker.forget()
         self.recovery.found()
-        found.T_submap_camera, found.state, found.mapped = np.eye(4), APART, True
+        estimate.T_submap_camera, estimate.state, estimate.mapped = np.eye(4), APART, True
 
-    def _step_result(self, frame: Frame, found: FrameEstimate, loops: Sequence[Loop]) -> Step:
-        component, in_submap_m = self.atlas.components[-1], self.drift.position_m(found.T_submap_camera)
-        state = APART if component and found.state != LOST else found.state
-        found.tracking |= {
-            "position_std_m": self.confidence.position_std_m(in_submap_m), "doubtful": float(self.tracker.doubtful),
-            "usual_residual": self.tracker.statistics.residual, "moving": share_of(self.tracker.front),
-        }  # fmt: skip
-        p_off = self.confidence.probability(state, found.tracking)
-        return Step(
-            frame.index, frame.timestamp_s, self.atlas.anchors[-1] @ found.T_submap_camera, found.mapped,
-            state == LOST, found.tracking, len(self.mapper.field), len(self.atlas.anchors) - 1,
-            tuple(loops), self._timer.stop(self.view), state, component, p_off,
-        )  # fmt: skip
+    def _result(self, seen: PreparedFrame, estimate: FrameEstimate, loops: Sequence[Loop]) -> Step:
+        seconds = self._timer.stop(self.view)
+        return make_step(seen, estimate, self.active_submap(), self.tracker, self.confidence, loops, seconds)

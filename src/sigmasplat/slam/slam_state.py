@@ -1,6 +1,7 @@
 """The state of SLAM, and how to read it: map, path, components, checkpoint."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -31,11 +32,10 @@ from sigmasplat.mapping.validation_views import ValidationViews
 from sigmasplat.render.view import View
 from sigmasplat.slam.checkpoint import checkpoint_of
 from sigmasplat.slam.listeners import Listeners
-from sigmasplat.slam.step_result import Step, StepTimer
+from sigmasplat.slam.step_result import Step, StepTimer, SubmapState
 from sigmasplat.slam.steps import Steps
 from sigmasplat.tracking.drift import Drift
-from sigmasplat.tracking.features import Extractor, make_extractor
-from sigmasplat.tracking.moving.dynamic_detector import DynamicDetector
+from sigmasplat.tracking.features import Extractor, extractor_of
 from sigmasplat.tracking.prepared_frame import PreparedFrame, observe, view_of, working_frame
 from sigmasplat.tracking.recovery import Recovery
 from sigmasplat.tracking.relocaliser import Relocaliser
@@ -67,15 +67,13 @@ class SlamState:
         self.random = np.random.default_rng(self.config.seed)
         self.store = MemoryStore() if store is None else store
         self.atlas = Atlas()
-        wanted = self.config.tracking.features or self.config.recovery.relocalise
-        self.extractor = make_extractor(self.config.features) if wanted else None
-        features = self.extractor if self.config.tracking.features else None
-        self.tracker = Tracker(self.config.tracking, features, detector=DynamicDetector(self.config.moving))
+        self.extractor = extractor_of(self.config)
+        self.tracker = Tracker.of(self.config, self.extractor)
         self.mapper = Mapper(self.config, self.random)
         self.drift = Drift(scene_scale=self.config.render.scene_scale)
         self.validation_views = ValidationViews(self.config.uncertainty.probes, self.config.mapping.every)
         self.descriptor = make_descriptor(self.config.loops)
-        self.closer = LoopCloser(self.config, self.store, self.extractor if self.config.tracking.features else None)
+        self.closer = LoopCloser(self.config, self.store, self.tracker.extractor)
         self.recovery = Recovery(self.config.recovery)
         self.confidence = Confidence()
         self.relocaliser = Relocaliser(self.config, self.extractor)
@@ -105,6 +103,12 @@ class SlamState:
         if not len(self.store):
             return self.mapper.field.to(HOST)
         return merged_field(self.store, self.atlas, 0, self.mapper.field)
+
+    def active_submap(self) -> SubmapState:
+        """Return a copy of the active submap's state, as steps report it."""
+        atlas, splats = self.atlas, len(self.mapper.field)
+        drift = replace(self.drift)
+        return SubmapState(len(atlas.anchors) - 1, atlas.components[-1], atlas.anchors[-1], drift, splats)
 
     def components(self) -> list[Component]:
         """Return the components of the atlas that are not connected to the world."""

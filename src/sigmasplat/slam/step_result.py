@@ -1,17 +1,36 @@
 """The result of one frame, and the times of its stages."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.data.component import TRACKED
+from sigmasplat.data.component import APART, LOST, TRACKED
 from sigmasplat.data.stopwatch import Stopwatch
+from sigmasplat.graph.confidence import Confidence
 from sigmasplat.graph.loops import Loop
 from sigmasplat.render.view import View
+from sigmasplat.tracking.drift import Drift
+from sigmasplat.tracking.frame_estimate import FrameEstimate
+from sigmasplat.tracking.moving.dynamic_mask import share_of
+from sigmasplat.tracking.prepared_frame import PreparedFrame
+from sigmasplat.tracking.tracker import Tracker
+from sigmasplat.types import Matrix
+
+
+@dataclass(frozen=True, eq=False)
+class SubmapState:
+    """The active submap as a step reports it: number, component, T_world_submap [4, 4], drift, number of splats."""
+
+    number: int = 0
+    component: int = 0
+    T_world_submap: Matrix = field(default_factory=lambda: np.eye(4))
+    drift: Drift = field(default_factory=Drift)
+    splats: int = 0
+
 
 KERNELS = ("project", "sort", "blend", "blend_backward", "project_backward")
 """The stages that `View.seconds` counts, in its order."""
@@ -42,6 +61,25 @@ class Step:
     component: int = 0
     p_off: float = 0.0
     covariance: NDArray[np.float64] | None = None
+
+
+def make_step(
+    seen: PreparedFrame, estimate: FrameEstimate, submap: SubmapState, tracker: Tracker, confidence: Confidence,
+    loops: Sequence[Loop], seconds: dict[str, float], waiting: int | None = None,
+) -> Step:  # fmt: skip
+    """Return the result of a frame; submap: the active one; waiting: number of keyframes that wait to be mapped, on two
+    clocks."""
+    state = APART if submap.component and estimate.state != LOST else estimate.state
+    in_submap_m = submap.drift.position_m(estimate.T_submap_camera)
+    tracking = estimate.logged() | {
+        "position_std_m": confidence.position_std_m(in_submap_m), "doubtful": float(tracker.doubtful),
+        "usual_residual": tracker.statistics.residual,
+    } | ({} if waiting is None else {"waiting": float(waiting)}) | {"moving": share_of(tracker.front)}  # fmt: skip
+    p_off = confidence.probability(state, tracking)
+    return Step(
+        seen.frame.index, seen.frame.timestamp_s, submap.T_world_submap @ estimate.T_submap_camera, estimate.mapped,
+        state == LOST, tracking, submap.splats, submap.number, tuple(loops), seconds, state, submap.component, p_off,
+    )  # fmt: skip
 
 
 @dataclass(eq=False)

@@ -40,20 +40,13 @@ FACTOR_RANGE = (0.3, 3.0)
 
 
 @dataclass(frozen=True, eq=False)
-class SeenKeyframe:
-    """A keyframe with its predicted depth, and its pose T_newest_camera [4, 4] relative to the newest one."""
-
-    image: FeatureImage
-    T_newest_camera: Matrix
-
-
-@dataclass(frozen=True, eq=False)
 class DepthShape:
-    """θ [5] with its information [5, 5], and the keyframes that the next one is compared with."""
+    """θ [5] with its information [5, 5], and the views that the next keyframe is compared with: the images of keyframes
+    with predicted depth, and their poses T_newest_camera [4, 4] relative to the newest one."""
 
     theta: Matrix
     information: Matrix
-    views: tuple[SeenKeyframe, ...] = ()
+    views: tuple[tuple[FeatureImage, Matrix], ...] = ()
 
     @staticmethod
     def unknown() -> "DepthShape":
@@ -77,18 +70,17 @@ class DepthShape:
         prior = np.eye(TERMS) / SPREAD**2
         found = replace(self, information=KEPT * self.information + (1.0 - KEPT) * prior)
         T_new_last = se3.inverse(T_last_new)
-        views = [SeenKeyframe(seen.image, T_new_last @ seen.T_newest_camera) for seen in self.views]
+        views = [(seen, T_new_last @ T) for seen, T in self.views]
         new, z = image.features(extractor), depth_at(image, extractor)
-        for seen in views:
-            old, old_z = seen.image.features(extractor), depth_at(seen.image, extractor)
+        for seen, T in views:
+            old, old_z = seen.features(extractor), depth_at(seen, extractor)
             pairs = extractor.match(old, new)
             if len(pairs) < LEAST_MATCHES:
                 continue
             a, b = pairs.T
-            T = seen.T_newest_camera
             found = found._measured(old.take(a), old_z[a], new.take(b), T)
             found = found._measured(new.take(b), z[b], old.take(a), se3.inverse(T))
-        kept = tuple([*views, SeenKeyframe(image, np.eye(4))][-VIEWS:])
+        kept = tuple([*views, (image, np.eye(4))][-VIEWS:])
         return replace(found, views=kept)
 
     def _measured(self, first: Features, z: Matrix, second: Features, T_second_first: Matrix) -> "DepthShape":

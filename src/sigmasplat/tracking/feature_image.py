@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.frame import Detail, Frame
 from sigmasplat.data.opencv import opencv
+from sigmasplat.data.submap import Picture
 from sigmasplat.tracking.features import (
     Extractor,
     Features,
@@ -85,6 +86,12 @@ class FeatureImage:
     given_detail: Detail | LateDetail = field(init=False, repr=False)
     _features: Features | None = field(default=None, init=False, repr=False)
     _landmarks: Landmarks | None = field(default=None, init=False, repr=False)
+
+    @staticmethod
+    def of_picture(picture: Picture, camera: Camera) -> "FeatureImage":
+        """Return the image in which the features of a keyframe are found; camera: of the working images."""
+        detail = picture.detail or Detail(gray_levels(picture.unit_color), camera)
+        return FeatureImage(detail, picture.depth_m, camera)
 
     def features(self, extractor: Extractor) -> Features:
         """Return the features of the image."""

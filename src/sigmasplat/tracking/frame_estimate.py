@@ -1,35 +1,50 @@
 """The result of localising one frame, before it is mapped and recorded."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
+from sigmasplat.data import se3
 from sigmasplat.data.component import LOST, TRACKED
 from sigmasplat.data.hops import UNKNOWN_HOP, Hop
+from sigmasplat.fit.compare import Comparison
 from sigmasplat.fit.pose import PoseFit
 from sigmasplat.types import Matrix
 
 
-def metrics_of(fit: PoseFit) -> dict[str, float]:
-    """Return the tracking values that a step reports."""
-    compared = {} if fit.comparison is None else vars(fit.comparison)
-    return {
-        "agreement": fit.agreement, "overlap": fit.overlap, "first_loss": fit.first_loss,
-        "loss": fit.loss, "iterations": float(fit.iterations),
-    } | compared  # fmt: skip
-
-
 @dataclass(eq=False)
 class FrameEstimate:
-    """Where a frame is: T_submap_camera [4, 4] in the active submap, its state, values of tracking, whether it is to be
-    mapped, the hop to it from the last keyframe, and its exposure (a, b) relative to the map."""
+    """Where a frame is: T_submap_camera [4, 4] in the active submap, its state, and whether it is to be mapped.
+
+    fit: of tracking, None for the first frame; comparison: with the map at the pose, if it was made; hop: from the last
+    keyframe; inliers: matches of the relocalisation; drift_m: of the submap, if a rule reads it.
+    """
 
     T_submap_camera: Matrix
     state: str = TRACKED
-    tracking: dict[str, float] = field(default_factory=dict)
     mapped: bool = False
+    fit: PoseFit | None = None
+    comparison: Comparison | None = None
     hop: Hop = UNKNOWN_HOP
-    exposure: tuple[float, float] = (0.0, 0.0)
+    inliers: int | None = None
+    drift_m: float | None = None
 
     @staticmethod
-    def of(fit: PoseFit, T_submap_camera: Matrix, lost: bool) -> "FrameEstimate":
+    def of(fit: PoseFit, lost: bool) -> "FrameEstimate":
         """Return the result of tracking."""
-        return FrameEstimate(T_submap_camera, LOST if lost else TRACKED, metrics_of(fit), exposure=fit.exposure)
+        state = LOST if lost else TRACKED
+        return FrameEstimate(se3.inverse(fit.T_camera_world), state, fit=fit, comparison=fit.comparison)
+
+    @property
+    def exposure(self) -> tuple[float, float]:
+        """Return the exposure (a, b) of the frame relative to the map."""
+        return (0.0, 0.0) if self.fit is None else self.fit.exposure
+
+    def logged(self) -> dict[str, float]:
+        """Return the values by the names of the log; what is not known is left out."""
+        fit, values = self.fit, dict[str, float]()
+        if fit is not None:
+            values |= {"agreement": fit.agreement, "overlap": fit.overlap, "first_loss": fit.first_loss}
+            values |= {"loss": fit.loss, "iterations": float(fit.iterations)}
+        if self.comparison is not None:
+            values |= vars(self.comparison)
+        found = {"drift_m": self.drift_m, "inliers": self.inliers}
+        return values | {name: float(value) for name, value in found.items() if value is not None}

@@ -3,26 +3,10 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
-from sigmasplat.data.frame import Detail
 from sigmasplat.data.submap import KeyframeId, Picture, SubmapStore
 from sigmasplat.fit.target import Keyframe
-from sigmasplat.tracking.feature_image import FeatureImage, gray_levels
 from sigmasplat.types import Matrix
-
-
-@dataclass(frozen=True, eq=False)
-class KnownKeyframe:
-    """A keyframe of the map: its images and its pose T_submap_camera [4, 4]."""
-
-    picture: Picture
-    T_submap_camera: Matrix
-
-    def image(self, camera: Camera) -> FeatureImage:
-        """Return the image in which its features are found; camera: of the working images."""
-        detail = self.picture.detail or Detail(gray_levels(self.picture.unit_color), camera)
-        return FeatureImage(detail, self.picture.depth_m, camera)
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,12 +28,14 @@ class KnownMap:
         found = [(s, k) for s, poses in enumerate(self.keyframe_poses) if self.wanted(s) for k in range(len(poses))]
         return found[::-1]
 
-    def keyframe(self, where: KeyframeId) -> KnownKeyframe:
-        """Return one keyframe."""
+    def picture(self, where: KeyframeId) -> Picture:
+        """Return the images of a keyframe."""
         submap, k = where
-        stored = submap < len(self.store)
-        picture = self.store.picture(submap, k) if stored else self.active[k].picture()
-        return KnownKeyframe(picture, self.keyframe_poses[submap][k])
+        return self.store.picture(submap, k) if submap < len(self.store) else self.active[k].picture()
+
+    def T_submap_camera(self, where: KeyframeId) -> Matrix:
+        """Return the pose [4, 4] of a keyframe."""
+        return self.keyframe_poses[where[0]][where[1]]
 
     def splats(self, submap: int) -> GaussianField:
         """Return the splats of a submap, in its frame."""

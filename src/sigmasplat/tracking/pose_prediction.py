@@ -10,6 +10,7 @@ from sigmasplat.config import TrackingConfig
 from sigmasplat.data import se3
 from sigmasplat.data.frame import PosePrior
 from sigmasplat.fit.align import align
+from sigmasplat.fit.backends import fits_of
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.render.view import View
 from sigmasplat.tracking.tracked_keyframe import Splats
@@ -57,14 +58,6 @@ def predict(
     return PosePrediction(motion, turn, previous @ motion if motion_model else last, last, measured)
 
 
-def odometry(last: Pyramid, live: Pyramid, prediction: PosePrediction, config: TrackingConfig) -> Matrix | None:
-    """Align the last image to this one and return T_live_last [4, 4]; None if it fails."""
-    guesses = (se3.inverse(prediction.motion), prediction.turn.T.copy())  # the inverse, because it has no translation
-    found = [align(last, live, g, 2 * config.align_iterations, config.align_weight_color) for g in guesses]
-    best = max(found, key=lambda a: a.agreement * a.overlap)
-    return None if best.agreement * best.overlap < config.lost_share else best.T_live_reference
-
-
 @dataclass(frozen=True, eq=False)
 class Given:
     """What all fits of one frame share: the map, its view, where the camera is expected, and whether to stop."""
@@ -77,3 +70,14 @@ class Given:
     def unless(self, guesses: Iterable[Item], least: int = 0) -> Iterator[Item]:
         """Yield guesses, after the first `least` ones only while nothing asks to stop."""
         return unless(self.should_stop, guesses, least)
+
+
+def odometry(last: Pyramid | None, live: Pyramid, given: Given, config: TrackingConfig) -> Matrix | None:
+    """Align the last image to this one and return T_live_last [4, 4]; None without a last image, or if it fails."""
+    if last is None or (config.method == "adam" and not fits_of(given.view).aligns):
+        return None  # alignment needs the compiled kernels
+    prediction = given.prediction
+    guesses = (se3.inverse(prediction.motion), prediction.turn.T.copy())  # the inverse, because it has no translation
+    found = [align(last, live, g, 2 * config.align_iterations, config.align_weight_color) for g in guesses]
+    best = max(found, key=lambda a: a.agreement * a.overlap)
+    return None if best.agreement * best.overlap < config.lost_share else best.T_live_reference

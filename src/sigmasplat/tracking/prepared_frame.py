@@ -1,7 +1,6 @@
-"""One frame, or one keyframe of the map, in the forms that tracking needs."""
+"""One frame, or one keyframe of the map, in the forms that tracking and mapping need."""
 
 from dataclasses import dataclass, field, replace
-from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +12,10 @@ from sigmasplat.data.depth_std import std_by_model
 from sigmasplat.data.exposure import gray_exposure, unexposed
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.photo import Photo, photo_size
+from sigmasplat.data.submap import Picture
 from sigmasplat.errors import SourceError
 from sigmasplat.fit.pyramid import HIDDEN_M, Pyramid
-from sigmasplat.fit.references import Reference, live_image
+from sigmasplat.fit.references import live_image, picture_images
 from sigmasplat.fit.target import Target
 from sigmasplat.render.backend import make_view
 from sigmasplat.render.view import View
@@ -27,31 +27,41 @@ from sigmasplat.tracking.moving.dynamic_mask import DynamicMask
 
 
 @dataclass(eq=False)
-class PreparedImages:
-    """A frame in the forms that tracking needs: the target of the fits, its pyramid, the image for features, and the
-    pixels [H, W] that the user wants to be ignored, which have no depth."""
+class PreparedFrame:
+    """A frame in the forms that tracking and mapping need: the target of the fits, its pyramid, the image for features,
+    the pixels [H, W] that the user wants to be ignored, which have no depth, the working frame, and the whole one as it
+    was read."""
 
     target: Target
     live: Pyramid
     image: FeatureImage | None = None
     ignored: NDArray[np.bool_] | None = None
+    frame: Frame = field(kw_only=True)
+    whole: Frame = field(kw_only=True)
+
+    @staticmethod
+    def of_picture(picture: Picture, view: View) -> "PreparedFrame":
+        """Return a keyframe of the map in the form of a frame to be found."""
+        target, live = picture_images(view, picture, view.camera)
+        frame = Frame(0, 0.0, picture.unit_color, picture.depth_m, view.camera)
+        return PreparedFrame(target, live, FeatureImage.of_picture(picture, view.camera), frame=frame, whole=frame)
 
     @property
-    def shown(self) -> Self:
+    def shown(self) -> "PreparedFrame":
         """Return the frame for fits of its pose, which do not use the pixels that are to be ignored."""
         return self if self.ignored is None else self.aside(None)
 
-    def without(self, front: DynamicMask | None) -> Self:
+    def without(self, front: DynamicMask | None) -> "PreparedFrame":
         """Return the frame without depth where something is in front: it is neither mapped nor a reference there."""
         if front is None:
             return self
         return self.with_depth(np.where(front.hidden, np.float32(0.0), self.target.depth_image.numpy()))
 
-    def with_depth(self, depth_m: NDArray[np.float32]) -> Self:
+    def with_depth(self, depth_m: NDArray[np.float32]) -> "PreparedFrame":
         """Return the frame with other depth [H, W], m."""
         return replace(self._read_as(depth_m), live=self.live.with_depth(depth_m))
 
-    def aside(self, front: DynamicMask | None) -> Self:
+    def aside(self, front: DynamicMask | None) -> "PreparedFrame":
         """Return the frame for fits of its pose, which are to use neither depth nor colour of what is in front or
         ignored."""
         depth_m = self.target.depth_image.numpy()
@@ -68,31 +78,20 @@ class PreparedImages:
         hidden = np.zeros((), np.bool_) if front is None else front.hidden
         return hidden if self.ignored is None else hidden | self.ignored
 
-    def separate(self) -> Self:
+    def separate(self) -> "PreparedFrame":
         """Return the same frame with an own image for features, which are found and kept when they are first needed."""
         return replace(self, image=None if self.image is None else self.image.with_depth(self.image.depth_m))
 
-    def without_exposure(self, exposure: tuple[float, float]) -> Self:
-        """Return the frame with the exposure (a, b) of exp(a) · colour + b removed from its target."""
-        return replace(self, target=self.target.without_exposure(gray_exposure(*exposure)))
+    def without_exposure(self, exposure: tuple[float, float]) -> "PreparedFrame":
+        """Return the frame with the exposure (a, b) of exp(a) · colour + b removed from its target and its photo."""
+        gray = gray_exposure(*exposure)
+        whole = replace(self.whole, color=unexposed(self.whole.color, gray))
+        return replace(self, target=self.target.without_exposure(gray), whole=whole)
 
-    def _read_as(self, depth_m: NDArray[np.float32]) -> Self:
+    def _read_as(self, depth_m: NDArray[np.float32]) -> "PreparedFrame":
         """Return the frame with other depth [H, W], m, for everything but fits of its pose."""
         image = None if self.image is None else self.image.with_depth(depth_m)
         return replace(self, target=self.target.with_depth(depth_m), image=image)
-
-
-@dataclass(eq=False)
-class PreparedFrame(PreparedImages):
-    """A frame in the forms that tracking and mapping need: also the working frame, and the whole one as it was read."""
-
-    frame: Frame = field(kw_only=True)
-    whole: Frame = field(kw_only=True)
-
-    def without_exposure(self, exposure: tuple[float, float]) -> "PreparedFrame":
-        """Return the frame with the exposure (a, b) of exp(a) · colour + b removed from its target and its photo."""
-        whole = replace(self.whole, color=unexposed(self.whole.color, gray_exposure(*exposure)))
-        return replace(super().without_exposure(exposure), whole=whole)
 
     def photo(self, config: Config) -> Photo | None:
         """Return the colour at the size of the final map's last stage; None if working images are as large."""
@@ -140,14 +139,6 @@ def observe(whole: Frame, working: Frame, view: View, config: Config, extractor:
     if extractor is not None:
         image = FeatureImage(LateDetail(whole, config.features.width), working.depth_m, working.camera)
     return PreparedFrame(target, live, image, ignored, frame=working, whole=whole)
-
-
-@dataclass(eq=False)
-class FoundKeyframe(Reference):
-    """A keyframe of the map that shows what the camera sees: a reference with its pose in its submap, and its image for
-    features."""
-
-    image: FeatureImage
 
 
 def refuse_first_without_depth(frame: Frame, config: Config) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 from sigmasplat.config import RecoveryConfig
 from sigmasplat.data import se3
 from sigmasplat.data.atlas import Atlas
-from sigmasplat.tracking.prepared_frame import PreparedImages
+from sigmasplat.tracking.prepared_frame import PreparedFrame
 from sigmasplat.types import Matrix
 
 LEAST_READINGS = 0.05
@@ -18,7 +18,7 @@ SAME_M, SAME_RAD = 0.1, np.deg2rad(5.0)
 """Two observations of the pose between two components agree if they differ by less than this, in a room."""
 
 
-def usable(seen: PreparedImages) -> bool:
+def usable(seen: PreparedFrame) -> bool:
     """Return whether a frame shows enough to be recognised or to begin a map."""
     readings = seen.target.valid_pixels / (seen.target.camera.width * seen.target.camera.height)
     return readings >= LEAST_READINGS and (seen.image is None or float(seen.image.detail.gray.std()) >= LEAST_CONTRAST)
@@ -44,7 +44,7 @@ class Recovery:
     steady: int = 1_000_000
     link: Link | None = None
 
-    def count(self, lost: bool, doubtful: bool, seen: PreparedImages) -> None:
+    def count(self, lost: bool, doubtful: bool, seen: PreparedFrame) -> None:
         """Count a frame."""
         if lost:
             self.lost += usable(seen)

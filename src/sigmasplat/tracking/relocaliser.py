@@ -18,11 +18,12 @@ from sigmasplat.fit.pose import PoseFit, fit_pose_align
 from sigmasplat.fit.references import Reference, map_reference, picture_images
 from sigmasplat.render.view import View
 from sigmasplat.tracking.drift import floor, symmetric
-from sigmasplat.tracking.feature_image import pose_by_features
+from sigmasplat.tracking.feature_image import FeatureImage, pose_by_features
 from sigmasplat.tracking.features import Extractor, Features, Landmarks, matches_by_descriptor
-from sigmasplat.tracking.known_map import KnownKeyframe, KnownMap
+from sigmasplat.tracking.known_map import KnownMap
 from sigmasplat.tracking.pose_validation import MOST_SPREAD_M, recognised, score
-from sigmasplat.tracking.prepared_frame import FoundKeyframe, PreparedImages
+from sigmasplat.tracking.prepared_frame import PreparedFrame
+from sigmasplat.tracking.tracked_keyframe import TrackedKeyframe
 from sigmasplat.types import Matrix, Task, completed
 
 STRONGEST = 400
@@ -44,7 +45,7 @@ class Relocation:
     pose, the fit whose T_camera_world is T_camera_submap [4, 4], and its comparison with the map."""
 
     where: KeyframeId
-    keyframe: FoundKeyframe
+    keyframe: TrackedKeyframe
     inliers: int
     fit: PoseFit
     comparison: Comparison
@@ -110,7 +111,7 @@ class Relocaliser:
     _landmarks: "OrderedDict[KeyframeId, Landmarks]" = field(default_factory=OrderedDict, init=False)
 
     def find(
-        self, known: KnownMap, view: View, seen: PreparedImages, index_at_most: int | None = INDEX_AT_MOST
+        self, known: KnownMap, view: View, seen: PreparedFrame, index_at_most: int | None = INDEX_AT_MOST
     ) -> Relocation | None:
         """Return where the camera is, or None if no keyframe leads to a pose that the map confirms.
 
@@ -119,13 +120,13 @@ class Relocaliser:
         return self.search(known, view, seen, index_at_most).found
 
     def search(
-        self, known: KnownMap, view: View, seen: PreparedImages, index_at_most: int | None = INDEX_AT_MOST
+        self, known: KnownMap, view: View, seen: PreparedFrame, index_at_most: int | None = INDEX_AT_MOST
     ) -> SearchResult:
         """Search as `find` does, and also return what was refused."""
         return completed(self.searching(known, view, seen, index_at_most))
 
     def searching(
-        self, known: KnownMap, view: View, seen: PreparedImages, index_at_most: int | None = INDEX_AT_MOST
+        self, known: KnownMap, view: View, seen: PreparedFrame, index_at_most: int | None = INDEX_AT_MOST
     ) -> Task[SearchResult]:
         """Search as `search` does, in slices: the features of one keyframe, one pose. `known` must not change."""
         wanted = known.keyframes()
@@ -155,7 +156,7 @@ class Relocaliser:
         """Return the landmarks of a keyframe; those used last stay in memory."""
         if where not in self._landmarks:
             assert self.extractor is not None
-            landmarks = known.keyframe(where).image(view.camera).landmarks(self.extractor)
+            landmarks = FeatureImage.of_picture(known.picture(where), view.camera).landmarks(self.extractor)
             self._landmarks[where] = landmarks
             some = landmarks.features.take(np.arange(min(STRONGEST, len(landmarks))))
             self._strongest[where] = replace(some, descriptors=_compact(some.descriptors))
@@ -164,7 +165,7 @@ class Relocaliser:
         self._landmarks.move_to_end(where)
         return self._landmarks[where]
 
-    def _candidates(self, wanted: Sequence[KeyframeId], seen: PreparedImages) -> list[KeyframeId]:
+    def _candidates(self, wanted: Sequence[KeyframeId], seen: PreparedFrame) -> list[KeyframeId]:
         """Return the keyframes with the most matches, best first."""
         assert seen.image is not None and self.extractor is not None
         live = seen.image.features(self.extractor)
@@ -177,25 +178,25 @@ class Relocaliser:
         best = sorted((vote for vote in votes if vote[0] >= LEAST_MATCHES), key=lambda vote: -vote[0])
         return [where for _, where in best[: self.config.recovery.candidates]]
 
-    def _poses(self, known: KnownMap, view: View, seen: PreparedImages, where: KeyframeId) -> Iterator[Relocation]:
+    def _poses(self, known: KnownMap, view: View, seen: PreparedFrame, where: KeyframeId) -> Iterator[Relocation]:
         """Yield the pose of a candidate, aligned to the keyframe's own image, then to the map rendered there."""
         assert seen.image is not None and self.extractor is not None
-        keyframe, landmarks = known.keyframe(where), self._landmarks_of(known, view, where)
+        picture, landmarks = known.picture(where), self._landmarks_of(known, view, where)
         found = pose_by_features(landmarks, seen.image, self.extractor, seed=self.config.seed)
         if found is None:
             return
-        guess = found.T_live_reference @ se3.inverse(keyframe.T_submap_camera)
-        scale = view.options.scene_scale
-        _, pyramid = picture_images(view, keyframe.picture, view.camera)
-        own = FoundKeyframe(pyramid, se3.inverse(keyframe.T_submap_camera), keyframe.image(view.camera))
-        yield Relocation(where, own, found.inliers, *aligned(own, seen, guess, self.config.tracking), scale)
+        T_keyframe_submap, scale = se3.inverse(known.T_submap_camera(where)), view.options.scene_scale
+        guess = found.T_live_reference @ T_keyframe_submap
+        own = Reference(picture_images(view, picture, view.camera)[1], T_keyframe_submap)
+        keyframe = TrackedKeyframe(own, FeatureImage.of_picture(picture, view.camera))
+        yield Relocation(where, keyframe, found.inliers, *aligned(own, seen, guess, self.config.tracking), scale)
         params = known.splats(where[0]).params.to(view.sums.device)
         rendered = map_reference(params, view, guess, self.config.tracking)
-        yield Relocation(where, own, found.inliers, *aligned(rendered, seen, guess, self.config.tracking), scale)
+        yield Relocation(where, keyframe, found.inliers, *aligned(rendered, seen, guess, self.config.tracking), scale)
 
 
 def aligned(
-    reference: Reference, seen: PreparedImages, T_camera_world: Matrix, config: TrackingConfig
+    reference: Reference, seen: PreparedFrame, T_camera_world: Matrix, config: TrackingConfig
 ) -> tuple[PoseFit, Comparison]:
     """Align a frame to a reference from a guess; return the fit, and the comparison of both images at it.
 
@@ -212,8 +213,3 @@ def aligned(
 def _compact(descriptors: Matrix) -> Matrix:
     """Return float descriptors in half precision, which holds them exactly."""
     return descriptors.astype(np.float16) if descriptors.dtype == np.float32 else descriptors
-
-
-def sight_of(keyframe: KnownKeyframe, view: View) -> PreparedImages:
-    """Return a keyframe of the map in the form of a frame to be found."""
-    return PreparedImages(*picture_images(view, keyframe.picture, view.camera), keyframe.image(view.camera))

@@ -12,7 +12,7 @@ from sigmasplat.fit.references import Reference, keyframe_reference
 from sigmasplat.render.view import View
 from sigmasplat.tracking.feature_image import FeatureImage
 from sigmasplat.tracking.moving.dynamic_mask import DynamicMask
-from sigmasplat.tracking.prepared_frame import FoundKeyframe, PreparedImages
+from sigmasplat.tracking.prepared_frame import PreparedFrame
 from sigmasplat.types import Matrix
 
 
@@ -25,18 +25,28 @@ class Splats(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class TrackedKeyframe:
-    """reference: its image with the weights of the map, None if nothing aligns to it; image: for features; front: what
+    """What tracking keeps of a keyframe. The map's `Keyframe` has planes for the fits instead, and the state of Adam:
+    neither needs the other's memory.
+
+    reference: its image with the weights of the map, None if nothing aligns to it; image: for features; front: what
     was in front of the scene."""
 
     reference: Reference | None
     image: FeatureImage | None
     front: DynamicMask | None = None
 
+    def weighed(self, params: Tensor, view: View, config: TrackingConfig) -> "TrackedKeyframe":
+        """Return a keyframe of the map at which the camera was found, weighed by the map with rows `params` [N, 17]."""
+        assert self.reference is not None and self.image is not None
+        own = self.reference
+        reference = keyframe_reference(params, view, own.pyramid, own.T_camera_world, config)
+        return TrackedKeyframe(reference, self.image.weighed(reference.weights))
+
 
 def mapped_keyframe(
     params: Tensor,
     view: View,
-    seen: PreparedImages,
+    seen: PreparedFrame,
     T_world_camera: Matrix,
     config: TrackingConfig,
     front: DynamicMask | None,
@@ -47,9 +57,3 @@ def mapped_keyframe(
     T_camera_world = se3.inverse(T_world_camera)
     reference = keyframe_reference(params, view, seen.live, T_camera_world, config)
     return TrackedKeyframe(reference, seen.image and seen.image.weighed(reference.weights), front)
-
-
-def found_keyframe(params: Tensor, view: View, keyframe: FoundKeyframe, config: TrackingConfig) -> TrackedKeyframe:
-    """Return a keyframe of the map at which the camera was found, weighed by the map with rows `params` [N, 17]."""
-    reference = keyframe_reference(params, view, keyframe.pyramid, keyframe.T_camera_world, config)
-    return TrackedKeyframe(reference, keyframe.image.weighed(reference.weights))

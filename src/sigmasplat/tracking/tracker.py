@@ -5,11 +5,10 @@ from dataclasses import dataclass, field as dataclass_field, replace
 
 import numpy as np
 
-from sigmasplat.config import TrackingConfig
+from sigmasplat.config import Config, TrackingConfig
 from sigmasplat.data import se3
 from sigmasplat.data.frame import NO_PRIOR, PosePrior
 from sigmasplat.fit.align import Alignment, align
-from sigmasplat.fit.backends import fits_of
 from sigmasplat.fit.compare import Comparison
 from sigmasplat.fit.pose import PoseFit, fit_pose_adam, fit_pose_align
 from sigmasplat.fit.pyramid import Pyramid
@@ -25,8 +24,8 @@ from sigmasplat.tracking.moving.dynamic_detector import DynamicDetector
 from sigmasplat.tracking.moving.dynamic_mask import DynamicMask
 from sigmasplat.tracking.pose_prediction import Given, PosePrediction, odometry, predict
 from sigmasplat.tracking.pose_validation import TrackingStatistics
-from sigmasplat.tracking.prepared_frame import FoundKeyframe, PreparedImages
-from sigmasplat.tracking.tracked_keyframe import Splats, TrackedKeyframe, found_keyframe, mapped_keyframe
+from sigmasplat.tracking.prepared_frame import PreparedFrame
+from sigmasplat.tracking.tracked_keyframe import Splats, TrackedKeyframe, mapped_keyframe
 from sigmasplat.types import Matrix, ShouldStop, never
 
 
@@ -61,12 +60,18 @@ class Tracker:
     doubtful: int = 0
     started: bool = False
 
-    def start(self, seen: PreparedImages, prior: PosePrior = NO_PRIOR) -> None:
+    @staticmethod
+    def of(config: Config, extractor: Extractor | None) -> "Tracker":
+        """Return the tracker of a run; the extractor is left out if tracking uses no features."""
+        features = extractor if config.tracking.features else None
+        return Tracker(config.tracking, features, detector=DynamicDetector(config.moving))
+
+    def start(self, seen: PreparedFrame, prior: PosePrior = NO_PRIOR) -> None:
         """Fix the gauge: the first camera is the world."""
         self.last_image, self.last_features, self.prior = seen.live, seen.image, prior
 
     def track(
-        self, field: Splats, view: View, seen: PreparedImages, prior: PosePrior = NO_PRIOR,
+        self, field: Splats, view: View, seen: PreparedFrame, prior: PosePrior = NO_PRIOR,
         should_stop: ShouldStop = never,
     ) -> PoseFit:  # fmt: skip
         """Estimate T_camera_world of a frame; `self.lost` then says whether tracking failed. A given pose is taken as
@@ -95,7 +100,7 @@ class Tracker:
         self._remember(best, seen.without(self.front))
         return best
 
-    def _estimated(self, given: Given, seen: PreparedImages, shown: PreparedImages) -> PoseFit:
+    def _estimated(self, given: Given, seen: PreparedFrame, shown: PreparedFrame) -> PoseFit:
         """Return the best of the fits from all guesses; shown: the frame as it is fitted first."""
         best = self._fit(given, shown, given.prediction.predicted)
         best, shown = self._uncovered(given, seen, shown, best)
@@ -105,8 +110,8 @@ class Tracker:
         return self._retry(given, shown, best) if self._doubts(best) else best
 
     def _uncovered(
-        self, given: Given, seen: PreparedImages, first: PreparedImages, fit: PoseFit
-    ) -> tuple[PoseFit, PreparedImages]:
+        self, given: Given, seen: PreparedFrame, first: PreparedFrame, fit: PoseFit
+    ) -> tuple[PoseFit, PreparedFrame]:
         """Find what is in front of the scene, and fit the pose without it; return the fit and the frame without it. If
         nothing is, or the images contradict that pose: the same fit, and the frame as it was fitted (`first`)."""
         before, self.front = self.front, None
@@ -118,8 +123,8 @@ class Tracker:
         return (fit, first) if found is None else found
 
     def _without_front(
-        self, given: Given, seen: PreparedImages, first: PreparedImages, fit: PoseFit, before: DynamicMask | None
-    ) -> tuple[PoseFit, PreparedImages] | None:
+        self, given: Given, seen: PreparedFrame, first: PreparedFrame, fit: PoseFit, before: DynamicMask | None
+    ) -> tuple[PoseFit, PreparedFrame] | None:
         """Return the fit and the frame without what is in space that was free, or None; before: in front in the last
         frame. The newest keyframe loses what has left it. If it is hidden, the last image and the map give the pose."""
         slow, known = self.detector.slow(seen, se3.inverse(fit.T_camera_world)), before or self.keyframe_front
@@ -157,8 +162,8 @@ class Tracker:
         return None if self.front is None else (found, shown)
 
     def _without_object(
-        self, given: Given, seen: PreparedImages, drawn: PoseFit, known: bool
-    ) -> tuple[PoseFit, PreparedImages] | None:
+        self, given: Given, seen: PreparedFrame, drawn: PoseFit, known: bool
+    ) -> tuple[PoseFit, PreparedFrame] | None:
         """Return the fit and the frame without the thing that moves and has drawn the pose with it; None if there is
         none. known: the last frame had something in front."""
         predicted = given.prediction.predicted
@@ -171,7 +176,7 @@ class Tracker:
                 return found, shown
         return None
 
-    def _notice_rest(self, seen: PreparedImages, T_world_camera: Matrix) -> None:
+    def _notice_rest(self, seen: PreparedFrame, T_world_camera: Matrix) -> None:
         """Take what has come to rest for a part of the scene, and remember the frame."""
         front = self.detector.still_moving(self.front, seen, T_world_camera)
         self.keyframe_front = None if self.front is not None and front is None else self.keyframe_front
@@ -181,7 +186,7 @@ class Tracker:
         lost = self._is_lost(fit) or self._contradicted(fit) or self._leaps(fit, predicted)
         return not (lost or judge.is_missed(fit.comparison, whole))
 
-    def _remember(self, fit: PoseFit, seen: PreparedImages) -> None:
+    def _remember(self, fit: PoseFit, seen: PreparedFrame) -> None:
         """Keep what the next frame needs."""
         T_world_camera = se3.inverse(fit.T_camera_world)
         if self.lost:
@@ -201,15 +206,14 @@ class Tracker:
         """Return where the camera of the next frame is expected."""
         return predict(self.previous, self.velocity, self.prior, prior, self.config.motion_model)
 
-    def _fit(self, given: Given, seen: PreparedImages, guess: Matrix, patience: int = 1) -> PoseFit:
+    def _fit(self, given: Given, seen: PreparedFrame, guess: Matrix, patience: int = 1) -> PoseFit:
         """Fit from an initial T_world_camera; patience: factor on the number of iterations of gradient descent; with 0,
         the pose stays as it is, and is only judged."""
         T_camera_world, c = se3.inverse(guess), self.config
         if c.method == "adam":
             config = c if self.started else c.without_motion()
-            return fit_pose_adam(
-                given.field.params, given.view, seen.target, T_camera_world, config, patience * config.iterations
-            )
+            steps = patience * config.iterations
+            return fit_pose_adam(given.field.params, given.view, seen.target, T_camera_world, config, steps)
         reference = self.keyframe or map_reference(given.field.params, given.view, T_camera_world, c)
         return self._aligned(reference, seen.live, T_camera_world, patience > 0)
 
@@ -229,7 +233,7 @@ class Tracker:
                 return found
         return reference.compared(live, T_camera_world)
 
-    def _other_guesses(self, seen: PreparedImages, prediction: PosePrediction) -> Iterator[Matrix]:
+    def _other_guesses(self, seen: PreparedFrame, prediction: PosePrediction) -> Iterator[Matrix]:
         """Yield T_world_camera by features, and by constant velocity alone if a gyroscope changed the first guess."""
         if self.extractor is not None and seen.image is not None:
             known = None if self.keyframe is None else self.keyframe_features
@@ -242,13 +246,15 @@ class Tracker:
         if prediction.measured:
             yield self.previous @ self.velocity if self.config.motion_model else self.previous
 
-    def _retry(self, given: Given, seen: PreparedImages, fit: PoseFit) -> PoseFit:
+    def _retry(self, given: Given, seen: PreparedFrame, fit: PoseFit) -> PoseFit:
         """Retry from odometry with twice the iterations (VarSplat §3), and from the last pose; return the best fit.
 
         With alignment, also try the map rendered at these poses: it contains more than the newest keyframe.
         """
-        odometry = None if given.should_stop() else self._odometry(given, seen.live)
-        starts = [given.prediction.last] if odometry is None else [odometry, given.prediction.last]
+        moved = None if given.should_stop() else odometry(self.last_image, seen.live, given, self.config)
+        starts = [given.prediction.last]
+        if moved is not None:
+            starts.insert(0, np.asarray(self.previous @ se3.inverse(moved)))
         fits = [fit, *(self._fit(given, seen, start, 2) for start in given.unless(starts))]
         for start in given.unless(starts if self.config.method == "align" else ()):
             reference = map_reference(given.field.params, given.view, se3.inverse(start), self.config)
@@ -257,13 +263,6 @@ class Tracker:
         if self._is_lost(best):
             best.T_camera_world = se3.inverse(starts[0])
         return best
-
-    def _odometry(self, given: Given, live: Pyramid) -> Matrix | None:
-        """Align the last image to this one and return T_world_camera; None if this fails too."""
-        if self.last_image is None or (self.config.method == "adam" and not fits_of(given.view).aligns):
-            return None  # alignment needs the compiled kernels
-        found = odometry(self.last_image, live, given.prediction, self.config)
-        return None if found is None else np.asarray(self.previous @ se3.inverse(found))
 
     # ---- verdicts ----
 
@@ -303,7 +302,7 @@ class Tracker:
 
     # ---- keyframes ----
 
-    def keep_keyframe(self, field: Splats, view: View, seen: PreparedImages, T_world_camera: Matrix) -> None:
+    def keep_keyframe(self, field: Splats, view: View, seen: PreparedFrame, T_world_camera: Matrix) -> None:
         """Use a keyframe that was just mapped: its refined pose, and its image as the reference of the next frames."""
         self.move_by(T_world_camera @ se3.inverse(self.previous))  # at a cut, the coordinates change
         self.previous, self.lost = T_world_camera, False
@@ -316,11 +315,11 @@ class Tracker:
             self.keyframe = keyframe.reference
         self.keyframe_features, self.keyframe_front = keyframe.image, keyframe.front
 
-    def move_to(self, field: Splats, view: View, keyframe: FoundKeyframe, T_world_camera: Matrix) -> None:
+    def move_to(self, field: Splats, view: View, keyframe: TrackedKeyframe, T_world_camera: Matrix) -> None:
         """Continue at another pose, with a keyframe as the reference of the next frames."""
         self.previous, self.velocity, self.lost = T_world_camera, np.eye(4), False
         self.detector = self.detector.cleared()
-        self.follow(found_keyframe(field.params, view, keyframe, self.config))
+        self.follow(keyframe.weighed(field.params, view, self.config))
 
     def move_by(self, T_new_old: Matrix) -> None:
         """Express the last pose and the reference in other coordinates [4, 4]."""

@@ -1,20 +1,88 @@
 """Make the missing runs of a batch: find their sequences, keep finished runs, and go on after a failure."""
 
+import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sigmasplat.errors import ConfigError, RunError
-from sigmasplat.plugins.batch.executor import DataRoots, Executor, Outcome, Sequences
+from sigmasplat.plugins.batch.executor import DataRoots, Executor, LocalExecutor, Outcome, Sequences
 from sigmasplat.plugins.batch.job import FACT, Job, has_other_run
-from sigmasplat.plugins.batch.local import LocalExecutor
-from sigmasplat.plugins.batch.progress import Estimate, duration, frames_counted
 from sigmasplat.run_folder.runs import RunFolder
+from sigmasplat.types import Progress
 
 if TYPE_CHECKING:
     from sigmasplat.run.terminal import Screen
+
+LOOK_EVERY_S = 2.0
+
+
+class Estimate:
+    """Estimates the time left from the seconds per frame of finished runs, separately for each preset.
+
+    frames: number of frames of each job, by its name; slots: number of runs at the same time.
+    """
+
+    def __init__(self, frames: Mapping[str, int], slots: int) -> None:
+        self.frames, self.slots = frames, slots
+        self.seconds = dict[str, float]()
+        self.counted = dict[str, int]()
+
+    def add(self, job: Job, seconds: float) -> None:
+        """Add a finished run."""
+        preset = job.config.name
+        self.seconds[preset] = self.seconds.get(preset, 0.0) + seconds
+        self.counted[preset] = self.counted.get(preset, 0) + self.frames[job.name]
+
+    def left_s(self, jobs: Sequence[Job]) -> float | None:
+        """Return the seconds that these jobs still take, None before the first run has finished.
+
+        Presets without a finished run count with the mean of the others.
+        """
+        if not any(self.counted.values()):
+            return None
+        mean = sum(self.seconds.values()) / sum(self.counted.values())
+        rates = {preset: self.seconds[preset] / frames for preset, frames in self.counted.items() if frames}
+        return sum(rates.get(job.config.name, mean) * self.frames[job.name] for job in jobs) / self.slots
+
+
+def duration(seconds: float) -> str:
+    """Write a duration with its largest unit, and the next smaller one below ten: 45 s, 12 min, 3 h 20 min, 2 d 5 h."""
+    minutes = round(seconds / 60)
+    if seconds < 90:
+        return f"{round(seconds)} s"
+    if minutes < 100:
+        return f"{minutes} min"
+    if minutes < 48 * 60:
+        return f"{minutes // 60} h {minutes % 60} min"
+    return f"{minutes // 1440} d {minutes % 1440 // 60} h"
+
+
+@contextmanager
+def frames_counted(jobs: Sequence[Job], frames: Mapping[str, int], out: Path, show: Progress) -> Iterator[None]:
+    """Call `show(done, total)` with the frames of all runs from time to time, as read from their logs."""
+    total, ended = sum(frames[job.name] for job in jobs), threading.Event()
+
+    def look() -> None:
+        while not ended.wait(LOOK_EVERY_S):
+            show(sum(_logged(out / job.name) for job in jobs), total)
+
+    thread = threading.Thread(target=look, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
+
+def _logged(folder: Path) -> int:
+    with suppress(OSError):
+        return (folder / "log.jsonl").read_bytes().count(b"\n")
+    return 0
 
 
 @dataclass
@@ -34,7 +102,7 @@ class Batch:
         others = [job.name for job in self.jobs if has_other_run(job, self.out / job.name)]
         if others and not overwrite:
             raise RunError(
-                f"{self.out} contains {len(others)} runs of other settings, other code or other scores "
+                f"{self.out} contains {_counted(len(others))} of other settings, other code or other scores "
                 f"(first: {others[0]}); give another --out, or --overwrite to replace them"
             )
 
@@ -80,7 +148,7 @@ class Batch:
             return
         estimate.add(job, self._seconds(job))
         left_s = estimate.left_s(waiting)
-        rest = f", {len(waiting)} runs left, about {duration(left_s)}" if waiting and left_s is not None else ""
+        rest = f", {_counted(len(waiting))} left, about {duration(left_s)}" if waiting and left_s is not None else ""
         screen.say(f"{count} {job.name} finished; {duration(elapsed_s)} passed{rest}")
 
     def _find_sequences(
@@ -126,3 +194,7 @@ def open_executor(
     if roots.by_worker:
         raise ConfigError(f"--data names the worker {next(iter(roots.by_worker))}, which needs --scheduler")
     return LocalExecutor(roots.everywhere, save_every_s, jobs)
+
+
+def _counted(runs: int) -> str:
+    return "1 run" if runs == 1 else f"{runs} runs"

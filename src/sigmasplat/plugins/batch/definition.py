@@ -8,7 +8,7 @@ from sigmasplat.config import Config
 from sigmasplat.config.presets import list_presets, preset
 from sigmasplat.config.text import override
 from sigmasplat.errors import ConfigError, nearest
-from sigmasplat.files.guard import guarded
+from sigmasplat.files.reading import guarded
 from sigmasplat.plugins.batch.job import Job
 from sigmasplat.plugins.papers.table_files import read_table
 from sigmasplat.run_folder.run_values import MOST_NUMBER

@@ -1,4 +1,5 @@
-"""Check consecutive frames of a recording: delay between colour and depth, jumps of the view, swapped and black frames.
+"""Check times and consecutive frames of a recording: unit, order, gaps; delay between colour and depth, jumps of the
+view, swapped and black frames.
 
 Every frame is reduced to a few thousand pixels. The motion energy of a frame is its mean change since the frame before,
 of colour and of depth. Both follow the motion of the camera, so that their best correlation is at the delay between
@@ -13,6 +14,53 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from sigmasplat.data.frame import Frame
+from sigmasplat.errors import SourceError
+from sigmasplat.input.source import Source
+
+PLAUSIBLE_RATE_HZ = (0.1, 1000.0)
+"""Frame rates of cameras, also of recordings that keep every tenth frame; with times in another unit it is outside."""
+GAP_S = 1.0
+GAP_STEPS = 10.0
+"""A gap is longer than `GAP_S` and than this multiple of the median step."""
+
+
+def times_of(source: Source) -> NDArray[np.float64]:
+    """Return the times of all frames whose files can be read, seconds [N]."""
+    times = []
+    for i in range(len(source)):
+        try:
+            times.append(source.timestamp_s(i))
+        except SourceError:
+            continue  # reported when the frame is read
+    return np.array(times)
+
+
+def time_warnings(times_s: NDArray[np.float64]) -> list[str]:
+    """Return warnings about the times of the frames, seconds [N]; [] if they are plausible."""
+    steps_s = np.diff(times_s)
+    if not len(steps_s):
+        return []
+    warnings = []
+    backward = np.flatnonzero(steps_s <= 0)
+    if len(backward):
+        warnings.append(
+            f"{len(backward)} frames have the same time as the frame before, or an earlier one (first: frame "
+            f"{backward[0] + 1} at {times_s[backward[0] + 1]:.3f} s); correct the times"
+        )
+    middle_s = float(np.median(steps_s))
+    low, high = PLAUSIBLE_RATE_HZ
+    if middle_s > 0 and not low <= 1.0 / middle_s <= high:
+        warnings.append(f"the times give {1.0 / middle_s:.3g} frames per second; write times in seconds")
+        return warnings
+    gaps = np.flatnonzero(steps_s > max(GAP_S, GAP_STEPS * middle_s))
+    if len(gaps):
+        longest = int(gaps[steps_s[gaps].argmax()])
+        warnings.append(
+            f"{len(gaps)} gaps in time (longest: {steps_s[longest]:.1f} s after frame {longest}); tracking may be "
+            "lost there: use one part with --start and --end"
+        )
+    return warnings
+
 
 Numbers = NDArray[np.float64]
 
@@ -53,16 +101,15 @@ class Motion:
         for frame in frames:
             step = max(1, frame.camera.width // WIDTH)
             height, width = (size // step * step for size in frame.depth_m.shape)
-            gray = frame.color[:height, :width].mean(-1)
-            grays.append(gray.reshape(height // step, step, width // step, step).mean((1, 3)))
+            grays.append(reduced(frame.color))
             depths.append(frame.depth_m[step // 2 : height : step, step // 2 : width : step])
             times.append(frame.timestamp_s)
         return Motion(np.array(times), np.array(grays, np.float32), np.array(depths, np.float32))
 
-    def changes(self, apart: int = 1) -> Numbers:
-        """Return the mean change of the image between frames `apart`, without the change of mean brightness."""
+    def changes(self) -> Numbers:
+        """Return the mean change of the image between neighbouring frames, without the change of mean brightness."""
         plain = self.gray - self.gray.mean((1, 2), keepdims=True)
-        return np.asarray(np.abs(plain[apart:] - plain[:-apart]).mean((1, 2)), np.float64)
+        return np.asarray(np.abs(np.diff(plain, axis=0)).mean((1, 2)), np.float64)
 
     def depth_changes(self) -> Numbers:
         """Return the mean relative change of depth between neighbouring frames, over pixels with depth in both."""
@@ -85,22 +132,10 @@ class Motion:
         delay = float(lags[best] + 0.5 * (below - above) / (below - 2 * peak + above - 1e-12))
         return delay if abs(delay) >= MIN_DELAY else None
 
-    def swapped(self) -> list[int]:
-        """Return the frames that should be one place later: the next frame fits the one before it clearly better."""
-        return swapped_in(self.changes(), self.changes(2))
-
-    def jumps(self) -> list[int]:
-        """Return the frames whose view is far from that of the frame before, compared with the frames around."""
-        return jumps_in(self.changes())
-
-    def black(self) -> list[int]:
-        """Return the frames that are black."""
-        return [int(i) for i in np.flatnonzero(np.percentile(self.gray, 99, axis=(1, 2)) < BLACK)]
-
 
 @dataclass(eq=False)
 class MotionWatch:
-    """Looks for swapped, black and jumping frames during a run. It keeps three numbers per frame, and two images."""
+    """Looks for swapped, black and jumping frames. It keeps three numbers per frame, and two images."""
 
     numbers: list[int] = field(default_factory=list)
     black: list[int] = field(default_factory=list)
@@ -110,20 +145,31 @@ class MotionWatch:
 
     def __call__(self, frame: Frame) -> None:
         """Take the next frame into account."""
-        gray = reduced(frame.color)
+        self.add(frame.index, reduced(frame.color))
+
+    def add(self, number: int, gray: NDArray[np.float32]) -> None:
+        """Take the next frame into account, as a gray image."""
         if float(np.percentile(gray, 99)) < BLACK:
-            self.black.append(frame.index)
-        gray -= gray.mean()
+            self.black.append(number)
+        gray = gray - gray.mean()
         for earlier, changes in zip(self.last[::-1], (self.one, self.two), strict=False):
             changes.append(float(np.abs(gray - earlier).mean()))
-        self.numbers.append(frame.index)
+        self.numbers.append(number)
         self.last = [*self.last[-1:], gray]
 
     def warnings(self) -> list[str]:
         """Return warnings about the frames so far."""
         one, two = np.array(self.one), np.array(self.two)
-        swapped, jumps = ([self.numbers[i] for i in found] for found in (swapped_in(one, two), jumps_in(one)))
-        return frame_warnings(self.black, swapped, jumps)
+        swapped, jumps = ([self.numbers[i] for i in found] for found in (_swapped_in(one, two), _jumps_in(one)))
+        warnings = [
+            f"{len(frames)} frames are {name} (first: frame {frames[0]}); remove or correct them"
+            for name, frames in {"black": self.black, "swapped with the next": swapped}.items()
+            if frames
+        ]
+        if jumps:
+            where = f"the view jumps {len(jumps)} times (first: before frame {jumps[0]})"
+            warnings.append(f"{where}; tracking may be lost there")
+        return warnings
 
 
 def reduced(color: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -137,8 +183,9 @@ def reduced(color: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(rows.mean((1, 3)), np.float32)
 
 
-def swapped_in(one: Numbers, two: Numbers) -> list[int]:
-    """Return the frames that should be one place later, from the changes to the next frame and to the one after it."""
+def _swapped_in(one: Numbers, two: Numbers) -> list[int]:
+    """Return the frames that should be one place later, because the next frame fits the one before it clearly better:
+    from the changes to the next frame and to the one after it."""
     if len(one) < 3:
         return []
     between = (one[1:-1] < one[:-2]) & (one[1:-1] < one[2:])
@@ -146,7 +193,7 @@ def swapped_in(one: Numbers, two: Numbers) -> list[int]:
     return [int(i) + 1 for i in np.flatnonzero(found)]
 
 
-def jumps_in(change: Numbers) -> list[int]:
+def _jumps_in(change: Numbers) -> list[int]:
     """Return the frames before which the view jumps, from the changes to the next frame."""
     usual = ndimage.median_filter(change, size=min(21, len(change)), mode="nearest") if len(change) else change
     return [int(i) + 1 for i in np.flatnonzero((change > JUMP * usual) & (change > JUMP_LEAST))]
@@ -178,19 +225,7 @@ def motion_warnings(motion: Motion, first: int = 0) -> list[str]:
             f"{late} is {seconds:.3f} s ({abs(delay):.1f} frames) behind {early}, judged by the motion of both; "
             f"subtract this from the times of {late}"
         )
-    faults = ([first + i for i in found] for found in (motion.black(), motion.swapped(), motion.jumps()))
-    return warnings + frame_warnings(*faults)
-
-
-def frame_warnings(black: list[int], swapped: list[int], jumps: list[int]) -> list[str]:
-    """Return warnings about the frames with these numbers."""
-    warnings = [
-        f"{len(frames)} frames are {name} (first: frame {frames[0]}); remove or correct them"
-        for name, frames in {"black": black, "swapped with the next": swapped}.items()
-        if frames
-    ]
-    if jumps:
-        warnings.append(
-            f"the view jumps {len(jumps)} times (first: before frame {jumps[0]}); tracking may be lost there"
-        )
-    return warnings
+    watch = MotionWatch()
+    for i, gray in enumerate(motion.gray):
+        watch.add(first + i, gray)
+    return warnings + watch.warnings()

@@ -1,12 +1,12 @@
 """Inspect a recording before a run: format, size, depth and poses; problems that degrade the map, and their fixes."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageDraw, ImageFont
 
 from sigmasplat.config import InputConfig
 from sigmasplat.config.presets import default_preset, list_presets
@@ -14,14 +14,13 @@ from sigmasplat.config.sensors import AUTO
 from sigmasplat.data.frame import Frame
 from sigmasplat.errors import SourceError
 from sigmasplat.input.calibration import CameraUnknown, unlikely_camera
-from sigmasplat.input.depth_units import depth_warning
 from sigmasplat.input.opening import format_name
+from sigmasplat.input.recorded import depth_warning
 from sigmasplat.input.source import Source
-from sigmasplat.plugins.checks.motion import Motion, motion_warnings
-from sigmasplat.plugins.checks.registration import EdgeAgreement, edge_agreement, overlay
-from sigmasplat.plugins.checks.sensor_noise import SensorNoise, measure_noise
-from sigmasplat.plugins.checks.timing import time_warnings, times_of
-from sigmasplat.plugins.outputs.drawing import colormap, contact_sheet
+from sigmasplat.plugins.checks.depth import EdgeAgreement, SensorNoise, edge_agreement, measure_noise, overlay
+from sigmasplat.plugins.checks.motion import Motion, motion_warnings, time_warnings, times_of
+from sigmasplat.plugins.outputs.drawing import colormap
+from sigmasplat.plugins.outputs.drawing.view_panels import BACKGROUND, FAINT, TEXT
 from sigmasplat.plugins.sources import open_source
 
 SAMPLES = 16
@@ -243,7 +242,7 @@ def _sheet(frames: list[Frame]) -> Image.Image:
     depths = np.concatenate([frame.depth_m.reshape(-1) for frame in chosen])
     low, high = colormap.value_range(depths, depths > 0)
     columns = [
-        contact_sheet.SheetColumn(
+        SheetColumn(
             f"{frame.timestamp_s:.2f} s",
             (
                 (frame.color * 255.0).round().astype(np.uint8),
@@ -253,6 +252,33 @@ def _sheet(frames: list[Frame]) -> Image.Image:
         )
         for frame in chosen
     ]
-    return contact_sheet.draw_contact_sheet(
-        columns, ("colour", f"depth, {low:.2f} to {high:.2f} m", "depth outlines on the image")
-    )
+    return draw_contact_sheet(columns, ("colour", f"depth, {low:.2f} to {high:.2f} m", "depth outlines on the image"))
+
+
+WIDTH, GAP, HEAD, LINE = 260, 8, 28, 26
+
+
+@dataclass(frozen=True, eq=False)
+class SheetColumn:
+    """One column: its title, and a picture uint8 [H, W, 3] for each row."""
+
+    title: str
+    pictures: tuple[colormap.Rgb, ...]
+
+
+def draw_contact_sheet(columns: Sequence[SheetColumn], rows: Sequence[str]) -> Image.Image:
+    """Draw the columns side by side, with the name of each row above it. All pictures get the aspect of the first."""
+    first = columns[0].pictures[0]
+    height = round(WIDTH * first.shape[0] / first.shape[1])
+    size = (len(columns) * (WIDTH + GAP) + GAP, HEAD + len(rows) * (height + LINE) + GAP)
+    made = Image.new("RGB", size, BACKGROUND)
+    draw, font = ImageDraw.Draw(made), ImageFont.load_default(15)
+    for k, column in enumerate(columns):
+        left = GAP + k * (WIDTH + GAP)
+        draw.text((left + 2, HEAD // 2), column.title, FAINT, font, anchor="lm")
+        for r, picture in enumerate(column.pictures):
+            small = Image.fromarray(np.ascontiguousarray(picture)).resize((WIDTH, height), Image.Resampling.LANCZOS)
+            made.paste(small, (left, HEAD + r * (height + LINE) + LINE))
+    for r, name in enumerate(rows):
+        draw.text((GAP + 2, HEAD + r * (height + LINE) + LINE // 2), name, TEXT, font, anchor="lm")
+    return made

@@ -15,18 +15,28 @@ from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import RunError
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.evaluation import reconstruct
-from sigmasplat.plugins.evaluation.frame_states import score_states
 from sigmasplat.plugins.evaluation.metrics import views
 from sigmasplat.plugins.evaluation.metrics.lpips import Lpips
 from sigmasplat.plugins.evaluation.metrics.published_reconstruction import VIEWS
 from sigmasplat.plugins.evaluation.metrics.trajectory import aligned_truth, score_path, truth_in_estimate
-from sigmasplat.plugins.evaluation.moving_views import show_moving
-from sigmasplat.plugins.evaluation.path_scores import arbitrary_scale, in_metres, in_units_of_run, score_frame_sets
-from sigmasplat.plugins.evaluation.pose_covariance import score_pose_covariance
+from sigmasplat.plugins.evaluation.path_scores import (
+    arbitrary_scale,
+    in_metres,
+    in_units_of_run,
+    score_frame_sets,
+    score_pose_covariance,
+    score_states,
+)
 from sigmasplat.plugins.evaluation.report import charts
 from sigmasplat.plugins.evaluation.report.page import report_plan, write_charts, write_page
 from sigmasplat.plugins.evaluation.report.view_strips import ViewStrips
-from sigmasplat.plugins.evaluation.view_scoring import ViewScoring, refined_fx, score_full_resolution, score_test_views
+from sigmasplat.plugins.evaluation.view_scoring import (
+    ViewScoring,
+    refined_fx,
+    score_full_resolution,
+    score_test_views,
+    show_moving,
+)
 from sigmasplat.render import FieldRenderer
 from sigmasplat.render.low_pass import as_refined
 from sigmasplat.render.predictive import Predicted, predict

@@ -1,16 +1,28 @@
 """Score the path of a run on the sets of frames that published systems use: keyframes, and all frames."""
 
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sigmasplat.data import se3
+from sigmasplat.data.component import APART, LOST, RELOCALISED
 from sigmasplat.data.trajectory import Trajectory
-from sigmasplat.plugins.evaluation.frame_states import final_positions
-from sigmasplat.plugins.evaluation.metrics.trajectory import absolute_error, align_similarity, associate
+from sigmasplat.graph.path_covariance import PathCovariance
+from sigmasplat.plugins.evaluation.metrics.trajectory import (
+    absolute_error,
+    align_rigid,
+    align_similarity,
+    associate,
+    score_covariances,
+    score_failures,
+)
 from sigmasplat.run_folder.frames import RunFrames
 from sigmasplat.run_folder.runs import RunFolder
+from sigmasplat.types import Matrix
 
 
 def score_frame_sets(run: RunFolder, frames: RunFrames, truth: Trajectory | None) -> dict[str, Any]:
@@ -70,3 +82,109 @@ def _error(times_s: NDArray[np.float64], positions: NDArray[np.float64], truth: 
     if not known.any():
         return None
     return asdict(absolute_error(positions[rows][known], truth.T_world_camera[truth_rows][known, :3, 3]))
+
+
+def score_states(run: RunFolder, frames: RunFrames, truth: Trajectory | None) -> dict[str, Any]:
+    """Return the numbers of frames by state, the components apart, and `failures`, which is None without a truth."""
+    counts: dict[str, Any] = {"believed": len(frames.rows), "believed_share": len(frames.rows) / max(len(frames), 1)}
+    for state in (LOST, RELOCALISED, APART):
+        found = frames.indices(state)
+        counts |= {state: len(found), f"{state}_frames": found}
+    return counts | {"components": _components(run), "failures": _failures(run, frames, truth)}
+
+
+def _components(run: RunFolder) -> list[dict[str, Any]]:
+    """Describe the components apart: number, frames, and time of the first and the last frame."""
+    paths = {number: run.read_component(number).trajectory for number in run.component_numbers()}
+    return [
+        {"number": number, "frames": len(path), "start_s": path.timestamps_s[0], "end_s": path.timestamps_s[-1]}
+        for number, path in paths.items()
+    ]
+
+
+def _failures(run: RunFolder, frames: RunFrames, truth: Trajectory | None) -> dict[str, Any] | None:
+    """Score the valid and the lost frames of the world; the alignment is that of the ATE, from valid frames."""
+    if truth is None:
+        return None
+    times_s = np.array([record["timestamp_s"] for record in frames.log])
+    positions = final_positions(run, frames)
+    rows, truth_rows = associate(times_s, truth.timestamps_s)
+    true_positions = np.full_like(positions, np.nan)
+    true_positions[rows] = truth.T_world_camera[truth_rows, :3, 3]
+    fitted = frames.valid & np.isfinite(true_positions).all(1)
+    T = align_rigid(positions[fitted], true_positions[fitted])
+    error_m = np.linalg.norm(positions @ T[:3, :3].T + T[:3, 3] - true_positions, axis=1)
+    scores = score_failures(error_m, frames.p_off, frames.valid)
+    silent_rows = scores.pop("silent_rows")
+    return scores | {"silent_frames": [frames.log[row]["index"] for row in silent_rows]}
+
+
+def final_positions(run: RunFolder, frames: RunFrames) -> NDArray[np.float64]:
+    """Return the final positions [F, 3], m, of valid frames and, from the checkpoint, of lost ones; else nan."""
+    positions = np.full((len(frames), 3), np.nan)
+    lost = np.flatnonzero((np.array(frames.states) == LOST) & ~frames.outside())
+    if len(lost) and (run.path / "checkpoint.safetensors").is_file():
+        poses = run.read_checkpoint()[0].get("T_world_camera")
+        if poses is not None:
+            lost = lost[lost < len(poses)]
+            positions[lost] = poses.numpy()[lost, :3, 3]
+    positions[frames.rows] = frames.path.T_world_camera[:, :3, 3]
+    return positions
+
+
+WINDOW_FRAMES = 50
+MOTIONS = {"hops": "keyframe to keyframe", "windows": f"{WINDOW_FRAMES} frames", "from_start": "from the start"}
+"""Kinds of motions, and their names in tables."""
+
+
+def score_pose_covariance(run: RunFolder, frames: RunFrames, truth: Trajectory | None) -> dict[str, Any] | None:
+    """Score the motions of `score_motions` between valid frames of a run.
+
+    Returns None without a truth, or if the run did not record the errors of its path.
+    """
+    if truth is None or not len(frames.rows) or not (run.path / "checkpoint.safetensors").is_file():
+        return None
+    errors = PathCovariance.of(run.read_checkpoint()[0])
+    if errors is None or len(errors) <= frames.rows[-1]:
+        return None
+    keyframes = [row for row, record in enumerate(frames.log) if record["is_keyframe"]]
+    return score_path_covariance(errors, frames.path, frames.rows, keyframes, truth)
+
+
+def score_path_covariance(
+    errors: PathCovariance, path: Trajectory, rows: NDArray[np.intp], keyframes: Iterable[int], truth: Trajectory
+) -> dict[str, Any]:
+    """Score the motions of `score_motions` between the valid frames with a true pose.
+
+    path: poses of the valid frames; rows: their numbers [B]; keyframes: the numbers of all keyframes.
+    """
+    matched, true_rows = associate(path.timestamps_s, truth.timestamps_s)
+    true = dict(zip(rows[matched].tolist(), truth.T_world_camera[true_rows], strict=True))
+    return score_motions(errors, true, [frame for frame in keyframes if frame in true])
+
+
+def score_motions(
+    errors: PathCovariance, T_world_camera: Mapping[int, Matrix], keyframes: Sequence[int]
+) -> dict[str, Any]:
+    """Score motions from each keyframe to the next, over 50 frames, and from the first frame (`CovarianceScore`).
+
+    T_world_camera: true poses [4, 4] of valid frames, in order; keyframes: the keyframes among them. Motions do not
+    depend on the world frame, so no alignment is needed.
+    """
+    known = list(T_world_camera)
+    pairs = {
+        "hops": list(pairwise(keyframes)),
+        "windows": [(frame, frame + WINDOW_FRAMES) for frame in known if frame + WINDOW_FRAMES in T_world_camera],
+        "from_start": [(known[0], frame) for frame in known[1:]],
+    }
+
+    def scored(between: Sequence[tuple[int, int]]) -> dict[str, Any] | None:
+        estimate, true = (
+            np.array([se3.inverse(poses[a]) @ poses[b] for a, b in between]).reshape(-1, 4, 4)
+            for poses in (errors.T_world_camera, T_world_camera)
+        )
+        covariance = np.array([errors.between(a, b) for a, b in between]).reshape(-1, 6, 6)
+        score = score_covariances(estimate, true, covariance)
+        return None if score is None else asdict(score)
+
+    return {"window_frames": WINDOW_FRAMES} | {name: scored(between) for name, between in pairs.items()}

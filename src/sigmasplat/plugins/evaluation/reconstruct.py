@@ -25,7 +25,7 @@ from sigmasplat.final.fusion import FusionView, Renderer, count_keyframes, fuse,
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.evaluation.metrics import reconstruction
 from sigmasplat.plugins.evaluation.metrics.published_reconstruction import VIEWS, score_published
-from sigmasplat.plugins.evaluation.metrics.splats import score_splats
+from sigmasplat.plugins.evaluation.metrics.reconstruction import score_splats
 from sigmasplat.plugins.evaluation.metrics.trajectory import align_rigid, associate, pair_poses
 from sigmasplat.plugins.outputs.meshes.gap_filling import filled
 from sigmasplat.plugins.outputs.meshes.mesh_files import read_mesh, write_mesh

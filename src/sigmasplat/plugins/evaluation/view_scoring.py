@@ -10,17 +10,25 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import binary_opening
 
 from sigmasplat.config import Config, InputConfig
+from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
+from sigmasplat.data.field import GaussianField
+from sigmasplat.data.frame import Frame
 from sigmasplat.data.photo import photo_size
+from sigmasplat.data.selection import evenly_spread
+from sigmasplat.data.submap import SubmapStore
+from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.errors import SourceError
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.evaluation.metrics import views
 from sigmasplat.plugins.evaluation.metrics.lpips import Lpips
-from sigmasplat.plugins.evaluation.metrics.scored_view import ScoredView
-from sigmasplat.plugins.evaluation.novel_views import score_novel_views
+from sigmasplat.plugins.evaluation.metrics.trajectory import associate
+from sigmasplat.plugins.evaluation.metrics.views import ScoredView
 from sigmasplat.plugins.evaluation.report.view_strips import ViewStrips
-from sigmasplat.plugins.evaluation.view_selection import working_frame
+from sigmasplat.plugins.outputs.drawing.view_panels import ViewPanel
 from sigmasplat.types import Progress, no_progress
 
 
@@ -114,3 +122,83 @@ def score_test_views(
         test_views, test_views.truth(), T_estimate_truth, scoring.maps.final, settings, scoring.renderer, strips,
         scoring.most, scoring.lpips,
     )  # fmt: skip
+
+
+def working_frame(source: Source, settings: InputConfig, index: int) -> Frame:
+    """Read a frame at the resolution, depth range and crop that SLAM works with. Raises SourceError if unreadable."""
+    s = settings
+    return source.frame(index).prepared(s.width, s.min_depth_m, s.max_depth_m, s.crop_px)
+
+
+KIND = "test"
+
+
+def score_novel_views(
+    test_views: Source,
+    poses: Trajectory | None,
+    T_estimate_truth: NDArray[np.float64],
+    field: GaussianField,
+    settings: InputConfig,
+    renderer: views.Renderer,
+    strips: ViewStrips | None,
+    most: int,
+    lpips: Lpips | None = None,
+) -> dict[str, Any] | None:
+    """Render the final map at the true poses of at most `most` test views, and return their mean scores.
+
+    `T_estimate_truth`, the alignment of the ATE, transforms the poses to the estimate's world. So errors of the path
+    lower these scores, as in the papers. Adds a few views to `strips`, if given. Unreadable views and those without a
+    pose are skipped. Returns the scores as `views.mean_scores` does, or None if no poses are known.
+    """
+    if poses is None:
+        return None
+    rendered = []
+    for i in evenly_spread(range(len(test_views)), most):
+        try:
+            frame = working_frame(test_views, settings, i)
+        except SourceError:
+            continue
+        rows, found = associate(np.array([frame.timestamp_s]), poses.timestamps_s)
+        if len(rows):
+            T_camera_world = se3.inverse(T_estimate_truth @ poses.T_world_camera[found[0]])
+            rendered.append(views.scored_view(frame, renderer(field, frame.camera, T_camera_world), KIND))
+    if strips is not None:
+        for view in rendered[:: max(1, len(rendered) // max(strips.per_kind, 1))][: strips.per_kind]:
+            strips.add(view)
+    return views.mean_scores([view.scores(lpips) for view in rendered])
+
+
+HEADING, PANELS = "taken for moving", 4
+TINT = np.array([1.0, 0.2, 0.6], np.float32)
+LEAST_SHARE = 0.01
+"""Frames with a smaller share are not shown."""
+
+
+def show_moving(
+    strips: ViewStrips, source: Source, settings: InputConfig, store: SubmapStore, log: list[dict[str, Any]]
+) -> None:
+    """Add a strip of keyframes in which something moved, tinted where the map does not use them; nothing without."""
+    shares = [(record.get("tracking") or {}).get("moving", 0.0) for record in log]
+    if not any(share >= LEAST_SHARE for share in shares):
+        return
+    places = [(row, s, k) for s in range(len(store)) for k, row in enumerate(store.load(s).frames) if row >= 0]
+    moving = [place for place in places if place[0] < len(log) and shares[place[0]] >= LEAST_SHARE]
+    panels = []
+    for row, s, k in evenly_spread(moving, PANELS):
+        try:
+            frame = working_frame(source, settings, log[row]["index"])
+        except SourceError:
+            continue
+        depth_m = store.picture(s, k).depth_m
+        if depth_m.shape == frame.depth_m.shape:
+            masked = binary_opening((depth_m == 0) & (frame.depth_m > 0))
+            caption = f"frame {frame.index} · {100 * shares[row]:.0f} % of the image"
+            panels.append(ViewPanel(f"frame {frame.index}", tinted(frame.color, masked), caption))
+    if panels:
+        strips.draw("view-moving.png", HEADING, panels)
+
+
+def tinted(color: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """Return colour [H, W, 3] in [0, 1] as bytes, with a tint at some pixels [H, W]."""
+    shown = np.where(mask[..., None], 0.5 * color + 0.5 * TINT, color)
+    return np.asarray(np.rint(255.0 * np.clip(shown, 0.0, 1.0)), np.uint8)

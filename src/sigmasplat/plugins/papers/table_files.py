@@ -1,12 +1,11 @@
-"""Find the definitions of the tables of papers: one TOML file per table in presets/tables (docs/tables.md)."""
+"""Find the definitions of the tables of papers: one TOML file per table in `tables/` (docs/tables.md)."""
 
 import tomllib
 from pathlib import Path
 from typing import Any
 
 from sigmasplat.errors import ConfigError, nearest
-from sigmasplat.files.guard import guarded
-from sigmasplat.files.reading import read_text
+from sigmasplat.files.reading import guarded, read_text
 
 TABLES = Path(__file__).parent / "tables"
 

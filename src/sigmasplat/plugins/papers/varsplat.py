@@ -21,7 +21,7 @@ from sigmasplat.config import (
 )
 
 UNCERTAIN_M = 0.02
-"""The rule of accumulated uncertainty is the paper's, the limit is ours; docs/varsplat.md shows its effect."""
+"""The rule of accumulated uncertainty is the paper's, the limit is ours."""
 
 # The settings that all data sets share. Neither the paper nor the code removes readings; the near plane is 3DGS's.
 PAPER = Config(
@@ -104,7 +104,7 @@ FAST = Config(
     mapping=MappingConfig(
         every=5,  # as for Replica; mapping every frame would take five times as long
         overlap_below=0.7,  # more keyframes when the camera moves fast
-        iterations=18,  # what two cores can do while the camera runs (5, 10 and 30: docs/kernels.md)
+        iterations=18,  # what two cores can do while the camera runs
         newest_probability=0.2,  # with so few iterations, 0.4 degrades older keyframes: 1 dB on redkitchen
         first_iterations=150,  # until about then, a new map renders surfaces a centimetre too close
         weight_nll_color=1e-2,  # ×100: V then predicts the errors better; it also affects shapes and poses a little

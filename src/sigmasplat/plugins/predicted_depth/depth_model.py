@@ -13,11 +13,10 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from sigmasplat.config import InputConfig
+from sigmasplat.env import import_optional
 from sigmasplat.errors import SourceError
-from sigmasplat.files.guard import MOST_CHARACTERS, cause
-from sigmasplat.files.optional import import_optional
 from sigmasplat.files.pictures import check_pixels
-from sigmasplat.files.reading import read_bytes
+from sigmasplat.files.reading import MOST_CHARACTERS, cause, read_bytes
 
 Floats = NDArray[np.float32]
 Size = tuple[int, int]

@@ -5,8 +5,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from sigmasplat.env import import_optional
 from sigmasplat.errors import RunError
-from sigmasplat.files.optional import import_optional
 from sigmasplat.plugins.robots.ros_messages import EXTRA, TOPICS, Encoded, RosMessages, Topic
 
 CHUNK_BYTES = 65_536

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.data import se3
-from sigmasplat.data.accelerometer import up_of_path
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.frame import Frame
+from sigmasplat.data.imu import up_of_path
 from sigmasplat.data.submap import SubmapStore
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SigmaSplatError

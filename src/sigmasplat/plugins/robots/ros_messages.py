@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
-from sigmasplat.files.optional import import_optional
+from sigmasplat.env import import_optional
 from sigmasplat.plugins.robots.frames import OPTICAL
 from sigmasplat.types import Matrix
 

@@ -21,8 +21,8 @@ from concurrent.futures import Future
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
+from sigmasplat.env import import_optional
 from sigmasplat.errors import ConfigError, SigmaSplatError
-from sigmasplat.files.optional import import_optional
 from sigmasplat.plugins.robots.ros_messages import TOPICS, Encoded, RosMessages, Topic
 
 if TYPE_CHECKING:

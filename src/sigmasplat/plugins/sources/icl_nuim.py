@@ -14,35 +14,36 @@ from pathlib import Path
 import numpy as np
 
 from sigmasplat.config import InputConfig
+from sigmasplat.data.camera import Camera
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SourceError
-from sigmasplat.files.reading import exists
-from sigmasplat.input.calibration import ICL_NUIM, TUM_UNITS_PER_METRE, freiburg_calibration, resolve_calibration
-from sigmasplat.input.folders import FRAMES_PER_SECOND
-from sigmasplat.input.lists import parse_numbers, read_lines, read_poses
-from sigmasplat.input.recorded import ImagePair, RecordedSource, first_size
+from sigmasplat.input.calibration import TUM_UNITS_PER_METRE, Calibration, freiburg_calibration
+from sigmasplat.input.images import FRAMES_PER_SECOND, first_file
+from sigmasplat.input.lists import parse_numbers, read_groundtruth, read_lines, read_poses
+from sigmasplat.input.recorded import ImagePair, RecordedSource, folder_source
 from sigmasplat.registry import SourceFormat
 
+CAMERA = Calibration(Camera(640, 480, 481.2, 480.0, 319.5, 239.5), TUM_UNITS_PER_METRE)
 LIST_NAMES = ("associations.txt", "association.txt", "associate.txt")
 MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 
 
-def open_icl_nuim(folder: Path, settings: InputConfig) -> RecordedSource:
+def open_icl_nuim(path: str, settings: InputConfig) -> RecordedSource:
     """Open a folder. Raises SourceError if its list, images or ground-truth poses cannot be used."""
-    path = _list_in(folder)
-    if path is None:
+    folder = Path(path)
+    listed = first_file(folder, LIST_NAMES)
+    if listed is None:
         raise SourceError(
             f"{folder}: text depth is not supported; take the set's TUM-compatible PNGs (…_frei_png.tar.gz)"
         )
-    images = _images(path)
-    truth_path = next(iter(sorted(folder.glob("*.gt.freiburg"))), None)
-    rendered = truth_path is not None or "frei_png" in folder.resolve().name
-    recorded = ICL_NUIM if rendered else freiburg_calibration(folder)
-    calibration = resolve_calibration(
-        folder, recorded, first_size([i.color for i in images]), settings, TUM_UNITS_PER_METRE
-    )
-    truth = _truth(folder, truth_path)
-    return RecordedSource(folder.resolve().name, images, calibration, settings, truth)
+    images = _images(listed)
+    mirrored = next(iter(sorted(folder.glob("*.gt.freiburg"))), None)
+    rendered = mirrored is not None or "frei_png" in folder.resolve().name
+    known = CAMERA if rendered else freiburg_calibration(folder)
+    truth = read_poses(mirrored) if mirrored else read_groundtruth(folder)
+    if mirrored and truth:
+        truth = Trajectory(truth.timestamps_s / FRAMES_PER_SECOND, MIRROR @ truth.T_world_camera @ MIRROR)
+    return folder_source(folder, settings, images, known, TUM_UNITS_PER_METRE, truth)
 
 
 def _images(path: Path) -> list[ImagePair]:
@@ -63,21 +64,8 @@ def _images(path: Path) -> list[ImagePair]:
     return sorted(images, key=lambda image: image.timestamp_s)
 
 
-def _truth(folder: Path, path: Path | None) -> Trajectory | None:
-    if path is not None:
-        recorded = read_poses(path)
-        return Trajectory(recorded.timestamps_s / FRAMES_PER_SECOND, MIRROR @ recorded.T_world_camera @ MIRROR)
-    plain = folder / "groundtruth.txt"
-    return read_poses(plain) if exists(plain) else None
+def _recognises(path: str) -> bool:
+    return first_file(Path(path), LIST_NAMES) is not None or any(Path(path).glob("scene_*_0000.depth"))
 
 
-def _list_in(folder: Path) -> Path | None:
-    return next((folder / name for name in LIST_NAMES if (folder / name).is_file()), None)
-
-
-PLUGIN = SourceFormat(
-    "ICL-NUIM",
-    "associations.txt",
-    lambda path: _list_in(Path(path)) is not None or any(Path(path).glob("scene_*_0000.depth")),
-    lambda path, settings: open_icl_nuim(Path(path), settings),
-)
+PLUGIN = SourceFormat("ICL-NUIM", "associations.txt", _recognises, open_icl_nuim)

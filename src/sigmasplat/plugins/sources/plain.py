@@ -11,10 +11,8 @@ from pathlib import Path
 
 from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
-from sigmasplat.files.reading import exists
-from sigmasplat.input.calibration import MM_PER_METRE, resolve_calibration
-from sigmasplat.input.color_only import without_depth
-from sigmasplat.input.folders import (
+from sigmasplat.input.calibration import MM_PER_METRE
+from sigmasplat.input.images import (
     COLOR_ENDINGS,
     COLOR_FOLDERS,
     DEPTH_ENDINGS,
@@ -25,34 +23,32 @@ from sigmasplat.input.folders import (
     pair_images,
     times_of_names,
 )
-from sigmasplat.input.lists import read_poses
-from sigmasplat.input.recorded import ImagePair, RecordedSource, first_size
+from sigmasplat.input.lists import read_groundtruth
+from sigmasplat.input.opening import without_depth
+from sigmasplat.input.recorded import ImagePair, RecordedSource, folder_source
 from sigmasplat.registry import SourceFormat
 
-COLOR_NAME, DEPTH_NAME = "color|rgb|images/*", "depth/*"
+NAMES = "color|rgb|images/*", "depth/*"
 
 
-def open_plain(folder: Path, settings: InputConfig) -> RecordedSource:
+def open_plain(path: str, settings: InputConfig) -> RecordedSource:
     """Open a folder. Raises SourceError if images cannot be paired or the camera is unknown."""
-    colors = list_images(first_subfolder(folder, COLOR_FOLDERS), COLOR_ENDINGS)
+    folder = Path(path)
     depth_folder = first_subfolder(folder, DEPTH_FOLDERS)
     if depth_folder is None and (problem := without_depth(folder)):
         raise problem
-    depths = list_images(depth_folder, DEPTH_ENDINGS)
-    pairs, skipped = _pairs(folder, colors, depths)
+    colors = list_images(first_subfolder(folder, COLOR_FOLDERS), COLOR_ENDINGS)
+    pairs, skipped = _pairs(folder, colors, list_images(depth_folder, DEPTH_ENDINGS))
     times_s = times_of_names([color for color, _ in pairs])
     images = [ImagePair(t, *pair) for t, pair in zip(times_s, pairs, strict=True)]
-    calibration = resolve_calibration(folder, None, first_size([i.color for i in images]), settings, MM_PER_METRE)
-    truth_path = folder / "groundtruth.txt"
-    truth = read_poses(truth_path) if exists(truth_path) else None
-    return RecordedSource(folder.resolve().name, images, calibration, settings, truth, skipped)
+    return folder_source(folder, settings, images, None, MM_PER_METRE, read_groundtruth(folder), skipped)
 
 
 def _pairs(folder: Path, colors: list[Path], depths: list[Path]) -> tuple[list[tuple[Path, Path]], list[str]]:
     """Pair images by name, else by number, else by order if both kinds have the same count."""
     stems, depth_stems = {path.stem: path for path in colors}, {path.stem: path for path in depths}
     if stems.keys() & depth_stems.keys():
-        names, skipped = pair_images(folder, stems, depth_stems, COLOR_NAME, DEPTH_NAME)
+        names, skipped = pair_images(folder, stems, depth_stems, *NAMES)
         return [(stems[name], depth_stems[name]) for name in names], skipped
     color_by_number, depth_by_number = index_by_number(colors), index_by_number(depths)
     if colors and len(colors) == len(depths) and not color_by_number.keys() & depth_by_number.keys():
@@ -62,7 +58,7 @@ def _pairs(folder: Path, colors: list[Path], depths: list[Path]) -> tuple[list[t
             f"{folder}: {len(colors)} colour and {len(depths)} depth images share no names, and their numbers are not "
             "unique; give each pair the same name"
         )
-    keys, skipped = pair_images(folder, color_by_number, depth_by_number, COLOR_NAME, DEPTH_NAME)
+    keys, skipped = pair_images(folder, color_by_number, depth_by_number, *NAMES)
     return [(color_by_number[n], depth_by_number[n]) for n in keys], skipped
 
 
@@ -70,6 +66,6 @@ PLUGIN = SourceFormat(
     "plain folder",
     "color/ (or rgb/, images/) and depth/",
     lambda path: first_subfolder(Path(path), (*COLOR_FOLDERS, *DEPTH_FOLDERS)) is not None,
-    lambda path, settings: open_plain(Path(path), settings),
+    open_plain,
     priority=-1,
 )

@@ -4,7 +4,7 @@
 come from the device. The SDK moves depth to the colour camera's pixels, but keeps the distances along the axis of the
 depth camera, which differ by some millimetres. With input.register_depth=on depth is registered exactly, but slower.
 With "realsense:stereo=1" the projector is off, and depth is computed here from the two infrared images. Cameras with a
-motion module deliver gyroscope and accelerometer too (`sources.realsense_imu`), without it with "realsense:imu=0".
+motion module deliver gyroscope and accelerometer too (`realsense_imu`), without it with "realsense:imu=0".
 """
 
 import weakref
@@ -21,14 +21,13 @@ from sigmasplat.data.camera import Camera
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.frame_arrays import color_from_bytes
 from sigmasplat.data.resizing import resized_color
+from sigmasplat.env import import_optional
 from sigmasplat.errors import SourceError
-from sigmasplat.files.optional import import_optional
 from sigmasplat.input.calibration import Calibration, Distortion, resolve_calibration
 from sigmasplat.input.rectification import Rectification
-from sigmasplat.plugins.sources.camera.stereo import StereoMatcher, StereoRectification
-from sigmasplat.plugins.sources.camera.stereo_cameras import StereoCameras
 from sigmasplat.plugins.sources.live import LiveSource
 from sigmasplat.plugins.sources.realsense_imu import NOT_MEASURED, MotionModule, open_motion_module
+from sigmasplat.plugins.sources.stereo_matching import StereoCameras, StereoMatcher, StereoRectification
 from sigmasplat.registry import SourceFormat
 from sigmasplat.types import Matrix
 
@@ -139,7 +138,7 @@ class DepthImages:
 
 
 class InfraredImages:
-    """The left and the right infrared image, from which depth is computed here (`sources.camera.stereo`)."""
+    """The left and the right infrared image, from which depth is computed here (`stereo_matching`)."""
 
     computed = True
 

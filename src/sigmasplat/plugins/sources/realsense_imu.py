@@ -28,8 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.data import se3
-from sigmasplat.data.accelerometer import RunningAccelerometer
-from sigmasplat.data.running_gyroscope import RunningGyroscope
+from sigmasplat.data.imu import RunningAccelerometer, RunningGyroscope
 from sigmasplat.errors import SourceError
 from sigmasplat.types import Matrix
 

@@ -9,6 +9,7 @@ issues 7 and 27; nerfstudio, record3d_utils.py. Depth has fewer pixels than colo
 0, 1 or 2, and readings with confidence 0 are ignored.
 """
 
+import re
 import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,19 +21,54 @@ from numpy.typing import NDArray
 
 from sigmasplat.config import InputConfig
 from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.env import import_optional
 from sigmasplat.errors import SourceError
-from sigmasplat.files.guard import DAMAGED
-from sigmasplat.files.optional import import_optional
 from sigmasplat.files.pictures import check_pixels
-from sigmasplat.files.reading import refuse_special
-from sigmasplat.files.structured import MOST_JSON_BYTES, parse_json
+from sigmasplat.files.reading import DAMAGED, MOST_JSON_BYTES, guarded, parse_json, read_bytes, refuse_special
 from sigmasplat.input.calibration import Calibration, build_camera, check_positive, json_number, resolve_calibration
 from sigmasplat.input.images import decode_color, depth_to_metres, image_size
-from sigmasplat.input.pose_files import FLIP_YZ, rigid_transform
+from sigmasplat.input.lists import FLIP_YZ, rigid_transform
 from sigmasplat.input.recorded import ImagePair, RecordedSource, Size, first_readable
-from sigmasplat.plugins.sources.files.archive import Archive
 from sigmasplat.plugins.sources.stray_scanner import with_coarser_depth
 from sigmasplat.registry import SourceFormat
+
+MOST_MEMBER_BYTES = 128 << 20
+"""Largest file of an archive after unzipping: an image, or its depth."""
+
+
+class Archive:
+    """The files of a zip archive or of its unpacked folder, by relative name; nothing is unpacked to disk."""
+
+    def __init__(self, path: Path) -> None:
+        """List the files. Raises SourceError if a file is not a complete zip archive."""
+        self.path, self._zip = path, None
+        if path.is_dir():
+            self.names = [str(entry.relative_to(path)) for part in ("*", "*/*") for entry in path.glob(part)]
+            return
+        with guarded(path, "copy it again", SourceError, "not a complete zip archive"):
+            self._zip = zipfile.ZipFile(path)
+        self.names = self._zip.namelist()
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.names
+
+    def read(self, name: str, most: int = MOST_MEMBER_BYTES) -> bytes:
+        """Return the bytes of a file. Raises SourceError naming it if it is missing, damaged, encrypted, or has more
+        than `most` bytes."""
+        where = self.path / name
+        if self._zip is None:
+            return read_bytes(where, SourceError, most)
+        failed = "cannot be read from its archive"
+        with guarded(where, "copy it again", SourceError, failed), self._zip.open(name) as member:
+            data = member.read(most + 1)
+        if len(data) > most:
+            raise SourceError(f"{where}: unzips to more than {most / 1e6:.0f} MB; is it the right file?")
+        return data
+
+    def by_number(self, folder: str, endings: str) -> dict[int, str]:
+        """Map N to each name folder/N.ending, in order of N; `endings` is a regular expression such as "jpg|png"."""
+        found = [(re.fullmatch(rf"{folder}/(\d+)\.({endings})", name), name) for name in self.names]
+        return dict(sorted((int(match.group(1)), name) for match, name in found if match))
 
 
 @dataclass(frozen=True)
@@ -45,7 +81,6 @@ class R3dImagePair(ImagePair):
     lzfse: Any
 
     def read_color(self) -> NDArray[np.uint8]:
-        """Read 8-bit RGB [H, W, 3]. Raises SourceError naming the member."""
         return decode_color(self.color, self.archive.read(f"rgbd/{self.number}.jpg"))
 
     def read_depth(self, units_per_metre: float) -> NDArray[np.float32]:
@@ -58,7 +93,6 @@ class R3dImagePair(ImagePair):
         return depth_to_metres(self.depth, depth_m, units_per_metre)
 
     def sizes(self) -> tuple[Size, Size]:
-        """Return (width, height) of colour and depth. Raises SourceError naming the colour image."""
         height, width = self.read_color().shape[:2]
         return (width, height), self.depth_size
 
@@ -80,14 +114,12 @@ class ExrImagePair(ImagePair):
     openexr: Any
 
     def read_depth(self, units_per_metre: float) -> NDArray[np.float32]:
-        """Read depth in metres [H, W]. Raises SourceError naming the file."""
         channels = self._opened().channels()
         name = next((name for name in ("R", "Y", "Z") if name in channels), next(iter(channels)))
         depth_m = np.asarray(channels[name].pixels, np.float32)
         return depth_to_metres(self.depth, np.nan_to_num(depth_m, nan=0.0, posinf=0.0, neginf=0.0), units_per_metre)
 
     def sizes(self) -> tuple[Size, Size]:
-        """Return (width, height) of colour and depth. Raises SourceError naming the file."""
         return image_size(self.color), self._size()
 
     def _size(self) -> Size:
@@ -104,8 +136,9 @@ class ExrImagePair(ImagePair):
             raise SourceError(f"{self.depth}: unreadable EXR file ({error}); export it again") from error
 
 
-def open_record3d(path: Path, settings: InputConfig) -> RecordedSource:
+def open_record3d(place: str, settings: InputConfig) -> RecordedSource:
     """Open a .r3d file, packed or unpacked, or an export. Raises SourceError if metadata or images cannot be used."""
+    path = Path(place)
     archive = Archive(path)
     name = "metadata.json" if "metadata.json" in archive else "metadata"
     metadata = _metadata(archive, name)
@@ -214,6 +247,6 @@ PLUGIN = SourceFormat(
     "Record3D",
     "a .r3d file, or metadata.json with rgb/ and depth/*.exr",
     _recognises,
-    lambda path, settings: open_record3d(Path(path), settings),
+    open_record3d,
     sensor="lidar-iphone",
 )

@@ -15,67 +15,70 @@ from pathlib import Path
 import numpy as np
 
 from sigmasplat.config import InputConfig
+from sigmasplat.data.camera import Camera
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SourceError
 from sigmasplat.files.reading import open_regular
-from sigmasplat.input.association import MAX_GAP_S, associate, no_pairs, refuse_other_units
 from sigmasplat.input.calibration import (
     MM_PER_METRE,
-    PRIMESENSE,
     Calibration,
     build_camera,
     check_positive,
     json_number,
     read_json_object,
-    resolve_calibration,
 )
-from sigmasplat.input.folders import (
+from sigmasplat.input.images import (
     COLOR_ENDINGS,
     COLOR_FOLDERS,
     DEPTH_ENDINGS,
     FRAMES_PER_SECOND,
+    first_file,
     first_subfolder,
     index_by_number,
     list_images,
     pair_images,
 )
-from sigmasplat.input.lists import parse_numbers, read_lines
-from sigmasplat.input.pose_files import build_trajectory, checked_pose, to_matrix
-from sigmasplat.input.recorded import ImagePair, RecordedSource, first_size
+from sigmasplat.input.lists import (
+    MAX_GAP_S,
+    build_trajectory,
+    checked_pose,
+    pair_times,
+    parse_numbers,
+    read_lines,
+    to_matrix,
+)
+from sigmasplat.input.recorded import ImagePair, RecordedSource, folder_source
 from sigmasplat.registry import SourceFormat
 
 INTRINSIC_NAMES = ("intrinsic.json", "intrinsics.json", "camera_intrinsic.json", "camera_intrinsics.json")
+PRIMESENSE = Calibration(Camera(640, 480, 525.0, 525.0, 319.5, 239.5), MM_PER_METRE)
+"""Open3D's PrimeSenseDefault."""
 
 _TIMED = re.compile(r"([0-9]+)-([0-9]{9,})")
 
 
-def open_redwood(folder: Path, settings: InputConfig) -> RecordedSource:
+def open_redwood(path: str, settings: InputConfig) -> RecordedSource:
     """Open a folder. Raises SourceError if images, camera or trajectory cannot be used."""
-    path = _intrinsic_file(folder)
-    fields = read_json_object(path) if path else {}
-    rate = check_positive(path or folder, "fps", json_number(path or folder, fields, "fps", FRAMES_PER_SECOND))
+    folder = Path(path)
+    file = first_file(folder, INTRINSIC_NAMES)
+    fields = read_json_object(file) if file else {}
+    rate = check_positive(file or folder, "fps", json_number(file or folder, fields, "fps", FRAMES_PER_SECOND))
     colors = list_images(first_subfolder(folder, COLOR_FOLDERS), COLOR_ENDINGS)
     depths = list_images(folder / "depth", DEPTH_ENDINGS)
     images, skipped = _timed(folder, colors, depths) or _numbered(folder, colors, depths, rate)
-    recorded = _recorded(path, fields) if path else PRIMESENSE
-    size = first_size([i.color for i in images])
-    calibration = resolve_calibration(folder, recorded, size, settings, recorded.depth_units_per_metre)
-    return RecordedSource(folder.resolve().name, images, calibration, settings, _truth(folder, images), skipped)
+    known = _recorded(file, fields) if file else PRIMESENSE
+    truth = _truth(folder, images)
+    return folder_source(folder, settings, images, known, known.depth_units_per_metre, truth, skipped)
 
 
 def _timed(folder: Path, colors: list[Path], depths: list[Path]) -> tuple[list[ImagePair], list[str]] | None:
     """Pair images by the time in their names, None if the names contain no time."""
     if not (colors and depths and all(_TIMED.fullmatch(path.stem) for path in colors + depths)):
         return None
-    times_s = [np.array([int(path.stem.split("-")[1]) * 1e-6 for path in paths]) for paths in (colors, depths)]
-    named = {"colour": times_s[0], "depth": times_s[1]}
-    refuse_other_units(folder, named)
-    pairs = associate(times_s[0], times_s[1])
-    if not len(pairs):
-        raise no_pairs(folder, named)
-    paired = set(pairs[:, 0].tolist())
-    skipped = [f"{path}: no depth within {MAX_GAP_S:g} s" for i, path in enumerate(colors) if i not in paired]
-    return [ImagePair(float(times_s[1][j]), colors[i], depths[j]) for i, j in pairs], skipped
+    color_s, depth_s = (np.array([int(p.stem.split("-")[1]) * 1e-6 for p in paths]) for paths in (colors, depths))
+    pairs, alone = pair_times(folder, {"colour": color_s, "depth": depth_s})
+    skipped = [f"{colors[i]}: no depth within {MAX_GAP_S:g} s" for i in alone]
+    return [ImagePair(float(depth_s[j]), colors[i], depths[j]) for i, j in pairs], skipped
 
 
 def _numbered(folder: Path, colors: list[Path], depths: list[Path], rate: float) -> tuple[list[ImagePair], list[str]]:
@@ -131,24 +134,20 @@ def _begins_as_trajectory(path: Path) -> bool:
     return len(words) == 3 and all(word.isdecimal() for word in words)
 
 
-def _intrinsic_file(folder: Path) -> Path | None:
-    return next((folder / name for name in INTRINSIC_NAMES if (folder / name).is_file()), None)
-
-
-def recognises(path: str) -> bool:
+def _recognises(path: str) -> bool:
     """Return whether there are image folders with a camera file, a trajectory, or names with times as in Redwood."""
     folder = Path(path)
     colors = first_subfolder(folder, COLOR_FOLDERS)
     if colors is None and not (folder / "depth").is_dir():
         return False
     timed = colors is not None and any(_TIMED.fullmatch(entry.stem) for entry in colors.iterdir())
-    return timed or _intrinsic_file(folder) is not None or _log_in(folder) is not None
+    return timed or first_file(folder, INTRINSIC_NAMES) is not None or _log_in(folder) is not None
 
 
 PLUGIN = SourceFormat(
     "Redwood / Open3D",
     "color/, depth/ and camera_intrinsic.json or trajectory.log",
-    recognises,
-    lambda path, settings: open_redwood(Path(path), settings),
+    _recognises,
+    open_redwood,
     sensor="kinect-v1",
 )

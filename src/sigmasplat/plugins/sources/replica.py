@@ -12,26 +12,30 @@ import numpy as np
 
 from sigmasplat.config import InputConfig
 from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SourceError
 from sigmasplat.files.reading import exists, read_text
-from sigmasplat.input.calibration import REPLICA, Calibration, read_replica_calibration, resolve_calibration
-from sigmasplat.input.folders import FRAMES_PER_SECOND, pair_images
-from sigmasplat.input.recorded import ImagePair, RecordedSource
+from sigmasplat.input.calibration import Calibration, build_camera, check_positive, json_number, read_json_object
+from sigmasplat.input.images import FRAMES_PER_SECOND, first_file, pair_images
+from sigmasplat.input.recorded import ImagePair, RecordedSource, folder_source
 from sigmasplat.registry import SourceFormat
+from sigmasplat.types import Matrix
+
+CAMERA = Calibration(Camera(1200, 680, 600.0, 600.0, 599.5, 339.5), 6553.5)
 
 
-def open_replica(folder: Path, settings: InputConfig) -> RecordedSource:
+def open_replica(path: str, settings: InputConfig) -> RecordedSource:
     """Open a folder. Raises SourceError if images, calibration or ground-truth poses cannot be used."""
+    folder, place = Path(path), Path(path).resolve()
     colors, depths = _numbered(folder, "frame"), _numbered(folder, "depth")
     numbers, skipped = pair_images(folder, colors, depths, "results/frame*.jpg", "results/depth*.png")
     images = [ImagePair(n / FRAMES_PER_SECOND, colors[n], depths[n]) for n in numbers]
-    recorded = _calibration(folder)
-    size = (recorded.camera.width, recorded.camera.height)
-    calibration = resolve_calibration(folder, recorded, size, settings, recorded.depth_units_per_metre)
+    beside = first_file(folder, ("cam_params.json", place.parent / "cam_params.json"))
+    known = _calibration(beside) if beside else CAMERA
+    surface = first_file(place.parent, (f"{place.name}_mesh.ply", place / f"{place.name}_mesh.ply"))
     truth = _truth(folder / "traj.txt", numbers)
-    name, surface = folder.resolve().name, _surface(folder.resolve())
-    return RecordedSource(name, images, calibration, settings, truth, skipped, surface=surface)
+    return folder_source(folder, settings, images, known, known.depth_units_per_metre, truth, skipped, surface=surface)
 
 
 def _numbered(folder: Path, stem: str) -> dict[int, Path]:
@@ -44,17 +48,13 @@ def _numbered(folder: Path, stem: str) -> dict[int, Path]:
     return dict(sorted(found.items()))
 
 
-def _calibration(folder: Path) -> Calibration:
-    for path in (folder / "cam_params.json", folder.resolve().parent / "cam_params.json"):
-        if path.is_file():
-            return read_replica_calibration(path)
-    return REPLICA
-
-
-def _surface(folder: Path) -> Path | None:
-    """Return the file of the true surface, in the parent folder or here; None without one."""
-    files = (place / f"{folder.name}_mesh.ply" for place in (folder.parent, folder))
-    return next((path for path in files if path.is_file()), None)
+def _calibration(path: Path) -> Calibration:
+    """Read `cam_params.json`: {"camera": {w, h, fx, fy, cx, cy, scale}}. Raises SourceError."""
+    fields = read_json_object(path).get("camera")
+    if not isinstance(fields, dict):
+        raise SourceError(f'{path}: no "camera" object with w, h, fx, fy, cx, cy, scale')
+    w, h, *focal, scale = (json_number(path, fields, key) for key in ("w", "h", "fx", "fy", "cx", "cy", "scale"))
+    return Calibration(build_camera(path, int(w), int(h), focal), check_positive(path, "scale", scale))
 
 
 def _truth(path: Path, numbers: list[int]) -> Trajectory | None:
@@ -66,27 +66,23 @@ def _truth(path: Path, numbers: list[int]) -> Trajectory | None:
         raise SourceError(
             f"{path}: {len(lines)} poses, but the last image has number {numbers[-1]}; is the file truncated?"
         )
-    poses = []
-    for number in numbers:
-        T = _matrix(f"{path}:{number + 1}", lines[number])
-        if not se3.is_rigid(T):
-            raise SourceError(f"{path}:{number + 1}: not a finite rigid pose: {lines[number].strip()[:80]}")
-        poses.append(T)
+    poses = [_pose(f"{path}:{number + 1}", lines[number].strip()) for number in numbers]
     return Trajectory(np.array(numbers) / FRAMES_PER_SECOND, np.stack(poses))
 
 
-def _matrix(where: str, line: str) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+def _pose(where: str, line: str) -> Matrix:
     try:
-        return np.array([float(word) for word in line.split()]).reshape(4, 4)
+        T = np.array([float(word) for word in line.split()]).reshape(4, 4)
     except ValueError as error:
-        raise SourceError(
-            f"{where}: expected 16 numbers (row-major camera-to-world), found {line.strip()[:80]!r}"
-        ) from error
+        raise SourceError(f"{where}: expected 16 numbers (row-major camera-to-world), found {line[:80]!r}") from error
+    if not se3.is_rigid(T):
+        raise SourceError(f"{where}: not a finite rigid pose: {line[:80]}")
+    return T
 
 
 PLUGIN = SourceFormat(
     "Replica",
     "results/frame*.jpg and results/depth*.png",
     lambda path: bool(_numbered(Path(path), "frame") or _numbered(Path(path), "depth")),
-    lambda path, settings: open_replica(Path(path), settings),
+    open_replica,
 )

@@ -2,26 +2,244 @@
 
 Topics are found by their content, or chosen with input.color_topic and input.depth_topic. Opening reads the bag once
 for the timestamps; images are read on demand.
+
+Gyroscope and accelerometer come from sensor_msgs/Imu, in the axes of the colour camera: from /tf_static between the
+frames that the messages name, or from the transforms of RealSense's SDK. The clock is that of the headers, as for the
+images, or the recording time if the headers fit no image.
+
+If the bag has no depth, or if input.depth_topic names the right one of two infrared topics, the infrared pair of a
+RealSense is read as a stereo pair. The rectified images of ROS (infra1/image_rect_raw) and the streams of RealSense's
+SDK (Infrared_1) have CameraInfo; the baseline is in P of the right camera, in the transforms of the SDK's streams, or
+in /tf_static.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.config import InputConfig
-from sigmasplat.input.association import MAX_GAP_S, associate, no_pairs, refuse_other_units
+from sigmasplat.data.imu import Accelerometer, Gyroscope, accelerometer_from_samples, gyroscope_from_samples
+from sigmasplat.errors import SourceError
+from sigmasplat.input.lists import MAX_GAP_S, associate, no_pairs, pair_times, refuse_other_units
 from sigmasplat.input.recorded import ImagePair, RecordedSource, Size
-from sigmasplat.plugins.sources.ros.bag import Bag, Entry, is_bag
-from sigmasplat.plugins.sources.ros.cameras import read_bag_calibration
-from sigmasplat.plugins.sources.ros.images import decode_color_message, decode_depth_message, message_size
-from sigmasplat.plugins.sources.ros.imu import read_bag_imu
-from sigmasplat.plugins.sources.ros.topics import color_topic, depth_topic
-from sigmasplat.plugins.sources.ros.truth import read_truth
-from sigmasplat.plugins.sources.stereo_bag import open_stereo_bag, stereo_topics
+from sigmasplat.plugins.sources.bag_cameras import (
+    ImageTopic,
+    Optics,
+    color_topic,
+    depth_topic,
+    image_topics,
+    info_of,
+    lookup_transform,
+    read_bag_calibration,
+    read_optics,
+    read_truth,
+    sdk_transform,
+    topic_by_name,
+)
+from sigmasplat.plugins.sources.bag_messages import (
+    Bag,
+    Entry,
+    Topic,
+    decode_any_color,
+    decode_color_message,
+    decode_depth_message,
+    is_bag,
+    message_size,
+)
+from sigmasplat.plugins.sources.stereo import StereoPair, StereoRig, StereoSource, given_intrinsics
+from sigmasplat.plugins.sources.stereo_matching import StereoCameras
 from sigmasplat.registry import SourceFormat
+from sigmasplat.types import Matrix
+
+IMU = "sensor_msgs/msg/Imu"
+Values = NDArray[np.float64]
+
+
+class Imu(NamedTuple):
+    """What moves with the camera; None = not measured."""
+
+    gyroscope: Gyroscope | None
+    accelerometer: Accelerometer | None
+
+
+def read_bag_imu(bag: Bag, color: ImageTopic, frame_times_s: Values) -> Imu:
+    """Return gyroscope and accelerometer, each of the first topic that has its values in axes whose rotation to the
+    colour camera is known. Cameras may publish them in two topics.
+
+    frame_times_s [N]: times of the images. Topics of the device of the camera come first, then those with the most
+    messages. Raises SourceError if the bag is damaged.
+    """
+    device = color.name.strip("/").partition("/")[0]
+
+    def preferred(topic: Topic) -> tuple[bool, int, str]:
+        return topic.name.strip("/").partition("/")[0] != device, -topic.count, topic.name
+
+    gyroscope, accelerometer = None, None
+    for topic in sorted(bag.topics_of_type(IMU), key=preferred):
+        R_color_imu = _axes(bag, color, topic.name)
+        if R_color_imu is None:
+            continue
+        rates, forces = (values @ R_color_imu.T for values in _measured(bag, topic.name))
+        for times_s in _clocks(bag, topic.name):
+            gyroscope = gyroscope or _gyroscope(times_s, rates, frame_times_s)
+            accelerometer = accelerometer or _accelerometer(times_s, forces, frame_times_s)
+        if gyroscope and accelerometer:
+            break
+    return Imu(gyroscope, accelerometer)
+
+
+def _gyroscope(times_s: Values, rates: Values, frame_times_s: Values) -> Gyroscope | None:
+    found = gyroscope_from_samples(times_s, rates)
+    return found if found is not None and found.measured_any(frame_times_s) else None
+
+
+def _accelerometer(times_s: Values, forces: Values, frame_times_s: Values) -> Accelerometer | None:
+    found = accelerometer_from_samples(times_s, forces)
+    return found if found is not None and any(found.at(t) is not None for t in frame_times_s) else None
+
+
+def _measured(bag: Bag, name: str) -> tuple[Values, Values]:
+    """Return angular velocities and specific forces [M, 3]; nan without them: the first value of the covariance is −1
+    then."""
+    # Numbers only: the messages of an hour would take a gigabyte.
+    rows = [
+        [(v.x, v.y, v.z, covariance[0]) for v, covariance in (
+            (message.angular_velocity, message.angular_velocity_covariance),
+            (message.linear_acceleration, message.linear_acceleration_covariance),
+        )]
+        for message in bag.messages(name)
+    ]  # fmt: skip
+    values = np.array(rows, np.float64).reshape(-1, 2, 4)
+    rates, forces = np.where(values[..., 3:] == -1, np.nan, values[..., :3]).swapaxes(0, 1)
+    return rates, forces
+
+
+def _clocks(bag: Bag, name: str) -> tuple[Values, Values]:
+    """Return the times of the messages [M], s: of the headers, and of recording."""
+    entries = bag.index(name)[name]
+    return np.array([e.stamp_ns for e in entries]) / 1e9, np.array([e.recorded_ns for e in entries]) / 1e9
+
+
+def _axes(bag: Bag, color: ImageTopic, name: str) -> Matrix | None:
+    """Return R_color_imu [3, 3], None if it is not known."""
+    if name.startswith("/device_"):
+        T = sdk_transform(bag, color, name.removesuffix("/imu/data"))
+        return None if T is None else T[:3, :3]
+    frame = bag.first_message(name).header.frame_id.lstrip("/")
+    if not (frame and color.frame):
+        return None
+    if frame == color.frame:
+        return np.eye(3)
+    T = lookup_transform(bag, color.frame, frame, use_tf=False)
+    return None if T is None else T[:3, :3]
+
+
+PAIRS = (("infra1", "infra2"), ("Infrared_1", "Infrared_2"), ("/left/", "/right/"))
+"""Parts of the names of left and right topics: RealSense with ROS, RealSense's SDK, other stereo cameras."""
+
+
+@dataclass(frozen=True)
+class BagStereoPair(StereoPair):
+    """Two messages; the paths contain bag, topic and time."""
+
+    bag: Bag
+    messages: Mapping[Path, tuple[str, Entry]]
+
+    def decoded(self, path: Path) -> NDArray[np.uint8]:
+        """Read an image, RGB [H, W, 3]. Raises SourceError naming topic and time."""
+        return decode_any_color(path, self.bag.read(*self.messages[path]))
+
+    def sizes(self) -> tuple[Size, Size]:
+        left, right = (message_size(path, self.bag.read(*self.messages[path])) for path in (self.color, self.depth))
+        return left, right
+
+
+def stereo_topics(bag: Bag, settings: InputConfig) -> tuple[ImageTopic, ImageTopic] | None:
+    """Return the left and the right topic of a bag that is read as stereo, else None.
+
+    With both topics requested, they are the pair if the second one is not depth. Without, there must be no depth.
+    """
+    if settings.color_topic and settings.depth_topic:
+        left, right = (topic_by_name(bag, name) for name in (settings.color_topic, settings.depth_topic))
+        return None if right.kind == "depth" and not _is_right(right.name) else (left, right)
+    if settings.color_topic or settings.depth_topic:
+        return None
+    if any("depth" in topic.name.lower() or not _is_side(topic.name) for topic in image_topics(bag, "depth")):
+        return None
+    found = {topic.name: topic for kind in ("", "colour", "depth") for topic in image_topics(bag, kind)}
+    for of_left, of_right in PAIRS:
+        for name in sorted(found, key=lambda name: ("compressed" in name, "rect" not in name, name)):
+            if of_left in name and name.replace(of_left, of_right) in found:
+                return found[name], found[name.replace(of_left, of_right)]
+    return None
+
+
+def _is_side(name: str) -> bool:
+    return any(side in name for pair in PAIRS for side in pair)
+
+
+def _is_right(name: str) -> bool:
+    return any(right in name for _, right in PAIRS)
+
+
+def open_stereo_bag(bag: Bag, left: ImageTopic, right: ImageTopic, settings: InputConfig) -> StereoSource:
+    """Open two topics of a bag as a stereo pair. Raises SourceError if cameras or baseline are unknown."""
+    cameras = _stereo_cameras(bag, left, right, settings)
+    found = bag.index(left.name, right.name)
+    times = [np.array([entry.stamp_ns / 1e9 for entry in found[topic.name]]) for topic in (left, right)]
+    indices, alone = pair_times(bag.path, {"left": times[0], "right": times[1]})
+    paths = [
+        [bag.path / f"{topic.name.lstrip('/')} at {t:.3f} s, {k}" for k, t in enumerate(of_topic)]
+        for topic, of_topic in zip((left, right), times, strict=True)
+    ]
+    messages = {
+        path: (topic.name, entry)
+        for topic, named in zip((left, right), paths, strict=True)
+        for path, entry in zip(named, found[topic.name], strict=True)
+    }
+
+    def pair_of(time_s: float, one: Path, other: Path, rig: StereoRig) -> BagStereoPair:
+        return BagStereoPair(time_s, one, other, rig, bag, messages)
+
+    pairs = [(float(times[0][i]), paths[0][i], paths[1][j]) for i, j in indices]
+    skipped = [f"{paths[0][i]}: no right image within {MAX_GAP_S:g} s" for i in alone]
+    truth = read_truth(bag, left.frame, False)
+    return StereoSource(bag.path.resolve().stem, pairs, cameras, settings, truth, skipped, pair_of)
+
+
+def _stereo_cameras(bag: Bag, left: ImageTopic, right: ImageTopic, settings: InputConfig) -> StereoCameras:
+    optics: list[Optics] = []
+    for topic in (left, right):
+        known = read_optics(bag, topic)
+        if known is None:
+            raise SourceError(f"{bag.path}: {topic.name} has no camera_info; record it beside the images")
+        optics.append(known)
+    T_right_left = _rig(bag, left, right)
+    (left_camera, right_camera), lenses = zip(*optics, strict=True)
+    lenses = lenses if settings.undistort else (None, None)
+    return StereoCameras(given_intrinsics(left_camera, settings), right_camera, T_right_left, *lenses)
+
+
+def _rig(bag: Bag, left: ImageTopic, right: ImageTopic) -> Matrix:
+    if (found := sdk_transform(bag, right, left)) is not None:
+        return found
+    P = np.zeros((3, 4)) if (info := info_of(bag, right)) is None else info
+    T_right_left = np.eye(4)
+    if P[0, 0] > 0 and P[0, 3] < 0:
+        T_right_left[0, 3] = P[0, 3] / P[0, 0]
+        return T_right_left
+    found = lookup_transform(bag, right.frame, left.frame) if left.frame and right.frame else None
+    if found is None or not np.linalg.norm(found[:3, 3]):
+        raise SourceError(
+            f"{bag.path}: the baseline of {left.name} and {right.name} is unknown; record camera_info with P, or "
+            "/tf_static"
+        )
+    return found
+
 
 Times = NDArray[np.float64]
 
@@ -35,15 +253,12 @@ class BagImagePair(ImagePair):
     entries: tuple[Entry, Entry]
 
     def read_color(self) -> NDArray[np.uint8]:
-        """Read 8-bit RGB [H, W, 3]. Raises SourceError naming topic and time."""
         return decode_color_message(self.color, self.bag.read(self.topics[0], self.entries[0]))
 
     def read_depth(self, units_per_metre: float) -> NDArray[np.float32]:
-        """Read depth in metres [H, W]. Raises SourceError naming topic and time."""
         return decode_depth_message(self.depth, self.bag.read(self.topics[1], self.entries[1]), units_per_metre)
 
     def sizes(self) -> tuple[Size, Size]:
-        """Return (width, height) of colour and depth. Raises SourceError naming topic and time."""
         paths = (self.color, self.depth)
         color, depth = (
             message_size(p, self.bag.read(t, e)) for p, t, e in zip(paths, self.topics, self.entries, strict=True)
@@ -51,8 +266,9 @@ class BagImagePair(ImagePair):
         return color, depth
 
 
-def open_bag(path: Path, settings: InputConfig) -> RecordedSource:
+def open_bag(place: str, settings: InputConfig) -> RecordedSource:
     """Open a bag. Raises SourceError if it is damaged, its topics are ambiguous, or its cameras are unknown."""
+    path = Path(place)
     bag = Bag(path)
     if pair := stereo_topics(bag, settings):
         return open_stereo_bag(bag, *pair, settings)
@@ -61,13 +277,11 @@ def open_bag(path: Path, settings: InputConfig) -> RecordedSource:
     found = bag.index(color.name, depth.name)
     entries = found[color.name], found[depth.name]
     pairs, recorded_time = _paired(entries)
-    named = {name: _times_s(found[name], recorded_time) for name in (color.name, depth.name)}
-    refuse_other_units(path, named)
+    topics, (color_s, depth_s) = (color.name, depth.name), (_times_s(part, recorded_time) for part in entries)
+    refuse_other_units(path, dict(zip(topics, (color_s, depth_s), strict=True)))
     if not len(pairs):
-        raise no_pairs(path, {name: _times_s(found[name], True) for name in (color.name, depth.name)})
+        raise no_pairs(path, {name: _times_s(found[name], True) for name in topics})
     truth = read_truth(bag, color.frame, recorded_time)
-    topics = (color.name, depth.name)
-    color_s, depth_s = (_times_s(part, recorded_time) for part in entries)
     colors = [_message_path(path, color.name, t) for t in color_s]
     depths = [_message_path(path, depth.name, t) for t in depth_s]
     images = [
@@ -77,8 +291,7 @@ def open_bag(path: Path, settings: InputConfig) -> RecordedSource:
     imu = read_bag_imu(bag, color, color_s)
     alone = sorted(set(range(len(entries[0]))) - set(pairs[:, 0].tolist()))
     skipped = [f"{colors[i]}: no depth within {MAX_GAP_S:g} s" for i in alone]
-    name = path.resolve().stem
-    return RecordedSource(name, images, calibration, settings, truth, skipped, **imu._asdict())
+    return RecordedSource(path.resolve().stem, images, calibration, settings, truth, skipped, **imu._asdict())
 
 
 def _paired(entries: tuple[Sequence[Entry], Sequence[Entry]]) -> tuple[NDArray[np.intp], bool]:
@@ -111,5 +324,5 @@ PLUGIN = SourceFormat(
     "ROS bag",
     "a .bag, .mcap or .db3 file, or a folder with metadata.yaml",
     lambda path: is_bag(Path(path)),
-    lambda path, settings: open_bag(Path(path), settings),
+    open_bag,
 )

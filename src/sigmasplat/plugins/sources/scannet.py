@@ -1,4 +1,4 @@
-"""Read ScanNet scenes extracted from .sens files, in both layouts of SensReader.
+"""Read ScanNet scenes extracted from .sens files, in both layouts of SensReader, and ScanNet++ scenes.
 
 color/0.jpg  depth/0.png  pose/0.txt                         SensReader/python; also 000000.jpg
 intrinsic/intrinsic_color.txt  intrinsic_depth.txt  extrinsic_color.txt  extrinsic_depth.txt
@@ -8,6 +8,16 @@ frame-000000.color.jpg  .depth.pgm  .pose.txt  _info.txt     SensReader/c++; als
 Depth (640×480, mm) has its own camera. It is registered to colour (1296×968), and the working width is depth's.
 Extrinsics transform a common frame to each camera: T_color_depth = E_color · E_depth⁻¹ (as in BundleFusion).
 Poses are camera to world, and −inf where tracking was lost: these frames are kept, without ground truth.
+
+ScanNet++ has undistorted DSLR photographs, and depth rendered from the laser scan:
+
+dslr/nerfstudio/transforms_undistorted.json     `frames` and `test_frames` (see `input/transforms.py`)
+dslr/undistorted_images/DSC00001.JPG            from the data set's toolbox, `dslr.undistort`
+dslr/undistorted_depths/DSC00001.png            16 bits, mm, rendered, undistorted (Nik-V9/scannetpp)
+dslr/train_test_lists.json                      optional {"train": […], "test": […]}: names in order
+
+The sequence contains the training photographs. The test photographs are not taken along the path, so they cannot be
+tracked: `test_views()` returns them with their poses. SplaTAM and similar systems read the same layout.
 """
 
 from pathlib import Path
@@ -19,12 +29,19 @@ from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.errors import SourceError
 from sigmasplat.files.reading import read_text
-from sigmasplat.input.calibration import MM_PER_METRE, Calibration, build_camera, check_positive, resolve_calibration
-from sigmasplat.input.folders import (
+from sigmasplat.input.calibration import (
+    MM_PER_METRE,
+    Calibration,
+    build_camera,
+    check_positive,
+    read_json_object,
+)
+from sigmasplat.input.images import (
     COLOR_ENDINGS,
     DEPTH_ENDINGS,
     FRAMES_PER_SECOND,
     FrameFiles,
+    first_file,
     first_subfolder,
     frame_files,
     has_frame_files,
@@ -32,9 +49,9 @@ from sigmasplat.input.folders import (
     list_images,
     pair_images,
 )
-from sigmasplat.input.lists import parse_numbers
-from sigmasplat.input.pose_files import read_matrix, read_pose_files, to_matrix
-from sigmasplat.input.recorded import ImagePair, RecordedSource, first_size
+from sigmasplat.input.lists import build_trajectory, parse_numbers, read_matrix, read_pose_files, to_matrix
+from sigmasplat.input.recorded import ImagePair, RecordedSource, first_size, folder_source
+from sigmasplat.input.transforms import Fields, read_camera, read_frames, read_pose
 from sigmasplat.registry import SourceFormat
 from sigmasplat.types import Matrix
 
@@ -44,8 +61,9 @@ COLOR_SIZE, DEPTH_SIZE = (1296, 968), (640, 480)
 INFO_NAMES = ("_info.txt", "info.txt")
 
 
-def open_scannet(folder: Path, settings: InputConfig) -> RecordedSource:
+def open_scannet(path: str, settings: InputConfig) -> RecordedSource:
     """Open a scene's folder. Raises SourceError if images, cameras or poses cannot be used."""
+    folder = Path(path)
     files = _files(folder)
     if not files["color"] and not files["depth"] and (packed := sorted(folder.glob("*.sens"))):
         raise SourceError(
@@ -54,10 +72,9 @@ def open_scannet(folder: Path, settings: InputConfig) -> RecordedSource:
     keys, skipped = pair_images(folder, files["color"], files["depth"], "color/*.jpg", "depth/*.png")
     images = [ImagePair(n / FRAMES_PER_SECOND, files["color"][n], files["depth"][n]) for n in keys]
     size, depth_size = first_size([i.color for i in images]), first_size([i.depth for i in images])
-    recorded = _recorded(folder, size, depth_size)
-    calibration = resolve_calibration(folder, recorded, size, settings, MM_PER_METRE)
+    known = _recorded(folder, size, depth_size)
     truth = read_pose_files((n / FRAMES_PER_SECOND, files["pose"][n]) for n in keys if n in files["pose"])
-    return RecordedSource(folder.resolve().name, images, calibration, settings, truth, skipped)
+    return folder_source(folder, settings, images, known, MM_PER_METRE, truth, skipped)
 
 
 def _files(folder: Path) -> FrameFiles:
@@ -90,7 +107,8 @@ def _matrices(folder: Path) -> tuple[dict[str, Path], dict[str, Matrix], float]:
     """Return file and value of each matrix by `{color|depth}_{intrinsic|extrinsic}`, and depth units per metre."""
     where, found, units = {}, {}, MM_PER_METRE
     for info in (folder / name for name in INFO_NAMES if (folder / name).is_file()):
-        entries = dict(_entry(line) for line in read_text(info, errors="replace").splitlines() if "=" in line)
+        lines = (line.split("=", 1) for line in read_text(info, errors="replace").splitlines() if "=" in line)
+        entries = {key.strip(): value.strip() for key, value in lines}
         if shift := entries.get("m_depthShift"):
             units = check_positive(info, "m_depthShift", parse_numbers(info, 1, [shift])[0])
         for key, kind in (("Color", "color"), ("Depth", "depth")):
@@ -102,15 +120,9 @@ def _matrices(folder: Path) -> tuple[dict[str, Path], dict[str, Matrix], float]:
     for kind in ("color", "depth"):
         for part in ("intrinsic", "extrinsic"):
             names = (f"intrinsic/{part}_{kind}.txt", f"{part}s_{kind}.txt", f"{part}_{kind}.txt")
-            path = next((folder / name for name in names if (folder / name).is_file()), None)
-            if path:
+            if path := first_file(folder, names):
                 where[f"{kind}_{part}"], found[f"{kind}_{part}"] = path, read_matrix(path)
     return where, found, units
-
-
-def _entry(line: str) -> tuple[str, str]:
-    key, _, value = line.partition("=")
-    return key.strip(), value.strip()
 
 
 def _camera(path: Path, K: Matrix, size: tuple[int, int], published: tuple[int, int]) -> Camera:
@@ -119,7 +131,7 @@ def _camera(path: Path, K: Matrix, size: tuple[int, int], published: tuple[int, 
     return build_camera(path, *own, [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]).resized(*size)
 
 
-def recognises(path: str) -> bool:
+def _recognises(path: str) -> bool:
     """Return whether it is a scene, extracted or not."""
     folder = Path(path)
     has_info = any((folder / name).is_file() for name in INFO_NAMES)
@@ -130,10 +142,62 @@ def recognises(path: str) -> bool:
     return images is not None and (camera or (folder / "pose").is_dir())
 
 
-PLUGIN = SourceFormat(
-    "ScanNet",
-    "color/, depth/ and pose/",
-    recognises,
-    lambda path, settings: open_scannet(Path(path), settings),
-    sensor="kinect-v1",
+TRANSFORMS = Path("nerfstudio") / "transforms_undistorted.json"
+IMAGES, DEPTHS, LISTS = "undistorted_images", "undistorted_depths", "train_test_lists.json"
+
+
+def open_scannetpp(path: str, settings: InputConfig) -> RecordedSource:
+    """Open a scene's folder or its `dslr`. Raises SourceError if its JSON file, images or camera cannot be used."""
+    dslr = _dslr(Path(path))
+    fields = read_json_object(dslr / TRANSFORMS)
+    _refuse_missing_folders(dslr)
+    views = _chosen(dslr, fields, "test", "test_frames") if fields.get("test_frames") else []
+    views = [view for view in views if (dslr / IMAGES / view["file_path"]).is_file()]
+    test = _source(dslr, fields, views, settings) if views else None
+    return _source(dslr, fields, _chosen(dslr, fields, "train", "frames"), settings, test)
+
+
+def _source(
+    dslr: Path, fields: Fields, frames: list[Fields], settings: InputConfig, test: RecordedSource | None = None
+) -> RecordedSource:
+    path, scene = dslr / TRANSFORMS, dslr.resolve().parent
+    files = [(dslr / IMAGES / f["file_path"], (dslr / DEPTHS / f["file_path"]).with_suffix(".png")) for f in frames]
+    images = [ImagePair(i / FRAMES_PER_SECOND, *pair) for i, pair in enumerate(files)]
+    size = first_size([color for color, _ in files])
+    known = read_camera(path, fields, frames, size, MM_PER_METRE)
+    truth = build_trajectory((i.timestamp_s, read_pose(path, frame)) for i, frame in zip(images, frames, strict=True))
+    return folder_source(scene, settings, images, known, MM_PER_METRE, truth, test=test)
+
+
+def _chosen(dslr: Path, fields: Fields, split: str, key: str) -> list[Fields]:
+    """Return the frames of a split, in the order of train_test_lists.json if it exists, else of their names."""
+    frames = {frame["file_path"]: frame for frame in read_frames(dslr / TRANSFORMS, fields, key)}
+    lists = read_json_object(dslr / LISTS) if (dslr / LISTS).is_file() else {}
+    names = lists.get(split, sorted(frames))
+    if not isinstance(names, list) or not names:
+        raise SourceError(f"{dslr / LISTS}: {split!r} is {str(names)[:60]}, expected a list of file names")
+    absent = [str(name) for name in names if str(name) not in frames]
+    if absent:
+        raise SourceError(f"{dslr / LISTS}: {absent[0]} of {split!r} is not among the {key} of {TRANSFORMS.name}")
+    return [frames[name] for name in names]
+
+
+def _refuse_missing_folders(dslr: Path) -> None:
+    for part, made_by in ((IMAGES, "the toolbox's `python -m dslr.undistort`"), (DEPTHS, "a depth renderer")):
+        if not (dslr / part).is_dir():
+            there = ", ".join(sorted(entry.name for entry in dslr.iterdir() if entry.is_dir()))
+            raise SourceError(
+                f"{dslr}: no {part}/ (found {there}); create it with {made_by}, for the undistorted camera"
+            )
+
+
+def _dslr(scene: Path) -> Path:
+    return scene if (scene / TRANSFORMS).is_file() else scene / "dslr"
+
+
+PLUGIN = (
+    SourceFormat("ScanNet", "color/, depth/ and pose/", _recognises, open_scannet, sensor="kinect-v1"),
+    SourceFormat(
+        "ScanNet++", "dslr/nerfstudio/", lambda path: (_dslr(Path(path)) / TRANSFORMS).is_file(), open_scannetpp
+    ),
 )

@@ -11,46 +11,53 @@ the ground-truth path is converted: T_world_color = T_world_depth · T_depth_col
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from sigmasplat.config import InputConfig
 from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SourceError
-from sigmasplat.input.calibration import (
-    MM_PER_METRE,
-    SEVEN_SCENES,
-    SEVEN_SCENES_COLOR,
-    Calibration,
-    resolve_calibration,
-)
-from sigmasplat.input.folders import FRAMES_PER_SECOND, frame_files, has_frame_files, pair_images
-from sigmasplat.input.pose_files import read_pose_files
+from sigmasplat.input.calibration import MM_PER_METRE, Calibration, resolve_calibration
+from sigmasplat.input.images import FRAMES_PER_SECOND, frame_files, has_frame_files, pair_images
+from sigmasplat.input.lists import read_pose_files
 from sigmasplat.input.recorded import ImagePair, RecordedSource, first_size
 from sigmasplat.input.rectification import registers_depth
 from sigmasplat.registry import SourceFormat
 
+# 585, 320, 240 are the values of the 7-Scenes page. They belong to the depth camera, and so do the published poses. The
+# colour camera and its position were fitted to the RedKitchen sequence by maximising the agreement of neighbouring
+# images (andyzeng/tsdf-fusion-python, data/; the fit is in shared/data/redkitchen/calibration.json).
+DEPTH_CAMERA = Calibration(Camera(640, 480, 585.0, 585.0, 320.0, 240.0), MM_PER_METRE)
+BOTH_CAMERAS = Calibration(
+    Camera(640, 480, 528.12, 528.12, 318.96, 232.91),
+    MM_PER_METRE,
+    depth_camera=DEPTH_CAMERA.camera,
+    T_color_depth=np.array([
+        [0.999969, -0.007635, 0.001694, -0.02421],
+        [0.007625, 0.999954, 0.005732, 0.005946],
+        [-0.001738, -0.005719, 0.999982, 0.006997],
+        [0.0, 0.0, 0.0, 1.0],
+    ]),
+)  # fmt: skip
 
-def open_seven_scenes(folder: Path, settings: InputConfig) -> RecordedSource:
+
+def open_seven_scenes(path: str, settings: InputConfig) -> RecordedSource:
     """Open the folder of a sequence, or of a scene with one sequence. Raises SourceError if it cannot be used."""
-    if not has_frame_files(folder):
-        folder = _only_sequence(folder)
+    folder = Path(path) if has_frame_files(Path(path)) else _only_sequence(Path(path))
     files = frame_files(folder)
     numbers, skipped = pair_images(folder, files["color"], files["depth"], "frame-*.color.png", "frame-*.depth.png")
     images = [ImagePair(n / FRAMES_PER_SECOND, files["color"][n], files["depth"][n]) for n in numbers]
-    calibration = _calibration(folder, images, settings)
+    known = BOTH_CAMERAS if settings.register_depth == "on" else DEPTH_CAMERA
+    size = first_size([pair.color for pair in images])
+    calibration = resolve_calibration(folder, known, size, settings, MM_PER_METRE)
+    calibration = replace(calibration, T_color_depth=se3.orthonormalise(calibration.T_color_depth))
     truth = read_pose_files((n / FRAMES_PER_SECOND, files["pose"][n]) for n in numbers if n in files["pose"])
     if truth and registers_depth(calibration, settings):
         truth = Trajectory(truth.timestamps_s, truth.T_world_camera @ se3.inverse(calibration.T_color_depth))
     source = RecordedSource(folder.resolve().name, images, calibration, settings, truth, skipped)
-    source.registrable = source.registrable or calibration.camera == SEVEN_SCENES.camera
+    source.registrable = source.registrable or calibration.camera == DEPTH_CAMERA.camera
     return source
-
-
-def _calibration(folder: Path, images: list[ImagePair], settings: InputConfig) -> Calibration:
-    known = SEVEN_SCENES_COLOR if settings.register_depth == "on" else SEVEN_SCENES
-    size = first_size([files.color for files in images])
-    calibration = resolve_calibration(folder, known, size, settings, MM_PER_METRE)
-    T = calibration.T_color_depth
-    return replace(calibration, T_color_depth=se3.orthonormalise(T))
 
 
 def _only_sequence(scene: Path) -> Path:
@@ -65,7 +72,7 @@ def _only_sequence(scene: Path) -> Path:
     return sequences[0]
 
 
-def recognises(path: str) -> bool:
+def _recognises(path: str) -> bool:
     """Return whether it is a sequence without a camera file, or a scene with such sequences."""
     folder = Path(path)
     if has_frame_files(folder):
@@ -73,10 +80,4 @@ def recognises(path: str) -> bool:
     return any(has_frame_files(entry) or entry.suffix == ".zip" for entry in folder.glob("seq-*"))
 
 
-PLUGIN = SourceFormat(
-    "7-Scenes",
-    "frame-*.color.png",
-    recognises,
-    lambda path, settings: open_seven_scenes(Path(path), settings),
-    sensor="kinect-v1",
-)
+PLUGIN = SourceFormat("7-Scenes", "frame-*.color.png", _recognises, open_seven_scenes, sensor="kinect-v1")

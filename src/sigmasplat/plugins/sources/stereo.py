@@ -6,7 +6,7 @@ TUM-like   rgb.txt right.txt [groundtruth.txt] calibration.json   lines of "t pa
 KITTI      image_2/ image_3/ (or image_0/ image_1/) calib.txt [times.txt] [poses.txt]   rectified, odometry benchmark
 EuRoC      mav0/cam0 mav0/cam1: data.csv, sensor.yaml, data/*.png; state_groundtruth_estimate0/data.csv
 
-Depth belongs to the left image. It is computed from both images when a frame is read (`sources.camera.stereo`).
+Depth belongs to the left image. It is computed from both images when a frame is read (`stereo_matching`).
 """
 
 import re
@@ -23,15 +23,26 @@ from sigmasplat.data.camera import Camera
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SourceError
 from sigmasplat.files.reading import read_text
-from sigmasplat.input.association import associate, no_pairs
 from sigmasplat.input.calibration import Calibration, build_camera, resolve_calibration
-from sigmasplat.input.folders import COLOR_ENDINGS, list_images
-from sigmasplat.input.images import read_color
-from sigmasplat.input.lists import parse_numbers, read_lines, read_poses
-from sigmasplat.input.pose_files import build_trajectory, checked_pose, rigid_transform, to_matrix
+from sigmasplat.input.images import COLOR_ENDINGS, list_images, read_color
+from sigmasplat.input.lists import (
+    build_trajectory,
+    checked_pose,
+    pair_times,
+    parse_numbers,
+    read_groundtruth,
+    read_lines,
+    rigid_transform,
+    to_matrix,
+)
 from sigmasplat.input.recorded import ImagePair, RecordedSource, Size, first_size
-from sigmasplat.plugins.sources.camera.stereo import StereoMatcher, StereoRectification, scene_scale
-from sigmasplat.plugins.sources.camera.stereo_cameras import StereoCameras, read_stereo_cameras
+from sigmasplat.plugins.sources.stereo_matching import (
+    StereoCameras,
+    StereoMatcher,
+    StereoRectification,
+    read_stereo_cameras,
+    scene_scale,
+)
 from sigmasplat.plugins.sources.tum import read_list
 from sigmasplat.registry import SourceFormat
 from sigmasplat.types import Matrix
@@ -41,6 +52,7 @@ KITTI_FRAMES_PER_SECOND = 10.0
 NANOSECONDS = 1e-9
 
 Pair = tuple[float, Path, Path]
+Timed = tuple[NDArray[np.float64], list[Path]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,15 +139,16 @@ class StereoSource(RecordedSource):
         self.scene_scale = scene_scale(self.depth_of, len(self))
 
     def depth_std_of(self, i: int) -> NDArray[np.float32]:
-        """Return the standard deviation of the depth of frame i, m [H, W]; 0 without a reading."""
         return self._pairs[self._checked_index(i)].depth_and_std_m()[1]
 
 
-def open_stereo(folder: Path, settings: InputConfig) -> StereoSource:
+def open_stereo(path: str, settings: InputConfig) -> StereoSource:
     """Open a folder of stereo pairs. Raises SourceError if lists, images, calibration or poses cannot be used."""
+    folder = Path(path)
     if (folder / "right.txt").is_file():
         return _open_tum_like(folder, settings)
-    return _open_euroc(folder, settings) if _euroc_root(folder) else _open_kitti(folder, settings)
+    root = _euroc_root(folder)
+    return _open_euroc(folder, root, settings) if root else _open_kitti(folder, settings)
 
 
 def _open_tum_like(folder: Path, settings: InputConfig) -> StereoSource:
@@ -146,22 +159,13 @@ def _open_tum_like(folder: Path, settings: InputConfig) -> StereoSource:
     if not path.is_file():
         raise SourceError(f"{folder}: the baseline of the stereo pair is unknown; write {path} with baseline_m, metres")
     cameras = read_stereo_cameras(path, replace(left, distortion=left.distortion if settings.undistort else None))
-    truth_path = folder / "groundtruth.txt"
-    truth = read_poses(truth_path) if truth_path.is_file() else None
-    return StereoSource(folder.resolve().name, pairs, cameras, settings, truth, skipped)
+    return StereoSource(folder.resolve().name, pairs, cameras, settings, read_groundtruth(folder), skipped)
 
 
-def _timed_pairs(
-    folder: Path,
-    left: tuple[NDArray[np.float64], list[Path]],
-    right: tuple[NDArray[np.float64], list[Path]],
-) -> tuple[list[Pair], list[str]]:
+def _timed_pairs(folder: Path, left: Timed, right: Timed) -> tuple[list[Pair], list[str]]:
     """Pair left and right images by time; also return the left images without a right one."""
-    indices = associate(left[0], right[0])
-    if not len(indices):
-        raise no_pairs(folder, {"left": left[0], "right": right[0]})
-    paired = set(indices[:, 0].tolist())
-    skipped = [f"{path}: no right image" for i, path in enumerate(left[1]) if i not in paired]
+    indices, alone = pair_times(folder, {"left": left[0], "right": right[0]})
+    skipped = [f"{left[1][i]}: no right image" for i in alone]
     return [(float(left[0][i]), left[1][i], right[1][j]) for i, j in indices], skipped
 
 
@@ -248,9 +252,7 @@ def _euroc_root(folder: Path) -> Path | None:
     return None
 
 
-def _open_euroc(folder: Path, settings: InputConfig) -> StereoSource:
-    root = _euroc_root(folder)
-    assert root is not None
+def _open_euroc(folder: Path, root: Path, settings: InputConfig) -> StereoSource:
     pairs, skipped = _timed_pairs(folder, *(_euroc_list(root / name) for name in ("cam0", "cam1")))
     sensors = [_euroc_sensor(root / name / "sensor.yaml") for name in ("cam0", "cam1")]
     (left, left_lens, T_body_left), (right, right_lens, T_body_right) = sensors
@@ -269,7 +271,7 @@ def _open_euroc(folder: Path, settings: InputConfig) -> StereoSource:
     return StereoSource(folder.resolve().name, pairs, cameras, settings, truth, skipped)
 
 
-def _euroc_list(camera: Path) -> tuple[NDArray[np.float64], list[Path]]:
+def _euroc_list(camera: Path) -> Timed:
     times_s, paths = [], []
     for line, words in read_lines(camera / "data.csv"):
         times_s.append(parse_numbers(camera / "data.csv", line, words[:1])[0] * NANOSECONDS)
@@ -281,9 +283,12 @@ def _euroc_sensor(path: Path) -> tuple[Camera, tuple[float, ...], Matrix]:
     """Read camera, distortion and T_body_camera of a sensor.yaml. Raises SourceError naming file and field."""
     text = read_text(path)
 
+    def found(pattern: str) -> list[float]:
+        block = re.search(rf"{pattern}\[([^\]]*)\]", text, re.MULTILINE)
+        return parse_numbers(path, 1, block.group(1).replace(",", " ").split()) if block else []
+
     def numbers(key: str, count: int) -> list[float]:
-        block = re.search(rf"^\s*{key}:[^\[]*\[([^\]]*)\]", text, re.MULTILINE)
-        values = parse_numbers(path, 1, block.group(1).replace(",", " ").split()) if block else []
+        values = found(rf"^\s*{key}:[^\[]*")
         if len(values) != count:
             raise SourceError(f'{path}: field "{key}" needs {count} numbers, found {len(values)}')
         return values
@@ -292,8 +297,7 @@ def _euroc_sensor(path: Path) -> tuple[Camera, tuple[float, ...], Matrix]:
     if lens and lens.group(1) not in ("radial-tangential", "plumb_bob"):
         raise SourceError(f"{path}: distortion_model is {lens.group(1)}, only radial-tangential is supported")
     width, height = (int(value) for value in numbers("resolution", 2))
-    T_block = re.search(r"T_BS:.*?data:\s*\[([^\]]*)\]", text, re.DOTALL)
-    values = parse_numbers(path, 1, T_block.group(1).replace(",", " ").split()) if T_block else []
+    values = found(r"T_BS:[\s\S]*?data:\s*")
     T = np.array(values).reshape(4, 4) if len(values) == 16 else np.zeros((4, 4))
     if not se3.is_rigid(T):
         raise SourceError(f'{path}: field "T_BS" is not a rigid 4×4 matrix')
@@ -306,7 +310,7 @@ def given_intrinsics(camera: Camera, settings: InputConfig) -> Camera:
     return replace(camera, **{key: value for key in ("fx", "fy", "cx", "cy") if (value := getattr(settings, key))})
 
 
-def recognises(path: str) -> bool:
+def _recognises(path: str) -> bool:
     """Return whether there is a stereo pair without depth images."""
     folder = Path(path)
     if (folder / "depth.txt").is_file() or (folder / "depth").is_dir():
@@ -320,7 +324,7 @@ def recognises(path: str) -> bool:
 PLUGIN = SourceFormat(
     "stereo pair",
     "rgb.txt and right.txt, image_2/ and image_3/ with calib.txt, or mav0/cam0 and mav0/cam1",
-    recognises,
-    lambda path, settings: open_stereo(Path(path), settings),
+    _recognises,
+    open_stereo,
     priority=2,
 )

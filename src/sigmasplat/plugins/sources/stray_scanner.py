@@ -20,16 +20,13 @@ from numpy.typing import NDArray
 
 from sigmasplat.config import InputConfig
 from sigmasplat.data import se3
-from sigmasplat.data.accelerometer import GRAVITY_M_S2, accelerometer_from_samples
-from sigmasplat.data.gyroscope import gyroscope_from_samples
+from sigmasplat.data.imu import GRAVITY_M_S2, accelerometer_from_samples, gyroscope_from_samples
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SourceError
-from sigmasplat.files.reading import read_text
-from sigmasplat.files.structured import csv_rows
+from sigmasplat.files.reading import csv_rows, read_text
 from sigmasplat.input.calibration import MM_PER_METRE, Calibration, build_camera, resolve_calibration
-from sigmasplat.input.images import image_size, read_depth, read_values
+from sigmasplat.input.images import Video, image_size, read_depth, read_values
 from sigmasplat.input.recorded import ImagePair, RecordedSource, Size, first_size
-from sigmasplat.input.video import Video
 from sigmasplat.registry import SourceFormat
 
 POSE = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")
@@ -50,7 +47,6 @@ class StrayImagePair(ImagePair):
     confidence: Path
 
     def read_color(self) -> NDArray[np.uint8]:
-        """Read 8-bit RGB [H, W, 3]. Raises SourceError naming the video."""
         return self.video.frame(self.number)
 
     def read_depth(self, units_per_metre: float) -> NDArray[np.float32]:
@@ -66,12 +62,12 @@ class StrayImagePair(ImagePair):
         return np.where(confidence > 0, depth_m, np.float32(0.0))
 
     def sizes(self) -> tuple[Size, Size]:
-        """Return (width, height) of colour and depth. Raises SourceError naming the depth file."""
         return self.video.size, image_size(self.depth)
 
 
-def open_stray_scanner(folder: Path, settings: InputConfig) -> RecordedSource:
+def open_stray_scanner(path: str, settings: InputConfig) -> RecordedSource:
     """Open a folder. Raises SourceError if video, depth, camera or poses cannot be used."""
+    folder = Path(path)
     video_path, depths = folder / "rgb.mp4", _numbered(folder / "depth")
     if not video_path.is_file():
         raise SourceError(f"no video in {folder} (looked for rgb.mp4); copy the whole folder from the phone")
@@ -206,6 +202,6 @@ PLUGIN = SourceFormat(
     "Stray Scanner",
     "rgb.mp4, depth/ and odometry.csv",
     _recognises,
-    lambda path, settings: open_stray_scanner(Path(path), settings),
+    open_stray_scanner,
     sensor="lidar-iphone",
 )

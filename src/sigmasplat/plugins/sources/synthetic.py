@@ -1,5 +1,6 @@
 """Render the synthetic room: exact depth and poses, any length and size, the same bytes for the same seed."""
 
+from inspect import signature
 from typing import Any
 
 import numpy as np
@@ -14,13 +15,17 @@ from sigmasplat.data.mesh import Mesh
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SourceError
 from sigmasplat.input.source import Source
-from sigmasplat.plugins.sources.camera.stereo import StereoMatcher
-from sigmasplat.plugins.sources.room.furnish import furnish_rooms
-from sigmasplat.plugins.sources.room.mover import mask_of, mover as moving_ball
+from sigmasplat.plugins.sources.room.capture import (
+    camera_path,
+    drifted_depth,
+    measured_color,
+    measured_depth,
+    predicted_depth,
+)
+from sigmasplat.plugins.sources.room.furnish import furnish_rooms, mask_of, mover as moving_ball
 from sigmasplat.plugins.sources.room.render import RoomScene, build_scene, render_scene
-from sigmasplat.plugins.sources.room.sensor import drifted_depth, measured_color, measured_depth, predicted_depth
-from sigmasplat.plugins.sources.room.solid import triangulate
-from sigmasplat.plugins.sources.room.walk import camera_path
+from sigmasplat.plugins.sources.room.shapes import triangulate
+from sigmasplat.plugins.sources.stereo_matching import StereoMatcher
 from sigmasplat.registry import SourceFormat
 from sigmasplat.types import Matrix
 
@@ -42,11 +47,11 @@ class SyntheticRoom(Source):
     noise: whether depth and colour have sensor noise; loops: rounds of the path; exposure_change: whether the image
     gain varies by ±8 % over the sequence; rooms: number of rooms, joined by doorways; overrun: how far the path
     continues past its start, percent of a round; drift: standard deviation of the depth calibration's slow drift
-    (`room.sensor.drifted_depth`), tenths of a percent of the depth; test_views: number of exact views away from the
+    (`room.capture.drifted_depth`), tenths of a percent of the depth; test_views: number of exact views away from the
     path (`SyntheticRoom.test_views`); stereo: if above 0, depth is computed from a stereo pair with this baseline in cm
     instead of being exact (`right_image`); mover: the share of the image, in percent on average, that a ball covers
-    which moves through the room by itself (`room.mover`); scored views and the true surface show the room without it;
-    predicted: whether depth is that of an imagined network, with a smooth scale error (`room.sensor.predicted_depth`).
+    which moves through the room by itself (`Mover`); scored views and the true surface show the room without it;
+    predicted: whether depth is that of an imagined network, with a smooth scale error (`room.capture.predicted_depth`).
 
     A path with loops to close: frames=720,rooms=2,overrun=20,noise=1,drift=6. A round of 600 frames is a slow pace. The
     way back looks in other directions than the way out, so drift accumulates over a whole round; the last 120 frames
@@ -56,31 +61,16 @@ class SyntheticRoom(Source):
     """
 
     def __init__(
-        self,
-        frames: int = 200,
-        width: int = 320,
-        height: int = 240,
-        seed: int = 0,
-        noise: bool = False,
-        loops: int = 1,
-        exposure_change: bool = True,
-        rooms: int = 1,
-        overrun: int = 0,
-        drift: int = 0,
-        test_views: int = 0,
-        stereo: int = 0,
-        mover: int = 0,
-        predicted: bool = False,
-    ) -> None:
+        self, frames: int = 200, width: int = 320, height: int = 240, seed: int = 0, noise: bool = False,
+        loops: int = 1, exposure_change: bool = True, rooms: int = 1, overrun: int = 0, drift: int = 0,
+        test_views: int = 0, stereo: int = 0, mover: int = 0, predicted: bool = False,
+    ) -> None:  # fmt: skip
         """Compute the camera path, no image yet. Raises SourceError unless counts and sizes are ≥ 1, the rest ≥ 0."""
         counts = {"frames": frames, "width": width, "height": height, "loops": loops, "rooms": rooms}
-        for key, value in counts.items():
-            if value < 1:
-                raise SourceError(f"synthetic room: {key} must be at least 1, found {value}")
         others = {"seed": seed, "overrun": overrun, "drift": drift, "test_views": test_views, "stereo": stereo}
-        for key, value in others.items():
-            if value < 0:
-                raise SourceError(f"synthetic room: {key} must be at least 0, found {value}")
+        for key, value in (counts | others).items():
+            if value < (key in counts):
+                raise SourceError(f"synthetic room: {key} must be at least {int(key in counts)}, found {value}")
         if not 0 <= mover <= MOST_MOVER or (mover and rooms > 1):
             found = f"{mover} and rooms={rooms}" if rooms > 1 else str(mover)
             raise SourceError(f"synthetic room: mover is 0 to {MOST_MOVER} percent and needs rooms=1, found {found}")
@@ -105,8 +95,7 @@ class SyntheticRoom(Source):
     def frame(self, i: int) -> Frame:
         """Render frame i; colour has steps of 1/255, as from a camera."""
         T_world_camera = self._T_world_camera[self._checked_index(i)]
-        color, depth_m = render_scene(self._scene(i), self.camera, T_world_camera)
-        color = np.clip(color * np.float32(self._gain(i)), 0.0, 1.0)
+        color, depth_m = self._exposed(i, T_world_camera)
         if self._drift:
             depth_m = drifted_depth(depth_m, i, self._seed, self._drift)
         if self._noise:
@@ -125,8 +114,7 @@ class SyntheticRoom(Source):
         T_left_right = np.eye(4)
         T_left_right[0, 3] = self._baseline_m
         T_world_right = self._T_world_camera[self._checked_index(i)] @ T_left_right
-        color = render_scene(self._scene(i), self.camera, T_world_right)[0]
-        color = np.clip(color * np.float32(self._gain(i)), 0.0, 1.0)
+        color = self._exposed(i, T_world_right)[0]
         if self._noise:
             color = measured_color(color, np.random.default_rng((self._seed, i, 9)))
         return np.asarray(np.rint(color * 255.0), np.uint8)
@@ -139,7 +127,6 @@ class SyntheticRoom(Source):
         return self._matcher.depth_and_std_m(left, self.right_image(i))[1]
 
     def timestamp_s(self, i: int) -> float:
-        """Return the time of frame i, without rendering it."""
         return self._checked_index(i) / FRAMES_PER_SECOND
 
     def exact_depth_of(self, i: int) -> NDArray[np.float32]:
@@ -180,25 +167,21 @@ class SyntheticRoom(Source):
         """Return the surfaces of all shapes in the room's frame, including hidden parts."""
         return triangulate([shape for shapes in furnish_rooms(self._rooms, self._seed) for shape in shapes])
 
-    def _gain(self, i: int) -> float:
-        """Return the exposure gain of frame i: one sine period over the sequence."""
-        if not self._exposure_change:
-            return 1.0
-        return 1.0 + EXPOSURE_SWING * float(np.sin(2 * np.pi * i / max(len(self) - 1, 1)))
+    def _exposed(self, i: int, T_world_camera: Matrix) -> tuple[Floats, Floats]:
+        """Return colour and depth of frame i from a pose; the exposure gain makes one sine period over the sequence."""
+        color, depth_m = render_scene(self._scene(i), self.camera, T_world_camera)
+        swing = EXPOSURE_SWING if self._exposure_change else 0.0
+        gain = 1.0 + swing * float(np.sin(2 * np.pi * i / max(len(self) - 1, 1)))
+        return np.clip(color * np.float32(gain), 0.0, 1.0), depth_m
 
 
 class _ViewsAway(Source):
     """Exact views of the room away from a camera path, in free space: nothing is nearer than `CLEARANCE_M`."""
 
     def __init__(
-        self,
-        camera: Camera,
-        scene: RoomScene,
-        random: np.random.Generator,
-        T_world_path: Matrix,
-        count: int,
+        self, camera: Camera, scene: RoomScene, random: np.random.Generator, T_world_path: Matrix, count: int,
         away: tuple[Matrix, Matrix],
-    ) -> None:
+    ) -> None:  # fmt: skip
         super().__init__("synthetic test views", camera)
         self._scene, (self._away_m, self._away_rad) = scene, away
         on_path = T_world_path[np.linspace(0, len(T_world_path) - 1, count).round().astype(int)]
@@ -237,22 +220,13 @@ def open_synthetic(text: str) -> SyntheticRoom:
         key, _, value = (word.strip() for word in part.partition("="))
         if key not in _OPTIONS or not value.lstrip("-").isdecimal():
             raise SourceError(f"synthetic room: unknown option {part!r}; give whole numbers for {', '.join(_OPTIONS)}")
-        options[key] = int(value)
-    for key in ("noise", "exposure_change", "predicted"):
-        if key in options:
-            options[key] = bool(options[key])
+        options[key] = type(_OPTIONS[key].default)(int(value))
     return SyntheticRoom(**options)
 
 
-_OPTIONS = (
-    "frames", "width", "height", "seed", "noise", "loops", "exposure_change", "rooms", "overrun", "drift", "test_views",
-    "stereo", "mover", "predicted",
-)  # fmt: skip
+_OPTIONS = signature(SyntheticRoom).parameters
 
 PLUGIN = SourceFormat(
-    "synthetic",
-    "the word 'synthetic'",
-    lambda path: path.partition(":")[0] == "synthetic",
-    lambda path, settings: open_synthetic(path),
-    priority=3,
-)
+    "synthetic", "the word 'synthetic'", lambda path: path.partition(":")[0] == "synthetic",
+    lambda path, settings: open_synthetic(path), priority=3,
+)  # fmt: skip

@@ -1,8 +1,13 @@
-"""Read and write sequences in the layout of the TUM RGB-D benchmark.
+"""Read and write sequences in the layout of the TUM RGB-D benchmark; read the Bonn RGB-D Dynamic Dataset.
 
 rgb.txt  depth.txt  groundtruth.txt     lines of "t path" or "t tx ty tz qx qy qz qw", comments after #
 calibration.json                        optional: fx fy cx cy width height depth_scale [distortion]
 gyroscope.txt                           optional: "t wx wy wz", rad/s about the camera's x, y, z (right, down, forward)
+
+Bonn (recognised by `bonn` in the folder's path) has the same lists, another camera, and ground truth of the motion
+capture's markers. Its page publishes the intrinsics, and how to convert the motion-capture poses T to camera poses:
+T_world_camera = T_ROS · T · T_ROS · T_m (used there for the first pose of a run, to align a model with the laser scan).
+The published T_m is not rigid: its axes have length 1.059. Here its rotation is orthonormalised, its offset unchanged.
 """
 
 import json
@@ -19,20 +24,30 @@ from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.frame_arrays import UINT16_MAX
-from sigmasplat.data.gyroscope import Gyroscope
+from sigmasplat.data.imu import Gyroscope
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import RunError, SourceError
 from sigmasplat.files.reading import exists
-from sigmasplat.input.association import MAX_GAP_S, associate, nearest_gaps_s, no_pairs, refuse_other_units
-from sigmasplat.input.calibration import TUM_UNITS_PER_METRE, Calibration, freiburg_calibration, resolve_calibration
-from sigmasplat.input.lists import parse_numbers, read_lines, read_poses
-from sigmasplat.input.recorded import ImagePair, RecordedSource, first_size
+from sigmasplat.input.calibration import (
+    TUM_UNITS_PER_METRE,
+    Calibration,
+    freiburg_calibration,
+)
+from sigmasplat.input.lists import (
+    MAX_GAP_S,
+    nearest_gaps_s,
+    pair_times,
+    parse_numbers,
+    read_groundtruth,
+    read_lines,
+)
+from sigmasplat.input.recorded import ImagePair, RecordedSource, folder_source
 from sigmasplat.input.source import Source
 from sigmasplat.registry import SourceFormat
 
 
 def open_tum(
-    folder: Path,
+    path: str,
     settings: InputConfig,
     camera: Calibration | None = None,
     camera_path: Callable[[Trajectory], Trajectory] | None = None,
@@ -43,33 +58,22 @@ def open_tum(
     camera: the calibration, if it does not follow from the folder's name;
     camera_path: converts the recorded path to the camera's path, if another body was recorded.
     """
+    folder = Path(path)
     color_times_s, colors = read_list(folder / "rgb.txt")
     depth_times_s, depths = _depth_list(folder)
-    times_s = {"rgb.txt": color_times_s, "depth.txt": depth_times_s}
-    refuse_other_units(folder, times_s)
-    pairs = associate(color_times_s, depth_times_s)
-    if not len(pairs):
-        raise no_pairs(folder, times_s)
+    pairs, alone = pair_times(folder, {"rgb.txt": color_times_s, "depth.txt": depth_times_s})
     images = [ImagePair(float(color_times_s[i]), colors[i], depths[j]) for i, j in pairs]
-    paired = set(pairs[:, 0].tolist())
     gaps_s = nearest_gaps_s(color_times_s, depth_times_s)
     skipped = [
-        f"{path}: no depth within {MAX_GAP_S:g} s, nearest {gaps_s[i]:.3f} s away"
+        f"{colors[i]}: no depth within {MAX_GAP_S:g} s, nearest {gaps_s[i]:.3f} s away"
         + " (used by another image)" * bool(gaps_s[i] < MAX_GAP_S)
-        for i, path in enumerate(colors)
-        if i not in paired
+        for i in alone
     ]
-    truth_path = folder / "groundtruth.txt"
-    # Read now: damaged ground truth must stop the run before it starts, not its evaluation an hour later.
-    truth = read_poses(truth_path) if exists(truth_path) else None
-    if truth and camera_path:
-        truth = camera_path(truth)
-    size = first_size([pair.color for pair in images])
-    calibration = resolve_calibration(
-        folder, camera or freiburg_calibration(folder), size, settings, TUM_UNITS_PER_METRE
-    )
+    truth = read_groundtruth(folder)
+    truth = camera_path(truth) if truth and camera_path else truth
+    known = camera or freiburg_calibration(folder)
     gyroscope = read_gyroscope(folder / "gyroscope.txt") if exists(folder / "gyroscope.txt") else None
-    return RecordedSource(folder.resolve().name, images, calibration, settings, truth, skipped, gyroscope=gyroscope)
+    return folder_source(folder, settings, images, known, TUM_UNITS_PER_METRE, truth, skipped, gyroscope=gyroscope)
 
 
 def write_tum(source: Source, folder: str | Path) -> None:
@@ -187,10 +191,42 @@ def write_images(frame: Frame, folder: Path) -> str:
     return stem
 
 
-PLUGIN = SourceFormat(
-    "TUM",
-    "rgb.txt and depth.txt",
-    lambda path: (Path(path) / "rgb.txt").is_file() or (Path(path) / "depth.txt").is_file(),
-    lambda path, settings: open_tum(Path(path), settings),
-    priority=1,
+BONN = Calibration(
+    Camera(640, 480, 542.822841, 542.57687, 315.59352, 237.756098),
+    TUM_UNITS_PER_METRE,
+    (0.039903, -0.099343, -0.00073, -0.000144, 0.0),
+)
+T_ROS = np.array([[-1.0, 0, 0, 0], [0, 0, 1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+T_MARKERS_CAMERA = se3.orthonormalise(
+    np.array([
+        [1.0157, 0.1828, -0.2389, 0.0113],
+        [0.0009, -0.8431, -0.6413, -0.0098],
+        [-0.3009, 0.6147, -0.8085, 0.0111],
+        [0.0, 0.0, 0.0, 1.0],
+    ])
+)  # fmt: skip
+
+
+def open_bonn(path: str, settings: InputConfig) -> RecordedSource:
+    """Open a folder of the Bonn data set. Raises SourceError as `open_tum`."""
+    return open_tum(path, settings, BONN, _camera_path)
+
+
+def _camera_path(markers: Trajectory) -> Trajectory:
+    """Convert the recorded path of the markers to the path of the camera."""
+    return Trajectory(markers.timestamps_s, T_ROS @ markers.T_world_camera @ T_ROS @ T_MARKERS_CAMERA)
+
+
+def _has_lists(path: str) -> bool:
+    return (Path(path) / "rgb.txt").is_file() or (Path(path) / "depth.txt").is_file()
+
+
+def _is_bonn(path: str) -> bool:
+    """Return whether it is a TUM folder whose path contains "bonn"."""
+    return _has_lists(path) and any("bonn" in part.lower() for part in Path(path).resolve().parts[-3:])
+
+
+PLUGIN = (
+    SourceFormat("TUM", "rgb.txt and depth.txt", _has_lists, open_tum, priority=1),
+    SourceFormat("Bonn dynamic", "TUM's lists under rgbd_bonn_…", _is_bonn, open_bonn, priority=2, sensor="kinect-v1"),
 )

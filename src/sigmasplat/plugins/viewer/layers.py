@@ -13,7 +13,7 @@ from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.map_uncertainty import MapUncertainty
-from sigmasplat.plugins.evaluation.metrics.scored_view import COVERED_ALPHA
+from sigmasplat.plugins.evaluation.metrics.views import COVERED_ALPHA
 from sigmasplat.plugins.outputs.drawing import colormap
 from sigmasplat.render import render
 from sigmasplat.render.predictive import predicted, variance_parts

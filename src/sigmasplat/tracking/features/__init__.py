@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from sigmasplat.config import Config
 from sigmasplat.config.features import FeatureConfig
 from sigmasplat.tracking.features.base import Extractor, Features, Pairs, matched_by_distance
 from sigmasplat.tracking.features.landmarks import Landmarks, depth_readings, landmarks_of
@@ -12,7 +13,7 @@ from sigmasplat.tracking.features.sift_orb import Orb, Sift
 from sigmasplat.tracking.features.xfeat import XFeat
 
 __all__ = [
-    "Extractor", "Features", "Landmarks", "PnP", "depth_readings", "landmarks_of", "make_extractor",
+    "Extractor", "Features", "Landmarks", "PnP", "depth_readings", "extractor_of", "landmarks_of", "make_extractor",
     "matches_by_descriptor", "pose_from_landmarks",
 ]  # fmt: skip
 
@@ -25,6 +26,12 @@ def matches_by_descriptor(a: Features, b: Features, extractor: Extractor) -> Pai
     if a.descriptors.dtype == np.uint8:
         return extractor.match(a, b)
     return matched_by_distance(a.descriptors.astype(np.float32), b.descriptors.astype(np.float32), RATIO)
+
+
+def extractor_of(config: Config) -> Extractor | None:
+    """Return the extractor of a run; None if nothing in it uses features."""
+    wanted = config.tracking.features or config.recovery.relocalise
+    return make_extractor(config.features) if wanted else None
 
 
 def make_extractor(config: FeatureConfig) -> Extractor:

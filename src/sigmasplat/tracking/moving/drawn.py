@@ -27,7 +27,7 @@ from sigmasplat.tracking.moving.free_space import Depth, Mask
 from sigmasplat.tracking.moving.two_motions import two_motions
 from sigmasplat.tracking.moving.windows import boxed, upper_median, widened
 from sigmasplat.tracking.pose_validation import agrees_more, differs, disagrees, gray_gain, may_draw
-from sigmasplat.tracking.prepared_frame import PreparedImages
+from sigmasplat.tracking.prepared_frame import PreparedFrame
 from sigmasplat.types import Matrix
 
 OBJECT_SHARE, MOST_OBJECTS = (0.02, 0.7), 3
@@ -52,7 +52,7 @@ SHIFT_STEP = 4
 
 
 def suspected(
-    keyframe: Reference, seen: PreparedImages, fit: PoseFit, config: TrackingConfig, every: bool
+    keyframe: Reference, seen: PreparedFrame, fit: PoseFit, config: TrackingConfig, every: bool
 ) -> Iterator[DynamicMask]:
     """Yield the things in front that may have pulled a pose; with `every`, all that stand free."""
     live_m = seen.target.depth_image.numpy()
@@ -62,7 +62,7 @@ def suspected(
 
 
 def _may_have_drawn(
-    thing: DynamicMask, keyframe: Reference, seen: PreparedImages, fit: PoseFit, config: TrackingConfig
+    thing: DynamicMask, keyframe: Reference, seen: PreparedFrame, fit: PoseFit, config: TrackingConfig
 ) -> bool:
     """Return whether the gray values agree better without a thing, at the same pose or at one that an alignment of
     small images finds, where the depth agrees as well."""
@@ -115,7 +115,7 @@ def _stands_free(depth: Depth, regions: NDArray[np.int32], region: int, box: NDA
 def has_drawn(
     thing: DynamicMask,
     keyframe: Reference | None,
-    seen: PreparedImages,
+    seen: PreparedFrame,
     drawn: PoseFit,
     found: PoseFit,
     contradicted: bool,
@@ -134,13 +134,13 @@ def has_drawn(
     return motions is not None and motions.apart and (motions.rest_gains - 1.0) * shift >= APART
 
 
-def _shift(thing: DynamicMask, seen: PreparedImages, T_first: Matrix, T_second: Matrix) -> float:
+def _shift(thing: DynamicMask, seen: PreparedFrame, T_first: Matrix, T_second: Matrix) -> float:
     """Return by how much a thing is shifted between two poses T_camera_world [4, 4], as a share of the image width."""
     return shift_px(thing, seen.target.camera, T_first @ se3.inverse(T_second)) / seen.target.camera.width
 
 
 def _disturbs(
-    thing: DynamicMask, keyframe: Reference, seen: PreparedImages, drawn: PoseFit, found: PoseFit, contradicted: bool
+    thing: DynamicMask, keyframe: Reference, seen: PreparedFrame, drawn: PoseFit, found: PoseFit, contradicted: bool
 ) -> bool:
     """Return whether the rest agrees much more without a thing, the thing does not agree with the rest, and the pulled
     pose is not only a poor fit."""
@@ -151,7 +151,7 @@ def _disturbs(
     return contradicted or not _fits_poorly(thing, keyframe, seen, drawn, found)
 
 
-def _fits_poorly(thing: DynamicMask, keyframe: Reference, seen: PreparedImages, drawn: PoseFit, found: PoseFit) -> bool:
+def _fits_poorly(thing: DynamicMask, keyframe: Reference, seen: PreparedFrame, drawn: PoseFit, found: PoseFit) -> bool:
     """Return whether the first pose is only a poor fit: the rest agrees hardly better there than with the thing, and
     the thing itself agrees better at the other pose."""
     alone = seen.live.hiding(thing.depth_m <= 0)

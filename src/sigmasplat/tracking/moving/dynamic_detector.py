@@ -16,7 +16,7 @@ from sigmasplat.tracking.moving.depth_history import DepthHistory
 from sigmasplat.tracking.moving.drawn import is_still, suspected
 from sigmasplat.tracking.moving.dynamic_mask import DynamicMask, Earlier, dynamic_mask
 from sigmasplat.tracking.pose_validation import differs
-from sigmasplat.tracking.prepared_frame import PreparedImages
+from sigmasplat.tracking.prepared_frame import PreparedFrame
 from sigmasplat.types import Matrix, ShouldStop
 
 FRONT = 0.03
@@ -62,7 +62,7 @@ class DynamicDetector:
         keyframe_front: DynamicMask | None,
         last: DynamicMask | None,
         T_world_last: Matrix,
-        seen: PreparedImages,
+        seen: PreparedFrame,
         T_world_camera: Matrix,
     ) -> DynamicMask | None:
         """Find what is in front of the scene at a pose: in places that the newest keyframe saw to be free.
@@ -78,9 +78,7 @@ class DynamicDetector:
         live_m, scale = target.depth_image.numpy(), keyframe.pyramid.scene_scale
         return dynamic_mask(scene, before, live_m, target.camera, self.config.find, scene_scale=scale)
 
-    def without_gone(
-        self, keyframe: Reference | None, seen: PreparedImages, T_world_camera: Matrix
-    ) -> Reference | None:
+    def without_gone(self, keyframe: Reference | None, seen: PreparedFrame, T_world_camera: Matrix) -> Reference | None:
         """Return the newest keyframe without what has moved away since, at a pose of the live camera."""
         if keyframe is None or not self.config.find:
             return keyframe
@@ -90,7 +88,7 @@ class DynamicDetector:
         return keyframe if gone is None else keyframe.without(gone.hidden)
 
     def suspected(
-        self, keyframe: Reference | None, seen: PreparedImages, fit: PoseFit, config: TrackingConfig,
+        self, keyframe: Reference | None, seen: PreparedFrame, fit: PoseFit, config: TrackingConfig,
         contradicted: bool, urgent: bool,
     ) -> tuple["DynamicDetector", Iterator[DynamicMask]]:  # fmt: skip
         """Return the watch after a look, and the things in front that may have pulled a pose: those without which the
@@ -107,7 +105,7 @@ class DynamicDetector:
         return replace(self, looks=self.looks + 1), suspected(keyframe, seen, fit, config, contradicted)
 
     def takes_for_moving(
-        self, front: DynamicMask | None, keyframe: Reference | None, seen: PreparedImages, fit: PoseFit
+        self, front: DynamicMask | None, keyframe: Reference | None, seen: PreparedFrame, fit: PoseFit
     ) -> bool:
         """Return whether what is in front moves, by a fit without it: a still thing can seem to be in free space where
         poses or depth are wrong."""
@@ -143,14 +141,14 @@ class DynamicDetector:
             return self
         return replace(self, earlier=(*self.earlier, keyframe)[-EARLIER:])
 
-    def slow(self, seen: PreparedImages, T_world_camera: Matrix) -> DynamicMask | None:
+    def slow(self, seen: PreparedFrame, T_world_camera: Matrix) -> DynamicMask | None:
         """Find what moves too slowly to show against the newest keyframe."""
         if not self.config.find:
             return None
         target, most = seen.target, self.config.still_frames
         return self.history.in_front(target.depth_image.numpy(), T_world_camera, target.camera, most)
 
-    def after(self, seen: PreparedImages, front: DynamicMask | None, T_world_camera: Matrix) -> "DynamicDetector":
+    def after(self, seen: PreparedFrame, front: DynamicMask | None, T_world_camera: Matrix) -> "DynamicDetector":
         """Return what is known after a frame that is not lost."""
         if not self.config.find:
             return self
@@ -159,7 +157,7 @@ class DynamicDetector:
         return replace(self, history=history, looks=self.looks if front is None else 0)
 
     def still_moving(
-        self, front: DynamicMask | None, seen: PreparedImages, T_world_camera: Matrix
+        self, front: DynamicMask | None, seen: PreparedFrame, T_world_camera: Matrix
     ) -> DynamicMask | None:
         """Return what is in front without what has come to rest, which is part of the scene again."""
         if front is None or not self.config.find:

@@ -5,6 +5,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import gammaincinv
+from scipy.stats import rankdata
 
 from sigmasplat.data import se3
 from sigmasplat.data.trajectory import Trajectory
@@ -199,3 +201,115 @@ def score_path(
         return unknown | found | ({"ate_odometry": asdict(ate(odometry, truth))} if odometry else {}), None
     except SourceError as problem:
         return unknown, problem
+
+
+OFF_M = 0.05
+"""`p_off` is the probability that a pose is off by more than this."""
+SILENT_M = 0.10
+"""A valid pose that is off by more than this is a silent failure."""
+BINS = 10
+
+Values = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+def score_failures(error_m: Values, p_off: Values, valid: Mask) -> dict[str, Any]:
+    """Score the frames of a run.
+
+    error_m [F]: distance from the true position after the alignment of the ATE, nan if it is not known; p_off [F]: the
+    predicted probability that it is above 5 cm, nan if it is not known; valid [F]: whether the pose is valid.
+
+    `silent_rows` are the rows of the valid frames that are off by more than 10 cm. `auroc` and `brier` judge p_off
+    on all frames with both values; both are nan if there is no such frame, and auroc also if all or none are off.
+    """
+    silent = valid & (error_m > SILENT_M)
+    known = np.isfinite(error_m) & np.isfinite(p_off)
+    off, p = error_m[known] > OFF_M, p_off[known]
+    return {
+        "frames": int(np.isfinite(error_m).sum()),
+        "off": int((error_m > OFF_M).sum()),
+        "silent": int(silent.sum()),
+        "silent_rows": np.flatnonzero(silent).tolist(),
+        "auroc": auroc(p, off),
+        "brier": brier(p, off),
+        "calibration": calibration(p, off),
+    }
+
+
+def auroc(p: Values, off: Mask) -> float:
+    """Return the area under the ROC curve: how often p is higher for a frame that is off than for one that is not.
+
+    Ties count one half. ½: p is random; nan if all or none are off.
+    """
+    positive, negative = int(off.sum()), int((~off).sum())
+    if not positive or not negative:
+        return float("nan")
+    ranks = rankdata(p)[off].sum() - positive * (positive + 1) / 2.0
+    return float(ranks / (positive * negative))
+
+
+def brier(p: Values, off: Mask) -> float:
+    """Return the mean of (p − off)² (Brier 1950); 0 is perfect, nan without values."""
+    return float(np.mean((p - off) ** 2)) if len(p) else float("nan")
+
+
+def calibration(p: Values, off: Mask, bins: int = BINS) -> list[dict[str, float]]:
+    """Return the mean p and the share of frames that are off, for each non-empty bin of p of equal width."""
+    bin_of = np.minimum((p * bins).astype(int), bins - 1)
+    return [
+        {"predicted": float(p[at].mean()), "observed": float(off[at].mean()), "frames": int(at.sum())}
+        for at in (bin_of == number for number in np.unique(bin_of))
+    ]
+
+
+LEVEL = 0.9
+"""The coverage that is measured."""
+
+
+@dataclass(frozen=True)
+class CovarianceScore:
+    """How honest covariances are, over `count` errors.
+
+    NEES is eᵀ Σ⁻¹ e. If Σ is right, its mean is the number of components, 6 or 3, and `coverage_90` is 0.9: the share
+    of errors inside the ellipsoid that should hold 90 %. `position_`: of the position alone. position_k: the median
+    NEES of the position divided by its expected value 2.37, as in `smfeval`: the variances are k times too small.
+    """
+
+    count: int
+    nees_mean: float
+    nees_median: float
+    coverage_90: float
+    position_nees_median: float
+    position_k: float
+    position_coverage_90: float
+
+
+def score_covariances(T_estimate: Matrix, T_true: Matrix, covariance: Matrix) -> CovarianceScore | None:
+    """Score estimated poses or motions [N, 4, 4] against the true ones, given covariances [N, 6, 6] of the left twists
+    of the estimates (m, rad); None without poses."""
+    if not len(T_estimate):
+        return None
+    twists = se3.log_stack(T_true @ se3.inverse(T_estimate))
+    J = se3.displacement(T_estimate)[:, :3]
+    shifts = T_true[:, :3, 3] - T_estimate[:, :3, 3]
+    full, position = nees(twists, covariance), nees(shifts, J @ covariance @ np.swapaxes(J, 1, 2))
+    median = float(np.median(position))
+    return CovarianceScore(
+        len(full),
+        float(full.mean()),
+        float(np.median(full)),
+        float((full <= chi2_quantile(LEVEL, 6)).mean()),
+        median,
+        median / chi2_quantile(0.5, 3),
+        float((position <= chi2_quantile(LEVEL, 3)).mean()),
+    )
+
+
+def nees(errors: Matrix, covariance: Matrix) -> Matrix:
+    """Return eᵀ Σ⁻¹ e [N] of errors [N, D] with covariances [N, D, D]."""
+    return np.asarray((errors * np.linalg.solve(covariance, errors[:, :, None])[..., 0]).sum(1))
+
+
+def chi2_quantile(share: float, freedom: int) -> float:
+    """Return the value that a χ² variable with `freedom` degrees of freedom stays below with probability `share`."""
+    return 2.0 * float(gammaincinv(freedom / 2.0, share))

@@ -28,7 +28,7 @@ class Verdict(NamedTuple):
 def verdicts(metrics: Metrics, unsure: Sequence[int], advice: Sequence[Advice]) -> list[Verdict]:
     """Return where the path is not sure, how good the map is, and what to do next.
 
-    unsure: images with a pose that are probably off by more than 5 cm; advice: what to repair, most important first.
+    unsure: images whose pose is probably off by more than 5 cm; advice: what to repair, the most important first.
     """
     words, command = advice[0] if advice else ("The checks of the report found nothing to repair.", "")
     todo = Verdict("Next", "Try this" if advice else "Use the map", words, command)

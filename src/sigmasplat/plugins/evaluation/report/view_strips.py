@@ -8,7 +8,7 @@ from pathlib import Path
 from PIL import Image
 
 from sigmasplat.errors import RunError
-from sigmasplat.plugins.evaluation.metrics.scored_view import ScoredView
+from sigmasplat.plugins.evaluation.metrics.views import ScoredView
 from sigmasplat.plugins.outputs.drawing.view_panels import (
     PANEL_WIDTH,
     ViewPanel,

@@ -14,7 +14,7 @@ from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.trajectory import Trajectory
-from sigmasplat.plugins.evaluation.metrics.scored_view import COVERED_ALPHA
+from sigmasplat.plugins.evaluation.metrics.views import COVERED_ALPHA
 from sigmasplat.render import Render
 from sigmasplat.render.predictive import Predicted
 from sigmasplat.types import Matrix, Progress, no_progress

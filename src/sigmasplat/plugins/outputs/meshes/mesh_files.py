@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from sigmasplat.data.mesh import Mesh
 from sigmasplat.errors import RunError, SourceError
 from sigmasplat.files.atomic import replacing
-from sigmasplat.files.binary import open_binary
 from sigmasplat.files.ply_elements import BYTE_ORDERS, MAX_HEADER_BYTES, PLY_TYPES
+from sigmasplat.files.reading import open_binary
 from sigmasplat.plugins.outputs.meshes.glb import GRAY, glb
 
 ElementHeader = tuple[str, int, list[list[str]]]

@@ -5,9 +5,8 @@ from pathlib import Path
 
 from sigmasplat.data.field import GaussianField
 from sigmasplat.errors import SourceError
-from sigmasplat.files.binary import open_binary
-from sigmasplat.files.guard import guarded
 from sigmasplat.files.ply_elements import read_header
+from sigmasplat.files.reading import guarded, open_binary
 from sigmasplat.plugins.outputs.splats import compressed_ply, gltf, sog, splat, spz, spz_container, usd
 from sigmasplat.run_folder import splat_ply as ply
 

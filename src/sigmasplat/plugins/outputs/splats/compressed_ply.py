@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from sigmasplat.data.field import GaussianField
 from sigmasplat.errors import SourceError
 from sigmasplat.files.atomic import replacing
-from sigmasplat.files.binary import open_binary
 from sigmasplat.files.ply_elements import Element, read_header
+from sigmasplat.files.reading import open_binary
 from sigmasplat.run_folder.quaternions import Doubles, from_smallest_three, smallest_three
 from sigmasplat.run_folder.splat_values import SplatValues, by_channel, morton_order, opacities_of, opacity_bytes
 

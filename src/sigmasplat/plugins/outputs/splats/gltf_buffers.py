@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from sigmasplat.errors import SourceError
-from sigmasplat.files.binary import open_binary
+from sigmasplat.files.reading import open_binary
 from sigmasplat.run_folder.quaternions import Doubles
 
 FLOAT = 5126

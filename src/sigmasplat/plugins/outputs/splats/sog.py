@@ -26,7 +26,7 @@ from sigmasplat.data.field import GaussianField
 from sigmasplat.data.harmonics import DEGREES, count
 from sigmasplat.errors import SourceError
 from sigmasplat.files.atomic import replacing
-from sigmasplat.files.binary import open_binary
+from sigmasplat.files.reading import open_binary
 from sigmasplat.plugins.outputs.splats.codebooks import LEVELS, levels, palette
 from sigmasplat.run_folder.quaternions import Doubles, from_smallest_three, smallest_three
 from sigmasplat.run_folder.splat_values import (

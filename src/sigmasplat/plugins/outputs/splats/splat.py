@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sigmasplat.data.field import GaussianField
 from sigmasplat.errors import SourceError
 from sigmasplat.files.atomic import replacing
-from sigmasplat.files.binary import open_binary
+from sigmasplat.files.reading import open_binary
 from sigmasplat.run_folder.quaternions import unit
 from sigmasplat.run_folder.splat_values import SplatValues, opacities_of, opacity_bytes
 

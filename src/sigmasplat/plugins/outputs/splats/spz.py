@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from sigmasplat.data.field import GaussianField
 from sigmasplat.errors import ConfigError, RunError
 from sigmasplat.files.atomic import replacing
-from sigmasplat.files.binary import open_binary
+from sigmasplat.files.reading import open_binary
 from sigmasplat.plugins.outputs.splats.spz_container import VERSIONS, SpzHeader, pack, unpack
 from sigmasplat.run_folder.quaternions import Doubles, from_smallest_three, smallest_three, unit
 from sigmasplat.run_folder.splat_values import SH_C0, SplatValues, morton_order, opacities_of, opacity_bytes

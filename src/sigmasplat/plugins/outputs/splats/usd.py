@@ -23,7 +23,7 @@ from sigmasplat.data.map_uncertainty import SplatStd
 from sigmasplat.env import install_extra
 from sigmasplat.errors import SigmaSplatError, SourceError
 from sigmasplat.files.atomic import replacing
-from sigmasplat.files.binary import open_binary
+from sigmasplat.files.reading import open_binary
 from sigmasplat.run_folder.quaternions import Doubles, unit
 from sigmasplat.run_folder.splat_values import SH_C0, SplatValues
 

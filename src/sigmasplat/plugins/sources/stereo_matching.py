@@ -1,7 +1,11 @@
-"""Compute depth from a stereo pair: rectify both images, match them, convert disparity to depth."""
+"""Compute depth from a stereo pair: rectify both images, match them, refine below a pixel, convert disparity to depth.
+
+Semi-global matching prefers some fractions of a pixel, by up to 0.2 px; `refine` removes that.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,12 +15,140 @@ from sigmasplat.config import InputConfig
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.opencv import opencv
-from sigmasplat.plugins.sources.camera.stereo_cameras import StereoCameras
-from sigmasplat.plugins.sources.camera.stereo_subpixel import Subpixel, refine
+from sigmasplat.errors import SourceError
+from sigmasplat.input.calibration import (
+    Calibration,
+    Distortion,
+    check_positive,
+    json_number,
+    read_camera,
+    read_distortion,
+    read_json_object,
+    read_rigid_transform,
+)
 from sigmasplat.types import Matrix
+
+
+@dataclass(frozen=True, eq=False)
+class StereoCameras:
+    """Two cameras, rectified or not. T_right_left [4, 4] transforms points of the left camera to the right one, m."""
+
+    left: Camera
+    right: Camera
+    T_right_left: Matrix
+    left_distortion: Distortion | None = None
+    right_distortion: Distortion | None = None
+
+    @property
+    def rectified(self) -> bool:
+        """Return whether the rows of both images correspond without any remapping."""
+        x, y, z = self.T_right_left[:3, 3]
+        parallel = np.allclose(self.T_right_left[:3, :3], np.eye(3), atol=1e-6) and max(abs(y), abs(z)) < 1e-4 * abs(x)
+        return self.left == self.right and parallel and not (self.left_distortion or self.right_distortion)
+
+
+def read_stereo_cameras(path: Path, left: Calibration) -> StereoCameras:
+    """Read what `calibration.json` says of the right camera: baseline_m; or right_camera and T_right_left.
+
+    Without right_camera, the right camera equals the left one. Raises SourceError naming file and field.
+    """
+    fields = read_json_object(path)
+    camera, lens = left.camera, left.distortion
+    inner = fields.get("right_camera")
+    if inner is not None:
+        if not isinstance(inner, dict):
+            raise SourceError(f'{path}: field "right_camera" is {inner!r}, expected an object with fx, fy, cx, cy')
+        camera = read_camera(path, inner, (camera.width, camera.height))
+        lens = read_distortion(path, inner)
+    if "T_right_left" in fields:
+        T_right_left = read_rigid_transform(path, fields, "T_right_left")
+        return StereoCameras(left.camera, camera, T_right_left, left.distortion, lens)
+    T_right_left = np.eye(4)
+    T_right_left[0, 3] = -check_positive(path, "baseline_m", json_number(path, fields, "baseline_m"))
+    return StereoCameras(left.camera, camera, T_right_left, left.distortion, lens)
+
 
 Bytes = NDArray[np.uint8]
 Floats = NDArray[np.float32]
+
+FIT_REACH_PX, SPREAD_PX = 5, 3.3
+"""The window: its half edge, and the standard deviation of its Gaussian weights."""
+SMOOTH_PX = 0.7
+"""Standard deviation of the smoothing of both images: their noise, and less aliasing in the gradient."""
+STEPS = 2
+FAR_OFF = 10.0
+"""A pixel whose gray values differ by this much counts half (of 255; Geman–McClure)."""
+FLAT = 4.0
+"""Prior of no slope: like this much squared gradient one pixel from the centre of the window."""
+PRIOR = 1.0
+"""Weight of the disparity that matching found, as squared gradient in gray values per pixel."""
+LARGEST_PX = 1.0
+"""Largest change of a disparity."""
+
+
+@dataclass(frozen=True, eq=False)
+class Subpixel:
+    """disparity: refined, px [H, W]; texture: root of the squared gradients that decide it, gray values per pixel;
+    residual: root mean square difference of the images in the window, gray values."""
+
+    disparity: Floats
+    texture: Floats
+    residual: Floats
+
+
+def refine(left: Bytes, right: Bytes, disparity: Floats, smooth: NDArray[np.bool_]) -> Subpixel:
+    """Fit a plane of disparity to the window around each pixel, so that the right image agrees with the left one.
+
+    left, right: rectified gray images [H, W]; disparity: px [H, W]; smooth: pixels whose disparity is known and away
+    from edges. Others keep their disparity and are not used. The mean difference of each window is left out, as two
+    cameras differ in brightness (least squares, Lucas and Kanade 1981; weights of Geman and McClure 1985).
+    """
+    cv2 = opencv()
+    a, b = (cv2.GaussianBlur(image.astype(np.float32), (0, 0), SMOOTH_PX) for image in (left, right))
+    slope = cv2.Sobel(b, cv2.CV_32F, 1, 0, scale=1 / 8)
+    rows, columns = np.indices(a.shape, np.float32)
+    used, found, decided = smooth.astype(np.float32), disparity, np.zeros_like(disparity)
+    count = _window(used) + np.float32(1e-6)
+
+    def difference(at: Floats) -> Floats:
+        there = cv2.remap(b, at, rows, cv2.INTER_CUBIC) - a
+        return np.asarray(there - _window(used * there) / count, np.float32)
+
+    for _ in range(STEPS):
+        apart, gradient = difference(columns - found), cv2.remap(slope, columns - found, rows, cv2.INTER_LINEAR)
+        weight = used / (1.0 + (apart / np.float32(FAR_OFF)) ** 2)
+        planes, decided = _planes(weight, gradient, apart + gradient * found, disparity)
+        near = np.clip(planes, disparity - np.float32(LARGEST_PX), disparity + np.float32(LARGEST_PX))
+        found = np.where(smooth, near, disparity).astype(np.float32)
+    residual = np.sqrt(_window(used * difference(columns - found) ** 2) / count)
+    return Subpixel(found, np.sqrt(decided), residual)
+
+
+def _planes(weight: Floats, gradient: Floats, wanted: Floats, prior: Floats) -> tuple[Floats, Floats]:
+    """Solve Σ w (g·(d + p·x + q·y) − wanted)² for d at the centre of each window [H, W]; return it, and the squared
+    gradients that decide it after p and q are chosen (Schur complement)."""
+    square, target = weight * gradient * gradient, weight * gradient * wanted
+    s, x, y = _window(square), _window(square, 1, 0), _window(square, 0, 1)
+    xx, xy, yy = (_window(square, i, 2 - i) for i in (2, 1, 0))
+    xx, yy = xx + np.float32(FLAT), yy + np.float32(FLAT)
+    t, tx, ty = _window(target), _window(target, 1, 0), _window(target, 0, 1)
+    determinant = xx * yy - xy * xy
+    along_x, along_y = (yy * x - xy * y) / determinant, (xx * y - xy * x) / determinant
+    decided = np.maximum(s - along_x * x - along_y * y, 0.0)
+    d = (t - along_x * tx - along_y * ty + np.float32(PRIOR) * prior) / (decided + np.float32(PRIOR))
+    return np.asarray(d, np.float32), np.asarray(decided, np.float32)
+
+
+def _window(image: Floats, powers_x: int = 0, powers_y: int = 0) -> Floats:
+    """Return the weighted mean of image · x^powers_x · y^powers_y over the window around each pixel [H, W]."""
+    cv2 = opencv()
+    offset = np.arange(-FIT_REACH_PX, FIT_REACH_PX + 1, dtype=np.float32)
+    gaussian = np.exp(-0.5 * (offset / SPREAD_PX) ** 2)
+    gaussian /= gaussian.sum()
+    along = [(gaussian * offset**power).astype(np.float32) for power in (powers_x, powers_y)]
+    return np.asarray(cv2.sepFilter2D(image, cv2.CV_32F, *along, borderType=cv2.BORDER_CONSTANT), np.float32)
+
+
 Maps = tuple[Floats, Floats]
 
 BLOCK_PX = 5

@@ -13,7 +13,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from paired_comparison import figures_of
 
 import sigmasplat
 from sigmasplat.config import Config
@@ -22,12 +24,14 @@ from sigmasplat.config.text import full_path, override, split_settings
 from sigmasplat.errors import ConfigError, RunError
 from sigmasplat.files import machine
 from sigmasplat.files.atomic import write_text
-from sigmasplat.files.guard import guarded
 from sigmasplat.files.machine import INSTALLED, code_digest
-from sigmasplat.files.reading import read_text
-
-if TYPE_CHECKING:
-    from sigmasplat.run.terminal import Screen
+from sigmasplat.files.reading import guarded, read_text
+from sigmasplat.plugins.evaluation import evaluate as evaluation
+from sigmasplat.run.scene import open_scene
+from sigmasplat.run.session import Session, new_folder
+from sigmasplat.run.terminal import Screen
+from sigmasplat.run_folder.run_values import are_numbers, check_fields, is_kind, is_number, is_whole
+from sigmasplat.slam.slam import Slam
 
 WEIGHTS = ("tracking.uncertainty", "loops.uncertainty", "registration.uncertainty", "final.uncertainty")
 TAUS = ("tracking.tau", "loops.tau", "registration.tau")
@@ -44,7 +48,7 @@ COMPARED = (
     ("+registration", "none"), ("+final", "+registration"),
 )  # fmt: skip
 """Pairs (variant, baseline) to compare."""
-MADE_BY = "sigmasplat bench ablation"
+MADE_BY = "benchmarks/ablation.py"
 SEED = "{seed}"
 
 
@@ -138,10 +142,10 @@ def common_config(preset: str, settings: Sequence[str], tau: float) -> Config:
 class Results:
     """The JSON file of an ablation: the conditions, then one entry per run; rewritten after each run."""
 
-    def __init__(self, path: Path, study: Study, overwrite: bool = False) -> None:
-        """Read the file if it exists; `overwrite` drops its runs that do not belong to the study.
+    def __init__(self, path: Path, study: Study) -> None:
+        """Read the file if it exists; runs that do not belong to the study are dropped.
 
-        Raises RunError if such runs exist and `overwrite` is off, or if the file is not an ablation's.
+        Raises RunError if the file is not an ablation's.
         """
         self.path = path
         self.head = json.loads(json.dumps({"made_by": MADE_BY} | study.conditions()))
@@ -149,12 +153,6 @@ class Results:
         stored = _read(path) if path.exists() else {"runs": []}
         same = all(stored.get(name) == value for name, value in self.head.items())
         self.runs = [run for run in stored["runs"] if same and _key(run) in planned]
-        dropped = len(stored["runs"]) - len(self.runs)
-        if dropped and not overwrite:
-            reason = (
-                "that this command does not ask for" if same else "of other settings, other code or another machine"
-            )
-            raise RunError(f"{path} contains {dropped} runs {reason}; give another --out, or --overwrite to drop them")
 
     def find(self, job: Job) -> dict[str, Any] | None:
         """Return the stored run of a job, or None."""
@@ -162,8 +160,6 @@ class Results:
 
     def add(self, job: Job, metrics: Mapping[str, Any], wall_s: float) -> None:
         """Add a run and write the file. Raises RunError if it cannot be written."""
-        from sigmasplat.plugins.evaluation.paired_comparison import figures_of
-
         self.runs.append(
             {
                 "source": job.source, "path": job.path, "variant": job.variant, "seed": job.seed,
@@ -189,16 +185,14 @@ def _key(run: Mapping[str, Any]) -> tuple[str, str, int]:
 
 def _read(path: Path) -> dict[str, Any]:
     """Read the file of an ablation. Raises RunError if it cannot be read or is another file."""
-    from sigmasplat.run_folder.run_values import are_numbers, check_fields, is_kind, is_number, is_whole  # loads torch
-
     text = is_kind(str)
     stored = {"source": text, "path": text, "variant": text, "seed": is_whole, "wall_s": is_number,
               "figures": are_numbers}  # fmt: skip
     content = read_text(path, RunError)
-    with guarded(path, "give another --out", RunError):
+    with guarded(path, "give another --name", RunError):
         found = json.loads(content)
     if not isinstance(found, dict) or found.get("made_by") != MADE_BY or not isinstance(found.get("runs"), list):
-        raise RunError(f"{path} is not a file of sigmasplat bench ablation; give another --out")
+        raise RunError(f"{path} is not a file of benchmarks/ablation.py; give another --name")
     for number, run in enumerate(found["runs"], 1):
         check_fields(run, stored, tuple(stored), f"{path}: run {number}")
     return found
@@ -226,16 +220,11 @@ def _folder(job: Job, keep: Path | None) -> Iterator[Path]:
         yield Path(temporary) / job.folder
 
 
-def run_job(job: Job, folder: Path, screen: "Screen") -> dict[str, Any]:
+def run_job(job: Job, folder: Path, screen: Screen) -> dict[str, Any]:
     """Run SLAM with a job's settings, score the run, and return its metrics.
 
     Raises KeyboardInterrupt if Ctrl-C stopped the run: its metrics would not be comparable.
     """
-    from sigmasplat.plugins.evaluation.evaluate import evaluate
-    from sigmasplat.run.scene import open_scene
-    from sigmasplat.run.session import Session, new_folder
-    from sigmasplat.slam.slam import Slam
-
     source, config = open_scene(job.path, job.config, job.given)
     run = new_folder(folder, config, source, True, source_path=job.path)
     with screen.steps(len(source)) as callback:
@@ -243,5 +232,5 @@ def run_job(job: Job, folder: Path, screen: "Screen") -> dict[str, Any]:
     if outcome.status == "interrupted":
         raise KeyboardInterrupt
     with screen.counting("evaluation") as progress:
-        evaluate(run, source, progress=progress)
+        evaluation.evaluate(run, source, progress=progress)
     return run.read_metrics()

@@ -1,0 +1,348 @@
+"""Choose the topics of a bag, and read its calibration and its ground-truth path.
+
+Intrinsics are in sensor_msgs/CameraInfo beside the images (camera_info). Camera poses are in tf2_msgs/TFMessage of
+/tf_static or /tf, between the frames that the images name. RealSense's SDK before version 2.58 uses its own topics
+/device_0/sensor_0/Depth_0/… (librealsense, ros_file_format.h): info/camera_info, tf/N (a geometry_msgs/Transform from a
+reference to the stream) and option/Depth_Units/value of the sensor.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from itertools import islice
+
+import numpy as np
+
+from sigmasplat.config import InputConfig
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.errors import SourceError, nearest
+from sigmasplat.input.calibration import MM_PER_METRE, Calibration, Distortion, build_camera, resolve_calibration
+from sigmasplat.input.lists import rigid_transform
+from sigmasplat.plugins.sources.bag_messages import (
+    COMPRESSED,
+    RAW,
+    Bag,
+    ImageKind,
+    Message,
+    image_kind,
+    list_topics,
+    message_size,
+)
+from sigmasplat.types import Matrix
+
+MAX_TF_MESSAGES = 2000
+"""Number of messages of /tf to read; transforms between the cameras of one device are repeated."""
+
+
+def lookup_transform(bag: Bag, target: str, source: str, use_tf: bool = True) -> Matrix | None:
+    """Return T_target_source [4, 4] from the bag's transforms, None if they do not connect the frames.
+
+    `use_tf`: whether to read the first messages of /tf too; old drivers repeat static transforms there.
+    """
+    edges: dict[str, dict[str, Matrix]] = {}
+    for name, most in (("/tf_static", None), ("/tf", MAX_TF_MESSAGES)):
+        if name not in bag.topics or not (use_tf or most is None):
+            continue
+        for message in islice(bag.messages(name), most):
+            for link in message.transforms:
+                parent, child = link.header.frame_id.lstrip("/"), link.child_frame_id.lstrip("/")
+                T = transform_of(
+                    f"{bag.path}: {name}: {parent} to {child}", link.transform.translation, link.transform.rotation
+                )
+                edges.setdefault(parent, {}).setdefault(child, T)
+                edges.setdefault(child, {}).setdefault(parent, se3.inverse(T))
+        if (found := _chained(edges, target, source)) is not None:
+            return found
+    return None
+
+
+def transform_of(where: str, position: Message, rotation: Message) -> Matrix:
+    """Build a transform from geometry_msgs fields. Raises SourceError naming `where` unless it is rigid."""
+    return rigid_transform(
+        where, [position.x, position.y, position.z], [rotation.w, rotation.x, rotation.y, rotation.z]
+    )
+
+
+def _chained(edges: dict[str, dict[str, Matrix]], target: str, source: str) -> Matrix | None:
+    """Return T_target_source by breadth-first search from the target, None if the source is not connected."""
+    reached = {target: np.eye(4)}
+    queue = [target]
+    for frame in queue:
+        for neighbour, T in edges.get(frame, {}).items():
+            if neighbour not in reached:
+                reached[neighbour] = reached[frame] @ T
+                queue.append(neighbour)
+    return reached.get(source)
+
+
+REGISTERED_NAMES = ("aligned_depth_to_color", "depth_registered", "depth_to_rgb")
+"""Parts of topic names for depth registered to colour (RealSense; OpenNI, Kinect; Azure Kinect)."""
+NOT_DEPTH_NAMES = ("infra", "/ir/", "confidence")
+"""Parts of topic names for 16-bit images that are not depth."""
+
+
+@dataclass(frozen=True)
+class ImageTopic:
+    """A topic of images: their kind, optical frame, and (width, height) of the first image."""
+
+    name: str
+    kind: ImageKind
+    frame: str
+    size: tuple[int, int]
+
+    @property
+    def base(self) -> str:
+        """The topic name without the suffix that image_transport adds to compressed images."""
+        return self.name.removesuffix("/compressedDepth").removesuffix("/compressed")
+
+    @property
+    def camera(self) -> str:
+        """The name space of all images of one camera."""
+        return self.base.rpartition("/")[0]
+
+    @property
+    def registered(self) -> bool:
+        """Whether its name says that depth is registered to colour."""
+        return any(words in self.name for words in REGISTERED_NAMES)
+
+
+def color_topic(bag: Bag, requested: str) -> ImageTopic:
+    """Return the requested topic, or the only one with colour images. Raises SourceError if it is ambiguous."""
+    found = [topic_by_name(bag, requested)] if requested else image_topics(bag, "colour")
+    best = _preferred(found, lambda topic: not any(word in topic.name.lower() for word in ("color", "rgb")))
+    return _one_camera(bag, "colour", best, "color")
+
+
+def depth_topic(bag: Bag, requested: str) -> ImageTopic:
+    """Return the requested topic, or the only one with depth; depth registered to colour is preferred.
+
+    Raises SourceError if there is no such topic or more than one.
+    """
+    if requested:
+        return _one_camera(bag, "depth", [topic_by_name(bag, requested)], "depth")
+    found = [
+        topic for topic in image_topics(bag, "depth") if not any(word in topic.name.lower() for word in NOT_DEPTH_NAMES)
+    ]
+    return _one_camera(bag, "depth", _preferred(found, lambda topic: not topic.registered), "depth")
+
+
+def image_topics(bag: Bag, kind: ImageKind) -> list[ImageTopic]:
+    """Return the topics whose first message is of this kind. Raises SourceError if the bag is damaged."""
+    found = [_described(bag, topic.name) for topic in bag.topics_of_type(RAW, COMPRESSED)]
+    return [topic for topic in found if topic.kind == kind]
+
+
+def topic_by_name(bag: Bag, name: str) -> ImageTopic:
+    """Return a topic by name. Raises SourceError if it does not exist or holds no images."""
+    topics = {topic.name: topic for topic in bag.topics_of_type(RAW, COMPRESSED)}
+    if name not in topics:
+        raise SourceError(
+            f"{bag.path}: no images in topic {name}{nearest(name, list(topics))}; "
+            f"there are {list_topics(topics.values())}"
+        )
+    return _described(bag, name)
+
+
+def _described(bag: Bag, name: str) -> ImageTopic:
+    message = bag.first_message(name)
+    size = message_size(bag.path / name.lstrip("/"), message)
+    return ImageTopic(name, image_kind(message), message.header.frame_id.lstrip("/"), size)
+
+
+def _preferred(topics: list[ImageTopic], worse: Callable[[ImageTopic], bool]) -> list[ImageTopic]:
+    """Return the topics that are not worse, or all topics if every one is."""
+    return [topic for topic in topics if not worse(topic)] or topics
+
+
+def _one_camera(bag: Bag, what: str, topics: list[ImageTopic], option: str) -> ImageTopic:
+    """Return the topic of the only camera: rectified before raw, uncompressed before compressed."""
+    if not topics or any(topic.kind != what for topic in topics):
+        raise SourceError(
+            f"{bag.path}: no {what} images in {topics[0].name if topics else 'any topic'}; "
+            f"the bag holds {list_topics(bag.topics.values())}"
+        )
+    cameras = sorted({topic.camera for topic in topics})
+    if len(cameras) > 1:
+        names = ", ".join(sorted(topic.name for topic in topics))
+        raise SourceError(f"{bag.path}: several topics hold {what} images ({names}); choose one: --{option}-topic NAME")
+    return min(topics, key=lambda topic: ("rect" not in topic.base, topic.base != topic.name, topic.name))
+
+
+BROWN_CONRADY = ("", "plumb_bob", "brown conrady", "inverse brown conrady", "modified brown conrady", "none")
+RATIONAL = "rational_polynomial"
+
+
+Optics = tuple[Camera, Distortion | None]
+"""Intrinsics, and lens distortion or None."""
+
+
+def read_bag_calibration(bag: Bag, color: ImageTopic, depth: ImageTopic, settings: InputConfig) -> Calibration:
+    """Return the calibration of a bag; the settings override it.
+
+    Raises SourceError if the colour camera is unknown, or if the pose of a separate depth camera is unknown.
+    """
+    optics = read_optics(bag, color)
+    units = _depth_units(bag, depth)
+    recorded = Calibration(optics[0], units, optics[1]) if optics else None
+    calibration = resolve_calibration(bag.path, recorded, color.size, settings, units)
+    decided = settings.calibration or calibration.depth_camera or settings.register_depth == "off"
+    if decided or _is_registered(color, depth):
+        return calibration
+    depth_optics = read_optics(bag, depth)
+    if depth_optics is None and depth.size == color.size:
+        return calibration  # assumed to be registered; `inspect` compares edges
+    if depth_optics is None:
+        raise SourceError(
+            f"{bag.path}: {depth.name} has no camera_info, so it cannot be registered to {color.name}; record it too, "
+            "or give --calibration FILE with depth_camera and T_color_depth"
+        )
+    camera, lens = depth_optics
+    return replace(
+        calibration, depth_camera=camera, depth_distortion=lens, T_color_depth=_color_depth(bag, color, depth)
+    )
+
+
+def _is_registered(color: ImageTopic, depth: ImageTopic) -> bool:
+    """Return whether depth is registered to colour: by its topic name, or by an equal optical frame."""
+    return depth.registered or (bool(depth.frame) and depth.frame == color.frame and not sdk_stream(depth))
+
+
+def read_optics(bag: Bag, topic: ImageTopic) -> Optics | None:
+    """Read the CameraInfo of an image topic; None if it is missing or empty. Raises SourceError if it is damaged."""
+    name = _info_name(bag, topic)
+    if name is None:
+        return None
+    info = bag.first_message(name)
+    rectified, where = "rect" in topic.base.rpartition("/")[2], bag.path / name.lstrip("/")
+    k = np.asarray(_field(info, "p")).reshape(3, 4)[:, :3]
+    if not rectified or k[0, 0] <= 0:
+        k = np.asarray(_field(info, "k")).reshape(3, 3)
+    if k[0, 0] <= 0:
+        return None
+    width, height = int(info.width) or topic.size[0], int(info.height) or topic.size[1]
+    camera = build_camera(where, width, height, [float(v) for v in (k[0, 0], k[1, 1], k[0, 2], k[1, 2])])
+    return camera, None if rectified else _lens(f"{bag.path}: {name}", info)
+
+
+def _info_name(bag: Bag, topic: ImageTopic) -> str | None:
+    infos = {info.name for info in bag.topics_of_type("sensor_msgs/msg/CameraInfo")}
+    names = (f"{topic.camera}/camera_info", f"{topic.base.removesuffix('/image/data')}/info/camera_info")
+    return next((name for name in names if name in infos), None)
+
+
+def info_of(bag: Bag, topic: ImageTopic) -> Matrix | None:
+    """Return the projection P [3, 4] of an image topic's CameraInfo, None without one."""
+    name = _info_name(bag, topic)
+    if name is None:
+        return None
+    return np.asarray(_field(bag.first_message(name), "p"), np.float64).reshape(3, 4)
+
+
+def _depth_units(bag: Bag, depth: ImageTopic) -> float:
+    """Return the depth units per metre: from the SDK's option if it was recorded, else for millimetres."""
+    sensor = "/".join(depth.name.split("/")[:3])
+    name = f"{sensor}/option/Depth_Units/value"
+    if name not in bag.topics or not bag.topics[name].count:
+        return MM_PER_METRE  # ROS depth as whole numbers is in millimetres (REP 118)
+    metres = float(bag.first_message(name).data)
+    return round(1.0 / metres, 3) if metres > 0 else MM_PER_METRE
+
+
+def _color_depth(bag: Bag, color: ImageTopic, depth: ImageTopic) -> Matrix:
+    found = sdk_transform(bag, color, depth)
+    if found is None and color.frame and depth.frame:
+        found = lookup_transform(bag, color.frame, depth.frame)
+    if found is None:
+        raise SourceError(
+            f"{bag.path}: no transform from the depth camera ({depth.frame or depth.name}) to the colour camera "
+            f"({color.frame or color.name}); record /tf_static or an aligned depth topic, "
+            "or give --calibration FILE with depth_camera and T_color_depth"
+        )
+    return found
+
+
+def sdk_stream(topic: ImageTopic) -> str:
+    """Return the SDK's name of a stream, such as /device_0/sensor_0/Depth_0, or "" for other bags."""
+    return topic.base.removesuffix("/image/data") if topic.base.startswith("/device_") else ""
+
+
+def sdk_transform(bag: Bag, target: ImageTopic, source: ImageTopic | str) -> Matrix | None:
+    """Return T_target_source between two streams, None if the bag is not from the SDK; source: a topic or a stream."""
+    stream = source if isinstance(source, str) else sdk_stream(source)
+    T_target_reference, T_source_reference = _sdk_pose(bag, sdk_stream(target)), _sdk_pose(bag, stream)
+    if T_target_reference is None or T_source_reference is None:
+        return None
+    return np.asarray(T_target_reference @ se3.inverse(T_source_reference))
+
+
+def _sdk_pose(bag: Bag, stream: str) -> Matrix | None:
+    """Return T_stream_reference, None if the bag is not from the SDK."""
+    found = bag.topics_of_type("geometry_msgs/msg/Transform")
+    names = [topic.name for topic in found if topic.name.startswith(f"{stream}/tf/")]
+    if not (stream and names):
+        return None
+    message = bag.first_message(names[0])
+    return transform_of(f"{bag.path}: {names[0]}", message.translation, message.rotation)
+
+
+def _lens(where: str, info: Message) -> Distortion | None:
+    """Return the distortion in OpenCV's order. Raises SourceError for an unsupported model."""
+    values = [float(v) for v in _field(info, "d")]
+    if not any(values):
+        return None
+    model = info.distortion_model.lower()
+    if model not in (*BROWN_CONRADY, RATIONAL) or len(values) < 4:
+        raise SourceError(
+            f"{where}: lens model {info.distortion_model} is not supported (plumb_bob and {RATIONAL} are); "
+            "record the rectified images (image_rect_color), or give --calibration FILE"
+        )
+    return tuple([*values, 0.0][: 8 if model == RATIONAL else 5])
+
+
+def _field(message: Message, name: str) -> Iterable[float]:
+    """Read a field whose name is in capitals in ROS 1 and in lower case in ROS 2."""
+    values: Iterable[float] = getattr(message, name if hasattr(message, name) else name.upper())
+    return values
+
+
+POSE_TYPES = (
+    "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "geometry_msgs/msg/TransformStamped",
+    "nav_msgs/msg/Odometry",
+)
+OWN_TOPICS = "/sigmasplat/"
+"""Topics of `sigmasplat run --bag` begin like this. Their poses are estimates of an earlier run."""
+
+
+def read_truth(bag: Bag, camera_frame: str, recorded_time: bool) -> Trajectory | None:
+    """Return the path of the colour camera if exactly one topic holds poses, else None.
+
+    If the messages name the moving body, the bag's static transforms convert its poses to the camera; without such a
+    transform the result is None. If they name no body (PoseStamped), the poses are assumed to be the camera's.
+    Estimates of an earlier run of SigmaSplat do not count. `recorded_time`: use recording times instead of header
+    times. Raises SourceError on a damaged pose.
+    """
+    topics = [topic for topic in bag.topics_of_type(*POSE_TYPES) if not topic.name.startswith(OWN_TOPICS)]
+    if len(topics) != 1 or topics[0].count < 2:
+        return None
+    name = topics[0].name
+    entries, messages = bag.index(name)[name], list(bag.messages(name))
+    body = getattr(messages[0], "child_frame_id", "").lstrip("/")
+    T_body_camera = np.eye(4)
+    if body and camera_frame and body != camera_frame:
+        found = lookup_transform(bag, body, camera_frame, use_tf=False)
+        if found is None:
+            return None
+        T_body_camera = found
+    times_s = np.array([(e.recorded_ns if recorded_time else e.stamp_ns) / 1e9 for e in entries])
+    poses = [_pose(f"{bag.path}: {name} at {t:.3f} s", m) for t, m in zip(times_s, messages, strict=True)]
+    return Trajectory(times_s, np.stack([se3.orthonormalise(T @ T_body_camera) for T in poses]))
+
+
+def _pose(where: str, message: Message) -> Matrix:
+    if hasattr(message, "transform"):
+        return transform_of(where, message.transform.translation, message.transform.rotation)
+    pose = message.pose.pose if hasattr(message.pose, "pose") else message.pose
+    return transform_of(where, pose.position, pose.orientation)

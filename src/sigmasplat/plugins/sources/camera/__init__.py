@@ -1,1 +1,0 @@
-"""Camera models: calibration, lens distortion, registration of depth to colour."""

@@ -1,1 +1,0 @@
-"""Find, pair and decode the files of a recording."""

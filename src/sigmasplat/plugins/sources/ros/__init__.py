@@ -1,1 +1,0 @@
-"""Read ROS 1 and ROS 2 bags."""
