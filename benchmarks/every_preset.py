@@ -19,11 +19,12 @@ from accuracy_tables import failures
 from tables import Section, significant
 
 from sigmasplat.config import Config
-from sigmasplat.config.presets import list_presets, preset as preset_of
+from sigmasplat.config.presets import list_presets, preset as preset_of, presets_by_scene
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.run_folder.runs import RunFolder
 
 arg = tyro.conf.arg
+EVERY = (*list_presets(), *presets_by_scene())
 SMALL = {"input.width": 160}
 MOST = {
     "input.crop_px": 4, "mapping.every": 5, "mapping.first_iterations": 20, "mapping.iterations": 8,
@@ -43,7 +44,7 @@ class Options(accuracy.Options):
         "redkitchen",
         "livingroom",
     )
-    presets: Annotated[tuple[str, ...], arg(help="presets to run")] = tuple(list_presets())
+    presets: Annotated[tuple[str, ...], arg(help="presets to run")] = EVERY
     seeds: Annotated[tuple[int, ...], arg(help="random seeds, one run for each")] = (0,)
     limit: Annotated[int | None, arg(help="number of frames at most")] = 45
     name: Annotated[str, arg(help="name of the results; use another name with other --set")] = "every-preset"

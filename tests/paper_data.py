@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from layouts import opengl, rows, save, save_text, transforms, tum_line
-from sigmasplat.config import InputConfig
+from paper_settings import InputConfig
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.mesh import Mesh
 from sigmasplat.plugins.evaluation.metrics.trajectory import associate

@@ -6,12 +6,12 @@ import numpy as np
 import torch
 
 from box_room import CAMERA, splats, walk
-from sigmasplat.config import Config
 from sigmasplat.data import se3
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.submap import Picture, Submap
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.input.source import Source
+from sigmasplat.plugins.papers.base import BASE
 from sigmasplat.run_folder.runs import RunFolder
 
 FRAMES, LOST = 6, 3
@@ -47,7 +47,7 @@ class Walls(Source):
 
 def made_run(folder: Path, submaps: bool) -> RunFolder:
     """Write the run, in two submaps that share frame 2, or in one piece."""
-    run = RunFolder.create(folder, Config(), "walls")
+    run = RunFolder.create(folder, BASE, "walls")
     for i in range(FRAMES):
         run.log({"index": i, "timestamp_s": i / 10, "is_keyframe": i in (0, 2, 4), "lost": i == LOST, "seconds": {}})
     run.write_trajectory(PATH)

@@ -6,7 +6,8 @@ from dataclasses import dataclass, field as dataclass_field, replace
 import numpy as np
 import torch
 
-from sigmasplat.config import Config, FinalConfig, MappingConfig, RenderConfig
+from paper_settings import FinalConfig, MappingConfig, RenderConfig
+from sigmasplat.config import Config
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import COLUMNS, GaussianField

@@ -21,7 +21,7 @@ DATA_SETS = {
 ORIGINS: dict[str, dict[str, str]] = {
     "varsplat": {
         "input.crop_px": "code", "input.min_depth_m": "code", "input.max_depth_m": "code; tum, scannet: ours",
-        "render.alpha_min": "code", "render.transmittance_stop": "code", "render.low_pass_px2": "code",
+        "render.alpha_min": "code", "render.low_pass_px2": "code",
         "render.near_m": "code",
         "seeding.first_uniform": "paper", "seeding.first_gradient": "paper", "seeding.first_edges": "paper",
         "seeding.later_max": "paper", "seeding.alpha_below": "paper", "seeding.depth_error_factor": "paper",
@@ -40,25 +40,25 @@ ORIGINS: dict[str, dict[str, str]] = {
         "tracking.weight_max": "paper", "tracking.alpha_power": "paper; scannetpp: code",
         "tracking.alpha_above": "code", "tracking.outlier_factor": "code", "tracking.motion_model": "paper",
         "tracking.reinit_factor": "code", "tracking.exposure": "paper", "tracking.lr_exposure": "paper",
-        "tracking.lost_agreement": "ours", "tracking.lost_share": "ours",
+        
         "submaps.distance_m": "paper", "submaps.angle_deg": "paper", "submaps.frames": "paper",
         "submaps.uncertainty_m": "ours",
         "loops.descriptor": "paper", "loops.min_similarity": "paper", "loops.min_interval": "paper; scannetpp: code",
-        "loops.most": "ours", "loops.tau": "paper", "loops.weight_max": "paper",
-        "registration.keyframes": "paper", "registration.iterations": "paper", "registration.lr_rotation": "paper",
+        "loops.most": "ours", "loops.tau": "paper", 
+        "registration.iterations": "paper", "registration.lr_rotation": "paper",
         "registration.lr_translation": "paper", "registration.plateau_stop": "ours",
-        "registration.plateau_window": "ours", "registration.target": "ours", "registration.exposure": "paper",
-        "registration.weight_color": "paper", "registration.tau": "paper; scannet, scannetpp: code",
-        "registration.weight_max": "paper", "registration.overlap_least": "paper", "registration.overlap_m": "paper",
-        "registration.agreement_least": "ours", "registration.share_least": "ours", "registration.spread_m": "ours",
-        "registration.spread_deg": "ours",
+        "registration.plateau_window": "ours", "registration.target": "ours", 
+        "registration.tau": "paper; scannet, scannetpp: code",
+        "registration.overlap_m": "paper",
+        "registration.spread_m": "ours",
+        
         "final.seed_from": "paper", "final.spacing_m": "paper", "final.iterations": "paper", "final.sh_degree": "paper",
-        "final.sh_every": "paper", "final.prune_every": "paper", "final.prune_opacity": "paper",
+        "final.sh_every": "paper", "final.prune_every": "paper", 
         "final.lr_means_last": "ours", "final.lr_log_scales": "ours", "final.uncertainty": "paper",
     },
     "cgslam": {
         "input.crop_px": "code", "input.min_depth_m": "code", "input.max_depth_m": "code",
-        "render.alpha_min": "code", "render.transmittance_stop": "code", "render.low_pass_px2": "code",
+        "render.alpha_min": "code", "render.low_pass_px2": "code",
         "render.near_m": "code",
         "seeding.first_uniform": "paper", "seeding.first_gradient": "paper", "seeding.first_edges": "paper",
         "seeding.later_max": "paper", "seeding.alpha_below": "paper", "seeding.depth_error_factor": "paper",
@@ -74,14 +74,14 @@ ORIGINS: dict[str, dict[str, str]] = {
         "mapping.lr_pose_rotation": "paper", "mapping.lr_pose_translation": "paper", "mapping.poses": "paper",
         "mapping.poses_from": "code", "mapping.prune_opacity": "code", "mapping.window": "paper",
         "mapping.covisibility": "ours", "mapping.frames_per_step": "paper",
-        "primitives.uncertain_m2": "paper", "primitives.owner": "paper", "primitives.faded_opacity": "ours",
-        "primitives.least_opacity": "ours", "primitives.split_gradient": "code", "primitives.split_scale_m": "code",
+        "primitives.uncertain_m2": "paper", "primitives.owner": "paper", 
+        "primitives.split_gradient": "code", "primitives.split_scale_m": "code",
         "primitives.clone": "paper", "primitives.most_scale_m": "code",
         "tracking.parametrisation": "paper", "tracking.iterations": "paper", "tracking.lr_rotation": "paper",
         "tracking.lr_translation": "paper", "tracking.weight_color": "paper", "tracking.uncertainty": "paper",
         "tracking.alpha_power": "paper", "tracking.alpha_above": "code", "tracking.outlier_factor": "code",
         "tracking.outlier_factor_color": "code", "tracking.average": "code", "tracking.motion_model": "paper",
-        "tracking.reinit_factor": "ours", "tracking.lost_agreement": "ours", "tracking.lost_share": "ours",
+        "tracking.reinit_factor": "ours", 
         "loops.close": "paper", "loops.uncertainty": "paper", "registration.uncertainty": "paper",
         "final.iterations": "paper", "final.uncertainty": "paper",
     },
@@ -120,10 +120,10 @@ def paper_table(system: str) -> str:
 
 def scene_table(system: str) -> str:
     """Return the released code's scenes: a row per set of values, a column per setting; all from the code."""
-    from sigmasplat.config.presets import list_presets, preset
+    from sigmasplat.config.presets import preset, presets_by_scene
 
     prefix = f"{system}-released-"
-    released = {name.removeprefix(prefix): preset(name) for name in list_presets() if name.startswith(prefix)}
+    released = {name.removeprefix(prefix): preset(name) for name in presets_by_scene() if name.startswith(prefix)}
     values = {column: [_value(config, column) for config in released.values()] for column in SCENES[system]}
     same = [f"`{column}` {each[0]}" for column, each in values.items() if len(set(each)) == 1]
     columns = [column for column, each in values.items() if len(set(each)) > 1]
@@ -138,9 +138,9 @@ def scene_table(system: str) -> str:
 def method_table(system: str) -> str:
     """Return the table of what all presets of the released code change: the setting, the paper's value, the code's."""
     from sigmasplat.config import Config
-    from sigmasplat.config.presets import list_presets, preset
+    from sigmasplat.config.presets import preset, presets_by_scene
 
-    released = [preset(name) for name in list_presets() if name.startswith(f"{system}-released-")]
+    released = [preset(name) for name in presets_by_scene() if name.startswith(f"{system}-released-")]
     rows = ["| setting | paper's presets | released | from |", "|---|---|---|---|"]
     for name in changed_by_all(released, [preset(f"{system}-{column}") for column in DATA_SETS[system]], Config()):
         if name not in SCENES[system]:

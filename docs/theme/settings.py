@@ -8,6 +8,7 @@ import ast
 import dataclasses
 import itertools
 import sys
+from functools import cache
 from pathlib import Path
 from typing import Any, get_args
 
@@ -16,10 +17,10 @@ PAGE = ROOT / "docs" / "settings.md"
 HEAD = """# Settings
 
 `--set SECTION.NAME=VALUE` changes a setting of `demo`, `run`, `inspect` and `bench`. The `config.json` of a run holds
-all settings that it used. *Default* is the value if the preset does not set one. *`{preset}`* is the value of the
-default preset, shown if it differs. Units are in the names: `_m` metres, `_deg` degrees, `_px` pixels, `_s` seconds.
-`lr_` is a learning rate, `weight_` the weight of a loss. "Ours" marks what is in neither paper. *Takes* is the type
-and the valid range. A run is refused if a value is out of range, infinite or not a number; the error names all of them.
+all settings that it used. The defaults are the preset `sigma`. Units are in the names: `_m` metres, `_deg` degrees,
+`_px` pixels, `_s` seconds. `lr_` is a learning rate, `weight_` the weight of a loss. "Ours" marks what is in neither
+paper. *Takes* is the type and the valid range. *Changed by* names the systems with another value in some preset. A run
+is refused if a value is out of range, infinite or not a number; the error names all of them.
 
 Generated from [`config/`](../src/sigmasplat/config/) by `docs/theme/settings.py`. Back to the [README](../README.md).
 """
@@ -37,39 +38,64 @@ def classes() -> dict[str, ast.ClassDef]:
     return {node.name: node for tree in trees for node in tree.body if isinstance(node, ast.ClassDef)}
 
 
-def table(defaults: Any, chosen: Any, preset_name: str, prefix: str = "") -> str:
+def changed_by(section: str, name: str) -> str:
+    """Return the systems whose presets have another value than the default."""
+    values = {system: [getattr(getattr(c, section), name) for c in configs] for system, configs in presets().items()}
+    default = values.pop("sigma")[0]
+    return ", ".join(system for system, found in values.items() if any(value != default for value in found))
+
+
+@cache
+def presets() -> dict[str, list[Any]]:
+    """Return the settings of all presets by system: the first word of the name, or two for released code."""
+    from sigmasplat.config.presets import list_presets, preset, presets_by_scene
+
+    found: dict[str, list[Any]] = {}
+    for name in [*list_presets(), *presets_by_scene()]:
+        system, _, rest = name.partition("-")
+        found.setdefault(f"{system}-released" if rest.startswith("released") else system, []).append(preset(name))
+    return found
+
+
+def table(defaults: Any, section: str = "") -> str:
     """Return the table of one section: a row per field that is not a section itself."""
     from sigmasplat.config.ranges import kinds_of
 
     said, kinds = sentences(classes()[type(defaults).__name__].body), kinds_of(type(defaults))
-    rows = [f"| setting | takes | default | `{preset_name}` | meaning |", "|---|---|---|---|---|"]
+    rows = ["| setting | takes | default | changed by | meaning |", "|---|---|---|---|---|"]
+    prefix = f"{section}." if section else ""
     for name in (field.name for field in dataclasses.fields(defaults)):
-        value, other = getattr(defaults, name), getattr(chosen, name)
+        value = getattr(defaults, name)
         if not dataclasses.is_dataclass(value):
-            differing = "" if other == value else _written(other)
             sentence = said.get(name, "").replace("|", "\\|")
-            rows.append(f"| `{prefix}{name}` | {_words(kinds[name])} | {_written(value)} | {differing} | {sentence} |")
+            systems = changed_by(section, name) if section else ""
+            rows.append(f"| `{prefix}{name}` | {_words(kinds[name])} | {_written(value)} | {systems} | {sentence} |")
     return "\n".join(rows) + "\n"
 
 
 def page() -> str:
     """Return the whole page."""
     from sigmasplat.config import Config
-    from sigmasplat.config.presets import default_preset, preset
 
-    defaults, chosen = Config(), preset(default_preset())
-    parts = [HEAD.format(preset=default_preset()), f"## Whole run\n\n{table(defaults, chosen, default_preset())}"]
+    defaults = Config()
+    parts = [HEAD, f"## Whole run\n\n{table(defaults)}"]
     for field in dataclasses.fields(defaults):
         section = getattr(defaults, field.name)
         if dataclasses.is_dataclass(section):
             said = " ".join((ast.get_docstring(classes()[type(section).__name__]) or "").split())
-            rows = table(section, getattr(chosen, field.name), default_preset(), f"{field.name}.")
+            rows = table(section, field.name)
             parts.append(f"## {field.name}\n\n{said.partition(' Raises ')[0]}\n\n{rows}")
     return "\n".join(parts)
 
 
 def _field(node: ast.stmt) -> str:
-    return node.target.id if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name) else ""
+    """Return the name of the setting that a statement declares, "" for a constant and any other statement."""
+    match node:
+        case ast.AnnAssign(annotation=ast.Subscript(value=ast.Name(id="ClassVar"))):
+            return ""
+        case ast.AnnAssign(target=ast.Name(id=name)):
+            return name
+    return ""
 
 
 def _text(node: ast.stmt) -> str:

@@ -10,7 +10,7 @@ A module registers what it adds as `PLUGIN`, one row or a tuple of rows. It is f
 import os
 import pkgutil
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from importlib import import_module, metadata
@@ -118,10 +118,12 @@ class Backend:
 
 @dataclass(frozen=True)
 class Preset:
-    """Settings with a name. make(): returns them."""
+    """Settings with a name. make(): returns them; scenes(): lists the scenes if settings differ by scene. One of them
+    then follows the name, and make(scene) returns its settings."""
 
     name: str
-    make: "Callable[[], Config]"
+    make: "Callable[..., Config]"
+    scenes: "Callable[[], Collection[str]] | None" = None
 
 
 Row = SourceFormat | Mask | DepthFilter | Output | Backend | Preset

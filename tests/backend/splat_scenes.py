@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sigmasplat.config import RenderConfig
+from paper_settings import RenderConfig
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from sigmasplat.config import RenderConfig
+from paper_settings import RenderConfig
 from sigmasplat.data.field import COLUMNS, GaussianField
 from sigmasplat.render.backend import make_view, on_device
 from sigmasplat.render.blended_values import BlendedValues, blend_values

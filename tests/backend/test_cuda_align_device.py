@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from align_oracle import HUGE, oracle, pair
-from sigmasplat.config import TrackingConfig
+from paper_settings import TrackingConfig
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.fit import align as aligning

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from emulated_cuda import Emulator
-from sigmasplat.config import TrackingConfig
+from paper_settings import TrackingConfig
 from sigmasplat.config.presets import default_preset, preset
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera

@@ -13,7 +13,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from sigmasplat.config import MappingConfig, TrackingConfig
+from paper_settings import MappingConfig, TrackingConfig
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import COLUMNS, GaussianField

@@ -11,7 +11,8 @@ import pytest
 import torch
 
 from emulated_cuda import Emulator
-from sigmasplat.config import Config, MappingConfig, TrackingConfig
+from paper_settings import MappingConfig, TrackingConfig
+from sigmasplat.config import Config
 from sigmasplat.config.presets import default_preset, preset
 from sigmasplat.config.text import override
 from sigmasplat.data import se3

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from emulated_cuda import Emulator
-from sigmasplat.config import TrackingConfig
+from paper_settings import TrackingConfig
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.frame import Frame

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from sigmasplat.config import MappingConfig
+from paper_settings import MappingConfig
 from sigmasplat.data import se3
 from sigmasplat.data.field import COLUMNS, GaussianField
 from sigmasplat.data.frame import Frame

@@ -6,7 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from sigmasplat.config import MappingConfig
+from paper_settings import MappingConfig
+from sigmasplat import config as settings
 from sigmasplat.data import se3
 from sigmasplat.data.field import GaussianField
 from sigmasplat.fit import fused_terms, losses
@@ -24,7 +25,7 @@ OWN = "darkness"
 
 
 @dataclass(frozen=True)
-class OwnMapping(MappingConfig):
+class OwnMapping(settings.MappingConfig):
     """Mapping's settings with a weight for it, as docs/recipes.md adds one."""
 
     weight_darkness: float = 0.0

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 import torch
 
+from paper_settings import MappingConfig, TrackingConfig
 from sigmasplat import cli
-from sigmasplat.config import Config, MappingConfig, TrackingConfig
+from sigmasplat.config import Config
 from sigmasplat.config.presets import preset
 from sigmasplat.config.text import override
 from sigmasplat.data import se3

@@ -11,7 +11,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from sigmasplat.config import RenderConfig
 from sigmasplat.data import se3
 from sigmasplat.data.field import COLUMNS
 from sigmasplat.render.reference import operators as reference
@@ -23,6 +22,7 @@ from splat_scenes import FIELD, WIDE, Scene, render, twist_gradient
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
+from paper_settings import RenderConfig
 from sigmasplat.render.cpu import operators as cpu
 from sigmasplat.render.cpu.view import CpuView
 

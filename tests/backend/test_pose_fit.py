@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from sigmasplat.config import RegistrationConfig, TrackingConfig
+from paper_settings import RegistrationConfig, TrackingConfig
 from sigmasplat.data import se3
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.frame import Frame

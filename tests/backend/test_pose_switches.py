@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from sigmasplat.config import RenderConfig
+from paper_settings import RenderConfig
 from sigmasplat.data import se3
 from sigmasplat.data.field import GaussianField, Rows
 from sigmasplat.data.harmonics import view_colors

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from sigmasplat.config import RenderConfig
+from paper_settings import RenderConfig
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import COLUMNS, GaussianField
 from sigmasplat.errors import BackendError

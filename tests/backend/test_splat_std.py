@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from sigmasplat.config import RenderConfig
+from paper_settings import RenderConfig
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.map_uncertainty import COLOR_PARTS, DEPTH_PARTS, Background, Calibration, MapUncertainty
 from sigmasplat.fit.target import Keyframe, Target

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 import torch
 
-from sigmasplat.config import RenderConfig
+from paper_settings import RenderConfig
 from sigmasplat.data.camera import Camera
 
 PIXEL = Camera(1, 1, 10.0, 10.0, 0.0, 0.0)

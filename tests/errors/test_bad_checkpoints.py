@@ -9,7 +9,6 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from sigmasplat.config import Config
 from sigmasplat.data.atlas import Atlas
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
@@ -19,6 +18,7 @@ from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import RunError, SigmaSplatError
 from sigmasplat.graph.pose_graph import Edge
 from sigmasplat.plugins.outputs.floorplan.floor_plan import floor_plan
+from sigmasplat.plugins.papers.base import BASE
 from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.slam.checkpoint import checkpoint_of
 
@@ -55,7 +55,7 @@ def run(tmp_path: Path) -> RunFolder:
         for k in range(keyframes):
             atlas.set_keyframes([T] * (k + 1), UNKNOWN_HOP)
     edges = [Edge(0, 1, T, np.eye(6), loop=True)]
-    run = RunFolder.create(tmp_path / "run", Config(), "room")
+    run = RunFolder.create(tmp_path / "run", BASE, "room")
     trajectory = Trajectory(np.arange(3.0), np.tile(np.eye(4), (3, 1, 1)))
     run.write_checkpoint(checkpoint_of(GaussianField.empty(), trajectory, atlas, [0, 1, 2], edges), {})
     return run

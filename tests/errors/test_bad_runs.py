@@ -6,19 +6,19 @@ import pytest
 import torch
 from safetensors import SafetensorError
 
-from sigmasplat.config import Config
 from sigmasplat.errors import ConfigError, RunError
 from sigmasplat.files import tensors
+from sigmasplat.plugins.papers.base import BASE
 from sigmasplat.run_folder.runs import RunFolder
 
 
 def make(path: Path) -> RunFolder:
-    return RunFolder.create(path, Config(), "room")
+    return RunFolder.create(path, BASE, "room")
 
 
 def refused(path: Path, overwrite: bool = False) -> str:
     with pytest.raises(RunError) as caught:
-        RunFolder.create(path, Config(), "room", overwrite=overwrite)
+        RunFolder.create(path, BASE, "room", overwrite=overwrite)
     assert "\n" not in str(caught.value) and str(path) in str(caught.value)
     return str(caught.value)
 
@@ -43,7 +43,7 @@ def test_a_run_without_settings_can_be_overwritten(tmp_path: Path) -> None:
     run = make(tmp_path / "run")
     (run.path / "config.json").unlink()
     assert "--overwrite" in refused(run.path)
-    again = RunFolder.create(run.path, Config(), "room", overwrite=True)
+    again = RunFolder.create(run.path, BASE, "room", overwrite=True)
     assert RunFolder.open(again.path).facts()["status"] == "running"
 
 

@@ -22,6 +22,7 @@ from sigmasplat.config import Config
 from sigmasplat.errors import ConfigError, RunError, SourceError
 from sigmasplat.input.lists import associate
 from sigmasplat.plugins.outputs.splats.any_format import read_any
+from sigmasplat.plugins.papers.base import BASE
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.run_folder.runs import RunFolder
 
@@ -242,7 +243,7 @@ def test_a_log_without_times_has_no_path(tmp_path: Path) -> None:
     {"keyframes": torch.zeros(2)},
 ], ids=["shape", "nan", "lengths", "type"])  # fmt: skip
 def test_checkpoints_of_a_run(tensors: dict[str, torch.Tensor], tmp_path: Path) -> None:
-    run = RunFolder.create(tmp_path / "run", Config(), "walls")
+    run = RunFolder.create(tmp_path / "run", BASE, "walls")
     run.write_checkpoint(tensors, {})
     with pytest.raises(RunError, match=r"checkpoint\.safetensors"):
         run.read_checkpoint()

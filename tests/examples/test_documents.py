@@ -14,7 +14,7 @@ import pytest
 from changed_settings import changed_settings
 from documents import DOCUMENTS, ROOT, prose
 from sigmasplat.config import Config
-from sigmasplat.config.presets import list_presets, preset
+from sigmasplat.config.presets import list_presets, preset, presets_by_scene
 from sigmasplat.fit.compare import Comparison
 from sigmasplat.plugins.papers.table_files import list_tables
 
@@ -59,14 +59,14 @@ def unknown_names(path: Path) -> list[str]:
     logged = fitted | compared if path.name == "runs.md" else set()
 
     def is_known(section: str, name: str) -> bool:
-        known = {*vars(getattr(Config(), section)), "py", "json", "safetensors"} | logged
+        known = {*dir(getattr(Config(), section)), "py", "json", "safetensors"} | logged  # settings and constants
         return name in known or (PACKAGE / section / f"{name}.py").is_file()
 
     return [
         *(f"{file}::{name}" for file, name in tests if f"def {name}(" not in (ROOT / file).read_text(encoding="utf-8")),
         *(file for file in files if not (PACKAGE / file).is_file()),
         *(f"{section}.{name}" for section, name in settings if not is_known(section, name)),
-        *(name for name in presets if name not in {*list_presets(), *list_tables()}),
+        *(name for name in presets if name not in {*list_presets(), *presets_by_scene(), *list_tables()}),
     ]
 
 

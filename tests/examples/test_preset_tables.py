@@ -8,8 +8,8 @@ from types import ModuleType
 import pytest
 
 from changed_settings import changed_settings
-from sigmasplat.config import Config
-from sigmasplat.config.presets import list_presets, preset
+from sigmasplat.config.presets import list_presets, preset, presets_by_scene
+from sigmasplat.plugins.papers.base import BASE
 
 DOCS = Path(__file__).parents[2] / "docs"
 SYSTEMS = ("varsplat", "cgslam")
@@ -34,7 +34,7 @@ def test_the_tables_are_those_of_the_presets(tables: ModuleType, system: str) ->
 def test_each_setting_of_a_papers_preset_has_an_origin(tables: ModuleType, system: str) -> None:
     origins, columns = tables.ORIGINS[system], tables.DATA_SETS[system]
     for column in columns:
-        missing = changed_settings(preset(f"{system}-{column}"), Config()) - set(origins)
+        missing = changed_settings(preset(f"{system}-{column}"), BASE) - set(origins)
         assert missing == set(), f"{system}-{column}: no row in docs/theme/presets.py"
     for name, origin in origins.items():
         usual, _, others = origin.partition("; ")
@@ -46,7 +46,7 @@ def test_each_setting_of_a_papers_preset_has_an_origin(tables: ModuleType, syste
 @pytest.mark.parametrize("system", SYSTEMS)
 def test_each_setting_of_a_released_preset_is_in_a_table(tables: ModuleType, system: str) -> None:
     """Each setting in which a scene differs from the paper's presets is a column or a row of the code's tables."""
-    names = [name for name in list_presets() if name.startswith(f"{system}-released-")]
+    names = [name for name in presets_by_scene() if name.startswith(f"{system}-")]
     shown = {line.split("`")[1] for line in tables.method_table(system).splitlines() if line.startswith("| `")}
     for name in names:
         differing = set.intersection(
@@ -56,7 +56,7 @@ def test_each_setting_of_a_released_preset_is_in_a_table(tables: ModuleType, sys
 
 
 def test_every_preset_is_named_on_a_page_of_its_system() -> None:
-    for name in list_presets():
+    for name in [*list_presets(), *presets_by_scene()]:
         page = "varsplat" if name.split("-")[0] in ("varsplat", "loopsplat") else "cgslam"
         text = (DOCS / f"{page}.md").read_text(encoding="utf-8")
         scene = name.partition("-released-")[2]

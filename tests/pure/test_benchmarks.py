@@ -16,8 +16,9 @@ import pytest
 import torch
 
 from benchmark_results import BENCHMARKS, laid_out, results
+from paper_settings import RenderConfig
 from sigmasplat import cli
-from sigmasplat.config import Config, RenderConfig
+from sigmasplat.config import Config
 from sigmasplat.config.presets import preset
 from sigmasplat.config.text import override
 from sigmasplat.data import se3

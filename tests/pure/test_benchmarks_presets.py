@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from benchmark_results import laid_out
-from sigmasplat.config.presets import list_presets, preset
+from sigmasplat.config.presets import preset
 from sigmasplat.config.text import override, split_settings
 from sigmasplat.run_folder.runs import RunFolder
 
@@ -17,7 +17,7 @@ accuracy = importlib.import_module("accuracy")
 every_preset = importlib.import_module("every_preset")
 
 
-@pytest.mark.parametrize("name", list_presets())
+@pytest.mark.parametrize("name", every_preset.EVERY)
 def test_a_shortened_preset_stays_what_it_is_and_cuts_often(name: str) -> None:
     whole, short = preset(name), override(preset(name), split_settings(every_preset.shortened(preset(name))))
     assert short.mapping.iterations <= 8 and short.final.iterations <= 40 and short.input.width == 160

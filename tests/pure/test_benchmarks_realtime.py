@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from benchmark_results import laid_out
-from sigmasplat.config import Config
+from sigmasplat.plugins.papers.base import BASE
 from sigmasplat.run_folder.runs import RunFolder
 
 realtime, replayed = importlib.import_module("realtime"), importlib.import_module("replayed")
@@ -19,7 +19,7 @@ def figures(**changed: Any) -> dict[str, Any]:
 
 
 def test_latencies_of_the_first_second_do_not_count(tmp_path: Path) -> None:
-    run = RunFolder.create(tmp_path / "run", Config(), "made")
+    run = RunFolder.create(tmp_path / "run", BASE, "made")
     for i in range(60):
         seconds = {"total": 0.01, "latency": 0.5 if i <= 30 else 0.001 * i}
         run.log({"timestamp_s": i / 30, "lost": False, "is_keyframe": i % 10 == 0, "seconds": seconds})

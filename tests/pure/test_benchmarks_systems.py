@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 from benchmark_results import laid_out
-from sigmasplat.config import Config
 from sigmasplat.errors import ConfigError
+from sigmasplat.plugins.papers.base import BASE
 from sigmasplat.run_folder.runs import RunFolder
 
 accuracy, consistency, systems, tables = map(
@@ -68,7 +68,7 @@ def test_every_figure_of_a_table_is_one_that_is_picked() -> None:
 def job(tmp_path: Path) -> Any:
     """Leave a run without a scored surface where its job has it."""
     job = accuracy.Job("room", ROOM, "varsplat-fast", 0, (), 5, "abc")
-    folder = RunFolder.create(job.folder(tmp_path) / "run", Config(), "room")
+    folder = RunFolder.create(job.folder(tmp_path) / "run", BASE, "room")
     folder.write_metrics({"ate": {"rmse_m": 0.5}, "reconstruction": None})
     return job
 

@@ -33,6 +33,7 @@ from sigmasplat.errors import SigmaSplatError, SourceError
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.cuda import stages as cuda_stages
 from sigmasplat.plugins.outputs.meshes.mesh_files import write_mesh
+from sigmasplat.plugins.papers.base import BASE
 from sigmasplat.run.session import Session
 from sigmasplat.run.terminal import Screen
 from sigmasplat.run_folder.frames import noted_up
@@ -265,9 +266,9 @@ def test_changes_of_state_are_printed(corridor: Corridor, capsys: pytest.Capture
 def test_the_progress_bar_shows_that_tracking_is_lost(corridor: Corridor) -> None:
     MadeUpSlam.lost = {3, 4, 5}
     out = io.StringIO()
-    folder = RunFolder.create(Path("direct"), Config(), "corridor")
+    folder = RunFolder.create(Path("direct"), BASE, "corridor")
     with Screen(Console(file=out, force_terminal=True, width=120)).steps(6) as callback:
-        Session(MadeUpSlam(Config()), corridor, folder, callback).execute()
+        Session(MadeUpSlam(BASE), corridor, folder, callback).execute()
     assert "LOST since frame 3" in out.getvalue()
 
 
@@ -503,9 +504,9 @@ def test_a_terminal_shows_progress_bars(corridor: Corridor) -> None:
     out = io.StringIO()
     screen = Screen(Console(file=out, force_terminal=True, width=120))
     MadeUpSlam.tried = {4: [CLOSED]}
-    folder = RunFolder.create(Path("direct"), Config(), "corridor")
+    folder = RunFolder.create(Path("direct"), BASE, "corridor")
     with screen.steps(6) as callback:
-        Session(MadeUpSlam(Config()), corridor, folder, callback).execute()
+        Session(MadeUpSlam(BASE), corridor, folder, callback).execute()
     said = out.getvalue()
     assert "SLAM" in said and "6/6" in said and "final map" in said and "2/2" in said and "loop closed" in said
 
@@ -580,8 +581,8 @@ def test_eval_and_export_read_what_run_wrote(corridor: Corridor, capsys: pytest.
 
 
 def test_a_session_runs_without_a_terminal(corridor: Corridor) -> None:
-    folder = RunFolder.create(Path("direct"), Config(), "corridor")
-    outcome = Session(MadeUpSlam(Config()), corridor, folder).execute()
+    folder = RunFolder.create(Path("direct"), BASE, "corridor")
+    outcome = Session(MadeUpSlam(BASE), corridor, folder).execute()
     assert (outcome.status, outcome.frames, outcome.lost) == ("complete", 6, 0)
     assert outcome.wall_s > 0
 
@@ -598,8 +599,8 @@ def test_a_run_writes_the_vertical_direction_that_an_accelerometer_measured(
 
     monkeypatch.setattr(Corridor, "__len__", lambda self: 12)
     monkeypatch.setattr(Corridor, "frame", frame)
-    run = RunFolder.create(Path("sideways"), Config(), "corridor")
-    Session(MadeUpSlam(Config()), corridor, run).execute()
+    run = RunFolder.create(Path("sideways"), BASE, "corridor")
+    Session(MadeUpSlam(BASE), corridor, run).execute()
     if measured:
         assert noted_up(run.facts()) == pytest.approx([1.0, 0.0, 0.0])
         assert run.read_log()[1]["specific_force_m_s2"] == pytest.approx([9.81, -0.3, 0.0])

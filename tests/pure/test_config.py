@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from sigmasplat import env
-from sigmasplat.config import SECTIONS, Config
+from sigmasplat.config import SECTIONS, Config, gone
 from sigmasplat.config.presets import preset
 from sigmasplat.config.ranges import kinds_of, problem_of, unpacked
 from sigmasplat.config.text import override, split_settings
@@ -104,7 +104,7 @@ def test_every_number_has_a_range_and_every_default_is_in_it() -> None:
         ("tracking", "method", "guess"),
         ("tracking", "exposure", None),
         ("loops", "weights", 3),
-        ("loops", "weight_max", 0.5),
+        ("tracking", "weight_max", 0.5),
         ("seeding", "opacity", 0.0),
         ("uncertainty", "probes", -1),
     ],
@@ -146,9 +146,9 @@ def test_limits_that_depend_on_each_other_are_set_together() -> None:
 @pytest.mark.parametrize("text", ["big", "-3", "1.5", ""])
 def test_the_width_of_the_final_map_is_a_word_or_a_number(text: str) -> None:
     with pytest.raises(ConfigError, match=r"final\.width must be working, camera or a number"):
-        override(Config(), {"final.width": text}).checked()
+        override(Config(), {"final.width": text})
     for good in ("working", "camera", "640"):
-        assert override(Config(), {"final.width": good}).checked().final.width == good
+        assert override(Config(), {"final.width": good}).final.width == good
 
 
 def test_settings_split_at_the_first_equals_sign() -> None:
@@ -185,8 +185,8 @@ def test_environment_values_that_mean_nothing_are_refused() -> None:
 
 def test_a_backend_of_another_name_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"no backend 'cpuu' \(did you mean cuda|no backend 'cpuu'"):
-        Config(backend="cpuu").checked()
-    assert Config(backend="cuda").checked().backend == "cuda"
+        Config(backend="cpuu")
+    assert Config(backend="cuda").backend == "cuda"
 
 
 def _python(code: str, **environment: str) -> str:
@@ -219,3 +219,28 @@ def test_the_public_names_exist() -> None:
     assert set(sigmasplat.__all__) <= set(dir(sigmasplat))
     with pytest.raises(AttributeError, match="nothing_here"):
         _ = sigmasplat.nothing_here
+
+
+def test_a_saved_setting_that_is_gone_is_dropped_if_its_value_is_the_one_that_is_left() -> None:
+    """A run folder of an earlier version: settings of methods that are gone, and of numbers that are constants now."""
+    saved = preset("sigma").to_dict()
+    for name, value in gone().items():
+        section, _, setting = name.partition(".")
+        assert setting not in saved[section], name
+        saved[section][setting] = value
+    assert Config.from_dict(saved) == preset("sigma")
+    assert {"render.depth_gate_m", "tracking.variance", "registration.keyframes", "tracking.lost_share"} <= set(gone())
+
+
+def test_another_value_of_a_setting_that_is_gone_is_refused_in_one_line() -> None:
+    saved = preset("sigma").to_dict()
+    saved["registration"]["keyframes"] = 5
+    saved["loops"]["variance"] = "predicted"
+    with pytest.raises(ConfigError) as refused:
+        Config.from_dict(saved)
+    said = str(refused.value)
+    assert "setting registration.keyframes is gone: its value is always 2, found 5" in said
+    assert "setting loops.variance is gone: its value is always published, found 'predicted'" in said
+    assert "\n" not in said
+    with pytest.raises(ConfigError, match=r"^setting loops\.variance is gone: its value is always published$"):
+        override(preset("sigma"), {"loops.variance": "predicted"})

@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from sigmasplat.config import DensifyConfig
+from paper_settings import DensifyConfig
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import ATTRIBUTES, COLUMNS, WIDTH, GaussianField

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from depth_networks import BYTES, FLOAT, HALF, network, node, weighted
-from sigmasplat.config import InputConfig
+from paper_settings import InputConfig
 from sigmasplat.errors import ConfigError, SourceError
 from sigmasplat.plugins.predicted_depth import source as predicted
 from sigmasplat.plugins.predicted_depth.depth_model import DepthModel

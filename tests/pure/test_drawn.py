@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sigmasplat.config import MovingConfig, TrackingConfig
+from paper_settings import MovingConfig, TrackingConfig
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.frame import Frame

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sigmasplat.config import SubmapConfig
+from paper_settings import SubmapConfig
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.fit.pyramid import Pyramid

@@ -9,13 +9,13 @@ import torch
 
 from command_line import exit_code
 from sigmasplat.commands.export import ExportOptions
-from sigmasplat.config import Config
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.map_uncertainty import SHIPPED, Background, MapUncertainty, SplatStd
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.files.ply_elements import read_header
 from sigmasplat.plugins.outputs.formats import PLUGIN, ExportSource, choose, listed, owners
 from sigmasplat.plugins.outputs.splats.any_format import read_any
+from sigmasplat.plugins.papers.base import BASE
 from sigmasplat.registry import Output
 from sigmasplat.run_folder import splat_ply as ply
 from sigmasplat.run_folder.runs import RunFolder
@@ -26,7 +26,7 @@ from sigmasplat.run_folder.trajectory import read_trajectory
 def export(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
     """Run `sigmasplat export` beside a run, walk/, of ten splats and two poses; return the last line of its output."""
     monkeypatch.chdir(tmp_path)
-    run = RunFolder.create(Path("walk"), Config(), "room")
+    run = RunFolder.create(Path("walk"), BASE, "room")
     field = GaussianField.from_values(
         torch.rand(10, 3, generator=torch.Generator().manual_seed(0)),
         torch.full((10,), 0.1),

@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from sigmasplat.config import RenderConfig
+from paper_settings import RenderConfig
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import COLUMNS, WIDTH, GaussianField, left_factor, quaternion_of, transformed

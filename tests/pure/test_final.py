@@ -10,7 +10,8 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
-from sigmasplat.config import Config, MappingConfig
+from paper_settings import MappingConfig
+from sigmasplat.config import Config
 from sigmasplat.data import se3
 from sigmasplat.data.field import COLUMNS, GaussianField, Rows
 from sigmasplat.data.submap import MemoryStore, Submap

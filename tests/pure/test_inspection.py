@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from command_line import exit_code
-from sigmasplat.config import InputConfig
+from paper_settings import InputConfig
 from sigmasplat.data.camera import Camera
 from sigmasplat.input.rectification import DepthRegistration
 from sigmasplat.plugins.checks.depth import edge_agreement, outlines

@@ -11,15 +11,16 @@ import pytest
 import torch
 from PIL import Image
 
-from sigmasplat.config import Config, InputConfig
+from paper_settings import InputConfig
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import RunError
 from sigmasplat.files import atomic
 from sigmasplat.files.json_files import to_json
+from sigmasplat.plugins.papers.base import BASE
 from sigmasplat.run_folder.runs import RunFolder
 
-CONFIG = replace(Config(), name="test", seed=7, input=InputConfig(width=160))
+CONFIG = replace(BASE, name="test", seed=7, input=InputConfig(width=160))
 
 
 @pytest.fixture
@@ -98,7 +99,7 @@ def test_overwriting_removes_only_the_files_of_a_run(run: RunFolder) -> None:
     run.log({"index": 0})
     run.write_image("view.png", Image.new("RGB", (4, 4)))
     (run.path / "notes.txt").write_text("mine")
-    again = RunFolder.create(run.path, Config(), "elsewhere", overwrite=True)
+    again = RunFolder.create(run.path, BASE, "elsewhere", overwrite=True)
     assert again.facts()["source"] == "elsewhere" and (run.path / "notes.txt").read_text() == "mine"
     assert not (run.path / "log.jsonl").exists() and not list(run.images.iterdir())
 
@@ -115,7 +116,7 @@ def test_overwriting_removes_loops_and_submaps_but_no_other_files(run: RunFolder
     run.write_loops([{"query": 7}])
     leave_submaps(run)
     assert len(run.submaps) == 1
-    again = RunFolder.create(run.path, Config(), "elsewhere", overwrite=True)
+    again = RunFolder.create(run.path, BASE, "elsewhere", overwrite=True)
     assert again.read_loops() == [] and len(again.submaps) == 0
     assert sorted(p.name for p in again.submaps.folder.iterdir()) == ["a.txt", "submap-mine.safetensors"]
 

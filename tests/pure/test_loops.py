@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from sigmasplat.config import Config, LoopConfig
+from paper_settings import LoopConfig
+from sigmasplat.config import Config
 from sigmasplat.data import se3
 from sigmasplat.data.atlas import Atlas
 from sigmasplat.data.camera import Camera

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from sigmasplat.config import RenderConfig
+from paper_settings import RenderConfig
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
 from sigmasplat.render import FieldRenderer, render

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from sigmasplat.config import Config, DensifyConfig, MappingConfig, RenderConfig, SeedConfig
+from paper_settings import DensifyConfig, MappingConfig, RenderConfig, SeedConfig
+from sigmasplat.config import Config
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import COLUMNS
 from sigmasplat.data.frame import Frame
@@ -105,7 +106,7 @@ def test_splats_that_contradict_readings_are_removed_when_the_last_step_is_made(
     """A wall that is seen at 1 m is an error if all readings say 2 m. It is faded at once and goes after the last step,
     whether the steps are divided or not; what owns no pixel stays."""
     seeding = replace(EVERY_PIXEL, opacity=0.95)
-    uncertain = DensifyConfig(uncertain_m2=0.025, faded_opacity=0.05)
+    uncertain = DensifyConfig(uncertain_m2=0.025)
     fit = replace(NO_FIT, iterations=2, every=5, prune_opacity=0.01, lr_means=0.0, lr_opacity_logits=0.0)
     counts = list[int]()
     for divided in (False, True):

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from sigmasplat.config import Config, DensifyConfig, MappingConfig, RenderConfig, SeedConfig
+from paper_settings import DensifyConfig, MappingConfig, RenderConfig, SeedConfig
+from sigmasplat.config import Config
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import COLUMNS, GaussianField
@@ -49,7 +50,7 @@ def shifted(x_m: float) -> np.ndarray:
     return se3.exp(np.array([x_m, 0.0, 0.0, 0.0, 0.0, 0.0]))
 
 
-def mapper(mapping: MappingConfig = FITTED, primitives: DensifyConfig | None = None, **seeding: Any) -> Mapper:
+def mapper(mapping: MappingConfig = FITTED, primitives: Any = None, **seeding: Any) -> Mapper:
     config = Config(mapping=mapping, primitives=primitives or DensifyConfig(), seeding=replace(SEEDS, **seeding))
     return Mapper(config, np.random.default_rng(0))
 

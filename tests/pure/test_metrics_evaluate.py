@@ -13,7 +13,7 @@ import torch
 from PIL import Image
 
 from lpips_weights import write_weights
-from sigmasplat.config import Config, FinalConfig, InputConfig
+from paper_settings import FinalConfig, InputConfig
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.component import Component
@@ -27,12 +27,13 @@ from sigmasplat.plugins.evaluation.evaluate import evaluate
 from sigmasplat.plugins.evaluation.metrics.lpips import Lpips
 from sigmasplat.plugins.evaluation.report.view_strips import data_uri, file_data_uri
 from sigmasplat.plugins.outputs.drawing.view_panels import FOOT, GAP, HEAD, PANEL_WIDTH
+from sigmasplat.plugins.papers.base import BASE
 from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.run_folder.submaps import DiskStore
 
 CAMERA = Camera(48, 36, 40.0, 40.0, 23.5, 17.5)
 FRAMES = 20
-CONFIG = replace(Config(), name="hand-made", input=InputConfig(max_depth_m=4.0))
+CONFIG = replace(BASE, name="hand-made", input=InputConfig(max_depth_m=4.0))
 
 
 class HandMade(Source):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sigmasplat.config import TrackingConfig
+from paper_settings import TrackingConfig
 from sigmasplat.data import se3
 from sigmasplat.fit.motion import AxisAngle, Parametrisation, QuaternionMotion, parametrisation
 

@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from sigmasplat.config import MovingConfig
+from paper_settings import MovingConfig
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.frame import Frame

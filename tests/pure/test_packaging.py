@@ -14,11 +14,12 @@ import pytest
 import sigmasplat
 from module_files import module_from
 from sigmasplat.cli import COMMANDS
-from sigmasplat.config.presets import list_presets
+from sigmasplat.config.presets import list_presets, presets_by_scene
 from sigmasplat.files.machine import package_version
 from sigmasplat.plugins.checks import installation
 
 ROOT = Path(__file__).parents[2]
+VARSPLAT = {name for name in [*list_presets(), *presets_by_scene()] if name.startswith("varsplat-")}
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 EXTRAS = PROJECT["project"]["optional-dependencies"]
 PYTHONS = [
@@ -254,7 +255,7 @@ def bash_script() -> str:
         (["doct"], {"doctor"}),
         ([""], set(COMMANDS) | {"-h", "--help"}),
         (["run", "--se"], {"--set", "--seed"}),
-        (["run", "--preset", "varsplat-"], {name for name in list_presets() if name.startswith("varsplat-")}),
+        (["run", "--preset", "varsplat-"], VARSPLAT),
         (["run", "some/fold"], set()),  # bash then offers files: `complete -o default`
         (["completion", "x"], set()),
     ],

@@ -7,7 +7,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from sigmasplat.config import FinalConfig
+from paper_settings import FinalConfig
 from sigmasplat.data import se3
 from sigmasplat.data.atlas import Atlas
 from sigmasplat.data.hops import UNKNOWN_HOP, Hop, TrackedHops

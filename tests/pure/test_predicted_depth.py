@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sigmasplat.config import Config, InputConfig
+from paper_settings import InputConfig
+from sigmasplat.config import Config
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.input.opening import open_source
 from sigmasplat.input.source import Subset

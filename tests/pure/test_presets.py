@@ -10,11 +10,13 @@ import pytest
 
 from changed_settings import changed_settings
 from sigmasplat.config import Config
-from sigmasplat.config.presets import FAMILIES, default_preset, list_presets, preset
+from sigmasplat.config.presets import FAMILIES, default_preset, list_presets, preset, presets_by_scene
 from sigmasplat.config.text import override
 from sigmasplat.errors import ConfigError
+from sigmasplat.plugins.papers.base import BASE
 
 DATASETS = ("replica", "tum", "scannet")
+EVERY = [*list_presets(), *presets_by_scene()]
 PAPER = [f"cgslam-{dataset}" for dataset in DATASETS]
 LIGHT = [f"cgslam-light-{dataset}" for dataset in DATASETS]
 LOOPS = [f"cgslam-loops-{dataset}" for dataset in DATASETS]
@@ -85,7 +87,6 @@ COMMON: dict[str, Any] = {
     "primitives.least_opacity": 15 / 255,
     "primitives.split_gradient": 0.002,
     "primitives.clone": True,
-    "primitives.most_radius_px": 0.0,
     "tracking.method": "adam",
     "tracking.parametrisation": "axis-angle",
     "tracking.first_iterations": 0,
@@ -124,7 +125,7 @@ def test_every_pixel_is_seeded_and_no_reading_is_removed() -> None:
 
 
 def test_a_faded_splat_is_still_drawn() -> None:
-    for config in map(preset, list_presets()):
+    for config in map(preset, EVERY):
         if config.primitives.uncertain_m2:
             assert config.render.alpha_min < config.primitives.faded_opacity
             assert config.mapping.prune_opacity < config.primitives.least_opacity < config.primitives.faded_opacity
@@ -195,7 +196,7 @@ def test_released_presets_share_the_settings_of_the_code() -> None:
 
 
 def test_presets_and_rows_of_the_table_match() -> None:
-    released = [name.partition("-released-") for name in list_presets() if "-released-" in name]
+    released = [name.partition("-released-") for name in presets_by_scene()]
     assert {scene for system, _, scene in released if system == "cgslam"} == set(SCENES)
     assert {scene for system, _, scene in released if system == "varsplat"} == set(VARSPLAT_SCENES)
 
@@ -352,7 +353,7 @@ def test_loops_are_those_of_the_other_system_and_the_rest_stays() -> None:
 
 def test_fast_is_one_map_without_variance() -> None:
     fast, like = preset("cgslam-fast"), preset("varsplat-fast")
-    assert fast.submaps == Config().submaps and not fast.loops.close and fast.final.iterations == 0
+    assert fast.submaps == BASE.submaps and not fast.loops.close and fast.final.iterations == 0
     assert (fast.mapping.weight_nll_color, fast.mapping.weight_nll_depth) == (0.0, 0.0)
     assert fast.tracking.uncertainty and fast.tracking.align_depth_by == "U"
     assert (fast.input, fast.seeding, fast.render) == (like.input, like.seeding, like.render)
@@ -386,7 +387,7 @@ def test_sigma_adds_to_fast_and_removes_nothing() -> None:
 
 
 def test_saved_presets_come_back(tmp_path: Path) -> None:
-    for name in list_presets():
+    for name in EVERY:
         config = preset(name)
         assert config.name == name
         config.save(tmp_path / "config.json")
@@ -396,7 +397,7 @@ def test_saved_presets_come_back(tmp_path: Path) -> None:
 def test_the_values_of_presets_are_allowed() -> None:
     """Each value has the type of its setting, is one of its words, and is not negative: an override accepts it."""
     default, wrong = Config(), list[str]()
-    for config in map(preset, list_presets()):
+    for config in map(preset, EVERY):
         for section in (
             f.name for f in dataclasses.fields(Config) if dataclasses.is_dataclass(getattr(config, f.name))
         ):
@@ -410,10 +411,30 @@ def test_the_values_of_presets_are_allowed() -> None:
 
 def test_families_are_few_and_leave_no_preset_out() -> None:
     assert FAMILIES[0] == default_preset() in list_presets() and len(FAMILIES) == 4
-    for name in list_presets():
+    for name in EVERY:
         assert sum(fnmatchcase(name, family) for family in FAMILIES) == 1, name
     for family in FAMILIES:
         assert any(fnmatchcase(name, family) for name in list_presets()), family
+
+
+def test_the_default_settings_are_those_of_the_default_preset() -> None:
+    assert dataclasses.replace(Config(), name="sigma") == preset("sigma") == preset(default_preset())
+
+
+def test_a_scene_is_looked_up_in_the_table_of_its_code() -> None:
+    assert preset("varsplat-released:room0") == preset("varsplat-released-room0")
+    assert preset("varsplat-released:room0").name == "varsplat-released-room0"
+    for name, message in (
+        ("varsplat-released", "no scene in preset varsplat-released-SCENE; known: room0, room1, "),
+        ("varsplat-released:rom0", "no scene 'rom0' (did you mean room"),
+        (
+            "cgslam-released-room0",
+            "no scene 'room0' (did you mean fr1-room?) in preset cgslam-released-SCENE; known: replica, ",
+        ),
+    ):
+        with pytest.raises(ConfigError) as problem:
+            preset(name)
+        assert str(problem.value).startswith(message) and "\n" not in str(problem.value)
 
 
 @pytest.mark.parametrize(
@@ -423,7 +444,7 @@ def test_families_are_few_and_leave_no_preset_out() -> None:
         ("fr1-desk", "no preset 'fr1-desk'; known: cgslam-released-fr1-desk, varsplat-released-fr1-desk (and "),
         ("cgslam-loops", "no preset 'cgslam-loops'; known: cgslam-loops-fast, cgslam-loops-replica, "),
         ("varsplat-fst", "no preset 'varsplat-fst' (did you mean varsplat-fast?); known: cgslam-fast, "),
-        ("quick", f"no preset 'quick'; known: {', '.join(list_presets())}"),
+        ("quick", f"no preset 'quick'; known: {', '.join(list_presets())}, cgslam-released-SCENE, "),
     ],
 )
 def test_an_unknown_preset_suggests_similar_ones(name: str, message: str) -> None:
@@ -448,16 +469,12 @@ NEW = [
     "tracking.outlier_factor_color",
     "tracking.average",
     "tracking.align_depth_by",
-    "tracking.variance",
-    "loops.variance",
-    "registration.variance",
-    "final.variance",
 ]
 
 
 def test_the_earlier_systems_use_nothing_of_this_one() -> None:
-    """Their runs stay what they were: every setting that came with CG-SLAM is at its default, which is off."""
-    default = Config()
+    """Their runs stay what they were: every setting that came with CG-SLAM is off."""
+    default = BASE
     for system, dataset in itertools.product(("varsplat", "loopsplat"), (*DATASETS, "fast")):
         config = preset(f"{system}-{dataset}")
         assert changed_settings(config, default).isdisjoint(NEW), config.name

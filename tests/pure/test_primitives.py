@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sigmasplat.config import MappingConfig, RenderConfig
+from paper_settings import MappingConfig, RenderConfig
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import COLUMNS, GaussianField

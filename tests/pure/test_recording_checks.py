@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter
 import bag_recordings
 import layouts
 from command_line import exit_code
-from sigmasplat.config import InputConfig
+from paper_settings import InputConfig
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.frame import Frame
 from sigmasplat.errors import SourceError

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sigmasplat.config import RecoveryConfig
+from paper_settings import RecoveryConfig
 from sigmasplat.data import se3
 from sigmasplat.data.atlas import Atlas
 from sigmasplat.data.camera import Camera

@@ -10,7 +10,8 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from sigmasplat.config import Config, RegistrationConfig, RenderConfig, SeedConfig, TrackingConfig
+from paper_settings import RegistrationConfig, RenderConfig, SeedConfig, TrackingConfig
+from sigmasplat.config import Config
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import COLUMNS, GaussianField

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from command_line import exit_code
-from sigmasplat.config import Config, InputConfig
+from paper_settings import InputConfig
 from sigmasplat.config.presets import preset
 from sigmasplat.config.scale import for_scene
 from sigmasplat.config.sensors import SENSORS, SensorModel, sensor_model
@@ -26,6 +26,7 @@ from sigmasplat.fit.target import Target
 from sigmasplat.input.calibration import read_calibration
 from sigmasplat.mapping.seeding import make_splats
 from sigmasplat.plugins.checks.depth import measure_noise
+from sigmasplat.plugins.papers.base import BASE
 from sigmasplat.tracking.prepared_frame import view_of, working_frame
 
 CAMERA = Camera(160, 120, 140.0, 140.0, 79.5, 59.5)
@@ -60,11 +61,8 @@ def test_a_model_is_named_or_spelled_and_everything_else_is_refused() -> None:
     for wrong in ("kinect", "z3:1", "z2", "z2:x", "z2:-1", "z2:nan", "edge:2", ""):
         with pytest.raises(ConfigError, match=r"input\.sensor"):
             InputConfig(sensor=wrong)
-    assert for_scene(Config(), 1.0, None, sensor="kinect-v1").input.sensor == "kinect-v1"
-    assert (
-        for_scene(Config().changed(input={"sensor": "generic"}), 1.0, None, sensor="kinect-v1").input.sensor
-        == "generic"
-    )
+    assert for_scene(BASE, 1.0, None, sensor="kinect-v1").input.sensor == "kinect-v1"
+    assert for_scene(BASE.changed(input={"sensor": "generic"}), 1.0, None, sensor="kinect-v1").input.sensor == "generic"
 
 
 def test_a_calibration_names_its_sensor(tmp_path: Path) -> None:

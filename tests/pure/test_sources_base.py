@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from sigmasplat.config import InputConfig
+from paper_settings import InputConfig
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.trajectory import Trajectory

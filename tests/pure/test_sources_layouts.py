@@ -9,7 +9,7 @@ from PIL import Image
 import layouts
 from documents import ROOT
 from layouts import FRAMES, LAYOUTS, SMALL_CAMERA, sample
-from sigmasplat.config import InputConfig
+from paper_settings import InputConfig
 from sigmasplat.data.camera import Camera
 from sigmasplat.input.opening import format_of, formats
 from sigmasplat.plugins.checks.recording import inspect_source

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from fake_realsense import Device, distortion
-from sigmasplat.config import InputConfig
+from paper_settings import InputConfig
 from sigmasplat.errors import RunError, SourceError
 from sigmasplat.input.recorded import depth_warning
 from sigmasplat.plugins.sources import SyntheticRoom, open_source

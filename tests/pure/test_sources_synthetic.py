@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from sigmasplat.config import InputConfig
+from paper_settings import InputConfig
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.errors import SourceError

@@ -9,7 +9,6 @@ from types import SimpleNamespace
 import pytest
 from PIL import Image
 
-from sigmasplat.config import Config
 from sigmasplat.config.presets import preset
 from sigmasplat.config.text import override, split_settings
 from sigmasplat.errors import RunError
@@ -24,6 +23,7 @@ from sigmasplat.plugins.evaluation.report.summary import (
 from sigmasplat.plugins.evaluation.report.tables import score_tables, state_rows
 from sigmasplat.plugins.evaluation.report.view_strips import PanelFigure, data_uri, file_data_uri
 from sigmasplat.plugins.outputs.floorplan.rescan import RescanRegion
+from sigmasplat.plugins.papers.base import BASE
 from sigmasplat.run_folder.runs import RunFolder
 
 GOOD = {
@@ -229,7 +229,7 @@ def test_tables_show_coverage_and_calibration_or_that_there_are_no_predicted_err
 
 
 def test_the_page_is_one_file(tmp_path) -> None:
-    run = RunFolder.create(tmp_path / "run", replace(Config(), name="made-up"), "kitchen")
+    run = RunFolder.create(tmp_path / "run", replace(BASE, name="made-up"), "kitchen")
     run.note(status="complete", source_path="data/kitchen")
     for version in ("light", "dark", "narrow-light", "narrow-dark"):
         run.write_image(f"trajectory-{version}.png", Image.new("RGB", (40, 30), (200, 60, 20)))

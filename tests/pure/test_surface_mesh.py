@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from box_room import CAMERA, CHEST, HIGH, LOW, PILLAR, cast, pose, seer, splats
-from sigmasplat.config import Config
-from sigmasplat.config.surface import SurfaceConfig
+from sigmasplat.config import SurfaceConfig
 from sigmasplat.data import se3
 from sigmasplat.data.mesh import Mesh
 from sigmasplat.data.submap import Picture
 from sigmasplat.errors import ConfigError
 from sigmasplat.final.fusion import FusionView, fuse, with_readings
 from sigmasplat.plugins.outputs.meshes.decimation import decimated
+from sigmasplat.plugins.papers.base import BASE
 from sigmasplat.render.mesh import mesh_depth
 
 VOXEL_M = 0.04
@@ -59,7 +59,7 @@ def test_a_room_is_closed_where_it_was_seen(with_pictures: bool) -> None:
     views = list(readings(np.random.default_rng(0)))
     if not with_pictures:
         views = [FusionView(v.field, v.camera, v.T_camera_field, v.T_world_camera) for v in views]
-    mesh = fuse(views, len(views), Config(), voxel_m=VOXEL_M, renderer=seer(np.eye(4)))
+    mesh = fuse(views, len(views), BASE, voxel_m=VOXEL_M, renderer=seer(np.eye(4)))
     share, error_m = coverage(mesh)
     assert share > 0.998 and error_m < 0.01
     inside = (mesh.vertices > LOW - VOXEL_M) & (mesh.vertices < HIGH + VOXEL_M)
@@ -70,7 +70,7 @@ def test_a_reading_corrects_a_map_that_is_off() -> None:
     """The renderer of a room without its chest stands for a wrong map: the readings see the chest."""
     views = list(readings(np.random.default_rng(1), noise_m=0.005))
     wrong = seer(np.eye(4), boxes=(PILLAR,))
-    mesh = fuse(views, len(views), Config(), voxel_m=VOXEL_M, renderer=wrong)
+    mesh = fuse(views, len(views), BASE, voxel_m=VOXEL_M, renderer=wrong)
     top = CHEST[1][2]
     above = (np.abs(mesh.vertices[:, 2] - top) < 0.02) & (mesh.vertices[:, 0] < CHEST[1][0] - VOXEL_M)
     assert above.sum() > 30

@@ -14,6 +14,7 @@ from sigmasplat.plugins.batch.definition import MEAN, Cell, Score, Table
 from sigmasplat.plugins.batch.executor import DataRoots
 from sigmasplat.plugins.batch.job import Job
 from sigmasplat.plugins.batch.scores import OURS, PAPER, Written, rows
+from sigmasplat.plugins.papers.base import BASE
 from sigmasplat.plugins.papers.table_files import list_tables
 
 WANTED = {
@@ -123,7 +124,7 @@ def test_text_of_a_table(table: Table) -> None:
 
 
 def test_scenes_are_found_in_the_folders_of_a_table(tmp_path: Path) -> None:
-    job = Job("x", ("room0", "Replica/room0"), Config())
+    job = Job("x", ("room0", "Replica/room0"), BASE)
     with pytest.raises(SourceError, match="no room0 in"):
         job.sequence(str(tmp_path))
     (tmp_path / "Replica/room0").mkdir(parents=True)

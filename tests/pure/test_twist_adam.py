@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from sigmasplat.config import MappingConfig, RenderConfig
+from paper_settings import MappingConfig, RenderConfig
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField

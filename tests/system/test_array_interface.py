@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 import torch
 
+from paper_settings import InputConfig
 from recorded_room import write_images
 from schedules import AtOnce, Drawn
 from sigmasplat import Camera, Slam, open_source
-from sigmasplat.config import Config, InputConfig
+from sigmasplat.config import Config
 from sigmasplat.config.presets import default_preset, preset
 from sigmasplat.config.text import override
 from sigmasplat.data import se3

@@ -12,8 +12,8 @@ from PIL import Image
 
 from command_line import exit_code
 from depth_networks import weighted
+from paper_settings import InputConfig
 from run_process import lines, wait_for
-from sigmasplat.config import InputConfig
 from sigmasplat.data.frame_arrays import color_from_bytes
 from sigmasplat.plugins.predicted_depth.depth_model import DepthModel
 from sigmasplat.plugins.sources import open_source

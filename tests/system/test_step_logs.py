@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from command_line import exit_code
-from sigmasplat.config import Config
+from sigmasplat.plugins.papers.base import BASE
 from sigmasplat.run import step_logs
 from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.slam.step_result import Step
@@ -44,7 +44,7 @@ def test_csv_has_the_values_of_the_log(tmp_path: Path) -> None:
 
 
 def test_a_resumed_run_replaces_the_lines_after_its_state(tmp_path: Path) -> None:
-    found = RunFolder.create(tmp_path / "run", Config(), "room")
+    found = RunFolder.create(tmp_path / "run", BASE, "room")
     whole = run(tmp_path / "whole")
     lines = whole.read_log()
     with step_logs.step_logs(["csv"], found) as (log,):

@@ -12,7 +12,7 @@ import torch
 import trimesh
 
 from command_line import exit_code
-from sigmasplat.config import Config, InputConfig
+from paper_settings import InputConfig
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
@@ -26,12 +26,13 @@ from sigmasplat.plugins.evaluation.evaluate import evaluate
 from sigmasplat.plugins.evaluation.metrics.reconstruction import distances
 from sigmasplat.plugins.evaluation.reconstruct import FusionInput
 from sigmasplat.plugins.outputs.meshes.mesh_files import read_mesh
+from sigmasplat.plugins.papers.base import BASE
 from sigmasplat.plugins.sources import SyntheticRoom, open_source
 from sigmasplat.run_folder.runs import RunFolder
 
 CAMERA = Camera(96, 72, 80.0, 80.0, 47.5, 35.5)
 """The run works at half this size."""
-CONFIG = replace(Config(), name="hand-made", input=InputConfig(width=48, max_depth_m=4.0))
+CONFIG = replace(BASE, name="hand-made", input=InputConfig(width=48, max_depth_m=4.0))
 KEYFRAMES, WALL_M, VOXEL_M = [0, 2, 4], 2.0, 0.05
 WORLD = se3.exp(np.array([5.0, 6, 7, 0.5, 1.0, 1.5]))
 

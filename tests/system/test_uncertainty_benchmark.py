@@ -41,7 +41,7 @@ from uncertainty_scores import (
 from unseen_views import held_back_views
 from view_predictors import PREDICTORS, see
 
-from sigmasplat.config import RenderConfig
+from paper_settings import RenderConfig
 from sigmasplat.config.presets import preset
 from sigmasplat.config.text import override
 from sigmasplat.data import se3

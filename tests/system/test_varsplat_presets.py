@@ -7,12 +7,14 @@ import numpy as np
 import pytest
 
 from sigmasplat.config import Config
-from sigmasplat.config.presets import list_presets, preset
+from sigmasplat.config.presets import list_presets, preset, presets_by_scene
 from sigmasplat.config.text import override
 from sigmasplat.slam.slam import Slam
 from small_room import frames
 
-NAMES = [name for name in list_presets() if name.startswith("varsplat-released-") or name.endswith("-scannetpp")]
+NAMES = [name for name in presets_by_scene() if name.startswith("varsplat-")]
+NAMES += [name for name in list_presets() if name.endswith("-scannetpp")]
+
 SHORT = {
     "input.width": "48", "input.crop_px": "0", "mapping.every": "1", "mapping.first_iterations": "12",
     "mapping.iterations": "6", "tracking.iterations": "6", "submaps.frames": "2", "loops.min_interval": "1",

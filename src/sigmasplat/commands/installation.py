@@ -4,7 +4,7 @@ import subprocess
 import sys
 
 from sigmasplat.commands import options
-from sigmasplat.config.presets import list_presets
+from sigmasplat.config.presets import list_presets, presets_by_scene
 
 OK, UNHEALTHY = 0, 1
 
@@ -48,5 +48,5 @@ def completion(shell: options.Shell) -> int:
     command = [sys.executable, "-m", "sigmasplat", "--tyro-print-completion", shell]
     print(subprocess.run(command, capture_output=True, text=True, check=True).stdout, end="")
     if shell == "bash":
-        print(BASH.format(presets=" ".join(list_presets())), end="")
+        print(BASH.format(presets=" ".join([*list_presets(), *presets_by_scene()])), end="")
     return 0

@@ -155,16 +155,16 @@ def configured(
     like: Config | None = None,
 ) -> Config:  # fmt: skip
     """Return a preset's settings, changed by --set, the input options and --seed; with `like`, working images are made
-    as in these settings unless --set says otherwise. Raises ConfigError, also if settings exclude each other."""
+    as in these settings unless --set says otherwise. Raises ConfigError."""
     given = (working_images(like) if like else {}) | split_settings(settings) | input_options.settings()
     config = override(preset_of(preset), given)
-    return (config if seed is None else override(config, {"seed": str(seed)})).checked()
+    return config if seed is None else override(config, {"seed": str(seed)})
 
 
 def working_images(config: Config) -> dict[str, str]:
     """Return the default settings of the input, but with the size and depth range of the images of `config`."""
     kept = {name: getattr(config.input, name) for name in ("width", "crop_px", "min_depth_m", "max_depth_m")}
-    return {f"input.{name}": str(value) for name, value in (asdict(InputConfig()) | kept).items()}
+    return {f"input.{name}": str(value) for name, value in (asdict(InputConfig(denoise_depth=False)) | kept).items()}
 
 
 def source_of(folder: "RunFolder", moved_to: str | None) -> "Source":

@@ -3,22 +3,24 @@
 
 import dataclasses
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, get_origin
 
-from sigmasplat.config.densify import DensifyConfig
-from sigmasplat.config.features import FeatureConfig
-from sigmasplat.config.frames import MappingConfig, RenderConfig, SeedConfig, TrackingConfig
+from sigmasplat.config.frames import DensifyConfig, MappingConfig, RenderConfig, SeedConfig, TrackingConfig
 from sigmasplat.config.input import RECORDED_POSES, InputConfig
-from sigmasplat.config.moving import MovingConfig
 from sigmasplat.config.ranges import Count, Section, kinds_of, problems_of, refuse, shown
-from sigmasplat.config.real_time import RealTimeConfig
-from sigmasplat.config.recovery import RecoveryConfig
+from sigmasplat.config.run import (
+    FeatureConfig,
+    MovingConfig,
+    RealTimeConfig,
+    RecoveryConfig,
+    SurfaceConfig,
+    UncertaintyConfig,
+)
 from sigmasplat.config.submaps import FinalConfig, LoopConfig, RegistrationConfig, SubmapConfig
-from sigmasplat.config.surface import SurfaceConfig
-from sigmasplat.config.uncertainty import UncertaintyConfig
 from sigmasplat.errors import ConfigError
 from sigmasplat.files.reading import read_json
 from sigmasplat.registry import Backend, named
@@ -67,18 +69,14 @@ class Config:
         others = [name for name, section in SECTIONS.items() if not isinstance(getattr(self, name), section)]
         sections = (f"{name} must be an object of settings, found {shown(getattr(self, name))}" for name in others)
         refuse([*problems_of(self), *sections])
+        asked = self.backend
+        if asked not in OWN_BACKENDS:
+            named((Backend,), asked)
 
     def changed(self, **sections: Mapping[str, Any]) -> "Config":
         """Return the settings with some values replaced, as in config.changed(mapping={"every": 5})."""
         new = {name: dataclasses.replace(getattr(self, name), **values) for name, values in sections.items()}
         return dataclasses.replace(self, **new)
-
-    def checked(self) -> "Config":
-        """Return the settings. Raises ConfigError if no backend has the name that they ask for."""
-        asked = self.backend
-        if asked not in OWN_BACKENDS:
-            named((Backend,), asked)
-        return self
 
     def to_dict(self) -> dict[str, Any]:
         """Return the settings as nested dicts, as in a run's config.json."""
@@ -99,8 +97,8 @@ class Config:
                 problems.append(f"unknown setting {name!r} (known: {', '.join(sorted(known))})")
             elif name in SECTIONS and isinstance(value, dict):
                 names = kinds_of(SECTIONS[name])
-                unknown = sorted(set(value) - set(names))
-                problems += [f"unknown setting {name}.{key} (known: {', '.join(sorted(names))})" for key in unknown]
+                for key in sorted(set(value) - set(names)):
+                    problems += _unknown(f"{name}.{key}", value[key], names, _scale(values))
                 try:
                     found[name] = SECTIONS[name](**{key: item for key, item in value.items() if key in names})
                 except ConfigError as problem:
@@ -124,6 +122,56 @@ class Config:
             raise ConfigError(f"{path}: {problem}") from problem
 
 
+def _unknown(name: str, value: object, known: Iterable[str], scale: float) -> list[str]:
+    """Return what is wrong with a saved value of a setting that is not a setting: nothing if it is the value that
+    every run has now, or this length in a scene of another scale."""
+    if name not in gone():
+        return [f"unknown setting {name} (known: {', '.join(sorted(known))})"]
+    only = gone()[name]
+    same = value == only or (isinstance(only, float) and name.endswith("_m") and value == only * scale)
+    return [] if same else [f"{said_gone(name)}, found {shown(value)}"]
+
+
+def _scale(values: Mapping[str, Any]) -> float:
+    """Return the scale of the scene in saved settings."""
+    render = values.get("render")
+    scale = render.get("scene_scale") if isinstance(render, dict) else None
+    return scale if isinstance(scale, float) else 1.0
+
+
+def said_gone(name: str) -> str:
+    """Return what to say about a setting that is gone."""
+    return f"setting {name} is gone: its value is always {gone()[name]}"
+
+
+def _is_constant(type_: Any) -> bool:
+    origin: object = get_origin(type_)
+    return origin is ClassVar
+
+
+@cache
+def gone() -> dict[str, object]:
+    """Return the settings of earlier versions that are constants now, or of methods that are gone, with the value that
+    every run has now."""
+    constants = {
+        f"{section}.{name}": getattr(kind, name)
+        for section, kind in SECTIONS.items()
+        for name, type_ in kind.__annotations__.items()
+        if _is_constant(type_)
+    }
+    return constants | GONE
+
+
+GONE: dict[str, object] = {
+    "render.depth_gate_m": 0.0, "render.mean_pose_gradient": True, "render.depth_pose_gradient": True,
+    "render.color_pose_gradient": True, "seeding.voxel_m": 0.0, "seeding.voxel_most": 8,
+    "seeding.sensor_noise": False, "mapping.color_covariance": "diagonal", "mapping.keyframe_history": 0,
+    "primitives.uncertain_by": "centre", "primitives.most_radius_px": 0.0, "tracking.align_to": "keyframe",
+    "tracking.update_stop": 0.0, "tracking.variance": "published", "submaps.variance_sum": 0.0,
+    "loops.variance": "published", "registration.variance": "published", "final.variance": "published",
+    "surface.sensor_noise": False,
+}  # fmt: skip
+"""Settings of methods that are gone, with the value that was their absence."""
 SECTIONS: dict[str, type[Section]] = {
     f.name: f.type for f in dataclasses.fields(Config) if isinstance(f.type, type) and issubclass(f.type, Section)
 }

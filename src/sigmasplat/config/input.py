@@ -88,7 +88,7 @@ class InputConfig(Section, name="input"):
     camera."""
     undistort: bool = True
     """Whether lens distortion is removed, if it is known."""
-    width: Annotated[int, WIDTHS_PX] = 0
+    width: Annotated[int, WIDTHS_PX] = 320  # a quarter of the pixels of 640×480, which determine the cost of rendering
     """Width of the working images in pixels, height in proportion; 0 = as in the source."""
     crop_px: Count = 0
     """Pixels removed at each edge after resizing, for undistorted images or sensors without depth at the edges."""
@@ -107,7 +107,7 @@ class InputConfig(Section, name="input"):
     """Model of the standard deviation of depth readings: kinect-v1, realsense-stereo, lidar-iphone, time-of-flight;
     generic = the law of `render.depth_noise_per_m`; or a model as in `base:0.001,z2:0.0015` (parts: base, z1, z2, edge,
     grazing, most). auto = that of the sensor if the source knows it, otherwise generic. `inspect` measures one."""
-    denoise_depth: bool = False
+    denoise_depth: bool = True
     """Whether depth images that are noisier than those of a structured-light sensor are smoothed."""
 
     @property

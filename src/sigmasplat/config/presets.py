@@ -12,25 +12,42 @@ FAMILIES = ("sigma", "cgslam-*", "loopsplat-*", "varsplat-*")
 """The names of all presets in short, the default first: a name, or a pattern for several names."""
 
 
-def _presets() -> dict[str, Preset]:
-    return {row.name: row for row in rows(Preset)}
-
-
 def default_preset() -> str:
     """Return the name of the default preset, which is sized for a machine without a GPU."""
     return "sigma"
 
 
 def list_presets() -> list[str]:
-    """List the names of all presets."""
-    return sorted(_presets())
+    """List the names of all presets that need no scene; `presets_by_scene` lists the others."""
+    return sorted(row.name for row in rows(Preset) if row.scenes is None)
+
+
+def presets_by_scene() -> list[str]:
+    """List the names of presets with a scene, as in `varsplat-released-room0`."""
+    return [f"{row.name}-{scene}" for row in rows(Preset) if row.scenes is not None for scene in row.scenes()]
+
+
+def is_preset(name: str) -> bool:
+    """Return whether there is a preset of this name, with a scene if it needs one."""
+    return name in list_presets() or name.replace(":", "-", 1) in presets_by_scene()
 
 
 def preset(name: str) -> Config:
-    """Return the settings of a preset. Raises ConfigError on an unknown name, with similar names or all names."""
-    if name not in _presets():
-        raise ConfigError(f"no preset {name!r}{_similar(name) or _all(name)}")
-    return dataclasses.replace(_presets()[name].make(), name=name)
+    """Return the settings of a preset; a scene follows its name, as in `varsplat-released:room0`. Raises ConfigError on
+    an unknown name, with similar names or all names, and on an unknown scene, with all scenes."""
+    name = name.replace(":", "-", 1)
+    if name == default_preset():
+        return _named(Config(), name)
+    for row in rows(Preset):
+        if row.scenes is None and name == row.name:
+            return _named(row.make(), name)
+        if row.scenes is not None and f"{name}-".startswith(f"{row.name}-"):
+            return _named(row.make(name[len(row.name) + 1 :]), name)
+    raise ConfigError(f"no preset {name!r}{_similar(name) or _all(name)}")
+
+
+def _named(config: Config, name: str) -> Config:
+    return dataclasses.replace(config, name=name)
 
 
 def configured(config: Config | str | None, settings: Mapping[str, object] | None = None) -> Config:
@@ -47,10 +64,12 @@ def configured(config: Config | str | None, settings: Mapping[str, object] | Non
 
 def _similar(name: str) -> str:
     """Return text with the presets that begin or end with a name, "" if there are none."""
-    similar = [known for known in list_presets() if known.endswith(f"-{name}") or known.startswith(f"{name}-")]
-    return f"; known: {', '.join(similar)} (and {len(_presets()) - len(similar)} others)" if similar else ""
+    every = [*list_presets(), *presets_by_scene()]
+    similar = [known for known in every if known.endswith(f"-{name}") or known.startswith(f"{name}-")]
+    return f"; known: {', '.join(similar)} (and {len(every) - len(similar)} others)" if similar else ""
 
 
 def _all(name: str) -> str:
     """Return text with the preset closest to a name, and all presets."""
-    return f"{nearest(name, _presets())}; known: {', '.join(list_presets())}"
+    known = [*list_presets(), *(f"{row.name}-SCENE" for row in rows(Preset) if row.scenes is not None)]
+    return f"{nearest(name, known)}; known: {', '.join(known)}"

@@ -18,7 +18,7 @@ POWERS = {
     "tracking": {"lr_translation": 1},
     "submaps": {"distance_m": 1, "uncertainty_m": 1},
     "loops": {"near_m": 1},
-    "registration": {"lr_translation": 1, "overlap_m": 1, "spread_m": 1},
+    "registration": {"lr_translation": 1},
     "final": {
         "lr_pose_translation": 1, "pose_reach_m": 1, "pose_reach_most_m": 1, "lr_means_last": 1, "spacing_m": 1,
         "merge_m": 1,

@@ -200,24 +200,24 @@ class Registrar:
     def _judge(
         self, a: Submap, b: Submap, found: Sequence[Localisation], centre_b: Matrix, T_a_b: Matrix
     ) -> Registration:
-        c = self.config
+        c, scale = self.config, self.view.options.scene_scale
         good = [f for f in found if f.agreement >= c.agreement_least and f.agreement * f.overlap >= c.share_least]
         good = [f for f in good if f.comparison is None or confirmed(f.comparison)]
         if len(good) < 2:
             best = max(f.agreement * f.overlap for f in found)
             why = f"{len(good)} of {len(found)} keyframes were localised (the best explains {best:.0%})"
             return refused(T_a_b, found, len(good), why)
-        agreed = consensus(good, centre_b, c.spread_m, np.deg2rad(c.spread_deg))
+        agreed = consensus(good, centre_b, c.spread_m * scale, np.deg2rad(c.spread_deg))
         if len(agreed) < 2:
             return refused(T_a_b, good, len(agreed), f"the poses of {len(good)} keyframes disagree")
         if self._aligns_to_keyframes and not any(f.at_keyframe for f in agreed):
             return refused(T_a_b, agreed, len(agreed), f"only maps agree with {len(agreed)} keyframes, no image does")
         mean = combined(agreed)
-        overlap = shared(a, b, mean, c.overlap_m)
+        overlap = shared(a, b, mean, c.overlap_m * scale)
         if overlap < c.overlap_least:
             return refused(T_a_b, agreed, len(agreed), f"overlap {overlap:.2f} is below {c.overlap_least}", overlap)
         residual = float(np.mean([f.residual for f in agreed]))
-        scale, keyframes = self.view.options.scene_scale, min(agreed, key=lambda f: f.residual).keyframes
+        keyframes = min(agreed, key=lambda f: f.residual).keyframes
         drift = drift_between(a, b, keyframes, mean, scale)
         information = symmetric(np.asarray(np.linalg.inv(mean_covariance(agreed, mean, scale) + drift)))
         return Registration(mean, information, residual, len(agreed), overlap, True, "accepted", keyframes, drift)

@@ -107,7 +107,7 @@ def open_source(path: str | Path, settings: InputConfig | None = None, **changes
     Raises SourceError if the path does not exist, no format recognises it, or its content cannot be used;
     ConfigError on an unknown setting.
     """
-    chosen = with_changes(settings or InputConfig(), changes)
+    chosen = with_changes(settings or InputConfig(width=0), changes)
     predicted = chosen.predicted_depth or chosen.depth_model
     source = _with_predicted_depth(path, chosen) if predicted else _recorded(path, chosen)
     with _guarded(path):

@@ -28,6 +28,7 @@ from sigmasplat.data.map_uncertainty import (
 )
 from sigmasplat.render.backend import on_device
 from sigmasplat.render.blended_values import BlendedValues, blend_values
+from sigmasplat.render.render import CENTER
 
 NEW_ANGLE = 0.004
 """1 − cos 5°: at this distance from the directions that a splat was seen from, half of it counts as extrapolated."""
@@ -196,7 +197,7 @@ def predict(
 ) -> Predicted:
     """Predict the variance of colour and depth of a map at a pose (4×4). Raises BackendError as `render` does."""
     known = uncertainty.splats, uncertainty.background
-    parts = variance_parts(field, *known, camera, T_camera_map, options or RenderConfig(), backend)
+    parts = variance_parts(field, *known, camera, T_camera_map, options or CENTER, backend)
     return predicted(parts, uncertainty.calibration)
 
 

@@ -18,6 +18,9 @@ from sigmasplat.render.low_pass import as_refined
 from sigmasplat.render.ray_depth import depth_at, depth_of, plane_features
 from sigmasplat.render.reference.operators import depth_slopes
 
+CENTER = RenderConfig(depth="center")
+"""The options of a render if none are given: depths of centres, which every backend has."""
+
 
 @dataclass(frozen=True, eq=False)
 class Render:
@@ -67,7 +70,7 @@ def render(
     depths, and the viewing directions of `harmonics`. Raises BackendError if the backend is not available.
     """
     kernels, name = backend_module(backend, field.params.device), backend_name(backend, field.params.device)
-    options = options_on(name, options or RenderConfig())
+    options = options_on(name, options or CENTER)
     field = on_device(field, backend)
     T = torch.as_tensor(T_camera_world)
     p = kernels.project(field.means, field.quats, field.scales, T, camera, options)

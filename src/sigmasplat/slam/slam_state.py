@@ -62,7 +62,7 @@ class SlamState:
         *,
         settings: Mapping[str, object] | None = None,
     ) -> None:
-        self.config = configured(config, settings).checked()
+        self.config = configured(config, settings)
         self.filtered = frame_filter(self.config.input.filters)
         self.random = np.random.default_rng(self.config.seed)
         self.store = MemoryStore() if store is None else store

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any, get_args, get_origin, get_type_hints
 
 from sigmasplat.config import Config
-from sigmasplat.config.presets import list_presets, preset
+from sigmasplat.config.presets import list_presets, preset, presets_by_scene
 from sigmasplat.config.text import override
 from sigmasplat.errors import ConfigError, nearest
 from sigmasplat.files.reading import guarded
@@ -121,7 +121,8 @@ class Table:
         Raises ConfigError on an unknown name.
         """
         of_table = {system.name: system for system in self.systems}
-        known = of_table | {name: System(name, name) for name in list_presets() if name not in of_table}
+        presets = [*list_presets(), *presets_by_scene()]
+        known = of_table | {name: System(name, name) for name in presets if name not in of_table}
         for name in names:
             if name not in known:
                 there = f"{', '.join(of_table)}, and all presets"

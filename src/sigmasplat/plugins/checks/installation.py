@@ -145,7 +145,7 @@ def _picture(backend: Any, device: Any = "cpu") -> Any:
 
     random = torch.Generator().manual_seed(0)
     means, shapes, quats, colors = (torch.rand(300, n, generator=random).to(device) for n in (3, 3, 4, 3))
-    camera, options = Camera(64, 48, 60.0, 60.0, 31.5, 23.5), RenderConfig()
+    camera, options = Camera(64, 48, 60.0, 60.0, 31.5, 23.5), RenderConfig(depth="center")
     means = (means - 0.5) * means.new_tensor([3.0, 2.0, 2.0]) + means.new_tensor([0.0, 0.0, 2.0])
     seen = backend.project(means, quats - 0.5, 0.01 + 0.1 * shapes, torch.eye(4), camera, options)
     blended = backend.blend(*seen[:4], 0.2 + 0.7 * colors[:, 0], colors, None, camera, options)

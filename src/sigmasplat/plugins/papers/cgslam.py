@@ -11,72 +11,63 @@ Ours: `primitives.faded_opacity`, and the steps at which uncertain splats fade a
 
 import dataclasses
 
-from sigmasplat.config import (
-    Config,
-    DensifyConfig,
-    FinalConfig,
-    InputConfig,
-    LoopConfig,
-    MappingConfig,
-    RegistrationConfig,
-    RenderConfig,
-    SeedConfig,
-    SubmapConfig,
-    TrackingConfig,
-)
+from sigmasplat.config import Config
 from sigmasplat.plugins.papers import varsplat
+from sigmasplat.plugins.papers.base import BASE
 
-PAPER = Config(
-    input=InputConfig(min_depth_m=0.0),  # as in the code, no reading is removed
-    render=RenderConfig(alpha_min=15.0 / 255.0, near_m=0.2),
-    seeding=SeedConfig(
-        first_uniform=10_000_000,  # more than the number of pixels of any image: selects every pixel with a reading
-        first_gradient=0,
-        first_edges=False,
-        later_max=0,
-        alpha_below=0.5,
-        depth_error_factor=0.0,
-        min_distance_m=0.0,
-        opacity=0.5,
-        push_back=1.0,
-    ),
-    mapping=MappingConfig(
-        first_iterations=1500,
-        weight_ssim=0.1,
-        weight_isotropy=0.0,
-        weight_isotropy_ratio=0.1,
-        weight_nll_color=0.0,
-        weight_nll_depth=0.0,
-        lr_quats=1e-3,
-        lr_opacity_logits=0.05,
-        lr_colors=2.5e-3,
-        lr_pose_translation=2.15e-3,
-        lr_pose_rotation=1.5e-3,
-        poses="all",
-        poses_from="half",
-        prune_opacity=0.005,
-        window=4,
-        covisibility="splats",  # paper (for its speed) and code use NetVLAD, whose weights are a download
-        frames_per_step=0,
-    ),
-    primitives=DensifyConfig(
-        uncertain_m2=0.025, faded_opacity=0.07, least_opacity=15.0 / 255.0, split_gradient=0.002, clone=True
-    ),
-    tracking=TrackingConfig(
-        parametrisation="axis-angle",
-        lr_rotation=1.5e-3,
-        lr_translation=2.15e-3,
-        uncertainty=False,
-        alpha_power=0.0,
-        alpha_above=0.99,
-        outlier_factor=10.0,
-        outlier_factor_color=10.0,
-        average="kept",
-    ),
-    submaps=SubmapConfig(),
-    loops=LoopConfig(close=False, uncertainty=False),
-    registration=RegistrationConfig(uncertainty=False),
-    final=FinalConfig(uncertainty=False),
+PAPER = BASE.changed(
+    input={"min_depth_m": 0.0},  # as in the code, no reading is removed
+    render={"alpha_min": 15.0 / 255.0, "near_m": 0.2},
+    seeding={
+        "first_uniform": 10_000_000,  # more than the number of pixels of any image: selects every pixel with a reading
+        "first_gradient": 0,
+        "first_edges": False,
+        "later_max": 0,
+        "alpha_below": 0.5,
+        "depth_error_factor": 0.0,
+        "min_distance_m": 0.0,
+        "opacity": 0.5,
+        "push_back": 1.0,
+    },
+    mapping={
+        "first_iterations": 1500,
+        "weight_ssim": 0.1,
+        "weight_isotropy": 0.0,
+        "weight_isotropy_ratio": 0.1,
+        "weight_nll_color": 0.0,
+        "weight_nll_depth": 0.0,
+        "lr_quats": 1e-3,
+        "lr_opacity_logits": 0.05,
+        "lr_colors": 2.5e-3,
+        "lr_pose_translation": 2.15e-3,
+        "lr_pose_rotation": 1.5e-3,
+        "poses": "all",
+        "poses_from": "half",
+        "prune_opacity": 0.005,
+        "window": 4,
+        "covisibility": "splats",  # paper (for its speed) and code use NetVLAD, whose weights are a download
+        "frames_per_step": 0,
+    },
+    primitives={
+        "uncertain_m2": 0.025,
+        "split_gradient": 0.002,
+        "clone": True,
+    },
+    tracking={
+        "parametrisation": "axis-angle",
+        "lr_rotation": 1.5e-3,
+        "lr_translation": 2.15e-3,
+        "uncertainty": False,
+        "alpha_power": 0.0,
+        "alpha_above": 0.99,
+        "outlier_factor": 10.0,
+        "outlier_factor_color": 10.0,
+        "average": "kept",
+    },
+    submaps={},
+    loops={"close": False, "uncertainty": False},
+    registration={"uncertainty": False},
+    final={"uncertainty": False},
 )
 """The settings that all data sets share."""
 
@@ -142,7 +133,7 @@ FAST = dataclasses.replace(
             "weight_isotropy": 0.0, "weight_isotropy_ratio": 0.1, "weight_moment": 0.15, "poses": "all",
             "poses_from": "half", "window": 4, "covisibility": "splats", "frames_per_step": 1,
         },
-        primitives={"uncertain_m2": 0.025, "faded_opacity": 0.07},
+        primitives={"uncertain_m2": 0.025},
         tracking={"align_depth_by": "U", "uncertainty": True},
     ),
     submaps=PAPER.submaps, loops=PAPER.loops, registration=PAPER.registration, final=PAPER.final,

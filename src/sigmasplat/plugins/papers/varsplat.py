@@ -1,38 +1,26 @@
 """Presets of VarSplat and LoopSplat. Numbers that the papers do not give are those of the released code; methods that
-only the code has are in `varsplat_released`.
+only the code has are in `released`.
 
 `varsplat-*` follow VarSplat (arXiv 2603.09673) §2–3. `loopsplat-*` are the same without any uncertainty weight, which
 is the front end of LoopSplat (arXiv 2408.10154). `*-fast` are ours, sized for two CPU cores. Where each number comes
 from: docs/varsplat.md.
 """
 
-from sigmasplat.config import (
-    Config,
-    DensifyConfig,
-    FinalConfig,
-    InputConfig,
-    LoopConfig,
-    MappingConfig,
-    RegistrationConfig,
-    RenderConfig,
-    SeedConfig,
-    SubmapConfig,
-    TrackingConfig,
-)
+from sigmasplat.config import Config
+from sigmasplat.plugins.papers.base import BASE
 
 UNCERTAIN_M = 0.02
 """The rule of accumulated uncertainty is the paper's, the limit is ours."""
 
 # The settings that all data sets share. Neither the paper nor the code removes readings; the near plane is 3DGS's.
-PAPER = Config(
-    input=InputConfig(min_depth_m=0.0),
-    render=RenderConfig(near_m=0.2),
-    seeding=SeedConfig(first_gradient=50_000, alpha_below=0.6, depth_error_factor=40.0, opacity=0.5),
-    mapping=MappingConfig(iterations=100, weight_nll_color=1e-4, freeze_old_colors=True),
-    tracking=TrackingConfig(weight_max=3.0),
-    submaps=SubmapConfig(distance_m=0.5, angle_deg=50.0, uncertainty_m=UNCERTAIN_M),
-    loops=LoopConfig(descriptor="netvlad-or-grid"),
-    final=FinalConfig(seed_from="mesh", iterations=30_000, sh_degree=3, uncertainty=False),  # §7 does not use V
+PAPER = BASE.changed(
+    input={"min_depth_m": 0.0},
+    render={"near_m": 0.2},
+    seeding={"first_gradient": 50_000, "alpha_below": 0.6, "depth_error_factor": 40.0, "opacity": 0.5},
+    mapping={"iterations": 100, "weight_nll_color": 1e-4, "freeze_old_colors": True},
+    submaps={"distance_m": 0.5, "angle_deg": 50.0, "uncertainty_m": UNCERTAIN_M},
+    loops={"descriptor": "netvlad-or-grid"},
+    final={"seed_from": "mesh", "iterations": 30_000, "sh_degree": 3, "uncertainty": False},  # §7 does not use V
 )
 
 # Synthetic data with exact depth; the PNGs end at 10 m.
@@ -87,61 +75,60 @@ SCANNETPP = PAPER.changed(
 
 # For two CPU cores. λ_d, λ_r, 0.8 L1 + 0.2 SSIM, the initial σ², w_max and tau are the paper's (Replica). The values
 # below are ours; comments give the reasons.
-FAST = Config(
-    input=InputConfig(width=320, max_depth_m=8.0),  # a quarter of the pixels, which determine the cost of rendering
-    seeding=SeedConfig(
-        first_uniform=40_000,  # half of 320×240: more splats add cost but no accuracy
-        first_gradient=15_000,
-        first_edges=False,  # sampling by gradient finds the same pixels
-        later_max=0,
-        density=0.35,  # share of a keyframe's new pixels; with all of them ATE and PSNR stay the same, but time grows
-        depth_error_least_m=0.1,  # 40 × a median of 2 mm alone would treat sensor noise as a new surface
-        scale_from="pixel",  # searching the map for neighbours costs more than fitting a keyframe
-        scale_factor=0.8,
-        opacity=0.8,  # nearly opaque seeds: the map can be tracked after few iterations
-        max_splats=250_000,
-    ),
-    mapping=MappingConfig(
-        every=5,  # as for Replica; mapping every frame would take five times as long
-        overlap_below=0.7,  # more keyframes when the camera moves fast
-        iterations=18,  # what two cores can do while the camera runs
-        newest_probability=0.2,  # with so few iterations, 0.4 degrades older keyframes: 1 dB on redkitchen
-        first_iterations=150,  # until about then, a new map renders surfaces a centimetre too close
-        weight_nll_color=1e-2,  # ×100: V then predicts the errors better; it also affects shapes and poses a little
-        lr_log_variances=2e-2,  # twenty iterations must change σ² as much as hundreds do in the paper
-        lr_means=2e-4,
-        lr_opacity_logits=0.02,  # seeds start nearly opaque, and steps of 0.05 would scatter their opacities
-        lr_log_scales=1e-2,
-        lr_pose_translation=2e-4,  # the new keyframe adapts to the map: a third less ATE on livingroom
-        lr_pose_rotation=1e-4,
-        prune_opacity=0.05,
-    ),
-    primitives=DensifyConfig(split_radius_px=13.0),  # else an inherited map becomes coarser as the camera moves
-    tracking=TrackingConfig(
-        method="align",  # Gauss–Newton on images instead of 200 renders per frame
-        align_weight_color=0.1,  # gray has the smaller basin of convergence; with 0.5, steps of 5° fail
-        tau=10.0,
-        weight_max=3.0,
-    ),
-    submaps=SubmapConfig(
-        distance_m=0.5,
-        angle_deg=50.0,
-        uncertainty_m=UNCERTAIN_M,
-        inherit=True,  # starting a submap empty costs two seconds of first iterations
-    ),
-    loops=LoopConfig(
-        similarity_floor=0.8,  # the built-in descriptor needs it: it describes shapes, not places
-        near_m=0.5,  # the built-in descriptor rarely recognises a place from another side
-        most=3,  # registering a pair costs as much as thirty frames
-    ),
-    registration=RegistrationConfig(
-        iterations=6,  # four keyframes per pair, and each step is a render; Gauss–Newton has done most of the work
-        lr_translation=1e-3,
-        lr_rotation=1e-3,
-        tau=10.0,
-        color_mean="pixels",
-    ),
-    final=FinalConfig(iterations=1500),  # half a minute; 500 lose 2 dB on livingroom
+FAST = BASE.changed(
+    input={"width": 320, "max_depth_m": 8.0},  # a quarter of the pixels, which determine the cost of rendering
+    seeding={
+        "first_uniform": 40_000,  # half of 320×240: more splats add cost but no accuracy
+        "first_gradient": 15_000,
+        "first_edges": False,  # sampling by gradient finds the same pixels
+        "later_max": 0,
+        "density": 0.35,  # share of the new pixels; with all of them ATE and PSNR stay the same, but time grows
+        "depth_error_least_m": 0.1,  # 40 × a median of 2 mm alone would treat sensor noise as a new surface
+        "scale_from": "pixel",  # searching the map for neighbours costs more than fitting a keyframe
+        "scale_factor": 0.8,
+        "opacity": 0.8,  # nearly opaque seeds: the map can be tracked after few iterations
+        "max_splats": 250_000,
+    },
+    mapping={
+        "every": 5,  # as for Replica; mapping every frame would take five times as long
+        "overlap_below": 0.7,  # more keyframes when the camera moves fast
+        "iterations": 18,  # what two cores can do while the camera runs
+        "newest_probability": 0.2,  # with so few iterations, 0.4 degrades older keyframes: 1 dB on redkitchen
+        "first_iterations": 150,  # until about then, a new map renders surfaces a centimetre too close
+        "weight_nll_color": 1e-2,  # ×100: V then predicts the errors better; it also affects shapes and poses a little
+        "lr_log_variances": 2e-2,  # twenty iterations must change σ² as much as hundreds do in the paper
+        "lr_means": 2e-4,
+        "lr_opacity_logits": 0.02,  # seeds start nearly opaque, and steps of 0.05 would scatter their opacities
+        "lr_log_scales": 1e-2,
+        "lr_pose_translation": 2e-4,  # the new keyframe adapts to the map: a third less ATE on livingroom
+        "lr_pose_rotation": 1e-4,
+        "prune_opacity": 0.05,
+    },
+    primitives={"split_radius_px": 13.0},  # else an inherited map becomes coarser as the camera moves
+    tracking={
+        "method": "align",  # Gauss–Newton on images instead of 200 renders per frame
+        "align_weight_color": 0.1,  # gray has the smaller basin of convergence; with 0.5, steps of 5° fail
+        "tau": 10.0,
+    },
+    submaps={
+        "distance_m": 0.5,
+        "angle_deg": 50.0,
+        "uncertainty_m": UNCERTAIN_M,
+        "inherit": True,  # starting a submap empty costs two seconds of first iterations
+    },
+    loops={
+        "similarity_floor": 0.8,  # the built-in descriptor needs it: it describes shapes, not places
+        "near_m": 0.5,  # the built-in descriptor rarely recognises a place from another side
+        "most": 3,  # registering a pair costs as much as thirty frames
+    },
+    registration={
+        "iterations": 6,  # four keyframes per pair, and each step is a render; Gauss–Newton has done most of the work
+        "lr_translation": 1e-3,
+        "lr_rotation": 1e-3,
+        "tau": 10.0,
+        "color_mean": "pixels",
+    },
+    final={"iterations": 1500},  # half a minute; 500 lose 2 dB on livingroom
 )
 
 DATASETS = {"replica": REPLICA, "tum": TUM, "scannet": SCANNET, "scannetpp": SCANNETPP, "fast": FAST}

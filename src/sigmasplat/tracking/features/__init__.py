@@ -4,8 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from sigmasplat.config import Config
-from sigmasplat.config.features import FeatureConfig
+from sigmasplat.config import Config, FeatureConfig
 from sigmasplat.tracking.features.base import Extractor, Features, Pairs, matched_by_distance
 from sigmasplat.tracking.features.landmarks import Landmarks, depth_readings, landmarks_of
 from sigmasplat.tracking.features.pose import PnP, pose_from_landmarks

@@ -6,7 +6,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.config.features import FeatureConfig
+from sigmasplat.config import FeatureConfig
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.opencv import opencv
 

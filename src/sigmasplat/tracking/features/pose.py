@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.config.features import FeatureConfig
+from sigmasplat.config import FeatureConfig
 from sigmasplat.data import se3
 from sigmasplat.data.opencv import opencv
 from sigmasplat.tracking.features.base import Features

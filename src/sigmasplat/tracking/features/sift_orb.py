@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.config.features import FeatureConfig
+from sigmasplat.config import FeatureConfig
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.opencv import opencv
 from sigmasplat.tracking.features.base import Features, Gray, Pairs, matched_by_distance, no_features, reduced, rounded

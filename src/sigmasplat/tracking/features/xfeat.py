@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from sigmasplat.config.features import FeatureConfig
+from sigmasplat.config import FeatureConfig
 from sigmasplat.data.camera import Camera
 from sigmasplat.env import install_extra, install_package
 from sigmasplat.errors import ConfigError

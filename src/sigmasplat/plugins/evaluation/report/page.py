@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from sigmasplat.config import Config
-from sigmasplat.config.presets import default_preset, list_presets, preset
+from sigmasplat.config.presets import default_preset, is_preset, preset
 from sigmasplat.config.text import differences
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.trajectory import Trajectory
@@ -107,7 +107,7 @@ def rerun_command(config: Config, facts: dict[str, Any]) -> str:
     words = ["sigmasplat", "run", str(facts.get("source_path") or "PATH")]
     if onto := facts.get("onto"):
         words += ["--onto", str(onto["run"])]
-    if config.name not in list_presets():
+    if not is_preset(config.name):
         return shlex.join(words)
     if config.name != default_preset():
         words += ["--preset", config.name]

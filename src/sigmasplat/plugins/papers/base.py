@@ -1,0 +1,112 @@
+"""The settings that the papers' presets build on: those in which the papers differ from our defaults, as values."""
+
+from sigmasplat.config import Config
+
+BASE_VALUES: dict[str, dict[str, object]] = {
+    "input": {
+        "width": 0,
+        "denoise_depth": False,
+    },
+    "render": {
+        "depth": "center",
+    },
+    "seeding": {
+        "first_uniform": 100_000,
+        "first_gradient": 50_000,
+        "first_edges": True,
+        "later_max": 30_000,
+        "depth_error_least_m": 0.0,
+        "opacity": 0.5,
+        "scale_from": "neighbours",
+        "scale_factor": 1.0,
+        "thickness": 1.0,
+        "density": 1.0,
+        "max_splats": 0,
+    },
+    "mapping": {
+        "every": 1,
+        "overlap_below": 0.0,
+        "iterations": 100,
+        "first_iterations": 100,
+        "divided": False,
+        "newest_probability": 0.4,
+        "weight_depth": 1.0,
+        "weight_mean_depth": 0.0,
+        "weight_moment": 0.0,
+        "weight_nll_color": 0.0001,
+        "lr_means": 0.0001,
+        "lr_log_scales": 0.005,
+        "lr_opacity_logits": 0.05,
+        "lr_log_variances": 0.0025,
+        "prune_opacity": 0.5,
+    },
+    "primitives": {
+        "uncertain_m2": 0.0,
+        "split_radius_px": 0.0,
+    },
+    "tracking": {
+        "method": "adam",
+        "sensor_noise": False,
+        "align_weight_color": 0.5,
+        "tau": 50.0,
+        "features": False,
+        "verify": False,
+    },
+    "recovery": {
+        "relocalise": False,
+        "steady_frames": 0,
+        "new_map_after": 0,
+    },
+    "moving": {
+        "find": False,
+    },
+    "submaps": {
+        "distance_m": 0.0,
+        "angle_deg": 0.0,
+        "uncertainty_m": 0.0,
+        "inherit": False,
+    },
+    "loops": {
+        "similarity_floor": 0.0,
+        "near_m": 0.0,
+        "most": 4,
+        "slices_per_frame": 0,
+    },
+    "registration": {
+        "iterations": 100,
+        "lr_rotation": 0.015,
+        "lr_translation": 0.005,
+        "to_keyframe": False,
+        "color_mean": "values",
+        "tau": 50.0,
+    },
+    "final": {
+        "iterations": 0,
+        "lr_pose_translation": 0.0,
+        "lr_pose_rotation": 0.0,
+        "pose_reach_m": 0.0,
+        "pose_reach_most_m": 0.0,
+        "exposure": False,
+        "order": "random",
+        "lr_factor": 1.0,
+        "lr_log_scales": 0.0,
+        "lr_decay": 1.0,
+        "beta2": 0.999,
+        "sh_degree": 0,
+        "sh_every": 1000,
+        "merge_m": 0.02,
+        "prune_weight_px": 0.0,
+        "weight_moment": True,
+        "max_axis_ratio": 0.0,
+        "max_needle_ratio": 0.0,
+    },
+    "surface": {
+        "depth": "map",
+    },
+    "uncertainty": {
+        "probes": 0,
+    },
+}
+"""What is ours alone is off, and a value that both papers share is theirs; the presets name the rest."""
+
+BASE = Config().changed(**BASE_VALUES)

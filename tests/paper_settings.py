@@ -1,0 +1,21 @@
+"""Sections of settings that begin with the values of the papers (`BASE`) instead of the defaults: for tests of methods
+that the defaults do not use, such as tracking by descent."""
+
+from functools import partial
+
+from sigmasplat import config
+from sigmasplat.plugins.papers.base import BASE_VALUES
+
+RenderConfig = partial(config.RenderConfig, **BASE_VALUES["render"])
+SeedConfig = partial(config.SeedConfig, **BASE_VALUES["seeding"])
+MappingConfig = partial(config.MappingConfig, **BASE_VALUES["mapping"])
+DensifyConfig = partial(config.DensifyConfig, **BASE_VALUES["primitives"])
+TrackingConfig = partial(config.TrackingConfig, **BASE_VALUES["tracking"])
+RecoveryConfig = partial(config.RecoveryConfig, **BASE_VALUES["recovery"])
+MovingConfig = partial(config.MovingConfig, **BASE_VALUES["moving"])
+SubmapConfig = partial(config.SubmapConfig, **BASE_VALUES["submaps"])
+LoopConfig = partial(config.LoopConfig, **BASE_VALUES["loops"])
+RegistrationConfig = partial(config.RegistrationConfig, **BASE_VALUES["registration"])
+FinalConfig = partial(config.FinalConfig, **BASE_VALUES["final"])
+SurfaceConfig = partial(config.SurfaceConfig, **BASE_VALUES["surface"])
+InputConfig = partial(config.InputConfig, **BASE_VALUES["input"])
