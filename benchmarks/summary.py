@@ -95,8 +95,8 @@ def coverage(results: Results) -> str:
         )
     )
     return (
-        f"**not with a real sensor**: 90 % should be covered, {rooms} % are in rendered rooms, {kitchen} % on redkitchen, "
-        f"{desk} % on fr1_xyz"
+        f"**not with a real sensor**: 90 % should be covered, {rooms} % are in rendered rooms, {kitchen} % on "
+        f"redkitchen, {desk} % on fr1_xyz"
     )
 
 
