@@ -30,7 +30,6 @@ from ablation_runs import (
     run_jobs,
 )  # fmt: skip
 from paired_comparison import FIGURES, columns, described, paired_differences, passed_by_chance, rows
-from sigmasplat.input.depth_units import depth_warning
 from tables import Section
 
 from sigmasplat.commands import options
@@ -39,6 +38,7 @@ from sigmasplat.commands.options import prepare_torch
 from sigmasplat.config.presets import default_preset
 from sigmasplat.config.text import split_settings
 from sigmasplat.errors import ConfigError, SigmaSplatError
+from sigmasplat.input.recorded import depth_warning
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.run.terminal import Screen
 

@@ -105,6 +105,11 @@ PAGES = {
                 only=("livingroom", "redkitchen", "mean of the rooms with noise"),
             ),
             Shown(
+                "pose-covariance-mocap",
+                "The same on recordings that were not used in development, with true poses by motion capture.",
+                without=("NEES, mean", "… median"),
+            ),
+            Shown(
                 "failure-probability",
                 "The probability of a wrong pose, on the recordings that it was fitted to and with one left out.",
                 ("Tracked frames, without lost ones",),

@@ -106,4 +106,4 @@ def test_a_system_that_finds_no_pose_has_no_error_and_its_frames_are_counted() -
     runs = [run("ORB-SLAM3", "desk", None, without_pose=6), run("ours", "desk", 0.01), run("ours", "redkitchen", 0.02)]
     (table,) = peers.sections({"figures": {"runs": runs, "quoted": []}})
     assert list(table.columns) == ["system", "redkitchen", "desk", "frames without a pose"]
-    assert table.rows == [["ORB-SLAM3", "–", "–", "desk 6 of 6"], ["ours", "2.00", "1.00", "–"]]
+    assert table.rows == [["ORB-SLAM3", "–", "–", "desk 6 of 6"], ["ours", "2", "1", "–"]]
