@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from sigmasplat.plugins.robots.live import LiveRobot
     from sigmasplat.plugins.viewer.app import ViewerApp
     from sigmasplat.realtime.system import RealTime
+    from sigmasplat.run.callbacks import Callback
     from sigmasplat.run.finished_map import FinishedMap
-    from sigmasplat.run.protocols import Callback
     from sigmasplat.run.resume import StartPoint
     from sigmasplat.run.terminal import Screen
     from sigmasplat.run_folder.runs import RunFolder
@@ -302,7 +302,7 @@ def _progress(
 ) -> Iterator["Callback"]:  # fmt: skip
     """Yield the callback that shows the session on the terminal, in the requested logs, in bag and stream if there is a
     robot output, and in the viewer if there is one."""
-    from sigmasplat.run.protocols import BetweenFrames, CallbackList
+    from sigmasplat.run.callbacks import BetweenFrames, CallbackList
     from sigmasplat.run.step_logs import log_names, step_logs
 
     with (
