@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Annotated
 from sigmasplat.commands import options
 from sigmasplat.commands.end_of_run import warn_at_the_end
 from sigmasplat.commands.evaluate import score
-from sigmasplat.commands.input_options import DEFAULT_INPUT_OPTIONS, InputOptions, InputOptionsFlat
-from sigmasplat.commands.options import arg, configured, prepare_torch, source_of
+from sigmasplat.commands.input_options import DEFAULT_INPUT_OPTIONS, InputOptions, InputOptionsFlat, arg
+from sigmasplat.commands.options import configured, prepare_torch, source_of
 from sigmasplat.commands.robot_output import (
     DEFAULT_ROBOT_OPTIONS,
     RobotOptions,
@@ -44,10 +44,10 @@ DEMO_FOLDER, DEMO_FRAMES = Path("runs/demo"), 120
 FinalWidth = Annotated[
     str | None,
     arg(
-        metavar="working|camera|PIXELS",
-        help="width of the images that the final map is refined on at the end: as tracking, as the camera, or a number "
+        "working|camera|PIXELS",
+        "width of the images that the final map is refined on at the end: as tracking, as the camera, or a number "
         "of pixels; short form of --set final.width=…",
-        help_behavior_hint="(default: that of the preset)",
+        "(default: that of the preset)",
     ),
 ]
 
