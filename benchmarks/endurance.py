@@ -35,8 +35,9 @@ from sigmasplat.config import Config
 from sigmasplat.config.presets import default_preset, preset as preset_of
 from sigmasplat.config.text import override, split_settings
 from sigmasplat.plugins.sources import open_source
-from sigmasplat.run.protocols import NullCallback, StepResult
+from sigmasplat.run.callbacks import Callback
 from sigmasplat.run_folder.runs import RunFolder
+from sigmasplat.slam.step_result import Step
 
 arg = tyro.conf.arg
 SOURCE = "synthetic:frames=300,noise=1,width=64,height=48"
@@ -65,7 +66,7 @@ class Options:
         return override(preset_of(self.preset), split_settings(self.settings) | {"seed": str(self.seed)})
 
 
-class Watch(NullCallback):
+class Watch(Callback):
     """Takes figures in equal intervals, and ends the run with Ctrl-C."""
 
     def __init__(self, run: RunFolder, seconds: float) -> None:
@@ -73,7 +74,7 @@ class Watch(NullCallback):
         self.begun_s = self.since_s = time.monotonic()
         self.cpu_s, self.frames = time.process_time(), 0
 
-    def __call__(self, step: StepResult) -> None:
+    def __call__(self, step: Step) -> None:
         """Take the figures of an interval if it has ended."""
         self.frames += 1
         if (now_s := time.monotonic()) < self.since_s + self.every_s:

@@ -17,7 +17,7 @@ from sigmasplat.graph.path_covariance import PathCovariance
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.evaluation.metrics.trajectory import associate, score_failures, truth_in_estimate
 from sigmasplat.plugins.evaluation.path_scores import score_path_covariance
-from sigmasplat.run.protocols import Callback
+from sigmasplat.run.callbacks import Callback
 from sigmasplat.slam.slam import Slam
 from sigmasplat.tracking.keyframe_rule import is_held_back
 from sigmasplat.types import Matrix, no_progress

@@ -39,8 +39,9 @@ from sigmasplat.data.frame_arrays import color_from_bytes
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.sources import open_source
-from sigmasplat.run.protocols import NullCallback, StepResult
+from sigmasplat.run.callbacks import Callback
 from sigmasplat.run_folder.runs import RunFolder
+from sigmasplat.slam.step_result import Step
 
 arg = tyro.conf.arg
 SOURCE = "synthetic:frames=900,rooms=2,noise=1,width=640,height=480"
@@ -92,7 +93,7 @@ class Repeated(Source):
         return None
 
 
-class Samples(NullCallback):
+class Samples(Callback):
     """Samples the process once a second, and ends the run with Ctrl-C after its last frame."""
 
     def __init__(self, run: RunFolder, last: int) -> None:
@@ -100,7 +101,7 @@ class Samples(NullCallback):
         self.next_s, self.begun_s = 0.0, time.perf_counter()
         self.taken = list[dict[str, float]]()
 
-    def __call__(self, step: StepResult) -> None:
+    def __call__(self, step: Step) -> None:
         """Take a sample if one is due."""
         if step.timestamp_s >= self.next_s:
             self.next_s = step.timestamp_s + SAMPLES_EVERY_S

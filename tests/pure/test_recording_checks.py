@@ -16,7 +16,7 @@ from sigmasplat.data.camera import Camera
 from sigmasplat.data.frame import Frame
 from sigmasplat.errors import SourceError
 from sigmasplat.input.calibration import refuse_impossible_camera, unlikely_camera
-from sigmasplat.plugins.checks.motion import Motion, MotionWatch, motion_warnings, time_warnings
+from sigmasplat.plugins.checks.motion import Motion, MotionWatch, motion_warnings, rate, time_warnings
 from sigmasplat.plugins.checks.recording import inspect_source
 from sigmasplat.plugins.sources import open_source
 
@@ -80,7 +80,8 @@ def test_swapped_and_black_frames_and_jumps_are_found() -> None:
 
 def test_times_are_checked_for_unit_order_and_gaps() -> None:
     assert time_warnings(TIMES) == [] and time_warnings(TIMES[:1]) == []
-    assert "frames per second" in time_warnings(TIMES * 1e3)[0]
+    assert f"{rate(TIMES * 1e3)} frames per second" in time_warnings(TIMES * 1e3)[0]
+    assert [rate(np.arange(5) * step_s) for step_s in (1 / 30, 2.6e-5, 1e3, 0.0)] == ["30.0", "38461.5", "0.001", "–"]
     assert "frames per second" in time_warnings(TIMES * 1e-6)[0]
     same = TIMES.copy()
     same[[5, 9]] = same[[4, 8]]

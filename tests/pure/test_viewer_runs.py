@@ -28,7 +28,7 @@ from sigmasplat.plugins.viewer.live import ACTIVE_SHARE, LiveView
 from sigmasplat.plugins.viewer.server import free_port, is_loopback, open_server, url_of
 from sigmasplat.plugins.viewer.snapshot import Snapshot
 from sigmasplat.plugins.viewer.splats import VisibilityFilter, merge_pieces
-from sigmasplat.run.protocols import CallbackList, NullCallback
+from sigmasplat.run.callbacks import Callback, CallbackList
 from sigmasplat.run.session import Session
 from sigmasplat.run_folder.runs import TRUTH, RunFolder
 from sigmasplat.run_folder.submaps import DiskStore
@@ -208,7 +208,7 @@ def live_run(tmp_path: Path, clock: Clock, budget: int = 300_000) -> tuple[list[
     config, source, shown = settings(), open_source(ROOM), list[Snapshot]()
     slam = Slam(config, DiskStore(tmp_path / "submaps"))
     view = LiveView(slam, shown.append, "room", budget, every_s=2.0, clock=clock)
-    watch = CallbackList(NullCallback(), view)
+    watch = CallbackList(Callback(), view)
     for i in range(FRAMES):
         clock.now_s += clock.frame_s
         watch(slam.step(source.frame(i)))

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from sigmasplat.commands import options
-from sigmasplat.commands.input_options import DEFAULT_INPUT_OPTIONS, From1, InputOptionsFlat
-from sigmasplat.commands.options import arg
+from sigmasplat.commands.input_options import DEFAULT_INPUT_OPTIONS, From1, InputOptionsFlat, arg, flag
 from sigmasplat.config.presets import default_preset
 from sigmasplat.config.text import full_path
 from sigmasplat.errors import ConfigError, SourceError
@@ -21,50 +20,45 @@ DataFolders = Annotated[
     tuple[str, ...],
     tyro.conf.UseAppendAction,
     arg(
-        metavar="[WORKER=]ROOT",
-        help="folder of the sequences; WORKER= names the worker or host of a cluster that has another one",
-        help_behavior_hint="(repeatable)",
+        "[WORKER=]ROOT",
+        "folder of the sequences; WORKER= names the worker or host of a cluster that has another one",
+        "(repeatable)",
     ),
 ]
-Jobs = Annotated[From1, arg(metavar="N", help="number of runs at the same time on this machine")]
+Jobs = Annotated[From1, arg("N", "number of runs at the same time on this machine")]
 Scheduler = Annotated[
     str | None,
     arg(
-        metavar="ADDRESS",
-        help="make the runs on the Dask cluster of this scheduler, for example tcp://10.0.0.1:8786",
-        help_behavior_hint="(default: on this machine)",
+        "ADDRESS",
+        "make the runs on the Dask cluster of this scheduler, for example tcp://10.0.0.1:8786",
+        "(default: on this machine)",
     ),
 ]
 BatchFolder = Annotated[
     Path | None,
-    arg(metavar="DIR", help="folder of the results; finished runs in it are kept", help_behavior_hint=""),
+    arg("DIR", "folder of the results; finished runs in it are kept", ""),
 ]
 ReplaceRuns = Annotated[
     bool,
-    arg(name="overwrite", help="replace runs in DIR that have other settings or other code", help_behavior_hint=""),
+    flag("replace runs in DIR that have other settings or other code", name="overwrite"),
 ]
 Recordings = Annotated[
     tuple[str, ...],
     tyro.conf.Positional,
-    arg(metavar="FOLDER", help="recordings: folders or synthetic[:frames=N,…]", help_behavior_hint="(at least one)"),
+    arg("FOLDER", "recordings: folders or synthetic[:frames=N,…]", "(at least one)"),
 ]
 TableName = Annotated[
     str,
     tyro.conf.Positional,
-    arg(metavar="TABLE", help="name of the table, path of a definition (.toml), or `list` to list all tables"),
+    arg("TABLE", "name of the table, path of a definition (.toml), or `list` to list all tables"),
 ]
 TableScenes = Annotated[
     tuple[str, ...],
-    arg(name="scenes", metavar="SCENE", help="scenes to run", help_behavior_hint="(default: all of the table)"),
+    arg("SCENE", "scenes to run", "(default: all of the table)", name="scenes"),
 ]
 TableSystems = Annotated[
     tuple[str, ...],
-    arg(
-        name="systems",
-        metavar="SYSTEM",
-        help="systems of the table to run, or presets",
-        help_behavior_hint="(default: those of the table)",
-    ),
+    arg("SYSTEM", "systems of the table to run, or presets", "(default: those of the table)", name="systems"),
 ]
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from sigmasplat.commands import batch as batch_options, options
-from sigmasplat.commands.input_options import Limit
+from sigmasplat.commands.input_options import Limit, arg
 from sigmasplat.config.presets import default_preset
 from sigmasplat.config.text import split_settings
 from sigmasplat.errors import ConfigError, SourceError
@@ -115,7 +115,7 @@ BEST = "best value of its column"
 
 
 PaperTableFlat = Annotated[PaperTable, tyro.conf.arg(name=""), tyro.conf.OmitArgPrefixes]
-What = Annotated[Literal["table"], tyro.conf.Positional, tyro.conf.arg(metavar="table", help="what to make")]
+What = Annotated[Literal["table"], tyro.conf.Positional, arg("table", "what to make")]
 
 
 def bench(what: What, asked: PaperTableFlat) -> int:

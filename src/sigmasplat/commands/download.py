@@ -5,29 +5,22 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from sigmasplat.commands.input_options import arg, flag
+
 if TYPE_CHECKING:
     from sigmasplat.plugins.download.catalogue import PublicSet
     from sigmasplat.run.terminal import Screen
 
-arg = tyro.conf.arg
-SetName = Annotated[
-    str, tyro.conf.Positional, arg(metavar="SET", help="tum, replica, icl, 7scenes, bonn, redwood; lpips; or list")
-]
+SetName = Annotated[str, tyro.conf.Positional, arg("SET", "tum, replica, icl, 7scenes, bonn, redwood; lpips; or list")]
 Names = Annotated[
     tuple[str, ...],
     tyro.conf.Positional,
-    arg(
-        metavar="NAME",
-        help="names of recordings; `download list SET` lists them",
-        help_behavior_hint="(none if there is only one)",
-    ),
+    arg("NAME", "names of recordings; `download list SET` lists them", "(none if there is only one)"),
 ]
-DataFolder = Annotated[Path, arg(metavar="DIR", help="folder for the data sets")]
-ListOnly = Annotated[
-    bool, arg(name="list", help="list data sets or recordings, download nothing", help_behavior_hint="")
-]
-Overwrite = Annotated[bool, arg(help="download existing recordings again", help_behavior_hint="")]
-KeepArchive = Annotated[bool, arg(help="keep the archives after unpacking", help_behavior_hint="")]
+DataFolder = Annotated[Path, arg("DIR", "folder for the data sets")]
+ListOnly = Annotated[bool, flag("list data sets or recordings, download nothing", name="list")]
+Overwrite = Annotated[bool, flag("download existing recordings again")]
+KeepArchive = Annotated[bool, flag("keep the archives after unpacking")]
 
 
 def download(

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from sigmasplat.commands import options
-from sigmasplat.commands.options import arg, prepare_torch, source_of
+from sigmasplat.commands.input_options import arg, flag
+from sigmasplat.commands.options import prepare_torch, source_of
 from sigmasplat.config.ranges import Range
 from sigmasplat.env import LPIPS_FOLDER
 
@@ -25,31 +26,29 @@ class EvalOptions:
     true_mesh: Annotated[
         Path | None,
         arg(
-            metavar="FILE",
-            help="also write mesh.ply, and score it against this PLY in the world frame of the true path",
-            help_behavior_hint="(default: that of the data set)",
+            "FILE",
+            "also write mesh.ply, and score it against this PLY in the world frame of the true path",
+            "(default: that of the data set)",
         ),
     ] = None
     random_views: Annotated[
-        int, arg(metavar="N", help="number of random views that score the depth of mesh.ply; papers use 1000")
+        int, arg("N", "number of random views that score the depth of mesh.ply; papers use 1000")
     ] = 1000
     fill_gaps: Annotated[
         float,
         Range(0),
-        arg(metavar="M", help="score mesh.ply also with gaps up to M metres closed (see mesh --fill-gaps); 0 = do not"),
+        arg("M", "score mesh.ply also with gaps up to M metres closed (see mesh --fill-gaps); 0 = do not"),
     ] = 0.0
-    full_resolution: Annotated[
-        bool, arg(help="also score the views at the resolution of the recording", help_behavior_hint="")
-    ] = False
+    full_resolution: Annotated[bool, flag("also score the views at the resolution of the recording")] = False
     lpips: Annotated[
         Path | None,
         arg(
-            metavar="DIR",
-            help="folder of the weights of LPIPS; `sigmasplat download lpips alex` gets them",
-            help_behavior_hint=f"(default: {LPIPS_FOLDER}, if it exists)",
+            "DIR",
+            "folder of the weights of LPIPS; `sigmasplat download lpips alex` gets them",
+            f"(default: {LPIPS_FOLDER}, if it exists)",
         ),
     ] = None
-    lpips_net: Annotated[Literal["alex", "vgg"], arg(help="network of LPIPS; papers use alex")] = "alex"
+    lpips_net: Annotated[Literal["alex", "vgg"], arg(None, "network of LPIPS; papers use alex")] = "alex"
 
     def network(self) -> tuple["Lpips | None", str]:
         """Load the network of LPIPS, or return the line that says why it is not scored. Raises ConfigError if weights
@@ -62,7 +61,7 @@ class EvalOptions:
 
 
 DEFAULT_EVAL_OPTIONS = EvalOptions()
-EvalOptionsFlat = Annotated[EvalOptions, arg(name=""), tyro.conf.OmitArgPrefixes]
+EvalOptionsFlat = Annotated[EvalOptions, tyro.conf.arg(name=""), tyro.conf.OmitArgPrefixes]
 
 
 def evaluate_run(

@@ -7,100 +7,77 @@ from typing import Annotated, Literal
 import tyro
 
 from sigmasplat.commands import options
-from sigmasplat.commands.input_options import From0, Number, Whole
-from sigmasplat.commands.options import arg, prepare_torch, refuse_existing, source_of
+from sigmasplat.commands.input_options import From0, Number, Whole, arg, flag
+from sigmasplat.commands.options import prepare_torch, refuse_existing, source_of
 from sigmasplat.config.ranges import Range
 from sigmasplat.files.lock import output_locked
 from sigmasplat.plugins.outputs.formats import ExportSource, choose, listed, refuse_unused
 from sigmasplat.registry import Output, rows
 
-CellM = Annotated[float, Range(0.001, 1), arg(metavar="M", help="cell size of the floor plan in metres")]
+CellM = Annotated[float, Range(0.001, 1), arg("M", "cell size of the floor plan in metres")]
 FilmSize = Annotated[
     int,
     Range(32, 4096, or_zero=True),
-    arg(
-        metavar="PX",
-        help="width of each panel of a video in pixels",
-        help_behavior_hint="(default: that of the run's images)",
-    ),
+    arg("PX", "width of each panel of a video in pixels", "(default: that of the run's images)"),
 ]
-FilmRate = Annotated[float, Range(1, 120), arg(metavar="N", help="images per second of a video")]
+FilmRate = Annotated[float, Range(1, 120), arg("N", "images per second of a video")]
 FilmSeconds = Annotated[
     Number,
     Range(0.04, 3600),
-    arg(
-        metavar="S",
-        help="length of a video in seconds",
-        help_behavior_hint="(default: that of the path, 4 to 20; orbit: 12)",
-    ),
+    arg("S", "length of a video in seconds", "(default: that of the path, 4 to 20; orbit: 12)"),
 ]
 FilmPath = Annotated[
-    Literal["run", "orbit"], arg(help="camera path of a video: along the run's path, or in a circle above the room")
+    Literal["run", "orbit"], arg(None, "camera path of a video: along the run's path, or in a circle above the room")
 ]
 FilmPanels = Annotated[
-    Literal["all", "color"], arg(help="panels of a video: colour, depth and uncertainty side by side, or colour alone")
+    Literal["all", "color"], arg(None, "panels of a video: colour, depth and uncertainty side by side, or colour alone")
 ]
 
-
-arg = tyro.conf.arg
 
 FormatName = Annotated[
     str | None,
-    arg(metavar="NAME", help="format to write", help_behavior_hint="(default: by the ending of FILE, else ply)"),
+    arg("NAME", "format to write", "(default: by the ending of FILE, else ply)"),
 ]
 SigmaBelow = Annotated[
     From0,
-    arg(
-        metavar="S",
-        help="keep only splats with σ below S, for colours 0 to 1; σ is learned, not calibrated",
-        help_behavior_hint="(default: all)",
-    ),
+    arg("S", "keep only splats with σ below S, for colours 0 to 1; σ is learned, not calibrated", "(default: all)"),
 ]
 StdBelowM = Annotated[
     From0,
     arg(
-        metavar="M",
-        help="keep only splats whose surface has a standard deviation of depth below M metres (depth_std_m, "
+        "M",
+        "keep only splats whose surface has a standard deviation of depth below M metres (depth_std_m, "
         "docs/exports.md); needs a run with uncertainty.json",
-        help_behavior_hint="(default: all)",
+        "(default: all)",
     ),
 ]
 OpacityAbove = Annotated[
     From0,
-    arg(metavar="A", help="keep only splats with opacity above A", help_behavior_hint="(default: all)"),
+    arg("A", "keep only splats with opacity above A", "(default: all)"),
 ]
 Plain = Annotated[
     bool,
-    arg(
-        help="write PLY with only the 62 columns of 3DGS, without σ², for readers that accept no others",
-        help_behavior_hint="",
-    ),
+    flag("write PLY with only the 62 columns of 3DGS, without σ², for readers that accept no others"),
 ]
-Pictures = Annotated[
-    bool, arg(help="also write the images of the keyframes, and export only keyframes as views", help_behavior_hint="")
-]
+Pictures = Annotated[bool, flag("also write the images of the keyframes, and export only keyframes as views")]
 MaxSplats = Annotated[
     Whole,
     Range(1),
-    arg(
-        metavar="N",
-        help="keep at most N splats, those that fill the most pixels of the run's views",
-        help_behavior_hint="(default: all)",
-    ),
+    arg("N", "keep at most N splats, those that fill the most pixels of the run's views", "(default: all)"),
 ]
 MapAxes = Annotated[
     Literal["y-up", "z-up", "y-down", "camera"] | None,
     arg(
-        metavar="{y-up,z-up,y-down,camera}",
-        help="axes of a map or of points: y-up, z-up and y-down are levelled; camera: those of the run's path; y-up "
+        "{y-up,z-up,y-down,camera}",
+        "axes of a map or of points: y-up, z-up and y-down are levelled; camera: those of the run's path; y-up "
         "and camera only for SPZ, glTF and OpenUSD",
-        help_behavior_hint="(default: y-up for points, SPZ, glTF and OpenUSD, else y-down)",
+        "(default: y-up for points, SPZ, glTF and OpenUSD, else y-down)",
     ),
 ]
 SpzVersion = Annotated[
     Whole,
     Range(2, 4),
-    arg(metavar="{2,3,4}", help="version of SPZ", help_behavior_hint="(default: 3, which most viewers read)"),
+    arg("{2,3,4}", "version of SPZ", "(default: 3, which most viewers read)"),
 ]
 
 

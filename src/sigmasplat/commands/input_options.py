@@ -3,14 +3,25 @@
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
 from sigmasplat.config import RECORDED_POSES
 from sigmasplat.config.ranges import Range
 
-arg = tyro.conf.arg
+
+def arg(metavar: str | None, help: str, hint: str | None = None, **more: Any) -> Any:
+    """Describe an option: its placeholder, one line of help, and what the help says of the default (None: its value).
+
+    more: as for `tyro.conf.arg`.
+    """
+    return tyro.conf.arg(metavar=metavar, help=help, help_behavior_hint=hint, **more)
+
+
+def flag(help: str, **more: Any) -> Any:
+    """Describe a switch that is off by default."""
+    return arg(None, help, "", **more)
 
 
 def _number(read: Callable[[str], float]) -> tyro.constructors.PrimitiveConstructorSpec[float | None]:
@@ -28,27 +39,21 @@ Whole = Annotated[int | None, _number(int)]
 Number = Annotated[float | None, _number(float)]
 From0 = Annotated[Number, Range(0)]
 From1 = Annotated[int, Range(1)]
-Limit = Annotated[Whole, Range(1), arg(metavar="N", help="use at most N frames", help_behavior_hint="(default: all)")]
+Limit = Annotated[Whole, Range(1), arg("N", "use at most N frames", "(default: all)")]
 PredictedDepth = Annotated[
     Path | None,
     arg(
-        metavar="FOLDER",
-        help="depth that a network predicted, one image per frame: for a video, for colour images, or instead of the "
+        "FOLDER",
+        "depth that a network predicted, one image per frame: for a video, for colour images, or instead of the "
         "recorded depth. The scale of the result is arbitrary",
-        help_behavior_hint="",
+        "",
     ),
 ]
 DepthModel = Annotated[
     Path | None,
-    arg(
-        metavar="FILE.onnx",
-        help="network that predicts depth from each colour image, used like --predicted-depth",
-        help_behavior_hint="",
-    ),
+    arg("FILE.onnx", "network that predicts depth from each colour image, used like --predicted-depth", ""),
 ]
-PredictedInverse = Annotated[
-    bool, arg(help="predicted depth is inverse depth, as that of MiDaS or Depth Anything", help_behavior_hint="")
-]
+PredictedInverse = Annotated[bool, flag("predicted depth is inverse depth, as that of MiDaS or Depth Anything")]
 
 
 @dataclass(frozen=True)
@@ -56,43 +61,34 @@ class InputOptions:
     """Options that select and calibrate the input: short forms of the settings input.* of --set."""
 
     limit: Limit = None
-    stride: Annotated[Whole, Range(1), arg(metavar="N", help="use every N-th frame", help_behavior_hint="")] = None
-    start: Annotated[From0, arg(metavar="S", help="start S seconds after the first frame", help_behavior_hint="")] = (
-        None
-    )
-    end: Annotated[From0, arg(metavar="S", help="stop S seconds after the first frame", help_behavior_hint="")] = None
+    stride: Annotated[Whole, Range(1), arg("N", "use every N-th frame", "")] = None
+    start: Annotated[From0, arg("S", "start S seconds after the first frame", "")] = None
+    end: Annotated[From0, arg("S", "stop S seconds after the first frame", "")] = None
     hold_out: Annotated[
         Whole,
         Range(2, or_zero=True),
-        arg(
-            metavar="N",
-            help="hold back every N-th frame: it is tracked but not mapped, so that it can test the map",
-            help_behavior_hint="",
-        ),
+        arg("N", "hold back every N-th frame: it is tracked but not mapped, so that it can test the map", ""),
     ] = None
-    strict: Annotated[bool, arg(help="stop at an unreadable image instead of skipping it", help_behavior_hint="")] = (
-        False
-    )
+    strict: Annotated[bool, flag("stop at an unreadable image instead of skipping it")] = False
     calibration: Annotated[
         Path | None,
-        arg(metavar="FILE", help="calibration.json to use instead of the recorded calibration", help_behavior_hint=""),
+        arg("FILE", "calibration.json to use instead of the recorded calibration", ""),
     ] = None
     masks: Annotated[
         Path | None,
         arg(
-            metavar="FOLDER",
-            help="ignore pixels: one image per frame of the recording, not 0 = ignored, such as people found by a "
-            "segmenter",
-            help_behavior_hint="",
+            "FOLDER",
+            "ignore pixels: one image per frame of the recording, not 0 = ignored, such as people found by a segmenter",
+            "",
         ),
     ] = None
     poses: Annotated[
         str | None,
         arg(
-            metavar="FILE",
-            help="known camera poses, used instead of tracking: TUM or KITTI text, images.txt of COLMAP, "
+            "FILE",
+            "known camera poses, used instead of tracking: TUM or KITTI text, images.txt of COLMAP, "
             'transforms.json, or a folder of matrices; "recorded" = those of the device, such as ARKit\'s',
-            help_behavior_hint="",
+            "",
         ),
     ] = None
     predicted_depth: PredictedDepth = None
@@ -100,29 +96,17 @@ class InputOptions:
     predicted_inverse: PredictedInverse = False
     fx: Annotated[
         From0,
-        arg(
-            metavar="PX",
-            help="horizontal focal length in pixels; also the vertical one unless --fy is given",
-            help_behavior_hint="",
-        ),
+        arg("PX", "horizontal focal length in pixels; also the vertical one unless --fy is given", ""),
     ] = None
-    fy: Annotated[From0, arg(metavar="PX", help="vertical focal length in pixels", help_behavior_hint="")] = None
-    cx: Annotated[From0, arg(metavar="PX", help="column of the principal point in pixels", help_behavior_hint="")] = (
-        None
-    )
-    cy: Annotated[From0, arg(metavar="PX", help="row of the principal point in pixels", help_behavior_hint="")] = None
-    depth_scale: Annotated[
-        From0, arg(metavar="UNITS", help="units of the depth images per metre", help_behavior_hint="")
-    ] = None
-    color_topic: Annotated[
-        str | None, arg(metavar="NAME", help="ROS bag: topic of the colour images", help_behavior_hint="")
-    ] = None
-    depth_topic: Annotated[
-        str | None, arg(metavar="NAME", help="ROS bag: topic of the depth images", help_behavior_hint="")
-    ] = None
+    fy: Annotated[From0, arg("PX", "vertical focal length in pixels", "")] = None
+    cx: Annotated[From0, arg("PX", "column of the principal point in pixels", "")] = None
+    cy: Annotated[From0, arg("PX", "row of the principal point in pixels", "")] = None
+    depth_scale: Annotated[From0, arg("UNITS", "units of the depth images per metre", "")] = None
+    color_topic: Annotated[str | None, arg("NAME", "ROS bag: topic of the colour images", "")] = None
+    depth_topic: Annotated[str | None, arg("NAME", "ROS bag: topic of the depth images", "")] = None
     register_depth: Annotated[
         Literal["auto", "on", "off"],
-        arg(help="register depth to the colour camera; auto: if the recording has a separate depth camera"),
+        arg(None, "register depth to the colour camera; auto: if the recording has a separate depth camera"),
     ] = "auto"
 
     def settings(self) -> dict[str, str]:
@@ -145,4 +129,4 @@ class InputOptions:
 
 
 DEFAULT_INPUT_OPTIONS = InputOptions()
-InputOptionsFlat = Annotated[InputOptions, arg(name=""), tyro.conf.OmitArgPrefixes]
+InputOptionsFlat = Annotated[InputOptions, tyro.conf.arg(name=""), tyro.conf.OmitArgPrefixes]

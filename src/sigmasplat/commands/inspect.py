@@ -3,10 +3,8 @@
 from pathlib import Path
 from typing import Annotated
 
-import tyro
-
 from sigmasplat.commands import options
-from sigmasplat.commands.input_options import DEFAULT_INPUT_OPTIONS, InputOptionsFlat
+from sigmasplat.commands.input_options import DEFAULT_INPUT_OPTIONS, InputOptionsFlat, arg
 from sigmasplat.commands.options import configured
 from sigmasplat.config.presets import default_preset
 
@@ -14,12 +12,12 @@ OK, WARNED = 0, 1
 SHEETS = Path("runs/inspect")
 SheetFile = Annotated[
     Path | None,
-    tyro.conf.arg(metavar="FILE", help="contact sheet, PNG", help_behavior_hint="(default: runs/inspect/NAME.png)"),
+    arg("FILE", "contact sheet, PNG", "(default: runs/inspect/NAME.png)"),
 ]
 
 JsonFile = Annotated[
     Path | None,
-    tyro.conf.arg(metavar="FILE", help="write what was found as JSON", help_behavior_hint=""),
+    arg("FILE", "write what was found as JSON", ""),
 ]
 
 

@@ -3,9 +3,8 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import tyro
-
 from sigmasplat.commands import options
+from sigmasplat.commands.input_options import arg
 from sigmasplat.commands.options import prepare_torch, refuse_existing, source_of
 from sigmasplat.config.ranges import Range
 from sigmasplat.errors import ConfigError
@@ -13,32 +12,24 @@ from sigmasplat.errors import ConfigError
 if TYPE_CHECKING:
     from sigmasplat.plugins.outputs.axes import Axes
 
-arg = tyro.conf.arg
 
 MeshFile = Annotated[
     Path | None,
-    arg(
-        metavar="FILE",
-        help="file to write: .glb, .ply, .obj or .stl (no colours)",
-        help_behavior_hint="(default: mesh.ply in RUN)",
-    ),
+    arg("FILE", "file to write: .glb, .ply, .obj or .stl (no colours)", "(default: mesh.ply in RUN)"),
 ]
-Triangles = Annotated[int, Range(0), arg(metavar="N", help="largest number of triangles; 0 = no limit")]
+Triangles = Annotated[int, Range(0), arg("N", "largest number of triangles; 0 = no limit")]
 FillGaps = Annotated[
     float,
     Range(0),
-    arg(
-        metavar="M",
-        help="close gaps that are at most M metres across by smooth patches, which have a high depth_std_m; 0 = none",
-    ),
+    arg("M", "close gaps that are at most M metres across by smooth patches, which have a high depth_std_m; 0 = none"),
 ]
 MeshAxes = Annotated[
     Literal["y-up", "z-up", "y-down", "camera"] | None,
     arg(
-        metavar="{y-up,z-up,y-down,camera}",
-        help="axes of the file: y-up for viewers, z-up for CAD, y-down, or camera, those of the run's path; all but "
+        "{y-up,z-up,y-down,camera}",
+        "axes of the file: y-up for viewers, z-up for CAD, y-down, or camera, those of the run's path; all but "
         "camera are levelled (docs/exports.md)",
-        help_behavior_hint="(default: y-up; mesh.ply in RUN: camera)",
+        "(default: y-up; mesh.ply in RUN: camera)",
     ),
 ]
 

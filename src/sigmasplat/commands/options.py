@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from sigmasplat import env
-from sigmasplat.commands.input_options import DEFAULT_INPUT_OPTIONS, From0, From1, InputOptions, Whole
+from sigmasplat.commands.input_options import DEFAULT_INPUT_OPTIONS, From0, From1, InputOptions, Whole, arg, flag
 from sigmasplat.config import Config, InputConfig
 from sigmasplat.config.presets import FAMILIES, preset as preset_of
 from sigmasplat.config.ranges import Range
@@ -20,116 +20,96 @@ if TYPE_CHECKING:
     from sigmasplat.input.source import Source
     from sigmasplat.run_folder.runs import RunFolder
 
-arg = tyro.conf.arg
 
-PresetName = Annotated[str, arg(metavar="NAME", help=f"preset of settings to start from: {', '.join(FAMILIES)}")]
-Shell = Annotated[
-    Literal["bash", "zsh"], tyro.conf.Positional, arg(metavar="{bash,zsh}", help="the shell that you use")
-]
+PresetName = Annotated[str, arg("NAME", f"preset of settings to start from: {', '.join(FAMILIES)}")]
+Shell = Annotated[Literal["bash", "zsh"], tyro.conf.Positional, arg("{bash,zsh}", "the shell that you use")]
 Settings = Annotated[
     tuple[str, ...],
     tyro.conf.UseAppendAction,
-    arg(name="set", metavar="SECTION.NAME=VALUE", help="change one setting; docs/settings.md lists them"),
+    arg("SECTION.NAME=VALUE", "change one setting; docs/settings.md lists them", name="set"),
 ]
-Seed = Annotated[Whole, arg(metavar="N", help="seed of all random numbers", help_behavior_hint="(default: 0)")]
-RunPath = Annotated[Path, tyro.conf.Positional, arg(metavar="RUN", help="run folder")]
+Seed = Annotated[Whole, arg("N", "seed of all random numbers", "(default: 0)")]
+RunPath = Annotated[Path, tyro.conf.Positional, arg("RUN", "run folder")]
 OutFolder = Annotated[
     Path | None,
-    arg(metavar="DIR", aliases=["--output"], help="run folder", help_behavior_hint="(default: a new one in runs/)"),
+    arg("DIR", "run folder", "(default: a new one in runs/)", aliases=["--output"]),
 ]
-DemoFolder = Annotated[Path, arg(metavar="DIR", aliases=["--output"], help="run folder")]
-Frames = Annotated[From1, arg(metavar="N", help="number of frames")]
+DemoFolder = Annotated[Path, arg("DIR", "run folder", aliases=["--output"])]
+Frames = Annotated[From1, arg("N", "number of frames")]
 SourcePath = Annotated[
     str,
     tyro.conf.Positional,
-    arg(metavar="PATH", help="a recording, synthetic[:frames=N] for the synthetic room, or realsense for the camera"),
+    arg("PATH", "a recording, synthetic[:frames=N] for the synthetic room, or realsense for the camera"),
 ]
-Runs = Annotated[From1, arg(metavar="N", help="number of runs of each sequence, with seeds 0 to N − 1")]
-Overwrite = Annotated[bool, arg(help="replace an earlier result", help_behavior_hint="")]
-Profile = Annotated[bool, arg(help="print the time spent in each stage", help_behavior_hint="")]
-SaveEvery = Annotated[
-    float, Range(0), arg(metavar="S", help="save the state for `resume` every S seconds; 0 = at the end only")
-]
-RealTime = Annotated[bool, arg(help="replay a recording at its own times, and track it in real time")]
+Runs = Annotated[From1, arg("N", "number of runs of each sequence, with seeds 0 to N − 1")]
+Overwrite = Annotated[bool, flag("replace an earlier result")]
+Profile = Annotated[bool, flag("print the time spent in each stage")]
+SaveEvery = Annotated[float, Range(0), arg("S", "save the state for `resume` every S seconds; 0 = at the end only")]
+RealTime = Annotated[bool, arg(None, "replay a recording at its own times, and track it in real time")]
 AllPoses = Annotated[
     bool,
-    arg(help="also write trajectory_all.txt with the poses of all frames, including lost ones", help_behavior_hint=""),
+    flag("also write trajectory_all.txt with the poses of all frames, including lost ones"),
 ]
 Log = Annotated[
     str,
     arg(
-        metavar="NAMES",
-        help="also write the values of every frame to logs/ in RUN: csv, tensorboard, rerun, or several by commas",
-        help_behavior_hint="",
+        "NAMES",
+        "also write the values of every frame to logs/ in RUN: csv, tensorboard, rerun, or several by commas",
+        "",
     ),
 ]
-View = Annotated[
-    bool, arg(help="show the run in the browser while it runs, and afterwards until Ctrl-C", help_behavior_hint="")
-]
+View = Annotated[bool, flag("show the run in the browser while it runs, and afterwards until Ctrl-C")]
 Host = Annotated[
     str,
-    arg(metavar="ADDRESS", help="address that viewer and stream listen on; the default allows this machine only"),
+    arg("ADDRESS", "address that viewer and stream listen on; the default allows this machine only"),
 ]
 Port = Annotated[
-    int, Range(0, 65535), arg(metavar="N", help="port of the viewer; if it is busy, the next free one is used; 0 = any")
+    int, Range(0, 65535), arg("N", "port of the viewer; if it is busy, the next free one is used; 0 = any")
 ]
-Evaluate = Annotated[bool, arg(name="eval", help="do not score the run: no metrics, no report", help_behavior_hint="")]
+Evaluate = Annotated[bool, flag("do not score the run: no metrics, no report", name="eval")]
 MovedSource = Annotated[
     str | None,
-    arg(
-        name="source",
-        metavar="PATH",
-        help="path of the sequence if it has moved",
-        help_behavior_hint="(default: its path in the run)",
-    ),
+    arg("PATH", "path of the sequence if it has moved", "(default: its path in the run)", name="source"),
 ]
 OutFile = Annotated[
     Path | None,
-    arg(metavar="FILE", help="file to write", help_behavior_hint="(default: named after RUN, in this folder)"),
+    arg("FILE", "file to write", "(default: named after RUN, in this folder)"),
 ]
 Record = Annotated[
     Path | None,
-    arg(
-        metavar="DIR",
-        help="folder for the recording of a live camera",
-        help_behavior_hint="(default: recording/ in the run folder)",
-    ),
+    arg("DIR", "folder for the recording of a live camera", "(default: recording/ in the run folder)"),
 ]
 VoxelM = Annotated[
     float | None,
     Range(0, open_below=True),
     arg(
-        metavar="M",
-        help="edge of a voxel in metres; the truncation distance is 4 voxels",
-        help_behavior_hint="(default: 0.01, times the scale of the scene)",
+        "M",
+        "edge of a voxel in metres; the truncation distance is 4 voxels",
+        "(default: 0.01, times the scale of the scene)",
     ),
 ]
 WithMesh = Annotated[
     bool,
-    arg(name="mesh", help="also write mesh.ply, and score it if the true surface is known", help_behavior_hint=""),
+    flag("also write mesh.ply, and score it if the true surface is known", name="mesh"),
 ]
-InRun = Annotated[Path, arg(name="in", metavar="RUN", help="folder of a finished run, in whose map to search")]
+InRun = Annotated[Path, arg("RUN", "folder of a finished run, in whose map to search", name="in")]
 OntoRun = Annotated[
     Path | None,
-    arg(metavar="RUN", help="continue the map of a finished run in a new run folder", help_behavior_hint=""),
+    arg("RUN", "continue the map of a finished run in a new run folder", ""),
 ]
 FinalSeconds = Annotated[
     From0,
     arg(
-        metavar="S",
-        help="time budget of the final map's refinement in seconds: short form of --set final.seconds=S",
-        help_behavior_hint="(default: no limit)",
+        "S",
+        "time budget of the final map's refinement in seconds: short form of --set final.seconds=S",
+        "(default: no limit)",
     ),
 ]
 PosesFile = Annotated[
     Path | None,
-    arg(
-        metavar="FILE",
-        help="file to write: .jsonl (all results) or .txt (poses as TUM text)",
-        help_behavior_hint="(default: none)",
-    ),
+    arg("FILE", "file to write: .jsonl (all results) or .txt (poses as TUM text)", "(default: none)"),
 ]
-RunOrMap = Annotated[Path, tyro.conf.Positional, arg(metavar="RUN", help="run folder or map file")]
+RunOrMap = Annotated[Path, tyro.conf.Positional, arg("RUN", "run folder or map file")]
 
 
 @dataclass(frozen=True)
@@ -147,7 +127,7 @@ class RunOptions:
 
 
 DEFAULT_RUN_OPTIONS = RunOptions()
-RunOptionsFlat = Annotated[RunOptions, arg(name=""), tyro.conf.OmitArgPrefixes]
+RunOptionsFlat = Annotated[RunOptions, tyro.conf.arg(name=""), tyro.conf.OmitArgPrefixes]
 
 
 def configured(

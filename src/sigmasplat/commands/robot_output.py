@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from sigmasplat.commands.input_options import Whole
+from sigmasplat.commands.input_options import Whole, arg
 from sigmasplat.config.ranges import Range
 from sigmasplat.plugins.viewer.server import is_loopback
 
@@ -21,23 +21,15 @@ if TYPE_CHECKING:
 
 Bag = Annotated[
     Path | None,
-    tyro.conf.arg(
-        metavar="DIR",
-        help="also write a ROS 2 bag (MCAP): transforms, odometry, loops, map, images; needs no ROS",
-        help_behavior_hint="",
-    ),
+    arg("DIR", "also write a ROS 2 bag (MCAP): transforms, odometry, loops, map, images; needs no ROS", ""),
 ]
 Stream = Annotated[
     Whole,
     Range(0, 65535),
-    tyro.conf.arg(
-        metavar="PORT",
-        help="also stream the same messages over a WebSocket to Foxglove, usually 8765; 0 = any free port",
-        help_behavior_hint="",
-    ),
+    arg("PORT", "also stream the same messages over a WebSocket to Foxglove, usually 8765; 0 = any free port", ""),
 ]
 BagImages = Annotated[
-    Literal["none", "keyframes", "all"], tyro.conf.arg(help="which images the bag and the stream contain, uncompressed")
+    Literal["none", "keyframes", "all"], arg(None, "which images the bag and the stream contain, uncompressed")
 ]
 
 

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Annotated
 from sigmasplat.commands import options
 from sigmasplat.commands.end_of_run import warn_at_the_end
 from sigmasplat.commands.evaluate import score
-from sigmasplat.commands.input_options import DEFAULT_INPUT_OPTIONS, InputOptions, InputOptionsFlat
-from sigmasplat.commands.options import arg, configured, prepare_torch, source_of
+from sigmasplat.commands.input_options import DEFAULT_INPUT_OPTIONS, InputOptions, InputOptionsFlat, arg
+from sigmasplat.commands.options import configured, prepare_torch, source_of
 from sigmasplat.commands.robot_output import (
     DEFAULT_ROBOT_OPTIONS,
     RobotOptions,
@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from sigmasplat.plugins.robots.live import LiveRobot
     from sigmasplat.plugins.viewer.app import ViewerApp
     from sigmasplat.realtime.system import RealTime
+    from sigmasplat.run.callbacks import Callback
     from sigmasplat.run.finished_map import FinishedMap
-    from sigmasplat.run.protocols import Callback
     from sigmasplat.run.resume import StartPoint
     from sigmasplat.run.terminal import Screen
     from sigmasplat.run_folder.runs import RunFolder
@@ -44,10 +44,10 @@ DEMO_FOLDER, DEMO_FRAMES = Path("runs/demo"), 120
 FinalWidth = Annotated[
     str | None,
     arg(
-        metavar="working|camera|PIXELS",
-        help="width of the images that the final map is refined on at the end: as tracking, as the camera, or a number "
+        "working|camera|PIXELS",
+        "width of the images that the final map is refined on at the end: as tracking, as the camera, or a number "
         "of pixels; short form of --set final.width=…",
-        help_behavior_hint="(default: that of the preset)",
+        "(default: that of the preset)",
     ),
 ]
 
@@ -302,7 +302,7 @@ def _progress(
 ) -> Iterator["Callback"]:  # fmt: skip
     """Yield the callback that shows the session on the terminal, in the requested logs, in bag and stream if there is a
     robot output, and in the viewer if there is one."""
-    from sigmasplat.run.protocols import BetweenFrames, CallbackList
+    from sigmasplat.run.callbacks import BetweenFrames, CallbackList
     from sigmasplat.run.step_logs import log_names, step_logs
 
     with (

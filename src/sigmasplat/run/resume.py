@@ -12,6 +12,7 @@ from sigmasplat.files.reading import guarded
 from sigmasplat.final.refinement import Refined
 from sigmasplat.fit.adam import VectorAdam
 from sigmasplat.input.source import Source
+from sigmasplat.run.callbacks import Checkpointer
 from sigmasplat.run.same_conditions import refuse_other_sequence
 from sigmasplat.run.session import run_now
 from sigmasplat.run_folder.run_values import STATE_FIELDS, check_fields
@@ -28,7 +29,7 @@ MOST_TIME_SHARE = 0.05
 
 
 @dataclass(eq=False)
-class StateFile:
+class StateFile(Checkpointer):
     """Checkpointer that writes state.safetensors into a run folder, at most every `every_s` seconds, and less often if
     a save takes long (`MOST_TIME_SHARE`).
 

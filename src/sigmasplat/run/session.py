@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sigmasplat.config import Config
 from sigmasplat.data.component import RELOCALISED
@@ -19,19 +19,17 @@ from sigmasplat.data.frame import Frame
 from sigmasplat.errors import RunError
 from sigmasplat.files.lock import LOCK, locked, no_warning
 from sigmasplat.input.source import Source
+from sigmasplat.run.callbacks import Callback, Checkpointer
 from sigmasplat.run.figures import profile
-from sigmasplat.run.protocols import (
-    Callback,
-    Checkpointer,
-    NullCallback,
-    NullCheckpointer,
-    SlamSystem,
-    StepResult,
-)
 from sigmasplat.run.same_conditions import start_facts
 from sigmasplat.run.signals import interrupt_event
 from sigmasplat.run_folder.frames import RunFrames
 from sigmasplat.run_folder.runs import ALL_POSES, RunFolder
+
+if TYPE_CHECKING:
+    from sigmasplat.realtime.system import RealTime
+    from sigmasplat.slam.slam import Slam
+    from sigmasplat.slam.step_result import Step
 
 RUNS = Path("runs")
 LOOPS_GROWTH = 1.05
@@ -170,11 +168,11 @@ class Session:
     later: runs a task that no frame needs to wait for; at once by default, beside the frames in real time.
     """
 
-    slam: SlamSystem
+    slam: "Slam | RealTime"
     source: Source
     run: RunFolder
-    callback: Callback = field(default_factory=NullCallback)
-    checkpointer: Checkpointer = field(default_factory=NullCheckpointer)
+    callback: Callback = field(default_factory=Callback)
+    checkpointer: Checkpointer = field(default_factory=Checkpointer)
     first_index: int = 0
     wall_s: float = 0.0
     all_poses: bool = False
@@ -267,7 +265,7 @@ class Session:
             interrupt.clear()  # this Ctrl-C has ended the live frames; the next one interrupts the final map
         return not interrupt.is_set()
 
-    def _log(self, step: StepResult, frame: Frame, arrived_s: float | None) -> None:
+    def _log(self, step: "Step", frame: Frame, arrived_s: float | None) -> None:
         """Append the step to log.jsonl, with the force on the camera and the time since the image arrived if they are
         known; update loops.json if enough loops were tried since it was written, and count the frame."""
         line = log_line(step)
@@ -330,7 +328,7 @@ class Session:
         return Outcome(status, self.frames, self.lost, self.wall_s, *counts)
 
 
-def log_line(step: StepResult) -> dict[str, Any]:
+def log_line(step: "Step") -> dict[str, Any]:
     """Return a step as a record of log.jsonl: T_world_camera as 4 rows, times in seconds, loops if any were tried."""
     line = {
         "index": step.index,

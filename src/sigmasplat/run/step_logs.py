@@ -9,13 +9,16 @@ import io
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sigmasplat.env import install_extra
 from sigmasplat.errors import ConfigError, nearest
 from sigmasplat.files.atomic import make_folder, write_text
-from sigmasplat.run.protocols import Callback, LoopResult, StepResult
+from sigmasplat.run.callbacks import Callback
 from sigmasplat.run_folder.runs import RunFolder
+
+if TYPE_CHECKING:
+    from sigmasplat.slam.step_result import Step
 
 EXTRA = "logs"
 CSV, TENSORBOARD, RERUN = "steps.csv", "tensorboard", "steps{}.rrd"
@@ -28,7 +31,7 @@ COLUMNS = (
 """Columns of steps.csv, as in log.jsonl; position of the camera as estimated when the frame was processed."""
 
 
-def values_of(step: StepResult) -> dict[str, Any]:
+def values_of(step: "Step") -> dict[str, Any]:
     """Return the values of a step by column; a value that the step does not have is None."""
     x, y, z = (float(value) for value in step.T_world_camera[:3, 3])
     return {
@@ -40,18 +43,8 @@ def values_of(step: StepResult) -> dict[str, Any]:
     }  # fmt: skip
 
 
-class StepLog:
+class StepLog(Callback):
     """A log of steps. It creates its files at the first step, so that a run that fails before it leaves nothing."""
-
-    def __call__(self, step: StepResult) -> None:
-        """Write a step."""
-        raise NotImplementedError
-
-    def finishing(self, done: int, total: int) -> None:
-        """Write nothing about the final map."""
-
-    def last_loops(self, loops: Sequence[LoopResult]) -> None:
-        """Write nothing about the last loops."""
 
     def close(self) -> None:
         """Complete the files."""
@@ -63,7 +56,7 @@ class CsvLog(StepLog):
     def __init__(self, folder: Path, first_index: int) -> None:
         self.path, self.first_index = folder / CSV, first_index
 
-    def __call__(self, step: StepResult) -> None:
+    def __call__(self, step: "Step") -> None:
         """Append a line. Raises RunError if the file cannot be written."""
         if self.first_index >= 0:
             self._begin()
@@ -91,7 +84,7 @@ class TensorBoardLog(StepLog):
         self.folder, self.first_index = folder / TENSORBOARD, first_index
         self.writer: Any = None
 
-    def __call__(self, step: StepResult) -> None:
+    def __call__(self, step: "Step") -> None:
         """Write the numbers of a step."""
         if self.writer is None:
             self.writer = self.writer_type(str(self.folder), purge_step=self.first_index or None)
@@ -114,7 +107,7 @@ class RerunLog(StepLog):
         self.stream: Any = None
         self.positions = list[tuple[float, float, float]]()
 
-    def __call__(self, step: StepResult) -> None:
+    def __call__(self, step: "Step") -> None:
         """Write the pose and the numbers of a step; the path so far at keyframes."""
         rerun, values = self.rerun, values_of(step)
         if self.stream is None:

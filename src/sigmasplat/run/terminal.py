@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.filesize import decimal
@@ -18,9 +19,13 @@ from rich.progress import (
 from rich.table import Table
 
 from sigmasplat.data.component import APART, RELOCALISED
+from sigmasplat.run.callbacks import Callback
 from sigmasplat.run.figures import shares
-from sigmasplat.run.protocols import LoopResult, StepResult
 from sigmasplat.types import Progress
+
+if TYPE_CHECKING:
+    from sigmasplat.graph.loops import Loop
+    from sigmasplat.slam.step_result import Step
 
 PLAIN_LINES_EVERY_S = 10.0
 Show = Callable[[int, int | None, str], None]
@@ -121,7 +126,7 @@ def _bar(bars: Bars, title: str, total: int | None) -> Show:
     return lambda done, known, text: bars.update(task, completed=done, total=known or total, text=text)
 
 
-class _StepShow:
+class _StepShow(Callback):
     """Callback that shows steps as text of a bar, and lost tracking and loops as lines."""
 
     def __init__(self, say: Callable[[str], None], begin: Begin, total: int | None, done: int = 0) -> None:
@@ -133,7 +138,7 @@ class _StepShow:
         self.lost_since: int | None = None
         self.component = 0
 
-    def __call__(self, step: StepResult) -> None:
+    def __call__(self, step: "Step") -> None:
         self.done += 1
         self.lost += step.lost
         self._print_lost(step)
@@ -152,17 +157,17 @@ class _StepShow:
         left_s = (total - done) * (now_s - began_s) / (done - first) if done > first else None
         self.show_final(done, total, f"about {left_s:.0f} s left" if left_s and done < total else "")
 
-    def last_loops(self, loops: Sequence[LoopResult]) -> None:
+    def last_loops(self, loops: Sequence["Loop"]) -> None:
         """Print the loops closed after the last frame."""
         self._print_loops("at the end", loops)
 
-    def _print_loops(self, when: str, loops: Sequence[LoopResult]) -> None:
+    def _print_loops(self, when: str, loops: Sequence["Loop"]) -> None:
         for loop in loops:
             if loop.accepted:
                 figures = f"residual {loop.residual:.3f}, moved {100.0 * loop.translation_m:.1f} cm"
                 self.say(f"{when}: loop closed between submaps {loop.query} and {loop.database} ({figures})")
 
-    def _print_lost(self, step: StepResult) -> None:
+    def _print_lost(self, step: "Step") -> None:
         where = f"frame {step.index} (t = {step.timestamp_s:.3f} s)"
         if step.lost and self.lost_since is None:
             self.lost_since = step.index
@@ -172,7 +177,7 @@ class _StepShow:
             self.say(f"{where}: {how}; it was lost since frame {self.lost_since}")
             self.lost_since = None
 
-    def _print_component(self, step: StepResult) -> None:
+    def _print_component(self, step: "Step") -> None:
         component = step.component if step.state == APART else 0
         if step.lost or component == self.component:
             return

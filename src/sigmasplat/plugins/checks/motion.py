@@ -35,6 +35,14 @@ def times_of(source: Source) -> NDArray[np.float64]:
     return np.array(times)
 
 
+def rate(times_s: NDArray[np.float64]) -> str:
+    """Write the usual number of frames per second for times in seconds [N]: one over the median step."""
+    middle_s = float(np.median(np.diff(times_s))) if len(times_s) > 1 else 0.0
+    if middle_s <= 0.0:
+        return "–"
+    return f"{1.0 / middle_s:.1f}" if middle_s < 10.0 else f"{1.0 / middle_s:.2g}"
+
+
 def time_warnings(times_s: NDArray[np.float64]) -> list[str]:
     """Return warnings about the times of the frames, seconds [N]; [] if they are plausible."""
     steps_s = np.diff(times_s)
@@ -50,7 +58,7 @@ def time_warnings(times_s: NDArray[np.float64]) -> list[str]:
     middle_s = float(np.median(steps_s))
     low, high = PLAUSIBLE_RATE_HZ
     if middle_s > 0 and not low <= 1.0 / middle_s <= high:
-        warnings.append(f"the times give {1.0 / middle_s:.3g} frames per second; write times in seconds")
+        warnings.append(f"the times give {rate(times_s)} frames per second; write times in seconds")
         return warnings
     gaps = np.flatnonzero(steps_s > max(GAP_S, GAP_STEPS * middle_s))
     if len(gaps):

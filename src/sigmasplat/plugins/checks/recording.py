@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from sigmasplat.config import InputConfig
@@ -18,7 +19,7 @@ from sigmasplat.input.opening import format_name
 from sigmasplat.input.recorded import depth_warning
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.checks.depth import EdgeAgreement, SensorNoise, edge_agreement, measure_noise, overlay
-from sigmasplat.plugins.checks.motion import Motion, motion_warnings, time_warnings, times_of
+from sigmasplat.plugins.checks.motion import Motion, motion_warnings, rate, time_warnings, times_of
 from sigmasplat.plugins.outputs.drawing import colormap
 from sigmasplat.plugins.outputs.drawing.view_panels import BACKGROUND, FAINT, TEXT
 from sigmasplat.plugins.sources import open_source
@@ -77,7 +78,7 @@ def inspect_source(path: str | Path, settings: InputConfig, samples: int = SAMPL
     ]
     rows = [
         ("format", name),
-        *_size_rows(source, frames[0]),
+        *_size_rows(source, frames[0], times_s),
         *_depth_rows(source, frames, settings),
         ("depth noise", _noise_row(source, noise, sensor)),
         ("colour–depth alignment", "unknown: no outlines in depth" if agreement is None else agreement.sentence()),
@@ -131,12 +132,12 @@ def _unused_warnings(source: Source) -> list[str]:
     return [f"{unused} of {len(source) + unused} images are not used (first: {source.skipped[0]})"]
 
 
-def _size_rows(source: Source, first: Frame) -> list[tuple[str, str]]:
+def _size_rows(source: Source, first: Frame, times_s: NDArray[np.float64]) -> list[tuple[str, str]]:
     count, camera = len(source), source.camera
-    span_s = source.timestamp_s(count - 1) - first.timestamp_s
-    rate = f"{(count - 1) / span_s:.1f} per second, {span_s:.1f} s" if span_s > 0 else "no times"
+    span_s = float(np.ptp(times_s)) if len(times_s) else 0.0
+    times = f"{rate(times_s)} per second, {span_s:.1f} s" if span_s > 0 else "no times"
     return [
-        ("frames", f"{count}, {rate}"),
+        ("frames", f"{count}, {times}"),
         ("size", f"{camera.width}×{camera.height} pixels"),
         ("camera", f"fx {camera.fx:.1f}, fy {camera.fy:.1f}, cx {camera.cx:.1f}, cy {camera.cy:.1f} pixels"),
     ]

@@ -16,6 +16,7 @@ from sigmasplat.data.imu import up_of_path
 from sigmasplat.data.submap import SubmapStore
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SigmaSplatError
+from sigmasplat.graph.loops import Loop
 from sigmasplat.graph.path_covariance import PathCovariance
 from sigmasplat.plugins.outputs.floorplan.floor_plan import FloorPlan, floor_plan
 from sigmasplat.plugins.robots.frames import (
@@ -55,9 +56,10 @@ from sigmasplat.plugins.robots.ros_messages import (
 )
 from sigmasplat.render import FieldRenderer
 from sigmasplat.render.predictive import predict
-from sigmasplat.run.protocols import LoopResult, StepResult
+from sigmasplat.run.callbacks import Callback
 from sigmasplat.slam.checkpoint import path_errors
 from sigmasplat.slam.slam import Slam
+from sigmasplat.slam.step_result import Step
 from sigmasplat.types import Matrix
 
 Images = Literal["none", "keyframes", "all"]
@@ -67,8 +69,8 @@ STATIC = ((MAP, WORLD, T_MAP_WORLD), (LINK, OPTICAL, T_LINK_OPTICAL))
 """Each message of static transforms contains all of them, because late subscribers get only the last one."""
 
 
-class LiveRobot:
-    """A `protocols.Callback` that gives messages to outlets.
+class LiveRobot(Callback):
+    """Gives messages to outlets.
 
     It copies small data in the thread of the run. Messages are made and written on the threads of the outlets. images:
     of which frames images are given. warn: prints a line if an outlet fails.
@@ -90,7 +92,7 @@ class LiveRobot:
         if self.images != "none":
             self._frames[frame.index] = frame
 
-    def __call__(self, step: StepResult) -> None:
+    def __call__(self, step: Step) -> None:
         """Give the messages of a step to the outlets."""
         self._now(step.timestamp_s)
         self._forces.step(step.index, len(self.slam.steps) - 1)
@@ -104,10 +106,7 @@ class LiveRobot:
         self._offer_submaps(step.submap)
         self._report_failures()
 
-    def finishing(self, done: int, total: int) -> None:
-        """Do nothing while the final map is made."""
-
-    def last_loops(self, loops: Sequence[LoopResult]) -> None:
+    def last_loops(self, loops: Sequence[Loop]) -> None:
         """Give the final map, and the last pose if the last loops have moved it."""
         self._now(self.slam.steps[-1].timestamp_s)
         if any(loop.accepted for loop in loops):
@@ -132,7 +131,7 @@ class LiveRobot:
         if first:
             self._offer(partial(_static, self._stamp_ns, STATIC), TF_STATIC)
 
-    def _offer_images(self, step: StepResult) -> None:
+    def _offer_images(self, step: Step) -> None:
         frame = self._frames.pop(step.index, None)
         for index in list(self._frames):  # a copy: in real time `watch` runs on another thread
             if index < step.index:
@@ -141,7 +140,7 @@ class LiveRobot:
             job = partial(_images, self._stamp_ns, frame)
             self._offer(job, COLOR, COLOR_INFO, DEPTH, DEPTH_INFO, bulky=True)
 
-    def _offer_pose(self, step: StepResult, T_odom_camera: Matrix) -> None:
+    def _offer_pose(self, step: Step, T_odom_camera: Matrix) -> None:
         """Give the transforms and the odometry of a frame that is not lost.
 
         If the frame's component is not connected to the world, map → odom is not known and left out.

@@ -4,11 +4,13 @@ import time
 from collections.abc import Callable, Sequence
 
 from sigmasplat.data.component import LOST, outside_world, states_at_end, submaps_outside
+from sigmasplat.graph.loops import Loop
 from sigmasplat.plugins.outputs.drawing.colormap import Rgb
 from sigmasplat.plugins.viewer.finished import ShowSnapshot
 from sigmasplat.plugins.viewer.snapshot import BUDGET, DEFAULT_CAMERA, CameraPath, Piece, Snapshot, thin, within_budget
-from sigmasplat.run.protocols import LoopResult, StepResult
+from sigmasplat.run.callbacks import Callback
 from sigmasplat.slam.slam import Slam
+from sigmasplat.slam.step_result import Step
 
 EVERY_S = 2.0
 MAX_TIME_SHARE = 0.02
@@ -17,8 +19,8 @@ ACTIVE_SHARE = 1 / 3
 """Share of the budget for the active submap; the finished ones use the rest."""
 
 
-class LiveView:
-    """A `protocols.Callback` that shows snapshots of a system.
+class LiveView(Callback):
+    """Shows snapshots of a system.
 
     It copies the map between two frames, in the thread of the run, so that no data change while they are read.
     """
@@ -32,7 +34,7 @@ class LiveView:
         self._finished: tuple[Piece, ...] = ()
         self._keyframes: dict[int, tuple[int, int]] = {}
 
-    def __call__(self, step: StepResult) -> None:
+    def __call__(self, step: Step) -> None:
         """Show a snapshot after a step if one is due."""
         started_s = self._clock()
         if started_s >= self._due_s:
@@ -45,7 +47,7 @@ class LiveView:
         if done == 0 and len(self.slam.store) == len(self.slam.atlas.anchors):
             self.show(self.snapshot())
 
-    def last_loops(self, loops: Sequence[LoopResult]) -> None:
+    def last_loops(self, loops: Sequence[Loop]) -> None:
         """Show the final map."""
         self.show(self.snapshot(finished=True))
 
