@@ -140,19 +140,11 @@ class RecordedSource(Source):
     """A sequence of image pairs, rectified to one pinhole camera."""
 
     def __init__(
-        self,
-        name: str,
-        images: Sequence[ImagePair],
-        calibration: Calibration,
-        settings: InputConfig,
-        truth: Trajectory | None = None,
-        skipped: Sequence[str] = (),
-        test: Source | None = None,
-        gyroscope: Gyroscope | None = None,
-        accelerometer: Accelerometer | None = None,
-        surface: Path | None = None,
+        self, name: str, images: Sequence[ImagePair], calibration: Calibration, settings: InputConfig,
+        truth: Trajectory | None = None, skipped: Sequence[str] = (), test: Source | None = None,
+        gyroscope: Gyroscope | None = None, accelerometer: Accelerometer | None = None, surface: Path | None = None,
         estimated: bool = False,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Store image pairs in order of time; `truth` is the path of the colour camera; `skipped` lists files left out.
 
         test: separate test views; gyroscope, accelerometer: in the axes of the colour camera; surface: file of the true

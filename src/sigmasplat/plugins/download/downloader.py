@@ -89,15 +89,9 @@ class DownloadJob:
 
 
 def download_recording(
-    public_set: PublicSet,
-    name: str,
-    out: Path,
-    progress: FileProgress,
-    log: Log = lambda line: None,
-    overwrite: bool = False,
-    keep_archive: bool = False,
-    retry: RetryPolicy | None = None,
-) -> Path:
+    public_set: PublicSet, name: str, out: Path, progress: FileProgress, log: Log = lambda line: None,
+    overwrite: bool = False, keep_archive: bool = False, retry: RetryPolicy | None = None,
+) -> Path:  # fmt: skip
     """Download a recording of a data set, unless it exists already; return its folder below `out`.
 
     `log` receives the licence and the size first. Downloaded parts are kept on errors and on Ctrl-C, and the next call

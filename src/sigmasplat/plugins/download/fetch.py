@@ -294,12 +294,9 @@ def _content_range(value: str) -> tuple[int, int | None]:
 
 
 def _receive(
-    response: http.client.HTTPResponse,
-    part: PartialFile,
-    size_bytes: int | None,
-    progress: "Progress",
+    response: http.client.HTTPResponse, part: PartialFile, size_bytes: int | None, progress: "Progress",
     retry: RetryPolicy,
-) -> None:
+) -> None:  # fmt: skip
     """Write the body as it arrives. Raises _TransferError if the connection fails or is too slow."""
     host = response.geturl()
     since_s, since_bytes = time.monotonic(), part.size_bytes
