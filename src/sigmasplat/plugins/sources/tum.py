@@ -196,12 +196,11 @@ T_MARKERS_CAMERA = se3.orthonormalise(
 
 def open_bonn(path: str, settings: InputConfig) -> RecordedSource:
     """Open a folder of the Bonn data set. Raises SourceError as `open_tum`."""
-    return open_tum(path, settings, BONN, _camera_path)
 
+    def camera_path(markers: Trajectory) -> Trajectory:
+        return Trajectory(markers.timestamps_s, T_ROS @ markers.T_world_camera @ T_ROS @ T_MARKERS_CAMERA)
 
-def _camera_path(markers: Trajectory) -> Trajectory:
-    """Convert the recorded path of the markers to the path of the camera."""
-    return Trajectory(markers.timestamps_s, T_ROS @ markers.T_world_camera @ T_ROS @ T_MARKERS_CAMERA)
+    return open_tum(path, settings, BONN, camera_path)
 
 
 def _has_lists(path: str) -> bool:
