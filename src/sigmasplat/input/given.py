@@ -194,7 +194,7 @@ def _poses_of(whole: Source, given: str) -> list[Matrix | None]:
     if isinstance(poses, Trajectory):
         found, why = _by_time(whole, poses)
     elif isinstance(poses, list):
-        found, why = poses, "no pose is finite; give at least one finite pose"
+        found, why = poses, ": no pose is finite; give at least one finite pose"
         if len(poses) != len(whole):
             raise SourceError(
                 f"{given}: found {len(poses)} poses for {len(whole)} frames; give one for each frame, in order"
@@ -202,7 +202,7 @@ def _poses_of(whole: Source, given: str) -> list[Matrix | None]:
     else:
         found, why = _by_name(whole, poses)
     if all(T is None for T in found):
-        raise SourceError(f"{given}: {why}")
+        raise SourceError(f"{given}{why}")
     return found
 
 
@@ -213,7 +213,7 @@ def _by_time(whole: Source, path: Trajectory) -> tuple[list[Matrix | None], str]
     for i, row in associate(times_s, path.timestamps_s):
         found[i] = path.T_world_camera[row]
     return found, (
-        f"no pose is within {MAX_GAP_S:g} s of a frame (poses {path.timestamps_s.min():.3f} … "
+        f": no pose is within {MAX_GAP_S:g} s of a frame (poses {path.timestamps_s.min():.3f} … "
         f"{path.timestamps_s.max():.3f} s, frames {times_s.min():.3f} … {times_s.max():.3f} s); "
         "use the clock of the recording, in seconds"
     )
@@ -223,6 +223,6 @@ def _by_name(whole: Source, poses: dict[str, Matrix]) -> tuple[list[Matrix | Non
     names = [Path(whole.image_name(i)).stem for i in range(len(whole))]
     has = f"images are named as {names[0]}" if names[0] else "the recording has no names of images"
     return [poses.get(name) for name in names], (
-        f"no pose has the name of an image (poses are named as {next(iter(poses), 'nothing')}, {has}); "
+        f": no pose has the name of an image (poses are named as {next(iter(poses), 'nothing')}, {has}); "
         "use the names of the recording's colour images, or give TUM text"
     )

@@ -41,12 +41,9 @@ def to_matrix(where: str, values: Any) -> Matrix:
     except (ValueError, TypeError):
         flat = np.zeros(0)
     if len(flat) not in (12, 16):
-        raise SourceError(f"{where}: expected a 4×4 matrix by rows, found {_described(values)}")
+        found = f"{len(values)} values" if isinstance(values, list) else repr(values)[:60]
+        raise SourceError(f"{where}: expected a 4×4 matrix by rows, found {found}")
     return np.vstack([flat[:12].reshape(3, 4), flat[12:].reshape(-1, 4) if len(flat) == 16 else [[0, 0, 0, 1]]])
-
-
-def _described(values: Any) -> str:
-    return f"{len(values)} values" if isinstance(values, list) else repr(values)[:60]
 
 
 def checked_pose(where: str, T: Matrix) -> Matrix | None:

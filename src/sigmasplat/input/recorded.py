@@ -140,19 +140,11 @@ class RecordedSource(Source):
     """A sequence of image pairs, rectified to one pinhole camera."""
 
     def __init__(
-        self,
-        name: str,
-        images: Sequence[ImagePair],
-        calibration: Calibration,
-        settings: InputConfig,
-        truth: Trajectory | None = None,
-        skipped: Sequence[str] = (),
-        test: Source | None = None,
-        gyroscope: Gyroscope | None = None,
-        accelerometer: Accelerometer | None = None,
-        surface: Path | None = None,
+        self, name: str, images: Sequence[ImagePair], calibration: Calibration, settings: InputConfig,
+        truth: Trajectory | None = None, skipped: Sequence[str] = (), test: Source | None = None,
+        gyroscope: Gyroscope | None = None, accelerometer: Accelerometer | None = None, surface: Path | None = None,
         estimated: bool = False,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Store image pairs in order of time; `truth` is the path of the colour camera; `skipped` lists files left out.
 
         test: separate test views; gyroscope, accelerometer: in the axes of the colour camera; surface: file of the true
@@ -170,7 +162,8 @@ class RecordedSource(Source):
         self._images, self._truth, self._test = images, truth, test
         self._gyroscope, self._accelerometer = gyroscope, accelerometer
         self._surface, self._estimated = surface, estimated
-        self._refuse_sizes_of_first()
+        files, (size, depth_size) = first_readable(images, lambda pair: (pair, pair.sizes()))
+        check_image_sizes(self._rectified, files.color, size, files.depth, depth_size)
         self._refuse_other_clock()
         refuse_without_depth(self)
 
@@ -215,11 +208,6 @@ class RecordedSource(Source):
 
     def true_surface_file(self) -> Path | None:
         return self._surface
-
-    def _refuse_sizes_of_first(self) -> None:
-        """Raise SourceError before a run if the image sizes do not match the calibration."""
-        files, (size, depth_size) = first_readable(self._images, lambda pair: (pair, pair.sizes()))
-        check_image_sizes(self._rectified, files.color, size, files.depth, depth_size)
 
     def _refuse_other_clock(self) -> None:
         """Raise SourceError before a run if the gyroscope measured at another time than the images were taken."""

@@ -185,7 +185,9 @@ class Rectification:
         self._depth_lens = self._color_lens
         self._registration: DepthRegistration | None = None
         if depth_camera is not None:
-            self.camera = _limited_width(calibration.camera, max(depth_camera.width, settings.width))
+            color, width = calibration.camera, max(depth_camera.width, settings.width)
+            if color.width > width:
+                self.camera = color.resized(width, round(color.height * width / color.width))
             self._depth_lens = _undistortion(depth_camera, depth_lens)
             self._registration = DepthRegistration(depth_camera, self.camera, calibration.T_color_depth)
 
@@ -244,8 +246,3 @@ def check_image_sizes(
 
 def _undistortion(camera: Camera, coefficients: tuple[float, ...] | None) -> Undistortion | None:
     return Undistortion(camera, np.array(coefficients)) if coefficients else None
-
-
-def _limited_width(color: Camera, width: int) -> Camera:
-    """Return the colour camera with at most `width` pixels per row."""
-    return color if color.width <= width else color.resized(width, round(color.height * width / color.width))

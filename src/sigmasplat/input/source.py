@@ -4,9 +4,10 @@ import queue
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,13 +24,8 @@ from sigmasplat.native.threads import yield_to_others
 Item = TypeVar("Item")
 
 
-@dataclass(frozen=True)
-class _Result(Generic[Item]):
-    """One item, or the exception that ended the producer, or neither at the end."""
-
-    item: Item | None = None
-    error: BaseException | None = None
-    last: bool = False
+Results = queue.Queue[tuple[Item | None, BaseException | None, bool]]
+"""Items; last the exception that ended the producer, or nothing. True: nothing follows."""
 
 
 def read_ahead(items: Iterable[Item], length: int = 4) -> Iterator[Item]:
@@ -39,42 +35,39 @@ def read_ahead(items: Iterable[Item], length: int = 4) -> Iterator[Item]:
     An exception of the producer is raised here in place of the item. The thread ends after the last item,
     or as soon as the consumer closes or deletes this generator.
     """
-    results: queue.Queue[_Result[Item]] = queue.Queue(maxsize=length)
+    results: Results[Item] = queue.Queue(maxsize=length)
     stop = threading.Event()
     thread = threading.Thread(target=_produce, args=(items, results, stop), name="read-ahead", daemon=True)
     thread.start()
     try:
-        while not (result := results.get()).last:
-            yield result.item  # type: ignore[misc]
-        if result.error is not None:
-            raise result.error
+        while True:
+            item, error, last = results.get()
+            if error is not None:
+                raise error
+            if last:
+                return
+            yield item  # type: ignore[misc]
     finally:
         stop.set()
-        _drain(results)  # frees space, so that a producer blocked in put() wakes up and sees `stop`
+        with suppress(queue.Empty):  # frees space, so that a producer blocked in put() wakes up and sees `stop`
+            while True:
+                results.get_nowait()
         thread.join()
 
 
-def _produce(items: Iterable[Item], results: "queue.Queue[_Result[Item]]", stop: threading.Event) -> None:
+def _produce(items: Iterable[Item], results: Results[Item], stop: threading.Event) -> None:
     yield_to_others()
     try:
         for item in items:
             if stop.is_set():
                 return
-            results.put(_Result(item=item))
+            results.put((item, None, False))
             if stop.is_set():
                 return
     except BaseException as error:  # passed to the consumer's thread, which raises it
-        results.put(_Result(error=error, last=True))
+        results.put((None, error, True))
     else:
-        results.put(_Result(last=True))
-
-
-def _drain(results: "queue.Queue[_Result[Item]]") -> None:
-    while True:
-        try:
-            results.get_nowait()
-        except queue.Empty:
-            return
+        results.put((None, None, True))
 
 
 FACTS = (

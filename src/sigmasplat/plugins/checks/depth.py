@@ -163,7 +163,10 @@ class SensorNoise:
 
     def row(self, sensor: str) -> str:
         """Describe the noise beside that of the model in use (`input.sensor`)."""
-        measured, used = (_in_mm(model) for model in (self.model, in_use(sensor)))
+        measured, used = (
+            ", ".join(f"{1000 * std_at(model, z):.2g}" for z in SHOWN_M) + " mm"
+            for model in (self.model, in_use(sensor))
+        )
         return (
             f"{measured} at {', '.join(f'{z:g}' for z in SHOWN_M)} m, from {self.patches} flat patches at "
             f"{self.range_m[0]:.1f} to {self.range_m[1]:.1f} m; in use ({sensor}): {used}; measured model: "
@@ -234,7 +237,3 @@ def flat_patches(frame: Frame) -> tuple[Floats, Floats]:
     cosine = fitted[:, 0] / (ray * np.linalg.norm(normal, axis=0))
     flat = (least > CURVED * rest) & (cosine > LEAST_COSINE)
     return z[flat], (z * z * np.sqrt(rest / (size * size - 3)))[flat]
-
-
-def _in_mm(model: SensorModel) -> str:
-    return ", ".join(f"{1000 * std_at(model, z):.2g}" for z in SHOWN_M) + " mm"

@@ -1,6 +1,6 @@
 """Inspect a recording before a run: format, size, depth and poses; problems that degrade the map, and their fixes."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from sigmasplat.input.calibration import CameraUnknown, unlikely_camera
 from sigmasplat.input.opening import format_name
 from sigmasplat.input.recorded import depth_warning
 from sigmasplat.input.source import Source
-from sigmasplat.plugins.checks.depth import EdgeAgreement, SensorNoise, edge_agreement, measure_noise, overlay
+from sigmasplat.plugins.checks.depth import EdgeAgreement, edge_agreement, measure_noise, overlay
 from sigmasplat.plugins.checks.motion import Motion, motion_warnings, rate, time_warnings, times_of
 from sigmasplat.plugins.outputs.drawing import colormap
 from sigmasplat.plugins.outputs.drawing.view_panels import BACKGROUND, FAINT, TEXT
@@ -58,29 +58,32 @@ class Inspection:
 def inspect_source(path: str | Path, settings: InputConfig, samples: int = SAMPLES) -> Inspection:
     """Open a recording and inspect `samples` frames, evenly spaced. Raises SourceError if it cannot be opened."""
     name, (source, guessed) = format_name(path, settings), _opened(path, settings)
-    frames = _sampled(source, samples)
+    spaced = np.linspace(0, len(source) - 1, min(samples, len(source))).round()
+    frames = [*_readable(source, sorted({int(k) for k in spaced}), source.skipped)]
     if not frames:
         raise SourceError(f"{source.name}: none of {samples} sampled frames can be read; check the image files")
     agreement = None if source.computed_depth else edge_agreement(frames)  # stereo depth has the left image's pixels
     noise = None if source.predicted_depth else measure_noise(frames)
+    not_measured = "not measured: depth is predicted" if source.predicted_depth else "unknown: too few flat surfaces"
     sensor = (source.sensor or AUTO) if settings.sensor == AUTO else settings.sensor
     times_s = times_of(source)
     first = max(0, (len(source) - CONSECUTIVE) // 2)
+    consecutive = range(first, min(first + CONSECUTIVE, len(source)))
     warnings = [
         *guessed,
-        *_warnings_of_one(unlikely_camera(source.camera)),
+        *filter(None, [unlikely_camera(source.camera)]),
         *time_warnings(times_s),
         *_unused_warnings(source),
         *_depth_warnings(source, frames, settings),
         *_registration_warnings(source, agreement),
         *_brightness_warnings(frames),
-        *motion_warnings(Motion.of(_consecutive(source, first)), first),
+        *motion_warnings(Motion.of(_readable(source, consecutive, [])), first),
     ]
     rows = [
         ("format", name),
         *_size_rows(source, frames[0], times_s),
         *_depth_rows(source, frames, settings),
-        ("depth noise", _noise_row(source, noise, sensor)),
+        ("depth noise", noise.row(sensor) if noise else not_measured),
         ("colour–depth alignment", "unknown: no outlines in depth" if agreement is None else agreement.sentence()),
         ("poses", source.described_truth() or "none: the error of the path cannot be measured"),
         *_imu_rows(frames),
@@ -100,28 +103,13 @@ def _opened(path: str | Path, settings: InputConfig) -> tuple[Source, list[str]]
         return open_source(path, settings, fx=float(fx)), [f"{problem}; this inspection assumes fx = {fx} pixels"]
 
 
-def _sampled(source: Source, samples: int) -> list[Frame]:
-    """Read evenly spaced frames. Unreadable ones are added to `source.skipped`."""
-    frames = []
-    for i in sorted({int(k) for k in np.linspace(0, len(source) - 1, min(samples, len(source))).round()}):
-        try:
-            frames.append(source.frame(i))
-        except SourceError as problem:
-            source.skipped.append(str(problem))
-    return frames
-
-
-def _consecutive(source: Source, first: int) -> Iterator[Frame]:
-    """Yield the readable frames of the part whose motion is checked."""
-    for i in range(first, min(first + CONSECUTIVE, len(source))):
+def _readable(source: Source, numbers: Iterable[int], skipped: list[str]) -> Iterator[Frame]:
+    """Yield the frames with these numbers; what is wrong with the others is added to `skipped`."""
+    for i in numbers:
         try:
             yield source.frame(i)
-        except SourceError:
-            continue
-
-
-def _warnings_of_one(warning: str | None) -> list[str]:
-    return [warning] if warning else []
+        except SourceError as problem:
+            skipped.append(str(problem))
 
 
 def _unused_warnings(source: Source) -> list[str]:
@@ -156,15 +144,9 @@ def _depth_rows(source: Source, frames: list[Frame], settings: InputConfig) -> l
         ("depth", f"{low:.2f} to {high:.2f} m, median {middle:.2f} m; {used:.0%} within the limits of the run"),
         ("without depth", f"{_holes(frames):.0%} of the pixels"),
         ("depth camera", _depth_camera(source, settings)),
-        *_scale_question(middle, settings),
-    ]
-
-
-def _noise_row(source: Source, noise: SensorNoise | None, sensor: str) -> str:
-    """Describe the noise of depth, if it was measured."""
-    if noise is not None:
-        return noise.row(sensor)
-    return "not measured: depth is predicted" if source.predicted_depth else "unknown: too few flat surfaces"
+    ] + [("your depth scale", f"it gives a median depth of {middle:.2f} m: is this plausible?")] * bool(
+        settings.depth_scale
+    )
 
 
 def _imu_rows(frames: list[Frame]) -> list[tuple[str, str]]:
@@ -185,19 +167,12 @@ def _depth_camera(source: Source, settings: InputConfig) -> str:
     return "same as colour, according to the recording"
 
 
-def _scale_question(middle_m: float, settings: InputConfig) -> list[tuple[str, str]]:
-    """Return a question about the median depth if the user gave a depth scale, else no row."""
-    if not settings.depth_scale:
-        return []
-    return [("your depth scale", f"it gives a median depth of {middle_m:.2f} m: is this plausible?")]
-
-
 def _holes(frames: list[Frame]) -> float:
     return float(np.mean([(frame.depth_m == 0).mean() for frame in frames]))
 
 
 def _depth_warnings(source: Source, frames: list[Frame], settings: InputConfig) -> list[str]:
-    warnings = _warnings_of_one(depth_warning(source))
+    warnings = [*filter(None, [depth_warning(source)])]
     if _holes(frames) > MANY_HOLES:
         warnings.append(f"{_holes(frames):.0%} of the pixels have no depth; the map will have holes")
     max_depth_m = settings.max_depth_m * source.scene_scale

@@ -34,10 +34,13 @@ def verify(path: Path, published: str, progress: "Progress") -> str:
     algorithm = published.partition(":")[0] or "sha256"
     found = f"{algorithm}:{_digest(path, algorithm, progress)}"
     record = path.with_name(f"{path.name}.sha256")
-    wanted = published or _recorded_checksum(record)
+    words = record.read_text(encoding="utf-8").split() if record.is_file() else []  # as sha256sum writes them
+    wanted = published or (f"sha256:{words[0]}" if words else "")
     if wanted and not found.startswith(wanted):
         path.unlink()
-        raise DownloadError(f"{path} was damaged and has been removed; {_advice(record, published, found, wanted)}")
+        changed = f"has changed (before {wanted}, now {found}); run it again, or delete {record} to accept it"
+        what = f"is {found}, not {wanted}; run it again" if published else changed
+        raise DownloadError(f"{path} was damaged and has been removed; its checksum {what}")
     if not wanted:
         write_text(record, f"{found.partition(':')[2]}  {path.name}\n")
     return found
@@ -52,18 +55,6 @@ def _digest(path: Path, algorithm: str, progress: "Progress") -> str:
             done += len(chunk)
             progress(done, total)
     return digest.hexdigest()
-
-
-def _recorded_checksum(record: Path) -> str:
-    """Return the checksum from a file in the format of sha256sum, "" if there is no file."""
-    words = record.read_text(encoding="utf-8").split() if record.is_file() else []
-    return f"sha256:{words[0]}" if words else ""
-
-
-def _advice(record: Path, published: str, found: str, wanted: str) -> str:
-    if published:
-        return f"its checksum is {found}, not {wanted}; run it again"
-    return f"its checksum has changed (before {wanted}, now {found}); run it again, or delete {record} to accept it"
 
 
 MARKER = ".sigmasplat-download.json"
@@ -89,15 +80,9 @@ class DownloadJob:
 
 
 def download_recording(
-    public_set: PublicSet,
-    name: str,
-    out: Path,
-    progress: FileProgress,
-    log: Log = lambda line: None,
-    overwrite: bool = False,
-    keep_archive: bool = False,
-    retry: RetryPolicy | None = None,
-) -> Path:
+    public_set: PublicSet, name: str, out: Path, progress: FileProgress, log: Log = lambda line: None,
+    overwrite: bool = False, keep_archive: bool = False, retry: RetryPolicy | None = None,
+) -> Path:  # fmt: skip
     """Download a recording of a data set, unless it exists already; return its folder below `out`.
 
     `log` receives the licence and the size first. Downloaded parts are kept on errors and on Ctrl-C, and the next call

@@ -16,7 +16,6 @@ import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
-from email.message import Message
 from io import FileIO
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -176,18 +175,11 @@ def fetch(url: str, target: Path, progress: "Progress", check_size: CheckSize, r
                 gained = part.size_bytes - before
                 failures = 0 if gained >= retry.progress_bytes else failures + 1
                 if failures >= retry.max_attempts or (broken.hopeless and not part.size_bytes):
-                    raise DownloadError(f"{broken}{_resume_hint(part)}") from broken
-                time.sleep(_wait_s(failures, broken.wait_s, retry))
+                    kept = f"; {part.size_bytes:,} bytes are kept, run it again to resume" if part.size_bytes else ""
+                    raise DownloadError(f"{broken}{kept}") from broken
+                waited_s = retry.first_wait_s * 2.0 ** max(failures - 1, 0)
+                time.sleep(min(max(waited_s, broken.wait_s), retry.max_wait_s))
         part.finish()
-
-
-def _resume_hint(part: PartialFile) -> str:
-    return f"; {part.size_bytes:,} bytes are kept, run it again to resume" if part.size_bytes else ""
-
-
-def _wait_s(failures: int, requested_s: float, retry: RetryPolicy) -> float:
-    waited = retry.first_wait_s * 2.0 ** max(failures - 1, 0)
-    return min(max(waited, requested_s), retry.max_wait_s)
 
 
 def _continue(url: str, part: PartialFile, progress: "Progress", check_size: CheckSize, retry: RetryPolicy) -> None:
@@ -273,14 +265,10 @@ def _prepare(
             f"{_host(url)} does not send the length of the file, so a complete download could not be recognised"
         )
     size_bytes = int(length) if length.isdigit() else None
-    part.begin(RemoteVersion(url, _version(headers), size_bytes))
+    etag = str(headers.get("ETag", ""))  # If-Range takes a strong one, or the date
+    version_now = etag if etag.startswith('"') else str(headers.get("Last-Modified", ""))
+    part.begin(RemoteVersion(url, version_now, size_bytes))
     return size_bytes
-
-
-def _version(headers: Message) -> str:
-    """Return the value for If-Range: a strong ETag, or the date."""
-    etag = str(headers.get("ETag", ""))
-    return etag if etag.startswith('"') else str(headers.get("Last-Modified", ""))
 
 
 def _content_range(value: str) -> tuple[int, int | None]:
@@ -294,12 +282,9 @@ def _content_range(value: str) -> tuple[int, int | None]:
 
 
 def _receive(
-    response: http.client.HTTPResponse,
-    part: PartialFile,
-    size_bytes: int | None,
-    progress: "Progress",
+    response: http.client.HTTPResponse, part: PartialFile, size_bytes: int | None, progress: "Progress",
     retry: RetryPolicy,
-) -> None:
+) -> None:  # fmt: skip
     """Write the body as it arrives. Raises _TransferError if the connection fails or is too slow."""
     host = response.geturl()
     since_s, since_bytes = time.monotonic(), part.size_bytes

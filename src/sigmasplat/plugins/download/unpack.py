@@ -37,17 +37,12 @@ class Budget:
     bytes: int
     files: int
 
-    def spend_bytes(self, count: int) -> None:
-        """Subtract bytes to be written. Raises ArchiveError if the budget is exceeded."""
-        self.bytes -= count
-        if self.bytes < 0:
-            raise ArchiveError("holds more bytes than expected for this data set")
-
-    def spend_file(self) -> None:
-        """Subtract a file or folder to be created. Raises ArchiveError if the budget is exceeded."""
-        self.files -= 1
-        if self.files < 0:
-            raise ArchiveError("holds more files than expected for this data set")
+    def spend(self, bytes: int, files: int) -> None:
+        """Subtract bytes, and files or folders, to be written. Raises ArchiveError if the budget is exceeded."""
+        self.bytes, self.files = self.bytes - bytes, self.files - files
+        if self.bytes < 0 or self.files < 0:
+            what = "bytes" if self.bytes < 0 else "files"
+            raise ArchiveError(f"holds more {what} than expected for this data set")
 
 
 def is_archive(name: str) -> bool:
@@ -89,7 +84,7 @@ def _unpack_tar(archive: Path, folder: Path, budget: Budget, progress: "Progress
         stream = _BudgetedStream(inflated, budget)
         with tarfile.open(fileobj=stream, mode="r|") as tar:
             for member in tar:
-                budget.spend_file()
+                budget.spend(0, 1)
                 place = _target_path(folder, member.name)
                 if member.isdir():
                     _make_folder(place)
@@ -114,7 +109,7 @@ class _BudgetedStream(io.RawIOBase):
     def read(self, size: int = -1) -> bytes:
         """Read at most `size` bytes."""
         chunk = self._stream.read(size)
-        self._budget.spend_bytes(len(chunk))
+        self._budget.spend(len(chunk), 0)
         return chunk
 
 
@@ -122,8 +117,7 @@ def _unpack_zip(archive: Path, folder: Path, budget: Budget, progress: "Progress
     with zipfile.ZipFile(archive) as zipped:
         entries = zipped.infolist()
         for entry in entries:  # check the headers before anything is written
-            budget.spend_file()
-            budget.spend_bytes(entry.file_size)
+            budget.spend(entry.file_size, 1)
             _check_entry(entry)
             _target_path(folder, entry.filename)
         done, total = 0, sum(entry.compress_size for entry in entries)

@@ -40,32 +40,16 @@ PREFIX = re.compile(r"^\[ONNXRuntimeError\] : \d+ : \w+ : ")
 
 
 class Tensor(NamedTuple):
-    """An input or output of a network: name, type as onnxruntime writes it, sizes of its axes (other than a number:
-    any)."""
+    """An input or output of a network: name, type as onnxruntime writes it, sizes of its axes (no number: any)."""
 
     name: str
     type: str
     shape: tuple[Any, ...]
 
-    @classmethod
-    def all_of(cls, described: Iterable[Any]) -> "list[Tensor]":
-        """Copy what onnxruntime describes."""
-        return [cls(str(each.name), str(each.type), tuple(each.shape)) for each in described]
 
-    def __str__(self) -> str:
-        """Return type and shape in one short line."""
-        return _listed([f"{self.type} of shape {'×'.join(map(str, self.shape)) or 'unknown'}"])
-
-
-class Step(NamedTuple):
-    """Sides of images are multiples of this number of pixels; the shorter side is about `side` pixels."""
-
-    multiple: int
-    side: int
-
-
-STEPS = (Step(14, 518), Step(32, 384))
-"""What networks of any size need: first those of the ViT/14 family (Depth Anything), then MiDaS, DPT and ZoeDepth."""
+STEPS = ((14, 518), (32, 384))
+"""What networks of any size need: the sides of images are multiples of the first number, and the shorter side is about
+the second one, pixels; for the ViT/14 family (Depth Anything), then for MiDaS, DPT and ZoeDepth."""
 
 
 @dataclass(frozen=True)
@@ -93,8 +77,9 @@ class ImageInput:
         channels_first = first == CHANNELS or (first is None and last != CHANNELS)
         height, width = (*middle, last) if channels_first else (first, *middle)
         if numbers is None or not (channels_first or last == CHANNELS) or (batch and shape[0] not in (1, None)):
+            found = _listed([f"{only.type} of shape {'×'.join(map(str, only.shape)) or 'unknown'}"])
             raise SourceError(
-                f"{path}: the input of the network is {only}; export it for one colour image: "
+                f"{path}: the input of the network is {found}; export it for one colour image: "
                 "1×3×H×W or 1×H×W×3, float32, float16 or uint8"
             )
         check_pixels(path, (width or 1, height or 1))
@@ -105,10 +90,10 @@ class ImageInput:
         if self.height and self.width:
             return [(self.height, self.width)]
         found = []
-        for step in STEPS:
-            scale = (side or step.side) / min(height, width)
+        for multiple, usual in STEPS:
+            scale = (side or usual) / min(height, width)
             scale = self.height / height if self.height else self.width / width if self.width else scale
-            rows, columns = (max(1, round(each * scale / step.multiple)) * step.multiple for each in (height, width))
+            rows, columns = (max(1, round(each * scale / multiple)) * multiple for each in (height, width))
             found.append((self.height or rows, self.width or columns))
         return found
 
@@ -145,7 +130,8 @@ class DepthModel:
             # prints and tries the same again.
             options, cpu = _options(runtime, settings.depth_model_threads), ["CPUExecutionProvider"]
             self._session = runtime.InferenceSession(data, options, providers=cpu, enable_fallback=False)
-            inputs, outputs = map(Tensor.all_of, (self._session.get_inputs(), self._session.get_outputs()))
+            described = self._session.get_inputs(), self._session.get_outputs()  # copied: their text may be damaged
+            inputs, outputs = ([Tensor(str(t.name), str(t.type), tuple(t.shape)) for t in each] for each in described)
         self._input = ImageInput.of(path, inputs)
         self._output = _chosen_output(path, outputs, settings.depth_model_output)
         self._size_of: dict[tuple[int, ...], Size] = {}

@@ -187,7 +187,8 @@ def read_bag_calibration(bag: Bag, color: ImageTopic, depth: ImageTopic, setting
     recorded = Calibration(optics[0], units, optics[1]) if optics else None
     calibration = resolve_calibration(bag.path, recorded, color.size, settings, units)
     decided = settings.calibration or calibration.depth_camera or settings.register_depth == "off"
-    if decided or _is_registered(color, depth):
+    same_frame = bool(depth.frame) and depth.frame == color.frame and not sdk_stream(depth)
+    if decided or depth.registered or same_frame:
         return calibration
     depth_optics = read_optics(bag, depth)
     if depth_optics is None and depth.size == color.size:
@@ -201,11 +202,6 @@ def read_bag_calibration(bag: Bag, color: ImageTopic, depth: ImageTopic, setting
     return replace(
         calibration, depth_camera=camera, depth_distortion=lens, T_color_depth=_color_depth(bag, color, depth)
     )
-
-
-def _is_registered(color: ImageTopic, depth: ImageTopic) -> bool:
-    """Return whether depth is registered to colour: by its topic name, or by an equal optical frame."""
-    return depth.registered or (bool(depth.frame) and depth.frame == color.frame and not sdk_stream(depth))
 
 
 def read_optics(bag: Bag, topic: ImageTopic) -> Optics | None:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from sigmasplat.env import import_optional
 from sigmasplat.errors import SourceError
 from sigmasplat.files.reading import open_regular, refuse_special
-from sigmasplat.input.images import decode_color, depth_to_metres, image_size, read_values
+from sigmasplat.input.images import decode_color, depth_to_metres, image_size, read_values, without_nan
 
 Message = Any
 Value = TypeVar("Value")
@@ -229,7 +229,7 @@ def decode_depth_message(path: Path, message: Message, units_per_metre: float) -
     if message.encoding not in DEPTH_TYPE:
         raise _encoding(path, "depth", message.encoding, DEPTH_TYPE)
     raw = _pixels(path, message, DEPTH_TYPE[message.encoding], 1)[..., 0]
-    return depth_to_metres(path, _without_nan(raw) if raw.dtype.kind == "f" else raw, units_per_metre)
+    return depth_to_metres(path, without_nan(raw) if raw.dtype.kind == "f" else raw, units_per_metre)
 
 
 def _decompressed(path: Path, message: Message, units_per_metre: float) -> NDArray[np.float32]:
@@ -242,7 +242,7 @@ def _decompressed(path: Path, message: Message, units_per_metre: float) -> NDArr
         return depth_to_metres(path, raw, units_per_metre)
     a, b = struct.unpack_from("<ff", data, 4)
     with np.errstate(divide="ignore", invalid="ignore"):
-        return depth_to_metres(path, _without_nan(np.where(raw > 0, a / (raw - b), 0.0)), units_per_metre)
+        return depth_to_metres(path, without_nan(np.where(raw > 0, a / (raw - b), 0.0)), units_per_metre)
 
 
 def _pixels(path: Path, message: Message, kind: str, channels: int) -> NDArray[Any]:
@@ -256,12 +256,6 @@ def _pixels(path: Path, message: Message, kind: str, channels: int) -> NDArray[A
         )
     rows = message.data.reshape(message.height, message.step)[:, :row]
     return np.ascontiguousarray(rows).view(dtype).reshape(message.height, message.width, channels)
-
-
-def _without_nan(depth_m: NDArray[Any]) -> NDArray[np.float32]:
-    """Return float depth with 0 for NaN (no reading) and infinity (out of range), see REP 117."""
-    filled: NDArray[np.float32] = np.nan_to_num(depth_m, nan=0.0, posinf=0.0, neginf=0.0).astype(np.float32)
-    return filled
 
 
 def _encoding(path: Path, what: str, found: str, known: dict[str, Any]) -> SourceError:

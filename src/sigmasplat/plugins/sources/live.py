@@ -6,11 +6,10 @@ import time
 from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
-from typing import NamedTuple, Protocol
 
 from sigmasplat.config import InputConfig
 from sigmasplat.data.camera import Camera
@@ -28,17 +27,10 @@ USUAL, FEW = 20, 5
 """What is usual is the median over this many recent frames; with fewer than the second number, it is not known."""
 
 
-class Arrival(NamedTuple):
-    """A frame and the time when it arrived."""
-
-    frame: Frame
-    arrived_s: float
-
-
-class Waiting(Protocol):
-    """Waits for a time, but no longer than until an event is set."""
-
-    def __call__(self, until_s: float, stop: threading.Event) -> None: ...
+Arrival = tuple[Frame, float]
+"""A frame, and the time when it arrived."""
+Waiting = Callable[[float, threading.Event], None]
+"""Waits for a time, but no longer than until an event is set."""
 
 
 def wait_until(until_s: float, stop: threading.Event) -> None:
@@ -82,8 +74,8 @@ class Arrivals(Wrapped):
         thread.start()
         try:
             while (arrival := queue.get()) is not None:
-                self.arrived_s = arrival.arrived_s
-                yield arrival.frame
+                frame, self.arrived_s = arrival
+                yield frame
         finally:
             queue.stop.set()
             thread.join()
@@ -100,7 +92,7 @@ class Arrivals(Wrapped):
                     self._wait(begin_s + frame.timestamp_s, queue.stop)
                 if queue.stop.is_set():
                     return
-                queue.put(Arrival(frame, self._clock()))
+                queue.put((frame, self._clock()))
             queue.end(None)
         except BaseException as error:  # passed to the consumer's thread, which raises it
             queue.end(error)
@@ -109,17 +101,15 @@ class Arrivals(Wrapped):
                 frames.close()
 
 
-@dataclass(eq=False)
 class _Newest:
     """The frames that wait for the consumer; usual_s: the usual time between frames, infinite if it is not known."""
 
-    def __post_init__(self) -> None:
+    def __init__(self) -> None:
         self.stop, self.dropped, self.usual_s = threading.Event(), 0, math.inf
         self._arrived_s = deque[float](maxlen=USUAL + 1)
         self._changed, self._frames = threading.Condition(), deque[Arrival]()
-        self._ended, self._error = False, None
-
-    _error: BaseException | None = None
+        self._ended = False
+        self._error: BaseException | None = None
 
     @property
     def waits(self) -> bool:
@@ -133,7 +123,7 @@ class _Newest:
                 self._frames.popleft()
                 self.dropped += 1
             self._frames.append(arrival)
-            self._arrived_s.append(arrival.arrived_s)
+            self._arrived_s.append(arrival[1])
             if len(self._arrived_s) > FEW:
                 self.usual_s = median(later - earlier for earlier, later in pairwise(self._arrived_s))
             self._changed.notify()

@@ -249,8 +249,6 @@ def _transform(extrinsics: Any) -> NDArray[np.float64]:
 
 
 PLUGIN = SourceFormat(
-    "RealSense",
-    "the word 'realsense', for the camera",
-    lambda path: path.partition(":")[0] == "realsense",
+    "RealSense", "the word 'realsense', for the camera", lambda path: path.partition(":")[0] == "realsense",
     open_realsense,
-)
+)  # fmt: skip

@@ -26,7 +26,7 @@ from sigmasplat.errors import SourceError
 from sigmasplat.files.pictures import check_pixels
 from sigmasplat.files.reading import DAMAGED, MOST_JSON_BYTES, guarded, parse_json, read_bytes, refuse_special
 from sigmasplat.input.calibration import Calibration, build_camera, check_positive, json_number, resolve_calibration
-from sigmasplat.input.images import decode_color, depth_to_metres, image_size
+from sigmasplat.input.images import decode_color, depth_to_metres, image_size, without_nan
 from sigmasplat.input.lists import FLIP_YZ, rigid_transform
 from sigmasplat.input.recorded import ImagePair, RecordedSource, Size, first_readable
 from sigmasplat.plugins.sources.stray_scanner import with_coarser_depth
@@ -85,8 +85,7 @@ class R3dImagePair(ImagePair):
 
     def read_depth(self, units_per_metre: float) -> NDArray[np.float32]:
         """Read depth in metres [H, W], 0 at confidence 0. Raises SourceError naming the member."""
-        depth_m = self._unpacked("depth", np.float32)
-        depth_m = np.nan_to_num(depth_m, nan=0.0, posinf=0.0, neginf=0.0)
+        depth_m = without_nan(self._unpacked("depth", np.float32))
         name = f"rgbd/{self.number}.conf"
         if name in self.archive:
             depth_m = np.where(self._unpacked("conf", np.uint8) > 0, depth_m, np.float32(0.0))
@@ -117,7 +116,7 @@ class ExrImagePair(ImagePair):
         channels = self._opened().channels()
         name = next((name for name in ("R", "Y", "Z") if name in channels), next(iter(channels)))
         depth_m = np.asarray(channels[name].pixels, np.float32)
-        return depth_to_metres(self.depth, np.nan_to_num(depth_m, nan=0.0, posinf=0.0, neginf=0.0), units_per_metre)
+        return depth_to_metres(self.depth, without_nan(depth_m), units_per_metre)
 
     def sizes(self) -> tuple[Size, Size]:
         return image_size(self.color), self._size()

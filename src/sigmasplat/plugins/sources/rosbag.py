@@ -84,22 +84,16 @@ def read_bag_imu(bag: Bag, color: ImageTopic, frame_times_s: Values) -> Imu:
         if R_color_imu is None:
             continue
         rates, forces = (values @ R_color_imu.T for values in _measured(bag, topic.name))
-        for times_s in _clocks(bag, topic.name):
-            gyroscope = gyroscope or _gyroscope(times_s, rates, frame_times_s)
-            accelerometer = accelerometer or _accelerometer(times_s, forces, frame_times_s)
+        entries = bag.index(topic.name)[topic.name]
+        for times_s in (_times_s(entries, recorded) for recorded in (False, True)):
+            turns, pulls = gyroscope_from_samples(times_s, rates), accelerometer_from_samples(times_s, forces)
+            if gyroscope is None and turns and turns.measured_any(frame_times_s):
+                gyroscope = turns
+            if accelerometer is None and pulls and any(pulls.at(t) is not None for t in frame_times_s):
+                accelerometer = pulls
         if gyroscope and accelerometer:
             break
     return Imu(gyroscope, accelerometer)
-
-
-def _gyroscope(times_s: Values, rates: Values, frame_times_s: Values) -> Gyroscope | None:
-    found = gyroscope_from_samples(times_s, rates)
-    return found if found is not None and found.measured_any(frame_times_s) else None
-
-
-def _accelerometer(times_s: Values, forces: Values, frame_times_s: Values) -> Accelerometer | None:
-    found = accelerometer_from_samples(times_s, forces)
-    return found if found is not None and any(found.at(t) is not None for t in frame_times_s) else None
 
 
 def _measured(bag: Bag, name: str) -> tuple[Values, Values]:
@@ -116,12 +110,6 @@ def _measured(bag: Bag, name: str) -> tuple[Values, Values]:
     values = np.array(rows, np.float64).reshape(-1, 2, 4)
     rates, forces = np.where(values[..., 3:] == -1, np.nan, values[..., :3]).swapaxes(0, 1)
     return rates, forces
-
-
-def _clocks(bag: Bag, name: str) -> tuple[Values, Values]:
-    """Return the times of the messages [M], s: of the headers, and of recording."""
-    entries = bag.index(name)[name]
-    return np.array([e.stamp_ns for e in entries]) / 1e9, np.array([e.recorded_ns for e in entries]) / 1e9
 
 
 def _axes(bag: Bag, color: ImageTopic, name: str) -> Matrix | None:
@@ -165,10 +153,14 @@ def stereo_topics(bag: Bag, settings: InputConfig) -> tuple[ImageTopic, ImageTop
     """
     if settings.color_topic and settings.depth_topic:
         left, right = (topic_by_name(bag, name) for name in (settings.color_topic, settings.depth_topic))
-        return None if right.kind == "depth" and not _is_right(right.name) else (left, right)
+        is_right = any(of_right in right.name for _, of_right in PAIRS)
+        return None if right.kind == "depth" and not is_right else (left, right)
     if settings.color_topic or settings.depth_topic:
         return None
-    if any("depth" in topic.name.lower() or not _is_side(topic.name) for topic in image_topics(bag, "depth")):
+    if any(
+        "depth" in topic.name.lower() or not any(side in topic.name for pair in PAIRS for side in pair)
+        for topic in image_topics(bag, "depth")
+    ):
         return None
     found = {topic.name: topic for kind in ("", "colour", "depth") for topic in image_topics(bag, kind)}
     for of_left, of_right in PAIRS:
@@ -176,14 +168,6 @@ def stereo_topics(bag: Bag, settings: InputConfig) -> tuple[ImageTopic, ImageTop
             if of_left in name and name.replace(of_left, of_right) in found:
                 return found[name], found[name.replace(of_left, of_right)]
     return None
-
-
-def _is_side(name: str) -> bool:
-    return any(side in name for pair in PAIRS for side in pair)
-
-
-def _is_right(name: str) -> bool:
-    return any(right in name for _, right in PAIRS)
 
 
 def open_stereo_bag(bag: Bag, left: ImageTopic, right: ImageTopic, settings: InputConfig) -> StereoSource:
@@ -299,17 +283,13 @@ def _paired(entries: tuple[Sequence[Entry], Sequence[Entry]]) -> tuple[NDArray[n
 
     Some drivers leave the headers empty, or use a different clock for each sensor.
     """
-    clocks = (False, True) if _headers_have_times(entries) else (True,)
+    has_times = all(part[0].stamp_ns != part[-1].stamp_ns or len(part) == 1 for part in entries)
+    clocks = (False, True) if has_times else (True,)
     found = []
     for recorded in clocks:
         color_s, depth_s = (_times_s(part, recorded) for part in entries)
         found.append((associate(color_s, depth_s), recorded))
     return max(found, key=lambda answer: len(answer[0]))
-
-
-def _headers_have_times(entries: tuple[Sequence[Entry], Sequence[Entry]]) -> bool:
-    """Return whether the headers contain times."""
-    return all(part[0].stamp_ns != part[-1].stamp_ns or len(part) == 1 for part in entries)
 
 
 def _times_s(entries: Sequence[Entry], recorded: bool) -> Times:

@@ -80,15 +80,8 @@ class StereoPair(ImagePair):
 
     def read(self, units_per_metre: float) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32]]:
         """Read both images once: the left one, rectified, its depth and the standard deviation of depth, m."""
-        left = self.read_color()
-        return left, *self._match(left)
-
-    def depth_and_std_m(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Match both images: depth of the left one and its standard deviation, m [H, W]. Raises SourceError."""
-        return self._match(self.read_color())
-
-    def _match(self, left: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        return self.rig.matcher.depth_and_std_m(left, self.rig.rectification.right(self._read(self.depth)))
+        left, right = self.read_color(), self.rig.rectification.right(self._read(self.depth))
+        return left, *self.rig.matcher.depth_and_std_m(left, right)
 
     def decoded(self, path: Path) -> NDArray[np.uint8]:
         """Read one of the two recorded images, RGB [H, W, 3]. Raises SourceError naming the file."""
@@ -110,15 +103,10 @@ class StereoSource(RecordedSource):
     computed_depth = True
 
     def __init__(
-        self,
-        name: str,
-        pairs: Sequence[Pair],
-        cameras: StereoCameras,
-        settings: InputConfig,
-        truth: Trajectory | None,
-        skipped: Sequence[str] = (),
+        self, name: str, pairs: Sequence[Pair], cameras: StereoCameras, settings: InputConfig,
+        truth: Trajectory | None, skipped: Sequence[str] = (),
         pair_of: Callable[[float, Path, Path, StereoRig], StereoPair] = StereoPair,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Prepare rectification and matching. `truth` is the path of the recorded left camera; `pair_of` makes a pair
         from its time, left and right image.
 
@@ -139,7 +127,7 @@ class StereoSource(RecordedSource):
         self.scene_scale = scene_scale(self.depth_of, len(self))
 
     def depth_std_of(self, i: int) -> NDArray[np.float32]:
-        return self._pairs[self._checked_index(i)].depth_and_std_m()[1]
+        return self._pairs[self._checked_index(i)].read(1.0)[2]
 
 
 def open_stereo(path: str, settings: InputConfig) -> StereoSource:

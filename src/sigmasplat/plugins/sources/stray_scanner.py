@@ -68,7 +68,8 @@ class StrayImagePair(ImagePair):
 def open_stray_scanner(path: str, settings: InputConfig) -> RecordedSource:
     """Open a folder. Raises SourceError if video, depth, camera or poses cannot be used."""
     folder = Path(path)
-    video_path, depths = folder / "rgb.mp4", _numbered(folder / "depth")
+    video_path = folder / "rgb.mp4"
+    depths = {int(path.stem): path for path in sorted((folder / "depth").glob("*.png")) if path.stem.isdecimal()}
     if not video_path.is_file():
         raise SourceError(f"no video in {folder} (looked for rgb.mp4); copy the whole folder from the phone")
     if not depths:
@@ -106,10 +107,6 @@ def with_coarser_depth(calibration: Calibration, depth_size: Size) -> Calibratio
     return Calibration(calibration.camera, calibration.depth_units_per_metre, lens, camera, lens)
 
 
-def _numbered(folder: Path) -> dict[int, Path]:
-    return {int(path.stem): path for path in sorted(folder.glob("*.png")) if path.stem.isdecimal()}
-
-
 def _odometry(path: Path) -> Rows:
     """Read odometry.csv as rows by frame number. Raises SourceError naming file and line."""
     if not path.is_file():
@@ -123,19 +120,15 @@ def _odometry(path: Path) -> Rows:
         )
     rows = {}
     for number, line in lines:
-        row = _row(f"{path}:{number}", names, line)
+        where, found = f"{path}:{number}", f"{','.join(line)[:80]!r}"
+        try:
+            row = {name: float(word) for name, word in zip(names, line, strict=True)}
+        except ValueError as error:
+            raise SourceError(f"{where}: expected {len(names)} numbers, found {found}") from error
+        if not np.isfinite(list(row.values())).all():
+            raise SourceError(f"{where}: not finite: {found}; delete the line")
         rows[int(row["frame"])] = row
     return rows
-
-
-def _row(where: str, names: list[str], words: list[str]) -> dict[str, float]:
-    try:
-        row = {name: float(word) for name, word in zip(names, words, strict=True)}
-    except ValueError as error:
-        raise SourceError(f"{where}: expected {len(names)} numbers, found {','.join(words)[:80]!r}") from error
-    if not np.isfinite(list(row.values())).all():
-        raise SourceError(f"{where}: not finite: {','.join(words)[:80]!r}; delete the line")
-    return row
 
 
 def _calibration(folder: Path, rows: Rows, size: Size, depth_size: Size, settings: InputConfig) -> Calibration:

@@ -11,7 +11,8 @@ The published T_m is not rigid: its axes have length 1.059. Here its rotation is
 """
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 
@@ -27,6 +28,7 @@ from sigmasplat.data.frame_arrays import UINT16_MAX
 from sigmasplat.data.imu import Gyroscope
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import RunError, SourceError
+from sigmasplat.files.atomic import write_text
 from sigmasplat.files.reading import exists
 from sigmasplat.input.calibration import (
     TUM_UNITS_PER_METRE,
@@ -79,41 +81,17 @@ def open_tum(
 def write_tum(source: Source, folder: str | Path) -> None:
     """Write any source as a TUM folder: PNG images, lists, calibration.json and the ground-truth path, if known.
 
-    Depth has steps of 1/5000 m; readings above 13.1 m do not fit 16 bits and become 0 (no reading).
-    Raises RunError if the folder already holds a sequence or cannot be written.
+    Raises as `TumWriter`.
     """
-    folder = Path(folder)
-    _create_folder(folder, source.camera)
-    try:
-        _write_truth(source.truth(), folder / "groundtruth.txt")
-        stems = [write_images(frame, folder) for frame in source]
-        for part in ("depth", "rgb"):  # rgb.txt last: it marks a complete folder
-            (folder / f"{part}.txt").write_text("# timestamp path\n" + "".join(f"{s} {part}/{s}.png\n" for s in stems))
-    except OSError as error:
-        raise RunError(f"cannot write the sequence to {folder} ({error})") from error
-
-
-def _create_folder(folder: Path, camera: Camera) -> None:
-    """Create an empty TUM folder with calibration.json. Raises RunError if it holds a sequence or cannot be written."""
-    if (folder / "rgb.txt").exists():
-        raise RunError(f"{folder} already holds a sequence (rgb.txt); give another folder")
-    try:
-        for part in ("rgb", "depth"):
-            (folder / part).mkdir(parents=True, exist_ok=True)
-        calibration = asdict(camera) | {"depth_scale": TUM_UNITS_PER_METRE}
-        (folder / "calibration.json").write_text(json.dumps(calibration, indent=1) + "\n")
-    except OSError as error:
-        raise RunError(f"cannot write the sequence to {folder} ({error})") from error
-
-
-def _write_truth(truth: Trajectory | None, path: Path) -> None:
-    if truth is None:
-        return
-    lines = ["# timestamp tx ty tz qx qy qz qw\n"]
-    for t, T in zip(truth.timestamps_s, truth.T_world_camera, strict=True):
-        w, x, y, z = se3.quaternion_from_rotation(T[:3, :3])
-        lines.append(f"{t:.6f} " + " ".join(f"{v:.9f}" for v in (*T[:3, 3], x, y, z, w)) + "\n")
-    path.write_text("".join(lines))
+    writer = TumWriter(Path(folder), source.camera)
+    if (truth := source.truth()) is not None:
+        lines = ["# timestamp tx ty tz qx qy qz qw\n"]
+        for t, T in zip(truth.timestamps_s, truth.T_world_camera, strict=True):
+            w, x, y, z = se3.quaternion_from_rotation(T[:3, :3])
+            lines.append(f"{t:.6f} " + " ".join(f"{v:.9f}" for v in (*T[:3, 3], x, y, z, w)) + "\n")
+        write_text(writer.folder / "groundtruth.txt", "".join(lines))
+    for frame in source:
+        writer.add(frame)
 
 
 def _depth_list(folder: Path) -> tuple[NDArray[np.float64], list[Path]]:
@@ -162,33 +140,42 @@ def read_gyroscope(path: Path) -> Gyroscope:
 
 
 class TumWriter:
-    """Writes frames to a new TUM folder: both images first, then a line in each list."""
+    """Writes frames to a new TUM folder: both images first, then a line in each list.
+
+    Depth has steps of 1/5000 m; readings above 13.1 m do not fit 16 bits and become 0 (no reading).
+    """
 
     def __init__(self, folder: Path, camera: Camera) -> None:
-        """Create the folder. Raises RunError if it already holds a sequence or cannot be written."""
-        self.folder = folder
-        _create_folder(folder, camera)
+        """Create the folder and calibration.json. Raises RunError if it holds a sequence or cannot be written."""
+        if (folder / "rgb.txt").exists():
+            raise RunError(f"{folder} already holds a sequence (rgb.txt); give another folder")
+        with self._writing():
+            for part in ("rgb", "depth"):
+                (folder / part).mkdir(parents=True, exist_ok=True)
+            calibration = asdict(camera) | {"depth_scale": TUM_UNITS_PER_METRE}
+            (folder / "calibration.json").write_text(json.dumps(calibration, indent=1) + "\n")
 
     def add(self, frame: Frame) -> None:
         """Write one more frame; timestamps must increase. Raises RunError if the folder cannot be written."""
-        try:
-            stem = write_images(frame, self.folder)
-            for part in ("depth", "rgb"):
+        stem = f"{frame.timestamp_s:.6f}"
+        units = np.rint(frame.depth_m * TUM_UNITS_PER_METRE)
+        images = {
+            "depth": np.where(units < UINT16_MAX, units, 0).astype(np.uint16),
+            "rgb": np.rint(frame.color * 255.0).astype(np.uint8),
+        }
+        with self._writing():
+            for part, image in images.items():
+                Image.fromarray(image).save(self.folder / part / f"{stem}.png", compress_level=1)
+            for part in images:
                 with (self.folder / f"{part}.txt").open("a", encoding="utf-8") as file:
                     file.write(f"{stem} {part}/{stem}.png\n")
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        try:
+            yield
         except OSError as error:
             raise RunError(f"cannot write the sequence to {self.folder} ({error})") from error
-
-
-def write_images(frame: Frame, folder: Path) -> str:
-    """Write rgb/T.png and depth/T.png, 1/5000 m, and return T; readings above 13.1 m do not fit and become 0."""
-    stem = f"{frame.timestamp_s:.6f}"
-    units = np.rint(frame.depth_m * TUM_UNITS_PER_METRE)
-    depth = np.where(units < UINT16_MAX, units, 0).astype(np.uint16)
-    color = np.rint(frame.color * 255.0).astype(np.uint8)
-    Image.fromarray(color).save(folder / "rgb" / f"{stem}.png", compress_level=1)
-    Image.fromarray(depth).save(folder / "depth" / f"{stem}.png", compress_level=1)
-    return stem
 
 
 BONN = Calibration(
@@ -209,12 +196,11 @@ T_MARKERS_CAMERA = se3.orthonormalise(
 
 def open_bonn(path: str, settings: InputConfig) -> RecordedSource:
     """Open a folder of the Bonn data set. Raises SourceError as `open_tum`."""
-    return open_tum(path, settings, BONN, _camera_path)
 
+    def camera_path(markers: Trajectory) -> Trajectory:
+        return Trajectory(markers.timestamps_s, T_ROS @ markers.T_world_camera @ T_ROS @ T_MARKERS_CAMERA)
 
-def _camera_path(markers: Trajectory) -> Trajectory:
-    """Convert the recorded path of the markers to the path of the camera."""
-    return Trajectory(markers.timestamps_s, T_ROS @ markers.T_world_camera @ T_ROS @ T_MARKERS_CAMERA)
+    return open_tum(path, settings, BONN, camera_path)
 
 
 def _has_lists(path: str) -> bool:

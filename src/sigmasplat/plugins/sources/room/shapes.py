@@ -154,16 +154,12 @@ def cast_rays(shapes: Sequence[Shape], rays: Rays, windows: Windows | None = Non
             first = np.flatnonzero(t < nearest)
             nearest[first], index[first] = t[first], k
         elif (window := windows[k]) is not None:
-            among = _inside(rays.pixels, window)
+            (u, v), (u0, v0, u1, v1) = rays.pixels, window
+            among = np.flatnonzero((u >= u0) & (u <= u1) & (v >= v0) & (v <= v1))
             t = shape.first_hit(rays.origins, rays.directions if len(among) == n else rays.directions[:, among])
             closer = t < nearest[among]
             nearest[among[closer]], index[among[closer]] = t[closer], k
     return nearest, index
-
-
-def _inside(pixels: Floats, window: tuple[float, float, float, float]) -> Indices:
-    u, v = pixels
-    return np.flatnonzero((u >= window[0]) & (u <= window[2]) & (v >= window[1]) & (v <= window[3]))
 
 
 def image_windows(shapes: Sequence[Shape], T_camera_world: NDArray[np.float64], camera: Camera) -> Windows:
