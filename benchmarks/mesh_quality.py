@@ -26,11 +26,11 @@ import tyro
 from accuracy_tables import spread
 from tables import Section
 
-from sigmasplat.data import isosurface, se3
+from sigmasplat.data import se3
 from sigmasplat.data.mesh import Mesh
 from sigmasplat.data.selection import evenly_spread
 from sigmasplat.data.trajectory import Trajectory
-from sigmasplat.data.tsdf import Tsdf
+from sigmasplat.data.tsdf import Tsdf, extract_surface
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.evaluation.metrics.reconstruction import (
@@ -42,7 +42,7 @@ from sigmasplat.plugins.evaluation.metrics.reconstruction import (
     visible_points,
 )
 from sigmasplat.plugins.evaluation.metrics.trajectory import align_rigid, ate, pair_poses
-from sigmasplat.plugins.outputs.meshes.mesh_files import read_mesh
+from sigmasplat.plugins.outputs.mesh_files import read_mesh
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.render.mesh import mesh_depth
 from sigmasplat.run_folder.runs import RunFolder
@@ -123,7 +123,7 @@ def reference_of(path: str, source: Source, options: Options) -> Reference:
         for i in rows:
             frame = source.frame(i).prepared(0, 0.1, 8.0)
             volume.integrate(frame.depth_m, frame.color, frame.camera, truth.T_world_camera[i])
-        surface = isosurface.surface(volume)
+        surface = extract_surface(volume)
     else:
         surface = exact.subdivided(LARGEST_EDGE_M)
     camera = source.camera.prepared(options.width)

@@ -7,12 +7,12 @@ import numpy as np
 from finished_run import FinishedRun
 
 from sigmasplat.config import Config
-from sigmasplat.data import isosurface, se3
+from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.mesh import Mesh
 from sigmasplat.data.selection import evenly_spread
 from sigmasplat.data.trajectory import Trajectory
-from sigmasplat.data.tsdf import Tsdf
+from sigmasplat.data.tsdf import Tsdf, extract_surface
 from sigmasplat.final.fusion import TRUNCATION_VOXELS, VOXEL_M, count_keyframes, fuse, surface_views
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.evaluation.metrics.reconstruction import BEHIND_M, Mask, distances, visible_points
@@ -76,7 +76,7 @@ def _fused(config: Config, source: Source, truth: Trajectory) -> Mesh:
     for k in evenly_spread(range(len(rows)), REFERENCE_FRAMES):
         frame = working_frame(source, config.input, int(rows[k]))
         volume.integrate(frame.depth_m, frame.color, frame.camera, truth.T_world_camera[at[k]])
-    return isosurface.surface(volume)
+    return extract_surface(volume)
 
 
 def _seen(vertices: Matrix, reference: Mesh, camera: Camera, T_world_camera: Iterable[Matrix]) -> Mask:

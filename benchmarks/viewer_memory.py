@@ -33,8 +33,8 @@ from sigmasplat.data.field import GaussianField
 from sigmasplat.data.frame import Frame
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.mapping.mapper import Mapper
-from sigmasplat.plugins.viewer.live import LiveView
 from sigmasplat.plugins.viewer.snapshot import field_without_moments
+from sigmasplat.plugins.viewer.snapshot_sources import LiveView
 from sigmasplat.run_folder.submaps import DiskStore
 from sigmasplat.slam.slam import Slam
 from sigmasplat.slam.step_result import Step

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from sigmasplat.data.harmonics import count
-from sigmasplat.run_folder.quaternions import unit
-from sigmasplat.run_folder.splat_values import SH_C0, SplatValues
+from sigmasplat.run_folder.splat_values import SH_C0, SplatValues, unit
 
 FOLDER = Path(os.environ.get("SIGMASPLAT_READERS") or Path(__file__).parents[1] / "build" / "readers").resolve()
 

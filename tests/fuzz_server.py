@@ -82,16 +82,16 @@ def _lines(path: Path) -> list[str]:
 
 def _show_once() -> None:
     """Make `view` end when it has shown a run, as with Ctrl-C."""
-    from sigmasplat.plugins.viewer import finished
+    from sigmasplat.plugins.viewer import snapshot_sources
 
-    follow = finished.follow_run
+    follow = snapshot_sources.follow_run
 
     def follow_once(run: Any, show: Any, stop: threading.Event, source: Any = None) -> None:
         stop.set()
         follow(run, show, stop, source)
         raise KeyboardInterrupt
 
-    finished.follow_run = follow_once
+    snapshot_sources.follow_run = follow_once
 
 
 def run_command(arguments: Sequence[str], folder: Path) -> Ending:

@@ -14,7 +14,7 @@ from paper_settings import InputConfig
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.mesh import Mesh
 from sigmasplat.plugins.evaluation.metrics.trajectory import associate
-from sigmasplat.plugins.outputs.meshes.mesh_files import write_mesh
+from sigmasplat.plugins.outputs.mesh_files import write_mesh
 from sigmasplat.plugins.sources import SyntheticRoom, open_source
 
 FRAMES, WIDTH, HEIGHT = 8, 80, 60

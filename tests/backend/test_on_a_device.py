@@ -26,8 +26,8 @@ from sigmasplat.plugins.checks import installation
 from sigmasplat.plugins.cuda.view import CudaView
 from sigmasplat.plugins.sources import SyntheticRoom
 from sigmasplat.plugins.viewer.layers import render_layer
-from sigmasplat.plugins.viewer.live import LiveView
 from sigmasplat.plugins.viewer.snapshot import Snapshot
+from sigmasplat.plugins.viewer.snapshot_sources import LiveView
 from sigmasplat.render import FieldRenderer, render
 from sigmasplat.render.cpu.view import CpuView
 from sigmasplat.run_folder.state import read_state, write_state

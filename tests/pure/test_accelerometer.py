@@ -18,8 +18,7 @@ from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import RunError, SourceError
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.outputs.axes import level_cameras
-from sigmasplat.plugins.outputs.floorplan.ground import floor_frame
-from sigmasplat.plugins.outputs.floorplan.surface_samples import sample_surfaces
+from sigmasplat.plugins.outputs.floorplan.ground import floor_frame, sample_surfaces
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.run_folder.frames import RunFrames, noted_up
 from sigmasplat.run_folder.runs import RunFolder

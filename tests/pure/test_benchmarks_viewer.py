@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sigmasplat.plugins.viewer.live import LiveView
 from sigmasplat.plugins.viewer.snapshot import Snapshot
+from sigmasplat.plugins.viewer.snapshot_sources import LiveView
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))

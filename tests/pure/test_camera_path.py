@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from sigmasplat.data import se3
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SigmaSplatError
-from sigmasplat.plugins.outputs.camera_path import look_along, orbit, smooth_path
+from sigmasplat.plugins.outputs.video import look_along, orbit, smooth_path
 
 WORLD = se3.exp(np.array([3.0, -2.0, 1.0, 1.9, 0.4, -0.3]))
 

@@ -18,14 +18,12 @@ from sigmasplat.data.map_uncertainty import SHIPPED, Background, MapUncertainty,
 from sigmasplat.data.mesh import Mesh
 from sigmasplat.errors import ConfigError, RunError
 from sigmasplat.plugins.evaluation.reconstruct import FusionInput
-from sigmasplat.plugins.outputs.colmap import export_colmap
 from sigmasplat.plugins.outputs.drawing.film import FilmScale, legend_strip
 from sigmasplat.plugins.outputs.floorplan.floor_plan import floor_plan
-from sigmasplat.plugins.outputs.nerfstudio import export_nerfstudio
-from sigmasplat.plugins.outputs.plan import export_plan, write_plan
-from sigmasplat.plugins.outputs.points import export_points, splat_points
+from sigmasplat.plugins.outputs.floorplan.picture import export_plan, write_plan
 from sigmasplat.plugins.outputs.run_reader import RunReader
 from sigmasplat.plugins.outputs.video import VideoOptions, export_video, film_camera, orbit_view
+from sigmasplat.plugins.outputs.views import export_colmap, export_nerfstudio, export_points, splat_points
 
 
 @pytest.fixture(params=["submaps", "in one piece"])

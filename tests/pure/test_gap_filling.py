@@ -6,9 +6,8 @@ from skimage.measure import marching_cubes
 
 from sigmasplat.data.mesh import Mesh
 from sigmasplat.errors import ConfigError
-from sigmasplat.plugins.outputs.meshes.decimation import decimated
-from sigmasplat.plugins.outputs.meshes.gap_filling import filled, gaps
-from sigmasplat.plugins.outputs.meshes.mesh_files import read_mesh, write_mesh
+from sigmasplat.plugins.outputs.mesh_editing import decimated, filled, gaps
+from sigmasplat.plugins.outputs.mesh_files import read_mesh, write_mesh
 
 STEP_M, RADIUS_M = 0.03, 0.48
 

@@ -12,7 +12,7 @@ import pytest
 
 from sigmasplat.data.mesh import Mesh
 from sigmasplat.errors import RunError, SourceError
-from sigmasplat.plugins.outputs.meshes.mesh_files import read_mesh, write_mesh
+from sigmasplat.plugins.outputs.mesh_files import read_mesh, write_mesh
 
 
 def some_mesh(colors: bool = True) -> Mesh:

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import RunError
-from sigmasplat.plugins.outputs import colmap, nerfstudio
+from sigmasplat.plugins.outputs import views
 from sigmasplat.run_folder.trajectory import write_kitti_poses
 
 CAMERA = Camera(64, 48, 50.0, 51.0, 30.25, 24.75)
@@ -56,7 +56,7 @@ def test_kitti_rows_are_the_matrices(tmp_path: Path) -> None:
 def test_transforms_are_opengl_cameras(tmp_path: Path) -> None:
     """Project points as nerfstudio does: x right, y up, view along −z, pixels measured from the corner."""
     path, file = some_path(), tmp_path / "transforms.json"
-    nerfstudio.write_transforms(
+    views.write_transforms(
         file,
         CAMERA,
         NAMES,
@@ -79,7 +79,7 @@ def test_transforms_are_opengl_cameras(tmp_path: Path) -> None:
 
 def test_transforms_without_images_have_no_depth_entries(tmp_path: Path) -> None:
     path = some_path()
-    nerfstudio.write_transforms(tmp_path / "t.json", CAMERA, NAMES, path.T_world_camera, path.timestamps_s.tolist())
+    views.write_transforms(tmp_path / "t.json", CAMERA, NAMES, path.T_world_camera, path.timestamps_s.tolist())
     read = json.loads((tmp_path / "t.json").read_text())
     assert "depth_file_path" not in read["frames"][0] and not {"ply_file_path", "depth_unit_scale_factor"} & set(read)
 
@@ -87,7 +87,7 @@ def test_transforms_without_images_have_no_depth_entries(tmp_path: Path) -> None
 def write_colmap(folder: Path) -> tuple[Trajectory, np.ndarray, np.ndarray]:
     path, rng = some_path(), np.random.default_rng(4)
     points, colors = rng.normal(size=(30, 3)), rng.uniform(-0.1, 1.1, (30, 3))
-    colmap.write_model(folder, CAMERA, NAMES, path.T_world_camera, points, colors)
+    views.write_model(folder, CAMERA, NAMES, path.T_world_camera, points, colors)
     return path, points, colors
 
 

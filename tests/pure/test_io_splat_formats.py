@@ -17,10 +17,9 @@ from sigmasplat.data.field import GaussianField, Rows
 from sigmasplat.data.harmonics import count
 from sigmasplat.errors import ConfigError, RunError
 from sigmasplat.plugins.outputs.splats import any_format, compressed_ply, gltf, sog, splat, spz, usd
-from sigmasplat.plugins.outputs.splats.codebooks import levels
+from sigmasplat.plugins.outputs.splats.sog import levels
 from sigmasplat.run_folder import splat_ply as ply
-from sigmasplat.run_folder.quaternions import from_smallest_three, smallest_three
-from sigmasplat.run_folder.splat_values import SplatValues, morton_order
+from sigmasplat.run_folder.splat_values import SplatValues, from_smallest_three, morton_order, smallest_three
 
 Writer = Callable[[Path, GaussianField], None]
 WRITERS: dict[str, Writer] = {

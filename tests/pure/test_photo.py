@@ -7,8 +7,7 @@ import pytest
 
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
-from sigmasplat.data.frame import Frame
-from sigmasplat.data.photo import Photo, enlarged_depth, photo_size
+from sigmasplat.data.frame import Frame, Photo, enlarged_depth, photo_size
 from sigmasplat.data.submap import Picture, Submap
 from sigmasplat.run_folder.submaps import DiskStore
 

@@ -16,9 +16,8 @@ from sigmasplat.data.relative_pose import RelativePose
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.graph.path_covariance import PathCovariance, recorded
 from sigmasplat.plugins.evaluation.metrics.trajectory import score_covariances
-from sigmasplat.run_folder.pose_covariance import KNOWN, write_ros, write_square
 from sigmasplat.run_folder.runs import RunFolder
-from sigmasplat.run_folder.trajectory import write_trajectory
+from sigmasplat.run_folder.trajectory import KNOWN, write_ros, write_square, write_trajectory
 
 Array = NDArray[np.float64]
 CALIBRATED = 2.366

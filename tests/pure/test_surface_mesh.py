@@ -12,7 +12,7 @@ from sigmasplat.data.mesh import Mesh
 from sigmasplat.data.submap import Picture
 from sigmasplat.errors import ConfigError
 from sigmasplat.final.fusion import FusionView, fuse, with_readings
-from sigmasplat.plugins.outputs.meshes.decimation import decimated
+from sigmasplat.plugins.outputs.mesh_editing import decimated
 from sigmasplat.plugins.papers.base import BASE
 from sigmasplat.render.mesh import mesh_depth
 

@@ -9,9 +9,8 @@ from scipy.spatial import cKDTree
 
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
-from sigmasplat.data.isosurface import surface
 from sigmasplat.data.mesh import Mesh
-from sigmasplat.data.tsdf import Tsdf, packed, unpacked
+from sigmasplat.data.tsdf import Tsdf, extract_surface, packed, unpacked
 from sigmasplat.errors import ConfigError, SigmaSplatError
 
 CAMERA = Camera(160, 120, 150.0, 150.0, 79.5, 59.5)
@@ -61,7 +60,7 @@ def fused(poses: list[np.ndarray], depth_of: Callable[[np.ndarray], np.ndarray])
     volume = Tsdf(VOXEL_M, 4 * VOXEL_M)
     for T in poses:
         volume.integrate(depth_of(T), gray(depth_of(T)), CAMERA, T)
-    return surface(volume)
+    return extract_surface(volume)
 
 
 @cache
@@ -130,7 +129,7 @@ def test_a_floor_between_two_layers_of_blocks_has_no_cracks() -> None:
     for height_m in (0.045, 0.071):
         up, depth, volume = se3.exp(np.array([0, 0, height_m, 0, 0, 0])), floor_depth(T), Tsdf()
         volume.integrate(depth, gray(depth), CAMERA, up @ T)
-        faces[height_m] = len(surface(volume).faces)
+        faces[height_m] = len(extract_surface(volume).faces)
     assert faces[0.071] > 0.95 * faces[0.045] > 10_000
 
 
@@ -157,7 +156,7 @@ def test_no_reading_makes_no_surface() -> None:
     assert not ((u > 62) & (u < 97) & (v > 42) & (v < 77)).any() and len(mesh.vertices) > 5000
     volume = Tsdf()
     volume.integrate(depth, gray(depth), CAMERA, T, weight)
-    assert surface(volume).vertices.tobytes() == mesh.vertices.tobytes(), "no weight is no reading"
+    assert extract_surface(volume).vertices.tobytes() == mesh.vertices.tobytes(), "no weight is no reading"
 
 
 def test_weights_weigh() -> None:
@@ -165,7 +164,7 @@ def test_weights_weigh() -> None:
     depth, volume = floor_depth(T), Tsdf()
     volume.integrate(depth, gray(depth), CAMERA, T, np.full_like(depth, 3.0))
     volume.integrate(depth + np.float32(0.012), gray(depth), CAMERA, T, np.full_like(depth, 1.0))
-    assert np.median(surface(volume).vertices[:, 2]) == pytest.approx(-0.003, abs=2e-4)
+    assert np.median(extract_surface(volume).vertices[:, 2]) == pytest.approx(-0.003, abs=2e-4)
 
 
 def test_colours_are_those_of_the_images() -> None:
@@ -175,7 +174,7 @@ def test_colours_are_those_of_the_images() -> None:
     color[:, :80, 0], color[:, 80:, 2] = 0.8, 0.6
     for brighter in (-0.1, 0.1):
         volume.integrate(depth, color + np.float32(brighter) * (color > 0), CAMERA, T)
-    mesh = surface(volume)
+    mesh = extract_surface(volume)
     right = ((mesh.vertices - T[:3, 3]) @ T[:3, :3])[:, 0]
     assert mesh.colors is not None
     np.testing.assert_allclose(
@@ -192,7 +191,7 @@ def test_empty_space_has_no_colour() -> None:
     depth, volume = floor_depth(T), Tsdf()
     volume.integrate(depth, np.broadcast_to([0, 0.8, 0], (120, 160, 3)), CAMERA, T)
     volume.integrate(depth * 1.2, np.broadcast_to([0, 0, 0.8], (120, 160, 3)), CAMERA, T, np.full_like(depth, 0.2))
-    mesh = surface(volume)
+    mesh = extract_surface(volume)
     green = mesh.colors[mesh.vertices[:, 2] > -0.05]
     assert len(green) > 5000
     np.testing.assert_allclose(green, np.broadcast_to([0, 0.8, 0], green.shape), atol=1e-5)
@@ -207,8 +206,8 @@ def test_free_space_erases_what_one_image_saw_there() -> None:
     for volume, images in ((once, [ghost]), (often, [ghost, depth, depth])):
         for image in images:
             volume.integrate(image, gray(image), CAMERA, T)
-    assert (surface(once).vertices[:, 2] > 0.3).sum() > 50
-    assert not (surface(often).vertices[:, 2] > 0.3).any()
+    assert (extract_surface(once).vertices[:, 2] > 0.3).sum() > 50
+    assert not (extract_surface(often).vertices[:, 2] > 0.3).any()
 
 
 def test_small_parts_are_dropped() -> None:

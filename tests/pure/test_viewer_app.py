@@ -21,7 +21,6 @@ viser = pytest.importorskip("viser", reason="viser is not installed (pip install
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
 from sigmasplat.plugins.viewer.app import ViewerApp  # noqa: E402
-from sigmasplat.plugins.viewer.live import LiveView  # noqa: E402
 from sigmasplat.plugins.viewer.panel import (  # noqa: E402
     COLOURINGS,
     ERROR_PARTS,
@@ -33,6 +32,7 @@ from sigmasplat.plugins.viewer.panel import (  # noqa: E402
 )
 from sigmasplat.plugins.viewer.server import HOST, close, open_server  # noqa: E402
 from sigmasplat.plugins.viewer.snapshot import EMPTY_PATH, Piece, Snapshot  # noqa: E402
+from sigmasplat.plugins.viewer.snapshot_sources import LiveView  # noqa: E402
 
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
 viewer_memory = importlib.import_module("viewer_memory")

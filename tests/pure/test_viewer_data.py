@@ -12,30 +12,28 @@ from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.map_uncertainty import SHIPPED, Background, MapUncertainty, SplatStd
+from sigmasplat.plugins.outputs.chosen_splats import sigmas
 from sigmasplat.plugins.outputs.drawing import colormap
-from sigmasplat.plugins.outputs.splat_filter import sigmas
-from sigmasplat.plugins.viewer import lines
+from sigmasplat.plugins.viewer import snapshot as lines
 from sigmasplat.plugins.viewer.layers import (
     Legend,
-    browser_camera,
-    draw_legend,
-    render_layer,
-    render_predicted,
-    surface_normals,
-)
-from sigmasplat.plugins.viewer.panel import escaped
-from sigmasplat.plugins.viewer.snapshot import CameraPath, Piece, Snapshot, thin, within_budget
-from sigmasplat.plugins.viewer.splats import (
     VisibilityFilter,
+    browser_camera,
     covariances,
+    draw_legend,
     merge_pieces,
     merged_uncertainty,
     palette_range,
+    render_layer,
+    render_predicted,
     sorted_depth_stds,
     sorted_sigmas,
     splat_arrays,
+    surface_normals,
     visibility_filter,
 )
+from sigmasplat.plugins.viewer.panel import escaped
+from sigmasplat.plugins.viewer.snapshot import CameraPath, Piece, Snapshot, thin, within_budget
 from sigmasplat.render import render
 from sigmasplat.render.predictive import predict
 

@@ -7,8 +7,7 @@ from collections.abc import Iterator
 import pytest
 
 from sigmasplat.errors import SigmaSplatError
-from sigmasplat.plugins.viewer.origin import is_own_page
-from sigmasplat.plugins.viewer.server import HOST, close, open_server
+from sigmasplat.plugins.viewer.server import HOST, close, is_own_page, open_server
 
 HERE = "127.0.0.1:8080"
 

@@ -23,11 +23,17 @@ from sigmasplat.plugins.evaluation.evaluate import evaluate
 from sigmasplat.plugins.evaluation.reconstruct import FusionInput
 from sigmasplat.plugins.outputs.formats import PLUGIN, ExportSource, choose
 from sigmasplat.plugins.sources import SyntheticRoom, open_source
-from sigmasplat.plugins.viewer.finished import SubmapCache, check_has_map, finished_snapshot, running_snapshot
-from sigmasplat.plugins.viewer.live import ACTIVE_SHARE, LiveView
+from sigmasplat.plugins.viewer.layers import VisibilityFilter, merge_pieces
 from sigmasplat.plugins.viewer.server import free_port, is_loopback, open_server, url_of
 from sigmasplat.plugins.viewer.snapshot import Snapshot
-from sigmasplat.plugins.viewer.splats import VisibilityFilter, merge_pieces
+from sigmasplat.plugins.viewer.snapshot_sources import (
+    ACTIVE_SHARE,
+    LiveView,
+    SubmapCache,
+    check_has_map,
+    finished_snapshot,
+    running_snapshot,
+)
 from sigmasplat.run.callbacks import Callback, CallbackList
 from sigmasplat.run.session import Session
 from sigmasplat.run_folder.runs import TRUTH, RunFolder

@@ -17,7 +17,7 @@ from sigmasplat.data.submap import MemoryStore
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.plugins.outputs.run_reader import RunReader
 from sigmasplat.plugins.sources import SyntheticRoom, open_source
-from sigmasplat.plugins.viewer.finished import SubmapCache, finished_snapshot
+from sigmasplat.plugins.viewer.snapshot_sources import SubmapCache, finished_snapshot
 from sigmasplat.run.finished_map import FinishedMap
 from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.run_folder.trajectory import write_trajectory

@@ -13,7 +13,7 @@ from lpips_weights import write_weights
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.mesh import Mesh
 from sigmasplat.input.source import Source
-from sigmasplat.plugins.outputs.meshes.mesh_files import write_mesh
+from sigmasplat.plugins.outputs.mesh_files import write_mesh
 from sigmasplat.plugins.sources import SyntheticRoom
 from sigmasplat.run_folder.runs import RunFolder
 

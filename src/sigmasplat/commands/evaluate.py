@@ -103,7 +103,7 @@ def score(
     from sigmasplat.plugins.evaluation.report.advice import next_commands
     from sigmasplat.plugins.evaluation.report.summary import result_sentence
     from sigmasplat.plugins.evaluation.report.tables import key_figures
-    from sigmasplat.plugins.outputs.meshes.mesh_files import read_mesh
+    from sigmasplat.plugins.outputs.mesh_files import read_mesh
 
     try:
         lpips, unscored = eval_options.network()

@@ -51,9 +51,8 @@ def make_mesh(
     from sigmasplat.files.lock import output_locked
     from sigmasplat.plugins.evaluation.reconstruct import FusionInput
     from sigmasplat.plugins.outputs.axes import levelled, transform_to
-    from sigmasplat.plugins.outputs.meshes.decimation import decimated, refuse_budget
-    from sigmasplat.plugins.outputs.meshes.gap_filling import filled
-    from sigmasplat.plugins.outputs.meshes.mesh_files import check_ending, write_mesh
+    from sigmasplat.plugins.outputs.mesh_editing import decimated, filled, refuse_budget
+    from sigmasplat.plugins.outputs.mesh_files import check_ending, write_mesh
     from sigmasplat.plugins.outputs.run_reader import RunReader
     from sigmasplat.run.terminal import Screen
     from sigmasplat.run_folder.runs import MESH, RunFolder

@@ -311,7 +311,7 @@ def _progress(
     ):
         readers: list[Callback] = [robot] if robot else []  # they read the system, not only the step
         if viewer is not None:
-            from sigmasplat.plugins.viewer.live import LiveView
+            from sigmasplat.plugins.viewer.snapshot_sources import LiveView
 
             readers.append(LiveView(start.slam, viewer.show, source.name))
         if system:

@@ -22,7 +22,7 @@ def view(run: options.RunPath, host: options.Host = HOST, port: options.Port = P
 
     example: sigmasplat view runs/kitchen-sigma
     """
-    from sigmasplat.plugins.viewer.finished import check_has_map, follow_run
+    from sigmasplat.plugins.viewer.snapshot_sources import check_has_map, follow_run
     from sigmasplat.run.terminal import Screen
     from sigmasplat.run_folder.runs import RunFolder
 
@@ -62,7 +62,7 @@ def serve_viewer(screen: "Screen", host: str, port: int) -> Iterator["ViewerApp"
 
 def keep_showing(screen: "Screen", viewer: "ViewerApp", folder: "RunFolder", source: "Source") -> None:
     """Keep showing a finished run until Ctrl-C."""
-    from sigmasplat.plugins.viewer.finished import finished_snapshot
+    from sigmasplat.plugins.viewer.snapshot_sources import finished_snapshot
 
     try:
         viewer.show(finished_snapshot(folder, source))

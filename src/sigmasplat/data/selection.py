@@ -4,11 +4,16 @@ from collections.abc import Sequence
 from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 Item = TypeVar("Item")
 
 
+def evenly_spaced(count: int, most: int) -> NDArray[np.int64]:
+    """Return at most `most` evenly spaced rows of `count`, including the first and the last."""
+    return np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(np.int64))
+
+
 def evenly_spread(items: Sequence[Item], most: int) -> list[Item]:
     """Return at most `most` items, evenly spread, with the first and the last one."""
-    rows = np.unique(np.linspace(0, len(items) - 1, min(most, len(items))).round().astype(int))
-    return [items[row] for row in rows]
+    return [items[row] for row in evenly_spaced(len(items), most)]

@@ -12,8 +12,7 @@ from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.exposure import between, unexposed
 from sigmasplat.data.field import GaussianField
-from sigmasplat.data.frame import Detail
-from sigmasplat.data.photo import Photo
+from sigmasplat.data.frame import Detail, Photo
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.types import Matrix
 

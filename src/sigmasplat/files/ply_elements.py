@@ -1,7 +1,8 @@
-"""Read the header of a binary PLY file, and the rows of its elements."""
+"""Read the header of a binary PLY file, and the rows of its elements; make headers."""
 
 import os
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -49,6 +50,14 @@ class Element:
             what = "splats" if self.name == "vertex" else f"rows of '{self.name}'"
             raise SourceError(f"{path} is truncated: its header says {self.count} {what} = {size} bytes, found {left}")
         return np.frombuffer(file.read(size), row_type)
+
+
+def header_of(*elements: tuple[str, int, Iterable[str]], comment: str = "") -> bytes:
+    """Return the header of a binary little-endian PLY: name, number of rows and properties ("float x") of elements."""
+    lines = ["ply", "format binary_little_endian 1.0", *([f"comment {comment}"] * bool(comment))]
+    for name, count, properties in elements:
+        lines += [f"element {name} {count}", *(f"property {words}" for words in properties)]
+    return "".join(f"{line}\n" for line in [*lines, "end_header"]).encode("ascii")
 
 
 def read_header(file: BinaryIO, path: Path) -> list[Element]:

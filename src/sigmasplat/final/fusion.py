@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.config import Config
-from sigmasplat.data import isosurface, se3
+from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.mesh import Mesh
 from sigmasplat.data.submap import Picture, SubmapStore
-from sigmasplat.data.tsdf import Tsdf
+from sigmasplat.data.tsdf import Tsdf, extract_surface
 from sigmasplat.fit.confidence import uncertainty_weights
 from sigmasplat.render import FieldRenderer, Render
 from sigmasplat.types import Matrix, Progress, no_progress
@@ -129,7 +129,7 @@ def fuse(
             depth_m, color, weight = with_readings(depth_m, color, at.picture)
         volume.integrate(depth_m, color, at.camera, at.T_world_camera, weight)
         progress(done, total)
-    mesh = isosurface.surface(volume)
+    mesh = extract_surface(volume)
     del volume  # free memory: cleaning needs as much again
     return mesh.without_small_parts(LEAST_VERTICES, FLOATER_SHARE if config.surface.depth == "map+sensor" else 0.0)
 

@@ -10,8 +10,7 @@ from torch import Tensor
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.depth_std import generic_std, relative_weights
-from sigmasplat.data.frame import Detail, Frame
-from sigmasplat.data.photo import Photo
+from sigmasplat.data.frame import Detail, Frame, Photo
 from sigmasplat.data.submap import Picture
 from sigmasplat.fit.adam import VectorAdam
 from sigmasplat.native import kernels

@@ -13,8 +13,7 @@ from torch import Tensor
 from sigmasplat.config import Config
 from sigmasplat.data import se3
 from sigmasplat.data.field import GaussianField, Rows
-from sigmasplat.data.frame import Detail
-from sigmasplat.data.photo import Photo
+from sigmasplat.data.frame import Detail, Photo
 from sigmasplat.data.submap import Picture, Submap
 from sigmasplat.fit.adam import Rates
 from sigmasplat.fit.densify_stats import DensifyStats

@@ -21,11 +21,9 @@ from sigmasplat.files.atomic import part_of, remove_leftovers, replacing, sync_f
 from sigmasplat.files.json_files import append_line, read_json, read_lines, write_json, write_json_on_full_disk
 from sigmasplat.files.lock import LOCK, locked, no_warning
 from sigmasplat.files.tensors import open_tensors, write_tensors
-from sigmasplat.run_folder import splat_ply as ply, trajectory as tum, uncertainty as uncertainty_files
-from sigmasplat.run_folder.checkpoint_values import check_checkpoint
-from sigmasplat.run_folder.components import COMPONENT_FILES, component_numbers, write_components
+from sigmasplat.run_folder import map_files, splat_ply as ply, trajectory as tum
 from sigmasplat.run_folder.frames import RunFrames
-from sigmasplat.run_folder.run_values import FACTS, check_fields, check_log, check_profile
+from sigmasplat.run_folder.run_values import FACTS, check_checkpoint, check_fields, check_log, check_profile
 from sigmasplat.run_folder.submaps import DiskStore
 
 PROGRAM = "sigmasplat"
@@ -41,7 +39,7 @@ ALL_POSES = "trajectory_all.txt"
 """The poses of all frames, written if requested."""
 FILES = (
     "config.json", "trajectory.txt", "map.ply", "checkpoint.safetensors", "log.jsonl", "loops.json",
-    "metrics.json", "profile.json", "report.html", TRUTH, uncertainty_files.JSON, uncertainty_files.TENSORS,
+    "metrics.json", "profile.json", "report.html", TRUTH, map_files.UNCERTAINTY_JSON, map_files.UNCERTAINTY_TENSORS,
 )  # fmt: skip
 """Files that a run may have in addition to run.json, which always exists and identifies the folder as ours."""
 COMPONENTS = "components"
@@ -236,15 +234,15 @@ class RunFolder:
 
     def write_components(self, components: Sequence[Component]) -> None:
         """Write components/, the path and map of each component that is not connected to the world; remove others."""
-        write_components(self.path / COMPONENTS, components)
+        map_files.write_components(self.path / COMPONENTS, components)
 
     def component_numbers(self) -> list[int]:
         """Return the numbers of the components that are not connected to the world, in ascending order."""
-        return component_numbers(self.path / COMPONENTS)
+        return map_files.component_numbers(self.path / COMPONENTS)
 
     def read_component(self, number: int) -> Component:
         """Read a component from components/. Raises RunError if a file is missing, SourceError if it is damaged."""
-        trajectory, field = (self._existing(f"{COMPONENTS}/{number}/{name}") for name in COMPONENT_FILES)
+        trajectory, field = (self._existing(f"{COMPONENTS}/{number}/{name}") for name in map_files.COMPONENT_FILES)
         return Component(number, ply.read_field(field), tum.read_trajectory(trajectory))
 
     def write_map(self, field: GaussianField) -> None:
@@ -257,18 +255,18 @@ class RunFolder:
 
     def write_uncertainty(self, uncertainty: MapUncertainty) -> None:
         """Write uncertainty.json and uncertainty.safetensors: how sure map.ply is."""
-        uncertainty_files.write_uncertainty(self.path, uncertainty)
+        map_files.write_uncertainty(self.path, uncertainty)
 
     def read_uncertainty(self) -> MapUncertainty | None:
         """Return how sure map.ply is; None if the run has not measured it. Raises RunError if a file is damaged."""
-        return uncertainty_files.read_uncertainty(self.path)
+        return map_files.read_uncertainty(self.path)
 
     def read_splat_std(self) -> tuple[GaussianField, SplatStd] | None:
         """Return map.ply and the standard deviations of its splats; None if the run has not measured them.
 
         Raises RunError if a file is damaged, or does not have one row for each splat; SourceError as `read_map` does.
         """
-        if not (self.path / uncertainty_files.JSON).is_file():
+        if not (self.path / map_files.UNCERTAINTY_JSON).is_file():
             return None
         field = self.read_map()
         uncertainty = self.uncertainty_of(field)
@@ -281,7 +279,7 @@ class RunFolder:
         """
         uncertainty = self.read_uncertainty()
         if uncertainty is not None:
-            uncertainty_files.refuse_misfit(self.path, uncertainty, len(field))
+            map_files.refuse_misfit(self.path, uncertainty, len(field))
         return uncertainty
 
     def map_bytes(self) -> int:

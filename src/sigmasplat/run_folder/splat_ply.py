@@ -22,7 +22,7 @@ from sigmasplat.data.harmonics import DEGREES, count
 from sigmasplat.data.map_uncertainty import SplatStd
 from sigmasplat.errors import SourceError
 from sigmasplat.files.atomic import replacing
-from sigmasplat.files.ply_elements import read_header
+from sigmasplat.files.ply_elements import header_of, read_header
 from sigmasplat.files.reading import open_binary
 from sigmasplat.run_folder.splat_values import SH_C0, by_channel, check_finite, check_values
 
@@ -49,10 +49,8 @@ def write_field(path: Path, field: GaussianField, *, plain: bool = False, std: S
     """
     known = None if plain else std
     names = _columns(field, plain, known)
-    properties = "".join(f"property float {name}\n" for name in names)
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(field)}\n{properties}end_header\n"
     with replacing(path) as temporary, temporary.open("wb") as file:
-        file.write(header.encode("ascii"))
+        file.write(header_of(("vertex", len(field), [f"float {name}" for name in names])))
         for first in range(0, len(field), AT_ONCE):
             file.write(_rows(field, known, names, slice(first, first + AT_ONCE)).tobytes())
 

@@ -11,14 +11,41 @@ from numpy.typing import NDArray
 from sigmasplat.data.field import ATTRIBUTES, COLUMNS, INITIAL_LOG_VARIANCE, WIDTH, GaussianField, Rows
 from sigmasplat.data.harmonics import DEGREES, count, turned
 from sigmasplat.errors import SourceError
-from sigmasplat.run_folder.quaternions import Doubles, unit
+
+Doubles = NDArray[np.float64]
+
+
+def unit(quats: Doubles) -> Doubles:
+    """Return quaternions [N, 4] scaled to length 1."""
+    lengths: Doubles = np.linalg.norm(quats, axis=1, keepdims=True)
+    return quats / lengths
+
+
+def smallest_three(quats: Doubles) -> tuple[NDArray[np.intp], Doubles]:
+    """Split unit quaternions [N, 4] into the index of the largest component [N] and the other three [N, 3], in order.
+
+    Signs are chosen so that the largest component is positive. It then follows from the others, which are within ±1/√2.
+    """
+    which = np.abs(quats).argmax(1)
+    rows = np.arange(len(quats))
+    positive = quats * np.where(quats[rows, which] < 0.0, -1.0, 1.0)[:, None]
+    return which, positive[np.arange(4) != which[:, None]].reshape(-1, 3)
+
+
+def from_smallest_three(which: NDArray[np.intp], others: Doubles) -> Doubles:
+    """Return unit quaternions [N, 4] from the result of `smallest_three`."""
+    quats: Doubles = np.empty((len(which), 4))
+    quats[np.arange(4) != which[:, None]] = others.ravel()
+    quats[np.arange(len(which)), which] = np.sqrt(np.maximum(1.0 - (others**2).sum(1), 0.0))
+    return unit(quats)
+
 
 SH_C0 = 0.28209479177387814
 """Y₀₀ = 1/(2√π): the constant spherical harmonic."""
 R_RUB_RDF = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
 """Rotates axes x right, y down, z forward to x right, y up, z back, and back."""
 Number = TypeVar("Number", bound=np.generic)
-MORTON_BITS, ROUNDING = 20, 1e-6
+MORTON_BITS, ROUNDING, SMALLEST_SCALE_M = 20, 1e-6, 1e-12
 
 MOST_REPEATED = 1_000_000
 """Number of splats that any compressed file may announce."""
@@ -73,11 +100,15 @@ class SplatValues:
         quats = self.quats * np.array([1.0, *xyz])
         return replace(self, means=self.means * xyz, quats=quats, harmonics=self.harmonics * signs)
 
-    def field(self, path: Path) -> GaussianField:
-        """Return a field of the values read from `path`, with initial σ². Raises SourceError unless all are finite."""
+    def field(self, path: Path, sigmas: Doubles | None = None) -> GaussianField:
+        """Return a field of the values read from `path`. sigmas [N, 3]: σ of each channel; σ² is initial without them,
+        and where they are 0. Raises SourceError unless all values are finite."""
         params = np.full((len(self), WIDTH), INITIAL_LOG_VARIANCE, np.float32)
         for name in ("means", "quats", "log_scales", "colors"):
             params[:, COLUMNS[name]] = getattr(self, name)
+        if sigmas is not None:
+            log_variances = np.where(sigmas > 0.0, 2.0 * np.log(np.maximum(sigmas, 1e-18)), INITIAL_LOG_VARIANCE)
+            params[:, COLUMNS["log_variances"]] = log_variances
         params[:, 10] = np.log(self.opacities) - np.log1p(-self.opacities)
         check_values(params, path)
         field = GaussianField(torch.from_numpy(params))
@@ -103,14 +134,31 @@ def by_channel(harmonics: NDArray[Number]) -> NDArray[Number]:
     return harmonics.reshape(rows, columns // 3, 3).swapaxes(1, 2).reshape(rows, columns)
 
 
+def to_bytes(values: Doubles) -> NDArray[np.uint8]:
+    """Round values to bytes; those outside 0 to 255 are clipped."""
+    return np.clip(np.round(values), 0.0, 255.0).astype(np.uint8)
+
+
 def opacity_bytes(opacities: Doubles) -> NDArray[np.uint8]:
     """Convert opacities in [0, 1] to bytes."""
-    return np.round(opacities * 255.0).astype(np.uint8)
+    return to_bytes(opacities * 255.0)
 
 
 def opacities_of(values: NDArray[np.uint8]) -> Doubles:
     """Convert bytes to opacities; 0 and 255 become slightly larger and smaller, so that logits are finite."""
     return np.clip(values / 255.0, 0.25 / 255.0, 1.0 - 0.25 / 255.0)
+
+
+def log_scales_of(scales_m: Doubles) -> Doubles:
+    """Return the logarithms of scales in metres; those of 0 are finite."""
+    return np.asarray(np.log(np.maximum(scales_m, SMALLEST_SCALE_M)))
+
+
+def rotations_of(xyzw: Doubles, path: Path) -> Doubles:
+    """Return the unit quaternions wxyz [N, 4] of a file's xyzw. Raises SourceError if one is far from unit length."""
+    if (np.linalg.norm(xyzw, axis=1) < 0.5).any():
+        raise SourceError(f"{path} is damaged: a rotation is not a unit quaternion")
+    return unit(np.roll(xyzw, 1, axis=1))
 
 
 def morton_order(points: Doubles) -> NDArray[np.intp]:

@@ -14,8 +14,7 @@ import torch
 
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import ATTRIBUTES, GaussianField, Rows
-from sigmasplat.data.frame import Detail
-from sigmasplat.data.photo import Photo
+from sigmasplat.data.frame import Detail, Photo
 from sigmasplat.data.submap import Picture, Submap, refuse_misfit
 from sigmasplat.errors import RunError
 from sigmasplat.files.atomic import make_folder

@@ -6,9 +6,8 @@ from sigmasplat.data.atlas import Atlas
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.column import Column
 from sigmasplat.data.field import GaussianField, Rows
-from sigmasplat.data.frame import Detail, PosePrior
+from sigmasplat.data.frame import Detail, Photo, PosePrior
 from sigmasplat.data.hops import TrackedHops
-from sigmasplat.data.photo import Photo
 from sigmasplat.data.places import Places
 from sigmasplat.data.poses import KeyframePoses, Poses
 from sigmasplat.data.relative_pose import RelativePose

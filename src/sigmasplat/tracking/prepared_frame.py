@@ -10,8 +10,7 @@ from sigmasplat.config.sensors import sensor_model
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.depth_std import std_by_model
 from sigmasplat.data.exposure import gray_exposure, unexposed
-from sigmasplat.data.frame import Frame
-from sigmasplat.data.photo import Photo, photo_size
+from sigmasplat.data.frame import Frame, Photo, photo_size
 from sigmasplat.data.submap import Picture
 from sigmasplat.errors import SourceError
 from sigmasplat.fit.pyramid import HIDDEN_M, Pyramid

@@ -27,8 +27,8 @@ from sigmasplat.plugins.evaluation.metrics import reconstruction
 from sigmasplat.plugins.evaluation.metrics.published_reconstruction import VIEWS, score_published
 from sigmasplat.plugins.evaluation.metrics.reconstruction import score_splats
 from sigmasplat.plugins.evaluation.metrics.trajectory import align_rigid, associate, pair_poses
-from sigmasplat.plugins.outputs.meshes.gap_filling import filled
-from sigmasplat.plugins.outputs.meshes.mesh_files import read_mesh, write_mesh
+from sigmasplat.plugins.outputs.mesh_editing import filled
+from sigmasplat.plugins.outputs.mesh_files import read_mesh, write_mesh
 from sigmasplat.run_folder.runs import MESH, RunFolder
 from sigmasplat.types import Matrix, Progress, no_progress
 

@@ -16,8 +16,7 @@ from sigmasplat.config import Config, InputConfig
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
-from sigmasplat.data.frame import Frame
-from sigmasplat.data.photo import photo_size
+from sigmasplat.data.frame import Frame, photo_size
 from sigmasplat.data.selection import evenly_spread
 from sigmasplat.data.submap import SubmapStore
 from sigmasplat.data.trajectory import Trajectory

@@ -23,8 +23,7 @@ import numpy as np
 
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SigmaSplatError
-from sigmasplat.plugins.outputs.floorplan.ground import floor_frame
-from sigmasplat.plugins.outputs.floorplan.surface_samples import sample_surfaces
+from sigmasplat.plugins.outputs.floorplan.ground import floor_frame, sample_surfaces
 from sigmasplat.plugins.outputs.run_reader import RunReader
 from sigmasplat.render import FieldRenderer
 from sigmasplat.run_folder.frames import noted_up

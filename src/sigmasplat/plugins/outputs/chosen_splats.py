@@ -1,4 +1,4 @@
-"""Write the splats of a run or of a map file: those within given bounds, in given axes."""
+"""Write the splats of a run or of a map file: those within bounds or of most weight in its views, in given axes."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -6,21 +6,107 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from torch import Tensor
 
-from sigmasplat.data.field import GaussianField
+from sigmasplat.data import se3
+from sigmasplat.data.field import COLUMNS, INITIAL_LOG_VARIANCE, GaussianField
 from sigmasplat.data.map_uncertainty import SplatStd
+from sigmasplat.data.selection import evenly_spread
 from sigmasplat.errors import ConfigError, RunError, SigmaSplatError
-from sigmasplat.plugins.outputs.axes import Axes, levelled, transform_to
-from sigmasplat.plugins.outputs.rendered_weight import heaviest
-from sigmasplat.plugins.outputs.splat_filter import FilterResult, filter_splats, has_learned_variance, sigmas
+from sigmasplat.plugins.outputs.axes import AXES, Axes, levelled, transform_to
+from sigmasplat.plugins.outputs.run_reader import RunReader
+from sigmasplat.render.backend import on_device
+from sigmasplat.render.blended_values import blend_values
 from sigmasplat.types import Matrix
 
 if TYPE_CHECKING:
     from sigmasplat.plugins.outputs.source import ExportSource
 
+
+@dataclass(frozen=True)
+class FilterResult:
+    """The mask of the kept splats, bool [N], and the number of dropped splats by reason: σ; standard deviation of
+    depth, but not σ; only opacity."""
+
+    kept: Tensor
+    by_sigma: int
+    by_opacity: int
+    by_std: int = 0
+
+    @property
+    def dropped(self) -> int:
+        """Return the number of dropped splats."""
+        return self.by_sigma + self.by_std + self.by_opacity
+
+
+def sigmas(field: GaussianField) -> Tensor:
+    """Return σ of each splat [N]: the root of σ² averaged over the colour channels, for colours in [0, 1]."""
+    return field.variances.mean(1).sqrt()
+
+
+def has_learned_variance(field: GaussianField) -> bool:
+    """Return whether any σ² differs from its initial value. Maps read from files without σ² have this value too."""
+    return bool((field.params[:, COLUMNS["log_variances"]] != INITIAL_LOG_VARIANCE).any())
+
+
+def filter_splats(
+    field: GaussianField,
+    *,
+    sigma_below: float | None = None,
+    opacity_above: float | None = None,
+    std_below_m: float | None = None,
+    std: SplatStd | None = None,
+) -> FilterResult:
+    """Select splats with σ < `sigma_below`, opacity > `opacity_above` and depth_std_m of `std` < `std_below_m`.
+
+    None sets no bound. Raises SigmaSplatError on `std_below_m` without `std`.
+    """
+    if std_below_m is not None and std is None:
+        raise SigmaSplatError("std_below_m needs the standard deviations of the splats (RunFolder.read_splat_std)")
+    every = torch.ones(len(field), dtype=torch.bool, device=field.params.device)
+    certain = every if sigma_below is None else sigmas(field) < sigma_below
+    accurate = every if std_below_m is None or std is None else std.depth_std_m.to(every.device) < std_below_m
+    opaque = every if opacity_above is None else field.opacities > opacity_above
+    kept = certain & accurate
+    dropped = int((~certain).sum()), int((kept & ~opaque).sum()), int((certain & ~accurate).sum())
+    return FilterResult(kept & opaque, *dropped)
+
+
+MOST_VIEWS = 60
+"""At most this many poses of the path, evenly spread, are rendered."""
+
+
+def heaviest(reader: RunReader, field: GaussianField, most: int) -> Tensor:
+    """Return the mask [N] of the `most` splats with the largest rendered weight; of equal ones, the first ones.
+
+    The rendered weight of a splat is Σ w over the pixels of a view, in the view where it is largest. A sum over all
+    views would drop what few views show. Raises RunError if the run has no path.
+    """
+    weights = rendered_weights(reader, field)
+    kept = torch.zeros(len(field), dtype=torch.bool)
+    kept[torch.from_numpy(np.argsort(-weights.numpy(), kind="stable")[:most].copy())] = True
+    return kept.to(field.params.device)
+
+
+def rendered_weights(reader: RunReader, field: GaussianField) -> Tensor:
+    """Return the rendered weight [N] of the splats in pixels of the run's working resolution (`heaviest`)."""
+    camera, config = reader.camera, reader.config
+    shown = on_device(field, config.backend)
+    none = torch.zeros(len(field), 0)
+    ones = torch.ones(camera.height, camera.width, 1)
+    best = torch.zeros(len(field))
+    for T_world_camera in evenly_spread(list(reader.valid_path().T_world_camera), MOST_VIEWS):
+        seen = blend_values(
+            shown, camera, se3.inverse(T_world_camera), none, config.render, config.backend, gather=True
+        )
+        best = torch.maximum(best, seen.gather(ones.to(seen.alpha))[:, 0].cpu())
+    return best
+
+
 Y_UP_FORMATS: tuple[Axes, ...] = ("y-up", "camera")
 """The axes of formats that define y as up. `camera` is not levelled, only rotated by 180° about x."""
 HALF_TURN = np.diag([1.0, -1.0, -1.0, 1.0])
+WriteSplats = Callable[[GaussianField, SplatStd | None], None]
 
 
 @dataclass(frozen=True)
@@ -48,34 +134,17 @@ class SplatChoice:
             raise ConfigError(f"--max-splats must be at least 1, found {self.max_splats}")
 
 
-@dataclass(frozen=True)
-class SplatTarget:
-    """How a format is written: the function, the format's own axes, and the axes that it can have.
-
-    write(field, std): the field has the axes of the file, or, if the format defines y as up, those rotated by 180°
-    about x, because the writers in `io.splats` rotate back.
-    """
-
-    write: Callable[[GaussianField, SplatStd | None], None]
-    own: Axes
-    allowed: tuple[Axes, ...]
-
-    @property
-    def turns(self) -> bool:
-        """Return whether the writer rotates by 180° about x."""
-        return self.own == "y-up"
-
-
-def write_splats(source: "ExportSource", choice: SplatChoice, target: SplatTarget) -> str:
+def write_splats(source: "ExportSource", choice: SplatChoice, own: Axes, write: WriteSplats) -> str:
     """Write the splats within the bounds; return how many were written and dropped, and the axes.
 
-    Raises ConfigError on a meaningless bound, on axes that the format cannot have, or if the splats lack the value that
-    is bounded; RunError if no splat is left.
+    own: the axes of the format. If it defines y as up, the field that `write` gets is rotated by 180° about x, because
+    the writers in `splats/` rotate it back. Raises ConfigError on a meaningless bound, on axes that the format cannot
+    have, or if the splats lack the value that is bounded; RunError if no splat is left.
     """
     choice.check()
-    axes = choice.axes or target.own
-    if axes not in target.allowed:
-        raise ConfigError(f"--axes {axes} cannot be used with this format, only {', '.join(target.allowed)}")
+    axes, allowed = choice.axes or own, Y_UP_FORMATS if own == "y-up" else AXES
+    if axes not in allowed:
+        raise ConfigError(f"--axes {axes} cannot be used with this format, only {', '.join(allowed)}")
     field, std = source.splats()
     result, total = _filtered(source, field, std, choice)
     field.keep(result.kept)
@@ -84,10 +153,10 @@ def write_splats(source: "ExportSource", choice: SplatChoice, target: SplatTarge
         kept = heaviest(source.reader(), field, choice.max_splats)
         field.keep(kept)
         std = None if std is None else std.at(kept.cpu())
-    T, note = _transform(source, axes, target)
+    T, note = _transform(source, axes, own)
     field = field if np.array_equal(T, np.eye(4)) else field.moved(torch.from_numpy(T))
     print(f"writing {len(field):,} splats …", flush=True)
-    target.write(field, std)
+    write(field, std)
     count = f"{len(field):,} splats, axes {axes}{note}"
     reasons = _reasons(choice, result, total - result.dropped - len(field))
     return f"{count}; dropped {total - len(field):,} of {total:,}: {reasons}" if reasons else count
@@ -124,11 +193,11 @@ def _reasons(choice: SplatChoice, result: FilterResult, light: int) -> str:
     return ", ".join(reasons)
 
 
-def _transform(source: "ExportSource", axes: Axes, target: SplatTarget) -> tuple[Matrix, str]:
+def _transform(source: "ExportSource", axes: Axes, own: Axes) -> tuple[Matrix, str]:
     """Return the transform [4, 4] before writing, and a note if the file is not levelled though the axes say so."""
     if axes == "camera":
         return np.eye(4), ""
-    turn = HALF_TURN if target.turns else np.eye(4)
+    turn = HALF_TURN if own == "y-up" else np.eye(4)
     if source.path.is_file():
         return turn @ transform_to(axes), " (a map without a path is not levelled)"
     try:

@@ -5,19 +5,25 @@ Imports that load torch are inside the functions, so that `sigmasplat export --h
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from sigmasplat.errors import ConfigError
-from sigmasplat.plugins.outputs import splat_formats
 from sigmasplat.plugins.outputs.source import ExportSource as ExportSource
 from sigmasplat.registry import Output
 
 if TYPE_CHECKING:
+    from sigmasplat.data.field import GaussianField
+    from sigmasplat.data.map_uncertainty import SplatStd
     from sigmasplat.data.trajectory import Trajectory
     from sigmasplat.plugins.outputs.axes import Axes
     from sigmasplat.plugins.outputs.run_reader import RunReader
     from sigmasplat.types import Matrix, Progress
+
+
+Bound = float | None
+SPLATS = "sigmasplat.plugins.outputs.splats"
 
 
 def owners(formats: tuple[Output, ...]) -> dict[str, Output]:
@@ -65,6 +71,52 @@ def refuse_unused(chosen: Output, formats: tuple[Output, ...], given: list[str])
             )
 
 
+def _ply(
+    source: ExportSource, target: Path, *, sigma_below: Bound, std_below_m: Bound, opacity_above: Bound,
+    max_splats: int | None, axes: "Axes | None", plain: bool,
+) -> str:  # fmt: skip
+    chosen = sigma_below, std_below_m, opacity_above, max_splats, axes
+    return _write_splats(source, target, chosen, "sigmasplat.run_folder.splat_ply", "y-down", True, plain=plain)
+
+
+def _spz(
+    source: ExportSource, target: Path, *, sigma_below: Bound, std_below_m: Bound, opacity_above: Bound,
+    max_splats: int | None, axes: "Axes | None", spz_version: int | None,
+) -> str:  # fmt: skip
+    from sigmasplat.plugins.outputs.splats.spz import DEFAULT_VERSION, VERSIONS
+
+    version = DEFAULT_VERSION if spz_version is None else spz_version
+    if version not in VERSIONS:
+        raise ConfigError(f"--spz-version must be 2, 3 or 4, found {version}")
+    chosen = sigma_below, std_below_m, opacity_above, max_splats, axes
+    return _write_splats(source, target, chosen, f"{SPLATS}.spz", "y-up", False, version=version)
+
+
+def _splats(module: str, own: "Axes" = "y-down", keeps_std: bool = False) -> Callable[..., str]:
+    """Return the writer of a format without options of its own: splats/MODULE, its axes, whether it keeps `std`."""
+
+    def write(
+        source: ExportSource, target: Path, *, sigma_below: Bound, std_below_m: Bound, opacity_above: Bound,
+        max_splats: int | None, axes: "Axes | None",
+    ) -> str:  # fmt: skip
+        chosen = sigma_below, std_below_m, opacity_above, max_splats, axes
+        return _write_splats(source, target, chosen, f"{SPLATS}.{module}", own, keeps_std)
+
+    return write
+
+
+def _write_splats(
+    source: ExportSource, target: Path, chosen: tuple[Any, ...], module: str, own: "Axes", keeps_std: bool, **more: Any
+) -> str:
+    """Write the chosen splats with `write_field` of a module."""
+    from sigmasplat.plugins.outputs.chosen_splats import SplatChoice, write_splats
+
+    def write(field: "GaussianField", std: "SplatStd | None") -> None:
+        import_module(module).write_field(target, field, **more, **({"std": std} if keeps_std else {}))
+
+    return write_splats(source, SplatChoice(*chosen), own, write)
+
+
 @contextmanager
 def _counting(title: str) -> "Iterator[Progress]":
     from sigmasplat.run.terminal import Screen
@@ -84,13 +136,13 @@ def _trajectory(source: ExportSource, target: Path) -> str:
 
 
 def _covariance(source: ExportSource, target: Path) -> str:
-    from sigmasplat.run_folder.pose_covariance import write_square
+    from sigmasplat.run_folder.trajectory import write_square
 
     return _write_covariances(source, target, write_square)
 
 
 def _ros_covariance(source: ExportSource, target: Path) -> str:
-    from sigmasplat.run_folder.pose_covariance import write_ros
+    from sigmasplat.run_folder.trajectory import write_ros
 
     return _write_covariances(source, target, write_ros)
 
@@ -117,13 +169,13 @@ def _kitti(source: ExportSource, target: Path) -> str:
 
 
 def _nerfstudio(source: ExportSource, target: Path, *, pictures: bool) -> str:
-    from sigmasplat.plugins.outputs.nerfstudio import export_nerfstudio
+    from sigmasplat.plugins.outputs.views import export_nerfstudio
 
     return _export_views(export_nerfstudio, source, target, pictures)
 
 
 def _colmap(source: ExportSource, target: Path, *, pictures: bool) -> str:
-    from sigmasplat.plugins.outputs.colmap import export_colmap
+    from sigmasplat.plugins.outputs.views import export_colmap
 
     return _export_views(export_colmap, source, target, pictures)
 
@@ -145,7 +197,7 @@ def _export_views(
 def _points(source: ExportSource, target: Path, *, voxel_m: float | None, axes: "Axes | None") -> str:
     from sigmasplat.plugins.evaluation.reconstruct import FusionInput
     from sigmasplat.plugins.outputs.axes import levelled, transform_to
-    from sigmasplat.plugins.outputs.points import export_points
+    from sigmasplat.plugins.outputs.views import export_points
 
     reader, chosen = source.reader(), axes or "y-up"
     with _counting("surface") as progress:
@@ -167,7 +219,7 @@ def _video(
 
 
 def _plan(source: ExportSource, target: Path, *, cell_m: float) -> str:
-    from sigmasplat.plugins.outputs.plan import export_plan
+    from sigmasplat.plugins.outputs.floorplan.picture import export_plan
 
     with _counting("floor plan") as progress:
         plan = export_plan(source.reader(), target, cell_m=cell_m, progress=progress)
@@ -176,7 +228,7 @@ def _plan(source: ExportSource, target: Path, *, cell_m: float) -> str:
 
 
 def _bag(source: ExportSource, target: Path, *, pictures: bool) -> str:
-    from sigmasplat.plugins.outputs.bag import export_bag
+    from sigmasplat.plugins.robots.bag import export_bag
 
     reader = source.reader()
     with _counting("floor plan") as progress:
@@ -185,18 +237,13 @@ def _bag(source: ExportSource, target: Path, *, pictures: bool) -> str:
 
 
 PLUGIN = (
-    Output("ply", (".ply",), "3DGS PLY with σ², for every viewer", splat_formats.ply),
-    Output(
-        "compressed-ply",
-        (".compressed.ply",),
-        "SuperSplat's compressed PLY, a fifth of the size",
-        splat_formats.like_ply("compressed_ply"),
-    ),
-    Output("splat", (".splat",), "32 bytes per splat, for web viewers", splat_formats.like_ply("splat")),
-    Output("spz", (".spz",), "Niantic's SPZ, less than a fifth of the size", splat_formats.spz),
-    Output("sog", (".sog",), "SuperSplat's SOG, the smallest", splat_formats.like_ply("sog")),
-    Output("gltf", (".glb", ".gltf"), "glTF with splats (KHR) and σ", splat_formats.scene("gltf")),
-    Output("usd", (".usdc", ".usda", ".usd"), "OpenUSD with splats and σ", splat_formats.scene("usd")),
+    Output("ply", (".ply",), "3DGS PLY with σ², for every viewer", _ply),
+    Output("compressed-ply", (".compressed.ply",), "SuperSplat's PLY, a fifth of the size", _splats("compressed_ply")),
+    Output("splat", (".splat",), "32 bytes per splat, for web viewers", _splats("splat")),
+    Output("spz", (".spz",), "Niantic's SPZ, less than a fifth of the size", _spz),
+    Output("sog", (".sog",), "SuperSplat's SOG, the smallest", _splats("sog")),
+    Output("gltf", (".glb", ".gltf"), "glTF with splats (KHR) and σ", _splats("gltf", "y-up", True)),
+    Output("usd", (".usdc", ".usda", ".usd"), "OpenUSD with splats and σ", _splats("usd", "y-up", True)),
     Output("trajectory", (".txt",), "the path as TUM text", _trajectory),
     Output("covariance", (".cov.txt",), "the path as TUM text with the covariance of each pose", _covariance),
     Output("ros-covariance", (".ros.txt",), "the same as geometry_msgs/PoseWithCovariance", _ros_covariance),
@@ -204,13 +251,7 @@ PLUGIN = (
     Output("nerfstudio", (".json",), "views as nerfstudio's transforms.json", _nerfstudio, True),
     Output("colmap", ("-colmap",), "a folder with COLMAP's text model in sparse/0", _colmap, True),
     Output("points", (".points.ply",), "the surface as points with normals", _points, True),
-    Output(
-        "video",
-        (".webm", ".mp4", ".gif", ".webp"),
-        "a video: colour, depth, uncertainty",
-        _video,
-        True,
-    ),
+    Output("video", (".webm", ".mp4", ".gif", ".webp"), "a video: colour, depth, uncertainty", _video, True),
     Output("bag", (".mcap", "-bag"), "ROS 2 messages: path with covariance, loops, map", _bag, True),
     Output("plan", (".plan.png", ".png"), "a floor plan with regions to scan again", _plan, True),
 )

@@ -1,13 +1,33 @@
-"""Write a ROS 2 bag: a folder with metadata.yaml and one MCAP file, through the rosbags package (Apache-2.0)."""
+"""Write ROS 2 messages as a bag, through the rosbags package (Apache-2.0): of a running or of a finished run.
+
+A bag is a folder with metadata.yaml and one MCAP file, or the MCAP file alone."""
 
 import os
+import shutil
+from collections.abc import Iterator
 from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sigmasplat.data.component import LOST
+from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.env import import_optional
-from sigmasplat.errors import RunError
-from sigmasplat.plugins.robots.ros_messages import EXTRA, TOPICS, Encoded, RosMessages, Topic
+from sigmasplat.errors import RunError, SigmaSplatError
+from sigmasplat.graph.path_covariance import PathCovariance
+from sigmasplat.plugins.outputs.axes import level_cameras
+from sigmasplat.plugins.outputs.floorplan.floor_plan import FloorPlan, run_floor_plan
+from sigmasplat.plugins.outputs.run_reader import RunReader
+from sigmasplat.plugins.robots import ros_messages as ros
+from sigmasplat.plugins.robots.odometry import has_motion, odometry_poses
+from sigmasplat.plugins.robots.ros_messages import Encoded, RosMessages, Topic
+from sigmasplat.run_folder.frames import noted_up
+from sigmasplat.types import Matrix, Progress, no_progress
 
 CHUNK_BYTES = 65_536
 
@@ -20,8 +40,8 @@ class BagSink:
 
     def __init__(self, folder: Path) -> None:
         """Raises SourceError without the rosbags package, RunError if the folder exists or cannot be made."""
-        self.rosbag2 = import_optional("rosbags.rosbag2", EXTRA, "a ROS bag")
-        self.interfaces = import_optional("rosbags.interfaces", EXTRA, "a ROS bag")
+        self.rosbag2 = import_optional("rosbags.rosbag2", ros.EXTRA, "a ROS bag")
+        self.interfaces = import_optional("rosbags.interfaces", ros.EXTRA, "a ROS bag")
         self.folder = folder
         if folder.suffix == ".mcap":
             raise RunError(f"{folder}: a bag is a folder; give its name without .mcap")
@@ -39,7 +59,7 @@ class BagSink:
         self.writer = library.Writer(self.folder, version=9, storage_plugin=library.StoragePlugin.MCAP)
         self.writer.set_compression(library.CompressionMode.STORAGE, library.CompressionFormat.ZSTD)
         self.writer.open()
-        for topic in TOPICS:
+        for topic in ros.TOPICS:
             self.connections[topic.name] = self.writer.add_connection(
                 topic.name, topic.msgtype, typestore=messages.store, offered_qos_profiles=[self._quality(topic)]
             )
@@ -82,3 +102,163 @@ class BagSink:
             kinds.QosHistory.KEEP_LAST, 1 if topic.latched else 100, kinds.QosReliability.RELIABLE, durability,
             no_limit, no_limit, kinds.QosLiveliness.AUTOMATIC, no_limit, False,
         )  # fmt: skip
+
+
+FILE_ENDING = ".mcap"
+
+
+def export_bag(
+    reader: RunReader, target: Path, *, pictures: bool = False, progress: Progress = no_progress
+) -> dict[str, int]:
+    """Write a bag, or one MCAP file if `target` ends in .mcap; return the number of messages of each topic.
+
+    pictures: also write the images of the keyframes. Calls `progress(poses done, total)` while the floor plan is made.
+    Raises RunError if the run has no path or map, or if the target cannot be written; SourceError without the rosbags
+    package.
+    """
+    messages = RosMessages()
+    one_file = target.suffix == FILE_ENDING
+    folder = target.with_name(f".{target.name}.part")
+    shutil.rmtree(folder, ignore_errors=True)
+    counts = dict[str, int]()
+    try:
+        folder.mkdir()
+        bag = folder / target.name.removesuffix(FILE_ENDING)
+        sink = BagSink(bag)
+        sink.open(messages)
+        try:
+            for message in _messages(reader, messages, pictures, progress):
+                sink.write(message)
+                counts[message.topic.name] = counts.get(message.topic.name, 0) + 1
+            sink.close()
+        except BaseException:
+            sink.abort()
+            raise
+        _remove_earlier(target)
+        (bag / f"{bag.name}{FILE_ENDING}" if one_file else bag).rename(target)
+    except OSError as problem:
+        raise RunError(f"cannot write {target}: {problem.strerror or problem}; choose a writable place") from problem
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+    return counts
+
+
+def _remove_earlier(target: Path) -> None:
+    """Remove an earlier export. Raises OSError if it is a folder with other files."""
+    if not target.is_dir():
+        return target.unlink(missing_ok=True)
+    for name in ("metadata.yaml", f"{target.name}{FILE_ENDING}"):
+        (target / name).unlink(missing_ok=True)
+    target.rmdir()
+
+
+@dataclass(frozen=True, eq=False)
+class _FinishedPath:
+    """The path of a finished run as ROS reads it. valid: frames with a known pose in the world."""
+
+    reader: RunReader
+    T_map_world: Matrix
+
+    @cached_property
+    def checkpoint(self) -> dict[str, Tensor]:
+        """Return the tensors of the run's checkpoint."""
+        return self.reader.run.read_checkpoint()[0]
+
+    @cached_property
+    def valid(self) -> dict[int, Matrix]:
+        """Return T_map_link [4, 4] of each valid frame."""
+        path = self.reader.valid_path()
+        return dict(zip(self.reader.valid_frames(), ros.link_pose(self.T_map_world @ path.T_world_camera), strict=True))
+
+    @cached_property
+    def odometry(self) -> tuple[Matrix, NDArray[np.bool_]]:
+        """Return T_odom_camera [F, 4, 4] of all frames, and whether all motions up to each frame were tracked [F]."""
+        tensors, frames = self.checkpoint, self.reader.frames
+        chain = tensors.get("T_world_camera_odometry", tensors["T_world_camera"]).numpy()
+        if len(chain) < len(frames):
+            run = self.reader.run.path
+            raise RunError(f"{run}: {len(chain)} poses in the checkpoint for {len(frames)} frames; run it again")
+        components = [0] * len(frames)
+        if "submap_component" in tensors:
+            components = tensors["submap_component"][tensors["frame_submap"]].tolist()
+        lost = [state == LOST for state in frames.states]
+        moved = [has_motion(s, r.get("tracking", {})) for s, r in zip(frames.states, frames.log, strict=True)]
+        return odometry_poses(chain[: len(frames)], moved, lost, components)
+
+    @cached_property
+    def errors(self) -> tuple[PathCovariance, PathCovariance] | None:
+        """Return the errors of the path, and of the path without loops; None if the run did not record them."""
+        errors = PathCovariance.of(self.checkpoint)
+        return None if errors is None else (errors, errors.without_loops())
+
+    def in_map(self, row: int) -> Matrix | None:
+        """Return the covariance [6, 6] of a valid frame's pose in the map; None if it is not known."""
+        if self.errors is None:
+            return None
+        return ros.ros_covariance(self.errors[0].of_frame(row), self.T_map_world, self.valid[row])
+
+    def in_odom(self, row: int) -> Matrix | None:
+        """Return the covariance [6, 6] of a frame's pose in odom; None if it is not known."""
+        poses, tracked = self.odometry
+        if self.errors is None or not tracked[row]:
+            return None
+        return ros.ros_covariance(
+            self.errors[1].of_frame(row), ros.T_LINK_OPTICAL, ros.link_pose(ros.T_LINK_OPTICAL @ poses[row])
+        )
+
+
+def _messages(reader: RunReader, messages: RosMessages, pictures: bool, progress: Progress) -> Iterator[Encoded]:
+    """Yield the messages of a run in order of time; the map comes first, so that a player has it from the start."""
+    plan, T_floor_world = _floor(reader, progress)
+    T_map_world = ros.levelled_map(T_floor_world)
+    first_ns = ros.stamp_of(reader.frames.log[0]["timestamp_s"])
+    static = [(ros.MAP, ros.WORLD, T_map_world), (ros.LINK, ros.OPTICAL, ros.T_LINK_OPTICAL)]
+    yield messages.transforms(ros.TF_STATIC, first_ns, static)
+    field, std = reader.run.read_splat_std() or (reader.run.read_map(), None)
+    yield messages.cloud(
+        first_ns, ros.MAP, ros.points_of(field, None if std is None else std.depth_std_m).moved(T_map_world)
+    )
+    if plan is not None:
+        yield from ros.grids(plan, first_ns, ros.MAP, messages)
+    yield from _frames(reader, messages, _FinishedPath(reader, T_map_world), pictures)
+
+
+def _frames(reader: RunReader, messages: RosMessages, path: _FinishedPath, pictures: bool) -> Iterator[Encoded]:
+    """Yield the messages of the frames: transforms, odometry, pose with covariance, loops, images of keyframes."""
+    images = reader.keyframes() if pictures else iter(())
+    loops, picture = _loop_frames(reader), next(images, None)
+    for row, record in enumerate(reader.frames.log):
+        stamp_ns = ros.stamp_of(record["timestamp_s"])
+        if picture is not None and picture[0] == row:
+            yield from messages.images(stamp_ns, reader.camera, picture[1].unit_color, picture[1].depth_m)
+            picture = next(images, None)
+        if reader.frames.states[row] == LOST:
+            continue
+        T_odom_link = ros.link_pose(ros.T_LINK_OPTICAL @ path.odometry[0][row])
+        T_map_link = path.valid.get(row)
+        yield messages.transforms(ros.TF, stamp_ns, ros.camera_links(T_odom_link, T_map_link))
+        yield messages.odometry(stamp_ns, ros.ODOM, ros.LINK, T_odom_link, path.in_odom(row))
+        if T_map_link is not None:
+            for topic in (ros.POSE, ros.LOOP) if row in loops else (ros.POSE,):
+                yield messages.pose(topic, stamp_ns, ros.MAP, T_map_link, path.in_map(row))
+
+
+def _loop_frames(reader: RunReader) -> set[int]:
+    """Return the rows of the log at which a loop was found that is accepted at the end."""
+    accepted = {(loop["query"], loop["database"]) for loop in reader.run.read_loops() if loop["accepted"]}
+    return {
+        row
+        for row, record in enumerate(reader.frames.log)
+        if any((loop["query"], loop["database"]) in accepted for loop in record.get("loops", ()))
+    }
+
+
+def _floor(reader: RunReader, progress: Progress) -> tuple[FloorPlan | None, Matrix]:
+    """Return the floor plan and T_floor_world; if no surface is visible, no plan, and axes levelled by the cameras."""
+    path: Trajectory = reader.valid_path()
+    with suppress(SigmaSplatError):
+        plan = run_floor_plan(reader.run, path, reader.camera, progress=progress)
+        return plan, plan.T_floor_world
+    T = np.eye(4)
+    T[:3, :3] = level_cameras(path, noted_up(reader.run.facts()))
+    return None, T

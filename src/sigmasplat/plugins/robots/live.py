@@ -1,16 +1,14 @@
 """Give a run that goes on to outlets: transforms, odometry, loops, images, and the map as points and as a grid."""
 
 from array import array
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property, partial
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor
 
 from sigmasplat.data import se3
-from sigmasplat.data.field import GaussianField
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.imu import up_of_path
 from sigmasplat.data.submap import SubmapStore
@@ -19,41 +17,10 @@ from sigmasplat.errors import SigmaSplatError
 from sigmasplat.graph.loops import Loop
 from sigmasplat.graph.path_covariance import PathCovariance
 from sigmasplat.plugins.outputs.floorplan.floor_plan import FloorPlan, floor_plan
-from sigmasplat.plugins.robots.frames import (
-    FLOOR,
-    LINK,
-    MAP,
-    ODOM,
-    OPTICAL,
-    T_LINK_OPTICAL,
-    T_MAP_WORLD,
-    WORLD,
-    camera_links,
-    levelled_map,
-    link_pose,
-    ros_covariance,
-)
-from sigmasplat.plugins.robots.map_messages import MAX_POINTS, grids, points_of
+from sigmasplat.plugins.robots import ros_messages as ros
 from sigmasplat.plugins.robots.odometry import LiveOdometry, has_motion
 from sigmasplat.plugins.robots.outlet import Job, Outlet
-from sigmasplat.plugins.robots.ros_messages import (
-    CLOUD,
-    COLOR,
-    COLOR_INFO,
-    DEPTH,
-    DEPTH_INFO,
-    GRID,
-    GRID_STD,
-    LOOP,
-    ODOMETRY,
-    TF,
-    TF_STATIC,
-    Encoded,
-    Points,
-    RosMessages,
-    Topic,
-    stamp_of,
-)
+from sigmasplat.plugins.robots.ros_messages import MAX_POINTS, Encoded, Points, RosMessages, Topic
 from sigmasplat.render import FieldRenderer
 from sigmasplat.render.predictive import predict
 from sigmasplat.run.callbacks import Callback
@@ -65,7 +32,7 @@ from sigmasplat.types import Matrix
 Images = Literal["none", "keyframes", "all"]
 SUBMAP_POINTS = 20_000
 """At most this many points of each submap while the run goes on; fewer if there are many submaps."""
-STATIC = ((MAP, WORLD, T_MAP_WORLD), (LINK, OPTICAL, T_LINK_OPTICAL))
+STATIC = ((ros.MAP, ros.WORLD, ros.T_MAP_WORLD), (ros.LINK, ros.OPTICAL, ros.T_LINK_OPTICAL))
 """Each message of static transforms contains all of them, because late subscribers get only the last one."""
 
 
@@ -119,7 +86,7 @@ class LiveRobot(Callback):
             outlet.close()
         self._report_failures()
 
-    # ---- in the thread of the run ----
+    # ---- in the thread of the run; jobs are called on the threads of the outlets ----
 
     def _offer(self, job: Job, *topics: Topic, bulky: bool = False) -> None:
         for outlet in self.outlets:
@@ -127,9 +94,13 @@ class LiveRobot(Callback):
 
     def _now(self, timestamp_s: float) -> None:
         """Set the time of the next messages; the first time, give the static transforms."""
-        first, self._stamp_ns = self._stamp_ns < 0, stamp_of(timestamp_s)
+        first, self._stamp_ns = self._stamp_ns < 0, ros.stamp_of(timestamp_s)
         if first:
-            self._offer(partial(_static, self._stamp_ns, STATIC), TF_STATIC)
+            self._offer_static(STATIC)
+
+    def _offer_static(self, links: Sequence[tuple[str, str, Matrix]]) -> None:
+        stamp_ns = self._stamp_ns
+        self._offer(lambda messages: [messages.transforms(ros.TF_STATIC, stamp_ns, links)], ros.TF_STATIC)
 
     def _offer_images(self, step: Step) -> None:
         frame = self._frames.pop(step.index, None)
@@ -137,26 +108,44 @@ class LiveRobot(Callback):
             if index < step.index:
                 del self._frames[index]
         if frame is not None and (self.images == "all" or step.is_keyframe):
-            job = partial(_images, self._stamp_ns, frame)
-            self._offer(job, COLOR, COLOR_INFO, DEPTH, DEPTH_INFO, bulky=True)
+            image = self._stamp_ns, frame.camera, frame.color, frame.depth_m
+            topics = ros.COLOR, ros.COLOR_INFO, ros.DEPTH, ros.DEPTH_INFO
+            self._offer(lambda messages: messages.images(*image), *topics, bulky=True)
 
     def _offer_pose(self, step: Step, T_odom_camera: Matrix) -> None:
         """Give the transforms and the odometry of a frame that is not lost.
 
         If the frame's component is not connected to the world, map → odom is not known and left out.
         """
-        T_odom_link = link_pose(T_LINK_OPTICAL @ T_odom_camera)
-        links = camera_links(T_odom_link, None if step.component else link_pose(T_MAP_WORLD @ step.T_world_camera))
+        T_odom_link = ros.link_pose(ros.T_LINK_OPTICAL @ T_odom_camera)
+        links = ros.camera_links(
+            T_odom_link, None if step.component else ros.link_pose(ros.T_MAP_WORLD @ step.T_world_camera)
+        )
         known = self.odometry.covariance
-        covariance = None if known is None else ros_covariance(known, T_LINK_OPTICAL, T_odom_link)
-        self._offer(partial(_pose, self._stamp_ns, links, covariance), TF, ODOMETRY)
+        covariance = None if known is None else ros.ros_covariance(known, ros.T_LINK_OPTICAL, T_odom_link)
+        stamp_ns = self._stamp_ns
+
+        def job(messages: RosMessages) -> list[Encoded]:
+            odometry = messages.odometry(stamp_ns, ros.ODOM, ros.LINK, T_odom_link, covariance)
+            return [messages.transforms(ros.TF, stamp_ns, links), odometry]
+
+        self._offer(job, ros.TF, ros.ODOMETRY)
 
     def _offer_loop(self, row: int) -> None:
         """Give the pose of a frame in the map with its covariance; this is computed on the outlet's thread."""
-        slam = self.slam
-        if slam.atlas.in_world[row]:
-            errors = path_errors(slam.atlas, slam.keyframe_indices, slam.closer.valid)
-            self._offer(partial(_loop, self._stamp_ns, errors, row), LOOP)
+        slam, stamp_ns = self.slam, self._stamp_ns
+        if not slam.atlas.in_world[row]:
+            return
+        errors = path_errors(slam.atlas, slam.keyframe_indices, slam.closer.valid)
+
+        def job(messages: RosMessages) -> list[Encoded]:
+            path = PathCovariance.of(errors)
+            assert path is not None
+            T_map_link = ros.link_pose(ros.T_MAP_WORLD @ path.T_world_camera[row])
+            covariance = ros.ros_covariance(path.of_frame(row), ros.T_MAP_WORLD, T_map_link)
+            return [messages.pose(ros.LOOP, stamp_ns, ros.MAP, T_map_link, covariance)]
+
+        self._offer(job, ros.LOOP)
 
     def _offer_submaps(self, finished: int) -> None:
         """Give the points of all finished submaps of the world, when one more is finished; they are read on the thread
@@ -167,23 +156,34 @@ class LiveRobot(Callback):
         new = range(len(self._submaps), finished)
         self._submaps.extend(_SubmapPoints(self.slam.store, index) for index in new)
         parts = [
-            (submap, T_MAP_WORLD @ atlas.anchors[s])
+            (submap, ros.T_MAP_WORLD @ atlas.anchors[s])
             for s, submap in enumerate(self._submaps)
             if not atlas.components[s]
         ]
+        stamp_ns = self._stamp_ns
+
+        def job(messages: RosMessages) -> list[Encoded]:
+            each = MAX_POINTS // len(parts)
+            moved = [submap.points.thinned(each).moved(T) for submap, T in parts]
+            return [messages.cloud(stamp_ns, ros.MAP, Points.joined(moved))]
+
         if parts:
-            self._offer(partial(_submaps, self._stamp_ns, parts), CLOUD)
+            self._offer(job, ros.CLOUD)
 
     def _offer_final_map(self) -> None:
         """Give the final map as points and as a grid."""
-        field, known = self.slam.field, self.slam.uncertainty
+        field, known, stamp_ns = self.slam.field, self.slam.uncertainty, self._stamp_ns
         std = None if known is None or known.std is None else known.std.depth_std_m
-        self._offer(partial(_final_cloud, self._stamp_ns, field, std), CLOUD)
+
+        def job(messages: RosMessages) -> list[Encoded]:
+            return [messages.cloud(stamp_ns, ros.MAP, ros.points_of(field, std).moved(ros.T_MAP_WORLD))]
+
+        self._offer(job, ros.CLOUD)
         plan = self._floor_plan()
         if plan is not None:
-            floor = (MAP, FLOOR, T_MAP_WORLD @ se3.inverse(levelled_map(plan.T_floor_world)))
-            self._offer(partial(_static, self._stamp_ns, [*STATIC, floor]), TF_STATIC)
-            self._offer(partial(grids, plan, self._stamp_ns, FLOOR), GRID, GRID_STD)
+            floor = (ros.MAP, ros.FLOOR, ros.T_MAP_WORLD @ se3.inverse(ros.levelled_map(plan.T_floor_world)))
+            self._offer_static((*STATIC, floor))
+            self._offer(partial(ros.grids, plan, stamp_ns, ros.FLOOR), ros.GRID, ros.GRID_STD)
 
     def _floor_plan(self) -> FloorPlan | None:
         """Return the floor plan of the final map; None if no surface is visible."""
@@ -207,35 +207,6 @@ class LiveRobot(Callback):
             if outlet.failure and name not in self._failed:
                 self._failed.add(name)
                 self.warn(f"the {name} ended ({outlet.failure}) after {outlet.written} messages; the run goes on")
-
-
-# ---- jobs, on the threads of the outlets ----
-
-
-def _static(stamp_ns: int, links: Sequence[tuple[str, str, Matrix]], messages: RosMessages) -> list[Encoded]:
-    return [messages.transforms(TF_STATIC, stamp_ns, links)]
-
-
-def _images(stamp_ns: int, frame: Frame, messages: RosMessages) -> list[Encoded]:
-    return messages.images(stamp_ns, frame.camera, frame.color, frame.depth_m)
-
-
-def _pose(
-    stamp_ns: int, links: Sequence[tuple[str, str, Matrix]], covariance: Matrix | None, messages: RosMessages
-) -> list[Encoded]:
-    T_odom_link = links[-1][2]
-    return [
-        messages.transforms(TF, stamp_ns, links),
-        messages.odometry(stamp_ns, ODOM, LINK, T_odom_link, covariance),
-    ]
-
-
-def _loop(stamp_ns: int, errors: Mapping[str, Tensor], row: int, messages: RosMessages) -> list[Encoded]:
-    path = PathCovariance.of(errors)
-    assert path is not None
-    T_map_link = link_pose(T_MAP_WORLD @ path.T_world_camera[row])
-    covariance = ros_covariance(path.of_frame(row), T_MAP_WORLD, T_map_link)
-    return [messages.pose(LOOP, stamp_ns, MAP, T_map_link, covariance)]
 
 
 class _Forces:
@@ -274,16 +245,4 @@ class _SubmapPoints:
 
     @cached_property
     def points(self) -> Points:
-        return points_of(self.store.load(self.index).field, None, SUBMAP_POINTS)
-
-
-def _submaps(stamp_ns: int, parts: Sequence[tuple[_SubmapPoints, Matrix]], messages: RosMessages) -> list[Encoded]:
-    each = MAX_POINTS // len(parts)
-    moved = [submap.points.thinned(each).moved(T) for submap, T in parts]
-    return [messages.cloud(stamp_ns, MAP, Points.joined(moved))]
-
-
-def _final_cloud(
-    stamp_ns: int, field: GaussianField, depth_std_m: Tensor | None, messages: RosMessages
-) -> list[Encoded]:
-    return [messages.cloud(stamp_ns, MAP, points_of(field, depth_std_m).moved(T_MAP_WORLD))]
+        return ros.points_of(self.store.load(self.index).field, None, SUBMAP_POINTS)

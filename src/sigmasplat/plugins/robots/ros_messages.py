@@ -9,12 +9,58 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
+from sigmasplat.data.field import GaussianField
 from sigmasplat.env import import_optional
-from sigmasplat.plugins.robots.frames import OPTICAL
+from sigmasplat.plugins.outputs.floorplan.floor_plan import FREE, OBJECT, WALL, FloorPlan
 from sigmasplat.types import Matrix
+
+MAP, ODOM, LINK, OPTICAL = "map", "odom", "camera_link", "camera_optical_frame"
+WORLD, FLOOR = "sigmasplat_world", "floor"
+
+T_LINK_OPTICAL = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+"""From optical axes (x right, y down, z forward) to those of a body (x forward, y left, z up); the origin is shared."""
+T_MAP_WORLD = T_LINK_OPTICAL
+"""From the world to the map while a run goes on: the first camera is assumed to be level."""
+T_BODY_FLOOR = np.array([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+"""From the axes of the floor plan (x right, y ahead, z up) to x ahead, y left, z up."""
+
+
+def levelled_map(T_floor_world: Matrix) -> Matrix:
+    """Return T_map_world [4, 4] for a known floor: x ahead, y left, z up, origin on the floor below the first camera.
+
+    T_floor_world: that of `FloorPlan`.
+    """
+    return np.asarray(T_BODY_FLOOR @ T_floor_world)
+
+
+def link_pose(T_outer_optical: Matrix) -> Matrix:
+    """Return the pose of camera_link, given that of the optical frame in the same outer frame [..., 4, 4]."""
+    return np.asarray(T_outer_optical @ se3.inverse(T_LINK_OPTICAL))
+
+
+def camera_links(T_odom_link: Matrix, T_map_link: Matrix | None) -> list[tuple[str, str, Matrix]]:
+    """Return the transforms of a frame as (parent, child, pose): map → odom, left out if T_map_link is None, and odom →
+    camera_link."""
+    links = [(ODOM, LINK, T_odom_link)]
+    if T_map_link is not None:
+        links.insert(0, (MAP, ODOM, se3.orthonormalise(T_map_link @ se3.inverse(T_odom_link))))
+    return links
+
+
+def ros_covariance(covariance: Matrix, T_outer_world: Matrix, T_outer_link: Matrix) -> Matrix:
+    """Return the covariance [6, 6] as in geometry_msgs/PoseWithCovariance: x, y, z, rotation about x, y, z, all in the
+    axes of the outer frame.
+
+    covariance [6, 6]: of the left twist (ρ, φ), m and rad, of the pose in the world; T_outer_world [4, 4]: from the
+    world to the outer frame; T_outer_link [4, 4]: the pose in the outer frame.
+    """
+    J = se3.displacement(T_outer_link) @ se3.adjoint(T_outer_world)
+    return np.asarray(J @ covariance @ J.T)
+
 
 EXTRA = "ros"
 KNOWN_VARIANCE = 1e-10
@@ -232,3 +278,45 @@ class RosMessages:
         if covariance is not None:
             values = (covariance if covariance.any() else KNOWN_VARIANCE * np.eye(6)).reshape(-1).astype(np.float64)
         return self._make("geometry_msgs/msg/PoseWithCovariance", pose=self._pose(T), covariance=values)
+
+
+MAX_POINTS = 200_000
+MIN_OPACITY = 0.5
+UNOBSERVED, EMPTY, OCCUPIED = -1, 0, 100
+"""Values of nav_msgs/OccupancyGrid."""
+CM_PER_M = 100.0
+
+
+def points_of(field: GaussianField, depth_std_m: Tensor | None, most: int = MAX_POINTS) -> Points:
+    """Return the centres of the opaque splats as a copy, evenly thinned to `most`.
+
+    depth_std_m [N]: standard deviation of the depth that each splat shows; None if it was not measured.
+    """
+    opacities = field.opacities.detach().cpu().numpy()
+    rows = np.flatnonzero(opacities >= MIN_OPACITY)
+    rows = rows[np.linspace(0, len(rows) - 1, min(most, len(rows))).astype(int)]
+    std = np.full(len(rows), np.nan, np.float32) if depth_std_m is None else depth_std_m.cpu().numpy()[rows]
+    means, colors = (values.detach().cpu().numpy()[rows] for values in (field.means, field.colors))
+    return Points(means.astype(np.float32), colors.astype(np.float32), opacities[rows], std.astype(np.float32))
+
+
+def grids(plan: FloorPlan, stamp_ns: int, frame: str, messages: RosMessages) -> list[Encoded]:
+    """Make two nav_msgs/OccupancyGrid of a floor plan: what is occupied, and how sure its surfaces are.
+
+    The first: 0 free floor, 100 object or wall, −1 not observed, also where only the floor was not observed. The
+    second: the standard deviation of depth of the surfaces in a cell in cm, at most 100; −1 without a surface.
+    frame: the frame with the axes of `levelled_map`. The grids are not rotated in it, because navigation software
+    ignores the rotation of a grid.
+    """
+    occupied = np.full(plan.kind.shape, UNOBSERVED, np.int8)
+    occupied[plan.kind == FREE] = EMPTY
+    occupied[(plan.kind == OBJECT) | (plan.kind == WALL)] = OCCUPIED
+    known = np.isfinite(plan.depth_sigma_m)
+    std_cm = np.rint(CM_PER_M * np.minimum(np.where(known, plan.depth_sigma_m, 0.0), 1.0))
+    T_frame_grid = np.eye(4)  # x ahead is y of the plan, y left is −x of the plan
+    T_frame_grid[:2, 3] = plan.origin_m[1], -(plan.origin_m[0] + plan.cell_m * plan.kind.shape[1])
+    layers = ((GRID, occupied), (GRID_STD, np.where(known, std_cm, UNOBSERVED).astype(np.int8)))
+    return [
+        messages.grid(topic, stamp_ns, frame, np.ascontiguousarray(cells.T[::-1]), plan.cell_m, T_frame_grid)
+        for topic, cells in layers
+    ]

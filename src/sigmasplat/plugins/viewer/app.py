@@ -10,29 +10,11 @@ import viser
 
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.plugins.outputs.drawing.colormap import INFERNO
-from sigmasplat.plugins.viewer import lines
-from sigmasplat.plugins.viewer.layers import (
-    LayerImage,
-    Legend,
-    browser_camera,
-    draw_legend,
-    render_layer,
-    render_predicted,
-)
+from sigmasplat.plugins.viewer import layers, snapshot as lines
+from sigmasplat.plugins.viewer.layers import Floats, LayerImage, Legend, VisibilityFilter
 from sigmasplat.plugins.viewer.panel import PREDICTED_MODES, ControlPanel, ControlState, escaped
 from sigmasplat.plugins.viewer.scene import ViserScene, camera_pose, move_camera, set_initial_camera
 from sigmasplat.plugins.viewer.snapshot import BUDGET, Piece, Snapshot, within_budget
-from sigmasplat.plugins.viewer.splats import (
-    Floats,
-    VisibilityFilter,
-    merge_pieces,
-    merged_uncertainty,
-    palette_range,
-    sorted_depth_stds,
-    sorted_sigmas,
-    splat_arrays,
-    visibility_filter,
-)
 
 REST_S, LIVE_REST_S = 0.05, 0.5
 """Pause after each drawing, so that mouse moves do not keep the CPU busy and do not slow SLAM down."""
@@ -76,7 +58,7 @@ class ViewerApp:
         self._snapshot: Snapshot | None = None
         self._drawn: dict[Any, Any] = {}
         self._values: tuple[list[IdentityKey], dict[str, Floats]] = (
-            [], {"σ": sorted_sigmas(()), "depth error": sorted_depth_stds(())}
+            [], {"σ": layers.sorted_sigmas(()), "depth error": layers.sorted_depth_stds(())}
         )  # fmt: skip
         self._merged: tuple[Any, Any] = (None, None)
         self._wake, self._stop = threading.Event(), threading.Event()
@@ -129,10 +111,10 @@ class ViewerApp:
         self.panel.offer(any(piece.uncertainty is not None for piece in pieces), snapshot.mesh is not None)
         controls = self.panel.state()
         ordered = self._values_of(pieces)
-        visible = visibility_filter(
+        visible = layers.visibility_filter(
             ordered["σ"], controls.hidden_share, controls.min_opacity, controls.max_std_m
         )  # fmt: skip
-        span = palette_range(ordered["depth error" if controls.colouring == "depth error" else "σ"])
+        span = layers.palette_range(ordered["depth error" if controls.colouring == "depth error" else "σ"])
         with self.server.atomic():
             self._draw_path(snapshot, controls)
             self._draw_splats(pieces, controls, span, visible)
@@ -146,7 +128,7 @@ class ViewerApp:
         for client in self.server.get_clients().values():
             legend = self._draw_layer(client, snapshot, controls, pieces, visible) or legend
         if self._is_new("legend", legend and legend[1:]):
-            self.panel.show_legend(None if legend is None else draw_legend(legend))
+            self.panel.show_legend(None if legend is None else layers.draw_legend(legend))
 
     def _is_new(self, what: Any, state: Any) -> bool:
         """Return whether something was not drawn in this state before, and remember the state."""
@@ -159,7 +141,10 @@ class ViewerApp:
         """Return σ and depth errors of the splats in ascending order."""
         fields = [IdentityKey(piece.field) for piece in pieces]
         if self._values[0] != fields:
-            self._values = (fields, {"σ": sorted_sigmas(pieces), "depth error": sorted_depth_stds(pieces)})
+            self._values = (
+                fields,
+                {"σ": layers.sorted_sigmas(pieces), "depth error": layers.sorted_depth_stds(pieces)},
+            )
         return self._values[1]
 
     def _draw_path(self, snapshot: Snapshot, controls: ControlState) -> None:
@@ -186,7 +171,7 @@ class ViewerApp:
         state = ([(p.name, IdentityKey(p.field)) for p in pieces], controls.colouring, ends, visible)
         if self._is_new("splats", state):
             sent = within_budget(pieces, BUDGET)  # a large final map is rendered completely, but sent thinned
-            drawn = {p.name: (splat_arrays(p, controls.colouring, span, visible), p.T_world_piece) for p in sent}
+            drawn = {p.name: (layers.splat_arrays(p, controls.colouring, span, visible), p.T_world_piece) for p in sent}
             self.scene.show_splats(drawn)
         else:
             self.scene.place_splats({piece.name: piece.T_world_piece for piece in pieces})
@@ -220,14 +205,17 @@ class ViewerApp:
         rows = sharp_rows if self._sharp else rows
         if drawn is None or drawn[0] != state or drawn[2] < rows:
             if self._merged[0] != splats:
-                self._merged = (splats, (merge_pieces(pieces, visible), merged_uncertainty(pieces, visible)))
-            camera = browser_camera(c.fov, c.aspect, rows)
+                self._merged = (
+                    splats,
+                    (layers.merge_pieces(pieces, visible), layers.merged_uncertainty(pieces, visible)),
+                )
+            camera = layers.browser_camera(c.fov, c.aspect, rows)
             (field, known), how = self._merged[1], (snapshot.options, snapshot.backend)
             made: LayerImage
             if controls.layer in PREDICTED_MODES and known is not None:
-                made = render_predicted(field, known, camera, pose, controls.layer, controls.error_part, *how)
+                made = layers.render_predicted(field, known, camera, pose, controls.layer, controls.error_part, *how)
             else:
-                made = render_layer(field, camera, pose, controls.layer, *how)
+                made = layers.render_layer(field, camera, pose, controls.layer, *how)
             if client.client_id not in self.server.get_clients():
                 return None  # the client has disconnected in the meantime
             client.scene.set_background_image(made.pixels, "jpeg", jpeg_quality=85)

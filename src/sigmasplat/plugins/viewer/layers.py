@@ -1,5 +1,7 @@
-"""Render the map from a browser's viewpoint with SigmaSplat's renderer, and draw one layer of it in colours."""
+"""Colour the map: the splats that the browser draws, and the layers that SigmaSplat renders from its viewpoint."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -9,15 +11,152 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from sigmasplat.config import RenderConfig
-from sigmasplat.data import se3
+from sigmasplat.data import harmonics, se3
 from sigmasplat.data.camera import Camera
-from sigmasplat.data.field import GaussianField
+from sigmasplat.data.field import ATTRIBUTES, COLUMNS, GaussianField, left_factor, quaternion_of, transformed
 from sigmasplat.data.map_uncertainty import MapUncertainty
 from sigmasplat.plugins.evaluation.metrics.views import COVERED_ALPHA
+from sigmasplat.plugins.outputs.chosen_splats import sigmas
 from sigmasplat.plugins.outputs.drawing import colormap
+from sigmasplat.plugins.viewer.snapshot import Piece, field_without_moments
 from sigmasplat.render import render
 from sigmasplat.render.predictive import predicted, variance_parts
 from sigmasplat.types import Matrix
+
+Colouring = Literal["colour", "σ", "depth error"]
+Floats = NDArray[np.float32]
+
+MIN_VISIBLE_OPACITY = 0.1
+"""Splats with a lower opacity are ignored when the range of σ or of the depth error is computed."""
+
+
+@dataclass(frozen=True, eq=False)
+class SplatArrays:
+    """N splats to draw: centers [N, 3] m and covariances [N, 3, 3] m² in the piece's frame, colors [N, 3] uint8,
+    opacities [N]."""
+
+    centers: Floats
+    covariances: Floats
+    colors: colormap.Rgb
+    opacities: Floats
+
+    def __len__(self) -> int:
+        return len(self.centers)
+
+
+@dataclass(frozen=True)
+class VisibilityFilter:
+    """Hides splats whose σ is above `max_sigma`, whose opacity is below `min_opacity`, or whose depth_std_m is above
+    `max_std_m`, if it is known."""
+
+    max_sigma: float = float("inf")
+    min_opacity: float = 0.0
+    max_std_m: float = float("inf")
+
+    def mask(self, piece: Piece) -> Tensor:
+        """Return which splats are shown, bool [N]."""
+        shown = (sigmas(piece.field) <= self.max_sigma) & (piece.field.opacities >= self.min_opacity)
+        return shown if piece.depth_std_m is None else shown & (piece.depth_std_m <= self.max_std_m)
+
+
+def sorted_sigmas(pieces: Sequence[Piece]) -> Floats:
+    """Return σ of all visible splats in ascending order; of all splats if none is visible."""
+    return _sorted([(piece, sigmas(piece.field)) for piece in pieces])
+
+
+def sorted_depth_stds(pieces: Sequence[Piece]) -> Floats:
+    """Return depth_std_m of the splats of all pieces that have it, selected and sorted as `sorted_sigmas`."""
+    return _sorted([(piece, piece.depth_std_m) for piece in pieces if piece.depth_std_m is not None])
+
+
+def _sorted(values: Sequence[tuple[Piece, Tensor]]) -> Floats:
+    found = [of_piece[piece.field.opacities >= MIN_VISIBLE_OPACITY].numpy() for piece, of_piece in values]
+    if not sum(map(len, found)):
+        found = [of_piece.numpy() for _, of_piece in values]
+    return np.sort(np.concatenate([np.empty(0, np.float32), *found]))
+
+
+def visibility_filter(
+    ordered: Floats, hidden_share: float, min_opacity: float, max_std_m: float = float("inf")
+) -> VisibilityFilter:
+    """Return the filter that hides this share of the splats, those with the largest σ; `ordered` is sorted."""
+    max_sigma = float("inf")
+    if hidden_share > 0.0 and len(ordered):
+        max_sigma = float(np.quantile(ordered, max(1.0 - hidden_share, 0.0)))
+    return VisibilityFilter(max_sigma, min_opacity, max_std_m)
+
+
+def palette_range(ordered: Floats) -> tuple[float, float]:
+    """Return the range of values that the palette covers: from 0 to a high percentile."""
+    return 0.0, colormap.value_range(ordered, np.ones(len(ordered), bool))[1]
+
+
+def splat_arrays(
+    piece: Piece, colouring: Colouring, span: tuple[float, float], visible: VisibilityFilter
+) -> SplatArrays:
+    """Return the visible splats in their own colours, or coloured by σ or depth error over the range `span`.
+
+    Splats without a known depth error are grey.
+    """
+    mask = visible.mask(piece)
+    chosen = field_without_moments(piece.field.params[mask], {})
+    if colouring == "σ":
+        colors = colormap.apply(sigmas(chosen).numpy(), *span, colormap.INFERNO)
+    elif colouring == "depth error" and piece.depth_std_m is None:
+        colors = np.full((len(chosen), 3), colormap.NO_READING, np.uint8)
+    elif colouring == "depth error" and piece.depth_std_m is not None:
+        colors = colormap.apply(piece.depth_std_m[mask].numpy(), *span, colormap.INFERNO)
+    else:
+        colors = np.asarray((chosen.colors.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8))
+    return SplatArrays(
+        chosen.means.numpy(), covariances(chosen.quats.numpy(), chosen.scales.numpy()), colors, chosen.opacities.numpy()
+    )
+
+
+def covariances(quats_wxyz: Floats, scales: Floats) -> Floats:
+    """Return R diag(s²) Rᵀ [N, 3, 3] for quaternions [N, 4] wxyz of any norm and scales s [N, 3] m."""
+    spread = se3.rotation_from_quaternion(np.asarray(quats_wxyz, np.float64)) * scales[:, None, :]
+    return np.asarray(spread @ spread.transpose(0, 2, 1), np.float32)
+
+
+def merge_pieces(pieces: Sequence[Piece], visible: VisibilityFilter) -> GaussianField:
+    """Return the visible splats of all pieces as one field in the world frame."""
+    parts = [(piece, visible.mask(piece)) for piece in pieces]
+    params = [piece.field.params[kept] for piece, kept in parts] or [GaussianField.empty().params]
+    names = {name for piece, _ in parts for name in piece.field.attributes}
+    attributes: dict[str, list[Tensor]] = {name: [] for name in sorted(names)}
+    for (piece, kept), rows in zip(parts, params, strict=False):
+        T = torch.from_numpy(piece.T_world_piece).to(rows)
+        _move(rows, T)
+        for name, all_rows in attributes.items():
+            all_rows.append(_moved_extra(piece.field, name, T)[kept])
+    return field_without_moments(
+        torch.cat(params), {name: torch.cat(all_rows) for name, all_rows in attributes.items()}
+    )
+
+
+def merged_uncertainty(pieces: Sequence[Piece], visible: VisibilityFilter) -> MapUncertainty | None:
+    """Return how sure the splats of `merge_pieces` are; None unless it was measured for the only piece."""
+    if len(pieces) != 1 or pieces[0].uncertainty is None:
+        return None
+    known = pieces[0].uncertainty
+    return known.at(visible.mask(pieces[0]))
+
+
+def _move(params: Tensor, T_world_piece: Tensor) -> None:
+    """Transform parameter rows to the world in place: `GaussianField.moved` without the optimiser's state."""
+    means, quats, R = params[:, COLUMNS["means"]], params[:, COLUMNS["quats"]], T_world_piece[:3, :3]
+    params[:, COLUMNS["means"]] = transformed(means, R) + T_world_piece[:3, 3]
+    params[:, COLUMNS["quats"]] = transformed(quats, left_factor(quaternion_of(R)))
+
+
+def _moved_extra(field: GaussianField, name: str, T_world_piece: Tensor) -> Tensor:
+    """Return an attribute of the splats in the world frame; zeros if this piece does not have it."""
+    if name not in field.attributes:
+        return field.params.new_zeros(len(field), ATTRIBUTES[name])
+    values = field.attributes[name].params
+    return harmonics.turned(values, T_world_piece[:3, :3]) if name == "harmonics" else values
+
 
 Layer = Literal["colour", "depth", "normals", "V", "U", "opacity", "color error", "depth error"]
 ErrorPart = Literal["all", "aleatoric", "epistemic"]

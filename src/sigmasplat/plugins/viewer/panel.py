@@ -8,8 +8,7 @@ import numpy as np
 import viser
 
 from sigmasplat.plugins.outputs.drawing.colormap import NO_READING, Rgb
-from sigmasplat.plugins.viewer.layers import LEGEND_SIZE, ErrorPart, Layer
-from sigmasplat.plugins.viewer.splats import Colouring
+from sigmasplat.plugins.viewer.layers import LEGEND_SIZE, Colouring, ErrorPart, Layer
 
 ViewMode = Literal["splats", "mesh", "colour", "depth", "normals", "V", "U", "opacity", "color error", "depth error"]
 VIEW_MODES: tuple[ViewMode, ...] = (

@@ -13,8 +13,8 @@ from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.mesh import Mesh
 from sigmasplat.plugins.outputs.drawing.colormap import Rgb
-from sigmasplat.plugins.viewer.lines import LOST_COLOUR, Bytes, Floats, Segments
-from sigmasplat.plugins.viewer.splats import SplatArrays
+from sigmasplat.plugins.viewer.layers import SplatArrays
+from sigmasplat.plugins.viewer.snapshot import LOST_COLOUR, Bytes, Floats, Segments
 from sigmasplat.types import Matrix
 
 FRUSTUM_M, THUMBNAIL_PX = 0.08, 160

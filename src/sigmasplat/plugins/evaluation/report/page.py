@@ -16,9 +16,8 @@ from sigmasplat.plugins.evaluation.report.html import Contents, build_report
 from sigmasplat.plugins.evaluation.report.summary import rescan_sentences, summary_sentences, verdicts
 from sigmasplat.plugins.evaluation.report.view_strips import PanelFigure, file_data_uri
 from sigmasplat.plugins.outputs.drawing import plot
-from sigmasplat.plugins.outputs.floorplan.floor_plan import FloorPlan
+from sigmasplat.plugins.outputs.floorplan.floor_plan import FloorPlan, run_floor_plan
 from sigmasplat.plugins.outputs.floorplan.picture import draw_floor_plan, draw_narrow_floor_plan
-from sigmasplat.plugins.outputs.plan import run_floor_plan
 from sigmasplat.run_folder.frames import RunFrames
 from sigmasplat.run_folder.runs import RunFolder
 

@@ -13,15 +13,18 @@ from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import ConfigError, SigmaSplatError
-from sigmasplat.plugins.outputs.floorplan.ground import floor_frame
-from sigmasplat.plugins.outputs.floorplan.rescan import RescanMaps, RescanRegion, find_rescan_regions
-from sigmasplat.plugins.outputs.floorplan.surface_samples import (
+from sigmasplat.plugins.outputs.floorplan.ground import (
     SurfacePredictor,
     SurfaceRenderer,
     SurfaceSample,
+    floor_frame,
     sample_surfaces,
 )
-from sigmasplat.render import render
+from sigmasplat.plugins.outputs.floorplan.rescan import RescanMaps, RescanRegion, find_rescan_regions
+from sigmasplat.render import FieldRenderer, render
+from sigmasplat.render.predictive import predict
+from sigmasplat.run_folder.frames import noted_up
+from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.types import Matrix, Progress, no_progress
 
 CELL_M = 0.05
@@ -140,6 +143,28 @@ def floor_plan(
     return FloorPlan(
         cell_m, grid.origin_m, T_floor_world, kind, color_sigma, depth_sigma_m, alpha, path[:, :2], tuple(regions),
         wrong_share,
+    )  # fmt: skip
+
+
+def run_floor_plan(
+    run: RunFolder, path: Trajectory, camera: Camera, *, cell_m: float = CELL_M, progress: Progress = no_progress
+) -> FloorPlan:
+    """Make the floor plan of a run's map.
+
+    path: the believed poses; camera: that of the images the run worked on. It is rendered with the run's settings, and
+    its errors are predicted if the run has measured how sure its map is. Calls `progress(poses done, total)`. Raises
+    RunError without a map, or if the uncertainty belongs to another map; ConfigError unless 1 mm ≤ cell_m ≤ 1 m;
+    SigmaSplatError if no surface is visible.
+    """
+    config, field = run.config(), run.read_map()
+    renderer = FieldRenderer(config.render, config.backend)
+    known = run.uncertainty_of(field)
+    predictor = None
+    if known is not None:
+        predictor = partial(predict, field, known, options=config.render, backend=config.backend)
+    return floor_plan(
+        field, path, camera, cell_m=cell_m, renderer=renderer, predictor=predictor, up_world=noted_up(run.facts()),
+        progress=progress,
     )  # fmt: skip
 
 

@@ -1,12 +1,16 @@
-"""Draw a floor plan as a picture: what is there, the uncertainty of colour and depth, and where to scan again."""
+"""Draw a floor plan: what is there, the uncertainty of colour and depth, and where to scan again."""
 
 import textwrap
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from sigmasplat.errors import RunError
+from sigmasplat.files.atomic import replacing
+from sigmasplat.files.json_files import write_json
 from sigmasplat.plugins.outputs.drawing import colormap
 from sigmasplat.plugins.outputs.drawing.plot import (
     ACCENT,
@@ -19,9 +23,20 @@ from sigmasplat.plugins.outputs.drawing.plot import (
     Theme,
     nice_ticks,
 )
-from sigmasplat.plugins.outputs.floorplan.floor_plan import FLOOR_UNOBSERVED, FREE, OBJECT, UNOBSERVED, WALL, FloorPlan
+from sigmasplat.plugins.outputs.floorplan.floor_plan import (
+    CELL_M,
+    FLOOR_UNOBSERVED,
+    FREE,
+    OBJECT,
+    UNOBSERVED,
+    WALL,
+    FloorPlan,
+    run_floor_plan,
+)
+from sigmasplat.plugins.outputs.floorplan.ground import WRONG_BY
 from sigmasplat.plugins.outputs.floorplan.rescan import unsure_rule
-from sigmasplat.plugins.outputs.floorplan.surface_samples import WRONG_BY
+from sigmasplat.plugins.outputs.run_reader import RunReader
+from sigmasplat.types import Progress, no_progress
 
 PANEL_PX = 440
 """The longer side of a panel."""
@@ -48,6 +63,32 @@ def draw_floor_plan(plan: FloorPlan, theme: Theme = LIGHT, *, list_regions: bool
 def draw_narrow_floor_plan(plan: FloorPlan, theme: Theme = LIGHT) -> Image.Image:
     """Draw a plan for a page as narrow as a phone: three panels one below the other, without the list of regions."""
     return _drawn(_Sheet(plan, theme, _narrow_layout(plan), False))
+
+
+def export_plan(
+    reader: RunReader, target: Path, *, cell_m: float = CELL_M, progress: Progress = no_progress
+) -> FloorPlan:
+    """Write the image (.png) and the data of the plan beside it (.json); return the plan.
+
+    Calls `progress(done, total)` for each rendered view. Raises RunError on another ending, without a map or path, or
+    if a file cannot be written; ConfigError unless 1 mm ≤ cell_m ≤ 1 m.
+    """
+    if target.suffix.lower() != ".png":
+        raise RunError(f"cannot write a floor plan as {target.name}; give a name that ends in .png")
+    plan = run_floor_plan(reader.run, reader.valid_path(), reader.camera, cell_m=cell_m, progress=progress)
+    write_plan(plan, target)
+    return plan
+
+
+def write_plan(plan: FloorPlan, target: Path) -> None:
+    """Write the image to `target` (.png) and the data beside it (.json).
+
+    Raises RunError if a file cannot be written.
+    """
+    picture = draw_floor_plan(plan)
+    with replacing(target) as temporary:
+        picture.save(temporary, "PNG")
+    write_json(target.with_suffix(".json"), plan.record())
 
 
 def _drawn(sheet: "_Sheet") -> Image.Image:

@@ -10,7 +10,7 @@ from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError
 from skimage.draw import polygon
 
-from sigmasplat.plugins.outputs.floorplan.surface_samples import WRONG_BY
+from sigmasplat.plugins.outputs.floorplan.ground import WRONG_BY
 from sigmasplat.types import Matrix
 
 MAX_DEPTH_SIGMA_M = 0.05

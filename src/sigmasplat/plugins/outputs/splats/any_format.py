@@ -7,15 +7,15 @@ from sigmasplat.data.field import GaussianField
 from sigmasplat.errors import SourceError
 from sigmasplat.files.ply_elements import read_header
 from sigmasplat.files.reading import guarded, open_binary
-from sigmasplat.plugins.outputs.splats import compressed_ply, gltf, sog, splat, spz, spz_container, usd
+from sigmasplat.plugins.outputs.splats import compressed_ply, gltf, sog, splat, spz, usd
 from sigmasplat.run_folder import splat_ply as ply
 
 READABLE = ".ply, .compressed.ply, .splat, .spz, .sog, .glb, .gltf, .usda, .usdc or .usd"
 START = 4096
 """The first bytes of a file, which decide its format. A .gltf nearly always says `asset` in them."""
 READERS: dict[bytes, Callable[[Path], GaussianField]] = {
-    spz_container.GZIP: spz.read_field,
-    spz_container.MAGIC: spz.read_field,
+    spz.GZIP: spz.read_field,
+    spz.MAGIC: spz.read_field,
     sog.MAGIC: sog.read_field,
     gltf.MAGIC: gltf.read_field,
     usd.BINARY: usd.read_field,

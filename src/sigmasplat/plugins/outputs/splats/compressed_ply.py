@@ -17,10 +17,18 @@ from numpy.typing import NDArray
 from sigmasplat.data.field import GaussianField
 from sigmasplat.errors import SourceError
 from sigmasplat.files.atomic import replacing
-from sigmasplat.files.ply_elements import Element, read_header
+from sigmasplat.files.ply_elements import Element, header_of, read_header
 from sigmasplat.files.reading import open_binary
-from sigmasplat.run_folder.quaternions import Doubles, from_smallest_three, smallest_three
-from sigmasplat.run_folder.splat_values import SplatValues, by_channel, morton_order, opacities_of, opacity_bytes
+from sigmasplat.run_folder.splat_values import (
+    Doubles,
+    SplatValues,
+    by_channel,
+    from_smallest_three,
+    morton_order,
+    opacities_of,
+    opacity_bytes,
+    smallest_three,
+)
 
 CHUNK = 256
 LIMITS = [f"{end}_{name}" for group in (("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b"))
@@ -48,9 +56,14 @@ def write_field(path: Path, field: GaussianField) -> None:
     words[:, 1] = which << 30 | _packed(others * np.sqrt(0.5) + 0.5, ROTATION_BITS)
     words[:, 3] = words[:, 3] << 8 | opacity_bytes(values.opacities)
     sh = by_channel(np.clip((values.harmonics / SH_RANGE + 0.5) * 256.0, 0.0, 255.0).astype(np.uint8))
-    header = _header({"chunk": ("float", LIMITS), "vertex": ("uint", WORDS)}, len(values), sh.shape[1])
+    elements: list[tuple[str, int, list[str]]] = [
+        ("chunk", -(-len(values) // CHUNK), [f"float {name}" for name in LIMITS]),
+        ("vertex", len(values), [f"uint {name}" for name in WORDS]),
+    ]
+    if sh.shape[1]:
+        elements.append(("sh", len(values), [f"uchar {REST}{i}" for i in range(sh.shape[1])]))
     with replacing(path) as temporary, temporary.open("wb") as file:
-        file.write(header.encode("ascii"))
+        file.write(header_of(*elements))
         file.write(np.concatenate(limits, axis=1).astype("<f4").tobytes())
         file.write(words.tobytes())
         file.write(sh.tobytes())
@@ -110,16 +123,6 @@ def _unpacked(word: NDArray[np.uint32], bits: tuple[int, int, int]) -> Doubles:
         part[:, column] = (word & steps) / steps
         word = word >> np.uint32(width)
     return part
-
-
-def _header(elements: dict[str, tuple[str, list[str]]], count: int, harmonics: int) -> str:
-    lines = ["ply", "format binary_little_endian 1.0"]
-    counts = {"chunk": -(-count // CHUNK)}
-    if harmonics:
-        elements = {**elements, "sh": ("uchar", [f"{REST}{i}" for i in range(harmonics)])}
-    for name, (kind, properties) in elements.items():
-        lines += [f"element {name} {counts.get(name, count)}", *(f"property {kind} {p}" for p in properties)]
-    return "\n".join([*lines, "end_header", ""])
 
 
 def _harmonics(rest: list[NDArray[np.void]], count: int) -> Doubles:

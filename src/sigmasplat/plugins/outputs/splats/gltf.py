@@ -2,38 +2,194 @@
 
 One primitive of points with float32 attributes: POSITION, and KHR_gaussian_splatting:ROTATION (xyzw), SCALE (metres),
 OPACITY (0 to 1) and SH_DEGREE_l_COEF_n (degree 0 is (colour − ½)/C0). Our own attributes, which other readers skip:
-_SIGMA, the standard deviation of each colour channel; _CORRELATION if the map has full colour covariances;
+_SIGMA, the standard deviation of each colour channel;
 _DEPTH_STD_M and _COLOR_STD if they are known. The reader ignores the last two. COLOR_0 is for readers without the
 extension, which show points: linear colours and opacity. Colours of splats are those of the images, so `colorSpace` is
 srgb_rec709_display. Axes are x right, y up, z back: the writer rotates maps by 180° about x, the reader rotates them
 back. Specification: KhronosGroup/glTF, extensions/2.0/Khronos/KHR_gaussian_splatting.
 """
 
+import base64
+import binascii
 import json
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from sigmasplat.data.field import COLUMNS, INITIAL_LOG_VARIANCE, GaussianField
+from sigmasplat.data.field import GaussianField
 from sigmasplat.data.harmonics import DEGREES, count
 from sigmasplat.data.map_uncertainty import SplatStd
 from sigmasplat.errors import SourceError
 from sigmasplat.files.atomic import replacing
-from sigmasplat.plugins.outputs.splats.gltf_buffers import FLOAT, GltfFile
-from sigmasplat.run_folder.quaternions import Doubles, unit
-from sigmasplat.run_folder.splat_values import SH_C0, SplatValues
+from sigmasplat.files.reading import open_binary
+from sigmasplat.run_folder.splat_values import SH_C0, Doubles, SplatValues, log_scales_of, rotations_of
+
+FLOAT = 5126
+COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", FLOAT: "<f4"}
+WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+DATA_URI = "data:application/octet-stream;base64,"
+UNMOVED = {
+    "matrix": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1],
+    "translation": [0, 0, 0], "rotation": [0, 0, 0, 1], "scale": [1, 1, 1],
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class GltfFile:
+    """The JSON document of a file, and the data chunk of a GLB."""
+
+    path: Path
+    document: Mapping[str, Any]
+    chunk: bytes
+
+    @staticmethod
+    def open(path: Path) -> "GltfFile":
+        """Read a file. Raises SourceError if it is missing, damaged, or not glTF 2.0."""
+        with open_binary(path, "cannot read map") as file:
+            data = file.read()
+        chunk = b""
+        if data.startswith(MAGIC):
+            data, chunk = _chunks(data, path)
+        try:
+            document = json.loads(data)
+            version = str(document["asset"]["version"])
+        except (ValueError, TypeError, KeyError, RecursionError) as problem:
+            raise SourceError(f"{path} is not glTF 2.0, or is damaged or truncated: {problem}") from problem
+        if not version.startswith("2."):
+            raise SourceError(f"{path} is glTF {version}; only glTF 2.0 can be read")
+        return GltfFile(path, document, chunk)
+
+    @staticmethod
+    def data_uri(data: bytes) -> str:
+        """Return a URI that contains the data of a buffer."""
+        return DATA_URI + base64.b64encode(data).decode("ascii")
+
+    def damaged(self, what: str) -> SourceError:
+        """Return the error of a file whose document is wrong."""
+        return SourceError(f"{self.path} is damaged or not supported: {what}")
+
+    def entry(self, kind: str, index: object) -> Mapping[str, Any]:
+        """Return an entry of a list of the document, such as accessor 3. Raises SourceError."""
+        entries = self.document.get(kind)
+        if isinstance(index, bool) or not isinstance(index, int) or not isinstance(entries, list):
+            raise self.damaged(f"{kind} {index} is missing")
+        if not 0 <= index < len(entries) or not isinstance(entries[index], Mapping):
+            raise self.damaged(f"{kind} {index} is missing")
+        found: Mapping[str, Any] = entries[index]
+        return found
+
+    def primitive(self, extension: str) -> Mapping[str, Any] | None:
+        """Return the first primitive with an extension; None without one. Raises SourceError if its node is moved."""
+        meshes = self.document.get("meshes")
+        for i in range(len(meshes) if isinstance(meshes, list) else 0):
+            for primitive in self._list(self.entry("meshes", i), "primitives"):
+                found: Mapping[str, Any] = primitive if isinstance(primitive, Mapping) else {}
+                extensions = found.get("extensions")
+                if isinstance(extensions, Mapping) and extension in extensions:
+                    self._check_node(i)
+                    return found
+        return None
+
+    def _check_node(self, mesh: int) -> None:
+        for node in self._list(self.document, "nodes"):
+            if isinstance(node, Mapping) and (node.get("mesh") == mesh or "children" in node):
+                for name, value in UNMOVED.items():
+                    if node.get(name, value) != value:
+                        raise self.damaged(f"its splats are moved by the {name} of a node; apply it before saving")
+
+    def _list(self, owner: Mapping[str, Any], name: str) -> list[Any]:
+        found = owner.get(name, [])
+        if not isinstance(found, list):
+            raise self.damaged(f"{name} is not a list")
+        return found
+
+    def has(self, primitive: Mapping[str, Any], name: str) -> bool:
+        """Return whether a primitive has an attribute."""
+        attributes = primitive.get("attributes")
+        return isinstance(attributes, Mapping) and name in attributes
+
+    def attribute(self, primitive: Mapping[str, Any], name: str, width: int) -> Doubles:
+        """Return an attribute [N, width], normalised integers as numbers in [−1, 1], N as for POSITION.
+
+        Raises SourceError if it is missing, outside of its buffer, or not finite.
+        """
+        if not self.has(primitive, name):
+            raise self.damaged(f"it has no attribute {name}")
+        accessor = self.entry("accessors", primitive["attributes"][name])
+        kind, size, at = (self._whole(accessor, key) for key in ("componentType", "count", "byteOffset"))
+        if kind not in COMPONENTS or WIDTHS.get(str(accessor.get("type"))) != width or "sparse" in accessor:
+            raise self.damaged(f"{name} is not a plain accessor of {width} numbers")
+        rows = self.entry("accessors", primitive["attributes"].get("POSITION")).get("count")
+        if size != rows:
+            raise self.damaged(f"{name} has {size} values for {rows} splats")
+        item = np.dtype(COMPONENTS[kind])
+        view = self.entry("bufferViews", accessor.get("bufferView"))
+        if view.get("extensions"):
+            raise self.damaged(f"the buffer of {name} is compressed; save the map without compression")
+        stride = self._whole(view, "byteStride") or width * item.itemsize
+        start, length = self._whole(view, "byteOffset") + at, self._whole(view, "byteLength") - at
+        data = self._buffer(view.get("buffer"))
+        if stride < width * item.itemsize or size * stride - stride + width * item.itemsize > length * bool(size):
+            raise self.damaged(f"{name} is larger than its part of the buffer")
+        if start + length > len(data):
+            raise SourceError(f"{self.path} is truncated: {name} ends at byte {start + length} of {len(data)}")
+        values = np.ndarray((size, width), item, data, start, (stride, item.itemsize)).astype(np.float64)
+        if accessor.get("normalized"):
+            values = np.maximum(values / np.iinfo(item).max, -1.0) if kind != FLOAT else values
+        if not np.isfinite(values).all():
+            raise SourceError(f"{self.path}: {name} has nan or inf")
+        return values
+
+    def _whole(self, owner: Mapping[str, Any], name: str) -> int:
+        found = owner.get(name, 0)
+        if isinstance(found, bool) or not isinstance(found, int) or not 0 <= found < 1 << 53:
+            raise self.damaged(f"{name} is not a whole number")
+        return found
+
+    def _buffer(self, index: object) -> bytes:
+        """Return the data of a buffer: the chunk of a GLB, a data URI, or a file beside the document."""
+        uri = self.entry("buffers", index).get("uri")
+        if uri is None:
+            return self.chunk
+        if not isinstance(uri, str):
+            raise self.damaged("the URI of a buffer is not text")
+        if uri.startswith("data:"):
+            try:
+                return base64.b64decode(uri.partition(",")[2], validate=True)
+            except binascii.Error as problem:
+                raise self.damaged("the data of a buffer is not base64") from problem
+        if Path(uri).name != uri or uri in ("", ".", ".."):
+            raise self.damaged("the URI of a buffer is not a file in the same folder")
+        with open_binary(self.path.with_name(uri), f"cannot read the data of {self.path}:") as file:
+            return file.read()
+
+
+def _chunks(data: bytes, path: Path) -> tuple[bytes, bytes]:
+    """Split a GLB into its document and its data. Raises SourceError."""
+    version, length = struct.unpack_from("<II", data, 4) if len(data) >= 12 else (2, len(data) + 1)
+    if version != 2 or length > len(data):
+        what = f"is a GLB of version {version}" if version != 2 else "is truncated"
+        raise SourceError(f"{path} {what}: its header says {length} bytes, found {len(data)}")
+    parts, at = dict[bytes, bytes](), 12
+    while at + 8 <= length:
+        size, kind = struct.unpack_from("<I4s", data, at)
+        if at + 8 + size > length:
+            raise SourceError(f"{path} is truncated: a chunk says {size} bytes, found {length - at - 8}")
+        parts.setdefault(kind, data[at + 8 : at + 8 + size])
+        at += 8 + size
+    return parts.get(JSON_CHUNK, b""), parts.get(DATA_CHUNK, b"")
+
 
 NAME = "KHR_gaussian_splatting"
 MAGIC = b"glTF"
 UNSIGNED_BYTE, VERTICES = 5121, 34962
 TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 JSON_CHUNK, DATA_CHUNK = b"JSON", b"BIN\0"
-SMALLEST_SCALE_M = 1e-12
 
 
 def write_field(path: Path, field: GaussianField, *, std: SplatStd | None = None) -> None:
@@ -90,29 +246,19 @@ def read_field(path: Path) -> GaussianField:
         return file.attribute(primitive, prefix + name, width)
 
     means = attribute("POSITION", 3, "")
-    rotations = attribute("ROTATION", 4)
-    if (np.linalg.norm(rotations, axis=1) < 0.5).any():
-        raise SourceError(f"{path} is damaged: a rotation is not a unit quaternion")
+    rotations = rotations_of(attribute("ROTATION", 4), path)
     degree = max(d for d in range(DEGREES + 1) if file.has(primitive, f"{NAME}:SH_DEGREE_{d}_COEF_0") or d == 0)
     harmonics = [attribute(f"SH_DEGREE_{d}_COEF_{n}", 3) for d in range(1, degree + 1) for n in range(2 * d + 1)]
-    scales, opacities = attribute("SCALE", 3), attribute("OPACITY", 1)[:, 0]
-    field = (
-        SplatValues(
-            means,
-            unit(np.roll(rotations, 1, axis=1)),
-            np.log(np.maximum(scales, SMALLEST_SCALE_M)),
-            np.clip(opacities, 1e-7, 1.0 - 1e-7),
-            attribute("SH_DEGREE_0_COEF_0", 3) * SH_C0 + 0.5,
-            np.concatenate(harmonics, axis=1) if harmonics else np.empty((len(means), 0)),
-        )
-        .turned_about_x()
-        .field(path)
+    values = SplatValues(
+        means,
+        rotations,
+        log_scales_of(attribute("SCALE", 3)),
+        np.clip(attribute("OPACITY", 1)[:, 0], 1e-7, 1.0 - 1e-7),
+        attribute("SH_DEGREE_0_COEF_0", 3) * SH_C0 + 0.5,
+        np.concatenate(harmonics, axis=1) if harmonics else np.empty((len(means), 0)),
     )
-    if file.has(primitive, "_SIGMA"):
-        sigmas = attribute("_SIGMA", 3, "")
-        log_variances = np.where(sigmas > 0.0, 2.0 * np.log(np.maximum(sigmas, 1e-18)), INITIAL_LOG_VARIANCE)
-        field.params[:, COLUMNS["log_variances"]] = torch.from_numpy(log_variances.astype(np.float32))
-    return field
+    sigmas = attribute("_SIGMA", 3, "") if file.has(primitive, "_SIGMA") else None
+    return values.turned_about_x().field(path, sigmas)
 
 
 def _attributes(field: GaussianField, std: SplatStd | None) -> Iterator[tuple[str, NDArray[Any]]]:
@@ -135,25 +281,28 @@ def _attributes(field: GaussianField, std: SplatStd | None) -> Iterator[tuple[st
         own["_COLOR_STD"] = std.color_std.cpu().double().numpy()[:, None]
     for name, array in own.items():
         yield name, array.astype(np.float32)
-    colors = np.column_stack([_linear(np.clip(values.colors, 0.0, 1.0)), values.opacities])
+    colors = np.column_stack([linear(values.colors), values.opacities])
     yield "COLOR_0", np.round(colors * 255.0).astype(np.uint8)
 
 
-def _linear(colors: Doubles) -> Doubles:
-    """Convert sRGB colours in [0, 1] to linear ones (IEC 61966-2-1)."""
-    return np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
+def linear(srgb: NDArray[np.floating]) -> Doubles:
+    """Convert sRGB in [0, 1] to linear light (IEC 61966-2-1); values outside are clipped."""
+    values = np.clip(np.asarray(srgb, np.float64), 0.0, 1.0)
+    return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
 
 
 def _packed(document: dict[str, Any], data: bytes, text: bool) -> bytes:
-    """Return the bytes of a .gltf with its data in a URI, or of a GLB: two chunks with lengths of multiples of four."""
+    """Return the bytes of a .gltf with its data in a URI, or of a GLB."""
     if text:
         if data:
             document["buffers"][0]["uri"] = GltfFile.data_uri(data)
         return json.dumps(document).encode()
-    words = json.dumps(document, separators=(",", ":")).encode()
-    chunks = [
-        (JSON_CHUNK, words + b" " * (-len(words) % 4)),
-        *([(DATA_CHUNK, data + bytes(-len(data) % 4))] * bool(data)),
-    ]
+    return glb_of(json.dumps(document, separators=(",", ":")).encode(), data)
+
+
+def glb_of(document: bytes, data: bytes) -> bytes:
+    """Return a GLB: the document as JSON and, if there are any, the data; the length of a chunk is a multiple of 4."""
+    chunks = [(JSON_CHUNK, document + b" " * (-len(document) % 4))]
+    chunks += [(DATA_CHUNK, data + bytes(-len(data) % 4))] * bool(data)
     body = b"".join(struct.pack("<I4s", len(chunk), kind) + chunk for kind, chunk in chunks)
     return struct.pack("<4sII", MAGIC, 2, 12 + len(body)) + body

@@ -21,22 +21,73 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
+from scipy.cluster.vq import vq
 
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.harmonics import DEGREES, count
 from sigmasplat.errors import SourceError
 from sigmasplat.files.atomic import replacing
 from sigmasplat.files.reading import open_binary
-from sigmasplat.plugins.outputs.splats.codebooks import LEVELS, levels, palette
-from sigmasplat.run_folder.quaternions import Doubles, from_smallest_three, smallest_three
 from sigmasplat.run_folder.splat_values import (
     SH_C0,
+    Doubles,
     SplatValues,
     check_count,
+    from_smallest_three,
     morton_order,
     opacities_of,
     opacity_bytes,
+    smallest_three,
+    to_bytes,
 )
+
+LEVELS = 256
+LEVEL_STEPS, PALETTE_STEPS = 40, 6
+"""Steps of Lloyd's algorithm."""
+
+
+def levels(values: Doubles) -> tuple[Doubles, NDArray[np.uint8]]:
+    """Return 256 ascending levels and the index of the nearest one for each value, in the shape of `values`.
+
+    Lloyd's algorithm in one dimension: a level is the mean of the values between the middles to its neighbours. It
+    starts from levels that share the cube root of the density of the values, which is optimal for many levels.
+    """
+    if not values.size:
+        return np.zeros(LEVELS), np.zeros(values.shape, np.uint8)
+    ordered = np.sort(values, axis=None)
+    sums = np.concatenate([[0.0], np.cumsum(ordered - ordered[0])])
+    book = _first_levels(ordered)
+    for _ in range(LEVEL_STEPS):
+        edges = np.concatenate([[0], np.searchsorted(ordered, (book[1:] + book[:-1]) / 2.0), [len(ordered)]])
+        counts = np.diff(edges)
+        means = np.diff(sums[edges]) / np.maximum(counts, 1) + ordered[0]
+        book = np.sort(np.where(counts > 0, means, book))
+    nearest = np.searchsorted((book[1:] + book[:-1]) / 2.0, values)
+    return book, nearest.astype(np.uint8)
+
+
+def _first_levels(ordered: Doubles) -> Doubles:
+    """Return levels that are dense where the sorted values are: the density to the power of one third."""
+    counts, edges = np.histogram(ordered, bins=4 * LEVELS)
+    shares = np.concatenate([[0.0], np.cumsum(np.cbrt(counts))])
+    book: Doubles = np.interp((np.arange(LEVELS) + 0.5) / LEVELS * shares[-1], shares, edges)
+    return book
+
+
+def palette(rows: Doubles, size: int) -> tuple[Doubles, NDArray[np.intp]]:
+    """Return up to `size` rows that stand for all rows [N, k], and the index of the nearest one for each row [N].
+
+    Lloyd's algorithm from rows at equal distances in the given order. Rows without a member keep their values.
+    """
+    book = rows[np.linspace(0, len(rows) - 1, min(size, len(rows))).round().astype(np.intp)]
+    labels, _ = vq(rows, book)
+    for _ in range(PALETTE_STEPS):
+        members = np.bincount(labels, minlength=len(book))
+        sums = np.stack([np.bincount(labels, rows[:, i], len(book)) for i in range(rows.shape[1])], axis=1)
+        book = np.where(members[:, None] > 0, sums / np.maximum(members, 1)[:, None], book)
+        labels, _ = vq(rows, book)
+    return book, labels.astype(np.intp)
+
 
 MAGIC = b"PK\x03\x04"
 FIRST_TAG = 252
@@ -64,7 +115,7 @@ def write_field(path: Path, field: GaussianField) -> None:
         "means_l.webp": _image(steps & 255),
         "means_u.webp": _image(steps >> 8),
         "scales.webp": _image(scales),
-        "quats.webp": _image(_bytes((others * np.sqrt(0.5) + 0.5) * 255.0), which + FIRST_TAG),
+        "quats.webp": _image(to_bytes((others * np.sqrt(0.5) + 0.5) * 255.0), which + FIRST_TAG),
         "sh0.webp": _image(colors, opacity_bytes(values.opacities)),
     }
     meta: dict[str, Any] = {
@@ -239,7 +290,3 @@ def _webp(pixels: Pixels) -> bytes:
     data = io.BytesIO()
     Image.fromarray(pixels).save(data, "WEBP", lossless=True, exact=True, quality=75, method=4)
     return data.getvalue()
-
-
-def _bytes(values: Doubles) -> Pixels:
-    return np.clip(np.round(values), 0.0, 255.0).astype(np.uint8)

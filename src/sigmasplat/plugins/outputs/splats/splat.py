@@ -17,11 +17,9 @@ from sigmasplat.data.field import GaussianField
 from sigmasplat.errors import SourceError
 from sigmasplat.files.atomic import replacing
 from sigmasplat.files.reading import open_binary
-from sigmasplat.run_folder.quaternions import unit
-from sigmasplat.run_folder.splat_values import SplatValues, opacities_of, opacity_bytes
+from sigmasplat.run_folder.splat_values import SplatValues, log_scales_of, opacities_of, opacity_bytes, to_bytes, unit
 
 ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 3), ("opacity", "u1"), ("quat", "u1", 4)])
-SMALLEST_SCALE_M = 1e-12
 UNIT = (0.9, 1.1)
 """Range of the norm of a unit quaternion after rounding to bytes, with a margin for other writers' rounding."""
 
@@ -34,9 +32,9 @@ def write_field(path: Path, field: GaussianField) -> None:
     rows = np.empty(len(values), ROW)
     rows["mean"] = values.means
     rows["scale"] = np.exp(values.log_scales)
-    rows["color"] = np.round(np.clip(values.colors, 0.0, 1.0) * 255.0)
+    rows["color"] = to_bytes(values.colors * 255.0)
     rows["opacity"] = opacity_bytes(values.opacities)
-    rows["quat"] = np.clip(np.round(values.quats * 128.0 + 128.0), 0.0, 255.0)
+    rows["quat"] = to_bytes(values.quats * 128.0 + 128.0)
     with replacing(path) as temporary, temporary.open("wb") as file:
         file.write(rows.tobytes())
 
@@ -57,7 +55,7 @@ def read_field(path: Path) -> GaussianField:
     return SplatValues(
         rows["mean"].astype(np.float64),
         unit(quats),
-        np.log(np.maximum(rows["scale"].astype(np.float64), SMALLEST_SCALE_M)),
+        log_scales_of(rows["scale"].astype(np.float64)),
         opacities_of(rows["opacity"]),
         rows["color"] / 255.0,
         np.empty((len(rows), 0)),

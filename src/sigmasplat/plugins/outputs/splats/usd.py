@@ -17,20 +17,18 @@ from typing import Any
 import numpy as np
 import torch
 
-from sigmasplat.data.field import COLUMNS, INITIAL_LOG_VARIANCE, GaussianField
+from sigmasplat.data.field import GaussianField
 from sigmasplat.data.harmonics import DEGREES, count
 from sigmasplat.data.map_uncertainty import SplatStd
 from sigmasplat.env import install_extra
 from sigmasplat.errors import SigmaSplatError, SourceError
 from sigmasplat.files.atomic import replacing
 from sigmasplat.files.reading import open_binary
-from sigmasplat.run_folder.quaternions import Doubles, unit
-from sigmasplat.run_folder.splat_values import SH_C0, SplatValues
+from sigmasplat.run_folder.splat_values import SH_C0, Doubles, SplatValues, log_scales_of, rotations_of
 
 BINARY, TEXT = b"PXR-USDC", b"#usda"
 SCHEMA = "ParticleField3DGaussianSplat"
 COEFFICIENTS, DEGREE = "radiance:sphericalHarmonicsCoefficients", "radiance:sphericalHarmonicsDegree"
-SMALLEST_SCALE_M = 1e-12
 EXTENT_SIGMAS = 3.0
 """A splat is assumed to end this many standard deviations from its centre."""
 
@@ -91,25 +89,20 @@ def read_field(path: Path) -> GaussianField:
     sizes = (len(quats), len(scales), len(opacities), len(coefficients) / each)
     if any(size != len(means) for size in sizes):
         raise SourceError(f"{path} is damaged: its attributes have different numbers of splats")
-    if (np.linalg.norm(quats, axis=1) < 0.5).any():
-        raise SourceError(f"{path} is damaged: a rotation is not a unit quaternion")
     coefficients = coefficients.reshape(len(means), 3 * each)
     values = SplatValues(
         means,
-        unit(np.roll(quats, 1, axis=1)),
-        np.log(np.maximum(scales, SMALLEST_SCALE_M)),
+        rotations_of(quats, path),
+        log_scales_of(scales),
         np.clip(opacities, 1e-7, 1.0 - 1e-7),
         coefficients[:, :3] * SH_C0 + 0.5,
         coefficients[:, 3:],
     )
     z_up = layer.pseudoRoot.HasInfo("upAxis") and layer.pseudoRoot.GetInfo("upAxis") == "Z"
-    field = (values if z_up else values.turned_about_x()).field(path)
-    if "primvars:sigma" in _names(prim):
-        sigmas = _numbers(prim, "primvars:sigma", 3, path)
-        if len(sigmas) != len(means):
-            raise SourceError(f"{path} is damaged: primvars:sigma has {len(sigmas)} values for {len(means)} splats")
-        log_variances = np.where(sigmas > 0.0, 2.0 * np.log(np.maximum(sigmas, 1e-18)), INITIAL_LOG_VARIANCE)
-        field.params[:, COLUMNS["log_variances"]] = torch.from_numpy(log_variances.astype(np.float32))
+    sigmas = _numbers(prim, "primvars:sigma", 3, path) if "primvars:sigma" in _names(prim) else None
+    if sigmas is not None and len(sigmas) != len(means):
+        raise SourceError(f"{path} is damaged: primvars:sigma has {len(sigmas)} values for {len(means)} splats")
+    field = (values if z_up else values.turned_about_x()).field(path, sigmas)
     return field.moved(torch.from_numpy(R_RDF_RFU)) if z_up else field
 
 

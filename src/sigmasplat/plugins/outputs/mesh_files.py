@@ -4,9 +4,10 @@ PLY and GLB also contain depth_std_m, if it is known; PLY also `filled`, the ver
 the metre.
 """
 
+import json
 import os
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,11 +15,80 @@ from numpy.typing import NDArray
 from sigmasplat.data.mesh import Mesh
 from sigmasplat.errors import RunError, SourceError
 from sigmasplat.files.atomic import replacing
-from sigmasplat.files.ply_elements import BYTE_ORDERS, MAX_HEADER_BYTES, PLY_TYPES
+from sigmasplat.files.ply_elements import PLY_TYPES, Element, header_of, read_header
 from sigmasplat.files.reading import open_binary
-from sigmasplat.plugins.outputs.meshes.glb import GRAY, glb
+from sigmasplat.plugins.outputs.splats.gltf import glb_of, linear
 
-ElementHeader = tuple[str, int, list[list[str]]]
+UINT16, UINT32, FLOAT32, VERTEX_TARGET, INDEX_TARGET = 5123, 5125, 5126, 34962, 34963
+"""Constants of the glTF 2.0 specification."""
+GRAY = 0.7
+Values = NDArray[np.floating]
+MATERIAL = {
+    "name": "recorded light",
+    "pbrMetallicRoughness": {"baseColorFactor": [1.0, 1.0, 1.0, 1.0], "metallicFactor": 0.0, "roughnessFactor": 1.0},
+    "doubleSided": True,
+    "extensions": {"KHR_materials_unlit": {}},
+}
+
+
+def glb(mesh: Mesh) -> bytes:
+    """Return a mesh whose y axis points up, as glTF requires, as the bytes of a GLB file.
+
+    POSITION and NORMAL are float32, COLOR_0 is linear in normalised uint16 with alpha 1. depth_std_m becomes
+    `_DEPTH_STD_M`: glTF requires an underscore before the names of own attributes.
+    """
+    vertices = mesh.vertices.astype("<f4")
+    bounds = {"min": vertices.min(0).tolist(), "max": vertices.max(0).tolist()} if len(vertices) else {}
+    attributes: dict[str, tuple[NDArray[Any], dict[str, Any]]] = {
+        "POSITION": (vertices, {"componentType": FLOAT32, "type": "VEC3", **bounds}),
+        "NORMAL": (_normals(mesh), {"componentType": FLOAT32, "type": "VEC3"}),
+        "COLOR_0": (_linear_colors(mesh), {"componentType": UINT16, "type": "VEC4", "normalized": True}),
+    }
+    if mesh.depth_std_m is not None:
+        attributes["_DEPTH_STD_M"] = (mesh.depth_std_m.astype("<f4"), {"componentType": FLOAT32, "type": "SCALAR"})
+    if not len(mesh.faces):  # glTF has no empty accessors, and a scene without meshes is valid
+        return glb_of(json.dumps({"asset": _ASSET, "scene": 0, "scenes": [{}]}).encode(), b"")
+    arrays = [array for array, _ in attributes.values()] + [mesh.faces.astype("<u4")]
+    starts = np.cumsum([0, *(array.nbytes for array in arrays)]).tolist()
+    targets = [VERTEX_TARGET] * len(attributes) + [INDEX_TARGET]
+    indices = {"componentType": UINT32, "type": "SCALAR", "bufferView": len(attributes), "count": mesh.faces.size}
+    accessors = [
+        {"bufferView": view, "count": len(vertices), **kind} for view, (_, kind) in enumerate(attributes.values())
+    ]
+    primitive = {
+        "attributes": {name: number for number, name in enumerate(attributes)},
+        "indices": len(attributes),
+        "material": 0,
+    }
+    scene = {
+        "asset": _ASSET, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0, "name": "surface"}],
+        "meshes": [{"primitives": [primitive]}], "materials": [MATERIAL],
+        "extensionsUsed": ["KHR_materials_unlit"], "buffers": [{"byteLength": starts[-1]}],
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": start, "byteLength": array.nbytes, "target": target}
+            for array, start, target in zip(arrays, starts, targets, strict=False)
+        ],
+        "accessors": [*accessors, indices],
+    }  # fmt: skip
+    return glb_of(json.dumps(scene).encode(), b"".join(array.tobytes() for array in arrays))
+
+
+_ASSET = {"version": "2.0", "generator": "sigmasplat"}
+
+
+def _linear_colors(mesh: Mesh) -> NDArray[np.uint16]:
+    srgb = np.full(mesh.vertices.shape, GRAY) if mesh.colors is None else mesh.colors
+    rgba = np.ones((len(srgb), 4))
+    rgba[:, :3] = linear(srgb)
+    return np.rint(rgba * 65535.0).astype("<u2")
+
+
+def _normals(mesh: Mesh) -> NDArray[np.float32]:
+    """Return unit normals; a vertex without an area gets an arbitrary one, as glTF requires unit length."""
+    normals = mesh.normals()
+    normals[(normals**2).sum(1) < 0.5] = (0.0, 1.0, 0.0)
+    return normals.astype("<f4")
+
 
 NOTE = "sigmasplat, unit metre"
 
@@ -48,8 +118,7 @@ def read_mesh(path: Path) -> Mesh:
     Raises SourceError if it is missing, truncated, not such a PLY, or not a valid mesh.
     """
     with open_binary(path, "cannot read mesh") as file:
-        order, elements = _header(file, path)
-        rows = {name: _rows(file, path, order, name, count, fields) for name, count, fields in elements}
+        rows = {element.name: _rows(file, path, element) for element in read_header(file, path)}
     vertices, faces = rows.get("vertex"), rows.get("face")
     if vertices is None or faces is None or not {"x", "y", "z"} <= set(vertices.dtype.names or ()):
         raise SourceError(f"{path} is not a mesh: it needs vertices with x, y, z and faces; is it a point cloud?")
@@ -75,34 +144,14 @@ def _colors(vertices: NDArray[np.void]) -> NDArray[np.float32] | None:
     return np.clip(colors / np.float32(scale), 0.0, 1.0).astype(np.float32)
 
 
-def _header(file: BinaryIO, path: Path) -> tuple[str, list[ElementHeader]]:
-    """Read the header: byte order, and name, count and properties of each element. Raises SourceError."""
-    if file.readline(8).strip() != b"ply":
-        raise SourceError(f"{path} is not a PLY file (its first line is not 'ply')")
-    order, elements = "", list[ElementHeader]()
-    while file.tell() < MAX_HEADER_BYTES and (raw := file.readline(MAX_HEADER_BYTES)):
-        words = raw.decode("ascii", "replace").split()
-        if words == ["end_header"] and order:
-            return order, elements
-        if words[:1] == ["format"]:
-            order = BYTE_ORDERS.get(" ".join(words[1:2]), "")
-            if not order:
-                raise SourceError(f"{path}: the PLY is not binary ({' '.join(words)}); save it as binary")
-        elif words[:1] == ["element"] and len(words) == 3 and words[2].isdecimal():
-            elements.append((words[1], int(words[2]), []))
-        elif words[:1] == ["property"] and elements:
-            elements[-1][2].append(words[1:])
-    raise SourceError(f"{path} is truncated: the PLY's header has no 'end_header'")
-
-
-def _rows(
-    file: BinaryIO, path: Path, order: str, name: str, count: int, properties: list[list[str]]
-) -> NDArray[np.void]:
+def _rows(file: BinaryIO, path: Path, element: Element) -> NDArray[np.void]:
     """Read one element. All lists are read with the length of the first one; their lengths are returned as column
     "NAME count"."""
     fields: list[tuple[str, str] | tuple[str, str, int]] = []
-    length = 0
-    for words in properties:
+    length, order, count = 0, element.order, element.count
+    if count < 0:
+        raise SourceError(f"{path}: the PLY's header does not say how many rows '{element.name}' has")
+    for words in element.properties:
         kinds = [PLY_TYPES.get(word) for word in words[:-1] if word != "list"]
         if None in kinds or len(kinds) != (2 if words[0] == "list" else 1):
             raise SourceError(f"{path}: cannot read the PLY's properties ({' '.join(words)})")
@@ -116,7 +165,7 @@ def _rows(
     data = file.read(min(count * row.itemsize, left))
     whole = np.frombuffer(data[: len(data) // max(row.itemsize, 1) * row.itemsize], row)
     if len(whole) < count and not any((whole[k] != length).any() for k in row.names or () if k.endswith(" count")):
-        raise SourceError(f"{path} is truncated: its header says {count} of element {name}, found {len(whole)}")
+        raise SourceError(f"{path} is truncated: its header says {count} of element {element.name}, found {len(whole)}")
     return whole
 
 
@@ -131,26 +180,39 @@ def _length_after(file: BinaryIO, start: np.dtype[np.void]) -> int:
 def _ply(mesh: Mesh, note: str) -> bytes:
     """Return the mesh as binary little-endian PLY: float x y z, float nx ny nz, uchar red green blue, float depth_std_m
     if it is known, uchar filled (1 = closes a gap) if gaps were closed, faces as lists of int."""
-    points, normals, colors = ("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue")
-    columns = [(name, "<f4") for name in (*points, *normals)] + [(name, "u1") for name in colors]
-    columns += [] if mesh.depth_std_m is None else [("depth_std_m", "<f4")]
-    columns += [] if mesh.filled is None else [("filled", "u1")]
-    vertices = np.zeros(len(mesh.vertices), np.dtype(columns))
-    for names, values in ((points, mesh.vertices), (normals, mesh.normals()), (colors, _bytes(mesh))):
-        for k, name in enumerate(names):
-            vertices[name] = values[:, k]
-    if mesh.depth_std_m is not None:
-        vertices["depth_std_m"] = mesh.depth_std_m
-    if mesh.filled is not None:
-        vertices["filled"] = mesh.filled
     faces = np.zeros(len(mesh.faces), np.dtype([("count", "u1"), ("corners", "<i4", 3)]))
     faces["count"], faces["corners"] = 3, mesh.faces
-    properties = [f"property {'float' if kind == '<f4' else 'uchar'} {name}" for name, kind in columns]
-    header = [
-        "ply", "format binary_little_endian 1.0", f"comment {note}", f"element vertex {len(vertices)}", *properties,
-        f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header",
-    ]  # fmt: skip
-    return "".join(f"{line}\n" for line in header).encode("ascii") + vertices.tobytes() + faces.tobytes()
+    vertices = vertex_rows(mesh.vertices, _bytes(mesh), mesh.normals(), mesh.depth_std_m, mesh.filled)
+    corners = ("face", len(faces), ["list uchar int vertex_indices"])
+    return header_of(vertex_header(vertices), corners, comment=note) + vertices.tobytes() + faces.tobytes()
+
+
+def vertex_rows(
+    positions: Values, colors: NDArray[np.uint8], normals: Values | None, depth_std_m: Values | None,
+    filled: NDArray[np.bool_] | None = None,
+) -> NDArray[np.void]:  # fmt: skip
+    """Return vertices as rows of a PLY, with the columns that are given."""
+    groups = {
+        "x y z": positions, "nx ny nz": normals, "red green blue": colors, "depth_std_m": depth_std_m,
+        "filled": filled,
+    }  # fmt: skip
+    columns = {
+        name: values if values.ndim == 1 else values[:, k]
+        for names, values in groups.items()
+        if values is not None
+        for k, name in enumerate(names.split())
+    }
+    kinds = {name: "<f4" if values.dtype.kind == "f" else "u1" for name, values in columns.items()}
+    rows = np.zeros(len(positions), list(kinds.items()))
+    for name, values in columns.items():
+        rows[name] = values
+    return rows
+
+
+def vertex_header(rows: NDArray[np.void]) -> tuple[str, int, list[str]]:
+    """Return the element of `vertex_rows` for the header."""
+    kinds = {name: "uchar" if rows.dtype[name].itemsize == 1 else "float" for name in rows.dtype.names or ()}
+    return "vertex", len(rows), [f"{kind} {name}" for name, kind in kinds.items()]
 
 
 def _obj(mesh: Mesh, note: str) -> bytes:
@@ -176,10 +238,6 @@ def _stl(mesh: Mesh, note: str) -> bytes:
     return header + len(rows).to_bytes(4, "little") + rows.tobytes()
 
 
-def _glb(mesh: Mesh, note: str) -> bytes:
-    return glb(mesh)
-
-
 def _bytes(mesh: Mesh) -> NDArray[np.uint8]:
     """Return the vertices' colours as bytes [V, 3]; gray if the mesh has no colours."""
     return color_bytes(np.full(mesh.vertices.shape, GRAY, np.float32) if mesh.colors is None else mesh.colors)
@@ -190,4 +248,4 @@ def color_bytes(colors: NDArray[np.floating]) -> NDArray[np.uint8]:
     return np.asarray(np.rint(np.clip(colors, 0.0, 1.0) * 255.0), np.uint8)
 
 
-_FORMATS = {".ply": _ply, ".obj": _obj, ".glb": _glb, ".stl": _stl}
+_FORMATS = {".ply": _ply, ".obj": _obj, ".glb": lambda mesh, note: glb(mesh), ".stl": _stl}

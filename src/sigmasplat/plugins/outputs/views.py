@@ -1,0 +1,215 @@
+"""Write a run for programs that train on images: views as nerfstudio's transforms.json or as COLMAP's text model, and
+points.
+
+nerfstudio's format is read by instant-ngp and most trainers of radiance fields, too. Its cameras have OpenGL's axes: x
+right, y up, z backwards (nerfstudio's documentation, "Data conventions"). COLMAP's poses are world to camera,
+quaternions wxyz; points have no tracks, because no features were matched (COLMAP's documentation, "Output Format").
+In both, the image's corner is (0, 0) and the first pixel's centre (½, ½), so the principal point is half a pixel larger
+than in `Camera`.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.field import GaussianField
+from sigmasplat.data.mesh import Mesh
+from sigmasplat.errors import RunError
+from sigmasplat.files.atomic import make_folder, replacing, write_text
+from sigmasplat.files.json_files import write_json
+from sigmasplat.files.ply_elements import header_of
+from sigmasplat.plugins.outputs.mesh_files import color_bytes, vertex_header, vertex_rows
+from sigmasplat.plugins.outputs.run_reader import RunReader
+from sigmasplat.types import Matrix, Progress, no_progress
+
+Points = NDArray[np.floating]
+
+MAX_POINTS = 100_000
+MIN_OPACITY = 0.5
+
+
+def export_points(surface: Mesh, target: Path) -> int:
+    """Write the vertices of a run's surface (`FusionInput.surface`), about one per voxel; return their number.
+
+    Raises RunError if the file cannot be written.
+    """
+    colors = surface.vertices * 0.0 + 0.7 if surface.colors is None else surface.colors
+    write_points(target, surface.vertices, colors, surface.normals(), surface.depth_std_m)
+    return len(surface.vertices)
+
+
+def splat_points(field: GaussianField, most: int = MAX_POINTS) -> tuple[Matrix, Matrix]:
+    """Return the centres [P, 3] m and colours [P, 3] of the opaque splats, evenly thinned to `most`."""
+    rows = np.flatnonzero(field.opacities.numpy() >= MIN_OPACITY)
+    rows = rows[np.linspace(0, len(rows) - 1, min(most, len(rows))).astype(int)]
+    return field.means.numpy()[rows].astype(np.float64), field.colors.numpy()[rows].astype(np.float64)
+
+
+def write_points(
+    path: Path, positions: Points, colors: Points, normals: Points | None = None, depth_std_m: Points | None = None
+) -> None:
+    """Write a binary PLY of positions [N, 3], colors [N, 3] in [0, 1], unit normals [N, 3] and depth_std_m [N].
+
+    Raises RunError if the file cannot be written.
+    """
+    rows = vertex_rows(positions, color_bytes(colors), normals, depth_std_m)
+    with replacing(path) as temporary:
+        temporary.write_bytes(header_of(vertex_header(rows)) + rows.tobytes())
+
+
+IMAGES, DEPTHS = "images", "depths"
+MAX_MM = 65535
+
+
+def image_name(frame: int) -> str:
+    """Return the file name of a frame's images."""
+    return f"frame-{frame:06d}.png"
+
+
+def export_images(reader: RunReader, folder: Path, depth: bool, progress: Progress) -> Sequence[int]:
+    """Write the colour of the keyframes as PNG to images/, and, if requested, their depth as 16-bit millimetres (0 = no
+    reading, also above 65.5 m) to depths/.
+
+    Keyframes without a valid pose are left out. Returns their frame numbers. Raises RunError if no keyframe is left.
+    """
+    valid, written = set(reader.valid_frames()), []
+    total = reader.count_keyframes()
+    for done, (frame, picture) in enumerate(reader.keyframes(), 1):
+        if frame in valid:
+            _write_png(folder / IMAGES / image_name(frame), picture.color)
+            if depth:
+                millimetres = np.rint(picture.depth_m.astype(np.float64) * 1000.0)
+                millimetres[millimetres > MAX_MM] = 0.0
+                _write_png(folder / DEPTHS / image_name(frame), millimetres.astype(np.uint16))
+            written.append(frame)
+        progress(done, total)
+    if not written:
+        raise RunError(f"run {reader.run.path} has no keyframes, so it has no images to export; run it again")
+    return written
+
+
+def _write_png(path: Path, pixels: NDArray[Any]) -> None:
+    make_folder(path.parent)
+    with replacing(path) as temporary:
+        Image.fromarray(pixels).save(temporary, "PNG")
+
+
+POINTS_NAME = "points.ply"
+T_GL_CAMERA = np.diag([1.0, -1.0, -1.0, 1.0])
+"""From `Camera`'s axes to OpenGL's; it is its own inverse."""
+MILLIMETRES = 0.001
+
+
+def export_nerfstudio(reader: RunReader, target: Path, images: bool = False, progress: Progress = no_progress) -> int:
+    """Write transforms.json; return the number of views.
+
+    Views are all frames whose pose is valid; with `images` only the keyframes, whose images are written to images/
+    and depths/ beside the file, with points.ply. The images' names are the same in both cases. Raises RunError.
+    """
+    frames = export_images(reader, target.parent, True, progress) if images else reader.valid_frames()
+    path = reader.poses_of(frames)
+    if images:
+        write_points(target.parent / POINTS_NAME, *splat_points(reader.run.read_map()))
+    write_transforms(
+        target,
+        reader.camera,
+        [f"{IMAGES}/{image_name(frame)}" for frame in frames],
+        path.T_world_camera,
+        path.timestamps_s.tolist(),
+        depth_names=[f"{DEPTHS}/{image_name(frame)}" for frame in frames] if images else None,
+        points_name=POINTS_NAME if images else None,
+    )
+    return len(frames)
+
+
+def write_transforms(
+    path: Path,
+    camera: Camera,
+    names: Sequence[str],
+    T_world_camera: Matrix,
+    timestamps_s: Sequence[float],
+    *,
+    depth_names: Sequence[str] | None = None,
+    points_name: str | None = None,
+) -> None:
+    """Write views: the images' file names relative to the file, T_world_camera [N, 4, 4], times.
+
+    depth_names: 16-bit images in millimetres; points_name: a PLY with the initial points. Raises RunError if the file
+    cannot be written.
+    """
+    frames = [
+        {"file_path": name, "timestamp_s": float(t), "transform_matrix": T @ T_GL_CAMERA}
+        for name, t, T in zip(names, timestamps_s, T_world_camera, strict=True)
+    ]
+    for frame, depth_name in zip(frames, depth_names or (), strict=bool(depth_names)):
+        frame["depth_file_path"] = depth_name
+    depth = {"depth_unit_scale_factor": MILLIMETRES} if depth_names else {}
+    points = {"ply_file_path": points_name} if points_name else {}
+    write_json(path, _intrinsics(camera) | depth | points | {"frames": frames})
+
+
+def _intrinsics(camera: Camera) -> dict[str, Any]:
+    """Return the camera in nerfstudio's terms: a pinhole is OPENCV without distortion."""
+    return {
+        "camera_model": "OPENCV", "w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy,
+        "cx": camera.cx + 0.5, "cy": camera.cy + 0.5, "k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0,
+    }  # fmt: skip
+
+
+SPARSE = Path("sparse") / "0"
+"""The folder in which trainers that start from COLMAP look for a model."""
+Points = NDArray[np.floating]
+
+
+def export_colmap(reader: RunReader, target: Path, images: bool = False, progress: Progress = no_progress) -> int:
+    """Write a sparse model to sparse/0 in a folder; return the number of views.
+
+    Views are all frames whose pose is valid; with `images` only the keyframes, whose images are written to images/.
+    Raises RunError.
+    """
+    make_folder(target / SPARSE)
+    frames = export_images(reader, target, False, progress) if images else reader.valid_frames()
+    names = [image_name(frame) for frame in frames]
+    poses = reader.poses_of(frames).T_world_camera
+    write_model(target / SPARSE, reader.camera, names, poses, *splat_points(reader.run.read_map()))
+    return len(frames)
+
+
+def write_model(
+    folder: Path, camera: Camera, names: Sequence[str], T_world_camera: Matrix, points: Points, colors: Points
+) -> None:
+    """Write a model into an existing folder; all images have the same camera.
+
+    names: the images' file names [N], relative to their folder; T_world_camera [N, 4, 4]; points [P, 3] m in the world;
+    colors [P, 3] in [0, 1]. Raises RunError if the files cannot be written.
+    """
+    write_text(folder / "cameras.txt", _camera_lines(camera))
+    write_text(folder / "images.txt", _image_lines(names, T_world_camera))
+    write_text(folder / "points3D.txt", _point_lines(points, colors))
+
+
+def _camera_lines(c: Camera) -> str:
+    numbers = " ".join(f"{value:.12g}" for value in (c.fx, c.fy, c.cx + 0.5, c.cy + 0.5))
+    return f"# CAMERA_ID, MODEL, WIDTH, HEIGHT, FX, FY, CX, CY\n1 PINHOLE {c.width} {c.height} {numbers}\n"
+
+
+def _image_lines(names: Sequence[str], T_world_camera: Matrix) -> str:
+    """Return two lines per image; the second one, for features, is empty."""
+    lines = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME; then POINTS2D as (X, Y, POINT3D_ID)"]
+    for number, (name, T) in enumerate(zip(names, se3.inverse(T_world_camera), strict=True), 1):
+        pose = (*se3.quaternion_from_rotation(T[:3, :3]), *T[:3, 3])
+        lines += [f"{number} {' '.join(f'{value:.12g}' for value in pose)} 1 {name}", ""]
+    return "\n".join(lines) + "\n"
+
+
+def _point_lines(points: Points, colors: Points) -> str:
+    """Return one line per point; its error is 0 and its track is empty."""
+    rows = zip(points.tolist(), color_bytes(colors).tolist(), strict=True)
+    lines = (f"{i} {x:.6f} {y:.6f} {z:.6f} {r} {g} {b} 0\n" for i, ((x, y, z), (r, g, b)) in enumerate(rows, 1))
+    return "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n" + "".join(lines)
