@@ -37,7 +37,7 @@ from sigmasplat.plugins.viewer.splats import (
     visibility_filter,
 )
 from sigmasplat.render import render
-from sigmasplat.render.predictive import predict
+from sigmasplat.uncertainty.predictive import predict
 
 OPTIONS = RenderConfig()
 ERROR_PARTS = ("all", "aleatoric", "epistemic")

@@ -12,10 +12,10 @@ from sigmasplat.plugins.outputs.floorplan.floor_plan import CELL_M, FloorPlan, f
 from sigmasplat.plugins.outputs.floorplan.picture import draw_floor_plan
 from sigmasplat.plugins.outputs.run_reader import RunReader
 from sigmasplat.render import FieldRenderer
-from sigmasplat.render.predictive import predict
 from sigmasplat.run_folder.frames import noted_up
 from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.types import Progress, no_progress
+from sigmasplat.uncertainty.predictive import predict
 
 
 def run_floor_plan(

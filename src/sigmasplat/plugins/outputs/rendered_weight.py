@@ -9,7 +9,7 @@ from sigmasplat.data.field import GaussianField
 from sigmasplat.data.selection import evenly_spread
 from sigmasplat.plugins.outputs.run_reader import RunReader
 from sigmasplat.render.backend import on_device
-from sigmasplat.render.blended_values import blend_values
+from sigmasplat.uncertainty.blended_values import blend_values
 
 MOST_VIEWS = 60
 """At most this many poses of the path, evenly spread, are rendered."""

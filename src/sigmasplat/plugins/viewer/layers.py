@@ -16,8 +16,8 @@ from sigmasplat.data.map_uncertainty import MapUncertainty
 from sigmasplat.plugins.evaluation.metrics.views import COVERED_ALPHA
 from sigmasplat.plugins.outputs.drawing import colormap
 from sigmasplat.render import render
-from sigmasplat.render.predictive import predicted, variance_parts
 from sigmasplat.types import Matrix
+from sigmasplat.uncertainty.predictive import predicted, variance_parts
 
 Layer = Literal["colour", "depth", "normals", "V", "U", "opacity", "color error", "depth error"]
 ErrorPart = Literal["all", "aleatoric", "epistemic"]

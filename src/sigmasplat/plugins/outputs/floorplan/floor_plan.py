@@ -114,7 +114,7 @@ def floor_plan(
 ) -> FloorPlan:
     """Make the floor plan of a map from poses along its path; `camera` gives the field of view.
 
-    predictor: predicts the errors of the map, if they are known (`render.predictive.predict`). up_world: as in
+    predictor: predicts the errors of the map, if they are known (`uncertainty.predictive.predict`). up_world: as in
     `floor_frame`. Calls `progress(poses done, total)`. Raises ConfigError unless 1 mm ≤ cell_m ≤ 1 m; SigmaSplatError
     if no surface is visible, or the plan has more than `MOST_CELLS`.
     """
