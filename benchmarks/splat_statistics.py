@@ -14,12 +14,12 @@ from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.map_uncertainty import MapUncertainty
-from sigmasplat.fit.splat_residuals import squared_errors
 from sigmasplat.fit.target import Keyframe
 from sigmasplat.render import FieldRenderer, Render
 from sigmasplat.render.backend import on_device
-from sigmasplat.render.blended_values import BlendedValues, blend_values
 from sigmasplat.types import Matrix
+from sigmasplat.uncertainty.blended_values import BlendedValues, blend_values
+from sigmasplat.uncertainty.splat_residuals import squared_errors
 
 GRADIENT_STEPS = 6
 """Steps of conjugate gradients for the ridge regression."""

@@ -34,12 +34,12 @@ from sigmasplat.data import se3
 from sigmasplat.data.map_uncertainty import COLOR_PARTS, DEPTH_PARTS, SHIPPED
 from sigmasplat.final.refinement import KeyframeReader
 from sigmasplat.final.uncertainty import FIRM, LIMIT, Samples, probe_samples, probe_views
-from sigmasplat.fit.splat_residuals import background_of, splat_residuals
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.plugins.evaluation.metrics.uncertainty import calibration_scores, z_scores
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.render.backend import make_view
 from sigmasplat.uncertainty.calibration import fit_weights
+from sigmasplat.uncertainty.splat_residuals import background_of, splat_residuals
 
 arg = tyro.conf.arg
 RUNS = record.ROOT / "runs" / "bench" / "uncertainty-weights"

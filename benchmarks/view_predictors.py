@@ -15,8 +15,8 @@ from torch import Tensor
 from sigmasplat.data.camera import Camera
 from sigmasplat.plugins.evaluation.metrics.views import COVERED_ALPHA
 from sigmasplat.render import FieldRenderer, Render
-from sigmasplat.render.predictive import Predicted, predict
 from sigmasplat.types import Matrix
+from sigmasplat.uncertainty.predictive import Predicted, predict
 
 Quantity = Literal["color", "depth"]
 QUANTITIES: tuple[Quantity, ...] = ("color", "depth")
@@ -124,7 +124,7 @@ def ridge_with_prior(quantity: Quantity) -> Callable[[SeenView], Tensor]:
 
 
 def predictive_color(seen: SeenView) -> Tensor:
-    """Return the predictive variance of colour (`render.predictive`); the best constant if the run has none."""
+    """Return the predictive variance of colour (`uncertainty.predictive`); the best constant if the run has none."""
     return constant(seen) * seen.facts.noise[0] if seen.predicted is None else seen.predicted.color
 
 

@@ -7,8 +7,8 @@ from torch import Tensor
 from paper_settings import RenderConfig
 from sigmasplat.data.field import COLUMNS, GaussianField
 from sigmasplat.render.backend import make_view, on_device
-from sigmasplat.render.blended_values import BlendedValues, blend_values
 from sigmasplat.render.splat_sums import gather
+from sigmasplat.uncertainty.blended_values import BlendedValues, blend_values
 from splat_fields import params_of
 from splat_scenes import KINDS, WIDE, Scene, assert_same_vector, scene
 

@@ -31,7 +31,7 @@ from sigmasplat.plugins.outputs.floorplan.floor_plan import (
 from sigmasplat.plugins.outputs.floorplan.ground import floor_frame, sample_surface, sample_surfaces
 from sigmasplat.plugins.outputs.floorplan.picture import draw_floor_plan, draw_kinds
 from sigmasplat.plugins.outputs.floorplan.rescan import RescanRegion, unsure_rule
-from sigmasplat.render.predictive import Predicted
+from sigmasplat.uncertainty.predictive import Predicted
 
 WORLD = se3.exp(np.array([3.0, -2.0, 1.0, 1.9, 0.4, -0.3]))
 UPRIGHT = np.eye(4)

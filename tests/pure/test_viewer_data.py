@@ -35,7 +35,7 @@ from sigmasplat.plugins.viewer.layers import (
 from sigmasplat.plugins.viewer.panel import escaped
 from sigmasplat.plugins.viewer.snapshot import CameraPath, Piece, Snapshot, thin, within_budget
 from sigmasplat.render import render
-from sigmasplat.render.predictive import predict
+from sigmasplat.uncertainty.predictive import predict
 
 OPTIONS = RenderConfig()
 ERROR_PARTS = ("all", "aleatoric", "epistemic")

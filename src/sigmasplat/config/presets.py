@@ -36,8 +36,6 @@ def preset(name: str) -> Config:
     """Return the settings of a preset; a scene follows its name, as in `varsplat-released:room0`. Raises ConfigError on
     an unknown name, with similar names or all names, and on an unknown scene, with all scenes."""
     name = name.replace(":", "-", 1)
-    if name == default_preset():
-        return _named(Config(), name)
     for row in rows(Preset):
         if row.scenes is None and name == row.name:
             return _named(row.make(), name)
@@ -58,7 +56,9 @@ def configured(config: Config | str | None, settings: Mapping[str, object] | Non
     """
     if config is not None and not isinstance(config, Config | str):
         raise ConfigError(f"settings are {type(config).__name__}; give a Config or the name of a preset")
-    base = config if isinstance(config, Config) else preset(config or default_preset())
+    if config is None:
+        config = _named(Config(), default_preset())
+    base = config if isinstance(config, Config) else preset(config)
     return override(base, {name: str(value) for name, value in (settings or {}).items()})
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from torch import Tensor
 
 COLOR_PARTS = ("mixture", "residual", "unexplained", "edges", "extrapolated", "floor")
-"""Parts of the predicted variance of colour, in the order of `render.predictive.variance_parts`."""
+"""Parts of the predicted variance of colour, in the order of `uncertainty.predictive.variance_parts`."""
 DEPTH_PARTS = ("ray", "residual", "unexplained", "edges", "extrapolated", "sensor", "floor")
 """Parts of the predicted variance of depth, as `COLOR_PARTS`."""
 EPISTEMIC = frozenset({"unexplained", "edges", "extrapolated"})

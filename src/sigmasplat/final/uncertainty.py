@@ -15,12 +15,12 @@ from sigmasplat.data.map_uncertainty import COLOR_PARTS, DEPTH_PARTS, SHIPPED, B
 from sigmasplat.data.selection import evenly_spread
 from sigmasplat.data.submap import SubmapStore
 from sigmasplat.final.refinement import KeyframeReader
-from sigmasplat.fit.splat_residuals import background_of, splat_residuals, squared_errors
 from sigmasplat.fit.target import Keyframe, Target
-from sigmasplat.render.predictive import COVERED, variance_parts
 from sigmasplat.render.view import View
 from sigmasplat.types import Matrix, Progress, no_progress
 from sigmasplat.uncertainty.calibration import fit_weights
+from sigmasplat.uncertainty.predictive import COVERED, variance_parts
+from sigmasplat.uncertainty.splat_residuals import background_of, splat_residuals, squared_errors
 from sigmasplat.uncertainty.splat_std import splat_std
 
 PIXELS = 4000

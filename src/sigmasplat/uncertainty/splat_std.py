@@ -10,7 +10,7 @@ from sigmasplat.data.field import GaussianField
 from sigmasplat.data.map_uncertainty import MapUncertainty, SplatStd
 from sigmasplat.fit.target import Keyframe
 from sigmasplat.render.backend import on_device
-from sigmasplat.render.predictive import COVERED, predicted, variance_parts
+from sigmasplat.uncertainty.predictive import COVERED, predicted, variance_parts
 
 PSEUDO_PIXELS = 0.003
 """Weight of the background's variance, in pixels: it decides for splats that no keyframe shows. A larger weight would

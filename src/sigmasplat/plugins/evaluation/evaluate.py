@@ -39,12 +39,12 @@ from sigmasplat.plugins.evaluation.view_scoring import (
 )
 from sigmasplat.render import FieldRenderer
 from sigmasplat.render.low_pass import as_refined
-from sigmasplat.render.predictive import Predicted, predict
 from sigmasplat.run_folder.frames import RunFrames
 from sigmasplat.run_folder.run_values import frame_seconds
 from sigmasplat.run_folder.runs import TRUTH, RunFolder
 from sigmasplat.run_folder.trajectory import write_trajectory
 from sigmasplat.types import Progress, no_progress
+from sigmasplat.uncertainty.predictive import Predicted, predict
 
 Log = list[dict[str, Any]]
 

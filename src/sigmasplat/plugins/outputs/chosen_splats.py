@@ -16,8 +16,8 @@ from sigmasplat.errors import ConfigError, RunError, SigmaSplatError
 from sigmasplat.plugins.outputs.axes import AXES, Axes, levelled, transform_to
 from sigmasplat.plugins.outputs.run_reader import RunReader
 from sigmasplat.render.backend import on_device
-from sigmasplat.render.blended_values import blend_values
 from sigmasplat.types import Matrix
+from sigmasplat.uncertainty.blended_values import blend_values
 
 if TYPE_CHECKING:
     from sigmasplat.plugins.outputs.source import ExportSource

@@ -22,12 +22,12 @@ from sigmasplat.plugins.robots.odometry import LiveOdometry, has_motion
 from sigmasplat.plugins.robots.outlet import Job, Outlet
 from sigmasplat.plugins.robots.ros_messages import MAX_POINTS, Encoded, Points, RosMessages, Topic
 from sigmasplat.render import FieldRenderer
-from sigmasplat.render.predictive import predict
 from sigmasplat.run.callbacks import Callback
 from sigmasplat.slam.checkpoint import path_errors
 from sigmasplat.slam.slam import Slam
 from sigmasplat.slam.step_result import Step
 from sigmasplat.types import Matrix
+from sigmasplat.uncertainty.predictive import predict
 
 Images = Literal["none", "keyframes", "all"]
 SUBMAP_POINTS = 20_000

@@ -20,8 +20,8 @@ from sigmasplat.plugins.outputs.chosen_splats import sigmas
 from sigmasplat.plugins.outputs.drawing import colormap
 from sigmasplat.plugins.viewer.snapshot import Piece, field_without_moments
 from sigmasplat.render import render
-from sigmasplat.render.predictive import predicted, variance_parts
 from sigmasplat.types import Matrix
+from sigmasplat.uncertainty.predictive import predicted, variance_parts
 
 Colouring = Literal["colour", "σ", "depth error"]
 Floats = NDArray[np.float32]

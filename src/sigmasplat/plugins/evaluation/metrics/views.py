@@ -19,7 +19,7 @@ from sigmasplat.plugins.evaluation.metrics import uncertainty
 from sigmasplat.plugins.evaluation.metrics.image import SSIM_LEAST_PX, depth_l1, ms_ssim, psnr, similarity_factors, ssim
 from sigmasplat.plugins.evaluation.metrics.lpips import Lpips
 from sigmasplat.render import Render
-from sigmasplat.render.predictive import Predicted
+from sigmasplat.uncertainty.predictive import Predicted
 
 COVERED_ALPHA = 0.5
 """Above this alpha a pixel counts as covered by the map: its depth is Σwz / Σw."""

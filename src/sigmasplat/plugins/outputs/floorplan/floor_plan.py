@@ -22,10 +22,10 @@ from sigmasplat.plugins.outputs.floorplan.ground import (
 )
 from sigmasplat.plugins.outputs.floorplan.rescan import RescanMaps, RescanRegion, find_rescan_regions
 from sigmasplat.render import FieldRenderer, render
-from sigmasplat.render.predictive import predict
 from sigmasplat.run_folder.frames import noted_up
 from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.types import Matrix, Progress, no_progress
+from sigmasplat.uncertainty.predictive import predict
 
 CELL_M = 0.05
 UNOBSERVED, FLOOR_UNOBSERVED, FREE, OBJECT, WALL = range(5)
@@ -117,7 +117,7 @@ def floor_plan(
 ) -> FloorPlan:
     """Make the floor plan of a map from poses along its path; `camera` gives the field of view.
 
-    predictor: predicts the errors of the map, if they are known (`render.predictive.predict`). up_world: as in
+    predictor: predicts the errors of the map, if they are known (`uncertainty.predictive.predict`). up_world: as in
     `floor_frame`. Calls `progress(poses done, total)`. Raises ConfigError unless 1 mm ≤ cell_m ≤ 1 m; SigmaSplatError
     if no surface is visible, or the plan has more than `MOST_CELLS`.
     """

@@ -18,8 +18,8 @@ from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.plugins.evaluation.metrics.views import COVERED_ALPHA
 from sigmasplat.render import Render
-from sigmasplat.render.predictive import Predicted
 from sigmasplat.types import Matrix, Progress, no_progress
+from sigmasplat.uncertainty.predictive import Predicted
 
 WIDTH_PX = 160
 """Width of the rendered images: at 5 m a pixel is about 4 cm wide."""

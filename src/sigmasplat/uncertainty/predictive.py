@@ -27,8 +27,8 @@ from sigmasplat.data.map_uncertainty import (
     MapUncertainty,
 )
 from sigmasplat.render.backend import on_device
-from sigmasplat.render.blended_values import BlendedValues, blend_values
 from sigmasplat.render.render import CENTER
+from sigmasplat.uncertainty.blended_values import BlendedValues, blend_values
 
 NEW_ANGLE = 0.004
 """1 − cos 5°: at this distance from the directions that a splat was seen from, half of it counts as extrapolated."""

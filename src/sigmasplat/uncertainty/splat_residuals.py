@@ -16,8 +16,8 @@ from sigmasplat.data.field import COLUMNS, GaussianField
 from sigmasplat.data.map_uncertainty import Background
 from sigmasplat.fit.target import Keyframe
 from sigmasplat.render.backend import on_device
-from sigmasplat.render.blended_values import blend_values
-from sigmasplat.render.predictive import COVERED, directions_toward
+from sigmasplat.uncertainty.blended_values import blend_values
+from sigmasplat.uncertainty.predictive import COVERED, directions_toward
 
 SQUARE_OF_MEAN = (3.0 * math.pi / 8.0, math.pi / 2.0)
 """Variance over squared mean absolute residual, of colour and of depth: that of independent Gaussian channels."""
