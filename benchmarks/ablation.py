@@ -30,7 +30,7 @@ from ablation_runs import (
     run_jobs,
 )  # fmt: skip
 from paired_comparison import FIGURES, columns, described, paired_differences, passed_by_chance, rows
-from sigmasplat.input.depth_units import depth_warning
+from sigmasplat.input.recorded import depth_warning
 from tables import Section
 
 from sigmasplat.commands import options
