@@ -69,7 +69,8 @@ def measure_depth(room: int, baseline_cm: int, frames: tuple[int, ...]) -> dict[
     assert isinstance(source, SyntheticRoom)
     ratios, covered = [], []
     for i in frames:
-        depth_m, std_m = source.frame(i).depth_m, source.depth_std_of(i)
+        frame = source.frame(i)
+        depth_m, std_m = frame.depth_m, frame.depth_std_m
         assert std_m is not None
         read = depth_m > 0
         ratios.append(np.abs(depth_m - source.exact_depth_of(i))[read] / std_m[read])

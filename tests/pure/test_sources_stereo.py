@@ -97,7 +97,8 @@ def test_standard_deviations_cover_the_errors_on_exact_depth():
     room = open_source("synthetic:frames=40,stereo=10,noise=1")
     ratios = []
     for i in (3, 23):
-        depth_m, std_m = room.frame(i).depth_m, room.depth_std_of(i)
+        frame = room.frame(i)
+        depth_m, std_m = frame.depth_m, frame.depth_std_m
         read = depth_m > 0
         assert np.array_equal(read, std_m > 0) and (std_m <= 0.05 * depth_m + 1e-6).all()
         ratios.append((np.abs(depth_m - room.exact_depth_of(i)) / np.where(read, std_m, 1))[read])

@@ -10,7 +10,7 @@ from sigmasplat.data.camera import Camera
 from sigmasplat.errors import RunError
 from sigmasplat.input.calibration import FREIBURG, freiburg_calibration
 from sigmasplat.input.recorded import depth_warning
-from sigmasplat.input.rectification import Undistortion, distort, undistort
+from sigmasplat.input.rectification import Undistortion, distort
 from sigmasplat.plugins.sources import SyntheticRoom, open_source
 from sigmasplat.plugins.sources.tum import write_tum
 from view_agreement import agreement
@@ -82,6 +82,14 @@ def test_the_folders_name_selects_the_camera(tmp_path):
 def test_calibration_json_overrides_the_folders_name(tiny_tum):
     renamed = tiny_tum.rename(tiny_tum.with_name("freiburg1_desk"))
     assert open_source(renamed).camera.fx == 30.0
+
+
+def undistort(points, coefficients):
+    """Invert `distort` by fixed-point iteration."""
+    ideal = points.copy()
+    for _ in range(50):
+        ideal = ideal + (points - distort(ideal, coefficients))
+    return ideal
 
 
 @pytest.mark.parametrize("name", ["1", "2"])

@@ -72,7 +72,7 @@ def depth_to_metres(path: Path, raw: NDArray[Any], units_per_metre: float) -> ND
 
 def without_nan(depth_m: NDArray[Any]) -> NDArray[np.float32]:
     """Return float depth with 0 for NaN (no reading) and infinity (out of range), see REP 117 of ROS."""
-    return np.nan_to_num(depth_m, nan=0.0, posinf=0.0, neginf=0.0).astype(np.float32)
+    return np.asarray(np.nan_to_num(depth_m, nan=0.0, posinf=0.0, neginf=0.0), np.float32)
 
 
 def _checked_metres(path: Path, depth_m: NDArray[np.float32]) -> NDArray[np.float32]:

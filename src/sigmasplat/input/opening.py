@@ -56,7 +56,9 @@ def _described(path: Path) -> str | None:
     if not all(_is_color_image(images[0]) for images in folders.values()):
         return None
     videos = [file for file in files if file.suffix.lower() in VIDEO_ENDINGS]
-    if stereo := _stereo_folders(folders):
+    cameras = {(folder.parent if folder.name == "data" else folder).name for folder in folders}
+    stereo = sorted(name for name in cameras if STEREO_FOLDER.fullmatch(name.lower()))
+    if len(stereo) > 1:
         return f"stereo or multi-camera images in {', '.join(stereo[:4])}"
     if folders:
         folder = max(folders, key=lambda folder: len(folders[folder]))
@@ -81,13 +83,6 @@ def _is_color_image(path: Path) -> bool:
             return not image.mode.startswith(("I", "F"))
     except SourceError:
         return True  # .heic, .dng, or damaged: then its name decides
-
-
-def _stereo_folders(folders: dict[Path, list[Path]]) -> list[str]:
-    """Return the folder names of a stereo rig's cameras; empty if there are fewer than two."""
-    cameras = [folder.parent if folder.name == "data" else folder for folder in folders]
-    names = sorted({camera.name for camera in cameras if STEREO_FOLDER.fullmatch(camera.name.lower())})
-    return names if len(names) > 1 else []
 
 
 PACKED = (".bag", ".mcap", ".db3", ".r3d")

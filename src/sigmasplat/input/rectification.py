@@ -32,14 +32,6 @@ def distort(points: Points, coefficients: Points) -> Points:
     )
 
 
-def undistort(points: Points, coefficients: Points, iterations: int = 50) -> Points:
-    """Invert `distort` by fixed-point iteration; it converges if the distortion is monotonic within the image."""
-    ideal = points.copy()
-    for _ in range(iterations):
-        ideal = ideal + (points - distort(ideal, coefficients))
-    return ideal
-
-
 class Undistortion:
     """Resample distorted images to the pinhole camera with the same focal lengths and principal point.
 

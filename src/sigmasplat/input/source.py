@@ -138,11 +138,6 @@ class Source(ABC):
         """Return the exact depth of frame i, m [H, W], 0 where there is no surface; None if it is unknown."""
         return None
 
-    def depth_std_of(self, i: int) -> NDArray[np.float32] | None:
-        """Return the standard deviation of the depth of frame i, m [H, W], 0 without a reading; None if it is
-        unknown."""
-        return None
-
     @abstractmethod
     def truth(self) -> Trajectory | None:
         """Return the ground-truth path as recorded, with its own timestamps and world frame; None if it is unknown."""
@@ -271,9 +266,6 @@ class Subset(Wrapped):
 
     def exact_depth_of(self, i: int) -> NDArray[np.float32] | None:
         return self._whole.exact_depth_of(self._at(i))
-
-    def depth_std_of(self, i: int) -> NDArray[np.float32] | None:
-        return self._whole.depth_std_of(self._at(i))
 
     def image_name(self, i: int) -> str:
         return self._whole.image_name(self._at(i))

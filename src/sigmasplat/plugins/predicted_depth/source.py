@@ -198,10 +198,6 @@ class WithPredictedDepth(Subset):
     def depth_of(self, i: int) -> Floats:
         return self._depth_of(self._checked_index(i), lambda: self._color_of(i))
 
-    def depth_std_of(self, i: int) -> Floats | None:
-        """Return None: networks do not say how wrong they are."""
-        return None
-
     def _color_of(self, i: int) -> Floats:
         return super().frame(i).color
 

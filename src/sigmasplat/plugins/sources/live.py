@@ -219,5 +219,5 @@ def recording_settings(settings: InputConfig) -> InputConfig:
     """Return the settings for reading the recording of a run, whose frames are already selected and rectified."""
     return InputConfig(
         strict=settings.strict, width=settings.width, crop_px=settings.crop_px,
-        min_depth_m=settings.min_depth_m, max_depth_m=settings.max_depth_m,
+        min_depth_m=settings.min_depth_m, max_depth_m=settings.max_depth_m, denoise_depth=settings.denoise_depth,
     )  # fmt: skip

@@ -140,7 +140,9 @@ def open_record3d(place: str, settings: InputConfig) -> RecordedSource:
     path = Path(place)
     archive = Archive(path)
     name = "metadata.json" if "metadata.json" in archive else "metadata"
-    metadata = _metadata(archive, name)
+    metadata = parse_json(archive.read(name, MOST_JSON_BYTES), path / name)
+    if not isinstance(metadata, dict):
+        raise SourceError(f"{path / name}: holds a {type(metadata).__name__}, not an object with K, w, h")
     native = archive.by_number("rgbd", "depth")
     colors = archive.by_number("rgbd", "jpg") if native else archive.by_number("rgb", "jpg|png")
     depths = native or archive.by_number("depth", "exr")
@@ -164,13 +166,6 @@ def open_record3d(place: str, settings: InputConfig) -> RecordedSource:
     skipped = [f"{path / colors[n]}: no depth image {n}" for n in sorted(colors.keys() - depths.keys())]
     truth = _truth(path / name, metadata, numbers, times_s)
     return RecordedSource(path.resolve().stem, images, calibration, settings, truth, skipped, estimated=True)
-
-
-def _metadata(archive: Archive, name: str) -> dict[str, Any]:
-    content = parse_json(archive.read(name, MOST_JSON_BYTES), archive.path / name)
-    if not isinstance(content, dict):
-        raise SourceError(f"{archive.path / name}: holds a {type(content).__name__}, not an object with K, w, h")
-    return content
 
 
 def _depth_size(path: Path, metadata: dict[str, Any]) -> Size:

@@ -65,7 +65,12 @@ def open_redwood(path: str, settings: InputConfig) -> RecordedSource:
     rate = check_positive(file or folder, "fps", json_number(file or folder, fields, "fps", FRAMES_PER_SECOND))
     colors = list_images(first_subfolder(folder, COLOR_FOLDERS), COLOR_ENDINGS)
     depths = list_images(folder / "depth", DEPTH_ENDINGS)
-    images, skipped = _timed(folder, colors, depths) or _numbered(folder, colors, depths, rate)
+    found = _timed(folder, colors, depths)
+    if found is None:
+        of_color, of_depth = index_by_number(colors), index_by_number(depths)
+        keys, skipped = pair_images(folder, of_color, of_depth, f"{'|'.join(COLOR_FOLDERS)}/*.jpg", "depth/*.png")
+        found = [ImagePair(n / rate, of_color[n], of_depth[n]) for n in keys], skipped
+    images, skipped = found
     known = _recorded(file, fields) if file else PRIMESENSE
     truth = _truth(folder, images)
     return folder_source(folder, settings, images, known, known.depth_units_per_metre, truth, skipped)
@@ -79,12 +84,6 @@ def _timed(folder: Path, colors: list[Path], depths: list[Path]) -> tuple[list[I
     pairs, alone = pair_times(folder, {"colour": color_s, "depth": depth_s})
     skipped = [f"{colors[i]}: no depth within {MAX_GAP_S:g} s" for i in alone]
     return [ImagePair(float(depth_s[j]), colors[i], depths[j]) for i, j in pairs], skipped
-
-
-def _numbered(folder: Path, colors: list[Path], depths: list[Path], rate: float) -> tuple[list[ImagePair], list[str]]:
-    of_color, of_depth = index_by_number(colors), index_by_number(depths)
-    keys, skipped = pair_images(folder, of_color, of_depth, f"{'|'.join(COLOR_FOLDERS)}/*.jpg", "depth/*.png")
-    return [ImagePair(n / rate, of_color[n], of_depth[n]) for n in keys], skipped
 
 
 def _recorded(path: Path, fields: dict[str, object]) -> Calibration:

@@ -119,15 +119,12 @@ class StereoSource(RecordedSource):
             raise SourceError(f"{name}: the second camera is not to the right of the first one; swap both")
         matcher = StereoMatcher(rectification.camera, rectification.baseline_m, settings)
         rig = StereoRig((cameras.left.width, cameras.left.height), rectification, matcher)
-        images = self._pairs = [pair_of(*pair, rig) for pair in pairs]
+        images = [pair_of(*pair, rig) for pair in pairs]
         if truth is not None:
             truth = Trajectory(truth.timestamps_s, truth.T_world_camera @ rectification.T_left_rectified)
         super().__init__(name, images, Calibration(rectification.camera, 1.0), settings, truth, skipped)
         self.depth_noise_per_m = matcher.noise_per_m
         self.scene_scale = scene_scale(self.depth_of, len(self))
-
-    def depth_std_of(self, i: int) -> NDArray[np.float32]:
-        return self._pairs[self._checked_index(i)].read(1.0)[2]
 
 
 def open_stereo(path: str, settings: InputConfig) -> StereoSource:

@@ -119,13 +119,6 @@ class SyntheticRoom(Source):
             color = measured_color(color, np.random.default_rng((self._seed, i, 9)))
         return np.asarray(np.rint(color * 255.0), np.uint8)
 
-    def depth_std_of(self, i: int) -> NDArray[np.float32] | None:
-        """Return the standard deviation of stereo depth; None without `stereo`."""
-        if self._matcher is None:
-            return None
-        left = np.rint(self.frame(i).color * 255.0).astype(np.uint8)
-        return self._matcher.depth_and_std_m(left, self.right_image(i))[1]
-
     def timestamp_s(self, i: int) -> float:
         return self._checked_index(i) / FRAMES_PER_SECOND
 

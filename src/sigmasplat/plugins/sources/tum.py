@@ -147,6 +147,7 @@ class TumWriter:
 
     def __init__(self, folder: Path, camera: Camera) -> None:
         """Create the folder and calibration.json. Raises RunError if it holds a sequence or cannot be written."""
+        self.folder = folder
         if (folder / "rgb.txt").exists():
             raise RunError(f"{folder} already holds a sequence (rgb.txt); give another folder")
         with self._writing():

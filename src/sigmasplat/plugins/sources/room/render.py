@@ -45,7 +45,9 @@ class Light:
 
     def at(self, points: Floats, normals: Floats) -> tuple[Floats, Floats]:
         """Return the light on surface points, RGB [3, N], and the visible shares of lamp and window [2, N]."""
-        ambient, lamp, window = self._shares_at(points + np.float32(0.6 * CELL_M) * normals)
+        start = np.array([[self.room_x_m - HALF_X_M - WALL_M], [-HALF_Y_M], [0.0]], np.float32)
+        where = (points + np.float32(0.6 * CELL_M) * normals - start) / np.float32(CELL_M) - 0.5
+        ambient, lamp, window = (map_coordinates(s, where, order=1, mode="nearest") for s in self.shares)
         total = AMBIENT_COLOR * (0.35 + 0.65 * ambient)
         total = total + LAMP_COLOR * (lamp * _lamp_light(self.lamp - points, normals, 1.6))
         total = total + WINDOW_COLOR * (window * _lamp_light(self.window - points, normals, 1.4))
@@ -63,12 +65,6 @@ class Light:
 
     def _place(self, at: tuple[float, float, float]) -> Floats:
         return np.array([[self.side * at[0] + self.room_x_m], [at[1]], [at[2]]], np.float32)
-
-    def _shares_at(self, points: Floats) -> Floats:
-        start = np.array([[self.room_x_m - HALF_X_M - WALL_M], [-HALF_Y_M], [0.0]], np.float32)
-        where = (points - start) / np.float32(CELL_M) - 0.5
-        seen: Floats = np.stack([map_coordinates(s, where, order=1, mode="nearest") for s in self.shares])
-        return seen
 
 
 def _lamp_light(towards: Floats, normals: Floats, reach_m: float) -> Floats:
