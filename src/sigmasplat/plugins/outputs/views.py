@@ -164,7 +164,6 @@ def _intrinsics(camera: Camera) -> dict[str, Any]:
 
 SPARSE = Path("sparse") / "0"
 """The folder in which trainers that start from COLMAP look for a model."""
-Points = NDArray[np.floating]
 
 
 def export_colmap(reader: RunReader, target: Path, images: bool = False, progress: Progress = no_progress) -> int:

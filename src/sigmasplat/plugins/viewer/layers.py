@@ -160,7 +160,6 @@ def _moved_extra(field: GaussianField, name: str, T_world_piece: Tensor) -> Tens
 
 Layer = Literal["colour", "depth", "normals", "V", "U", "opacity", "color error", "depth error"]
 ErrorPart = Literal["all", "aleatoric", "epistemic"]
-Floats = NDArray[np.float32]
 GREY = np.array([(0, 0, 0), (255, 255, 255)], np.float64)
 LEGEND_SIZE, LEGEND_BAR, INK, PAPER = (280, 34), 14, (233, 237, 242), (36, 40, 46)
 
