@@ -29,7 +29,7 @@ from sigmasplat.config import Config
 from sigmasplat.config.presets import default_preset, preset
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
-from sigmasplat.data.opencv import opencv
+from sigmasplat.env import opencv
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.plugins.evaluation.evaluate import evaluate
 from sigmasplat.plugins.sources import open_source

@@ -35,7 +35,7 @@ from sigmasplat.config.presets import default_preset, preset as preset_of
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.frame import Frame
-from sigmasplat.data.opencv import opencv
+from sigmasplat.env import opencv
 from sigmasplat.errors import SourceError
 from sigmasplat.fit.gray import gray_of
 from sigmasplat.input.source import Source

@@ -87,3 +87,18 @@ def import_optional(module: str, extra: str, what: str) -> Any:
         raise SourceError(
             f"{what} needs {module}, which is installed but does not load ({error}); install the missing system library"
         ) from error
+
+
+@cache
+def opencv() -> Any:
+    """Return the module cv2; it uses SIGMASPLAT_THREADS threads. Raises ConfigError if it cannot be imported."""
+    try:
+        cv2 = import_module("cv2")
+    except ImportError as problem:
+        raise ConfigError(
+            f"features and stereo pairs need OpenCV, which does not load ({problem}): "
+            f"{install_package('opencv-python-headless')}"
+        ) from problem
+    if switches().threads:
+        cv2.setNumThreads(switches().threads)
+    return cv2

@@ -14,7 +14,7 @@ from layouts import save, save_text, tum_line
 from sigmasplat.config.presets import preset
 from sigmasplat.config.scale import for_scene, scaled
 from sigmasplat.config.text import override
-from sigmasplat.data.opencv import opencv
+from sigmasplat.env import opencv
 from sigmasplat.errors import SourceError
 from sigmasplat.input.images import read_color
 from sigmasplat.plugins.batch.job import Job

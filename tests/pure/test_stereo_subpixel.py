@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sigmasplat.data.opencv import opencv
+from sigmasplat.env import opencv
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.plugins.sources.stereo_matching import refine
 

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from sigmasplat.config.sensors import SensorModel, sensor_model
 from sigmasplat.data.camera import Camera
-from sigmasplat.data.opencv import opencv
+from sigmasplat.env import opencv
 
 Floats = NDArray[np.float32]
 

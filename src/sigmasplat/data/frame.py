@@ -1,4 +1,4 @@
-"""One RGB-D image: immutable, checked on construction, without ground truth."""
+"""One RGB-D image: immutable, checked on construction, without ground truth; its photo as JPEG."""
 
 import copy
 from dataclasses import dataclass, replace
@@ -208,15 +208,10 @@ class Frame:
         width, height = (max(1, round(n * min(scale, 1.0))) for n, scale in zip(size, scales, strict=True))
         columns, rows = camera.pixels_in(self.camera.resized(width, height))
         color = _interpolated(_interpolated(resized_color(self.color, width, height), rows).swapaxes(0, 1), columns)
-        u, v = (np.rint(pixels).astype(np.intp) for pixels in camera.pixels_in(self.camera))
-        read = ((v >= 0) & (v < size[1]))[:, None] & (u >= 0) & (u < size[0])
-
-        def nearest(image: NDArray[np.float32]) -> NDArray[np.float32]:
-            return np.where(read, image[np.clip(v, 0, size[1] - 1)][:, np.clip(u, 0, size[0] - 1)], np.float32(0.0))
-
-        std = None if self.depth_std_m is None else nearest(self.depth_std_m)
+        u, v = (np.rint(pixels) for pixels in camera.pixels_in(self.camera))
+        std = None if self.depth_std_m is None else _at(self.depth_std_m, v, u)
         color = np.ascontiguousarray(color.swapaxes(0, 1))
-        return replace(self, color=color, depth_m=nearest(self.depth_m), camera=camera, depth_std_m=std)
+        return replace(self, color=color, depth_m=_at(self.depth_m, v, u), camera=camera, depth_std_m=std)
 
 
 def described(value: object) -> str:

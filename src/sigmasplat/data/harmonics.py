@@ -53,7 +53,7 @@ def view_colors(
 ) -> Tensor:
     """Return the colours [N, 3] of splats as a camera sees them: `colors` + Σ Y(direction from camera to splat) · k.
 
-    harmonics [N, 45], columns: `model.field.ATTRIBUTES`; means [N, 3] and camera_position [3] in the same frame,
+    harmonics [N, 45], columns: `data.field.ATTRIBUTES`; means [N, 3] and camera_position [3] in the same frame,
     metres. Not clamped: a colour may be outside [0, 1].
     """
     n = count(degree)

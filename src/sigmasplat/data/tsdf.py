@@ -3,7 +3,7 @@
 A voxel contains the weighted mean of D − z over the images that see it. z is its depth; D is the depth of the surface
 in its pixel. The value is positive in front of the surface and negative behind it. D is taken at the exact point where
 the voxel projects, not at the centre of the pixel. The inverse depth of a plane is affine in (u, v), so its slope in
-the image gives D at that point exactly.
+the image gives D at that point exactly. The surface is extracted by marching cubes, brick by brick, without seams.
 """
 
 from collections.abc import Callable

@@ -26,7 +26,7 @@ UNFINISHED = re.compile(rf"\.{OURS.pattern}\.part")
 
 
 class DiskStore:
-    """A `model.submap.SubmapStore` in a folder: one file per submap with its splats, keyframe poses and images.
+    """A `data.submap.SubmapStore` in a folder: one file per submap with its splats, keyframe poses and images.
 
     The folder is created with the first submap. Images are read one at a time, so that memory does not grow with their
     number. Adam's state is not stored, because a finished submap is not optimised.

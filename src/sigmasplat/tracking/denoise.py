@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.data.opencv import opencv
+from sigmasplat.env import opencv
 from sigmasplat.fit.compare import noise_scale
 from sigmasplat.fit.pyramid import NOISE_PER_M
 

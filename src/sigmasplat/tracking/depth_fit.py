@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.data.opencv import opencv
+from sigmasplat.env import opencv
 from sigmasplat.tracking.depth_shape import DepthShape
 
 Floats = NDArray[np.float32]

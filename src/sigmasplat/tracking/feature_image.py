@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.frame import Detail, Frame
-from sigmasplat.data.opencv import opencv
 from sigmasplat.data.submap import Picture
+from sigmasplat.env import opencv
 from sigmasplat.tracking.features import (
     Extractor,
     Features,

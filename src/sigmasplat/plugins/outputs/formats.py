@@ -16,10 +16,8 @@ from sigmasplat.registry import Output
 if TYPE_CHECKING:
     from sigmasplat.data.field import GaussianField
     from sigmasplat.data.map_uncertainty import SplatStd
-    from sigmasplat.data.trajectory import Trajectory
     from sigmasplat.plugins.outputs.axes import Axes
-    from sigmasplat.plugins.outputs.run_reader import RunReader
-    from sigmasplat.types import Matrix, Progress
+    from sigmasplat.types import Progress
 
 
 Bound = float | None
@@ -135,23 +133,18 @@ def _trajectory(source: ExportSource, target: Path) -> str:
     return f"{len(path):,} poses{reader.left_out() if has_log else ''}"
 
 
-def _covariance(source: ExportSource, target: Path) -> str:
-    from sigmasplat.run_folder.trajectory import write_square
+def _covariances(write: str) -> Callable[..., str]:
+    """Return the writer of a path with covariances, made of a function of `run_folder.trajectory`."""
 
-    return _write_covariances(source, target, write_square)
+    def export(source: ExportSource, target: Path) -> str:
+        from sigmasplat.run_folder import trajectory
 
+        reader = source.reader()
+        path = reader.valid_path()
+        getattr(trajectory, write)(target, path, reader.covariances())
+        return f"{len(path):,} poses with their covariance{reader.left_out()}"
 
-def _ros_covariance(source: ExportSource, target: Path) -> str:
-    from sigmasplat.run_folder.trajectory import write_ros
-
-    return _write_covariances(source, target, write_ros)
-
-
-def _write_covariances(source: ExportSource, target: Path, write: "Callable[[Path, Trajectory, Matrix], None]") -> str:
-    reader = source.reader()
-    path = reader.valid_path()
-    write(target, path, reader.covariances())
-    return f"{len(path):,} poses with their covariance{reader.left_out()}"
+    return export
 
 
 def _kitti(source: ExportSource, target: Path) -> str:
@@ -168,30 +161,21 @@ def _kitti(source: ExportSource, target: Path) -> str:
     return f"{len(reader.frames.rows):,} poses{left_out}{' (written as nan)' if left_out else ''}"
 
 
-def _nerfstudio(source: ExportSource, target: Path, *, pictures: bool) -> str:
-    from sigmasplat.plugins.outputs.views import export_nerfstudio
+def _views(write: str) -> Callable[..., str]:
+    """Return the writer of a format of views, made of a function of `outputs.views`."""
 
-    return _export_views(export_nerfstudio, source, target, pictures)
+    def export(source: ExportSource, target: Path, *, pictures: bool) -> str:
+        from sigmasplat.plugins.outputs import views
 
+        reader = source.reader()
+        if not pictures:
+            count = getattr(views, write)(reader, target)
+            return f"{count:,} views, no pictures (--pictures){reader.left_out()}"
+        with _counting("pictures") as progress:
+            count = getattr(views, write)(reader, target, True, progress)
+            return f"{count:,} views with their pictures{reader.left_out(keyframes=True)}"
 
-def _colmap(source: ExportSource, target: Path, *, pictures: bool) -> str:
-    from sigmasplat.plugins.outputs.views import export_colmap
-
-    return _export_views(export_colmap, source, target, pictures)
-
-
-def _export_views(
-    export: "Callable[[RunReader, Path, bool, Progress], int]", source: ExportSource, target: Path, pictures: bool
-) -> str:
-    from sigmasplat.types import no_progress
-
-    reader = source.reader()
-    if not pictures:
-        count = export(reader, target, False, no_progress)
-        return f"{count:,} views, no pictures (--pictures){reader.left_out()}"
-    with _counting("pictures") as progress:
-        count = export(reader, target, True, progress)
-        return f"{count:,} views with their pictures{reader.left_out(keyframes=True)}"
+    return export
 
 
 def _points(source: ExportSource, target: Path, *, voxel_m: float | None, axes: "Axes | None") -> str:
@@ -245,11 +229,16 @@ PLUGIN = (
     Output("gltf", (".glb", ".gltf"), "glTF with splats (KHR) and σ", _splats("gltf", "y-up", True)),
     Output("usd", (".usdc", ".usda", ".usd"), "OpenUSD with splats and σ", _splats("usd", "y-up", True)),
     Output("trajectory", (".txt",), "the path as TUM text", _trajectory),
-    Output("covariance", (".cov.txt",), "the path as TUM text with the covariance of each pose", _covariance),
-    Output("ros-covariance", (".ros.txt",), "the same as geometry_msgs/PoseWithCovariance", _ros_covariance),
+    Output(
+        "covariance",
+        (".cov.txt",),
+        "the path as TUM text with the covariance of each pose",
+        _covariances("write_square"),
+    ),
+    Output("ros-covariance", (".ros.txt",), "the same as geometry_msgs/PoseWithCovariance", _covariances("write_ros")),
     Output("kitti", (".kitti.txt",), "the path as KITTI text, one line per frame", _kitti, True),
-    Output("nerfstudio", (".json",), "views as nerfstudio's transforms.json", _nerfstudio, True),
-    Output("colmap", ("-colmap",), "a folder with COLMAP's text model in sparse/0", _colmap, True),
+    Output("nerfstudio", (".json",), "views as nerfstudio's transforms.json", _views("export_nerfstudio"), True),
+    Output("colmap", ("-colmap",), "a folder with COLMAP's text model in sparse/0", _views("export_colmap"), True),
     Output("points", (".points.ply",), "the surface as points with normals", _points, True),
     Output("video", (".webm", ".mp4", ".gif", ".webp"), "a video: colour, depth, uncertainty", _video, True),
     Output("bag", (".mcap", "-bag"), "ROS 2 messages: path with covariance, loops, map", _bag, True),

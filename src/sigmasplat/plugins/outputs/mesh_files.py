@@ -2,6 +2,11 @@
 
 PLY and GLB also contain depth_std_m, if it is known; PLY also `filled`, the vertices that only close gaps. The unit is
 the metre.
+
+A GLB looks in every viewer as it was recorded. Colours of a map contain the light of the room, so the material is unlit
+(KHR_materials_unlit). Viewers without the extension use it as a rough surface that is no metal: glTF's default is
+metal, which is black without surroundings to reflect. COLOR_0 is linear by definition, and a map's colours are sRGB. A
+room is seen from inside and from outside, hence `doubleSided`.
 """
 
 import json

@@ -1,5 +1,6 @@
 """Give a run that goes on to outlets: transforms, odometry, loops, images, and the map as points and as a grid."""
 
+import contextlib
 from array import array
 from collections.abc import Callable, Sequence
 from functools import cached_property, partial
@@ -16,18 +17,16 @@ from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.graph.loops import Loop
 from sigmasplat.graph.path_covariance import PathCovariance
-from sigmasplat.plugins.outputs.floorplan.floor_plan import FloorPlan, floor_plan
+from sigmasplat.plugins.outputs.floorplan.floor_plan import FloorPlan, map_floor_plan
 from sigmasplat.plugins.robots import ros_messages as ros
 from sigmasplat.plugins.robots.odometry import LiveOdometry, has_motion
 from sigmasplat.plugins.robots.outlet import Job, Outlet
 from sigmasplat.plugins.robots.ros_messages import MAX_POINTS, Encoded, Points, RosMessages, Topic
-from sigmasplat.render import FieldRenderer
 from sigmasplat.run.callbacks import Callback
 from sigmasplat.slam.checkpoint import path_errors
 from sigmasplat.slam.slam import Slam
 from sigmasplat.slam.step_result import Step
 from sigmasplat.types import Matrix
-from sigmasplat.uncertainty.predictive import predict
 
 Images = Literal["none", "keyframes", "all"]
 SUBMAP_POINTS = 20_000
@@ -187,19 +186,16 @@ class LiveRobot(Callback):
 
     def _floor_plan(self) -> FloorPlan | None:
         """Return the floor plan of the final map; None if no surface is visible."""
-        slam, config, field, known = self.slam, self.slam.config, self.slam.field, self.slam.uncertainty
+        slam = self.slam
         whole, valid = slam.trajectory(), slam.valid()
         path, up_world = whole.at(valid), self._forces.up_of(whole, valid)
-        predictor = None
-        if known is not None:
-            predictor = partial(predict, field, known, options=config.render, backend=config.backend)
-        renderer, camera = FieldRenderer(config.render, config.backend), slam.view.camera
-        try:
-            if not len(path):
-                return None
-            return floor_plan(field, path, camera, renderer=renderer, predictor=predictor, up_world=up_world)
-        except SigmaSplatError:
+        if not len(path):
             return None
+        with contextlib.suppress(SigmaSplatError):
+            return map_floor_plan(
+                slam.field, slam.uncertainty, slam.config, path, slam.view.camera, up_world=up_world
+            )  # fmt: skip
+        return None
 
     def _report_failures(self) -> None:
         for outlet in self.outlets:

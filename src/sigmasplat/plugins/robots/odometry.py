@@ -50,7 +50,7 @@ class LiveOdometry:
     covariance [6, 6]: of the left twist (ρ, φ), m and rad, of T_odom_camera; None if it is not known. It sums the
     errors of hops between keyframes that tracking estimates: those of alignment are independent, the systematic ones
     are the same in all hops. It does not contain what is measured only at the end of a run: the disagreement between
-    tracking and mapping (`slam.path_covariance`).
+    tracking and mapping (`graph.path_covariance`).
     """
 
     def __init__(self, atlas: Atlas) -> None:

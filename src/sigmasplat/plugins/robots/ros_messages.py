@@ -1,6 +1,13 @@
 """Make ROS 2 messages from poses, maps and images, as bytes (CDR), through the rosbags package (Apache-2.0).
 
-Stamps are the times of the frames, nanoseconds.
+Stamps are the times of the frames, nanoseconds. Coordinate frames are those of REP 105 (map, odom) and REP 103 (x
+forward, y left, z up; optical frames z forward):
+
+    map ─ odom ─ camera_link ─ camera_optical_frame
+     ├─ sigmasplat_world      the world of SigmaSplat: the camera of the first frame
+     └─ floor                 live only, after the final map: as `levelled_map`
+
+Only map → odom contains corrections (loops, relocalisation, mapping), so odom → camera_link is continuous.
 """
 
 from collections.abc import Sequence
@@ -16,6 +23,7 @@ from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
 from sigmasplat.env import import_optional
 from sigmasplat.plugins.outputs.floorplan.floor_plan import FREE, OBJECT, WALL, FloorPlan
+from sigmasplat.plugins.outputs.views import opaque_rows
 from sigmasplat.types import Matrix
 
 MAP, ODOM, LINK, OPTICAL = "map", "odom", "camera_link", "camera_optical_frame"
@@ -165,7 +173,7 @@ class RosMessages:
         return self._encoded(topic, stamp_ns, transforms=stamped)
 
     def odometry(self, stamp_ns: int, parent: str, child: str, T: Matrix, covariance: Matrix | None) -> Encoded:
-        """Make nav_msgs/Odometry: the pose T_parent_child with covariance [6, 6] (`frames.ros_covariance`), None if it
+        """Make nav_msgs/Odometry: the pose T_parent_child with covariance [6, 6] (`ros_covariance`), None if it
         is not known. Velocities are not estimated: their covariance is marked as not known."""
         zero = self._vector("geometry_msgs/msg/Vector3", np.zeros(3))
         twist = self._make(
@@ -281,7 +289,6 @@ class RosMessages:
 
 
 MAX_POINTS = 200_000
-MIN_OPACITY = 0.5
 UNOBSERVED, EMPTY, OCCUPIED = -1, 0, 100
 """Values of nav_msgs/OccupancyGrid."""
 CM_PER_M = 100.0
@@ -292,12 +299,12 @@ def points_of(field: GaussianField, depth_std_m: Tensor | None, most: int = MAX_
 
     depth_std_m [N]: standard deviation of the depth that each splat shows; None if it was not measured.
     """
-    opacities = field.opacities.detach().cpu().numpy()
-    rows = np.flatnonzero(opacities >= MIN_OPACITY)
-    rows = rows[np.linspace(0, len(rows) - 1, min(most, len(rows))).astype(int)]
+    rows = opaque_rows(field, most)
     std = np.full(len(rows), np.nan, np.float32) if depth_std_m is None else depth_std_m.cpu().numpy()[rows]
-    means, colors = (values.detach().cpu().numpy()[rows] for values in (field.means, field.colors))
-    return Points(means.astype(np.float32), colors.astype(np.float32), opacities[rows], std.astype(np.float32))
+    means, colors, opacities = (
+        values.detach().cpu().numpy()[rows] for values in (field.means, field.colors, field.opacities)
+    )
+    return Points(means.astype(np.float32), colors.astype(np.float32), opacities, std.astype(np.float32))
 
 
 def grids(plan: FloorPlan, stamp_ns: int, frame: str, messages: RosMessages) -> list[Encoded]:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from sigmasplat.config import InputConfig
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
-from sigmasplat.data.opencv import opencv
+from sigmasplat.env import opencv
 from sigmasplat.errors import SourceError
 from sigmasplat.input.calibration import (
     Calibration,

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 import viser
@@ -11,9 +11,7 @@ from sigmasplat.plugins.outputs.drawing.colormap import NO_READING, Rgb
 from sigmasplat.plugins.viewer.layers import LEGEND_SIZE, Colouring, ErrorPart, Layer
 
 ViewMode = Literal["splats", "mesh", "colour", "depth", "normals", "V", "U", "opacity", "color error", "depth error"]
-VIEW_MODES: tuple[ViewMode, ...] = (
-    "splats", "mesh", "colour", "depth", "normals", "V", "U", "opacity", "color error", "depth error",
-)  # fmt: skip
+VIEW_MODES: tuple[ViewMode, ...] = get_args(ViewMode)
 PREDICTED_MODES: tuple[ViewMode, ...] = ("color error", "depth error")
 """Only for maps with predicted errors."""
 MODE_LABELS: dict[ViewMode, str] = {

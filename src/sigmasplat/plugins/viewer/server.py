@@ -1,4 +1,7 @@
-"""Start the viewer's server, by default for this machine only, on the requested port or the next free one."""
+"""Start the viewer's server, by default for this machine only, on the requested port or the next free one.
+
+It refuses other pages in the same browser: any page may open a websocket to any address and read the answers.
+"""
 
 import contextlib
 import errno

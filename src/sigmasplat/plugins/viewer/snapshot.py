@@ -1,4 +1,7 @@
-"""Store the state of a run that the viewer shows at one time: path, keyframes, map. Needs no browser and no file."""
+"""Store the state of a run that the viewer shows at one time: path, keyframes, map; choose what is drawn of a path.
+
+It needs no browser and no file.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field as dataclass_field, replace

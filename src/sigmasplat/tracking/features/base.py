@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from sigmasplat.config import FeatureConfig
 from sigmasplat.data.camera import Camera
-from sigmasplat.data.opencv import opencv
+from sigmasplat.env import opencv
 
 Gray = NDArray[np.uint8]
 Pairs = NDArray[np.intp]

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from sigmasplat.config import FeatureConfig
 from sigmasplat.data.camera import Camera
-from sigmasplat.data.opencv import opencv
+from sigmasplat.env import opencv
 from sigmasplat.tracking.features.base import Features, Gray, Pairs, matched_by_distance, no_features, reduced, rounded
 
 SIFT_CONTRAST = 0.02

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.data import se3
-from sigmasplat.data.opencv import opencv
+from sigmasplat.env import opencv
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference
 from sigmasplat.tracking.moving.dynamic_mask import coarse_rays

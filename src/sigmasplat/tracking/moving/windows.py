@@ -4,7 +4,7 @@ twentieth of SciPy's time for the first, and less than SciPy for the second."""
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.data.opencv import opencv
+from sigmasplat.env import opencv
 
 Depth = NDArray[np.float32]
 

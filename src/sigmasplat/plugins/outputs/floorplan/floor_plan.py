@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sigmasplat.config import Config
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
+from sigmasplat.data.map_uncertainty import MapUncertainty
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import ConfigError, SigmaSplatError
 from sigmasplat.plugins.outputs.floorplan.ground import (
@@ -157,15 +159,20 @@ def run_floor_plan(
     SigmaSplatError if no surface is visible.
     """
     config, field = run.config(), run.read_map()
-    renderer = FieldRenderer(config.render, config.backend)
-    known = run.uncertainty_of(field)
+    known, up_world = run.uncertainty_of(field), noted_up(run.facts())
+    return map_floor_plan(field, known, config, path, camera, cell_m=cell_m, up_world=up_world, progress=progress)
+
+
+def map_floor_plan(
+    field: GaussianField, known: MapUncertainty | None, config: Config, path: Trajectory, camera: Camera, **options: Any
+) -> FloorPlan:
+    """Make the floor plan of a map with the settings that made it, and with its predicted errors if they are known;
+    arguments and errors as for `floor_plan`."""
     predictor = None
     if known is not None:
         predictor = partial(predict, field, known, options=config.render, backend=config.backend)
-    return floor_plan(
-        field, path, camera, cell_m=cell_m, renderer=renderer, predictor=predictor, up_world=noted_up(run.facts()),
-        progress=progress,
-    )  # fmt: skip
+    renderer = FieldRenderer(config.render, config.backend)
+    return floor_plan(field, path, camera, renderer=renderer, predictor=predictor, **options)
 
 
 def _transformed(T: Matrix, points: NDArray[np.floating]) -> Matrix:

@@ -2,11 +2,11 @@
 
 One primitive of points with float32 attributes: POSITION, and KHR_gaussian_splatting:ROTATION (xyzw), SCALE (metres),
 OPACITY (0 to 1) and SH_DEGREE_l_COEF_n (degree 0 is (colour − ½)/C0). Our own attributes, which other readers skip:
-_SIGMA, the standard deviation of each colour channel;
-_DEPTH_STD_M and _COLOR_STD if they are known. The reader ignores the last two. COLOR_0 is for readers without the
-extension, which show points: linear colours and opacity. Colours of splats are those of the images, so `colorSpace` is
-srgb_rec709_display. Axes are x right, y up, z back: the writer rotates maps by 180° about x, the reader rotates them
-back. Specification: KhronosGroup/glTF, extensions/2.0/Khronos/KHR_gaussian_splatting.
+_SIGMA, the standard deviation of each colour channel; _DEPTH_STD_M and _COLOR_STD if they are known. The reader ignores
+the last two. COLOR_0 is for readers without the extension, which show points: linear colours and opacity. Colours of
+splats are those of the images, so `colorSpace` is srgb_rec709_display. Axes are x right, y up, z back: the writer
+rotates maps by 180° about x, the reader rotates them back. Sizes are checked before numbers are read; sparse accessors
+and compressed buffers cannot be read. Specification: KhronosGroup/glTF, extensions/2.0/Khronos/KHR_gaussian_splatting.
 """
 
 import base64

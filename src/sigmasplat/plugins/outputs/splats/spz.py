@@ -1,13 +1,14 @@
 """Read and write splats as Niantic's SPZ: 19 or 20 bytes per splat before compression; web, game and phone viewers.
 
-Each kind of value is one stream for all splats: positions (24-bit fixed point), opacities (0 to 255), colours
-(f_dc · 0.15 + ½, 0 to 255), log scales (steps of 1/16 from −10), rotations, harmonics (steps of 1/128, 128 is 0).
-Rotations in version 2: one byte each of x, y, z, while w ≥ 0 follows from them; in versions 3 and 4: 2 bits for the
-index of the largest of x, y, z, w, then sign and 9 bits of each other one. Versions 2 and 3 are compressed with gzip,
-version 4 with Zstandard (`spz_container`).
-Axes are x right, y up, z back: the writer rotates maps by 180° about x, the reader rotates them back. Splats are in
-Morton order, because similar neighbours compress better. The format cannot hold σ². Layout:
-nianticlabs/spz, README.md and load-spz.cc.
+Each kind of value is one stream for all splats: positions (24-bit fixed point), opacities (0 to 255), colours (f_dc ·
+0.15 + ½, 0 to 255), log scales (steps of 1/16 from −10), rotations, harmonics (steps of 1/128, 128 is 0). Rotations in
+version 2: one byte each of x, y, z, while w ≥ 0 follows from them; in versions 3 and 4: 2 bits for the index of the
+largest of x, y, z, w, then sign and 9 bits of each other one. Versions 2 and 3 are one gzip stream of a header of 16
+bytes, then the streams one after the other. Version 4 is a header of 32 bytes, then possibly extensions, a table of 16
+bytes per stream (compressed and plain size), then the streams that have bytes, each compressed with Zstandard. Axes are
+x right, y up, z back: the writer rotates maps by 180° about x, the reader rotates them back. Splats are in Morton
+order, because similar neighbours compress better. The format cannot hold σ². Layout: nianticlabs/spz, README.md and
+load-spz.cc.
 """
 
 import gzip
