@@ -348,6 +348,10 @@ def test_a_batch_keeps_what_is_done_and_names_what_is_missing(
     assert "missing: no such folder or file" in said and "1 of 2 runs" in said
     assert exit_code(*words, *paper_data.tiny_options()) == 1
     assert "1 of 2 runs are finished" in capsys.readouterr().out
+    del words[2]
+    assert exit_code(*words, "--seeds", "2", *paper_data.tiny_options()) == 0
+    first, second = (RunFolder(path) for path in sorted((tmp_path / "out").iterdir()))
+    assert second.path.name == f"{first.path.name}-seed1" and (first.config().seed, second.config().seed) == (0, 1)
 
 
 @pytest.mark.slow

@@ -1,6 +1,7 @@
 """Command `sigmasplat batch`: run SLAM on many recordings. torch is loaded only when it is needed."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -42,6 +43,7 @@ ReplaceRuns = Annotated[
     bool,
     flag("replace runs in DIR that have other settings or other code", name="overwrite"),
 ]
+BatchSeeds = Annotated[From1, arg("N", "number of runs of each recording, with N seeds from --seed on")]
 Recordings = Annotated[
     tuple[str, ...],
     tyro.conf.Positional,
@@ -72,6 +74,7 @@ def batch(
     preset: options.PresetName = DEFAULT_PRESET,
     settings: options.Settings = (),
     seed: options.Seed = None,
+    seeds: BatchSeeds = 1,
     input_options: InputOptionsFlat = DEFAULT_INPUT_OPTIONS,
     data: DataFolders = (),
     mesh: options.WithMesh = False,
@@ -93,7 +96,11 @@ def batch(
         raise ConfigError("no FOLDER given; give one or more recordings")
     config = options.configured(preset, settings, seed, input_options)
     paths = tuple(dict.fromkeys(recordings if data else map(full_path, recordings)))
-    planned = [Job(name, (path,), config, mesh) for name, path in zip(_names(paths), paths, strict=True)]
+    planned = [
+        Job(f"{name}-seed{config.seed + k}" if k else name, (path,), replace(config, seed=config.seed + k), mesh)
+        for name, path in zip(_names(paths), paths, strict=True)
+        for k in range(seeds)
+    ]
     screen, made = Screen(), Batch(planned, out or OUT)
     made.refuse_other_runs(overwrite)
     try:
