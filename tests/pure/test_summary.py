@@ -61,7 +61,7 @@ def test_a_good_run_in_words() -> None:
         ({"lost": 2, "lost_frames": [8, 9]}, "2 of 500 images have no pose (8–9)"),
         (
             {"relocalised": 1, "relocalised_frames": [57]},
-            "No image was lost, but tracking had to find its place in the map again at image 57",
+            "had to find its place in the map again at image 57",
         ),
         ({"apart": 41, "components": [{}]}, "41 images are in a map of their own"),
         ({"apart": 41, "components": [{}, {}]}, "41 images are in 2 maps of their own"),
@@ -86,7 +86,7 @@ def test_a_good_run_in_words() -> None:
         ({"predictive": None, "calibration": None}, "has no predicted errors"),
         (
             {"pose_covariance": {"window_frames": 50, "windows": {"position_coverage_90": 0.934}}},
-            "90 % of the position errors over 50 frames should be within the covariance of the poses: measured 93 %. It has the right size.",
+            "over 50 frames should be within the covariance of the poses: measured 93 %. It has the right size.",
         ),
         (
             {"pose_covariance": {"window_frames": 50, "windows": {"position_coverage_90": 0.0, "position_k": 124.7}}},
