@@ -59,7 +59,10 @@ def test_a_good_run_in_words() -> None:
     [
         ({"lost": 52}, "lost on 52 of 500 images"),
         ({"lost": 2, "lost_frames": [8, 9]}, "2 of 500 images have no pose (8–9)"),
-        ({"relocalised": 1, "relocalised_frames": [57]}, "found its place in the map again at image 57"),
+        (
+            {"relocalised": 1, "relocalised_frames": [57]},
+            "had to find its place in the map again at image 57",
+        ),
         ({"apart": 41, "components": [{}]}, "41 images are in a map of their own"),
         ({"apart": 41, "components": [{}, {}]}, "41 images are in 2 maps of their own"),
         ({"failures": {"silent": 7}}, "7 poses are off by more than 10 cm"),
@@ -83,8 +86,14 @@ def test_a_good_run_in_words() -> None:
         ({"predictive": None, "calibration": None}, "has no predicted errors"),
         (
             {"pose_covariance": {"window_frames": 50, "windows": {"position_coverage_90": 0.934}}},
-            "90 % of the position errors over 50 frames should be within the covariance of the poses: measured 93 %",
+            "over 50 frames should be within the covariance of the poses: measured 93 %. It has the right size.",
         ),
+        (
+            {"pose_covariance": {"window_frames": 50, "windows": {"position_coverage_90": 0.0, "position_k": 124.7}}},
+            "measured 0 %. It is too small, in this recording by a factor of 124.7.",
+        ),
+        ({"pose_covariance": {"window_frames": 50, "windows": {"position_coverage_90": 1.0}}}, "It is too large."),
+        ({"lost": 2, "relocalised_frames": [9]}, "which have no pose. It found its place in the map again at image 9."),
         (
             {"held_out": {"psnr_db": 24.0, "depth_l1_m": 0.01, "depth_coverage": 0.7}},
             "30 % of the depth readings",

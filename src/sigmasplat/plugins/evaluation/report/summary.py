@@ -34,7 +34,8 @@ def verdicts(metrics: Metrics, unsure: Sequence[int], advice: Sequence[Advice]) 
     todo = Verdict("Next", "Try this" if advice else "Use the map", words, command)
     meaning = " ".join([*_images(metrics), *_depth(metrics)])
     known = f"{path_words(metrics)}, {len(unsure)} of them doubtful" if unsure else path_words(metrics)
-    return [Verdict("Path", known, _path(metrics, unsure)), Verdict("Map", map_words(metrics), meaning), todo]
+    path = " ".join([_path(metrics, unsure), *_pose_covariance(metrics)])
+    return [Verdict("Path", known, path), Verdict("Map", map_words(metrics), meaning), todo]
 
 
 def path_words(metrics: Metrics) -> str:
@@ -71,7 +72,6 @@ def summary_sentences(metrics: Metrics, machine: str = "") -> list[str]:
         _overview(metrics, machine),
         *_uncertainty(metrics),
         *_predicted_errors(metrics),
-        *_pose_covariance(metrics),
     ]
 
 
@@ -121,11 +121,12 @@ def _path(metrics: Metrics, unsure: Sequence[int]) -> str:
 
 def _tracked(metrics: Metrics) -> str:
     """Return whether tracking was lost, and where it found its place again in the map."""
-    lost, again = metrics.get("lost") or 0, metrics.get("relocalised_frames") or []
-    found = f" It found its place in the map again at image {format_ranges(again)}." if again else ""
-    if lost:
-        return f"Tracking was lost on {lost} of {metrics.get('frames')} images, which have no pose.{found}"
-    return f"Tracking stopped for no image.{found}" if found else "Tracking was never lost."
+    lost, again = metrics.get("lost") or 0, format_ranges(metrics.get("relocalised_frames") or [])
+    if not lost:
+        found = f"No image was lost, but tracking had to find its place in the map again at image {again}."
+        return found if again else "Tracking was never lost."
+    found = f" It found its place in the map again at image {again}." if again else ""
+    return f"Tracking was lost on {lost} of {metrics.get('frames')} images, which have no pose.{found}"
 
 
 def _apart_sentence(metrics: Metrics) -> str:
@@ -213,9 +214,12 @@ def _pose_covariance(metrics: Metrics) -> list[str]:
     found = covariance.get("windows")
     if not found:
         return []
+    off, factor = found["position_coverage_90"] - 0.9, found.get("position_k")
+    size = "has the right size" if abs(off) <= CALIBRATED else f"is too {'small' if off < 0 else 'large'}"
+    by = "" if factor is None or abs(off) <= CALIBRATED else f", in this recording by a factor of {number(factor, 1)}"
     return [
         f"90 % of the position errors over {covariance['window_frames']} frames should be within the covariance of the "
-        f"poses: measured {number(found['position_coverage_90'], 0, 100.0)} %."
+        f"poses: measured {number(found['position_coverage_90'], 0, 100.0)} %. It {size}{by}."
     ]
 
 
