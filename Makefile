@@ -41,7 +41,10 @@ WHEEL_VENV = $(if $(same_python),$(VENV),build/venv-$(or $(call version_of,$(PYT
 demo: install
 	$(BIN)/sigmasplat demo
 
-test: lint types pytest
+# mypy runs beside the tests; what it finds is said last.
+test: lint
+	@mkdir -p build; $(BIN)/mypy --strict src >build/types.log 2>&1 & types=$$!; \
+	$(run_tests); tests=$$?; wait $$types || { cat build/types.log; exit 1; }; exit $$tests
 
 test-all: NOT_RUN =
 test-all: test
@@ -53,10 +56,12 @@ lint: install-dev
 types: install-dev
 	$(BIN)/mypy --strict src
 
-# In sequence even under -j, so that the summary of pytest is the last line. One worker per core: each starts with a
-# contiguous half of the tests, so that most fixtures of a file are made once; the first to finish takes over tests.
-pytest: lint types
-	$(BIN)/pytest -n auto --maxprocesses 8 --dist worksteal $(if $(NOT_RUN),-m 'not $(NOT_RUN)') $(PYTEST_ARGS)
+# One worker per core: each starts with a contiguous half of the tests, so that most fixtures of a file are made once;
+# the first to finish takes over tests.
+run_tests = $(BIN)/pytest -n auto --maxprocesses 8 --dist worksteal $(if $(NOT_RUN),-m 'not $(NOT_RUN)') $(PYTEST_ARGS)
+
+pytest: install-dev
+	$(run_tests)
 
 install: $(VENV)/installed $(VENV)/native
 install-dev: $(VENV)/installed-dev $(VENV)/native

@@ -46,7 +46,7 @@ def shown_db(slam: Slam) -> float:
 RUNS: list[Any] = [
     pytest.param("cgslam-fast", SMALL, 0.004, 26.0, id="fast"),
     pytest.param("sigma", SMALL, 0.004, 26.0, id="sigma"),
-    pytest.param("cgslam-replica", PAPER, 0.02, 24.0, id="paper"),
+    pytest.param("cgslam-replica", PAPER, 0.02, 24.0, id="paper", marks=pytest.mark.slow),
     pytest.param(
         "cgslam-replica",
         PAPER | {"mapping.covisibility": "frustum"},
