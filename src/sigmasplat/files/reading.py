@@ -3,7 +3,6 @@ one line with place and remedy."""
 
 import codecs
 import csv
-import json
 import os
 import stat
 import struct
@@ -134,6 +133,8 @@ MOST_OWN_JSON_BYTES = 512 << 20
 
 def parse_json(text: str | bytes, where: object, error: type[SigmaSplatError] = SourceError) -> Any:
     """Parse JSON. Raises `error` naming `where` if it is not JSON, is nested too deep, or has endless numbers."""
+    import json  # here, because every command imports this module
+
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as problem:  # ValueError: not UTF-8, or a whole number of 4300 digits, too

@@ -301,8 +301,5 @@ def _message_path(path: Path, topic: str, time_s: float) -> Path:
 
 
 PLUGIN = SourceFormat(
-    "ROS bag",
-    "a .bag, .mcap or .db3 file, or a folder with metadata.yaml",
-    lambda path: is_bag(Path(path)),
-    open_bag,
+    "ROS bag", "a .bag, .mcap or .db3 file, or a folder with metadata.yaml", lambda path: is_bag(Path(path)), open_bag
 )

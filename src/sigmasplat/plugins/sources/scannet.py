@@ -29,13 +29,7 @@ from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.errors import SourceError
 from sigmasplat.files.reading import read_text
-from sigmasplat.input.calibration import (
-    MM_PER_METRE,
-    Calibration,
-    build_camera,
-    check_positive,
-    read_json_object,
-)
+from sigmasplat.input.calibration import MM_PER_METRE, Calibration, build_camera, check_positive, read_json_object
 from sigmasplat.input.images import (
     COLOR_ENDINGS,
     DEPTH_ENDINGS,

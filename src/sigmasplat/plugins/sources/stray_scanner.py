@@ -192,9 +192,5 @@ def _recognises(path: str) -> bool:
 
 
 PLUGIN = SourceFormat(
-    "Stray Scanner",
-    "rgb.mp4, depth/ and odometry.csv",
-    _recognises,
-    open_stray_scanner,
-    sensor="lidar-iphone",
+    "Stray Scanner", "rgb.mp4, depth/ and odometry.csv", _recognises, open_stray_scanner, sensor="lidar-iphone"
 )

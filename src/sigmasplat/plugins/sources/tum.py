@@ -30,19 +30,8 @@ from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import RunError, SourceError
 from sigmasplat.files.atomic import write_text
 from sigmasplat.files.reading import exists
-from sigmasplat.input.calibration import (
-    TUM_UNITS_PER_METRE,
-    Calibration,
-    freiburg_calibration,
-)
-from sigmasplat.input.lists import (
-    MAX_GAP_S,
-    nearest_gaps_s,
-    pair_times,
-    parse_numbers,
-    read_groundtruth,
-    read_lines,
-)
+from sigmasplat.input.calibration import TUM_UNITS_PER_METRE, Calibration, freiburg_calibration
+from sigmasplat.input.lists import MAX_GAP_S, nearest_gaps_s, pair_times, parse_numbers, read_groundtruth, read_lines
 from sigmasplat.input.recorded import ImagePair, RecordedSource, folder_source
 from sigmasplat.input.source import Source
 from sigmasplat.registry import SourceFormat
