@@ -53,7 +53,7 @@ def splat_points(field: GaussianField, most: int = MAX_POINTS) -> tuple[Matrix, 
 def opaque_rows(field: GaussianField, most: int) -> NDArray[np.intp]:
     """Return the rows of the opaque splats, evenly thinned to `most`."""
     rows = np.flatnonzero(field.opacities.detach().cpu().numpy() >= MIN_OPACITY)
-    return rows[np.linspace(0, len(rows) - 1, min(most, len(rows))).astype(int)]
+    return np.asarray(rows[np.linspace(0, len(rows) - 1, min(most, len(rows))).astype(int)])
 
 
 def write_points(
