@@ -13,20 +13,18 @@ from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.column import Column
 from sigmasplat.data.field import GaussianField
-from sigmasplat.data.places import Place
-from sigmasplat.data.poses import KeyframePoses, Poses
-from sigmasplat.data.relative_pose import UNKNOWN_HOP, Kind, RelativePose
+from sigmasplat.data.poses import KeyframePoses, Place, Poses
+from sigmasplat.data.relative_pose import UNKNOWN_HOP, Edges, Kind, RelativePose
 from sigmasplat.data.submap import MemoryStore, Submap
 from sigmasplat.errors import RunError
 from sigmasplat.files.json_files import write_json
-from sigmasplat.graph.described_submaps import DescribedSubmaps, SubmapDescriptor
-from sigmasplat.graph.edges import Edges
+from sigmasplat.graph.candidates import DescribedSubmaps, SubmapDescriptor
 from sigmasplat.graph.loops import Loop, Loops
 from sigmasplat.graph.pose_graph import LoopVerdict
 from sigmasplat.run_folder.state import read_state, write_state
 from sigmasplat.run_folder.submaps import DiskStore
+from sigmasplat.slam.results import Step
 from sigmasplat.slam.slam import Slam
-from sigmasplat.slam.step_result import Step
 
 MOST_BYTES = 100
 """Most bytes of RAM per frame of a long run; with lists of objects it was 1200."""

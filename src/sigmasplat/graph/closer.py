@@ -11,12 +11,18 @@ from sigmasplat.data import se3
 from sigmasplat.data.atlas import Atlas
 from sigmasplat.data.column import Column
 from sigmasplat.data.field import COLUMNS
-from sigmasplat.data.relative_pose import RelativePose
+from sigmasplat.data.relative_pose import Edges, RelativePose
 from sigmasplat.data.submap import Submap, SubmapStore
 from sigmasplat.errors import ConfigError
-from sigmasplat.graph.candidates import SubmapPair, find_candidates, find_nearby, opacity_ratio, pairs_to_register
-from sigmasplat.graph.described_submaps import DescribedSubmaps, SubmapDescriptor
-from sigmasplat.graph.edges import Edges
+from sigmasplat.graph.candidates import (
+    DescribedSubmaps,
+    SubmapDescriptor,
+    SubmapPair,
+    find_candidates,
+    find_nearby,
+    opacity_ratio,
+    pairs_to_register,
+)
 from sigmasplat.graph.loops import Loop, Loops, described
 from sigmasplat.graph.neighbourhood import MOST_FREE, Incidence, Neighbourhood, numbered
 from sigmasplat.graph.pose_graph import PoseGraph, most_chi2

@@ -8,8 +8,8 @@ import numpy as np
 
 from sigmasplat.config import Config
 from sigmasplat.data import se3
-from sigmasplat.data.component import APART, RELOCALISED, TRACKED
 from sigmasplat.data.field import GaussianField
+from sigmasplat.data.trajectory import APART, RELOCALISED, TRACKED
 from sigmasplat.fit.pose import PoseFit
 from sigmasplat.fit.references import Reference
 from sigmasplat.fit.target import Target
@@ -19,14 +19,13 @@ from sigmasplat.graph.newest_covariance import NO_ERRORS
 from sigmasplat.mapping.validation_views import ValidationViews
 from sigmasplat.realtime.messages import Offer, Search, Snapshot, TrackedFrame
 from sigmasplat.render.view import View
-from sigmasplat.slam.step_result import Step, StepTimer, SubmapState, make_step
+from sigmasplat.slam.results import Step, StepTimer, SubmapState, make_step
 from sigmasplat.tracking.fitted_depth import fitted_keyframe, fitted_to_map
 from sigmasplat.tracking.frame_estimate import FrameEstimate
 from sigmasplat.tracking.keyframe_rule import becomes_keyframe, is_held_back, is_mappable, may_validate
 from sigmasplat.tracking.pose_validation import is_questionable
-from sigmasplat.tracking.prepared_frame import PreparedFrame, refuse_first_without_depth
+from sigmasplat.tracking.prepared_frame import PreparedFrame, TrackedKeyframe, refuse_first_without_depth
 from sigmasplat.tracking.recovery import Recovery, usable
-from sigmasplat.tracking.tracked_keyframe import TrackedKeyframe
 from sigmasplat.tracking.tracker import Tracker
 from sigmasplat.types import Matrix
 

@@ -24,8 +24,7 @@ from sigmasplat.tracking.moving.dynamic_detector import DynamicDetector
 from sigmasplat.tracking.moving.dynamic_mask import DynamicMask
 from sigmasplat.tracking.pose_prediction import Given, PosePrediction, odometry, predict
 from sigmasplat.tracking.pose_validation import TrackingStatistics
-from sigmasplat.tracking.prepared_frame import PreparedFrame
-from sigmasplat.tracking.tracked_keyframe import Splats, TrackedKeyframe, mapped_keyframe
+from sigmasplat.tracking.prepared_frame import PreparedFrame, Splats, TrackedKeyframe, mapped_keyframe
 from sigmasplat.types import Matrix, ShouldStop, never
 
 
