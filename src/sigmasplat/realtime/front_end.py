@@ -1,7 +1,7 @@
 """The clock of the camera: track frames against the newest snapshot of the map, and choose keyframes."""
 
 import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -27,7 +27,7 @@ from sigmasplat.tracking.pose_validation import is_questionable
 from sigmasplat.tracking.prepared_frame import PreparedFrame, TrackedKeyframe, refuse_first_without_depth
 from sigmasplat.tracking.recovery import Recovery, usable
 from sigmasplat.tracking.tracker import Tracker
-from sigmasplat.types import Matrix
+from sigmasplat.types import Matrix, ShouldStop, never
 
 NOTHING = GaussianField.empty()
 
@@ -72,9 +72,7 @@ class FrontEnd:
         moved = not np.array_equal(before, now)
         if moved:
             T_new_old = now @ se3.inverse(before)
-            self.tracker.move_by(T_new_old)
-            if snapshot.frame == self.frames - 1:
-                self.tracker.previous = now  # without rounding
+            self.tracker.move_by(T_new_old, now if snapshot.frame == self.frames - 1 else None)
         kept = {n: T_new_old @ T if moved else T for n, T in self.poses.items() if n > snapshot.newest}
         self.poses = kept | dict(snapshot.poses)
         if snapshot.state:
@@ -88,12 +86,10 @@ class FrontEnd:
         self.confidence.spread_m, self.snapshot = [snapshot.spread_m], snapshot
 
     def _found(self, snapshot: Snapshot) -> None:
-        """Continue where the camera was estimate, or in a new map."""
+        """Continue where the camera was found, or in a new map."""
         self.recovery.found()
         self.found = snapshot.state
-        self.tracker.velocity, self.tracker.detector = np.eye(4), self.tracker.detector.cleared()
-        if snapshot.state == APART:
-            self.tracker.lost = False
+        self.tracker.continue_elsewhere(apart=snapshot.state == APART)
 
     def adopt_newest(self, snapshot: Snapshot) -> None:
         """Adopt a snapshot that follows others which were not adopted."""
@@ -110,9 +106,7 @@ class FrontEnd:
 
     # ---- a frame ----
 
-    def track(
-        self, seen: PreparedFrame, view: View, timer: StepTimer, should_stop: Callable[[], bool] = lambda: False
-    ) -> TrackedFrame:
+    def track(self, seen: PreparedFrame, view: View, timer: StepTimer, should_stop: ShouldStop = never) -> TrackedFrame:
         """Track a frame, and decide whether it becomes a keyframe; should_stop: as in `Tracker.track`."""
         number, offer, search = self.frames, None, None
         if number == 0:

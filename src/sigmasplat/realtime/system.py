@@ -27,7 +27,7 @@ from sigmasplat.tracking.features import extractor_of
 from sigmasplat.tracking.prepared_frame import view_of, working_frame
 from sigmasplat.tracking.recovery import Recovery
 from sigmasplat.tracking.tracker import Tracker
-from sigmasplat.types import Matrix, Progress, no_progress
+from sigmasplat.types import Matrix, Progress, ShouldStop, never, no_progress
 
 
 class RealTime(ArrayInterface):
@@ -47,7 +47,7 @@ class RealTime(ArrayInterface):
         slam: Slam,
         schedule: Schedule | None = None,
         covariances: bool = True,
-        should_stop: Callable[[], bool] = lambda: False,
+        should_stop: ShouldStop = never,
     ) -> None:
         self.slam, self._hurried, c = slam, should_stop, slam.config
         self._extractor = extractor_of(c)  # not shared with the mapping thread
