@@ -142,7 +142,7 @@ def test_loops_are_read_as_they_were_tried_with_the_latest_verdict() -> None:
     loops.judge(2, LoopVerdict(2, 1, 0.9, 2.0, accepted=True))
     loops.append(loop(9))
     assert (loops[1].accepted, loops[1].reason) == (False, "the pose graph disagrees (χ² 40)")
-    assert (loops[2].chi2, loops[2].weight, loops[2].is_edge) == (2.0, 0.9, True)
+    assert (loops[2].chi2, loops[2].weight, loops[2].accepted) == (2.0, 0.9, True)
     assert [loops.is_rejected(i) for i in (0, 1, 2)] == [False, True, False], "loop 0 is no edge of the pose graph"
     assert len(copied) == 9 and copied[1].accepted and np.isnan(copied[2].chi2), "a copy keeps its verdicts"
     assert [each.query for each in loops.newly_closed(before)] == [9]

@@ -6,7 +6,7 @@ never accepted by its number of inliers alone, because a repeated pattern has ma
 
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -116,10 +116,6 @@ class Relocation:
     def relative_pose(self, submap: int) -> RelativePose:
         """Return where a submap begins that starts at this camera."""
         return RelativePose(self.where[0], submap, self.T_submap_camera, self.information, "relocalisation")
-
-    def values(self) -> dict[str, float]:
-        """Return the comparison with the map and the number of matches, as a step reports them."""
-        return asdict(self.comparison) | {"inliers": float(self.inliers)}
 
     @property
     def score(self) -> float:
