@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sigmasplat.config import Config
 from sigmasplat.config.presets import default_preset, preset
 from sigmasplat.data import se3
-from sigmasplat.data.selection import evenly_spread
+from sigmasplat.data.trajectory import evenly_spread
 from sigmasplat.errors import SigmaSplatError, SourceError
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.evaluation.metrics.image import depth_l1, psnr

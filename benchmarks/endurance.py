@@ -37,7 +37,7 @@ from sigmasplat.config.text import override, split_settings
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.run.callbacks import Callback
 from sigmasplat.run_folder.runs import RunFolder
-from sigmasplat.slam.step_result import Step
+from sigmasplat.slam.results import Step
 
 arg = tyro.conf.arg
 SOURCE = "synthetic:frames=300,noise=1,width=64,height=48"

@@ -28,7 +28,7 @@ from sigmasplat.commands.options import source_of
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.mesh import Mesh
-from sigmasplat.data.selection import evenly_spread
+from sigmasplat.data.trajectory import evenly_spread
 from sigmasplat.errors import SigmaSplatError, SourceError
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.evaluation.metrics import views

@@ -144,7 +144,7 @@ def denoised(frame: Frame, config: Config) -> Frame:
     """Return a frame with the depth that mapping would get; a checkout may be older than `input.denoise_depth`."""
     if not getattr(config.input, "denoise_depth", False):
         return frame
-    from sigmasplat.tracking.denoise import denoised
+    from sigmasplat.tracking.prepared_frame import denoised
 
     return replace(frame, depth_m=denoised(frame.depth_m))
 

@@ -19,9 +19,8 @@ from sigmasplat.input.source import Source
 from sigmasplat.render.backend import make_view
 from sigmasplat.tracking.feature_image import FeatureImage, detail_of
 from sigmasplat.tracking.features import make_extractor
-from sigmasplat.tracking.known_map import KnownMap
 from sigmasplat.tracking.prepared_frame import PreparedFrame
-from sigmasplat.tracking.relocaliser import Relocaliser
+from sigmasplat.tracking.relocaliser import KnownMap, Relocaliser
 
 Matrix = NDArray[np.float64]
 EVERY, APART = 5, 40

@@ -41,7 +41,7 @@ from sigmasplat.input.source import Source
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.run.callbacks import Callback
 from sigmasplat.run_folder.runs import RunFolder
-from sigmasplat.slam.step_result import Step
+from sigmasplat.slam.results import Step
 
 arg = tyro.conf.arg
 SOURCE = "synthetic:frames=900,rooms=2,noise=1,width=640,height=480"

@@ -28,8 +28,7 @@ from tables import Section
 
 from sigmasplat.data import se3
 from sigmasplat.data.mesh import Mesh
-from sigmasplat.data.selection import evenly_spread
-from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.data.trajectory import Trajectory, evenly_spread
 from sigmasplat.data.tsdf import Tsdf, extract_surface
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.input.source import Source

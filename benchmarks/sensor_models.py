@@ -32,7 +32,7 @@ from sigmasplat.fit.references import confidence_of, relative_noise
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.evaluation.metrics.trajectory import associate
 from sigmasplat.plugins.sources import open_source
-from sigmasplat.tracking.denoise import denoised
+from sigmasplat.tracking.prepared_frame import denoised
 
 arg = tyro.conf.arg
 USES = ("tracking", "mapping")

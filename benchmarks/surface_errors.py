@@ -10,8 +10,7 @@ from sigmasplat.config import Config
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.mesh import Mesh
-from sigmasplat.data.selection import evenly_spread
-from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.data.trajectory import Trajectory, evenly_spread
 from sigmasplat.data.tsdf import Tsdf, extract_surface
 from sigmasplat.final.fusion import TRUNCATION_VOXELS, VOXEL_M, count_keyframes, fuse, surface_views
 from sigmasplat.input.source import Source

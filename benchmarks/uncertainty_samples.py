@@ -26,8 +26,8 @@ from sigmasplat.data import se3
 from sigmasplat.data.exposure import NEUTRAL, exposed
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.map_uncertainty import MapUncertainty
-from sigmasplat.data.selection import evenly_spread
 from sigmasplat.data.submap import SubmapStore
+from sigmasplat.data.trajectory import evenly_spread
 from sigmasplat.errors import ConfigError
 from sigmasplat.final.refinement import KeyframeReader
 from sigmasplat.final.uncertainty import map_uncertainty

@@ -9,7 +9,7 @@ from sigmasplat.config import Config
 from sigmasplat.data.exposure import NEUTRAL
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.resizing import resized_depth
-from sigmasplat.data.selection import evenly_spread
+from sigmasplat.data.trajectory import evenly_spread
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.evaluation.metrics.trajectory import aligned_poses, associate
 from sigmasplat.plugins.evaluation.view_scoring import working_frame

@@ -23,8 +23,7 @@ from sigmasplat.render.cpu.view import CpuView
 from sigmasplat.render.reference.view import ReferenceView
 from sigmasplat.render.view import View
 from sigmasplat.run_folder.state import read_state, write_state
-from sigmasplat.tracking.depth_fit import DepthFit
-from sigmasplat.tracking.depth_shape import DepthShape
+from sigmasplat.tracking.depth_fit import DepthFit, DepthShape
 from sigmasplat.tracking.moving import depth_history, dynamic_detector
 from sigmasplat.tracking.pose_validation import TrackingStatistics
 from sigmasplat.tracking.prepared_frame import PreparedFrame

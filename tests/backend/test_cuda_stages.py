@@ -14,7 +14,7 @@ from sigmasplat.plugins.cuda import stages as cuda_stages
 from sigmasplat.plugins.cuda.mapping_step import CudaStep
 from sigmasplat.plugins.cuda.stages import STAGES, Stages
 from sigmasplat.plugins.cuda.view import CudaView
-from sigmasplat.slam.step_result import KERNELS
+from sigmasplat.slam.results import KERNELS
 from splat_fields import OPTIONS, params_of, there_and_back
 from splat_scenes import scene
 

@@ -8,8 +8,8 @@ from paper_settings import RenderConfig
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.map_uncertainty import COLOR_PARTS, DEPTH_PARTS, Background, Calibration, MapUncertainty
 from sigmasplat.fit.target import Keyframe, Target
+from sigmasplat.uncertainty.calibration import splat_std
 from sigmasplat.uncertainty.predictive import predict
-from sigmasplat.uncertainty.splat_std import splat_std
 from splat_scenes import WIDE
 
 OPTIONS = RenderConfig()

@@ -12,14 +12,14 @@ from safetensors.torch import load_file, save_file
 from sigmasplat.data.atlas import Atlas
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
-from sigmasplat.data.places import Place, Places
+from sigmasplat.data.poses import Place, Places
 from sigmasplat.data.relative_pose import UNKNOWN_HOP, RelativePose
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import RunError, SigmaSplatError
 from sigmasplat.plugins.outputs.floorplan.floor_plan import floor_plan
 from sigmasplat.plugins.papers.base import BASE
 from sigmasplat.run_folder.runs import RunFolder
-from sigmasplat.slam.checkpoint import checkpoint_of
+from sigmasplat.slam.slam_state import checkpoint_of
 
 Tensors = dict[str, torch.Tensor]
 

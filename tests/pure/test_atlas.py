@@ -8,7 +8,7 @@ from sigmasplat.data.atlas import Atlas
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.column import Column
 from sigmasplat.data.field import GaussianField
-from sigmasplat.data.places import Place, Places
+from sigmasplat.data.poses import Place, Places
 from sigmasplat.data.relative_pose import UNKNOWN_HOP, RelativePose
 from sigmasplat.data.submap import MemoryStore, Picture, RefinedStore, StorePart, Submap
 from sigmasplat.errors import SigmaSplatError

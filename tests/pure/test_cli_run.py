@@ -23,12 +23,11 @@ from lpips_weights import write_weights
 from sigmasplat import cli
 from sigmasplat.config import Config
 from sigmasplat.data.camera import Camera
-from sigmasplat.data.component import Component
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.mesh import Mesh
 from sigmasplat.data.submap import SubmapStore
-from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.data.trajectory import Component, Trajectory
 from sigmasplat.errors import SigmaSplatError, SourceError
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.cuda import stages as cuda_stages

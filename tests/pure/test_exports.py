@@ -12,10 +12,10 @@ from box_room import CAMERA, HIGH, LOW, seer, splats
 from room_run import FRAMES, LOST, PATH, T_ROOM, WORLD, Walls, made_run, picture
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
-from sigmasplat.data.component import Component
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.map_uncertainty import SHIPPED, Background, MapUncertainty, SplatStd
 from sigmasplat.data.mesh import Mesh
+from sigmasplat.data.trajectory import Component
 from sigmasplat.errors import ConfigError, RunError
 from sigmasplat.plugins.evaluation.reconstruct import FusionInput
 from sigmasplat.plugins.outputs.drawing.film import FilmScale, legend_strip

@@ -9,7 +9,7 @@ import two_submaps as room
 from sigmasplat.data.atlas import Atlas
 from sigmasplat.data.exposure import NEUTRAL, between, centred, exposed, unexposed
 from sigmasplat.data.frame import Frame
-from sigmasplat.data.places import Place, Places
+from sigmasplat.data.poses import Place, Places
 from sigmasplat.data.submap import MemoryStore, Picture, RefinedStore, Submap
 from sigmasplat.final.final_map import FinalMap, final_map
 from sigmasplat.fit.exposure import fit_exposure

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sigmasplat.data.component import APART, LOST, RELOCALISED, TRACKED
+from sigmasplat.data.trajectory import APART, LOST, RELOCALISED, TRACKED
 from sigmasplat.graph.confidence import Confidence, std_of
 from sigmasplat.graph.loops import Loop
 

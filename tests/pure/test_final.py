@@ -21,7 +21,7 @@ from sigmasplat.final.final_map import final_map, merged, survivors, z_order
 from sigmasplat.final.fusion import FusionView, count_keyframes, fuse, fusion_views
 from sigmasplat.final.refinement import KeyframeReader, refine
 from sigmasplat.fit.adam import ATTRIBUTE_RATES
-from sigmasplat.mapping.pruning import largest_weights, prune_by_weight
+from sigmasplat.mapping.densify import largest_weights, prune_by_weight
 from sigmasplat.render.reference.view import ReferenceView
 from two_submaps import (
     ANCHORS,

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from sigmasplat.data.component import outside_world, submaps_outside
-from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.data.trajectory import Trajectory, outside_world, submaps_outside
 from sigmasplat.plugins.evaluation.metrics.trajectory import auroc, brier, calibration, score_failures
 from sigmasplat.run_folder.frames import RunFrames
 

@@ -13,20 +13,18 @@ from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.column import Column
 from sigmasplat.data.field import GaussianField
-from sigmasplat.data.places import Place
-from sigmasplat.data.poses import KeyframePoses, Poses
-from sigmasplat.data.relative_pose import UNKNOWN_HOP, Kind, RelativePose
+from sigmasplat.data.poses import KeyframePoses, Place, Poses
+from sigmasplat.data.relative_pose import UNKNOWN_HOP, Edges, Kind, RelativePose
 from sigmasplat.data.submap import MemoryStore, Submap
 from sigmasplat.errors import RunError
 from sigmasplat.files.json_files import write_json
-from sigmasplat.graph.described_submaps import DescribedSubmaps, SubmapDescriptor
-from sigmasplat.graph.edges import Edges
+from sigmasplat.graph.candidates import DescribedSubmaps, SubmapDescriptor
 from sigmasplat.graph.loops import Loop, Loops
 from sigmasplat.graph.pose_graph import LoopVerdict
 from sigmasplat.run_folder.state import read_state, write_state
 from sigmasplat.run_folder.submaps import DiskStore
+from sigmasplat.slam.results import Step
 from sigmasplat.slam.slam import Slam
-from sigmasplat.slam.step_result import Step
 
 MOST_BYTES = 100
 """Most bytes of RAM per frame of a long run; with lists of objects it was 1200."""
@@ -144,7 +142,7 @@ def test_loops_are_read_as_they_were_tried_with_the_latest_verdict() -> None:
     loops.judge(2, LoopVerdict(2, 1, 0.9, 2.0, accepted=True))
     loops.append(loop(9))
     assert (loops[1].accepted, loops[1].reason) == (False, "the pose graph disagrees (χ² 40)")
-    assert (loops[2].chi2, loops[2].weight, loops[2].is_edge) == (2.0, 0.9, True)
+    assert (loops[2].chi2, loops[2].weight, loops[2].accepted) == (2.0, 0.9, True)
     assert [loops.is_rejected(i) for i in (0, 1, 2)] == [False, True, False], "loop 0 is no edge of the pose graph"
     assert len(copied) == 9 and copied[1].accepted and np.isnan(copied[2].chi2), "a copy keeps its verdicts"
     assert [each.query for each in loops.newly_closed(before)] == [9]

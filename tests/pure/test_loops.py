@@ -20,7 +20,7 @@ from sigmasplat.graph.closer import LoopCloser, make_descriptor
 from sigmasplat.graph.neighbourhood import Incidence, Neighbourhood
 from sigmasplat.graph.registration import Registration
 from sigmasplat.tracking.descriptors import OrientationGrid
-from sigmasplat.types import Task
+from sigmasplat.types import Task, completed
 
 CAMERA = Camera(4, 3, 4.0, 4.0, 1.5, 1.0)
 STEP = se3.exp(np.array([1.0, 0, 0, 0, 0, 0.0]))
@@ -79,7 +79,7 @@ def finished(closer: LoopCloser, atlas: Atlas, degrees: float, T_submap_last: np
     picture = Picture(np.zeros((3, 4, 3), np.uint8), np.ones((3, 4), np.float32))
     closer.store.save(submap, [picture, picture])
     looks = [np.array([np.cos(a), np.sin(a)], np.float32) for a in np.deg2rad([degrees, degrees + 20.0])]
-    closer.submap_finished(submap, looks, atlas, None)  # type: ignore[arg-type]
+    completed(closer.closing(submap, looks, atlas, None))  # type: ignore[arg-type]
 
 
 def test_a_true_loop_takes_the_drift_out_and_leaves_the_first_anchor(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,11 +16,10 @@ from lpips_weights import write_weights
 from paper_settings import FinalConfig, InputConfig
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
-from sigmasplat.data.component import Component
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.submap import Picture, Submap
-from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.data.trajectory import Component, Trajectory
 from sigmasplat.errors import RunError, SourceError
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.evaluation.evaluate import evaluate

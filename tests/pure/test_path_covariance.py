@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from paper_settings import FinalConfig
 from sigmasplat.data import se3
 from sigmasplat.data.atlas import Atlas
-from sigmasplat.data.hops import TrackedHops
-from sigmasplat.data.relative_pose import UNKNOWN_HOP, Kind, RelativePose
-from sigmasplat.final.pose_trust_region import reaching
+from sigmasplat.data.relative_pose import UNKNOWN_HOP, Kind, RelativePose, TrackedHops
+from sigmasplat.final.final_map import reaching
 from sigmasplat.fit.align import BIAS_PX
 from sigmasplat.graph.path_covariance import PathCovariance, recorded
 from sigmasplat.graph.pose_graph import PoseGraph, Sensitivity, optimise

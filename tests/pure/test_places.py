@@ -8,6 +8,7 @@ import pytest
 from sigmasplat.data import se3
 from sigmasplat.graph.candidates import (
     Candidate,
+    SubmapDescriptor,
     find_candidates,
     find_nearby,
     gate,
@@ -16,7 +17,6 @@ from sigmasplat.graph.candidates import (
     self_similarity,
     variance_weights,
 )
-from sigmasplat.graph.described_submaps import SubmapDescriptor
 
 DEGREE = np.pi / 180
 

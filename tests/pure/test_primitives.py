@@ -15,7 +15,7 @@ from sigmasplat.data.field import COLUMNS, GaussianField
 from sigmasplat.data.frame import Frame
 from sigmasplat.fit.field import fit_field
 from sigmasplat.fit.target import Keyframe, Target
-from sigmasplat.mapping.pruning import depths, fade, splat_uncertainty, still_uncertain
+from sigmasplat.mapping.densify import depths, fade, splat_uncertainty, still_uncertain
 from sigmasplat.render.backend import make_view
 from sigmasplat.render.channels import features_of
 from sigmasplat.render.reference import operators as reference

@@ -19,8 +19,7 @@ from sigmasplat.data.submap import MemoryStore, Picture, Submap
 from sigmasplat.fit.target import Target
 from sigmasplat.graph import localisations, registration
 from sigmasplat.graph.candidates import Candidate, SubmapPair
-from sigmasplat.graph.feature_guesses import FeatureGuesses
-from sigmasplat.graph.localisations import Localisation
+from sigmasplat.graph.localisations import FeatureGuesses, Localisation
 from sigmasplat.graph.registration import Registrar, Registration, drift_between
 from sigmasplat.mapping.seeding import make_splats
 from sigmasplat.render.backend import make_view

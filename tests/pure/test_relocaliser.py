@@ -24,9 +24,8 @@ from sigmasplat.render.view import View
 from sigmasplat.run_folder.submaps import DiskStore
 from sigmasplat.tracking.feature_image import FeatureImage, detail_of, gray_levels, pose_by_features
 from sigmasplat.tracking.features import Extractor, make_extractor
-from sigmasplat.tracking.known_map import KnownMap
 from sigmasplat.tracking.prepared_frame import PreparedFrame
-from sigmasplat.tracking.relocaliser import Relocaliser, Relocation
+from sigmasplat.tracking.relocaliser import KnownMap, Relocaliser, Relocation
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 

@@ -18,14 +18,14 @@ from ros_reading import covariance, decoded, image, links, matrix, points, pose,
 from sigmasplat.data import se3
 from sigmasplat.data.atlas import Atlas
 from sigmasplat.data.camera import Camera
-from sigmasplat.data.component import LOST as LOST_STATE, RELOCALISED, TRACKED
 from sigmasplat.data.relative_pose import UNKNOWN_HOP, RelativePose
+from sigmasplat.data.trajectory import LOST as LOST_STATE, RELOCALISED, TRACKED
 from sigmasplat.graph.path_covariance import PathCovariance
 from sigmasplat.plugins.outputs.floorplan.floor_plan import FREE, OBJECT, UNOBSERVED, WALL, FloorPlan
 from sigmasplat.plugins.robots.odometry import LiveOdometry, has_motion, odometry_poses
 from sigmasplat.plugins.robots.outlet import MOST_BULKY, MOST_JOBS, Outlet
 from sigmasplat.plugins.robots.ros_messages import T_LINK_OPTICAL, grids, levelled_map, link_pose, ros_covariance
-from sigmasplat.slam.checkpoint import path_errors
+from sigmasplat.slam.slam_state import path_errors
 
 pytest.importorskip("rosbags", reason="rosbags is not installed (extra `ros`)")
 from sigmasplat.plugins.robots.bag import BagSink

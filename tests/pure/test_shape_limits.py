@@ -3,7 +3,7 @@
 import torch
 
 from sigmasplat.data.field import COLUMNS, GaussianField
-from sigmasplat.final.shape_limits import limit_shapes
+from sigmasplat.final.refinement import limit_shapes
 
 BALL, DISC, NEEDLE, BLADE = (0.1, 0.1, 0.1), (0.2, 0.001, 0.2), (0.01, 0.01, 0.9), (0.0001, 0.9, 0.02)
 SCALES = COLUMNS["log_scales"]

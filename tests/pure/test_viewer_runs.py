@@ -17,7 +17,7 @@ from sigmasplat.config import Config
 from sigmasplat.config.presets import default_preset, preset
 from sigmasplat.config.text import override
 from sigmasplat.data import se3
-from sigmasplat.data.component import Component
+from sigmasplat.data.trajectory import Component
 from sigmasplat.errors import ConfigError, RunError, SigmaSplatError
 from sigmasplat.plugins.evaluation.evaluate import evaluate
 from sigmasplat.plugins.evaluation.reconstruct import FusionInput

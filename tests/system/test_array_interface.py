@@ -20,7 +20,7 @@ from sigmasplat.data import se3
 from sigmasplat.errors import ConfigError, SourceError
 from sigmasplat.graph.path_covariance import PathCovariance
 from sigmasplat.realtime.system import RealTime
-from sigmasplat.slam.step_result import Step
+from sigmasplat.slam.results import Step
 from small_room import SMALL, frame_at, frames
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")

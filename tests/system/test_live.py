@@ -15,7 +15,7 @@ from sigmasplat.plugins.sources import open_source
 from sigmasplat.plugins.sources.realsense import WARM_UP_FRAMES
 from sigmasplat.realtime.system import RealTime
 from sigmasplat.run_folder.runs import RunFolder
-from sigmasplat.slam.step_result import Step
+from sigmasplat.slam.results import Step
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 

@@ -17,9 +17,9 @@ from schedules import AtOnce, Drawn, Late
 from sigmasplat.config import Config
 from sigmasplat.config.presets import preset
 from sigmasplat.config.text import override
-from sigmasplat.data.component import LOST, RELOCALISED
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.submap import MemoryStore
+from sigmasplat.data.trajectory import LOST, RELOCALISED
 from sigmasplat.errors import RunError
 from sigmasplat.plugins.evaluation.metrics.trajectory import ate
 from sigmasplat.realtime.schedule import MappingThread

@@ -18,20 +18,18 @@ from sigmasplat.config import Config
 from sigmasplat.config.presets import preset
 from sigmasplat.config.text import override
 from sigmasplat.data.column import Column
-from sigmasplat.data.hops import TrackedHops
-from sigmasplat.data.places import Places
-from sigmasplat.data.poses import KeyframePoses, Poses
+from sigmasplat.data.poses import KeyframePoses, Places, Poses
+from sigmasplat.data.relative_pose import Edges, TrackedHops
 from sigmasplat.errors import RunError
-from sigmasplat.graph.edges import Edges
 from sigmasplat.graph.loops import Loops
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.run.resume import REFINEMENT_CLASSES
 from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.run_folder.state import read_state, write_state
 from sigmasplat.run_folder.submaps import DiskStore
+from sigmasplat.slam.results import Steps
 from sigmasplat.slam.saved_state import CLASSES, fixed, restore, state_of
 from sigmasplat.slam.slam import Slam
-from sigmasplat.slam.steps import Steps
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 

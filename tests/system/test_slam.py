@@ -19,8 +19,8 @@ from sigmasplat.plugins.evaluation.metrics.image import psnr
 from sigmasplat.plugins.evaluation.metrics.trajectory import ate
 from sigmasplat.plugins.sources import SyntheticRoom
 from sigmasplat.render import render
+from sigmasplat.slam.results import Step
 from sigmasplat.slam.slam import Slam
-from sigmasplat.slam.step_result import Step
 from small_room import SMALL, frames, walk
 
 _core = pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")

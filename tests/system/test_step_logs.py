@@ -10,7 +10,7 @@ from command_line import exit_code
 from sigmasplat.plugins.papers.base import BASE
 from sigmasplat.run import step_logs
 from sigmasplat.run_folder.runs import RunFolder
-from sigmasplat.slam.step_result import Step
+from sigmasplat.slam.results import Step
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 

@@ -9,10 +9,8 @@ from numpy.typing import NDArray
 from sigmasplat.data import se3
 from sigmasplat.data.column import Column
 from sigmasplat.data.exposure import between
-from sigmasplat.data.hops import TrackedHops
-from sigmasplat.data.places import Place, Places
-from sigmasplat.data.poses import KeyframePoses, Poses
-from sigmasplat.data.relative_pose import UNKNOWN_HOP, RelativePose
+from sigmasplat.data.poses import KeyframePoses, Place, Places, Poses
+from sigmasplat.data.relative_pose import UNKNOWN_HOP, RelativePose, TrackedHops
 from sigmasplat.types import Matrix
 
 

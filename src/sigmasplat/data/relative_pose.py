@@ -1,10 +1,13 @@
-"""The measured pose of one camera or submap relative to another one."""
+"""Measured poses relative to each other, one by one and in columns: hops between keyframes, edges of the pose graph."""
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
+from sigmasplat.data.column import Column, Records
 from sigmasplat.types import Matrix
 
 Kind = Literal["hop", "odometry", "loop", "relocalisation", "join"]
@@ -51,3 +54,151 @@ class RelativePose:
 
 
 UNKNOWN_HOP = RelativePose.hop(np.eye(4))
+
+
+@dataclass(eq=False)
+class TrackedHops(Records[RelativePose]):
+    """The hops to all keyframes, submap by submap. rows [K, 59]: submap, then T_camera_before, covariance and bias by
+    rows."""
+
+    POSE_COLUMNS: ClassVar[slice] = slice(1, 17)
+    """The columns of `rows` that hold a pose."""
+
+    rows: Column = field(default_factory=lambda: Column.of(np.float64, 1 + 16 + 36 + 6))
+
+    @staticmethod
+    def of(known: Iterable[tuple[int, RelativePose]]) -> "TrackedHops":
+        """Return hops in their order, each with the submap of its keyframe."""
+        hops = TrackedHops()
+        for submap, hop in known:
+            hops.append(submap, hop)
+        return hops
+
+    def append(self, submap: int, hop: RelativePose) -> None:
+        """Append the hop to the next keyframe, which is in a submap that is not before the last one."""
+        self.rows.append([submap, *hop.T_a_b.ravel(), *hop.covariance.ravel(), *hop.bias])
+
+    def begins_submap(self, i: int) -> bool:
+        """Return whether a keyframe is the first one of its submap; no hop leads to it."""
+        submap = self.rows.used[:, 0]
+        return bool(i == 0 or submap[i] != submap[i - 1])
+
+    @property
+    def T_camera_before(self) -> Matrix:
+        """Return the motion of each hop [K, 4, 4]."""
+        return self.rows.used[:, 1:17].reshape(-1, 4, 4).copy()
+
+    @property
+    def covariance(self) -> Matrix:
+        """Return the covariance of each hop [K, 6, 6]."""
+        return self.rows.used[:, 17:53].reshape(-1, 6, 6).copy()
+
+    @property
+    def bias(self) -> Matrix:
+        """Return the bias of each hop [K, 6]."""
+        return self.rows.used[:, 53:].copy()
+
+    def _record(self, i: int) -> RelativePose:
+        row = self.rows.used[i]
+        T_camera_before, covariance = row[1:17].reshape(4, 4).copy(), row[17:53].reshape(6, 6).copy()
+        return RelativePose.hop(T_camera_before, covariance, row[53:].copy())
+
+
+@dataclass(frozen=True, eq=False)
+class Hops:
+    """The motion to each of K keyframes from the one before it in its submap, as tracking found it:
+    T_camera_before [K, 4, 4], covariance [K, 6, 6], bias [K, 6]."""
+
+    T_camera_before: Matrix
+    covariance: Matrix
+    bias: Matrix
+
+    def known(self, row: int) -> Matrix | None:
+        """Return the covariance [6, 6] that tracking estimated for one hop, with its bias; None if it is not known."""
+        covariance = self.covariance[row]
+        return covariance + np.diag(self.bias[row] ** 2) if np.isfinite(covariance).all() else None
+
+
+NUMBERS = 5
+"""Columns before the motion, see `Edges.rows`."""
+TRUSTED: tuple[Kind, ...] = ("odometry", "relocalisation", "join")
+"""The kinds of edges that the pose graph does not judge."""
+INFORMATION = slice(NUMBERS + 16, NUMBERS + 16 + 36)
+DRIFT = slice(NUMBERS + 16 + 36, None)
+
+
+@dataclass(eq=False)
+class Edges(Records[RelativePose]):
+    """Edges in their order. An edge is made when it is read.
+
+    rows [E, 93]: a, b, row of the loop that the edge is, or −1 minus its place in
+    `TRUSTED`, both keyframes, T_a_b, information and
+    drift by rows.
+    """
+
+    POSE_COLUMNS: ClassVar[slice] = slice(NUMBERS, NUMBERS + 16)
+    """The columns of `rows` that hold a pose."""
+
+    rows: Column = field(default_factory=lambda: Column.of(np.float64, NUMBERS + 16 + 2 * 36))
+
+    @staticmethod
+    def of(known: Iterable[RelativePose]) -> "Edges":
+        """Return edges in their order; each loop has row 0."""
+        if isinstance(known, Edges):
+            return known
+        edges = Edges()
+        for edge in known:
+            edges.append(edge)
+        return edges
+
+    def append(self, edge: RelativePose, loop_row: int = 0) -> None:
+        """Append an edge; loop_row: of a loop, its row among all pairs that were tried."""
+        loop_row = -1 - TRUSTED.index(edge.kind) if edge.kind in TRUSTED else loop_row
+        numbers, matrices = (edge.a, edge.b, loop_row, *edge.keyframes), (edge.T_a_b, edge.information, edge.drift)
+        self.rows.append(np.concatenate([numbers, *(matrix.ravel() for matrix in matrices)]))
+
+    @property
+    def ends(self) -> NDArray[np.int64]:
+        """Return a and b of each edge [E, 2]."""
+        return np.asarray(self.rows.used[:, :2].astype(np.int64))
+
+    @property
+    def T_a_b(self) -> Matrix:
+        """Return the motion of each edge [E, 4, 4]."""
+        return self.rows.used[:, NUMBERS : NUMBERS + 16].reshape(-1, 4, 4).copy()
+
+    @property
+    def information(self) -> Matrix:
+        """Return the information of each edge [E, 6, 6]."""
+        return self.rows.used[:, INFORMATION].reshape(-1, 6, 6).copy()
+
+    @property
+    def keyframes(self) -> NDArray[np.int64]:
+        """Return both keyframes of each edge [E, 2]."""
+        return np.asarray(self.rows.used[:, 3:NUMBERS].astype(np.int64))
+
+    @property
+    def drift(self) -> Matrix:
+        """Return the drift in each edge [E, 6, 6]."""
+        return self.rows.used[:, DRIFT].reshape(-1, 6, 6).copy()
+
+    @property
+    def is_loop(self) -> NDArray[np.bool_]:
+        """Return which edges are loops [E]."""
+        return np.asarray(self.rows.used[:, 2] >= 0)
+
+    def taken(self, chosen: NDArray[np.bool_]) -> "Edges":
+        """Return a copy of some edges."""
+        rows = self.rows.used[chosen]
+        return Edges(Column(rows, len(rows)))
+
+    def loop_rows(self, edges: Sequence[int]) -> NDArray[np.int64]:
+        """Return the row of the loop that each of some edges is [n], below 0 for a trusted edge."""
+        return np.asarray(self.rows.used[np.array(edges, np.intp), 2].astype(np.int64))
+
+    def _record(self, i: int) -> RelativePose:
+        row = self.rows.used[i].copy()
+        a, b, loop_row, in_a, in_b = (int(number) for number in row[:NUMBERS].tolist())
+        information, drift = (row[columns].reshape(6, 6) for columns in (INFORMATION, DRIFT))
+        kind = "loop" if loop_row >= 0 else TRUSTED[-1 - loop_row]
+        return RelativePose(a, b, row[self.POSE_COLUMNS].reshape(4, 4), information, kind, (in_a, in_b), drift)

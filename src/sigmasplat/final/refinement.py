@@ -4,9 +4,11 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field as dataclass_field, replace
 from functools import lru_cache
+from math import log
 from typing import Any, Protocol
 
 import numpy as np
+import torch
 
 from sigmasplat.config import Config, FinalConfig, MappingConfig
 from sigmasplat.data import se3
@@ -15,14 +17,35 @@ from sigmasplat.data.exposure import NEUTRAL, centred
 from sigmasplat.data.field import COLUMNS, GaussianField
 from sigmasplat.data.submap import SubmapStore
 from sigmasplat.errors import SigmaSplatError
-from sigmasplat.final.shape_limits import limit_shapes
 from sigmasplat.fit.adam import BETA2, Rates, VectorAdam
 from sigmasplat.fit.exposure import fit_exposure
 from sigmasplat.fit.field import fit_field
 from sigmasplat.fit.target import Keyframe, Target
-from sigmasplat.mapping.pruning import prune_by_weight
+from sigmasplat.mapping.densify import prune_by_weight
 from sigmasplat.render.view import View
 from sigmasplat.types import Matrix, Progress
+
+
+def limit_shapes(field: GaussianField, axis_ratio: float, needle_ratio: float) -> None:
+    """Limit the ratios of the axes of every splat; 0 turns a limit off.
+
+    The longest axis becomes at most `needle_ratio` times the second longest, and the two shorter axes at least
+    1/`axis_ratio` of the longest. Adam's moments of changed axes are cleared.
+    """
+    columns = COLUMNS["log_scales"]
+    before = field.params[:, columns]
+    limited = before
+    if needle_ratio:
+        second = before.median(1, keepdim=True).values
+        limited = torch.minimum(limited, second + log(needle_ratio))
+    if axis_ratio:
+        longest = limited.amax(1, keepdim=True)
+        limited = torch.maximum(limited, longest - log(axis_ratio))
+    changed = limited != before
+    for moment in (field.moment1, field.moment2):
+        moment[:, columns] = moment[:, columns].masked_fill(changed, 0.0)
+    field.params[:, columns] = limited
+
 
 EXPOSURE_FROM = 0.1
 """Exposures are fitted from this share of the refinement on: the merged map has the colours of single submaps."""

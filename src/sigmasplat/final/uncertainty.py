@@ -12,16 +12,15 @@ from sigmasplat.config import Config
 from sigmasplat.data import se3
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.map_uncertainty import COLOR_PARTS, DEPTH_PARTS, SHIPPED, Background, Calibration, MapUncertainty
-from sigmasplat.data.selection import evenly_spread
 from sigmasplat.data.submap import SubmapStore
+from sigmasplat.data.trajectory import evenly_spread
 from sigmasplat.final.refinement import KeyframeReader
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.render.view import View
 from sigmasplat.types import Matrix, Progress, no_progress
-from sigmasplat.uncertainty.calibration import fit_weights
+from sigmasplat.uncertainty.calibration import fit_weights, splat_std
 from sigmasplat.uncertainty.predictive import COVERED, variance_parts
 from sigmasplat.uncertainty.splat_residuals import background_of, splat_residuals, squared_errors
-from sigmasplat.uncertainty.splat_std import splat_std
 
 PIXELS = 4000
 """About this many pixels of a probe view, every k-th one, calibrate the weights."""

@@ -11,12 +11,18 @@ from sigmasplat.data import se3
 from sigmasplat.data.atlas import Atlas
 from sigmasplat.data.column import Column
 from sigmasplat.data.field import COLUMNS
-from sigmasplat.data.relative_pose import RelativePose
+from sigmasplat.data.relative_pose import Edges, RelativePose
 from sigmasplat.data.submap import Submap, SubmapStore
 from sigmasplat.errors import ConfigError
-from sigmasplat.graph.candidates import SubmapPair, find_candidates, find_nearby, opacity_ratio, pairs_to_register
-from sigmasplat.graph.described_submaps import DescribedSubmaps, SubmapDescriptor
-from sigmasplat.graph.edges import Edges
+from sigmasplat.graph.candidates import (
+    DescribedSubmaps,
+    SubmapDescriptor,
+    SubmapPair,
+    find_candidates,
+    find_nearby,
+    opacity_ratio,
+    pairs_to_register,
+)
 from sigmasplat.graph.loops import Loop, Loops, described
 from sigmasplat.graph.neighbourhood import MOST_FREE, Incidence, Neighbourhood, numbered
 from sigmasplat.graph.pose_graph import PoseGraph, most_chi2
@@ -24,7 +30,7 @@ from sigmasplat.graph.registration import Registrar
 from sigmasplat.render.view import View
 from sigmasplat.tracking.descriptors import Descriptor, OrientationGrid
 from sigmasplat.tracking.features import Extractor
-from sigmasplat.types import Matrix, Task, completed
+from sigmasplat.types import Matrix, Task
 
 RIGID = np.diag(np.repeat([1e-4, 1e-5], 3) ** -2.0)
 """Information of the edge to a submap of an earlier session: 0.1 mm and 0.0006°. Its map is finished, and poses in its
@@ -116,23 +122,14 @@ class LoopCloser:
         c, log_variances = self.config.loops, submap.field.params[:, COLUMNS["log_variances"]].numpy()
         return opacity_ratio(submap.field.opacities.numpy(), log_variances, c.tau, c.weight_max)
 
-    def submap_finished(
-        self, submap: Submap, descriptors: Sequence[NDArray[np.float32]], atlas: Atlas, view: View
-    ) -> list[Loop]:
-        """Look for loops from a finished submap to earlier ones; if one is found, correct the anchors.
-
-        descriptors [D]: one per keyframe, in order, of unit norm or zero. Returns the pairs that were tried, each with
-        the latest verdict.
-        """
-        return completed(self.closing(submap, descriptors, atlas, view))
-
     def closing(
         self, submap: Submap, descriptors: Sequence[NDArray[np.float32]], atlas: Atlas, view: View
     ) -> Task[list[Loop]]:
-        """Look for loops as `submap_finished` does, in slices of one alignment.
+        """Look for loops from a finished submap to earlier ones, in slices of one alignment; if one is found, correct
+        the anchors. Returns the pairs that were tried, each with the latest verdict.
 
-        Nothing changes before the last slice: a search that was begun can be made again from its first slice, as long
-        as the anchors stay.
+        descriptors [D]: one per keyframe, in order, of unit norm or zero. Nothing changes before the last
+        slice: a search that was begun can be made again from its first slice, as long as the anchors stay.
         """
         if not self.config.loops.close or not descriptors:
             return []

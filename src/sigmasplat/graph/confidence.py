@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from sigmasplat.data.component import APART, LOST, RELOCALISED
+from sigmasplat.data.trajectory import APART, LOST, RELOCALISED
 from sigmasplat.graph.loops import Loop
 from sigmasplat.types import Matrix
 

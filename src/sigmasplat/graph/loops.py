@@ -1,7 +1,6 @@
 """All pairs of submaps that were tried as loops, in columns."""
 
 from dataclasses import dataclass, field, replace
-from math import isfinite
 from typing import Any, ClassVar
 
 import numpy as np
@@ -45,11 +44,6 @@ class Loop:
     T_query_database: Matrix
     chi2: float = float("nan")
     weight: float = float("nan")
-
-    @property
-    def is_edge(self) -> bool:
-        """Return whether the registration succeeded: the loop is an edge of the pose graph, accepted by it or not."""
-        return isfinite(self.chi2) or self.accepted
 
     def record(self) -> dict[str, Any]:
         """Return plain values, T_query_database as 4 rows."""

@@ -26,11 +26,9 @@ from torch import Tensor
 
 from sigmasplat.data import se3
 from sigmasplat.data.atlas import Atlas
-from sigmasplat.data.hops import Hops
-from sigmasplat.data.places import Places
-from sigmasplat.data.relative_pose import RelativePose
-from sigmasplat.data.selection import evenly_spread
-from sigmasplat.graph.edges import Edges
+from sigmasplat.data.poses import Places
+from sigmasplat.data.relative_pose import Edges, Hops, RelativePose
+from sigmasplat.data.trajectory import evenly_spread
 from sigmasplat.graph.pose_graph import Sensitivity
 from sigmasplat.graph.variance_factors import variance_factors
 from sigmasplat.tracking.drift import UNKNOWN

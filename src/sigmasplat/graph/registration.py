@@ -21,8 +21,7 @@ from sigmasplat.fit.references import Reference, keyframe_reference, map_referen
 from sigmasplat.fit.target import Target
 from sigmasplat.fit.tracking_loss import PoseMaps
 from sigmasplat.graph.candidates import SubmapPair
-from sigmasplat.graph.feature_guesses import FeatureGuesses
-from sigmasplat.graph.localisations import Localisation, combined, consensus, inverted, mean_covariance
+from sigmasplat.graph.localisations import FeatureGuesses, Localisation, combined, consensus, inverted, mean_covariance
 from sigmasplat.render.view import View
 from sigmasplat.tracking.drift import drift_to, symmetric, systematic_errors
 from sigmasplat.tracking.features import Extractor

@@ -20,9 +20,17 @@ from sigmasplat.fit.densify_stats import DensifyStats
 from sigmasplat.fit.field import FieldFit, fitting
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.fit.tracking_loss import PoseMaps
-from sigmasplat.mapping.densify import densify_mask, multiply, split, too_large, too_wide
+from sigmasplat.mapping.densify import (
+    densify_mask,
+    fade,
+    multiply,
+    splat_uncertainty,
+    split,
+    still_uncertain,
+    too_large,
+    too_wide,
+)
 from sigmasplat.mapping.moving import carve, mask_keyframes
-from sigmasplat.mapping.pruning import fade, splat_uncertainty, still_uncertain
 from sigmasplat.mapping.seeding import first_pixels, later_pixels, make_splats, thin_out
 from sigmasplat.mapping.window import choose_window, dominating, draw_keyframes
 from sigmasplat.render.view import View

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from sigmasplat.data import se3
-from sigmasplat.data.component import APART, RELOCALISED
 from sigmasplat.data.relative_pose import UNKNOWN_HOP
+from sigmasplat.data.trajectory import APART, RELOCALISED
 from sigmasplat.fit.align import Alignment
 from sigmasplat.fit.pose import fit_pose_align
 from sigmasplat.graph.loops import Loops
@@ -17,11 +17,10 @@ from sigmasplat.graph.newest_covariance import NO_ERRORS
 from sigmasplat.realtime.messages import Call, Offer, Search, Snapshot, TrackedFrame
 from sigmasplat.slam.listeners import Before, Correction, correction_since
 from sigmasplat.slam.mapping_backend import MappingBackend
-from sigmasplat.slam.step_result import StepTimer
+from sigmasplat.slam.results import StepTimer
 from sigmasplat.tracking.pose_validation import is_better
-from sigmasplat.tracking.prepared_frame import PreparedFrame
+from sigmasplat.tracking.prepared_frame import PreparedFrame, TrackedKeyframe, mapped_keyframe
 from sigmasplat.tracking.relocaliser import Relocation
-from sigmasplat.tracking.tracked_keyframe import TrackedKeyframe, mapped_keyframe
 from sigmasplat.types import Matrix
 
 AS_GOOD = 0.99

@@ -1,15 +1,15 @@
 """The clock of the camera: track frames against the newest snapshot of the map, and choose keyframes."""
 
 import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from sigmasplat.config import Config
 from sigmasplat.data import se3
-from sigmasplat.data.component import APART, RELOCALISED, TRACKED
 from sigmasplat.data.field import GaussianField
+from sigmasplat.data.trajectory import APART, RELOCALISED, TRACKED
 from sigmasplat.fit.pose import PoseFit
 from sigmasplat.fit.references import Reference
 from sigmasplat.fit.target import Target
@@ -19,16 +19,15 @@ from sigmasplat.graph.newest_covariance import NO_ERRORS
 from sigmasplat.mapping.validation_views import ValidationViews
 from sigmasplat.realtime.messages import Offer, Search, Snapshot, TrackedFrame
 from sigmasplat.render.view import View
-from sigmasplat.slam.step_result import Step, StepTimer, SubmapState, make_step
+from sigmasplat.slam.results import Step, StepTimer, SubmapState, make_step
 from sigmasplat.tracking.fitted_depth import fitted_keyframe, fitted_to_map
 from sigmasplat.tracking.frame_estimate import FrameEstimate
 from sigmasplat.tracking.keyframe_rule import becomes_keyframe, is_held_back, is_mappable, may_validate
 from sigmasplat.tracking.pose_validation import is_questionable
-from sigmasplat.tracking.prepared_frame import PreparedFrame, refuse_first_without_depth
+from sigmasplat.tracking.prepared_frame import PreparedFrame, TrackedKeyframe, refuse_first_without_depth
 from sigmasplat.tracking.recovery import Recovery, usable
-from sigmasplat.tracking.tracked_keyframe import TrackedKeyframe
 from sigmasplat.tracking.tracker import Tracker
-from sigmasplat.types import Matrix
+from sigmasplat.types import Matrix, ShouldStop, never
 
 NOTHING = GaussianField.empty()
 
@@ -73,9 +72,7 @@ class FrontEnd:
         moved = not np.array_equal(before, now)
         if moved:
             T_new_old = now @ se3.inverse(before)
-            self.tracker.move_by(T_new_old)
-            if snapshot.frame == self.frames - 1:
-                self.tracker.previous = now  # without rounding
+            self.tracker.move_by(T_new_old, now if snapshot.frame == self.frames - 1 else None)
         kept = {n: T_new_old @ T if moved else T for n, T in self.poses.items() if n > snapshot.newest}
         self.poses = kept | dict(snapshot.poses)
         if snapshot.state:
@@ -89,12 +86,10 @@ class FrontEnd:
         self.confidence.spread_m, self.snapshot = [snapshot.spread_m], snapshot
 
     def _found(self, snapshot: Snapshot) -> None:
-        """Continue where the camera was estimate, or in a new map."""
+        """Continue where the camera was found, or in a new map."""
         self.recovery.found()
         self.found = snapshot.state
-        self.tracker.velocity, self.tracker.detector = np.eye(4), self.tracker.detector.cleared()
-        if snapshot.state == APART:
-            self.tracker.lost = False
+        self.tracker.continue_elsewhere(apart=snapshot.state == APART)
 
     def adopt_newest(self, snapshot: Snapshot) -> None:
         """Adopt a snapshot that follows others which were not adopted."""
@@ -111,9 +106,7 @@ class FrontEnd:
 
     # ---- a frame ----
 
-    def track(
-        self, seen: PreparedFrame, view: View, timer: StepTimer, should_stop: Callable[[], bool] = lambda: False
-    ) -> TrackedFrame:
+    def track(self, seen: PreparedFrame, view: View, timer: StepTimer, should_stop: ShouldStop = never) -> TrackedFrame:
         """Track a frame, and decide whether it becomes a keyframe; should_stop: as in `Tracker.track`."""
         number, offer, search = self.frames, None, None
         if number == 0:

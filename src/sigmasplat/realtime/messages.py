@@ -14,10 +14,9 @@ from sigmasplat.fit.target import Target
 from sigmasplat.graph.loops import Loops
 from sigmasplat.graph.newest_covariance import NO_ERRORS, PoseErrors
 from sigmasplat.slam.listeners import Correction
-from sigmasplat.slam.step_result import Step, SubmapState
+from sigmasplat.slam.results import Step, SubmapState
 from sigmasplat.tracking.moving.dynamic_mask import DynamicMask
-from sigmasplat.tracking.prepared_frame import PreparedFrame
-from sigmasplat.tracking.tracked_keyframe import TrackedKeyframe
+from sigmasplat.tracking.prepared_frame import PreparedFrame, TrackedKeyframe
 from sigmasplat.types import Matrix
 
 Poses = Mapping[int, Matrix]

@@ -7,11 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sigmasplat.data.component import LOST, Component
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.map_uncertainty import MapUncertainty
-from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.data.trajectory import LOST, Component, Trajectory
 from sigmasplat.errors import SourceError
 from sigmasplat.graph.loops import Loops
 from sigmasplat.native.threads import set_kernel_threads
@@ -22,13 +21,13 @@ from sigmasplat.realtime.schedule import MappingThread, Schedule
 from sigmasplat.render.view import View
 from sigmasplat.slam.array_interface import ArrayInterface
 from sigmasplat.slam.listeners import Events
+from sigmasplat.slam.results import Step, StepTimer
 from sigmasplat.slam.slam import Slam
-from sigmasplat.slam.step_result import Step, StepTimer
 from sigmasplat.tracking.features import extractor_of
 from sigmasplat.tracking.prepared_frame import view_of, working_frame
 from sigmasplat.tracking.recovery import Recovery
 from sigmasplat.tracking.tracker import Tracker
-from sigmasplat.types import Matrix, Progress, no_progress
+from sigmasplat.types import Matrix, Progress, ShouldStop, never, no_progress
 
 
 class RealTime(ArrayInterface):
@@ -48,7 +47,7 @@ class RealTime(ArrayInterface):
         slam: Slam,
         schedule: Schedule | None = None,
         covariances: bool = True,
-        should_stop: Callable[[], bool] = lambda: False,
+        should_stop: ShouldStop = never,
     ) -> None:
         self.slam, self._hurried, c = slam, should_stop, slam.config
         self._extractor = extractor_of(c)  # not shared with the mapping thread

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from sigmasplat.graph.loops import Loop
-    from sigmasplat.slam.step_result import Step
+    from sigmasplat.slam.results import Step
 
 
 class Callback:

@@ -18,10 +18,9 @@ from sigmasplat.fit.compare import Comparison
 from sigmasplat.run.finished_map import FinishedMap
 from sigmasplat.run_folder.trajectory import write_trajectory
 from sigmasplat.tracking.features import make_extractor
-from sigmasplat.tracking.known_map import KnownMap
 from sigmasplat.tracking.prepared_frame import observe, view_of, working_frame
 from sigmasplat.tracking.recovery import usable
-from sigmasplat.tracking.relocaliser import Relocaliser, Relocation, SearchResult
+from sigmasplat.tracking.relocaliser import KnownMap, Relocaliser, Relocation, SearchResult
 from sigmasplat.types import Matrix
 
 FOUND, APART, NOT_FOUND = "found", "apart", "not found"

@@ -13,7 +13,7 @@ from sigmasplat.config import Config
 from sigmasplat.data import se3
 from sigmasplat.errors import SourceError
 from sigmasplat.input.source import Source
-from sigmasplat.tracking.depth_shape import depth_at
+from sigmasplat.tracking.depth_fit import depth_at
 from sigmasplat.tracking.feature_image import FeatureImage, LateDetail, motion_by_features
 from sigmasplat.tracking.features import Extractor, Features, make_extractor
 from sigmasplat.types import Matrix

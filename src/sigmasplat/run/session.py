@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sigmasplat.config import Config
-from sigmasplat.data.component import RELOCALISED
 from sigmasplat.data.frame import Frame
+from sigmasplat.data.trajectory import RELOCALISED
 from sigmasplat.errors import RunError
 from sigmasplat.files.lock import LOCK, locked, no_warning
 from sigmasplat.input.source import Source
@@ -28,8 +28,8 @@ from sigmasplat.run_folder.runs import ALL_POSES, RunFolder
 
 if TYPE_CHECKING:
     from sigmasplat.realtime.system import RealTime
+    from sigmasplat.slam.results import Step
     from sigmasplat.slam.slam import Slam
-    from sigmasplat.slam.step_result import Step
 
 RUNS = Path("runs")
 LOOPS_GROWTH = 1.05

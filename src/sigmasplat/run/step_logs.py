@@ -18,7 +18,7 @@ from sigmasplat.run.callbacks import Callback
 from sigmasplat.run_folder.runs import RunFolder
 
 if TYPE_CHECKING:
-    from sigmasplat.slam.step_result import Step
+    from sigmasplat.slam.results import Step
 
 EXTRA = "logs"
 CSV, TENSORBOARD, RERUN = "steps.csv", "tensorboard", "steps{}.rrd"

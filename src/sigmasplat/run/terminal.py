@@ -18,14 +18,14 @@ from rich.progress import (
 )
 from rich.table import Table
 
-from sigmasplat.data.component import APART, RELOCALISED
+from sigmasplat.data.trajectory import APART, RELOCALISED
 from sigmasplat.run.callbacks import Callback
 from sigmasplat.run.figures import shares
 from sigmasplat.types import Progress
 
 if TYPE_CHECKING:
     from sigmasplat.graph.loops import Loop
-    from sigmasplat.slam.step_result import Step
+    from sigmasplat.slam.results import Step
 
 PLAIN_LINES_EVERY_S = 10.0
 Show = Callable[[int, int | None, str], None]

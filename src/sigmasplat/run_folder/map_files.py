@@ -7,7 +7,6 @@ from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 
-from sigmasplat.data.component import Component
 from sigmasplat.data.map_uncertainty import (
     COLOR_PARTS,
     DEPTH_PARTS,
@@ -18,6 +17,7 @@ from sigmasplat.data.map_uncertainty import (
     MapUncertainty,
     SplatStd,
 )
+from sigmasplat.data.trajectory import Component
 from sigmasplat.errors import RunError
 from sigmasplat.files.atomic import make_folder
 from sigmasplat.files.json_files import read_json, write_json

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sigmasplat.data.component import APART, LOST, RELOCALISED, TRACKED
+from sigmasplat.data.trajectory import APART, LOST, RELOCALISED, TRACKED
 from sigmasplat.errors import RunError
 
 Test = Callable[[Any], bool]

@@ -11,10 +11,9 @@ from PIL import Image
 from torch import Tensor
 
 from sigmasplat.config import Config
-from sigmasplat.data.component import Component
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.map_uncertainty import MapUncertainty, SplatStd
-from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.data.trajectory import Component, Trajectory
 from sigmasplat.errors import RunError
 from sigmasplat.files import machine
 from sigmasplat.files.atomic import part_of, remove_leftovers, replacing, sync_file, write_text

@@ -11,7 +11,7 @@ from sigmasplat.data.frame_arrays import Array, ColorOrder, frame_from_arrays
 from sigmasplat.errors import SourceError
 from sigmasplat.graph.loops import Loop
 from sigmasplat.slam.listeners import Correction, Listeners
-from sigmasplat.slam.step_result import Step
+from sigmasplat.slam.results import Step
 from sigmasplat.types import Matrix
 
 OnKeyframe = TypeVar("OnKeyframe", bound=Callable[[Step], object])

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from sigmasplat.data.atlas import Atlas
 from sigmasplat.graph.loops import Loop, Loops
-from sigmasplat.slam.step_result import Step
-from sigmasplat.slam.steps import Steps
+from sigmasplat.slam.results import Step, Steps
 from sigmasplat.types import Matrix
 
 Arguments = ParamSpec("Arguments")

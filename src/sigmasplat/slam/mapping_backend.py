@@ -19,10 +19,9 @@ from sigmasplat.graph.confidence import std_of
 from sigmasplat.mapping.mapper import Mapper
 from sigmasplat.slam.slam_state import SlamState
 from sigmasplat.tracking.drift import Drift
-from sigmasplat.tracking.known_map import KnownMap
 from sigmasplat.tracking.prepared_frame import PreparedFrame
 from sigmasplat.tracking.recovery import usable
-from sigmasplat.tracking.relocaliser import INDEX_AT_MOST, Relocation
+from sigmasplat.tracking.relocaliser import INDEX_AT_MOST, KnownMap, Relocation
 from sigmasplat.types import Matrix, ShouldStop, Task, completed, never
 
 LAST_TRIES = 3

@@ -7,28 +7,23 @@ from sigmasplat.data.camera import Camera
 from sigmasplat.data.column import Column
 from sigmasplat.data.field import GaussianField, Rows
 from sigmasplat.data.frame import Detail, Photo, PosePrior
-from sigmasplat.data.hops import TrackedHops
-from sigmasplat.data.places import Places
-from sigmasplat.data.poses import KeyframePoses, Poses
-from sigmasplat.data.relative_pose import RelativePose
+from sigmasplat.data.poses import KeyframePoses, Places, Poses
+from sigmasplat.data.relative_pose import Edges, RelativePose, TrackedHops
 from sigmasplat.data.submap import Picture
 from sigmasplat.errors import RunError
 from sigmasplat.fit.adam import VectorAdam
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference
 from sigmasplat.fit.target import Keyframe, Target
+from sigmasplat.graph.candidates import DescribedSubmaps
 from sigmasplat.graph.closer import LoopCloser, PendingSearch
 from sigmasplat.graph.confidence import Confidence
-from sigmasplat.graph.described_submaps import DescribedSubmaps
-from sigmasplat.graph.edges import Edges
 from sigmasplat.graph.loops import Loop, Loops
 from sigmasplat.mapping.mapper import Mapper, SecondHalf
 from sigmasplat.mapping.validation_views import ValidationView, ValidationViews
+from sigmasplat.slam.results import Step, Steps
 from sigmasplat.slam.slam import Slam
-from sigmasplat.slam.step_result import Step
-from sigmasplat.slam.steps import Steps
-from sigmasplat.tracking.depth_fit import DepthFit
-from sigmasplat.tracking.depth_shape import DepthShape
+from sigmasplat.tracking.depth_fit import DepthFit, DepthShape
 from sigmasplat.tracking.drift import Drift
 from sigmasplat.tracking.feature_image import FeatureImage
 from sigmasplat.tracking.moving.depth_history import DepthHistory, RememberedDepth

@@ -6,12 +6,11 @@ from dataclasses import replace
 import numpy as np
 
 from sigmasplat.data import se3
-from sigmasplat.data.component import APART, RELOCALISED, TRACKED
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.relative_pose import UNKNOWN_HOP, RelativePose
 from sigmasplat.data.submap import RefinedStore, StorePart
-from sigmasplat.final.final_map import final_map
-from sigmasplat.final.pose_trust_region import reaching
+from sigmasplat.data.trajectory import APART, RELOCALISED, TRACKED
+from sigmasplat.final.final_map import final_map, reaching
 from sigmasplat.final.uncertainty import final_uncertainty
 from sigmasplat.fit.pose import PoseFit
 from sigmasplat.graph.loops import Loop
@@ -20,7 +19,7 @@ from sigmasplat.render.low_pass import as_refined
 from sigmasplat.slam.array_interface import ArrayInterface
 from sigmasplat.slam.listeners import notifying
 from sigmasplat.slam.mapping_backend import MappingBackend
-from sigmasplat.slam.step_result import Step, StepTimer, make_step
+from sigmasplat.slam.results import Step, StepTimer, make_step
 from sigmasplat.tracking.fitted_depth import fitted_keyframe, fitted_to_map
 from sigmasplat.tracking.frame_estimate import FrameEstimate
 from sigmasplat.tracking.keyframe_rule import becomes_keyframe, is_held_back, is_mappable, may_validate
@@ -204,7 +203,7 @@ class Slam(MappingBackend, ArrayInterface):
             estimate.T_submap_camera = place.T_submap_camera
             self.tracker.move_to(self.mapper.field, self.view, place.keyframe, place.T_submap_camera)
         else:
-            self.tracker.detector = self.tracker.detector.cleared()
+            self.tracker.forget_moving()
             completed(self.branch_at(place))
             estimate.T_submap_camera, estimate.mapped = np.eye(4), True
         self.recovery.found()

@@ -1,6 +1,6 @@
 """The state of SLAM, and how to read it: map, path, components, checkpoint."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,27 +13,26 @@ from sigmasplat.config.presets import configured
 from sigmasplat.data.atlas import Atlas
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.column import Column
-from sigmasplat.data.component import LOST, Component
-from sigmasplat.data.field import GaussianField
+from sigmasplat.data.field import GaussianField, Rows
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.frame_filters import frame_filter
 from sigmasplat.data.map_uncertainty import MapUncertainty
+from sigmasplat.data.relative_pose import RelativePose
 from sigmasplat.data.submap import MemoryStore, OnDisk, SubmapStore
-from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.data.trajectory import LOST, Component, Trajectory
 from sigmasplat.errors import SourceError
-from sigmasplat.final.merged import components_apart, merged_field
+from sigmasplat.final.final_map import components_apart, merged_field
 from sigmasplat.final.refinement import SavedRefinement
 from sigmasplat.graph.closer import LoopCloser, make_descriptor
 from sigmasplat.graph.confidence import Confidence
 from sigmasplat.graph.loops import Loop, Loops
 from sigmasplat.graph.newest_covariance import NewestCovariance, PoseErrors
+from sigmasplat.graph.path_covariance import recorded
 from sigmasplat.mapping.mapper import Mapper
 from sigmasplat.mapping.validation_views import ValidationViews
 from sigmasplat.render.view import View
-from sigmasplat.slam.checkpoint import checkpoint_of
 from sigmasplat.slam.listeners import Listeners
-from sigmasplat.slam.step_result import Step, StepTimer, SubmapState
-from sigmasplat.slam.steps import Steps
+from sigmasplat.slam.results import Step, Steps, StepTimer, SubmapState
 from sigmasplat.tracking.drift import Drift
 from sigmasplat.tracking.features import Extractor, extractor_of
 from sigmasplat.tracking.prepared_frame import PreparedFrame, observe, view_of, working_frame
@@ -230,3 +229,39 @@ class SlamState:
         """Return whether any part compares keyframes by their descriptors."""
         m = self.config.mapping
         return (self.cuts and self.config.loops.close) or (m.window > 2 and m.covisibility == "descriptor")
+
+
+def checkpoint_of(
+    active: GaussianField, path: Trajectory, atlas: Atlas, keyframes: Sequence[int], edges: Sequence[RelativePose]
+) -> dict[str, Tensor]:
+    """Return the active submap's field with its attributes and its optimiser state, poses, times, keyframes, anchors,
+    the submap of each frame, the exposures of frames if they are known, and the errors of the path, in host
+    memory."""
+    return {
+        **_rows_of(active, ""),
+        **{key: part for name, rows in active.attributes.items() for key, part in _rows_of(rows, f"{name}_").items()},
+        "timestamps_s": torch.from_numpy(path.timestamps_s),
+        "T_world_camera": torch.from_numpy(path.T_world_camera),
+        "T_world_camera_odometry": torch.from_numpy(atlas.T_world_camera(loops=False)),
+        "T_world_keyframe": torch.from_numpy(atlas.T_world_keyframes),
+        "T_submap_camera": torch.from_numpy(atlas.T_submap_camera),
+        **path_errors(atlas, keyframes, edges),
+    }
+
+
+def path_errors(atlas: Atlas, keyframes: Sequence[int], edges: Sequence[RelativePose]) -> dict[str, Tensor]:
+    """Return the part of a checkpoint that `PathCovariance.of` reads; arguments as for `checkpoint_of`."""
+    return {
+        "keyframes": torch.tensor(keyframes, dtype=torch.int64),
+        "T_world_submap": torch.from_numpy(np.array(atlas.anchors)),
+        "submap_component": torch.tensor(atlas.components, dtype=torch.int64),
+        "frame_submap": torch.tensor(atlas.places.submap),
+        **({"exposure": torch.from_numpy(atlas.frame_exposures())} if atlas.exposures else {}),
+        **recorded(atlas, edges),
+    }
+
+
+def _rows_of(rows: Rows, prefix: str) -> dict[str, Tensor]:
+    """Return the parameters and the optimiser state of rows, in host memory, with a prefix to each name."""
+    parts = {f"{prefix}{name}": getattr(rows, name).cpu() for name in ("params", "moment1", "moment2", "last_step")}
+    return parts | {f"{prefix}adam_steps": torch.tensor(rows.steps)}

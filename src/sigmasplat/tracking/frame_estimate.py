@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 from sigmasplat.data import se3
-from sigmasplat.data.component import LOST, TRACKED
 from sigmasplat.data.relative_pose import UNKNOWN_HOP, RelativePose
+from sigmasplat.data.trajectory import LOST, TRACKED
 from sigmasplat.fit.compare import Comparison
 from sigmasplat.fit.pose import PoseFit
 from sigmasplat.types import Matrix

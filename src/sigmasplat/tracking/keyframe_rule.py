@@ -4,7 +4,7 @@ import numpy as np
 
 from sigmasplat.config import MappingConfig
 from sigmasplat.data import se3
-from sigmasplat.data.component import TRACKED
+from sigmasplat.data.trajectory import TRACKED
 from sigmasplat.fit.pose import PoseFit
 from sigmasplat.tracking.frame_estimate import FrameEstimate
 from sigmasplat.tracking.recovery import Recovery

@@ -13,7 +13,7 @@ from sigmasplat.fit.align import align
 from sigmasplat.fit.backends import fits_of
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.render.view import View
-from sigmasplat.tracking.tracked_keyframe import Splats
+from sigmasplat.tracking.prepared_frame import Splats
 from sigmasplat.types import Matrix, ShouldStop, unless
 
 Item = TypeVar("Item")

@@ -1,28 +1,59 @@
-"""One frame, or one keyframe of the map, in the forms that tracking and mapping need."""
+"""One frame, or one keyframe, in the forms that tracking and mapping need."""
 
 from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
-from sigmasplat.config import Config
+from sigmasplat.config import Config, TrackingConfig
 from sigmasplat.config.sensors import sensor_model
+from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.depth_std import std_by_model
 from sigmasplat.data.exposure import gray_exposure, unexposed
 from sigmasplat.data.frame import Frame, Photo, photo_size
 from sigmasplat.data.submap import Picture
+from sigmasplat.env import opencv
 from sigmasplat.errors import SourceError
-from sigmasplat.fit.pyramid import HIDDEN_M, Pyramid
-from sigmasplat.fit.references import live_image, picture_images
+from sigmasplat.fit.backends import fits_of
+from sigmasplat.fit.compare import noise_scale
+from sigmasplat.fit.pyramid import HIDDEN_M, NOISE_PER_M, Pyramid
+from sigmasplat.fit.references import Reference, keyframe_reference, live_image, picture_images
 from sigmasplat.fit.target import Target
 from sigmasplat.render.backend import make_view
 from sigmasplat.render.view import View
-from sigmasplat.tracking.denoise import denoised
 from sigmasplat.tracking.depth_fit import smoothed
 from sigmasplat.tracking.feature_image import FeatureImage, LateDetail
 from sigmasplat.tracking.features import Extractor
 from sigmasplat.tracking.moving.dynamic_mask import DynamicMask
+from sigmasplat.types import Matrix
+
+DIAMETER_PX = 5
+"""Each reading becomes the weighted mean of the readings in a window of this width."""
+SPREAD_PX, SPREAD_SIGMA = 2.0, 3.0
+"""Spread of the weights: with the distance in pixels, and with the difference of the readings in standard deviations of
+a reading, so that depth steps stay sharp."""
+HOLE = -1.0
+"""Inverse depth, 1/m, of a pixel without a reading: so far from all readings that its weight is 0."""
+
+
+def denoised(
+    depth_m: NDArray[np.float32], noise_per_m: float = NOISE_PER_M, scene_scale: float = 1.0
+) -> NDArray[np.float32]:
+    """Return depth [H, W] m, 0 = no reading, smoothed by a bilateral filter if its noise is above that of the sensor
+    model (`noise_scale`); otherwise the same image. Holes stay holes.
+
+    The filter works on inverse depth (Tomasi & Manduchi 1998): noise that grows with z² is constant there.
+    """
+    scale = noise_scale(depth_m, noise_per_m, scene_scale)
+    if scale <= 1.0:
+        return depth_m
+    read = depth_m > 0
+    inverse = np.where(read, 1.0 / np.maximum(depth_m, np.float32(1e-3)), np.float32(HOLE)).astype(np.float32)
+    smooth = opencv().bilateralFilter(inverse, DIAMETER_PX, SPREAD_SIGMA * scale * noise_per_m, SPREAD_PX)
+    return np.where(read, 1.0 / np.maximum(smooth, np.float32(1e-3)), np.float32(0.0)).astype(np.float32)
 
 
 @dataclass(eq=False)
@@ -147,3 +178,46 @@ def refuse_first_without_depth(frame: Frame, config: Config) -> None:
             f"frame {frame.index} has no depth reading in [{config.input.min_depth_m}, {config.input.max_depth_m}] m "
             "to start a map from; check the depth scale or start at a later one"
         )
+
+
+class Splats(Protocol):
+    """What tracking reads of a map: rows of splats [N, 17]."""
+
+    @property
+    def params(self) -> Tensor: ...
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedKeyframe:
+    """What tracking keeps of a keyframe. The map's `Keyframe` has planes for the fits instead, and the state of Adam:
+    neither needs the other's memory.
+
+    reference: its image with the weights of the map, None if nothing aligns to it; image: for features; front: what
+    was in front of the scene."""
+
+    reference: Reference | None
+    image: FeatureImage | None
+    front: DynamicMask | None = None
+
+    def weighed(self, params: Tensor, view: View, config: TrackingConfig) -> "TrackedKeyframe":
+        """Return a keyframe of the map at which the camera was found, weighed by the map with rows `params` [N, 17]."""
+        assert self.reference is not None and self.image is not None
+        own = self.reference
+        reference = keyframe_reference(params, view, own.pyramid, own.T_camera_world, config)
+        return TrackedKeyframe(reference, self.image.weighed(reference.weights))
+
+
+def mapped_keyframe(
+    params: Tensor,
+    view: View,
+    seen: PreparedFrame,
+    T_world_camera: Matrix,
+    config: TrackingConfig,
+    front: DynamicMask | None,
+) -> TrackedKeyframe:
+    """Return a keyframe that was just mapped, weighed by the map with rows `params` [N, 17]."""
+    if config.method != "align" and not fits_of(view).aligns:
+        return TrackedKeyframe(None, seen.image, front)  # nothing aligns to it
+    T_camera_world = se3.inverse(T_world_camera)
+    reference = keyframe_reference(params, view, seen.live, T_camera_world, config)
+    return TrackedKeyframe(reference, seen.image and seen.image.weighed(reference.weights), front)

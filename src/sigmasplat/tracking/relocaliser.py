@@ -5,27 +5,61 @@ never accepted by its number of inliers alone, because a repeated pattern has ma
 """
 
 from collections import OrderedDict
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from sigmasplat.config import Config, TrackingConfig
 from sigmasplat.data import se3
+from sigmasplat.data.field import GaussianField
 from sigmasplat.data.relative_pose import RelativePose
-from sigmasplat.data.submap import KeyframeId
+from sigmasplat.data.submap import KeyframeId, Picture, SubmapStore
 from sigmasplat.fit.compare import Comparison
 from sigmasplat.fit.pose import PoseFit, fit_pose_align
 from sigmasplat.fit.references import Reference, map_reference, picture_images
+from sigmasplat.fit.target import Keyframe
 from sigmasplat.render.view import View
 from sigmasplat.tracking.drift import floor, symmetric
 from sigmasplat.tracking.feature_image import FeatureImage, pose_by_features
 from sigmasplat.tracking.features import Extractor, Features, Landmarks, matches_by_descriptor
-from sigmasplat.tracking.known_map import KnownMap
 from sigmasplat.tracking.pose_validation import MOST_SPREAD_M, recognised, score
-from sigmasplat.tracking.prepared_frame import PreparedFrame
-from sigmasplat.tracking.tracked_keyframe import TrackedKeyframe
+from sigmasplat.tracking.prepared_frame import PreparedFrame, TrackedKeyframe
 from sigmasplat.types import Matrix, Task, completed
+
+
+@dataclass(frozen=True, eq=False)
+class KnownMap:
+    """Finished submaps in a store, and the active one by its keyframes and splats.
+
+    keyframe_poses: T_submap_camera [4, 4] of the keyframes of each submap (`Atlas.keyframe_poses`); wanted: whether a
+    submap is searched.
+    """
+
+    store: SubmapStore
+    keyframe_poses: Sequence[Sequence[Matrix]]
+    active: Sequence[Keyframe]
+    field: GaussianField
+    wanted: Callable[[int], bool] = lambda submap: True
+
+    def keyframes(self) -> list[KeyframeId]:
+        """Return all keyframes to search, the newest first."""
+        found = [(s, k) for s, poses in enumerate(self.keyframe_poses) if self.wanted(s) for k in range(len(poses))]
+        return found[::-1]
+
+    def picture(self, where: KeyframeId) -> Picture:
+        """Return the images of a keyframe."""
+        submap, k = where
+        return self.store.picture(submap, k) if submap < len(self.store) else self.active[k].picture()
+
+    def T_submap_camera(self, where: KeyframeId) -> Matrix:
+        """Return the pose [4, 4] of a keyframe."""
+        return self.keyframe_poses[where[0]][where[1]]
+
+    def splats(self, submap: int) -> GaussianField:
+        """Return the splats of a submap, in its frame."""
+        return self.store.load(submap).field if submap < len(self.store) else self.field
+
 
 STRONGEST = 400
 """Number of features of each image that are compared to choose candidates."""
@@ -82,10 +116,6 @@ class Relocation:
     def relative_pose(self, submap: int) -> RelativePose:
         """Return where a submap begins that starts at this camera."""
         return RelativePose(self.where[0], submap, self.T_submap_camera, self.information, "relocalisation")
-
-    def values(self) -> dict[str, float]:
-        """Return the comparison with the map and the number of matches, as a step reports them."""
-        return asdict(self.comparison) | {"inliers": float(self.inliers)}
 
     @property
     def score(self) -> float:

@@ -24,8 +24,7 @@ from sigmasplat.tracking.moving.dynamic_detector import DynamicDetector
 from sigmasplat.tracking.moving.dynamic_mask import DynamicMask
 from sigmasplat.tracking.pose_prediction import Given, PosePrediction, odometry, predict
 from sigmasplat.tracking.pose_validation import TrackingStatistics
-from sigmasplat.tracking.prepared_frame import PreparedFrame
-from sigmasplat.tracking.tracked_keyframe import Splats, TrackedKeyframe, mapped_keyframe
+from sigmasplat.tracking.prepared_frame import PreparedFrame, Splats, TrackedKeyframe, mapped_keyframe
 from sigmasplat.types import Matrix, ShouldStop, never
 
 
@@ -321,9 +320,19 @@ class Tracker:
         self.detector = self.detector.cleared()
         self.follow(keyframe.weighed(field.params, view, self.config))
 
-    def move_by(self, T_new_old: Matrix) -> None:
-        """Express the last pose and the reference in other coordinates [4, 4]."""
-        self.previous = T_new_old @ self.previous
+    def forget_moving(self) -> None:
+        """Forget what moves: the camera continues in another map."""
+        self.detector = self.detector.cleared()
+
+    def continue_elsewhere(self, apart: bool) -> None:
+        """Go on where the search has found the camera, or in a new map (`apart`)."""
+        self.velocity, self.lost = np.eye(4), self.lost and not apart
+        self.forget_moving()
+
+    def move_by(self, T_new_old: Matrix, previous: Matrix | None = None) -> None:
+        """Express the last pose and the reference in other coordinates [4, 4]; previous: the last pose there, if it is
+        known without rounding."""
+        self.previous = T_new_old @ self.previous if previous is None else previous
         self.keyframe = None if self.keyframe is None else self.keyframe.moved_by(T_new_old)
         self.detector = self.detector.moved_by(T_new_old)
 

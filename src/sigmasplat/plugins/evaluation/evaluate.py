@@ -10,8 +10,7 @@ from sigmasplat.config import Config, FinalConfig
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.mesh import Mesh
-from sigmasplat.data.selection import evenly_spread
-from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.data.trajectory import Trajectory, evenly_spread
 from sigmasplat.errors import RunError
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.evaluation import reconstruct

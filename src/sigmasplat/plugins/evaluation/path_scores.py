@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.data import se3
-from sigmasplat.data.component import APART, LOST, RELOCALISED
-from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.data.trajectory import APART, LOST, RELOCALISED, Trajectory
 from sigmasplat.graph.path_covariance import PathCovariance
 from sigmasplat.plugins.evaluation.metrics.trajectory import (
     absolute_error,

@@ -17,9 +17,8 @@ from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.frame import Frame, photo_size
-from sigmasplat.data.selection import evenly_spread
 from sigmasplat.data.submap import SubmapStore
-from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.data.trajectory import Trajectory, evenly_spread
 from sigmasplat.errors import SourceError
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.evaluation.metrics import views

@@ -11,7 +11,7 @@ from torch import Tensor
 from sigmasplat.data import se3
 from sigmasplat.data.field import COLUMNS, INITIAL_LOG_VARIANCE, GaussianField
 from sigmasplat.data.map_uncertainty import SplatStd
-from sigmasplat.data.selection import evenly_spread
+from sigmasplat.data.trajectory import evenly_spread
 from sigmasplat.errors import ConfigError, RunError, SigmaSplatError
 from sigmasplat.plugins.outputs.axes import AXES, Axes, levelled, transform_to
 from sigmasplat.plugins.outputs.run_reader import RunReader

@@ -8,9 +8,8 @@ import numpy as np
 
 from sigmasplat.config import Config
 from sigmasplat.data.camera import Camera
-from sigmasplat.data.component import APART, LOST
 from sigmasplat.data.submap import Picture
-from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.data.trajectory import APART, LOST, Trajectory
 from sigmasplat.errors import RunError
 from sigmasplat.graph.path_covariance import PathCovariance
 from sigmasplat.input.source import Source

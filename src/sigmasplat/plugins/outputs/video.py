@@ -18,8 +18,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
-from sigmasplat.data.selection import evenly_spread
-from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.data.trajectory import Trajectory, evenly_spread
 from sigmasplat.env import install_package
 from sigmasplat.errors import BackendError, ConfigError, RunError, SigmaSplatError
 from sigmasplat.files.atomic import replacing

@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sigmasplat.data.component import LOST
-from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.data.trajectory import LOST, Trajectory
 from sigmasplat.env import import_optional
 from sigmasplat.errors import RunError, SigmaSplatError
 from sigmasplat.graph.path_covariance import PathCovariance

@@ -23,9 +23,9 @@ from sigmasplat.plugins.robots.odometry import LiveOdometry, has_motion
 from sigmasplat.plugins.robots.outlet import Job, Outlet
 from sigmasplat.plugins.robots.ros_messages import MAX_POINTS, Encoded, Points, RosMessages, Topic
 from sigmasplat.run.callbacks import Callback
-from sigmasplat.slam.checkpoint import path_errors
+from sigmasplat.slam.results import Step
 from sigmasplat.slam.slam import Slam
-from sigmasplat.slam.step_result import Step
+from sigmasplat.slam.slam_state import path_errors
 from sigmasplat.types import Matrix
 
 Images = Literal["none", "keyframes", "all"]

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from sigmasplat.data import se3
 from sigmasplat.data.atlas import Atlas
-from sigmasplat.data.component import LOST, RELOCALISED
+from sigmasplat.data.trajectory import LOST, RELOCALISED
 from sigmasplat.types import Matrix
 
 FOUND_BY_FEATURES = "inliers"

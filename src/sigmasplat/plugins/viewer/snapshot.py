@@ -17,7 +17,7 @@ from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import COLUMNS, GaussianField, Rows
 from sigmasplat.data.map_uncertainty import MapUncertainty
 from sigmasplat.data.mesh import Mesh
-from sigmasplat.data.selection import evenly_spaced
+from sigmasplat.data.trajectory import evenly_spaced
 from sigmasplat.plugins.outputs.drawing.colormap import Rgb
 from sigmasplat.plugins.outputs.drawing.plot import ACCENT, BLUE, DARK, GREEN
 from sigmasplat.types import Matrix

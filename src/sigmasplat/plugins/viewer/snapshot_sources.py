@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.data.camera import Camera
-from sigmasplat.data.component import LOST, outside_world, states_at_end, submaps_outside
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.mesh import Mesh
+from sigmasplat.data.trajectory import LOST, outside_world, states_at_end, submaps_outside
 from sigmasplat.errors import RunError, SigmaSplatError
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.outputs.drawing.colormap import Rgb
@@ -37,8 +37,8 @@ from sigmasplat.types import Matrix
 
 if TYPE_CHECKING:
     from sigmasplat.graph.loops import Loop
+    from sigmasplat.slam.results import Step
     from sigmasplat.slam.slam import Slam
-    from sigmasplat.slam.step_result import Step
 
 EVERY_S = 2.0
 Log = list[dict[str, Any]]

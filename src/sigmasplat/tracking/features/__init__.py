@@ -5,11 +5,17 @@ from collections.abc import Callable
 import numpy as np
 
 from sigmasplat.config import Config, FeatureConfig
-from sigmasplat.tracking.features.base import Extractor, Features, Pairs, matched_by_distance
-from sigmasplat.tracking.features.landmarks import Landmarks, depth_readings, landmarks_of
+from sigmasplat.tracking.features.base import (
+    Extractor,
+    Features,
+    Landmarks,
+    Pairs,
+    depth_readings,
+    landmarks_of,
+    matched_by_distance,
+)
+from sigmasplat.tracking.features.kinds import Orb, Sift, XFeat
 from sigmasplat.tracking.features.pose import PnP, pose_from_landmarks
-from sigmasplat.tracking.features.sift_orb import Orb, Sift
-from sigmasplat.tracking.features.xfeat import XFeat
 
 __all__ = [
     "Extractor", "Features", "Landmarks", "PnP", "depth_readings", "extractor_of", "landmarks_of", "make_extractor",

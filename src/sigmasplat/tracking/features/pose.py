@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 from sigmasplat.config import FeatureConfig
 from sigmasplat.data import se3
 from sigmasplat.env import opencv
-from sigmasplat.tracking.features.base import Features
-from sigmasplat.tracking.features.landmarks import Landmarks, depth_sigma_m
+from sigmasplat.tracking.features.base import Features, Landmarks, depth_sigma_m
 from sigmasplat.types import Matrix
 
 LEAST_INLIERS = 8

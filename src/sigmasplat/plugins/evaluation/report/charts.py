@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.data.component import APART, LOST, RELOCALISED, TRACKED
+from sigmasplat.data.trajectory import APART, LOST, RELOCALISED, TRACKED
 from sigmasplat.plugins.outputs.drawing.plot import ACCENT, BLUE, FAINT, GREEN, PURPLE, Chart, Curve
 from sigmasplat.run_folder.frames import RunFrames
 from sigmasplat.run_folder.run_values import frame_seconds

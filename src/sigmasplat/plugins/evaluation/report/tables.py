@@ -2,8 +2,8 @@
 
 from typing import Any
 
-from sigmasplat.data.component import APART, LOST, RELOCALISED, TRACKED
 from sigmasplat.data.map_uncertainty import SHIPPED
+from sigmasplat.data.trajectory import APART, LOST, RELOCALISED, TRACKED
 from sigmasplat.run.figures import format_ranges, number, rate
 
 

@@ -13,8 +13,7 @@ from torch import Tensor
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
-from sigmasplat.data.selection import evenly_spaced
-from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.data.trajectory import Trajectory, evenly_spaced
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.plugins.evaluation.metrics.views import COVERED_ALPHA
 from sigmasplat.render import Render
