@@ -179,9 +179,10 @@ def test_an_empty_image_has_no_features(kind: str) -> None:
     assert pose_from_landmarks(landmarks, none, np.zeros((0, 2), np.intp), 0) is None
 
 
-def test_wide_images_are_reduced(views: Any) -> None:
+def test_wide_images_are_reduced(views: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     reference = views[0]
-    found = extractor("sift", width=320).find(gray_bytes(reference), reference.camera)
+    monkeypatch.setattr(FeatureConfig, "width", 320)
+    found = extractor("sift").find(gray_bytes(reference), reference.camera)
     assert found.camera == reference.camera.resized(320, 240)
     assert found.points[:, 0].max() < 320
 

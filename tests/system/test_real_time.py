@@ -173,12 +173,13 @@ def test_a_keyframe_is_aligned_again_when_the_weights_of_the_one_before_it_are_k
     assert np.linalg.norm(apart[:, :3, 3], axis=1).max() < 1e-4, "without it 2.4e-4"
 
 
-def test_too_many_waiting_keyframes_are_refused_and_counted() -> None:
+def test_too_many_waiting_keyframes_are_refused_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     class Never(AtOnce):
         def wake(self) -> None:
             pass
 
-    often = config(realtime__keyframe_deg="0.5", realtime__waiting_most="3", mapping__every="1")
+    often = config(realtime__keyframe_deg="0.5", mapping__every="1")
+    monkeypatch.setattr(type(often.realtime), "waiting_most", 3)
     system = RealTime(Slam(often), Never())
     steps = [system.step(frame) for frame in frames(20)]
     assert sum(step.is_keyframe for step in steps) == 3 and system.keyframes_refused > 5
