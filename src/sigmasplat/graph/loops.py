@@ -20,8 +20,8 @@ NUMBERS = 11
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Loop:
-    """A pair of submaps that was tried as a loop, and the result: a record for the log, also of a refused pair, which has
-    no `RelativePose` in the pose graph.
+    """A pair of submaps that was tried as a loop, and the result: a record for the log, also of a refused pair, which
+    has no `RelativePose` in the pose graph.
 
     query, database: submaps; query_frame, database_frame: the frames of their most similar keyframes; similarity,
     gated: of these keyframes (VarSplat §4); residual, overlap, localised: of the registration; translation_m,
