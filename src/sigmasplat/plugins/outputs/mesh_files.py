@@ -155,7 +155,7 @@ def _rows(file: BinaryIO, path: Path, element: Element) -> NDArray[np.void]:
     fields: list[tuple[str, str] | tuple[str, str, int]] = []
     length, order, count = 0, element.order, element.count
     if count < 0:
-        raise SourceError(f"{path}: the PLY's header does not say how many rows '{element.name}' has")
+        raise SourceError(f"{path}: its header has no number of '{element.name}'; save the mesh again")
     for words in element.properties:
         kinds = [PLY_TYPES.get(word) for word in words[:-1] if word != "list"]
         if None in kinds or len(kinds) != (2 if words[0] == "list" else 1):

@@ -156,9 +156,9 @@ def export_video(
     else:
         poses = smooth_path(path, count)
     show = partial(_show, renderer, field, camera)
-    draw = _color_images if options.panels == "color" else _images
+    width = None if options.panels == "color" else camera.width
     progress(0, count)
-    write_video(target, draw(show, poses, camera.width, progress), options.fps)
+    write_video(target, _images(show, poses, width, progress), options.fps)
     return count
 
 
@@ -198,19 +198,14 @@ def _show(renderer: SurfaceRenderer, field: GaussianField, camera: Camera, T_wor
         return FilmMaps.of(renderer(field, camera, se3.inverse(T_world_camera)))
 
 
-def _images(show: Callable[[Matrix], FilmMaps], poses: Matrix, width: int, progress: Progress) -> Iterator[Rgb]:
-    """Yield the images of a video; a few of them determine the colour scale."""
-    scale = FilmScale.of([show(pose) for pose in evenly_spread(list(poses), SAMPLES)])
-    strip = legend_strip(scale, width)
+def _images(show: Callable[[Matrix], FilmMaps], poses: Matrix, width: int | None, progress: Progress) -> Iterator[Rgb]:
+    """Yield the images of a video: panels of this width, whose colour scale a few images determine; None: colour."""
+    draw: Callable[[FilmMaps], Rgb] = color_bytes
+    if width is not None:
+        scale = FilmScale.of([show(pose) for pose in evenly_spread(list(poses), SAMPLES)])
+        draw = partial(film_image, scale=scale, strip=legend_strip(scale, width))
     for done, pose in enumerate(poses, 1):
-        yield film_image(show(pose), scale, strip)
-        progress(done, len(poses))
-
-
-def _color_images(show: Callable[[Matrix], FilmMaps], poses: Matrix, width: int, progress: Progress) -> Iterator[Rgb]:
-    """Yield the colours of a video."""
-    for done, pose in enumerate(poses, 1):
-        yield color_bytes(show(pose))
+        yield draw(show(pose))
         progress(done, len(poses))
 
 

@@ -10,7 +10,6 @@ queue; if it reads too slowly, its oldest messages are dropped.
 
 import asyncio
 import contextlib
-import ipaddress
 import json
 import logging
 import socket
@@ -19,11 +18,11 @@ import threading
 from collections import deque
 from concurrent.futures import Future
 from typing import TYPE_CHECKING, Any
-from urllib.parse import urlsplit
 
 from sigmasplat.env import import_optional
 from sigmasplat.errors import ConfigError, SigmaSplatError
 from sigmasplat.plugins.robots.ros_messages import TOPICS, Encoded, RosMessages, Topic
+from sigmasplat.plugins.viewer.server import is_loopback, page_of
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
@@ -56,21 +55,10 @@ def is_allowed_origin(origin: str | None) -> bool:
     """
     if origin is None:
         return True
-    try:
-        page = urlsplit(origin.lower())
-        name = page.hostname or ""
-    except ValueError:
-        return False
-    if page.scheme not in ("http", "https"):
-        return bool(page.scheme)  # "null" has no scheme: a page in a sandbox
-    return name == "localhost" or (name == WEB_APP and page.scheme == "https") or _is_loopback(name)
-
-
-def _is_loopback(name: str) -> bool:
-    try:
-        return ipaddress.ip_address(name).is_loopback
-    except ValueError:
-        return False
+    scheme, _, name = page_of(origin)
+    if scheme not in ("http", "https"):
+        return bool(scheme)  # "null" has no scheme: a page in a sandbox
+    return is_loopback(name) or (name == WEB_APP and scheme == "https")
 
 
 def check_stream(port: int) -> None:

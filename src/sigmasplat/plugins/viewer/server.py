@@ -34,22 +34,27 @@ def is_own_page(origin: str | None, reached: str | None, host: str) -> bool:
     """
     if origin is None:
         return True
-    try:
-        page, name = urlsplit(origin.lower()), urlsplit(origin.lower()).hostname or ""
-    except ValueError:
-        return False
-    if page.scheme not in ("http", "https") or reached is None or page.netloc != reached.lower():
+    scheme, address, name = page_of(origin)
+    if scheme not in ("http", "https") or reached is None or address != reached.lower():
         return False
     machine = socket.gethostname().lower()
-    return name in ("localhost", host.lower(), machine, f"{machine}.local") or _is_ip(name)
+    return name in ("localhost", host.lower(), machine, f"{machine}.local") or _ip(name) is not None
 
 
-def _is_ip(name: str) -> bool:
+def page_of(origin: str) -> tuple[str, str, str]:
+    """Return scheme, address and host of the page that a header Origin names; empty if it names none."""
     try:
-        ipaddress.ip_address(name)
+        page = urlsplit(origin.lower())
+        return page.scheme, page.netloc, page.hostname or ""
     except ValueError:
-        return False
-    return True
+        return "", "", ""
+
+
+def _ip(name: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
+    try:
+        return ipaddress.ip_address(name)
+    except ValueError:
+        return None
 
 
 @contextmanager
@@ -153,4 +158,5 @@ def url_of(host: str, port: int) -> str:
 
 def is_loopback(host: str) -> bool:
     """Return whether an address can be reached from this machine only."""
-    return host in ("localhost", "::1") or host.startswith("127.")
+    ip = _ip(host)
+    return host == "localhost" or (ip is not None and ip.is_loopback)
