@@ -35,7 +35,7 @@ from tables import Section
 from sigmasplat.commands import options
 from sigmasplat.commands.input_options import Limit
 from sigmasplat.commands.options import prepare_torch
-from sigmasplat.config.presets import default_preset
+from sigmasplat.config.find_preset import default_preset
 from sigmasplat.config.text import split_settings
 from sigmasplat.errors import ConfigError, SigmaSplatError
 from sigmasplat.input.recorded import depth_warning

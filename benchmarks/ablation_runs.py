@@ -19,7 +19,7 @@ from paired_comparison import figures_of
 
 import sigmasplat
 from sigmasplat.config import Config
-from sigmasplat.config.presets import preset as preset_of
+from sigmasplat.config.find_preset import preset as preset_of
 from sigmasplat.config.text import full_path, override, split_settings
 from sigmasplat.errors import ConfigError, RunError
 from sigmasplat.files import machine

@@ -24,7 +24,7 @@ import tyro
 
 import sigmasplat
 from sigmasplat.commands.options import Settings
-from sigmasplat.config.presets import default_preset, preset as preset_of
+from sigmasplat.config.find_preset import default_preset, preset as preset_of
 from sigmasplat.config.text import override, split_settings
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.files.machine import INSTALLED, code_digest

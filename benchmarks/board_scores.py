@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.config import Config
-from sigmasplat.config.presets import default_preset, preset
+from sigmasplat.config.find_preset import default_preset, preset
 from sigmasplat.data import se3
 from sigmasplat.data.trajectory import evenly_spread
 from sigmasplat.errors import SigmaSplatError, SourceError

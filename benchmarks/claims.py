@@ -24,7 +24,7 @@ from pose_gradient import ONE_MAP, RATES
 import sigmasplat
 from sigmasplat.commands.options import Settings
 from sigmasplat.config import Config
-from sigmasplat.config.presets import preset
+from sigmasplat.config.find_preset import preset
 from sigmasplat.config.text import override, split_settings
 from sigmasplat.errors import ConfigError, SigmaSplatError
 from sigmasplat.files.machine import INSTALLED, code_digest

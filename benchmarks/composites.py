@@ -36,7 +36,7 @@ from tables import Section
 
 from sigmasplat.commands.options import Settings
 from sigmasplat.config import Config, InputConfig
-from sigmasplat.config.presets import default_preset
+from sigmasplat.config.find_preset import default_preset
 from sigmasplat.data import se3
 from sigmasplat.data.frame import Frame
 from sigmasplat.input.source import Source, Subset

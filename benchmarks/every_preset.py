@@ -19,7 +19,7 @@ from accuracy_tables import failures
 from tables import Section, significant
 
 from sigmasplat.config import Config
-from sigmasplat.config.presets import list_presets, preset as preset_of, presets_by_scene
+from sigmasplat.config.find_preset import list_presets, preset as preset_of, presets_by_scene
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.run_folder.runs import RunFolder
 

@@ -28,7 +28,7 @@ from tables import Section
 import sigmasplat
 from sigmasplat.commands.options import Settings
 from sigmasplat.config import Config
-from sigmasplat.config.presets import default_preset, preset as preset_of
+from sigmasplat.config.find_preset import default_preset, preset as preset_of
 from sigmasplat.config.text import override, split_settings
 from sigmasplat.data import se3
 from sigmasplat.data.field import GaussianField
@@ -144,7 +144,7 @@ def denoised(frame: Frame, config: Config) -> Frame:
     """Return a frame with the depth that mapping would get; a checkout may be older than `input.denoise_depth`."""
     if not getattr(config.input, "denoise_depth", False):
         return frame
-    from sigmasplat.tracking.prepared_frame import denoised
+    from sigmasplat.tracking.depth_filters import denoised
 
     return replace(frame, depth_m=denoised(frame.depth_m))
 

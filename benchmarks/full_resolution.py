@@ -26,7 +26,7 @@ from tables import Section
 
 from sigmasplat.commands.options import Settings
 from sigmasplat.config import Config
-from sigmasplat.config.presets import default_preset, preset
+from sigmasplat.config.find_preset import default_preset, preset
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
 from sigmasplat.env import opencv

@@ -21,7 +21,7 @@ import tyro
 from tables import Section, significant
 
 from sigmasplat.commands.options import Settings
-from sigmasplat.config.presets import default_preset
+from sigmasplat.config.find_preset import default_preset
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.run_folder.trajectory import write_trajectory

@@ -14,7 +14,7 @@ from torch import Tensor
 from works import RENDER, Timing
 
 from sigmasplat.config import TrackingConfig
-from sigmasplat.config.presets import default_preset, preset
+from sigmasplat.config.find_preset import default_preset, preset
 from sigmasplat.config.text import override
 from sigmasplat.errors import BackendError
 from sigmasplat.fit.field import fit_field

@@ -32,7 +32,7 @@ from tables import Section, significant
 
 from sigmasplat.commands.options import Settings
 from sigmasplat.config import Config
-from sigmasplat.config.presets import default_preset, preset as preset_of
+from sigmasplat.config.find_preset import default_preset, preset as preset_of
 from sigmasplat.config.text import override, split_settings
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.frame_arrays import color_from_bytes

@@ -22,7 +22,7 @@ from tracking import true_poses
 
 import sigmasplat
 from sigmasplat.config import SubmapConfig
-from sigmasplat.config.presets import default_preset
+from sigmasplat.config.find_preset import default_preset
 from sigmasplat.data import se3
 from sigmasplat.errors import SigmaSplatError, SourceError
 from sigmasplat.files.machine import INSTALLED, code_digest

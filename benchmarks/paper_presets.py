@@ -18,7 +18,7 @@ from accuracy_tables import failures, spread, values_of
 from every_preset import with_submaps
 from tables import Section
 
-from sigmasplat.config.presets import preset as preset_of
+from sigmasplat.config.find_preset import preset as preset_of
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.run_folder.runs import RunFolder
 

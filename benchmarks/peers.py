@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from peer_clock import SECONDS, TOTALS
 from tables import Section
 
-from sigmasplat.config.presets import default_preset, preset as preset_of
+from sigmasplat.config.find_preset import default_preset, preset as preset_of
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import ConfigError, SigmaSplatError, SourceError
 from sigmasplat.files.atomic import write_text

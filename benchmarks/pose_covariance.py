@@ -19,7 +19,7 @@ import tyro
 from cpu import alone
 from tables import Section, significant
 
-from sigmasplat.config.presets import default_preset, preset as preset_of
+from sigmasplat.config.find_preset import default_preset, preset as preset_of
 from sigmasplat.config.text import override
 from sigmasplat.errors import SourceError
 from sigmasplat.graph.path_covariance import PathCovariance

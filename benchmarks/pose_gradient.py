@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from tables import Section, significant
 
 from sigmasplat.config import Config
-from sigmasplat.config.presets import preset as preset_of
+from sigmasplat.config.find_preset import preset as preset_of
 from sigmasplat.config.text import override, split_settings
 from sigmasplat.data import se3
 from sigmasplat.data.field import GaussianField

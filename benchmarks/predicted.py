@@ -22,7 +22,7 @@ from PIL import Image
 from tables import Section, significant
 
 from sigmasplat.commands.options import Settings
-from sigmasplat.config.presets import default_preset
+from sigmasplat.config.find_preset import default_preset
 from sigmasplat.data.se3 import quaternion_from_rotation
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.sources import open_source

@@ -27,7 +27,7 @@ from replayed import at_rate
 from tables import Section, significant
 
 from sigmasplat.commands.options import Settings
-from sigmasplat.config.presets import default_preset
+from sigmasplat.config.find_preset import default_preset
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.run_folder.runs import RunFolder
 

@@ -25,7 +25,7 @@ from tables import Section, significant
 
 from sigmasplat.commands.options import Settings
 from sigmasplat.config import Config
-from sigmasplat.config.presets import default_preset
+from sigmasplat.config.find_preset import default_preset
 from sigmasplat.data.frame import Frame
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.slam.slam import Slam

@@ -21,7 +21,7 @@ from tables import Section, significant
 
 import sigmasplat
 from sigmasplat.commands.options import Settings
-from sigmasplat.config.presets import default_preset, preset
+from sigmasplat.config.find_preset import default_preset, preset
 from sigmasplat.config.sensors import sensor_model
 from sigmasplat.data import se3
 from sigmasplat.files.machine import INSTALLED, code_digest
@@ -32,7 +32,7 @@ from sigmasplat.fit.references import confidence_of, relative_noise
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.evaluation.metrics.trajectory import associate
 from sigmasplat.plugins.sources import open_source
-from sigmasplat.tracking.prepared_frame import denoised
+from sigmasplat.tracking.depth_filters import denoised
 
 arg = tyro.conf.arg
 USES = ("tracking", "mapping")

@@ -21,7 +21,7 @@ import tyro
 from tables import Section, significant
 
 from sigmasplat.commands.options import Settings
-from sigmasplat.config.presets import default_preset
+from sigmasplat.config.find_preset import default_preset
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.plugins.sources.synthetic import SyntheticRoom
 from sigmasplat.run_folder.runs import RunFolder

@@ -18,7 +18,7 @@ import tyro
 from accuracy_tables import Result, failures, groups, spread, values_of
 from tables import Section
 
-from sigmasplat.config.presets import preset as preset_of
+from sigmasplat.config.find_preset import preset as preset_of
 from sigmasplat.config.text import override, split_settings
 from sigmasplat.errors import ConfigError, SigmaSplatError
 from sigmasplat.plugins.sources import open_source

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from tracking_tables import coverage
 
 from sigmasplat.config import Config
-from sigmasplat.config.presets import default_preset, preset as preset_of
+from sigmasplat.config.find_preset import default_preset, preset as preset_of
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.frame import Frame

@@ -27,7 +27,7 @@ from uncertainty_samples import HELD_BACK, Job, Measured, Study, measure, study_
 from sigmasplat.commands import options as described
 from sigmasplat.commands.input_options import Limit
 from sigmasplat.commands.options import prepare_torch
-from sigmasplat.config.presets import default_preset
+from sigmasplat.config.find_preset import default_preset
 from sigmasplat.config.ranges import Range
 from sigmasplat.config.text import split_settings
 from sigmasplat.errors import ConfigError, SigmaSplatError

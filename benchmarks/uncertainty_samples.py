@@ -20,7 +20,7 @@ from unseen_views import UnseenView, away_views, held_back_views
 from view_predictors import PREDICTORS, Predictor, SeenView, see
 
 from sigmasplat.config import Config
-from sigmasplat.config.presets import preset as preset_of
+from sigmasplat.config.find_preset import preset as preset_of
 from sigmasplat.config.text import full_path, override, split_settings
 from sigmasplat.data import se3
 from sigmasplat.data.exposure import NEUTRAL, exposed

@@ -26,7 +26,7 @@ import tyro
 
 import sigmasplat
 from sigmasplat.config import Config
-from sigmasplat.config.presets import default_preset, preset
+from sigmasplat.config.find_preset import default_preset, preset
 from sigmasplat.config.text import override, split_settings
 from sigmasplat.errors import ConfigError, SigmaSplatError
 from sigmasplat.files.machine import INSTALLED, code_digest

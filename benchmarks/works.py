@@ -11,7 +11,7 @@ from scenes import Scene
 from torch import Tensor
 
 from sigmasplat.config import RenderConfig
-from sigmasplat.config.presets import default_preset, preset
+from sigmasplat.config.find_preset import default_preset, preset
 from sigmasplat.data.field import GaussianField
 from sigmasplat.fit import losses
 from sigmasplat.fit.backends import fits_of

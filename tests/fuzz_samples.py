@@ -20,7 +20,7 @@ from sigmasplat.commands.options import configured
 from sigmasplat.data.field import GaussianField
 from sigmasplat.plugins.batch.job import Job
 from sigmasplat.plugins.outputs.splats import compressed_ply, gltf, sog, splat, spz
-from sigmasplat.plugins.papers.table_files import TABLES
+from sigmasplat.plugins.presets.table_files import TABLES
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.run.resume import StateFile
 from sigmasplat.run_folder import splat_ply as ply

@@ -6,7 +6,7 @@ from functools import partial
 from typing import Any
 
 from sigmasplat import config
-from sigmasplat.plugins.papers.base import BASE, BASE_VALUES
+from sigmasplat.plugins.presets.base import BASE, BASE_VALUES
 
 RenderConfig = partial(config.RenderConfig, **BASE_VALUES["render"])
 SeedConfig = partial(config.SeedConfig, **BASE_VALUES["seeding"])

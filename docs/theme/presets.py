@@ -103,7 +103,7 @@ SCENES: dict[str, tuple[str, ...]] = {
 
 def paper_table(system: str) -> str:
     """Return a paper's presets: a row per setting that differs between data sets, then the others by origin."""
-    from sigmasplat.config.presets import preset
+    from sigmasplat.config.find_preset import preset
 
     columns = DATA_SETS[system]
     rows = [f"| setting | {' | '.join(columns)} | from |", "|---" * (len(columns) + 2) + "|"]
@@ -120,7 +120,7 @@ def paper_table(system: str) -> str:
 
 def scene_table(system: str) -> str:
     """Return the released code's scenes: a row per set of values, a column per setting; all from the code."""
-    from sigmasplat.config.presets import preset, presets_by_scene
+    from sigmasplat.config.find_preset import preset, presets_by_scene
 
     prefix = f"{system}-released-"
     released = {name.removeprefix(prefix): preset(name) for name in presets_by_scene() if name.startswith(prefix)}
@@ -138,7 +138,7 @@ def scene_table(system: str) -> str:
 def method_table(system: str) -> str:
     """Return the table of what all presets of the released code change: the setting, the paper's value, the code's."""
     from sigmasplat.config import Config
-    from sigmasplat.config.presets import preset, presets_by_scene
+    from sigmasplat.config.find_preset import preset, presets_by_scene
 
     released = [preset(name) for name in presets_by_scene() if name.startswith(f"{system}-released-")]
     rows = ["| setting | paper's presets | released | from |", "|---|---|---|---|"]
@@ -167,7 +167,7 @@ def changed_by_all(released: list[Any], papers: list[Any], default: Any) -> list
 
 def fast_list(system: str) -> str:
     """Return the settings in which a system's preset for two CPU cores differs from that for TUM: both values."""
-    from sigmasplat.config.presets import preset
+    from sigmasplat.config.find_preset import preset
 
     theirs, ours = preset(f"{system}-tum"), preset(f"{system}-fast")
     changed = []

@@ -48,7 +48,7 @@ def changed_by(section: str, name: str) -> str:
 @cache
 def presets() -> dict[str, list[Any]]:
     """Return the settings of all presets by system: the first word of the name, or two for released code."""
-    from sigmasplat.config.presets import list_presets, preset, presets_by_scene
+    from sigmasplat.config.find_preset import list_presets, preset, presets_by_scene
 
     found: dict[str, list[Any]] = {}
     for name in [*list_presets(), *presets_by_scene()]:

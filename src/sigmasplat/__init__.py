@@ -15,7 +15,7 @@ from sigmasplat import env as env  # must come before torch: it sets how idle Op
 
 if TYPE_CHECKING:
     from sigmasplat.config import Config as Config
-    from sigmasplat.config.presets import preset as preset
+    from sigmasplat.config.find_preset import preset as preset
     from sigmasplat.data.camera import Camera as Camera
     from sigmasplat.data.field import GaussianField as GaussianField
     from sigmasplat.data.frame import Frame as Frame
@@ -37,7 +37,7 @@ _HOMES = {
     "Slam": "sigmasplat.slam.slam",
     "open_scene": "sigmasplat.run.scene",
     "open_source": "sigmasplat.plugins.sources",
-    "preset": "sigmasplat.config.presets",
+    "preset": "sigmasplat.config.find_preset",
 }
 __all__ = [*sorted(_HOMES), "__version__"]
 

@@ -1,5 +1,5 @@
 from sigmasplat.config import Config as Config, InputConfig as InputConfig, RenderConfig as RenderConfig
-from sigmasplat.config.presets import preset as preset
+from sigmasplat.config.find_preset import preset as preset
 from sigmasplat.data import se3 as se3
 from sigmasplat.data.camera import Camera as Camera
 from sigmasplat.data.field import GaussianField as GaussianField

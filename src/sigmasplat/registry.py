@@ -2,7 +2,7 @@
 
 A module registers what it adds as `PLUGIN`, one row or a tuple of rows. It is found in three ways:
 
-- a module in `plugins/sources` (a data set), `plugins/outputs`, `plugins/papers` or `plugins/cuda` of this package;
+- a module in `plugins/sources` (a data set), `plugins/outputs`, `plugins/presets` or `plugins/cuda` of this package;
 - an entry point of the group `sigmasplat.plugins` of an installed package, which names the module;
 - `--plugin FILE.py` before or after a command, which is the same as naming the file in SIGMASPLAT_PLUGINS.
 """
@@ -129,7 +129,7 @@ class Preset:
 Row = SourceFormat | Mask | DepthFilter | Output | Backend | Preset
 Kind = TypeVar("Kind", SourceFormat, Mask, DepthFilter, Output, Backend, Preset)
 BUILT_IN: dict[type, str] = {
-    SourceFormat: "sources", Output: "outputs.formats", Preset: "papers", Backend: "cuda.backend", Mask: "",
+    SourceFormat: "sources", Output: "outputs.formats", Preset: "presets", Backend: "cuda.backend", Mask: "",
     DepthFilter: "",
 }  # fmt: skip
 """Where in `sigmasplat.plugins` the rows of each kind are: in a module, or in all modules of a package."""

@@ -10,7 +10,7 @@ import torch
 
 from emulated_cuda import Emulator
 from paper_settings import TrackingConfig
-from sigmasplat.config.presets import default_preset, preset
+from sigmasplat.config.find_preset import default_preset, preset
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.frame import Frame, PosePrior
@@ -23,9 +23,9 @@ from sigmasplat.render.cpu.view import CpuView
 from sigmasplat.render.reference.view import ReferenceView
 from sigmasplat.render.view import View
 from sigmasplat.run_folder.state import read_state, write_state
-from sigmasplat.tracking.depth_fit import DepthFit, DepthShape
 from sigmasplat.tracking.moving import depth_history, dynamic_detector
 from sigmasplat.tracking.pose_validation import TrackingStatistics
+from sigmasplat.tracking.predicted_depth_fit import DepthFit, DepthShape
 from sigmasplat.tracking.prepared_frame import PreparedFrame
 from sigmasplat.tracking.tracker import Tracker
 from splat_fields import CPU, OPTIONS

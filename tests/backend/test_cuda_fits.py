@@ -13,7 +13,7 @@ import torch
 from emulated_cuda import Emulator
 from paper_settings import MappingConfig, TrackingConfig
 from sigmasplat.config import Config
-from sigmasplat.config.presets import default_preset, preset
+from sigmasplat.config.find_preset import default_preset, preset
 from sigmasplat.config.text import override
 from sigmasplat.data import se3
 from sigmasplat.data.field import GaussianField

@@ -14,7 +14,7 @@ import torch
 from paper_settings import MappingConfig, TrackingConfig
 from sigmasplat import cli
 from sigmasplat.config import Config
-from sigmasplat.config.presets import preset
+from sigmasplat.config.find_preset import preset
 from sigmasplat.config.text import override
 from sigmasplat.data import se3
 from sigmasplat.data.field import GaussianField

@@ -14,9 +14,9 @@ import pytest
 from changed_settings import changed_settings
 from documents import DOCUMENTS, ROOT, prose
 from sigmasplat.config import Config
-from sigmasplat.config.presets import list_presets, preset, presets_by_scene
+from sigmasplat.config.find_preset import list_presets, preset, presets_by_scene
 from sigmasplat.fit.compare import Comparison
-from sigmasplat.plugins.papers.table_files import list_tables
+from sigmasplat.plugins.presets.table_files import list_tables
 
 README = ROOT / "README.md"
 PACKAGE = ROOT / "src" / "sigmasplat"

@@ -8,8 +8,8 @@ from types import ModuleType
 import pytest
 
 from changed_settings import changed_settings
-from sigmasplat.config.presets import list_presets, preset, presets_by_scene
-from sigmasplat.plugins.papers.base import BASE
+from sigmasplat.config.find_preset import list_presets, preset, presets_by_scene
+from sigmasplat.plugins.presets.base import BASE
 
 DOCS = Path(__file__).parents[2] / "docs"
 SYSTEMS = ("varsplat", "cgslam")

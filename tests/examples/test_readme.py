@@ -19,7 +19,7 @@ from documents import DOCUMENTS, ROOT, blocks
 from module_files import module_from
 from sigmasplat import cli
 from sigmasplat.commands import options
-from sigmasplat.config.presets import default_preset, preset
+from sigmasplat.config.find_preset import default_preset, preset
 from sigmasplat.config.text import override
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.registry import rows

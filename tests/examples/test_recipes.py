@@ -45,7 +45,7 @@ def run(package: Path) -> Callable[[str], None]:
 
 
 def test_a_preset_is_values_and_a_setting_is_a_field(package: Path, run: Callable[[str], None]) -> None:
-    presets = package / "plugins" / "papers"
+    presets = package / "plugins" / "presets"
     (presets / "mine.py").write_text(
         '"""Settings for my robot."""\n\nfrom sigmasplat.api import Preset, preset\n'
         "from sigmasplat.config.text import override\n\n"
@@ -62,7 +62,7 @@ def test_a_preset_is_values_and_a_setting_is_a_field(package: Path, run: Callabl
     run(
         "from sigmasplat.config.text import override\n"
         "from sigmasplat.errors import ConfigError\n"
-        "from sigmasplat.config.presets import list_presets, preset\n"
+        "from sigmasplat.config.find_preset import list_presets, preset\n"
         "robot = preset('robot')\n"
         "assert (robot.name, robot.input.width, robot.tracking.patience_s) == ('robot', 480, 0.5)\n"
         "assert {'robot', 'varsplat-office', 'loopsplat-office'} <= set(list_presets())\n"

@@ -27,7 +27,7 @@ from paired_comparison import (
 
 import sigmasplat
 from sigmasplat.config import Config
-from sigmasplat.config.presets import preset
+from sigmasplat.config.find_preset import preset
 from sigmasplat.config.text import override
 from sigmasplat.errors import RunError
 from sigmasplat.files.machine import INSTALLED, code_digest

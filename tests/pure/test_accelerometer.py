@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from bag_recordings import Recorder, aligned
 from box_room import CAMERA, seer, splats, walk
 from recordings import scene, write_stray
-from sigmasplat.config.presets import preset
+from sigmasplat.config.find_preset import preset
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.frame import Frame

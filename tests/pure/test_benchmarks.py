@@ -19,7 +19,7 @@ from benchmark_results import BENCHMARKS, laid_out, results
 from paper_settings import RenderConfig
 from sigmasplat import cli
 from sigmasplat.config import Config
-from sigmasplat.config.presets import preset
+from sigmasplat.config.find_preset import preset
 from sigmasplat.config.text import override
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera

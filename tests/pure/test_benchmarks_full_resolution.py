@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from benchmark_results import laid_out
-from sigmasplat.config.presets import preset
+from sigmasplat.config.find_preset import preset
 from sigmasplat.config.text import override
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField

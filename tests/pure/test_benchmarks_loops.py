@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from benchmark_results import laid_out
-from sigmasplat.config.presets import preset
+from sigmasplat.config.find_preset import preset
 from sigmasplat.data import se3
 from sigmasplat.errors import SourceError
 from sigmasplat.plugins.sources import open_source

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from benchmark_results import laid_out
-from sigmasplat.config.presets import preset
+from sigmasplat.config.find_preset import preset
 from sigmasplat.config.text import override, split_settings
 from sigmasplat.run_folder.runs import RunFolder
 

@@ -8,7 +8,7 @@ import pytest
 
 from benchmark_results import laid_out
 from sigmasplat.config import Config, FeatureConfig
-from sigmasplat.config.presets import preset
+from sigmasplat.config.find_preset import preset
 from sigmasplat.data import se3
 from sigmasplat.errors import SourceError
 from sigmasplat.plugins.sources.synthetic import SyntheticRoom

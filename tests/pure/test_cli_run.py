@@ -32,7 +32,7 @@ from sigmasplat.errors import SigmaSplatError, SourceError
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.cuda import stages as cuda_stages
 from sigmasplat.plugins.outputs.mesh_files import write_mesh
-from sigmasplat.plugins.papers.base import BASE
+from sigmasplat.plugins.presets.base import BASE
 from sigmasplat.run.session import Session
 from sigmasplat.run.terminal import Screen
 from sigmasplat.run_folder.frames import noted_up

@@ -11,7 +11,7 @@ import pytest
 
 from sigmasplat import env
 from sigmasplat.config import SECTIONS, Config, gone
-from sigmasplat.config.presets import preset
+from sigmasplat.config.find_preset import preset
 from sigmasplat.config.ranges import kinds_of, problem_of, unpacked
 from sigmasplat.config.text import override, split_settings
 from sigmasplat.errors import ConfigError

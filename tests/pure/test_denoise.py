@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from sigmasplat.fit.compare import noise_scale
-from sigmasplat.tracking.prepared_frame import denoised
+from sigmasplat.tracking.depth_filters import denoised
 
 Depth = NDArray[np.float32]
 

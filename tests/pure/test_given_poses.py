@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 import recordings
 from command_line import exit_code
 from sigmasplat.config import Config
-from sigmasplat.config.presets import preset
+from sigmasplat.config.find_preset import preset
 from sigmasplat.config.scale import for_scene
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera

@@ -32,7 +32,7 @@ BLIND = (
     "input",
 )
 DECIDING = {"tracking", "mapping", "graph", "final", "slam", "realtime"}
-PRESETS = ("plugins/papers", "config/presets.py")
+PRESETS = ("plugins/presets", "config/find_preset.py")
 SYSTEM_NAMES = re.compile("varsplat|cg[-_ ]?slam|loopsplat", re.IGNORECASE)
 PRESET_NAMES = re.compile("varsplat|cg_?slam|loopsplat")
 GPL = {"evo", "plyfile"}

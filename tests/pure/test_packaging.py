@@ -14,7 +14,7 @@ import pytest
 import sigmasplat
 from module_files import module_from
 from sigmasplat.cli import COMMANDS
-from sigmasplat.config.presets import list_presets, presets_by_scene
+from sigmasplat.config.find_preset import list_presets, presets_by_scene
 from sigmasplat.files.machine import package_version
 from sigmasplat.plugins.checks import installation
 

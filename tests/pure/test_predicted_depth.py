@@ -15,7 +15,7 @@ from sigmasplat.plugins.evaluation.path_scores import arbitrary_scale, in_metres
 from sigmasplat.run.scene import config_for, config_of_facts, scene_facts
 from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.slam.slam import Slam
-from sigmasplat.tracking.depth_fit import DepthFit, pixel_noise, smoothed
+from sigmasplat.tracking.predicted_depth_fit import DepthFit, pixel_noise, smoothed
 
 HEIGHT, WIDTH = 96, 128
 

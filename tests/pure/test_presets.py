@@ -10,10 +10,10 @@ import pytest
 
 from changed_settings import changed_settings
 from sigmasplat.config import Config
-from sigmasplat.config.presets import FAMILIES, default_preset, list_presets, preset, presets_by_scene
+from sigmasplat.config.find_preset import FAMILIES, default_preset, list_presets, preset, presets_by_scene
 from sigmasplat.config.text import override
 from sigmasplat.errors import ConfigError
-from sigmasplat.plugins.papers.base import BASE
+from sigmasplat.plugins.presets.base import BASE
 
 DATASETS = ("replica", "tum", "scannet")
 EVERY = [*list_presets(), *presets_by_scene()]

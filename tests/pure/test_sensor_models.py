@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from command_line import exit_code
 from paper_settings import InputConfig
-from sigmasplat.config.presets import preset
+from sigmasplat.config.find_preset import preset
 from sigmasplat.config.scale import for_scene
 from sigmasplat.config.sensors import SENSORS, SensorModel, sensor_model
 from sigmasplat.data.camera import Camera
@@ -26,7 +26,7 @@ from sigmasplat.fit.target import Target
 from sigmasplat.input.calibration import read_calibration
 from sigmasplat.mapping.seeding import make_splats
 from sigmasplat.plugins.checks.depth import measure_noise
-from sigmasplat.plugins.papers.base import BASE
+from sigmasplat.plugins.presets.base import BASE
 from sigmasplat.tracking.prepared_frame import view_of, working_frame
 
 CAMERA = Camera(160, 120, 140.0, 140.0, 79.5, 59.5)

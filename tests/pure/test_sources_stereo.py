@@ -11,7 +11,7 @@ from ablation_runs import run_job
 from bag_recordings import Recorder
 from command_line import exit_code
 from layouts import save, save_text, tum_line
-from sigmasplat.config.presets import preset
+from sigmasplat.config.find_preset import preset
 from sigmasplat.config.scale import for_scene, scaled
 from sigmasplat.config.text import override
 from sigmasplat.env import opencv

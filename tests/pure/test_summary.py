@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 from PIL import Image
 
-from sigmasplat.config.presets import preset
+from sigmasplat.config.find_preset import preset
 from sigmasplat.config.text import override, split_settings
 from sigmasplat.errors import RunError
 from sigmasplat.plugins.evaluation.report.advice import advice, next_commands
@@ -23,7 +23,7 @@ from sigmasplat.plugins.evaluation.report.summary import (
 from sigmasplat.plugins.evaluation.report.tables import score_tables, state_rows
 from sigmasplat.plugins.evaluation.report.view_strips import PanelFigure, data_uri, file_data_uri
 from sigmasplat.plugins.outputs.floorplan.rescan import RescanRegion
-from sigmasplat.plugins.papers.base import BASE
+from sigmasplat.plugins.presets.base import BASE
 from sigmasplat.run_folder.runs import RunFolder
 
 GOOD = {

@@ -13,7 +13,7 @@ from sigmasplat.data.submap import Picture
 from sigmasplat.errors import ConfigError
 from sigmasplat.final.fusion import FusionView, fuse, with_readings
 from sigmasplat.plugins.outputs.mesh_editing import decimated
-from sigmasplat.plugins.papers.base import BASE
+from sigmasplat.plugins.presets.base import BASE
 from sigmasplat.render.mesh import mesh_depth
 
 VOXEL_M = 0.04

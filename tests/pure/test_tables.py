@@ -14,8 +14,8 @@ from sigmasplat.plugins.batch.definition import MEAN, Cell, Score, Table
 from sigmasplat.plugins.batch.executor import DataRoots
 from sigmasplat.plugins.batch.job import Job
 from sigmasplat.plugins.batch.scores import OURS, PAPER, Written, rows
-from sigmasplat.plugins.papers.base import BASE
-from sigmasplat.plugins.papers.table_files import list_tables
+from sigmasplat.plugins.presets.base import BASE
+from sigmasplat.plugins.presets.table_files import list_tables
 
 WANTED = {
     "varsplat-replica", "varsplat-tum", "varsplat-scannet", "varsplat-scannetpp", "varsplat-ablation",

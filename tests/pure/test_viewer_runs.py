@@ -14,7 +14,7 @@ import torch
 
 from command_line import exit_code
 from sigmasplat.config import Config
-from sigmasplat.config.presets import default_preset, preset
+from sigmasplat.config.find_preset import default_preset, preset
 from sigmasplat.config.text import override
 from sigmasplat.data import se3
 from sigmasplat.data.trajectory import Component

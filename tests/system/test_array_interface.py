@@ -14,7 +14,7 @@ from recorded_room import write_images
 from schedules import AtOnce, Drawn
 from sigmasplat import Camera, Slam, open_source
 from sigmasplat.config import Config
-from sigmasplat.config.presets import default_preset, preset
+from sigmasplat.config.find_preset import default_preset, preset
 from sigmasplat.config.text import override
 from sigmasplat.data import se3
 from sigmasplat.errors import ConfigError, SourceError

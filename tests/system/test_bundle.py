@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from sigmasplat.config import Config
-from sigmasplat.config.presets import default_preset, preset
+from sigmasplat.config.find_preset import default_preset, preset
 from sigmasplat.config.text import override
 from sigmasplat.data import se3
 from sigmasplat.fit.target import Keyframe, Target

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from sigmasplat.config.presets import preset
+from sigmasplat.config.find_preset import preset
 from sigmasplat.config.text import override
 from sigmasplat.plugins.evaluation.metrics.image import psnr
 from sigmasplat.plugins.evaluation.metrics.trajectory import ate

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from command_line import exit_code
 from sigmasplat.config import Config
-from sigmasplat.config.presets import preset
+from sigmasplat.config.find_preset import preset
 from sigmasplat.config.text import override
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sigmasplat.config import Config
-from sigmasplat.config.presets import preset
+from sigmasplat.config.find_preset import preset
 from sigmasplat.config.scale import for_scene
 from sigmasplat.config.text import override
 from sigmasplat.data import se3

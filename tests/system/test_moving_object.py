@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sigmasplat.config.presets import preset
+from sigmasplat.config.find_preset import preset
 from sigmasplat.config.text import override
 from sigmasplat.data import se3
 from sigmasplat.data.frame import Frame

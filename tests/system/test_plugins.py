@@ -143,7 +143,7 @@ def test_missing_files_and_unknown_filters_are_refused(tmp_path: Path, capsys: p
 
 
 def test_a_mask_of_another_shape_is_refused_and_a_depth_filter_changes_what_slam_sees() -> None:
-    from sigmasplat.data.frame_filters import frame_filter
+    from sigmasplat.tracking.depth_filters import frame_filter
 
     frame = next(iter(api.open_source("synthetic:frames=1,width=32,height=24")))
     registry.rows.cache_clear()

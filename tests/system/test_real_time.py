@@ -15,7 +15,7 @@ import pytest
 from command_line import exit_code
 from schedules import AtOnce, Drawn, Late
 from sigmasplat.config import Config
-from sigmasplat.config.presets import preset
+from sigmasplat.config.find_preset import preset
 from sigmasplat.config.text import override
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.submap import MemoryStore

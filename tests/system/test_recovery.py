@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from sigmasplat.config import Config
-from sigmasplat.config.presets import preset
+from sigmasplat.config.find_preset import preset
 from sigmasplat.config.text import override
 from sigmasplat.data import se3
 from sigmasplat.data.frame import Frame

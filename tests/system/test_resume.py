@@ -15,7 +15,7 @@ import torch
 from command_line import exit_code
 from sigmasplat.commands.run import resume_line
 from sigmasplat.config import Config
-from sigmasplat.config.presets import preset
+from sigmasplat.config.find_preset import preset
 from sigmasplat.config.text import override
 from sigmasplat.data.column import Column
 from sigmasplat.data.poses import KeyframePoses, Places, Poses

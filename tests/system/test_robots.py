@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from command_line import exit_code
 from ros_reading import covariance, decoded, image, links, points, pose, read_bag, seconds
 from sigmasplat.config import Config
-from sigmasplat.config.presets import default_preset, preset
+from sigmasplat.config.find_preset import default_preset, preset
 from sigmasplat.config.text import override
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.frame import Frame

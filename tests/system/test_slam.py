@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from sigmasplat.config import Config
-from sigmasplat.config.presets import default_preset, preset
+from sigmasplat.config.find_preset import default_preset, preset
 from sigmasplat.config.text import override
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from command_line import exit_code
-from sigmasplat.plugins.papers.base import BASE
+from sigmasplat.plugins.presets.base import BASE
 from sigmasplat.run import step_logs
 from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.slam.results import Step

@@ -8,7 +8,7 @@ import pytest
 from command_line import exit_code
 from sigmasplat import cli
 from sigmasplat.config import Config
-from sigmasplat.config.presets import default_preset, preset
+from sigmasplat.config.find_preset import default_preset, preset
 from sigmasplat.config.text import override
 from sigmasplat.data import se3
 from sigmasplat.data.frame import Frame

@@ -42,7 +42,7 @@ from unseen_views import held_back_views
 from view_predictors import PREDICTORS, see
 
 from paper_settings import RenderConfig
-from sigmasplat.config.presets import preset
+from sigmasplat.config.find_preset import preset
 from sigmasplat.config.text import override
 from sigmasplat.data import se3
 from sigmasplat.data.field import GaussianField

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from sigmasplat.config import Config
-from sigmasplat.config.presets import preset
+from sigmasplat.config.find_preset import preset
 from sigmasplat.config.text import override
 from sigmasplat.data.map_uncertainty import SHIPPED
 from sigmasplat.data.submap import RefinedStore

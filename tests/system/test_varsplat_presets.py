@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sigmasplat.config import Config
-from sigmasplat.config.presets import list_presets, preset, presets_by_scene
+from sigmasplat.config.find_preset import list_presets, preset, presets_by_scene
 from sigmasplat.config.text import override
 from sigmasplat.slam.slam import Slam
 from small_room import frames

@@ -20,7 +20,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from sigmasplat.config.presets import default_preset, preset
+from sigmasplat.config.find_preset import default_preset, preset
 from sigmasplat.config.text import override
 from sigmasplat.plugins.outputs.drawing import colormap
 from sigmasplat.plugins.sources import open_source

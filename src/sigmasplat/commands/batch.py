@@ -9,7 +9,7 @@ import tyro
 
 from sigmasplat.commands import options
 from sigmasplat.commands.input_options import DEFAULT_INPUT_OPTIONS, From1, InputOptionsFlat, arg, flag
-from sigmasplat.config.presets import default_preset
+from sigmasplat.config.find_preset import default_preset
 from sigmasplat.config.text import full_path
 from sigmasplat.errors import ConfigError, SourceError
 

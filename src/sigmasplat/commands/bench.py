@@ -9,10 +9,10 @@ import tyro
 
 from sigmasplat.commands import batch as batch_options, options
 from sigmasplat.commands.input_options import Limit, arg
-from sigmasplat.config.presets import default_preset
+from sigmasplat.config.find_preset import default_preset
 from sigmasplat.config.text import split_settings
 from sigmasplat.errors import ConfigError, SourceError
-from sigmasplat.plugins.papers.table_files import list_tables, read_table
+from sigmasplat.plugins.presets.table_files import list_tables, read_table
 
 if TYPE_CHECKING:
     from sigmasplat.plugins.batch.batch import Batch

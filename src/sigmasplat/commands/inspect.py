@@ -6,7 +6,7 @@ from typing import Annotated
 from sigmasplat.commands import options
 from sigmasplat.commands.input_options import DEFAULT_INPUT_OPTIONS, InputOptionsFlat, arg
 from sigmasplat.commands.options import configured
-from sigmasplat.config.presets import default_preset
+from sigmasplat.config.find_preset import default_preset
 
 OK, WARNED = 0, 1
 SHEETS = Path("runs/inspect")

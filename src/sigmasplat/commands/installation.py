@@ -4,7 +4,7 @@ import subprocess
 import sys
 
 from sigmasplat.commands import options
-from sigmasplat.config.presets import list_presets, presets_by_scene
+from sigmasplat.config.find_preset import list_presets, presets_by_scene
 
 OK, UNHEALTHY = 0, 1
 

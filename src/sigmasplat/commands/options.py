@@ -10,7 +10,7 @@ import tyro
 from sigmasplat import env
 from sigmasplat.commands.input_options import DEFAULT_INPUT_OPTIONS, From0, From1, InputOptions, Whole, arg, flag
 from sigmasplat.config import Config, InputConfig
-from sigmasplat.config.presets import FAMILIES, preset as preset_of
+from sigmasplat.config.find_preset import FAMILIES, preset as preset_of
 from sigmasplat.config.ranges import Range
 from sigmasplat.config.text import override, split_settings
 from sigmasplat.errors import RunError

@@ -22,7 +22,7 @@ from sigmasplat.commands.robot_output import (
     robot_output,
 )
 from sigmasplat.commands.view import keep_showing, serve_viewer
-from sigmasplat.config.presets import default_preset
+from sigmasplat.config.find_preset import default_preset
 from sigmasplat.config.text import full_path, split_settings
 from sigmasplat.errors import ConfigError
 

@@ -20,10 +20,10 @@ from sigmasplat.mapping.validation_views import ValidationViews
 from sigmasplat.realtime.messages import Offer, Search, Snapshot, TrackedFrame
 from sigmasplat.render.view import View
 from sigmasplat.slam.results import Step, StepTimer, SubmapState, make_step
-from sigmasplat.tracking.fitted_depth import fitted_keyframe, fitted_to_map
 from sigmasplat.tracking.frame_estimate import FrameEstimate
 from sigmasplat.tracking.keyframe_rule import becomes_keyframe, is_held_back, is_mappable, may_validate
 from sigmasplat.tracking.pose_validation import is_questionable
+from sigmasplat.tracking.predicted_depth_frames import fitted_keyframe, fitted_to_map
 from sigmasplat.tracking.prepared_frame import PreparedFrame, TrackedKeyframe, refuse_first_without_depth
 from sigmasplat.tracking.recovery import Recovery, usable
 from sigmasplat.tracking.tracker import Tracker

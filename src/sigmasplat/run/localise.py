@@ -10,13 +10,13 @@ import numpy as np
 from sigmasplat.config import Config
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.frame import Frame
-from sigmasplat.data.frame_filters import frame_filter
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.files.atomic import write_text
 from sigmasplat.files.json_files import json_line
 from sigmasplat.fit.compare import Comparison
 from sigmasplat.run.finished_map import FinishedMap
 from sigmasplat.run_folder.trajectory import write_trajectory
+from sigmasplat.tracking.depth_filters import frame_filter
 from sigmasplat.tracking.features import make_extractor
 from sigmasplat.tracking.prepared_frame import observe, view_of, working_frame
 from sigmasplat.tracking.recovery import usable

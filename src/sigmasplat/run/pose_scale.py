@@ -13,9 +13,9 @@ from sigmasplat.config import Config
 from sigmasplat.data import se3
 from sigmasplat.errors import SourceError
 from sigmasplat.input.source import Source
-from sigmasplat.tracking.depth_fit import depth_at
 from sigmasplat.tracking.feature_image import FeatureImage, LateDetail, motion_by_features
 from sigmasplat.tracking.features import Extractor, Features, make_extractor
+from sigmasplat.tracking.predicted_depth_fit import depth_at
 from sigmasplat.types import Matrix
 
 PLACES, STEPS = 12, (32, 16, 8, 4, 2, 1)

@@ -23,13 +23,13 @@ from sigmasplat.mapping.mapper import Mapper, SecondHalf
 from sigmasplat.mapping.validation_views import ValidationView, ValidationViews
 from sigmasplat.slam.results import Step, Steps
 from sigmasplat.slam.slam import Slam
-from sigmasplat.tracking.depth_fit import DepthFit, DepthShape
 from sigmasplat.tracking.drift import Drift
 from sigmasplat.tracking.feature_image import FeatureImage
 from sigmasplat.tracking.moving.depth_history import DepthHistory, RememberedDepth
 from sigmasplat.tracking.moving.dynamic_detector import DynamicDetector
 from sigmasplat.tracking.moving.dynamic_mask import DynamicMask
 from sigmasplat.tracking.pose_validation import TrackingStatistics
+from sigmasplat.tracking.predicted_depth_fit import DepthFit, DepthShape
 from sigmasplat.tracking.recovery import Recovery
 from sigmasplat.tracking.relocaliser import Relocaliser
 from sigmasplat.tracking.tracker import Tracker

@@ -20,10 +20,10 @@ from sigmasplat.slam.array_interface import ArrayInterface
 from sigmasplat.slam.listeners import notifying
 from sigmasplat.slam.mapping_backend import MappingBackend
 from sigmasplat.slam.results import Step, StepTimer, make_step
-from sigmasplat.tracking.fitted_depth import fitted_keyframe, fitted_to_map
 from sigmasplat.tracking.frame_estimate import FrameEstimate
 from sigmasplat.tracking.keyframe_rule import becomes_keyframe, is_held_back, is_mappable, may_validate
 from sigmasplat.tracking.pose_validation import is_better, is_questionable
+from sigmasplat.tracking.predicted_depth_frames import fitted_keyframe, fitted_to_map
 from sigmasplat.tracking.prepared_frame import PreparedFrame, refuse_first_without_depth, working_frame
 from sigmasplat.tracking.recovery import usable
 from sigmasplat.tracking.relocaliser import Relocation

@@ -9,13 +9,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.config import Config
-from sigmasplat.config.presets import configured
+from sigmasplat.config.find_preset import configured
 from sigmasplat.data.atlas import Atlas
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.column import Column
 from sigmasplat.data.field import GaussianField, Rows
 from sigmasplat.data.frame import Frame
-from sigmasplat.data.frame_filters import frame_filter
 from sigmasplat.data.map_uncertainty import MapUncertainty
 from sigmasplat.data.relative_pose import RelativePose
 from sigmasplat.data.submap import MemoryStore, OnDisk, SubmapStore
@@ -33,6 +32,7 @@ from sigmasplat.mapping.validation_views import ValidationViews
 from sigmasplat.render.view import View
 from sigmasplat.slam.listeners import Listeners
 from sigmasplat.slam.results import Step, Steps, StepTimer, SubmapState
+from sigmasplat.tracking.depth_filters import frame_filter
 from sigmasplat.tracking.drift import Drift
 from sigmasplat.tracking.features import Extractor, extractor_of
 from sigmasplat.tracking.prepared_frame import PreparedFrame, observe, view_of, working_frame

@@ -15,45 +15,19 @@ from sigmasplat.data.depth_std import std_by_model
 from sigmasplat.data.exposure import gray_exposure, unexposed
 from sigmasplat.data.frame import Frame, Photo, photo_size
 from sigmasplat.data.submap import Picture
-from sigmasplat.env import opencv
 from sigmasplat.errors import SourceError
 from sigmasplat.fit.backends import fits_of
-from sigmasplat.fit.compare import noise_scale
-from sigmasplat.fit.pyramid import HIDDEN_M, NOISE_PER_M, Pyramid
+from sigmasplat.fit.pyramid import HIDDEN_M, Pyramid
 from sigmasplat.fit.references import Reference, keyframe_reference, live_image, picture_images
 from sigmasplat.fit.target import Target
 from sigmasplat.render.backend import make_view
 from sigmasplat.render.view import View
-from sigmasplat.tracking.depth_fit import smoothed
+from sigmasplat.tracking.depth_filters import denoised
 from sigmasplat.tracking.feature_image import FeatureImage, LateDetail
 from sigmasplat.tracking.features import Extractor
 from sigmasplat.tracking.moving.dynamic_mask import DynamicMask
+from sigmasplat.tracking.predicted_depth_fit import smoothed
 from sigmasplat.types import Matrix
-
-DIAMETER_PX = 5
-"""Each reading becomes the weighted mean of the readings in a window of this width."""
-SPREAD_PX, SPREAD_SIGMA = 2.0, 3.0
-"""Spread of the weights: with the distance in pixels, and with the difference of the readings in standard deviations of
-a reading, so that depth steps stay sharp."""
-HOLE = -1.0
-"""Inverse depth, 1/m, of a pixel without a reading: so far from all readings that its weight is 0."""
-
-
-def denoised(
-    depth_m: NDArray[np.float32], noise_per_m: float = NOISE_PER_M, scene_scale: float = 1.0
-) -> NDArray[np.float32]:
-    """Return depth [H, W] m, 0 = no reading, smoothed by a bilateral filter if its noise is above that of the sensor
-    model (`noise_scale`); otherwise the same image. Holes stay holes.
-
-    The filter works on inverse depth (Tomasi & Manduchi 1998): noise that grows with z² is constant there.
-    """
-    scale = noise_scale(depth_m, noise_per_m, scene_scale)
-    if scale <= 1.0:
-        return depth_m
-    read = depth_m > 0
-    inverse = np.where(read, 1.0 / np.maximum(depth_m, np.float32(1e-3)), np.float32(HOLE)).astype(np.float32)
-    smooth = opencv().bilateralFilter(inverse, DIAMETER_PX, SPREAD_SIGMA * scale * noise_per_m, SPREAD_PX)
-    return np.where(read, 1.0 / np.maximum(smooth, np.float32(1e-3)), np.float32(0.0)).astype(np.float32)
 
 
 @dataclass(eq=False)

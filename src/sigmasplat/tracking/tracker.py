@@ -15,15 +15,15 @@ from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference, map_reference
 from sigmasplat.render.view import View
 from sigmasplat.tracking import pose_validation as judge
-from sigmasplat.tracking.depth_fit import NOTHING_FITTED, DepthFit
 from sigmasplat.tracking.feature_image import FeatureImage, motion_by_features
 from sigmasplat.tracking.features import Extractor
 from sigmasplat.tracking.moving.depth_history import together
-from sigmasplat.tracking.moving.drawn import has_drawn
 from sigmasplat.tracking.moving.dynamic_detector import DynamicDetector
 from sigmasplat.tracking.moving.dynamic_mask import DynamicMask
+from sigmasplat.tracking.moving.pose_pullers import has_drawn
 from sigmasplat.tracking.pose_prediction import Given, PosePrediction, odometry, predict
 from sigmasplat.tracking.pose_validation import TrackingStatistics
+from sigmasplat.tracking.predicted_depth_fit import NOTHING_FITTED, DepthFit
 from sigmasplat.tracking.prepared_frame import PreparedFrame, Splats, TrackedKeyframe, mapped_keyframe
 from sigmasplat.types import Matrix, ShouldStop, never
 

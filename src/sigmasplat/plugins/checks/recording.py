@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from sigmasplat.config import InputConfig
-from sigmasplat.config.presets import default_preset, list_presets
+from sigmasplat.config.find_preset import default_preset, list_presets
 from sigmasplat.config.sensors import AUTO
 from sigmasplat.data.frame import Frame
 from sigmasplat.errors import SourceError

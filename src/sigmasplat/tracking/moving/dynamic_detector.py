@@ -13,8 +13,8 @@ from sigmasplat.fit.pose import PoseFit
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference
 from sigmasplat.tracking.moving.depth_history import DepthHistory
-from sigmasplat.tracking.moving.drawn import is_still, suspected
 from sigmasplat.tracking.moving.dynamic_mask import DynamicMask, Earlier, dynamic_mask
+from sigmasplat.tracking.moving.pose_pullers import is_still, suspected
 from sigmasplat.tracking.pose_validation import differs
 from sigmasplat.tracking.prepared_frame import PreparedFrame
 from sigmasplat.types import Matrix, ShouldStop

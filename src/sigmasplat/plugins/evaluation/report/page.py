@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from sigmasplat.config import Config
-from sigmasplat.config.presets import default_preset, is_preset, preset
+from sigmasplat.config.find_preset import default_preset, is_preset, preset
 from sigmasplat.config.text import differences
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.trajectory import Trajectory

@@ -12,8 +12,8 @@ Ours: `primitives.faded_opacity`, and the steps at which uncertain splats fade a
 import dataclasses
 
 from sigmasplat.config import Config
-from sigmasplat.plugins.papers import varsplat
-from sigmasplat.plugins.papers.base import BASE
+from sigmasplat.plugins.presets import varsplat
+from sigmasplat.plugins.presets.base import BASE
 
 PAPER = BASE.changed(
     input={"min_depth_m": 0.0},  # as in the code, no reading is removed

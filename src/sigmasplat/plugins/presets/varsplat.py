@@ -7,7 +7,7 @@ from: docs/varsplat.md.
 """
 
 from sigmasplat.config import Config
-from sigmasplat.plugins.papers.base import BASE
+from sigmasplat.plugins.presets.base import BASE
 
 UNCERTAIN_M = 0.02
 """The rule of accumulated uncertainty is the paper's, the limit is ours."""

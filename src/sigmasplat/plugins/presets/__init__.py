@@ -1,9 +1,9 @@
-"""The settings of the published systems, one module each, and the tables of their papers."""
+"""The presets: a row for each name. The values of a published system are in a module of its own."""
 
 from functools import partial
 
 from sigmasplat.config import Config
-from sigmasplat.plugins.papers import cgslam, released, varsplat
+from sigmasplat.plugins.presets import cgslam, released, varsplat
 from sigmasplat.registry import Preset
 
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from sigmasplat.data import se3
 from sigmasplat.render.view import View
-from sigmasplat.tracking.depth_fit import DepthFit
+from sigmasplat.tracking.predicted_depth_fit import DepthFit
 from sigmasplat.tracking.prepared_frame import PreparedFrame, Splats
 from sigmasplat.tracking.tracker import Tracker
 from sigmasplat.types import Matrix

@@ -20,7 +20,7 @@ from typing import Any
 
 from sigmasplat.config import Config
 from sigmasplat.errors import ConfigError, nearest
-from sigmasplat.plugins.papers import cgslam, varsplat
+from sigmasplat.plugins.presets import cgslam, varsplat
 
 # min_interval: the code's limit + 1, because it asks for more than the limit. max_depth_m: no reading is removed, the
 # PNGs of TUM and ScanNet end at 13 and 66 m.
