@@ -8,6 +8,7 @@ import ast
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 from html import escape
 from pathlib import Path
 
@@ -84,13 +85,22 @@ text { font: 13px system-ui, sans-serif; fill: #1f2328 }
 
 
 def imported(tree: ast.AST) -> Iterator[str]:
-    """Yield every module, or name in one, that a file imports, dotted; at the top or inside a function."""
+    """Yield every module, or name in one, that a file imports, dotted; at the top or inside a function. A name of the
+    API is that of its home."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, "imports are absolute, so that the layers can be read"
-            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+            homes = api_homes() if node.module == "sigmasplat.api" else {}
+            yield from (f"{homes.get(alias.name, node.module)}.{alias.name}" for alias in node.names)
+
+
+@cache
+def api_homes() -> dict[str, str]:
+    """Return the module of each name of the API."""
+    body = ast.parse((PACKAGE / "api.pyi").read_text(encoding="utf-8")).body
+    return {alias.name: str(node.module) for node in body if isinstance(node, ast.ImportFrom) for alias in node.names}
 
 
 def parsed(path: Path) -> ast.AST:

@@ -130,6 +130,16 @@ def test_readers_of_runs_do_not_know_how_slam_decides() -> None:
     assert len(found) > 60 and {path: names for path, names in found.items() if names} == {}
 
 
+def test_plugins_import_the_api_and_each_other_only() -> None:
+    files = [path for path in FILES if below(path, ("plugins",))]
+    found = dict[str, list[str]]()
+    for path in files:
+        modules = (node.module or "" for node in ast.walk(parsed(path)) if isinstance(node, ast.ImportFrom))
+        names = (module for module in modules if module.startswith("sigmasplat"))
+        found[str(path)] = [name for name in names if not name.startswith(("sigmasplat.api", "sigmasplat.plugins"))]
+    assert len(found) > 100 and {path: names for path, names in found.items() if names} == {}
+
+
 def test_the_picture_of_the_floors_shows_the_current_imports() -> None:
     committed = floors.PICTURE.read_text(encoding="utf-8")
     same = floors.without_sizes(committed) == floors.without_sizes(floors.draw())
@@ -187,6 +197,7 @@ def test_the_checks_notice_what_they_are_for() -> None:
     assert problems_of_floors("run", ast.parse("import sigmasplat.plugins.viewer.app"))
     assert problems_of_floors("slam", ast.parse("from sigmasplat import open_source"))
     assert circles({"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"a"}}) == [["a", "b", "c"]] and not circles({"a": set()})
+    assert problems_of_floors("slam", ast.parse("from sigmasplat.api import open_source"))
     assert not problems_of_floors("slam", ast.parse("from sigmasplat.fit.pose import fit_pose\nimport torch"))
     assert reads_truth(ast.parse("path = source.truth()")) and reads_truth(ast.parse("source.true_surface()"))
     documented = ast.parse('"""VarSplat eq. 3"""\nx = 1  # LoopSplat\n')

@@ -35,7 +35,7 @@ def read_frames(path: Path, fields: Fields, key: str = "frames") -> list[Fields]
     return frames
 
 
-def read_camera(
+def read_transforms_camera(
     path: Path, fields: Fields, frames: Sequence[Fields], size: tuple[int, int], units: float
 ) -> Calibration:
     """Build the camera shared by all frames; `size` (width, height) is the default for a missing size.

@@ -8,14 +8,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sigmasplat.errors import ConfigError, RunError
+from sigmasplat.api import ConfigError, Progress, RunError, RunFolder
 from sigmasplat.plugins.batch.executor import DataRoots, Executor, LocalExecutor, Outcome, Sequences
 from sigmasplat.plugins.batch.job import FACT, Job, has_other_run
-from sigmasplat.run_folder.runs import RunFolder
-from sigmasplat.types import Progress
 
 if TYPE_CHECKING:
-    from sigmasplat.run.terminal import Screen
+    from sigmasplat.api import Screen
 
 LOOK_EVERY_S = 2.0
 

@@ -19,9 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sigmasplat.env import install_extra
-from sigmasplat.errors import ConfigError, RunError
-from sigmasplat.files.atomic import write_text
+from sigmasplat.api import ConfigError, RunError, install_extra, write_text
 from sigmasplat.plugins.batch.executor import DataRoots, Outcome, RunProcesses, Sequences, sequences_of
 from sigmasplat.plugins.batch.job import Job, installed_code
 

@@ -4,14 +4,19 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, get_args, get_origin, get_type_hints
 
-from sigmasplat.config import Config
-from sigmasplat.config.find_preset import list_presets, preset, presets_by_scene
-from sigmasplat.config.text import override
-from sigmasplat.errors import ConfigError, nearest
-from sigmasplat.files.reading import guarded
+from sigmasplat.api import (
+    MOST_NUMBER,
+    Config,
+    ConfigError,
+    guarded,
+    list_presets,
+    nearest,
+    override,
+    preset,
+    presets_by_scene,
+)
 from sigmasplat.plugins.batch.job import Job
 from sigmasplat.plugins.presets.table_files import read_table
-from sigmasplat.run_folder.run_values import MOST_NUMBER
 
 MEAN = "mean"
 """The name of the column with the mean over scenes."""

@@ -12,8 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
-from sigmasplat.errors import ConfigError, SigmaSplatError
-from sigmasplat.files.machine import usable_cores
+from sigmasplat.api import ConfigError, SigmaSplatError, usable_cores
 from sigmasplat.plugins.batch.job import Job
 from sigmasplat.plugins.sources import open_source
 

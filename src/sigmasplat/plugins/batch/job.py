@@ -8,12 +8,16 @@ from pathlib import Path
 from typing import Any
 
 import sigmasplat
-from sigmasplat.config import Config
-from sigmasplat.errors import SigmaSplatError, SourceError
-from sigmasplat.files.json_files import read_json
-from sigmasplat.files.machine import INSTALLED, code_digest
-from sigmasplat.run.scene import config_of_facts
-from sigmasplat.run_folder.runs import RunFolder
+from sigmasplat.api import (
+    INSTALLED,
+    Config,
+    RunFolder,
+    SigmaSplatError,
+    SourceError,
+    code_digest,
+    config_of_facts,
+    read_json,
+)
 
 FACT = "batch"
 """The entry of run.json that says which job a run folder belongs to."""

@@ -15,20 +15,28 @@ from pathlib import Path
 
 import torch
 
-from sigmasplat import env
-from sigmasplat.config import Config
-from sigmasplat.errors import SigmaSplatError, is_out_of_memory, out_of_memory
-from sigmasplat.files.lock import locked
-from sigmasplat.input.source import Source
+from sigmasplat.api import (
+    Config,
+    RefinementFile,
+    RunFolder,
+    Session,
+    SigmaSplatError,
+    Slam,
+    Source,
+    StartPoint,
+    StateFile,
+    env,
+    is_out_of_memory,
+    locked,
+    new_folder,
+    open_scene,
+    out_of_memory,
+    refuse_other_model,
+    resume,
+)
 from sigmasplat.plugins.batch.job import Job
 from sigmasplat.plugins.evaluation.evaluate import evaluate
 from sigmasplat.plugins.evaluation.metrics.lpips import find_lpips
-from sigmasplat.run.resume import RefinementFile, StartPoint, StateFile, resume
-from sigmasplat.run.same_conditions import refuse_other_model
-from sigmasplat.run.scene import open_scene
-from sigmasplat.run.session import Session, new_folder
-from sigmasplat.run_folder.runs import RunFolder
-from sigmasplat.slam.slam import Slam
 
 REFUSED, INTERRUPTED = 2, 130
 

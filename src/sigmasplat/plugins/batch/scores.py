@@ -7,10 +7,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from sigmasplat.files.atomic import make_folder, write_text
+from sigmasplat.api import RunFolder, make_folder, number, write_text
 from sigmasplat.plugins.batch.definition import MEAN, Cell, Score, Table
-from sigmasplat.run.figures import number
-from sigmasplat.run_folder.runs import RunFolder
 
 OURS, PAPER = "ours", "paper"
 

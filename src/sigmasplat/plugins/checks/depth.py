@@ -16,9 +16,7 @@ from PIL import Image
 from scipy import ndimage, signal
 from scipy.optimize import nnls
 
-from sigmasplat.config.sensors import SensorModel, sensor_model
-from sigmasplat.data.frame import Frame
-from sigmasplat.fit.pyramid import NOISE_PER_M
+from sigmasplat.api import NOISE_PER_M, Frame, SensorModel, sensor_model
 
 Plane = NDArray[np.float32]
 

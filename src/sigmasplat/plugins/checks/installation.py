@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from importlib import import_module, metadata
 from typing import Any
 
-from sigmasplat import env
-from sigmasplat.files import machine
+from sigmasplat.api import env, machine
 
 MAX_DIFFERENCE = 1e-2
 """If rounding moves a splat across the threshold alpha_min, a pixel can change by up to 1/255."""
@@ -72,7 +71,7 @@ def check_cuda() -> Iterator[Finding]:
     """Check NVRTC, driver and GPUs, one line each. Missing parts are not faults: a machine without a GPU is healthy."""
     import torch
 
-    from sigmasplat.errors import BackendError
+    from sigmasplat.api import BackendError
     from sigmasplat.plugins.cuda import cubins, launch as cuda_launch
 
     try:
@@ -106,7 +105,7 @@ def _device(device: Any) -> Iterator[Finding]:
     """Describe a GPU, and run the self-test on it."""
     import torch
 
-    from sigmasplat.errors import BackendError
+    from sigmasplat.api import BackendError
     from sigmasplat.plugins.cuda import cubins
 
     about = torch.cuda.get_device_properties(device)
@@ -122,8 +121,7 @@ def self_test(device: Any = "cpu") -> Finding:
     """Render 300 splats with the kernels of a device and with the reference renderer, and compare the images."""
     import torch
 
-    from sigmasplat.render.backend import backend_module
-    from sigmasplat.render.reference import operators as reference
+    from sigmasplat.api import backend_module, operators as reference
 
     started_s = time.perf_counter()
     name = "cpu" if str(device) == "cpu" else "cuda"
@@ -140,8 +138,7 @@ def _picture(backend: Any, device: Any = "cpu") -> Any:
     """Render a fixed random cloud of splats: colour and alpha, [H, W, 4]."""
     import torch
 
-    from sigmasplat.config import RenderConfig
-    from sigmasplat.data.camera import Camera
+    from sigmasplat.api import Camera, RenderConfig
 
     random = torch.Generator().manual_seed(0)
     means, shapes, quats, colors = (torch.rand(300, n, generator=random).to(device) for n in (3, 3, 4, 3))

@@ -13,9 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from sigmasplat.data.frame import Frame
-from sigmasplat.errors import SourceError
-from sigmasplat.input.source import Source
+from sigmasplat.api import Frame, Source, SourceError
 
 PLAUSIBLE_RATE_HZ = (0.1, 1000.0)
 """Frame rates of cameras, also of recordings that keep every tenth frame; with times in another unit it is outside."""

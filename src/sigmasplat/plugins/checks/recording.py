@@ -9,15 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from sigmasplat.config import InputConfig
-from sigmasplat.config.find_preset import default_preset, list_presets
-from sigmasplat.config.sensors import AUTO
-from sigmasplat.data.frame import Frame
-from sigmasplat.errors import SourceError
-from sigmasplat.input.calibration import CameraUnknown, unlikely_camera
-from sigmasplat.input.opening import format_name
-from sigmasplat.input.recorded import depth_warning
-from sigmasplat.input.source import Source
+from sigmasplat.api import (
+    AUTO,
+    CameraUnknown,
+    Frame,
+    InputConfig,
+    Source,
+    SourceError,
+    default_preset,
+    depth_warning,
+    format_name,
+    list_presets,
+    unlikely_camera,
+)
 from sigmasplat.plugins.checks.depth import EdgeAgreement, edge_agreement, measure_noise, overlay
 from sigmasplat.plugins.checks.motion import Motion, motion_warnings, rate, time_warnings, times_of
 from sigmasplat.plugins.outputs.drawing import colormap

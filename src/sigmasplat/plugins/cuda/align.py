@@ -10,10 +10,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sigmasplat.fit.interface import NORMAL_TERMS, AlignedPose, AlignRules, LevelPlanes
+from sigmasplat.api import NORMAL_TERMS, AlignedPose, AlignRules, LevelPlanes, Matrix
 from sigmasplat.plugins.cuda import launch as cuda_launch
 from sigmasplat.plugins.cuda.cubins import ALIGNING
-from sigmasplat.types import Matrix
 
 CELL = 16
 """Width and height of a cell in pixels; one block of threads processes one cell (native/align_pixel.h)."""

@@ -6,16 +6,11 @@ from types import ModuleType
 
 import torch
 
-from sigmasplat.config import RenderConfig
-from sigmasplat.data.camera import Camera
-from sigmasplat.fit.backends import TORCH
-from sigmasplat.fit.interface import DeviceFits
-from sigmasplat.fit.reference_maps import reference_maps
+from sigmasplat.api import TORCH, Backend, Camera, DeviceFits, RenderConfig, reference_maps
 from sigmasplat.plugins.cuda import descent, images, launch, rows
 from sigmasplat.plugins.cuda.mapping_step import CudaStep
 from sigmasplat.plugins.cuda.view import CudaView
 from sigmasplat.plugins.cuda.view_dependent import CudaViewDependentStep
-from sigmasplat.registry import Backend
 
 
 def _operators() -> ModuleType:

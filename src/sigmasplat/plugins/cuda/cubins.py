@@ -9,8 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from sigmasplat.env import install_extra
-from sigmasplat.errors import BackendError
+from sigmasplat.api import BackendError, install_extra
 
 FOLDER = Path(__file__).parents[2] / "native"
 """Folder of the sources: headers shared with the CPU kernels, and the CUDA kernels in its subfolder `cuda`."""

@@ -11,17 +11,22 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sigmasplat.config import TrackingConfig
-from sigmasplat.fit.adam import BETA1, BETA2, EPSILON
-from sigmasplat.fit.descent import descend, exposure_rate
-from sigmasplat.fit.interface import Descent
-from sigmasplat.fit.motion import parametrisation
-from sigmasplat.fit.target import Target
-from sigmasplat.fit.tracking_loss import tracking_params
+from sigmasplat.api import (
+    BETA1,
+    BETA2,
+    EPSILON,
+    Descent,
+    Matrix,
+    Target,
+    TrackingConfig,
+    descend,
+    exposure_rate,
+    parametrisation,
+    tracking_params,
+)
 from sigmasplat.plugins.cuda.graph import Work, repeatable
 from sigmasplat.plugins.cuda.launch import THREADS, blocks_for
 from sigmasplat.plugins.cuda.view import CudaView
-from sigmasplat.types import Matrix
 
 MEDIANS, PASSES, DIGITS = 5, 3, 2048
 """Medians of the errors of depth and colour, and of the three channels of V. Each is found by three passes that count

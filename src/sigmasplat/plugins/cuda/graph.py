@@ -10,7 +10,7 @@ from functools import cache
 
 import torch
 
-from sigmasplat.errors import BackendError
+from sigmasplat.api import BackendError
 from sigmasplat.plugins.cuda.stages import measured
 
 Work = Callable[[], None]

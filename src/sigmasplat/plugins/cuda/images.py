@@ -5,14 +5,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sigmasplat.fit.gray import luma
-from sigmasplat.fit.interface import ImageKernels, Plane
-from sigmasplat.fit.target import Target
+from sigmasplat.api import ImageKernels, Plane, Target, View, luma
 from sigmasplat.plugins.cuda import launch as cuda_launch
 from sigmasplat.plugins.cuda.align import align, normal_equations
 from sigmasplat.plugins.cuda.cubins import ALIGNING
 from sigmasplat.plugins.cuda.launch import blocks_for
-from sigmasplat.render.view import View
 
 Half = Tensor | None
 

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sigmasplat.errors import BackendError
+from sigmasplat.api import BackendError
 from sigmasplat.plugins.cuda import cubins
 
 THREADS = 256

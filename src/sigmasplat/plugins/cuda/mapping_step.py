@@ -5,16 +5,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sigmasplat.data.field import GaussianField
-from sigmasplat.fit.adam import Rates
-from sigmasplat.fit.fused_terms import pixel_weights
-from sigmasplat.fit.interface import Accumulator, Weights
-from sigmasplat.fit.mapping_step import render_for
-from sigmasplat.fit.target import Target
+from sigmasplat.api import Accumulator, GaussianField, Matrix, Rates, Target, Weights, pixel_weights, render_for
 from sigmasplat.plugins.cuda.launch import blocks_for
 from sigmasplat.plugins.cuda.rows import CudaAccumulator, add_shape_gradient, step_rows
 from sigmasplat.plugins.cuda.view import CudaView
-from sigmasplat.types import Matrix
 
 TILE = 16
 CHANNELS = 3

@@ -9,17 +9,20 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sigmasplat.config import RenderConfig
-from sigmasplat.data.camera import Camera
-from sigmasplat.errors import BackendError
+from sigmasplat.api import (
+    BackendError,
+    Camera,
+    RenderConfig,
+    blend_with,
+    operators as reference,
+    pose_gradient,
+    project_with,
+    view_params,
+)
 from sigmasplat.plugins.cuda import launch as cuda_launch
 from sigmasplat.plugins.cuda.cubins import FEATURE_COUNTS
 from sigmasplat.plugins.cuda.launch import blocks_for
 from sigmasplat.plugins.cuda.raster import Planes, Raster
-from sigmasplat.render.kernel_operators import blend_with, project_with
-from sigmasplat.render.kernel_params import view_params
-from sigmasplat.render.pose_gradient import pose_gradient
-from sigmasplat.render.reference import operators as reference
 
 FEATURES_AT_ONCE = FEATURE_COUNTS[-1]
 

@@ -15,9 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sigmasplat.config import RenderConfig
-from sigmasplat.data.camera import Camera
-from sigmasplat.errors import BackendError
+from sigmasplat.api import BackendError, Camera, RenderConfig
 from sigmasplat.plugins.cuda.cubins import FEATURE_COUNTS, FITTING
 from sigmasplat.plugins.cuda.launch import Argument, Launcher, Struct, blocks_for
 

@@ -6,13 +6,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sigmasplat.data.field import ATTRIBUTES, GaussianField, Rows
-from sigmasplat.fit.adam import BETA1, EPSILON, Rates
-from sigmasplat.fit.fused_terms import SHAPE_TERMS, kernel_weights
-from sigmasplat.fit.interface import Twist, Weights
+from sigmasplat.api import (
+    ATTRIBUTES,
+    BETA1,
+    EPSILON,
+    SHAPE_TERMS,
+    GaussianField,
+    Matrix,
+    Rates,
+    Rows,
+    Twist,
+    Weights,
+    kernel_weights,
+)
 from sigmasplat.plugins.cuda.launch import blocks_for
 from sigmasplat.plugins.cuda.view import CudaView
-from sigmasplat.types import Matrix
 
 MOST_COLUMNS = max(ATTRIBUTES.values())
 """Maximum number of columns that the Adam kernel steps."""

@@ -4,16 +4,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sigmasplat.config import RenderConfig
-from sigmasplat.config.sensors import SensorModel
-from sigmasplat.data.camera import Camera
-from sigmasplat.errors import BackendError
+from sigmasplat.api import BackendError, Camera, Layers, Matrix, RenderConfig, SensorModel, view_params
 from sigmasplat.plugins.cuda import launch as cuda_launch
 from sigmasplat.plugins.cuda.raster import Planes, Raster
 from sigmasplat.plugins.cuda.stages import Stages
-from sigmasplat.render.kernel_params import view_params
-from sigmasplat.render.view import Layers
-from sigmasplat.types import Matrix
 
 
 class CudaView:

@@ -5,16 +5,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sigmasplat.data.field import GaussianField
-from sigmasplat.data.harmonics import count
-from sigmasplat.fit.adam import Rates
-from sigmasplat.fit.interface import Accumulator, Weights, one_image_only
-from sigmasplat.fit.mapping_step import render_for
-from sigmasplat.fit.target import Target
+from sigmasplat.api import Accumulator, GaussianField, Matrix, Rates, Target, Weights, count, one_image_only, render_for
 from sigmasplat.plugins.cuda.launch import blocks_for
 from sigmasplat.plugins.cuda.mapping_step import CudaStep
 from sigmasplat.plugins.cuda.rows import add_shape_gradient, step_rows
-from sigmasplat.types import Matrix
 
 
 class CudaViewDependentStep:

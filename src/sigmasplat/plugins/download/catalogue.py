@@ -14,7 +14,7 @@ from urllib.parse import urlsplit
 
 from rich.filesize import decimal
 
-from sigmasplat.errors import DownloadError
+from sigmasplat.api import DownloadError
 
 
 @dataclass(frozen=True)

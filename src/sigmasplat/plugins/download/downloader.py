@@ -12,14 +12,13 @@ from typing import TYPE_CHECKING
 
 from rich.filesize import decimal
 
-from sigmasplat.errors import DownloadError
-from sigmasplat.files.atomic import write_text
+from sigmasplat.api import DownloadError, write_text
 from sigmasplat.plugins.download.catalogue import PublicRecording, PublicSet, RemoteFile, format_size
 from sigmasplat.plugins.download.fetch import RetryPolicy, fetch
 from sigmasplat.plugins.download.unpack import ArchiveError, Budget, is_archive, unpack
 
 if TYPE_CHECKING:
-    from sigmasplat.types import Progress
+    from sigmasplat.api import Progress
 
 CHUNK_BYTES = 2**20
 

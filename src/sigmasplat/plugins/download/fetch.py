@@ -21,10 +21,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
-from sigmasplat.errors import DownloadError
+from sigmasplat.api import DownloadError
 
 if TYPE_CHECKING:
-    from sigmasplat.types import Progress
+    from sigmasplat.api import Progress
 
 
 @dataclass(frozen=True)

@@ -15,10 +15,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, TYPE_CHECKING
 
-from sigmasplat.errors import DownloadError
+from sigmasplat.api import DownloadError
 
 if TYPE_CHECKING:
-    from sigmasplat.types import Progress
+    from sigmasplat.api import Progress
 
 CHUNK_BYTES = 2**20
 MAX_RATIO, RATIO_CHECKED_ABOVE_BYTES = 200, 2**20

@@ -6,13 +6,28 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.config import Config, FinalConfig
-from sigmasplat.data.camera import Camera
-from sigmasplat.data.field import GaussianField
-from sigmasplat.data.mesh import Mesh
-from sigmasplat.data.trajectory import Trajectory, evenly_spread
-from sigmasplat.errors import RunError
-from sigmasplat.input.source import Source
+from sigmasplat.api import (
+    TRUTH,
+    Camera,
+    Config,
+    FieldRenderer,
+    FinalConfig,
+    GaussianField,
+    Mesh,
+    Predicted,
+    Progress,
+    RunError,
+    RunFolder,
+    RunFrames,
+    Source,
+    Trajectory,
+    as_refined,
+    evenly_spread,
+    frame_seconds,
+    no_progress,
+    predict,
+    write_trajectory,
+)
 from sigmasplat.plugins.evaluation import reconstruct
 from sigmasplat.plugins.evaluation.metrics import views
 from sigmasplat.plugins.evaluation.metrics.lpips import Lpips
@@ -36,14 +51,6 @@ from sigmasplat.plugins.evaluation.view_scoring import (
     score_test_views,
     show_moving,
 )
-from sigmasplat.render import FieldRenderer
-from sigmasplat.render.low_pass import as_refined
-from sigmasplat.run_folder.frames import RunFrames
-from sigmasplat.run_folder.run_values import frame_seconds
-from sigmasplat.run_folder.runs import TRUTH, RunFolder
-from sigmasplat.run_folder.trajectory import write_trajectory
-from sigmasplat.types import Progress, no_progress
-from sigmasplat.uncertainty.predictive import Predicted, predict
 
 Log = list[dict[str, Any]]
 

@@ -8,9 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.data import se3
-from sigmasplat.data.trajectory import APART, LOST, RELOCALISED, Trajectory
-from sigmasplat.graph.path_covariance import PathCovariance
+from sigmasplat.api import APART, LOST, RELOCALISED, Matrix, PathCovariance, RunFolder, RunFrames, Trajectory, se3
 from sigmasplat.plugins.evaluation.metrics.trajectory import (
     absolute_error,
     align_rigid,
@@ -19,9 +17,6 @@ from sigmasplat.plugins.evaluation.metrics.trajectory import (
     score_covariances,
     score_failures,
 )
-from sigmasplat.run_folder.frames import RunFrames
-from sigmasplat.run_folder.runs import RunFolder
-from sigmasplat.types import Matrix
 
 
 def score_frame_sets(run: RunFolder, frames: RunFrames, truth: Trajectory | None) -> dict[str, Any]:

@@ -13,24 +13,33 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from sigmasplat.config import Config
-from sigmasplat.data import se3
-from sigmasplat.data.camera import Camera
-from sigmasplat.data.field import GaussianField
-from sigmasplat.data.map_uncertainty import SplatStd
-from sigmasplat.data.mesh import Mesh
-from sigmasplat.data.trajectory import Trajectory
-from sigmasplat.errors import RunError
-from sigmasplat.final.fusion import FusionView, Renderer, count_keyframes, fuse, surface_views
-from sigmasplat.input.source import Source
+from sigmasplat.api import (
+    MESH,
+    Camera,
+    Config,
+    FusionView,
+    GaussianField,
+    Matrix,
+    Mesh,
+    Progress,
+    Renderer,
+    RunError,
+    RunFolder,
+    Source,
+    SplatStd,
+    Trajectory,
+    count_keyframes,
+    fuse,
+    no_progress,
+    se3,
+    surface_views,
+)
 from sigmasplat.plugins.evaluation.metrics import reconstruction
 from sigmasplat.plugins.evaluation.metrics.published_reconstruction import VIEWS, score_published
 from sigmasplat.plugins.evaluation.metrics.reconstruction import score_splats
 from sigmasplat.plugins.evaluation.metrics.trajectory import align_rigid, associate, pair_poses
 from sigmasplat.plugins.outputs.mesh_editing import filled
 from sigmasplat.plugins.outputs.mesh_files import read_mesh, write_mesh
-from sigmasplat.run_folder.runs import MESH, RunFolder
-from sigmasplat.types import Matrix, Progress, no_progress
 
 OPAQUE = 0.5
 LARGEST_EDGE_M = 0.1

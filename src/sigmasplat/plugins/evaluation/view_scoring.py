@@ -12,22 +12,28 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_opening
 
-from sigmasplat.config import Config, InputConfig
-from sigmasplat.data import se3
-from sigmasplat.data.camera import Camera
-from sigmasplat.data.field import GaussianField
-from sigmasplat.data.frame import Frame, photo_size
-from sigmasplat.data.submap import SubmapStore
-from sigmasplat.data.trajectory import Trajectory, evenly_spread
-from sigmasplat.errors import SourceError
-from sigmasplat.input.source import Source
+from sigmasplat.api import (
+    Camera,
+    Config,
+    Frame,
+    GaussianField,
+    InputConfig,
+    Progress,
+    Source,
+    SourceError,
+    SubmapStore,
+    Trajectory,
+    evenly_spread,
+    no_progress,
+    photo_size,
+    se3,
+)
 from sigmasplat.plugins.evaluation.metrics import views
 from sigmasplat.plugins.evaluation.metrics.lpips import Lpips
 from sigmasplat.plugins.evaluation.metrics.trajectory import associate
 from sigmasplat.plugins.evaluation.metrics.views import ScoredView
 from sigmasplat.plugins.evaluation.report.view_strips import ViewStrips
 from sigmasplat.plugins.outputs.drawing.view_panels import ViewPanel
-from sigmasplat.types import Progress, no_progress
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,13 +21,9 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from sigmasplat.data.trajectory import Trajectory
-from sigmasplat.errors import SigmaSplatError
+from sigmasplat.api import FieldRenderer, Matrix, SigmaSplatError, Trajectory, noted_up
 from sigmasplat.plugins.outputs.floorplan.ground import floor_frame, sample_surfaces
 from sigmasplat.plugins.outputs.run_reader import RunReader
-from sigmasplat.render import FieldRenderer
-from sigmasplat.run_folder.frames import noted_up
-from sigmasplat.types import Matrix
 
 Axes = Literal["y-up", "z-up", "y-down", "camera"]
 AXES: tuple[Axes, ...] = get_args(Axes)

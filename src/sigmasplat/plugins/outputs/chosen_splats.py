@@ -8,16 +8,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sigmasplat.data import se3
-from sigmasplat.data.field import COLUMNS, INITIAL_LOG_VARIANCE, GaussianField
-from sigmasplat.data.map_uncertainty import SplatStd
-from sigmasplat.data.trajectory import evenly_spread
-from sigmasplat.errors import ConfigError, RunError, SigmaSplatError
+from sigmasplat.api import (
+    COLUMNS,
+    INITIAL_LOG_VARIANCE,
+    ConfigError,
+    GaussianField,
+    Matrix,
+    RunError,
+    SigmaSplatError,
+    SplatStd,
+    blend_values,
+    evenly_spread,
+    on_device,
+    se3,
+)
 from sigmasplat.plugins.outputs.axes import AXES, Axes, levelled, transform_to
 from sigmasplat.plugins.outputs.run_reader import RunReader
-from sigmasplat.render.backend import on_device
-from sigmasplat.types import Matrix
-from sigmasplat.uncertainty.blended_values import blend_values
 
 if TYPE_CHECKING:
     from sigmasplat.plugins.outputs.source import ExportSource

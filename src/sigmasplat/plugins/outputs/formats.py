@@ -9,15 +9,12 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sigmasplat.errors import ConfigError
+from sigmasplat.api import ConfigError, Output
 from sigmasplat.plugins.outputs.source import ExportSource as ExportSource
-from sigmasplat.registry import Output
 
 if TYPE_CHECKING:
-    from sigmasplat.data.field import GaussianField
-    from sigmasplat.data.map_uncertainty import SplatStd
+    from sigmasplat.api import GaussianField, Progress, SplatStd
     from sigmasplat.plugins.outputs.axes import Axes
-    from sigmasplat.types import Progress
 
 
 Bound = float | None
@@ -117,14 +114,14 @@ def _write_splats(
 
 @contextmanager
 def _counting(title: str) -> "Iterator[Progress]":
-    from sigmasplat.run.terminal import Screen
+    from sigmasplat.api import Screen
 
     with Screen().counting(title) as progress:
         yield progress
 
 
 def _trajectory(source: ExportSource, target: Path) -> str:
-    from sigmasplat.run_folder.trajectory import write_trajectory
+    from sigmasplat.api import write_trajectory
 
     reader = source.reader()
     has_log = (reader.run.path / "log.jsonl").is_file()
@@ -137,7 +134,7 @@ def _covariances(write: str) -> Callable[..., str]:
     """Return the writer of a path with covariances, made of a function of `run_folder.trajectory`."""
 
     def export(source: ExportSource, target: Path) -> str:
-        from sigmasplat.run_folder import trajectory
+        from sigmasplat.api import trajectory
 
         reader = source.reader()
         path = reader.valid_path()
@@ -151,7 +148,7 @@ def _kitti(source: ExportSource, target: Path) -> str:
     """Write one line per frame, since the line number is the frame number; nan for frames without a valid pose."""
     import numpy as np
 
-    from sigmasplat.run_folder.trajectory import write_kitti_poses
+    from sigmasplat.api import write_kitti_poses
 
     reader = source.reader()
     poses = np.full((len(reader.frames), 4, 4), np.nan)

@@ -15,9 +15,7 @@ from scipy.sparse.linalg import splu
 from scipy.spatial import Delaunay, cKDTree
 from scipy.spatial.distance import pdist
 
-from sigmasplat.data.mesh import Mesh
-from sigmasplat.errors import ConfigError
-from sigmasplat.types import Matrix
+from sigmasplat.api import ConfigError, Matrix, Mesh
 
 Indices = NDArray[np.int64]
 

@@ -17,11 +17,17 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.data.mesh import Mesh
-from sigmasplat.errors import RunError, SourceError
-from sigmasplat.files.atomic import replacing
-from sigmasplat.files.ply_elements import PLY_TYPES, Element, header_of, read_header
-from sigmasplat.files.reading import open_binary
+from sigmasplat.api import (
+    PLY_TYPES,
+    Element,
+    Mesh,
+    RunError,
+    SourceError,
+    header_of,
+    open_binary,
+    read_header,
+    replacing,
+)
 from sigmasplat.plugins.outputs.splats.gltf import glb_of, linear
 
 UINT16, UINT32, FLOAT32, VERTEX_TARGET, INDEX_TARGET = 5123, 5125, 5126, 34962, 34963

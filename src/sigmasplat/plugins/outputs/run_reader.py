@@ -6,16 +6,20 @@ from functools import cached_property
 
 import numpy as np
 
-from sigmasplat.config import Config
-from sigmasplat.data.camera import Camera
-from sigmasplat.data.submap import Picture
-from sigmasplat.data.trajectory import APART, LOST, Trajectory
-from sigmasplat.errors import RunError
-from sigmasplat.graph.path_covariance import PathCovariance
-from sigmasplat.input.source import Source
-from sigmasplat.run_folder.frames import RunFrames
-from sigmasplat.run_folder.runs import RunFolder
-from sigmasplat.types import Matrix
+from sigmasplat.api import (
+    APART,
+    LOST,
+    Camera,
+    Config,
+    Matrix,
+    PathCovariance,
+    Picture,
+    RunError,
+    RunFolder,
+    RunFrames,
+    Source,
+    Trajectory,
+)
 
 
 @dataclass(frozen=True, eq=False)

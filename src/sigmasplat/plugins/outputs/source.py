@@ -5,14 +5,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sigmasplat.errors import RunError
+from sigmasplat.api import RunError
 
 if TYPE_CHECKING:
-    from sigmasplat.data.field import GaussianField
-    from sigmasplat.data.map_uncertainty import SplatStd
-    from sigmasplat.input.source import Source
+    from sigmasplat.api import GaussianField, RunFolder, Source, SplatStd
     from sigmasplat.plugins.outputs.run_reader import RunReader
-    from sigmasplat.run_folder.runs import RunFolder
 
 
 def _no_sequence(run: "RunFolder") -> "Source":
@@ -37,7 +34,7 @@ class ExportSource:
 
     def run(self) -> "RunFolder":
         """Open the run. Raises RunError if there is no run, or if the source is a map."""
-        from sigmasplat.run_folder.runs import RunFolder
+        from sigmasplat.api import RunFolder
 
         if self.path.is_file():
             raise RunError(f"{self.path} is a file, which can be exported only as another map; give a run folder")

@@ -15,20 +15,28 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 
-from sigmasplat.data import se3
-from sigmasplat.data.camera import Camera
-from sigmasplat.data.field import GaussianField
-from sigmasplat.data.trajectory import Trajectory, evenly_spread
-from sigmasplat.env import install_package
-from sigmasplat.errors import BackendError, ConfigError, RunError, SigmaSplatError
-from sigmasplat.files.atomic import replacing
+from sigmasplat.api import (
+    BackendError,
+    Camera,
+    ConfigError,
+    FieldRenderer,
+    GaussianField,
+    Matrix,
+    Progress,
+    RunError,
+    SigmaSplatError,
+    Trajectory,
+    evenly_spread,
+    install_package,
+    no_progress,
+    noted_up,
+    replacing,
+    se3,
+)
 from sigmasplat.plugins.outputs.drawing.colormap import Rgb
 from sigmasplat.plugins.outputs.drawing.film import FilmMaps, FilmScale, color_bytes, film_image, legend_strip
 from sigmasplat.plugins.outputs.floorplan.ground import SurfaceRenderer, floor_frame, sample_surfaces
 from sigmasplat.plugins.outputs.run_reader import RunReader
-from sigmasplat.render import FieldRenderer
-from sigmasplat.run_folder.frames import noted_up
-from sigmasplat.types import Matrix, Progress, no_progress
 
 SMOOTHING_S = 0.25
 """Standard deviation of the Gaussian that removes camera shake."""

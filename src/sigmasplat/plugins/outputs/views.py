@@ -16,17 +16,23 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from sigmasplat.data import se3
-from sigmasplat.data.camera import Camera
-from sigmasplat.data.field import GaussianField
-from sigmasplat.data.mesh import Mesh
-from sigmasplat.errors import RunError
-from sigmasplat.files.atomic import make_folder, replacing, write_text
-from sigmasplat.files.json_files import write_json
-from sigmasplat.files.ply_elements import header_of
+from sigmasplat.api import (
+    Camera,
+    GaussianField,
+    Matrix,
+    Mesh,
+    Progress,
+    RunError,
+    header_of,
+    make_folder,
+    no_progress,
+    replacing,
+    se3,
+    write_json,
+    write_text,
+)
 from sigmasplat.plugins.outputs.mesh_files import color_bytes, vertex_header, vertex_rows
 from sigmasplat.plugins.outputs.run_reader import RunReader
-from sigmasplat.types import Matrix, Progress, no_progress
 
 Points = NDArray[np.floating]
 

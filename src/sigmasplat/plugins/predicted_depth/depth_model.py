@@ -12,11 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from sigmasplat.config import InputConfig
-from sigmasplat.env import import_optional
-from sigmasplat.errors import SourceError
-from sigmasplat.files.pictures import check_pixels
-from sigmasplat.files.reading import MOST_CHARACTERS, cause, read_bytes
+from sigmasplat.api import MOST_CHARACTERS, InputConfig, SourceError, cause, check_pixels, import_optional, read_bytes
 
 Floats = NDArray[np.float32]
 Size = tuple[int, int]

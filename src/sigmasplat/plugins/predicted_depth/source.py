@@ -15,31 +15,38 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from sigmasplat.config import InputConfig
-from sigmasplat.data.frame import Frame
-from sigmasplat.data.frame_arrays import color_from_bytes
-from sigmasplat.data.trajectory import Trajectory
-from sigmasplat.errors import SourceError
-from sigmasplat.files.pictures import read_npy
-from sigmasplat.files.reading import exists
-from sigmasplat.input.calibration import MM_PER_METRE, Calibration, resolve_calibration
-from sigmasplat.input.images import (
+from sigmasplat.api import (
     COLOR_ENDINGS,
     COLOR_FOLDERS,
     DEPTH_ENDINGS,
     DEPTH_FOLDERS,
+    MM_PER_METRE,
+    PLAUSIBLE_MEDIAN_M,
+    VIDEO_ENDINGS,
+    Calibration,
+    Frame,
+    ImagePair,
+    InputConfig,
+    RecordedSource,
+    Size,
+    Source,
+    SourceError,
+    Subset,
+    Trajectory,
     Video,
+    color_from_bytes,
+    exists,
+    first_readable,
     first_subfolder,
     image_size,
     list_images,
     read_color,
+    read_npy,
+    read_poses,
     read_values,
+    resolve_calibration,
     times_of_names,
 )
-from sigmasplat.input.lists import read_poses
-from sigmasplat.input.opening import VIDEO_ENDINGS
-from sigmasplat.input.recorded import PLAUSIBLE_MEDIAN_M, ImagePair, RecordedSource, Size, first_readable
-from sigmasplat.input.source import Source, Subset
 from sigmasplat.plugins.predicted_depth.depth_model import DepthModel
 
 Floats = NDArray[np.float32]

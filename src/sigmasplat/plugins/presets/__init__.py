@@ -2,9 +2,8 @@
 
 from functools import partial
 
-from sigmasplat.config import Config
+from sigmasplat.api import Config, Preset
 from sigmasplat.plugins.presets import cgslam, released, varsplat
-from sigmasplat.registry import Preset
 
 
 def _made(config: Config) -> Config:

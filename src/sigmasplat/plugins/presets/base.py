@@ -1,6 +1,6 @@
 """The settings that the papers' presets build on: those in which the papers differ from our defaults, as values."""
 
-from sigmasplat.config import Config
+from sigmasplat.api import Config
 
 BASE_VALUES: dict[str, dict[str, object]] = {
     "input": {

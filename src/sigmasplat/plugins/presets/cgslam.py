@@ -11,7 +11,7 @@ Ours: `primitives.faded_opacity`, and the steps at which uncertain splats fade a
 
 import dataclasses
 
-from sigmasplat.config import Config
+from sigmasplat.api import Config
 from sigmasplat.plugins.presets import varsplat
 from sigmasplat.plugins.presets.base import BASE
 

@@ -18,8 +18,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from sigmasplat.config import Config
-from sigmasplat.errors import ConfigError, nearest
+from sigmasplat.api import Config, ConfigError, nearest
 from sigmasplat.plugins.presets import cgslam, varsplat
 
 # min_interval: the code's limit + 1, because it asks for more than the limit. max_depth_m: no reading is removed, the

@@ -4,8 +4,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-from sigmasplat.errors import ConfigError, nearest
-from sigmasplat.files.reading import guarded, read_text
+from sigmasplat.api import ConfigError, guarded, nearest, read_text
 
 TABLES = Path(__file__).parent / "tables"
 

@@ -6,7 +6,7 @@ is the front end of LoopSplat (arXiv 2408.10154). `*-fast` are ours, sized for t
 from: docs/varsplat.md.
 """
 
-from sigmasplat.config import Config
+from sigmasplat.api import Config
 from sigmasplat.plugins.presets.base import BASE
 
 UNCERTAIN_M = 0.02

@@ -15,18 +15,24 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sigmasplat.data.trajectory import LOST, Trajectory
-from sigmasplat.env import import_optional
-from sigmasplat.errors import RunError, SigmaSplatError
-from sigmasplat.graph.path_covariance import PathCovariance
+from sigmasplat.api import (
+    LOST,
+    Matrix,
+    PathCovariance,
+    Progress,
+    RunError,
+    SigmaSplatError,
+    Trajectory,
+    import_optional,
+    no_progress,
+    noted_up,
+)
 from sigmasplat.plugins.outputs.axes import level_cameras
 from sigmasplat.plugins.outputs.floorplan.floor_plan import FloorPlan, run_floor_plan
 from sigmasplat.plugins.outputs.run_reader import RunReader
 from sigmasplat.plugins.robots import ros_messages as ros
 from sigmasplat.plugins.robots.odometry import has_motion, odometry_poses
 from sigmasplat.plugins.robots.ros_messages import Encoded, RosMessages, Topic
-from sigmasplat.run_folder.frames import noted_up
-from sigmasplat.types import Matrix, Progress, no_progress
 
 CHUNK_BYTES = 65_536
 

@@ -9,24 +9,26 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.data import se3
-from sigmasplat.data.frame import Frame
-from sigmasplat.data.imu import up_of_path
-from sigmasplat.data.submap import SubmapStore
-from sigmasplat.data.trajectory import Trajectory
-from sigmasplat.errors import SigmaSplatError
-from sigmasplat.graph.loops import Loop
-from sigmasplat.graph.path_covariance import PathCovariance
+from sigmasplat.api import (
+    Callback,
+    Frame,
+    Loop,
+    Matrix,
+    PathCovariance,
+    SigmaSplatError,
+    Slam,
+    Step,
+    SubmapStore,
+    Trajectory,
+    path_errors,
+    se3,
+    up_of_path,
+)
 from sigmasplat.plugins.outputs.floorplan.floor_plan import FloorPlan, map_floor_plan
 from sigmasplat.plugins.robots import ros_messages as ros
 from sigmasplat.plugins.robots.odometry import LiveOdometry, has_motion
 from sigmasplat.plugins.robots.outlet import Job, Outlet
 from sigmasplat.plugins.robots.ros_messages import MAX_POINTS, Encoded, Points, RosMessages, Topic
-from sigmasplat.run.callbacks import Callback
-from sigmasplat.slam.results import Step
-from sigmasplat.slam.slam import Slam
-from sigmasplat.slam.slam_state import path_errors
-from sigmasplat.types import Matrix
 
 Images = Literal["none", "keyframes", "all"]
 SUBMAP_POINTS = 20_000

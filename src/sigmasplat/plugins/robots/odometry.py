@@ -5,10 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.data import se3
-from sigmasplat.data.atlas import Atlas
-from sigmasplat.data.trajectory import LOST, RELOCALISED
-from sigmasplat.types import Matrix
+from sigmasplat.api import LOST, RELOCALISED, Atlas, Matrix, se3
 
 FOUND_BY_FEATURES = "inliers"
 """A step has this value if relocalisation decided its pose."""

@@ -18,13 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sigmasplat.data import se3
-from sigmasplat.data.camera import Camera
-from sigmasplat.data.field import GaussianField
-from sigmasplat.env import import_optional
+from sigmasplat.api import Camera, GaussianField, Matrix, import_optional, se3
 from sigmasplat.plugins.outputs.floorplan.floor_plan import FREE, OBJECT, WALL, FloorPlan
 from sigmasplat.plugins.outputs.views import opaque_rows
-from sigmasplat.types import Matrix
 
 MAP, ODOM, LINK, OPTICAL = "map", "odom", "camera_link", "camera_optical_frame"
 WORLD, FLOOR = "sigmasplat_world", "floor"

@@ -19,8 +19,7 @@ from collections import deque
 from concurrent.futures import Future
 from typing import TYPE_CHECKING, Any
 
-from sigmasplat.env import import_optional
-from sigmasplat.errors import ConfigError, SigmaSplatError
+from sigmasplat.api import ConfigError, SigmaSplatError, import_optional
 from sigmasplat.plugins.robots.ros_messages import TOPICS, Encoded, RosMessages, Topic
 from sigmasplat.plugins.viewer.server import is_loopback, page_of
 

@@ -1,9 +1,8 @@
 """Choose the topics of a bag, and read its calibration and its ground-truth path.
 
 Intrinsics are in sensor_msgs/CameraInfo beside the images (camera_info). Camera poses are in tf2_msgs/TFMessage of
-/tf_static or /tf, between the frames that the images name. RealSense's SDK before version 2.58 uses its own topics
-/device_0/sensor_0/Depth_0/… (librealsense, ros_file_format.h): info/camera_info, tf/N (a geometry_msgs/Transform from a
-reference to the stream) and option/Depth_Units/value of the sensor.
+/tf_static or /tf, between the frames that the images name. RealSense's SDK before 2.58 uses topics of its own below
+/device_0/sensor_0/Depth_0/ (librealsense, ros_file_format.h): info/camera_info, tf/N, option/Depth_Units/value.
 """
 
 from collections.abc import Callable, Iterable
@@ -12,13 +11,21 @@ from itertools import islice
 
 import numpy as np
 
-from sigmasplat.config import InputConfig
-from sigmasplat.data import se3
-from sigmasplat.data.camera import Camera
-from sigmasplat.data.trajectory import Trajectory
-from sigmasplat.errors import SourceError, nearest
-from sigmasplat.input.calibration import MM_PER_METRE, Calibration, Distortion, build_camera, resolve_calibration
-from sigmasplat.input.lists import rigid_transform
+from sigmasplat.api import (
+    MM_PER_METRE,
+    Calibration,
+    Camera,
+    Distortion,
+    InputConfig,
+    Matrix,
+    SourceError,
+    Trajectory,
+    build_camera,
+    nearest,
+    resolve_calibration,
+    rigid_transform,
+    se3,
+)
 from sigmasplat.plugins.sources.bag_messages import (
     COMPRESSED,
     RAW,
@@ -29,7 +36,6 @@ from sigmasplat.plugins.sources.bag_messages import (
     list_topics,
     message_size,
 )
-from sigmasplat.types import Matrix
 
 MAX_TF_MESSAGES = 2000
 """Number of messages of /tf to read; transforms between the cameras of one device are repeated."""

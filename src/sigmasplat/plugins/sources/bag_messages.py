@@ -17,10 +17,17 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.env import import_optional
-from sigmasplat.errors import SourceError
-from sigmasplat.files.reading import open_regular, refuse_special
-from sigmasplat.input.images import decode_color, depth_to_metres, image_size, read_values, without_nan
+from sigmasplat.api import (
+    SourceError,
+    decode_color,
+    depth_to_metres,
+    image_size,
+    import_optional,
+    open_regular,
+    read_values,
+    refuse_special,
+    without_nan,
+)
 
 Message = Any
 Value = TypeVar("Value")

@@ -13,15 +13,25 @@ from pathlib import Path
 
 import numpy as np
 
-from sigmasplat.config import InputConfig
-from sigmasplat.data.camera import Camera
-from sigmasplat.data.trajectory import Trajectory
-from sigmasplat.errors import SourceError
-from sigmasplat.input.calibration import TUM_UNITS_PER_METRE, Calibration, freiburg_calibration
-from sigmasplat.input.images import FRAMES_PER_SECOND, first_file
-from sigmasplat.input.lists import parse_numbers, read_groundtruth, read_lines, read_poses
-from sigmasplat.input.recorded import ImagePair, RecordedSource, folder_source
-from sigmasplat.registry import SourceFormat
+from sigmasplat.api import (
+    FRAMES_PER_SECOND,
+    TUM_UNITS_PER_METRE,
+    Calibration,
+    Camera,
+    ImagePair,
+    InputConfig,
+    RecordedSource,
+    SourceError,
+    SourceFormat,
+    Trajectory,
+    first_file,
+    folder_source,
+    freiburg_calibration,
+    parse_numbers,
+    read_groundtruth,
+    read_lines,
+    read_poses,
+)
 
 CAMERA = Calibration(Camera(640, 480, 481.2, 480.0, 319.5, 239.5), TUM_UNITS_PER_METRE)
 LIST_NAMES = ("associations.txt", "association.txt", "associate.txt")

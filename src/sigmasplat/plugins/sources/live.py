@@ -11,12 +11,7 @@ from itertools import pairwise
 from pathlib import Path
 from statistics import median
 
-from sigmasplat.config import InputConfig
-from sigmasplat.data.camera import Camera
-from sigmasplat.data.frame import Frame
-from sigmasplat.data.trajectory import Trajectory
-from sigmasplat.errors import SourceError
-from sigmasplat.input.source import Source, Wrapped, read_ahead
+from sigmasplat.api import Camera, Frame, InputConfig, Source, SourceError, Trajectory, Wrapped, read_ahead
 from sigmasplat.plugins.sources.tum import TumWriter
 
 WAITING_MOST = 2

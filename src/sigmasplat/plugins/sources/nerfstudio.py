@@ -16,18 +16,30 @@ from typing import Any
 
 import numpy as np
 
-from sigmasplat.config import InputConfig
-from sigmasplat.data import se3
-from sigmasplat.errors import SourceError
-from sigmasplat.input.calibration import Calibration, check_positive, json_number, read_json_object
-from sigmasplat.input.images import FRAMES_PER_SECOND, natural_key
-from sigmasplat.input.lists import build_trajectory
-from sigmasplat.input.recorded import ImagePair, RecordedSource, first_size, folder_source
-from sigmasplat.input.transforms import Fields, read_camera, read_frames, read_pose
+from sigmasplat.api import (
+    FRAMES_PER_SECOND,
+    Calibration,
+    Fields,
+    ImagePair,
+    InputConfig,
+    Matrix,
+    RecordedSource,
+    SourceError,
+    SourceFormat,
+    build_trajectory,
+    check_positive,
+    first_size,
+    folder_source,
+    json_number,
+    natural_key,
+    read_frames,
+    read_json_object,
+    read_pose,
+    read_transforms_camera,
+    se3,
+)
 from sigmasplat.plugins.sources.stereo import StereoSource, given_intrinsics
 from sigmasplat.plugins.sources.stereo_matching import StereoCameras
-from sigmasplat.registry import SourceFormat
-from sigmasplat.types import Matrix
 
 NAME = "transforms.json"
 METRES_PER_UNIT = 0.001
@@ -67,7 +79,7 @@ def _calibration(path: Path, fields: Fields, frames: list[Fields], images: list[
     size, depth_size = first_size([i.color for i in images]), first_size([i.depth for i in images])
     per_unit = json_number(path, fields, "depth_unit_scale_factor", METRES_PER_UNIT)
     units = round(1.0 / check_positive(path, "depth_unit_scale_factor", per_unit), 6)
-    known = read_camera(path, fields, frames, size, units)
+    known = read_transforms_camera(path, fields, frames, size, units)
     if depth_size == size:
         return known
     return replace(known, depth_camera=known.camera.resized(*depth_size), depth_distortion=known.distortion)
@@ -86,8 +98,8 @@ def open_stereo_transforms(place: str, settings: InputConfig) -> StereoSource:
     pairs, alone = _pairs(frames)
     lefts = [left for left, _ in pairs]
     size = first_size([folder / left["file_path"] for left in lefts])
-    left = _undistorted(read_camera(path, fields, lefts, size, 1.0), settings)
-    right = _undistorted(read_camera(path, fields, [right for _, right in pairs], size, 1.0), settings)
+    left = _undistorted(read_transforms_camera(path, fields, lefts, size, 1.0), settings)
+    right = _undistorted(read_transforms_camera(path, fields, [right for _, right in pairs], size, 1.0), settings)
     if lefts[0] is pairs[0][1]:  # one frame with two images
         T_right_left = np.eye(4)
         T_right_left[0, 3] = -check_positive(path, "baseline_m", json_number(path, fields, "baseline_m"))

@@ -9,24 +9,26 @@ Names such as 12.033333.png are times in seconds; otherwise frames are 1/30 s ap
 
 from pathlib import Path
 
-from sigmasplat.config import InputConfig
-from sigmasplat.errors import SourceError
-from sigmasplat.input.calibration import MM_PER_METRE
-from sigmasplat.input.images import (
+from sigmasplat.api import (
     COLOR_ENDINGS,
     COLOR_FOLDERS,
     DEPTH_ENDINGS,
     DEPTH_FOLDERS,
+    MM_PER_METRE,
+    ImagePair,
+    InputConfig,
+    RecordedSource,
+    SourceError,
+    SourceFormat,
     first_subfolder,
+    folder_source,
     index_by_number,
     list_images,
     pair_images,
+    read_groundtruth,
     times_of_names,
+    without_depth,
 )
-from sigmasplat.input.lists import read_groundtruth
-from sigmasplat.input.opening import without_depth
-from sigmasplat.input.recorded import ImagePair, RecordedSource, folder_source
-from sigmasplat.registry import SourceFormat
 
 NAMES = "color|rgb|images/*", "depth/*"
 

@@ -16,20 +16,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.config import InputConfig
-from sigmasplat.data.camera import Camera
-from sigmasplat.data.frame import Frame
-from sigmasplat.data.frame_arrays import color_from_bytes
-from sigmasplat.data.resizing import resized_color
-from sigmasplat.env import import_optional
-from sigmasplat.errors import SourceError
-from sigmasplat.input.calibration import Calibration, Distortion, resolve_calibration
-from sigmasplat.input.rectification import Rectification
+from sigmasplat.api import (
+    Calibration,
+    Camera,
+    Distortion,
+    Frame,
+    InputConfig,
+    Matrix,
+    Rectification,
+    SourceError,
+    SourceFormat,
+    color_from_bytes,
+    import_optional,
+    resized_color,
+    resolve_calibration,
+)
 from sigmasplat.plugins.sources.live import LiveSource
 from sigmasplat.plugins.sources.realsense_imu import NOT_MEASURED, MotionModule, open_motion_module
 from sigmasplat.plugins.sources.stereo_matching import StereoCameras, StereoMatcher, StereoRectification
-from sigmasplat.registry import SourceFormat
-from sigmasplat.types import Matrix
 
 Images = tuple[NDArray[np.float32], NDArray[np.float32]]
 """Colour [H, W, 3] and depth in metres [H, W]."""

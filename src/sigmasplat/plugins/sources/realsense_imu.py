@@ -27,10 +27,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.data import se3
-from sigmasplat.data.imu import RunningAccelerometer, RunningGyroscope
-from sigmasplat.errors import SourceError
-from sigmasplat.types import Matrix
+from sigmasplat.api import Matrix, RunningAccelerometer, RunningGyroscope, SourceError, se3
 
 WANTED_HZ = 200
 """Of the rates that a sensor offers, the nearest one is used: several samples per image, and few calls of Python."""

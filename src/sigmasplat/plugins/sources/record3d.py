@@ -19,18 +19,36 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.config import InputConfig
-from sigmasplat.data.trajectory import Trajectory
-from sigmasplat.env import import_optional
-from sigmasplat.errors import SourceError
-from sigmasplat.files.pictures import check_pixels
-from sigmasplat.files.reading import DAMAGED, MOST_JSON_BYTES, guarded, parse_json, read_bytes, refuse_special
-from sigmasplat.input.calibration import Calibration, build_camera, check_positive, json_number, resolve_calibration
-from sigmasplat.input.images import decode_color, depth_to_metres, image_size, without_nan
-from sigmasplat.input.lists import FLIP_YZ, rigid_transform
-from sigmasplat.input.recorded import ImagePair, RecordedSource, Size, first_readable
+from sigmasplat.api import (
+    DAMAGED,
+    FLIP_YZ,
+    MOST_JSON_BYTES,
+    Calibration,
+    ImagePair,
+    InputConfig,
+    RecordedSource,
+    Size,
+    SourceError,
+    SourceFormat,
+    Trajectory,
+    build_camera,
+    check_pixels,
+    check_positive,
+    decode_color,
+    depth_to_metres,
+    first_readable,
+    guarded,
+    image_size,
+    import_optional,
+    json_number,
+    parse_json,
+    read_bytes,
+    refuse_special,
+    resolve_calibration,
+    rigid_transform,
+    without_nan,
+)
 from sigmasplat.plugins.sources.stray_scanner import with_coarser_depth
-from sigmasplat.registry import SourceFormat
 
 MOST_MEMBER_BYTES = 128 << 20
 """Largest file of an archive after unzipping: an image, or its depth."""

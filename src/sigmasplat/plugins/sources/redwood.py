@@ -14,41 +14,39 @@ from pathlib import Path
 
 import numpy as np
 
-from sigmasplat.config import InputConfig
-from sigmasplat.data.camera import Camera
-from sigmasplat.data.trajectory import Trajectory
-from sigmasplat.errors import SourceError
-from sigmasplat.files.reading import open_regular
-from sigmasplat.input.calibration import (
-    MM_PER_METRE,
-    Calibration,
-    build_camera,
-    check_positive,
-    json_number,
-    read_json_object,
-)
-from sigmasplat.input.images import (
+from sigmasplat.api import (
     COLOR_ENDINGS,
     COLOR_FOLDERS,
     DEPTH_ENDINGS,
     FRAMES_PER_SECOND,
+    MAX_GAP_S,
+    MM_PER_METRE,
+    Calibration,
+    Camera,
+    ImagePair,
+    InputConfig,
+    RecordedSource,
+    SourceError,
+    SourceFormat,
+    Trajectory,
+    build_camera,
+    build_trajectory,
+    check_positive,
+    checked_pose,
     first_file,
     first_subfolder,
+    folder_source,
     index_by_number,
+    json_number,
     list_images,
+    open_regular,
     pair_images,
-)
-from sigmasplat.input.lists import (
-    MAX_GAP_S,
-    build_trajectory,
-    checked_pose,
     pair_times,
     parse_numbers,
+    read_json_object,
     read_lines,
     to_matrix,
 )
-from sigmasplat.input.recorded import ImagePair, RecordedSource, folder_source
-from sigmasplat.registry import SourceFormat
 
 INTRINSIC_NAMES = ("intrinsic.json", "intrinsics.json", "camera_intrinsic.json", "camera_intrinsics.json")
 PRIMESENSE = Calibration(Camera(640, 480, 525.0, 525.0, 319.5, 239.5), MM_PER_METRE)

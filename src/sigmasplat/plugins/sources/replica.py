@@ -10,17 +10,28 @@ from pathlib import Path
 
 import numpy as np
 
-from sigmasplat.config import InputConfig
-from sigmasplat.data import se3
-from sigmasplat.data.camera import Camera
-from sigmasplat.data.trajectory import Trajectory
-from sigmasplat.errors import SourceError
-from sigmasplat.files.reading import exists, read_text
-from sigmasplat.input.calibration import Calibration, build_camera, check_positive, json_number, read_json_object
-from sigmasplat.input.images import FRAMES_PER_SECOND, first_file, pair_images
-from sigmasplat.input.recorded import ImagePair, RecordedSource, folder_source
-from sigmasplat.registry import SourceFormat
-from sigmasplat.types import Matrix
+from sigmasplat.api import (
+    FRAMES_PER_SECOND,
+    Calibration,
+    Camera,
+    ImagePair,
+    InputConfig,
+    Matrix,
+    RecordedSource,
+    SourceError,
+    SourceFormat,
+    Trajectory,
+    build_camera,
+    check_positive,
+    exists,
+    first_file,
+    folder_source,
+    json_number,
+    pair_images,
+    read_json_object,
+    read_text,
+    se3,
+)
 
 CAMERA = Calibration(Camera(1200, 680, 600.0, 600.0, 599.5, 339.5), 6553.5)
 

@@ -21,11 +21,24 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.config import InputConfig
-from sigmasplat.data.imu import Accelerometer, Gyroscope, accelerometer_from_samples, gyroscope_from_samples
-from sigmasplat.errors import SourceError
-from sigmasplat.input.lists import MAX_GAP_S, associate, no_pairs, pair_times, refuse_other_units
-from sigmasplat.input.recorded import ImagePair, RecordedSource, Size
+from sigmasplat.api import (
+    MAX_GAP_S,
+    Accelerometer,
+    Gyroscope,
+    ImagePair,
+    InputConfig,
+    Matrix,
+    RecordedSource,
+    Size,
+    SourceError,
+    SourceFormat,
+    accelerometer_from_samples,
+    associate,
+    gyroscope_from_samples,
+    no_pairs,
+    pair_times,
+    refuse_other_units,
+)
 from sigmasplat.plugins.sources.bag_cameras import (
     ImageTopic,
     Optics,
@@ -52,8 +65,6 @@ from sigmasplat.plugins.sources.bag_messages import (
 )
 from sigmasplat.plugins.sources.stereo import StereoPair, StereoRig, StereoSource, given_intrinsics
 from sigmasplat.plugins.sources.stereo_matching import StereoCameras
-from sigmasplat.registry import SourceFormat
-from sigmasplat.types import Matrix
 
 IMU = "sensor_msgs/msg/Imu"
 Values = NDArray[np.float64]

@@ -24,30 +24,44 @@ from pathlib import Path
 
 import numpy as np
 
-from sigmasplat.config import InputConfig
-from sigmasplat.data import se3
-from sigmasplat.data.camera import Camera
-from sigmasplat.errors import SourceError
-from sigmasplat.files.reading import read_text
-from sigmasplat.input.calibration import MM_PER_METRE, Calibration, build_camera, check_positive, read_json_object
-from sigmasplat.input.images import (
+from sigmasplat.api import (
     COLOR_ENDINGS,
     DEPTH_ENDINGS,
     FRAMES_PER_SECOND,
+    MM_PER_METRE,
+    Calibration,
+    Camera,
+    Fields,
     FrameFiles,
+    ImagePair,
+    InputConfig,
+    Matrix,
+    RecordedSource,
+    SourceError,
+    SourceFormat,
+    build_camera,
+    build_trajectory,
+    check_positive,
     first_file,
+    first_size,
     first_subfolder,
+    folder_source,
     frame_files,
     has_frame_files,
     index_by_number,
     list_images,
     pair_images,
+    parse_numbers,
+    read_frames,
+    read_json_object,
+    read_matrix,
+    read_pose,
+    read_pose_files,
+    read_text,
+    read_transforms_camera,
+    se3,
+    to_matrix,
 )
-from sigmasplat.input.lists import build_trajectory, parse_numbers, read_matrix, read_pose_files, to_matrix
-from sigmasplat.input.recorded import ImagePair, RecordedSource, first_size, folder_source
-from sigmasplat.input.transforms import Fields, read_camera, read_frames, read_pose
-from sigmasplat.registry import SourceFormat
-from sigmasplat.types import Matrix
 
 COLOR_SIZE, DEPTH_SIZE = (1296, 968), (640, 480)
 """Width and height of ScanNet's recordings. The published matrices are for these sizes, even if images are resized."""
@@ -158,7 +172,7 @@ def _source(
     files = [(dslr / IMAGES / f["file_path"], (dslr / DEPTHS / f["file_path"]).with_suffix(".png")) for f in frames]
     images = [ImagePair(i / FRAMES_PER_SECOND, *pair) for i, pair in enumerate(files)]
     size = first_size([color for color, _ in files])
-    known = read_camera(path, fields, frames, size, MM_PER_METRE)
+    known = read_transforms_camera(path, fields, frames, size, MM_PER_METRE)
     truth = build_trajectory((i.timestamp_s, read_pose(path, frame)) for i, frame in zip(images, frames, strict=True))
     return folder_source(scene, settings, images, known, MM_PER_METRE, truth, test=test)
 

@@ -13,17 +13,26 @@ from pathlib import Path
 
 import numpy as np
 
-from sigmasplat.config import InputConfig
-from sigmasplat.data import se3
-from sigmasplat.data.camera import Camera
-from sigmasplat.data.trajectory import Trajectory
-from sigmasplat.errors import SourceError
-from sigmasplat.input.calibration import MM_PER_METRE, Calibration, resolve_calibration
-from sigmasplat.input.images import FRAMES_PER_SECOND, frame_files, has_frame_files, pair_images
-from sigmasplat.input.lists import read_pose_files
-from sigmasplat.input.recorded import ImagePair, RecordedSource, first_size
-from sigmasplat.input.rectification import registers_depth
-from sigmasplat.registry import SourceFormat
+from sigmasplat.api import (
+    FRAMES_PER_SECOND,
+    MM_PER_METRE,
+    Calibration,
+    Camera,
+    ImagePair,
+    InputConfig,
+    RecordedSource,
+    SourceError,
+    SourceFormat,
+    Trajectory,
+    first_size,
+    frame_files,
+    has_frame_files,
+    pair_images,
+    read_pose_files,
+    registers_depth,
+    resolve_calibration,
+    se3,
+)
 
 # 585, 320, 240 are the values of the 7-Scenes page. They belong to the depth camera, and so do the published poses. The
 # colour camera and its position were fitted to the RedKitchen sequence by maximising the agreement of neighbouring

@@ -17,25 +17,34 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.config import InputConfig
-from sigmasplat.data import se3
-from sigmasplat.data.camera import Camera
-from sigmasplat.data.trajectory import Trajectory
-from sigmasplat.errors import SourceError
-from sigmasplat.files.reading import read_text
-from sigmasplat.input.calibration import Calibration, build_camera, resolve_calibration
-from sigmasplat.input.images import COLOR_ENDINGS, list_images, read_color
-from sigmasplat.input.lists import (
+from sigmasplat.api import (
+    COLOR_ENDINGS,
+    Calibration,
+    Camera,
+    ImagePair,
+    InputConfig,
+    Matrix,
+    RecordedSource,
+    Size,
+    SourceError,
+    SourceFormat,
+    Trajectory,
+    build_camera,
     build_trajectory,
     checked_pose,
+    first_size,
+    list_images,
     pair_times,
     parse_numbers,
+    read_color,
     read_groundtruth,
     read_lines,
+    read_text,
+    resolve_calibration,
     rigid_transform,
+    se3,
     to_matrix,
 )
-from sigmasplat.input.recorded import ImagePair, RecordedSource, Size, first_size
 from sigmasplat.plugins.sources.stereo_matching import (
     StereoCameras,
     StereoMatcher,
@@ -44,8 +53,6 @@ from sigmasplat.plugins.sources.stereo_matching import (
     scene_scale,
 )
 from sigmasplat.plugins.sources.tum import read_list
-from sigmasplat.registry import SourceFormat
-from sigmasplat.types import Matrix
 
 KITTI_PAIRS = (("image_2", "image_3"), ("image_0", "image_1"))
 KITTI_FRAMES_PER_SECOND = 10.0

@@ -11,22 +11,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.config import InputConfig
-from sigmasplat.data import se3
-from sigmasplat.data.camera import Camera
-from sigmasplat.env import opencv
-from sigmasplat.errors import SourceError
-from sigmasplat.input.calibration import (
+from sigmasplat.api import (
     Calibration,
+    Camera,
     Distortion,
+    InputConfig,
+    Matrix,
+    SourceError,
     check_positive,
     json_number,
+    opencv,
     read_camera,
     read_distortion,
     read_json_object,
     read_rigid_transform,
+    se3,
 )
-from sigmasplat.types import Matrix
 
 
 @dataclass(frozen=True, eq=False)

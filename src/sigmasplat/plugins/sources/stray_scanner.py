@@ -18,16 +18,30 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.config import InputConfig
-from sigmasplat.data import se3
-from sigmasplat.data.imu import GRAVITY_M_S2, accelerometer_from_samples, gyroscope_from_samples
-from sigmasplat.data.trajectory import Trajectory
-from sigmasplat.errors import SourceError
-from sigmasplat.files.reading import csv_rows, read_text
-from sigmasplat.input.calibration import MM_PER_METRE, Calibration, build_camera, resolve_calibration
-from sigmasplat.input.images import Video, image_size, read_depth, read_values
-from sigmasplat.input.recorded import ImagePair, RecordedSource, Size, first_size
-from sigmasplat.registry import SourceFormat
+from sigmasplat.api import (
+    GRAVITY_M_S2,
+    MM_PER_METRE,
+    Calibration,
+    ImagePair,
+    InputConfig,
+    RecordedSource,
+    Size,
+    SourceError,
+    SourceFormat,
+    Trajectory,
+    Video,
+    accelerometer_from_samples,
+    build_camera,
+    csv_rows,
+    first_size,
+    gyroscope_from_samples,
+    image_size,
+    read_depth,
+    read_text,
+    read_values,
+    resolve_calibration,
+    se3,
+)
 
 POSE = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")
 ANGULAR, LINEAR = ("alpha_x", "alpha_y", "alpha_z"), ("a_x", "a_y", "a_z")

@@ -6,15 +6,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.config import InputConfig
-from sigmasplat.data import se3
-from sigmasplat.data.camera import Camera
-from sigmasplat.data.frame import Frame
-from sigmasplat.data.frame_arrays import color_from_bytes
-from sigmasplat.data.mesh import Mesh
-from sigmasplat.data.trajectory import Trajectory
-from sigmasplat.errors import SourceError
-from sigmasplat.input.source import Source
+from sigmasplat.api import (
+    Camera,
+    Frame,
+    InputConfig,
+    Matrix,
+    Mesh,
+    Source,
+    SourceError,
+    SourceFormat,
+    Trajectory,
+    color_from_bytes,
+    se3,
+)
 from sigmasplat.plugins.sources.room.capture import (
     camera_path,
     drifted_depth,
@@ -26,8 +30,6 @@ from sigmasplat.plugins.sources.room.furnish import furnish_rooms, mask_of, move
 from sigmasplat.plugins.sources.room.render import RoomScene, build_scene, render_scene
 from sigmasplat.plugins.sources.room.shapes import triangulate
 from sigmasplat.plugins.sources.stereo_matching import StereoMatcher
-from sigmasplat.registry import SourceFormat
-from sigmasplat.types import Matrix
 
 FRAMES_PER_SECOND = 30.0
 FOCAL_PER_WIDTH = 0.8

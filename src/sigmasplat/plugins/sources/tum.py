@@ -20,21 +20,33 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from sigmasplat.config import InputConfig
-from sigmasplat.data import se3
-from sigmasplat.data.camera import Camera
-from sigmasplat.data.frame import Frame
-from sigmasplat.data.frame_arrays import UINT16_MAX
-from sigmasplat.data.imu import Gyroscope
-from sigmasplat.data.trajectory import Trajectory
-from sigmasplat.errors import RunError, SourceError
-from sigmasplat.files.atomic import write_text
-from sigmasplat.files.reading import exists
-from sigmasplat.input.calibration import TUM_UNITS_PER_METRE, Calibration, freiburg_calibration
-from sigmasplat.input.lists import MAX_GAP_S, nearest_gaps_s, pair_times, parse_numbers, read_groundtruth, read_lines
-from sigmasplat.input.recorded import ImagePair, RecordedSource, folder_source
-from sigmasplat.input.source import Source
-from sigmasplat.registry import SourceFormat
+from sigmasplat.api import (
+    MAX_GAP_S,
+    TUM_UNITS_PER_METRE,
+    UINT16_MAX,
+    Calibration,
+    Camera,
+    Frame,
+    Gyroscope,
+    ImagePair,
+    InputConfig,
+    RecordedSource,
+    RunError,
+    Source,
+    SourceError,
+    SourceFormat,
+    Trajectory,
+    exists,
+    folder_source,
+    freiburg_calibration,
+    nearest_gaps_s,
+    pair_times,
+    parse_numbers,
+    read_groundtruth,
+    read_lines,
+    se3,
+    write_text,
+)
 
 
 def open_tum(

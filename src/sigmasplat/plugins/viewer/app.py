@@ -8,7 +8,7 @@ from typing import Any
 
 import viser
 
-from sigmasplat.errors import SigmaSplatError
+from sigmasplat.api import SigmaSplatError
 from sigmasplat.plugins.outputs.drawing.colormap import INFERNO
 from sigmasplat.plugins.viewer import layers, snapshot as lines
 from sigmasplat.plugins.viewer.layers import Floats, LayerImage, Legend, VisibilityFilter

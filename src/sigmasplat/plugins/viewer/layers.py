@@ -10,18 +10,27 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from sigmasplat.config import RenderConfig
-from sigmasplat.data import harmonics, se3
-from sigmasplat.data.camera import Camera
-from sigmasplat.data.field import ATTRIBUTES, COLUMNS, GaussianField, left_factor, quaternion_of, transformed
-from sigmasplat.data.map_uncertainty import MapUncertainty
+from sigmasplat.api import (
+    ATTRIBUTES,
+    COLUMNS,
+    Camera,
+    GaussianField,
+    MapUncertainty,
+    Matrix,
+    RenderConfig,
+    harmonics,
+    left_factor,
+    predicted,
+    quaternion_of,
+    render,
+    se3,
+    transformed,
+    variance_parts,
+)
 from sigmasplat.plugins.evaluation.metrics.views import COVERED_ALPHA
 from sigmasplat.plugins.outputs.chosen_splats import sigmas
 from sigmasplat.plugins.outputs.drawing import colormap
 from sigmasplat.plugins.viewer.snapshot import Piece, field_without_moments
-from sigmasplat.render import render
-from sigmasplat.types import Matrix
-from sigmasplat.uncertainty.predictive import predicted, variance_parts
 
 Colouring = Literal["colour", "σ", "depth error"]
 Floats = NDArray[np.float32]

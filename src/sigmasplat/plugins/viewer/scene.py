@@ -9,13 +9,10 @@ import trimesh
 import viser
 from PIL import Image
 
-from sigmasplat.data import se3
-from sigmasplat.data.camera import Camera
-from sigmasplat.data.mesh import Mesh
+from sigmasplat.api import Camera, Matrix, Mesh, se3
 from sigmasplat.plugins.outputs.drawing.colormap import Rgb
 from sigmasplat.plugins.viewer.layers import SplatArrays
 from sigmasplat.plugins.viewer.snapshot import LOST_COLOUR, Bytes, Floats, Segments
-from sigmasplat.types import Matrix
 
 FRUSTUM_M, THUMBNAIL_PX = 0.08, 160
 LINE_PX, FRUSTUM_PX, DOT_M = {"path": 4.0, "truth": 2.0}, 1.0, 0.03

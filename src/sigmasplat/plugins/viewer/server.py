@@ -14,8 +14,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
-from sigmasplat.env import install_extra
-from sigmasplat.errors import ConfigError, SigmaSplatError
+from sigmasplat.api import ConfigError, SigmaSplatError, install_extra
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection

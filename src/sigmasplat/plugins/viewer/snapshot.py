@@ -12,15 +12,19 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sigmasplat.config import RenderConfig
-from sigmasplat.data.camera import Camera
-from sigmasplat.data.field import COLUMNS, GaussianField, Rows
-from sigmasplat.data.map_uncertainty import MapUncertainty
-from sigmasplat.data.mesh import Mesh
-from sigmasplat.data.trajectory import evenly_spaced
+from sigmasplat.api import (
+    COLUMNS,
+    Camera,
+    GaussianField,
+    MapUncertainty,
+    Matrix,
+    Mesh,
+    RenderConfig,
+    Rows,
+    evenly_spaced,
+)
 from sigmasplat.plugins.outputs.drawing.colormap import Rgb
 from sigmasplat.plugins.outputs.drawing.plot import ACCENT, BLUE, DARK, GREEN
-from sigmasplat.types import Matrix
 
 BUDGET = 300_000
 """Maximum number of splats sent to a browser: 10 MB, which it sorts after each camera move."""

@@ -11,12 +11,25 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sigmasplat.data.camera import Camera
-from sigmasplat.data.field import GaussianField
-from sigmasplat.data.mesh import Mesh
-from sigmasplat.data.trajectory import LOST, outside_world, states_at_end, submaps_outside
-from sigmasplat.errors import RunError, SigmaSplatError
-from sigmasplat.input.source import Source
+from sigmasplat.api import (
+    LOST,
+    MESH,
+    TRUTH,
+    Callback,
+    Camera,
+    GaussianField,
+    Matrix,
+    Mesh,
+    RunError,
+    RunFolder,
+    RunFrames,
+    SigmaSplatError,
+    Source,
+    outside_world,
+    read_trajectory,
+    states_at_end,
+    submaps_outside,
+)
 from sigmasplat.plugins.outputs.drawing.colormap import Rgb
 from sigmasplat.plugins.outputs.mesh_files import read_mesh
 from sigmasplat.plugins.viewer.snapshot import (
@@ -29,16 +42,9 @@ from sigmasplat.plugins.viewer.snapshot import (
     within_budget,
     without_moments,
 )
-from sigmasplat.run.callbacks import Callback
-from sigmasplat.run_folder.frames import RunFrames
-from sigmasplat.run_folder.runs import MESH, TRUTH, RunFolder
-from sigmasplat.run_folder.trajectory import read_trajectory
-from sigmasplat.types import Matrix
 
 if TYPE_CHECKING:
-    from sigmasplat.graph.loops import Loop
-    from sigmasplat.slam.results import Step
-    from sigmasplat.slam.slam import Slam
+    from sigmasplat.api import Loop, Slam, Step
 
 EVERY_S = 2.0
 Log = list[dict[str, Any]]

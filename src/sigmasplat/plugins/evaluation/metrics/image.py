@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import correlate1d
 
-from sigmasplat.errors import SigmaSplatError
+from sigmasplat.api import SigmaSplatError
 
 Pixels = NDArray[np.floating[Any]]
 Mask = NDArray[np.bool_]

@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sigmasplat.errors import ConfigError
+from sigmasplat.api import ConfigError
 
 Net = Literal["alex", "vgg"]
 Pixels = NDArray[np.floating[Any]]

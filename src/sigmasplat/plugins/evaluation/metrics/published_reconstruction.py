@@ -13,13 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
-from sigmasplat.data import se3
-from sigmasplat.data.camera import Camera
-from sigmasplat.data.mesh import Mesh
+from sigmasplat.api import Camera, Matrix, Mesh, Progress, mesh_depth, no_progress, se3
 from sigmasplat.plugins.evaluation.metrics.reconstruction import COMPLETE_M, CORRECT_M, POINTS, f1
 from sigmasplat.plugins.evaluation.metrics.trajectory import align_rigid
-from sigmasplat.render.mesh import mesh_depth
-from sigmasplat.types import Matrix, Progress, no_progress
 
 Mask = NDArray[np.bool_]
 

@@ -10,11 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from sigmasplat.data import se3
-from sigmasplat.data.camera import Camera
-from sigmasplat.data.mesh import Mesh
-from sigmasplat.render.mesh import mesh_depth
-from sigmasplat.types import Matrix, Progress, no_progress
+from sigmasplat.api import Camera, Matrix, Mesh, Progress, mesh_depth, no_progress, se3
 
 Mask = NDArray[np.bool_]
 

@@ -8,10 +8,7 @@ from numpy.typing import NDArray
 from scipy.special import gammaincinv
 from scipy.stats import rankdata
 
-from sigmasplat.data import se3
-from sigmasplat.data.trajectory import Trajectory
-from sigmasplat.errors import SourceError
-from sigmasplat.types import Matrix
+from sigmasplat.api import Matrix, SourceError, Trajectory, se3
 
 Rows = NDArray[np.intp]
 

@@ -9,17 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sigmasplat.data import se3
-from sigmasplat.data.camera import Camera
-from sigmasplat.data.exposure import exposed
-from sigmasplat.data.field import GaussianField
-from sigmasplat.data.frame import Frame
-from sigmasplat.data.submap import SubmapStore
+from sigmasplat.api import Camera, Frame, GaussianField, Predicted, Render, SubmapStore, exposed, se3
 from sigmasplat.plugins.evaluation.metrics import uncertainty
 from sigmasplat.plugins.evaluation.metrics.image import SSIM_LEAST_PX, depth_l1, ms_ssim, psnr, similarity_factors, ssim
 from sigmasplat.plugins.evaluation.metrics.lpips import Lpips
-from sigmasplat.render import Render
-from sigmasplat.uncertainty.predictive import Predicted
 
 COVERED_ALPHA = 0.5
 """Above this alpha a pixel counts as covered by the map: its depth is Σwz / Σw."""

@@ -4,7 +4,7 @@ import shlex
 from pathlib import PurePath
 from typing import Any
 
-from sigmasplat.run.figures import format_ranges, number, rate
+from sigmasplat.api import format_ranges, number, rate
 
 Metrics = dict[str, Any]
 Advice = tuple[str, str]

@@ -6,11 +6,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.data.trajectory import APART, LOST, RELOCALISED, TRACKED
+from sigmasplat.api import APART, LOST, RELOCALISED, TRACKED, Matrix, RunFrames, frame_seconds
 from sigmasplat.plugins.outputs.drawing.plot import ACCENT, BLUE, FAINT, GREEN, PURPLE, Chart, Curve
-from sigmasplat.run_folder.frames import RunFrames
-from sigmasplat.run_folder.run_values import frame_seconds
-from sigmasplat.types import Matrix
 
 SUBMAP_COLOURS = (BLUE, GREEN, PURPLE)
 """Neighbouring submaps get different colours; the accent colour is for loops."""

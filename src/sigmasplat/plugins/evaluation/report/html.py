@@ -5,12 +5,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from sigmasplat.api import number
 from sigmasplat.plugins.evaluation.report import tables
 from sigmasplat.plugins.evaluation.report.advice import Advice
 from sigmasplat.plugins.evaluation.report.summary import Verdict
 from sigmasplat.plugins.evaluation.report.view_strips import PanelFigure
 from sigmasplat.plugins.outputs.floorplan.rescan import RescanRegion
-from sigmasplat.run.figures import number
 
 NARROW = "(max-width: 640px)"
 """Pages this narrow show the narrow version of charts and plan."""

@@ -5,12 +5,19 @@ import shlex
 from collections.abc import Mapping
 from typing import Any
 
-from sigmasplat.config import Config
-from sigmasplat.config.find_preset import default_preset, is_preset, preset
-from sigmasplat.config.text import differences
-from sigmasplat.data.camera import Camera
-from sigmasplat.data.trajectory import Trajectory
-from sigmasplat.errors import RunError, SigmaSplatError
+from sigmasplat.api import (
+    Camera,
+    Config,
+    RunError,
+    RunFolder,
+    RunFrames,
+    SigmaSplatError,
+    Trajectory,
+    default_preset,
+    differences,
+    is_preset,
+    preset,
+)
 from sigmasplat.plugins.evaluation.report.advice import advice, next_commands
 from sigmasplat.plugins.evaluation.report.html import Contents, build_report
 from sigmasplat.plugins.evaluation.report.summary import rescan_sentences, summary_sentences, verdicts
@@ -18,8 +25,6 @@ from sigmasplat.plugins.evaluation.report.view_strips import PanelFigure, file_d
 from sigmasplat.plugins.outputs.drawing import plot
 from sigmasplat.plugins.outputs.floorplan.floor_plan import FloorPlan, run_floor_plan
 from sigmasplat.plugins.outputs.floorplan.picture import draw_floor_plan, draw_narrow_floor_plan
-from sigmasplat.run_folder.frames import RunFrames
-from sigmasplat.run_folder.runs import RunFolder
 
 LIKELY = 0.5
 """The page names valid frames whose `p_off` is larger."""

@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
+from sigmasplat.api import format_ranges, number, rate
 from sigmasplat.plugins.evaluation.report.advice import PSNR_WORDS, Advice, Metrics
 from sigmasplat.plugins.outputs.floorplan.rescan import unsure_rule
-from sigmasplat.run.figures import format_ranges, number, rate
 
 if TYPE_CHECKING:
     from sigmasplat.plugins.outputs.floorplan.floor_plan import FloorPlan

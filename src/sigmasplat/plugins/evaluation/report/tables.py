@@ -2,9 +2,7 @@
 
 from typing import Any
 
-from sigmasplat.data.map_uncertainty import SHIPPED
-from sigmasplat.data.trajectory import APART, LOST, RELOCALISED, TRACKED
-from sigmasplat.run.figures import format_ranges, number, rate
+from sigmasplat.api import APART, LOST, RELOCALISED, SHIPPED, TRACKED, format_ranges, number, rate
 
 
 def key_figures(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:

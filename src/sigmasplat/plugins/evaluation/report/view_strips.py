@@ -7,7 +7,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from sigmasplat.errors import RunError
+from sigmasplat.api import RunError, RunFolder
 from sigmasplat.plugins.evaluation.metrics.views import ScoredView
 from sigmasplat.plugins.outputs.drawing.view_panels import (
     PANEL_WIDTH,
@@ -16,7 +16,6 @@ from sigmasplat.plugins.outputs.drawing.view_panels import (
     predicted_panels,
     view_panels,
 )
-from sigmasplat.run_folder.runs import RunFolder
 
 QUALITY, EFFORT = 86, 2
 """Quality of WebP, and the effort to compress (0 to 6; a larger one takes longer and hardly saves space)."""

@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from sigmasplat.api import Render
 from sigmasplat.plugins.evaluation.metrics.views import COVERED_ALPHA
 from sigmasplat.plugins.outputs.drawing import colormap
 from sigmasplat.plugins.outputs.drawing.view_panels import BACKGROUND, FAINT, TEXT
-from sigmasplat.render import Render
 
 STRIP, MARGIN, GAP = 40, 10, 8
 SHORTEST_BAR = 60

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from sigmasplat.types import Matrix
+from sigmasplat.api import Matrix
 
 Colour = tuple[int, int, int]
 Box = tuple[float, float, float, float]

@@ -8,13 +8,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.config import Config
-from sigmasplat.data import se3
-from sigmasplat.data.camera import Camera
-from sigmasplat.data.field import GaussianField
-from sigmasplat.data.map_uncertainty import MapUncertainty
-from sigmasplat.data.trajectory import Trajectory
-from sigmasplat.errors import ConfigError, SigmaSplatError
+from sigmasplat.api import (
+    Camera,
+    Config,
+    ConfigError,
+    FieldRenderer,
+    GaussianField,
+    MapUncertainty,
+    Matrix,
+    Progress,
+    RunFolder,
+    SigmaSplatError,
+    Trajectory,
+    no_progress,
+    noted_up,
+    predict,
+    render,
+    se3,
+)
 from sigmasplat.plugins.outputs.floorplan.ground import (
     SurfacePredictor,
     SurfaceRenderer,
@@ -23,11 +34,6 @@ from sigmasplat.plugins.outputs.floorplan.ground import (
     sample_surfaces,
 )
 from sigmasplat.plugins.outputs.floorplan.rescan import RescanMaps, RescanRegion, find_rescan_regions
-from sigmasplat.render import FieldRenderer, render
-from sigmasplat.run_folder.frames import noted_up
-from sigmasplat.run_folder.runs import RunFolder
-from sigmasplat.types import Matrix, Progress, no_progress
-from sigmasplat.uncertainty.predictive import predict
 
 CELL_M = 0.05
 UNOBSERVED, FLOOR_UNOBSERVED, FREE, OBJECT, WALL = range(5)

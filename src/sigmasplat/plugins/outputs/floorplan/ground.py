@@ -10,15 +10,20 @@ from numpy.typing import NDArray
 from scipy.special import erfc
 from torch import Tensor
 
-from sigmasplat.data import se3
-from sigmasplat.data.camera import Camera
-from sigmasplat.data.field import GaussianField
-from sigmasplat.data.trajectory import Trajectory, evenly_spaced
-from sigmasplat.errors import SigmaSplatError
+from sigmasplat.api import (
+    Camera,
+    GaussianField,
+    Matrix,
+    Predicted,
+    Progress,
+    Render,
+    SigmaSplatError,
+    Trajectory,
+    evenly_spaced,
+    no_progress,
+    se3,
+)
 from sigmasplat.plugins.evaluation.metrics.views import COVERED_ALPHA
-from sigmasplat.render import Render
-from sigmasplat.types import Matrix, Progress, no_progress
-from sigmasplat.uncertainty.predictive import Predicted
 
 WIDTH_PX = 160
 """Width of the rendered images: at 5 m a pixel is about 4 cm wide."""

@@ -8,9 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from sigmasplat.errors import RunError
-from sigmasplat.files.atomic import replacing
-from sigmasplat.files.json_files import write_json
+from sigmasplat.api import Progress, RunError, no_progress, replacing, write_json
 from sigmasplat.plugins.outputs.drawing import colormap
 from sigmasplat.plugins.outputs.drawing.plot import (
     ACCENT,
@@ -36,7 +34,6 @@ from sigmasplat.plugins.outputs.floorplan.floor_plan import (
 from sigmasplat.plugins.outputs.floorplan.ground import WRONG_BY
 from sigmasplat.plugins.outputs.floorplan.rescan import unsure_rule
 from sigmasplat.plugins.outputs.run_reader import RunReader
-from sigmasplat.types import Progress, no_progress
 
 PANEL_PX = 440
 """The longer side of a panel."""

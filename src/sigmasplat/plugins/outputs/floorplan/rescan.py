@@ -10,8 +10,8 @@ from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError
 from skimage.draw import polygon
 
+from sigmasplat.api import Matrix
 from sigmasplat.plugins.outputs.floorplan.ground import WRONG_BY
-from sigmasplat.types import Matrix
 
 MAX_DEPTH_SIGMA_M = 0.05
 MAX_WRONG_SHARE = 0.5

@@ -3,12 +3,8 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from sigmasplat.data.field import GaussianField
-from sigmasplat.errors import SourceError
-from sigmasplat.files.ply_elements import read_header
-from sigmasplat.files.reading import guarded, open_binary
+from sigmasplat.api import GaussianField, SourceError, guarded, open_binary, read_header, splat_ply as ply
 from sigmasplat.plugins.outputs.splats import compressed_ply, gltf, sog, splat, spz, usd
-from sigmasplat.run_folder import splat_ply as ply
 
 READABLE = ".ply, .compressed.ply, .splat, .spz, .sog, .glb, .gltf, .usda, .usdc or .usd"
 START = 4096

@@ -14,19 +14,21 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.data.field import GaussianField
-from sigmasplat.errors import SourceError
-from sigmasplat.files.atomic import replacing
-from sigmasplat.files.ply_elements import Element, header_of, read_header
-from sigmasplat.files.reading import open_binary
-from sigmasplat.run_folder.splat_values import (
+from sigmasplat.api import (
     Doubles,
+    Element,
+    GaussianField,
+    SourceError,
     SplatValues,
     by_channel,
     from_smallest_three,
+    header_of,
     morton_order,
     opacities_of,
     opacity_bytes,
+    open_binary,
+    read_header,
+    replacing,
     smallest_three,
 )
 

@@ -21,13 +21,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.data.field import GaussianField
-from sigmasplat.data.harmonics import DEGREES, count
-from sigmasplat.data.map_uncertainty import SplatStd
-from sigmasplat.errors import SourceError
-from sigmasplat.files.atomic import replacing
-from sigmasplat.files.reading import open_binary
-from sigmasplat.run_folder.splat_values import SH_C0, Doubles, SplatValues, log_scales_of, rotations_of
+from sigmasplat.api import (
+    DEGREES,
+    SH_C0,
+    Doubles,
+    GaussianField,
+    SourceError,
+    SplatStd,
+    SplatValues,
+    count,
+    log_scales_of,
+    open_binary,
+    replacing,
+    rotations_of,
+)
 
 FLOAT = 5126
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", FLOAT: "<f4"}

@@ -23,20 +23,21 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 from scipy.cluster.vq import vq
 
-from sigmasplat.data.field import GaussianField
-from sigmasplat.data.harmonics import DEGREES, count
-from sigmasplat.errors import SourceError
-from sigmasplat.files.atomic import replacing
-from sigmasplat.files.reading import open_binary
-from sigmasplat.run_folder.splat_values import (
+from sigmasplat.api import (
+    DEGREES,
     SH_C0,
     Doubles,
+    GaussianField,
+    SourceError,
     SplatValues,
     check_count,
+    count,
     from_smallest_three,
     morton_order,
     opacities_of,
     opacity_bytes,
+    open_binary,
+    replacing,
     smallest_three,
     to_bytes,
 )

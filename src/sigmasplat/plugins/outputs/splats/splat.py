@@ -13,11 +13,18 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.data.field import GaussianField
-from sigmasplat.errors import SourceError
-from sigmasplat.files.atomic import replacing
-from sigmasplat.files.reading import open_binary
-from sigmasplat.run_folder.splat_values import SplatValues, log_scales_of, opacities_of, opacity_bytes, to_bytes, unit
+from sigmasplat.api import (
+    GaussianField,
+    SourceError,
+    SplatValues,
+    log_scales_of,
+    opacities_of,
+    opacity_bytes,
+    open_binary,
+    replacing,
+    to_bytes,
+    unit,
+)
 
 ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 3), ("opacity", "u1"), ("quat", "u1", 4)])
 UNIT = (0.9, 1.1)

@@ -17,14 +17,22 @@ from typing import Any
 import numpy as np
 import torch
 
-from sigmasplat.data.field import GaussianField
-from sigmasplat.data.harmonics import DEGREES, count
-from sigmasplat.data.map_uncertainty import SplatStd
-from sigmasplat.env import install_extra
-from sigmasplat.errors import SigmaSplatError, SourceError
-from sigmasplat.files.atomic import replacing
-from sigmasplat.files.reading import open_binary
-from sigmasplat.run_folder.splat_values import SH_C0, Doubles, SplatValues, log_scales_of, rotations_of
+from sigmasplat.api import (
+    DEGREES,
+    SH_C0,
+    Doubles,
+    GaussianField,
+    SigmaSplatError,
+    SourceError,
+    SplatStd,
+    SplatValues,
+    count,
+    install_extra,
+    log_scales_of,
+    open_binary,
+    replacing,
+    rotations_of,
+)
 
 BINARY, TEXT = b"PXR-USDC", b"#usda"
 SCHEMA = "ParticleField3DGaussianSplat"

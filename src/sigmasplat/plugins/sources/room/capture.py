@@ -5,9 +5,8 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d, map_coordinates, maximum_filter, minimum_filter, zoom
 
-from sigmasplat.data.camera import Camera
+from sigmasplat.api import Camera, Matrix
 from sigmasplat.plugins.sources.room.furnish import HALF_X_M, PITCH_M
-from sigmasplat.types import Matrix
 
 PATH_SAMPLES = 4000
 """Samples for measuring the length of a path."""

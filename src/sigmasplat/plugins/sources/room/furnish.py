@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.data.camera import Camera
+from sigmasplat.api import Camera, Matrix
 from sigmasplat.plugins.sources.room.shapes import Kind, Rays, Shape
 from sigmasplat.plugins.sources.room.textures import (
     Color,
@@ -28,7 +28,6 @@ from sigmasplat.plugins.sources.room.textures import (
     weave,
     wood,
 )
-from sigmasplat.types import Matrix
 
 Triple = tuple[float, float, float]
 HALF_X_M, HALF_Y_M, HEIGHT_M = 2.5, 2.0, 2.6

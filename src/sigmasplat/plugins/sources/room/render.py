@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, map_coordinates
 
-from sigmasplat.data import se3
-from sigmasplat.data.camera import Camera
+from sigmasplat.api import Camera, se3
 from sigmasplat.plugins.sources.room.furnish import HALF_X_M, HALF_Y_M, HEIGHT_M, PITCH_M, WALL_M, furnish_rooms
 from sigmasplat.plugins.sources.room.shapes import (
     Indices,

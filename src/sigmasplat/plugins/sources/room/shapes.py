@@ -13,8 +13,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.data.camera import Camera
-from sigmasplat.data.mesh import Mesh
+from sigmasplat.api import Camera, Mesh
 from sigmasplat.plugins.sources.room.textures import Floats, Material
 
 Indices = NDArray[np.intp]
