@@ -205,7 +205,14 @@ def followed(config: Config) -> Slam:
     return slam
 
 
-@pytest.mark.parametrize("run", [run for run in RUNS if run != "cgslam-fast"])
+@pytest.mark.parametrize(
+    "run",
+    [
+        run if run in ("sigma", "varsplat-fast") else pytest.param(run, marks=pytest.mark.slow)
+        for run in RUNS
+        if run != "cgslam-fast"
+    ],
+)
 def test_slam_runs(device: torch.device, run: str) -> None:
     ours, theirs = (followed(settings(run, backend)) for backend in ("cuda", "cpu"))
     paths = [slam.trajectory().T_world_camera for slam in (ours, theirs)]

@@ -323,6 +323,7 @@ def test_a_scene_that_only_a_dead_worker_has_is_missing_unless_another_worker_br
         assert "office0" in next(line for line in text.splitlines() if "Missing" in line)
 
 
+@pytest.mark.slow
 def test_a_worker_that_does_not_see_the_folder_sends_its_files(
     tmp_path: Path, replica: Path, whole: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -339,6 +340,7 @@ def test_a_worker_that_does_not_see_the_folder_sends_its_files(
     assert not (sent / "submaps").exists() and (sent / "report.html").exists()
 
 
+@pytest.mark.slow
 def test_a_batch_keeps_what_is_done_and_names_what_is_missing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -51,6 +51,7 @@ def arguments(photos: Path, out: Path, *depth: str) -> list[str]:
     return ["run", str(photos), *more, *settings]
 
 
+@pytest.mark.slow
 def test_a_network_gives_what_a_folder_of_its_predictions_gives_and_a_resume_needs_the_same(
     photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -25,6 +25,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+@pytest.mark.slow
 def test_errors_of_the_path_are_of_the_size_that_the_covariance_says(run: Path) -> None:
     scores = json.loads((run / "metrics.json").read_text())["pose_covariance"]
     assert scores["hops"]["count"] >= 11 and scores["windows"]["count"] == 10 and scores["from_start"]["count"] == 59

@@ -49,6 +49,7 @@ def scored(folder: Path, run: Path, *options: str) -> dict[str, object]:
     return RunFolder.open(run).read_metrics()
 
 
+@pytest.mark.slow
 def test_replicas_layout_has_all_scores_of_the_papers(
     room: SyntheticRoom, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -301,6 +301,7 @@ def started(out: Path) -> subprocess.Popen[str]:
     return process
 
 
+@pytest.mark.slow
 def test_ctrl_c_leaves_a_valid_run_with_all_frames_mapped(tmp_path: Path) -> None:
     process = started(tmp_path / "run")
     process.send_signal(signal.SIGINT)

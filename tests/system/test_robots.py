@@ -197,7 +197,7 @@ def test_the_final_map_is_given_as_points_and_as_a_grid(recorded: tuple[Slam, Pa
     assert up[2] > 0.7, "z of the floor is nearly that of the map, whose first camera was nearly level"
 
 
-@pytest.mark.parametrize("measured", [True, False])
+@pytest.mark.parametrize("measured", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_the_accelerometer_levels_the_floor_of_a_camera_held_sideways(tmp_path: Path, measured: bool) -> None:
     frames, up_world = turned_by_90_degrees(there_and_back(), measured)
     followed([BagSink(tmp_path / "bag")], frames=frames)
@@ -250,6 +250,7 @@ def files_of_at_most(size: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
+@pytest.mark.slow
 def test_a_full_disk_ends_the_bag_and_not_the_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     large = "synthetic:frames=60,width=320,height=240"
     more = ("--no-eval", "--limit", "8", *TINY)
@@ -388,6 +389,7 @@ def framed(payload: bytes, code: int = 1) -> bytes:
     return bytes([0x80 | code]) + size + b"\0\0\0\0" + payload
 
 
+@pytest.mark.slow
 def test_malicious_and_slow_clients_change_nothing() -> None:
     stream, garbage = StreamSink(MESSAGES, port=0), np.random.default_rng(0)
     requests = [

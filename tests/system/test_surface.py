@@ -162,7 +162,7 @@ def test_evaluation_scores_the_mesh_in_the_truths_frame(run: RunFolder) -> None:
     )
     assert run.read_metrics()["reconstruction"].items() >= {n: v for n, v in found.items() if np.isfinite(v)}.items()
     page = (run.path / "report.html").read_text()
-    assert "Surface F1 at 1 cm" in page and "Completion ratio (&lt; 5 cm), %" in page
+    assert "F1 (1 cm), %" in page and "Completion ratio (&lt; 5 cm), %" in page
     off = read_mesh(run.path / "mesh.ply").vertices[:, 2] - (WALL_M - 0.005)
     assert np.abs(off).max() < 0.004 and np.median(np.abs(off)) < 1e-5, "in the world of the run"
 

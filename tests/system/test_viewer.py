@@ -202,6 +202,7 @@ def scene_of(screenshot: Pixels) -> Pixels:
     return screenshot[200:, : WIDTH - PANEL]
 
 
+@pytest.mark.slow
 def test_a_live_run_shows_its_map_while_it_grows_and_stays_until_ctrl_c(tmp_path: Path) -> None:
     out = tmp_path / "run"
     options = [word for pair in QUICK.items() for word in ("--set", "=".join(pair))]

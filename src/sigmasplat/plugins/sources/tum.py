@@ -140,6 +140,9 @@ def read_gyroscope(path: Path) -> Gyroscope:
         raise SourceError(f"{path}: {error}") from error
 
 
+HEAD = "# timestamp path\n"
+
+
 class TumWriter:
     """Writes frames to a new TUM folder: both images first, then a line in each list.
 
@@ -170,7 +173,7 @@ class TumWriter:
                 Image.fromarray(image).save(self.folder / part / f"{stem}.png", compress_level=1)
             for part in images:
                 with (self.folder / f"{part}.txt").open("a", encoding="utf-8") as file:
-                    file.write(f"{stem} {part}/{stem}.png\n")
+                    file.write(f"{'' if file.tell() else HEAD}{stem} {part}/{stem}.png\n")
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
