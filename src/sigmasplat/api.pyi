@@ -1,5 +1,5 @@
-# The one list of the names that plug-ins import, and of their homes (api.py reads it). A name keeps its meaning when its
-# home moves. Plug-ins of others need few of them: the rows of registry.py, Camera, Frame, Config, Source, Trajectory.
+# The one list of what plug-ins import, and the homes of the names (api.py reads it). A name keeps its meaning when its
+# home moves. Plug-ins of others need few: the rows of registry.py, Camera, Frame, Config, Source, Trajectory.
 from sigmasplat import env as env
 from sigmasplat.config import (
     Config as Config,
