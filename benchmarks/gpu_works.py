@@ -1,11 +1,10 @@
 """Define the operations that the GPU benchmark times, each as the product runs it, and time them on a device."""
 
-import dataclasses
 import importlib.util
 import sys
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -68,6 +67,12 @@ def _wait(device: torch.device) -> None:
         torch.cuda.synchronize(device)
 
 
+class Launched(TrackingConfig):
+    """Settings with which each kernel is launched on its own."""
+
+    cuda_graphs: ClassVar[bool] = False
+
+
 class GpuWorks:
     """All operations of a frame on one scene, in the coordinates of its camera. Each method runs one operation once."""
 
@@ -117,7 +122,7 @@ class GpuWorks:
 
     def launched_tracking_iterations(self) -> None:
         """Descend the tracking loss for `TRACKING_ITERATIONS`, without a CUDA graph."""
-        launched = dataclasses.replace(self.tracking, cuda_graphs=False)
+        launched = Launched(method="adam", plateau_stop=0.0)
         fit_pose_adam(self.params, self.all, self.later, np.eye(4), launched, TRACKING_ITERATIONS)
 
 

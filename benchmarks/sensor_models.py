@@ -22,7 +22,7 @@ from tables import Section, significant
 import sigmasplat
 from sigmasplat.commands.options import Settings
 from sigmasplat.config.find_preset import default_preset, preset
-from sigmasplat.config.sensors import sensor_model
+from sigmasplat.config.sensors import GENERIC, sensor_model
 from sigmasplat.data import se3
 from sigmasplat.files.machine import INSTALLED, code_digest
 from sigmasplat.fit.align import align
@@ -35,7 +35,6 @@ from sigmasplat.plugins.sources import open_source
 from sigmasplat.tracking.depth_filters import denoised
 
 arg = tyro.conf.arg
-USES = ("tracking", "mapping")
 PAIR_M, PAIR_WIDTH, PAIR_RANGE_M = 0.06, 320, (0.1, 8.0)
 """Pairs are about as far apart as a frame and its keyframe."""
 GUESS_OFF = np.array([0.01, -0.01, 0.01, 0.005, -0.005, 0.005])
@@ -58,7 +57,7 @@ class Options:
     sources: Annotated[tuple[str, ...], arg(help="sequences with their sensor: NAME=SENSOR")] = (
         "redkitchen=kinect-v1", "hololens=time-of-flight", "cubicles=kinect-v1", "livingroom=kinect-v1",
     )  # fmt: skip
-    variants: Annotated[tuple[str, ...], arg(help="uses of the model, joined by +; none = without it")] = (
+    variants: Annotated[tuple[str, ...], arg(help="none = without the model; tracking; tracking+mapping")] = (
         "none", "tracking",
     )  # fmt: skip
     pairs: Annotated[int, arg(help="pairs of frames that are aligned")] = 60
@@ -103,8 +102,9 @@ def jobs_of(options: Options) -> list[tuple[str, str, accuracy.Job]]:
     for name, sensor in (given.split("=", 1) for given in options.sources):
         for seed in options.seeds:
             for variant in options.variants:
-                uses = [f"{use}.sensor_noise={str(use in variant.split('+')).lower()}" for use in USES]
-                settings = (f"input.sensor={sensor}", *uses, *options.settings)
+                settings = (f"input.sensor={GENERIC if variant == 'none' else sensor}", *options.settings)
+                if "mapping" in variant.split("+"):
+                    settings = ("mapping.sensor_noise=true", *settings)
                 where = Path(name).name, accuracy.located(name)
                 jobs.append(
                     (sensor, variant, accuracy.Job(*where, options.preset, seed, settings, options.limit, code))

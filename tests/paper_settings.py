@@ -5,22 +5,23 @@ import dataclasses
 from functools import partial
 from typing import Any
 
+from constants import made
 from sigmasplat import config
 from sigmasplat.plugins.presets.base import BASE, BASE_VALUES
 
-RenderConfig = partial(config.RenderConfig, **BASE_VALUES["render"])
-SeedConfig = partial(config.SeedConfig, **BASE_VALUES["seeding"])
-MappingConfig = partial(config.MappingConfig, **BASE_VALUES["mapping"])
-DensifyConfig = partial(config.DensifyConfig, **BASE_VALUES["primitives"])
-TrackingConfig = partial(config.TrackingConfig, **BASE_VALUES["tracking"])
-RecoveryConfig = partial(config.RecoveryConfig, **BASE_VALUES["recovery"])
-MovingConfig = partial(config.MovingConfig, **BASE_VALUES["moving"])
-SubmapConfig = partial(config.SubmapConfig, **BASE_VALUES["submaps"])
-LoopConfig = partial(config.LoopConfig, **BASE_VALUES["loops"])
-RegistrationConfig = partial(config.RegistrationConfig, **BASE_VALUES["registration"])
-FinalConfig = partial(config.FinalConfig, **BASE_VALUES["final"])
-SurfaceConfig = partial(config.SurfaceConfig, **BASE_VALUES["surface"])
-InputConfig = partial(config.InputConfig, **BASE_VALUES["input"])
+RenderConfig = partial(made, config.RenderConfig, **BASE_VALUES["render"])
+SeedConfig = partial(made, config.SeedConfig, **BASE_VALUES["seeding"])
+MappingConfig = partial(made, config.MappingConfig, **BASE_VALUES["mapping"])
+DensifyConfig = partial(made, config.DensifyConfig, **BASE_VALUES["primitives"])
+TrackingConfig = partial(made, config.TrackingConfig, **BASE_VALUES["tracking"])
+RecoveryConfig = partial(made, config.RecoveryConfig, **BASE_VALUES["recovery"])
+MovingConfig = partial(made, config.MovingConfig, **BASE_VALUES["moving"])
+SubmapConfig = partial(made, config.SubmapConfig, **BASE_VALUES["submaps"])
+LoopConfig = partial(made, config.LoopConfig, **BASE_VALUES["loops"])
+RegistrationConfig = partial(made, config.RegistrationConfig, **BASE_VALUES["registration"])
+FinalConfig = partial(made, config.FinalConfig, **BASE_VALUES["final"])
+SurfaceConfig = partial(made, config.SurfaceConfig, **BASE_VALUES["surface"])
+InputConfig = partial(made, config.InputConfig, **BASE_VALUES["input"])
 
 
 def paper_settings(**sections: Any) -> config.Config:

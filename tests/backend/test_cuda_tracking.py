@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from constants import changed
 from emulated_cuda import Emulator
 from paper_settings import TrackingConfig
 from sigmasplat.data import se3
@@ -36,7 +37,7 @@ CHOICES = list(itertools.product(["image", "kept"], [0.0, 2.5], [False, True]))
 STEPS = TrackingConfig(lr_rotation=4e-4, lr_translation=1e-3, tau=5.0)
 WAYS = {
     "ours": STEPS,
-    "exposed": dataclasses.replace(STEPS, exposure=True, lr_exposure=4e-3),
+    "exposed": changed(STEPS, exposure=True, lr_exposure=4e-3),
     "paper": PAPER,
     "paper, exposed": dataclasses.replace(PAPER, exposure=True, uncertainty=True, tau=2.0),
 }
@@ -105,7 +106,7 @@ def test_weights_and_masks_matter_here() -> None:
         {"outlier_factor": 2.0}, {"alpha_power": 2.0}, {"uncertainty": True, "weight_max": 1.01},
     ]  # fmt: skip
     losses = [
-        float(launched(view, shown(), dataclasses.replace(base, **c)).found[0])  # type: ignore[attr-defined]
+        float(launched(view, shown(), changed(base, **c)).found[0])  # type: ignore[attr-defined]
         for c in changes
     ]
     assert len({round(loss, 6) for loss in losses}) == len(changes)
@@ -392,7 +393,7 @@ def graphs(monkeypatch: pytest.MonkeyPatch, looking_often: None) -> type[Recorde
 
 
 def test_one_graph_is_made_and_run_again(graphs: type[Recorded]) -> None:
-    want, _ = descended(7, None, dataclasses.replace(STEPS, cuda_graphs=False))
+    want, _ = descended(7, None, changed(STEPS, cuda_graphs=False))
     assert graphs.made == 0
     got, _ = descended(7, None)
     assert graphs.made == 1 and got[1:] == want[1:]

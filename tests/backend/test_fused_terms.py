@@ -1,6 +1,7 @@
 """A loss term that a device's kernels do not have is computed by autograd beside them; it is never dropped."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import pytest
 import torch
@@ -28,6 +29,7 @@ OWN = "darkness"
 class OwnMapping(settings.MappingConfig):
     """Mapping's settings with a weight for it, as docs/recipes.md adds one."""
 
+    lr_colors: ClassVar[float] = 0.02
     weight_darkness: float = 0.0
 
 
@@ -69,7 +71,7 @@ def test_a_term_that_the_kernels_do_not_have_counts_all_the_same(
 def test_a_fit_descends_a_term_of_ones_own(kernels: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(losses.TERMS, OWN, darkness)
     s, brightness = scene("random", 60), {}
-    config = OwnMapping(weight_l1=0.0, lr_colors=0.02, weight_darkness=3.0)
+    config = OwnMapping(weight_l1=0.0, weight_darkness=3.0)
     for degree in (0, 1):
         field, view = GaussianField(params_of(s)), view_on(kernels, WIDE)
         target = target_of(WIDE, (view.alpha.shape[0], view.alpha.shape[1]))

@@ -3,6 +3,7 @@
 On a true device where there is one, else on what stands in for it (stand_in.py).
 """
 
+import dataclasses
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 
+from constants import changed
 from paper_settings import MappingConfig, TrackingConfig
 from sigmasplat import cli
 from sigmasplat.config import Config
@@ -180,7 +182,7 @@ RUNS = {
     # A frame in doubt is fitted again with twice the steps. From there on a device records a CUDA graph, but the
     # stand-in for a device cannot.
     "sigma by descent": {
-        "tracking.method": "adam", "tracking.iterations": "12", "tracking.cuda_graphs": "no", "loops.close": "no",
+        "tracking.method": "adam", "tracking.iterations": "12", "loops.close": "no",
     },
     "cgslam-fast": {"submaps.frames": "0"},
     "cgslam-loops-fast": {
@@ -194,7 +196,8 @@ FRAMES = 5
 
 def settings(run: str, backend: str, **changes: str) -> Config:
     named = {name.replace("__", "."): value for name, value in changes.items()}
-    return override(preset(run.split()[0]), QUICK | {"backend": backend} | RUNS[run] | named)
+    config = override(preset(run.split()[0]), QUICK | {"backend": backend} | RUNS[run] | named)
+    return dataclasses.replace(config, tracking=changed(config.tracking, cuda_graphs=False))
 
 
 def followed(config: Config) -> Slam:

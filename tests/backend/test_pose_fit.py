@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from constants import changed
 from paper_settings import RegistrationConfig, TrackingConfig
 from sigmasplat.data import se3
 from sigmasplat.data.field import GaussianField
@@ -167,7 +168,7 @@ def test_exposure_is_found_where_asked() -> None:
     view = make_view("cpu", CAMERA, OPTIONS)
     target = seen_from(view, TRUTH)
     target.color.mul_(np.exp(0.1)).add_(0.03)
-    config = dataclasses.replace(STEPS, exposure=True, lr_exposure=4e-3)
+    config = changed(STEPS, exposure=True, lr_exposure=4e-3)
     fit = fit_pose_adam(wall(), view, target, se3.exp(0.3 * OFF) @ TRUTH, config, 90)
     np.testing.assert_allclose(fit.exposure, (0.1, 0.03), atol=0.015)
     assert_near(fit.T_camera_world, TRUTH, 2e-3, 0.1)

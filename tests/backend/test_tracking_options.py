@@ -213,14 +213,14 @@ def test_an_iterate_that_sees_nothing_does_not_win() -> None:
 @pytest.mark.parametrize(
     ("first", "agreement", "asked"),
     [
-        ((200, 0.003), 1.0, [(200, 0.003), (15, 0.0015)]),
-        ((200, 0.003), 0.0, [(200, 0.003), (400, 0.003), (15, 0.0015), (30, 0.0015)]),
-        ((0, 0.0), 1.0, [(15, 0.0015), (15, 0.0015)]),
+        (200, 1.0, [(200, 0.003), (15, 0.0015)]),
+        (200, 0.0, [(200, 0.003), (400, 0.003), (15, 0.0015), (30, 0.0015)]),
+        (0, 1.0, [(15, 0.0015), (15, 0.0015)]),
     ],
     ids=["tracked", "lost", "off"],
 )
 def test_the_second_frame_may_take_longer_and_turn_faster(
-    monkeypatch: pytest.MonkeyPatch, first: tuple[int, float], agreement: float, asked: list[tuple[int, float]]
+    monkeypatch: pytest.MonkeyPatch, first: int, agreement: float, asked: list[tuple[int, float]]
 ) -> None:
     """It alone, whatever becomes of it; a second try takes twice as long."""
     seen: list[tuple[int, float]] = []
@@ -234,7 +234,7 @@ def test_the_second_frame_may_take_longer_and_turn_faster(
     target = seen_from(view, TRUTH)
     live = Pyramid.of(gray_of(target.image.numpy()), target.depth_image.numpy(), CAMERA)
     frame = Frame(0, 0.0, target.image.numpy(), target.depth_image.numpy(), CAMERA)
-    config = dataclasses.replace(PAPER, iterations=15, first_iterations=first[0], first_lr_rotation=first[1])
+    config = dataclasses.replace(PAPER, iterations=15, first_iterations=first)
     follower = tracker.Tracker(config)
     for _ in range(2):
         follower.track(field, view, PreparedFrame(target, live, frame=frame, whole=frame))

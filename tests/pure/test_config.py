@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from sigmasplat import env
-from sigmasplat.config import SECTIONS, Config, gone
+from sigmasplat.config import FOLLOWS, SECTIONS, Config, gone
 from sigmasplat.config.find_preset import preset
 from sigmasplat.config.ranges import kinds_of, problem_of, unpacked
 from sigmasplat.config.text import override, split_settings
@@ -104,7 +104,7 @@ def test_every_number_has_a_range_and_every_default_is_in_it() -> None:
         ("tracking", "method", "guess"),
         ("tracking", "exposure", None),
         ("loops", "weights", 3),
-        ("tracking", "weight_max", 0.5),
+        ("tracking", "alpha_power", -0.5),
         ("seeding", "opacity", 0.0),
         ("uncertainty", "probes", -1),
     ],
@@ -230,6 +230,30 @@ def test_a_saved_setting_that_is_gone_is_dropped_if_its_value_is_the_one_that_is
         saved[section][setting] = value
     assert Config.from_dict(saved) == preset("sigma")
     assert {"render.depth_gate_m", "tracking.variance", "registration.keyframes", "tracking.lost_share"} <= set(gone())
+
+
+def test_a_saved_setting_that_follows_another_one_is_dropped_if_the_other_one_gives_its_value() -> None:
+    """A run folder of an earlier version holds both; each preset has the values that its earlier runs saved."""
+    old = {
+        "final.lr_decay": {"epochs": 0.05, "random": 1.0}, "recovery.new_map_after": {True: 20, False: 0},
+        "seeding.alpha_below": {40.0: 0.6, 0.0: 0.5}, "mapping.freeze_until": {True: "half", False: "end"},
+        "tracking.first_lr_rotation": {200: 3e-3, 0: 0.0}, "tracking.sensor_noise": {True: True, False: False},
+    }  # fmt: skip
+    assert set(old) <= set(FOLLOWS)
+    for name in ("sigma", "varsplat-fast", "cgslam-released-replica", "varsplat-released-room0"):
+        saved = preset(name).to_dict()
+        for full, values in old.items():
+            section, _, setting = full.partition(".")
+            assert setting not in saved[section], full
+            saved[section][setting] = values[saved[section][FOLLOWS[full].partition(".")[2]]]
+        assert Config.from_dict(saved) == preset(name)
+    saved["final"]["lr_decay"] = 0.7
+    with pytest.raises(
+        ConfigError, match=r"^setting final\.lr_decay is gone: its value follows final\.order, found 0\.7$"
+    ):
+        Config.from_dict(saved)
+    with pytest.raises(ConfigError, match=r"^setting final\.lr_decay is gone: its value follows final\.order$"):
+        override(preset("sigma"), {"final.lr_decay": "0.05"})
 
 
 def test_another_value_of_a_setting_that_is_gone_is_refused_in_one_line() -> None:

@@ -86,7 +86,7 @@ def exposed_store() -> MemoryStore:
 
 
 def made(exposure: bool, iterations: int = 150) -> FinalMap:
-    settings = room.config(iterations=iterations, order="epochs", lr_factor=4.0, exposure=exposure)
+    settings = room.config(iterations=iterations, lr_factor=4.0, exposure=exposure)
     view = ReferenceView(room.CAMERA, settings.render)
     return final_map(exposed_store(), room.ANCHORS, settings, view, np.random.default_rng(0))
 

@@ -10,6 +10,7 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
+from constants import changed
 from paper_settings import MappingConfig
 from sigmasplat.config import Config
 from sigmasplat.data import se3
@@ -177,7 +178,7 @@ def test_weighing_by_variance_prefers_the_map_of_lower_variance() -> None:
     for field in (near, far):
         field.params[:, COLUMNS["colors"]] = 0.5
     at = [FusionView(field, CAMERA, np.eye(4), np.eye(4)) for field in (near, far)]
-    settings = replace(CONFIG, tracking=replace(CONFIG.tracking, tau=1.0, weight_max=100.0))
+    settings = replace(CONFIG, tracking=changed(CONFIG.tracking, tau=1.0, weight_max=100.0))
     left = {}
     for weigh in (False, True):
         mesh = fuse(at, 2, settings, voxel_m=0.02, weigh=weigh)
@@ -195,7 +196,7 @@ def test_refinement_improves_views_of_keyframes(uncertainty: bool) -> None:
     store, true, told = make_store(spoil=0.15), wall(-1.4, 1.6), list[tuple[int, int]]()
     start = refined(store, config(uncertainty=uncertainty))
     settings, view = config(uncertainty=uncertainty, iterations=30), ReferenceView(CAMERA, CONFIG.render)
-    settings = replace(settings, mapping=replace(settings.mapping, lr_colors=0.04, lr_pose_rotation=1.0))
+    settings = replace(settings, mapping=changed(settings.mapping, lr_colors=0.04, lr_pose_rotation=1.0))
     field = final_map(store, ANCHORS, settings, view, np.random.default_rng(0), lambda *at: told.append(at)).field
     assert psnr_of_held(field, true) > psnr_of_held(start, true) + 3.0
     assert told == [(i, 30) for i in range(31)]
@@ -214,8 +215,8 @@ def test_free_poses_lower_the_loss_and_recover_a_perturbed_keyframe() -> None:
     given, losses, found = store.submaps[0].T_submap_camera[1].copy(), dict[str, list[float]](), {}
     still = {f"lr_{name}": 0.0 for name in COLUMNS}
     for name, rate in (("free", 3e-2), ("fixed", 0.0)):
-        settings = config(iterations=60, lr_pose_translation=rate, order="epochs", lr_decay=0.03)
-        settings = replace(settings, mapping=replace(settings.mapping, **still))
+        settings = config(iterations=60, lr_pose_translation=rate, lr_decay=0.03)
+        settings = replace(settings, mapping=changed(settings.mapping, **still))
         view = ReferenceView(CAMERA, settings.render)
         keyframes, field = KeyframeReader(store, ANCHORS, view), wall(-1.4, 1.6)
         losses[name] = refine(field, keyframes, settings, view, np.random.default_rng(0), lambda done, total: None)
@@ -235,8 +236,8 @@ def test_a_pose_comes_to_rest_at_the_reach_and_the_first_one_stays() -> None:
     still = {f"lr_{name}": 0.0 for name in COLUMNS}
     moved_m = {}
     for reach in (0.0, reach_m, 1e-9):
-        settings = config(iterations=240, lr_pose_translation=3e-3, pose_reach_m=reach, order="epochs")
-        settings = replace(settings, mapping=replace(settings.mapping, **still))
+        settings = config(iterations=240, lr_pose_translation=3e-3, pose_reach_m=reach)
+        settings = replace(settings, mapping=changed(settings.mapping, **still))
         view = ReferenceView(CAMERA, settings.render)
         keyframes = KeyframeReader(store, ANCHORS, view)
         refine(wall(-1.4, 1.6), keyframes, settings, view, np.random.default_rng(0), lambda done, total: None)
@@ -381,7 +382,7 @@ def test_view_dependent_colour_is_learned_in_refinement(monkeypatch: pytest.Monk
     errors = []
     for degree in (0, 1):
         settings = config(iterations=40, sh_degree=degree, sh_every=1)
-        only_colors = replace(settings.mapping, lr_colors=0.02, lr_means=0.0, lr_opacity_logits=0.0)
+        only_colors = changed(settings.mapping, lr_colors=0.02, lr_means=0.0, lr_opacity_logits=0.0)
         field = refined(store, replace(settings, mapping=only_colors))
         off = [look(around(a), field).color / 255.0 - look(around(a), shiny).color / 255.0 for a in (-0.6, 0.6)]
         errors.append(np.abs(off).mean())
@@ -430,10 +431,7 @@ def test_what_no_map_can_be_made_of_is_refused() -> None:
         ({"sh_degree": 4}, r"final\.sh_degree must be between 0 and 3, found 4"),
         ({"spacing_m": 0.0}, r"final\.spacing_m must be above 0, found 0\.0"),
         ({"merge_m": 0.0}, r"final\.merge_m must be above 0"),
-        ({"lr_decay": 0.0}, r"final\.lr_decay must be above 0"),
-        ({"max_axis_ratio": 0.5}, r"final\.max_axis_ratio must be 0 or at least 1"),
         ({"sh_every": 0}, r"final\.sh_every must be at least 1"),
-        ({"prune_every": -1}, r"final\.prune_every must be at least 1"),
     ],
 )
 def test_settings_out_of_range_are_refused(settings: dict[str, object], complaint: str) -> None:

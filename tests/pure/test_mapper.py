@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from constants import changed
 from paper_settings import DensifyConfig, MappingConfig, RenderConfig, SeedConfig, paper_settings
 from sigmasplat import config as settings
 from sigmasplat.data.camera import Camera
@@ -154,7 +155,7 @@ def test_old_colours_are_frozen_where_asked(frozen: bool) -> None:
 
 @pytest.mark.parametrize("until", ["end", "half"])
 def test_all_colours_are_frozen_to_the_end_or_to_half_of_the_steps(until: str) -> None:
-    mapping = replace(NO_FIT, iterations=6, first_iterations=6, freeze_new_colors=True, freeze_until=until)
+    mapping = changed(NO_FIT, iterations=6, first_iterations=6, freeze_new_colors=True, freeze_until=until)
     made = mapper(replace(EVERY_PIXEL, opacity=0.6), mapping)
     made.map(view(), 0, target(), np.eye(4))
     seeds = target().image.reshape(-1, 3)
@@ -167,7 +168,7 @@ def test_all_colours_are_frozen_to_the_end_or_to_half_of_the_steps(until: str) -
 def test_a_keyframe_forgets_adams_moments_where_asked() -> None:
     """Without a step at the second keyframe, only forgetting changes the moments of the first one."""
     for fresh in (False, True):
-        mapping = replace(NO_FIT, first_iterations=3, fresh_adam=fresh)
+        mapping = changed(NO_FIT, first_iterations=3, fresh_adam=fresh)
         made = mapper(replace(EVERY_PIXEL, opacity=0.95), mapping)
         made.map(view(), 0, target(), np.eye(4))
         assert made.field.steps == 3 and bool(made.field.moment2.any())

@@ -8,6 +8,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from constants import changed
 from paper_settings import MappingConfig, RenderConfig
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
@@ -223,7 +224,7 @@ def test_a_faded_splat_of_the_wall_comes_back_and_a_floater_does_not(view: View)
     frame = keyframe(view, np.eye(4), 2.0)
     frame.target.color[:, : CAMERA.height, : CAMERA.width] = 0.9
     faded = fade(field, torch.tensor([lonely, PIXELS]), 0.07)
-    still = replace(MappingConfig(), weight_nll_color=0.0, lr_means=0.0, lr_log_scales=0.0, lr_quats=0.0, lr_colors=0.0)
+    still = changed(MappingConfig(), weight_nll_color=0.0, lr_means=0.0, lr_log_scales=0.0, lr_quats=0.0, lr_colors=0.0)
     fit_field(field, view, [[frame]] * 15, still)
     uncertainty, _ = splat_uncertainty(field, view, [frame], "dominant")
     opacity = field.opacities

@@ -1,6 +1,5 @@
 """Seeding: which pixels become splats, where these lie and how large they are, on scenes with known answers."""
 
-import dataclasses
 import itertools
 
 import numpy as np
@@ -8,6 +7,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
+import constants
 from paper_settings import SeedConfig
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
@@ -28,7 +28,7 @@ SETTINGS = SeedConfig(
 
 
 def changed(**values: object) -> SeedConfig:
-    return dataclasses.replace(SETTINGS, **values)  # type: ignore[arg-type]
+    return constants.changed(SETTINGS, **values)
 
 
 def random(seed: int = 0) -> np.random.Generator:
@@ -155,7 +155,7 @@ def test_without_a_factor_only_thin_places_are_seeded() -> None:
     alpha[:, :20] = 0.49
     behind = maps(np.full(SIZE, 3.0, np.float32), alpha)
     for least_m in (0.0, 0.1):
-        off = changed(alpha_below=0.5, depth_error_factor=0.0, depth_error_least_m=least_m)
+        off = changed(depth_error_factor=0.0, depth_error_least_m=least_m)
         np.testing.assert_array_equal(later_pixels(behind, target(np.full(SIZE, 2.0)), off), alpha < 0.5)
     assert later_pixels(behind, target(np.full(SIZE, 2.0)), changed(depth_error_factor=0.5)).all(), "else all is new"
 

@@ -117,7 +117,7 @@ def test_standard_deviations_are_resized_with_their_readings() -> None:
 
 
 def test_a_model_equal_to_the_law_gives_the_same_bits() -> None:
-    config = preset("sigma").changed(input={"width": 160}, tracking={"sensor_noise": True})
+    config = preset("sigma").changed(input={"width": 160}, tracking={"verify": True})
     found = []
     for name in ("z2:0.003", "auto", "base:0.02,z2:0.001"):
         settings = config.changed(input={"sensor": name})

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from command_line import exit_code
+from constants import changed
 from schedules import AtOnce, Drawn, Late
 from sigmasplat.config import Config
 from sigmasplat.config.find_preset import preset
@@ -34,12 +35,13 @@ pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built
 FRAMES = 40
 QUICK = SMALL | {
     "mapping.first_iterations": "12", "mapping.iterations": "6", "submaps.frames": "12", "final.iterations": "0",
-    "registration.iterations": "2", "loops.min_interval": "1", "realtime.spare_iterations": "8",
+    "registration.iterations": "2", "loops.min_interval": "1",
 }  # fmt: skip
 
 
 def config(**changes: str) -> Config:
-    return override(preset("sigma"), QUICK | {name.replace("__", "."): value for name, value in changes.items()})
+    made = override(preset("sigma"), QUICK | {name.replace("__", "."): value for name, value in changes.items()})
+    return replace(made, realtime=changed(made.realtime, spare_iterations=8))
 
 
 def error_m(system: RealTime) -> float:

@@ -11,6 +11,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
+from constants import changed
 from sigmasplat.config import Config
 from sigmasplat.config.find_preset import preset
 from sigmasplat.config.text import override
@@ -30,7 +31,7 @@ _core = pytest.importorskip("sigmasplat.native._core", reason="the kernels are n
 BLACK = -1
 SMALL = {
     "input.width": "160", "mapping.first_iterations": "20", "mapping.iterations": "6", "mapping.every": "3",
-    "submaps.frames": "5", "final.iterations": "0", "recovery.new_map_after": "3",
+    "submaps.frames": "5", "final.iterations": "0",
 }  # fmt: skip
 OFF_M = 0.1
 """A valid pose that is off by more than this is a silent failure."""
@@ -40,7 +41,8 @@ Order = Sequence[int]
 
 def settings(**changes: str) -> Config:
     names = {name.replace("__", "."): value for name, value in changes.items()}
-    return override(preset("sigma"), SMALL | names)
+    config = override(preset("sigma"), SMALL | names)
+    return replace(config, recovery=changed(config.recovery, new_map_after=3))
 
 
 @cache

@@ -3,7 +3,7 @@
 
 import dataclasses
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -97,12 +97,14 @@ class Config:
                 problems.append(f"unknown setting {name!r} (known: {', '.join(sorted(known))})")
             elif name in SECTIONS and isinstance(value, dict):
                 names = kinds_of(SECTIONS[name])
-                for key in sorted(set(value) - set(names)):
-                    problems += _unknown(f"{name}.{key}", value[key], names, _scale(values))
+                others = {f"{name}.{key}": value[key] for key in sorted(set(value) - set(names))}
                 try:
                     found[name] = SECTIONS[name](**{key: item for key, item in value.items() if key in names})
+                    problems += _misfits(found[name], {key: others.pop(key) for key in others.keys() & FOLLOWS})
                 except ConfigError as problem:
                     problems.append(str(problem))
+                for key, item in others.items():
+                    problems += _unknown(key, item, names, _scale(values))
             else:
                 found[name] = value
         try:
@@ -132,6 +134,13 @@ def _unknown(name: str, value: object, known: Iterable[str], scale: float) -> li
     return [] if same else [f"{said_gone(name)}, found {shown(value)}"]
 
 
+def _misfits(section: Section, saved: Mapping[str, object]) -> Iterator[str]:
+    """Yield what is wrong with saved values of settings that follow others now: those that the others do not give."""
+    for name, value in sorted(saved.items()):
+        if value != getattr(section, name.partition(".")[2]):
+            yield f"{said_gone(name)}, found {shown(value)}"
+
+
 def _scale(values: Mapping[str, Any]) -> float:
     """Return the scale of the scene in saved settings."""
     render = values.get("render")
@@ -141,6 +150,8 @@ def _scale(values: Mapping[str, Any]) -> float:
 
 def said_gone(name: str) -> str:
     """Return what to say about a setting that is gone."""
+    if name in FOLLOWS:
+        return f"setting {name} is gone: its value follows {FOLLOWS[name]}"
     return f"setting {name} is gone: its value is always {gone()[name]}"
 
 
@@ -167,11 +178,22 @@ GONE: dict[str, object] = {
     "render.color_pose_gradient": True, "seeding.voxel_m": 0.0, "seeding.voxel_most": 8,
     "seeding.sensor_noise": False, "mapping.color_covariance": "diagonal", "mapping.keyframe_history": 0,
     "primitives.uncertain_by": "centre", "primitives.most_radius_px": 0.0, "tracking.align_to": "keyframe",
+    "tracking.motion_model": True,
     "tracking.update_stop": 0.0, "tracking.variance": "published", "submaps.variance_sum": 0.0,
     "loops.variance": "published", "registration.variance": "published", "final.variance": "published",
     "surface.sensor_noise": False,
 }  # fmt: skip
 """Settings of methods that are gone, with the value that was their absence."""
+FOLLOWS = {
+    "seeding.alpha_below": "seeding.depth_error_factor", "seeding.push_back": "seeding.depth_error_factor",
+    "mapping.freeze_until": "mapping.freeze_new_colors", "mapping.fresh_adam": "mapping.freeze_new_colors",
+    "tracking.sensor_noise": "tracking.verify", "tracking.first_lr_rotation": "tracking.first_iterations",
+    "recovery.steady_frames": "recovery.relocalise", "recovery.new_map_after": "recovery.relocalise",
+    "final.lr_factor": "final.order", "final.lr_log_scales": "final.order", "final.lr_decay": "final.order",
+    "final.beta2": "final.order", "final.prune_weight_px": "final.order", "final.weight_moment": "final.order",
+    "final.max_axis_ratio": "final.order", "final.max_needle_ratio": "final.order",
+}  # fmt: skip
+"""Settings of earlier versions that are a function of another one now, with its name."""
 SECTIONS: dict[str, type[Section]] = {
     f.name: f.type for f in dataclasses.fields(Config) if isinstance(f.type, type) and issubclass(f.type, Section)
 }

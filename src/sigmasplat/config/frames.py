@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from math import ceil
 from typing import Annotated, ClassVar, Literal
 
-from sigmasplat.config.ranges import Above0, AtLeastOne, Count, NotNegative, Range, Section, Share, WeightBound
+from sigmasplat.config.ranges import Above0, AtLeastOne, Count, NotNegative, Range, Section, Share
 
 FIRST_FRAMES = 15
 """The steps of the first keyframe that are divided over later frames are made in about this many of them."""
@@ -50,12 +50,9 @@ class SeedConfig(Section, name="seeding"):
     """Whether all pixels on and beside Canny edges of the first keyframe become splats too."""
     later_max: Count = 0
     """Maximum number of new splats per later keyframe; 0 = no limit."""
-    alpha_below: NotNegative = 0.6
-    """Pixels are seeded where the rendered alpha of the map is below this. A higher value fills holes sooner and makes
-    more splats."""
     depth_error_factor: NotNegative = 40.0
     """Pixels are seeded where the rendered surface is behind the measured one by this multiple of the median depth
-    error; 0 = off (CG-SLAM)."""
+    error; 0 = off (CG-SLAM). They are seeded too where the rendered alpha of the map is below `alpha_below`."""
     depth_error_least_m: NotNegative = 0.1  # 40 × a median of 2 mm alone would treat sensor noise as a new surface
     """Minimum distance, in metres, between rendered and measured surface for seeding by `depth_error_factor`."""
     min_distance_m: NotNegative = 0.01
@@ -73,9 +70,6 @@ class SeedConfig(Section, name="seeding"):
     thickness: Above0 = 0.1  # the depth of a disc seen at an angle is right, and the path a little better
     """Size of a seed along the surface's normal, as a share of its size along the surface; 1 = a sphere (papers). Below
     1 seeds are discs on the surface that the depth image shows, and wider where they are seen at an angle."""
-    push_back: Above0 = 1.005
-    """Factor on the depth of seeds. Blending with closer splats makes the rendered depth too small at first; a factor
-    above 1 compensates for this (VarSplat's code)."""
     density: Share = 0.35  # with all of them ATE and PSNR stay the same, but time grows
     """Share of the chosen pixels of a later keyframe that become splats."""
     outlier_neighbours: Count = 0
@@ -84,6 +78,17 @@ class SeedConfig(Section, name="seeding"):
     """Whether outliers are also removed from the seeds of an empty map; off = VarSplat's code."""
     max_splats: Count = 250_000
     """Maximum number of splats in a submap; 0 = no limit."""
+
+    @property
+    def alpha_below(self) -> float:
+        """Pixels are seeded where the rendered alpha of the map is below this: with CG-SLAM's rule it is ½."""
+        return 0.6 if self.depth_error_factor else 0.5
+
+    @property
+    def push_back(self) -> float:
+        """Factor on the depth of seeds. Blending with closer splats makes the rendered depth too small at first; a
+        factor above 1 compensates for this (VarSplat's code)."""
+        return 1.005 if self.depth_error_factor else 1.0
 
 
 @dataclass(frozen=True)
@@ -134,14 +139,14 @@ class MappingConfig(Section, name="mapping"):
     lr_means_first: NotNegative = 0.0
     """Learning rate of positions at the start of the first keyframe; it decays exponentially to `lr_means`. 0 =
     `lr_means` throughout."""
-    lr_quats: NotNegative = 1e-3
+    lr_quats: ClassVar[float] = 1e-3
     """Learning rate of rotations: change of a unit quaternion's components per step."""
     # with 1e-2, discs on plain walls become balls: their depth is wrong from another side
     lr_log_scales: NotNegative = 0.0035
     """Learning rate of sizes: change of their logarithm per step; 0.005 is half a per cent."""
     lr_opacity_logits: NotNegative = 0.02  # seeds start nearly opaque, and steps of 0.05 would scatter their opacities
     """Learning rate of opacities: change of the logit per step."""
-    lr_colors: NotNegative = 2.5e-3
+    lr_colors: ClassVar[float] = 2.5e-3
     """Learning rate of colours (0 to 1): change per step."""
     lr_log_variances: NotNegative = 0.02  # few iterations must change σ² as much as hundreds do in the paper
     """Learning rate of σ²: change of its logarithm per step. Use a higher one with few `iterations`, so that σ²
@@ -159,15 +164,11 @@ class MappingConfig(Section, name="mapping"):
     freeze_old_colors: bool = False
     """Whether splats older than the keyframe keep their colours."""
     freeze_new_colors: bool = False
-    """Whether the new splats of a keyframe keep the colour of their pixel (VarSplat's code)."""
-    freeze_until: Literal["end", "half"] = "end"
-    """How long colours are frozen: in all steps of a keyframe, or only in the first half (VarSplat's code)."""
+    """As VarSplat's code: the new splats of a keyframe keep the colour of their pixel, colours are frozen in the first
+    half of its steps only, and each keyframe starts with a new Adam optimiser."""
     exposure: bool = False
     """Whether keyframes are mapped in the exposure of the map: the exposure that `tracking.exposure` found is removed
     from their colours (VarSplat's code for ScanNet)."""
-    fresh_adam: bool = False
-    """Whether each keyframe starts with a new Adam optimiser, without the moments of earlier keyframes (VarSplat's
-    code)."""
     prune_opacity: Share = 0.05
     """Splats with at most this opacity are removed after the steps of a keyframe. A lower value keeps faint splats, a
     higher one makes holes."""
@@ -182,6 +183,17 @@ class MappingConfig(Section, name="mapping"):
     `render.depth_noise_per_m` says (`input.sensor`), at most 4 times."""
     frames_per_step: Count = 1
     """Each step minimises the mean loss of this many keyframes of the window; 0 = of all of them (CG-SLAM)."""
+
+    @property
+    def freeze_until(self) -> Literal["end", "half"]:
+        """How long colours are frozen: in all steps of a keyframe, or only in the first half (VarSplat's code)."""
+        return "half" if self.freeze_new_colors else "end"
+
+    @property
+    def fresh_adam(self) -> bool:
+        """Whether each keyframe starts with a new Adam optimiser, without the moments of earlier keyframes (VarSplat's
+        code)."""
+        return self.freeze_new_colors
 
     @property
     def first_per_frame(self) -> int:
@@ -248,9 +260,6 @@ class TrackingConfig(Section, name="tracking"):
     align_stop: ClassVar[float] = 2e-4
     """Alignment ends the finest pyramid level when a step is smaller than this (metres and radians). The limit doubles
     from each level to the next coarser one."""
-    sensor_noise: bool = True
-    """Whether alignment uses the part of σ that depends on the distance, by the model of `input.sensor`, instead of
-    the law of `render.depth_noise_per_m`: in tracking, for loops, and where a lost camera is searched for."""
     align_weight_color: Share = 0.1  # gray has the smaller basin of convergence; with 0.5, steps of 5° fail
     """Weight of gray residuals in alignment; depth residuals have 1 minus this."""
     amsgrad: bool = False
@@ -260,9 +269,8 @@ class TrackingConfig(Section, name="tracking"):
     """What Adam optimises: a quaternion and a translation relative to the initial guess (VarSplat's code), or the
     axis-angle rotation and the position of the camera (CG-SLAM)."""
     first_iterations: Count = 0
-    """Number of Adam steps for the second frame, which has no motion model yet; 0 = as for other frames."""
-    first_lr_rotation: NotNegative = 0.0
-    """Learning rate of rotation for the second frame; 0 = as for other frames."""
+    """Number of Adam steps for the second frame, which has no motion model yet, with a rotation of 3e-3 rad per step
+    (CG-SLAM's code); 0 = as for other frames."""
     lr_rotation: NotNegative = 2e-3
     """Learning rate of rotation, radians per step; with quaternions the angle per step is twice as large. Use a higher
     one for fast motion."""
@@ -275,7 +283,7 @@ class TrackingConfig(Section, name="tracking"):
     tau: Above0 = 10.0
     """τ of the pixel weights, in units of log V: at 50, a V of ten times the median lowers the weight by 5 %. A smaller
     τ gives V more influence."""
-    weight_max: WeightBound = 3.0
+    weight_max: ClassVar[float] = 3.0
     """Bounds of the pixel weights: at most this, at least 1 / this."""
     alpha_power: NotNegative = 3.0
     """Pixels are weighted by the rendered alpha to this power. A higher one ignores parts where the map is thin."""
@@ -289,21 +297,21 @@ class TrackingConfig(Section, name="tracking"):
     average: Literal["image", "kept"] = "image"
     """Whether the errors of colour and depth are averaged over all pixels, or over the pixels that each of them uses
     (CG-SLAM)."""
-    motion_model: bool = True
-    """Whether the initial guess assumes constant velocity; off = it is the last pose, for jerky cameras."""
     reinit_factor: NotNegative = 5.0
     """If the first loss exceeds this multiple of its running median, tracking restarts from odometry with twice the
     iterations."""
     exposure: bool = False
     """Whether a factor and an offset of the colour are fitted with the pose, for cameras that change their exposure."""
-    lr_exposure: NotNegative = 0.01
+    lr_exposure: ClassVar[float] = 0.01
     """Learning rate of the exposure: change per step of the factor's logarithm and of the offset (colours 0 to 1)."""
     features: bool = True
     """Whether sparse features give a second guess of the pose where motion is wide or the first fit is doubtful (ours).
     The same fit starts from each guess, and the result that explains more is used."""
     verify: bool = True
     """Whether a pose is judged by comparing surfaces at it (ours); off = by agreement and overlap only. It needs
-    `method` align."""
+    `method` align. Alignment then uses the part of σ that depends on the distance, by the model of `input.sensor`,
+    instead of the law of `render.depth_noise_per_m`: in tracking, for loops, and where a lost camera is searched for.
+    """
     lost_agreement: ClassVar[float] = 0.6
     """Tracking is lost if map and sensor agree in depth on less than this share of the pixels where both have a
     surface; not used with `verify`."""
@@ -318,11 +326,22 @@ class TrackingConfig(Section, name="tracking"):
     one step changes the loss by less than this share; 0 = off."""
     plateau_window: AtLeastOne = 10
     """Number of Adam steps within which the loss must fall by the share `plateau_stop`."""
-    cuda_graphs: bool = True
+    cuda_graphs: ClassVar[bool] = True
     """On a CUDA device, whether several iterations of descent are launched as one CUDA graph; off = each kernel is
     launched on its own."""
 
     def without_motion(self) -> "TrackingConfig":
         """Return the settings for the second frame of a sequence, which has no motion model yet (CG-SLAM's code)."""
-        iterations = self.first_iterations or self.iterations
-        return replace(self, iterations=iterations, lr_rotation=self.first_lr_rotation or self.lr_rotation)
+        if not self.first_iterations:
+            return self
+        return replace(self, iterations=self.first_iterations, lr_rotation=self.first_lr_rotation)
+
+    @property
+    def sensor_noise(self) -> bool:
+        """Whether alignment uses the model of `input.sensor`: with `verify`."""
+        return self.verify
+
+    @property
+    def first_lr_rotation(self) -> float:
+        """Learning rate of rotation for the second frame; 0 = as for other frames."""
+        return 3e-3 if self.first_iterations else 0.0

@@ -48,9 +48,7 @@ AtLeastOne = Annotated[int, Range(1)]
 NotNegative = Annotated[float, Range(0)]
 Above0 = Annotated[float, Range(0, open_below=True)]
 Share = Annotated[float, Range(0, 1)]
-WeightBound = Annotated[float, Range(1)]
 WIDTHS_PX = Range(8, 8192, or_zero=True)
-RatioLimit = Annotated[float, Range(1, or_zero=True)]
 
 
 PLAIN = frozenset({bool, int, float, str})

@@ -33,17 +33,23 @@ class RecoveryConfig(Section, name="recovery"):
     """Relocalisation of a lost camera, and new maps if it is not found (ours)."""
 
     relocalise: bool = True
-    """Whether a lost camera is searched for in the keyframes of all submaps, by features; off = only near the last pose
-    (papers)."""
+    """Whether a lost camera is searched for in the keyframes of all submaps, by features; off = only near the last
+    pose, every tracked frame may be mapped, and no new map begins (papers)."""
     candidates: ClassVar[int] = 8
     """Number of keyframes, those with the most matches, from which the pose of a lost camera is computed and
     verified."""
-    steady_frames: Count = 2
-    """After the camera was lost, nothing is mapped until this many frames in a row have been tracked without doubt;
-    0 = off (papers)."""
-    new_map_after: Count = 20
-    """A new map begins after this many lost frames in a row; frames without depth or with a flat image do not count. It
-    joins the old map when a place is recognised; 0 = never."""
+
+    @property
+    def steady_frames(self) -> int:
+        """After the camera was lost, nothing is mapped until this many frames in a row have been tracked without doubt;
+        0 = off (papers)."""
+        return 2 if self.relocalise else 0
+
+    @property
+    def new_map_after(self) -> int:
+        """A new map begins after this many lost frames in a row; frames without depth or with a flat image do not
+        count. It joins the old map when a place is recognised; 0 = never."""
+        return 20 if self.relocalise else 0
 
 
 @dataclass(frozen=True)
@@ -54,7 +60,7 @@ class MovingConfig(Section, name="moving"):
     """Whether keyframes are compared with each other: what one shows in space that another has seen to be free is
     masked, and splats there are removed. Off = only what is nearer than the newest keyframe is masked, in tracking with
     `tracking.verify` (papers: nothing)."""
-    still_frames: Count = 30
+    still_frames: ClassVar[int] = 30
     """What was found to move and then stays in place for this many frames becomes part of the map again; 0 = never."""
     compared: ClassVar[int] = 3
     """Number of earlier keyframes of the submap that a new keyframe is compared with."""
@@ -94,5 +100,5 @@ class RealTimeConfig(Section, name="realtime"):
     each adds an error to the path, unless the overlap is low. 0 = by the number of frames, as in a recording."""
     waiting_most: ClassVar[int] = 24
     """Maximum number of keyframes that wait for mapping; while as many wait, no frame becomes a keyframe."""
-    spare_iterations: Count = 60
+    spare_iterations: ClassVar[int] = 60
     """Maximum number of additional iterations after a keyframe is mapped, while no other keyframe waits; 0 = none."""

@@ -11,7 +11,6 @@ from sigmasplat.config.ranges import (
     Count,
     NotNegative,
     Range,
-    RatioLimit,
     Section,
     Share,
     shown,
@@ -159,20 +158,9 @@ class FinalConfig(Section, name="final"):
     """Whether the exposure of each keyframe relative to the map is fitted during refinement: a gain and an offset for
     each colour channel. Frames between keyframes get an interpolated exposure."""
     order: Literal["random", "epochs"] = "epochs"
-    """Order of the keyframes in refinement: random = drawn for each step (paper); epochs = every keyframe once, in
-    random order, before any is used again."""
-    lr_factor: Above0 = 12.0  # the rates of mapping are too small for 1000 steps: shapes hardly change
-    """Factor on the learning rates of mapping (`mapping.lr_…`) in the first refinement step, except that of
-    positions."""
-    lr_log_scales: NotNegative = 0.08  # with half of it, views are up to 0.2 dB less sharp
-    """Learning rate of sizes in the first refinement step. 0 = `final.lr_factor` times `mapping.lr_log_scales`."""
-    lr_decay: Above0 = 0.05
-    """Learning rates of splats and poses in the last refinement step, as a share of those in the first; they decay
-    exponentially. 1 = constant."""
-    # each keyframe has about a dozen steps: 0.999 remembers gradients of the merged map
-    beta2: Annotated[float, Range(0, 0.9999)] = 0.99
-    """Decay β₂ of Adam's second moment during refinement. With 0.99 the size of a step follows the last hundred
-    gradients, and fewer steps make an equally sharp map."""
+    """Order of the keyframes in refinement, and what belongs to it: random = drawn for each of many steps at the rates
+    of mapping (paper); epochs = every keyframe once, in random order, before any is used again, for few steps at rates
+    that fall, without U, without hidden splats, and with limits on the shapes of splats (ours)."""
     lr_means_last: NotNegative = 0.0
     """Learning rate of positions in the last refinement step; it decays exponentially from `mapping.lr_means` (3DGS). 0
     = `mapping.lr_means` throughout."""
@@ -187,10 +175,7 @@ class FinalConfig(Section, name="final"):
     max_splats: Count = 0
     """Largest number of splats of the final map; those that contribute least to the images of keyframes are removed. 0
     = no limit."""
-    prune_weight_px: NotNegative = 0.5
-    """Before and after refinement, splats are removed if their weights in every keyframe sum to less than this, in
-    pixels. 0 = none are removed."""
-    prune_every: AtLeastOne = 500
+    prune_every: ClassVar[int] = 500
     """Number of refinement steps between removals of splats with low opacity (`prune_opacity`)."""
     prune_opacity: ClassVar[float] = 0.005
     """Splats with at most this opacity, 0 to 1, are removed during refinement."""
@@ -201,14 +186,60 @@ class FinalConfig(Section, name="final"):
     width_iterations: Count = 8000
     """Number of refinement steps of the stage with images of `width`, after those of `iterations`, if `iterations` is
     above 0. Two thirds of them use working images, so that the map stays sharp at that size too."""
-    weight_moment: bool = False  # U does not improve the final map, and costs an eighth of the time
-    """Whether the depth uncertainty U stays in the loss of refinement (`mapping.weight_moment`); off is faster."""
-    max_axis_ratio: RatioLimit = 19.0
-    """Largest ratio of a splat's longest axis to its shortest; refinement lengthens shorter axes. 0 = no limit."""
-    max_needle_ratio: RatioLimit = 8.0
-    """Largest ratio of a splat's longest axis to its second longest; refinement shortens the longest. 0 = no limit."""
     uncertainty: bool = True
     """Whether variance is used to merge submaps and still learned during refinement; off = paper."""
+
+    @property
+    def short(self) -> bool:
+        """Return whether refinement has few steps (`order`)."""
+        return self.order == "epochs"
+
+    @property
+    def lr_factor(self) -> float:
+        """Factor on the learning rates of mapping (`mapping.lr_…`) in the first refinement step, except that of
+        positions. The rates of mapping are too small for 1000 steps: shapes hardly change."""
+        return 12.0 if self.short else 1.0
+
+    @property
+    def lr_log_scales(self) -> float:
+        """Learning rate of sizes in the first refinement step; with half of it, views are up to 0.2 dB less sharp. 0 =
+        `final.lr_factor` times `mapping.lr_log_scales`."""
+        return 0.08 if self.short else 0.0
+
+    @property
+    def lr_decay(self) -> float:
+        """Learning rates of splats and poses in the last refinement step, as a share of those in the first; they decay
+        exponentially. 1 = constant."""
+        return 0.05 if self.short else 1.0
+
+    @property
+    def beta2(self) -> float:
+        """Decay β₂ of Adam's second moment during refinement. With 0.99 the size of a step follows the last hundred
+        gradients: each keyframe has about a dozen steps, and 0.999 remembers gradients of the merged map."""
+        return 0.99 if self.short else 0.999
+
+    @property
+    def prune_weight_px(self) -> float:
+        """Before and after refinement, splats are removed if their weights in every keyframe sum to less than this, in
+        pixels. 0 = none are removed."""
+        return 0.5 if self.short else 0.0
+
+    @property
+    def weight_moment(self) -> bool:
+        """Whether the depth uncertainty U stays in the loss of refinement (`mapping.weight_moment`). It does not
+        improve a map of few steps, and costs an eighth of the time."""
+        return not self.short
+
+    @property
+    def max_axis_ratio(self) -> float:
+        """Largest ratio of a splat's longest axis to its shortest; refinement lengthens shorter axes. 0 = no limit."""
+        return 19.0 if self.short else 0.0
+
+    @property
+    def max_needle_ratio(self) -> float:
+        """Largest ratio of a splat's longest axis to its second longest; refinement shortens the longest. 0 = no
+        limit."""
+        return 8.0 if self.short else 0.0
 
     @property
     def width_px(self) -> int:

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
-from sigmasplat.config import SECTIONS, Config, gone, said_gone
+from sigmasplat.config import FOLLOWS, SECTIONS, Config, gone, said_gone
 from sigmasplat.config.ranges import kinds_of, problem_of, refuse, shown, unpacked
 from sigmasplat.errors import ConfigError, nearest
 
@@ -61,7 +61,7 @@ def _kind(config: Config, section: str, field: str, name: str) -> Any:
     """Return the type of a setting with its range; `name` is the full name that the user gave. Raises ConfigError."""
     if section and section not in SECTIONS:
         raise ConfigError(f"unknown setting {name!r}{nearest(section, SECTIONS)}; sections: {', '.join(SECTIONS)}")
-    if name in gone():
+    if name in gone() or name in FOLLOWS:
         raise ConfigError(said_gone(name))
     kinds = kinds_of(SECTIONS[section] if section else type(config))
     if field not in kinds or (not section and field in SECTIONS):

@@ -265,7 +265,7 @@ def tracking_of(registration: RegistrationConfig, tracking: TrackingConfig) -> T
     if r.color_mean == "values":
         weight_color /= weight_color + 3.0 * (1.0 - weight_color)
     return dataclasses.replace(
-        tracking, uncertainty=r.uncertainty, tau=r.tau, weight_max=r.weight_max, weight_color=weight_color,
+        tracking, uncertainty=r.uncertainty, tau=r.tau, weight_color=weight_color,
         lr_rotation=r.lr_rotation, lr_translation=r.lr_translation, exposure=r.exposure, plateau_stop=r.plateau_stop,
         plateau_window=r.plateau_window, alpha_power=1.0, alpha_above=OPAQUE, outlier_factor=0.0,
         outlier_factor_color=0.0, average="image", parametrisation="quaternion", align_depth_by="V", amsgrad=False,

@@ -37,14 +37,11 @@ class PosePrediction:
     given: bool = False
 
 
-def predict(
-    previous: Matrix, velocity: Matrix, before: PosePrior, now: PosePrior, motion_model: bool
-) -> PosePrediction:
+def predict(previous: Matrix, velocity: Matrix, before: PosePrior, now: PosePrior) -> PosePrediction:
     """Predict the pose by constant velocity; with a gyroscope, its rotation replaces that of the velocity; given poses
     replace the whole motion.
 
-    previous, velocity [4, 4]: the last pose T_world_camera and motion; before, now: of the last frame and of this one;
-    motion_model: whether the first guess assumes the velocity.
+    previous, velocity [4, 4]: the last pose T_world_camera and motion; before, now: of the last frame and of this one.
     """
     if before.T_given_camera is not None and now.T_given_camera is not None:
         motion = se3.inverse(before.T_given_camera) @ now.T_given_camera
@@ -55,7 +52,7 @@ def predict(
         motion, measured = motion.copy(), True
         motion[:3, :3] = turn[:3, :3] = R_before.T @ R_now
         last = last @ turn
-    return PosePrediction(motion, turn, previous @ motion if motion_model else last, last, measured)
+    return PosePrediction(motion, turn, previous @ motion, last, measured)
 
 
 @dataclass(frozen=True, eq=False)

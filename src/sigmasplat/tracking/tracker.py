@@ -203,7 +203,7 @@ class Tracker:
 
     def prediction(self, prior: PosePrior) -> PosePrediction:
         """Return where the camera of the next frame is expected."""
-        return predict(self.previous, self.velocity, self.prior, prior, self.config.motion_model)
+        return predict(self.previous, self.velocity, self.prior, prior)
 
     def _fit(self, given: Given, seen: PreparedFrame, guess: Matrix, patience: int = 1) -> PoseFit:
         """Fit from an initial T_world_camera; patience: factor on the number of iterations of gradient descent; with 0,
@@ -243,7 +243,7 @@ class Tracker:
             if motion is not None:
                 yield self.previous @ se3.inverse(motion)
         if prediction.measured:
-            yield self.previous @ self.velocity if self.config.motion_model else self.previous
+            yield self.previous @ self.velocity
 
     def _retry(self, given: Given, seen: PreparedFrame, fit: PoseFit) -> PoseFit:
         """Retry from odometry with twice the iterations (VarSplat §3), and from the last pose; return the best fit.

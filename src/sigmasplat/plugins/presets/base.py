@@ -46,7 +46,6 @@ BASE_VALUES: dict[str, dict[str, object]] = {
     },
     "tracking": {
         "method": "adam",
-        "sensor_noise": False,
         "align_weight_color": 0.5,
         "tau": 50.0,
         "features": False,
@@ -54,8 +53,6 @@ BASE_VALUES: dict[str, dict[str, object]] = {
     },
     "recovery": {
         "relocalise": False,
-        "steady_frames": 0,
-        "new_map_after": 0,
     },
     "moving": {
         "find": False,
@@ -88,17 +85,9 @@ BASE_VALUES: dict[str, dict[str, object]] = {
         "pose_reach_most_m": 0.0,
         "exposure": False,
         "order": "random",
-        "lr_factor": 1.0,
-        "lr_log_scales": 0.0,
-        "lr_decay": 1.0,
-        "beta2": 0.999,
         "sh_degree": 0,
         "sh_every": 1000,
         "merge_m": 0.02,
-        "prune_weight_px": 0.0,
-        "weight_moment": True,
-        "max_axis_ratio": 0.0,
-        "max_needle_ratio": 0.0,
     },
     "surface": {
         "depth": "map",

@@ -41,7 +41,7 @@ def _varsplat(row: dict[str, Any]) -> Config:
         input={"crop_px": row["crop_px"]},
         seeding={"outlier_first": False},
         mapping={
-            "freeze_new_colors": True, "freeze_until": "half", "fresh_adam": True,
+            "freeze_new_colors": True,
             "weight_nll_depth": 1e-4 if row["nll_depth"] else 0.0,
         },
         tracking={"amsgrad": True, "tau": row["tau_tracking"]},
@@ -64,7 +64,6 @@ def _cgslam(row: dict[str, Any]) -> Config:
             "iterations": row["iterations"], "lr_rotation": row["lr_rotation"],
             "lr_translation": row["lr_translation"],
             "weight_color": cgslam.color_share(row["color"], row["depth"]), "first_iterations": 200,
-            "first_lr_rotation": 3e-3,
         },
         render={"covariance_pose_gradient": False},
         primitives={"uncertain_m2": 0.0, "owner": "median", "clone": False},
