@@ -72,8 +72,7 @@ GROUPS: dict[str, Group] = {
         (
             *DESCENT, "tracking.iterations=30", "tracking.lr_rotation=0.0015", "tracking.parametrisation=axis-angle",
             "tracking.weight_color=0.625", "tracking.uncertainty=false", "tracking.alpha_power=0",
-            "tracking.alpha_above=0.99", "tracking.outlier_factor=10", "tracking.outlier_factor_color=10",
-            "tracking.average=kept",
+            "tracking.alpha_above=0.99", "tracking.outlier_factor=10", "tracking.average=kept",
         ),
         {
             "full": (),

@@ -57,7 +57,7 @@ class Options:
 def measure(path: str, options: Options) -> list[dict[str, Any]]:
     """Run one sequence; return its hops and the number of submaps. Raises SourceError if it cannot be read."""
     config = override(preset_of(options.preset), split_settings(options.settings))
-    rule = replace(config.submaps, uncertainty_m=options.uncertainty_m, distance_m=0.0, angle_deg=0.0, frames=0)
+    rule = replace(config.submaps, uncertainty_m=options.uncertainty_m, distance_m=0.0, frames=0)
     found = followed(path, replace(config, submaps=rule), options.limit)
     return [{"rule": "covariance", "limit": options.uncertainty_m, **found}]
 

@@ -56,7 +56,7 @@ def shortened(config: Config) -> tuple[str, ...]:
     values = config.to_dict()
     lowered = {name: value for name, value in MOST.items() if _value(values, name) > value}
     rules = values["submaps"]
-    cuts = any(rules[rule] for rule in ("distance_m", "angle_deg", "frames", "uncertainty_m"))
+    cuts = any(rules[rule] for rule in ("distance_m", "frames", "uncertainty_m"))
     return tuple(f"{name}={value}" for name, value in (SMALL | lowered | (CUT if cuts else {})).items())
 
 

@@ -42,7 +42,7 @@ Matrix = NDArray[np.float64]
 Experiment = Literal["sequence", "localise"]
 RATES = {**tracking.RATES, "CG-SLAM": (7.5e-4, 2.15e-3)}
 """Learning rates of tracking by Adam: quaternion, which rotates by twice as much, and translation. CG-SLAM: 1.5e-3."""
-ONE_MAP = ("submaps.distance_m=0", "submaps.angle_deg=0", "submaps.frames=0", "submaps.uncertainty_m=0")
+ONE_MAP = ("submaps.distance_m=0", "submaps.frames=0", "submaps.uncertainty_m=0")
 SEEDS_PER_PIXEL = (0.5, 0.2)
 """In the first frame, drawn uniformly and by gradient; the same density as varsplat-fast at its own width."""
 

@@ -102,7 +102,7 @@ loops.near_m=0.5
 --set
 submaps.frames=2
 --set
-seeding.opacity=0.5
+seeding.scale_factor=0.5
 --calibration
 INPUT
 --register-depth

@@ -11,7 +11,7 @@ from pathlib import Path
 
 ROOM = "synthetic:frames=200,width=80,height=60"
 QUICK = ["input.width=80", "mapping.first_iterations=5", "mapping.iterations=3", "submaps.distance_m=0",
-         "submaps.angle_deg=0", "final.iterations=5"]  # fmt: skip
+         "final.iterations=5"]  # fmt: skip
 PATIENCE_S = 90.0
 
 

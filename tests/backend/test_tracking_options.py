@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from constants import changed
 from paper_settings import TrackingConfig
 from sigmasplat.data import se3
 from sigmasplat.data.field import GaussianField
@@ -103,7 +104,7 @@ def test_planes_hold_the_gradient_of_the_loss(view: View, average: Any, factor_c
 @pytest.mark.parametrize(("average", "factor_color", "uncertainty"), CHOICES)
 def test_the_kernel_does_as_the_definition(isa: str, average: Any, factor_color: float, uncertainty: bool) -> None:
     """On the very same planes, so that no pixel near a limit falls to either side."""
-    config = dataclasses.replace(
+    config = changed(
         PAPER, average=average, outlier_factor_color=factor_color, uncertainty=uncertainty, alpha_power=3.0
     )
     slow, fast = (make_view(backend, CAMERA, OPTIONS) for backend in ("reference", "cpu"))
@@ -118,7 +119,7 @@ def test_the_kernel_does_as_the_definition(isa: str, average: Any, factor_color:
 
 def test_colour_and_depth_each_leave_out_their_own_outliers(view: View) -> None:
     """The limit of colour is on the error after exposure, summed over the channels."""
-    config = dataclasses.replace(PAPER, outlier_factor=4.0, outlier_factor_color=4.0)
+    config = changed(PAPER, outlier_factor=4.0, outlier_factor_color=4.0)
     target = damaged(view)
     gain, offset = EXPOSURE[0].exp(), EXPOSURE[1]
     target.color.mul_(gain).add_(offset)  # so that exposure explains all but noise and the patch
@@ -135,7 +136,7 @@ def test_colour_and_depth_each_leave_out_their_own_outliers(view: View) -> None:
 
 
 def test_a_mean_over_what_is_kept_does_not_know_how_much_is_left_out(view: View) -> None:
-    target, config = seen_from(view, TRUTH), dataclasses.replace(PAPER, outlier_factor=0.0, outlier_factor_color=0.0)
+    target, config = seen_from(view, TRUTH), changed(PAPER, outlier_factor=0.0, outlier_factor_color=0.0)
     target.color.add_(0.1)
     target.depth.add_(0.2 * (target.depth > 0))
     view.forward(wall(), TRUTH)

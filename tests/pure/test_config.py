@@ -105,7 +105,7 @@ def test_every_number_has_a_range_and_every_default_is_in_it() -> None:
         ("tracking", "exposure", None),
         ("loops", "weights", 3),
         ("tracking", "alpha_power", -0.5),
-        ("seeding", "opacity", 0.0),
+        ("seeding", "scale_factor", 0.0),
         ("uncertainty", "probes", -1),
     ],
 )

@@ -94,7 +94,7 @@ def test_each_rule_alone_ends_a_submap_unless_it_is_off() -> None:
     T[:3, 3] = [0.3, 0.4, 0.0]
     for rule, config in (
         ("distance", SubmapConfig(distance_m=0.4)),
-        ("angle", SubmapConfig(angle_deg=25.0)),
+        ("angle", SubmapConfig(distance_m=1.0, angle_deg=25.0)),
         ("frames", SubmapConfig(frames=10)),
         ("uncertainty", SubmapConfig(uncertainty_m=0.015)),
         ("", SubmapConfig(distance_m=0.6, angle_deg=35.0, frames=11, uncertainty_m=0.025)),

@@ -20,7 +20,9 @@ from sigmasplat.types import completed, never
 CAMERA = Camera(16, 12, 15.0, 15.0, 7.5, 5.5)
 PIXELS = 16 * 12
 NO_FIT = MappingConfig(iterations=0, first_iterations=0, prune_opacity=0.1)
-EVERY_PIXEL = SeedConfig(first_uniform=PIXELS, first_gradient=0, first_edges=False, scale_from="pixel", later_max=0)
+EVERY_PIXEL = SeedConfig(
+    first_uniform=PIXELS, first_gradient=0, first_edges=False, scale_from="pixel", opacity=0.5, density=1.0, later_max=0
+)
 
 
 def view() -> ReferenceView:
@@ -42,7 +44,7 @@ def mapper(seeding: SeedConfig = EVERY_PIXEL, mapping: MappingConfig = NO_FIT) -
 def test_seeds_are_as_wide_as_they_lie_apart() -> None:
     pixel_m = 2.0 / CAMERA.fx
     for share, spacing in ((1, 1.0), (4, 2.0)):
-        made = mapper(replace(EVERY_PIXEL, first_uniform=PIXELS // share))
+        made = mapper(changed(EVERY_PIXEL, first_uniform=PIXELS // share))
         made.map(view(), 0, target(), np.eye(4))
         assert len(made.field) == PIXELS // share
         assert float(made.field.scales.mean()) == pytest.approx(spacing * pixel_m, rel=1e-3)
@@ -50,14 +52,14 @@ def test_seeds_are_as_wide_as_they_lie_apart() -> None:
 
 def test_the_budget_of_splats_is_kept() -> None:
     for budget, splats in ((123, 123), (PIXELS + 20, PIXELS + 20), (0, PIXELS + 60)):
-        made = mapper(replace(EVERY_PIXEL, max_splats=budget, opacity=0.95))
+        made = mapper(changed(EVERY_PIXEL, max_splats=budget, opacity=0.95))
         made.map(view(), 0, target(), np.eye(4))
         made.map(view(), 1, target(object_columns=5), np.eye(4))
         assert len(made.field) == splats
 
 
 def test_what_the_map_explains_is_not_seeded_again() -> None:
-    made = mapper(replace(EVERY_PIXEL, opacity=0.95))
+    made = mapper(changed(EVERY_PIXEL, opacity=0.95))
     made.map(view(), 0, target(), np.eye(4))
     made.map(view(), 1, target(), np.eye(4))
     assert len(made.field) == PIXELS
@@ -109,7 +111,7 @@ def test_splats_that_contradict_readings_are_removed_when_the_last_step_is_made(
     """A wall that is seen at 1 m is an error if all readings say 2 m. It is faded at once and goes after the last step,
     whether the steps are divided or not; what owns no pixel stays."""
     monkeypatch.setattr(settings.DensifyConfig, "faded_opacity", 0.05)  # below the opacity that recovers
-    seeding = replace(EVERY_PIXEL, opacity=0.95)
+    seeding = changed(EVERY_PIXEL, opacity=0.95)
     uncertain = DensifyConfig(uncertain_m2=0.025)
     fit = replace(NO_FIT, iterations=2, every=5, prune_opacity=0.01, lr_means=0.0, lr_opacity_logits=0.0)
     counts = list[int]()
@@ -128,7 +130,7 @@ def test_splats_that_contradict_readings_are_removed_when_the_last_step_is_made(
 
 
 def test_faded_splats_are_pruned() -> None:
-    made = mapper(replace(EVERY_PIXEL, opacity=0.05))
+    made = mapper(changed(EVERY_PIXEL, opacity=0.05))
     made.map(view(), 0, target(), np.eye(4))
     assert len(made.field) == 0 and len(made.keyframes) == 1
 
@@ -156,7 +158,7 @@ def test_old_colours_are_frozen_where_asked(frozen: bool) -> None:
 @pytest.mark.parametrize("until", ["end", "half"])
 def test_all_colours_are_frozen_to_the_end_or_to_half_of_the_steps(until: str) -> None:
     mapping = changed(NO_FIT, iterations=6, first_iterations=6, freeze_new_colors=True, freeze_until=until)
-    made = mapper(replace(EVERY_PIXEL, opacity=0.6), mapping)
+    made = mapper(changed(EVERY_PIXEL, opacity=0.6), mapping)
     made.map(view(), 0, target(), np.eye(4))
     seeds = target().image.reshape(-1, 3)
     assert torch.equal(made.field.params[:, COLUMNS["colors"]], seeds) == (until == "end")
@@ -169,7 +171,7 @@ def test_a_keyframe_forgets_adams_moments_where_asked() -> None:
     """Without a step at the second keyframe, only forgetting changes the moments of the first one."""
     for fresh in (False, True):
         mapping = changed(NO_FIT, first_iterations=3, fresh_adam=fresh)
-        made = mapper(replace(EVERY_PIXEL, opacity=0.95), mapping)
+        made = mapper(changed(EVERY_PIXEL, opacity=0.95), mapping)
         made.map(view(), 0, target(), np.eye(4))
         assert made.field.steps == 3 and bool(made.field.moment2.any())
         made.map(view(), 1, target(), np.eye(4))

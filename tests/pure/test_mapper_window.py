@@ -24,7 +24,7 @@ from sigmasplat.render.reference.view import ReferenceView
 CAMERA = Camera(24, 18, 22.0, 22.0, 11.5, 8.5)
 SEEDS = SeedConfig(
     first_uniform=10_000, first_gradient=0, first_edges=False, scale_from="pixel", later_max=0, opacity=0.9,
-    push_back=1.0,
+    density=1.0, push_back=1.0,
 )  # fmt: skip
 FITTED = MappingConfig(
     iterations=6, first_iterations=6, weight_nll_color=0.0, prune_opacity=0.005, window=4, frames_per_step=0,
@@ -52,7 +52,7 @@ def shifted(x_m: float) -> np.ndarray:
 
 def mapper(mapping: MappingConfig = FITTED, primitives: Any = None, **seeding: Any) -> Mapper:
     config = paper_settings(
-        mapping=mapping, primitives=primitives or DensifyConfig(), seeding=replace(SEEDS, **seeding)
+        mapping=mapping, primitives=primitives or DensifyConfig(), seeding=changed(SEEDS, **seeding)
     )
     return Mapper(config, np.random.default_rng(0))
 
@@ -142,7 +142,7 @@ def floater(made: Mapper) -> int:
 @pytest.mark.parametrize("owner", ["dominant", "median"])
 def test_a_floater_is_doubted_and_goes_the_wall_stays(owner: Any) -> None:
     made = mapped(mapper(replace(FITTED, iterations=20), DensifyConfig(uncertain_m2=0.025, owner=owner)), (0.0,))
-    made.config = replace(made.config, seeding=replace(SEEDS, depth_error_factor=0.0))
+    made.config = replace(made.config, seeding=changed(SEEDS, depth_error_factor=0.0))
     wall, floating = set(made.field.ids.tolist()), floater(made)
     made.map(view(), 1, target(), shifted(0.02))
     left = set(made.field.ids.tolist())

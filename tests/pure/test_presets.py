@@ -461,7 +461,6 @@ NEW = [
     "mapping.frames_per_step",
     "tracking.parametrisation",
     "tracking.first_iterations",
-    "tracking.outlier_factor_color",
     "tracking.average",
     "tracking.align_depth_by",
 ]

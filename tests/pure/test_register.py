@@ -33,7 +33,7 @@ Matrix = NDArray[np.float64]
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
-SEEDS = SeedConfig(scale_from="pixel", opacity=0.8, scale_factor=0.8)
+SEEDS = SeedConfig(scale_from="pixel", density=1.0, scale_factor=0.8)
 CONFIG = paper_settings(
     tracking=TrackingConfig(method="align", align_weight_color=0.1),
     registration=RegistrationConfig(iterations=10, lr_translation=1e-3, lr_rotation=1e-3, tau=10.0),

@@ -48,7 +48,7 @@ ROOM, FRAMES = "synthetic:frames=120,width=64,height=48", 14
 
 def settings(**more: str) -> Config:
     quick = {"input.width": "64", "mapping.first_iterations": "4", "mapping.iterations": "2", "submaps.distance_m": "0",
-             "submaps.angle_deg": "0", "submaps.uncertainty_m": "0", "submaps.frames": "5", "loops.close": "no",
+             "submaps.uncertainty_m": "0", "submaps.frames": "5", "loops.close": "no",
              "final.iterations": "3"}  # fmt: skip
     return override(preset(default_preset()), quick | more)
 

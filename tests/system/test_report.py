@@ -22,7 +22,7 @@ FLAGS = [
 ]  # fmt: skip
 SETTINGS = {
     "input.width": "64", "mapping.first_iterations": "20", "mapping.iterations": "5", "final.iterations": "5",
-    "submaps.distance_m": "0", "submaps.angle_deg": "0", "submaps.uncertainty_m": "0", "submaps.frames": "6",
+    "submaps.distance_m": "0", "submaps.uncertainty_m": "0", "submaps.frames": "6",
 }  # fmt: skip
 PHONE_PX, SCREENS = 400, {400: 844, 1280: 800}
 """Width of a phone, and the height of the screen for each width, pixels."""

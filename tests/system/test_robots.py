@@ -43,7 +43,7 @@ from sigmasplat.plugins.robots.stream import MOST_REQUEST_BYTES, SUBPROTOCOLS, S
 
 SETTINGS = {
     "input.width": "160", "mapping.first_iterations": "40", "mapping.iterations": "10", "final.iterations": "4",
-    "submaps.distance_m": "0", "submaps.angle_deg": "0", "submaps.uncertainty_m": "0", "submaps.frames": "10",
+    "submaps.distance_m": "0", "submaps.uncertainty_m": "0", "submaps.frames": "10",
     "loops.min_interval": "1", "loops.min_similarity": "0.3",
     "mapping.lr_pose_translation": "2e-4", "mapping.lr_pose_rotation": "1e-4", "registration.to_keyframe": "false",
     "loops.slices_per_frame": "0",

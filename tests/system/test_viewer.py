@@ -43,7 +43,7 @@ FLAGS = [
 ]  # fmt: skip
 PATIENCE_S = 120.0
 QUICK = {"input.width": "64", "mapping.first_iterations": "20", "mapping.iterations": "5", "submaps.distance_m": "0",
-         "submaps.angle_deg": "0", "submaps.uncertainty_m": "0", "submaps.frames": "6", "loops.close": "no",
+         "submaps.uncertainty_m": "0", "submaps.frames": "6", "loops.close": "no",
          "final.iterations": "5"}  # fmt: skip
 Pixels = NDArray[np.uint8]
 

@@ -185,6 +185,8 @@ GONE: dict[str, object] = {
 }  # fmt: skip
 """Settings of methods that are gone, with the value that was their absence."""
 FOLLOWS = {
+    "seeding.opacity": "seeding.scale_from", "seeding.density": "seeding.scale_from",
+    "tracking.outlier_factor_color": "tracking.average", "submaps.angle_deg": "submaps.distance_m",
     "seeding.alpha_below": "seeding.depth_error_factor", "seeding.push_back": "seeding.depth_error_factor",
     "mapping.freeze_until": "mapping.freeze_new_colors", "mapping.fresh_adam": "mapping.freeze_new_colors",
     "tracking.sensor_noise": "tracking.verify", "tracking.first_lr_rotation": "tracking.first_iterations",

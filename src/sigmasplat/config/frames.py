@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass, replace
 from math import ceil
-from typing import Annotated, ClassVar, Literal
+from typing import ClassVar, Literal
 
-from sigmasplat.config.ranges import Above0, AtLeastOne, Count, NotNegative, Range, Section, Share
+from sigmasplat.config.ranges import Above0, AtLeastOne, Count, NotNegative, Section, Share
 
 FIRST_FRAMES = 15
 """The steps of the first keyframe that are divided over later frames are made in about this many of them."""
@@ -57,21 +57,15 @@ class SeedConfig(Section, name="seeding"):
     """Minimum distance, in metres, between rendered and measured surface for seeding by `depth_error_factor`."""
     min_distance_m: NotNegative = 0.01
     """No seed is placed closer than this to an existing splat in view."""
-    # nearly opaque seeds: the map can be tracked after few iterations
-    opacity: Annotated[float, Range(0, 1, open_below=True)] = 0.8
-    """Initial opacity of seeds, 0 to 1. With a higher value the map can be used for tracking sooner; a lower value
-    leaves more freedom to the fit."""
     # searching the map for neighbours costs more than fitting a keyframe
     scale_from: Literal["neighbours", "pixel"] = "pixel"
     """Initial size of seeds: neighbours = root mean squared distance to the 3 nearest splats (papers); pixel = size of
-    a pixel at that depth × spacing of the seeds."""
+    a pixel at that depth × spacing of the seeds, for fewer and more opaque seeds (`density`, `opacity`)."""
     scale_factor: Above0 = 0.65  # with the slower change of sizes, larger seeds blur submaps
     """Factor on the size from `scale_from`. A larger one closes gaps, a smaller one keeps edges."""
     thickness: Above0 = 0.1  # the depth of a disc seen at an angle is right, and the path a little better
     """Size of a seed along the surface's normal, as a share of its size along the surface; 1 = a sphere (papers). Below
     1 seeds are discs on the surface that the depth image shows, and wider where they are seen at an angle."""
-    density: Share = 0.35  # with all of them ATE and PSNR stay the same, but time grows
-    """Share of the chosen pixels of a later keyframe that become splats."""
     outlier_neighbours: Count = 0
     """Number of neighbours for statistical outlier removal; 0 = off."""
     outlier_first: bool = True
@@ -80,14 +74,23 @@ class SeedConfig(Section, name="seeding"):
     """Maximum number of splats in a submap; 0 = no limit."""
 
     @property
+    def opacity(self) -> float:
+        """Initial opacity of seeds, 0 to 1. With a higher value the map can be used for tracking sooner."""
+        return 0.8 if self.scale_from == "pixel" else 0.5
+
+    @property
+    def density(self) -> float:
+        """Share of the chosen pixels of a later keyframe that become splats; more of them only take more time."""
+        return 0.35 if self.scale_from == "pixel" else 1.0
+
+    @property
     def alpha_below(self) -> float:
         """Pixels are seeded where the rendered alpha of the map is below this: with CG-SLAM's rule it is ½."""
         return 0.6 if self.depth_error_factor else 0.5
 
     @property
     def push_back(self) -> float:
-        """Factor on the depth of seeds. Blending with closer splats makes the rendered depth too small at first; a
-        factor above 1 compensates for this (VarSplat's code)."""
+        """Factor on the depth of seeds: blending with closer splats makes rendered depth small (VarSplat's code)."""
         return 1.005 if self.depth_error_factor else 1.0
 
 
@@ -191,8 +194,7 @@ class MappingConfig(Section, name="mapping"):
 
     @property
     def fresh_adam(self) -> bool:
-        """Whether each keyframe starts with a new Adam optimiser, without the moments of earlier keyframes (VarSplat's
-        code)."""
+        """Whether each keyframe starts with a new Adam optimiser, without earlier moments (VarSplat's code)."""
         return self.freeze_new_colors
 
     @property
@@ -252,7 +254,7 @@ class TrackingConfig(Section, name="tracking"):
     image."""
     iterations: Count = 200
     """Maximum number of Adam steps per frame. Use more for fast or shaky motion, fewer for speed."""
-    align_iterations: Count = 15
+    align_iterations: ClassVar[int] = 15
     """Maximum number of Gauss–Newton steps per pyramid level."""
     align_depth_by: Literal["V", "U"] = "V"
     """Whether alignment weights depth residuals by V, like gray residuals, or in the same way by the depth variance U
@@ -291,12 +293,9 @@ class TrackingConfig(Section, name="tracking"):
     """Only pixels with a rendered alpha above this are used; 0 = off."""
     outlier_factor: NotNegative = 50.0
     """Only pixels with a depth error below this multiple of its median are used; 0 = off."""
-    outlier_factor_color: NotNegative = 0.0
-    """Colour is used only at pixels where its error, summed over the channels, is below this multiple of its median; 0
-    = off."""
     average: Literal["image", "kept"] = "image"
-    """Whether the errors of colour and depth are averaged over all pixels, or over the pixels that each of them uses
-    (CG-SLAM)."""
+    """Whether the errors of colour and depth are averaged over all pixels, or over the pixels that each of them uses:
+    colour where its error is no outlier (CG-SLAM)."""
     reinit_factor: NotNegative = 5.0
     """If the first loss exceeds this multiple of its running median, tracking restarts from odometry with twice the
     iterations."""
@@ -310,8 +309,7 @@ class TrackingConfig(Section, name="tracking"):
     verify: bool = True
     """Whether a pose is judged by comparing surfaces at it (ours); off = by agreement and overlap only. It needs
     `method` align. Alignment then uses the part of σ that depends on the distance, by the model of `input.sensor`,
-    instead of the law of `render.depth_noise_per_m`: in tracking, for loops, and where a lost camera is searched for.
-    """
+    instead of the law of `render.depth_noise_per_m`, also for loops and where a lost camera is searched for."""
     lost_agreement: ClassVar[float] = 0.6
     """Tracking is lost if map and sensor agree in depth on less than this share of the pixels where both have a
     surface; not used with `verify`."""
@@ -340,6 +338,11 @@ class TrackingConfig(Section, name="tracking"):
     def sensor_noise(self) -> bool:
         """Whether alignment uses the model of `input.sensor`: with `verify`."""
         return self.verify
+
+    @property
+    def outlier_factor_color(self) -> float:
+        """Colour counts only where its error, summed over channels, is below this multiple of its median; 0 = off."""
+        return 10.0 if self.average == "kept" else 0.0
 
     @property
     def first_lr_rotation(self) -> float:

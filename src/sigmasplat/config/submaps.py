@@ -23,10 +23,8 @@ class SubmapConfig(Section, name="submaps"):
     """Rules that end the active submap and start the next one; checked at each keyframe (VarSplat §2)."""
 
     distance_m: NotNegative = 0.5
-    """A new submap starts if the camera is farther than this from the submap's first pose; 0 = off. If all rules are
-    off, the map is one submap."""
-    angle_deg: NotNegative = 50.0
-    """A new submap starts if the camera has rotated by more than this from the submap's first pose; 0 = off."""
+    """A new submap starts if the camera is farther than this from the submap's first pose, or has rotated by more than
+    `angle_deg`; 0 = off. If all rules are off, the map is one submap."""
     frames: Count = 0
     """A new submap starts this many frames after the first one of the active submap; 0 = off."""
     uncertainty_m: NotNegative = 0.02
@@ -35,6 +33,11 @@ class SubmapConfig(Section, name="submaps"):
     inherit: bool = True  # starting a submap empty costs two seconds of first iterations
     """Whether a new submap starts with copies of the splats in view, which are then mapped like any others; off = it
     starts empty (paper)."""
+
+    @property
+    def angle_deg(self) -> float:
+        """A new submap starts if the camera has rotated by more than this from the submap's first pose; 0 = off."""
+        return 50.0 if self.distance_m else 0.0
 
 
 @dataclass(frozen=True)

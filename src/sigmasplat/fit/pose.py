@@ -63,15 +63,17 @@ def fit_pose_adam(
     return PoseFit(T_best, agree, overlap, found.first_loss, found.loss, found.steps, exposure=found.exposure)
 
 
-def fit_pose_align(reference: Reference, live: Pyramid, T_camera_world: Matrix, config: TrackingConfig) -> PoseFit:
+def fit_pose_align(
+    reference: Reference, live: Pyramid, T_camera_world: Matrix, config: TrackingConfig, moves: bool = True
+) -> PoseFit:
     """Align the live image, a gray and depth (m) pyramid, to a reference by Gauss–Newton (`fit.align`), from a guess.
 
-    T_camera_world [4, 4]: the guess for the live camera. In the result, `loss` is the final cost and `first_loss` is
-    NaN.
+    T_camera_world [4, 4]: the guess for the live camera; moves: if False, it is only judged. In the result, `loss` is
+    the final cost and `first_loss` is NaN.
     """
     guess = T_camera_world @ se3.inverse(reference.T_camera_world)
     found = align(
-        reference.pyramid, live, guess, config.align_iterations, config.align_weight_color, config.align_stop,
+        reference.pyramid, live, guess, config.align_iterations * moves, config.align_weight_color, config.align_stop,
         config.plateau_stop,
     )  # fmt: skip
     return PoseFit(

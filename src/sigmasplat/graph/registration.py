@@ -268,7 +268,7 @@ def tracking_of(registration: RegistrationConfig, tracking: TrackingConfig) -> T
         tracking, uncertainty=r.uncertainty, tau=r.tau, weight_color=weight_color,
         lr_rotation=r.lr_rotation, lr_translation=r.lr_translation, exposure=r.exposure, plateau_stop=r.plateau_stop,
         plateau_window=r.plateau_window, alpha_power=1.0, alpha_above=OPAQUE, outlier_factor=0.0,
-        outlier_factor_color=0.0, average="image", parametrisation="quaternion", align_depth_by="V", amsgrad=False,
+        average="image", parametrisation="quaternion", align_depth_by="V", amsgrad=False,
     )  # fmt: skip
 
 

@@ -238,8 +238,8 @@ def aligned(
     Where only a wall is in view, alignment can slide along it: then the guess explains the image better, and is kept.
     """
     found = list[tuple[PoseFit, Comparison]]()
-    for settings in (config, replace(config, align_iterations=0)):
-        fit = fit_pose_align(reference, seen.live, T_camera_world, settings)
+    for moves in (True, False):
+        fit = fit_pose_align(reference, seen.live, T_camera_world, config, moves)
         fit.comparison = reference.compared(seen.live, fit.T_camera_world)
         found.append((fit, fit.comparison))
     return max(found, key=lambda each: score(each[1]))

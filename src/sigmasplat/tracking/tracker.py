@@ -1,7 +1,7 @@
 """Tracking: predict the pose, fit it to the fixed map, judge the fit, and try other guesses if it is doubtful."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field as dataclass_field, replace
+from dataclasses import dataclass, field as dataclass_field
 
 import numpy as np
 
@@ -217,8 +217,7 @@ class Tracker:
         return self._aligned(reference, seen.live, T_camera_world, patience > 0)
 
     def _aligned(self, reference: Reference, live: Pyramid, T_camera_world: Matrix, moves: bool = True) -> PoseFit:
-        config = self.config if moves else replace(self.config, align_iterations=0)
-        fit = fit_pose_align(reference, live, T_camera_world, config)
+        fit = fit_pose_align(reference, live, T_camera_world, self.config, moves)
         if self.config.verify:
             fit.comparison = self._compared(reference, live, fit.T_camera_world)
         return fit

@@ -16,11 +16,9 @@ BASE_VALUES: dict[str, dict[str, object]] = {
         "first_edges": True,
         "later_max": 30_000,
         "depth_error_least_m": 0.0,
-        "opacity": 0.5,
         "scale_from": "neighbours",
         "scale_factor": 1.0,
         "thickness": 1.0,
-        "density": 1.0,
         "max_splats": 0,
     },
     "mapping": {
@@ -59,7 +57,6 @@ BASE_VALUES: dict[str, dict[str, object]] = {
     },
     "submaps": {
         "distance_m": 0.0,
-        "angle_deg": 0.0,
         "uncertainty_m": 0.0,
         "inherit": False,
     },

@@ -25,7 +25,6 @@ PAPER = BASE.changed(
         "later_max": 0,
         "depth_error_factor": 0.0,
         "min_distance_m": 0.0,
-        "opacity": 0.5,
     },
     mapping={
         "first_iterations": 1500,
@@ -57,7 +56,6 @@ PAPER = BASE.changed(
         "alpha_power": 0.0,
         "alpha_above": 0.99,
         "outlier_factor": 10.0,
-        "outlier_factor_color": 10.0,
         "average": "kept",
     },
     submaps={},

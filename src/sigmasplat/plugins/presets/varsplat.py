@@ -16,9 +16,9 @@ UNCERTAIN_M = 0.02
 PAPER = BASE.changed(
     input={"min_depth_m": 0.0},
     render={"near_m": 0.2},
-    seeding={"first_gradient": 50_000, "depth_error_factor": 40.0, "opacity": 0.5},
+    seeding={"first_gradient": 50_000, "depth_error_factor": 40.0},
     mapping={"iterations": 100, "weight_nll_color": 1e-4, "freeze_old_colors": True},
-    submaps={"distance_m": 0.5, "angle_deg": 50.0, "uncertainty_m": UNCERTAIN_M},
+    submaps={"distance_m": 0.5, "uncertainty_m": UNCERTAIN_M},
     loops={"descriptor": "netvlad-or-grid"},
     final={"seed_from": "mesh", "iterations": 30_000, "sh_degree": 3, "uncertainty": False},  # §7 does not use V
 )
@@ -52,7 +52,7 @@ TUM = PAPER.changed(
 SCANNET = TUM.changed(
     input={"crop_px": 12},
     tracking={"exposure": True, "tau": 20.0, "alpha_above": 0.98, "outlier_factor": 50.0},
-    submaps={"distance_m": 0.0, "angle_deg": 0.0, "frames": 50},
+    submaps={"distance_m": 0.0, "frames": 50},
     loops={"min_interval": 4},
     registration={"tau": 20.0},
 )  # fmt: skip
@@ -68,7 +68,7 @@ SCANNETPP = PAPER.changed(
         "iterations": 300, "lr_rotation": 2e-3, "lr_translation": 1e-2, "weight_color": 0.5, "tau": 3.0,
         "alpha_above": 0.98, "alpha_power": 0.0, "outlier_factor": 50.0, "reinit_factor": 50.0,
     },
-    submaps={"distance_m": 0.0, "angle_deg": 0.0, "frames": 100},
+    submaps={"distance_m": 0.0, "frames": 100},
     loops={"min_similarity": 0.34},
     registration={"tau": 10.0},
 )  # fmt: skip
@@ -82,11 +82,9 @@ FAST = BASE.changed(
         "first_gradient": 15_000,
         "first_edges": False,  # sampling by gradient finds the same pixels
         "later_max": 0,
-        "density": 0.35,  # share of the new pixels; with all of them ATE and PSNR stay the same, but time grows
         "depth_error_least_m": 0.1,  # 40 × a median of 2 mm alone would treat sensor noise as a new surface
         "scale_from": "pixel",  # searching the map for neighbours costs more than fitting a keyframe
         "scale_factor": 0.8,
-        "opacity": 0.8,  # nearly opaque seeds: the map can be tracked after few iterations
         "max_splats": 250_000,
     },
     mapping={
@@ -112,7 +110,6 @@ FAST = BASE.changed(
     },
     submaps={
         "distance_m": 0.5,
-        "angle_deg": 50.0,
         "uncertainty_m": UNCERTAIN_M,
         "inherit": True,  # starting a submap empty costs two seconds of first iterations
     },
