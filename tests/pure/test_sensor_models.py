@@ -9,6 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from command_line import exit_code
+from constants import changed
 from paper_settings import InputConfig
 from sigmasplat.config.find_preset import preset
 from sigmasplat.config.scale import for_scene
@@ -140,7 +141,7 @@ def test_every_alignment_uses_the_model() -> None:
         frame = working_frame(framed(wall(0.3)), settings)
         view = view_of(frame.camera, settings)
         target, stored = picture_images(view, Picture((255 * frame.color).astype(np.uint8), frame.depth_m), CAMERA)
-        solid = replace(settings.seeding, opacity=0.99)
+        solid = changed(settings.seeding, opacity=0.99)
         field = make_splats(target, np.eye(4), frame.depth_m > 0, 1.0, GaussianField.empty(), solid)
         rendered = map_reference(field.params, view, np.eye(4), settings.tracking)
         part = Reference(stored, np.eye(4)).without(np.indices((120, 160))[1] < 40)

@@ -39,9 +39,9 @@ QUICK = SMALL | {
 }  # fmt: skip
 
 
-def config(**changes: str) -> Config:
+def config(spare_iterations: int = 8, **changes: str) -> Config:
     made = override(preset("sigma"), QUICK | {name.replace("__", "."): value for name, value in changes.items()})
-    return replace(made, realtime=changed(made.realtime, spare_iterations=8))
+    return replace(made, realtime=changed(made.realtime, spare_iterations=spare_iterations))
 
 
 def error_m(system: RealTime) -> float:
@@ -56,7 +56,7 @@ FITTED = {"tracking__fit_depth": "true", "mapping__divided": "false"}
 
 @pytest.mark.parametrize("more", [{}, FITTED], ids=["measured", "predicted"])
 def test_the_results_are_those_of_a_recording_if_mapping_always_ends_before_the_next_frame(more: dict) -> None:
-    same = config(realtime__keyframe_deg="0", realtime__spare_iterations="0", **more)
+    same = config(spare_iterations=0, realtime__keyframe_deg="0", **more)
     usual, system = Slam(same), RealTime(Slam(same), AtOnce())
     for frame in frames(FRAMES):
         usual.step(frame)
@@ -158,9 +158,7 @@ def test_a_map_that_falls_behind_is_still_fitted_and_cut() -> None:
 
 def test_a_keyframe_is_aligned_again_when_the_weights_of_the_one_before_it_are_known() -> None:
     """Else the path would be that of an alignment without weights."""
-    same = config(
-        mapping__every="4", realtime__keyframe_deg="0", realtime__spare_iterations="0", submaps__frames="1000"
-    )
+    same = config(spare_iterations=0, mapping__every="4", realtime__keyframe_deg="0", submaps__frames="1000")
     usual, late = Slam(same), RealTime(Slam(same), Late(slices=3))
     for frame in frames(FRAMES):
         usual.step(frame)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from sigmasplat.config import Config
+from sigmasplat.config import Config, RecoveryConfig
 from sigmasplat.config.find_preset import default_preset, preset
 from sigmasplat.config.text import override
 from sigmasplat.data import se3
@@ -152,11 +152,12 @@ def test_frames_that_are_held_back_are_tracked_but_never_mapped() -> None:
     assert {step.index for step in slam.steps if not step.is_keyframe} == held_back
 
 
-def test_a_lost_frame_that_is_held_back_begins_no_map() -> None:
+def test_a_lost_frame_that_is_held_back_begins_no_map(monkeypatch: pytest.MonkeyPatch) -> None:
     """The camera jumps to another part of the room while every second frame is held back."""
     some = [*frames(4), *[walk().frame(100)] * 8]
-    changes = {"recovery__new_map_after": "2", "input__hold_every": "2"}
-    slam = follow((replace(frame, index=i, timestamp_s=i / 30) for i, frame in enumerate(some)), settings(**changes))
+    monkeypatch.setattr(RecoveryConfig, "new_map_after", 2)
+    config = settings(input__hold_every="2")
+    slam = follow((replace(frame, index=i, timestamp_s=i / 30) for i, frame in enumerate(some)), config)
     assert len(slam.atlas.anchors) > 1, "a new map began"
     assert not any(index % 2 for index in slam.keyframe_indices)
 
