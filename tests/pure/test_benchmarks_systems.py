@@ -165,6 +165,7 @@ def test_an_ablation_is_judged_at_equal_scene_and_seed() -> None:
     assert not {"Effects", "Mean of scenes"} & set(laid_out("consistency", {"jobs": jobs[-1:]}))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("taskset") is None, reason="runs are kept on their cores by taskset")
 def test_a_tiny_ablation_from_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     options = consistency.Options(

@@ -91,6 +91,7 @@ def made(exposure: bool, iterations: int = 150) -> FinalMap:
     return final_map(exposed_store(), room.ANCHORS, settings, view, np.random.default_rng(0))
 
 
+@pytest.mark.slow
 def test_refinement_separates_exposures_from_the_map() -> None:
     """The map keeps one colour per surface, and the images are nearer to it in their fitted exposures."""
     fitted, plain = made(exposure=True), made(exposure=False)

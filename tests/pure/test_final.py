@@ -227,6 +227,7 @@ def test_free_poses_lower_the_loss_and_recover_a_perturbed_keyframe() -> None:
     np.testing.assert_allclose(found["free"][0], true[0], atol=1e-12, err_msg="the first keyframe fixes the gauge")
 
 
+@pytest.mark.slow
 def test_a_pose_comes_to_rest_at_the_reach_and_the_first_one_stays() -> None:
     """The picture of one keyframe asks for a pose 8 cm away; the tracked pose holds it at a distance of the reach."""
     store, reach_m = make_store(), 0.01

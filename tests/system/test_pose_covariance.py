@@ -35,6 +35,7 @@ def test_errors_of_the_path_are_of_the_size_that_the_covariance_says(run: Path) 
     assert scores["hops"]["coverage_90"] > 0.6
 
 
+@pytest.mark.slow
 def test_the_exported_path_is_certain_at_the_start_and_nowhere_else(run: Path, tmp_path: Path) -> None:
     assert exit_code("export", str(run), "--out", str(tmp_path / "path.cov.txt")) == 0
     rows = np.loadtxt(tmp_path / "path.cov.txt")
