@@ -98,7 +98,7 @@ def write(measured: dict[str, Any], folder: Path = RESULTS) -> Path:
 def write_json(values: dict[str, Any], path: Path) -> None:
     """Write a JSON file, whole or not at all."""
     temporary = path.with_suffix(".part")
-    temporary.write_text(json.dumps(values, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    temporary.write_text(json.dumps(values, indent=1, allow_nan=False, default=os.fspath) + "\n", encoding="utf-8")
     temporary.replace(path)
 
 
