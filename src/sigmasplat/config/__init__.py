@@ -38,8 +38,8 @@ OWN_BACKENDS = ("auto", "cpu", "cuda", "reference")
 
 @dataclass(frozen=True)
 class Config:
-    """All settings of a run. Every value has a working default; `presets.preset` returns those of a published
-    system."""
+    """All settings of a run. Every value has a working default; `find_preset.preset` returns those of a
+    published system."""
 
     name: str = "custom"
     """Name of these settings in reports and folder names: the name of the preset."""

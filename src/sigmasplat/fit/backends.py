@@ -20,7 +20,7 @@ from sigmasplat.fit.interface import DeviceFits, MappingStep, Twist, Weights
 from sigmasplat.fit.mapping_step import OwnTermsStep, TorchStep
 from sigmasplat.fit.reference_maps import reference_arrays
 from sigmasplat.fit.view_dependent import ImageStep, ViewDependentStep
-from sigmasplat.registry import Backend, rows
+from sigmasplat.registry import Backend, named
 from sigmasplat.render.cpu.view import CpuView
 from sigmasplat.render.view import View
 from sigmasplat.types import Matrix
@@ -78,7 +78,7 @@ def fits_of(on: OnBackend) -> DeviceFits:
 @cache
 def _added(name: str) -> DeviceFits:
     """Return what the backend of a plug-in offers."""
-    fits: DeviceFits = next(row for row in rows(Backend) if row.name == name).fits()
+    fits: DeviceFits = named((Backend,), name).fits()
     return fits
 
 

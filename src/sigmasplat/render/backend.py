@@ -5,6 +5,7 @@ view gets here. Other devices are plug-ins (`registry.Backend`), CUDA among them
 """
 
 from types import ModuleType
+from typing import cast
 
 import torch
 
@@ -13,7 +14,7 @@ from sigmasplat.config import RenderConfig
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField, Rows
 from sigmasplat.errors import BackendError
-from sigmasplat.registry import Backend, rows
+from sigmasplat.registry import Backend, named, rows
 from sigmasplat.render.view import View
 
 OWN = ("cpu", "reference")
@@ -27,7 +28,7 @@ def backend_names() -> list[str]:
 
 def backend_row(name: str) -> Backend | None:
     """Return the plug-in of a backend by name; None for those of this package's core."""
-    return None if name in OWN else next(row for row in rows(Backend) if row.name == name)
+    return None if name in OWN else cast(Backend, named((Backend,), name))
 
 
 def backend_name(asked: str, device: torch.device | None = None) -> str:
