@@ -34,7 +34,7 @@ from sigmasplat.plugins.evaluation.metrics.trajectory import aligned_poses, asso
 from sigmasplat.plugins.evaluation.view_scoring import working_frame
 from sigmasplat.plugins.sources.synthetic import open_synthetic
 from sigmasplat.render import render
-from sigmasplat.render.reference.operators import project
+from sigmasplat.render.reference import project
 from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.types import Matrix
 

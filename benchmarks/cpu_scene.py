@@ -13,8 +13,8 @@ from works import RENDER, Works, set_up, time_works, timed
 
 from sigmasplat.native import _core
 from sigmasplat.render import render
-from sigmasplat.render.cpu.view import CpuView
-from sigmasplat.render.reference.view import ReferenceView
+from sigmasplat.render.cpu import CpuView
+from sigmasplat.render.reference import ReferenceView
 
 PAIR_PIXELS = 400
 REFERENCE_WIDTH, REFERENCE_BACKWARD_SHARE = 80, 10

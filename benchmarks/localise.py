@@ -14,7 +14,7 @@ from sigmasplat.data.field import GaussianField
 from sigmasplat.data.frame import Frame
 from sigmasplat.fit.adam import VectorAdam
 from sigmasplat.render import Render, render
-from sigmasplat.render.pose_gradient import twist_matrix
+from sigmasplat.render.kernels import twist_matrix
 
 Matrix = NDArray[np.float64]
 WAYS = {

@@ -27,7 +27,7 @@ from accuracy_tables import spread
 from tables import Section
 
 from sigmasplat.data import se3
-from sigmasplat.data.mesh import Mesh
+from sigmasplat.data.mesh import Mesh, mesh_depth
 from sigmasplat.data.trajectory import Trajectory, evenly_spread
 from sigmasplat.data.tsdf import Tsdf, extract_surface
 from sigmasplat.errors import SigmaSplatError
@@ -43,7 +43,6 @@ from sigmasplat.plugins.evaluation.metrics.reconstruction import (
 from sigmasplat.plugins.evaluation.metrics.trajectory import align_rigid, ate, pair_poses
 from sigmasplat.plugins.outputs.mesh_files import read_mesh
 from sigmasplat.plugins.sources import open_source
-from sigmasplat.render.mesh import mesh_depth
 from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.types import Matrix
 

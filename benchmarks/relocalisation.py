@@ -37,7 +37,7 @@ from sigmasplat.data.camera import Camera
 from sigmasplat.data.frame import Frame
 from sigmasplat.env import opencv
 from sigmasplat.errors import SourceError
-from sigmasplat.fit.gray import gray_of
+from sigmasplat.fit.target import gray_of
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.tracking.features import depth_readings, landmarks_of, make_extractor, pose_from_landmarks

@@ -25,7 +25,7 @@ from scenes import Scene, make_scene
 from tables import Section, significant
 from works import RENDER, STAGES, Works, set_up
 
-from sigmasplat.render.reference import operators as reference
+from sigmasplat.render import reference
 
 arg = tyro.conf.arg
 LANES = {"avx512": (16, 4, 4), "avx2": (8, 4, 2)}

@@ -14,11 +14,11 @@ from sigmasplat.data.field import GaussianField
 from sigmasplat.data.frame import Frame
 from sigmasplat.errors import SourceError
 from sigmasplat.fit.align import align
-from sigmasplat.fit.gray import gray_of
 from sigmasplat.fit.pyramid import Pyramid
+from sigmasplat.fit.target import gray_of
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.sources import open_source
-from sigmasplat.render.reference import operators as reference
+from sigmasplat.render import reference
 
 DEPTH_RANGE_M = (0.1, 8.0)
 OFFSETS = (0, 5, -5, 10, -10, 15, -15, 20, -20)

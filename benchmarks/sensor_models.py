@@ -26,9 +26,9 @@ from sigmasplat.config.sensors import GENERIC, sensor_model
 from sigmasplat.data import se3
 from sigmasplat.files.machine import INSTALLED, code_digest
 from sigmasplat.fit.align import align
-from sigmasplat.fit.gray import gray_of
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import confidence_of, relative_noise
+from sigmasplat.fit.target import gray_of
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.evaluation.metrics.trajectory import associate
 from sigmasplat.plugins.sources import open_source

@@ -9,7 +9,7 @@ from finished_run import FinishedRun
 from sigmasplat.config import Config
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
-from sigmasplat.data.mesh import Mesh
+from sigmasplat.data.mesh import Mesh, mesh_depth
 from sigmasplat.data.trajectory import Trajectory, evenly_spread
 from sigmasplat.data.tsdf import Tsdf, extract_surface
 from sigmasplat.final.fusion import TRUNCATION_VOXELS, VOXEL_M, count_keyframes, fuse, surface_views
@@ -18,7 +18,6 @@ from sigmasplat.plugins.evaluation.metrics.reconstruction import BEHIND_M, Mask,
 from sigmasplat.plugins.evaluation.metrics.trajectory import aligned_poses, associate
 from sigmasplat.plugins.evaluation.view_scoring import working_frame
 from sigmasplat.render import FieldRenderer
-from sigmasplat.render.mesh import mesh_depth
 from sigmasplat.types import Matrix, Progress, no_progress
 
 VERTICES = 100_000

@@ -29,11 +29,10 @@ from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.frame import Frame
 from sigmasplat.errors import SourceError
-from sigmasplat.fit.gray import gray_of
 from sigmasplat.fit.pose import PoseFit, fit_pose_adam, fit_pose_align
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import map_reference
-from sigmasplat.fit.target import Target
+from sigmasplat.fit.target import Target, gray_of
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.evaluation.metrics.trajectory import associate
 from sigmasplat.plugins.sources import open_source

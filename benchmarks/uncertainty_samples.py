@@ -23,7 +23,7 @@ from sigmasplat.config import Config
 from sigmasplat.config.find_preset import preset as preset_of
 from sigmasplat.config.text import full_path, override, split_settings
 from sigmasplat.data import se3
-from sigmasplat.data.exposure import NEUTRAL, exposed
+from sigmasplat.data.camera import NEUTRAL, exposed
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.map_uncertainty import MapUncertainty
 from sigmasplat.data.submap import SubmapStore

@@ -38,8 +38,7 @@ from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.plugins.evaluation.metrics.uncertainty import calibration_scores, z_scores
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.render.backend import make_view
-from sigmasplat.uncertainty.calibration import fit_weights
-from sigmasplat.uncertainty.splat_residuals import background_of, splat_residuals
+from sigmasplat.uncertainty.calibration import background_of, fit_weights, splat_residuals
 
 arg = tyro.conf.arg
 RUNS = record.ROOT / "runs" / "bench" / "uncertainty-weights"

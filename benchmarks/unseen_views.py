@@ -6,9 +6,9 @@ import numpy as np
 from finished_run import FinishedRun
 
 from sigmasplat.config import Config
-from sigmasplat.data.exposure import NEUTRAL
+from sigmasplat.data.camera import NEUTRAL
 from sigmasplat.data.frame import Frame
-from sigmasplat.data.resizing import resized_depth
+from sigmasplat.data.images import resized_depth
 from sigmasplat.data.trajectory import evenly_spread
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.evaluation.metrics.trajectory import aligned_poses, associate

@@ -16,15 +16,14 @@ from sigmasplat.data.field import GaussianField
 from sigmasplat.fit import losses
 from sigmasplat.fit.backends import fits_of
 from sigmasplat.fit.field import fit_field
-from sigmasplat.fit.gray import gray_of
 from sigmasplat.fit.pose import fit_pose_adam, fit_pose_align
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import keyframe_reference, map_reference
-from sigmasplat.fit.target import Keyframe, Target
+from sigmasplat.fit.target import Keyframe, Target, gray_of
 from sigmasplat.native import _core
-from sigmasplat.render.cpu import operators as _operators  # noqa: F401 # applies the switches before anybody sets them
-from sigmasplat.render.cpu.view import CpuView
-from sigmasplat.render.kernel_params import view_params
+from sigmasplat.render import cpu as _cpu  # noqa: F401 # applies the switches before anybody sets them
+from sigmasplat.render.cpu import CpuView
+from sigmasplat.render.kernels import view_params
 
 RENDER = RenderConfig(depth="center")
 ADAM_ITERATIONS = 60

@@ -18,7 +18,7 @@ from sigmasplat import Camera, GaussianField, open_source
 from sigmasplat.config import RenderConfig
 from sigmasplat.data import se3
 from sigmasplat.data.frame import Frame
-from sigmasplat.render.cpu import operators as cpu
+from sigmasplat.render import cpu
 
 OPTIONS = RenderConfig(depth="center")
 

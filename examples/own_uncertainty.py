@@ -18,11 +18,11 @@ from sigmasplat.config import TrackingConfig
 from sigmasplat.config.text import override
 from sigmasplat.data import se3
 from sigmasplat.data.frame import Frame
-from sigmasplat.fit.confidence import uncertainty_weights
-from sigmasplat.fit.gray import gray_of
 from sigmasplat.fit.pose import fit_pose_align
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference
+from sigmasplat.fit.target import gray_of
+from sigmasplat.fit.tracking_loss import uncertainty_weights
 from sigmasplat.plugins.evaluation.metrics import uncertainty
 from sigmasplat.render.render import Render, render
 

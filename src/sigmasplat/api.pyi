@@ -19,8 +19,7 @@ from sigmasplat.config.sensors import AUTO as AUTO, SensorModel as SensorModel, 
 from sigmasplat.config.text import differences as differences, override as override
 from sigmasplat.data import harmonics as harmonics, se3 as se3
 from sigmasplat.data.atlas import Atlas as Atlas
-from sigmasplat.data.camera import Camera as Camera
-from sigmasplat.data.exposure import exposed as exposed
+from sigmasplat.data.camera import Camera as Camera, exposed as exposed
 from sigmasplat.data.field import (
     ATTRIBUTES as ATTRIBUTES,
     COLUMNS as COLUMNS,
@@ -38,6 +37,7 @@ from sigmasplat.data.frame_arrays import (
     frame_from_arrays as frame_from_arrays,
 )
 from sigmasplat.data.harmonics import DEGREES as DEGREES, count as count
+from sigmasplat.data.images import resized_color as resized_color
 from sigmasplat.data.imu import (
     GRAVITY_M_S2 as GRAVITY_M_S2,
     Accelerometer as Accelerometer,
@@ -49,8 +49,7 @@ from sigmasplat.data.imu import (
     up_of_path as up_of_path,
 )
 from sigmasplat.data.map_uncertainty import SHIPPED as SHIPPED, MapUncertainty as MapUncertainty, SplatStd as SplatStd
-from sigmasplat.data.mesh import Mesh as Mesh
-from sigmasplat.data.resizing import resized_color as resized_color
+from sigmasplat.data.mesh import Mesh as Mesh, mesh_depth as mesh_depth
 from sigmasplat.data.submap import Picture as Picture, SubmapStore as SubmapStore
 from sigmasplat.data.trajectory import (
     APART as APART,
@@ -117,13 +116,11 @@ from sigmasplat.final.fusion import (
 )
 from sigmasplat.fit.adam import BETA1 as BETA1, BETA2 as BETA2, EPSILON as EPSILON, Rates as Rates
 from sigmasplat.fit.backends import TORCH as TORCH, fits_of as fits_of
-from sigmasplat.fit.descent import descend as descend, exposure_rate as exposure_rate
-from sigmasplat.fit.fused_terms import (
-    SHAPE_TERMS as SHAPE_TERMS,
-    kernel_weights as kernel_weights,
-    pixel_weights as pixel_weights,
+from sigmasplat.fit.descent import (
+    descend as descend,
+    exposure_rate as exposure_rate,
+    parametrisation as parametrisation,
 )
-from sigmasplat.fit.gray import luma as luma
 from sigmasplat.fit.interface import (
     NORMAL_TERMS as NORMAL_TERMS,
     Accumulator as Accumulator,
@@ -136,14 +133,20 @@ from sigmasplat.fit.interface import (
     Plane as Plane,
     Twist as Twist,
     Weights as Weights,
-    one_image_only as one_image_only,
 )
-from sigmasplat.fit.mapping_step import render_for as render_for
-from sigmasplat.fit.motion import parametrisation as parametrisation
+from sigmasplat.fit.losses import (
+    SHAPE_TERMS as SHAPE_TERMS,
+    kernel_weights as kernel_weights,
+    pixel_weights as pixel_weights,
+)
+from sigmasplat.fit.mapping_step import (
+    TorchStep as TorchStep,
+    ViewDependentStep as ViewDependentStep,
+    render_for as render_for,
+)
 from sigmasplat.fit.pyramid import NOISE_PER_M as NOISE_PER_M
-from sigmasplat.fit.reference_maps import reference_maps as reference_maps
-from sigmasplat.fit.target import Target as Target
-from sigmasplat.fit.tracking_loss import tracking_params as tracking_params
+from sigmasplat.fit.target import Target as Target, luma as luma
+from sigmasplat.fit.tracking_loss import reference_maps as reference_maps, tracking_params as tracking_params
 from sigmasplat.graph.loops import Loop as Loop
 from sigmasplat.graph.path_covariance import PathCovariance as PathCovariance
 from sigmasplat.input.calibration import (
@@ -239,14 +242,15 @@ from sigmasplat.registry import (
     Preset as Preset,
     SourceFormat as SourceFormat,
 )
-from sigmasplat.render import FieldRenderer as FieldRenderer, Render as Render, render as render
+from sigmasplat.render import FieldRenderer as FieldRenderer, Render as Render, reference as reference, render as render
 from sigmasplat.render.backend import backend_module as backend_module, make_view as make_view, on_device as on_device
-from sigmasplat.render.kernel_operators import blend_with as blend_with, project_with as project_with
-from sigmasplat.render.kernel_params import view_params as view_params
-from sigmasplat.render.low_pass import as_refined as as_refined
-from sigmasplat.render.mesh import mesh_depth as mesh_depth
-from sigmasplat.render.pose_gradient import pose_gradient as pose_gradient
-from sigmasplat.render.reference import operators as operators
+from sigmasplat.render.kernels import (
+    blend_with as blend_with,
+    pose_gradient as pose_gradient,
+    project_with as project_with,
+    view_params as view_params,
+)
+from sigmasplat.render.render import as_refined as as_refined
 from sigmasplat.render.view import Layers as Layers, View as View
 from sigmasplat.run.callbacks import Callback as Callback
 from sigmasplat.run.figures import format_ranges as format_ranges, number as number, rate as rate

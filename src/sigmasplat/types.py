@@ -1,6 +1,9 @@
-"""Define the types that many modules share, and the default for an optional callback."""
+"""Define the types that many modules share, the default for an optional callback, and the stopwatch of stages."""
 
-from collections.abc import Callable, Generator, Iterable, Iterator
+import time
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from itertools import islice
 from typing import TypeVar
 
@@ -59,3 +62,24 @@ def unless(should_stop: ShouldStop, guesses: Iterable[Item], least: int = 0) -> 
             yield next(waiting)
         except StopIteration:
             return
+
+
+@dataclass(eq=False)
+class Stopwatch:
+    """Sums wall-clock seconds by stage. Stages can be nested: each one counts its whole time."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Add the time of a block of code to a stage, even if the block raises."""
+        begin = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.add({name: time.perf_counter() - begin})
+
+    def add(self, seconds: Mapping[str, float], prefix: str = "") -> None:
+        """Add seconds by stage that were measured elsewhere; `prefix` is put before each name."""
+        for name, spent in seconds.items():
+            self.seconds[prefix + name] = self.seconds.get(prefix + name, 0.0) + spent

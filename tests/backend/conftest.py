@@ -92,14 +92,14 @@ def backend(request: pytest.FixtureRequest) -> Backend:
 
 
 def _reference(request: pytest.FixtureRequest) -> Backend:
-    from sigmasplat.render.reference import operators as reference
+    from sigmasplat.render import reference
 
     return Backend("reference", reference.project, reference.blend, partial(render, backend="reference"))
 
 
 def _cpu(request: pytest.FixtureRequest) -> Backend:
     pytest.importorskip("sigmasplat.native._core", reason="sigmasplat.native._core is not built (make test builds it)")
-    from sigmasplat.render.cpu import operators as cpu
+    from sigmasplat.render import cpu
 
     return Backend("cpu", cpu.project, cpu.blend, partial(render, backend="cpu"))
 

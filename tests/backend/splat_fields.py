@@ -11,8 +11,8 @@ from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
 from sigmasplat.fit.target import Keyframe
 from sigmasplat.plugins.cuda.view import CudaView
-from sigmasplat.render.cpu.view import CpuView
-from sigmasplat.render.reference.view import ReferenceView
+from sigmasplat.render.cpu import CpuView
+from sigmasplat.render.reference import ReferenceView
 from splat_scenes import Scene, make
 
 OPTIONS = RenderConfig()

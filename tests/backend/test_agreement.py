@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from sigmasplat.render.reference import operators as reference
+from sigmasplat.render import reference
 from splat_oracle import look
 from splat_scenes import KINDS, Scene, assert_same_vector, gradients, probe, render, scene, twist_gradient
 

@@ -16,12 +16,11 @@ from sigmasplat.data.camera import Camera
 from sigmasplat.errors import BackendError
 from sigmasplat.fit import align as aligning
 from sigmasplat.fit.align import Alignment, align
-from sigmasplat.fit.cpu.images import CPU_IMAGES
-from sigmasplat.fit.gray import gray_of
+from sigmasplat.fit.cpu import CPU_IMAGES
 from sigmasplat.fit.interface import LevelPlanes
 from sigmasplat.fit.pyramid import Pyramid
-from sigmasplat.plugins.cuda.align import MOTIONS
-from sigmasplat.plugins.cuda.images import CUDA_IMAGES
+from sigmasplat.fit.target import gray_of
+from sigmasplat.plugins.cuda.images import CUDA_IMAGES, MOTIONS
 from sigmasplat.plugins.sources import SyntheticRoom
 from splat_fits import Watch
 

@@ -16,14 +16,13 @@ from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.fit import align as aligning
 from sigmasplat.fit.align import align
-from sigmasplat.fit.cpu.images import CPU_IMAGES
+from sigmasplat.fit.cpu import CPU_IMAGES
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference, keyframe_reference, live_image, map_reference
 from sigmasplat.plugins.cuda import launch as cuda_launch
-from sigmasplat.plugins.cuda.align import MOTIONS
-from sigmasplat.plugins.cuda.images import CUDA_IMAGES
+from sigmasplat.plugins.cuda.images import CUDA_IMAGES, MOTIONS
 from sigmasplat.plugins.cuda.view import CudaView
-from sigmasplat.render.cpu.view import CpuView
+from sigmasplat.render.cpu import CpuView
 from sigmasplat.render.view import View
 from sigmasplat.run_folder.state import read_state, write_state
 from sigmasplat.slam.slam import Slam

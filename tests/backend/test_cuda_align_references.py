@@ -19,8 +19,8 @@ from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference, keyframe_reference, live_image, map_reference
 from sigmasplat.graph.registration import Registrar
 from sigmasplat.plugins.cuda.view import CudaView
-from sigmasplat.render.cpu.view import CpuView
-from sigmasplat.render.reference.view import ReferenceView
+from sigmasplat.render.cpu import CpuView
+from sigmasplat.render.reference import ReferenceView
 from sigmasplat.render.view import View
 from sigmasplat.run_folder.state import read_state, write_state
 from sigmasplat.tracking.moving import depth_history, dynamic_detector

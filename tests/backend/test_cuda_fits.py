@@ -23,7 +23,7 @@ from sigmasplat.fit.target import Keyframe
 from sigmasplat.plugins.cuda import view as cuda_view
 from sigmasplat.plugins.cuda.view import CudaView
 from sigmasplat.plugins.sources import SyntheticRoom
-from sigmasplat.render.cpu.view import CpuView
+from sigmasplat.render.cpu import CpuView
 from sigmasplat.slam.slam import Slam
 from splat_fields import OPTIONS, params_of
 from splat_fits import target_of

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from sigmasplat.errors import BackendError
-from sigmasplat.plugins.cuda.graph import Recorder, repeatable
+from sigmasplat.plugins.cuda.descent import Recorder, repeatable
 
 
 class Graph:

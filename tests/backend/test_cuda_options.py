@@ -18,15 +18,12 @@ from sigmasplat.errors import ConfigError
 from sigmasplat.fit.backends import step_for
 from sigmasplat.fit.field import fit_field, loss_weights
 from sigmasplat.fit.interface import MappingStep
-from sigmasplat.fit.mapping_step import GradientAccumulator, TorchStep
+from sigmasplat.fit.mapping_step import GradientAccumulator, TorchStep, ViewDependentStep
 from sigmasplat.fit.target import Keyframe
-from sigmasplat.fit.view_dependent import ViewDependentStep
-from sigmasplat.plugins.cuda.mapping_step import CudaStep
-from sigmasplat.plugins.cuda.rows import CudaAccumulator, to_host
+from sigmasplat.plugins.cuda.mapping_step import CudaAccumulator, CudaStep, CudaViewDependentStep, to_host
 from sigmasplat.plugins.cuda.view import CudaView
-from sigmasplat.plugins.cuda.view_dependent import CudaViewDependentStep
-from sigmasplat.render.cpu.view import CpuView
-from sigmasplat.render.reference.view import ReferenceView
+from sigmasplat.render.cpu import CpuView
+from sigmasplat.render.reference import ReferenceView
 from sigmasplat.render.view import View
 from splat_fields import (
     CPU,

@@ -10,9 +10,9 @@ import torch
 
 from emulated_cuda import Emulator
 from sigmasplat.data.field import GaussianField
-from sigmasplat.plugins.cuda import stages as cuda_stages
+from sigmasplat.plugins.cuda import launch as cuda_launch
+from sigmasplat.plugins.cuda.launch import STAGES, Stages
 from sigmasplat.plugins.cuda.mapping_step import CudaStep
-from sigmasplat.plugins.cuda.stages import STAGES, Stages
 from sigmasplat.plugins.cuda.view import CudaView
 from sigmasplat.slam.results import KERNELS
 from splat_fields import OPTIONS, params_of, there_and_back
@@ -59,9 +59,9 @@ class Mark:
 
 @pytest.fixture
 def measured() -> Iterator[Device]:
-    cuda_stages.measure()
+    cuda_launch.measure()
     yield Device()
-    cuda_stages.measure(False)
+    cuda_launch.measure(False)
 
 
 def test_times_are_booked_by_stage_without_waiting(measured: Device) -> None:

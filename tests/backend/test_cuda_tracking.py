@@ -24,7 +24,7 @@ from sigmasplat.fit.tracking_loss import tracking_gradient
 from sigmasplat.plugins.cuda import descent as cuda_descent
 from sigmasplat.plugins.cuda.descent import CudaDescent, CudaTrackingLoss, descend_on_device
 from sigmasplat.plugins.cuda.view import CudaView
-from sigmasplat.render.cpu.view import CpuView
+from sigmasplat.render.cpu import CpuView
 from splat_fields import OPTIONS
 from splat_fits import Watch
 from splat_scenes import assert_same_vector

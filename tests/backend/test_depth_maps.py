@@ -16,13 +16,13 @@ from sigmasplat.data.field import COLUMNS, GaussianField
 from sigmasplat.data.frame import Frame
 from sigmasplat.fit import losses
 from sigmasplat.fit.adam import Rates
-from sigmasplat.fit.cpu.mapping_step import CompiledStep
+from sigmasplat.fit.cpu import CompiledStep
 from sigmasplat.fit.field import fit_field, loss_weights
 from sigmasplat.fit.mapping_step import TorchStep
 from sigmasplat.fit.target import Keyframe, Target
-from sigmasplat.render.cpu.view import CpuView
-from sigmasplat.render.reference import operators as reference
-from sigmasplat.render.reference.view import ReferenceView
+from sigmasplat.render import reference
+from sigmasplat.render.cpu import CpuView
+from sigmasplat.render.reference import ReferenceView
 from sigmasplat.render.view import View
 from splat_fields import OPTIONS, Gradients, crowd, exact_view, params_of, plane_gradients
 from splat_scenes import KINDS, WIDE, Scene, assert_same_vector, scene

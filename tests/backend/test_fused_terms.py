@@ -11,12 +11,11 @@ from paper_settings import MappingConfig
 from sigmasplat import config as settings
 from sigmasplat.data import se3
 from sigmasplat.data.field import GaussianField
-from sigmasplat.fit import fused_terms, losses
+from sigmasplat.fit import losses
 from sigmasplat.fit.backends import step_for
 from sigmasplat.fit.field import fit_field, loss_weights
-from sigmasplat.fit.fused_terms import FusedTerm
 from sigmasplat.fit.target import Keyframe
-from sigmasplat.render.reference.view import ReferenceView
+from sigmasplat.render.reference import ReferenceView
 from sigmasplat.render.view import View
 from splat_fields import OPTIONS, params_of, view_on
 from splat_fits import target_of
@@ -49,16 +48,8 @@ def loss_on(view: View, weights: dict[str, float]) -> tuple[float, Tensor]:
     return loss, step.view.g_sums[:3, : WIDE.height, : WIDE.width].clone()
 
 
-OTHER = {"cpu": "cuda", "cuda": "cpu"}
-
-
-@pytest.mark.parametrize("fused_elsewhere", [False, True], ids=["fused nowhere", "fused on the other device"])
-def test_a_term_that_the_kernels_do_not_have_counts_all_the_same(
-    kernels: str, monkeypatch: pytest.MonkeyPatch, fused_elsewhere: bool
-) -> None:
+def test_a_term_that_the_kernels_do_not_have_counts_all_the_same(kernels: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(losses.TERMS, OWN, darkness)
-    if fused_elsewhere:
-        monkeypatch.setitem(fused_terms.PIXEL_TERMS, OWN, FusedTerm(7, frozenset({OTHER[kernels]})))
     plain = loss_weights(MappingConfig(weight_nll_color=1e-2))
     weights = plain | {OWN: 0.3}
     got, gradient = loss_on(view_on(kernels, WIDE), weights)

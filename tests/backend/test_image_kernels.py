@@ -7,15 +7,24 @@ from numpy.typing import NDArray
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
-from sigmasplat.data import resizing, se3
+from image_definitions import (
+    compare_in_numpy,
+    free_places_in_numpy,
+    halved_color_in_numpy,
+    halved_depth_in_numpy,
+    halved_in_numpy,
+    noise_scale_in_numpy,
+    resized_depth_in_numpy,
+    target_in_torch,
+)
+from sigmasplat.data import images, se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.frame import Frame
-from sigmasplat.fit.compare import NOTHING, compare, compare_in_numpy, noise_scale, noise_scale_in_numpy
-from sigmasplat.fit.cpu.images import halved, halved_depth, halved_depth_in_numpy, halved_in_numpy
-from sigmasplat.fit.gray import LUMA, gray_of
+from sigmasplat.fit.compare import NOTHING, compare, noise_scale
+from sigmasplat.fit.cpu import halved, halved_depth
 from sigmasplat.fit.pyramid import HIDDEN_M, Pyramid
-from sigmasplat.fit.target import Target
-from sigmasplat.tracking.moving.free_space import free_places, free_places_in_numpy
+from sigmasplat.fit.target import LUMA, Target, gray_of
+from sigmasplat.tracking.moving.free_space import free_places
 
 Image = NDArray[np.float32]
 HEIGHT, WIDTH = 90, 122
@@ -40,16 +49,16 @@ def depth(noise_m: float = 0.004) -> Image:
 
 @pytest.mark.parametrize("size", [(61, 45), (40, 45), (61, 30), (37, 29), (122, 180), (244, 180), (121, 89), (1, 1)])
 def test_resized_depth_has_the_bytes_of_its_definition(isa: str, size: tuple[int, int]) -> None:
-    expected = resizing.resized_depth_in_numpy(depth(), *size)
-    assert np.array_equal(resizing.resized_depth(depth(), *size), expected), isa
+    expected = resized_depth_in_numpy(depth(), *size)
+    assert np.array_equal(images.resized_depth(depth(), *size), expected), isa
     kept = (expected >= 1.5) & (expected <= 2.3)
-    assert np.array_equal(resizing.resized_depth(depth(), *size, 1.5, 2.3), np.where(kept, expected, 0))
+    assert np.array_equal(images.resized_depth(depth(), *size, 1.5, 2.3), np.where(kept, expected, 0))
 
 
 @pytest.mark.parametrize("size", [(90, 122), (2, 2), (2, 38), (64, 64)])
 def test_halved_colour_has_the_bytes_of_its_definition(isa: str, size: tuple[int, int]) -> None:
     image = color(*size)
-    assert np.array_equal(resizing.halved_color(image), resizing.halved_color_in_numpy(image)), isa
+    assert np.array_equal(images.halved_color(image), halved_color_in_numpy(image)), isa
 
 
 @pytest.mark.parametrize("size", [(90, 122), (33, 67), (2, 2), (40, 64)])
@@ -65,7 +74,7 @@ def test_gray_is_the_luma(isa: str) -> None:
 
 def test_a_target_has_the_image_and_zeros_beyond_it(isa: str) -> None:
     frame, size = Frame(0, 0.0, color(), depth(), CAMERA), (96, 128)
-    found, expected = Target.of(frame, size), Target.in_torch(frame, size)
+    found, expected = Target.of(frame, size), target_in_torch(frame, size)
     assert torch.equal(found.color, expected.color) and torch.equal(found.depth, expected.depth), isa
     assert found.valid_pixels == expected.valid_pixels
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from sigmasplat.render.reference import operators as reference
+from sigmasplat.render import reference
 from splat_fields import BIG, OPTIONS, crowd, exact_view, params_of, there_and_back
 from splat_scenes import KINDS, assert_same_vector, gradients, probe, render, scene
 
@@ -16,12 +16,12 @@ pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built
 from sigmasplat.data.field import GaussianField
 from sigmasplat.fit.adam import Rates
 from sigmasplat.fit.backends import CPU
-from sigmasplat.fit.cpu.mapping_step import CompiledStep
+from sigmasplat.fit.cpu import CompiledStep
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.target import Target
 from sigmasplat.native import _core
-from sigmasplat.render.cpu import operators as cpu
-from sigmasplat.render.cpu.view import CpuView
+from sigmasplat.render import cpu
+from sigmasplat.render.cpu import CpuView
 
 Outputs = dict[str, Tensor]
 THREADS = (1, 2, 3)

@@ -6,14 +6,14 @@ import torch
 from numpy.typing import NDArray
 
 from sigmasplat.data import se3
-from sigmasplat.render.reference import operators as reference
+from sigmasplat.render import reference
 from splat_oracle import depths
 from splat_scenes import KINDS, Scene, scene, twist_gradient
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
 from sigmasplat.native import _core
-from sigmasplat.render.kernel_params import view_params
+from sigmasplat.render.kernels import view_params
 
 Array = NDArray[np.float64]
 PARTS = {"mean": slice(0, 3), "quat": slice(3, 7), "scale": slice(7, 10), "rho": slice(10, 13), "phi": slice(13, 16)}

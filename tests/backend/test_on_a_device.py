@@ -31,7 +31,7 @@ from sigmasplat.plugins.viewer.layers import render_layer
 from sigmasplat.plugins.viewer.snapshot import Snapshot
 from sigmasplat.plugins.viewer.snapshot_sources import LiveView
 from sigmasplat.render import FieldRenderer, render
-from sigmasplat.render.cpu.view import CpuView
+from sigmasplat.render.cpu import CpuView
 from sigmasplat.run_folder.state import read_state, write_state
 from sigmasplat.slam.saved_state import CLASSES, fixed, restore, state_of
 from sigmasplat.slam.slam import Slam

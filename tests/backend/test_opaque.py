@@ -13,8 +13,8 @@ from torch import Tensor
 
 from sigmasplat.data import se3
 from sigmasplat.data.field import COLUMNS
-from sigmasplat.render.reference import operators as reference
-from sigmasplat.render.reference.view import ReferenceView
+from sigmasplat.render import reference
+from sigmasplat.render.reference import ReferenceView
 from sigmasplat.render.view import View
 from splat_fields import params_of
 from splat_oracle import look
@@ -23,8 +23,8 @@ from splat_scenes import FIELD, WIDE, Scene, render, twist_gradient
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
 from paper_settings import RenderConfig
-from sigmasplat.render.cpu import operators as cpu
-from sigmasplat.render.cpu.view import CpuView
+from sigmasplat.render import cpu
+from sigmasplat.render.cpu import CpuView
 
 OPTIONS = RenderConfig()
 """Walls as wide as the world move the image by their depth alone: without it the pose feels what lies behind them."""

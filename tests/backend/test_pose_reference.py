@@ -10,11 +10,10 @@ from torch import Tensor
 from paper_settings import TrackingConfig
 from sigmasplat.data import se3
 from sigmasplat.data.field import COLUMNS, GaussianField
-from sigmasplat.fit.gray import gray_of
 from sigmasplat.fit.pose import fit_pose_align
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference, keyframe_reference, map_reference
-from sigmasplat.fit.target import Target
+from sigmasplat.fit.target import Target, gray_of
 from sigmasplat.plugins.sources import SyntheticRoom
 from sigmasplat.render import render
 from sigmasplat.render.backend import make_view

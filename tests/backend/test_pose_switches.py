@@ -12,12 +12,10 @@ from sigmasplat.data import se3
 from sigmasplat.data.field import GaussianField, Rows
 from sigmasplat.data.harmonics import view_colors
 from sigmasplat.fit.adam import Rates
-from sigmasplat.fit.mapping_step import TorchStep
+from sigmasplat.fit.mapping_step import TorchStep, ViewDependentStep
 from sigmasplat.fit.target import Target
-from sigmasplat.fit.view_dependent import ViewDependentStep
-from sigmasplat.render import Render, render
-from sigmasplat.render.channels import features_of
-from sigmasplat.render.reference import operators as reference
+from sigmasplat.render import Render, reference, render
+from sigmasplat.render.projection import features_of
 from splat_fields import exact_view, params_of, plane_gradients
 from splat_scenes import SMALL, Scene, assert_same_vector, probe, scene, twist_differences, twist_gradient
 
@@ -190,7 +188,7 @@ def turns_by_kernels(s: Scene, p: Tensor, g: Tensor) -> tuple[Tensor, Tensor]:
     """Do the same by the kernels' own arithmetic, compiled in double."""
     pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
     from sigmasplat.native import _core
-    from sigmasplat.render.kernel_params import view_params
+    from sigmasplat.render.kernels import view_params
 
     numbers = view_params(s.camera, s.T_camera_world.numpy(), s.options, np.float64)
     footprint, out = np.empty((len(p), 8)), np.empty((len(p), 16))

@@ -12,10 +12,9 @@ from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import COLUMNS, GaussianField
 from sigmasplat.errors import BackendError
 from sigmasplat.plugins.cuda.view import CudaView
-from sigmasplat.render import render
+from sigmasplat.render import reference, render
 from sigmasplat.render.backend import options_on
-from sigmasplat.render.cpu.view import CpuView
-from sigmasplat.render.reference import operators as reference
+from sigmasplat.render.cpu import CpuView
 from sigmasplat.uncertainty.blended_values import blend_values
 from splat_fields import CPU, crowd, exact_view, params_of, plane_gradients
 from splat_scenes import KINDS, WIDE, Scene, assert_same_vector, scene

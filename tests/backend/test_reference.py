@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from sigmasplat.render.reference import operators as reference
+from sigmasplat.render import reference
 from splat_oracle import flat, look
 from splat_scenes import (
     FIELD,

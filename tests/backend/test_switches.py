@@ -9,20 +9,20 @@ import pytest
 
 from sigmasplat import env
 from sigmasplat.errors import BackendError
+from sigmasplat.render import reference
 from sigmasplat.render.backend import backend_module, make_view
-from sigmasplat.render.cpu.view import CpuView
-from sigmasplat.render.reference import operators as reference
-from sigmasplat.render.reference.view import ReferenceView
+from sigmasplat.render.cpu import CpuView
+from sigmasplat.render.reference import ReferenceView
 from splat_fields import OPTIONS
 from splat_scenes import SMALL
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
 from sigmasplat.native import _core
-from sigmasplat.render.cpu import operators as cpu
+from sigmasplat.render import cpu
 
 SHOW = """
-import sigmasplat.render.cpu.operators
+import sigmasplat.render.cpu
 from sigmasplat.native import _core
 print(_core.isa_name(), _core.threads())
 """

@@ -15,10 +15,9 @@ from sigmasplat.data import se3
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.frame import Frame
 from sigmasplat.fit.backends import fits_of
-from sigmasplat.fit.gray import gray_of
 from sigmasplat.fit.pose import PoseFit, fit_pose_adam
 from sigmasplat.fit.pyramid import Pyramid
-from sigmasplat.fit.target import Target
+from sigmasplat.fit.target import Target, gray_of
 from sigmasplat.render.backend import make_view
 from sigmasplat.render.view import View
 from sigmasplat.tracking import tracker

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import COLUMNS, GaussianField
-from sigmasplat.render.reference import operators as reference
-from sigmasplat.render.reference.view import reaches
+from sigmasplat.render import reference
+from sigmasplat.render.reference import reaches
 from sigmasplat.render.view import View
 from splat_fields import OPTIONS, crowd, exact_view, maps_of, params_of, plane_gradients, there_and_back, view_on
 from splat_scenes import KINDS, SMALL, WIDE, Scene, assert_same_vector, scene

@@ -18,12 +18,11 @@ from sigmasplat.data.harmonics import count
 from sigmasplat.fit.adam import Rates
 from sigmasplat.fit.backends import fits_of, step_for
 from sigmasplat.fit.field import fit_field, loss_weights
-from sigmasplat.fit.mapping_step import TorchStep
+from sigmasplat.fit.mapping_step import TorchStep, ViewDependentStep
 from sigmasplat.fit.target import Keyframe, Target
-from sigmasplat.fit.view_dependent import ViewDependentStep
 from sigmasplat.render import render
-from sigmasplat.render.cpu.view import CpuView
-from sigmasplat.render.reference.view import ReferenceView
+from sigmasplat.render.cpu import CpuView
+from sigmasplat.render.reference import ReferenceView
 from sigmasplat.render.view import View
 from splat_fields import OPTIONS, exact_view, params_of, plane_gradients
 from splat_scenes import SMALL, WIDE, Scene, assert_same_vector, scene

@@ -12,8 +12,8 @@ from align_oracle import CAMERA, HUGE, MISSING, Pair, missing, oracle, pair
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.fit.align import align, align_to_all
-from sigmasplat.fit.gray import gray_of
 from sigmasplat.fit.pyramid import Pyramid
+from sigmasplat.fit.target import gray_of
 from sigmasplat.plugins.sources import SyntheticRoom
 
 _core = pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")

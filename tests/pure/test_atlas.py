@@ -6,9 +6,8 @@ import pytest
 from sigmasplat.data import se3
 from sigmasplat.data.atlas import Atlas
 from sigmasplat.data.camera import Camera
-from sigmasplat.data.column import Column
 from sigmasplat.data.field import GaussianField
-from sigmasplat.data.poses import Place, Places
+from sigmasplat.data.poses import Column, Place, Places
 from sigmasplat.data.relative_pose import UNKNOWN_HOP, RelativePose
 from sigmasplat.data.submap import MemoryStore, Picture, RefinedStore, StorePart, Submap
 from sigmasplat.errors import SigmaSplatError
@@ -98,7 +97,7 @@ def test_probe_views_follow_their_keyframe_in_the_final_map() -> None:
     submap = RefinedStore(store, [moved]).load(0)
     assert np.allclose(submap.T_submap_camera, moved)
     assert np.allclose(submap.T_submap_probe[0], moved[0] @ se3.inverse(T[0]) @ probe)
-    with pytest.raises(SigmaSplatError, match="submap 1 cannot be saved after the final map is made"):
+    with pytest.raises(SigmaSplatError, match="submap 1 cannot be saved in a store that is only read"):
         RefinedStore(store, [moved]).save(Submap(1, GaussianField.empty(), (0,), T[:1], CAMERA), [picture])
 
 

@@ -28,8 +28,7 @@ from sigmasplat.errors import ConfigError, SourceError
 from sigmasplat.fit.pose import PoseFit
 from sigmasplat.native import _core
 from sigmasplat.plugins.sources import open_source
-from sigmasplat.render import render
-from sigmasplat.render.reference import operators as reference
+from sigmasplat.render import reference, render
 from sigmasplat.tracking.tracker import Tracker
 
 accuracy, accuracy_tables, cpu, cpu_scene, cpu_tables, record, scenes, tables, works = map(

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 from sigmasplat.data import se3
 from sigmasplat.data.frame import Frame
 from sigmasplat.fit.compare import NOTHING, Comparison, compare, noise_scale
-from sigmasplat.fit.gray import gray_of
 from sigmasplat.fit.pyramid import Pyramid
+from sigmasplat.fit.target import gray_of
 from sigmasplat.plugins.sources import SyntheticRoom
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from sigmasplat.fit.confidence import outlier_mask, uncertainty_weights
+from sigmasplat.fit.tracking_loss import outlier_mask, uncertainty_weights
 
 H, W = 13, 17
 

@@ -10,10 +10,10 @@ from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import ATTRIBUTES, COLUMNS, WIDTH, GaussianField
 from sigmasplat.fit.adam import Rates, adam_step
-from sigmasplat.fit.densify_stats import DensifyStats
+from sigmasplat.fit.field import DensifyStats
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.mapping.densify import clone, densify_mask, multiply, split, too_large, too_wide
-from sigmasplat.render.reference import operators as reference
+from sigmasplat.render import reference
 
 CAMERA = Camera(40, 30, 50.0, 52.0, 18.6, 15.3)
 MOVED = [*range(0, 3), *range(7, 10)]

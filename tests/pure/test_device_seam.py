@@ -8,11 +8,11 @@ from types import SimpleNamespace
 
 from sigmasplat.fit import losses
 from sigmasplat.fit.backends import fits_of
-from sigmasplat.fit.fused_terms import PIXEL_TERMS, SHAPE_TERMS, fused_terms, pixel_weights
+from sigmasplat.fit.losses import FUSED_TERMS, PIXEL_TERMS, SHAPE_TERMS, pixel_weights
 from sigmasplat.render.backend import backend_names
 
 PACKAGE = Path(__file__).parents[2] / "src" / "sigmasplat"
-MAY_CHOOSE = ("render/", "native/", "fit/cpu/", "plugins/cuda/", "fit/backends.py", "fit/fused_terms.py")
+MAY_CHOOSE = ("render/", "native/", "fit/cpu.py", "plugins/cuda/", "fit/backends.py")
 """Where code may depend on the device."""
 MAY_NAME = (*MAY_CHOOSE, "config/__init__.py", "env.py", "plugins/checks/installation.py", "run_folder/state.py")
 """Those, and what reads the setting, describes the machine, or puts tensors back where they were."""
@@ -114,21 +114,16 @@ def test_fused_terms_are_in_the_order_of_the_kernels_struct() -> None:
         text = (PACKAGE / file).read_text(encoding="utf-8")
         found = re.search(rf"struct {struct} \{{ float ([\w, ]+);", text)
         assert found, f"{file} defines {struct}"
-        backend = "cuda" if "cuda" in file else "cpu"
-        fused = {name: term.index for name, term in table.items() if backend in term.backends}
-        assert found[1].split(", ") == sorted(fused, key=lambda name: fused[name] or 0)
-        assert sorted(fused.values(), key=int) == list(range(len(fused)))
+        assert tuple(found[1].split(", ")) == table
 
 
 def test_fused_terms_are_loss_terms() -> None:
-    for backend in ("cpu", "cuda"):
-        assert fused_terms(backend) <= set(losses.TERMS)
-    assert fused_terms("reference") == frozenset()
+    assert set(losses.TERMS) >= FUSED_TERMS
 
 
 def test_without_variance_planes_the_terms_that_need_them_weigh_nothing() -> None:
     weights = dict.fromkeys(PIXEL_TERMS, 0.5)
-    assert pixel_weights(weights, "cpu", variance=True).tolist() == [0.5] * len(PIXEL_TERMS)
-    zero = [PIXEL_TERMS[name].index for name in ("nll_color", "nll_depth")]
-    found = pixel_weights(weights, "cuda", variance=False)
+    assert pixel_weights(weights, variance=True).tolist() == [0.5] * len(PIXEL_TERMS)
+    zero = [PIXEL_TERMS.index(name) for name in ("nll_color", "nll_depth")]
+    found = pixel_weights(weights, variance=False)
     assert [k for k, weight in enumerate(found) if weight == 0.0] == zero

@@ -7,17 +7,17 @@ import torch
 
 import two_submaps as room
 from sigmasplat.data.atlas import Atlas
-from sigmasplat.data.exposure import NEUTRAL, between, centred, exposed, unexposed
+from sigmasplat.data.camera import NEUTRAL, between, centred, exposed, unexposed
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.poses import Place, Places
 from sigmasplat.data.submap import MemoryStore, Picture, RefinedStore, Submap
 from sigmasplat.final.final_map import FinalMap, final_map
-from sigmasplat.fit.exposure import fit_exposure
+from sigmasplat.fit.pose import fit_exposure
 from sigmasplat.fit.target import Target
 from sigmasplat.plugins.evaluation.metrics.image import psnr
 from sigmasplat.plugins.evaluation.metrics.views import scored_view
 from sigmasplat.render import render
-from sigmasplat.render.reference.view import ReferenceView
+from sigmasplat.render.reference import ReferenceView
 from sigmasplat.types import Matrix
 
 GAINS = (1.0, 0.7, 1.2, 0.8, 1.15, 0.9)

@@ -16,7 +16,7 @@ from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.frame import Frame
 from sigmasplat.errors import ConfigError
-from sigmasplat.fit.gray import gray_of
+from sigmasplat.fit.target import gray_of
 from sigmasplat.plugins.sources.synthetic import SyntheticRoom
 from sigmasplat.tracking.features import (
     Features,

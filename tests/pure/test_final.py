@@ -23,7 +23,7 @@ from sigmasplat.final.fusion import FusionView, count_keyframes, fuse, fusion_vi
 from sigmasplat.final.refinement import KeyframeReader, refine
 from sigmasplat.fit.adam import ATTRIBUTE_RATES
 from sigmasplat.mapping.densify import largest_weights, prune_by_weight
-from sigmasplat.render.reference.view import ReferenceView
+from sigmasplat.render.reference import ReferenceView
 from two_submaps import (
     ANCHORS,
     CAMERA,

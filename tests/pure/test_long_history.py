@@ -11,9 +11,8 @@ import torch
 
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
-from sigmasplat.data.column import Column
 from sigmasplat.data.field import GaussianField
-from sigmasplat.data.poses import KeyframePoses, Place, Poses
+from sigmasplat.data.poses import Column, KeyframePoses, Place, Poses
 from sigmasplat.data.relative_pose import UNKNOWN_HOP, Edges, Kind, RelativePose
 from sigmasplat.data.submap import MemoryStore, Submap
 from sigmasplat.errors import RunError

@@ -10,7 +10,7 @@ from paper_settings import RenderConfig
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
 from sigmasplat.render import FieldRenderer, render
-from sigmasplat.render.low_pass import as_refined
+from sigmasplat.render.render import as_refined
 
 SMALL = Camera(32, 24, 30.0, 30.0, 16.0, 12.0)
 OPTIONS = RenderConfig()

@@ -14,7 +14,7 @@ from sigmasplat.data.field import COLUMNS
 from sigmasplat.data.frame import Frame
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.mapping.mapper import Mapper
-from sigmasplat.render.reference.view import ReferenceView
+from sigmasplat.render.reference import ReferenceView
 from sigmasplat.types import completed, never
 
 CAMERA = Camera(16, 12, 15.0, 15.0, 7.5, 5.5)

@@ -19,7 +19,7 @@ from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.mapping import mapper as mapper_module
 from sigmasplat.mapping.mapper import Mapper
 from sigmasplat.mapping.window import draw_keyframes
-from sigmasplat.render.reference.view import ReferenceView
+from sigmasplat.render.reference import ReferenceView
 
 CAMERA = Camera(24, 18, 22.0, 22.0, 11.5, 8.5)
 SEEDS = SeedConfig(

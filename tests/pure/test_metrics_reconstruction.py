@@ -5,7 +5,7 @@ import pytest
 
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
-from sigmasplat.data.mesh import Mesh
+from sigmasplat.data.mesh import Mesh, mesh_depth
 from sigmasplat.plugins.evaluation.metrics.reconstruction import (
     MeshScores,
     distances,
@@ -14,7 +14,6 @@ from sigmasplat.plugins.evaluation.metrics.reconstruction import (
     score,
     visible_points,
 )
-from sigmasplat.render.mesh import mesh_depth
 
 CAMERA = Camera(80, 60, 60.0, 60.0, 39.5, 29.5)
 EMPTY = Mesh(np.empty((0, 3), np.float32), np.empty((0, 3), np.int32))

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from paper_settings import TrackingConfig
 from sigmasplat.data import se3
-from sigmasplat.fit.motion import AxisAngle, Parametrisation, QuaternionMotion, parametrisation
+from sigmasplat.fit.descent import AxisAngle, Parametrisation, QuaternionMotion, parametrisation
 
 Array = NDArray[np.float64]
 AXES = np.array([[0.6, -0.48, 0.64], [1.0, 0.0, 0.0], [0.0, 0.6, -0.8]])

@@ -17,9 +17,9 @@ from sigmasplat.data.frame import Frame
 from sigmasplat.fit.field import fit_field
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.mapping.densify import depths, fade, splat_uncertainty, still_uncertain
+from sigmasplat.render import reference
 from sigmasplat.render.backend import make_view
-from sigmasplat.render.channels import features_of
-from sigmasplat.render.reference import operators as reference
+from sigmasplat.render.projection import features_of
 from sigmasplat.render.render import render
 from sigmasplat.render.view import View
 

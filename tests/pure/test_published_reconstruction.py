@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
-from sigmasplat.data.mesh import Mesh
+from sigmasplat.data.mesh import Mesh, mesh_depth
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.plugins.evaluation.metrics.published_reconstruction import (
     aligned_by_icp,
@@ -17,7 +17,6 @@ from sigmasplat.plugins.evaluation.metrics.published_reconstruction import (
     random_views,
     score_published,
 )
-from sigmasplat.render.mesh import mesh_depth
 
 SMALL = Camera(36, 30, 20.0, 20.0, 17.5, 14.5)
 TURN = se3.exp(np.array([0.4, -0.2, 0.3, 0.3, 0.5, -0.2]))

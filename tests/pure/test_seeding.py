@@ -16,7 +16,7 @@ from sigmasplat.data.frame import Frame
 from sigmasplat.fit.target import Target
 from sigmasplat.fit.tracking_loss import PoseMaps
 from sigmasplat.mapping.seeding import first_pixels, later_pixels, make_splats, thin_out
-from sigmasplat.render.reference.operators import rotations
+from sigmasplat.render.reference import rotations
 
 Array = NDArray[np.float32]
 Mask = NDArray[np.bool_]

@@ -15,10 +15,10 @@ from sigmasplat.config.find_preset import preset
 from sigmasplat.config.scale import for_scene
 from sigmasplat.config.sensors import SENSORS, SensorModel, sensor_model
 from sigmasplat.data.camera import Camera
-from sigmasplat.data.depth_std import alignment_std, generic_std, modelled_std, relative_weights
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.frame_arrays import frame_from_arrays
+from sigmasplat.data.images import alignment_std, generic_std, modelled_std, relative_weights
 from sigmasplat.data.submap import Picture
 from sigmasplat.errors import ConfigError, SourceError
 from sigmasplat.fit.align import align, balanced

@@ -10,7 +10,7 @@ from bag_recordings import CAMERA_TOPICS, FOCAL, Recorder, aligned, compressed_d
 from recordings import FRAMES, Scene, encoded, scene
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
-from sigmasplat.data.resizing import resized_color
+from sigmasplat.data.images import resized_color
 from sigmasplat.errors import SourceError
 from sigmasplat.input.rectification import DepthRegistration, Undistortion, distort
 from sigmasplat.plugins.sources import open_source

@@ -2,15 +2,14 @@
 
 import pytest
 
-from sigmasplat.data import stopwatch
-from sigmasplat.data.stopwatch import Stopwatch
+from sigmasplat.types import Stopwatch
 
 
 @pytest.fixture
 def watch(monkeypatch: pytest.MonkeyPatch) -> Stopwatch:
     """A stopwatch whose clock advances by one second each time it is read."""
     seconds = iter(range(100))
-    monkeypatch.setattr(stopwatch.time, "perf_counter", lambda: float(next(seconds)))
+    monkeypatch.setattr("time.perf_counter", lambda: float(next(seconds)))
     return Stopwatch()
 
 

@@ -8,13 +8,12 @@ import pytest
 from box_room import CAMERA, CHEST, HIGH, LOW, PILLAR, cast, pose, seer, splats
 from sigmasplat.config import SurfaceConfig
 from sigmasplat.data import se3
-from sigmasplat.data.mesh import Mesh
+from sigmasplat.data.mesh import Mesh, mesh_depth
 from sigmasplat.data.submap import Picture
 from sigmasplat.errors import ConfigError
 from sigmasplat.final.fusion import FusionView, fuse, with_readings
 from sigmasplat.plugins.outputs.mesh_editing import decimated
 from sigmasplat.plugins.presets.base import BASE
-from sigmasplat.render.mesh import mesh_depth
 
 VOXEL_M = 0.04
 

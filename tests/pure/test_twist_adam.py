@@ -12,7 +12,7 @@ from sigmasplat.data.frame import Frame
 from sigmasplat.fit.adam import BETA1, BETA2, EPSILON, VectorAdam, VectorAmsgrad
 from sigmasplat.fit.field import fit_field
 from sigmasplat.fit.target import Keyframe, Target
-from sigmasplat.render.reference.view import ReferenceView
+from sigmasplat.render.reference import ReferenceView
 
 Array = NDArray[np.float64]
 RATES = np.repeat([2e-3, 5e-3], 3)

@@ -15,7 +15,7 @@ from sigmasplat.data.frame import Frame
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.mapping.window import SCORES, choose_window, covisible_splats, dominating
-from sigmasplat.render.reference.view import ReferenceView
+from sigmasplat.render.reference import ReferenceView
 
 Array = NDArray[np.float64]
 CAMERA = Camera(48, 36, 40.0, 42.0, 22.6, 18.3)
@@ -186,7 +186,7 @@ def test_splats_that_dominate_are_named_by_their_ids() -> None:
 
 def test_padding_is_not_seen() -> None:
     pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built")
-    from sigmasplat.render.cpu.view import CpuView
+    from sigmasplat.render.cpu import CpuView
 
     wide = Camera(40, 30, 40.0, 42.0, 22.6, 18.3)
     random = np.random.default_rng(0)

@@ -17,8 +17,7 @@ from sigmasplat.commands.run import resume_line
 from sigmasplat.config import Config
 from sigmasplat.config.find_preset import preset
 from sigmasplat.config.text import override
-from sigmasplat.data.column import Column
-from sigmasplat.data.poses import KeyframePoses, Places, Poses
+from sigmasplat.data.poses import Column, KeyframePoses, Places, Poses
 from sigmasplat.data.relative_pose import Edges, TrackedHops
 from sigmasplat.errors import RunError
 from sigmasplat.graph.loops import Loops

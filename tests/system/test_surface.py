@@ -286,7 +286,7 @@ def test_the_command_makes_a_mesh_of_a_real_run(tmp_path: Path, capsys: pytest.C
 
 def test_the_triangles_of_the_room_match_its_depth() -> None:
     """Every depth of a noiseless frame is on the true surface, and no part of the surface is in front of it."""
-    from sigmasplat.render.mesh import mesh_depth
+    from sigmasplat.data.mesh import mesh_depth
 
     room = SyntheticRoom(frames=40, width=96, height=72, seed=1)
     surface = room.true_surface()

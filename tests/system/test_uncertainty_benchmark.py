@@ -50,9 +50,8 @@ from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.plugins.evaluation.metrics.trajectory import aligned_poses
 from sigmasplat.plugins.evaluation.metrics.uncertainty import sparsification
 from sigmasplat.plugins.sources import open_source
-from sigmasplat.render import FieldRenderer
+from sigmasplat.render import FieldRenderer, reference
 from sigmasplat.render.backend import make_view
-from sigmasplat.render.reference import operators as reference
 from small_room import frame_at, walk
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")

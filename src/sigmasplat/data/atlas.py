@@ -7,9 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.data import se3
-from sigmasplat.data.column import Column
-from sigmasplat.data.exposure import between
-from sigmasplat.data.poses import KeyframePoses, Place, Places, Poses
+from sigmasplat.data.camera import between
+from sigmasplat.data.poses import Column, KeyframePoses, Place, Places, Poses
 from sigmasplat.data.relative_pose import UNKNOWN_HOP, RelativePose, TrackedHops
 from sigmasplat.types import Matrix
 

@@ -11,7 +11,7 @@ from PIL import Image
 
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
-from sigmasplat.data.resizing import interpolated_depth, resized_color, resized_depth, resized_std, within
+from sigmasplat.data.images import interpolated_depth, resized_color, resized_depth, resized_std, within
 from sigmasplat.errors import SourceError
 from sigmasplat.types import Matrix
 

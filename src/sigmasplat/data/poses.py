@@ -1,14 +1,171 @@
-"""Poses in columns: of submaps, of their keyframes, and the places of frames relative to keyframes."""
+"""Values of all frames or keyframes in one array, because a list of objects takes several times the memory: poses of
+submaps and of their keyframes, places of frames relative to keyframes.
+"""
 
-from collections.abc import Iterable, Sequence
+import mmap
+import os
+from abc import abstractmethod
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, NamedTuple, overload
+from pathlib import Path
+from tempfile import TemporaryFile
+from typing import Any, ClassVar, Generic, NamedTuple, TypeVar, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.data.column import Column, Records
 from sigmasplat.types import Matrix
+
+STEP_BYTES = 2**20
+"""The file grows by this much, or by an eighth."""
+
+
+class DiskMemory:
+    """Growing memory in an unnamed file of a folder.
+
+    The file has no name, so it is gone when the process ends, however it ends: nothing can be left over, and nothing is
+    read from it later. Raises OSError if the file cannot be made.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        existing = next(path for path in (folder, *folder.absolute().parents) if path.is_dir())
+        self._file = TemporaryFile(dir=existing, buffering=0)  # noqa: SIM115 - it lives as long as this object
+        self._map: mmap.mmap | None = None
+        self.size = 0
+
+    def grown(self, size: int) -> mmap.mmap:
+        """Return the memory with at least so many bytes; its content is kept, and earlier maps of it stay valid.
+
+        Raises OSError if the disk is full: space is reserved here, because a disk that is full when memory is written
+        would end the process.
+        """
+        steps = -(-max(size, self.size + self.size // 8) // STEP_BYTES)
+        reserve = getattr(os, "posix_fallocate", None)
+        if reserve is None:
+            raise OSError("this system cannot reserve space in a file")
+        reserve(self._file.fileno(), 0, steps * STEP_BYTES)
+        self.size = steps * STEP_BYTES
+        self._map = mmap.mmap(self._file.fileno(), self.size)
+        return self._map
+
+    def release(self) -> None:
+        """Give the RAM back to the system; the content is read from the file when it is next used."""
+        if self._map is not None:
+            with suppress(OSError):
+                self._map.madvise(mmap.MADV_DONTNEED)
+
+
+Record = TypeVar("Record")
+GROWTH = 1.25
+"""Factor by which the space grows when it is full."""
+FEWEST = 64
+LEAST_ON_DISK = 2**18
+"""A column with fewer bytes stays in RAM."""
+
+
+@dataclass(eq=False)
+class Column:
+    """One value per frame, keyframe or submap, a number or an array, appended one by one.
+
+    values [space, …]: the first `count` are used. Raises ValueError if `values` has fewer. folder: where a long column
+    may move to a file without a name, so that RAM does not grow with it; None = it stays in RAM.
+    """
+
+    values: NDArray[Any] = field(default_factory=lambda: np.zeros(0))
+    count: int = 0
+    folder: Path | None = field(default=None, init=False)
+    _disk: DiskMemory | None = field(default=None, init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.count <= len(self.values):
+            raise ValueError(f"a column of {len(self.values)} values cannot hold {self.count}")
+
+    @staticmethod
+    def of(dtype: Any, *shape: int) -> "Column":
+        """Return an empty column of values with a type and a shape."""
+        return Column(np.zeros((0, *shape), dtype))
+
+    def __len__(self) -> int:
+        return self.count
+
+    @property
+    def used(self) -> NDArray[Any]:
+        """Return a view of the values [count, …]."""
+        return self.values[: self.count]
+
+    def append(self, value: Any) -> None:
+        """Append a value. Arrays that `used` returned before stay as they were."""
+        if self.count == len(self.values):
+            self._reserve(self.count + 1)
+        self.values[self.count] = value
+        self.count += 1
+
+    def extend(self, values: NDArray[Any]) -> None:
+        """Append values [n, …]."""
+        end = self.count + len(values)
+        if end > len(self.values):
+            self._reserve(end)
+        self.values[self.count : end] = values
+        self.count = end
+
+    def release(self) -> None:
+        """Give the RAM of a column on disk back to the system, after much of it was read."""
+        if self._disk is not None:
+            self._disk.release()
+
+    def _reserve(self, least: int) -> None:
+        """Make space for at least so many values: on disk for a long column that may move there, if there is room."""
+        row_bytes = self.values.itemsize * int(np.prod(self.values.shape[1:]))
+        if self.folder is not None and least * row_bytes > LEAST_ON_DISK:
+            try:
+                self._move(least, row_bytes, self.folder)
+                return
+            except OSError:  # no space left, or a file system that cannot do this
+                self.folder = self._disk = None
+        space = max(FEWEST, least, int(GROWTH * self.count) + 1)
+        grown = np.zeros((space, *self.values.shape[1:]), self.values.dtype)
+        grown[: self.count] = self.used
+        self.values = grown
+
+    def _move(self, least: int, row_bytes: int, folder: Path) -> None:
+        """Reserve space in the file; values in RAM are copied to it the first time."""
+        before, disk = (None if self._disk else self.used), self._disk or DiskMemory(folder)
+        memory = disk.grown(least * row_bytes)
+        space = disk.size // row_bytes
+        flat = np.frombuffer(memory, self.values.dtype, space * (row_bytes // self.values.itemsize))
+        self.values, self._disk = flat.reshape(space, *self.values.shape[1:]), disk
+        if before is not None:
+            self.values[: self.count] = before
+
+    def first(self, count: int) -> "Column":
+        """Return the first values, in the same memory."""
+        return Column(self.values[: min(count, self.count)], min(count, self.count))
+
+
+@dataclass(eq=False)
+class Records(Sequence[Record], Generic[Record]):
+    """A sequence of records that are made from the rows of a column on reading."""
+
+    rows: Column
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __iter__(self) -> Iterator[Record]:
+        return (self._record(i) for i in range(len(self)))
+
+    @overload
+    def __getitem__(self, i: int) -> Record: ...
+    @overload
+    def __getitem__(self, i: slice) -> list[Record]: ...
+    def __getitem__(self, i: int | slice) -> Record | list[Record]:
+        known = range(len(self))
+        return [self._record(k) for k in known[i]] if isinstance(i, slice) else self._record(known[i])
+
+    @abstractmethod
+    def _record(self, i: int) -> Record:
+        """Return a record by its number, which exists."""
 
 
 def _of_poses() -> Column:

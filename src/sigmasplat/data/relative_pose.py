@@ -7,7 +7,7 @@ from typing import ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.data.column import Column, Records
+from sigmasplat.data.poses import Column, Records
 from sigmasplat.types import Matrix
 
 Kind = Literal["hop", "odometry", "loop", "relocalisation", "join"]

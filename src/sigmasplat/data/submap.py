@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.data import se3
-from sigmasplat.data.camera import Camera
-from sigmasplat.data.exposure import between, unexposed
+from sigmasplat.data.camera import Camera, between, unexposed
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.frame import Detail, Photo
 from sigmasplat.errors import SigmaSplatError
@@ -112,67 +111,71 @@ class MemoryStore:
         self.probes.append(list(probes))
 
     def load(self, index: int) -> Submap:
-        """Return a submap."""
         return self.submaps[index]
 
     def picture(self, index: int, keyframe: int) -> Picture:
-        """Return the images of one keyframe of a submap."""
         return self.pictures[index][keyframe]
 
     def probe(self, index: int, probe: int) -> Picture:
-        """Return the images of one probe view of a submap."""
         return self.probes[index][probe]
 
 
 @dataclass(frozen=True, eq=False)
-class StorePart:
-    """Some submaps of a store, numbered from 0 in the order of `members`. It can only be read."""
+class ReadOnlyStore:
+    """The submaps of a store, which can only be read. Subclasses change what is read."""
 
     store: SubmapStore
-    members: Sequence[int]
-
-    def __len__(self) -> int:
-        return len(self.members)
-
-    def save(self, submap: Submap, pictures: list[Picture], probes: Sequence[Picture] = ()) -> None:
-        """Raise SigmaSplatError: a part cannot grow."""
-        raise SigmaSplatError(f"submap {submap.index} cannot be saved in a part of a store; save it in the whole store")
-
-    def load(self, index: int) -> Submap:
-        """Return a submap."""
-        return self.store.load(self.members[index])
-
-    def picture(self, index: int, keyframe: int) -> Picture:
-        """Return the images of one keyframe of a submap."""
-        return self.store.picture(self.members[index], keyframe)
-
-    def probe(self, index: int, probe: int) -> Picture:
-        """Return the images of one probe view of a submap."""
-        return self.store.probe(self.members[index], probe)
-
-
-@dataclass(frozen=True, eq=False)
-class RefinedStore:
-    """The submaps of a store as the final map sees them: with the poses of their keyframes that its refinement has
-    moved, and with images in the exposure of the map. Probe views follow their keyframe. It can only be read.
-
-    keyframe_poses: T_submap_camera [4, 4] of each submap's keyframes, None: not moved. The splats of the submaps fit
-    the old poses. exposures: [K, 3, 2] of each submap's keyframes (`model.exposure`), None: not fitted.
-    """
-
-    store: SubmapStore
-    keyframe_poses: Sequence[Sequence[Matrix]] | None = None
-    exposures: Sequence[Matrix] | None = None
 
     def __len__(self) -> int:
         return len(self.store)
 
     def save(self, submap: Submap, pictures: list[Picture], probes: Sequence[Picture] = ()) -> None:
-        """Raise SigmaSplatError: the final map is complete."""
-        raise SigmaSplatError(f"submap {submap.index} cannot be saved after the final map is made")
+        """Raise SigmaSplatError."""
+        raise SigmaSplatError(f"submap {submap.index} cannot be saved in a store that is only read")
 
     def load(self, index: int) -> Submap:
-        """Return a submap with the moved poses."""
+        return self.store.load(index)
+
+    def picture(self, index: int, keyframe: int) -> Picture:
+        return self.store.picture(index, keyframe)
+
+    def probe(self, index: int, probe: int) -> Picture:
+        return self.store.probe(index, probe)
+
+
+@dataclass(frozen=True, eq=False)
+class StorePart(ReadOnlyStore):
+    """Some submaps of a store, numbered from 0 in the order of `members`."""
+
+    members: Sequence[int]
+
+    def __len__(self) -> int:
+        return len(self.members)
+
+    def load(self, index: int) -> Submap:
+        return self.store.load(self.members[index])
+
+    def picture(self, index: int, keyframe: int) -> Picture:
+        return self.store.picture(self.members[index], keyframe)
+
+    def probe(self, index: int, probe: int) -> Picture:
+        return self.store.probe(self.members[index], probe)
+
+
+@dataclass(frozen=True, eq=False)
+class RefinedStore(ReadOnlyStore):
+    """The submaps of a store as the final map sees them: with the poses of their keyframes that its refinement has
+    moved, and with images in the exposure of the map. Probe views follow their keyframe; their
+    exposure is interpolated between those of keyframes.
+
+    keyframe_poses: T_submap_camera [4, 4] of each submap's keyframes, None: not moved. The splats of the submaps fit
+    the old poses. exposures: [K, 3, 2] of each submap's keyframes (`model.exposure`), None: not fitted.
+    """
+
+    keyframe_poses: Sequence[Sequence[Matrix]] | None = None
+    exposures: Sequence[Matrix] | None = None
+
+    def load(self, index: int) -> Submap:
         submap = self.store.load(index)
         if self.keyframe_poses is None:
             return submap
@@ -183,13 +186,10 @@ class RefinedStore:
         return replace(submap, T_submap_camera=poses, T_submap_probe=probes)
 
     def picture(self, index: int, keyframe: int) -> Picture:
-        """Return the images of one keyframe of a submap, in the exposure of the map."""
         picture = self.store.picture(index, keyframe)
         return picture if self.exposures is None else picture.without_exposure(self.exposures[index][keyframe])
 
     def probe(self, index: int, probe: int) -> Picture:
-        """Return the images of one probe view of a submap, in the exposure of the map: its exposure is interpolated
-        between those of keyframes."""
         picture = self.store.probe(index, probe)
         if self.exposures is None:
             return picture

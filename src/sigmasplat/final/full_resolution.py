@@ -8,15 +8,14 @@ from functools import lru_cache
 import numpy as np
 
 from sigmasplat.config import Config, FinalConfig, MappingConfig
-from sigmasplat.data.camera import Camera
-from sigmasplat.data.exposure import centred
+from sigmasplat.data.camera import Camera, centred
 from sigmasplat.data.field import GaussianField
 from sigmasplat.final.refinement import Clock, KeyframeReader, SavedRefinement, refinement
 from sigmasplat.fit.adam import Rates
 from sigmasplat.fit.field import fit_field
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.render.backend import make_view
-from sigmasplat.render.low_pass import as_refined
+from sigmasplat.render.render import as_refined
 from sigmasplat.render.view import View
 from sigmasplat.types import Progress
 

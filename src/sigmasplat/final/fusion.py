@@ -19,7 +19,7 @@ from sigmasplat.data.field import GaussianField
 from sigmasplat.data.mesh import Mesh
 from sigmasplat.data.submap import Picture, SubmapStore
 from sigmasplat.data.tsdf import Tsdf, extract_surface
-from sigmasplat.fit.confidence import uncertainty_weights
+from sigmasplat.fit.tracking_loss import uncertainty_weights
 from sigmasplat.render import FieldRenderer, Render
 from sigmasplat.types import Matrix, Progress, no_progress
 

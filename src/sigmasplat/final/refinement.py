@@ -12,14 +12,14 @@ import torch
 
 from sigmasplat.config import Config, FinalConfig, MappingConfig
 from sigmasplat.data import se3
-from sigmasplat.data.depth_std import std_by_model
-from sigmasplat.data.exposure import NEUTRAL, centred
+from sigmasplat.data.camera import NEUTRAL, centred
 from sigmasplat.data.field import COLUMNS, GaussianField
+from sigmasplat.data.images import std_by_model
 from sigmasplat.data.submap import SubmapStore
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.fit.adam import BETA2, Rates, VectorAdam
-from sigmasplat.fit.exposure import fit_exposure
 from sigmasplat.fit.field import fit_field
+from sigmasplat.fit.pose import fit_exposure
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.mapping.densify import prune_by_weight
 from sigmasplat.render.view import View

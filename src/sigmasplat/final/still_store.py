@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from sigmasplat.config import MovingConfig
 from sigmasplat.data import se3
 from sigmasplat.data.field import GaussianField
-from sigmasplat.data.submap import KeyframeId, Picture, Submap, SubmapStore
+from sigmasplat.data.submap import KeyframeId, Picture, ReadOnlyStore, SubmapStore
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.mapping.moving import carve_everywhere, contradicted
 from sigmasplat.types import Matrix
@@ -22,37 +22,20 @@ TURN_M = 1.0
 
 
 @dataclass(frozen=True, eq=False)
-class StillStore:
-    """A store whose keyframes have no depth where something moved. It can only be read.
+class StillStore(ReadOnlyStore):
+    """A store whose keyframes have no depth where something moved.
 
     hidden: the pixels [H, W] of each keyframe that are masked, packed into bits, by submap and keyframe.
     """
 
-    store: SubmapStore
     hidden: dict[KeyframeId, NDArray[np.uint8]] = dataclass_field(default_factory=dict)
 
-    def __len__(self) -> int:
-        return len(self.store)
-
-    def save(self, submap: Submap, pictures: list[Picture], probes: Sequence[Picture] = ()) -> None:
-        """Save in the store itself."""
-        self.store.save(submap, pictures, probes)
-
-    def load(self, index: int) -> Submap:
-        """Return a submap."""
-        return self.store.load(index)
-
     def picture(self, index: int, keyframe: int) -> Picture:
-        """Return the images of one keyframe of a submap, without depth where something moved."""
         picture, bits = self.store.picture(index, keyframe), self.hidden.get((index, keyframe))
         if bits is None:
             return picture
         hidden = np.unpackbits(bits, count=picture.depth_m.size).reshape(picture.depth_m.shape).astype(bool)
         return replace(picture, depth_m=np.where(hidden, np.float32(0.0), picture.depth_m))
-
-    def probe(self, index: int, probe: int) -> Picture:
-        """Return the images of one probe view of a submap."""
-        return self.store.probe(index, probe)
 
     def hide(self, place: KeyframeId, pixels: NDArray[np.bool_]) -> None:
         """Mask more pixels [H, W] of a keyframe."""

@@ -18,9 +18,8 @@ from sigmasplat.final.refinement import KeyframeReader
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.render.view import View
 from sigmasplat.types import Matrix, Progress, no_progress
-from sigmasplat.uncertainty.calibration import fit_weights, splat_std
+from sigmasplat.uncertainty.calibration import background_of, fit_weights, splat_residuals, splat_std, squared_errors
 from sigmasplat.uncertainty.predictive import COVERED, variance_parts
-from sigmasplat.uncertainty.splat_residuals import background_of, splat_residuals, squared_errors
 
 PIXELS = 4000
 """About this many pixels of a probe view, every k-th one, calibrate the weights."""

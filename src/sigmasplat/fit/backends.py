@@ -9,33 +9,19 @@ from typing import Protocol
 import numpy as np
 from torch import Tensor
 
-from sigmasplat.fit import adam, tracking_loss
-from sigmasplat.fit.cpu import adam as cpu_adam, images as cpu_images, tracking_loss as cpu_tracking_loss
-from sigmasplat.fit.cpu.mapping_step import CompiledStep
-from sigmasplat.fit.cpu.reference_maps import reference_maps as cpu_reference_maps
-from sigmasplat.fit.cpu.view_dependent import CompiledViewDependentStep
+from sigmasplat.fit import adam, cpu, tracking_loss
 from sigmasplat.fit.descent import descend
-from sigmasplat.fit.fused_terms import fused_terms
 from sigmasplat.fit.interface import DeviceFits, MappingStep, Twist, Weights
-from sigmasplat.fit.mapping_step import OwnTermsStep, TorchStep
-from sigmasplat.fit.reference_maps import reference_arrays
-from sigmasplat.fit.view_dependent import ImageStep, ViewDependentStep
+from sigmasplat.fit.losses import FUSED_TERMS
+from sigmasplat.fit.mapping_step import OwnTermsStep, TorchStep, ViewDependentStep
+from sigmasplat.fit.tracking_loss import reference_arrays
 from sigmasplat.registry import Backend, named
-from sigmasplat.render.cpu.view import CpuView
 from sigmasplat.render.view import View
 from sigmasplat.types import Matrix
 
 
 def _on_host(twists: Sequence[Twist], costs: Sequence[float | Tensor]) -> tuple[list[Matrix], list[float]]:
     return [np.asarray(twist) for twist in twists], [float(cost) for cost in costs]
-
-
-def _cpu_view_dependent_step(base: ImageStep, degree: int) -> MappingStep:
-    """Return the fused step, or the one in torch for views that the kernels do not render (full colour covariance)."""
-    view = base.view
-    return (
-        CompiledViewDependentStep(base, view, degree) if isinstance(view, CpuView) else ViewDependentStep(base, degree)
-    )
 
 
 TORCH = DeviceFits(
@@ -46,18 +32,18 @@ TORCH = DeviceFits(
     tracking_loss=tracking_loss.tracking_gradient,
     descend=descend,
     reference_maps=reference_arrays,
-    live_planes=cpu_images.live_planes,
-    images=cpu_images.CPU_IMAGES,
+    live_planes=cpu.live_planes,
+    images=cpu.CPU_IMAGES,
     aligns=False,
 )
 CPU = replace(
     TORCH,
-    mapping_step=CompiledStep,
-    view_dependent_step=_cpu_view_dependent_step,
-    settle=cpu_adam.settle,
-    tracking_loss=cpu_tracking_loss.tracking_gradient,
-    descend=partial(descend, tracking_loss=cpu_tracking_loss.tracking_gradient),
-    reference_maps=cpu_reference_maps,
+    mapping_step=cpu.CompiledStep,
+    view_dependent_step=cpu.CompiledViewDependentStep,
+    settle=cpu.settle,
+    tracking_loss=cpu.tracking_gradient,
+    descend=partial(descend, tracking_loss=cpu.tracking_gradient),
+    reference_maps=cpu.reference_maps,
     aligns=True,
 )
 OWN = {"reference": TORCH, "cpu": CPU}
@@ -90,7 +76,7 @@ def step_for(view: View, weights: Weights, degree: int) -> MappingStep:
     fits = fits_of(view)
     step = fits.mapping_step(view)
     used = frozenset(name for name, weight in weights.items() if weight)
-    own = used - fused_terms(view.backend)
+    own = used - FUSED_TERMS
     if own and fits is not TORCH:
         step = OwnTermsStep(step, own)
     return fits.view_dependent_step(step, degree) if degree else step

@@ -5,20 +5,41 @@ from dataclasses import dataclass, field as dataclass_field
 from itertools import repeat
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from sigmasplat.config import MappingConfig
 from sigmasplat.data import se3
 from sigmasplat.data.field import COLUMNS, GaussianField
-from sigmasplat.data.stopwatch import Stopwatch
 from sigmasplat.errors import BackendError
 from sigmasplat.fit import losses
 from sigmasplat.fit.adam import Rates, settle
 from sigmasplat.fit.backends import fits_of, step_for
-from sigmasplat.fit.interface import FitStats, Twist
+from sigmasplat.fit.interface import Twist
 from sigmasplat.fit.target import Keyframe
 from sigmasplat.render.view import View
-from sigmasplat.types import Matrix, Task, completed
+from sigmasplat.types import Matrix, Stopwatch, Task, completed
+
+
+@dataclass(eq=False)
+class DensifyStats:
+    """Gradient of one keyframe's loss with respect to the image means of N splats (3DGS): the sum of its norms over
+    steps [N], and the number of steps in which each splat was visible [N]. Invalid after rows are removed or added."""
+
+    keyframe: Keyframe
+    grad2d: Tensor
+    times: Tensor
+
+    @staticmethod
+    def of(keyframe: Keyframe, n: int, device: torch.device | None = None) -> "DensifyStats":
+        """Make statistics of n splats, all 0, on a device (default: host memory)."""
+        return DensifyStats(keyframe, torch.zeros(n, device=device), torch.zeros(n, device=device))
+
+    def on_gradient(self, keyframe: Keyframe, grad2d: Tensor) -> None:
+        """Add the norms [N] of one step, 0 for an invisible splat. Norms of other keyframes are ignored."""
+        if keyframe is self.keyframe:
+            self.grad2d += grad2d
+            self.times += grad2d > 0
 
 
 @dataclass
@@ -69,7 +90,7 @@ def fit_field(
     schedule: Iterable[Rates] | None = None,
     frozen_colors: int = 0,
     degree: int = 0,
-    stats: FitStats | None = None,
+    stats: DensifyStats | None = None,
 ) -> FieldFit:
     """Take one Adam step on the field for each batch of keyframes, in the given order, with the mean loss of the batch.
 
@@ -96,7 +117,7 @@ def fitting(
     schedule: Iterable[Rates] | None = None,
     frozen_colors: int = 0,
     degree: int = 0,
-    stats: FitStats | None = None,
+    stats: DensifyStats | None = None,
 ) -> Task[FieldFit]:
     """Fit as `fit_field` does, in slices of one step."""
     if field.params.device != view.sums.device:
@@ -128,7 +149,7 @@ class _Steps:
         weights: dict[str, float],
         frozen_colors: int,
         degree: int,
-        stats: FitStats | None,
+        stats: DensifyStats | None,
     ) -> None:
         self.field, self.weights, self.frozen_colors, self.stats = field, weights, frozen_colors, stats
         field.moment1[:frozen_colors, COLUMNS["colors"]] = 0.0  # otherwise Adam would keep moving them

@@ -11,9 +11,8 @@ from torch import Tensor
 
 from sigmasplat.config import TrackingConfig
 from sigmasplat.data.field import GaussianField, Rows
-from sigmasplat.errors import ConfigError
 from sigmasplat.fit.adam import Rates
-from sigmasplat.fit.target import Keyframe, Target
+from sigmasplat.fit.target import Target
 from sigmasplat.render.view import View
 from sigmasplat.types import Matrix
 
@@ -40,14 +39,6 @@ class Accumulator(Protocol):
     def step(self, field: GaussianField, rates: Rates, weights: Weights, frozen_colors: int) -> float | Tensor:
         """Add the gradient of the shape terms and take Adam's step. Return the cost of the shape terms."""
         ...
-
-
-class FitStats(Protocol):
-    """Statistics of a fit, such as `DensifyStats`."""
-
-    def on_gradient(self, keyframe: Keyframe, grad2d: Tensor) -> None:
-        """Receive the norm of the gradient with respect to each splat's image mean [N], of one keyframe in one step.
-        The tensor is reused in the next step."""
 
 
 class MappingStep(Protocol):
@@ -79,11 +70,6 @@ class MappingStep(Protocol):
     def accumulator(self, field: GaussianField) -> Accumulator:
         """Allocate the gradient sum of several images. Raises ConfigError if the step takes one image only."""
         ...
-
-
-def one_image_only() -> ConfigError:
-    """Return the error of steps that cannot sum several images."""
-    return ConfigError("mapping.frames_per_step must be 1 with view-dependent colour")
 
 
 # ---- tracking ----
@@ -195,7 +181,7 @@ class DeviceFits:
     backend."""
 
     mapping_step: Callable[[Any], MappingStep]
-    """Make the mapping step of a view; it computes the terms that fit/fused_terms.py lists for its backend."""
+    """Make the mapping step of a view; it computes `fit.losses.FUSED_TERMS`."""
     view_dependent_step: Callable[[Any, int], MappingStep]
     """Make the step of view-dependent colour up to a degree, from the mapping step."""
     settle: Callable[[Rows, Rates], None]
@@ -207,11 +193,10 @@ class DeviceFits:
     descend: Callable[[Tensor, Any, Target, Matrix, TrackingConfig, int], Descent]
     """Minimise the tracking loss (`fit.descent.descend`)."""
     reference_maps: Callable[[Any, TrackingConfig, Tensor | None], ReferenceMaps]
-    """Make the reference maps of alignment from a view (`fit.reference_maps.reference_maps`)."""
+    """Make the reference maps of alignment from a view (`fit.tracking_loss.reference_maps`)."""
     live_planes: Callable[[View, Plane, Plane, Target], tuple[Plane, Plane]]
     """Return gray and depth of a frame (colour [H, W, 3], depth [H, W] m, its target) on the device that aligns
     them."""
     images: ImageKernels
     aligns: bool
-    """Whether images may be aligned even if the settings do not ask for it. Plain torch also runs without compiled
-    kernels, which alignment needs."""
+    """Whether images are aligned even if the settings do not ask for it: plain torch fits by its definitions alone."""

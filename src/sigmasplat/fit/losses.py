@@ -14,9 +14,11 @@ images. Without valid pixels a term is 0 with zero gradient, never NaN.
 """
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import conv2d
 
@@ -181,3 +183,25 @@ def median_depth(depth: Tensor, median_depth: Tensor, valid: Tensor) -> Tensor:
     The median is the depth of the splat at which half of the light is absorbed. Both depths get a gradient.
     """
     return masked((depth - median_depth).abs(), valid & (median_depth > 0)).sum() / valid.sum().clamp(min=1)
+
+
+PIXEL_TERMS = ("l1", "depth", "nll_color", "nll_depth", "median_depth", "moment", "mean_depth")
+"""Terms per pixel that the compiled kernels compute, in the order of `LossWeights` (native/kernels.h,
+native/cuda/fit.cu)."""
+SHAPE_TERMS = ("isotropy", "isotropy_ratio")
+"""Those of the splats instead of an image, in the order of `StepOptions` (native/kernels.h)."""
+FUSED_TERMS = frozenset((*PIXEL_TERMS, "ssim", *SHAPE_TERMS))
+"""All terms of the compiled kernels. The others are computed in torch."""
+VARIANCE_TERMS = ("nll_color", "nll_depth")
+"""Terms that need the variance planes."""
+
+
+def kernel_weights(terms: Sequence[str], weights: Mapping[str, float]) -> NDArray[np.float64]:
+    """Return the weights of some terms as the array that the kernels take."""
+    return np.array([weights.get(name, 0.0) for name in terms])
+
+
+def pixel_weights(weights: Mapping[str, float], variance: bool) -> NDArray[np.float64]:
+    """Return the weights of the pixel terms as an array; without variance planes, terms that need them get weight 0."""
+    known = weights if variance else {n: w for n, w in weights.items() if n not in VARIANCE_TERMS}
+    return kernel_weights(PIXEL_TERMS, known)

@@ -1,15 +1,20 @@
-"""One mapping step on a view: compute the gradient of the image terms, propagate it to the splats, take Adam's step."""
+"""One mapping step on a view: compute the gradient of the image terms, propagate it to the splats, take Adam's step;
+the same with view-dependent colours, spherical harmonics (VarSplat §7, refinement).
+"""
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
-from sigmasplat.data.field import COLUMNS, GaussianField
+from sigmasplat.data.field import COLUMNS, GaussianField, Rows
+from sigmasplat.data.harmonics import basis, count, view_colors
+from sigmasplat.errors import ConfigError
 from sigmasplat.fit import losses
-from sigmasplat.fit.adam import Rates, adam_step
-from sigmasplat.fit.fused_terms import SHAPE_TERMS
-from sigmasplat.fit.interface import MappingStep, Weights
+from sigmasplat.fit.adam import ROWS_AT_ONCE, Rates, adam_rows, adam_step
+from sigmasplat.fit.interface import Accumulator, MappingStep, Twist, Weights
+from sigmasplat.fit.losses import SHAPE_TERMS
 from sigmasplat.fit.target import Target
-from sigmasplat.render.channels import variance_of
+from sigmasplat.render.projection import variance_of
 from sigmasplat.render.view import View
 from sigmasplat.types import Matrix
 
@@ -77,15 +82,12 @@ class GradientAccumulator:
         self.visible = torch.zeros(len(field), dtype=torch.bool, device=field.params.device)
 
     def add(self, field: GaussianField, share: float, grad2d: Tensor | None = None) -> Matrix:
-        """Add the view's gradient planes, weighted by their share of the mean. Return the image's own pose twist
-        [6]."""
         twist = self._view.backward(field.params, self._rows, grad2d)
         self.visible |= self._view.visible(len(field))
         self.grad += share * self._rows
         return twist
 
     def step(self, field: GaussianField, rates: Rates, weights: Weights, frozen_colors: int) -> float:
-        """Add the gradient of the shape terms and take Adam's step. Return the cost of the shape terms."""
         scales = COLUMNS["log_scales"]
         of_all = float(self.visible.sum()) / max(len(field), 1)
         on_scales, cost = shape_gradient(field.params[self.visible][:, scales], weights, of_all, 1.0)
@@ -105,11 +107,9 @@ class TorchStep:
         view.g_alpha.zero_()  # only the term of mean depth writes it
 
     def forward(self, field: GaussianField, T_camera_world: Matrix, target: Target, weights: Weights) -> None:
-        """Render the field into the view's planes."""
         render_for(self.view, field.params, T_camera_world, target, weights)
 
-    def images(self, target: Target, weights: Weights) -> float:
-        """Write the gradient of every image term to the view's gradient planes; return the loss."""
+    def images(self, target: Target, weights: Weights) -> float | Tensor:
         loss, gradients = image_gradients(self.view, target, weights)
         for plane, gradient in gradients:
             plane.copy_(gradient)
@@ -117,17 +117,12 @@ class TorchStep:
 
     def splats(
         self, field: GaussianField, rates: Rates, weights: Weights, frozen_colors: int, grad2d: Tensor | None = None
-    ) -> tuple[Matrix, float]:
-        """Propagate the gradient planes to the splats in view, add the gradient of the shape terms, and step.
-
-        Returns the pose twist [6] and the cost of the shape terms. grad2d [N] is filled as by `View.backward`.
-        """
+    ) -> tuple[Twist, float | Tensor]:
         accumulator = self.accumulator(field)
         twist = accumulator.add(field, 1.0, grad2d)
         return twist, accumulator.step(field, rates, weights, frozen_colors)
 
-    def accumulator(self, field: GaussianField) -> GradientAccumulator:
-        """Allocate the gradient sum of several images."""
+    def accumulator(self, field: GaussianField) -> Accumulator:
         return GradientAccumulator(self.view, field)
 
 
@@ -141,9 +136,85 @@ class OwnTermsStep:
         )  # fmt: skip
 
     def images(self, target: Target, weights: Weights) -> float | Tensor:
-        """Write the gradient of every image term to the view's gradient planes; return the loss."""
         fused = self._fused.images(target, {n: w for n, w in weights.items() if n not in self._own})
         own, gradients = image_gradients(self.view, target, {n: w for n, w in weights.items() if n in self._own})
         for plane, gradient in gradients:
             plane.add_(gradient)
         return fused + own
+
+
+COLORS, MEANS, SCALES = (COLUMNS[name] for name in ("colors", "means", "log_scales"))
+
+
+class ViewDependentStep:
+    """One mapping step of a field with view-dependent colours of degree 1 to 3.
+
+    The view renders rows with the colours that this camera sees, and returns the gradient of these rows.
+    """
+
+    def __init__(self, base: MappingStep, degree: int) -> None:
+        self.base, self.view, self.degree = base, base.view, degree
+        self.width = 3 * count(degree)
+        self.rows, self._R, self._position = torch.empty(0), torch.empty(0), torch.empty(0)
+
+    def forward(self, field: GaussianField, T_camera_world: Matrix, target: Target, weights: Weights) -> None:
+        self._R, t = (
+            torch.as_tensor(part).to(field.params) for part in (T_camera_world[:3, :3], T_camera_world[:3, 3])
+        )
+        self._position = -(self._R * t[:, None]).sum(0)
+        self.rows, harmonics = field.params.clone(), field.get_or_create("harmonics").params
+        ahead = field.means @ self._R[2] + t[2] > 0
+        for rows in torch.split(ahead.nonzero().squeeze(1), ROWS_AT_ONCE):
+            own, k = field.params.index_select(0, rows), harmonics.index_select(0, rows)
+            own[:, COLORS] = view_colors(own[:, COLORS], k, own[:, MEANS], self._position, self.degree)
+            self.rows.index_copy_(0, rows, own)
+        render_for(self.view, self.rows, T_camera_world, target, weights)
+
+    def images(self, target: Target, weights: Weights) -> float | Tensor:
+        return self.base.images(target, weights)
+
+    def splats(
+        self, field: GaussianField, rates: Rates, weights: Weights, frozen_colors: int, grad2d: Tensor | None = None
+    ) -> tuple[Twist, float | Tensor]:
+        grad, cost = torch.zeros_like(field.params), 0.0
+        twist = self.view.backward(self.rows, grad, grad2d)
+        harmonics = self._begin(field.get_or_create("harmonics"))
+        harmonic_rates = Rates(rates.of_attribute("harmonics").per_column[: self.width], rates.beta2)
+        visible = self.view.visible(len(field)).nonzero().squeeze(1)
+        for rows in torch.split(visible, ROWS_AT_ONCE):
+            g, own, k = (x.index_select(0, rows) for x in (grad, field.params, harmonics.params))
+            g[rows < frozen_colors, COLORS] = 0.0
+            g_harmonics, g_means = self._through_colors(own, k, g[:, COLORS])
+            g_scales, term = shape_gradient(
+                own[:, SCALES], weights, len(rows) / max(len(field), 1), len(rows) / max(len(visible), 1)
+            )
+            g[:, MEANS] += g_means
+            g[:, SCALES] += g_scales
+            twist[:3] += (self._R @ g_means.sum(0)).cpu().numpy()  # a camera motion ρ acts like a splat motion −ρ
+            cost += term
+            adam_rows(field, rows, g, rates)
+            adam_rows(harmonics, rows, g_harmonics, harmonic_rates)
+        return twist, cost
+
+    def accumulator(self, field: GaussianField) -> Accumulator:
+        """Raise ConfigError: this step takes one image only."""
+        raise ConfigError("mapping.frames_per_step must be 1 with view-dependent colour")
+
+    def _begin(self, harmonics: Rows) -> Rows:
+        """Start a step of the harmonics; return the harmonics of the degrees in use, which share memory with the
+        field's."""
+        harmonics.steps += 1
+        params, moment1, moment2 = (
+            x[:, : self.width] for x in (harmonics.params, harmonics.moment1, harmonics.moment2)
+        )
+        return Rows(params, moment1, moment2, harmonics.last_step, harmonics.steps)
+
+    def _through_colors(self, own: Tensor, harmonics: Tensor, g_shown: Tensor) -> tuple[Tensor, Tensor]:
+        """Propagate the gradient of view-dependent colours [n, 3] to harmonics [n, width] and, by the direction, to
+        means [n, 3]."""
+        means = own[:, MEANS].clone().requires_grad_()
+        values = basis(normalize(means - self._position, dim=1), self.degree)
+        g_harmonics = values.detach()[:, :, None] * g_shown[:, None, :]
+        g_values = (harmonics.reshape(-1, self.width // 3, 3) @ g_shown[:, :, None])[:, :, 0]
+        (g_means,) = torch.autograd.grad(values, means, g_values)
+        return g_harmonics.reshape(-1, self.width), g_means

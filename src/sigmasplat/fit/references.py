@@ -10,14 +10,13 @@ from sigmasplat.config import TrackingConfig
 from sigmasplat.config.sensors import SensorModel
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
-from sigmasplat.data.depth_std import alignment_std, generic_std
+from sigmasplat.data.images import alignment_std, generic_std
 from sigmasplat.data.submap import Picture
 from sigmasplat.fit.backends import fits_of
 from sigmasplat.fit.compare import Comparison, compare
-from sigmasplat.fit.gray import Image
 from sigmasplat.fit.interface import Plane
 from sigmasplat.fit.pyramid import NOISE_PER_M, Pyramid
-from sigmasplat.fit.target import Target
+from sigmasplat.fit.target import Image, Target
 from sigmasplat.render.view import View
 from sigmasplat.types import Matrix
 

@@ -1,19 +1,44 @@
-"""Prepare a frame for a fit: image planes with the same padding as the view's."""
+"""Prepare a frame for a fit: image planes with the same padding as the view's; gray images."""
 
 from dataclasses import dataclass, field as dataclass_field, replace
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.ndimage import sobel
 from torch import Tensor
 
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
-from sigmasplat.data.depth_std import generic_std, relative_weights
 from sigmasplat.data.frame import Detail, Frame, Photo
+from sigmasplat.data.images import generic_std, relative_weights
 from sigmasplat.data.submap import Picture
 from sigmasplat.fit.adam import VectorAdam
-from sigmasplat.native import kernels
+from sigmasplat.native import _core
+
+Image = NDArray[np.float32]
+LUMA = np.array([0.299, 0.587, 0.114], np.float32)
+
+
+def gray_of(color: Image) -> Image:
+    """Return the luma [H, W] of colour [H, W, 3]."""
+    if color.dtype != np.float32 or not color.flags.c_contiguous:
+        return np.asarray(color @ LUMA)
+    gray = np.empty(color.shape[:-1], np.float32)
+    _core.gray(color, LUMA.tolist(), gray)
+    return gray
+
+
+def luma(color: Tensor) -> Tensor:
+    """Return the luma [H, W] of colour planes [3, H, W], on their device."""
+    red, green, blue = map(float, LUMA)
+    gray: Tensor = red * color[0] + green * color[1] + blue * color[2]
+    return gray
+
+
+def gradient_magnitude(gray: Image) -> Image:
+    """Return the Sobel gradient magnitude of gray [H, W]."""
+    return np.hypot(sobel(gray, 0), sobel(gray, 1))
 
 
 @dataclass(eq=False)
@@ -46,21 +71,9 @@ class Target:
     @staticmethod
     def of(frame: Frame, size: tuple[int, int]) -> "Target":
         """Make the target of a frame on planes of `size` = (rows, columns), at least the frame's size."""
-        core = kernels()
-        if core is None:
-            return Target.in_torch(frame, size)
         color, depth = torch.empty(3, *size), torch.empty(size)
-        readings: int = core.image_planes(frame.color, frame.depth_m, color.numpy(), depth.numpy())
+        readings = _core.image_planes(frame.color, frame.depth_m, color.numpy(), depth.numpy())
         return Target(frame.camera, color, depth, readings, padded(frame.depth_std_m, size))
-
-    @staticmethod
-    def in_torch(frame: Frame, size: tuple[int, int]) -> "Target":
-        """Return the target that `of` makes, also where the kernels are not built."""
-        h, w = frame.depth_m.shape
-        color, depth = torch.zeros(3, *size), torch.zeros(size)
-        color[:, :h, :w] = torch.tensor(frame.color).movedim(-1, 0)
-        depth[:h, :w] = torch.tensor(frame.depth_m)
-        return Target(frame.camera, color, depth, int((frame.depth_m > 0).sum()), padded(frame.depth_std_m, size))
 
     @property
     def image(self) -> Tensor:

@@ -1,4 +1,6 @@
-"""The papers' tracking loss: pixel weights, the loss, and its gradient on a view's planes."""
+"""The papers' tracking loss: pixel weights, the loss, and its gradient on a view's planes; reference maps of alignment
+with the same weights.
+"""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -7,10 +9,41 @@ import torch
 from torch import Tensor
 
 from sigmasplat.config import TrackingConfig
-from sigmasplat.fit.confidence import outlier_mask, uncertainty_weights
-from sigmasplat.fit.target import Target
-from sigmasplat.render.channels import variance_of
+from sigmasplat.fit.interface import ReferenceMaps
+from sigmasplat.fit.target import Target, luma
+from sigmasplat.render.projection import variance_of
 from sigmasplat.render.view import View
+
+
+@torch.no_grad()
+def uncertainty_weights(variance: Tensor, mask: Tensor, tau: float, weight_max: float, eps: float = 1e-6) -> Tensor:
+    """Return pixel weights from the certainty of the map's colour (VarSplat §3, w̃), [H, W, 3], without gradient.
+
+    w̃ = clamp(exp(−(log(V+ε) − median)/τ), 1/weight_max, weight_max) per channel. V [H, W, 3] is ≥ 0 up to rounding.
+    The median is that of log(V+ε) over mask [H, W]; for an even count it is the lower of the two middle values. Every
+    pixel gets a weight; the mask only selects the pixels of the median. An empty mask gives weight 1 everywhere.
+    """
+    log_variance, n = (variance.clamp(min=0.0) + eps).log(), mask.sum()
+    known_first = torch.where(mask[..., None], log_variance, torch.inf).flatten(0, -2).sort(0).values
+    # Indexed with a tensor, so that the host does not wait for a device to count the pixels.
+    median = known_first.index_select(0, (n - 1).clamp(min=0)[None] // 2)
+    weights = torch.exp((median - log_variance) / tau).clamp(1.0 / weight_max, weight_max)
+    return torch.where(n > 0, weights, 1.0)
+
+
+@torch.no_grad()
+def outlier_mask(error: Tensor, valid: Tensor, factor: float) -> Tensor:
+    """Return which valid pixels agree: |error| ≤ factor × its median over the valid pixels, bool [H, W] (VarSplat §3,
+    CG-SLAM §6).
+
+    error [H, W] of depth or colour, any sign; factor 0 = off. An error equal to the limit passes, so all pixels of a
+    perfect render (median 0) pass. NaN never passes.
+    """
+    if factor <= 0.0 or not valid.any():
+        return valid.clone()
+    error = error.abs()
+    known = error[valid].nan_to_num(nan=torch.inf)
+    return valid & (error <= factor * known.median())
 
 
 @dataclass(eq=False)
@@ -107,3 +140,32 @@ def tracking_params(config: TrackingConfig, alpha_above: float) -> list[float]:
     return [
         alpha_above, c.alpha_power, c.outlier_factor, c.outlier_factor_color, c.weight_color, c.tau, c.weight_max,
     ]  # fmt: skip
+
+
+ALIGN_ALPHA = 0.95
+"""Minimum alpha of the map for alignment; above it, C/A and D/A are those of the surface."""
+
+
+def reference_maps(view: View, config: TrackingConfig, moment: Tensor | None) -> ReferenceMaps:
+    """Make a reference from a view's last forward pass. Weights: w̃ averaged over the channels; for depth the same
+    formula with U, if the view has a moment. The maps are tensors on the device of the view's planes.
+
+    Where the map is thin, V has no meaning and the weight is 1; so is the depth weight without U. Without variance
+    there is no w̃, and gray has no weight.
+    """
+    maps = PoseMaps.of(view)
+    opaque, divisor = maps.alpha > ALIGN_ALPHA, maps.alpha.clamp(min=0.5)
+    gray, surface = luma(maps.color.movedim(-1, 0)) / divisor, torch.where(opaque, maps.depth / divisor, 0.0)
+    weights: list[Tensor | None] = [None, None]
+    for k, (variance, known) in enumerate(((maps.variance, opaque), (moment, opaque & (view.moment > 0)))):
+        if config.uncertainty and variance is not None:
+            w = uncertainty_weights(variance.reshape(*opaque.shape, -1), known, config.tau, config.weight_max).mean(-1)
+            weights[k] = torch.where(known, w, 1.0)
+    return ReferenceMaps(gray, surface, (weights[0], weights[1]))
+
+
+def reference_arrays(view: View, config: TrackingConfig, moment: Tensor | None) -> ReferenceMaps:
+    """Return the same maps as arrays, for a view whose planes are in host memory."""
+    gray, surface, weights = reference_maps(view, config, moment)
+    on_gray, on_depth = (None if weight is None else weight.numpy() for weight in weights)
+    return ReferenceMaps(gray.numpy(), surface.numpy(), (on_gray, on_depth))

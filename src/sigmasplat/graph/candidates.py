@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp, softmax
 
-from sigmasplat.data.column import Column, Records
+from sigmasplat.data.poses import Column, Records
 from sigmasplat.tracking.descriptors import similarity
 from sigmasplat.types import Matrix
 

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from sigmasplat.config import Config, LoopConfig
 from sigmasplat.data import se3
 from sigmasplat.data.atlas import Atlas
-from sigmasplat.data.column import Column
 from sigmasplat.data.field import COLUMNS
+from sigmasplat.data.poses import Column
 from sigmasplat.data.relative_pose import Edges, RelativePose
 from sigmasplat.data.submap import Submap, SubmapStore
 from sigmasplat.errors import ConfigError

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.data import se3
-from sigmasplat.data.column import Column, Records
+from sigmasplat.data.poses import Column, Records
 from sigmasplat.data.submap import Submap
 from sigmasplat.graph.candidates import Candidate
 from sigmasplat.graph.pose_graph import LoopVerdict

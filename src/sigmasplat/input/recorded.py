@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from sigmasplat.config import InputConfig
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.frame_arrays import color_from_bytes
+from sigmasplat.data.images import resized_color
 from sigmasplat.data.imu import Accelerometer, Gyroscope
-from sigmasplat.data.resizing import resized_color
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SourceError
 from sigmasplat.input.calibration import Calibration, refuse_impossible_camera, resolve_calibration

@@ -16,9 +16,9 @@ from sigmasplat.config import DensifyConfig
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import COLUMNS, GaussianField, Rows
-from sigmasplat.fit.densify_stats import DensifyStats
+from sigmasplat.fit.field import DensifyStats
 from sigmasplat.fit.target import Keyframe
-from sigmasplat.render.splat_sums import CHANNELS, gather
+from sigmasplat.render.backend import CHANNELS, gather
 from sigmasplat.render.view import View
 from sigmasplat.types import Matrix
 

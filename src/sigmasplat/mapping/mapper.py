@@ -16,8 +16,7 @@ from sigmasplat.data.field import GaussianField, Rows
 from sigmasplat.data.frame import Detail, Photo
 from sigmasplat.data.submap import Picture, Submap
 from sigmasplat.fit.adam import Rates
-from sigmasplat.fit.densify_stats import DensifyStats
-from sigmasplat.fit.field import FieldFit, fitting
+from sigmasplat.fit.field import DensifyStats, FieldFit, fitting
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.fit.tracking_loss import PoseMaps
 from sigmasplat.mapping.densify import (

@@ -11,8 +11,7 @@ from torch import Tensor
 
 from sigmasplat.config import SeedConfig
 from sigmasplat.data.field import GaussianField
-from sigmasplat.fit.gray import gradient_magnitude, gray_of
-from sigmasplat.fit.target import Target
+from sigmasplat.fit.target import Target, gradient_magnitude, gray_of
 from sigmasplat.fit.tracking_loss import PoseMaps
 
 Mask = NDArray[np.bool_]

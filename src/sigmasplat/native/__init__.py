@@ -1,12 +1,13 @@
-"""The compiled kernels: `_core`, built from the sources in this folder. It takes arrays and does not link torch."""
+"""The compiled kernels: `_core`, built from the sources in this folder. It takes arrays and does not link torch.
 
-from typing import Any
+Importing this package raises BackendError if they cannot be loaded.
+"""
 
+from sigmasplat.errors import BackendError
 
-def kernels() -> Any:
-    """Return the module of compiled kernels, or None if it is not built."""
-    try:
-        from sigmasplat.native import _core
-    except ImportError:
-        return None
-    return _core
+try:
+    from sigmasplat.native import _core as _core
+except ImportError as problem:
+    raise BackendError(
+        f"the compiled kernels cannot be loaded ({problem}); reinstall with `pip install .`"
+    ) from problem

@@ -1,4 +1,4 @@
-// Resize a camera image, and lay it out for the fits. data/resizing.py, fit/cpu/images.py and fit/target.py hold the
+// Resize a camera image, and lay it out for the fits. data/images.py, fit/cpu.py and fit/target.py hold the
 // definitions.
 
 // Every second lane of 2W values, from `FIRST` on.

@@ -5,7 +5,7 @@ import sys
 import threading
 from contextlib import suppress
 
-from sigmasplat.native import kernels
+from sigmasplat.native import _core
 
 NICENESS = 5
 """How much a thread yields if another one wants the same core. With a larger value, other programs keep it from running
@@ -15,21 +15,16 @@ while it holds the interpreter lock, and tracking has to wait for it."""
 def set_kernel_threads(count: int) -> int:
     """Set the number of threads that the CPU kernels use when the calling thread calls them, and return the number
     before; 0 = no change."""
-    core = kernels()
-    if core is None:
-        return 0  # without the kernels there is nothing to set
-    before = int(core.threads())
+    before = _core.threads()
     if count:
-        core.set_threads(count)
+        _core.set_threads(count)
     return before
 
 
 def idle_kernel_workers() -> None:
     """Let the threads that help the calling thread in the CPU kernels run only where a core is idle (Linux). They hold
     no lock, so no other thread waits for them."""
-    core = kernels()
-    if core is not None:
-        core.idle_workers()
+    _core.idle_workers()
 
 
 def yield_to_others() -> None:

@@ -1,5 +1,5 @@
 // View-dependent colours on the CPU: the colours that a camera sees, their gradients, and Adam's step of the harmonics.
-// Lanes are splats. fit/view_dependent.py is the definition.
+// Lanes are splats. fit/mapping_step.py is the definition.
 
 constexpr int HARMONICS = 45;              // columns of the attribute `harmonics`
 constexpr int columns_of(int degree) { return 3 * ((degree + 1) * (degree + 1) - 1); }

@@ -8,15 +8,19 @@ from types import ModuleType
 from typing import cast
 
 import torch
+from torch import Tensor
 
 from sigmasplat import env
 from sigmasplat.config import RenderConfig
 from sigmasplat.data.camera import Camera
-from sigmasplat.data.field import GaussianField, Rows
+from sigmasplat.data.field import COLUMNS, GaussianField, Rows
 from sigmasplat.errors import BackendError
 from sigmasplat.registry import Backend, named, rows
+from sigmasplat.render import cpu, reference
 from sigmasplat.render.view import View
 
+CHANNELS = 3
+"""Planes that `gather` sums at once: they use the colour channels."""
 OWN = ("cpu", "reference")
 """The backends that are no plug-ins."""
 
@@ -48,22 +52,13 @@ def backend_name(asked: str, device: torch.device | None = None) -> str:
 def backend_module(asked: str, device: torch.device | None = None) -> ModuleType:
     """Return the module with `project` and `blend` of the backend that `backend_name` returns.
 
-    Raises BackendError if it is unknown or not built.
+    Raises BackendError if it is unknown.
     """
     name = backend_name(asked, device)
     if row := backend_row(name):
         return row.operators()
     if name == "reference":
-        from sigmasplat.render.reference import operators as reference
-
         return reference
-    try:
-        from sigmasplat.render.cpu import operators as cpu
-    except ImportError as problem:
-        raise BackendError(
-            f"the compiled kernels cannot be loaded ({problem}); reinstall with `pip install .`, or use the slow "
-            "plain-torch backend: --set backend=reference --set tracking.method=adam"
-        ) from problem
     return cpu
 
 
@@ -75,17 +70,10 @@ def options_on(backend: str, options: RenderConfig) -> RenderConfig:
 
 def make_view(backend: str, camera: Camera, options: RenderConfig, variance: bool = True) -> View:
     """Make a view on a backend by name, or "auto". Raises BackendError as `backend_module` does."""
-    backend_module(backend)  # raises BackendError if the kernels are missing
     name = backend_name(backend)
     if row := backend_row(name):
         return row.view(camera, options, variance)
-    if name == "reference":
-        from sigmasplat.render.reference.view import ReferenceView
-
-        return ReferenceView(camera, options, variance)
-    from sigmasplat.render.cpu.view import CpuView
-
-    return CpuView(camera, options, variance)
+    return (reference.ReferenceView if name == "reference" else cpu.CpuView)(camera, options, variance)
 
 
 def on_device(field: GaussianField, backend: str) -> GaussianField:
@@ -96,3 +84,24 @@ def on_device(field: GaussianField, backend: str) -> GaussianField:
     device = row.device()
     attributes = {name: Rows(attribute.params.to(device)) for name, attribute in field.attributes.items()}
     return GaussianField(field.params.to(device), attributes=attributes)
+
+
+def gather(view: View, params: Tensor, planes: Tensor) -> Tensor:
+    """Return Σ_p w_ip g_p [N, 3] of three planes g [3, H, W] for the last forward pass of a view, of rows [N, 17];
+    all on the view's device.
+
+    The colour of a pixel is linear in the splats' colours, so this is the gradient of the colours if g is the gradient
+    of the image. The view's gradient planes of colour are 0 afterwards.
+    """
+    view.g_sums.zero_()
+    view.g_alpha.zero_()
+    height, width = planes.shape[-2:]
+    view.g_sums[:CHANNELS, :height, :width] = planes
+    if isinstance(view, cpu.CpuView):  # its kernels sum without the gradient of the alphas
+        sums = view.gather(view.g_sums[:CHANNELS])
+        view.g_sums.zero_()
+        return sums
+    g_params = torch.empty_like(params)
+    view.backward(params, g_params)
+    view.g_sums.zero_()
+    return g_params[:, COLUMNS["colors"]]

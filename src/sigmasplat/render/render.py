@@ -1,7 +1,7 @@
 """Render a field from a camera: two kernels, then formulas on their sums (DESIGN §3)."""
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -13,10 +13,8 @@ from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import COLUMNS, GaussianField
 from sigmasplat.data.harmonics import view_colors
 from sigmasplat.render.backend import backend_module, backend_name, on_device, options_on
-from sigmasplat.render.channels import features_of, variance_of
-from sigmasplat.render.low_pass import as_refined
-from sigmasplat.render.ray_depth import depth_at, depth_of, plane_features
-from sigmasplat.render.reference.operators import depth_slopes
+from sigmasplat.render.projection import depth_at, depth_of, features_of, plane_features, variance_of
+from sigmasplat.render.reference import depth_slopes
 
 CENTER = RenderConfig(depth="center")
 """The options of a render if none are given: depths of centres, which every backend has."""
@@ -127,3 +125,17 @@ class FieldRenderer:
         refined, refined_fx = self.refined or (None, None)
         options = as_refined(self.options, camera, refined_fx if field is refined else None)
         return render(copied, camera, T_camera_world, depth_reference, options, self.backend)
+
+
+def as_refined(options: RenderConfig, camera: Camera, refined_fx: float | None) -> RenderConfig:
+    """Return the settings that show a map in an image of `camera`.
+
+    refined_fx: focal length in pixels of the images that the map was refined on; None: images of any size.
+
+    The low-pass keeps its size on the scene, so it has fewer px² in a smaller image. Otherwise splats that are smaller
+    than a pixel would count as much as a pixel, because the low-pass widens splats without making them fainter (the
+    fault that Mip-Splatting describes, arXiv 2311.16493).
+    """
+    if refined_fx is None or camera.fx >= refined_fx:
+        return options
+    return replace(options, low_pass_px2=options.low_pass_px2 * (camera.fx / refined_fx) ** 2)

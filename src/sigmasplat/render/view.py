@@ -14,7 +14,6 @@ from torch import Tensor
 from sigmasplat.config import RenderConfig
 from sigmasplat.config.sensors import SensorModel
 from sigmasplat.data.camera import Camera
-from sigmasplat.render.reference import operators as reference
 from sigmasplat.types import Matrix
 
 
@@ -34,17 +33,6 @@ class Layers(NamedTuple):
         ids = [torch.zeros(rows, columns, dtype=torch.int32, device=device) for _ in range(2)]
         floats = [torch.zeros(rows, columns, device=device) for _ in range(3)]
         return Layers(ids[0], floats[0], ids[1], floats[1], floats[2])
-
-    def fill(self, b: reference.Blended, z: Tensor) -> None:
-        """Copy the result of a blend of splats at depths z [N] m."""
-        for plane, image in zip(self[:4], b[3:], strict=True):
-            plane.copy_(image)
-        self.fill_depth(z)
-
-    def fill_depth(self, z: Tensor) -> None:
-        """Set the median depth from the splats' depths z [N] m."""
-        nearest = z[self.median_id.clamp(min=0).long()] if len(z) else self.median_depth
-        self.median_depth.copy_(torch.where(self.median_id >= 0, nearest, 0.0))
 
 
 MaybeLayers = tuple[Tensor | None, Tensor | None, Tensor | None, Tensor | None, Tensor | None]

@@ -90,12 +90,10 @@ def _text(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def instruction_set() -> str | None:
-    """Return the instruction set of the kernels; None if they are not built."""
-    try:
-        from sigmasplat.native import _core
-    except ImportError:
-        return None
+def instruction_set() -> str:
+    """Return the instruction set of the kernels."""
+    from sigmasplat.native import _core
+
     asked = env.switches().isa
     return _core.isa_name() if asked == "auto" else asked
 

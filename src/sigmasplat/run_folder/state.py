@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sigmasplat.data.column import Column
+from sigmasplat.data.poses import Column
 from sigmasplat.errors import RunError
 from sigmasplat.files.tensors import open_tensors, write_tensors
 

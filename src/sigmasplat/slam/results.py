@@ -9,8 +9,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.data.column import Column, Records
-from sigmasplat.data.stopwatch import Stopwatch
+from sigmasplat.data.poses import Column, Records
 from sigmasplat.data.trajectory import APART, LOST, RELOCALISED, TRACKED
 from sigmasplat.graph.confidence import Confidence
 from sigmasplat.graph.loops import Loop
@@ -20,7 +19,7 @@ from sigmasplat.tracking.frame_estimate import FrameEstimate
 from sigmasplat.tracking.moving.dynamic_mask import share_of
 from sigmasplat.tracking.prepared_frame import PreparedFrame
 from sigmasplat.tracking.tracker import Tracker
-from sigmasplat.types import Matrix
+from sigmasplat.types import Matrix, Stopwatch
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,10 +4,9 @@ from typing import Any
 
 from sigmasplat.data.atlas import Atlas
 from sigmasplat.data.camera import Camera
-from sigmasplat.data.column import Column
 from sigmasplat.data.field import GaussianField, Rows
 from sigmasplat.data.frame import Detail, Photo, PosePrior
-from sigmasplat.data.poses import KeyframePoses, Places, Poses
+from sigmasplat.data.poses import Column, KeyframePoses, Places, Poses
 from sigmasplat.data.relative_pose import Edges, RelativePose, TrackedHops
 from sigmasplat.data.submap import Picture
 from sigmasplat.errors import RunError

@@ -15,7 +15,7 @@ from sigmasplat.final.uncertainty import final_uncertainty
 from sigmasplat.fit.pose import PoseFit
 from sigmasplat.graph.loops import Loop
 from sigmasplat.graph.path_covariance import PathCovariance
-from sigmasplat.render.low_pass import as_refined
+from sigmasplat.render.render import as_refined
 from sigmasplat.slam.array_interface import ArrayInterface
 from sigmasplat.slam.listeners import notifying
 from sigmasplat.slam.mapping_backend import MappingBackend

@@ -12,10 +12,10 @@ from sigmasplat.config import Config
 from sigmasplat.config.find_preset import configured
 from sigmasplat.data.atlas import Atlas
 from sigmasplat.data.camera import Camera
-from sigmasplat.data.column import Column
 from sigmasplat.data.field import GaussianField, Rows
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.map_uncertainty import MapUncertainty
+from sigmasplat.data.poses import Column
 from sigmasplat.data.relative_pose import RelativePose
 from sigmasplat.data.submap import MemoryStore, OnDisk, SubmapStore
 from sigmasplat.data.trajectory import LOST, Component, Trajectory

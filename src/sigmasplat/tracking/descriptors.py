@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
-from sigmasplat.fit.gray import gray_of
+from sigmasplat.fit.target import gray_of
 from sigmasplat.types import Matrix
 
 Plane = NDArray[np.float32]

@@ -10,10 +10,9 @@ from torch import Tensor
 from sigmasplat.config import Config, TrackingConfig
 from sigmasplat.config.sensors import sensor_model
 from sigmasplat.data import se3
-from sigmasplat.data.camera import Camera
-from sigmasplat.data.depth_std import std_by_model
-from sigmasplat.data.exposure import gray_exposure, unexposed
+from sigmasplat.data.camera import Camera, gray_exposure, unexposed
 from sigmasplat.data.frame import Frame, Photo, photo_size
+from sigmasplat.data.images import std_by_model
 from sigmasplat.data.submap import Picture
 from sigmasplat.errors import SourceError
 from sigmasplat.fit.backends import fits_of

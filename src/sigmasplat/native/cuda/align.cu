@@ -177,7 +177,7 @@ KERNEL normal_equations(AlignPlanes planes, AlignPinhole pinhole, AlignOptions o
 
 // ---- the loop: launched once per possible step; steps of a finished level do nothing -------------------------------
 
-struct AlignState {                        // of one alignment, in device memory; the host reads it at the end (plugins/cuda/align.py)
+struct AlignState {                        // of one alignment, in device memory; the host reads it at the end (plugins/cuda/images.py)
     AlignLoop loop;
     Descent descent;
     double readings;                       // number of reference pixels with depth

@@ -74,7 +74,7 @@ inline void rotation_of_quaternion(const double* q, double* R) {
     R[6] = 2.0 * (x * z - w * y); R[7] = 2.0 * (y * z + w * x); R[8] = 1.0 - 2.0 * (x * x + y * y);
 }
 
-// Compute the gradient with respect to the parameters from that of the left twist (ρ, φ) (fit/motion.py: AxisAngle,
+// Compute the gradient with respect to the parameters from that of the left twist (ρ, φ) (fit/descent.py: AxisAngle,
 // QuaternionMotion).
 inline void by_axis(const double* numbers, const double* twist, double* gradient) {
     double R[9], jacobian[9];

@@ -1,5 +1,5 @@
 // View-dependent colours on a GPU: from splats to the colours that a camera sees, and back. data/harmonics.py defines
-// the functions, fit/view_dependent.py the mapping step that uses them.
+// the functions, fit/mapping_step.py the mapping step that uses them.
 #pragma once
 #include "sums.cuh"
 

@@ -1,5 +1,5 @@
 // Tracking by Adam without the host: the papers' loss on a render with its gradient, and the step of the pose. Included
-// by fit.cu. fit/tracking_loss.py, fit/confidence.py, fit/motion.py and fit/descent.py are the definitions;
+// by fit.cu. fit/tracking_loss.py, fit/tracking_loss.py, fit/descent.py and fit/descent.py are the definitions;
 // native/track.h is the CPU version.
 #pragma once
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from importlib import import_module, metadata
 from typing import Any
 
-from sigmasplat.api import env, machine
+from sigmasplat.api import BackendError, env, machine
 
 MAX_DIFFERENCE = 1e-2
 """If rounding moves a splat across the threshold alpha_min, a pixel can change by up to 1/255."""
@@ -51,16 +51,17 @@ def verdict(findings: list[Finding]) -> tuple[bool, str]:
 def check_kernels() -> Finding:
     """Load the compiled kernels. Report the instruction set in use, and those that this processor supports."""
     try:
-        core: Any = import_module("sigmasplat.render.cpu.operators") and import_module("sigmasplat.native._core")
-    except ImportError as problem:
-        return Finding("kernels", f"cannot be loaded ({problem}); {_remedy(problem)}", False)
+        core: Any = import_module("sigmasplat.render.cpu") and import_module("sigmasplat.native._core")
+    except (BackendError, ImportError) as problem:
+        reason = problem.__cause__ or problem
+        return Finding("kernels", f"cannot be loaded ({reason}); {_remedy(reason)}", False)
     offered = ", ".join(core.supported_isas())
     return Finding("kernels", f"{core.isa_name()} (processor supports {offered}), {core.threads()} threads", True)
 
 
-def _remedy(problem: ImportError) -> str:
+def _remedy(problem: BaseException) -> str:
     """Return the command that fixes an import error of the kernels."""
-    if problem.name == "torch":
+    if getattr(problem, "name", None) == "torch":
         return "pip install torch"
     if "libgomp" in str(problem):  # some builds of torch include it under another name
         return "sudo apt install libgomp1"
@@ -71,7 +72,6 @@ def check_cuda() -> Iterator[Finding]:
     """Check NVRTC, driver and GPUs, one line each. Missing parts are not faults: a machine without a GPU is healthy."""
     import torch
 
-    from sigmasplat.api import BackendError
     from sigmasplat.plugins.cuda import cubins, launch as cuda_launch
 
     try:
@@ -105,7 +105,6 @@ def _device(device: Any) -> Iterator[Finding]:
     """Describe a GPU, and run the self-test on it."""
     import torch
 
-    from sigmasplat.api import BackendError
     from sigmasplat.plugins.cuda import cubins
 
     about = torch.cuda.get_device_properties(device)
@@ -121,7 +120,7 @@ def self_test(device: Any = "cpu") -> Finding:
     """Render 300 splats with the kernels of a device and with the reference renderer, and compare the images."""
     import torch
 
-    from sigmasplat.api import backend_module, operators as reference
+    from sigmasplat.api import backend_module, reference
 
     started_s = time.perf_counter()
     name = "cpu" if str(device) == "cpu" else "cuda"

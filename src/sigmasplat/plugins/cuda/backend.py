@@ -7,10 +7,9 @@ from types import ModuleType
 import torch
 
 from sigmasplat.api import TORCH, Backend, Camera, DeviceFits, RenderConfig, reference_maps
-from sigmasplat.plugins.cuda import descent, images, launch, rows
-from sigmasplat.plugins.cuda.mapping_step import CudaStep
+from sigmasplat.plugins.cuda import descent, images, launch
+from sigmasplat.plugins.cuda.mapping_step import CudaStep, CudaViewDependentStep, to_host
 from sigmasplat.plugins.cuda.view import CudaView
-from sigmasplat.plugins.cuda.view_dependent import CudaViewDependentStep
 
 
 def _operators() -> ModuleType:
@@ -36,7 +35,7 @@ def _fits() -> DeviceFits:
         TORCH,
         mapping_step=CudaStep,
         view_dependent_step=CudaViewDependentStep,
-        to_host=rows.to_host,
+        to_host=to_host,
         descend=descent.descend_on_device,
         reference_maps=reference_maps,
         live_planes=images.live_planes,

@@ -14,9 +14,9 @@ from sigmasplat.api import (
     Camera,
     RenderConfig,
     blend_with,
-    operators as reference,
     pose_gradient,
     project_with,
+    reference,
     view_params,
 )
 from sigmasplat.plugins.cuda import launch as cuda_launch

@@ -6,15 +6,15 @@ from torch import Tensor
 
 from sigmasplat.api import BackendError, Camera, Layers, Matrix, RenderConfig, SensorModel, view_params
 from sigmasplat.plugins.cuda import launch as cuda_launch
+from sigmasplat.plugins.cuda.launch import Stages
 from sigmasplat.plugins.cuda.raster import Planes, Raster
-from sigmasplat.plugins.cuda.stages import Stages
 
 
 class CudaView:
     """A view on the CUDA kernels: `View` with planes of exactly the image's size, on a device.
 
     The host waits for the device only at the end of a backward pass, when it reads the twist. `seconds` stay 0 unless
-    `measure` (plugins/cuda/stages.py) was called; reading them waits for the device.
+    `measure` (plugins/cuda/launch.py) was called; reading them waits for the device.
     """
 
     backend = "cuda"

@@ -4,8 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.data.camera import Camera
-from sigmasplat.native import kernels
-from sigmasplat.tracking.moving.windows import least_around
+from sigmasplat.native import _core
 from sigmasplat.types import Matrix
 
 Depth = NDArray[np.float32]
@@ -28,27 +27,11 @@ def free_places(
     T_camera_points [4, 4]: the pose of their frame; further_px: the window around each pixel is larger by so many
     pixels on each side. Without a reading in the window, nothing is known.
     """
-    core = kernels()
-    if core is None:
-        return free_places_in_numpy(points_m, T_camera_points, depth_m, camera, clear_m, further_px)
     c, free = camera, np.empty(points_m.shape[1], np.uint8)
     T, depth = np.ascontiguousarray(T_camera_points, np.float64), np.ascontiguousarray(depth_m)
     radius_px = AROUND_PX // 2 + further_px
-    core.free_places(points_m, T, depth, [c.fx, c.fy, c.cx, c.cy], radius_px, clear_m, CLEAR_RELATIVE, free)
+    _core.free_places(points_m, T, depth, [c.fx, c.fy, c.cx, c.cy], radius_px, clear_m, CLEAR_RELATIVE, free)
     return free.view(np.bool_)
-
-
-def free_places_in_numpy(
-    points_m: Depth, T_camera_points: Matrix, depth_m: Depth, camera: Camera, clear_m: float = CLEAR_M,
-    further_px: int = 0,
-) -> Mask:  # fmt: skip
-    """Return what `free_places` returns, also where the kernels are not built."""
-    X, Y, Z = points_m.astype(np.float64)
-    # The sums are explicit: those of a library's matrix product depend on how the memory is aligned.
-    x, y, z = (r[0] * X + r[1] * Y + r[2] * Z + r[3] for r in T_camera_points[:3])
-    inside, row, column = on_image(x, y, z, camera)
-    near_m = least_around(depth_m, AROUND_PX + 2 * further_px)[row, column]
-    return np.asarray(inside & (near_m < np.inf) & (z * (1 + CLEAR_RELATIVE) + clear_m < near_m))
 
 
 def on_image(x: Floats, y: Floats, z: Floats, camera: Camera) -> tuple[Mask, NDArray[np.intp], NDArray[np.intp]]:

@@ -1,1 +1,0 @@
-"""Run the fits on the compiled CPU kernels."""

@@ -1,1 +1,0 @@
-"""Render with the compiled CPU kernels."""

@@ -1,0 +1,166 @@
+"""Definitions in numpy of the kernels that prepare and compare images (native/resize.h, compare.h, free_space.h)."""
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from sigmasplat.data import images
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.frame import Frame
+from sigmasplat.fit.compare import (
+    CLOSE_M,
+    CLOSE_SIGMA,
+    FLAT,
+    LEAST_PIXELS,
+    LEVEL,
+    NOTHING,
+    STEP,
+    Comparison,
+    noise_m,
+)
+from sigmasplat.fit.interface import DEPTH_STEP_M
+from sigmasplat.fit.pyramid import HIDDEN_M, NOISE_PER_M, Pyramid
+from sigmasplat.fit.target import Target, padded
+from sigmasplat.tracking.moving.free_space import AROUND_PX, CLEAR_M, CLEAR_RELATIVE, on_image
+from sigmasplat.tracking.moving.windows import least_around
+from sigmasplat.types import Matrix
+
+Image = NDArray[np.float32]
+Depth = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+
+def halved_in_numpy(image: Image) -> Image:
+    """Return the same bytes as `halved`."""
+    return np.asarray(_quarter(image).mean(0))
+
+
+def halved_depth_in_numpy(depth: Image, step_m: float = DEPTH_STEP_M) -> Image:
+    """Return the same bytes as `halved_depth`."""
+    cells = _quarter(depth)
+    readings = (cells > 0).sum(0, dtype=np.float32)
+    near, far = np.where(cells > 0, cells, np.float32(np.inf)).min(0), cells.max(0)
+    mean = cells.sum(0) / np.maximum(readings, 1)
+    return np.where((readings > 1) & (far - near < step_m), mean, np.float32(0.0))
+
+
+def _quarter(image: Image) -> Image:
+    """Return the four pixels of each 2×2 cell, stacked as [4, H/2, W/2]."""
+    h, w = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2
+    return np.stack([image[0:h:2, 0:w:2], image[0:h:2, 1:w:2], image[1:h:2, 0:w:2], image[1:h:2, 1:w:2]])
+
+
+def halved_color_in_numpy(color: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return what `halved_color` returns."""
+    small = np.empty((color.shape[0] // 2, color.shape[1] // 2, 3), np.float32)
+    for c in range(3):
+        rows = color[:, ::2, c] + color[:, 1::2, c]
+        np.add(rows[::2], rows[1::2], out=small[..., c])
+    small *= np.float32(0.25)
+    return np.clip(small, 0.0, 1.0, out=small)
+
+
+def resized_depth_in_numpy(depth_m: Depth, width: int, height: int) -> Depth:
+    """Return what `resized_depth` returns without limits."""
+    if depth_m.shape == (height, width):
+        return depth_m.copy()
+    nearest = images._nearest_depth(depth_m, width, height)
+    rows, columns = (images._centers(m, n) for n, m in zip((height, width), depth_m.shape, strict=True))
+    return images.interpolated_depth(depth_m, rows, columns, nearest)
+
+
+def compare_in_numpy(reference: Pyramid, live: Pyramid, T_live_reference: Matrix) -> Comparison:
+    """Return what `compare` returns, but for rounding."""
+    level = min(LEVEL, len(reference.cameras) - 1)
+    host, camera = reference.kernels.to_host, reference.cameras[level]
+    depth, gray = (host(plane)[::STEP, ::STEP] for plane in (reference.depth[level], reference.gray[level]))
+    v, u = np.nonzero(depth > 0)
+    if len(u) < LEAST_PIXELS:
+        return NOTHING
+    z = depth[v, u].astype(np.float64)
+    rays = np.stack([(STEP * u - camera.cx) / camera.fx, (STEP * v - camera.cy) / camera.fy, np.ones(len(u))])
+    x, y, seen = T_live_reference[:3, :3] @ (rays * z) + T_live_reference[:3, 3:]
+    ahead = np.maximum(seen, 1e-3)
+    column, row = camera.fx * x / ahead + camera.cx, camera.fy * y / ahead + camera.cy
+    inside = (seen > 0.05) & (column >= 0) & (row >= 0) & (column < camera.width - 1) & (row < camera.height - 1)
+    if inside.sum() < LEAST_PIXELS:
+        return NOTHING
+    left, top, seen = column[inside].astype(np.intp), row[inside].astype(np.intp), seen[inside]
+    live_depth = host(live.depth[level])
+    hidden = live_depth >= HIDDEN_M
+    live_depth = np.where(hidden, np.float32(0.0), live_depth)
+    other, difference = _nearest_surface(live_depth, left, top, seen)
+    count, comparable = int(other.sum()), len(u) - int((hidden[top, left] & ~other).sum())
+    if count < LEAST_PIXELS:
+        return NOTHING
+    difference, noise = difference[other], noise_m(seen[other], live.noise_per_m, live.scene_scale)
+    noise = noise * noise_scale_in_numpy(live_depth, live.noise_per_m, live.scene_scale)
+    limit = CLOSE_SIGMA * noise + CLOSE_M * live.scene_scale
+    covered = min(1.0, count / max(int(np.count_nonzero(live_depth[::STEP, ::STEP])), 1))
+    front = difference <= -limit
+    close, behind = (float(np.mean(found)) for found in (np.abs(difference) < limit, difference >= limit))
+    common, before = count / comparable, float(np.mean(front))
+    if count - front.sum() < LEAST_PIXELS:
+        return Comparison(common, close, before, behind, float("inf"), float("nan"), count, covered)
+    residual = float(np.median(np.abs(difference)[~front] / noise[~front]))
+    right, below = column[inside] - left > 0.5, row[inside] - top > 0.5
+    live_gray = host(live.gray[level])[top + below, left + right]
+    correlation = _correlation(gray[v, u][inside][other][~front], live_gray[other][~front])
+    return Comparison(common, close, before, behind, residual, correlation, count, covered)
+
+
+def noise_scale_in_numpy(
+    depth: NDArray[np.float32], noise_per_m: float = NOISE_PER_M, scene_scale: float = 1.0
+) -> float:
+    """Return the same value as `noise_scale`."""
+    rows = depth[::STEP]
+    width = (rows.shape[1] - 2) // STEP * STEP
+    left, middle, right = (rows[:, i : i + width : STEP] for i in range(3))
+    read = (left > 0) & (middle > 0) & (right > 0)
+    if read.sum() < LEAST_PIXELS:
+        return 1.0
+    noise = noise_m(middle[read].astype(np.float64), noise_per_m, scene_scale)
+    bend = np.abs(middle[read] - 0.5 * (left[read] + right[read])) / noise
+    # For normal noise the bend has 1.22 standard deviations, and the median of its absolute value is 0.67 of these.
+    return max(1.0, float(np.median(bend)) / (1.2247 * 0.6745))
+
+
+def _nearest_surface(
+    depth: NDArray[np.float32], left: NDArray[np.intp], top: NDArray[np.intp], expected_m: Matrix
+) -> tuple[NDArray[np.bool_], Matrix]:
+    """Return which points fall on a reading, and the difference to the one of the four neighbours that is closest to
+    the expected depth: at a depth step either surface may be the right one."""
+    best = np.full(len(left), np.inf)
+    for down, across in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        reading = depth[top + down, left + across]
+        difference = np.where(reading > 0, reading - expected_m, np.inf)
+        best = np.where(np.abs(difference) < np.abs(best), difference, best)
+    return np.isfinite(best), best
+
+
+def _correlation(one: NDArray[np.float32], other: NDArray[np.float32]) -> float:
+    a, b = one - one.mean(dtype=np.float64), other - other.mean(dtype=np.float64)
+    norms = float(np.sqrt(np.mean(a * a))), float(np.sqrt(np.mean(b * b)))
+    return float(np.mean(a * b)) / (norms[0] * norms[1]) if min(norms) > FLAT else float("nan")
+
+
+def free_places_in_numpy(
+    points_m: Depth, T_camera_points: Matrix, depth_m: Depth, camera: Camera, clear_m: float = CLEAR_M,
+    further_px: int = 0,
+) -> Mask:  # fmt: skip
+    """Return what `free_places` returns."""
+    X, Y, Z = points_m.astype(np.float64)
+    # The sums are explicit: those of a library's matrix product depend on how the memory is aligned.
+    x, y, z = (r[0] * X + r[1] * Y + r[2] * Z + r[3] for r in T_camera_points[:3])
+    inside, row, column = on_image(x, y, z, camera)
+    near_m = least_around(depth_m, AROUND_PX + 2 * further_px)[row, column]
+    return np.asarray(inside & (near_m < np.inf) & (z * (1 + CLEAR_RELATIVE) + clear_m < near_m))
+
+
+def target_in_torch(frame: Frame, size: tuple[int, int]) -> Target:
+    """Return what `Target.of` returns."""
+    h, w = frame.depth_m.shape
+    color, depth = torch.zeros(3, *size), torch.zeros(size)
+    color[:, :h, :w] = torch.tensor(frame.color).movedim(-1, 0)
+    depth[:h, :w] = torch.tensor(frame.depth_m)
+    return Target(frame.camera, color, depth, int((frame.depth_m > 0).sum()), padded(frame.depth_std_m, size))
