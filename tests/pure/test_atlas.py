@@ -210,7 +210,7 @@ def test_a_part_of_a_store_numbers_its_submaps_anew_and_cannot_grow() -> None:
     assert len(part) == 2
     assert [part.load(k).index for k in range(2)] == [3, 1]
     assert [int(part.picture(k, 0).color[0, 0, 0]) for k in range(2)] == [3, 1]
-    with pytest.raises(SigmaSplatError, match="part of a store"):
+    with pytest.raises(SigmaSplatError, match="store that is only read"):
         part.save(piece(2), [picture()])
     assert len(store) == 4
 
