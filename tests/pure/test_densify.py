@@ -12,7 +12,7 @@ from sigmasplat.data.field import ATTRIBUTES, COLUMNS, WIDTH, GaussianField
 from sigmasplat.fit.adam import Rates, adam_step
 from sigmasplat.fit.field import DensifyStats
 from sigmasplat.fit.target import Keyframe, Target
-from sigmasplat.mapping.densify import clone, densify_mask, multiply, split, too_large, too_wide
+from sigmasplat.mapping.densify import copies, densify_mask, multiply, split, too_large, too_wide
 from sigmasplat.render import reference
 
 CAMERA = Camera(40, 30, 50.0, 52.0, 18.6, 15.3)
@@ -106,6 +106,10 @@ def test_a_turned_field_splits_into_turned_children() -> None:
     for field in (here, there):
         split(field, mask(6, 2, 3), np.random.default_rng(4))
     torch.testing.assert_close(there.means, here.moved(move).means, rtol=1e-4, atol=1e-4)
+
+
+def clone(field: GaussianField, rows: torch.Tensor) -> None:
+    field.append(copies(field, rows))
 
 
 def test_a_clone_stands_where_its_splat_does() -> None:

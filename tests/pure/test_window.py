@@ -1,4 +1,4 @@
-"""The sliding window: what keyframes share, by splats, readings and looks, and who is chosen by it."""
+"""The sliding window: what keyframes share, by splats and looks, and who is chosen by it."""
 
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ from sigmasplat.data.field import GaussianField
 from sigmasplat.data.frame import Frame
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.fit.target import Keyframe, Target
-from sigmasplat.mapping.window import SCORES, choose_window, covisible_splats, dominating
+from sigmasplat.mapping.window import choose_window, covisible_splats, dominating
 from sigmasplat.render.reference import ReferenceView
 
 Array = NDArray[np.float64]
@@ -38,10 +38,6 @@ def keyframe(
     return Keyframe(index, target, T, visible_ids=None if seen is None else np.array(seen, np.int64))
 
 
-def shared(newest: Keyframe, older: Keyframe) -> float:
-    return float(SCORES["frustum"](newest, [older])[0])
-
-
 def indices(window: list[Keyframe]) -> list[int]:
     return [k.index for k in window]
 
@@ -60,69 +56,6 @@ def test_the_share_is_of_the_newest_keyframes_splats() -> None:
     assert covisible_splats(few, [many, few, np.array([3, 10**6]), few[:0]]).tolist() == [1.0, 1.0, 0.5, 0.0]
     assert covisible_splats(many, [few]).tolist() == [0.2]
     assert covisible_splats(few[:0], [many, few]).tolist() == [0.0, 0.0]
-
-
-def test_a_camera_shares_all_readings_with_itself_and_zero_with_an_opposite_one() -> None:
-    rough = np.random.default_rng(0).uniform(0.5, 5.0, (CAMERA.height, CAMERA.width))
-    rough[::3] = 0.0
-    at = pose(1.0, -2.0, 3.0, 30.0)
-    assert shared(keyframe(0, at, rough), keyframe(1, at, rough)) == 1.0
-    assert shared(keyframe(0, at, rough), keyframe(1, at @ pose(yaw_deg=180.0), rough)) == 0.0
-    assert shared(keyframe(0, at, rough), keyframe(1, at @ pose(x=50.0), rough)) == 0.0
-    assert shared(keyframe(0, at, rough), keyframe(1, at @ pose(z=6.0), rough)) == 0.0, "all points lie behind it"
-
-
-def test_a_wall_hides_what_lies_behind_it() -> None:
-    far = keyframe(0, depth_m=2.0)
-    assert shared(far, keyframe(1, depth_m=1.0)) == 0.0
-    assert shared(keyframe(1, depth_m=1.0), far) == 1.0, "but not what lies before it"
-    assert shared(far, keyframe(1, depth_m=0.0)) == 1.0, "no reading hides nothing"
-    half = np.full((CAMERA.height, CAMERA.width), 2.0)
-    half[:, : CAMERA.width // 2] = 1.0
-    assert shared(far, keyframe(1, depth_m=half)) == pytest.approx(0.5, abs=0.02)
-    assert shared(keyframe(0, depth_m=2.14), keyframe(1, depth_m=2.0)) == 1.0, "within 5 % and 5 cm it is the same wall"
-    assert shared(keyframe(0, depth_m=2.16), keyframe(1, depth_m=2.0)) == 0.0
-
-
-def test_a_sideways_step_loses_the_columns_that_leave_the_image() -> None:
-    for shift_px in [0, 6, 24, 47]:
-        aside = keyframe(1, pose(x=shift_px * 2.0 / CAMERA.fx))
-        for a, b in ((keyframe(0), aside), (aside, keyframe(0))):
-            assert shared(a, b) == pytest.approx(1.0 - shift_px / CAMERA.width, abs=1.5 / 40)
-
-
-def test_readings_in_common_agree_with_a_plain_loop() -> None:
-    random = np.random.default_rng(3)
-    depths = [random.uniform(1.0, 3.0, (CAMERA.height, CAMERA.width)).astype(np.float32) for _ in range(2)]
-    depths[0][random.random(depths[0].shape) < 0.3] = 0.0
-    depths[1][random.random(depths[1].shape) < 0.3] = 0.0
-    T_world_a, T_world_b = pose(0.2, 0.1, 0.3, 5.0), pose(-0.1, 0.2, -0.2, -8.0)
-    seen, total = 0, 0
-    for row in range(CAMERA.height):  # all 36 rows, 40 of 48 columns
-        for column in sorted({int((k + 0.5) * CAMERA.width / 40) for k in range(40)}):
-            d = float(depths[0][row, column])
-            if d == 0.0:
-                continue
-            total += 1
-            ray = np.array([(column - CAMERA.cx) / CAMERA.fx, (row - CAMERA.cy) / CAMERA.fy, 1.0, 1.0 / d])
-            x, y, z, _ = np.linalg.inv(T_world_b) @ T_world_a @ (ray * d)
-            u, v = round(CAMERA.fx * x / z + CAMERA.cx), round(CAMERA.fy * y / z + CAMERA.cy)
-            if z > 0 and 0 <= u < CAMERA.width and 0 <= v < CAMERA.height:
-                there = float(depths[1][v, u])
-                seen += there == 0.0 or z <= 1.05 * there + 0.05
-    assert 0.2 < seen / total < 0.9
-    found = shared(keyframe(0, T_world_a, depths[0].astype(float)), keyframe(1, T_world_b, depths[1].astype(float)))
-    assert found == pytest.approx(seen / total, abs=1e-9)
-
-
-def test_moving_the_world_changes_no_share_of_readings() -> None:
-    a, b, move = pose(), pose(0.4, 0.1, 0.2, 10.0), se3.exp(np.array([3.0, -2.0, 7.0, 0.5, -1.0, 2.0]))
-    assert 0.1 < shared(keyframe(0, a), keyframe(1, b)) < 0.95
-    assert shared(keyframe(0, move @ a), keyframe(1, move @ b)) == shared(keyframe(0, a), keyframe(1, b))
-
-
-def test_no_readings_no_share() -> None:
-    assert shared(keyframe(0, depth_m=0.0), keyframe(1)) == 0.0
 
 
 def with_shares(shares: list[float]) -> list[Keyframe]:
@@ -151,13 +84,12 @@ def test_a_window_is_small_while_keyframes_are_few() -> None:
         assert indices(choose_window(keyframes, 4, "splats")) == [3, 2, 1][:count]
 
 
-def test_frustum_and_descriptor_choose_by_what_they_compare() -> None:
+def test_descriptors_choose_by_what_they_compare() -> None:
     keyframes = [keyframe(k, pose(x=0.6 * k)) for k in range(5)]
     angles = [0.1, 1.2, 0.7, 0.0, 0.0]
     keyframes = [
         replace(k, descriptor=np.float32([np.cos(a), np.sin(a)])) for k, a in zip(keyframes, angles, strict=True)
     ]
-    assert indices(choose_window(keyframes, 4, "frustum")) == [4, 3, 2, 1]
     assert indices(choose_window(keyframes, 4, "descriptor")) == [4, 3, 0, 2]
 
 
@@ -167,7 +99,6 @@ def test_what_is_missing_is_named() -> None:
         with pytest.raises(SigmaSplatError, match=f"keyframe [02] .*covisibility={by}"):
             choose_window(keyframes, 3, by)  # type: ignore[arg-type]
         assert indices(choose_window(keyframes, 2, by)) == [2, 1]  # type: ignore[arg-type]
-    assert len(choose_window(keyframes, 3, "frustum")) == 3
 
 
 def test_splats_that_dominate_are_named_by_their_ids() -> None:

@@ -47,14 +47,6 @@ RUNS: list[Any] = [
     pytest.param("cgslam-fast", SMALL, 0.004, 26.0, id="fast"),
     pytest.param("sigma", SMALL, 0.004, 26.0, id="sigma"),
     pytest.param("cgslam-replica", PAPER, 0.02, 24.0, id="paper", marks=pytest.mark.slow),
-    pytest.param(
-        "cgslam-replica",
-        PAPER | {"mapping.covisibility": "frustum"},
-        0.02,
-        24.0,
-        id="by-frustum",
-        marks=pytest.mark.slow,
-    ),
     pytest.param("cgslam-fast", SMALL | {"mapping.covisibility": "descriptor"}, 0.004, 26.0, id="by-descriptor"),
     pytest.param(
         "cgslam-released-replica",

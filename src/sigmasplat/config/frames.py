@@ -178,9 +178,9 @@ class MappingConfig(Section, name="mapping"):
     window: Count = 0
     """Use only this many keyframes: the newest two, and those that overlap most with the newest (CG-SLAM's
     sliding-window bundle adjustment). 0 = all, drawn at random (VarSplat)."""
-    covisibility: Literal["splats", "frustum", "descriptor"] = "splats"
-    """How the overlap of the window's keyframes is measured: by common dominant splats, by depth readings that the
-    other keyframe sees too, or by the image descriptor of `loops`."""
+    covisibility: Literal["splats", "descriptor"] = "splats"
+    """How the overlap of the window's keyframes is measured: by common dominant splats, or by the image
+    descriptor of `loops`."""
     sensor_noise: bool = False
     """Whether the losses of depth weigh each reading by how many times as sure it is as the law of
     `render.depth_noise_per_m` says (`input.sensor`), at most 4 times."""

@@ -51,7 +51,7 @@ def multiply(field: GaussianField, chosen: Tensor, config: DensifyConfig, random
     if not chosen.any():
         return chosen
     large = chosen & (_widest(field) > config.split_scale_m)
-    twins = _copies(field, chosen & ~large & config.clone)
+    twins = copies(field, chosen & ~large & config.clone)
     split(field, large, random)
     field.append(twins)
     return large
@@ -62,15 +62,10 @@ def split(field: GaussianField, chosen: Tensor, random: np.random.Generator) -> 
 
     Everything except position and size is copied from the splat. Ids are new, and Adam's moments start at 0.
     """
-    halves = _copies(field, chosen.nonzero().squeeze(1).repeat_interleave(2))
+    halves = copies(field, chosen.nonzero().squeeze(1).repeat_interleave(2))
     _scatter(halves, random)
     field.keep(~chosen)
     field.append(halves)
-
-
-def clone(field: GaussianField, rows: Tensor) -> None:
-    """Append copies of some splats (bool [N] or indices), with new ids; Adam's moments start at 0."""
-    field.append(_copies(field, rows))
 
 
 def too_large(field: GaussianField, most_scale_m: float) -> Tensor:
@@ -98,7 +93,7 @@ def _widest(field: GaussianField) -> Tensor:
     return torch.maximum(torch.maximum(first, second), third).exp()
 
 
-def _copies(field: GaussianField, rows: Tensor) -> GaussianField:
+def copies(field: GaussianField, rows: Tensor) -> GaussianField:
     """Return copies of rows with their attributes; Adam's moments start at 0."""
     attributes = {name: Rows(attribute.params[rows]) for name, attribute in field.attributes.items()}
     return GaussianField(field.params[rows], attributes=attributes)
