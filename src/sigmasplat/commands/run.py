@@ -249,13 +249,11 @@ def _run_and_score(
     realtime: track frames when they arrive. Raises KeyboardInterrupt if Ctrl-C came before the first frame was done.
     """
     from sigmasplat.plugins.checks.motion import MotionWatch
-    from sigmasplat.plugins.cuda import launch as cuda_launch
     from sigmasplat.plugins.sources.live import Arrivals, LiveSource
     from sigmasplat.realtime.system import RealTime
     from sigmasplat.run.resume import RefinementFile, StateFile
     from sigmasplat.run.session import Session
 
-    cuda_launch.measure(run_options.profile)
     state = StateFile(start.slam, folder, run_options.save_every)
     start.slam.saved_refinement = RefinementFile(start.slam, folder, run_options.save_every)
     read = Arrivals(source) if realtime else source

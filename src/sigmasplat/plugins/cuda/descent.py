@@ -30,7 +30,7 @@ from sigmasplat.api import (
     parametrisation,
     tracking_params,
 )
-from sigmasplat.plugins.cuda.launch import THREADS, blocks_for, measured
+from sigmasplat.plugins.cuda.launch import THREADS, blocks_for
 from sigmasplat.plugins.cuda.view import CudaView
 
 Work = Callable[[], None]
@@ -39,11 +39,10 @@ Work = Callable[[], None]
 def repeatable(work: Work, device: torch.device) -> Work:
     """Return a function that repeats some work: a graph of it, which has not run yet, or the work itself.
 
-    The work itself is returned if graphs are not available, or if stages are measured, because a graph would not
-    contain the events of the measurement. If recording fails, one warning gives the reason, and no more graphs are
-    recorded on that device.
+    The work itself is returned if graphs are not available. If recording fails, one warning gives the reason, and no
+    more graphs are recorded on that device.
     """
-    return work if device.type != "cuda" or measured() else _recorder(device).record(work)
+    return work if device.type != "cuda" else _recorder(device).record(work)
 
 
 class Recorder:

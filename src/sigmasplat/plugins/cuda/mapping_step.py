@@ -44,11 +44,10 @@ def add_shape_gradient(
     gradient of the first `frozen_colors` splats to 0. Return the cost of the shape terms, on the device."""
     n, (isotropy, ratio) = len(field), kernel_weights(SHAPE_TERMS, weights).tolist()
     costs = view.raster.empty(blocks_for(n), 1, dtype=torch.float64)
-    with view.stages.of("project_backward"):
-        view.raster.launch_fit(
-            "shape_terms", blocks_for(n), field.params, visible, visible.sum(dtype=torch.int64), n, frozen_colors,
-            isotropy / (3.0 * max(n, 1)), float(ratio), gradient, costs,
-        )  # fmt: skip
+    view.raster.launch_fit(
+        "shape_terms", blocks_for(n), field.params, visible, visible.sum(dtype=torch.int64), n, frozen_colors,
+        isotropy / (3.0 * max(n, 1)), float(ratio), gradient, costs,
+    )  # fmt: skip
     return costs.sum()
 
 
@@ -59,11 +58,10 @@ def step_rows(view: CudaView, visible: Tensor, rows: Rows, gradient: Tensor, rat
     per_column[:used] = rates.per_column.numpy()
     beta2 = rates.beta2
     numbers = [BETA1, beta2, EPSILON, 1.0 / (1.0 - BETA1**step), 1.0 / (1.0 - beta2**step)]
-    with view.stages.of("project_backward"):
-        view.raster.launch_fit(
-            "adam", blocks_for(gradient.numel()), rows.params, rows.moment1, rows.moment2, rows.last_step, visible,
-            gradient, gradient.numel(), rows.params.shape[1], used, per_column, np.array(numbers, np.float32), step,
-        )  # fmt: skip
+    view.raster.launch_fit(
+        "adam", blocks_for(gradient.numel()), rows.params, rows.moment1, rows.moment2, rows.last_step, visible,
+        gradient, gradient.numel(), rows.params.shape[1], used, per_column, np.array(numbers, np.float32), step,
+    )  # fmt: skip
     rows.last_step.masked_fill_(visible.bool(), step)
 
 
@@ -162,10 +160,9 @@ class CudaViewDependentStep(ViewDependentStep):
     def forward(self, field: GaussianField, T_camera_world: Matrix, target: Target, weights: Weights) -> None:
         harmonics, n = field.get_or_create("harmonics").params, len(field)
         self.rows, self._eye = field.params.clone(), _eye(T_camera_world)
-        with self.view.stages.of("project"):
-            self.view.raster.launch_fit(
-                "show_colors", blocks_for(n), self.rows, harmonics, n, self.degree, harmonics.shape[1], self._eye
-            )
+        self.view.raster.launch_fit(
+            "show_colors", blocks_for(n), self.rows, harmonics, n, self.degree, harmonics.shape[1], self._eye
+        )
         render_for(self.view, self.rows, T_camera_world, target, weights)
 
     def splats(
@@ -190,11 +187,10 @@ class CudaViewDependentStep(ViewDependentStep):
         """
         raster, n, harmonics = self.view.raster, len(field), field.get_or_create("harmonics").params
         found, partial = raster.empty(n, self.width), raster.empty(blocks_for(n), 3, dtype=torch.float64)
-        with self.view.stages.of("project_backward"):
-            raster.launch_fit(
-                "carry_colors", blocks_for(n), field.params, harmonics, visible, n, self.degree, harmonics.shape[1],
-                self.width, self._eye, gradient, found, partial,
-            )  # fmt: skip
+        raster.launch_fit(
+            "carry_colors", blocks_for(n), field.params, harmonics, visible, n, self.degree, harmonics.shape[1],
+            self.width, self._eye, gradient, found, partial,
+        )  # fmt: skip
         return found, partial.sum(0)
 
 

@@ -6,15 +6,14 @@ from torch import Tensor
 
 from sigmasplat.api import BackendError, Camera, Layers, Matrix, RenderConfig, SensorModel, view_params
 from sigmasplat.plugins.cuda import launch as cuda_launch
-from sigmasplat.plugins.cuda.launch import Stages
 from sigmasplat.plugins.cuda.raster import Planes, Raster
 
 
 class CudaView:
     """A view on the CUDA kernels: `View` with planes of exactly the image's size, on a device.
 
-    The host waits for the device only at the end of a backward pass, when it reads the twist. `seconds` stay 0 unless
-    `measure` (plugins/cuda/launch.py) was called; reading them waits for the device.
+    The host waits for the device only at the end of a backward pass, when it reads the twist. Stages are not timed:
+    `seconds` stay 0.
     """
 
     backend = "cuda"
@@ -37,11 +36,7 @@ class CudaView:
         self.layers = Layers.of(*size, device)
         self._made = (False, False)
         self._params = view_params(camera, np.eye(4), options)
-        self.stages = Stages()
-
-    @property
-    def seconds(self) -> Matrix:
-        return self.stages.seconds
+        self.seconds = np.zeros(5)
 
     def forward(
         self, params: Tensor, T_camera_world: Matrix, depth_reference: Tensor | None = None, layers: bool = False
@@ -53,12 +48,9 @@ class CudaView:
             self._reference.copy_(depth_reference)
         self._made = (depth_reference is not None, layers)
         r.prepare(n, len(self.sums), self.camera, self.options)
-        with self.stages.of("project"):
-            r.each_splat("pack_view", self._params, None, params, n, r.frame, r.packed)
-        with self.stages.of("sort"):
-            r.bin()
-        with self.stages.of("blend"):
-            r.blend(self._planes, self._reference if depth_reference is not None else None)
+        r.each_splat("pack_view", self._params, None, params, n, r.frame, r.packed)
+        r.bin()
+        r.blend(self._planes, self._reference if depth_reference is not None else None)
 
     def _on_device(self, params: Tensor) -> Tensor:
         """Return rows on this device, contiguous, as the kernels need them."""
@@ -77,15 +69,13 @@ class CudaView:
         """Do the same as `backward`, but leave the twist on the device; the host does not wait."""
         (moment, layers), r = self._made, self.raster
         on_moment, reference = (self.g_moment, self._reference) if moment else (None, None)
-        with self.stages.of("blend_backward"):
-            sums, at = r.gradients(self._planes, reference, self.g_sums, on_moment, self.g_alpha)
-        with self.stages.of("project_backward"):
-            on_median, twists = self._on_median() if layers else None, r.twists()
-            r.each_splat(
-                "chain_params", self._params, None, self._on_device(params), r.counts, sums, on_median, r.n,
-                sums.shape[1], at, g_params, grad2d, twists,
-            )  # fmt: skip
-            return twists.sum(0)
+        sums, at = r.gradients(self._planes, reference, self.g_sums, on_moment, self.g_alpha)
+        on_median, twists = self._on_median() if layers else None, r.twists()
+        r.each_splat(
+            "chain_params", self._params, None, self._on_device(params), r.counts, sums, on_median, r.n,
+            sums.shape[1], at, g_params, grad2d, twists,
+        )  # fmt: skip
+        return twists.sum(0)
 
     def _on_median(self) -> Tensor:
         """Sum ∂L/∂(median depth) over the pixels whose median depth is that of each splat, [n]."""
@@ -97,13 +87,11 @@ class CudaView:
 
     def backward_pose(self, params: Tensor) -> Matrix:
         r = self.raster
-        with self.stages.of("blend_backward"):
-            sums = r.pose_gradients(self._planes, self.g_sums)
-        with self.stages.of("project_backward"):
-            twists = r.twists()
-            r.each_splat(
-                "chain_pose", self._params, None, self._on_device(params), r.counts, sums, r.n, sums.shape[1], twists
-            )
+        sums = r.pose_gradients(self._planes, self.g_sums)
+        twists = r.twists()
+        r.each_splat(
+            "chain_pose", self._params, None, self._on_device(params), r.counts, sums, r.n, sums.shape[1], twists
+        )
         return twists.sum(0).cpu().numpy()
 
     def follow(self, params: Tensor, pose: Tensor) -> None:
@@ -111,13 +99,10 @@ class CudaView:
         not wait."""
         params = self._on_device(params)
         r, n, self._made = self.raster, len(params), (False, False)
-        with self.stages.of("project"):
-            r.prepare(n, len(self.sums), self.camera, self.options)
-            r.each_splat("pack_view", self._params, pose, params, n, r.frame, r.packed)
-        with self.stages.of("sort"):
-            r.bin_within()
-        with self.stages.of("blend"):
-            r.blend(self._planes, None)
+        r.prepare(n, len(self.sums), self.camera, self.options)
+        r.each_splat("pack_view", self._params, pose, params, n, r.frame, r.packed)
+        r.bin_within()
+        r.blend(self._planes, None)
 
     def follow_back(self, params: Tensor, pose: Tensor) -> Tensor:
         """Propagate the gradient planes of colour and depth to that pose. Return twists [blocks, 6] on the device, to
@@ -126,11 +111,9 @@ class CudaView:
         They are 0 if there were more `raster.pairs` than fit into memory.
         """
         r = self.raster
-        with self.stages.of("blend_backward"):
-            sums = r.pose_gradients_within(self._planes, self.g_sums)
-        with self.stages.of("project_backward"):
-            twists, rows = r.twists(), self._on_device(params)
-            r.each_splat("chain_pose", self._params, pose, rows, r.counts, sums, r.n, sums.shape[1], twists)
+        sums = r.pose_gradients_within(self._planes, self.g_sums)
+        twists, rows = r.twists(), self._on_device(params)
+        r.each_splat("chain_pose", self._params, pose, rows, r.counts, sums, r.n, sums.shape[1], twists)
         return twists
 
     def visible(self, n: int) -> Tensor:
