@@ -13,10 +13,10 @@ from sigmasplat.fit.compare import (
     FLAT,
     LEAST_PIXELS,
     LEVEL,
+    NOISE_M,
     NOTHING,
     STEP,
     Comparison,
-    noise_m,
 )
 from sigmasplat.fit.interface import DEPTH_STEP_M
 from sigmasplat.fit.pyramid import HIDDEN_M, NOISE_PER_M, Pyramid
@@ -67,6 +67,11 @@ def resized_depth_in_numpy(depth_m: Depth, width: int, height: int) -> Depth:
     nearest = images._nearest_depth(depth_m, width, height)
     rows, columns = (images._centers(m, n) for n, m in zip((height, width), depth_m.shape, strict=True))
     return images.interpolated_depth(depth_m, rows, columns, nearest)
+
+
+def noise_m(depth_m: Matrix, noise_per_m: float = NOISE_PER_M, scene_scale: float = 1.0) -> Matrix:
+    """Return the standard deviation assumed for depth readings, metres; its constant grows with the scene."""
+    return np.asarray(noise_per_m * depth_m**2 + NOISE_M * scene_scale)
 
 
 def compare_in_numpy(reference: Pyramid, live: Pyramid, T_live_reference: Matrix) -> Comparison:

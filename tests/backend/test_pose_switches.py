@@ -15,7 +15,7 @@ from sigmasplat.fit.adam import Rates
 from sigmasplat.fit.mapping_step import TorchStep, ViewDependentStep
 from sigmasplat.fit.target import Target
 from sigmasplat.render import Render, reference, render
-from sigmasplat.render.projection import features_of
+from sigmasplat.render.kernels import features_of
 from splat_fields import exact_view, params_of, plane_gradients
 from splat_scenes import SMALL, Scene, assert_same_vector, probe, scene, twist_differences, twist_gradient
 

@@ -12,7 +12,7 @@ from safetensors.torch import load_file, save_file
 from sigmasplat.data.atlas import Atlas
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
-from sigmasplat.data.poses import Place, Places
+from sigmasplat.data.poses import Place
 from sigmasplat.data.relative_pose import UNKNOWN_HOP, RelativePose
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import RunError, SigmaSplatError
@@ -47,8 +47,9 @@ DAMAGES = {
 def run(tmp_path: Path) -> RunFolder:
     """Return a run with the path of three frames in two submaps, the errors of the path, and no map."""
     T = np.eye(4)
-    places = Places.of([Place(0, 0, T), Place(0, 1, T), Place(1, 0, T)])
-    atlas = Atlas(places=places)
+    atlas = Atlas()
+    for submap, keyframe in ((0, 0), (0, 1), (1, 0)):
+        atlas.places.append(Place(submap, keyframe, T))
     for submap, keyframes in enumerate((2, 1)):
         atlas.begin_submap(T if submap else None)
         for k in range(keyframes):

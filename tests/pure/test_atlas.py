@@ -41,12 +41,12 @@ def test_frames_are_where_they_were_put() -> None:
 
 def test_moving_an_anchor_moves_its_own_frames_and_keyframes_and_no_others() -> None:
     atlas, world = two_submaps()
-    correction, keyframes = motion(77), atlas.T_world_keyframe(1)
+    correction, keyframes = motion(77), atlas.T_world_keyframes_of([1])[1]
     atlas.anchors[1] = correction @ atlas.anchors[1]
     assert np.allclose(atlas.T_world_camera()[:2], world[:2])
     assert np.allclose(atlas.T_world_camera(loops=False), world), "tracking alone knows of no correction"
     assert np.allclose(atlas.T_world_camera()[2:], correction @ np.array(world[2:]))
-    assert np.allclose(atlas.T_world_keyframe(1), correction @ keyframes)
+    assert np.allclose(atlas.T_world_keyframes_of([1])[1], correction @ keyframes)
 
 
 def test_a_frame_follows_its_keyframe() -> None:
@@ -87,7 +87,7 @@ def test_frames_follow_the_refined_poses_of_their_keyframes() -> None:
     assert np.allclose(atlas.T_world_camera(), [*world[:2], at @ world[2], at @ world[3]])
     assert np.allclose(atlas.T_world_camera(loops=False), world), "tracking alone knows of no refinement"
     assert np.allclose(atlas.T_submap_camera[2:], se3.inverse(atlas.anchors[1]) @ np.array(world[2:]))
-    assert np.allclose(atlas.T_world_keyframe(1), [atlas.anchors[1] @ T for T in atlas.refined[1]])
+    assert np.allclose(atlas.T_world_keyframes_of([1])[1], [atlas.anchors[1] @ T for T in atlas.refined[1]])
 
 
 def test_probe_views_follow_their_keyframe_in_the_final_map() -> None:

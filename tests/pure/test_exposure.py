@@ -9,7 +9,7 @@ import two_submaps as room
 from sigmasplat.data.atlas import Atlas
 from sigmasplat.data.camera import NEUTRAL, between, centred, exposed, unexposed
 from sigmasplat.data.frame import Frame
-from sigmasplat.data.poses import Place, Places
+from sigmasplat.data.poses import Place
 from sigmasplat.data.submap import MemoryStore, Picture, RefinedStore, Submap
 from sigmasplat.final.final_map import FinalMap, final_map
 from sigmasplat.fit.pose import fit_exposure
@@ -138,7 +138,9 @@ def test_the_final_maps_store_has_images_in_its_exposure() -> None:
 def test_frames_get_the_exposure_between_their_keyframes() -> None:
     """Keyframes are the rows 0, 3 and 5; the submap of row 5 is not in the final map."""
     known = ((0, 0), (0, 0), (0, 0), (0, 1), (0, 1), (1, 0))
-    atlas = Atlas(places=Places.of(Place(s, k, np.eye(4)) for s, k in known))
+    atlas = Atlas()
+    for submap, keyframe in known:
+        atlas.places.append(Place(submap, keyframe, np.eye(4)))
     atlas.exposures = {0: EXPOSURES[:2]}
     found = atlas.frame_exposures()
     np.testing.assert_allclose(found[[0, 3, 4, 5]], EXPOSURES[[0, 1, 1, 1]])

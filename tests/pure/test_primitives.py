@@ -19,7 +19,7 @@ from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.mapping.densify import depths, fade, splat_uncertainty, still_uncertain
 from sigmasplat.render import reference
 from sigmasplat.render.backend import make_view
-from sigmasplat.render.projection import features_of
+from sigmasplat.render.kernels import features_of
 from sigmasplat.render.render import render
 from sigmasplat.render.view import View
 

@@ -141,8 +141,3 @@ class Atlas:
         rows = np.array([row for row, _ in known], np.int64)
         exposures = np.array([exposure for _, exposure in known]).reshape(-1, 3, 2)
         return between(rows, exposures, np.arange(len(self.places)))
-
-    def T_world_keyframe(self, submap: int) -> Matrix:
-        """Return the poses of a submap's keyframes [K, 4, 4]."""
-        poses = self.refined.get(submap, self.keyframe_poses[submap])
-        return np.array([self.anchors[submap] @ T for T in poses]).reshape(-1, 4, 4)

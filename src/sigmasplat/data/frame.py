@@ -1,6 +1,7 @@
 """One RGB-D image: immutable, checked on construction, without ground truth; its photo as JPEG."""
 
 import copy
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from io import BytesIO
 from typing import NamedTuple
@@ -71,35 +72,49 @@ class Frame:
     specific_force_m_s2: NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
+        for problem in self._problems():
+            raise SourceError(f"frame {self.index}: {problem}")
+        self._keep(self.color, self.depth_m, self.depth_std_m)
+
+    def _problems(self) -> Iterator[str]:
+        """Yield what is wrong with the frame. Each check needs those before it."""
         for name, array in (("colour", self.color), ("depth", self.depth_m)):
             if not isinstance(array, np.ndarray) or array.dtype != np.float32:
-                raise SourceError(
-                    f"frame {self.index}: {name} is {described(array)}; give numpy float32, or use Slam.track or "
-                    "frame_from_arrays, which convert other arrays"
+                yield (
+                    f"{name} is {described(array)}; give numpy float32, or use Slam.track or frame_from_arrays, which "
+                    "convert other arrays"
                 )
         size = (self.camera.height, self.camera.width)
         if self.color.shape != (*size, 3) or self.depth_m.shape != size:
-            raise SourceError(
-                f"frame {self.index}: colour is {self.color.shape}, depth is {self.depth_m.shape}, the camera is "
-                f"{size[1]}×{size[0]}; register depth to colour and give both one size"
+            yield (
+                f"colour is {self.color.shape}, depth is {self.depth_m.shape}, the camera is {size[1]}×{size[0]}; "
+                "register depth to colour and give both one size"
             )
-        self._check_values()
-        if self.depth_std_m is not None:
-            self._check_std(self.depth_std_m)
+        low, high = float(self.color.min()), float(self.color.max())  # both are NaN if a value is NaN
+        nearest_m, farthest_m = float(self.depth_m.min()), float(self.depth_m.max())
+        for name, values in (("colour", (low, high)), ("depth", (nearest_m, farthest_m))):
+            if not np.isfinite(values).all():
+                yield f"{name} holds NaN or inf; write 0 where there is no reading"
+        if low < COLOR_LIMITS[0] or high > COLOR_LIMITS[1]:
+            yield color_range(low, high)
+        if nearest_m < 0.0:
+            yield f"depth is negative ({nearest_m:.3f} m); 0 means no reading"
+        std_m, force = self.depth_std_m, self.specific_force_m_s2
+        if std_m is not None:
+            if not isinstance(std_m, np.ndarray) or std_m.dtype != np.float32 or std_m.shape != self.depth_m.shape:
+                yield f"depth_std_m is {described(std_m)}; give float32, one value per pixel of depth"
+            wrong = int((~(np.isfinite(std_m) & (std_m > 0)) & (self.depth_m > 0)).sum())
+            if wrong:
+                yield (
+                    f"{wrong} depth readings have a standard deviation that is not above 0; give finite metres above "
+                    "0, or depth 0 where there is no reading"
+                )
         if self.R_inertial_camera is not None and not se3.is_rotation(self.R_inertial_camera):
-            raise SourceError(
-                f"frame {self.index}: R_inertial_camera is not a rotation [3, 3]; give None if it is not measured"
-            )
+            yield "R_inertial_camera is not a rotation [3, 3]; give None if it is not measured"
         if self.T_given_camera is not None and not se3.is_rigid(self.T_given_camera):
-            raise SourceError(
-                f"frame {self.index}: T_given_camera is not a rigid pose [4, 4]; give None if it is to be estimated"
-            )
-        force = self.specific_force_m_s2
+            yield "T_given_camera is not a rigid pose [4, 4]; give None if it is to be estimated"
         if force is not None and not (np.shape(force) == (3,) and np.isfinite(force).all()):
-            raise SourceError(
-                f"frame {self.index}: specific_force_m_s2 is not three finite numbers; give None if it is not measured"
-            )
-        self._keep(self.color, self.depth_m, self.depth_std_m)
+            yield "specific_force_m_s2 is not three finite numbers; give None if it is not measured"
 
     @property
     def prior(self) -> PosePrior:
@@ -117,31 +132,6 @@ class Frame:
             view = np.ascontiguousarray(array).view()
             view.setflags(write=False)
             object.__setattr__(self, name, view)
-
-    def _check_values(self) -> None:
-        """Raise SourceError on values that are not finite or out of range."""
-        low, high = float(self.color.min()), float(self.color.max())  # both are NaN if a value is NaN
-        nearest_m, farthest_m = float(self.depth_m.min()), float(self.depth_m.max())
-        for name, values in (("colour", (low, high)), ("depth", (nearest_m, farthest_m))):
-            if not np.isfinite(values).all():
-                raise SourceError(f"frame {self.index}: {name} holds NaN or inf; write 0 where there is no reading")
-        if low < COLOR_LIMITS[0] or high > COLOR_LIMITS[1]:
-            raise SourceError(f"frame {self.index}: {color_range(low, high)}")
-        if nearest_m < 0.0:
-            raise SourceError(f"frame {self.index}: depth is negative ({nearest_m:.3f} m); 0 means no reading")
-
-    def _check_std(self, std_m: NDArray[np.float32]) -> None:
-        """Raise SourceError unless every reading has a standard deviation above 0."""
-        if not isinstance(std_m, np.ndarray) or std_m.dtype != np.float32 or std_m.shape != self.depth_m.shape:
-            raise SourceError(
-                f"frame {self.index}: depth_std_m is {described(std_m)}; give float32, one value per pixel of depth"
-            )
-        wrong = ~(np.isfinite(std_m) & (std_m > 0)) & (self.depth_m > 0)
-        if wrong.any():
-            raise SourceError(
-                f"frame {self.index}: {int(wrong.sum())} depth readings have a standard deviation that is not above 0; "
-                "give finite metres above 0, or depth 0 where there is no reading"
-            )
 
     def resized(self, width: int, height: int) -> "Frame":
         """Return the frame at another size: colour averaged over the pixel's area, depth by `resized_depth`."""

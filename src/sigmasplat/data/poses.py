@@ -5,7 +5,7 @@ submaps and of their keyframes, places of frames relative to keyframes.
 import mmap
 import os
 from abc import abstractmethod
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -283,14 +283,6 @@ class Places(Records[Place]):
     """The columns of `rows` that hold a pose."""
 
     rows: Column = field(default_factory=lambda: Column.of(np.float64, NUMBERS + 16))
-
-    @staticmethod
-    def of(known: Iterable[Place]) -> "Places":
-        """Return places in their order."""
-        places = Places()
-        for place in known:
-            places.append(place)
-        return places
 
     @property
     def submap(self) -> NDArray[np.int64]:

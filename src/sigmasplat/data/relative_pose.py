@@ -66,14 +66,6 @@ class TrackedHops(Records[RelativePose]):
 
     rows: Column = field(default_factory=lambda: Column.of(np.float64, 1 + 16 + 36 + 6))
 
-    @staticmethod
-    def of(known: Iterable[tuple[int, RelativePose]]) -> "TrackedHops":
-        """Return hops in their order, each with the submap of its keyframe."""
-        hops = TrackedHops()
-        for submap, hop in known:
-            hops.append(submap, hop)
-        return hops
-
     def append(self, submap: int, hop: RelativePose) -> None:
         """Append the hop to the next keyframe, which is in a submap that is not before the last one."""
         self.rows.append([submap, *hop.T_a_b.ravel(), *hop.covariance.ravel(), *hop.bias])

@@ -22,8 +22,8 @@ from sigmasplat.errors import SigmaSplatError
 from sigmasplat.final.full_resolution import refine_on_photos, working_seconds
 from sigmasplat.final.fusion import count_keyframes, fuse, fusion_views
 from sigmasplat.final.refinement import Clock, KeyframeReader, SavedRefinement, refine
-from sigmasplat.final.still_store import carved, without_moving
 from sigmasplat.graph.path_covariance import PathCovariance
+from sigmasplat.mapping.moving import carved, without_moving
 from sigmasplat.render.view import View
 from sigmasplat.types import Matrix, Progress, no_progress
 

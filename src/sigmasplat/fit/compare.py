@@ -68,11 +68,6 @@ def compare(reference: Pyramid, live: Pyramid, T_live_reference: Matrix) -> Comp
     return Comparison(common, close, front, behind, residual, correlation, int(points), covered)
 
 
-def noise_m(depth_m: Matrix, noise_per_m: float = NOISE_PER_M, scene_scale: float = 1.0) -> Matrix:
-    """Return the standard deviation assumed for depth readings, metres; its constant grows with the scene."""
-    return np.asarray(noise_per_m * depth_m**2 + NOISE_M * scene_scale)
-
-
 def noise_scale(depth: NDArray[np.float32], noise_per_m: float = NOISE_PER_M, scene_scale: float = 1.0) -> float:
     """Return the factor, at least 1, by which a depth image [h, w] is noisier than assumed.
 

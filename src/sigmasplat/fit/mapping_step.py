@@ -14,7 +14,7 @@ from sigmasplat.fit.adam import ROWS_AT_ONCE, Rates, adam_rows, adam_step
 from sigmasplat.fit.interface import Accumulator, MappingStep, Twist, Weights
 from sigmasplat.fit.losses import SHAPE_TERMS
 from sigmasplat.fit.target import Target
-from sigmasplat.render.projection import variance_of
+from sigmasplat.render.kernels import variance_of
 from sigmasplat.render.view import View
 from sigmasplat.types import Matrix
 

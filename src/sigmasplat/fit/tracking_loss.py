@@ -11,7 +11,7 @@ from torch import Tensor
 from sigmasplat.config import TrackingConfig
 from sigmasplat.fit.interface import ReferenceMaps
 from sigmasplat.fit.target import Target, luma
-from sigmasplat.render.projection import variance_of
+from sigmasplat.render.kernels import variance_of
 from sigmasplat.render.view import View
 
 

@@ -192,8 +192,6 @@ class CpuView:
         return self.g_moment if moment else None, ids if layers else None, self.g_median_depth if layers else None
 
     def backward(self, params: Tensor, g_params: Tensor, grad2d: Tensor | None = None) -> Matrix:
-        """Write the gradient of the rows to g_params [N, 17], and grad2d [N] if given. Return the pose twist (ρ, φ)
-        [6]."""
         twist, (g_moment, median_id, g_median_depth) = np.zeros(6), self.depth_gradients()
         self.raster.view_backward(
             params, self.g_sums, g_moment, self.g_alpha, median_id, g_median_depth, g_params, grad2d, twist,
@@ -208,18 +206,11 @@ class CpuView:
         return sums
 
     def backward_pose(self, params: Tensor) -> Matrix:
-        """Return the pose twist (ρ, φ) [6] from the gradient planes of colour and depth; params are rows [N, 17]."""
         twist = np.zeros(6)
         self.raster.backward_pose(params, self.g_sums, twist, self.seconds[3:])
         return twist
 
     def visible(self, n: int) -> Tensor:
-        """Return which of the n splats of the last render reach the image, bool [n]."""
         seen = torch.empty(n, dtype=torch.uint8)
         self.raster.visible(seen)
         return seen.bool()
-
-    @property
-    def bytes(self) -> int:
-        """Return the memory held by this view's buffers."""
-        return self.raster.bytes + 4 * 2 * (self.sums.numel() + 2 * self.alpha.numel())

@@ -12,8 +12,7 @@ from sigmasplat.config import RenderConfig
 from sigmasplat.config.sensors import SensorModel
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
-from sigmasplat.render.kernels import twist_matrix
-from sigmasplat.render.projection import (
+from sigmasplat.render.kernels import (
     FRUSTUM_MARGIN,
     PLANES,
     Blended,
@@ -22,6 +21,7 @@ from sigmasplat.render.projection import (
     depth_of,
     features_of,
     plane_features,
+    twist_matrix,
 )
 from sigmasplat.render.view import Layers
 from sigmasplat.types import Matrix
@@ -280,8 +280,6 @@ class ReferenceView:
             self._maps.append((median_depth, self.g_median_depth))
 
     def backward(self, params: Tensor, g_params: Tensor, grad2d: Tensor | None = None) -> Matrix:
-        """Write the gradient of the rows to g_params [N, 17], and grad2d [N] if given. Return the pose twist (ρ, φ)
-        [6]."""
         maps, gradients = zip(*self._maps, strict=True)
         leaves = (self._leaf, self._twist, self._means2d)
         g_leaf, g_twist, g_means2d = torch.autograd.grad(maps, leaves, gradients, materialize_grads=True)
@@ -291,12 +289,10 @@ class ReferenceView:
         return np.asarray(g_twist.numpy(), np.float64)
 
     def backward_pose(self, params: Tensor) -> Matrix:
-        """Return the pose twist (ρ, φ) [6] from the gradient planes of colour and depth."""
         (g_twist,) = torch.autograd.grad(self._maps[0][0][:4], self._twist, self.g_sums[:4], materialize_grads=True)
         return np.asarray(g_twist.numpy(), np.float64)
 
     def visible(self, n: int) -> Tensor:
-        """Return which splats of the last render reach the image, bool [n]."""
         return self._visible
 
 

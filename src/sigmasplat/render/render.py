@@ -13,7 +13,7 @@ from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import COLUMNS, GaussianField
 from sigmasplat.data.harmonics import view_colors
 from sigmasplat.render.backend import backend_module, backend_name, on_device, options_on
-from sigmasplat.render.projection import depth_at, depth_of, features_of, plane_features, variance_of
+from sigmasplat.render.kernels import depth_at, depth_of, features_of, plane_features, variance_of
 from sigmasplat.render.reference import depth_slopes
 
 CENTER = RenderConfig(depth="center")

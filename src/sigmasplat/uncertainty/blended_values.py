@@ -16,7 +16,7 @@ from sigmasplat.config import RenderConfig
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import COLUMNS, GaussianField
 from sigmasplat.render.backend import backend_module, backend_name, options_on
-from sigmasplat.render.projection import Projection, depth_of, plane_features
+from sigmasplat.render.kernels import Projection, depth_of, plane_features
 from sigmasplat.render.render import colors_from
 
 MEANS, QUATS = COLUMNS["means"], COLUMNS["quats"]
