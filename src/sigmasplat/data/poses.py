@@ -17,51 +17,12 @@ from numpy.typing import NDArray
 
 from sigmasplat.types import Matrix
 
-STEP_BYTES = 2**20
-"""The file grows by this much, or by an eighth."""
-
-
-class DiskMemory:
-    """Growing memory in an unnamed file of a folder.
-
-    The file has no name, so it is gone when the process ends, however it ends: nothing can be left over, and nothing is
-    read from it later. Raises OSError if the file cannot be made.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        existing = next(path for path in (folder, *folder.absolute().parents) if path.is_dir())
-        self._file = TemporaryFile(dir=existing, buffering=0)  # noqa: SIM115 - it lives as long as this object
-        self._map: mmap.mmap | None = None
-        self.size = 0
-
-    def grown(self, size: int) -> mmap.mmap:
-        """Return the memory with at least so many bytes; its content is kept, and earlier maps of it stay valid.
-
-        Raises OSError if the disk is full: space is reserved here, because a disk that is full when memory is written
-        would end the process.
-        """
-        steps = -(-max(size, self.size + self.size // 8) // STEP_BYTES)
-        reserve = getattr(os, "posix_fallocate", None)
-        if reserve is None:
-            raise OSError("this system cannot reserve space in a file")
-        reserve(self._file.fileno(), 0, steps * STEP_BYTES)
-        self.size = steps * STEP_BYTES
-        self._map = mmap.mmap(self._file.fileno(), self.size)
-        return self._map
-
-    def release(self) -> None:
-        """Give the RAM back to the system; the content is read from the file when it is next used."""
-        if self._map is not None:
-            with suppress(OSError):
-                self._map.madvise(mmap.MADV_DONTNEED)
-
-
 Record = TypeVar("Record")
 GROWTH = 1.25
 """Factor by which the space grows when it is full."""
 FEWEST = 64
-LEAST_ON_DISK = 2**18
-"""A column with fewer bytes stays in RAM."""
+LEAST_ON_DISK, STEP_BYTES = 2**18, 2**20
+"""A column with fewer bytes stays in RAM; a file grows by the second, or by an eighth."""
 
 
 @dataclass(eq=False)
@@ -69,13 +30,15 @@ class Column:
     """One value per frame, keyframe or submap, a number or an array, appended one by one.
 
     values [space, …]: the first `count` are used. Raises ValueError if `values` has fewer. folder: where a long column
-    may move to a file without a name, so that RAM does not grow with it; None = it stays in RAM.
+    may move to a file, so that RAM does not grow with it; None = it stays in RAM. The file has no name, so it is gone
+    when the process ends, however it ends.
     """
 
     values: NDArray[Any] = field(default_factory=lambda: np.zeros(0))
     count: int = 0
     folder: Path | None = field(default=None, init=False)
-    _disk: DiskMemory | None = field(default=None, init=False, repr=False)
+    _file: Any = field(default=None, init=False, repr=False)
+    _map: mmap.mmap | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:
         if not 0 <= self.count <= len(self.values):
@@ -111,30 +74,37 @@ class Column:
 
     def release(self) -> None:
         """Give the RAM of a column on disk back to the system, after much of it was read."""
-        if self._disk is not None:
-            self._disk.release()
+        if self._map is not None:
+            with suppress(OSError):
+                self._map.madvise(mmap.MADV_DONTNEED)
 
     def _reserve(self, least: int) -> None:
         """Make space for at least so many values: on disk for a long column that may move there, if there is room."""
         row_bytes = self.values.itemsize * int(np.prod(self.values.shape[1:]))
-        if self.folder is not None and least * row_bytes > LEAST_ON_DISK:
+        if self.folder is not None and least * row_bytes > LEAST_ON_DISK and hasattr(os, "posix_fallocate"):
             try:
-                self._move(least, row_bytes, self.folder)
+                self._move(least * row_bytes, row_bytes, self.folder)
                 return
             except OSError:  # no space left, or a file system that cannot do this
-                self.folder = self._disk = None
+                self.folder = self._file = self._map = None
         space = max(FEWEST, least, int(GROWTH * self.count) + 1)
         grown = np.zeros((space, *self.values.shape[1:]), self.values.dtype)
         grown[: self.count] = self.used
         self.values = grown
 
-    def _move(self, least: int, row_bytes: int, folder: Path) -> None:
-        """Reserve space in the file; values in RAM are copied to it the first time."""
-        before, disk = (None if self._disk else self.used), self._disk or DiskMemory(folder)
-        memory = disk.grown(least * row_bytes)
-        space = disk.size // row_bytes
-        flat = np.frombuffer(memory, self.values.dtype, space * (row_bytes // self.values.itemsize))
-        self.values, self._disk = flat.reshape(space, *self.values.shape[1:]), disk
+    def _move(self, size: int, row_bytes: int, folder: Path) -> None:
+        """Reserve at least so many bytes in the file: a disk that is full when memory is written would end the process.
+        Values in RAM are copied to it the first time; earlier maps of it stay valid."""
+        before, reserved = (None, len(self._map)) if self._map else (self.used, 0)
+        if self._file is None:
+            existing = next(path for path in (folder, *folder.absolute().parents) if path.is_dir())
+            self._file = TemporaryFile(dir=existing, buffering=0)  # noqa: SIM115 - it lives as long as this object
+        size = -(-max(size, reserved + reserved // 8) // STEP_BYTES) * STEP_BYTES
+        os.posix_fallocate(self._file.fileno(), 0, size)
+        self._map = mmap.mmap(self._file.fileno(), size)
+        space = size // row_bytes
+        flat = np.frombuffer(self._map, self.values.dtype, space * (row_bytes // self.values.itemsize))
+        self.values = flat.reshape(space, *self.values.shape[1:])
         if before is not None:
             self.values[: self.count] = before
 
