@@ -1,6 +1,7 @@
 """Definitions in numpy of the kernels that prepare and compare images (native/resize.h, compare.h, free_space.h)."""
 
 import numpy as np
+import PIL.Image
 import torch
 from numpy.typing import NDArray
 
@@ -60,11 +61,28 @@ def halved_color_in_numpy(color: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.clip(small, 0.0, 1.0, out=small)
 
 
+def nearest_depth(depth_m: Depth, width: int, height: int) -> Depth:
+    """Return in each pixel's area the reading nearest to its centre, 0 without a reading."""
+    small = np.array(PIL.Image.fromarray(depth_m).resize((width, height), PIL.Image.Resampling.NEAREST), np.float32)
+    holes = np.flatnonzero(small == 0.0)
+    if not len(holes):
+        return small
+    readings, filled = depth_m.ravel(), small.ravel()
+    for at_rows, at_columns in zip(
+        *images._area_in_order(depth_m.shape[0], height, depth_m.shape[1], width), strict=True
+    ):
+        source = (at_rows.astype(np.intp) * depth_m.shape[1])[:, None] + at_columns
+        found = readings.take(source.ravel().take(holes))
+        filled[holes] = found
+        holes = holes[found == 0.0]
+    return small
+
+
 def resized_depth_in_numpy(depth_m: Depth, width: int, height: int) -> Depth:
     """Return what `resized_depth` returns without limits."""
     if depth_m.shape == (height, width):
         return depth_m.copy()
-    nearest = images._nearest_depth(depth_m, width, height)
+    nearest = nearest_depth(depth_m, width, height)
     rows, columns = (images._centers(m, n) for n, m in zip((height, width), depth_m.shape, strict=True))
     return images.interpolated_depth(depth_m, rows, columns, nearest)
 

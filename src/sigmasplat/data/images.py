@@ -1,6 +1,5 @@
 """Images of a camera: colour and depth, resized with the compiled kernels (native/resize.h); the noise of depth."""
 
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -43,20 +42,23 @@ def halved_color(color: NDArray[np.float32]) -> NDArray[np.float32]:
 # ---- depth ----
 
 
-def resized_depth(depth_m: Depth, width: int, height: int, least_m: float = 0.0, most_m: float = float("inf")) -> Depth:
+def resized_depth(
+    depth_m: Depth, width: int, height: int, least_m: float = 0.0, most_m: float = float("inf"),
+    same_surface: float = SAME_SURFACE,
+) -> Depth:  # fmt: skip
     """Return depth [height, width], m, at the centre of each pixel, 0 without a reading in its area, and 0 if it is
     outside [least_m, most_m].
 
     Depth is interpolated where the four readings around the centre are on one surface (`interpolated_depth`). Elsewhere
     it is the reading of the area that is nearest to the centre: the mean of a near and a far surface is on neither of
-    them.
+    them. same_surface: ratio of depths up to which they are on one surface; 0 = none are.
     """
     if depth_m.shape == (height, width):
         return within(depth_m.copy(), least_m, most_m)
     rows, columns = _axis(depth_m.shape[0], height), _axis(depth_m.shape[1], width)
     small = np.empty((height, width), np.float32)
     _core.resize_depth(
-        np.ascontiguousarray(depth_m), rows.pixels, rows.share, columns.pixels, columns.share, SAME_SURFACE,
+        np.ascontiguousarray(depth_m), *rows, *columns, same_surface,
         *_area_in_order(depth_m.shape[0], height, depth_m.shape[1], width), least_m, most_m, small,
     )  # fmt: skip
     return small
@@ -74,7 +76,7 @@ def resized_std(std_m: Depth | None, depth_m: Depth) -> Depth | None:
     if std_m is None:
         return None
     height, width = depth_m.shape
-    small = std_m if std_m.shape == depth_m.shape else _nearest_depth(std_m, width, height)
+    small = std_m if std_m.shape == depth_m.shape else resized_depth(std_m, width, height, same_surface=0.0)
     return np.where(depth_m > 0, small, np.float32(0.0))
 
 
@@ -109,36 +111,14 @@ def _around(positions: NDArray[np.float64], size: int) -> tuple[NDArray[np.intp]
     return np.clip(pixels, 0, size - 1), np.clip(pixels + 1, 0, size - 1), share
 
 
-def _nearest_depth(depth_m: Depth, width: int, height: int) -> Depth:
-    """Return in each pixel's area the reading nearest to its centre, 0 without a reading."""
-    small = np.array(Image.fromarray(depth_m).resize((width, height), Image.Resampling.NEAREST), np.float32)
-    holes = np.flatnonzero(small == 0.0)
-    if not len(holes):
-        return small
-    readings, filled = depth_m.ravel(), small.ravel()
-    for at_rows, at_columns in zip(*_area_in_order(depth_m.shape[0], height, depth_m.shape[1], width), strict=True):
-        source = (at_rows.astype(np.intp) * depth_m.shape[1])[:, None] + at_columns
-        found = readings.take(source.ravel().take(holes))
-        filled[holes] = found
-        holes = holes[found == 0.0]
-    return small
-
-
-@dataclass(frozen=True, eq=False)
-class _Axis:
-    """Which pixels of an axis a resized one reads [3, n]: the nearest one to each centre, and the two around it, with
-    the weight [n] of the second."""
-
-    pixels: Indices
-    share: Depth
-
-
 @lru_cache(maxsize=16)
-def _axis(size: int, resized: int) -> _Axis:
+def _axis(size: int, resized: int) -> tuple[Indices, Depth]:
+    """Return which pixels of an axis a resized one reads [3, n]: the nearest one to each centre, and the two around it;
+    and the weight [n] of the last."""
     numbers = Image.fromarray(np.arange(size, dtype=np.int32)[None])
     nearest = np.asarray(numbers.resize((resized, 1), Image.Resampling.NEAREST))[0]
     first, second, share = _around(_centers(size, resized), size)
-    return _Axis(np.stack([nearest, first, second]).astype(np.int32), share)
+    return np.stack([nearest, first, second]).astype(np.int32), share
 
 
 @lru_cache(maxsize=16)
