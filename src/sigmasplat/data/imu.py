@@ -264,7 +264,8 @@ def accelerometer_from_samples(
     """Make an accelerometer of recorded samples [M] and [M, 3] (`in_time_order`); None if they do not measure
     gravity."""
     times, forces = in_time_order(times_s, specific_force_m_s2)
-    if not len(times) or not _is_gravity(float(np.median(np.linalg.norm(forces, axis=1)))):
+    length_m_s2 = float(np.median(np.linalg.norm(forces, axis=1))) if len(times) else 0.0
+    if abs(length_m_s2 / GRAVITY_M_S2 - 1.0) > OFF_GRAVITY:
         return None
     return Accelerometer(times, forces)
 
@@ -284,10 +285,6 @@ class RunningAccelerometer:
         then, or if the recent samples do not measure gravity."""
         found = accelerometer_from_samples(self._recent.times_s, self._recent.values)
         return None if found is None else found.at(time_s)
-
-
-def _is_gravity(length_m_s2: float) -> bool:
-    return abs(length_m_s2 / GRAVITY_M_S2 - 1.0) <= OFF_GRAVITY
 
 
 def up_of_path(T_world_camera: Matrix, specific_force_m_s2: NDArray[np.float64]) -> NDArray[np.float64] | None:

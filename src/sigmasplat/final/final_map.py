@@ -120,7 +120,8 @@ def merged(store: SubmapStore, anchors: Sequence[Matrix], config: Config) -> Gau
     kept, waiting = list[OwnedSplats](), list[OwnedSplats]()
     for index in range(len(store)):
         part = _in_world(store, anchors, index)
-        waiting.append(OwnedSplats(part, np.full(len(part), index), _log_variance(part.params)))
+        log_variance = part.params[:, COLUMNS["log_variances"]].mean(1)
+        waiting.append(OwnedSplats(part, np.full(len(part), index), log_variance))
         if _count(waiting) >= max(AT_ONCE, _count(kept)):
             kept, waiting = [_without_duplicates([*kept, *waiting], config.final)], []
     return _without_duplicates([*kept, *waiting], config.final).field
@@ -143,11 +144,6 @@ def _without_duplicates(parts: Sequence[OwnedSplats], final: FinalConfig) -> Own
 def _in_world(store: SubmapStore, anchors: Sequence[Matrix], index: int) -> GaussianField:
     """Return a submap's splats in the world."""
     return store.load(index).field.moved(torch.from_numpy(anchors[index]))
-
-
-def _log_variance(rows: Tensor) -> Tensor:
-    """Return log σ² of rows [N, 17], mean over the channels."""
-    return rows[:, COLUMNS["log_variances"]].mean(1)
 
 
 def survivors(

@@ -93,13 +93,10 @@ def live_planes(view: View, color: Image, depth_m: Image, target: Target) -> tup
     return gray_of(color), depth_m
 
 
-def _beside(array: Image, plane: Image) -> Image:
-    return array
-
-
 CPU_IMAGES = ImageKernels(
-    np.ascontiguousarray, np.asarray, _beside, torch.tensor, halve, readings_of, align, normal_equations
-)
+    np.ascontiguousarray, np.asarray, lambda array, plane: array, torch.tensor, halve, readings_of, align,
+    normal_equations,
+)  # fmt: skip
 
 
 # ---- mapping ----

@@ -178,7 +178,11 @@ class ViewDependentStep:
     ) -> tuple[Twist, float | Tensor]:
         grad, cost = torch.zeros_like(field.params), 0.0
         twist = self.view.backward(self.rows, grad, grad2d)
-        harmonics = self._begin(field.get_or_create("harmonics"))
+        whole = field.get_or_create("harmonics")
+        whole.steps += 1
+        # The harmonics of the degrees in use share memory with the field's.
+        params, moment1, moment2 = (x[:, : self.width] for x in (whole.params, whole.moment1, whole.moment2))
+        harmonics = Rows(params, moment1, moment2, whole.last_step, whole.steps)
         harmonic_rates = Rates(rates.of_attribute("harmonics").per_column[: self.width], rates.beta2)
         visible = self.view.visible(len(field)).nonzero().squeeze(1)
         for rows in torch.split(visible, ROWS_AT_ONCE):
@@ -199,15 +203,6 @@ class ViewDependentStep:
     def accumulator(self, field: GaussianField) -> Accumulator:
         """Raise ConfigError: this step takes one image only."""
         raise ConfigError("mapping.frames_per_step must be 1 with view-dependent colour")
-
-    def _begin(self, harmonics: Rows) -> Rows:
-        """Start a step of the harmonics; return the harmonics of the degrees in use, which share memory with the
-        field's."""
-        harmonics.steps += 1
-        params, moment1, moment2 = (
-            x[:, : self.width] for x in (harmonics.params, harmonics.moment1, harmonics.moment2)
-        )
-        return Rows(params, moment1, moment2, harmonics.last_step, harmonics.steps)
 
     def _through_colors(self, own: Tensor, harmonics: Tensor, g_shown: Tensor) -> tuple[Tensor, Tensor]:
         """Propagate the gradient of view-dependent colours [n, 3] to harmonics [n, width] and, by the direction, to

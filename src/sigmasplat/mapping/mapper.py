@@ -299,11 +299,6 @@ class Mapper:
             coarse[coarse.nonzero()[max(most - len(self.field), 0) if most else len(coarse) :]] = False
             split(self.field, coarse, self.random)
 
-    def _judging_keyframes(self, window: list[Keyframe]) -> list[Keyframe]:
-        """Return the keyframes that pruning uses to judge splats: those of the window, or the newest if there is no
-        window."""
-        return window if self.config.mapping.window else window[:1]
-
     def _fade_uncertain(self, view: View, window: list[Keyframe]) -> Tensor:
         """Fade the splats that contradict the depth readings of the window; return their ids."""
         p = self.config.primitives
@@ -320,8 +315,9 @@ class Mapper:
         return still_uncertain(self.field, faded, nu_m2, p.uncertain_m2, p.least_opacity)
 
     def _uncertainty_m2(self, view: View, window: list[Keyframe]) -> Tensor:
-        """Return how far each splat [N] is from the depth readings, m²."""
-        keyframes = self._judging_keyframes(window)
+        """Return how far each splat [N] is from the depth readings of the window, or of the newest keyframe if there is
+        no window, m²."""
+        keyframes = window if self.config.mapping.window else window[:1]
         return splat_uncertainty(self.field, view, keyframes, self.config.primitives.owner)[0]
 
     def _prune(self, view: View, also: Tensor | None = None) -> None:

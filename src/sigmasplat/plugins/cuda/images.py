@@ -155,21 +155,12 @@ def live_planes(view: View, color: Plane, depth_m: Plane, target: Target) -> tup
     return luma(on_device.color[:, :h, :w]), on_device.depth_image
 
 
-def _contiguous(plane: Tensor) -> Tensor:
-    return plane.contiguous()
-
-
 def _to_host(plane: Tensor) -> NDArray[np.float32]:
     array: NDArray[np.float32] = plane.cpu().numpy()
     return array
 
 
-def _beside(array: NDArray[np.float32], plane: Tensor) -> Tensor:
-    return torch.from_numpy(array).to(plane.device)
-
-
-def _as_tensor(plane: Tensor) -> Tensor:
-    return plane
-
-
-CUDA_IMAGES = ImageKernels(_contiguous, _to_host, _beside, _as_tensor, halve, readings_of, align, normal_equations)
+CUDA_IMAGES = ImageKernels(
+    Tensor.contiguous, _to_host, lambda array, plane: torch.from_numpy(array).to(plane.device), lambda plane: plane,
+    halve, readings_of, align, normal_equations,
+)  # fmt: skip
