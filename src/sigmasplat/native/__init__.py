@@ -6,7 +6,7 @@ Importing this package raises BackendError if they cannot be loaded.
 from sigmasplat.errors import BackendError
 
 try:
-    from sigmasplat.native import _core as _core
+    import sigmasplat.native._core  # noqa: F401 # others import it
 except ImportError as problem:
     raise BackendError(
         f"the compiled kernels cannot be loaded ({problem}); reinstall with `pip install .`"
