@@ -35,7 +35,7 @@ class Picture:
         return self.color.astype(np.float32) / np.float32(255.0)
 
     def without_exposure(self, exposure: Matrix) -> "Picture":
-        """Return the same images with the colour in the exposure of the map (`model.exposure`); photo and detail are
+        """Return the same images with the colour in the exposure of the map (`data.camera`); photo and detail are
         not changed."""
         color = np.rint(unexposed(self.unit_color, exposure) * 255.0).astype(np.uint8)
         return replace(self, color=color)
@@ -169,7 +169,7 @@ class RefinedStore(ReadOnlyStore):
     exposure is interpolated between those of keyframes.
 
     keyframe_poses: T_submap_camera [4, 4] of each submap's keyframes, None: not moved. The splats of the submaps fit
-    the old poses. exposures: [K, 3, 2] of each submap's keyframes (`model.exposure`), None: not fitted.
+    the old poses. exposures: [K, 3, 2] of each submap's keyframes (`data.camera`), None: not fitted.
     """
 
     keyframe_poses: Sequence[Sequence[Matrix]] | None = None

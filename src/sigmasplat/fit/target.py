@@ -109,7 +109,7 @@ class Target:
         return Target(self.camera, self.color, depth, readings, self.depth_std, self.depth_weight)
 
     def without_exposure(self, exposure: NDArray[np.float64]) -> "Target":
-        """Return the same depth with the colours in the exposure of the map (`model.exposure`), in [0, 1]."""
+        """Return the same depth with the colours in the exposure of the map (`data.camera`), in [0, 1]."""
         gain, offset = torch.from_numpy(exposure).float().T[..., None, None]
         color, inside = torch.zeros_like(self.color), np.s_[:, : self.camera.height, : self.camera.width]
         color[inside] = ((self.color[inside] - offset) / gain).clamp_(0.0, 1.0)

@@ -1,5 +1,5 @@
 // What tracking computes from a render: pixel weights, the papers' loss with its gradient, and the reference of
-// alignment. fit/tracking_loss.py, tracking_loss.py and reference_maps.py are the definitions.
+// alignment. fit/tracking_loss.py has the definitions.
 
 constexpr float WEIGHT_EPSILON = 1e-6f;
 
