@@ -57,9 +57,9 @@ class PublicRecording:
 class PublicSet:
     """A data set that can be downloaded without registration.
 
-    folder: below the data folder; recordings: by short name, "" if there is only one; max_bytes, max_files: limits on
-    the size of an archive and the number of files in it; disk_ratio: bytes on disk during unpacking, per byte of the
-    archive; prefix: optional prefix of the short names; sequences: whether the recordings are sequences, not weights.
+    folder: below the data folder; recordings: by short name, "" if there is only one; disk_ratio: bytes on disk during
+    unpacking, per byte of the archive; prefix: optional prefix of the short names; sequences: whether the recordings
+    are sequences, not weights.
     """
 
     title: str
@@ -67,8 +67,6 @@ class PublicSet:
     licence: str
     folder: str
     recordings: Mapping[str, PublicRecording]
-    max_bytes: int
-    max_files: int
     disk_ratio: float = 1.3
     prefix: str = ""
     sequences: bool = True
@@ -82,7 +80,7 @@ class RestrictedSet:
     page: str
 
 
-MB, GB = 10**6, 10**9
+MB = 10**6
 
 _UNKNOWN_SIZES = (
     "fr2/large_no_loop fr2/pioneer_360 fr2/pioneer_slam fr2/pioneer_slam2 fr2/pioneer_slam3 "
@@ -196,37 +194,37 @@ def _redwood(name: str) -> PublicRecording:
 SETS: Mapping[str, PublicSet | RestrictedSet] = {
     "tum": PublicSet(
         "TUM RGB-D, static scenes", "https://cvg.cit.tum.de/data/datasets/rgbd-dataset", "CC BY 4.0", "tum",
-        {name: _tum(name, size) for name, size in TUM_SIZES_MB.items()}, 5 * GB, 50_000, prefix="rgbd_dataset_",
+        {name: _tum(name, size) for name, size in TUM_SIZES_MB.items()}, prefix="rgbd_dataset_",
     ),
     "replica": PublicSet(
         "Replica, 8 rooms rendered for NICE-SLAM", "https://github.com/facebookresearch/Replica-Dataset",
         "Replica research licence, not for commercial use", "",
-        {"": PublicRecording("replica", (RemoteFile(REPLICA_URL, 12_400 * MB),), start="room0")}, 20 * GB, 100_000,
+        {"": PublicRecording("replica", (RemoteFile(REPLICA_URL, 12_400 * MB),), start="room0")},
     ),
     "icl": PublicSet(
         "ICL-NUIM, synthetic, as TUM-compatible PNGs", "https://www.doc.ic.ac.uk/~ahanda/VaFRIC/iclnuim.html",
         "terms and citation on its page", "icl",
         {f"living_room{i}": _icl(f"living_room_traj{i}_frei_png") for i in range(4)}
-        | {f"office{i}": _icl(f"traj{i}_frei_png") for i in range(4)}, 3 * GB, 20_000,
+        | {f"office{i}": _icl(f"traj{i}_frei_png") for i in range(4)},
     ),
     "7scenes": PublicSet(
         "7-Scenes", "https://www.microsoft.com/en-us/research/project/rgb-d-dataset-7-scenes/",
         "Microsoft Research licence, not for commercial use", "7scenes",
-        {name: _seven_scenes(name, size) for name, size in SEVEN_SCENES_SIZES.items()}, 8 * GB, 100_000, disk_ratio=2.4,
+        {name: _seven_scenes(name, size) for name, size in SEVEN_SCENES_SIZES.items()}, disk_ratio=2.4,
     ),
     "bonn": PublicSet(
         "Bonn RGB-D Dynamic", "https://www.ipb.uni-bonn.de/data/rgbd-dynamic-dataset/",
         "for research, terms and citation on its page", "bonn",
-        {name: _bonn(name) for name in BONN_NAMES}, 5 * GB, 50_000, prefix="rgbd_bonn_",
+        {name: _bonn(name) for name in BONN_NAMES}, prefix="rgbd_bonn_",
     ),
     "redwood": PublicSet(
         "Redwood, ICL-NUIM rooms with longer paths and Kinect noise", "http://redwood-data.org/indoor/dataset.html",
-        "terms and citation on its page", "redwood", {name: _redwood(name) for name in REDWOOD_MD5}, 3 * GB, 20_000,
+        "terms and citation on its page", "redwood", {name: _redwood(name) for name in REDWOOD_MD5},
     ),
     "lpips": PublicSet(
         "Weights of LPIPS: linear layers, and AlexNet or VGG16 of torchvision",
         "https://github.com/richzhang/PerceptualSimilarity", "BSD 2-Clause (lpips), BSD 3-Clause (torchvision)",
-        "lpips", {net: _lpips(net) for net in LPIPS_FILES}, GB, 10, disk_ratio=1.0, sequences=False,
+        "lpips", {net: _lpips(net) for net in LPIPS_FILES}, disk_ratio=1.0, sequences=False,
     ),
     "scannet": RestrictedSet("ScanNet", "http://www.scan-net.org (terms of use to sign)"),
     "scannetpp": RestrictedSet(
