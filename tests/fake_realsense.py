@@ -15,12 +15,11 @@ import numpy as np
 
 from sigmasplat.plugins.sources import SyntheticRoom
 
-stream = Enum("stream", "depth color infrared gyro accel")
-format_ = Enum("format", "z16 rgb8 y8 motion_xyz32f combined_motion")
+stream = Enum("stream", "depth color gyro accel")
+format_ = Enum("format", "z16 rgb8 motion_xyz32f combined_motion")
 clock = Enum("timestamp_domain", "hardware_clock system_time global_time")
 EARLIER_S = {clock.hardware_clock: 5000.0, clock.system_time: 0.0, clock.global_time: 0.0}
 """By how much the times of each clock are smaller."""
-option = Enum("option", "emitter_enabled")
 distortion = Enum(
     "distortion", "none brown_conrady inverse_brown_conrady modified_brown_conrady kannala_brandt4 ftheta"
 )
@@ -39,8 +38,6 @@ class Device:
         self.must_align = True
         self.asked: list[tuple[Any, ...]] = []
         self.serial = ""
-        self.baseline_m, self.R_right_left = 0.0, np.eye(3)
-        self.set: list[tuple[str, float]] = []
         self.started = self.stopped = 0
         self.number = 0
         self.on_frame: Callable[[int], None] = lambda number: None
@@ -51,7 +48,7 @@ class Device:
     def module(self) -> ModuleType:
         """Return the module for `import pyrealsense2`."""
         made = ModuleType("pyrealsense2")
-        names = {"stream": stream, "format": format_, "distortion": distortion, "option": option}
+        names = {"stream": stream, "format": format_, "distortion": distortion}
         for name, value in names.items():
             setattr(made, name, value)
         made.pipeline = lambda: _Pipeline(self)  # type: ignore[attr-defined]
@@ -75,10 +72,8 @@ class _Config:
         self.device.serial = serial
 
     def enable_stream(self, kind: Any, *mode: Any) -> None:
-        """Take (width, height, format, rate), for infrared after the number of the image, as the SDK does."""
-        *numbers, pixels, framerate = mode
-        assert len(numbers) == (3 if kind is stream.infrared else 2)
-        self.device.asked.append((kind.name, *numbers, pixels.name, framerate))
+        width, height, pixels, framerate = mode
+        self.device.asked.append((kind.name, width, height, pixels.name, framerate))
 
 
 class _Pipeline:
@@ -89,17 +84,12 @@ class _Pipeline:
         if not self.device.plugged_in:
             raise RuntimeError("No device connected")
         self.device.started += 1
-        sensor = SimpleNamespace(
-            get_depth_scale=lambda: self.device.scale_m, supports=lambda option: True,
-            set_option=lambda option, value: self.device.set.append((option.name, value)),
-        )  # fmt: skip
+        sensor = SimpleNamespace(get_depth_scale=lambda: self.device.scale_m)
         sensors = [SimpleNamespace(get_stream_profiles=lambda: [_Profile(self.device, stream.color)])]
         sensors += [self.device.motion] if self.device.motion else []
         return SimpleNamespace(
             get_device=lambda: SimpleNamespace(first_depth_sensor=lambda: sensor, query_sensors=lambda: sensors),
-            get_stream=lambda kind, number=0: SimpleNamespace(
-                as_video_stream_profile=lambda: _Profile(self.device, kind, number)
-            ),
+            get_stream=lambda kind: SimpleNamespace(as_video_stream_profile=lambda: _Profile(self.device, kind)),
         )
 
     def stop(self) -> None:
@@ -122,8 +112,8 @@ class _Pipeline:
 class _Profile:
     """A stream of a camera. Depth is rendered from the colour camera, so that aligning does not change it."""
 
-    def __init__(self, device: Device, kind: Any, number: int = 0) -> None:
-        self.device, self.kind, self.number = device, kind, number
+    def __init__(self, device: Device, kind: Any) -> None:
+        self.device, self.kind = device, kind
 
     def format(self) -> Any:
         return format_.rgb8
@@ -135,7 +125,7 @@ class _Profile:
         return self.device.intrinsics()
 
     def get_extrinsics_to(self, other: "_Profile") -> SimpleNamespace:
-        return extrinsics(self.device.R_right_left, (-self.device.baseline_m, 0.0, 0.0))
+        return extrinsics(np.eye(3))
 
 
 def extrinsics(R: np.ndarray, translation: tuple[float, ...] = (0.0, 0.0, 0.0)) -> SimpleNamespace:
@@ -146,12 +136,12 @@ def extrinsics(R: np.ndarray, translation: tuple[float, ...] = (0.0, 0.0, 0.0)) 
 class MotionSensor:
     """The motion module: what it measures, in which axes, by which clock, and what goes wrong.
 
-    R_camera_imu: rotation from its axes to those of each camera, by (kind, number); angular_velocity, specific_force:
-    functions of time, along the axes of the camera `turned_to`; late_s: how late samples arrive.
+    R_camera_imu: rotation from its axes to those of the colour camera; angular_velocity, specific_force: functions of
+    time, along the axes of that camera; late_s: how late samples arrive.
     """
 
-    def __init__(self, R_camera_imu: dict[tuple[Any, int], np.ndarray], turned_to: tuple[Any, int]) -> None:
-        self.R_camera_imu, self.R_imu_turned = R_camera_imu, R_camera_imu[turned_to].T
+    def __init__(self, R_camera_imu: np.ndarray) -> None:
+        self.R_camera_imu = R_camera_imu
         self.angular_velocity: Callable[[float], Any] = lambda time_s: (0.0, 0.0, 0.0)
         self.specific_force: Callable[[float], Any] = lambda time_s: (0.0, -9.81, 0.0)
         self.clock: Callable[[float], Any] = lambda time_s: clock.global_time
@@ -209,7 +199,7 @@ class MotionSensor:
         """Call the callback with the sample of a time."""
         measured = self.angular_velocity if profile.kind is stream.gyro else self.specific_force
         value = np.asarray(measured(time_s), np.float64)
-        x, y, z = self.R_imu_turned @ value if np.isfinite(value).all() else value
+        x, y, z = self.R_camera_imu.T @ value if np.isfinite(value).all() else value
         sample = SimpleNamespace(
             get_motion_data=lambda: SimpleNamespace(x=x, y=y, z=z), get_profile=lambda: profile,
             get_timestamp=lambda: 1000.0 * (time_s + self.ahead_s - EARLIER_S[self.clock(time_s)]),
@@ -234,7 +224,7 @@ class _MotionProfile:
 
     def get_extrinsics_to(self, other: _Profile) -> SimpleNamespace:
         self.sensor._call("get_extrinsics_to")
-        return extrinsics(self.sensor.R_camera_imu[other.kind, other.number], (0.01, -0.005, 0.012))
+        return extrinsics(self.sensor.R_camera_imu, (0.01, -0.005, 0.012))
 
 
 class _Align:
@@ -255,11 +245,6 @@ class _Frames:
     def get_depth_frame(self) -> Any:
         assert self.aligned or not self.device.must_align, "depth is aligned to colour only after align.process()"
         return self._frame(np.rint(self.device.seen(self.number).depth_m / self.device.scale_m).astype(np.uint16))
-
-    def get_infrared_frame(self, side: int) -> Any:
-        room, number = self.device.room, self.number % len(self.device.room)
-        image = np.rint(room.frame(number).color * 255) if side == 1 else room.right_image(number)
-        return self._frame(np.asarray(image, np.uint8)[..., 1])
 
     def _frame(self, data: np.ndarray) -> Any:
         kind = self.device.clock(self.number)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from command_line import exit_code
-from fake_realsense import Device, MotionSensor, stream
+from fake_realsense import Device, MotionSensor
 from sigmasplat.data.frame import Frame
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.plugins.sources.realsense import WARM_UP_FRAMES
@@ -103,7 +103,7 @@ def test_an_unplugged_camera_gives_one_line_and_a_valid_run(device: Device, caps
 
 
 def test_the_motion_module_gives_the_vertical_direction(device: Device, capsys: pytest.CaptureFixture[str]) -> None:
-    device.motion = MotionSensor({(stream.color, 0): np.eye(3)}, (stream.color, 0))
+    device.motion = MotionSensor(np.eye(3))
     assert exit_code("run", "realsense", "--out", "run", "--no-eval", "--limit", "12", *QUICK, *WAITING) == 0
     run = RunFolder.open(Path("run"))
     assert [line["specific_force_m_s2"] for line in run.read_log()] == [pytest.approx([0.0, -9.81, 0.0])] * 12
@@ -113,7 +113,7 @@ def test_the_motion_module_gives_the_vertical_direction(device: Device, capsys: 
 def test_a_motion_module_that_is_busy_gives_one_line_and_a_valid_run(
     device: Device, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    device.motion = MotionSensor({(stream.color, 0): np.eye(3)}, (stream.color, 0))
+    device.motion = MotionSensor(np.eye(3))
     device.motion.failing["open"] = RuntimeError("Device or resource busy")
     assert exit_code("run", "realsense", "--out", "run", "--no-eval", "--limit", "3", *QUICK, *WAITING) == 0
     lines = [line for line in capsys.readouterr().err.splitlines() if "gyroscope and accelerometer" in line]

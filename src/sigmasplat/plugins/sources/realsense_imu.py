@@ -56,28 +56,6 @@ class Sample(NamedTuple):
     clock: Any
 
 
-class WaitingSamples:
-    """Samples that wait for the next image. The SDK's thread adds them, that of the images takes them."""
-
-    def __init__(self) -> None:
-        self._samples = deque[Sample](maxlen=WAITING_MOST)
-
-    def receive(self, frame: Any) -> None:
-        """Add the sample of a frame at once; leave out one that is not finite."""
-        motion = frame.as_motion_frame()
-        if not motion:
-            return
-        data, time_s = motion.get_motion_data(), float(motion.get_timestamp()) / 1000.0
-        values = (float(data.x), float(data.y), float(data.z))
-        if all(map(math.isfinite, (time_s, *values))):
-            kind = motion.get_profile().stream_type()
-            self._samples.append(Sample(kind, time_s, values, motion.get_frame_timestamp_domain()))
-
-    def taken(self) -> list[Sample]:
-        """Remove and return the samples that wait, in the order of arrival."""
-        return [self._samples.popleft() for _ in range(len(self._samples))]
-
-
 class MotionModule:
     """The motion module of a running camera. If it stops to be of use, that is noted once, and it is given up."""
 
@@ -87,7 +65,7 @@ class MotionModule:
         """R_camera_sensor: the rotation [3, 3] from the axes of each kind of stream to those of the frames; kinds: of
         the gyroscope and of the accelerometer; notes: gets the reason if the module is given up."""
         self._sensor, self._R_camera_sensor, self._notes = sensor, R_camera_sensor, notes
-        self._waiting = WaitingSamples()
+        self._waiting = deque[Sample](maxlen=WAITING_MOST)
         self._gyroscope, self._accelerometer = RunningGyroscope(), RunningAccelerometer()
         self._add = dict(zip(kinds, (self._gyroscope.add, self._accelerometer.add), strict=True))
         self._clock: Any = None
@@ -95,11 +73,25 @@ class MotionModule:
         self._unusable: Sample | None = None
         self._given_up = False
 
+    def receive(self, frame: Any) -> None:
+        """Keep the sample of a frame for the next image, on a thread of the SDK; leave out one that is not finite."""
+        if not (motion := frame.as_motion_frame()):
+            return
+        data, time_s = motion.get_motion_data(), float(motion.get_timestamp()) / 1000.0
+        values = (float(data.x), float(data.y), float(data.z))
+        if all(map(math.isfinite, (time_s, *values))):
+            kind = motion.get_profile().stream_type()
+            self._waiting.append(Sample(kind, time_s, values, motion.get_frame_timestamp_domain()))
+
+    def taken(self) -> list[Sample]:
+        """Remove and return the samples that wait, in the order of arrival."""
+        return [self._waiting.popleft() for _ in range(len(self._waiting))]
+
     def start(self, profiles: list[Any]) -> None:
         """Start the streams. Raises what the SDK raises."""
         self._sensor.open(profiles)
         try:
-            self._sensor.start(self._waiting.receive)
+            self._sensor.start(self.receive)
         except BaseException:
             with suppress(RuntimeError):
                 self._sensor.close()
@@ -117,7 +109,7 @@ class MotionModule:
 
         time_s, clock: of the image, which follows the one of the last call.
         """
-        samples = self._waiting.taken()
+        samples = self.taken()
         if self._given_up:
             return NOT_MEASURED
         if clock != self._clock:
@@ -130,24 +122,16 @@ class MotionModule:
         motion = Motion(self._gyroscope.R_inertial_camera(time_s), self._accelerometer.at(time_s))
         if motion.R_inertial_camera is not None or motion.specific_force_m_s2 is not None:
             self._measured_s, self._unusable = time_s, None
-        else:
-            self._unusable = samples[-1] if samples else self._unusable
-            self._give_up_after_some_time(time_s)
+            return motion
+        self._unusable = samples[-1] if samples else self._unusable
+        if time_s - self._measured_s > PATIENCE_S:
+            self._given_up, seen = True, self._unusable
+            newest = f"the newest is of {seen.time_s:.3f} s, clock {_name(seen.clock)}" if seen else "none arrived"
+            self._notes.append(_not_used(
+                f"no sample fits the images for {PATIENCE_S:g} s ({newest}; images: {time_s:.3f} s, clock "
+                f"{_name(clock)}); update the firmware, or install the SDK with support for metadata"
+            ))  # fmt: skip
         return motion
-
-    def _give_up_after_some_time(self, time_s: float) -> None:
-        """Give up and note why, if nothing was measured for `PATIENCE_S`."""
-        if time_s - self._measured_s <= PATIENCE_S:
-            return
-        self._given_up, seen = True, self._unusable
-        if seen is None:
-            reason = f"no sample arrived for {PATIENCE_S:g} s; plug the camera in again, or update its firmware"
-        elif seen.clock != self._clock:
-            clocks = f"their clock ({_name(seen.clock)}) is not that of the images ({_name(self._clock)})"
-            reason = f"{clocks}; install the SDK with support for metadata"
-        else:
-            reason = f"their times are {seen.time_s - time_s:.3f} s from those of the images; update the firmware"
-        self._notes.append(_not_used(reason))
 
 
 def open_motion_module(
