@@ -390,7 +390,8 @@ def framed(payload: bytes, code: int = 1) -> bytes:
 
 
 @pytest.mark.slow
-def test_malicious_and_slow_clients_change_nothing() -> None:
+def test_malicious_and_slow_clients_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sigmasplat.plugins.robots.stream.MOST_WAITING_BYTES", 2_000_000)  # these images are small
     stream, garbage = StreamSink(MESSAGES, port=0), np.random.default_rng(0)
     requests = [
         b"{", b"[]", b"null", b'"x"', b'{"op":"subscribe"}', b'{"op":"subscribe","subscriptions":7}',
