@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from archives import entry, folder_content, tar_gz, zipped
-from sigmasplat.plugins.download.unpack import ArchiveError, unpack
+from sigmasplat.plugins.download.downloader import ArchiveError, unpack
 from sigmasplat.types import no_progress
 
 FILES = {"rgb.txt": b"# colour\n", "rgb/1.png": bytes(range(256)) * 999, "rgb/2.png": b"", "a b/ö.txt": b"x"}

@@ -71,7 +71,6 @@ def fetch(url: str, target: Path, progress: "Progress", check_size: CheckSize) -
 
 @contextmanager
 def _writing(path: Path) -> Iterator[None]:
-    """Convert OSError to DownloadError."""
     try:
         yield
     except OSError as problem:
@@ -81,7 +80,6 @@ def _writing(path: Path) -> Iterator[None]:
 
 
 def _lock(file: IO[bytes]) -> None:
-    """Raise DownloadError if another process writes the file."""
     with suppress(OSError):  # a file system without locks
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
