@@ -98,7 +98,6 @@ class BagSink:
             self.writer.storage.bio.flush()
 
     def _quality(self, topic: Topic) -> Any:
-        """Return the quality of service with which a player publishes a topic."""
         kinds, no_limit = self.interfaces, self.interfaces.QosTime(2147483647, 4294967295)
         durability = kinds.QosDurability.TRANSIENT_LOCAL if topic.latched else kinds.QosDurability.VOLATILE
         return kinds.Qos(
@@ -147,7 +146,6 @@ def export_bag(
 
 
 def _remove_earlier(target: Path) -> None:
-    """Remove an earlier export. Raises OSError if it is a folder with other files."""
     if not target.is_dir():
         return target.unlink(missing_ok=True)
     for name in ("metadata.yaml", f"{target.name}{FILE_ENDING}"):

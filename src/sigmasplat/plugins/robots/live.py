@@ -172,7 +172,6 @@ class LiveRobot(Callback):
             self._offer(job, ros.CLOUD)
 
     def _offer_final_map(self) -> None:
-        """Give the final map as points and as a grid."""
         field, known, stamp_ns = self.slam.field, self.slam.uncertainty, self._stamp_ns
         std = None if known is None or known.std is None else known.std.depth_std_m
 
@@ -187,7 +186,6 @@ class LiveRobot(Callback):
             self._offer(partial(ros.grids, plan, stamp_ns, ros.FLOOR), ros.GRID, ros.GRID_STD)
 
     def _floor_plan(self) -> FloorPlan | None:
-        """Return the floor plan of the final map; None if no surface is visible."""
         slam = self.slam
         whole, valid = slam.trajectory(), slam.valid()
         path, up_world = whole.at(valid), self._forces.up_of(whole, valid)
@@ -236,8 +234,6 @@ class _Forces:
 
 
 class _SubmapPoints:
-    """The points of a finished submap, in its frame; read once."""
-
     def __init__(self, store: SubmapStore, index: int) -> None:
         self.store, self.index = store, index
 

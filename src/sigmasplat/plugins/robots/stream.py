@@ -147,7 +147,6 @@ class StreamSink:
             await asyncio.wait_for(server.wait_closed(), 1.5 * CLOSE_S)
 
     def _answer(self, connection: "ServerConnection", request: "Request") -> "Response | None":
-        """Refuse pages of other sites, and more clients than `MOST_CLIENTS`."""
         if not is_allowed_origin(request.headers.get("Origin")):
             return connection.respond(403, "this page may not read the stream\n")
         if len(self._clients) >= MOST_CLIENTS:
@@ -164,7 +163,6 @@ class StreamSink:
         return found
 
     async def _serve(self, connection: "ServerConnection") -> None:
-        """Serve a client until it disconnects."""
         from websockets.exceptions import ConnectionClosed
 
         connection.transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
