@@ -1,6 +1,6 @@
 """Download a recording: fetch, verify and unpack its archives, completely or not at all.
 
-Archives are untrusted: the standard library unpacks them below one folder; links and too much content are refused.
+Archives are untrusted: links, names that leave the folder, and too much content are refused.
 """
 
 import gzip
@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import IO, TYPE_CHECKING
 
 from rich.filesize import decimal
 
@@ -204,8 +204,6 @@ def _naming_archive(archive: Path) -> Iterator[None]:
         yield
     except ArchiveError as problem:
         raise ArchiveError(f"{archive.name} {problem}; it is refused, and no file of it is kept") from problem
-    except tarfile.FilterError as problem:
-        raise ArchiveError(f"{archive.name} is unsafe ({problem}); no file of it is kept") from problem
     except (*DAMAGE, zlib.error, EOFError, NotImplementedError, RuntimeError) as problem:
         raise ArchiveError(f"{archive.name} is damaged ({problem}); no file of it is kept") from problem
     except OSError as problem:
@@ -219,8 +217,8 @@ def _unpack_tar(archive: Path, folder: Path, most_bytes: int, progress: "Progres
             most_bytes = _less(most_bytes, member.size)
             if not (member.isreg() or member.isdir()):
                 raise ArchiveError(f"holds {member.name!r}, which is not a plain file or folder")
-            if not _is_litter(member.name):
-                tar.extract(member, folder, filter="data")
+            if (place := _place(folder, member.name)) and (source := tar.extractfile(member)):
+                _write(place, source)
             progress(min(packed.tell(), size_bytes - 1), size_bytes)
         while tar.fileobj.read(CHUNK_BYTES):  # type: ignore[union-attr]  # to the end, where the checksum is
             pass
@@ -234,19 +232,30 @@ def _unpack_zip(archive: Path, folder: Path, most_bytes: int, progress: "Progres
             if stat.S_ISLNK(entry.external_attr >> 16):
                 raise ArchiveError(f"holds {entry.filename!r}, which is not a plain file or folder")
         for entry in entries:
-            entry.filename = entry.filename.replace("\\", "/")  # as some programs of Windows write it
-            if not _is_litter(entry.filename):
-                zipped.extract(entry, folder)
+            if (place := _place(folder, entry.filename)) and not entry.is_dir():
+                with zipped.open(entry) as source:
+                    _write(place, source)
             done += entry.compress_size
             progress(done, archive.stat().st_size)
+
+
+def _place(folder: Path, name: str) -> Path | None:
+    """Return where a file is written, None for a desktop's own files. Raises ArchiveError if it is not below `folder`.
+    Separators may be those of Windows."""
+    parts = name.replace("\\", "/").split("/")
+    if name.startswith(("/", "\\")) or ".." in parts or parts[0].endswith(":"):
+        raise ArchiveError(f"holds {name!r}, a name that leaves the folder")
+    litter = DESKTOP_FILES.intersection(parts) or parts[-1].startswith("._")
+    return None if litter else folder.joinpath(*parts)
+
+
+def _write(place: Path, source: IO[bytes]) -> None:
+    place.parent.mkdir(parents=True, exist_ok=True)
+    with place.open("wb") as file:
+        shutil.copyfileobj(source, file)
 
 
 def _less(most_bytes: int, size_bytes: int) -> int:
     if size_bytes > most_bytes:
         raise ArchiveError("holds more bytes than expected for this data set")
     return most_bytes - size_bytes
-
-
-def _is_litter(name: str) -> bool:
-    parts = name.split("/")
-    return bool(DESKTOP_FILES.intersection(parts)) or parts[-1].startswith("._")
