@@ -220,7 +220,7 @@ def _unpack_tar(archive: Path, folder: Path, most_bytes: int, progress: "Progres
             if (place := _place(folder, member.name)) and (source := tar.extractfile(member)):
                 _write(place, source)
             progress(min(packed.tell(), size_bytes - 1), size_bytes)
-        while tar.fileobj.read(CHUNK_BYTES):  # type: ignore[union-attr]  # to the end, where the checksum is
+        while tar.fileobj.read(CHUNK_BYTES):  # to the end, where the checksum is
             pass
 
 
