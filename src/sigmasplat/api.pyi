@@ -42,8 +42,6 @@ from sigmasplat.data.imu import (
     GRAVITY_M_S2 as GRAVITY_M_S2,
     Accelerometer as Accelerometer,
     Gyroscope as Gyroscope,
-    RunningAccelerometer as RunningAccelerometer,
-    RunningGyroscope as RunningGyroscope,
     accelerometer_from_samples as accelerometer_from_samples,
     gyroscope_from_samples as gyroscope_from_samples,
     up_of_path as up_of_path,

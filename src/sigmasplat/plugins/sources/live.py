@@ -143,7 +143,7 @@ class LiveSource(Source):
     """A live camera. Frames come once, until the consumer stops, the limit is reached, or the camera fails.
 
     dropped: number of frames that arrived while the previous one was processed; only the newest is used;
-    ending: why the camera stopped, "" if it did not; notes: what did not work, though the camera goes on.
+    ending: why the camera stopped, "" if it did not.
     """
 
     live = True
@@ -154,7 +154,6 @@ class LiveSource(Source):
         self._writer: TumWriter | None = None
         self.dropped = 0
         self.ending = ""
-        self.notes: list[str] = []
 
     def record_to(self, folder: Path) -> None:
         """Record every frame to a new TUM folder. Raises RunError if it holds a sequence or cannot be written."""
