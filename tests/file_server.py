@@ -135,19 +135,6 @@ def web_page(request: Request) -> None:
     request.wfile.write(b"login")
 
 
-def trickle(seconds: float) -> Act:
-    """Send single bytes slowly for some seconds."""
-
-    def act(request: Request) -> None:
-        body, until = _open(request), time.monotonic() + seconds
-        while body and time.monotonic() < until:
-            request.wfile.write(body[:1])
-            body = body[1:]
-            time.sleep(0.02)
-
-    return act
-
-
 def silence(seconds: float) -> Act:
     """Send no answer for some seconds."""
     return lambda request: time.sleep(seconds)

@@ -42,8 +42,6 @@ from sigmasplat.data.imu import (
     GRAVITY_M_S2 as GRAVITY_M_S2,
     Accelerometer as Accelerometer,
     Gyroscope as Gyroscope,
-    RunningAccelerometer as RunningAccelerometer,
-    RunningGyroscope as RunningGyroscope,
     accelerometer_from_samples as accelerometer_from_samples,
     gyroscope_from_samples as gyroscope_from_samples,
     up_of_path as up_of_path,
@@ -158,6 +156,7 @@ from sigmasplat.input.calibration import (
     build_camera as build_camera,
     check_positive as check_positive,
     freiburg_calibration as freiburg_calibration,
+    given_intrinsics as given_intrinsics,
     json_number as json_number,
     read_camera as read_camera,
     read_distortion as read_distortion,
@@ -174,7 +173,6 @@ from sigmasplat.input.images import (
     FRAMES_PER_SECOND as FRAMES_PER_SECOND,
     FrameFiles as FrameFiles,
     Video as Video,
-    decode_color as decode_color,
     depth_to_metres as depth_to_metres,
     first_file as first_file,
     first_subfolder as first_subfolder,
@@ -225,6 +223,7 @@ from sigmasplat.input.recorded import (
     first_readable as first_readable,
     first_size as first_size,
     folder_source as folder_source,
+    numbered_pairs as numbered_pairs,
 )
 from sigmasplat.input.rectification import Rectification as Rectification, registers_depth as registers_depth
 from sigmasplat.input.source import Source as Source, Subset as Subset, Wrapped as Wrapped, read_ahead as read_ahead

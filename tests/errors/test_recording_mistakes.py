@@ -244,12 +244,10 @@ def test_one_line_says_what_to_do(
     ("path", "says"),
     [
         ("realsense", ("no RealSense camera provides 640×480 at 30 frames/s", "No device connected", "USB 3")),
-        ("realsense:size=5", ("unknown option 'size=5'", "width, height, fps, stereo, imu, serial")),
+        ("realsense:size=5", ("unknown option 'size=5'", "width, height, fps, serial")),
         ("realsense:width=wide", ("unknown option 'width=wide'",)),
         ("realsense:fps=0", ("unknown option 'fps=0'",)),
         ("realsense:width", ("unknown option 'width'",)),
-        ("realsense:imu=yes", ("unknown option 'imu=yes'",)),
-        ("realsense:imu=01", ("unknown option 'imu=01'",)),
     ],
 )
 def test_a_missing_camera_or_unknown_option(path: str, says: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,7 +4,6 @@ import hashlib
 import json
 import re
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -14,12 +13,16 @@ import file_server as acts
 from archives import folder_content, tar_gz, zipped
 from file_server import FileServer, serving
 from sigmasplat.errors import DownloadError
-from sigmasplat.plugins.download import describe_recordings, describe_sets, download_recording, find_recording
+from sigmasplat.plugins.download import (
+    describe_recordings,
+    describe_sets,
+    download_recording,
+    fetch as fetching,
+    find_recording,
+)
 from sigmasplat.plugins.download.catalogue import SETS, PublicRecording, PublicSet, RemoteFile
 from sigmasplat.plugins.download.downloader import MARKER
-from sigmasplat.plugins.download.fetch import RetryPolicy
 
-HASTY = RetryPolicy(max_attempts=2, first_wait_s=0.001)
 FILES = {"rgb.txt": b"# colour\n", "rgb/1.png": bytes(i * i % 251 for i in range(5000))}
 PUBLIC = [entry for entry in SETS.values() if isinstance(entry, PublicSet)]
 
@@ -27,6 +30,8 @@ PUBLIC = [entry for entry in SETS.values() if isinstance(entry, PublicSet)]
 @pytest.fixture
 def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[FileServer]:
     monkeypatch.setenv("no_proxy", "127.0.0.1")
+    monkeypatch.setattr(fetching, "ATTEMPTS", 2)
+    monkeypatch.setattr(fetching, "WAIT_S", 0.001)
     with serving() as server:
         server.files["/desk.tgz"] = tar_gz({f"desk/{name}": content for name, content in FILES.items()})
         yield server
@@ -35,12 +40,12 @@ def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[FileServer]:
 def public_set(server: FileServer, *archives: RemoteFile, start: str = "") -> PublicSet:
     """Return a data set with one recording, `desk`; by default it is /desk.tgz on the server."""
     made = archives or (RemoteFile(server.url("/desk.tgz")),)
-    return PublicSet("Test", "http://page", "free", "test", {"desk": PublicRecording("desk", made, start)}, 2**20, 20)
+    return PublicSet("Test", "http://page", "free", "test", {"desk": PublicRecording("desk", made, start)})
 
 
 def downloaded(public: PublicSet, out: Path, **options: bool) -> dict[str, bytes]:
     """Download `desk`; return its files without the marker."""
-    folder = download_recording(public, "desk", out, lambda *counts: None, retry=HASTY, **options)
+    folder = download_recording(public, "desk", out, lambda *counts: None, **options)
     assert folder == out / "test" / "desk"
     files = folder_content(folder)
     assert json.loads(files.pop(MARKER))["recording"] == "desk"
@@ -49,7 +54,7 @@ def downloaded(public: PublicSet, out: Path, **options: bool) -> dict[str, bytes
 
 def test_a_recording_is_downloaded_and_unpacked_without_its_outer_folder(server: FileServer, tmp_path: Path) -> None:
     assert downloaded(public_set(server), tmp_path) == FILES
-    assert sorted(path.name for path in (tmp_path / "test").iterdir()) == ["desk", "desk.tgz.sha256"]
+    assert sorted(path.name for path in (tmp_path / "test").iterdir()) == ["desk"]
 
 
 def test_an_existing_recording_is_not_downloaded_again(server: FileServer, tmp_path: Path) -> None:
@@ -121,35 +126,12 @@ def test_a_published_checksum_is_verified(algorithm: str, server: FileServer, tm
     assert downloaded(public_set(server, archive), tmp_path) == FILES
 
 
-def test_a_failed_download_leaves_no_folders(server: FileServer, tmp_path: Path) -> None:
-    missing = public_set(server, RemoteFile(server.url("/gone.tgz")))
-    with pytest.raises(DownloadError, match="is not available"):
-        downloaded(missing, tmp_path / "data" / "deep")
-    assert not any(tmp_path.iterdir()), "created folders are removed"
-    (tmp_path / "data").mkdir()
-    with pytest.raises(DownloadError, match="is not available"):
-        downloaded(missing, tmp_path / "data" / "deep")
-    assert [path.name for path in tmp_path.rglob("*")] == ["data"], "existing folders stay"
-
-
 def test_a_partial_download_keeps_its_folder(server: FileServer, tmp_path: Path) -> None:
     server.files["/half.tgz"] = server.files["/desk.tgz"]
     both = public_set(server, RemoteFile(server.url("/half.tgz")), RemoteFile(server.url("/gone.tgz")))
     with pytest.raises(DownloadError, match="is not available"):
         downloaded(both, tmp_path)
     assert (tmp_path / "test/half.tgz").read_bytes() == server.files["/desk.tgz"]
-
-
-def test_without_checksum_the_first_download_is_the_reference(server: FileServer, tmp_path: Path) -> None:
-    downloaded(public_set(server), tmp_path)
-    record = tmp_path / "test/desk.tgz.sha256"
-    assert record.read_text() == f"{hashlib.sha256(server.files['/desk.tgz']).hexdigest()}  desk.tgz\n"
-    server.files["/desk.tgz"] = tar_gz({"desk/rgb.txt": b"new"})
-    with pytest.raises(DownloadError, match=r"its checksum has changed .*delete .*sha256 to accept it"):
-        downloaded(public_set(server), tmp_path, overwrite=True)
-    assert folder_content(tmp_path / "test/desk").keys() == {*FILES, MARKER}, "the earlier recording is still there"
-    record.unlink()
-    assert downloaded(public_set(server), tmp_path, overwrite=True) == {"rgb.txt": b"new"}
 
 
 @pytest.mark.parametrize("there", ["folder", "file", "broken link"])
@@ -162,19 +144,15 @@ def test_a_foreign_folder_is_not_changed(there: str, server: FileServer, tmp_pat
     assert server.ranges == [] and (target.exists() or target.is_symlink())
 
 
-@pytest.mark.parametrize("content", [tar_gz({"desk/../../../evil": b"1"}), tar_gz(FILES)[:-900], zipped({"a": b""})])
+@pytest.mark.parametrize("content", [tar_gz({"../evil": b"1"}), tar_gz(FILES)[:-900], zipped({"a": b""})])
 def test_a_bad_archive_leaves_no_files(content: bytes, server: FileServer, tmp_path: Path) -> None:
     server.files["/desk.tgz"] = content
     with pytest.raises(DownloadError, match=r"desk.tgz has been removed, run it again"):
         downloaded(public_set(server), tmp_path)
-    assert list(folder_content(tmp_path)) == ["test/desk.tgz.sha256"]
-    assert [path.name for path in (tmp_path / "test").iterdir()] == ["desk.tgz.sha256"]
+    assert list((tmp_path / "test").iterdir()) == []
 
 
-def test_too_many_bytes_or_files_are_refused(server: FileServer, tmp_path: Path) -> None:
-    server.files["/desk.tgz"] = tar_gz({f"desk/{i}": b"" for i in range(30)})
-    with pytest.raises(DownloadError, match="more files than expected"):
-        downloaded(public_set(server), tmp_path)
+def test_too_many_bytes_are_refused(server: FileServer, tmp_path: Path) -> None:
     server.files["/bomb.tgz"] = tar_gz({"desk/zeros": bytes(2**22)})
     with pytest.raises(DownloadError, match="more bytes than expected"):
         downloaded(public_set(server, RemoteFile(server.url("/bomb.tgz"))), tmp_path)
@@ -184,19 +162,6 @@ def test_an_unexpected_layout_is_refused(server: FileServer, tmp_path: Path) -> 
     with pytest.raises(DownloadError, match="does not hold room0; the layout of the data set has changed"):
         downloaded(public_set(server, start="room0"), tmp_path)
     assert not (tmp_path / "test/desk").exists()
-
-
-def test_a_file_of_another_size_is_refused_early(server: FileServer, tmp_path: Path) -> None:
-    size = len(server.files["/desk.tgz"])
-    for archive, says in (
-        (RemoteFile(server.url("/desk.tgz"), 9 * size), "not about"),
-        (RemoteFile(server.url("/desk.tgz"), size + 1, "sha256:00"), f"has {size:,} bytes, not {size + 1:,}"),
-    ):
-        with pytest.raises(DownloadError, match=says):
-            downloaded(public_set(server, archive), tmp_path)
-    with pytest.raises(DownloadError, match="too many for this data set"):
-        downloaded(replace(public_set(server), max_bytes=100), tmp_path)
-    assert folder_content(tmp_path) == {}
 
 
 def test_disk_space_is_checked_first(server: FileServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -218,7 +183,7 @@ def test_ctrl_c_during_unpacking_leaves_only_the_archive(server: FileServer, tmp
 
     with pytest.raises(KeyboardInterrupt):
         download_recording(public_set(server), "desk", tmp_path, interrupt)
-    assert {path.name for path in (tmp_path / "test").iterdir()} == {"desk.tgz", "desk.tgz.sha256"}
+    assert {path.name for path in (tmp_path / "test").iterdir()} == {"desk.tgz"}
     requests = list(server.ranges)
     assert downloaded(public_set(server), tmp_path) == FILES
     assert server.ranges == requests
@@ -272,7 +237,6 @@ def test_the_catalogue_is_consistent(public: PublicSet) -> None:
     for archive in archives:
         parts = urlsplit(archive.url)
         assert parts.scheme == "https" and parts.hostname and not parts.query
-        assert (archive.size_bytes or 0) <= public.max_bytes
         assert re.fullmatch(r"(sha256:[0-9a-f]{8}([0-9a-f]{56})?|md5:[0-9a-f]{32})?", archive.checksum)
         assert archive.name.endswith((".tgz", ".tar.gz", ".zip")) or archive.into
     for folder in folders:

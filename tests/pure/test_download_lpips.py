@@ -12,17 +12,16 @@ import file_server as acts
 from file_server import FileServer, serving
 from lpips_weights import TRUNK_FILES, write_weights
 from sigmasplat.errors import DownloadError
-from sigmasplat.plugins.download import download_recording
+from sigmasplat.plugins.download import download_recording, fetch as fetching
 from sigmasplat.plugins.download.catalogue import SETS, PublicSet, RemoteFile
-from sigmasplat.plugins.download.fetch import RetryPolicy
 from sigmasplat.plugins.evaluation.metrics.lpips import Lpips, Net, find_lpips
-
-HASTY = RetryPolicy(max_attempts=2, first_wait_s=0.001)
 
 
 @pytest.fixture
 def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[FileServer]:
     monkeypatch.setenv("no_proxy", "127.0.0.1")
+    monkeypatch.setattr(fetching, "ATTEMPTS", 2)
+    monkeypatch.setattr(fetching, "WAIT_S", 0.001)
     with serving() as server:
         yield server
 
@@ -50,7 +49,7 @@ def served(server: FileServer, net: Net, weights: Path) -> PublicSet:
 
 def download(public: PublicSet, net: Net, out: Path) -> Path:
     """Download a network; return the folder in which `eval` looks for it."""
-    download_recording(public, net, out, lambda *counts: None, retry=HASTY)
+    download_recording(public, net, out, lambda *counts: None)
     return out / public.folder
 
 

@@ -1,8 +1,6 @@
 """Valid archives are unpacked completely; malicious ones write nothing outside their folder and are stopped early."""
 
-import io
 import tarfile
-import zipfile
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -11,19 +9,19 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from archives import entry, folder_content, tar_gz, zipped
-from sigmasplat.plugins.download.unpack import ArchiveError, Budget, unpack
+from sigmasplat.plugins.download.downloader import ArchiveError, unpack
 from sigmasplat.types import no_progress
 
 FILES = {"rgb.txt": b"# colour\n", "rgb/1.png": bytes(range(256)) * 999, "rgb/2.png": b"", "a b/ö.txt": b"x"}
 PLENTY = 2**24
 
 
-def unpacked(content: bytes, name: str, folder: Path, bytes_: int = PLENTY, files: int = 99) -> dict[str, bytes]:
+def unpacked(content: bytes, name: str, folder: Path, most: int = PLENTY) -> dict[str, bytes]:
     """Unpack an archive to `folder`/inside; return its files."""
     folder.mkdir(exist_ok=True)
     archive = folder / name
     archive.write_bytes(content)
-    unpack(archive, folder / "inside", Budget(bytes_, files), no_progress)
+    unpack(archive, folder / "inside", most, no_progress)
     return folder_content(folder / "inside")
 
 
@@ -36,7 +34,7 @@ def test_all_files_are_unpacked(pack: Callable[..., bytes], name: str, tmp_path:
 def test_progress_reaches_the_end(pack: Callable[..., bytes], name: str, tmp_path: Path) -> None:
     (tmp_path / name).write_bytes(pack(FILES))
     calls: list[tuple[int, int]] = []
-    unpack(tmp_path / name, tmp_path / "inside", Budget(PLENTY, 99), lambda *counts: calls.append(counts))
+    unpack(tmp_path / name, tmp_path / "inside", PLENTY, lambda *counts: calls.append(counts))
     assert calls[-1][0] == calls[-1][1] > 0 and calls == sorted(calls)
     assert calls.count(calls[-1]) == 1, "the end is reported once"
 
@@ -103,27 +101,13 @@ def test_a_link_in_a_zip_is_refused_before_anything_is_written(tmp_path: Path) -
     assert folder_content(tmp_path / "inside") == {}
 
 
-def test_a_duplicate_file_is_refused(tmp_path: Path) -> None:
-    twice = io.BytesIO()
-    with zipfile.ZipFile(twice, "w") as made, pytest.warns(UserWarning, match="Duplicate"):
-        made.writestr("a", b"1")
-        made.writestr("a", b"2")
-    with pytest.raises(ArchiveError, match="'a' twice"):
-        unpacked(twice.getvalue(), "a.zip", tmp_path)
-    with pytest.raises(ArchiveError, match="twice"):
-        unpacked(tar_gz({"a": b"1", "a/b": b"2"}), "a.tgz", tmp_path / "file-as-folder")
-
-
 @pytest.mark.parametrize(("pack", "name"), [(tar_gz, "bomb.tgz"), (zipped, "bomb.zip")])
 def test_archive_bombs_are_stopped(pack: Callable[..., bytes], name: str, tmp_path: Path) -> None:
     bomb = pack({"zeros": bytes(2**23)})
     assert len(bomb) < 2**14
-    with pytest.raises(ArchiveError, match=r"more bytes than expected|expands 1\d\d\d-fold"):
-        unpacked(bomb, name, tmp_path, bytes_=2**20)
+    with pytest.raises(ArchiveError, match="more bytes than expected"):
+        unpacked(bomb, name, tmp_path, most=2**20)
     assert sum(map(len, folder_content(tmp_path / "inside").values())) <= 2**20
-    with pytest.raises(ArchiveError, match="more files than expected"):
-        unpacked(pack({str(i): b"" for i in range(20)}), name, tmp_path / "files", files=10)
-    assert len(folder_content(tmp_path / "files/inside")) <= 10
 
 
 def test_a_zip_with_wrong_sizes_is_damaged(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from sigmasplat.input.rectification import DepthRegistration
 from sigmasplat.plugins.checks.depth import edge_agreement, outlines
 from sigmasplat.plugins.checks.recording import inspect_source
 from sigmasplat.plugins.sources import open_source
-from sigmasplat.plugins.sources.tum import write_tum
+from tum_recording import write_tum
 
 ROOM = "synthetic:frames=120,width=320,height=240"
 SEEN = InputConfig(stride=12)

@@ -36,7 +36,7 @@ class Counting(Source):
 
 
 def reading_threads() -> int:
-    return sum(thread.name == "read-ahead" for thread in threading.enumerate())
+    return sum(thread.name.startswith("read-ahead") for thread in threading.enumerate())
 
 
 def test_read_ahead_keeps_order_and_ends_its_thread():

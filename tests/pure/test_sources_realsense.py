@@ -10,7 +10,7 @@ from fake_realsense import Device, distortion
 from paper_settings import InputConfig
 from sigmasplat.errors import RunError, SourceError
 from sigmasplat.input.recorded import depth_warning
-from sigmasplat.plugins.sources import SyntheticRoom, open_source
+from sigmasplat.plugins.sources import open_source
 from sigmasplat.plugins.sources.live import LiveSource, recording_settings
 from sigmasplat.plugins.sources.realsense import WARM_UP_FRAMES
 
@@ -137,19 +137,3 @@ def test_operations_that_need_a_recording_raise(device: Device, ask: object) -> 
 def test_a_recording_is_not_subsampled_or_rectified_again() -> None:
     given = InputConfig(stride=3, limit=9, start_s=1.0, fx=5.0, depth_scale=9.0, crop_px=4, width=320, strict=True)
     assert recording_settings(given) == InputConfig(crop_px=4, width=320, strict=True)
-
-
-def test_infrared_images_give_depth_without_the_projector(device: Device) -> None:
-    room = open_source("synthetic:frames=60,width=160,height=120,stereo=10")
-    assert isinstance(room, SyntheticRoom)
-    device.room, device.baseline_m = room, 0.1
-    source = open_source("realsense:stereo=1,width=160,height=120", limit=2)
-    assert device.asked == [("infrared", side, 160, 120, "y8", 30) for side in (1, 2)]
-    assert device.set == [("emitter_enabled", 0)]
-    first = next(iter(source))
-    exact_m, read = room.exact_depth_of(WARM_UP_FRAMES + 1), first.depth_m > 0
-    assert source.computed_depth and source.depth_noise_per_m and source.camera == room.camera
-    assert read.mean() > 0.1 and np.median(np.abs(first.depth_m - exact_m)[read] / exact_m[read]) < 0.05
-    assert np.array_equal(first.color[..., 0], first.color[..., 1])
-    with pytest.raises(SourceError, match="unknown option 'stereo=2'"):
-        open_source("realsense:stereo=2")

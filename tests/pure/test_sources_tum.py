@@ -12,7 +12,7 @@ from sigmasplat.input.calibration import FREIBURG, freiburg_calibration
 from sigmasplat.input.recorded import depth_warning
 from sigmasplat.input.rectification import Undistortion, distort
 from sigmasplat.plugins.sources import SyntheticRoom, open_source
-from sigmasplat.plugins.sources.tum import write_tum
+from tum_recording import write_tum
 from view_agreement import agreement
 
 FR1 = np.array(FREIBURG["1"].distortion)

@@ -5,11 +5,10 @@ import sys
 import threading
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from command_line import exit_code
-from fake_realsense import Device, MotionSensor, stream
+from fake_realsense import Device
 from sigmasplat.data.frame import Frame
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.plugins.sources.realsense import WARM_UP_FRAMES
@@ -100,25 +99,6 @@ def test_an_unplugged_camera_gives_one_line_and_a_valid_run(device: Device, caps
     assert len(lines) == 1 and "no frame for 5 s" in lines[0]
     facts = RunFolder.open(Path("run")).facts()
     assert facts["status"] == "complete" and len(open_source("seen")) == 5
-
-
-def test_the_motion_module_gives_the_vertical_direction(device: Device, capsys: pytest.CaptureFixture[str]) -> None:
-    device.motion = MotionSensor({(stream.color, 0): np.eye(3)}, (stream.color, 0))
-    assert exit_code("run", "realsense", "--out", "run", "--no-eval", "--limit", "12", *QUICK, *WAITING) == 0
-    run = RunFolder.open(Path("run"))
-    assert [line["specific_force_m_s2"] for line in run.read_log()] == [pytest.approx([0.0, -9.81, 0.0])] * 12
-    assert "motion module" not in capsys.readouterr().err and not device.motion.opened
-
-
-def test_a_motion_module_that_is_busy_gives_one_line_and_a_valid_run(
-    device: Device, capsys: pytest.CaptureFixture[str]
-) -> None:
-    device.motion = MotionSensor({(stream.color, 0): np.eye(3)}, (stream.color, 0))
-    device.motion.failing["open"] = RuntimeError("Device or resource busy")
-    assert exit_code("run", "realsense", "--out", "run", "--no-eval", "--limit", "3", *QUICK, *WAITING) == 0
-    lines = [line for line in capsys.readouterr().err.splitlines() if "gyroscope and accelerometer" in line]
-    assert len(lines) == 1 and lines[0].startswith("warning: realsense: ") and "Device or resource busy" in lines[0]
-    assert len(RunFolder.open(Path("run")).read_log()) == 3
 
 
 def test_a_missing_camera_gives_one_line_and_no_files(device: Device, capsys: pytest.CaptureFixture[str]) -> None:

@@ -16,10 +16,10 @@ from sigmasplat.data.mesh import Mesh
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.sources import SyntheticRoom
-from sigmasplat.plugins.sources.tum import write_tum
 from sigmasplat.run.session import Session
 from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.slam.slam import Slam
+from tum_recording import write_tum
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 

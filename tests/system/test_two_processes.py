@@ -17,8 +17,8 @@ import pytest
 from command_line import exit_code
 from run_process import PATIENCE_S, ROOM, lines, running, wait_for
 from sigmasplat.plugins.sources import open_source
-from sigmasplat.plugins.sources.tum import write_tum
 from sigmasplat.run_folder.runs import RunFolder
+from tum_recording import write_tum
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 

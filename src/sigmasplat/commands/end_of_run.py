@@ -29,16 +29,15 @@ def warn_at_the_end(
 
 
 def _warn_of_skipped_frames(screen: "Screen", source: "Source") -> None:
-    """Print how many frames are missing from the run, and why, and what else did not work."""
+    """Print how many frames are missing from the run, and why."""
     from sigmasplat.plugins.sources.live import LiveSource
 
     if source.skipped:
         images = "image" if len(source.skipped) == 1 else "images"
         screen.warn(f"{len(source.skipped)} {images} skipped (first: {source.skipped[0]})")
     if isinstance(source, LiveSource):
-        for note in (*source.notes, source.ending):
-            if note:
-                screen.warn(note)
+        if source.ending:
+            screen.warn(source.ending)
         if source.dropped:
             screen.say(f"{source.dropped} frames of the camera were dropped because SLAM was slower")
 

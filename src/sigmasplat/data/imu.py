@@ -1,6 +1,5 @@
-"""Measurements of a gyroscope and an accelerometer that move with the camera, of recordings and of live cameras."""
+"""Measurements of a gyroscope and an accelerometer that move with the camera, of recordings."""
 
-from collections import deque
 from dataclasses import dataclass, field
 from itertools import accumulate
 
@@ -15,8 +14,6 @@ Values = NDArray[np.float64]
 
 MAX_GAP_S = 0.1
 """Between two samples that are farther apart, nothing was measured."""
-KEPT_S = 10.0
-"""The samples of a live camera are kept this long: longer than a frame takes."""
 
 
 def in_time_order(times_s: Values, values: Values) -> tuple[Values, Values]:
@@ -24,31 +21,6 @@ def in_time_order(times_s: Values, values: Values) -> tuple[Values, Values]:
     finite = np.isfinite(times_s) & np.isfinite(values).all(1)
     times, first = np.unique(times_s[finite], return_index=True)
     return times, values[finite][first]
-
-
-class RecentSamples:
-    """The samples of the last `KEPT_S` of a sensor that measures now: times_s [M], increasing, and values [M, 3]."""
-
-    def __init__(self) -> None:
-        self.times_s, self.values = np.zeros(0), np.zeros((0, 3))
-
-    def add(self, times_s: Values, values: Values) -> tuple[Values, Values]:
-        """Add samples [N] and [N, 3] that arrived since the last call; return those that were added.
-
-        Left out: values that are not finite, and samples that are not later than the newest one. If all of them are
-        more than `MAX_GAP_S` earlier, the clock was set back, and the samples so far are discarded.
-        """
-        times_s, values = in_time_order(times_s, values)
-        if len(self.times_s) and len(times_s):
-            newest_s = self.times_s[-1]
-            if times_s[-1] < newest_s - MAX_GAP_S:
-                self.times_s, self.values = np.zeros(0), np.zeros((0, 3))
-            else:
-                times_s, values = times_s[times_s > newest_s], values[times_s > newest_s]
-        all_s, both = np.concatenate([self.times_s, times_s]), np.concatenate([self.values, values])
-        kept = slice(int(np.searchsorted(all_s, all_s[-1] - KEPT_S)) if len(all_s) else 0, None)
-        self.times_s, self.values = all_s[kept], both[kept]
-        return times_s, values
 
 
 MAX_RAD_S = 40.0
@@ -142,92 +114,6 @@ def still_mean(angular_velocity_rad_s: NDArray[np.float64]) -> NDArray[np.float6
     return mean if np.linalg.norm(mean) < MAX_BIAS_RAD_S else None
 
 
-MOST_LATE_S = 0.03
-"""Samples may arrive this much later than the image: until then the newest velocity is taken to continue."""
-MOST_STILL_SECONDS = 600
-"""The bias is that of the newest seconds at rest, because it changes when the sensor warms up."""
-
-
-class RunningGyroscope:
-    """Rotations of the camera from the samples so far, about its axes, by the clock of the frames.
-
-    The rotation between two images is integrated from all samples that have arrived when it is asked for, with the bias
-    known by then. Nothing waits for samples that have not arrived.
-    """
-
-    def __init__(self) -> None:
-        self._recent, self._bias = RecentSamples(), RunningBias()
-        self._R_inertial_camera: Matrix = np.eye(3)
-        self._time_s: float | None = None
-
-    def add(self, times_s: NDArray[np.float64], angular_velocity_rad_s: NDArray[np.float64]) -> None:
-        """Add the samples [N] and [N, 3] that arrived since the last call. Values above `MAX_RAD_S` are left out."""
-        slow = np.abs(angular_velocity_rad_s).max(1, initial=0.0) < MAX_RAD_S - MAX_BIAS_RAD_S  # False for nan
-        self._bias.add(*self._recent.add(times_s[slow], angular_velocity_rad_s[slow]))
-
-    def R_inertial_camera(self, time_s: float) -> Matrix | None:
-        """Return the rotation [3, 3] from the camera's axes at a time to its axes at the first time that was asked for.
-
-        Times are those of images, in their order. None if nothing was measured at this time, or not all the way since
-        the image before; the rotation in between is unknown then, and left out of the later ones.
-        """
-        times_s = self._recent.times_s
-        if len(times_s) < 2 or not self._recent.values.any() or not times_s[0] <= time_s <= times_s[-1] + MOST_LATE_S:
-            return None
-        before_s, self._time_s = self._time_s, time_s
-        R_before_now = np.eye(3) if before_s is None else self._turned(before_s, time_s)
-        if R_before_now is None:
-            return None
-        self._R_inertial_camera = self._R_inertial_camera @ R_before_now
-        return self._R_inertial_camera
-
-    def _turned(self, begin_s: float, end_s: float) -> Matrix | None:
-        """Return the rotation [3, 3] from the camera's axes at the end to those at the begin; None if it is unknown."""
-        times_s, rates = self._recent.times_s, self._recent.values
-        if not times_s[0] <= begin_s <= end_s:
-            return None
-        if begin_s == end_s:
-            return np.eye(3)
-        during = slice(np.searchsorted(times_s, begin_s, "right") - 1, np.searchsorted(times_s, end_s) + 1)
-        times_s, rates = times_s[during], rates[during] - self._bias.rad_s
-        if times_s[-1] < end_s:
-            times_s, rates = np.append(times_s, end_s), np.concatenate([rates, rates[-1:]])
-        if np.diff(times_s).max() > MAX_GAP_S:
-            return None
-        gyroscope = Gyroscope(times_s, rates)
-        R_begin, R_end = gyroscope.R_inertial_camera(begin_s), gyroscope.R_inertial_camera(end_s)
-        return None if R_begin is None or R_end is None else R_begin.T @ R_end
-
-
-class RunningBias:
-    """The bias of a gyroscope from the seconds so far in which it was still (`still_bias` for a whole recording).
-
-    rad_s [3]: the median over these seconds; 0 until there is one.
-    """
-
-    def __init__(self) -> None:
-        self.rad_s = np.zeros(3)
-        self._still = deque[NDArray[np.float64]](maxlen=MOST_STILL_SECONDS)
-        self._second: list[NDArray[np.float64]] = []
-        self._begin_s = 0.0
-
-    def add(self, times_s: NDArray[np.float64], angular_velocity_rad_s: NDArray[np.float64]) -> None:
-        """Add samples [N] and [N, 3]; each second is judged when the next one begins."""
-        for time_s, rate in zip(times_s.tolist(), angular_velocity_rad_s, strict=True):
-            if self._second and not 0.0 <= time_s - self._begin_s < 1.0:
-                self._judge(np.stack(self._second))
-                self._second = []
-            if not self._second:
-                self._begin_s = time_s
-            self._second.append(rate)
-
-    def _judge(self, rates: NDArray[np.float64]) -> None:
-        mean = still_mean(rates)
-        if mean is not None:
-            self._still.append(mean)
-            self.rad_s = np.median(self._still, axis=0)
-
-
 GRAVITY_M_S2 = 9.81
 WINDOW_S = 0.1
 """The samples up to this long before and after an image are averaged: a hand shakes faster."""
@@ -268,23 +154,6 @@ def accelerometer_from_samples(
     if abs(length_m_s2 / GRAVITY_M_S2 - 1.0) > OFF_GRAVITY:
         return None
     return Accelerometer(times, forces)
-
-
-class RunningAccelerometer:
-    """An accelerometer that measures now, along the axes of the camera, by the clock of the frames."""
-
-    def __init__(self) -> None:
-        self._recent = RecentSamples()
-
-    def add(self, times_s: NDArray[np.float64], specific_force_m_s2: NDArray[np.float64]) -> None:
-        """Add the samples [N] and [N, 3] that arrived since the last call."""
-        self._recent.add(times_s, specific_force_m_s2)
-
-    def at(self, time_s: float) -> NDArray[np.float64] | None:
-        """Return the mean specific force [3] around a time, m/s², of the samples so far; None if nothing was measured
-        then, or if the recent samples do not measure gravity."""
-        found = accelerometer_from_samples(self._recent.times_s, self._recent.values)
-        return None if found is None else found.at(time_s)
 
 
 def up_of_path(T_world_camera: Matrix, specific_force_m_s2: NDArray[np.float64]) -> NDArray[np.float64] | None:

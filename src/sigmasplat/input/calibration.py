@@ -121,9 +121,13 @@ def resolve_calibration(
     if recorded is None:
         centred = Camera(*size, settings.fx, settings.fy or settings.fx, (size[0] - 1) / 2, (size[1] - 1) / 2)
         recorded = Calibration(centred, default_units)
-    given = {key: value for key in ("fx", "fy", "cx", "cy") if (value := getattr(settings, key))}
     units = settings.depth_scale or recorded.depth_units_per_metre
-    return replace(recorded, camera=replace(recorded.camera, **given), depth_units_per_metre=units)
+    return replace(recorded, camera=given_intrinsics(recorded.camera, settings), depth_units_per_metre=units)
+
+
+def given_intrinsics(camera: Camera, settings: InputConfig) -> Camera:
+    """Return the camera with the intrinsics that the settings give."""
+    return replace(camera, **{key: value for key in ("fx", "fy", "cx", "cy") if (value := getattr(settings, key))})
 
 
 def read_json_object(path: Path) -> dict[str, Any]:

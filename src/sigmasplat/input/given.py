@@ -177,14 +177,12 @@ class Posed(Subset):
 
 
 def _scaled(T: Matrix, scale: float) -> Matrix:
-    """Return a pose whose position is multiplied by a factor."""
     T = T.copy()
     T[:3, 3] *= scale
     return T
 
 
 def _poses_of(whole: Source, given: str) -> list[Matrix | None]:
-    """Return T_world_camera [4, 4] of each frame, None without one. Raises SourceError if no frame has one."""
     poses = whole.device_path() if given == RECORDED_POSES else read_given_poses(Path(given))
     if poses is None:
         raise SourceError(

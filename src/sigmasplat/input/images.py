@@ -17,15 +17,11 @@ from sigmasplat.errors import SourceError
 from sigmasplat.files.pictures import npy_shape, open_image, read_npy
 
 
-def read_color(path: Path) -> NDArray[np.uint8]:
-    """Read an image as 8-bit RGB [H, W, 3]. Raises SourceError naming a missing, truncated or damaged file."""
-    _refuse_missing(path)
-    with open_image(path) as image:
-        return np.asarray(image.convert("RGB"))
-
-
-def decode_color(path: Path, data: bytes) -> NDArray[np.uint8]:
-    """Decode an image in memory as 8-bit RGB [H, W, 3]; `path` names it. Raises SourceError if it is damaged."""
+def read_color(path: Path, data: bytes | None = None) -> NDArray[np.uint8]:
+    """Read an image file, or `data` of one, as 8-bit RGB [H, W, 3]. Raises SourceError naming a missing, truncated or
+    damaged file."""
+    if data is None:
+        _refuse_missing(path)
     with open_image(path, data) as image:
         return np.asarray(image.convert("RGB"))
 

@@ -202,7 +202,6 @@ def nearest_gaps_s(first_s: Times, second_s: Times) -> Times:
 
 
 def _near_pairs(first_s: Times, second_s: Times, tolerance_s: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return all index pairs that differ by less than the tolerance."""
     order = np.argsort(second_s, kind="stable")
     ordered = second_s[order]
     low = np.searchsorted(ordered, first_s - tolerance_s, "left")

@@ -103,14 +103,27 @@ def open_source(path: str | Path, settings: InputConfig | None = None, **changes
     ConfigError on an unknown setting.
     """
     chosen = with_changes(settings or InputConfig(width=0), changes)
-    predicted = chosen.predicted_depth or chosen.depth_model
-    source = _with_predicted_depth(path, chosen) if predicted else _recorded(path, chosen)
     with _guarded(path):
+        source = _whole(path, chosen)
         source = Masked(source, Path(chosen.masks)) if chosen.masks else source
         scales = chosen.poses_scale or 1.0, chosen.predicted_scale or 1.0
         source = Posed(source, chosen.poses, *scales) if chosen.poses else source
     part = chosen.stride > 1 or chosen.limit or chosen.start_s or chosen.end_s
     return Subset(source, chosen) if part and not source.live else source
+
+
+def _whole(path: str | Path, settings: InputConfig) -> Source:
+    """Open a whole sequence: with its own depth; with predicted depth instead; or images without depth, with predicted
+    depth."""
+    predicted: Any = None
+    if settings.predicted_depth or settings.depth_model:
+        predicted = importlib.import_module("sigmasplat.plugins.predicted_depth.source")
+        if predicted.lacks_depth(Path(path), _sure_format(path) is not None):
+            return cast(Source, predicted.open_color_only(Path(path), settings))
+    known = format_of(path)
+    source = known.open(str(path), settings)
+    source.sensor = source.sensor or known.sensor
+    return cast(Source, predicted.WithPredictedDepth(source, settings)) if predicted else source
 
 
 def format_name(path: str | Path, settings: InputConfig) -> str:
@@ -121,48 +134,27 @@ def format_name(path: str | Path, settings: InputConfig) -> str:
     return f"{known.name if known else 'colour only'}, with predicted depth"
 
 
-def _recorded(path: str | Path, settings: InputConfig) -> Source:
-    """Open a whole sequence with its own depth."""
-    known = format_of(path)
+def format_of(path: str | Path) -> SourceFormat:
+    """Return the first format that recognises the path. Raises SourceError if none does."""
     with _guarded(path):
-        source = known.open(str(path), settings)
-        source.sensor = source.sensor or known.sensor
-    return source
-
-
-def _with_predicted_depth(path: str | Path, settings: InputConfig) -> Source:
-    """Open a whole sequence with predicted depth: images without depth, or any other sequence."""
-    predicted = importlib.import_module("sigmasplat.plugins.predicted_depth.source")
-    known = _sure_format(path)
-    with _guarded(path):
-        if predicted.lacks_depth(Path(path), known is not None):
-            return cast(Source, predicted.open_color_only(Path(path), settings))
-    source = _recorded(path, settings)
-    with _guarded(path):
-        return cast(Source, predicted.WithPredictedDepth(source, settings))
+        if (known := _matching_format(path)) is None:
+            raise _unknown_format(Path(path))
+        return known
 
 
 def _guarded(path: str | Path) -> AbstractContextManager[None]:
-    """Return a context that turns what the readers of formats do not catch themselves into SourceError."""
+    """Turn what the readers of formats do not catch themselves into SourceError."""
     return guarded(path, "check its files and permissions, or copy it again", SourceError, "cannot be used")
 
 
-def format_of(path: str | Path) -> SourceFormat:
-    """Return the first format that recognises the path. Raises SourceError if none does."""
-    known = _matching_format(path)
-    if known is None:
-        raise _unknown_format(Path(path))
-    return known
-
-
 def _matching_format(path: str | Path) -> SourceFormat | None:
-    with _guarded(path):
-        return next((known for known in formats() if known.recognises(str(path))), None)
+    return next((known for known in formats() if known.recognises(str(path))), None)
 
 
 def _sure_format(path: str | Path) -> SourceFormat | None:
     """Return the format that recognises the path, None if it only guesses, or there is none."""
-    known = _matching_format(path)
+    with _guarded(path):
+        known = _matching_format(path)
     return known if known is not None and known.priority >= 0 else None
 
 
@@ -182,8 +174,7 @@ def _unknown_format(path: Path) -> SourceError:
             f"no such folder or file: {path}; give a recording, or 'synthetic' for the built-in room, "
             "or 'realsense' for the camera"
         )
-    with _guarded(path):
-        entries = sorted(path.iterdir()) if path.is_dir() else []
+    entries = sorted(path.iterdir()) if path.is_dir() else []
     candidates = (entry for entry in entries if entry.is_dir() or entry.suffix in PACKED)
     inner = [(entry.name, known) for entry in candidates if (known := _matching_format(entry))]
     if inner:

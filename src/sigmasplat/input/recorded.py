@@ -1,8 +1,9 @@
 """Read recorded sequences: a format lists the image pairs, this module reads and rectifies them. A few depth images are
 checked before a run for a wrong unit or missing readings."""
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -17,7 +18,7 @@ from sigmasplat.data.imu import Accelerometer, Gyroscope
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SourceError
 from sigmasplat.input.calibration import Calibration, refuse_impossible_camera, resolve_calibration
-from sigmasplat.input.images import image_size, read_color, read_depth
+from sigmasplat.input.images import FRAMES_PER_SECOND, image_size, pair_images, read_color, read_depth
 from sigmasplat.input.rectification import Rectification, check_image_sizes
 from sigmasplat.input.source import Source
 
@@ -36,7 +37,7 @@ def depth_warning(source: Source, samples: int = 5) -> str | None:
     """
     if source.depth_model:
         return None
-    medians = _frame_medians_m(source, _spread(len(source), samples))
+    medians = list(_medians_m(source, _spread(len(source), samples)))
     if medians and source.computed_depth:
         return None
     if not medians:
@@ -54,40 +55,30 @@ def depth_warning(source: Source, samples: int = 5) -> str | None:
 def refuse_without_depth(source: Source, samples: int = 5) -> None:
     """Raise SourceError if no frame has a depth reading; reads a few frames, and all frames only if those are blank.
     Nothing is read if a network predicts depth: it has predicted that of the first frame."""
-    if source.depth_model or _frame_medians_m(source, _spread(len(source), samples)):
+    if source.depth_model or any(_medians_m(source, [*_spread(len(source), samples), *range(len(source))])):
         return
-    if not _frame_medians_m(source, range(len(source)), stop_at=1):
-        raise SourceError(
-            f"{source.name}: depth is zero or unreadable in all {len(source)} frames; "
-            f"check the depth files (first problem: {_first_problem(source)})"
-        )
-
-
-def _first_problem(source: Source) -> str:
+    problem = "frame 0 has no pixel above 0"
     try:
         source.depth_of(0)
     except SourceError as error:
-        return str(error)
-    return "frame 0 has no pixel above 0"
+        problem = str(error)
+    raise SourceError(
+        f"{source.name}: depth is zero or unreadable in all {len(source)} frames; "
+        f"check the depth files (first problem: {problem})"
+    )
 
 
 def _spread(count: int, samples: int) -> list[int]:
     return sorted({int(i) for i in np.linspace(0, count - 1, min(samples, count)).round()})
 
 
-def _frame_medians_m(source: Source, indices: Iterable[int], stop_at: int | None = None) -> list[float]:
-    """Return the median reading of each frame that is readable and not blank."""
-    medians: list[float] = []
+def _medians_m(source: Source, indices: Iterable[int]) -> Iterator[float]:
+    """Yield the median reading of each frame that is readable and not blank."""
     for i in indices:
-        if stop_at is not None and len(medians) >= stop_at:
-            break
-        try:
+        with suppress(SourceError):  # reported when the source is iterated
             depth_m = source.depth_of(i)
-        except SourceError:
-            continue  # reported when the source is iterated
-        if (depth_m > 0).any():
-            medians.append(float(np.median(depth_m[depth_m > 0])))
-    return medians
+            if (depth_m > 0).any():
+                yield float(np.median(depth_m[depth_m > 0]))
 
 
 def _unit_guess(median_m: float, units_per_metre: float | None) -> str:
@@ -223,13 +214,29 @@ class RecordedSource(Source):
 
 def folder_source(
     folder: Path, settings: InputConfig, images: Sequence[ImagePair], known: Calibration | None, units_per_metre: float,
-    truth: Trajectory | None = None, skipped: Sequence[str] = (), **more: Any,
+    truth: Trajectory | None = None, skipped: Sequence[str] = (), name: str = "", one_camera: bool = False, **more: Any,
 ) -> RecordedSource:  # fmt: skip
-    """Build the source of a folder with images. Its camera is that of the settings, else of calibration.json, else
-    `known`; units_per_metre: default of depth_scale; more: as for RecordedSource. Raises SourceError as it does."""
-    size = first_size([image.color for image in images])
+    """Build the source of a recording. Its camera is that of the settings, else of calibration.json, else `known`.
+
+    units_per_metre: default of depth_scale; name: if it is not that of the folder; one_camera: whether depth with fewer
+    pixels than colour has the same camera, as on phones; more: as for RecordedSource. Raises SourceError as it does.
+    """
+    size, depth_size = first_readable(images, lambda pair: pair.sizes())
     calibration = resolve_calibration(folder, known, size, settings, units_per_metre)
-    return RecordedSource(folder.resolve().name, images, calibration, settings, truth, skipped, **more)
+    camera, lens = calibration.camera, calibration.distortion
+    if one_camera and depth_size != (camera.width, camera.height) and not calibration.depth_camera:
+        calibration = replace(calibration, depth_camera=camera.resized(*depth_size), depth_distortion=lens)
+    return RecordedSource(name or folder.resolve().name, images, calibration, settings, truth, skipped, **more)
+
+
+def numbered_pairs(
+    folder: Path, colors: Mapping[int, Path], depths: Mapping[int, Path], color_name: str, depth_name: str,
+    rate_hz: float = FRAMES_PER_SECOND,
+) -> tuple[dict[int, ImagePair], list[str]]:  # fmt: skip
+    """Return the images of each number that colour and depth share, and why the others are left out, as `pair_images`;
+    frame n is taken at n / rate_hz seconds."""
+    numbers, skipped = pair_images(folder, colors, depths, color_name, depth_name)
+    return {n: ImagePair(n / rate_hz, colors[n], depths[n]) for n in numbers}, skipped
 
 
 def first_size(paths: Sequence[Path]) -> tuple[int, int]:

@@ -1,13 +1,12 @@
 """Define the interface of an input sequence, the same for every format; a background thread reads ahead."""
 
-import queue
-import threading
 from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,10 +21,7 @@ from sigmasplat.files.reading import guarded
 from sigmasplat.native.threads import yield_to_others
 
 Item = TypeVar("Item")
-
-
-Results = queue.Queue[tuple[Item | None, BaseException | None, bool]]
-"""Items; last the exception that ended the producer, or nothing. True: nothing follows."""
+END: Any = object()
 
 
 def read_ahead(items: Iterable[Item], length: int = 4) -> Iterator[Item]:
@@ -35,39 +31,14 @@ def read_ahead(items: Iterable[Item], length: int = 4) -> Iterator[Item]:
     An exception of the producer is raised here in place of the item. The thread ends after the last item,
     or as soon as the consumer closes or deletes this generator.
     """
-    results: Results[Item] = queue.Queue(maxsize=length)
-    stop = threading.Event()
-    thread = threading.Thread(target=_produce, args=(items, results, stop), name="read-ahead", daemon=True)
-    thread.start()
+    iterator, pool = iter(items), ThreadPoolExecutor(1, "read-ahead", yield_to_others)
     try:
-        while True:
-            item, error, last = results.get()
-            if error is not None:
-                raise error
-            if last:
-                return
-            yield item  # type: ignore[misc]
+        waiting = deque(pool.submit(next, iterator, END) for _ in range(length))
+        while (item := waiting.popleft().result()) is not END:
+            waiting.append(pool.submit(next, iterator, END))
+            yield item
     finally:
-        stop.set()
-        with suppress(queue.Empty):  # frees space, so that a producer blocked in put() wakes up and sees `stop`
-            while True:
-                results.get_nowait()
-        thread.join()
-
-
-def _produce(items: Iterable[Item], results: Results[Item], stop: threading.Event) -> None:
-    yield_to_others()
-    try:
-        for item in items:
-            if stop.is_set():
-                return
-            results.put((item, None, False))
-            if stop.is_set():
-                return
-    except BaseException as error:  # passed to the consumer's thread, which raises it
-        results.put((None, error, True))
-    else:
-        results.put((None, None, True))
+        pool.shutdown(cancel_futures=True)
 
 
 FACTS = (
@@ -252,7 +223,6 @@ class Subset(Wrapped):
         return len(self._indices)
 
     def _at(self, i: int) -> int:
-        """Return the number of the i-th selected frame in the whole source."""
         return self._indices[self._checked_index(i)]
 
     def frame(self, i: int) -> Frame:

@@ -1,15 +1,10 @@
-"""List the public data sets (addresses, sizes, licences), and find them by name.
-
-The addresses are those in the download scripts of public SLAM repositories (MASt3R-SLAM's and monodepth2's for TUM,
-NICE-SLAM's and pySLAM's download_replica.sh, cuVSLAM's download_icl_nuim.sh, hloc's README for 7-Scenes, WildGS-SLAM's
-download_bonn.sh, Open3D's RedwoodIndoor*.cpp). Only Open3D publishes checksums. The checksums of TUM and 7-Scenes were
-recorded by two independent projects with equal results. Other sizes are approximate.
-"""
+"""The public data sets of sets.toml (addresses, sizes, licences): list them, and find them by name."""
 
 import difflib
+import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
 from urllib.parse import urlsplit
 
 from rich.filesize import decimal
@@ -57,9 +52,9 @@ class PublicRecording:
 class PublicSet:
     """A data set that can be downloaded without registration.
 
-    folder: below the data folder; recordings: by short name, "" if there is only one; max_bytes, max_files: limits on
-    the size of an archive and the number of files in it; disk_ratio: bytes on disk during unpacking, per byte of the
-    archive; prefix: optional prefix of the short names; sequences: whether the recordings are sequences, not weights.
+    folder: below the data folder; recordings: by short name, "" if there is only one; disk_ratio: bytes on disk during
+    unpacking, per byte of the archive; prefix: optional prefix of the short names; sequences: whether the recordings
+    are sequences, not weights.
     """
 
     title: str
@@ -67,8 +62,6 @@ class PublicSet:
     licence: str
     folder: str
     recordings: Mapping[str, PublicRecording]
-    max_bytes: int
-    max_files: int
     disk_ratio: float = 1.3
     prefix: str = ""
     sequences: bool = True
@@ -82,157 +75,25 @@ class RestrictedSet:
     page: str
 
 
-MB, GB = 10**6, 10**9
+def _read_sets(text: str) -> dict[str, PublicSet | RestrictedSet]:
+    """Read sets.toml; a set without recordings is available only on request."""
+    found: dict[str, PublicSet | RestrictedSet] = {}
+    for name, fields in tomllib.loads(text).items():
+        address, recordings = fields.pop("address", ""), fields.pop("recordings", None)
+        if recordings is None:
+            found[name] = RestrictedSet(**fields)
+            continue
+        made = {}
+        for short, row in recordings.items():
+            files = tuple(RemoteFile(address + file.pop("at"), **file) for file in row.pop("files"))
+            made[short] = PublicRecording(archives=files, **row)
+        found[name] = PublicSet(recordings=made, **fields)
+    return found
 
-_UNKNOWN_SIZES = (
-    "fr2/large_no_loop fr2/pioneer_360 fr2/pioneer_slam fr2/pioneer_slam2 fr2/pioneer_slam3 "
-    "fr3/nostructure_notexture_far fr3/nostructure_notexture_near_withloop fr3/nostructure_texture_far "
-    "fr3/nostructure_texture_near_withloop fr3/structure_notexture_far fr3/structure_notexture_near "
-    "fr3/structure_texture_far fr3/structure_texture_near fr2/coke fr2/dishes fr2/flowerbouquet "
-    "fr2/flowerbouquet_brownbackground fr2/metallic_sphere fr2/metallic_sphere2"
+
+SETS: Mapping[str, PublicSet | RestrictedSet] = _read_sets(
+    Path(__file__).with_name("sets.toml").read_text(encoding="utf-8")
 )
-TUM_SIZES_MB: Mapping[str, int | None] = {
-    "fr1/xyz": 448, "fr1/rpy": 410, "fr2/xyz": 2270, "fr2/rpy": 2020, "fr1/360": 430, "fr1/floor": 780, "fr1/desk": 344,
-    "fr1/desk2": 349, "fr1/room": 782, "fr2/360_hemisphere": 1430, "fr2/360_kidnap": 700, "fr2/desk": 1893,
-    "fr2/large_with_loop": 2690, "fr3/long_office_household": 1484, "fr1/plant": 700, "fr1/teddy": 880,
-    "fr3/cabinet": 490, "fr3/large_cabinet": 450, "fr3/teddy": 1230, **dict.fromkeys(_UNKNOWN_SIZES.split()),
-}  # fmt: skip
-"""The static scenes with published ground truth, without the dynamic scenes."""
-
-TUM_EXACT = {
-    "fr1/xyz": (448_204_271, "sha256:a0236d97b8c30cd93b653656d2b6c293ff7c982a4130ef2a1a8beecdb124ef98"),
-    "fr1/desk": (344_011_403, "sha256:e983d6830916e66dc4a46a71368046b149b283de87769690e7aa4e0b9483530c"),
-    "fr1/desk2": (349_445_005, "sha256:a569e4cb453a3cd9285bc985fcb109e65f055c75b33a4b155acd9a68d96b77d2"),
-}
-
-SEVEN_SCENES_SIZES = {
-    **{"chess": 3_079_608_937, "fire": 2_301_204_154, "heads": 956_332_240, "office": 4_707_873_861},
-    **{"pumpkin": 2_890_874_911, "redkitchen": 6_141_181_406, "stairs": 1_496_412_431},
-}
-CHESS_SHA256 = "sha256:d00b5b8f904123ec136768ee0ebd8f72aebb5473630fb5d8ec352e70ae4859d0"
-SEVEN_SCENES_URL = "https://download.microsoft.com/download/2/8/5/28564B23-0828-408F-8631-23B1EFF1DAC8"
-
-BONN_NAMES = (
-    *("balloon", "balloon2", "balloon_tracking", "balloon_tracking2", "crowd", "crowd2", "crowd3"),
-    *("kidnapping_box", "kidnapping_box2", "moving_nonobstructing_box", "moving_nonobstructing_box2"),
-    *("moving_obstructing_box", "moving_obstructing_box2", "person_tracking", "person_tracking2"),
-    *("placing_nonobstructing_box", "placing_nonobstructing_box2", "placing_nonobstructing_box3"),
-    *("placing_obstructing_box", "removing_nonobstructing_box", "removing_nonobstructing_box2"),
-    *("removing_obstructing_box", "static", "static_close_far", "synchronous", "synchronous2"),
-)
-
-REDWOOD_MD5 = {
-    "livingroom1": "c23481094ca3859b204d2fcbb4e435a4 2fec03a29258a29b9ffedde88fddd676 601ac4b51aba2455a90aed8aa1158c6a",
-    "livingroom2": "34792f7aa35b6c8b62e394e9372b95d7 cbb4a36b8488448d79ec93c202c0c90e 193961c018f4c2a753458d5231544036",
-    "office1": "6a58750880e83ac5948e0f28de294c04 7c7e479191d35c2ad1f8ac1c227f4f8d 3fac752ab38a4e8a96d1b5afa535f9f7",
-    "office2": "487cdfacffc8fc8247a5b21e860a3794 13f1c5b7c4f44524fa91f7ba87e44bb5 698f2f09da7d2ed3fcb604889e6f8479",
-}
-"""Contains colour, depth with Kinect noise, and the path."""
-REPLICA_URL = "https://cvg-data.inf.ethz.ch/nice-slam/data/Replica.zip"
-REDWOOD_URL = "https://github.com/isl-org/open3d_downloads/releases/download/augmented-icl-nuim"
-
-
-LPIPS_URL = "https://raw.githubusercontent.com/richzhang/PerceptualSimilarity/master/lpips/weights/v0.1"
-TORCH_URL = "https://download.pytorch.org/models"
-LPIPS_FILES = {
-    "alex": (
-        ("alex.pth", 6_009, "sha256:df73285e35b22355a2df87cdb6b70b343713b667eddbda73e1977e0c860835c0"),
-        ("alexnet-owt-7be5be79.pth", 244_408_911, "sha256:7be5be79"),
-    ),
-    "vgg": (
-        ("vgg.pth", 7_289, "sha256:a78928a0af1e5f0fcb1f3b9e8f8c3a2a5a3de244d830ad5c1feddc79b8432868"),
-        ("vgg16-397923af.pth", 553_433_881, "sha256:397923af"),
-    ),
-}
-"""For each network the linear layers of lpips 0.1.4 and torchvision's weights: name, size, checksum."""
-
-
-def _lpips(net: str) -> PublicRecording:
-    linear, trunk = LPIPS_FILES[net]
-    files = ((LPIPS_URL, *linear), (TORCH_URL, *trunk))
-    return PublicRecording(
-        net, tuple(RemoteFile(f"{url}/{name}", size, digest, into=name) for url, name, size, digest in files)
-    )
-
-
-def _tum(name: str, rough_mb: int | None) -> PublicRecording:
-    camera, scene = name.split("/")
-    part = camera.replace("fr", "freiburg")
-    folder = f"rgbd_dataset_{part}_{scene}"
-    size_bytes, checksum = TUM_EXACT.get(name, (rough_mb and rough_mb * MB, ""))
-    url = f"https://cvg.cit.tum.de/rgbd/dataset/{part}/{folder}.tgz"
-    return PublicRecording(folder, (RemoteFile(url, size_bytes, checksum),))
-
-
-def _icl(stem: str) -> PublicRecording:
-    return PublicRecording(stem, (RemoteFile(f"https://www.doc.ic.ac.uk/~ahanda/{stem}.tar.gz"),))
-
-
-def _seven_scenes(name: str, size_bytes: int) -> PublicRecording:
-    checksum = CHESS_SHA256 if name == "chess" else ""
-    archive = RemoteFile(f"{SEVEN_SCENES_URL}/{name}.zip", size_bytes, checksum, nested=True)
-    return PublicRecording(name, (archive,), start="seq-01")
-
-
-def _bonn(name: str) -> PublicRecording:
-    folder = f"rgbd_bonn_{name}"
-    return PublicRecording(
-        folder, (RemoteFile(f"https://www.ipb.uni-bonn.de/html/projects/rgbd_dynamic2019/{folder}.zip"),)
-    )
-
-
-def _redwood(name: str) -> PublicRecording:
-    color, depth, path = (f"md5:{digest}" for digest in REDWOOD_MD5[name].split())
-    return PublicRecording(
-        name,
-        (
-            RemoteFile(f"{REDWOOD_URL}/{name}-color.zip", None, color, into="color"),
-            RemoteFile(f"{REDWOOD_URL}/{name}-depth-simulated.zip", None, depth, into="depth"),
-            RemoteFile(f"{REDWOOD_URL}/{name}-traj.txt", None, path, into="trajectory.log"),
-        ),
-    )
-
-
-SETS: Mapping[str, PublicSet | RestrictedSet] = {
-    "tum": PublicSet(
-        "TUM RGB-D, static scenes", "https://cvg.cit.tum.de/data/datasets/rgbd-dataset", "CC BY 4.0", "tum",
-        {name: _tum(name, size) for name, size in TUM_SIZES_MB.items()}, 5 * GB, 50_000, prefix="rgbd_dataset_",
-    ),
-    "replica": PublicSet(
-        "Replica, 8 rooms rendered for NICE-SLAM", "https://github.com/facebookresearch/Replica-Dataset",
-        "Replica research licence, not for commercial use", "",
-        {"": PublicRecording("replica", (RemoteFile(REPLICA_URL, 12_400 * MB),), start="room0")}, 20 * GB, 100_000,
-    ),
-    "icl": PublicSet(
-        "ICL-NUIM, synthetic, as TUM-compatible PNGs", "https://www.doc.ic.ac.uk/~ahanda/VaFRIC/iclnuim.html",
-        "terms and citation on its page", "icl",
-        {f"living_room{i}": _icl(f"living_room_traj{i}_frei_png") for i in range(4)}
-        | {f"office{i}": _icl(f"traj{i}_frei_png") for i in range(4)}, 3 * GB, 20_000,
-    ),
-    "7scenes": PublicSet(
-        "7-Scenes", "https://www.microsoft.com/en-us/research/project/rgb-d-dataset-7-scenes/",
-        "Microsoft Research licence, not for commercial use", "7scenes",
-        {name: _seven_scenes(name, size) for name, size in SEVEN_SCENES_SIZES.items()}, 8 * GB, 100_000, disk_ratio=2.4,
-    ),
-    "bonn": PublicSet(
-        "Bonn RGB-D Dynamic", "https://www.ipb.uni-bonn.de/data/rgbd-dynamic-dataset/",
-        "for research, terms and citation on its page", "bonn",
-        {name: _bonn(name) for name in BONN_NAMES}, 5 * GB, 50_000, prefix="rgbd_bonn_",
-    ),
-    "redwood": PublicSet(
-        "Redwood, ICL-NUIM rooms with longer paths and Kinect noise", "http://redwood-data.org/indoor/dataset.html",
-        "terms and citation on its page", "redwood", {name: _redwood(name) for name in REDWOOD_MD5}, 3 * GB, 20_000,
-    ),
-    "lpips": PublicSet(
-        "Weights of LPIPS: linear layers, and AlexNet or VGG16 of torchvision",
-        "https://github.com/richzhang/PerceptualSimilarity", "BSD 2-Clause (lpips), BSD 3-Clause (torchvision)",
-        "lpips", {net: _lpips(net) for net in LPIPS_FILES}, GB, 10, disk_ratio=1.0, sequences=False,
-    ),
-    "scannet": RestrictedSet("ScanNet", "http://www.scan-net.org (terms of use to sign)"),
-    "scannetpp": RestrictedSet(
-        "ScanNet++", "https://scannetpp.mlsg.cit.tum.de/scannetpp/ (an account and an application)"
-    ),
-}  # fmt: skip
 
 
 def find_recording(set_name: str, recording: str = "") -> tuple[PublicSet, str]:

@@ -196,7 +196,6 @@ def _options(runtime: Any, threads: int) -> Any:
 
 
 def _chosen_output(path: Path, outputs: Sequence[Tensor], wanted: str) -> str:
-    """Return the name of the output with depth. Raises SourceError if it is unknown."""
     names = [each.name for each in outputs]
     found = [name for name in names if name == wanted] if wanted else names
     if len(found) > 1:

@@ -3,13 +3,12 @@
 Depth, or inverse depth, is in a folder with one image per frame, or comes from the network itself.
 """
 
-from abc import ABC, abstractmethod
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Lock
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,25 +58,36 @@ MOST_KEPT_PIXELS = 8_000_000
 """Predictions that are kept, 32 MB."""
 
 
-class PredictedDepth(ABC):
+class PredictedDepth:
     """The predicted depth of all frames of a recording, in metres of an arbitrary scale.
 
     One factor brings all images to the size of a room; it is 1 if the first image already looks like metres (floats) or
-    millimetres (whole numbers). paths: what names the depth of each frame in messages; model: name and SHA-256 of the
-    file that predicts it, None if it is in files. Raises SourceError if the first frame's cannot be used.
+    millimetres (whole numbers).
     """
 
-    model: Mapping[str, str] | None = None
-    made: ClassVar[str]
-    unknown: ClassVar[str]
-    """What to check if there is no depth, and what to do about NaN."""
+    def __init__(
+        self, paths: Sequence[Path], inverse: bool, read: Callable[[int, ReadColor], NDArray[Any]],
+        hints: tuple[str, str], model: Mapping[str, str] | None = None,
+    ) -> None:  # fmt: skip
+        """paths: what names the depth of each frame in messages; inverse: whether values are inverse depth; read: reads
+        the prediction of a frame, with the number of each pixel in the last two axes; hints: what to check if there is
+        no depth, and what to do about NaN; model: name and SHA-256 of the file that predicts it, None if it is in
+        files."""
+        self.paths, self.model = paths, model
+        self._inverse, self._read, self._hints, self._factor = inverse, read, hints, 1.0
 
-    def __init__(self, paths: Sequence[Path], inverse: bool) -> None:
-        self.paths, self._inverse, self._factor = paths, inverse, 1.0
-
-    @abstractmethod
-    def values(self, i: int, color: ReadColor) -> NDArray[Any]:
-        """Return the prediction for frame i, with the number of each pixel in the last two axes. Raises SourceError."""
+    def scaled_by(self, i: int, color: ReadColor) -> "PredictedDepth":
+        """Find the factor from frame i; return self. Raises SourceError if its depth cannot be used."""
+        first = self._depth(i, color)
+        known = first[first > 0]
+        if not len(known):
+            raise SourceError(
+                f"{self.paths[i]}: predicted depth has no value above 0; check how it was {self._hints[0]}"
+            )
+        median = float(np.median(known))
+        if self._inverse or not PLAUSIBLE_MEDIAN_M[0] <= median <= PLAUSIBLE_MEDIAN_M[1]:
+            self._factor = MEDIAN_M / median
+        return self
 
     def depth_of(self, i: int, width: int, height: int, color: ReadColor) -> Floats:
         """Return the depth of frame i [height, width], 0 where it is unknown; color: reads the frame's colour. Raises
@@ -88,19 +98,8 @@ class PredictedDepth(ABC):
         resized = Image.fromarray(depth_m).resize((width, height), Image.Resampling.NEAREST)
         return np.asarray(resized, np.float32)
 
-    def _find_factor(self, i: int, color: ReadColor) -> None:
-        """Find the factor from frame i. Raises SourceError if its depth cannot be used."""
-        first = self._depth(i, color)
-        known = first[first > 0]
-        if not len(known):
-            raise SourceError(f"{self.paths[i]}: predicted depth has no value above 0; check how it was {self.made}")
-        median = float(np.median(known))
-        if self._inverse or not PLAUSIBLE_MEDIAN_M[0] <= median <= PLAUSIBLE_MEDIAN_M[1]:
-            self._factor = MEDIAN_M / median
-
     def _depth(self, i: int, color: ReadColor) -> Floats:
-        """Return the depth of one frame, before the factor."""
-        values, path = self.values(i, color), self.paths[i]
+        values, path = self._read(i, color), self.paths[i]
         if values.ndim == 3 and 1 in values.shape[::2]:
             values = values[..., 0] if values.shape[2] == 1 else values[0]
         if values.ndim != 2 or values.dtype.kind not in "uif":
@@ -109,7 +108,7 @@ class PredictedDepth(ABC):
             )
         read = values.astype(np.float32)
         if bad := int((~np.isfinite(read)).sum()):
-            raise SourceError(f"{path}: predicted depth holds {bad} NaN or inf pixels; {self.unknown}")
+            raise SourceError(f"{path}: predicted depth holds {bad} NaN or inf pixels; {self._hints[1]}")
         if values.dtype.kind in "ui":
             read = read / np.float32(MM_PER_METRE)
         if not self._inverse:
@@ -118,69 +117,55 @@ class PredictedDepth(ABC):
         return np.where(usable, 1.0 / np.where(usable, read, 1.0), 0.0).astype(np.float32)
 
 
-class PredictedFolder(PredictedDepth):
-    """Predicted depth in a folder, one image for each frame. Raises SourceError if there is not one for each."""
-
-    made, unknown = "stored", "write 0 where it is unknown"
-
-    def __init__(self, folder: Path, names: Sequence[str], inverse: bool) -> None:
-        """Find the images of the frames: by name if the first frame's name (without ending) occurs, else in order.
-
-        names: those of the frames, or empty names if only the order counts; inverse: whether values are inverse depth.
-        """
-        if not folder.is_dir():
-            raise SourceError(f"no such folder: {folder}; give the folder of the predicted depth, one image per frame")
-        found = list_images(folder, DEPTH_ENDINGS)
-        by_name = {path.stem: path for path in found}
-        if names and names[0] in by_name:
-            missing = [name for name in names if name not in by_name]
-            if missing:
-                raise SourceError(
-                    f"{folder}: no predicted depth for {len(missing)} of {len(names)} frames (first: {missing[0]}); "
-                    "predict it for every frame"
-                )
-            found = [by_name[name] for name in names]
-        if len(found) != len(names):
+def predicted_in_folder(folder: Path, names: Sequence[str], inverse: bool) -> PredictedDepth:
+    """Return the depth of the images of a folder: by name if the first frame's name (without ending) occurs, else in
+    order. names: those of the frames, or empty names. Raises SourceError if there is not one image for each frame."""
+    if not folder.is_dir():
+        raise SourceError(f"no such folder: {folder}; give the folder of the predicted depth, one image per frame")
+    found = list_images(folder, DEPTH_ENDINGS)
+    by_name = {path.stem: path for path in found}
+    if names and names[0] in by_name:
+        missing = [name for name in names if name not in by_name]
+        if missing:
             raise SourceError(
-                f"{folder}: found predicted depth of {len(found)} frames, there are {len(names)}; give one for each"
+                f"{folder}: no predicted depth for {len(missing)} of {len(names)} frames (first: {missing[0]}); "
+                "predict it for every frame"
             )
-        super().__init__(found, inverse)
-        self._find_factor(0, no_color)
+        found = [by_name[name] for name in names]
+    if len(found) != len(names):
+        raise SourceError(
+            f"{folder}: found predicted depth of {len(found)} frames, there are {len(names)}; give one for each"
+        )
 
-    def values(self, i: int, color: ReadColor) -> NDArray[Any]:
-        path = self.paths[i]
-        return read_npy(path) if path.suffix.lower() == ".npy" else read_values(path)
+    def read(i: int, color: ReadColor) -> NDArray[Any]:
+        return read_npy(found[i]) if found[i].suffix.lower() == ".npy" else read_values(found[i])
+
+    hints = "stored", "write 0 where it is unknown"
+    return PredictedDepth(found, inverse, read, hints).scaled_by(0, lambda: np.zeros((0, 0, 3), np.float32))
 
 
-class PredictedByModel(PredictedDepth):
-    """Depth that a network predicts from the colour of a frame when the frame is read.
+def predicted_by_model(
+    model: DepthModel, frames: int, read_color: Callable[[int], Floats], inverse: bool
+) -> PredictedDepth:
+    """Return the depth that a network predicts from the colour of a frame when the frame is read.
 
-    Predictions of the newest frames are kept, so that reading a frame again does not predict again. Safe to use from
-    several threads.
+    Predictions of the newest frames are kept, so that reading a frame again does not predict again. Several threads may
+    read. Raises SourceError if the depth of the first frame whose colour can be read cannot be used.
     """
+    kept, lock = OrderedDict[int, Floats](), Lock()
 
-    made, unknown = "trained, and what colours it expects", "the network does not fit these images"
+    def read(i: int, color: ReadColor) -> Floats:
+        with lock:
+            if i not in kept:
+                kept[i] = model.predict(color())
+                while len(kept) > 1 and sum(each.size for each in kept.values()) > MOST_KEPT_PIXELS:
+                    kept.popitem(last=False)
+            return kept[i]
 
-    def __init__(self, model: DepthModel, frames: int, read_color: Callable[[int], Floats], inverse: bool) -> None:
-        """Predict the depth of the first frame whose colour can be read. Raises SourceError if that fails."""
-        super().__init__([model.path] * frames, inverse)
-        self.model = {"file": model.name, "sha256": model.sha256}
-        self._model, self._kept, self._lock = model, OrderedDict[int, Floats](), Lock()
-        first, color = first_readable(range(frames), lambda i: (i, read_color(i)))
-        self._find_factor(first, lambda: color)
-
-    def values(self, i: int, color: ReadColor) -> Floats:
-        with self._lock:
-            if i not in self._kept:
-                self._kept[i] = self._model.predict(color())
-                while len(self._kept) > 1 and sum(kept.size for kept in self._kept.values()) > MOST_KEPT_PIXELS:
-                    self._kept.popitem(last=False)
-            return self._kept[i]
-
-
-def no_color() -> Floats:
-    """Return no colour, for depth that does not need it."""
-    return np.zeros((0, 0, 3), np.float32)
+    hints = "trained, and what colours it expects", "the network does not fit these images"
+    made = PredictedDepth([model.path] * frames, inverse, read, hints, {"file": model.name, "sha256": model.sha256})
+    first, color = first_readable(range(frames), lambda i: (i, read_color(i)))
+    return made.scaled_by(first, lambda: color)
 
 
 class WithPredictedDepth(Subset):
@@ -294,8 +279,8 @@ def _predicted_depth(
     """Open the folder, or the network, that the settings name, for frames of these names."""
     if settings.depth_model:
         model = DepthModel(Path(settings.depth_model), settings)
-        return PredictedByModel(model, len(names), read_color, settings.predicted_inverse)
-    return PredictedFolder(Path(settings.predicted_depth), names, settings.predicted_inverse)
+        return predicted_by_model(model, len(names), read_color, settings.predicted_inverse)
+    return predicted_in_folder(Path(settings.predicted_depth), names, settings.predicted_inverse)
 
 
 def _color_images(folder: Path) -> list[Path]:

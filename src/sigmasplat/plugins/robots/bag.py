@@ -4,10 +4,8 @@ A bag is a folder with metadata.yaml and one MCAP file, or the MCAP file alone."
 
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -100,7 +98,6 @@ class BagSink:
             self.writer.storage.bio.flush()
 
     def _quality(self, topic: Topic) -> Any:
-        """Return the quality of service with which a player publishes a topic."""
         kinds, no_limit = self.interfaces, self.interfaces.QosTime(2147483647, 4294967295)
         durability = kinds.QosDurability.TRANSIENT_LOCAL if topic.latched else kinds.QosDurability.VOLATILE
         return kinds.Qos(
@@ -149,67 +146,11 @@ def export_bag(
 
 
 def _remove_earlier(target: Path) -> None:
-    """Remove an earlier export. Raises OSError if it is a folder with other files."""
     if not target.is_dir():
         return target.unlink(missing_ok=True)
     for name in ("metadata.yaml", f"{target.name}{FILE_ENDING}"):
         (target / name).unlink(missing_ok=True)
     target.rmdir()
-
-
-@dataclass(frozen=True, eq=False)
-class _FinishedPath:
-    """The path of a finished run as ROS reads it. valid: frames with a known pose in the world."""
-
-    reader: RunReader
-    T_map_world: Matrix
-
-    @cached_property
-    def checkpoint(self) -> dict[str, Tensor]:
-        """Return the tensors of the run's checkpoint."""
-        return self.reader.run.read_checkpoint()[0]
-
-    @cached_property
-    def valid(self) -> dict[int, Matrix]:
-        """Return T_map_link [4, 4] of each valid frame."""
-        path = self.reader.valid_path()
-        return dict(zip(self.reader.valid_frames(), ros.link_pose(self.T_map_world @ path.T_world_camera), strict=True))
-
-    @cached_property
-    def odometry(self) -> tuple[Matrix, NDArray[np.bool_]]:
-        """Return T_odom_camera [F, 4, 4] of all frames, and whether all motions up to each frame were tracked [F]."""
-        tensors, frames = self.checkpoint, self.reader.frames
-        chain = tensors.get("T_world_camera_odometry", tensors["T_world_camera"]).numpy()
-        if len(chain) < len(frames):
-            run = self.reader.run.path
-            raise RunError(f"{run}: {len(chain)} poses in the checkpoint for {len(frames)} frames; run it again")
-        components = [0] * len(frames)
-        if "submap_component" in tensors:
-            components = tensors["submap_component"][tensors["frame_submap"]].tolist()
-        lost = [state == LOST for state in frames.states]
-        moved = [has_motion(s, r.get("tracking", {})) for s, r in zip(frames.states, frames.log, strict=True)]
-        return odometry_poses(chain[: len(frames)], moved, lost, components)
-
-    @cached_property
-    def errors(self) -> tuple[PathCovariance, PathCovariance] | None:
-        """Return the errors of the path, and of the path without loops; None if the run did not record them."""
-        errors = PathCovariance.of(self.checkpoint)
-        return None if errors is None else (errors, errors.without_loops())
-
-    def in_map(self, row: int) -> Matrix | None:
-        """Return the covariance [6, 6] of a valid frame's pose in the map; None if it is not known."""
-        if self.errors is None:
-            return None
-        return ros.ros_covariance(self.errors[0].of_frame(row), self.T_map_world, self.valid[row])
-
-    def in_odom(self, row: int) -> Matrix | None:
-        """Return the covariance [6, 6] of a frame's pose in odom; None if it is not known."""
-        poses, tracked = self.odometry
-        if self.errors is None or not tracked[row]:
-            return None
-        return ros.ros_covariance(
-            self.errors[1].of_frame(row), ros.T_LINK_OPTICAL, ros.link_pose(ros.T_LINK_OPTICAL @ poses[row])
-        )
 
 
 def _messages(reader: RunReader, messages: RosMessages, pictures: bool, progress: Progress) -> Iterator[Encoded]:
@@ -225,13 +166,19 @@ def _messages(reader: RunReader, messages: RosMessages, pictures: bool, progress
     )
     if plan is not None:
         yield from ros.grids(plan, first_ns, ros.MAP, messages)
-    yield from _frames(reader, messages, _FinishedPath(reader, T_map_world), pictures)
+    yield from _frames(reader, messages, T_map_world, pictures)
 
 
-def _frames(reader: RunReader, messages: RosMessages, path: _FinishedPath, pictures: bool) -> Iterator[Encoded]:
+def _frames(reader: RunReader, messages: RosMessages, T_map_world: Matrix, pictures: bool) -> Iterator[Encoded]:
     """Yield the messages of the frames: transforms, odometry, pose with covariance, loops, images of keyframes."""
     images = reader.keyframes() if pictures else iter(())
     loops, picture = _loop_frames(reader), next(images, None)
+    tensors = reader.run.read_checkpoint()[0]
+    T_odom_camera, tracked = _odometry(reader, tensors)
+    path = PathCovariance.of(tensors)
+    chain = None if path is None else path.without_loops()
+    valid_links = ros.link_pose(T_map_world @ reader.valid_path().T_world_camera)
+    valid = dict(zip(reader.valid_frames(), valid_links, strict=True))
     for row, record in enumerate(reader.frames.log):
         stamp_ns = ros.stamp_of(record["timestamp_s"])
         if picture is not None and picture[0] == row:
@@ -239,13 +186,31 @@ def _frames(reader: RunReader, messages: RosMessages, path: _FinishedPath, pictu
             picture = next(images, None)
         if reader.frames.states[row] == LOST:
             continue
-        T_odom_link = ros.link_pose(ros.T_LINK_OPTICAL @ path.odometry[0][row])
-        T_map_link = path.valid.get(row)
+        T_odom_link, T_map_link = ros.link_pose(ros.T_LINK_OPTICAL @ T_odom_camera[row]), valid.get(row)
+        covariance = None
+        if chain is not None and tracked[row]:
+            covariance = ros.ros_covariance(chain.of_frame(row), ros.T_LINK_OPTICAL, T_odom_link)
         yield messages.transforms(ros.TF, stamp_ns, ros.camera_links(T_odom_link, T_map_link))
-        yield messages.odometry(stamp_ns, ros.ODOM, ros.LINK, T_odom_link, path.in_odom(row))
+        yield messages.odometry(stamp_ns, ros.ODOM, ros.LINK, T_odom_link, covariance)
         if T_map_link is not None:
+            covariance = None if path is None else ros.ros_covariance(path.of_frame(row), T_map_world, T_map_link)
             for topic in (ros.POSE, ros.LOOP) if row in loops else (ros.POSE,):
-                yield messages.pose(topic, stamp_ns, ros.MAP, T_map_link, path.in_map(row))
+                yield messages.pose(topic, stamp_ns, ros.MAP, T_map_link, covariance)
+
+
+def _odometry(reader: RunReader, tensors: Mapping[str, Tensor]) -> tuple[Matrix, NDArray[np.bool_]]:
+    """Return T_odom_camera [F, 4, 4] of all frames, and whether all motions up to each frame were tracked [F]."""
+    frames = reader.frames
+    chain = tensors.get("T_world_camera_odometry", tensors["T_world_camera"]).numpy()
+    if len(chain) < len(frames):
+        run = reader.run.path
+        raise RunError(f"{run}: {len(chain)} poses in the checkpoint for {len(frames)} frames; run it again")
+    components = [0] * len(frames)
+    if "submap_component" in tensors:
+        components = tensors["submap_component"][tensors["frame_submap"]].tolist()
+    lost = [state == LOST for state in frames.states]
+    moved = [has_motion(s, r.get("tracking", {})) for s, r in zip(frames.states, frames.log, strict=True)]
+    return odometry_poses(chain[: len(frames)], moved, lost, components)
 
 
 def _loop_frames(reader: RunReader) -> set[int]:

@@ -3,11 +3,10 @@
 import contextlib
 from array import array
 from collections.abc import Callable, Sequence
-from functools import cached_property, partial
+from functools import cache, partial
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sigmasplat.api import (
     Callback,
@@ -18,8 +17,6 @@ from sigmasplat.api import (
     SigmaSplatError,
     Slam,
     Step,
-    SubmapStore,
-    Trajectory,
     path_errors,
     se3,
     up_of_path,
@@ -49,22 +46,21 @@ class LiveRobot(Callback):
     ) -> None:
         self.slam, self.outlets, self.warn, self.images = slam, outlets, warn, images
         self.odometry = LiveOdometry(slam.atlas)
-        self._frames, self._forces = dict[int, Frame](), _Forces()
-        self._submaps = list[_SubmapPoints]()
+        self._frames = dict[int, Frame]()
+        self._rows, self._forces_m_s2 = array("q"), array("d")  # of the steps with a force on their frame
+        self._submaps = list[Callable[[], Points]]()  # in their own frames, each read once
         self._stamp_ns = -1
         self._failed = set[str]()
 
     def watch(self, frame: Frame) -> None:
-        """Keep until a frame's step the force on it, and its images if they may be wanted."""
-        self._forces.watch(frame)
-        if self.images != "none":
+        """Keep a frame until its step, if its images or the force on it may be wanted."""
+        if self.images != "none" or frame.specific_force_m_s2 is not None:
             self._frames[frame.index] = frame
 
     def __call__(self, step: Step) -> None:
         """Give the messages of a step to the outlets."""
         self._now(step.timestamp_s)
-        self._forces.step(step.index, len(self.slam.steps) - 1)
-        self._offer_images(step)
+        self._offer_images(step, self._frame_of(step))
         moved = has_motion(step.state, step.tracking)
         T_odom_camera = self.odometry.step(moved, step.lost, step.is_keyframe)
         if not step.lost:
@@ -103,12 +99,20 @@ class LiveRobot(Callback):
         stamp_ns = self._stamp_ns
         self._offer(lambda messages: [messages.transforms(ros.TF_STATIC, stamp_ns, links)], ros.TF_STATIC)
 
-    def _offer_images(self, step: Step) -> None:
+    def _frame_of(self, step: Step) -> Frame | None:
+        """Return the frame of a step if it was kept, and note the force on it; forget those that real time dropped."""
         frame = self._frames.pop(step.index, None)
         for index in list(self._frames):  # a copy: in real time `watch` runs on another thread
             if index < step.index:
                 del self._frames[index]
-        if frame is not None and (self.images == "all" or step.is_keyframe):
+        if frame is not None and frame.specific_force_m_s2 is not None:
+            self._rows.append(len(self.slam.steps) - 1)
+            self._forces_m_s2.extend(frame.specific_force_m_s2)
+        return frame
+
+    def _offer_images(self, step: Step, frame: Frame | None) -> None:
+        wanted = self.images == "all" or (self.images == "keyframes" and step.is_keyframe)
+        if frame is not None and wanted:
             image = self._stamp_ns, frame.camera, frame.color, frame.depth_m
             topics = ros.COLOR, ros.COLOR_INFO, ros.DEPTH, ros.DEPTH_INFO
             self._offer(lambda messages: messages.images(*image), *topics, bulky=True)
@@ -154,25 +158,26 @@ class LiveRobot(Callback):
         if len(self._submaps) == finished:
             return
         atlas = self.slam.atlas
-        new = range(len(self._submaps), finished)
-        self._submaps.extend(_SubmapPoints(self.slam.store, index) for index in new)
+        self._submaps += [cache(partial(self._read_points, s)) for s in range(len(self._submaps), finished)]
         parts = [
-            (submap, ros.T_MAP_WORLD @ atlas.anchors[s])
-            for s, submap in enumerate(self._submaps)
+            (points, ros.T_MAP_WORLD @ atlas.anchors[s])
+            for s, points in enumerate(self._submaps)
             if not atlas.components[s]
         ]
         stamp_ns = self._stamp_ns
 
         def job(messages: RosMessages) -> list[Encoded]:
             each = MAX_POINTS // len(parts)
-            moved = [submap.points.thinned(each).moved(T) for submap, T in parts]
+            moved = [points().thinned(each).moved(T) for points, T in parts]
             return [messages.cloud(stamp_ns, ros.MAP, Points.joined(moved))]
 
         if parts:
             self._offer(job, ros.CLOUD)
 
+    def _read_points(self, submap: int) -> Points:
+        return ros.points_of(self.slam.store.load(submap).field, None, SUBMAP_POINTS)
+
     def _offer_final_map(self) -> None:
-        """Give the final map as points and as a grid."""
         field, known, stamp_ns = self.slam.field, self.slam.uncertainty, self._stamp_ns
         std = None if known is None or known.std is None else known.std.depth_std_m
 
@@ -187,10 +192,11 @@ class LiveRobot(Callback):
             self._offer(partial(ros.grids, plan, stamp_ns, ros.FLOOR), ros.GRID, ros.GRID_STD)
 
     def _floor_plan(self) -> FloorPlan | None:
-        """Return the floor plan of the final map; None if no surface is visible."""
         slam = self.slam
         whole, valid = slam.trajectory(), slam.valid()
-        path, up_world = whole.at(valid), self._forces.up_of(whole, valid)
+        path, rows = whole.at(valid), np.array(self._rows, np.intp)
+        known, forces = valid[rows], np.array(self._forces_m_s2).reshape(-1, 3)
+        up_world = up_of_path(whole.T_world_camera[rows[known]], forces[known])
         if not len(path):
             return None
         with contextlib.suppress(SigmaSplatError):
@@ -205,42 +211,3 @@ class LiveRobot(Callback):
             if outlet.failure and name not in self._failed:
                 self._failed.add(name)
                 self.warn(f"the {name} ended ({outlet.failure}) after {outlet.written} messages; the run goes on")
-
-
-class _Forces:
-    """The forces that an accelerometer measures on the frames, if there is one."""
-
-    def __init__(self) -> None:
-        self._waiting = dict[int, NDArray[np.float64]]()
-        self._rows, self._forces_m_s2 = array("q"), array("d")
-
-    def watch(self, frame: Frame) -> None:
-        """Keep the force on a frame until its step; frames that real time drops have none."""
-        if frame.specific_force_m_s2 is not None:
-            self._waiting[frame.index] = frame.specific_force_m_s2
-
-    def step(self, index: int, row: int) -> None:
-        """Note the force on the frame with this index, which is the step `row`."""
-        for waiting in [i for i in list(self._waiting) if i <= index]:  # a copy: `watch` may run on another thread
-            force = self._waiting.pop(waiting)
-            if waiting == index:
-                self._rows.append(row)
-                self._forces_m_s2.extend(force)
-
-    def up_of(self, path: Trajectory, valid: NDArray[np.bool_]) -> NDArray[np.float64] | None:
-        """Return the unit vector [3] that points up in the world, from the valid poses of a path; None if it was not
-        measured."""
-        rows, forces = np.array(self._rows, np.intp), np.array(self._forces_m_s2).reshape(-1, 3)
-        use = valid[rows]
-        return up_of_path(path.T_world_camera[rows[use]], forces[use])
-
-
-class _SubmapPoints:
-    """The points of a finished submap, in its frame; read once."""
-
-    def __init__(self, store: SubmapStore, index: int) -> None:
-        self.store, self.index = store, index
-
-    @cached_property
-    def points(self) -> Points:
-        return ros.points_of(self.store.load(self.index).field, None, SUBMAP_POINTS)

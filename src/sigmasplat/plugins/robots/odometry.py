@@ -93,7 +93,6 @@ class LiveOdometry:
         return np.asarray(se3.inverse(T[0]) @ T[1])
 
     def _add_new_hops(self) -> None:
-        """Add the errors of the hops to keyframes that are new since the last step."""
         assert self._counted is not None
         hops, first = self.atlas.hops, self._counted
         self._counted = len(hops)

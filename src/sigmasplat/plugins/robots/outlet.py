@@ -105,7 +105,6 @@ class Outlet:
             self.sink.abort()
 
     def _next(self) -> tuple[Job, tuple[Topic, ...]] | None:
-        """Wait for a job; None at the end."""
         with self._changed:
             self._changed.wait_for(lambda: bool(self._jobs) or self._closing)
             if not self._jobs:

@@ -10,7 +10,7 @@ forward, y left, z up; optical frames z forward):
 Only map → odom contains corrections (loops, relocalisation, mapping), so odom → camera_link is continuous.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -139,11 +139,35 @@ def stamp_of(timestamp_s: float) -> int:
     return max(0, round(timestamp_s * 1e9))
 
 
+def _xyz(values: Matrix) -> dict[str, float]:
+    return dict(zip("xyz", map(float, values), strict=True))
+
+
+def _rotation(T: Matrix) -> dict[str, float]:
+    return dict(zip("wxyz", map(float, se3.quaternion_from_rotation(T[:3, :3])), strict=True))
+
+
+def _pose(T: Matrix) -> dict[str, Any]:
+    return {"position": _xyz(T[:3, 3]), "orientation": _rotation(T)}
+
+
+def _pose_with_covariance(T: Matrix, covariance: Matrix | None) -> dict[str, Any]:
+    values = np.array(UNKNOWN)
+    if covariance is not None:
+        values = (covariance if covariance.any() else KNOWN_VARIANCE * np.eye(6)).reshape(-1).astype(np.float64)
+    return {"pose": _pose(T), "covariance": values}
+
+
+def _header(stamp_ns: int, frame: str) -> dict[str, Any]:
+    return {"stamp": {"sec": stamp_ns // 10**9, "nanosec": stamp_ns % 10**9}, "frame_id": frame}
+
+
 class RosMessages:
     """Makes messages. Raises SourceError without the rosbags package."""
 
     def __init__(self) -> None:
         typesys = import_optional("rosbags.typesys", EXTRA, "ROS messages")
+        self._nodes = import_optional("rosbags.interfaces", EXTRA, "ROS messages").Nodetype
         self.store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
 
     def schema(self, topic: Topic) -> str:
@@ -154,42 +178,23 @@ class RosMessages:
     def transforms(self, topic: Topic, stamp_ns: int, links: Sequence[tuple[str, str, Matrix]]) -> Encoded:
         """Make a message of transforms (parent, child, T_parent_child [4, 4])."""
         stamped = [
-            self._make(
-                "geometry_msgs/msg/TransformStamped",
-                header=self._header(stamp_ns, parent),
-                child_frame_id=child,
-                transform=self._make(
-                    "geometry_msgs/msg/Transform",
-                    translation=self._vector("geometry_msgs/msg/Vector3", T[:3, 3]),
-                    rotation=self._quaternion(T),
-                ),
-            )
+            {
+                "header": _header(stamp_ns, parent), "child_frame_id": child,
+                "transform": {"translation": _xyz(T[:3, 3]), "rotation": _rotation(T)},
+            }
             for parent, child, T in links
-        ]
-        return self._encoded(topic, stamp_ns, transforms=stamped)
+        ]  # fmt: skip
+        return self._encoded(topic, stamp_ns, "", transforms=stamped)
 
     def odometry(self, stamp_ns: int, parent: str, child: str, T: Matrix, covariance: Matrix | None) -> Encoded:
         """Make nav_msgs/Odometry: the pose T_parent_child with covariance [6, 6] (`ros_covariance`), None if it
         is not known. Velocities are not estimated: their covariance is marked as not known."""
-        zero = self._vector("geometry_msgs/msg/Vector3", np.zeros(3))
-        twist = self._make(
-            "geometry_msgs/msg/TwistWithCovariance",
-            twist=self._make("geometry_msgs/msg/Twist", linear=zero, angular=zero),
-            covariance=np.array(UNKNOWN),
-        )
-        return self._encoded(
-            ODOMETRY,
-            stamp_ns,
-            header=self._header(stamp_ns, parent),
-            child_frame_id=child,
-            pose=self._pose_with_covariance(T, covariance),
-            twist=twist,
-        )
+        pose, twist = _pose_with_covariance(T, covariance), {"covariance": np.array(UNKNOWN)}
+        return self._encoded(ODOMETRY, stamp_ns, parent, child_frame_id=child, pose=pose, twist=twist)
 
     def pose(self, topic: Topic, stamp_ns: int, parent: str, T: Matrix, covariance: Matrix | None) -> Encoded:
         """Make geometry_msgs/PoseWithCovarianceStamped, arguments as for `odometry`."""
-        header = self._header(stamp_ns, parent)
-        return self._encoded(topic, stamp_ns, header=header, pose=self._pose_with_covariance(T, covariance))
+        return self._encoded(topic, stamp_ns, parent, pose=_pose_with_covariance(T, covariance))
 
     def cloud(self, stamp_ns: int, frame: str, points: Points) -> Encoded:
         """Make sensor_msgs/PointCloud2 with the fields x, y, z, rgb, opacity, depth_std (m, nan if not known)."""
@@ -201,14 +206,11 @@ class RosMessages:
         rows["rgb"] = (red << 16 | green << 8 | blue).view("<f4")
         rows["opacity"], rows["depth_std"] = points.opacities, points.depth_std_m
         size = rows.dtype.itemsize
-        fields = [
-            self._make("sensor_msgs/msg/PointField", name=name, offset=4 * i, datatype=7, count=1)
-            for i, name in enumerate(names)
-        ]
+        fields = [{"name": name, "offset": 4 * i, "datatype": 7, "count": 1} for i, name in enumerate(names)]
         return self._encoded(
-            CLOUD, stamp_ns, header=self._header(stamp_ns, frame), height=1, width=len(rows), fields=fields,
-            is_bigendian=False, point_step=size, row_step=size * len(rows),
-            data=np.frombuffer(rows.tobytes(), np.uint8), is_dense=bool(np.isfinite(points.positions).all()),
+            CLOUD, stamp_ns, frame, height=1, width=len(rows), fields=fields, point_step=size,
+            row_step=size * len(rows), data=np.frombuffer(rows.tobytes(), np.uint8),
+            is_dense=bool(np.isfinite(points.positions).all()),
         )  # fmt: skip
 
     def grid(
@@ -216,12 +218,11 @@ class RosMessages:
     ) -> Encoded:
         """Make nav_msgs/OccupancyGrid: cells [rows, columns], 0 to 100, −1 not known; T_frame_grid: the pose of the
         outer corner of row 0, column 0; columns grow along its x axis, rows along y."""
-        header = self._header(stamp_ns, frame)
-        info = self._make(
-            "nav_msgs/msg/MapMetaData", map_load_time=header.stamp, resolution=cell_m, width=cells.shape[1],
-            height=cells.shape[0], origin=self._pose(T_frame_grid),
-        )  # fmt: skip
-        return self._encoded(topic, stamp_ns, header=header, info=info, data=cells.reshape(-1))
+        info = {
+            "map_load_time": _header(stamp_ns, "")["stamp"], "resolution": cell_m, "width": cells.shape[1],
+            "height": cells.shape[0], "origin": _pose(T_frame_grid),
+        }  # fmt: skip
+        return self._encoded(topic, stamp_ns, frame, info=info, data=cells.reshape(-1))
 
     def images(
         self, stamp_ns: int, camera: Camera, color: NDArray[np.float32], depth_m: NDArray[np.float32]
@@ -230,58 +231,36 @@ class RosMessages:
         with nan where there is no reading (REP 118)."""
         rgb = np.rint(255.0 * color).astype(np.uint8)
         depth = np.where(depth_m > 0, depth_m, np.float32(np.nan)).astype("<f4")
-        header, info = self._header(stamp_ns, OPTICAL), self._camera_info(stamp_ns, camera)
+        size = {"height": camera.height, "width": camera.width}
+        K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
+        P = np.pad(K, ((0, 0), (0, 1)))
+        pinhole = {"d": np.zeros(5), "k": K.reshape(-1), "r": np.eye(3).reshape(-1), "p": P.reshape(-1)}
         found = []
         for topic, about, array, kind in ((COLOR, COLOR_INFO, rgb, "rgb8"), (DEPTH, DEPTH_INFO, depth, "32FC1")):
-            step = array.nbytes // camera.height
-            image = self._encoded(
-                topic, stamp_ns, header=header, height=camera.height, width=camera.width, encoding=kind,
-                is_bigendian=0, step=step, data=np.ascontiguousarray(array).reshape(-1).view(np.uint8),
-            )  # fmt: skip
-            found += [Encoded(about, stamp_ns, info), image]
+            data, step = np.ascontiguousarray(array).reshape(-1).view(np.uint8), array.nbytes // camera.height
+            found += [
+                self._encoded(about, stamp_ns, OPTICAL, distortion_model="plumb_bob", **size, **pinhole),
+                self._encoded(topic, stamp_ns, OPTICAL, encoding=kind, step=step, data=data, **size),
+            ]
         return found
 
-    def _camera_info(self, stamp_ns: int, camera: Camera) -> bytes:
-        fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
-        roi = self._make(
-            "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
-        )
-        return self._encoded(
-            COLOR_INFO, stamp_ns, header=self._header(stamp_ns, OPTICAL), height=camera.height, width=camera.width,
-            distortion_model="plumb_bob", d=np.zeros(5), k=np.array([fx, 0, cx, 0, fy, cy, 0, 0, 1.0]),
-            r=np.eye(3).reshape(-1), p=np.array([fx, 0, cx, 0, 0, fy, cy, 0, 0, 0, 1.0, 0]), binning_x=0, binning_y=0,
-            roi=roi,
-        ).data  # fmt: skip
-
-    # ---- parts of messages ----
-
-    def _make(self, kind: str, **fields: Any) -> Any:
-        return self.store.types[kind](**fields)
-
-    def _encoded(self, topic: Topic, stamp_ns: int, **fields: Any) -> Encoded:
-        message = self._make(topic.msgtype, **fields)
+    def _encoded(self, topic: Topic, stamp_ns: int, frame: str, **values: Any) -> Encoded:
+        message = self._made(topic.msgtype, {"header": _header(stamp_ns, frame), **values})
         return Encoded(topic, stamp_ns, bytes(self.store.serialize_cdr(message, topic.msgtype)))
 
-    def _header(self, stamp_ns: int, frame: str) -> Any:
-        stamp = self._make("builtin_interfaces/msg/Time", sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
-        return self._make("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
-
-    def _vector(self, kind: str, values: Matrix) -> Any:
-        return self._make(kind, **dict(zip("xyz", map(float, values), strict=True)))
-
-    def _quaternion(self, T: Matrix) -> Any:
-        w, x, y, z = map(float, se3.quaternion_from_rotation(T[:3, :3]))
-        return self._make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
-
-    def _pose(self, T: Matrix) -> Any:
-        position = self._vector("geometry_msgs/msg/Point", T[:3, 3])
-        return self._make("geometry_msgs/msg/Pose", position=position, orientation=self._quaternion(T))
-
-    def _pose_with_covariance(self, T: Matrix, covariance: Matrix | None) -> Any:
-        values = np.array(UNKNOWN)
-        if covariance is not None:
-            values = (covariance if covariance.any() else KNOWN_VARIANCE * np.eye(6)).reshape(-1).astype(np.float64)
-        return self._make("geometry_msgs/msg/PoseWithCovariance", pose=self._pose(T), covariance=values)
+    def _made(self, kind: str, values: Mapping[str, Any]) -> Any:
+        """Make a message from nested values; fields that are left out are zero or empty."""
+        fields = {}
+        for name, (node, detail) in self.store.fielddefs[kind][1]:
+            value = values.get(name)
+            if node == self._nodes.NAME:
+                value = self._made(detail, value or {})
+            elif node == self._nodes.SEQUENCE and detail[0][0] == self._nodes.NAME:
+                value = [self._made(detail[0][1], item) for item in value or ()]
+            elif value is None:
+                value = "" if detail[0] == "string" else 0
+            fields[name] = value
+        return self.store.types[kind](**fields)
 
 
 MAX_POINTS = 200_000

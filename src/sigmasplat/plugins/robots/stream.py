@@ -4,8 +4,8 @@ Protocol: https://docs.foxglove.dev/docs/sdk/websocket-server, https://github.co
 is not used: it answers any page in the browser, because it does not check the header Origin. A test compares the
 messages with those of the SDK.
 
-Nothing that a client sends reaches the run: only `subscribe` and `unsubscribe` are read. Each client has a bounded
-queue; if it reads too slowly, its oldest messages are dropped.
+Nothing that a client sends reaches the run: only `subscribe` and `unsubscribe` are read. A client that reads too slowly
+misses messages.
 """
 
 import asyncio
@@ -15,7 +15,6 @@ import logging
 import socket
 import struct
 import threading
-from collections import deque
 from concurrent.futures import Future
 from typing import TYPE_CHECKING, Any
 
@@ -31,8 +30,8 @@ EXTRA = "foxglove"
 HOST, PORT = "127.0.0.1", 8765
 SUBPROTOCOLS = ("foxglove.sdk.v1", "foxglove.websocket.v1")
 WEB_APP = "app.foxglove.dev"
-MOST_WAITING, MOST_WAITING_BYTES = 64, 32_000_000
-"""At most this many messages wait for a client, and at most this many bytes, except for the newest message."""
+MOST_WAITING_BYTES = 8_000_000
+"""While more than this waits for a client, it gets no further message."""
 SEND_BUFFER_BYTES = 262_144
 """Size of the system's own queue in front of a client. By default it grows to megabytes, all of them out of date."""
 MOST_CLIENTS = 16
@@ -68,54 +67,6 @@ def check_stream(port: int) -> None:
         import_optional(module, EXTRA, "--stream")
 
 
-class _Client:
-    """A connection: the topics of its subscriptions, and the messages that wait for it. Used on the loop only."""
-
-    def __init__(self, connection: "ServerConnection") -> None:
-        self.connection = connection
-        self.topics = dict[int, Topic]()
-        self.waiting, self.waiting_bytes = deque[bytes](), 0
-        self.ready, self.idle = asyncio.Event(), asyncio.Event()
-        self.idle.set()
-        self.dropped = 0
-
-    def add(self, message: Encoded) -> None:
-        """Queue a message for each subscription to its topic."""
-        for subscription, topic in self.topics.items():
-            if topic is message.topic:
-                self.queue(subscription, message)
-
-    def queue(self, subscription: int, message: Encoded) -> None:
-        """Queue a message for one subscription; drop the oldest ones if too much waits."""
-        data = MESSAGE_DATA.pack(1, subscription, message.stamp_ns) + message.data
-        while self.waiting and (
-            len(self.waiting) >= MOST_WAITING or self.waiting_bytes + len(data) > MOST_WAITING_BYTES
-        ):
-            self._next()
-            self.dropped += 1
-        self.waiting.append(data)
-        self.waiting_bytes += len(data)
-        self.ready.set()
-        self.idle.clear()
-
-    async def send_waiting(self) -> None:
-        """Send messages until the connection ends."""
-        from websockets.exceptions import ConnectionClosed
-
-        with contextlib.suppress(ConnectionClosed):
-            while True:
-                await self.ready.wait()
-                while self.waiting:
-                    await self.connection.send(self._next())
-                self.ready.clear()
-                self.idle.set()
-
-    def _next(self) -> bytes:
-        data = self.waiting.popleft()
-        self.waiting_bytes -= len(data)
-        return data
-
-
 class StreamSink:
     """A WebSocket server on a thread of its own.
 
@@ -132,7 +83,7 @@ class StreamSink:
         check_stream(port)
         logging.getLogger("websockets.server").setLevel(logging.CRITICAL)  # do not log clients that disconnect
         self.host, self.missed = host, 0
-        self._clients = set[_Client]()
+        self._clients = dict["ServerConnection", dict[int, Topic]]()  # topics by subscription; used on the loop only
         self._last = dict[str, Encoded]()
         self._wanted = frozenset[str]()
         channels = [
@@ -164,7 +115,7 @@ class StreamSink:
         return any(topic.latched or topic.name in self._wanted for topic in topics)
 
     def write(self, message: Encoded) -> None:
-        """Queue a message for its subscribers."""
+        """Send a message to its subscribers."""
         self._loop.call_soon_threadsafe(self._publish, message)
 
     def close(self) -> None:
@@ -173,9 +124,7 @@ class StreamSink:
             self._loop.call_soon_threadsafe(self._stop.set)
         self._thread.join(2 * CLOSE_S)
 
-    def abort(self) -> None:
-        """Disconnect all clients."""
-        self.close()
+    abort = close
 
     # ---- on the loop ----
 
@@ -186,24 +135,18 @@ class StreamSink:
         try:
             server = await serve(
                 self._serve, self.host, port, process_request=self._answer, select_subprotocol=self._subprotocol,
-                compression=None, max_size=MOST_REQUEST_BYTES, max_queue=4, open_timeout=5.0, close_timeout=1.0,
+                compression=None, max_size=MOST_REQUEST_BYTES, max_queue=4, open_timeout=5.0, close_timeout=CLOSE_S,
             )  # fmt: skip
         except Exception as problem:
             return started.set_exception(problem)
         stop = asyncio.Event()
         started.set_result((asyncio.get_running_loop(), stop, int(next(iter(server.sockets)).getsockname()[1])))
         await stop.wait()
-        with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(asyncio.gather(*(client.idle.wait() for client in self._clients)), CLOSE_S)
-        for client in self._clients:
-            if not client.idle.is_set():
-                client.connection.transport.abort()  # it does not read, so it would not answer a farewell
         server.close()
         with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(server.wait_closed(), CLOSE_S)
+            await asyncio.wait_for(server.wait_closed(), 1.5 * CLOSE_S)
 
     def _answer(self, connection: "ServerConnection", request: "Request") -> "Response | None":
-        """Refuse pages of other sites, and more clients than `MOST_CLIENTS`."""
         if not is_allowed_origin(request.headers.get("Origin")):
             return connection.respond(403, "this page may not read the stream\n")
         if len(self._clients) >= MOST_CLIENTS:
@@ -220,56 +163,56 @@ class StreamSink:
         return found
 
     async def _serve(self, connection: "ServerConnection") -> None:
-        """Serve a client until it disconnects."""
         from websockets.exceptions import ConnectionClosed
 
-        client = _Client(connection)
         connection.transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
-        self._clients.add(client)
-        sending = asyncio.ensure_future(client.send_waiting())
+        self._clients[connection] = {}
+        info = {"op": "serverInfo", "name": "SigmaSplat", "capabilities": [], "metadata": {}, "sessionId": "run"}
         try:
-            info = {"op": "serverInfo", "name": "SigmaSplat", "capabilities": [], "metadata": {}, "sessionId": "run"}
             await connection.send(json.dumps(info))
             await connection.send(self._advertisement)
-            requests = 0
-            async for text in connection:
-                self._request(client, text)
-                requests += 1
-                if requests == MOST_REQUESTS:
-                    break
+            for _ in range(MOST_REQUESTS):
+                self._request(connection, await connection.recv())
         except ConnectionClosed:
             pass
         finally:
-            sending.cancel()
-            self._clients.discard(client)
-            self.missed += client.dropped
+            del self._clients[connection]
             self._count_subscriptions()
 
-    def _request(self, client: _Client, text: str | bytes) -> None:
+    def _request(self, connection: "ServerConnection", text: str | bytes) -> None:
         """Handle a request of a client; ignore what is no valid subscription."""
+        topics = self._clients[connection]
         with contextlib.suppress(ValueError, KeyError, TypeError, AttributeError, IndexError, RecursionError):
             request = json.loads(text)
             if request["op"] == "subscribe":
                 for entry in request["subscriptions"][: len(TOPICS)]:
                     number, channel = entry["id"], entry["channelId"]
                     known = isinstance(number, int) and 0 <= number < 2**32 and 1 <= channel <= len(TOPICS)
-                    if known and len(client.topics) < len(TOPICS):
-                        self._subscribe(client, number, TOPICS[channel - 1])
+                    if known and len(topics) < len(TOPICS):
+                        topics[number] = TOPICS[channel - 1]
+                        if topics[number].name in self._last:
+                            self._send(connection, number, self._last[topics[number].name])
             elif request["op"] == "unsubscribe":
                 for number in request["subscriptionIds"]:
-                    client.topics.pop(number, None)
+                    topics.pop(number, None)
         self._count_subscriptions()
 
-    def _subscribe(self, client: _Client, number: int, topic: Topic) -> None:
-        client.topics[number] = topic
-        if topic.name in self._last:
-            client.queue(number, self._last[topic.name])
-
     def _count_subscriptions(self) -> None:
-        self._wanted = frozenset(topic.name for client in self._clients for topic in client.topics.values())
+        self._wanted = frozenset(topic.name for topics in self._clients.values() for topic in topics.values())
 
     def _publish(self, message: Encoded) -> None:
         if message.topic.latched:
             self._last[message.topic.name] = message
-        for client in self._clients:
-            client.add(message)
+        for connection, topics in self._clients.items():
+            for number, topic in topics.items():
+                if topic is message.topic:
+                    self._send(connection, number, message)
+
+    def _send(self, connection: "ServerConnection", subscription: int, message: Encoded) -> None:
+        """Send a message without waiting, unless too much waits already."""
+        from websockets.asyncio.server import broadcast
+
+        if connection.transport.get_write_buffer_size() > MOST_WAITING_BYTES:
+            self.missed += 1
+        else:
+            broadcast([connection], MESSAGE_DATA.pack(1, subscription, message.stamp_ns) + message.data)

@@ -5,7 +5,7 @@ Intrinsics are in sensor_msgs/CameraInfo beside the images (camera_info). Camera
 /device_0/sensor_0/Depth_0/ (librealsense, ros_file_format.h): info/camera_info, tf/N, option/Depth_Units/value.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from itertools import islice
 
@@ -116,8 +116,8 @@ class ImageTopic:
 def color_topic(bag: Bag, requested: str) -> ImageTopic:
     """Return the requested topic, or the only one with colour images. Raises SourceError if it is ambiguous."""
     found = [topic_by_name(bag, requested)] if requested else image_topics(bag, "colour")
-    best = _preferred(found, lambda topic: not any(word in topic.name.lower() for word in ("color", "rgb")))
-    return _one_camera(bag, "colour", best, "color")
+    named = [topic for topic in found if any(word in topic.name.lower() for word in ("color", "rgb"))]
+    return _one_camera(bag, "colour", named or found, "color")
 
 
 def depth_topic(bag: Bag, requested: str) -> ImageTopic:
@@ -127,10 +127,9 @@ def depth_topic(bag: Bag, requested: str) -> ImageTopic:
     """
     if requested:
         return _one_camera(bag, "depth", [topic_by_name(bag, requested)], "depth")
-    found = [
-        topic for topic in image_topics(bag, "depth") if not any(word in topic.name.lower() for word in NOT_DEPTH_NAMES)
-    ]
-    return _one_camera(bag, "depth", _preferred(found, lambda topic: not topic.registered), "depth")
+    topics = image_topics(bag, "depth")
+    found = [topic for topic in topics if not any(word in topic.name.lower() for word in NOT_DEPTH_NAMES)]
+    return _one_camera(bag, "depth", [topic for topic in found if topic.registered] or found, "depth")
 
 
 def image_topics(bag: Bag, kind: ImageKind) -> list[ImageTopic]:
@@ -154,11 +153,6 @@ def _described(bag: Bag, name: str) -> ImageTopic:
     message = bag.first_message(name)
     size = message_size(bag.path / name.lstrip("/"), message)
     return ImageTopic(name, image_kind(message), message.header.frame_id.lstrip("/"), size)
-
-
-def _preferred(topics: list[ImageTopic], worse: Callable[[ImageTopic], bool]) -> list[ImageTopic]:
-    """Return the topics that are not worse, or all topics if every one is."""
-    return [topic for topic in topics if not worse(topic)] or topics
 
 
 def _one_camera(bag: Bag, what: str, topics: list[ImageTopic], option: str) -> ImageTopic:
@@ -212,10 +206,9 @@ def read_bag_calibration(bag: Bag, color: ImageTopic, depth: ImageTopic, setting
 
 def read_optics(bag: Bag, topic: ImageTopic) -> Optics | None:
     """Read the CameraInfo of an image topic; None if it is missing or empty. Raises SourceError if it is damaged."""
-    name = _info_name(bag, topic)
-    if name is None:
+    if (found := _info(bag, topic)) is None:
         return None
-    info = bag.first_message(name)
+    name, info = found
     rectified, where = "rect" in topic.base.rpartition("/")[2], bag.path / name.lstrip("/")
     k = np.asarray(_field(info, "p")).reshape(3, 4)[:, :3]
     if not rectified or k[0, 0] <= 0:
@@ -227,18 +220,18 @@ def read_optics(bag: Bag, topic: ImageTopic) -> Optics | None:
     return camera, None if rectified else _lens(f"{bag.path}: {name}", info)
 
 
-def _info_name(bag: Bag, topic: ImageTopic) -> str | None:
+def _info(bag: Bag, topic: ImageTopic) -> tuple[str, Message] | None:
+    """Return the CameraInfo of an image topic with the name of its own topic."""
     infos = {info.name for info in bag.topics_of_type("sensor_msgs/msg/CameraInfo")}
     names = (f"{topic.camera}/camera_info", f"{topic.base.removesuffix('/image/data')}/info/camera_info")
-    return next((name for name in names if name in infos), None)
+    name = next((name for name in names if name in infos), None)
+    return None if name is None else (name, bag.first_message(name))
 
 
-def info_of(bag: Bag, topic: ImageTopic) -> Matrix | None:
+def read_projection(bag: Bag, topic: ImageTopic) -> Matrix | None:
     """Return the projection P [3, 4] of an image topic's CameraInfo, None without one."""
-    name = _info_name(bag, topic)
-    if name is None:
-        return None
-    return np.asarray(_field(bag.first_message(name), "p"), np.float64).reshape(3, 4)
+    found = _info(bag, topic)
+    return None if found is None else np.asarray(_field(found[1], "p"), np.float64).reshape(3, 4)
 
 
 def _depth_units(bag: Bag, depth: ImageTopic) -> float:
@@ -289,7 +282,6 @@ def _sdk_pose(bag: Bag, stream: str) -> Matrix | None:
 
 
 def _lens(where: str, info: Message) -> Distortion | None:
-    """Return the distortion in OpenCV's order. Raises SourceError for an unsupported model."""
     values = [float(v) for v in _field(info, "d")]
     if not any(values):
         return None

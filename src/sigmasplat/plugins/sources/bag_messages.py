@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 
 from sigmasplat.api import (
     SourceError,
-    decode_color,
     depth_to_metres,
     image_size,
     import_optional,
     open_regular,
+    read_color,
     read_values,
     refuse_special,
     without_nan,
@@ -141,7 +141,6 @@ class Bag:
             return self._guarded(lambda: self._types.deserialize_ros1(raw[:-4], msgtype))
 
     def _guarded(self, call: Callable[[], Value]) -> Value:
-        """Call the library. Raises SourceError for any of the exceptions that damaged bags can cause."""
         try:
             return call()
         except Exception as error:
@@ -177,12 +176,8 @@ RAW, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 ImageKind = Literal["colour", "depth", ""]
 
 COLOR_ORDER = {
-    "rgb8": (0, 1, 2),
-    "bgr8": (2, 1, 0),
-    "8UC3": (2, 1, 0),
-    "rgba8": (0, 1, 2),
-    "bgra8": (2, 1, 0),
-    "8UC4": (2, 1, 0),
+    **dict.fromkeys(("rgb8", "rgba8"), (0, 1, 2)),
+    **dict.fromkeys(("bgr8", "8UC3", "bgra8", "8UC4"), (2, 1, 0)),
 }
 """Positions of red, green and blue in a pixel."""
 DEPTH_TYPE = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
@@ -209,21 +204,17 @@ def message_size(path: Path, message: Message) -> tuple[int, int]:
     return image_size(path, data[start:])
 
 
-def decode_color_message(path: Path, message: Message) -> NDArray[np.uint8]:
-    """Return 8-bit RGB [H, W, 3]. Raises SourceError naming `path` if the message is damaged or not colour."""
+def decode_color_message(path: Path, message: Message, gray: bool = False) -> NDArray[np.uint8]:
+    """Return 8-bit RGB [H, W, 3]; gray: also of gray images, such as infrared. Raises SourceError naming `path` if the
+    message is damaged or not such an image."""
     if not hasattr(message, "encoding"):
-        return decode_color(path, message.data.tobytes())
+        return read_color(path, message.data.tobytes())
+    if gray and message.encoding in GRAY:
+        return np.repeat(_pixels(path, message, "u1", 1), 3, axis=2)
     if message.encoding not in COLOR_ORDER:
         raise _encoding(path, "colour", message.encoding, COLOR_ORDER)
     pixels = _pixels(path, message, "u1", 4 if message.encoding in ("rgba8", "bgra8", "8UC4") else 3)
     return np.ascontiguousarray(pixels[..., COLOR_ORDER[message.encoding]])
-
-
-def decode_any_color(path: Path, message: Message) -> NDArray[np.uint8]:
-    """Return 8-bit RGB [H, W, 3] of a colour or a gray image, such as infrared. Raises as `decode_color_message`."""
-    if getattr(message, "encoding", "") in GRAY:
-        return np.repeat(_pixels(path, message, "u1", 1), 3, axis=2)
-    return decode_color_message(path, message)
 
 
 def decode_depth_message(path: Path, message: Message, units_per_metre: float) -> NDArray[np.float32]:

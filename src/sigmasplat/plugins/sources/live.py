@@ -57,7 +57,7 @@ class Arrivals(Wrapped):
         """Return whether the next frame has arrived already, or is due soon. What is begun then makes that frame
         late."""
         late = self.arrived_s is not None and self._clock() - self.arrived_s > DUE * self._queue.usual_s
-        return late or self._queue.waits
+        return late or bool(self._queue.frames)
 
     def frame(self, i: int) -> Frame:
         return self._whole.frame(i)
@@ -97,27 +97,22 @@ class Arrivals(Wrapped):
 
 
 class _Newest:
-    """The frames that wait for the consumer; usual_s: the usual time between frames, infinite if it is not known."""
+    """The frames that wait for the consumer; usual_s: the usual time between them, infinite if it is not known."""
 
     def __init__(self) -> None:
         self.stop, self.dropped, self.usual_s = threading.Event(), 0, math.inf
         self._arrived_s = deque[float](maxlen=USUAL + 1)
-        self._changed, self._frames = threading.Condition(), deque[Arrival]()
+        self._changed, self.frames = threading.Condition(), deque[Arrival]()
         self._ended = False
         self._error: BaseException | None = None
-
-    @property
-    def waits(self) -> bool:
-        """Return whether a frame waits."""
-        return bool(self._frames)
 
     def put(self, arrival: Arrival) -> None:
         """Add a frame; drop the oldest if too many wait."""
         with self._changed:
-            if len(self._frames) == WAITING_MOST:
-                self._frames.popleft()
+            if len(self.frames) == WAITING_MOST:
+                self.frames.popleft()
                 self.dropped += 1
-            self._frames.append(arrival)
+            self.frames.append(arrival)
             self._arrived_s.append(arrival[1])
             if len(self._arrived_s) > FEW:
                 self.usual_s = median(later - earlier for earlier, later in pairwise(self._arrived_s))
@@ -132,9 +127,9 @@ class _Newest:
     def get(self) -> Arrival | None:
         """Wait for a frame; return None after the last one. Raises what the source raised."""
         with self._changed:
-            self._changed.wait_for(lambda: self._frames or self._ended)
-            if self._frames:
-                return self._frames.popleft()
+            self._changed.wait_for(lambda: self.frames or self._ended)
+            if self.frames:
+                return self.frames.popleft()
             if self._error is not None:
                 raise self._error
             return None
@@ -148,7 +143,7 @@ class LiveSource(Source):
     """A live camera. Frames come once, until the consumer stops, the limit is reached, or the camera fails.
 
     dropped: number of frames that arrived while the previous one was processed; only the newest is used;
-    ending: why the camera stopped, "" if it did not; notes: what did not work, though the camera goes on.
+    ending: why the camera stopped, "" if it did not.
     """
 
     live = True
@@ -159,7 +154,6 @@ class LiveSource(Source):
         self._writer: TumWriter | None = None
         self.dropped = 0
         self.ending = ""
-        self.notes: list[str] = []
 
     def record_to(self, folder: Path) -> None:
         """Record every frame to a new TUM folder. Raises RunError if it holds a sequence or cannot be written."""

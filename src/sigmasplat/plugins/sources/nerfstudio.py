@@ -30,6 +30,7 @@ from sigmasplat.api import (
     check_positive,
     first_size,
     folder_source,
+    given_intrinsics,
     json_number,
     natural_key,
     read_frames,
@@ -38,7 +39,7 @@ from sigmasplat.api import (
     read_transforms_camera,
     se3,
 )
-from sigmasplat.plugins.sources.stereo import StereoSource, given_intrinsics
+from sigmasplat.plugins.sources.stereo import StereoSource
 from sigmasplat.plugins.sources.stereo_matching import StereoCameras
 
 NAME = "transforms.json"
@@ -62,10 +63,11 @@ def open_nerfstudio(place: str, settings: InputConfig) -> RecordedSource:
         if not isinstance(frame.get("depth_file_path"), str)
     ]
     images = [ImagePair(i / FRAMES_PER_SECOND, *_files(folder, frame)) for i, frame in enumerate(frames)]
-    known = _calibration(path, fields, frames, images)
+    per_unit = json_number(path, fields, "depth_unit_scale_factor", METRES_PER_UNIT)
+    units = round(1.0 / check_positive(path, "depth_unit_scale_factor", per_unit), 6)
+    known = read_transforms_camera(path, fields, frames, first_size([i.color for i in images]), units)
     truth = build_trajectory((i.timestamp_s, read_pose(path, frame)) for i, frame in zip(images, frames, strict=True))
-    units = known.depth_units_per_metre
-    return folder_source(folder, settings, images, known, units, truth, skipped, estimated=True)
+    return folder_source(folder, settings, images, known, units, truth, skipped, one_camera=True, estimated=True)
 
 
 def _files(folder: Path, frame: Fields) -> tuple[Path, Path]:
@@ -73,16 +75,6 @@ def _files(folder: Path, frame: Fields) -> tuple[Path, Path]:
     color, depth = folder / frame["file_path"], folder / frame["depth_file_path"]
     bare = not color.suffix and not color.is_file()
     return (color.with_suffix(".png") if bare else color), depth
-
-
-def _calibration(path: Path, fields: Fields, frames: list[Fields], images: list[ImagePair]) -> Calibration:
-    size, depth_size = first_size([i.color for i in images]), first_size([i.depth for i in images])
-    per_unit = json_number(path, fields, "depth_unit_scale_factor", METRES_PER_UNIT)
-    units = round(1.0 / check_positive(path, "depth_unit_scale_factor", per_unit), 6)
-    known = read_transforms_camera(path, fields, frames, size, units)
-    if depth_size == size:
-        return known
-    return replace(known, depth_camera=known.camera.resized(*depth_size), depth_distortion=known.distortion)
 
 
 LEFT, RIGHT = "left", "right"
@@ -157,7 +149,6 @@ def _undistorted(calibration: Calibration, settings: InputConfig) -> Calibration
 
 
 def _is_stereo(path: str) -> bool:
-    """Return whether there is a transforms.json with pairs of images and without depth."""
     file = Path(path) / NAME
     if not file.is_file():
         return False

@@ -34,21 +34,20 @@ from sigmasplat.api import (
     build_camera,
     check_pixels,
     check_positive,
-    decode_color,
     depth_to_metres,
     first_readable,
+    folder_source,
     guarded,
     image_size,
     import_optional,
     json_number,
     parse_json,
     read_bytes,
+    read_color,
     refuse_special,
-    resolve_calibration,
     rigid_transform,
     without_nan,
 )
-from sigmasplat.plugins.sources.stray_scanner import with_coarser_depth
 
 MOST_MEMBER_BYTES = 128 << 20
 """Largest file of an archive after unzipping: an image, or its depth."""
@@ -99,7 +98,7 @@ class R3dImagePair(ImagePair):
     lzfse: Any
 
     def read_color(self) -> NDArray[np.uint8]:
-        return decode_color(self.color, self.archive.read(f"rgbd/{self.number}.jpg"))
+        return read_color(self.color, self.archive.read(f"rgbd/{self.number}.jpg"))
 
     def read_depth(self, units_per_metre: float) -> NDArray[np.float32]:
         """Read depth in metres [H, W], 0 at confidence 0. Raises SourceError naming the member."""
@@ -180,10 +179,12 @@ def open_record3d(place: str, settings: InputConfig) -> RecordedSource:
     else:
         openexr = import_optional("OpenEXR", "iphone", f"{path}: depth of Record3D")
         images = [ExrImagePair(*pair, openexr) for pair in pairs]
-    calibration = _calibration(path, path / name, metadata, images, settings)
+    known = _calibration(path / name, metadata, images)
     skipped = [f"{path / colors[n]}: no depth image {n}" for n in sorted(colors.keys() - depths.keys())]
     truth = _truth(path / name, metadata, numbers, times_s)
-    return RecordedSource(path.resolve().stem, images, calibration, settings, truth, skipped, estimated=True)
+    return folder_source(
+        path, settings, images, known, 1.0, truth, skipped, path.resolve().stem, one_camera=True, estimated=True
+    )
 
 
 def _depth_size(path: Path, metadata: dict[str, Any]) -> Size:
@@ -193,24 +194,21 @@ def _depth_size(path: Path, metadata: dict[str, Any]) -> Size:
     return int(json_number(path, metadata, "dw", wide[0])), int(json_number(path, metadata, "dh", wide[1]))
 
 
-def _calibration(
-    path: Path, where: Path, metadata: dict[str, Any], images: Sequence[ImagePair], settings: InputConfig
-) -> Calibration:
+def _calibration(where: Path, metadata: dict[str, Any], images: Sequence[ImagePair]) -> Calibration | None:
     """Read the camera, scaled to the image size, which is larger in exports than in the metadata."""
-    size, depth_size = first_readable(images, lambda pair: pair.sizes())
+    size, _ = first_readable(images, lambda pair: pair.sizes())
     width, height = (int(json_number(where, metadata, key, value)) for key, value in zip(("w", "h"), size, strict=True))
     focal = _rows(where, metadata, "perFrameIntrinsicCoeffs", 4)
-    if focal is not None and len(focal):
-        middle = np.median(focal, 0).tolist()
-    else:
+    if focal is None:
         k = _rows(where, {"K": [metadata.get("K")]}, "K", 9) if metadata.get("K") else None
-        middle = [float(k[0][i]) for i in (0, 4, 6, 7)] if k is not None else None
-    recorded = Calibration(build_camera(where, width, height, middle).resized(*size), 1.0) if middle else None
-    return with_coarser_depth(resolve_calibration(path, recorded, size, settings, 1.0), depth_size)
+        focal = None if k is None else k[:, [0, 4, 6, 7]]
+    if focal is None:
+        return None
+    middle = np.median(focal, 0).tolist()
+    return Calibration(build_camera(where, width, height, middle).resized(*size), 1.0)
 
 
 def _times_s(where: Path, metadata: dict[str, Any], numbers: list[int]) -> NDArray[np.float64]:
-    """Return the times of the frames, from the frame rate if times are not recorded. Raises SourceError."""
     times = metadata.get("frameTimestamps")
     if isinstance(times, list) and len(times) > numbers[-1]:
         values = [json_number(where, {"frameTimestamps": times[n]}, "frameTimestamps") for n in numbers]
@@ -230,7 +228,6 @@ def _truth(
 
 
 def _rows(where: Path, metadata: dict[str, Any], key: str, count: int) -> NDArray[np.float64] | None:
-    """Read rows of `count` numbers, None if the field is missing. Raises SourceError naming file and field."""
     if not metadata.get(key):
         return None
     try:

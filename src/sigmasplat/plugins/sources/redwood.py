@@ -39,8 +39,8 @@ from sigmasplat.api import (
     index_by_number,
     json_number,
     list_images,
+    numbered_pairs,
     open_regular,
-    pair_images,
     pair_times,
     parse_numbers,
     read_json_object,
@@ -65,9 +65,9 @@ def open_redwood(path: str, settings: InputConfig) -> RecordedSource:
     depths = list_images(folder / "depth", DEPTH_ENDINGS)
     found = _timed(folder, colors, depths)
     if found is None:
-        of_color, of_depth = index_by_number(colors), index_by_number(depths)
-        keys, skipped = pair_images(folder, of_color, of_depth, f"{'|'.join(COLOR_FOLDERS)}/*.jpg", "depth/*.png")
-        found = [ImagePair(n / rate, of_color[n], of_depth[n]) for n in keys], skipped
+        names = f"{'|'.join(COLOR_FOLDERS)}/*.jpg", "depth/*.png"
+        numbered, skipped = numbered_pairs(folder, index_by_number(colors), index_by_number(depths), *names, rate)
+        found = [*numbered.values()], skipped
     images, skipped = found
     known = _recorded(file, fields) if file else PRIMESENSE
     truth = _truth(folder, images)
@@ -85,7 +85,6 @@ def _timed(folder: Path, colors: list[Path], depths: list[Path]) -> tuple[list[I
 
 
 def _recorded(path: Path, fields: dict[str, object]) -> Calibration:
-    """Build the camera from Open3D's JSON. Raises SourceError naming file and field."""
     values = fields.get("intrinsic_matrix")
     if not isinstance(values, list) or len(values) != 9:
         raise SourceError(f'{path}: field "intrinsic_matrix" is {values!r}, expected 9 numbers by columns')
@@ -132,7 +131,6 @@ def _begins_as_trajectory(path: Path) -> bool:
 
 
 def _recognises(path: str) -> bool:
-    """Return whether there are image folders with a camera file, a trajectory, or names with times as in Redwood."""
     folder = Path(path)
     colors = first_subfolder(folder, COLOR_FOLDERS)
     if colors is None and not (folder / "depth").is_dir():

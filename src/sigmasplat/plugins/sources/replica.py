@@ -14,7 +14,6 @@ from sigmasplat.api import (
     FRAMES_PER_SECOND,
     Calibration,
     Camera,
-    ImagePair,
     InputConfig,
     Matrix,
     RecordedSource,
@@ -27,7 +26,7 @@ from sigmasplat.api import (
     first_file,
     folder_source,
     json_number,
-    pair_images,
+    numbered_pairs,
     read_json_object,
     read_text,
     se3,
@@ -40,13 +39,12 @@ def open_replica(path: str, settings: InputConfig) -> RecordedSource:
     """Open a folder. Raises SourceError if images, calibration or ground-truth poses cannot be used."""
     folder, place = Path(path), Path(path).resolve()
     colors, depths = _numbered(folder, "frame"), _numbered(folder, "depth")
-    numbers, skipped = pair_images(folder, colors, depths, "results/frame*.jpg", "results/depth*.png")
-    images = [ImagePair(n / FRAMES_PER_SECOND, colors[n], depths[n]) for n in numbers]
+    images, skipped = numbered_pairs(folder, colors, depths, "results/frame*.jpg", "results/depth*.png")
     beside = first_file(folder, ("cam_params.json", place.parent / "cam_params.json"))
     known = _calibration(beside) if beside else CAMERA
     surface = first_file(place.parent, (f"{place.name}_mesh.ply", place / f"{place.name}_mesh.ply"))
-    truth = _truth(folder / "traj.txt", numbers)
-    return folder_source(folder, settings, images, known, known.depth_units_per_metre, truth, skipped, surface=surface)
+    truth, units = _truth(folder / "traj.txt", [*images]), known.depth_units_per_metre
+    return folder_source(folder, settings, [*images.values()], known, units, truth, skipped, surface=surface)
 
 
 def _numbered(folder: Path, stem: str) -> dict[int, Path]:
@@ -69,7 +67,6 @@ def _calibration(path: Path) -> Calibration:
 
 
 def _truth(path: Path, numbers: list[int]) -> Trajectory | None:
-    """Read the poses of the given frames. Raises SourceError naming the line whose pose is not rigid."""
     if not exists(path):
         return None
     lines = [line for line in read_text(path).splitlines() if line.strip()]

@@ -13,7 +13,7 @@ SDK (Infrared_1) have CameraInfo; the baseline is in P of the right camera, in t
 in /tf_static.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -34,6 +34,7 @@ from sigmasplat.api import (
     SourceFormat,
     accelerometer_from_samples,
     associate,
+    given_intrinsics,
     gyroscope_from_samples,
     no_pairs,
     pair_times,
@@ -45,10 +46,10 @@ from sigmasplat.plugins.sources.bag_cameras import (
     color_topic,
     depth_topic,
     image_topics,
-    info_of,
     lookup_transform,
     read_bag_calibration,
     read_optics,
+    read_projection,
     read_truth,
     sdk_transform,
     topic_by_name,
@@ -56,14 +57,14 @@ from sigmasplat.plugins.sources.bag_cameras import (
 from sigmasplat.plugins.sources.bag_messages import (
     Bag,
     Entry,
+    Message,
     Topic,
-    decode_any_color,
     decode_color_message,
     decode_depth_message,
     is_bag,
     message_size,
 )
-from sigmasplat.plugins.sources.stereo import StereoPair, StereoRig, StereoSource, given_intrinsics
+from sigmasplat.plugins.sources.stereo import StereoPair, StereoRig, StereoSource
 from sigmasplat.plugins.sources.stereo_matching import StereoCameras
 
 IMU = "sensor_msgs/msg/Imu"
@@ -124,7 +125,6 @@ def _measured(bag: Bag, name: str) -> tuple[Values, Values]:
 
 
 def _axes(bag: Bag, color: ImageTopic, name: str) -> Matrix | None:
-    """Return R_color_imu [3, 3], None if it is not known."""
     if name.startswith("/device_"):
         T = sdk_transform(bag, color, name.removesuffix("/imu/data"))
         return None if T is None else T[:3, :3]
@@ -142,19 +142,43 @@ PAIRS = (("infra1", "infra2"), ("Infrared_1", "Infrared_2"), ("/left/", "/right/
 
 
 @dataclass(frozen=True)
-class BagStereoPair(StereoPair):
-    """Two messages; the paths contain bag, topic and time."""
+class BagPair(ImagePair):
+    """Two messages of a bag; the paths contain bag, topic and time."""
 
     bag: Bag
-    messages: Mapping[Path, tuple[str, Entry]]
+    topics: tuple[str, str]
+    entries: tuple[Entry, Entry]
+
+    def message(self, path: Path) -> Message:
+        """Read the message that `color` or `depth` names. Raises SourceError if it is damaged."""
+        which = int(path == self.depth)
+        return self.bag.read(self.topics[which], self.entries[which])
+
+    def sizes(self) -> tuple[Size, Size]:
+        return message_size(self.color, self.message(self.color)), message_size(self.depth, self.message(self.depth))
+
+
+@dataclass(frozen=True)
+class BagImagePair(BagPair):
+    """Colour and depth."""
+
+    def read_color(self) -> NDArray[np.uint8]:
+        return decode_color_message(self.color, self.message(self.color))
+
+    def read_depth(self, units_per_metre: float) -> NDArray[np.float32]:
+        return decode_depth_message(self.depth, self.message(self.depth), units_per_metre)
+
+
+@dataclass(frozen=True)
+class BagStereoPair(StereoPair, BagPair):
+    """A left and a right image."""
 
     def decoded(self, path: Path) -> NDArray[np.uint8]:
         """Read an image, RGB [H, W, 3]. Raises SourceError naming topic and time."""
-        return decode_any_color(path, self.bag.read(*self.messages[path]))
+        return decode_color_message(path, self.message(path), gray=True)
 
     def sizes(self) -> tuple[Size, Size]:
-        left, right = (message_size(path, self.bag.read(*self.messages[path])) for path in (self.color, self.depth))
-        return left, right
+        return BagPair.sizes(self)
 
 
 def stereo_topics(bag: Bag, settings: InputConfig) -> tuple[ImageTopic, ImageTopic] | None:
@@ -183,34 +207,28 @@ def stereo_topics(bag: Bag, settings: InputConfig) -> tuple[ImageTopic, ImageTop
 
 def open_stereo_bag(bag: Bag, left: ImageTopic, right: ImageTopic, settings: InputConfig) -> StereoSource:
     """Open two topics of a bag as a stereo pair. Raises SourceError if cameras or baseline are unknown."""
-    cameras = _stereo_cameras(bag, left, right, settings)
-    found = bag.index(left.name, right.name)
-    times = [np.array([entry.stamp_ns / 1e9 for entry in found[topic.name]]) for topic in (left, right)]
-    indices, alone = pair_times(bag.path, {"left": times[0], "right": times[1]})
-    paths = [
-        [bag.path / f"{topic.name.lstrip('/')} at {t:.3f} s, {k}" for k, t in enumerate(of_topic)]
-        for topic, of_topic in zip((left, right), times, strict=True)
-    ]
-    messages = {
-        path: (topic.name, entry)
-        for topic, named in zip((left, right), paths, strict=True)
-        for path, entry in zip(named, found[topic.name], strict=True)
-    }
+    cameras, topics = _stereo_cameras(bag, left, right, settings), (left.name, right.name)
+    found = bag.index(*topics)
+    entries = found[left.name], found[right.name]
+    left_s, right_s = (_times_s(part, False) for part in entries)
+    lefts, rights = (_message_paths(bag, name, t) for name, t in zip(topics, (left_s, right_s), strict=True))
+    indices, alone = pair_times(bag.path, {"left": left_s, "right": right_s})
 
-    def pair_of(time_s: float, one: Path, other: Path, rig: StereoRig) -> BagStereoPair:
-        return BagStereoPair(time_s, one, other, rig, bag, messages)
+    def pairs(rig: StereoRig) -> list[StereoPair]:
+        return [
+            BagStereoPair(float(left_s[i]), lefts[i], rights[j], bag, topics, (entries[0][i], entries[1][j]), rig)
+            for i, j in indices
+        ]
 
-    pairs = [(float(times[0][i]), paths[0][i], paths[1][j]) for i, j in indices]
-    skipped = [f"{paths[0][i]}: no right image within {MAX_GAP_S:g} s" for i in alone]
+    skipped = [f"{lefts[i]}: no right image within {MAX_GAP_S:g} s" for i in alone]
     truth = read_truth(bag, left.frame, False)
-    return StereoSource(bag.path.resolve().stem, pairs, cameras, settings, truth, skipped, pair_of)
+    return StereoSource(bag.path.resolve().stem, pairs, cameras, settings, truth, skipped)
 
 
 def _stereo_cameras(bag: Bag, left: ImageTopic, right: ImageTopic, settings: InputConfig) -> StereoCameras:
     optics: list[Optics] = []
     for topic in (left, right):
-        known = read_optics(bag, topic)
-        if known is None:
+        if (known := read_optics(bag, topic)) is None:
             raise SourceError(f"{bag.path}: {topic.name} has no camera_info; record it beside the images")
         optics.append(known)
     T_right_left = _rig(bag, left, right)
@@ -222,9 +240,8 @@ def _stereo_cameras(bag: Bag, left: ImageTopic, right: ImageTopic, settings: Inp
 def _rig(bag: Bag, left: ImageTopic, right: ImageTopic) -> Matrix:
     if (found := sdk_transform(bag, right, left)) is not None:
         return found
-    P = np.zeros((3, 4)) if (info := info_of(bag, right)) is None else info
-    T_right_left = np.eye(4)
-    if P[0, 0] > 0 and P[0, 3] < 0:
+    P, T_right_left = read_projection(bag, right), np.eye(4)
+    if P is not None and P[0, 0] > 0 and P[0, 3] < 0:
         T_right_left[0, 3] = P[0, 3] / P[0, 0]
         return T_right_left
     found = lookup_transform(bag, right.frame, left.frame) if left.frame and right.frame else None
@@ -236,57 +253,30 @@ def _rig(bag: Bag, left: ImageTopic, right: ImageTopic) -> Matrix:
     return found
 
 
-Times = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class BagImagePair(ImagePair):
-    """A pair of messages; the paths contain bag, topic and time."""
-
-    bag: Bag
-    topics: tuple[str, str]
-    entries: tuple[Entry, Entry]
-
-    def read_color(self) -> NDArray[np.uint8]:
-        return decode_color_message(self.color, self.bag.read(self.topics[0], self.entries[0]))
-
-    def read_depth(self, units_per_metre: float) -> NDArray[np.float32]:
-        return decode_depth_message(self.depth, self.bag.read(self.topics[1], self.entries[1]), units_per_metre)
-
-    def sizes(self) -> tuple[Size, Size]:
-        paths = (self.color, self.depth)
-        color, depth = (
-            message_size(p, self.bag.read(t, e)) for p, t, e in zip(paths, self.topics, self.entries, strict=True)
-        )
-        return color, depth
-
-
 def open_bag(place: str, settings: InputConfig) -> RecordedSource:
     """Open a bag. Raises SourceError if it is damaged, its topics are ambiguous, or its cameras are unknown."""
-    path = Path(place)
-    bag = Bag(path)
+    bag = Bag(Path(place))
     if pair := stereo_topics(bag, settings):
         return open_stereo_bag(bag, *pair, settings)
     color, depth = color_topic(bag, settings.color_topic), depth_topic(bag, settings.depth_topic)
-    calibration = read_bag_calibration(bag, color, depth, settings)
-    found = bag.index(color.name, depth.name)
+    calibration, topics = read_bag_calibration(bag, color, depth, settings), (color.name, depth.name)
+    found = bag.index(*topics)
     entries = found[color.name], found[depth.name]
     pairs, recorded_time = _paired(entries)
-    topics, (color_s, depth_s) = (color.name, depth.name), (_times_s(part, recorded_time) for part in entries)
-    refuse_other_units(path, dict(zip(topics, (color_s, depth_s), strict=True)))
+    color_s, depth_s = (_times_s(part, recorded_time) for part in entries)
+    refuse_other_units(bag.path, {color.name: color_s, depth.name: depth_s})
     if not len(pairs):
-        raise no_pairs(path, {name: _times_s(found[name], True) for name in topics})
+        raise no_pairs(bag.path, {name: _times_s(found[name], True) for name in topics})
     truth = read_truth(bag, color.frame, recorded_time)
-    colors = [_message_path(path, color.name, t) for t in color_s]
-    depths = [_message_path(path, depth.name, t) for t in depth_s]
+    colors, depths = _message_paths(bag, color.name, color_s), _message_paths(bag, depth.name, depth_s)
     images = [
         BagImagePair(float(color_s[i]), colors[i], depths[j], bag, topics, (entries[0][i], entries[1][j]))
         for i, j in pairs
     ]
-    imu = read_bag_imu(bag, color, color_s)
-    alone = sorted(set(range(len(entries[0]))) - set(pairs[:, 0].tolist()))
+    alone = sorted(set(range(len(colors))) - set(pairs[:, 0].tolist()))
     skipped = [f"{colors[i]}: no depth within {MAX_GAP_S:g} s" for i in alone]
-    return RecordedSource(path.resolve().stem, images, calibration, settings, truth, skipped, **imu._asdict())
+    imu = read_bag_imu(bag, color, color_s)
+    return RecordedSource(bag.path.resolve().stem, images, calibration, settings, truth, skipped, **imu._asdict())
 
 
 def _paired(entries: tuple[Sequence[Entry], Sequence[Entry]]) -> tuple[NDArray[np.intp], bool]:
@@ -303,12 +293,12 @@ def _paired(entries: tuple[Sequence[Entry], Sequence[Entry]]) -> tuple[NDArray[n
     return max(found, key=lambda answer: len(answer[0]))
 
 
-def _times_s(entries: Sequence[Entry], recorded: bool) -> Times:
+def _times_s(entries: Sequence[Entry], recorded: bool) -> Values:
     return np.array([(e.recorded_ns if recorded else e.stamp_ns) / 1e9 for e in entries])
 
 
-def _message_path(path: Path, topic: str, time_s: float) -> Path:
-    return path / f"{topic.lstrip('/')} at {time_s:.3f} s"
+def _message_paths(bag: Bag, topic: str, times_s: Values) -> list[Path]:
+    return [bag.path / f"{topic.lstrip('/')} at {time_s:.3f} s" for time_s in times_s]
 
 
 PLUGIN = SourceFormat(

@@ -50,7 +50,7 @@ from sigmasplat.api import (
     has_frame_files,
     index_by_number,
     list_images,
-    pair_images,
+    numbered_pairs,
     parse_numbers,
     read_frames,
     read_json_object,
@@ -77,12 +77,10 @@ def open_scannet(path: str, settings: InputConfig) -> RecordedSource:
         raise SourceError(
             f"{packed[0]} is not extracted; extract color, depth, pose and intrinsic from it with ScanNet's SensReader"
         )
-    keys, skipped = pair_images(folder, files["color"], files["depth"], "color/*.jpg", "depth/*.png")
-    images = [ImagePair(n / FRAMES_PER_SECOND, files["color"][n], files["depth"][n]) for n in keys]
-    size, depth_size = first_size([i.color for i in images]), first_size([i.depth for i in images])
-    known = _recorded(folder, size, depth_size)
-    truth = read_pose_files((n / FRAMES_PER_SECOND, files["pose"][n]) for n in keys if n in files["pose"])
-    return folder_source(folder, settings, images, known, MM_PER_METRE, truth, skipped)
+    images, skipped = numbered_pairs(folder, files["color"], files["depth"], "color/*.jpg", "depth/*.png")
+    known = _recorded(folder, *(first_size([files[kind][n] for n in images]) for kind in ("color", "depth")))
+    truth = read_pose_files((i.timestamp_s, files["pose"][n]) for n, i in images.items() if n in files["pose"])
+    return folder_source(folder, settings, [*images.values()], known, MM_PER_METRE, truth, skipped)
 
 
 def _files(folder: Path) -> FrameFiles:
@@ -140,7 +138,6 @@ def _camera(path: Path, K: Matrix, size: tuple[int, int], published: tuple[int, 
 
 
 def _recognises(path: str) -> bool:
-    """Return whether it is a scene, extracted or not."""
     folder = Path(path)
     has_info = any((folder / name).is_file() for name in INFO_NAMES)
     if any(folder.glob("*.sens")) or (has_info and has_frame_files(folder)):

@@ -14,11 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from sigmasplat.api import (
-    FRAMES_PER_SECOND,
     MM_PER_METRE,
     Calibration,
     Camera,
-    ImagePair,
     InputConfig,
     RecordedSource,
     SourceError,
@@ -27,7 +25,7 @@ from sigmasplat.api import (
     first_size,
     frame_files,
     has_frame_files,
-    pair_images,
+    numbered_pairs,
     read_pose_files,
     registers_depth,
     resolve_calibration,
@@ -55,22 +53,20 @@ def open_seven_scenes(path: str, settings: InputConfig) -> RecordedSource:
     """Open the folder of a sequence, or of a scene with one sequence. Raises SourceError if it cannot be used."""
     folder = Path(path) if has_frame_files(Path(path)) else _only_sequence(Path(path))
     files = frame_files(folder)
-    numbers, skipped = pair_images(folder, files["color"], files["depth"], "frame-*.color.png", "frame-*.depth.png")
-    images = [ImagePair(n / FRAMES_PER_SECOND, files["color"][n], files["depth"][n]) for n in numbers]
+    images, skipped = numbered_pairs(folder, files["color"], files["depth"], "frame-*.color.png", "frame-*.depth.png")
     known = BOTH_CAMERAS if settings.register_depth == "on" else DEPTH_CAMERA
-    size = first_size([pair.color for pair in images])
+    size = first_size([pair.color for pair in images.values()])
     calibration = resolve_calibration(folder, known, size, settings, MM_PER_METRE)
     calibration = replace(calibration, T_color_depth=se3.orthonormalise(calibration.T_color_depth))
-    truth = read_pose_files((n / FRAMES_PER_SECOND, files["pose"][n]) for n in numbers if n in files["pose"])
+    truth = read_pose_files((i.timestamp_s, files["pose"][n]) for n, i in images.items() if n in files["pose"])
     if truth and registers_depth(calibration, settings):
         truth = Trajectory(truth.timestamps_s, truth.T_world_camera @ se3.inverse(calibration.T_color_depth))
-    source = RecordedSource(folder.resolve().name, images, calibration, settings, truth, skipped)
+    source = RecordedSource(folder.resolve().name, [*images.values()], calibration, settings, truth, skipped)
     source.registrable = source.registrable or calibration.camera == DEPTH_CAMERA.camera
     return source
 
 
 def _only_sequence(scene: Path) -> Path:
-    """Return the only sequence of a scene. Raises SourceError unless there is exactly one."""
     sequences = [path for path in sorted(scene.glob("seq-*")) if path.is_dir() and has_frame_files(path)]
     packed = [path.name for path in sorted(scene.glob("seq-*.zip"))]
     if not sequences and packed:
@@ -82,7 +78,6 @@ def _only_sequence(scene: Path) -> Path:
 
 
 def _recognises(path: str) -> bool:
-    """Return whether it is a sequence without a camera file, or a scene with such sequences."""
     folder = Path(path)
     if has_frame_files(folder):
         return not any((folder / name).is_file() for name in ("_info.txt", "info.txt"))

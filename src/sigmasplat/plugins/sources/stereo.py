@@ -33,6 +33,7 @@ from sigmasplat.api import (
     build_trajectory,
     checked_pose,
     first_size,
+    given_intrinsics,
     list_images,
     pair_times,
     parse_numbers,
@@ -110,12 +111,11 @@ class StereoSource(RecordedSource):
     computed_depth = True
 
     def __init__(
-        self, name: str, pairs: Sequence[Pair], cameras: StereoCameras, settings: InputConfig,
-        truth: Trajectory | None, skipped: Sequence[str] = (),
-        pair_of: Callable[[float, Path, Path, StereoRig], StereoPair] = StereoPair,
+        self, name: str, pairs: Sequence[Pair] | Callable[[StereoRig], Sequence[StereoPair]], cameras: StereoCameras,
+        settings: InputConfig, truth: Trajectory | None, skipped: Sequence[str] = (),
     ) -> None:  # fmt: skip
-        """Prepare rectification and matching. `truth` is the path of the recorded left camera; `pair_of` makes a pair
-        from its time, left and right image.
+        """Prepare rectification and matching. `pairs` are files, or a function that makes the pairs; `truth` is the
+        path of the recorded left camera.
 
         Raises SourceError if the images do not match the calibration, or no frame has depth.
         """
@@ -126,7 +126,7 @@ class StereoSource(RecordedSource):
             raise SourceError(f"{name}: the second camera is not to the right of the first one; swap both")
         matcher = StereoMatcher(rectification.camera, rectification.baseline_m, settings)
         rig = StereoRig((cameras.left.width, cameras.left.height), rectification, matcher)
-        images = [pair_of(*pair, rig) for pair in pairs]
+        images = pairs(rig) if callable(pairs) else [StereoPair(*pair, rig) for pair in pairs]
         if truth is not None:
             truth = Trajectory(truth.timestamps_s, truth.T_world_camera @ rectification.T_left_rectified)
         super().__init__(name, images, Calibration(rectification.camera, 1.0), settings, truth, skipped)
@@ -155,7 +155,6 @@ def _open_tum_like(folder: Path, settings: InputConfig) -> StereoSource:
 
 
 def _timed_pairs(folder: Path, left: Timed, right: Timed) -> tuple[list[Pair], list[str]]:
-    """Pair left and right images by time; also return the left images without a right one."""
     indices, alone = pair_times(folder, {"left": left[0], "right": right[0]})
     skipped = [f"{left[1][i]}: no right image" for i in alone]
     return [(float(left[0][i]), left[1][i], right[1][j]) for i, j in indices], skipped
@@ -177,13 +176,11 @@ def _open_kitti(folder: Path, settings: InputConfig) -> StereoSource:
     skipped = [f"{left}: no right image" for left in lefts if left.stem not in by_name]
     size = first_size([left for _, left, _ in both])
     projections = _kitti_projections(folder / "calib.txt")
-    cameras = []
     for name in names:
-        P = projections.get(f"P{name[-1]}")
-        if P is None:
+        if f"P{name[-1]}" not in projections:
             raise SourceError(f"{folder / 'calib.txt'}: no projection P{name[-1]} of {name}; complete the file")
-        cameras.append((build_camera(folder / "calib.txt", *size, [P[0, 0], P[1, 1], P[0, 2], P[1, 2]]), P))
-    (left, P_left), (_, P_right) = cameras
+    P_left, P_right = (projections[f"P{name[-1]}"] for name in names)
+    left = build_camera(folder / "calib.txt", *size, [float(P_left[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2))])
     left = given_intrinsics(left, settings)
     T_right_left = np.eye(4)
     T_right_left[0, 3] = (P_right[0, 3] - P_left[0, 3]) / P_left[0, 0]
@@ -226,9 +223,8 @@ def _kitti_truth(path: Path, times_s: Sequence[float], x_m: float) -> Trajectory
     T_camera0_left[0, 3] = -x_m
     timed = []
     for time_s, (line, words) in zip(times_s, read_lines(path), strict=False):
-        where, numbers = f"{path}:{line}", parse_numbers(path, line, words)
-        rows = [numbers[:4], numbers[4:8], numbers[8:], [0.0, 0.0, 0.0, 1.0]]
-        T = checked_pose(where, to_matrix(where, rows))
+        where = f"{path}:{line}"
+        T = checked_pose(where, to_matrix(where, parse_numbers(path, line, words)))
         timed.append((time_s, None if T is None else T @ T_camera0_left))
     return build_trajectory(timed)
 
@@ -237,7 +233,6 @@ def _kitti_truth(path: Path, times_s: Sequence[float], x_m: float) -> Trajectory
 
 
 def _euroc_root(folder: Path) -> Path | None:
-    """Return the folder that holds cam0 and cam1 of a EuRoC recording, None if it is none."""
     for root in (folder / "mav0", folder):
         if all((root / name / "sensor.yaml").is_file() for name in ("cam0", "cam1")):
             return root
@@ -272,7 +267,6 @@ def _euroc_list(camera: Path) -> Timed:
 
 
 def _euroc_sensor(path: Path) -> tuple[Camera, tuple[float, ...], Matrix]:
-    """Read camera, distortion and T_body_camera of a sensor.yaml. Raises SourceError naming file and field."""
     text = read_text(path)
 
     def found(pattern: str) -> list[float]:
@@ -297,13 +291,7 @@ def _euroc_sensor(path: Path) -> tuple[Camera, tuple[float, ...], Matrix]:
     return build_camera(path, width, height, numbers("intrinsics", 4)), (k1, k2, p1, p2, 0.0), se3.orthonormalise(T)
 
 
-def given_intrinsics(camera: Camera, settings: InputConfig) -> Camera:
-    """Return the camera with the intrinsics that the settings give."""
-    return replace(camera, **{key: value for key in ("fx", "fy", "cx", "cy") if (value := getattr(settings, key))})
-
-
 def _recognises(path: str) -> bool:
-    """Return whether there is a stereo pair without depth images."""
     folder = Path(path)
     if (folder / "depth.txt").is_file() or (folder / "depth").is_dir():
         return False

@@ -52,19 +52,15 @@ def read_stereo_cameras(path: Path, left: Calibration) -> StereoCameras:
 
     Without right_camera, the right camera equals the left one. Raises SourceError naming file and field.
     """
-    fields = read_json_object(path)
-    camera, lens = left.camera, left.distortion
+    fields, camera, lens = read_json_object(path), left.camera, left.distortion
     inner = fields.get("right_camera")
     if inner is not None:
         if not isinstance(inner, dict):
             raise SourceError(f'{path}: field "right_camera" is {inner!r}, expected an object with fx, fy, cx, cy')
-        camera = read_camera(path, inner, (camera.width, camera.height))
-        lens = read_distortion(path, inner)
-    if "T_right_left" in fields:
-        T_right_left = read_rigid_transform(path, fields, "T_right_left")
-        return StereoCameras(left.camera, camera, T_right_left, left.distortion, lens)
-    T_right_left = np.eye(4)
-    T_right_left[0, 3] = -check_positive(path, "baseline_m", json_number(path, fields, "baseline_m"))
+        camera, lens = read_camera(path, inner, (camera.width, camera.height)), read_distortion(path, inner)
+    T_right_left = read_rigid_transform(path, fields, "T_right_left")
+    if "T_right_left" not in fields:
+        T_right_left[0, 3] = -check_positive(path, "baseline_m", json_number(path, fields, "baseline_m"))
     return StereoCameras(left.camera, camera, T_right_left, left.distortion, lens)
 
 

@@ -33,13 +33,12 @@ from sigmasplat.api import (
     accelerometer_from_samples,
     build_camera,
     csv_rows,
-    first_size,
+    folder_source,
     gyroscope_from_samples,
     image_size,
     read_depth,
     read_text,
     read_values,
-    resolve_calibration,
     se3,
 )
 
@@ -102,27 +101,18 @@ def open_stray_scanner(path: str, settings: InputConfig) -> RecordedSource:
     ]  # fmt: skip
     kept = set(numbers)
     skipped = [f"{depths[n]}: no frame {n} in rgb.mp4 or odometry.csv" for n in sorted(depths) if n not in kept]
-    calibration = _calibration(folder, rows, video.size, first_size([depths[n] for n in numbers]), settings)
+    known = _calibration(folder, rows, video.size)
     truth, (moved_s, rates, forces) = _truth(rows, numbers), _imu(folder / "imu.csv")
     gyroscope = gyroscope_from_samples(moved_s, rates)
     if gyroscope and not gyroscope.measured_any(np.array([rows[n]["timestamp"] for n in numbers])):
         gyroscope = None
-    return RecordedSource(
-        folder.resolve().name, images, calibration, settings, truth, skipped, estimated=True,
+    return folder_source(
+        folder, settings, images, known, MM_PER_METRE, truth, skipped, one_camera=True, estimated=True,
         gyroscope=gyroscope, accelerometer=accelerometer_from_samples(moved_s, forces),
     )  # fmt: skip
 
 
-def with_coarser_depth(calibration: Calibration, depth_size: Size) -> Calibration:
-    """Return the calibration of a phone whose depth has fewer pixels than colour, but the same camera."""
-    if depth_size == (calibration.camera.width, calibration.camera.height) or calibration.depth_camera:
-        return calibration
-    camera, lens = calibration.camera.resized(*depth_size), calibration.distortion
-    return Calibration(calibration.camera, calibration.depth_units_per_metre, lens, camera, lens)
-
-
 def _odometry(path: Path) -> Rows:
-    """Read odometry.csv as rows by frame number. Raises SourceError naming file and line."""
     if not path.is_file():
         raise SourceError(f"{path} is missing: it holds the times of the frames; copy the whole folder again")
     lines = csv_rows(path)
@@ -145,20 +135,16 @@ def _odometry(path: Path) -> Rows:
     return rows
 
 
-def _calibration(folder: Path, rows: Rows, size: Size, depth_size: Size, settings: InputConfig) -> Calibration:
+def _calibration(folder: Path, rows: Rows, size: Size) -> Calibration | None:
     """Read the camera: the median of all frames if they have intrinsics, because autofocus changes them slightly."""
-    path = folder / "camera_matrix.csv"
-    recorded = None
-    if rows and set(INTRINSICS) <= set(next(iter(rows.values()))):
+    path, file = folder / "camera_matrix.csv", folder / "odometry.csv"
+    if set(INTRINSICS) <= set(next(iter(rows.values()))):
         focal = np.median([[row[name] for name in INTRINSICS] for row in rows.values()], 0)
-        recorded = Calibration(build_camera(folder / "odometry.csv", *size, focal.tolist()), MM_PER_METRE)
-    elif path.is_file():
-        recorded = Calibration(build_camera(path, *size, _matrix(path)), MM_PER_METRE)
-    return with_coarser_depth(resolve_calibration(folder, recorded, size, settings, MM_PER_METRE), depth_size)
+        return Calibration(build_camera(file, *size, focal.tolist()), MM_PER_METRE)
+    return Calibration(build_camera(path, *size, _matrix(path)), MM_PER_METRE) if path.is_file() else None
 
 
 def _matrix(path: Path) -> list[float]:
-    """Read fx, fy, cx, cy. Raises SourceError naming the file."""
     try:
         rows = np.array(
             [[float(word) for word in line.split(",")] for line in read_text(path).split("\n") if line.strip()]

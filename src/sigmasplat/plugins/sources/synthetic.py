@@ -137,7 +137,6 @@ class SyntheticRoom(Source):
         return mask_of(self.mover.shape(i), self.camera, self._T_world_camera[i], depth_m)
 
     def _scene(self, i: int) -> RoomScene:
-        """Return the room as it is at frame i."""
         room = build_scene(self._rooms, self._seed)
         return room if self.mover is None else RoomScene([*room.shapes, self.mover.shape(i)], room.lights)
 

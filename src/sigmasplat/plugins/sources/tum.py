@@ -1,4 +1,4 @@
-"""Read and write sequences in the layout of the TUM RGB-D benchmark; read the Bonn RGB-D Dynamic Dataset.
+"""Read and record sequences in the layout of the TUM RGB-D benchmark; read the Bonn RGB-D Dynamic Dataset.
 
 rgb.txt  depth.txt  groundtruth.txt     lines of "t path" or "t tx ty tz qx qy qz qw", comments after #
 calibration.json                        optional: fx fy cx cy width height depth_scale [distortion]
@@ -32,7 +32,6 @@ from sigmasplat.api import (
     InputConfig,
     RecordedSource,
     RunError,
-    Source,
     SourceError,
     SourceFormat,
     Trajectory,
@@ -45,7 +44,6 @@ from sigmasplat.api import (
     read_groundtruth,
     read_lines,
     se3,
-    write_text,
 )
 
 
@@ -77,22 +75,6 @@ def open_tum(
     known = camera or freiburg_calibration(folder)
     gyroscope = read_gyroscope(folder / "gyroscope.txt") if exists(folder / "gyroscope.txt") else None
     return folder_source(folder, settings, images, known, TUM_UNITS_PER_METRE, truth, skipped, gyroscope=gyroscope)
-
-
-def write_tum(source: Source, folder: str | Path) -> None:
-    """Write any source as a TUM folder: PNG images, lists, calibration.json and the ground-truth path, if known.
-
-    Raises as `TumWriter`.
-    """
-    writer = TumWriter(Path(folder), source.camera)
-    if (truth := source.truth()) is not None:
-        lines = ["# timestamp tx ty tz qx qy qz qw\n"]
-        for t, T in zip(truth.timestamps_s, truth.T_world_camera, strict=True):
-            w, x, y, z = se3.quaternion_from_rotation(T[:3, :3])
-            lines.append(f"{t:.6f} " + " ".join(f"{v:.9f}" for v in (*T[:3, 3], x, y, z, w)) + "\n")
-        write_text(writer.folder / "groundtruth.txt", "".join(lines))
-    for frame in source:
-        writer.add(frame)
 
 
 def _depth_list(folder: Path) -> tuple[NDArray[np.float64], list[Path]]:
@@ -213,7 +195,6 @@ def _has_lists(path: str) -> bool:
 
 
 def _is_bonn(path: str) -> bool:
-    """Return whether it is a TUM folder whose path contains "bonn"."""
     return _has_lists(path) and any("bonn" in part.lower() for part in Path(path).resolve().parts[-3:])
 
 

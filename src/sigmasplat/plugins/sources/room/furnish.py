@@ -283,7 +283,6 @@ def _done(at: Matrix) -> NDArray[np.float64]:
 
 
 def _share(T_world_camera: Matrix, camera: Camera, centers_m: Matrix, radius_m: float) -> float:
-    """Return the mean share of the image that the ball covers."""
     some = np.linspace(0, len(centers_m) - 1, min(SAMPLES, len(centers_m))).round().astype(int)
     rays = camera.rays()[::CELL_PX, ::CELL_PX].reshape(-1, 3)
     rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)

@@ -48,21 +48,12 @@ class Light:
         where = (points + np.float32(0.6 * CELL_M) * normals - start) / np.float32(CELL_M) - 0.5
         ambient, lamp, window = (map_coordinates(s, where, order=1, mode="nearest") for s in self.shares)
         total = AMBIENT_COLOR * (0.35 + 0.65 * ambient)
-        total = total + LAMP_COLOR * (lamp * _lamp_light(self.lamp - points, normals, 1.6))
-        total = total + WINDOW_COLOR * (window * _lamp_light(self.window - points, normals, 1.4))
+        total = total + LAMP_COLOR * (lamp * _lamp_light(self.place(LAMP_M) - points, normals, 1.6))
+        total = total + WINDOW_COLOR * (window * _lamp_light(self.place(WINDOW_M) - points, normals, 1.4))
         return total.astype(np.float32), np.stack([lamp, window])
 
-    @property
-    def lamp(self) -> Floats:
-        """Return the position of the lamp [3, 1], metres."""
-        return self._place(LAMP_M)
-
-    @property
-    def window(self) -> Floats:
-        """Return the centre of the window [3, 1], metres."""
-        return self._place(WINDOW_M)
-
-    def _place(self, at: tuple[float, float, float]) -> Floats:
+    def place(self, at: tuple[float, float, float]) -> Floats:
+        """Return a place of the first room in this one [3, 1], metres."""
         return np.array([[self.side * at[0] + self.room_x_m], [at[1]], [at[2]]], np.float32)
 
 
@@ -97,9 +88,9 @@ def _ambient_share(points: Floats, shapes: Sequence[Shape]) -> Floats:
 
 def _lamp_share(points: Floats, shapes: Sequence[Shape], light: Light, which: int) -> Floats:
     """Return the share of sample points of the lamp (0) or window (1) visible from each lattice point."""
-    center, spread = ((light.lamp, (0.45, 0.45, 0.0)), (light.window, (0.6, 0.0, 0.42)))[which]
+    at, spread = ((LAMP_M, (0.45, 0.45, 0.0)), (WINDOW_M, (0.6, 0.0, 0.42)))[which]
     signs = [(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1) if y == z or which == 0]
-    targets = [center + np.array([[s[k] * spread[k]] for k in range(3)], np.float32) for s in signs[:4]]
+    targets = [light.place(at) + np.array([[s[k] * spread[k]] for k in range(3)], np.float32) for s in signs[:4]]
     return np.asarray(np.mean([_free(points, t - points, shapes) for t in targets], 0, dtype=np.float32))
 
 
@@ -180,7 +171,6 @@ def _rays(camera: Camera, T_world_camera: NDArray[np.float64], pixels: Floats) -
 
 
 def _edges(faces: Indices) -> NDArray[np.bool_]:
-    """Mark pixels with a neighbour (left, right, above or below) on another face."""
     marked = np.zeros(faces.shape, bool)
     across, down = faces[:, 1:] != faces[:, :-1], faces[1:] != faces[:-1]
     marked[:, 1:] |= across
@@ -205,7 +195,6 @@ class Hits:
 
 
 def _intersect(scene: RoomScene, rays: Rays, windows: Windows | None, focal_px: float) -> Hits:
-    """Return the nearest hit of each ray, with the surface properties."""
     t, hit = cast_rays(scene.shapes, rays, windows)
     n = len(t)
     normals, paint, (glow, mirror, gloss) = np.zeros((3, n), np.float32), np.zeros((3, n), np.float32), np.zeros((3, n))
@@ -265,8 +254,8 @@ def _light(scene: RoomScene, points: Floats, hits: Hits, mirrored: Floats) -> tu
         at, light = np.flatnonzero(room == k), scene.lights[int(k)]
         falling[:, at], shares = light.at(points[:, at], hits.normals[:, at])
         glossy = np.flatnonzero(hits.gloss[at])
-        for lamp, share in zip((light.lamp, light.window), shares[:, glossy], strict=True):
-            towards = normalised(lamp - points[:, at[glossy]])
+        for lamp, share in zip((LAMP_M, WINDOW_M), shares[:, glossy], strict=True):
+            towards = normalised(light.place(lamp) - points[:, at[glossy]])
             lobe = np.maximum(dot(towards, mirrored[:, at[glossy]]), 0.0) ** 24
             highlight[at[glossy]] += hits.gloss[at[glossy]] * share * lobe
     return falling, highlight

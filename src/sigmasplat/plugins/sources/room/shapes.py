@@ -213,7 +213,6 @@ def _grid(columns: int, rows: int) -> tuple[Doubles, Doubles, NDArray[np.int32]]
 
 
 def _box(shape: Shape) -> list[tuple[Doubles, NDArray[np.int32]]]:
-    """Return the six sides of a box."""
     sides = []
     for axis in range(3):
         across, up = (axis + 1) % 3, (axis + 2) % 3
@@ -226,7 +225,6 @@ def _box(shape: Shape) -> list[tuple[Doubles, NDArray[np.int32]]]:
 
 
 def _ball(shape: Shape) -> list[tuple[Doubles, NDArray[np.int32]]]:
-    """Return the surface of a ball."""
     around = max(MIN_SIDES, _cells(2 * np.pi * float(shape.half.max())))
     s, t, faces = _grid(around, around // 2)
     longitude, latitude = 2 * np.pi * s, np.pi * (t - 0.5)
@@ -235,7 +233,6 @@ def _ball(shape: Shape) -> list[tuple[Doubles, NDArray[np.int32]]]:
 
 
 def _drum(shape: Shape) -> list[tuple[Doubles, NDArray[np.int32]]]:
-    """Return the side and the caps of a drum."""
     radius = float(shape.half[:2].max())
     around = max(MIN_SIDES, _cells(2 * np.pi * radius))
     s, t, faces = _grid(around, _cells(2 * shape.half[2]))
