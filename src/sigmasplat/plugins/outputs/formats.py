@@ -74,19 +74,6 @@ def _ply(
     return _write_splats(source, target, chosen, "sigmasplat.run_folder.splat_ply", "y-down", True, plain=plain)
 
 
-def _spz(
-    source: ExportSource, target: Path, *, sigma_below: Bound, std_below_m: Bound, opacity_above: Bound,
-    max_splats: int | None, axes: "Axes | None", spz_version: int | None,
-) -> str:  # fmt: skip
-    from sigmasplat.plugins.outputs.splats.spz import DEFAULT_VERSION, VERSIONS
-
-    version = DEFAULT_VERSION if spz_version is None else spz_version
-    if version not in VERSIONS:
-        raise ConfigError(f"--spz-version must be 2, 3 or 4, found {version}")
-    chosen = sigma_below, std_below_m, opacity_above, max_splats, axes
-    return _write_splats(source, target, chosen, f"{SPLATS}.spz", "y-up", False, version=version)
-
-
 def _splats(module: str, own: "Axes" = "y-down", keeps_std: bool = False) -> Callable[..., str]:
     """Return the writer of a format without options of its own: splats/MODULE, its axes, whether it keeps `std`."""
 
@@ -219,12 +206,10 @@ def _bag(source: ExportSource, target: Path, *, pictures: bool) -> str:
 
 PLUGIN = (
     Output("ply", (".ply",), "3DGS PLY with σ², for every viewer", _ply),
-    Output("compressed-ply", (".compressed.ply",), "SuperSplat's PLY, a fifth of the size", _splats("compressed_ply")),
     Output("splat", (".splat",), "32 bytes per splat, for web viewers", _splats("splat")),
-    Output("spz", (".spz",), "Niantic's SPZ, less than a fifth of the size", _spz),
+    Output("spz", (".spz",), "Niantic's SPZ, less than a fifth of the size", _splats("spz", "y-up")),
     Output("sog", (".sog",), "SuperSplat's SOG, the smallest", _splats("sog")),
-    Output("gltf", (".glb", ".gltf"), "glTF with splats (KHR) and σ", _splats("gltf", "y-up", True)),
-    Output("usd", (".usdc", ".usda", ".usd"), "OpenUSD with splats and σ", _splats("usd", "y-up", True)),
+    Output("gltf", (".glb",), "glTF with splats (KHR) and σ", _splats("gltf", "y-up", True)),
     Output("trajectory", (".txt",), "the path as TUM text", _trajectory),
     Output(
         "covariance",

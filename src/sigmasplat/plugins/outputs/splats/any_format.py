@@ -4,9 +4,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 from sigmasplat.api import GaussianField, SourceError, guarded, open_binary, read_header, splat_ply as ply
-from sigmasplat.plugins.outputs.splats import compressed_ply, gltf, sog, splat, spz, usd
+from sigmasplat.plugins.outputs.splats import compressed_ply, gltf, sog, splat, spz
 
-READABLE = ".ply, .compressed.ply, .splat, .spz, .sog, .glb, .gltf, .usda, .usdc or .usd"
+READABLE = ".ply, .compressed.ply, .splat, .spz, .sog, .glb or .gltf"
 START = 4096
 """The first bytes of a file, which decide its format. A .gltf nearly always says `asset` in them."""
 READERS: dict[bytes, Callable[[Path], GaussianField]] = {
@@ -14,14 +14,14 @@ READERS: dict[bytes, Callable[[Path], GaussianField]] = {
     spz.MAGIC: spz.read_field,
     sog.MAGIC: sog.read_field,
     gltf.MAGIC: gltf.read_field,
-    usd.BINARY: usd.read_field,
-    usd.TEXT: usd.read_field,
 }
 """Readers by the first bytes of a file."""
 OTHER_FILES = {
     b"version https://git-lfs": "is a Git LFS pointer, not the map itself; run: git lfs pull",
     b"<": "is a web page or XML, not the map itself; download the map again",
     b"{": "is JSON; give the file with the splats",
+    b"PXR-USDC": "is OpenUSD, which is not read; save it as glTF or PLY",
+    b"#usda": "is OpenUSD, which is not read; save it as glTF or PLY",
     b"\x89PNG": "is an image; give the file with the splats",
 }
 """Messages about other files that users give by mistake, by their first bytes."""
@@ -30,8 +30,7 @@ OTHER_FILES = {
 def read_any(path: Path) -> GaussianField:
     """Read a map in any of the formats of `READABLE`; σ² that is not in the file becomes exp(−7).
 
-    Raises SourceError if it is missing, a folder, damaged, or of another format; SigmaSplatError if it is OpenUSD and
-    usd-core is not installed.
+    Raises SourceError if it is missing, a folder, damaged, or of another format.
     """
     if path.is_dir():
         raise SourceError(f"{path} is a folder, not a map; give a file: {READABLE}")

@@ -1,12 +1,12 @@
-"""Read and write splats as SuperSplat's compressed PLY: 16 bytes per splat, and 72 bytes per chunk of 256 splats.
+"""Read splats from SuperSplat's compressed PLY: 16 bytes per splat, and 72 bytes per chunk of 256 splats.
 
 Elements: `chunk`, minimum and maximum of positions, log scales and colours of 256 splats; `vertex`, four words with a
 splat's values relative to these limits; `sh`, only for view-dependent colours, one byte for each of f_rest_0…, in the
 order of 3DGS's PLY. Bits from the highest: packed_position and packed_scale 11, 10, 11; packed_rotation 2 for the index
 of the largest of w, x, y, z and 10 for each other one; packed_color 8 each for red, green, blue and opacity, which is
-stored directly. Chunks of early files have no colour limits; they are 0 and 1. Splats are in Morton order, so that
-chunks are small. The format cannot hold σ². Layout: PlayCanvas's splat-transform,
-write-compressed-ply.ts, compressed-chunk.ts and decompress-ply.ts.
+stored directly. Chunks of early files have no colour limits; they are 0 and 1. The format cannot hold σ². Layout:
+PlayCanvas's splat-transform, write-compressed-ply.ts, compressed-chunk.ts and decompress-ply.ts. It is not
+written: SOG is smaller, and the same programs read it.
 """
 
 from pathlib import Path
@@ -20,16 +20,10 @@ from sigmasplat.api import (
     GaussianField,
     SourceError,
     SplatValues,
-    by_channel,
     from_smallest_three,
-    header_of,
-    morton_order,
     opacities_of,
-    opacity_bytes,
     open_binary,
     read_header,
-    replacing,
-    smallest_three,
 )
 
 CHUNK = 256
@@ -38,37 +32,9 @@ LIMITS = [f"{end}_{name}" for group in (("x", "y", "z"), ("scale_x", "scale_y", 
 WITHOUT_COLORS = LIMITS[:12]
 WORDS = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
 REST, HARMONICS = "f_rest_", (9, 24, 45)
-LOG_SCALE_LIMIT = 20.0
 SH_RANGE = 8.0
 """The byte of a harmonic covers −4 to 4."""
 XYZ_BITS, ROTATION_BITS, COLOR_BITS = (11, 10, 11), (10, 10, 10), (8, 8, 8)
-
-
-def write_field(path: Path, field: GaussianField) -> None:
-    """Write the splats atomically. Raises RunError if the file cannot be written."""
-    values = SplatValues.of(field)
-    values = values.ordered(morton_order(values.means))
-    log_scales = np.clip(values.log_scales, -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT)
-    limits, words = [], np.empty((len(values), 4), "<u4")
-    for column, part, bits in ((0, values.means, XYZ_BITS), (2, log_scales, XYZ_BITS), (3, values.colors, COLOR_BITS)):
-        low, high = _ranges(part)
-        limits += [low, high]
-        words[:, column] = _packed(_within(part, low, high), bits)
-    which, others = smallest_three(values.quats)
-    words[:, 1] = which << 30 | _packed(others * np.sqrt(0.5) + 0.5, ROTATION_BITS)
-    words[:, 3] = words[:, 3] << 8 | opacity_bytes(values.opacities)
-    sh = by_channel(np.clip((values.harmonics / SH_RANGE + 0.5) * 256.0, 0.0, 255.0).astype(np.uint8))
-    elements: list[tuple[str, int, list[str]]] = [
-        ("chunk", -(-len(values) // CHUNK), [f"float {name}" for name in LIMITS]),
-        ("vertex", len(values), [f"uint {name}" for name in WORDS]),
-    ]
-    if sh.shape[1]:
-        elements.append(("sh", len(values), [f"uchar {REST}{i}" for i in range(sh.shape[1])]))
-    with replacing(path) as temporary, temporary.open("wb") as file:
-        file.write(header_of(*elements))
-        file.write(np.concatenate(limits, axis=1).astype("<f4").tobytes())
-        file.write(words.tobytes())
-        file.write(sh.tobytes())
 
 
 def read_field(path: Path) -> GaussianField:
@@ -93,28 +59,6 @@ def read_field(path: Path) -> GaussianField:
 def is_compressed(elements: list[Element]) -> bool:
     """Return whether a PLY with these elements is a compressed one."""
     return bool(elements) and elements[0].name == "chunk"
-
-
-def _ranges(part: Doubles) -> tuple[Doubles, Doubles]:
-    """Return the minima and maxima [C, 3] of each chunk, rounded to float32 as in the file."""
-    chunks = range(0, len(part), CHUNK)
-    low, high = (np.array([f(part[i : i + CHUNK], axis=0) for i in chunks]).reshape(-1, 3) for f in (np.min, np.max))
-    return low.astype(np.float32).astype(np.float64), high.astype(np.float32).astype(np.float64)
-
-
-def _within(part: Doubles, low: Doubles, high: Doubles) -> Doubles:
-    """Return each value relative to its chunk's limits, in [0, 1]; 0 if the limits are equal."""
-    low, span = (np.repeat(values, CHUNK, axis=0)[: len(part)] for values in (low, high - low))
-    return (part - low) / np.where(span > 0.0, span, 1.0)
-
-
-def _packed(part: Doubles, bits: tuple[int, int, int]) -> NDArray[np.uint32]:
-    """Pack three numbers in [0, 1] into one word [N], the first one in the highest bits."""
-    word = np.zeros(len(part), np.uint32)
-    for column, width in enumerate(bits):
-        steps = (1 << width) - 1
-        word = word << np.uint32(width) | np.clip(np.round(part[:, column] * steps), 0, steps).astype(np.uint32)
-    return word
 
 
 def _unpacked(word: NDArray[np.uint32], bits: tuple[int, int, int]) -> Doubles:
