@@ -212,7 +212,7 @@ def test_the_plan_is_an_image_and_a_json_file(reader: RunReader, tmp_path: Path)
     plan = floor_plan(reader.run.read_map(), reader.valid_path(), reader.camera, renderer=seer(WORLD))
     write_plan(plan, tmp_path / "plan.png")
     with Image.open(tmp_path / "plan.png") as drawn:
-        assert drawn.format == "PNG" and drawn.size[0] > 700
+        assert drawn.format == "PNG" and drawn.size[0] > 600
     record = json.loads((tmp_path / "plan.json").read_text())
     assert len(record["cells"]) == plan.kind.shape[0] and len(plan.path_m) == FRAMES - 1, "without the lost frame"
     with pytest.raises(RunError, match=r"give a name that ends in \.png"):

@@ -236,7 +236,7 @@ def test_the_benchmark_writes_scores_tables_and_pictures(tmp_path: Path, capsys:
     assert {"nees_mean", "coverage_90", "position_k"} <= scored["poses"]["from_start"].keys()
     row = scored["scores"]["color"]["final"][HELD_BACK]["all pixels"]["predictors"]["V + T prior"]
     assert {"ause", "spearman", "before", "after", "temperature"} <= row.keys()
-    assert len(list(out.glob("*.png"))) >= 4
+    assert len(list(out.glob("*.svg"))) >= 4
     (samples_file,) = (out / "samples").iterdir()
     written = samples_file.stat().st_mtime_ns
     assert uncertainty.main(options) == 0

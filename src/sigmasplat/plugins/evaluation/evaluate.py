@@ -42,7 +42,7 @@ from sigmasplat.plugins.evaluation.path_scores import (
     score_states,
 )
 from sigmasplat.plugins.evaluation.report import charts
-from sigmasplat.plugins.evaluation.report.page import report_plan, write_charts, write_page
+from sigmasplat.plugins.evaluation.report.page import report_plan, write_page
 from sigmasplat.plugins.evaluation.report.view_strips import ViewStrips
 from sigmasplat.plugins.evaluation.view_scoring import (
     ViewScoring,
@@ -296,8 +296,8 @@ def _worst_frame_s(log: Log) -> float | None:
     return max(map(frame_seconds, log[1:]), default=0.0) or None
 
 
-def _draw_plots(run: RunFolder, frames: RunFrames, truth: Trajectory | None) -> dict[str, str]:
-    """Draw the charts of path, states, submaps and times, and write truth.txt; return the captions by name."""
+def _draw_plots(run: RunFolder, frames: RunFrames, truth: Trajectory | None) -> dict[str, charts.Plot]:
+    """Return the charts of path, states, submaps and times by name, and write truth.txt."""
     times, estimate = frames.path.timestamps_s, frames.path.T_world_camera[:, :3, 3]
     known: NDArray[np.float64] | None = None
     aligned: Trajectory | None = None
@@ -306,7 +306,7 @@ def _draw_plots(run: RunFolder, frames: RunFrames, truth: Trajectory | None) -> 
         known = np.full_like(estimate, np.nan)
         known[rows] = aligned.T_world_camera[:, :3, 3]
     _write_truth(run, aligned)
-    return write_charts(run, charts.run_charts(frames, known, run.read_loops()))
+    return charts.run_charts(frames, known, run.read_loops())
 
 
 def _write_truth(run: RunFolder, aligned: Trajectory | None) -> None:

@@ -43,11 +43,11 @@ class LoopLink(NamedTuple):
 
 
 Log = list[dict[str, Any]]
+Plot = tuple[list[Chart], str]
+"""Charts and their caption."""
 
 
-def run_charts(
-    frames: RunFrames, truth: Matrix | None, loops: Sequence[dict[str, Any]] = ()
-) -> dict[str, tuple[list[Chart], str]]:
+def run_charts(frames: RunFrames, truth: Matrix | None, loops: Sequence[dict[str, Any]] = ()) -> dict[str, Plot]:
     """Return the charts of a run with captions, by name: trajectory; states if known; submaps if there are several;
     moving if anything moved; seconds if known. Without a valid frame there are only the seconds.
 
@@ -66,9 +66,7 @@ def run_charts(
     return found
 
 
-def _path_charts(
-    frames: RunFrames, truth: Matrix | None, loops: Sequence[dict[str, Any]]
-) -> dict[str, tuple[list[Chart], str]]:
+def _path_charts(frames: RunFrames, truth: Matrix | None, loops: Sequence[dict[str, Any]]) -> dict[str, Plot]:
     """Return the charts of the valid poses."""
     estimate, log = frames.path.T_world_camera[:, :3, 3], frames.log
     before_lost = np.array([row + 1 < len(frames) and frames.states[row + 1] == LOST for row in frames.rows], np.bool_)
