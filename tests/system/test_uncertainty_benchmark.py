@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 import uncertainty
-from finished_run import FinishedRun, run_slam
+from finished_run import FinishedRun, aligned_poses, run_slam
 from splat_statistics import (
     MapFacts,
     TrainingView,
@@ -47,7 +47,6 @@ from sigmasplat.config.text import override
 from sigmasplat.data import se3
 from sigmasplat.data.field import GaussianField
 from sigmasplat.fit.target import Keyframe, Target
-from sigmasplat.plugins.evaluation.metrics.trajectory import aligned_poses
 from sigmasplat.plugins.evaluation.metrics.uncertainty import sparsification
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.render import FieldRenderer
