@@ -25,7 +25,7 @@ from sigmasplat.plugins.sources import open_source
 from sigmasplat.run.resume import StateFile
 from sigmasplat.run_folder import splat_ply as ply
 from sigmasplat.run_folder.runs import RunFolder
-from splat_writers import write_compressed_ply, write_gltf, write_spz4
+from splat_writers import write_gltf, write_spz4
 
 Files = dict[str, bytes]
 INPUT, OUT = "INPUT", "OUT"
@@ -170,7 +170,7 @@ def _maps(folder: Path) -> Iterator[Sample]:
     field = GaussianField(torch.randn(6, 17, generator=torch.Generator().manual_seed(0)))
     field.get_or_create("harmonics").params[:] = 0.25
     writers: dict[str, Callable[..., None]] = {
-        ".ply": ply.write_field, ".compressed.ply": write_compressed_ply, ".splat": splat.write_field,
+        ".ply": ply.write_field, ".splat": splat.write_field,
         ".spz": spz.write_field, ".sog": sog.write_field, ".glb": gltf.write_field, ".gltf": write_gltf,
     }  # fmt: skip
     for ending, write in writers.items():

@@ -8,7 +8,6 @@ import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 import zstandard
@@ -17,13 +16,12 @@ from PIL import Image
 from sigmasplat import cli
 from sigmasplat.data.field import GaussianField
 from sigmasplat.errors import SourceError
-from sigmasplat.plugins.outputs.splats import compressed_ply, gltf, sog, splat, spz
+from sigmasplat.plugins.outputs.splats import gltf, sog, splat, spz
 from sigmasplat.plugins.outputs.splats.any_format import read_any
 from sigmasplat.run_folder import splat_ply as ply
-from splat_writers import write_compressed_ply
 
 WRITERS = {
-    ".ply": ply.write_field, ".compressed.ply": write_compressed_ply, ".splat": splat.write_field,
+    ".ply": ply.write_field, ".splat": splat.write_field,
     ".spz": spz.write_field, ".sog": sog.write_field, ".glb": gltf.write_field,
 }  # fmt: skip
 
@@ -88,8 +86,6 @@ def spz_header(version: int = 3, count: int = 1, degree: int = 0, magic: bytes =
 
 
 PLY = b"ply\nformat binary_little_endian 1.0\n"
-CHUNK = "".join(f"property float {name}\n" for name in compressed_ply.LIMITS).encode()
-WORDS = "".join(f"property uint {name}\n" for name in compressed_ply.WORDS).encode()
 BOMB = zstandard.ZstdCompressor().compress(bytes(1 << 20))
 MISTAKES: dict[str, tuple[bytes, str]] = {
     "an empty file": (b"", "it is empty"),
@@ -101,15 +97,7 @@ MISTAKES: dict[str, tuple[bytes, str]] = {
     "a count larger than any disk": (
         PLY + b"element vertex 999999999999999\nproperty float x\nend_header\n", "is truncated"
     ),
-    "chunks without splats": (PLY + b"element chunk 0\nelement face 0\nend_header\n", "it has chunk, face, not"),
-    "chunks without limits": (PLY + b"element chunk 0\nproperty float a\nelement vertex 0\n" + WORDS + b"end_header\n",
-                              "no column min_x in 'chunk'"),
-    "too few chunks": (PLY + b"element chunk 1\n" + CHUNK + b"element vertex 300\n" + WORDS + b"end_header\n",
-                       "1 chunks of 256 do not match 300 splats"),
-    "chunks with nan": (PLY + b"element chunk 1\n" + CHUNK + b"element vertex 1\n" + WORDS + b"end_header\n"
-                        + np.full(18, np.nan, "<f4").tobytes() + bytes(16), "limits of a chunk have nan or inf"),
-    "a wrong number of harmonics": (PLY + b"element chunk 0\n" + CHUNK + b"element vertex 0\n" + WORDS
-                                    + b"element sh 0\nproperty uchar f_rest_0\nend_header\n", "0 × 1 harmonics, exp"),
+    "SuperSplat's compressed PLY": (PLY + b"element chunk 1\nend_header\n", "which is not read; save it as SOG or as"),
     "SOG of version 1": (archive(), "not a SOG file of version 2"),
     "another zip": (archive().replace(b"meta.json", b"data.json"), "it has no meta.json"),
     "SOG whose meta data is not JSON": (archive("{"), "meta.json is not JSON"),

@@ -20,7 +20,6 @@ from sigmasplat.registry import Output
 from sigmasplat.run_folder import splat_ply as ply
 from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.run_folder.trajectory import read_trajectory
-from splat_writers import write_compressed_ply
 
 
 @pytest.fixture
@@ -57,8 +56,8 @@ def test_the_ending_selects_the_format(export: Callable[..., str], name: str) ->
 
 def test_a_map_is_exported_like_a_run(export: Callable[..., str]) -> None:
     export("walk", "--out", "a.spz")
-    write_compressed_ply(Path("b.compressed.ply"), read_any(Path("a.spz")))
-    assert export("b.compressed.ply").startswith("b.ply: 10 splats")
+    assert export("a.spz", "--out", "b.glb").startswith("b.glb: 10 splats")
+    assert export("b.glb").startswith("b.ply: 10 splats")
     first, last = read_any(Path("a.spz")), read_any(Path("b.ply"))
     assert sorted(first.means[:, 0].tolist()) == pytest.approx(sorted(last.means[:, 0].tolist()), abs=1e-3)
 
@@ -159,10 +158,6 @@ def test_the_first_format_with_an_ending_owns_it_and_longer_endings_win() -> Non
 
 
 def test_default_names_of_exports(tmp_path: Path) -> None:
-    for name in ("room.compressed.ply", "room.v2.spz"):
-        (tmp_path / name).touch()
-    assert (
-        ExportSource(tmp_path / "room.compressed.ply").name == "room"
-        and ExportSource(tmp_path / "room.v2.spz").name == "room.v2"
-    )
+    (tmp_path / "room.v2.spz").touch()
+    assert ExportSource(tmp_path / "room.v2.spz").name == "room.v2"
     assert ExportSource(tmp_path / "walk.1").name == "walk.1"

@@ -3,10 +3,10 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from sigmasplat.api import GaussianField, SourceError, guarded, open_binary, read_header, splat_ply as ply
-from sigmasplat.plugins.outputs.splats import compressed_ply, gltf, sog, splat, spz
+from sigmasplat.api import GaussianField, SourceError, guarded, open_binary, splat_ply as ply
+from sigmasplat.plugins.outputs.splats import gltf, sog, splat, spz
 
-READABLE = ".ply, .compressed.ply, .splat, .spz, .sog, .glb or .gltf"
+READABLE = ".ply, .splat, .spz, .sog, .glb or .gltf"
 START = 4096
 """The first bytes of a file, which decide its format. A .gltf nearly always says `asset` in them."""
 READERS: dict[bytes, Callable[[Path], GaussianField]] = {
@@ -42,17 +42,13 @@ def _read_known(path: Path) -> GaussianField:
     with open_binary(path, "cannot read map") as file:
         start = file.read(START)
     if start[:3] == b"ply" and start[3:4].isspace():
-        return _read_ply(path)
+        if b"\nelement chunk " in start:
+            raise SourceError(f"{path} is SuperSplat's compressed PLY, which is not read; save it as SOG or as PLY")
+        return ply.read_field(path)
     for magic, read in READERS.items():
         if start.startswith(magic):
             return read(path)
     return _read_headerless(path, start)
-
-
-def _read_ply(path: Path) -> GaussianField:
-    with open_binary(path, "cannot read map") as file:
-        compressed = compressed_ply.is_compressed(read_header(file, path))
-    return compressed_ply.read_field(path) if compressed else ply.read_field(path)
 
 
 def _read_headerless(path: Path, start: bytes) -> GaussianField:
