@@ -242,7 +242,6 @@ def _score_views(
 
 
 def _facts(run: RunFolder, source: Source, log: Log, field: GaussianField) -> dict[str, Any]:
-    """Return counts, size and speed of the run."""
     facts, loops = run.facts(), run.read_loops()
     wall_s, finish_s = facts.get("wall_s"), facts.get("finish_s")
     seconds = wall_s or sum(frame_seconds(record) for record in log)

@@ -112,7 +112,6 @@ def _trajectory(source: ExportSource, target: Path) -> str:
 
 
 def _covariances(write: str, source: ExportSource, target: Path) -> str:
-    """Write a path with covariances with a function of `run_folder.trajectory`."""
     from sigmasplat.api import trajectory
 
     reader = source.reader()
@@ -136,7 +135,6 @@ def _kitti(source: ExportSource, target: Path) -> str:
 
 
 def _views(write: str, source: ExportSource, target: Path, *, pictures: bool) -> str:
-    """Write views with a function of `outputs.views`."""
     from sigmasplat.plugins.outputs import views
 
     reader = source.reader()

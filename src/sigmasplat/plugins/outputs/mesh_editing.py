@@ -197,7 +197,6 @@ def _neighbours(faces: Indices, vertices: int) -> csr_array:
 
 
 def _joined(mesh: Mesh, patches: list[Patch]) -> Mesh:
-    """Return the mesh with patches."""
     if not patches:
         return mesh
     start, faces = len(mesh.vertices), [mesh.faces.astype(np.int64)]

@@ -118,7 +118,6 @@ def pair_poses(estimate: Trajectory, truth: Trajectory, max_difference_s: float 
 
 
 def _span(path: Trajectory) -> str:
-    """Describe the time span of a trajectory."""
     if not len(path):
         return "no poses"
     return f"{path.timestamps_s.min():.3f} … {path.timestamps_s.max():.3f} s ({len(path)} poses)"

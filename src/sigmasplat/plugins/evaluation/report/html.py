@@ -213,7 +213,6 @@ def _time(contents: Contents) -> str:
 
 
 def _advice(advice: list[Advice]) -> str:
-    """Show what to do, with commands. A click on a command selects all of it."""
     if not advice:
         return ""
     items = [
@@ -249,7 +248,6 @@ def _view(panels: list[PanelFigure]) -> str:
 
 
 def _panel(panel: PanelFigure) -> str:
-    """Show one panel of a view: title, picture, its colour bar and its caption."""
     low, high = (html.escape(end) for end in panel.ends)
     ramp = f"<i style='background: linear-gradient(90deg, {', '.join(panel.bar)})'></i>"
     below = f"<span class=bar>{low}{ramp}{high}</span>" if panel.bar else ""
@@ -259,7 +257,6 @@ def _panel(panel: PanelFigure) -> str:
 
 
 def _states(contents: Contents) -> str:
-    """Show the states of the frames: the chart and the table."""
     if "states" not in contents.plots:
         return ""
     table = f"<div class=card>{_table(tables.state_rows(contents.metrics))}</div>"
@@ -280,7 +277,6 @@ def _plan(contents: Contents) -> str:
 
 
 def _submaps(contents: Contents) -> str:
-    """Show the submaps and the loops between them, if there are several submaps."""
     if (contents.metrics.get("submaps") or 1) < 2:
         return ""
     accepted = [loop for loop in contents.loops if loop.get("accepted")]

@@ -125,12 +125,10 @@ def coloured(
 
 
 def _bytes(color: NDArray[np.float32]) -> colormap.Rgb:
-    """Convert colours in [0, 1] to 0 … 255."""
     return (np.clip(color, 0.0, 1.0) * 255.0).round().astype(np.uint8)
 
 
 def _draw_texts(strip: Image.Image, panel: ViewPanel, left: int, width: int, height: int) -> None:
-    """Draw the title above a panel, and its bar or caption below."""
     draw, middle, small = ImageDraw.Draw(strip), HEAD + height + FOOT // 2, ImageFont.load_default(16)
     draw.text((left + 2, HEAD // 2), panel.title, TEXT, ImageFont.load_default(18), anchor="lm")
     if panel.bar is None:

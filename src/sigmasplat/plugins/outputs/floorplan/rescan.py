@@ -135,7 +135,6 @@ def _hidden(unobserved: Mask, empty: Mask, cell_m: float) -> Mask:
 
 
 def _hull(cells: Mask) -> Mask:
-    """Return the convex hull of cells."""
     out, places = np.zeros_like(cells), np.argwhere(cells)
     try:
         corners = places[ConvexHull(places).vertices]
