@@ -25,7 +25,6 @@ from sigmasplat.plugins.sources import open_source
 from sigmasplat.run.resume import StateFile
 from sigmasplat.run_folder import splat_ply as ply
 from sigmasplat.run_folder.runs import RunFolder
-from splat_writers import write_gltf, write_spz4
 
 Files = dict[str, bytes]
 INPUT, OUT = "INPUT", "OUT"
@@ -171,17 +170,13 @@ def _maps(folder: Path) -> Iterator[Sample]:
     field.get_or_create("harmonics").params[:] = 0.25
     writers: dict[str, Callable[..., None]] = {
         ".ply": ply.write_field, ".splat": splat.write_field,
-        ".spz": spz.write_field, ".sog": sog.write_field, ".glb": gltf.write_field, ".gltf": write_gltf,
+        ".spz": spz.write_field, ".sog": sog.write_field, ".glb": gltf.write_field,
     }  # fmt: skip
     for ending, write in writers.items():
         place = folder / f"map{ending}"
         place.mkdir()
         write(place / f"map{ending}", field)
         yield _sample(f"map{ending}", place, place / f"map{ending}", EXPORTS)
-    place = folder / "map4.spz"
-    place.mkdir()
-    write_spz4(place / "map.spz", field)
-    yield _sample("map4.spz", place, place / "map.spz", EXPORTS)
 
 
 def _runs(folder: Path) -> Iterator[Sample]:

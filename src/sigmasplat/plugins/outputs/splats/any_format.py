@@ -6,9 +6,9 @@ from pathlib import Path
 from sigmasplat.api import GaussianField, SourceError, guarded, open_binary, splat_ply as ply
 from sigmasplat.plugins.outputs.splats import gltf, sog, splat, spz
 
-READABLE = ".ply, .splat, .spz, .sog, .glb or .gltf"
+READABLE = ".ply, .splat, .spz, .sog or .glb"
 START = 4096
-"""The first bytes of a file, which decide its format. A .gltf nearly always says `asset` in them."""
+"""The first bytes of a file, which decide its format."""
 READERS: dict[bytes, Callable[[Path], GaussianField]] = {
     spz.GZIP: spz.read_field,
     spz.MAGIC: spz.read_field,
@@ -19,7 +19,7 @@ READERS: dict[bytes, Callable[[Path], GaussianField]] = {
 OTHER_FILES = {
     b"version https://git-lfs": "is a Git LFS pointer, not the map itself; run: git lfs pull",
     b"<": "is a web page or XML, not the map itself; download the map again",
-    b"{": "is JSON; give the file with the splats",
+    b"{": "is JSON; give the file with the splats, of glTF the .glb",
     b"PXR-USDC": "is OpenUSD, which is not read; save it as glTF or PLY",
     b"#usda": "is OpenUSD, which is not read; save it as glTF or PLY",
     b"\x89PNG": "is an image; give the file with the splats",
@@ -52,12 +52,10 @@ def _read_known(path: Path) -> GaussianField:
 
 
 def _read_headerless(path: Path, start: bytes) -> GaussianField:
-    """Read a .splat file, which has no header, or a .gltf, which is JSON. Raises SourceError if it is neither."""
+    """Read a .splat file, which has no header. Raises SourceError if it is none."""
     try:
         return splat.read_field(path)
     except SourceError as problem:
-        if start.lstrip().startswith(b"{") and (b'"asset"' in start or path.suffix.lower() == ".gltf"):
-            return gltf.read_field(path)
         for magic, what in OTHER_FILES.items():
             if start.lstrip().startswith(magic):
                 raise SourceError(f"{path} {what}") from problem

@@ -9,8 +9,6 @@ rotates maps by 180° about x, the reader rotates them back. Sizes are checked b
 and compressed buffers cannot be read. Specification: KhronosGroup/glTF, extensions/2.0/Khronos/KHR_gaussian_splatting.
 """
 
-import base64
-import binascii
 import json
 import struct
 from collections.abc import Mapping
@@ -49,7 +47,7 @@ UNMOVED = {
 
 @dataclass(frozen=True)
 class GltfFile:
-    """The JSON document of a file, and the data chunk of a GLB."""
+    """The JSON document and the data of a GLB."""
 
     path: Path
     document: Mapping[str, Any]
@@ -59,10 +57,7 @@ class GltfFile:
     def open(path: Path) -> "GltfFile":
         """Read a file. Raises SourceError if it is missing, damaged, or not glTF 2.0."""
         with open_binary(path, "cannot read map") as file:
-            data = file.read()
-        chunk = b""
-        if data.startswith(MAGIC):
-            data, chunk = _chunks(data, path)
+            data, chunk = _chunks(file.read(), path)
         try:
             document = json.loads(data)
             version = str(document["asset"]["version"])
@@ -136,7 +131,9 @@ class GltfFile:
             raise self.damaged(f"the buffer of {name} is compressed; save the map without compression")
         stride = self._whole(view, "byteStride") or width * item.itemsize
         start, length = self._whole(view, "byteOffset") + at, self._whole(view, "byteLength") - at
-        data = self._buffer(view.get("buffer"))
+        if "uri" in self.entry("buffers", view.get("buffer")):
+            raise self.damaged(f"the data of {name} is in another file; save the map as one GLB")
+        data = self.chunk
         if stride < width * item.itemsize or size * stride - stride + width * item.itemsize > length * bool(size):
             raise self.damaged(f"{name} is larger than its part of the buffer")
         if start + length > len(data):
@@ -153,23 +150,6 @@ class GltfFile:
         if isinstance(found, bool) or not isinstance(found, int) or not 0 <= found < 1 << 53:
             raise self.damaged(f"{name} is not a whole number")
         return found
-
-    def _buffer(self, index: object) -> bytes:
-        """Return the data of a buffer: the chunk of a GLB, a data URI, or a file beside the document."""
-        uri = self.entry("buffers", index).get("uri")
-        if uri is None:
-            return self.chunk
-        if not isinstance(uri, str):
-            raise self.damaged("the URI of a buffer is not text")
-        if uri.startswith("data:"):
-            try:
-                return base64.b64decode(uri.partition(",")[2], validate=True)
-            except binascii.Error as problem:
-                raise self.damaged("the data of a buffer is not base64") from problem
-        if Path(uri).name != uri or uri in ("", ".", ".."):
-            raise self.damaged("the URI of a buffer is not a file in the same folder")
-        with open_binary(self.path.with_name(uri), f"cannot read the data of {self.path}:") as file:
-            return file.read()
 
 
 def _chunks(data: bytes, path: Path) -> tuple[bytes, bytes]:
@@ -245,7 +225,7 @@ def glb(
 
 
 def read_field(path: Path) -> GaussianField:
-    """Read .glb or .gltf; without _SIGMA, σ² becomes exp(−7). Of several primitives of splats, the first one is read.
+    """Read a GLB; without _SIGMA, σ² becomes exp(−7). Of several primitives of splats, the first one is read.
 
     Raises SourceError if it is missing, damaged, truncated, has no splats, or if its node is moved or scaled.
     """

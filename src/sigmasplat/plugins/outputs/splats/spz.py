@@ -1,4 +1,4 @@
-"""Read splats from Niantic's SPZ, versions 2 to 4, and write version 3: 20 bytes per splat before compression.
+"""Read splats from Niantic's SPZ, versions 2 and 3, and write version 3: 20 bytes per splat before compression.
 
 Most current readers accept version 3: nianticlabs/spz, splat-transform, three.js, Spark, Babylon.js.
 
@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
-import zstandard
 from numpy.typing import NDArray
 
 from sigmasplat.api import (
@@ -47,12 +46,10 @@ from sigmasplat.api import (
 
 MAGIC = b"NGSP"
 GZIP = b"\x1f\x8b\x08"
-VERSIONS = (2, 3, 4)
+VERSIONS = (2, 3)
 HEADER = struct.Struct("<4sIIBBBB")
-HEADER_OF_4 = struct.Struct("<4sIIBBBBI12x")
-STREAM = struct.Struct("<QQ")
 MAX_RATIO = 1032
-"""Maximum compression ratio of Deflate. Zstandard has none; nianticlabs/spz refuses more than 1024 in version 4."""
+"""Maximum compression ratio of Deflate."""
 MAX_EXTENSION_BYTES = 1 << 20
 """Maximum number of bytes read after the splats, where a file may have extensions."""
 
@@ -76,7 +73,7 @@ class SpzHeader:
         if self.version not in VERSIONS or self.degree > DEGREES:
             raise SourceError(
                 f"{path} is SPZ version {self.version} with harmonics of degree {self.degree}; "
-                "save it as version 2 to 4 with degree 0 to 3, or as PLY"
+                "save it as version 3 with degree 0 to 3, or as PLY"
             )
         check_count(self.size, packed_size, path)
         needed = self.size * sum(self.widths)
@@ -85,11 +82,11 @@ class SpzHeader:
 
 
 def unpack(file: BinaryIO, path: Path) -> tuple[SpzHeader, list[bytes]]:
-    """Read the header and the six streams. Raises SourceError if the file is damaged, truncated, or not SPZ."""
+    """Read the header and the six streams. Raises SourceError if the file is damaged, truncated, or not SPZ 2 or 3."""
     start = file.read(len(MAGIC))
     file.seek(0)
     if start == MAGIC:
-        return _unpack_zstandard(file, path)
+        raise SourceError(f"{path} is SPZ of version 4, which is not read; save it as version 3, or as PLY")
     try:
         return _unpack_gzip(file, path)
     except (EOFError, gzip.BadGzipFile, zlib.error) as problem:
@@ -115,37 +112,6 @@ def _unpack_gzip(file: BinaryIO, path: Path) -> tuple[SpzHeader, list[bytes]]:
         streams.append(body[: header.size * width])
         body = body[header.size * width :]
     return header, streams
-
-
-def _unpack_zstandard(file: BinaryIO, path: Path) -> tuple[SpzHeader, list[bytes]]:
-    data = file.read(HEADER_OF_4.size)
-    if len(data) < HEADER_OF_4.size:
-        raise SourceError(f"{path} is truncated: its header of {HEADER_OF_4.size} bytes is incomplete")
-    _, version, size, degree, bits, _flags, given, table_at = HEADER_OF_4.unpack(data)
-    header = SpzHeader(version, size, degree, bits)
-    header.check(path, path.stat().st_size)
-    sizes = [size * width for width in header.widths]
-    stored = [plain for plain in sizes if plain]
-    file.seek(table_at)
-    table = file.read(STREAM.size * given)
-    entries = list(STREAM.iter_unpack(table)) if len(table) == STREAM.size * given else []
-    if table_at < HEADER_OF_4.size or [plain for _, plain in entries if plain] != stored:
-        raise SourceError(f"{path} is damaged or truncated: its table of streams does not match {size} splats")
-    found = iter([_decompress(file, small, plain, path) for small, plain in entries if plain])
-    return header, [next(found) if plain else b"" for plain in sizes]
-
-
-def _decompress(file: BinaryIO, packed_size: int, size: int, path: Path) -> bytes:
-    """Read one stream of version 4. Raises SourceError unless it has exactly `size` bytes."""
-    packed = file.read(min(packed_size, path.stat().st_size))
-    try:
-        if zstandard.frame_content_size(packed) in (-1, size):
-            stream = zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)
-            if len(packed) == packed_size and len(stream) == size:
-                return stream
-    except zstandard.ZstdError as problem:
-        raise SourceError(f"{path} is damaged or truncated: {problem}; copy or download it again") from problem
-    raise SourceError(f"{path} is damaged or truncated: a stream does not have {size} bytes; copy or download it again")
 
 
 WRITTEN_VERSION = 3
@@ -177,7 +143,7 @@ def write_field(path: Path, field: GaussianField) -> None:
 
 
 def read_field(path: Path) -> GaussianField:
-    """Read an SPZ file of version 2, 3 or 4; σ² becomes exp(−7). Extensions are skipped.
+    """Read an SPZ file of version 2 or 3; σ² becomes exp(−7). Extensions are skipped.
 
     Raises SourceError if it is missing, damaged, truncated, of an unsupported version or degree, or not SPZ.
     """
