@@ -22,6 +22,7 @@ import program
 import record
 import torch
 import tyro
+from finished_run import aligned_poses
 from tables import Section
 
 from sigmasplat.commands.options import Settings
@@ -30,7 +31,7 @@ from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.frame import Frame
-from sigmasplat.plugins.evaluation.metrics.trajectory import aligned_poses, associate
+from sigmasplat.plugins.evaluation.metrics.trajectory import associate
 from sigmasplat.plugins.evaluation.view_scoring import working_frame
 from sigmasplat.plugins.sources.synthetic import open_synthetic
 from sigmasplat.render import render

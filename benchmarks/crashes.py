@@ -242,7 +242,6 @@ def name_only(path: Path) -> str:
 TIMELESS: dict[str, Callable[[Path], Any]] = {
     "log.jsonl": timeless_log, "run.json": timeless_json, "metrics.json": timeless_json, "profile.json": name_only,
     "report.html": name_only,
-    **{f"seconds-{style}.png": name_only for style in ("dark", "light", "narrow-dark", "narrow-light")},
 }  # fmt: skip
 
 

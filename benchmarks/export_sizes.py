@@ -45,14 +45,10 @@ GOAL_MB, GOAL_SHARE = 3.0, 0.99
 VARIANTS: tuple[tuple[str, str, Mapping[str, Any]], ...] = (
     ("PLY", ".ply", {}),
     ("PLY, --plain", ".ply", {"plain": True}),
-    ("compressed PLY", ".compressed.ply", {}),
     (".splat", ".splat", {}),
-    ("SPZ 2", ".spz", {"spz_version": 2}),
-    ("SPZ 3", ".spz", {"spz_version": 3}),
-    ("SPZ 4", ".spz", {"spz_version": 4}),
+    ("SPZ", ".spz", {}),
     ("SOG", ".sog", {}),
     ("glTF", ".glb", {}),
-    ("OpenUSD", ".usdc", {}),
 )
 """Names of rows, endings and options of the export."""
 SHARES = (0.75, 0.5)

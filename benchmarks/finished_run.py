@@ -129,3 +129,17 @@ def _path_scores(run: FinishedRun, source: Source) -> dict[str, Any]:
         at = np.flatnonzero(valid)
         found["poses"] = score_path_covariance(run.errors, run.path.at(at), at, run.keyframes, truth)
     return found
+
+
+def aligned_poses(T_truth_camera: Matrix, T_estimate_camera: Matrix) -> Matrix:
+    """Return T_estimate_truth [4, 4] from poses [K, 4, 4] of the same frames: the mean rotation, and the mean shift.
+
+    The alignment of the ATE uses positions only. On a short or straight path they do not fix the rotation, which would
+    move views and surfaces by more than their errors.
+    """
+    rotations = T_estimate_camera[:, :3, :3] @ T_truth_camera[:, :3, :3].swapaxes(1, 2)
+    u, _, vt = np.linalg.svd(rotations.sum(0))
+    found = np.eye(4)
+    found[:3, :3] = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    found[:3, 3] = (T_estimate_camera[:, :3, 3] - T_truth_camera[:, :3, 3] @ found[:3, :3].T).mean(0)
+    return found

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from finished_run import FinishedRun
+from finished_run import FinishedRun, aligned_poses
 
 from sigmasplat.config import Config
 from sigmasplat.data import se3
@@ -15,7 +15,7 @@ from sigmasplat.data.tsdf import Tsdf, extract_surface
 from sigmasplat.final.fusion import TRUNCATION_VOXELS, VOXEL_M, count_keyframes, fuse, surface_views
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.evaluation.metrics.reconstruction import BEHIND_M, Mask, distances, visible_points
-from sigmasplat.plugins.evaluation.metrics.trajectory import aligned_poses, associate
+from sigmasplat.plugins.evaluation.metrics.trajectory import associate
 from sigmasplat.plugins.evaluation.view_scoring import working_frame
 from sigmasplat.render import FieldRenderer
 from sigmasplat.types import Matrix, Progress, no_progress

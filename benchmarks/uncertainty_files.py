@@ -15,11 +15,11 @@ from uncertainty_scores import Run, score_runs, sparsification_charts
 import sigmasplat
 from sigmasplat.errors import RunError
 from sigmasplat.files import machine
-from sigmasplat.files.atomic import make_folder, replacing
+from sigmasplat.files.atomic import make_folder, write_text
 from sigmasplat.files.json_files import to_json, write_json
 from sigmasplat.files.machine import INSTALLED, code_digest
 from sigmasplat.files.tensors import open_tensors, write_tensors
-from sigmasplat.plugins.outputs.drawing.plot import LIGHT, SIZE, draw_charts
+from sigmasplat.plugins.outputs.drawing.plot import svg
 
 MEASURED_BY = (
     "finished_run", "splat_statistics", "surface_errors", "surface_predictors", "uncertainty_samples", "unseen_views",
@@ -27,8 +27,6 @@ MEASURED_BY = (
 )  # fmt: skip
 """The modules of this folder that decide the samples of a run."""
 SCORES, SAMPLES = "uncertainty.json", "samples"
-CHART_WIDTH = 600
-"""Width of one chart in a picture, pixels."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,9 +101,8 @@ class StudyFolder:
                 if not len(arrays["squared_error"]):
                     continue
                 name = f"{_plain(job)}-{kind.quantity}-{kind.map}-{kind.views}".replace(" ", "-")
-                with replacing(self.path / f"{name}.png") as temporary:
-                    charts = sparsification_charts(kind, arrays)
-                    draw_charts(charts, LIGHT, (CHART_WIDTH * len(charts), SIZE[1])).save(temporary, "PNG")
+                for number, chart in enumerate(sparsification_charts(kind, arrays), 1):
+                    write_text(self.path / f"{name}-{number}.svg", svg(chart))
         return runs
 
     def _samples(self, job: Job) -> Path:

@@ -12,12 +12,12 @@ from view_predictors import PREDICTORS, Predictor
 
 from sigmasplat.plugins.evaluation.metrics.uncertainty import (
     EPSILON,
-    best_scale,
+    ause,
     calibration_scores,
     gaussian_nll,
     over_channels,
-    ranking_scores,
     sparsification,
+    spearman,
     z_scores,
 )
 from sigmasplat.plugins.evaluation.metrics.views import COVERED_ALPHA
@@ -168,6 +168,17 @@ def _scores_of(
         "mean_variance": float(variance.mean()) if len(variance) else float("nan"),
         "mean_squared_error": float(error2.mean()) if len(error2) else float("nan"),
     }
+
+
+def best_scale(variance: NDArray[np.floating], squared_error: NDArray[np.floating], epsilon: float = EPSILON) -> float:
+    """Return the factor T with which T (V+ε) has the highest Gaussian likelihood, the temperature of a calibration."""
+    return z_scores(variance, squared_error, epsilon)["z_rms"] ** 2
+
+
+def ranking_scores(variance: NDArray[np.floating], squared_error: NDArray[np.floating]) -> dict[str, float]:
+    """Return the scores that only depend on the order of V: ause, spearman, of errors averaged over their channels."""
+    mean = over_channels(variance, squared_error)
+    return {"ause": ause(variance, mean), "spearman": spearman(variance, mean)}
 
 
 def sparsification_charts(kind: Kind, arrays: Arrays, predictors: Sequence[AnyPredictor] = EVERY) -> list[Chart]:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from finished_run import FinishedRun
+from finished_run import FinishedRun, aligned_poses
 
 from sigmasplat.config import Config
 from sigmasplat.data.camera import NEUTRAL
@@ -11,7 +11,7 @@ from sigmasplat.data.frame import Frame
 from sigmasplat.data.images import resized_depth
 from sigmasplat.data.trajectory import evenly_spread
 from sigmasplat.input.source import Source
-from sigmasplat.plugins.evaluation.metrics.trajectory import aligned_poses, associate
+from sigmasplat.plugins.evaluation.metrics.trajectory import associate
 from sigmasplat.plugins.evaluation.view_scoring import working_frame
 from sigmasplat.types import Matrix
 

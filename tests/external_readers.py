@@ -1,4 +1,4 @@
-"""Other programs that read maps: programs of Node from the folder SIGMASPLAT_READERS (`make readers`), and usd-core."""
+"""Other programs that read maps: programs of Node from the folder SIGMASPLAT_READERS (`make readers`)."""
 
 import csv
 import json

@@ -19,7 +19,7 @@ from sigmasplat.commands.input_options import DEFAULT_INPUT_OPTIONS
 from sigmasplat.commands.options import configured
 from sigmasplat.data.field import GaussianField
 from sigmasplat.plugins.batch.job import Job
-from sigmasplat.plugins.outputs.splats import compressed_ply, gltf, sog, splat, spz
+from sigmasplat.plugins.outputs.splats import gltf, sog, splat, spz
 from sigmasplat.plugins.presets.table_files import TABLES
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.run.resume import StateFile
@@ -169,18 +169,14 @@ def _maps(folder: Path) -> Iterator[Sample]:
     field = GaussianField(torch.randn(6, 17, generator=torch.Generator().manual_seed(0)))
     field.get_or_create("harmonics").params[:] = 0.25
     writers: dict[str, Callable[..., None]] = {
-        ".ply": ply.write_field, ".compressed.ply": compressed_ply.write_field, ".splat": splat.write_field,
-        ".spz": spz.write_field, ".sog": sog.write_field, ".glb": gltf.write_field, ".gltf": gltf.write_field,
+        ".ply": ply.write_field, ".splat": splat.write_field,
+        ".spz": spz.write_field, ".sog": sog.write_field, ".glb": gltf.write_field,
     }  # fmt: skip
     for ending, write in writers.items():
         place = folder / f"map{ending}"
         place.mkdir()
         write(place / f"map{ending}", field)
         yield _sample(f"map{ending}", place, place / f"map{ending}", EXPORTS)
-    place = folder / "map4.spz"
-    place.mkdir()
-    spz.write_field(place / "map.spz", field, version=4)
-    yield _sample("map4.spz", place, place / "map.spz", EXPORTS)
 
 
 def _runs(folder: Path) -> Iterator[Sample]:

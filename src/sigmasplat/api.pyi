@@ -64,7 +64,6 @@ from sigmasplat.data.trajectory import (
 from sigmasplat.env import (
     import_optional as import_optional,
     install_extra as install_extra,
-    install_package as install_package,
     opencv as opencv,
 )
 from sigmasplat.errors import (
@@ -271,7 +270,6 @@ from sigmasplat.run_folder.splat_values import (
     SH_C0 as SH_C0,
     Doubles as Doubles,
     SplatValues as SplatValues,
-    by_channel as by_channel,
     check_count as check_count,
     from_smallest_three as from_smallest_three,
     log_scales_of as log_scales_of,

@@ -40,7 +40,7 @@ def test_film_plan_and_points_are_written_with_their_progress(here: Path, capsys
     film = ("--out", "a.gif", "--size", "64", "--fps", "4", "--seconds", "0.5", "--path", "orbit")
     assert exit_code("export", "kitchen", *film) == 0
     with Image.open("a.gif") as drawn:
-        assert drawn.size == (192, 88) and drawn.n_frames == 2
+        assert drawn.size == (192, 48) and drawn.n_frames == 2
     assert exit_code("export", "kitchen", "--format", "plan", "--cell-m", "0.1") == 0
     assert json.loads((here / "kitchen.plan.json").read_text())["resolution_m"] == 0.1
     for name, axes in (("a", ()), ("own", ("--axes", "camera"))):

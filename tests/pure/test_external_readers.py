@@ -11,7 +11,7 @@ from external_readers import convert, package, read_by_splat_transform, script
 from sigmasplat.data.field import GaussianField, Rows
 from sigmasplat.data.harmonics import count
 from sigmasplat.data.map_uncertainty import SplatStd
-from sigmasplat.plugins.outputs.splats import gltf, sog, usd
+from sigmasplat.plugins.outputs.splats import gltf, sog
 from sigmasplat.plugins.outputs.splats.any_format import read_any
 from sigmasplat.run_folder import splat_ply as ply
 from sigmasplat.run_folder.splat_values import SplatValues
@@ -78,12 +78,9 @@ def assert_same(
 
 TOLERANCES: dict[str, dict[str, float]] = {
     ".ply": {},
-    ".compressed.ply": {"means": 8e-3, "log_scales": 5e-3, "color": 4e-3, "rotation": 1e-5, "harmonics": 0.02},
     ".splat": {"log_scales": 1e-3, "color": 4e-3, "rotation": 1e-3},
     ".sog": {"means": 1e-3, "log_scales": 0.02, "color": 4e-3, "rotation": 1e-4, "harmonics": 0.05},
-    ".2.spz": {"means": 2e-4, "log_scales": 0.04, "color": 4e-3, "rotation": 2e-3, "harmonics": 5e-3},
     ".3.spz": {"means": 2e-4, "log_scales": 0.04, "color": 4e-3, "rotation": 1e-5, "harmonics": 5e-3},
-    ".4.spz": {"means": 2e-4, "log_scales": 0.04, "color": 4e-3, "rotation": 1e-5, "harmonics": 5e-3},
 }
 """About half a step of each format's quantisation, in the coarsest part of its range."""
 
@@ -96,12 +93,10 @@ def exported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "map.ply"
 
 
-@pytest.mark.parametrize("ending", TOLERANCES)
+@pytest.mark.parametrize("ending", [".ply", ".splat", ".sog", ".3.spz"])
 def test_splat_transform_reads_what_we_export_the_same_way_up(exported: Path, ending: str) -> None:
     package("@playcanvas/splat-transform")
-    version = ending[1] if ending[1].isdigit() else None
-    options = ["--spz-version", version] if version else []
-    assert exit_code("export", "map.ply", "--out", f"out{ending}", *options) == 0
+    assert exit_code("export", "map.ply", "--out", f"out{ending}") == 0
     found = read_by_splat_transform(exported.with_name(f"out{ending}"), exported.parent)
     assert_same(found, SplatValues.of(splats(degree=0 if ending == ".splat" else 3)), **TOLERANCES[ending])
 
@@ -118,7 +113,7 @@ def test_axes_of_a_ply_are_those_of_its_coordinates(exported: Path, axes: str) -
     assert_same(found, SplatValues.of(splats().moved(torch.from_numpy(T))))
 
 
-@pytest.mark.parametrize("ending", [".3.spz", ".4.spz", ".compressed.ply", ".sog", ".ply"])
+@pytest.mark.parametrize("ending", [".3.spz", ".sog", ".ply"])
 def test_we_read_what_splat_transform_writes(exported: Path, ending: str) -> None:
     options = ["--spz-version", ending[1]] if ending[1].isdigit() else []
     written = convert(exported, exported.with_name(f"theirs{ending}"), *options)
@@ -134,12 +129,11 @@ def test_we_read_the_glb_of_splat_transform(exported: Path) -> None:
     assert_same(SplatValues.of(found.moved(half_turn)), SplatValues.of(splats()))
 
 
-@pytest.mark.parametrize("ending", [".glb", ".gltf"])
 @pytest.mark.parametrize("degree", [0, 1, 3])
-def test_the_validator_of_khronos_finds_no_other_fault(tmp_path: Path, ending: str, degree: int) -> None:
+def test_the_validator_of_khronos_finds_no_other_fault(tmp_path: Path, degree: int) -> None:
     package("gltf-validator")
-    gltf.write_field(tmp_path / f"a{ending}", splats(degree=degree), std=std())
-    found = script(VALIDATE, tmp_path / f"a{ending}")
+    gltf.write_field(tmp_path / "a.glb", splats(degree=degree), std=std())
+    found = script(VALIDATE, tmp_path / "a.glb")
     known = "/attributes/KHR_gaussian_splatting:"  # the published validator does not know attributes of extensions
     problems = [each for each in found["issues"]["messages"] if each["severity"] < 2 and known not in each["pointer"]]
     assert problems == [] and found["info"]["totalVertexCount"] == 60
@@ -164,33 +158,6 @@ def test_gltf_transform_reads_splats_and_sigma(tmp_path: Path) -> None:
     np.testing.assert_allclose(found["_DEPTH_STD_M"][:, 0], std().depth_std_m, rtol=1e-6)
     np.testing.assert_allclose(np.linalg.norm(found[f"{name}:ROTATION"], axis=1), 1.0, atol=1e-6)
     assert sum(key.startswith(f"{name}:SH_DEGREE_3") for key in found) == 7
-
-
-@pytest.mark.parametrize("ending", [".usda", ".usdc", ".usd"])
-def test_openusd_reads_splats_by_its_schema(tmp_path: Path, ending: str) -> None:
-    Usd = pytest.importorskip("pxr.Usd", reason="usd-core is not installed (pip install 'sigmasplat[usd]')")
-    from pxr import UsdGeom, UsdVol
-
-    field = splats()
-    usd.write_field(tmp_path / f"a{ending}", field, std=std())
-    stage = Usd.Stage.Open(str(tmp_path / f"a{ending}"))
-    prim = UsdVol.ParticleField3DGaussianSplat(stage.GetDefaultPrim())
-    assert prim and UsdGeom.GetStageUpAxis(stage) == "Y" and UsdGeom.GetStageMetersPerUnit(stage) == 1.0
-    means = np.array(prim.GetPositionsAttr().Get())
-    np.testing.assert_allclose(means, field.means.numpy() * [1.0, -1.0, -1.0], atol=1e-6)
-    np.testing.assert_allclose(np.array(prim.GetScalesAttr().Get()), field.scales, rtol=1e-5)
-    np.testing.assert_allclose(np.array(prim.GetOpacitiesAttr().Get()), field.opacities, atol=1e-6)
-    quats = np.array([[q.GetReal(), *q.GetImaginary()] for q in prim.GetOrientationsAttr().Get()])
-    turned = SplatValues.of(field).turned_about_x()
-    np.testing.assert_allclose(quats, turned.quats, atol=1e-6)
-    coefficients = np.array(prim.GetRadianceSphericalHarmonicsCoefficientsAttr().Get()).reshape(60, 16, 3)
-    np.testing.assert_allclose(coefficients[:, 1:].reshape(60, 45), turned.harmonics, atol=1e-6)
-    assert prim.GetRadianceSphericalHarmonicsDegreeAttr().Get() == 3
-    low, high = np.array(prim.GetExtentAttr().Get())
-    assert (means >= low).all() and (means <= high).all()
-    sigma = UsdGeom.PrimvarsAPI(prim).GetPrimvar("sigma")
-    assert sigma.GetInterpolation() == "vertex"
-    np.testing.assert_allclose(np.array(sigma.Get()), field.variances.sqrt(), rtol=1e-5)
 
 
 def test_sog_has_the_images_that_its_readers_expect(tmp_path: Path) -> None:

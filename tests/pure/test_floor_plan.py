@@ -16,21 +16,19 @@ from sigmasplat.data.camera import Camera
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import ConfigError, SigmaSplatError
 from sigmasplat.files.json_files import write_json
-from sigmasplat.plugins.outputs.drawing.plot import DARK, LIGHT
-from sigmasplat.plugins.outputs.floorplan.floor_plan import (
-    CELL_M,
+from sigmasplat.plugins.outputs.drawing.view_panels import BACKGROUND, GAP, HEAD, PANEL_WIDTH
+from sigmasplat.plugins.outputs.floorplan.floor_plan import CELL_M, SIGNS, FloorPlan, floor_plan
+from sigmasplat.plugins.outputs.floorplan.ground import floor_frame, sample_surface, sample_surfaces
+from sigmasplat.plugins.outputs.floorplan.picture import KIND_COLOURS, draw_floor_plan, plan_panels
+from sigmasplat.plugins.outputs.floorplan.rescan import (
     FLOOR_UNOBSERVED,
     FREE,
     OBJECT,
-    SIGNS,
     UNOBSERVED,
     WALL,
-    FloorPlan,
-    floor_plan,
+    RescanRegion,
+    unsure_rule,
 )
-from sigmasplat.plugins.outputs.floorplan.ground import floor_frame, sample_surface, sample_surfaces
-from sigmasplat.plugins.outputs.floorplan.picture import draw_floor_plan, draw_kinds
-from sigmasplat.plugins.outputs.floorplan.rescan import RescanRegion, unsure_rule
 from sigmasplat.uncertainty.predictive import Predicted
 
 WORLD = se3.exp(np.array([3.0, -2.0, 1.0, 1.9, 0.4, -0.3]))
@@ -47,11 +45,10 @@ def patch(low: tuple[float, float], high: tuple[float, float]):
 
 
 def plan_of(T_world_room: np.ndarray = UPRIGHT, **known) -> FloorPlan:
-    sigma, predictor = known.pop("sigma", None), known.pop("predictor", None)
+    predictor = known.pop("predictor", None)
     return floor_plan(
-        splats(T_world_room, sigma), walk(T_world_room), CAMERA, renderer=seer(T_world_room, **known),
-        predictor=predictor,
-    )  # fmt: skip
+        splats(T_world_room), walk(T_world_room), CAMERA, renderer=seer(T_world_room, **known), predictor=predictor
+    )
 
 
 def seer_of_errors(
@@ -137,34 +134,7 @@ def test_walls_and_objects_are_at_their_true_places() -> None:
 
 @pytest.mark.parametrize("T_world_room", [UPRIGHT, WORLD])
 def test_uncertain_and_thin_regions_are_found_within_a_cell(T_world_room: np.ndarray) -> None:
-    blurred, thin, patchy = (
-        patch((-1.2, -1.2), (-0.8, -0.8)),
-        patch((0.6, -1.3), (1.1, -0.8)),
-        patch((-1.4, 1), (-1, 1.4)),
-    )
-    plan = plan_of(
-        T_world_room,
-        sigma_m=lambda at: np.where(blurred(at), 0.12, 0.01),
-        alpha=lambda at: np.where(thin(at), 0.7, 1.0),
-        sigma=lambda at: np.where(patchy(at), 0.1, 0.01),
-    )
-    for why, x, y, area_m2, words in (
-        ("unsure", -1.0, -1.0, 0.16, "depth ± 12"),
-        ("thin", 0.85, -1.05, 0.25, "surface 30 % transparent"),
-        ("unsure", -1.2, 1.2, 0.16, "colour uncertainty 10.0 times"),
-    ):
-        here = [
-            r for r in plan.regions if r.why == why and np.abs(np.subtract(r.center_m, (x, y - 0.3))).max() < CELL_M
-        ]
-        assert len(here) == 1, (why, plan.regions)
-        assert here[0].area_m2 == pytest.approx(area_m2, rel=0.3) and here[0].found.startswith(words)
-    assert [r.area_m2 for r in plan.regions] == sorted([r.area_m2 for r in plan.regions], reverse=True)
-
-
-@pytest.mark.parametrize("T_world_room", [UPRIGHT, WORLD])
-def test_predicted_errors_give_regions_in_metres_and_shares_of_pixels(T_world_room: np.ndarray) -> None:
-    """Predicted errors replace the spread of depth and σ, which are large elsewhere here."""
-    deep, wrong, spread = (
+    deep, thin, wrong = (
         patch((-1.2, -1.2), (-0.8, -0.8)),
         patch((0.6, -1.3), (1.1, -0.8)),
         patch((-1.4, 1), (-1, 1.4)),
@@ -172,33 +142,39 @@ def test_predicted_errors_give_regions_in_metres_and_shares_of_pixels(T_world_ro
     errors = seer_of_errors(
         T_world_room, lambda at: np.where(deep(at), 0.08, 0.02), lambda at: np.where(wrong(at), 0.2, 0.02)
     )
-    plan = plan_of(
-        T_world_room,
-        predictor=errors,
-        sigma_m=lambda at: np.where(spread(at), 0.2, 0.01),
-        sigma=lambda at: np.where(spread(at), 0.1, 0.01),
-    )
-    found = {region.found.split(",")[0]: region for region in plan.regions if region.why == "unsure"}
-    assert set(found) == {"depth uncertain by 8 cm", "62 % of the pixels expected wrong by more than 0.1"}
-    for words, place in (("depth", (-1.0, -1.3)), ("62", (0.85, -1.35))):
-        (region,) = [region for name, region in found.items() if name.startswith(words)]
-        np.testing.assert_allclose(region.center_m, place, atol=CELL_M)
+    plan = plan_of(T_world_room, predictor=errors, alpha=lambda at: np.where(thin(at), 0.7, 1.0))
+    for why, x, y, area_m2, words in (
+        ("unsure", -1.0, -1.0, 0.16, "depth uncertain by 8 cm"),
+        ("thin", 0.85, -1.05, 0.25, "surface 30 % transparent"),
+        ("unsure", -1.2, 1.2, 0.16, "62 % of the pixels expected wrong by more than 0.1"),
+    ):
+        here = [
+            r for r in plan.regions if r.why == why and np.abs(np.subtract(r.center_m, (x, y - 0.3))).max() < CELL_M
+        ]
+        assert len(here) == 1, (why, plan.regions)
+        assert here[0].area_m2 == pytest.approx(area_m2, rel=0.3) and here[0].found.startswith(words)
+    assert sum(region.why == "unsure" for region in plan.regions) == 2
+    assert [r.area_m2 for r in plan.regions] == sorted([r.area_m2 for r in plan.regions], reverse=True)
     assert plan.predicted_errors and plan.record()["predicted_errors"]
-    assert plan.wrong_share is not None and np.nanmax(plan.wrong_share) == pytest.approx(0.617, abs=0.01)
+    assert np.nanmax(plan.wrong_share) == pytest.approx(0.617, abs=0.01)
+    assert [panel.ends[1][-2:] for panel in plan_panels(plan)] == ["", " %", "cm"]
 
 
-def test_a_plan_without_predicted_errors_compares_the_map_with_itself() -> None:
+def test_a_plan_without_predicted_errors_has_no_unsure_regions() -> None:
     plan = plain_plan()
-    assert not plan.predicted_errors and plan.wrong_share is None and not plan.record()["predicted_errors"]
-    assert "no predicted errors" in unsure_rule(False) and "median" not in unsure_rule(True)
+    assert not plan.predicted_errors and not plan.record()["predicted_errors"]
+    assert np.isnan(plan.wrong_share).all() and np.isnan(plan.depth_sigma_m).all() and len(plan_panels(plan)) == 1
+    assert "no predicted errors" in unsure_rule(False) and "5 cm" in unsure_rule(True)
 
 
 def test_the_list_of_regions_fits_the_picture() -> None:
     """The longest line ends before the margin on the right."""
     words = "depth uncertain by 8 cm, 62 % of the pixels expected wrong by more than 0.1"
     plan = replace(plain_plan(), regions=(RescanRegion((-10.0, -10.0), 0.1, 10.0, "unsure", words),))
-    picture, panels = (np.asarray(draw_floor_plan(plan, list_regions=listed)) for listed in (True, False))
-    assert (picture[panels.shape[0] :, -20:] == LIGHT.background).all()
+    picture = np.asarray(draw_floor_plan(plan))
+    without = np.asarray(draw_floor_plan(replace(plan, regions=())))
+    assert picture.shape[0] > without.shape[0] and picture.shape[1] >= without.shape[1]
+    assert (picture[-200:, -15:] == BACKGROUND).all()
 
 
 def test_a_certain_map_has_only_unobserved_regions_such_as_behind_the_pillar() -> None:
@@ -218,13 +194,15 @@ def test_another_world_frame_changes_the_plan_by_rounding_only() -> None:
     np.testing.assert_allclose(there.T_floor_world @ WORLD, here.T_floor_world, atol=2e-3)
     np.testing.assert_allclose(there.origin_m, here.origin_m, atol=1e-9)
     assert there.kind.shape == here.kind.shape and (there.kind == here.kind).mean() > 0.99
-    both = np.isfinite(here.depth_sigma_m) & np.isfinite(there.depth_sigma_m)
-    np.testing.assert_allclose(there.depth_sigma_m[both], here.depth_sigma_m[both], atol=1e-4)
+    both = np.isfinite(here.alpha) & np.isfinite(there.alpha)
+    assert both.mean() > 0.4
+    np.testing.assert_allclose(there.alpha[both], here.alpha[both], atol=1e-4)
 
 
 def test_the_record_holds_frame_cells_and_regions(tmp_path: Path) -> None:
-    blurred = patch((-1.2, -1.2), (-0.8, -0.8))
-    plan = plan_of(WORLD, sigma_m=lambda at: np.where(blurred(at), 0.12, 0.01))
+    deep = patch((-1.2, -1.2), (-0.8, -0.8))
+    errors = seer_of_errors(WORLD, lambda at: np.where(deep(at), 0.12, 0.01), lambda at: np.full(at.shape[:-1], 0.02))
+    plan = plan_of(WORLD, predictor=errors)
     write_json(tmp_path / "plan.json", plan.record())
     record = json.loads((tmp_path / "plan.json").read_text())
     assert record["resolution_m"] == CELL_M and np.shape(record["T_floor_world"]) == (4, 4)
@@ -236,18 +214,17 @@ def test_the_record_holds_frame_cells_and_regions(tmp_path: Path) -> None:
 
 def test_the_picture_shows_the_cells_with_y_up() -> None:
     plan = plain_plan()
-    for theme in (LIGHT, DARK):
-        picture = draw_floor_plan(plan, theme)
-        assert picture.getpixel((2, 2)) == theme.background and picture.mode == "RGB"
-        cells = draw_kinds(plan, theme)
-        assert tuple(cells[plan.kind == WALL][0]) == theme.text
-    size = round(440 / max(plan.kind.shape))
-    row = plan.kind.shape[0] - 1 - int((1.2 - 0.3 - plan.origin_m[1]) / CELL_M)  # y = 1.2 of the room, from above
-    column = int((-1.0 - plan.origin_m[0]) / CELL_M)
-    drawn = np.asarray(draw_floor_plan(plan).convert("RGB"))[
-        40 + row * size + size // 2, 24 + column * size + size // 2
-    ]
-    assert tuple(drawn) == LIGHT.background and kind_at(plan, -1.0, 1.2) == FREE
+    picture = draw_floor_plan(plan)
+    assert picture.getpixel((2, 2)) == BACKGROUND and picture.mode == "RGB"
+    panel = plan_panels(plan)[0].pixels
+    assert panel.shape[:2] == (round(plan.kind.shape[0] * panel.shape[1] / plan.kind.shape[1]), 2 * PANEL_WIDTH)
+    for x, y, kind in ((-1.0, 1.2, FREE), (HIGH[0] + 0.15, 0.0, UNOBSERVED), (-1.7, 0.0, OBJECT)):
+        assert kind_at(plan, x, y) == kind
+        at = (np.array([x, y - 0.3]) - plan.origin_m) / plan.cell_m * PANEL_WIDTH / plan.kind.shape[1]
+        column, row = int(at[0]), int(PANEL_WIDTH * plan.kind.shape[0] / plan.kind.shape[1] - at[1])
+        assert tuple(panel[2 * row, 2 * column]) == tuple(KIND_COLOURS[kind])
+        drawn = np.array(picture.getpixel((GAP + column, HEAD + row)))
+        assert np.abs(drawn - KIND_COLOURS[kind]).max() <= 2
 
 
 def test_bad_cells_and_maps_without_surfaces_are_refused() -> None:

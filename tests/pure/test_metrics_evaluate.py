@@ -24,7 +24,7 @@ from sigmasplat.errors import RunError, SourceError
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.evaluation.evaluate import evaluate
 from sigmasplat.plugins.evaluation.metrics.lpips import Lpips
-from sigmasplat.plugins.evaluation.report.view_strips import data_uri, file_data_uri
+from sigmasplat.plugins.evaluation.report.view_strips import data_uri
 from sigmasplat.plugins.outputs.drawing.view_panels import FOOT, GAP, HEAD, PANEL_WIDTH
 from sigmasplat.plugins.presets.base import BASE
 from sigmasplat.run_folder.runs import RunFolder
@@ -199,7 +199,7 @@ def test_states_and_silent_failures_are_scored(run: RunFolder) -> None:
     wrong = [(1 - 0.9) ** 2, (1 - 0.75) ** 2, 0.3**2, 0.8**2, *[0.01] * 13]
     assert failures["brier"] == pytest.approx(sum(wrong) / 17)
     page = (run.path / "report.html").read_text()
-    assert "States of the frames" in page and (run.images / "states-light.png").is_file()
+    assert "States of the frames" in page and "State of each frame" in page
     assert "13–14" in page and "silent failures" in page
 
 
@@ -227,7 +227,8 @@ def test_everything_is_written(run: RunFolder) -> None:
     assert json.loads((run.path / "metrics.json").read_text())["held_out"] == metrics["held_out"]
     page = (run.path / "report.html").read_text()
     names = shown(run, page)
-    assert names == {p.name for p in run.images.iterdir()} and len(names) == 12
+    assert names == {p.name for p in run.images.iterdir()} and len(names) == 4
+    assert "Path from above" in page
     assert {"view-training-000000.png", "view-held-out-000019.png"} <= names
     assert metrics["predictive"] is None, "the run did not measure how sure its map is"
 
@@ -239,13 +240,11 @@ def test_a_page_holds_three_views_of_each_kind(run: RunFolder) -> None:
 
 
 def shown(run: RunFolder, page: str) -> set[str]:
-    """Return the names of the pictures in images/ that the page holds: charts whole, view strips panel by panel."""
+    """Return the names of the pictures in images/ that the page holds, panel by panel."""
     return {path.name for path in run.images.iterdir() if all(address in page for address in addresses(path))}
 
 
 def addresses(path: Path) -> list[str]:
-    if not path.name.startswith("view-"):
-        return [file_data_uri(path)]
     strip = Image.open(path)
     lefts = range(GAP, strip.width - GAP, PANEL_WIDTH + GAP)
     return [data_uri(strip.crop((left, HEAD, left + PANEL_WIDTH, strip.height - FOOT))) for left in lefts]
@@ -388,7 +387,7 @@ def test_submaps_are_on_the_page(cut_run: RunFolder) -> None:
     page = (cut_run.path / "report.html").read_text()
     named = shown(cut_run, page)
     assert named == {p.name for p in cut_run.images.iterdir()}
-    assert {"submaps-light.png", "submaps-dark.png", "view-held-out-submap-000001.png"} <= named
+    assert "Submaps from above" in page and "view-held-out-submap-000001.png" in named
     assert "held-out views, in their submaps" in page and "overlap &lt;0.2" in page
 
 

@@ -8,15 +8,14 @@ from sigmasplat.plugins.evaluation.metrics.uncertainty import (
     LEVELS,
     auce,
     ause,
-    best_scale,
     calibration_scores,
     coverage,
     gaussian_nll,
-    ranking_scores,
     reliability,
     score,
     sparsification,
     spearman,
+    z_scores,
 )
 
 
@@ -56,12 +55,12 @@ def test_a_slightly_negative_variance_gives_a_finite_nll() -> None:
 def test_reliability_is_calibrated_for_true_variances() -> None:
     v, e = noise()
     rows = reliability(v, e)
-    assert [row.pixels for row in rows] == [4000] * 10
-    predicted, empirical = (np.array([getattr(row, name) for row in rows]) for name in ("predicted", "empirical"))
+    assert [row["pixels"] for row in rows] == [4000] * 10
+    predicted, empirical = (np.array([row[name] for row in rows]) for name in ("predicted", "empirical"))
     assert (np.diff(predicted) > 0).all()
     np.testing.assert_allclose(empirical / predicted, 1.0, atol=0.12)
     np.testing.assert_allclose(predicted.mean(), v.mean())
-    assert sum(row.pixels for row in reliability(v[:7], e[:7])) == 7
+    assert sum(row["pixels"] for row in reliability(v[:7], e[:7])) == 7
 
 
 def test_sparsification_by_hand() -> None:
@@ -100,8 +99,7 @@ def test_intervals_of_a_color_contain_their_share_of_the_errors_of_single_channe
     assert scores["auce"] < 0.005 and scores["coverage_68"] == pytest.approx(0.6827, abs=0.01)
     assert auce(v, channels.mean(1), 0.0) > 0.1
     assert scores["nll"] == pytest.approx(gaussian_nll(v, channels.mean(1), 0.0))
-    assert best_scale(v, channels) == pytest.approx(best_scale(v, channels.mean(1)))
-    assert ranking_scores(v, channels) == ranking_scores(v, channels.mean(1))
+    assert z_scores(v, channels)["z_rms"] == pytest.approx(z_scores(v, channels.mean(1))["z_rms"])
 
 
 @pytest.mark.parametrize("factor", [2.0, 0.5])
@@ -117,17 +115,17 @@ def test_the_largest_auce_is_one_half() -> None:
     assert auce(1e9 * v, e) == pytest.approx(0.5) and auce(1e-9 * v, e + 1.0, 0.0) == pytest.approx(0.5)
 
 
-def test_the_best_scale_has_the_highest_likelihood() -> None:
+def test_the_mean_squared_z_score_is_the_scale_of_the_highest_likelihood() -> None:
     v, e = noise()
-    assert best_scale(3.0 * v, e, 0.0) == pytest.approx(1 / 3, rel=0.03)
-    best = best_scale(v, 5.0 * e)
+    assert z_scores(3.0 * v, e, 0.0)["z_rms"] ** 2 == pytest.approx(1 / 3, rel=0.03)
+    best = z_scores(v, 5.0 * e)["z_rms"] ** 2
     for factor in (0.8, 1.25):
         assert gaussian_nll(best * v, 5.0 * e) < gaussian_nll(factor * best * v, 5.0 * e)
-    assert best_scale(v, 5.0 * e) == pytest.approx(calibration_scores(v, 5.0 * e)["z_rms"] ** 2)
+    assert best == pytest.approx(calibration_scores(v, 5.0 * e)["z_rms"] ** 2)
 
 
 def test_scores_without_pixels_are_nan() -> None:
     values = score(np.empty(0), np.empty(0))
     assert values["pixels"] == 0 and np.isnan(values["spearman"]) and values["reliability"] == []
     assert all(np.isnan(value) for value in calibration_scores(np.empty(0), np.empty(0)).values())
-    assert np.isnan(best_scale(np.empty(0), np.empty(0)))
+    assert np.isnan(z_scores(np.empty(0), np.empty(0))["z_rms"])

@@ -3,6 +3,7 @@
 import re
 from html.parser import HTMLParser
 from itertools import pairwise
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -24,10 +25,20 @@ from sigmasplat.plugins.outputs.drawing.view_panels import (
     predicted_panels,
     view_panels,
 )
-from sigmasplat.plugins.outputs.floorplan.rescan import RescanMaps, RescanRegion, find_rescan_regions, unsure_rule
+from sigmasplat.plugins.outputs.floorplan.rescan import (
+    FLOOR_UNOBSERVED,
+    FREE,
+    UNOBSERVED,
+    RescanRegion,
+    find_rescan_regions,
+    unsure_rule,
+)
 from sigmasplat.run.figures import number, rate
 from sigmasplat.run_folder.frames import RunFrames
 
+PLOTS = {"trajectory": (charts.trajectory_charts(np.eye(3), None), "caption")}
+SUBMAPS = {"submaps": ([charts.submap_chart(np.eye(3), np.arange(3), [])], "a caption")}
+NAMESPACE = "http://www.w3.org/2000/svg"
 STRIPS = {"held-out views": [[PanelFigure("input", "images/a.png")]]}
 VOID = {"meta", "img", "source", "br", "!doctype"}
 
@@ -92,15 +103,13 @@ def test_the_font_has_every_character_of_the_panels() -> None:
 
 def regions_of_every_kind() -> list[RescanRegion]:
     """Return regions of maps with an uncertain patch, a thin one, and cells that were not observed."""
-    observed = np.zeros((40, 40), bool)
-    observed[2:-2, 2:-2] = True
-    observed[20:24, 20:24] = False
-    floor_unobserved = np.zeros_like(observed)
-    floor_unobserved[30:34, 4:8] = True
-    color, depth, alpha = np.full((3, 40, 40), [[[0.01]], [[0.01]], [[1.0]]])
-    color[5:10, 5:10], depth[5:10, 5:10], alpha[5:10, 20:25] = 0.1, 0.2, 0.5
-    maps = RescanMaps(~observed, floor_unobserved, observed & ~floor_unobserved, color, depth, alpha)
-    return find_rescan_regions(maps, 0.05, np.zeros(2))
+    kind = np.full((40, 40), UNOBSERVED, np.uint8)
+    kind[2:-2, 2:-2] = FREE
+    kind[20:24, 20:24] = UNOBSERVED
+    kind[30:34, 4:8] = FLOOR_UNOBSERVED
+    wrong, depth, alpha = np.full((3, 40, 40), [[[0.01]], [[0.01]], [[1.0]]])
+    wrong[5:10, 5:10], depth[5:10, 5:10], alpha[5:10, 20:25] = 0.9, 0.2, 0.5
+    return find_rescan_regions(kind, alpha, depth, wrong, 0.05, np.zeros(2))
 
 
 def test_a_strip_shows_the_five_panels_of_a_view() -> None:
@@ -140,14 +149,34 @@ def test_ticks_are_round_and_few() -> None:
         assert round(leading, 6) in (1, 2, 5)
 
 
+NUMBER = re.compile(r"-?[\d.]+")
+
+
+def drawn(chart: plot.Chart) -> list[tuple[str, np.ndarray]]:
+    """Return the colour and the points [N, 2] in pixels of the curves of a chart, as its SVG shows them."""
+    found = re.findall(r"<path d='([^']*)' stroke='var\(--c(\d)\)'", plot.svg(chart))
+    return [(colour, np.array(NUMBER.findall(d.replace("h0", "")), float).reshape(-1, 2)) for d, colour in found]
+
+
 def test_both_axes_of_a_path_have_one_scale() -> None:
-    """A path around a 2 m × 2 m square is also a square in pixels, in the colour of the estimate."""
+    """A path around a 2 m × 2 m square is also a square in pixels, in the colour of the estimate; forward is up."""
     corners = np.array([[0, 0, 0], [2, 0, 0], [2, 0, 2], [0, 0, 2], [0, 0, 0.0]])
-    laid_out = charts.trajectory_charts(corners, None)
-    image = np.asarray(plot.draw_charts(laid_out[:1], plot.LIGHT, (600, 400))).astype(int)
-    orange = np.abs(image - plot.LIGHT.curves[0]).sum(-1) < 60
-    rows, columns = np.nonzero(orange)
-    assert np.ptp(rows) == pytest.approx(np.ptp(columns), abs=3) and np.ptp(rows) > 150
+    ((colour, places),) = drawn(charts.trajectory_charts(corners, None)[0])
+    width, height = np.ptp(places, axis=0)
+    assert width == pytest.approx(height, abs=0.3) and width > 150 and colour == str(plot.ACCENT)
+    assert places[2, 1] < places[1, 1] and places[1, 0] > places[0, 0]
+
+
+def test_a_chart_is_a_whole_file_for_light_and_dark_pages() -> None:
+    page = plot.svg(
+        plot.Chart("a < b", "x & y", "", [plot.Curve("one", np.eye(2), 0), plot.Curve("two", np.eye(2), 1)])
+    )
+    root = ElementTree.fromstring(page)
+    texts = "".join(root.itertext())
+    assert all(words in texts for words in ("a < b", "x & y", "● one", "● two"))
+    assert "prefers-color-scheme: dark" in texts
+    for colours in (plot.LIGHT, plot.DARK):
+        assert all(f"--c{k}: rgb({r} {g} {b})" in texts for k, (r, g, b) in enumerate(colours))
 
 
 def test_height_points_up_and_the_truth_may_have_gaps() -> None:
@@ -157,28 +186,27 @@ def test_height_points_up_and_the_truth_may_have_gaps() -> None:
     laid_out = charts.trajectory_charts(estimate, truth, np.array([False, True, False]))
     assert [curve.name for curve in laid_out[1].curves] == ["truth", "estimate", "lost"]
     assert laid_out[1].curves[1].points[:, 1].tolist() == [0, 1.5, 3]
-    plot.draw_charts(laid_out, plot.DARK)
+    estimate_shown = drawn(laid_out[1])[1][1]
+    assert (np.diff(estimate_shown[:, 1]) < 0).all() and [len(places) for _, places in drawn(laid_out[1])] == [2, 3, 1]
 
 
 def test_a_static_camera_and_a_single_frame_can_be_drawn() -> None:
     for n in (1, 5):
-        plot.draw_charts(charts.trajectory_charts(np.zeros((n, 3)), None), plot.LIGHT)
-        plot.draw_charts([charts.seconds_chart(np.arange(n), {"total": np.zeros(n)})], plot.LIGHT)
+        seconds = charts.seconds_chart(np.arange(n), {"total": np.zeros(n)})
+        for chart in (*charts.trajectory_charts(np.zeros((n, 3)), None), seconds):
+            ((_, places),) = drawn(chart)
+            assert len(places) == n and np.isfinite(places).all()
 
 
 def test_vast_values_are_left_out_and_equal_ones_have_an_axis() -> None:
-    for values in ([0.0, 1.0, 1e308, -1e308], [1e20] * 3, [-1e90, 1e90], [np.nan] * 2):
+    for values, kept in (([0.0, 1.0, 1e308, -1e308], 2), ([1e20] * 3, 3), ([-1e90, 1e90], 2), ([np.nan] * 2, 0)):
         seconds = charts.seconds_chart(np.arange(len(values)), {"total": np.array(values)})
-        plot.draw_charts([seconds, *charts.trajectory_charts(np.array([values] * 3).T, None)], plot.LIGHT)
+        for chart in (seconds, *charts.trajectory_charts(np.array([values] * 3).T, None)):
+            ((_, places),) = drawn(chart)
+            assert len(places) == kept and "nan" not in plot.svg(chart)
 
 
-def colours_near(image: np.ndarray, colour: tuple[int, int, int]) -> np.ndarray:
-    """Return where a picture shows a colour, as (row, column) pairs."""
-    return np.argwhere(np.abs(image.astype(int) - colour).sum(-1) < 60)
-
-
-@pytest.mark.parametrize("theme", [plot.LIGHT, plot.DARK], ids=lambda theme: theme.name)
-def test_submaps_have_colours_and_loops_are_lines(theme: plot.Theme) -> None:
+def test_submaps_have_colours_and_loops_are_lines() -> None:
     """A path around a 4 m square with one submap per side. The accepted loop is a line through the middle."""
     side = np.linspace(0, 4, 11)[:-1]
     nought = np.zeros(10)
@@ -186,22 +214,15 @@ def test_submaps_have_colours_and_loops_are_lines(theme: plot.Theme) -> None:
     estimate = np.stack([x, np.zeros(40), z], 1)
     submaps = np.arange(40) // 10
     chart = charts.submap_chart(estimate, submaps, [charts.LoopLink(25, 5, True), charts.LoopLink(35, 15, False)])
-    size = (600, 400)
-    image = np.asarray(plot.draw_charts([chart], theme, size))
-    blank = np.asarray(plot.draw_charts([charts.submap_chart(estimate, submaps, [])], theme, size))
-    for place in charts.SUBMAP_COLOURS:
-        assert len(colours_near(blank, theme.curves[place])) > 100
-    assert len(colours_near(blank, theme.curves[plot.ACCENT])) == 0
+    (faint, refused), *path, (accent, accepted) = drawn(chart)
+    assert (faint, accent) == (str(plot.FAINT), str(plot.ACCENT))
+    assert [colour for colour, _ in path] == [str(charts.SUBMAP_COLOURS[k % 3]) for k in range(4)]
+    around = np.concatenate([places for _, places in path])
+    middle = (around.min(0) + around.max(0)) / 2
     # The accepted loop is the column x = 2 m of the picture, the refused loop is the row z = 2 m.
-    changed = np.argwhere((image != blank).any(-1))
-    changed = changed[changed[:, 0] > 40]  # below the legend
-    accepted = colours_near(image[40:], theme.curves[plot.ACCENT])
-    middle = np.median(accepted[:, 1])
-    refused = changed[np.abs(changed[:, 1] - middle) > 6]
-    path = np.concatenate([colours_near(blank, theme.curves[place]) for place in charts.SUBMAP_COLOURS])
-    assert np.ptp(accepted[:, 1]) < 6 and np.ptp(accepted[:, 0]) > 200 and np.ptp(refused[:, 0]) < 6
-    for at, axis in ((accepted, 1), (refused, 0)):
-        assert np.median(at[:, axis]) == pytest.approx(0.5 * (path[:, axis].min() + path[:, axis].max()), abs=4)
+    np.testing.assert_allclose(accepted[:, 0], middle[0], atol=0.2)
+    np.testing.assert_allclose(refused[:, 1], middle[1], atol=0.2)
+    assert np.ptp(accepted[:, 1]) > 150 and np.ptp(refused[:, 0]) > 150
 
 
 def test_neighbouring_submaps_have_different_colours_and_are_joined() -> None:
@@ -217,7 +238,7 @@ def test_a_long_run_has_few_labels() -> None:
     estimate = np.random.default_rng(0).normal(size=(500, 3))
     chart = charts.submap_chart(estimate, np.arange(500) // 5, [])
     assert len(chart.curves) == 100 and 5 < len(chart.labels) <= charts.MAX_LABELS
-    plot.draw_charts([chart], plot.DARK)
+    assert len(drawn(chart)) == 100
 
 
 def test_a_loop_line_joins_the_positions_of_its_frames() -> None:
@@ -232,11 +253,11 @@ def test_a_loop_line_joins_the_positions_of_its_frames() -> None:
     loops = [{"query_frame": 8, "database_frame": 1, "accepted": True},
              {"query_frame": 5, "database_frame": 2, "accepted": False}]  # fmt: skip
     new = [record | {"state": "lost" if record["lost"] else "tracked"} for record in log]
-    drawn = charts.run_charts(RunFrames.of(new, path), None, loops)
-    (chart,), caption = drawn["submaps"]
+    made = charts.run_charts(RunFrames.of(new, path), None, loops)
+    (chart,), caption = made["submaps"]
     lines = {curve.name: curve.points[:, 0].tolist() for curve in chart.curves if curve.name}
     assert lines == {"loop accepted": [8, 1]} and "submap" in caption
-    lost = next(curve for curve in drawn["trajectory"][0][0].curves if curve.name == "lost")
+    lost = next(curve for curve in made["trajectory"][0][0].curves if curve.name == "lost")
     assert lost.points[:, 0].tolist() == [1, 5], "the last poses before"
     calm = [record | {"submap": 0, "lost": False} for record in log[:2]]
     assert set(charts.run_charts(RunFrames.of(calm, path.at(np.arange(2))), None)) == {"trajectory"}
@@ -258,8 +279,7 @@ def test_the_strip_shows_each_range_of_frames_in_one_state() -> None:
     ]  # fmt: skip
     assert {c.name for c in strip.curves if c.name} == {"tracked", "relocalised", "lost", "apart"}
     assert sum(len(c.points) for c in along.curves if c.dots) == 4, "only valid frames have a place"
-    for theme in (plot.LIGHT, plot.DARK):
-        plot.draw_charts([strip, along], theme)
+    assert len(drawn(strip)) == len(strip.curves) and len(drawn(along)) == len(along.curves)
 
 
 class Balance(HTMLParser):
@@ -300,16 +320,15 @@ METRICS = {
 @pytest.mark.parametrize("metrics", [METRICS, {"frames": 0}], ids=["full", "bare"])
 def test_the_page_is_complete_and_needs_no_other_file(metrics: dict[str, object]) -> None:
     contents = Contents(
-        "SigmaSplat · <room> & more", "fast", metrics, STRIPS, {"trajectory": "caption"},
+        "SigmaSplat · <room> & more", "fast", metrics, STRIPS, PLOTS,
         '{"name": "</pre><script>"}', ["estimate and truth share no timestamps"],
     )  # fmt: skip
     page = build_report(contents)
     reader = Balance()
     reader.feed(page)
     assert not reader.wrong and not reader.open
-    versions = ("light", "dark", "narrow-light", "narrow-dark")
-    assert set(reader.addresses) == {"images/a.png", *(f"images/trajectory-{version}.png" for version in versions)}
-    assert "http" not in page and "<script" not in page and "prefers-color-scheme: dark" in page
+    assert set(reader.addresses) == {"images/a.png"} and page.count("<svg") == page.count("</svg>") == 2
+    assert "http" not in page.replace(NAMESPACE, "") and "<script" not in page and "prefers-color-scheme: dark" in page
     text = "".join(reader.text)
     assert "<room> & more" in text and "</pre><script>" in text and "share no timestamps" in text
 
@@ -333,20 +352,20 @@ class Tables(HTMLParser):
 
 
 def test_the_page_adapts_to_narrow_screens() -> None:
-    """Tables scroll inside their cards, commands wrap, columns fit a phone, and charts have a narrow version."""
+    """Tables scroll inside their cards, commands wrap, columns fit a phone, and charts are as wide as their column."""
     loops, advice = [loop(7, True), loop(5, False)], [("Try this:", "sigmasplat run a-long-path")]
-    contents = Contents("t", "s", IN_SUBMAPS, STRIPS, {"submaps": "a caption"}, loops=loops, advice=advice,
+    contents = Contents("t", "s", IN_SUBMAPS, STRIPS, SUBMAPS, loops=loops, advice=advice,
                         seconds={"align": 8.0})  # fmt: skip
     page = build_report(contents)
     reader = Tables()
     reader.feed(page)
     assert len(reader.around) >= 6 and all("card" in classes for classes in reader.around)
     style = page[page.index("<style>") : page.index("</style>")]
-    for element, rule in ((".card", "overflow-x: auto"), ("pre", "white-space: pre-wrap")):
+    for element, rule in ((".card", "overflow-x: auto"), ("pre", "white-space: pre-wrap"), (".chart", "width: 100%")):
         assert re.search(rf"^{re.escape(element)} {{[^}}]*{rule}", style, re.MULTILINE), element
     widths = [int(px) for px in re.findall(r"minmax\((\d+)px", style)]
     assert widths and max(widths) <= 376 // 2
-    assert "width=device-width" in page and "images/submaps-narrow-light.png" in page
+    assert "width=device-width" in page
 
 
 def test_the_page_shows_the_measured_figures() -> None:
@@ -374,10 +393,10 @@ IN_SUBMAPS = METRICS | {
 
 def test_submaps_and_loops_have_a_section() -> None:
     loops = [loop(6, False, residual=None, reason="no overlap & <nothing>"), loop(7, True), loop(5, False)]
-    page = build_report(Contents("t", "s", IN_SUBMAPS, plots={"submaps": "a caption"}, loops=loops))
+    page = build_report(Contents("t", "s", IN_SUBMAPS, plots=SUBMAPS, loops=loops))
     reader = Balance()
     reader.feed(page)
-    assert not reader.wrong and not reader.open and "images/submaps-dark.png" in reader.addresses
+    assert not reader.wrong and not reader.open and "Submaps from above" in page
     text = " ".join(re.sub("<[^>]+>", " ", page).split())
     assert "Submaps and loops" in text and "8 submaps" in text and "12.5 s" in text and "a caption" in text
     assert "7 → 0 412 → 3 0.875 0.0213 61 4.3 1.50 accepted" in text
@@ -436,7 +455,7 @@ def test_the_map_and_the_verdicts_come_first_and_the_rest_is_folded() -> None:
     views = [[PanelFigure(f"panel {k}", f"images/{view}{k}.png", "<frame>") for k in range(5)] for view in "abc"]
     verdicts = [Verdict("Path", "All 3 images", "No image is <lost>."), Verdict("Next", "Try", "Smaller:", "run --x")]
     page = build_report(
-        Contents("t", "s", METRICS, {"held-out views": [STRIPS["held-out views"][0], *views]}, {"trajectory": "a path"},
+        Contents("t", "s", METRICS, {"held-out views": [STRIPS["held-out views"][0], *views]}, PLOTS,
                  '{"a": 1}', ["careful"], verdicts=verdicts, commands=[("View it:", "sigmasplat view r")])
     )  # fmt: skip
     opened = page[page.index("<main>") : page.index("<details")]
@@ -447,5 +466,5 @@ def test_the_map_and_the_verdicts_come_first_and_the_rest_is_folded() -> None:
     titles = re.findall(r"<details class=part><summary><h2>(.*?)</h2>", folded)
     assert titles == ["Trajectory", "Views", "Scores", "Settings (config.json)"]
     assert page.count("<h2>") == len(titles)
-    plain = build_report(Contents("t", "s", METRICS, plots={"plan": "a plan"}))
-    assert "images/plan-light.png" in plain[: plain.index("<details")], "without a view the floor plan is shown"
+    plain = build_report(Contents("t", "s", METRICS, plan=[PanelFigure("What is there", "images/plan.png")]))
+    assert "images/plan.png" in plain[: plain.index("<details")], "without a view the floor plan is shown"

@@ -1,18 +1,18 @@
 """The sentences of the report follow from the figures, and its commands can be run."""
 
-import json
 import shlex
 from dataclasses import replace
 from itertools import pairwise
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from PIL import Image
 
 from sigmasplat.config.find_preset import preset
 from sigmasplat.config.text import override, split_settings
-from sigmasplat.errors import RunError
 from sigmasplat.plugins.evaluation.report.advice import advice, next_commands
+from sigmasplat.plugins.evaluation.report.charts import trajectory_charts
 from sigmasplat.plugins.evaluation.report.page import rerun_command, write_page
 from sigmasplat.plugins.evaluation.report.summary import (
     rescan_sentences,
@@ -21,7 +21,7 @@ from sigmasplat.plugins.evaluation.report.summary import (
     verdicts,
 )
 from sigmasplat.plugins.evaluation.report.tables import score_tables, state_rows
-from sigmasplat.plugins.evaluation.report.view_strips import PanelFigure, data_uri, file_data_uri
+from sigmasplat.plugins.evaluation.report.view_strips import PanelFigure, data_uri
 from sigmasplat.plugins.outputs.floorplan.rescan import RescanRegion
 from sigmasplat.plugins.presets.base import BASE
 from sigmasplat.run_folder.runs import RunFolder
@@ -240,24 +240,16 @@ def test_tables_show_coverage_and_calibration_or_that_there_are_no_predicted_err
 def test_the_page_is_one_file(tmp_path) -> None:
     run = RunFolder.create(tmp_path / "run", replace(BASE, name="made-up"), "kitchen")
     run.note(status="complete", source_path="data/kitchen")
-    for version in ("light", "dark", "narrow-light", "narrow-dark"):
-        run.write_image(f"trajectory-{version}.png", Image.new("RGB", (40, 30), (200, 60, 20)))
     run.write_profile({"blend": 6.0, "io": 2.0})
     write_page(
         run,
         GOOD | {"uncertainty": None},
         {"held-out": [[PanelFigure("input", data_uri(Image.new("RGB", (40, 30))))]]},
-        {"trajectory": "a path"},
+        {"trajectory": (trajectory_charts(np.eye(3), None), "a path")},
         ["careful"],
     )
     page = (run.path / "report.html").read_text()
     for words in ("All 500 images have a pose", "careful", "sigmasplat view", "75", "Settings (config.json)"):
         assert words in page
-    assert [page.count(f"data:image/{kind};base64,") for kind in ("webp", "png")] == [2, 4]
-    assert "images/" not in page and "http" not in page
-
-
-def test_the_error_names_a_missing_picture(tmp_path) -> None:
-    with pytest.raises(RunError, match=r"view\.png"):
-        file_data_uri(tmp_path / "view.png")
-    assert json.dumps(SETTINGS)
+    assert page.count("data:image/webp;base64,") == 2 and page.count("<svg") == 2
+    assert "images/" not in page and "http" not in page.replace("http://www.w3.org/2000/svg", "")

@@ -29,7 +29,6 @@ from sigmasplat.plugins.viewer.layers import (
     sorted_depth_stds,
     sorted_sigmas,
     splat_arrays,
-    surface_normals,
     visibility_filter,
 )
 from sigmasplat.plugins.viewer.panel import escaped
@@ -204,10 +203,9 @@ def test_layers_show_the_maps_of_the_renderer() -> None:
     field, camera, T = field_of(400), Camera(40, 30, 30.0, 30.0, 19.5, 14.5), np.eye(4)
     T[2, 3] = -0.5
     seen = render(field, camera, se3.inverse(T))
-    shown = {n: render_layer(field, camera, T, n, OPTIONS, "auto") for n in ("colour", "depth", "V", "U", "opacity")}
+    shown = {n: render_layer(field, camera, T, n, OPTIONS, "auto") for n in ("colour", "depth", "V", "U")}
     np.testing.assert_array_equal(shown["colour"].pixels, (seen.color.clamp(0, 1) * 255).round().numpy())
     assert shown["colour"].legend is None
-    np.testing.assert_array_equal(shown["opacity"].pixels[..., 0], (seen.alpha * 255).double().round().numpy())
     covered = (seen.alpha > 0.5).numpy()
     for name in ("depth", "V", "U"):
         uncovered = (shown[name].pixels == colormap.NO_READING).all(-1)
@@ -217,19 +215,6 @@ def test_layers_show_the_maps_of_the_renderer() -> None:
     assert legend is not None and legend.high == pytest.approx(np.percentile(root[covered], 99), rel=1e-5)
     depth = shown["depth"].legend
     assert depth is not None and 2.0 < depth.low < depth.high < 4.5 and depth.unit == " m"
-
-
-def test_the_normals_of_a_tilted_plane_are_its_normal_and_point_to_the_camera() -> None:
-    camera, normal = Camera(40, 30, 50.0, 45.0, 18.0, 16.0), np.array([0.36, -0.48, -0.8])
-    v, u = np.mgrid[:30, :40]
-    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones((30, 40))], -1)
-    depth_m = (-2.0 / (rays @ normal)).astype(np.float32)
-    depth_m[10, 10] = 0.0
-    found = surface_normals(depth_m, camera)
-    inside = found[1:-1, 1:-1].reshape(-1, 3)
-    known = (inside != 0.0).any(1)
-    assert known.sum() == 28 * 38 - 5, "the pixel without depth and its four neighbours have no normal"
-    assert np.abs(inside[known] - normal).max() < 0.02
 
 
 def test_u_is_the_spread_of_depth_about_the_rendered_depth() -> None:

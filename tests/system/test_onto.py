@@ -17,7 +17,7 @@ from sigmasplat.data.submap import MemoryStore
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.plugins.outputs.run_reader import RunReader
 from sigmasplat.plugins.sources import SyntheticRoom, open_source
-from sigmasplat.plugins.viewer.snapshot_sources import SubmapCache, finished_snapshot
+from sigmasplat.plugins.viewer.snapshot_sources import SubmapCache, finished_snapshot, running_snapshot
 from sigmasplat.run.finished_map import FinishedMap
 from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.run_folder.trajectory import write_trajectory
@@ -94,9 +94,8 @@ def test_readers_use_the_frames_of_the_new_session_only(place: Path) -> None:
     assert len(found) == reader.count_keyframes() and min(found) == 0 and max(found) < 20
     snapshot = finished_snapshot(second)
     assert len(snapshot.path) == 20 and {piece.submap for piece in snapshot.pieces} == set(range(len(second.submaps)))
-    cache = SubmapCache(second)
-    cache.load_new([np.array(line["T_world_camera"]) for line in second.read_log()])
-    assert len(cache.pieces) == len(second.submaps)
+    cache = SubmapCache(second.submaps)
+    assert len(running_snapshot(second, cache).path) == 20 and len(cache.pieces) == len(second.submaps)
 
 
 def test_the_earlier_run_is_not_changed(place: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

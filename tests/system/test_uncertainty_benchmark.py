@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 import uncertainty
-from finished_run import FinishedRun, run_slam
+from finished_run import FinishedRun, aligned_poses, run_slam
 from splat_statistics import (
     MapFacts,
     TrainingView,
@@ -47,7 +47,6 @@ from sigmasplat.config.text import override
 from sigmasplat.data import se3
 from sigmasplat.data.field import GaussianField
 from sigmasplat.fit.target import Keyframe, Target
-from sigmasplat.plugins.evaluation.metrics.trajectory import aligned_poses
 from sigmasplat.plugins.evaluation.metrics.uncertainty import sparsification
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.render import FieldRenderer, reference
@@ -235,7 +234,7 @@ def test_the_benchmark_writes_scores_tables_and_pictures(tmp_path: Path, capsys:
     assert {"nees_mean", "coverage_90", "position_k"} <= scored["poses"]["from_start"].keys()
     row = scored["scores"]["color"]["final"][HELD_BACK]["all pixels"]["predictors"]["V + T prior"]
     assert {"ause", "spearman", "before", "after", "temperature"} <= row.keys()
-    assert len(list(out.glob("*.png"))) >= 4
+    assert len(list(out.glob("*.svg"))) >= 4
     (samples_file,) = (out / "samples").iterdir()
     written = samples_file.stat().st_mtime_ns
     assert uncertainty.main(options) == 0

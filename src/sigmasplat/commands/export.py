@@ -70,14 +70,9 @@ MapAxes = Annotated[
     arg(
         "{y-up,z-up,y-down,camera}",
         "axes of a map or of points: y-up, z-up and y-down are levelled; camera: those of the run's path; y-up "
-        "and camera only for SPZ, glTF and OpenUSD",
-        "(default: y-up for points, SPZ, glTF and OpenUSD, else y-down)",
+        "and camera only for SPZ and glTF",
+        "(default: y-up for points, SPZ and glTF, else y-down)",
     ),
-]
-SpzVersion = Annotated[
-    Whole,
-    Range(2, 4),
-    arg("{2,3,4}", "version of SPZ", "(default: 3, which most viewers read)"),
 ]
 
 
@@ -90,7 +85,6 @@ class ExportOptions:
     opacity_above: OpacityAbove = None
     max_splats: MaxSplats = None
     axes: MapAxes = None
-    spz_version: SpzVersion = None
     plain: Plain = False
     pictures: Pictures = False
     voxel_m: options.VoxelM = None

@@ -51,7 +51,7 @@ def make_mesh(
     from sigmasplat.files.lock import output_locked
     from sigmasplat.plugins.evaluation.reconstruct import FusionInput
     from sigmasplat.plugins.outputs.axes import levelled, transform_to
-    from sigmasplat.plugins.outputs.mesh_editing import decimated, filled, refuse_budget
+    from sigmasplat.plugins.outputs.mesh_editing import decimated, filled
     from sigmasplat.plugins.outputs.mesh_files import check_ending, write_mesh
     from sigmasplat.plugins.outputs.run_reader import RunReader
     from sigmasplat.run.terminal import Screen
@@ -60,7 +60,6 @@ def make_mesh(
     screen, folder, target = Screen(), RunFolder.open(run), out or run / MESH
     check_ending(target)
     chosen = _axes_of(target, axes, own=out is None)
-    refuse_budget(triangles)
     refuse_existing(out, overwrite)
     source = source_of(folder, moved_to)
     prepare_torch()

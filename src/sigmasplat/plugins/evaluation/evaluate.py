@@ -20,6 +20,7 @@ from sigmasplat.api import (
     RunFolder,
     RunFrames,
     Source,
+    SourceError,
     Trajectory,
     as_refined,
     evenly_spread,
@@ -42,7 +43,7 @@ from sigmasplat.plugins.evaluation.path_scores import (
     score_states,
 )
 from sigmasplat.plugins.evaluation.report import charts
-from sigmasplat.plugins.evaluation.report.page import report_plan, write_charts, write_page
+from sigmasplat.plugins.evaluation.report.page import report_plan, write_page
 from sigmasplat.plugins.evaluation.report.view_strips import ViewStrips
 from sigmasplat.plugins.evaluation.view_scoring import (
     ViewScoring,
@@ -53,6 +54,8 @@ from sigmasplat.plugins.evaluation.view_scoring import (
 )
 
 Log = list[dict[str, Any]]
+KINDS = {"held-out": False, "training": True}
+"""Whether a map was fitted to the views of a kind."""
 
 
 def evaluate(
@@ -85,12 +88,12 @@ def evaluate(
     """
     frames, field = _read_frames(run), run.read_map()
     records, log = frames.log, frames.posed_log()
-    truth, scale = _truth(run, frames, source) if log else (None, None)  # without a valid pose nothing is aligned
-    path_scores, problem = score_path(frames.path, _valid_odometry(run, frames), truth)
-    known = None if problem else truth
-    chosen = {kind: evenly_spread(views, views_per_kind) for kind, views in _kinds(log).items()}
+    known, scale, path_scores, problem = _score_path(run, frames, source)
+    kinds = {kind: [r for r in log if bool(r["is_keyframe"]) == of_map] for kind, of_map in KINDS.items()}
+    chosen = {kind: evenly_spread(records, views_per_kind) for kind, records in kinds.items()}
     strips, config = ViewStrips(run, strips_per_kind), run.config()
-    fx, aligned = refined_fx(config, source.camera), _alignment(frames, known)
+    fx, path = refined_fx(config, source.camera), frames.path
+    aligned = None if known is None else truth_in_estimate(path.timestamps_s, path.T_world_camera[:, :3, 3], known)
     standard, renderer = renderer is None, renderer or FieldRenderer(config.render, config.backend, (field, fx))
     maps = _map_sources(run, field, records, config.final)
     maps, predictions = _predicting(maps, run, frames, config, fx) if standard else (maps, views.PredictionScores())
@@ -109,7 +112,7 @@ def evaluate(
     metrics["test_views"] = None if scale else score_test_views(scoring, config.input, strips)
     show_moving(strips, source, config.input, run.submaps, records)
     run.write_metrics(metrics)
-    plan = report_plan(run, frames.path, source.camera) if standard else None
+    plan = report_plan(run, path, source.camera) if standard else None
     figures, warnings = strips.figures, [str(problem)] if problem else []
     write_page(run, metrics, figures, _draw_plots(run, frames, known), warnings, plan, frames)
     if problem:
@@ -128,17 +131,19 @@ def _read_frames(run: RunFolder) -> RunFrames:
     return frames
 
 
-def _truth(run: RunFolder, frames: RunFrames, source: Source) -> tuple[Trajectory | None, float | None]:
-    """Return the true path in the units of the run, and the run's unit in metres if it is arbitrary."""
-    truth = source.truth()
+def _score_path(
+    run: RunFolder, frames: RunFrames, source: Source
+) -> tuple[Trajectory | None, float | None, dict[str, Any], SourceError | None]:
+    """Return the true path in the units of the run, None if it shares no timestamps; the run's unit in metres if it is
+    arbitrary; and what `score_path` returns."""
+    truth = source.truth() if len(frames.rows) else None  # without a valid pose nothing is aligned
     scale = arbitrary_scale(run, frames.path, truth)
-    return None if truth is None else in_units_of_run(truth, scale), scale
-
-
-def _alignment(frames: RunFrames, truth: Trajectory | None) -> NDArray[np.float64] | None:
-    """Return T_estimate_truth [4, 4], the alignment of the ATE; None without a truth."""
-    path = frames.path
-    return None if truth is None else truth_in_estimate(path.timestamps_s, path.T_world_camera[:, :3, 3], truth)
+    truth = None if truth is None else in_units_of_run(truth, scale)
+    odometry = run.read_odometry()
+    if odometry is not None:
+        odometry = odometry.at(frames.rows[frames.rows < len(odometry)])
+    scores, problem = score_path(frames.path, odometry, truth)
+    return None if problem else truth, scale, scores, problem
 
 
 def _anchors(run: RunFolder, records: Log, final: FinalConfig) -> NDArray[np.float64] | None:
@@ -184,7 +189,9 @@ def _predicting(
         options = as_refined(config.render, camera, fx)
         return predict(field, known, camera, T_camera_world, options, config.backend)
 
-    return replace(maps, predict=predict_view), views.PredictionScores(_probe_frames(run, frames))
+    probes = [row for index in range(len(run.submaps)) for row in run.submaps.load(index).probe_frames]
+    calibrated_on = frozenset(frames.log[row]["index"] for row in probes if 0 <= row < len(frames))
+    return replace(maps, predict=predict_view), views.PredictionScores(calibrated_on)
 
 
 def _calibration(run: RunFolder) -> dict[str, Any] | None:
@@ -196,29 +203,9 @@ def _calibration(run: RunFolder) -> dict[str, Any] | None:
     return {"probes": known.probes} | {name: dict(of) for name, of in vars(known.calibration).items()}
 
 
-def _probe_frames(run: RunFolder, frames: RunFrames) -> frozenset[int]:
-    """Return the numbers, in the source, of the frames that the predictive variances were calibrated on."""
-    rows = [row for index in range(len(run.submaps)) for row in run.submaps.load(index).probe_frames]
-    return frozenset(frames.log[row]["index"] for row in rows if 0 <= row < len(frames))
-
-
 def _submaps(log: Log) -> int:
     """Count submaps; the log of an old version does not name any, which counts as one."""
     return 1 + max(int(record.get("submap", 0)) for record in log)
-
-
-def _valid_odometry(run: RunFolder, frames: RunFrames) -> Trajectory | None:
-    """Return the path of tracking alone at the valid frames; None if the run has no such path or no loop."""
-    odometry = run.read_odometry()
-    return None if odometry is None else odometry.at(frames.rows[frames.rows < len(odometry)])
-
-
-def _kinds(log: Log) -> dict[str, Log]:
-    """Split the frames by whether a map was fitted to them."""
-    return {
-        "held-out": [record for record in log if not record["is_keyframe"]],
-        "training": [record for record in log if record["is_keyframe"]],
-    }
 
 
 def _score_views(
@@ -244,60 +231,42 @@ def _score_views(
                 strips.add(in_submap, ", in their submaps")
         progress(done, scoring.count)
     kept = maps.T_world_submap is not None
+    # σ² of the final map is valid if it was learned during refinement too, or taken over from the submaps.
+    keeps_variance = final.uncertainty if final.iterations else final.seed_from == "submaps"
     judged, judged_before = (views.score_uncertainty(found[judged_on].samples, judged_on) for found in (scores, before))
     return views.kind_scores(scores, before, maps) | {
         "uncertainty": judged_before if kept else judged,
-        "uncertainty_final": judged if kept and _keeps_variance(final) else None,
+        "uncertainty_final": judged if kept and keeps_variance else None,
         "predictive": predictions.scores(),
     }
 
 
-def _keeps_variance(final: FinalConfig) -> bool:
-    """Return whether σ² of the final map is valid: still learned during refinement, or taken over from the submaps."""
-    return final.uncertainty if final.iterations else final.seed_from == "submaps"
-
-
 def _facts(run: RunFolder, source: Source, log: Log, field: GaussianField) -> dict[str, Any]:
-    """Return counts, size and speed of the run."""
-    loops = run.read_loops()
+    facts, loops = run.facts(), run.read_loops()
+    wall_s, finish_s = facts.get("wall_s"), facts.get("finish_s")
+    seconds = wall_s or sum(frame_seconds(record) for record in log)
     return {
         "source": source.name,
-        "status": run.facts().get("status"),
+        "status": facts.get("status"),
         "frames": len(log),
         "keyframes": sum(bool(record["is_keyframe"]) for record in log),
-        "skipped": run.facts().get("skipped", list(source.skipped)),
+        "skipped": facts.get("skipped", list(source.skipped)),
         "splats": len(field),
         "map_bytes": run.map_bytes(),
-        "frames_per_s": _frames_per_s(run, log),
-        "worst_frame_s": _worst_frame_s(log),
+        "frames_per_s": len(log) / seconds if seconds else None,
+        # The first frame, which creates the map, does not count.
+        "worst_frame_s": max(map(frame_seconds, log[1:]), default=0.0) or None,
         "submaps": _submaps(log),
-        "onto": (run.facts().get("onto") or {}).get("run"),
+        "onto": (facts.get("onto") or {}).get("run"),
         "loops": {"tried": len(loops), "accepted": sum(bool(loop.get("accepted")) for loop in loops)},
-        "finish_s": run.facts().get("finish_s"),
-        "final_steps": run.facts().get("final_steps"),
-        "total_s": _total_s(run),
+        "finish_s": finish_s,
+        "final_steps": facts.get("final_steps"),
+        "total_s": None if wall_s is None or finish_s is None else float(wall_s + finish_s),
     }
 
 
-def _frames_per_s(run: RunFolder, log: Log) -> float | None:
-    """Return the end-to-end speed: from wall_s of run.json if it exists, else from the sum of the frames' times."""
-    seconds = run.facts().get("wall_s") or sum(frame_seconds(record) for record in log)
-    return len(log) / seconds if seconds else None
-
-
-def _total_s(run: RunFolder) -> float | None:
-    """Return the seconds of all frames plus the final map, or None if run.json does not have both."""
-    frames_s, finish_s = (run.facts().get(key) for key in ("wall_s", "finish_s"))
-    return None if frames_s is None or finish_s is None else float(frames_s + finish_s)
-
-
-def _worst_frame_s(log: Log) -> float | None:
-    """Return the longest time of a frame except the first, which creates the map; None if no frame was timed."""
-    return max(map(frame_seconds, log[1:]), default=0.0) or None
-
-
-def _draw_plots(run: RunFolder, frames: RunFrames, truth: Trajectory | None) -> dict[str, str]:
-    """Draw the charts of path, states, submaps and times, and write truth.txt; return the captions by name."""
+def _draw_plots(run: RunFolder, frames: RunFrames, truth: Trajectory | None) -> dict[str, charts.Plot]:
+    """Return the charts of path, states, submaps and times by name, and write truth.txt."""
     times, estimate = frames.path.timestamps_s, frames.path.T_world_camera[:, :3, 3]
     known: NDArray[np.float64] | None = None
     aligned: Trajectory | None = None
@@ -305,13 +274,8 @@ def _draw_plots(run: RunFolder, frames: RunFrames, truth: Trajectory | None) -> 
         rows, aligned = aligned_truth(times, estimate, truth)
         known = np.full_like(estimate, np.nan)
         known[rows] = aligned.T_world_camera[:, :3, 3]
-    _write_truth(run, aligned)
-    return write_charts(run, charts.run_charts(frames, known, run.read_loops()))
-
-
-def _write_truth(run: RunFolder, aligned: Trajectory | None) -> None:
-    """Write truth.txt for the viewer and exports; delete an old one if the truth is not known."""
     if aligned is None:
-        (run.path / TRUTH).unlink(missing_ok=True)
+        (run.path / TRUTH).unlink(missing_ok=True)  # of an earlier evaluation
     else:
-        write_trajectory(run.path / TRUTH, aligned)
+        write_trajectory(run.path / TRUTH, aligned)  # for the viewer
+    return charts.run_charts(frames, known, run.read_loops())

@@ -1,6 +1,6 @@
 """Score the path of a run on the sets of frames that published systems use: keyframes, and all frames."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from itertools import pairwise
 from typing import Any
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.api import APART, LOST, RELOCALISED, Matrix, PathCovariance, RunFolder, RunFrames, Trajectory, se3
+from sigmasplat.api import APART, LOST, RELOCALISED, PathCovariance, RunFolder, RunFrames, Trajectory, se3
 from sigmasplat.plugins.evaluation.metrics.trajectory import (
     absolute_error,
     align_rigid,
@@ -61,13 +61,10 @@ def in_metres(scores: dict[str, Any], scale: float | None) -> dict[str, Any]:
     """Return scores of the path, in the units of the run, with all lengths (`…_m`) in metres of the truth."""
     if scale is None:
         return scores
-    return {name: _in_metres(found, scale) for name, found in scores.items()}
-
-
-def _in_metres(found: Any, scale: float) -> Any:
-    if not isinstance(found, dict):
-        return found
-    return {key: value * scale if key.endswith("_m") else value for key, value in found.items()}
+    return {
+        name: {key: value * scale if key.endswith("_m") else value for key, value in found.items()} if found else found
+        for name, found in scores.items()
+    }
 
 
 def _error(times_s: NDArray[np.float64], positions: NDArray[np.float64], truth: Trajectory) -> dict[str, Any] | None:
@@ -132,7 +129,7 @@ MOTIONS = {"hops": "keyframe to keyframe", "windows": f"{WINDOW_FRAMES} frames",
 
 
 def score_pose_covariance(run: RunFolder, frames: RunFrames, truth: Trajectory | None) -> dict[str, Any] | None:
-    """Score the motions of `score_motions` between valid frames of a run.
+    """Score the motions of `score_path_covariance` between valid frames of a run.
 
     Returns None without a truth, or if the run did not record the errors of its path.
     """
@@ -148,26 +145,16 @@ def score_pose_covariance(run: RunFolder, frames: RunFrames, truth: Trajectory |
 def score_path_covariance(
     errors: PathCovariance, path: Trajectory, rows: NDArray[np.intp], keyframes: Iterable[int], truth: Trajectory
 ) -> dict[str, Any]:
-    """Score the motions of `score_motions` between the valid frames with a true pose.
-
-    path: poses of the valid frames; rows: their numbers [B]; keyframes: the numbers of all keyframes.
-    """
-    matched, true_rows = associate(path.timestamps_s, truth.timestamps_s)
-    true = dict(zip(rows[matched].tolist(), truth.T_world_camera[true_rows], strict=True))
-    return score_motions(errors, true, [frame for frame in keyframes if frame in true])
-
-
-def score_motions(
-    errors: PathCovariance, T_world_camera: Mapping[int, Matrix], keyframes: Sequence[int]
-) -> dict[str, Any]:
     """Score motions from each keyframe to the next, over 50 frames, and from the first frame (`CovarianceScore`).
 
-    T_world_camera: true poses [4, 4] of valid frames, in order; keyframes: the keyframes among them. Motions do not
-    depend on the world frame, so no alignment is needed.
+    path: poses of the valid frames; rows: their numbers [B]; keyframes: the numbers of all keyframes. Only frames with
+    a true pose count. Motions do not depend on the world frame, so no alignment is needed.
     """
+    matched, true_rows = associate(path.timestamps_s, truth.timestamps_s)
+    T_world_camera = dict(zip(rows[matched].tolist(), truth.T_world_camera[true_rows], strict=True))
     known = list(T_world_camera)
     pairs = {
-        "hops": list(pairwise(keyframes)),
+        "hops": list(pairwise(frame for frame in keyframes if frame in T_world_camera)),
         "windows": [(frame, frame + WINDOW_FRAMES) for frame in known if frame + WINDOW_FRAMES in T_world_camera],
         "from_start": [(known[0], frame) for frame in known[1:]],
     }

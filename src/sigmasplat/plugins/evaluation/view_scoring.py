@@ -16,13 +16,11 @@ from sigmasplat.api import (
     Camera,
     Config,
     Frame,
-    GaussianField,
     InputConfig,
     Progress,
     Source,
     SourceError,
     SubmapStore,
-    Trajectory,
     evenly_spread,
     no_progress,
     photo_size,
@@ -118,46 +116,18 @@ def score_full_resolution(
 def score_test_views(
     scoring: ViewScoring, settings: InputConfig, strips: ViewStrips | None = None
 ) -> dict[str, Any] | None:
-    """Score the source's test views at the size of `settings`; None without test views or without a truth."""
-    test_views, T_estimate_truth = scoring.source.test_views(), scoring.T_estimate_truth
-    if test_views is None or T_estimate_truth is None:
-        return None
-    return score_novel_views(
-        test_views, test_views.truth(), T_estimate_truth, scoring.maps.final, settings, scoring.renderer, strips,
-        scoring.most, scoring.lpips,
-    )  # fmt: skip
+    """Render the final map at the true poses of the source's test views at the size of `settings`; return their mean
+    scores as `views.mean_scores` does, None without test views, their poses or a truth.
 
-
-def working_frame(source: Source, settings: InputConfig, index: int) -> Frame:
-    """Read a frame at the resolution, depth range and crop that SLAM works with. Raises SourceError if unreadable."""
-    s = settings
-    return source.frame(index).prepared(s.width, s.min_depth_m, s.max_depth_m, s.crop_px)
-
-
-KIND = "test"
-
-
-def score_novel_views(
-    test_views: Source,
-    poses: Trajectory | None,
-    T_estimate_truth: NDArray[np.float64],
-    field: GaussianField,
-    settings: InputConfig,
-    renderer: views.Renderer,
-    strips: ViewStrips | None,
-    most: int,
-    lpips: Lpips | None = None,
-) -> dict[str, Any] | None:
-    """Render the final map at the true poses of at most `most` test views, and return their mean scores.
-
-    `T_estimate_truth`, the alignment of the ATE, transforms the poses to the estimate's world. So errors of the path
-    lower these scores, as in the papers. Adds a few views to `strips`, if given. Unreadable views and those without a
-    pose are skipped. Returns the scores as `views.mean_scores` does, or None if no poses are known.
+    The alignment of the ATE transforms the poses to the estimate's world. So errors of the path lower these scores, as
+    in the papers. Adds a few views to `strips`, if given. Unreadable views and those without a pose are skipped.
     """
-    if poses is None:
+    test_views, T_estimate_truth = scoring.source.test_views(), scoring.T_estimate_truth
+    poses = None if test_views is None else test_views.truth()
+    if test_views is None or poses is None or T_estimate_truth is None:
         return None
     rendered = []
-    for i in evenly_spread(range(len(test_views)), most):
+    for i in evenly_spread(range(len(test_views)), scoring.most):
         try:
             frame = working_frame(test_views, settings, i)
         except SourceError:
@@ -165,11 +135,18 @@ def score_novel_views(
         rows, found = associate(np.array([frame.timestamp_s]), poses.timestamps_s)
         if len(rows):
             T_camera_world = se3.inverse(T_estimate_truth @ poses.T_world_camera[found[0]])
-            rendered.append(views.scored_view(frame, renderer(field, frame.camera, T_camera_world), KIND))
+            seen = scoring.renderer(scoring.maps.final, frame.camera, T_camera_world)
+            rendered.append(views.scored_view(frame, seen, "test"))
     if strips is not None:
         for view in rendered[:: max(1, len(rendered) // max(strips.per_kind, 1))][: strips.per_kind]:
             strips.add(view)
-    return views.mean_scores([view.scores(lpips) for view in rendered])
+    return views.mean_scores([view.scores(scoring.lpips) for view in rendered])
+
+
+def working_frame(source: Source, settings: InputConfig, index: int) -> Frame:
+    """Read a frame at the resolution, depth range and crop that SLAM works with. Raises SourceError if unreadable."""
+    s = settings
+    return source.frame(index).prepared(s.width, s.min_depth_m, s.max_depth_m, s.crop_px)
 
 
 HEADING, PANELS = "taken for moving", 4

@@ -2,15 +2,8 @@
 
 A run's world is the camera of its first frame: x right, y down, z forward, tilted as the camera was held. An export in
 other axes is rotated about the origin of that world. It is never scaled or shifted, so the unit stays the metre.
-
-| axes     | x     | y     | z     | levelled | expected by                                                      |
-|----------|-------|-------|-------|----------|------------------------------------------------------------------|
-| `y-up`   | right | up    | back  | yes      | glTF and SPZ by definition; three.js, Babylon.js, MeshLab,       |
-|          |       |       |       |          | Open3D's viewer; Blender's import of OBJ and glTF                |
-| `z-up`   | right | ahead | up    | yes      | CAD, slicers, ROS, CloudCompare; Blender's import of PLY and STL |
-| `y-down` | right | down  | ahead | yes      | viewers of 3DGS PLY files that turn a map by 180°: SuperSplat,   |
-|          |       |       |       |          | PlayCanvas, antimatter15's                                       |
-| `camera` | right | down  | ahead | no       | programs that also read the run's path or map.ply                |
+The axes, and who expects them: docs/exports.md, section Axes. `y-up`: right, up, back; `z-up`: right, ahead, up;
+`y-down`: right, down, ahead; `camera`: right, down, ahead, not levelled.
 
 All levelled axes have the same horizontal directions, those of the floor plan: `ahead` is the direction along the walls
 that is nearest to the viewing direction of the first camera. Blender's import of glTF turns `y-up` into `z-up`, so a

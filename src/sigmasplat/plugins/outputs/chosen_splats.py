@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -88,115 +89,81 @@ def heaviest(reader: RunReader, field: GaussianField, most: int) -> Tensor:
     The rendered weight of a splat is Σ w over the pixels of a view, in the view where it is largest. A sum over all
     views would drop what few views show. Raises RunError if the run has no path.
     """
-    weights = rendered_weights(reader, field)
+    camera, config = reader.camera, reader.config
+    shown, none = on_device(field, config.backend), torch.zeros(len(field), 0)
+    ones = torch.ones(camera.height, camera.width, 1)
+    weights = torch.zeros(len(field))
+    for T_world_camera in evenly_spread(list(reader.valid_path().T_world_camera), MOST_VIEWS):
+        T = se3.inverse(T_world_camera)
+        seen = blend_values(shown, camera, T, none, config.render, config.backend, gather=True)
+        weights = torch.maximum(weights, seen.gather(ones.to(seen.alpha))[:, 0].cpu())
     kept = torch.zeros(len(field), dtype=torch.bool)
     kept[torch.from_numpy(np.argsort(-weights.numpy(), kind="stable")[:most].copy())] = True
     return kept.to(field.params.device)
-
-
-def rendered_weights(reader: RunReader, field: GaussianField) -> Tensor:
-    """Return the rendered weight [N] of the splats in pixels of the run's working resolution (`heaviest`)."""
-    camera, config = reader.camera, reader.config
-    shown = on_device(field, config.backend)
-    none = torch.zeros(len(field), 0)
-    ones = torch.ones(camera.height, camera.width, 1)
-    best = torch.zeros(len(field))
-    for T_world_camera in evenly_spread(list(reader.valid_path().T_world_camera), MOST_VIEWS):
-        seen = blend_values(
-            shown, camera, se3.inverse(T_world_camera), none, config.render, config.backend, gather=True
-        )
-        best = torch.maximum(best, seen.gather(ones.to(seen.alpha))[:, 0].cpu())
-    return best
 
 
 Y_UP_FORMATS: tuple[Axes, ...] = ("y-up", "camera")
 """The axes of formats that define y as up. `camera` is not levelled, only rotated by 180° about x."""
 HALF_TURN = np.diag([1.0, -1.0, -1.0, 1.0])
 WriteSplats = Callable[[GaussianField, SplatStd | None], None]
+Bound = float | None
 
 
-@dataclass(frozen=True)
-class SplatChoice:
-    """Options of the command line: bounds of σ, of the standard deviation of depth (m) and of opacity, the largest
-    number of splats, and the axes; None sets no bound and selects the axes of the format."""
+def write_splats(
+    source: "ExportSource", own: Axes, write: WriteSplats, *, sigma_below: Bound, std_below_m: Bound,
+    opacity_above: Bound, max_splats: int | None, axes: Axes | None,
+) -> str:  # fmt: skip
+    """Write the splats within the bounds of σ, of the standard deviation of depth (m) and of opacity, and of those at
+    most `max_splats`; return how many were written and dropped, and the axes. None sets no bound.
 
-    sigma_below: float | None
-    std_below_m: float | None
-    opacity_above: float | None
-    max_splats: int | None
-    axes: Axes | None
-
-    @property
-    def bounds(self) -> dict[str, float | None]:
-        """Return the bounds by name."""
-        return {name: getattr(self, name) for name in ("sigma_below", "std_below_m", "opacity_above")}
-
-    def check(self) -> None:
-        """Raise ConfigError at the first bound without a meaning."""
-        for name, bound in self.bounds.items():
-            if bound is not None and not 0.0 <= bound < float("inf"):
-                raise ConfigError(f"--{name.replace('_', '-')} must be finite and not negative, found {bound}")
-        if self.max_splats is not None and self.max_splats < 1:
-            raise ConfigError(f"--max-splats must be at least 1, found {self.max_splats}")
-
-
-def write_splats(source: "ExportSource", choice: SplatChoice, own: Axes, write: WriteSplats) -> str:
-    """Write the splats within the bounds; return how many were written and dropped, and the axes.
-
-    own: the axes of the format. If it defines y as up, the field that `write` gets is rotated by 180° about x, because
-    the writers in `splats/` rotate it back. Raises ConfigError on a meaningless bound, on axes that the format cannot
+    own: the axes of the format, used without `axes`. If it defines y as up, the field that `write` gets is rotated by
+    180° about x, because the writers in `splats/` rotate it back. Raises ConfigError on axes that the format cannot
     have, or if the splats lack the value that is bounded; RunError if no splat is left.
     """
-    choice.check()
-    axes, allowed = choice.axes or own, Y_UP_FORMATS if own == "y-up" else AXES
+    axes, allowed = axes or own, Y_UP_FORMATS if own == "y-up" else AXES
     if axes not in allowed:
         raise ConfigError(f"--axes {axes} cannot be used with this format, only {', '.join(allowed)}")
     field, std = source.splats()
-    result, total = _filtered(source, field, std, choice)
-    field.keep(result.kept)
-    std = None if std is None else std.at(result.kept.cpu())
-    if choice.max_splats is not None and len(field) > choice.max_splats:
-        kept = heaviest(source.reader(), field, choice.max_splats)
-        field.keep(kept)
-        std = None if std is None else std.at(kept.cpu())
+    _check_known(source.path, field, std, sigma_below, std_below_m, max_splats)
+    total, bounds = len(field), {"sigma_below": sigma_below, "opacity_above": opacity_above, "std_below_m": std_below_m}
+    result = filter_splats(field, **bounds, std=std)
+    if total and result.dropped == total:
+        medians = f"{sigmas(field).median():.3g} and {field.opacities.median():.3g}"
+        medians += "" if std is None else f", of depth_std_m {std.depth_std_m.median():.3g} m"
+        raise RunError(f"no splat of {source.path} is left (median σ and opacity are {medians}); use weaker bounds")
+    kept = result.kept
+    if max_splats is not None and int(kept.sum()) > max_splats:
+        inside = field.moved(torch.eye(4))  # makes a copy
+        inside.keep(kept)
+        kept[kept.nonzero()[:, 0][~heaviest(source.reader(), inside, max_splats)]] = False
+    field.keep(kept)
+    std = None if std is None else std.at(kept.cpu())
     T, note = _transform(source, axes, own)
     field = field if np.array_equal(T, np.eye(4)) else field.moved(torch.from_numpy(T))
     print(f"writing {len(field):,} splats …", flush=True)
     write(field, std)
-    count = f"{len(field):,} splats, axes {axes}{note}"
-    reasons = _reasons(choice, result, total - result.dropped - len(field))
-    return f"{count}; dropped {total - len(field):,} of {total:,}: {reasons}" if reasons else count
+    reasons = [f"{result.by_std:,} for the standard deviation of depth"] * (std_below_m is not None)
+    if any(bound is not None for bound in bounds.values()):
+        reasons.append(f"{result.by_sigma:,} for σ, {result.by_opacity:,} for opacity")
+    reasons += [f"{total - result.dropped - len(field):,} for --max-splats"] * (max_splats is not None)
+    dropped = f"; dropped {total - len(field):,} of {total:,}: {', '.join(reasons)}" if reasons else ""
+    return f"{len(field):,} splats, axes {axes}{note}{dropped}"
 
 
-def _filtered(
-    source: "ExportSource", field: GaussianField, std: SplatStd | None, choice: SplatChoice
-) -> tuple[FilterResult, int]:
-    """Return which splats are within the bounds, and their number before."""
-    path = source.path
-    if choice.max_splats is not None and path.is_file():
+def _check_known(
+    path: Path, field: GaussianField, std: SplatStd | None, sigma_below: Bound, std_below_m: Bound,
+    max_splats: int | None,
+) -> None:  # fmt: skip
+    """Raise ConfigError if the splats lack a value that is bounded."""
+    if max_splats is not None and path.is_file():
         raise ConfigError(f"{path} is not a run, so --max-splats cannot be used; its weights need the run's path")
-    if choice.sigma_below is not None and len(field) and not has_learned_variance(field):
+    if sigma_below is not None and len(field) and not has_learned_variance(field):
         raise ConfigError(f"{path} has no learned σ, so --sigma-below cannot be used; give a run or its PLY")
-    if choice.std_below_m is not None and std is None:
+    if std_below_m is not None and std is None:
         raise ConfigError(
             f"{path} has no calibrated uncertainty, so --std-below-m cannot be used; give a run with uncertainty.json "
             "(run older runs again)"
         )
-    result, total = filter_splats(field, **choice.bounds, std=std), len(field)
-    if total and result.dropped == total:
-        medians = f"{sigmas(field).median():.3g} and {field.opacities.median():.3g}"
-        medians += "" if std is None else f", of depth_std_m {std.depth_std_m.median():.3g} m"
-        raise RunError(f"no splat of {path} is left (median σ and opacity are {medians}); use weaker bounds")
-    return result, total
-
-
-def _reasons(choice: SplatChoice, result: FilterResult, light: int) -> str:
-    """Describe how many splats were dropped for which reason; empty without a bound."""
-    given = [bound is not None for bound in choice.bounds.values()]
-    reasons = [f"{result.by_std:,} for the standard deviation of depth"] * (choice.std_below_m is not None)
-    reasons += [f"{result.by_sigma:,} for σ, {result.by_opacity:,} for opacity"] * any(given)
-    reasons += [f"{light:,} for --max-splats"] * (choice.max_splats is not None)
-    return ", ".join(reasons)
 
 
 def _transform(source: "ExportSource", axes: Axes, own: Axes) -> tuple[Matrix, str]:

@@ -3,8 +3,9 @@
 Imports that load torch are inside the functions, so that `sigmasplat export --help` is fast.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 
 
 Bound = float | None
-SPLATS = "sigmasplat.plugins.outputs.splats"
+SPLAT, SPZ, SOG, GLTF = (f"sigmasplat.plugins.outputs.splats.{name}" for name in ("splat", "spz", "sog", "gltf"))
 
 
 def owners(formats: tuple[Output, ...]) -> dict[str, Output]:
@@ -66,50 +67,30 @@ def refuse_unused(chosen: Output, formats: tuple[Output, ...], given: list[str])
             )
 
 
-def _ply(
-    source: ExportSource, target: Path, *, sigma_below: Bound, std_below_m: Bound, opacity_above: Bound,
-    max_splats: int | None, axes: "Axes | None", plain: bool,
+def _splats(
+    module: str, own: "Axes", keeps_std: bool, source: ExportSource, target: Path, *, sigma_below: Bound,
+    std_below_m: Bound, opacity_above: Bound, max_splats: int | None, axes: "Axes | None", **more: Any,
 ) -> str:  # fmt: skip
-    chosen = sigma_below, std_below_m, opacity_above, max_splats, axes
-    return _write_splats(source, target, chosen, "sigmasplat.run_folder.splat_ply", "y-down", True, plain=plain)
-
-
-def _spz(
-    source: ExportSource, target: Path, *, sigma_below: Bound, std_below_m: Bound, opacity_above: Bound,
-    max_splats: int | None, axes: "Axes | None", spz_version: int | None,
-) -> str:  # fmt: skip
-    from sigmasplat.plugins.outputs.splats.spz import DEFAULT_VERSION, VERSIONS
-
-    version = DEFAULT_VERSION if spz_version is None else spz_version
-    if version not in VERSIONS:
-        raise ConfigError(f"--spz-version must be 2, 3 or 4, found {version}")
-    chosen = sigma_below, std_below_m, opacity_above, max_splats, axes
-    return _write_splats(source, target, chosen, f"{SPLATS}.spz", "y-up", False, version=version)
-
-
-def _splats(module: str, own: "Axes" = "y-down", keeps_std: bool = False) -> Callable[..., str]:
-    """Return the writer of a format without options of its own: splats/MODULE, its axes, whether it keeps `std`."""
-
-    def write(
-        source: ExportSource, target: Path, *, sigma_below: Bound, std_below_m: Bound, opacity_above: Bound,
-        max_splats: int | None, axes: "Axes | None",
-    ) -> str:  # fmt: skip
-        chosen = sigma_below, std_below_m, opacity_above, max_splats, axes
-        return _write_splats(source, target, chosen, f"{SPLATS}.{module}", own, keeps_std)
-
-    return write
-
-
-def _write_splats(
-    source: ExportSource, target: Path, chosen: tuple[Any, ...], module: str, own: "Axes", keeps_std: bool, **more: Any
-) -> str:
-    """Write the chosen splats with `write_field` of a module."""
-    from sigmasplat.plugins.outputs.chosen_splats import SplatChoice, write_splats
+    """Write the chosen splats with `write_field` of a module; own: the axes of its format, keeps_std: it has `std`."""
+    from sigmasplat.plugins.outputs.chosen_splats import write_splats
 
     def write(field: "GaussianField", std: "SplatStd | None") -> None:
         import_module(module).write_field(target, field, **more, **({"std": std} if keeps_std else {}))
 
-    return write_splats(source, SplatChoice(*chosen), own, write)
+    return write_splats(
+        source, own, write, sigma_below=sigma_below, std_below_m=std_below_m, opacity_above=opacity_above,
+        max_splats=max_splats, axes=axes,
+    )  # fmt: skip
+
+
+def _ply(
+    source: ExportSource, target: Path, *, sigma_below: Bound, std_below_m: Bound, opacity_above: Bound,
+    max_splats: int | None, axes: "Axes | None", plain: bool,
+) -> str:  # fmt: skip
+    return _splats(
+        "sigmasplat.run_folder.splat_ply", "y-down", True, source, target, sigma_below=sigma_below,
+        std_below_m=std_below_m, opacity_above=opacity_above, max_splats=max_splats, axes=axes, plain=plain,
+    )  # fmt: skip
 
 
 @contextmanager
@@ -130,18 +111,13 @@ def _trajectory(source: ExportSource, target: Path) -> str:
     return f"{len(path):,} poses{reader.left_out() if has_log else ''}"
 
 
-def _covariances(write: str) -> Callable[..., str]:
-    """Return the writer of a path with covariances, made of a function of `run_folder.trajectory`."""
+def _covariances(write: str, source: ExportSource, target: Path) -> str:
+    from sigmasplat.api import trajectory
 
-    def export(source: ExportSource, target: Path) -> str:
-        from sigmasplat.api import trajectory
-
-        reader = source.reader()
-        path = reader.valid_path()
-        getattr(trajectory, write)(target, path, reader.covariances())
-        return f"{len(path):,} poses with their covariance{reader.left_out()}"
-
-    return export
+    reader = source.reader()
+    path = reader.valid_path()
+    getattr(trajectory, write)(target, path, reader.covariances())
+    return f"{len(path):,} poses with their covariance{reader.left_out()}"
 
 
 def _kitti(source: ExportSource, target: Path) -> str:
@@ -158,21 +134,16 @@ def _kitti(source: ExportSource, target: Path) -> str:
     return f"{len(reader.frames.rows):,} poses{left_out}{' (written as nan)' if left_out else ''}"
 
 
-def _views(write: str) -> Callable[..., str]:
-    """Return the writer of a format of views, made of a function of `outputs.views`."""
+def _views(write: str, source: ExportSource, target: Path, *, pictures: bool) -> str:
+    from sigmasplat.plugins.outputs import views
 
-    def export(source: ExportSource, target: Path, *, pictures: bool) -> str:
-        from sigmasplat.plugins.outputs import views
-
-        reader = source.reader()
-        if not pictures:
-            count = getattr(views, write)(reader, target)
-            return f"{count:,} views, no pictures (--pictures){reader.left_out()}"
-        with _counting("pictures") as progress:
-            count = getattr(views, write)(reader, target, True, progress)
-            return f"{count:,} views with their pictures{reader.left_out(keyframes=True)}"
-
-    return export
+    reader = source.reader()
+    if not pictures:
+        count = getattr(views, write)(reader, target)
+        return f"{count:,} views, no pictures (--pictures){reader.left_out()}"
+    with _counting("pictures") as progress:
+        count = getattr(views, write)(reader, target, True, progress)
+        return f"{count:,} views with their pictures{reader.left_out(keyframes=True)}"
 
 
 def _points(source: ExportSource, target: Path, *, voxel_m: float | None, axes: "Axes | None") -> str:
@@ -217,25 +188,20 @@ def _bag(source: ExportSource, target: Path, *, pictures: bool) -> str:
     return f"{sum(counts.values()):,} messages of {len(counts)} topics{reader.left_out()}"
 
 
+_covariance, _ros_covariance = (partial(_covariances, write) for write in ("write_square", "write_ros"))
+_nerfstudio, _colmap = (partial(_views, write) for write in ("export_nerfstudio", "export_colmap"))
 PLUGIN = (
     Output("ply", (".ply",), "3DGS PLY with σ², for every viewer", _ply),
-    Output("compressed-ply", (".compressed.ply",), "SuperSplat's PLY, a fifth of the size", _splats("compressed_ply")),
-    Output("splat", (".splat",), "32 bytes per splat, for web viewers", _splats("splat")),
-    Output("spz", (".spz",), "Niantic's SPZ, less than a fifth of the size", _spz),
-    Output("sog", (".sog",), "SuperSplat's SOG, the smallest", _splats("sog")),
-    Output("gltf", (".glb", ".gltf"), "glTF with splats (KHR) and σ", _splats("gltf", "y-up", True)),
-    Output("usd", (".usdc", ".usda", ".usd"), "OpenUSD with splats and σ", _splats("usd", "y-up", True)),
+    Output("splat", (".splat",), "32 bytes per splat, for web viewers", partial(_splats, SPLAT, "y-down", False)),
+    Output("spz", (".spz",), "Niantic's SPZ, less than a fifth of the size", partial(_splats, SPZ, "y-up", False)),
+    Output("sog", (".sog",), "SuperSplat's SOG, the smallest", partial(_splats, SOG, "y-down", False)),
+    Output("gltf", (".glb",), "glTF with splats (KHR) and σ", partial(_splats, GLTF, "y-up", True)),
     Output("trajectory", (".txt",), "the path as TUM text", _trajectory),
-    Output(
-        "covariance",
-        (".cov.txt",),
-        "the path as TUM text with the covariance of each pose",
-        _covariances("write_square"),
-    ),
-    Output("ros-covariance", (".ros.txt",), "the same as geometry_msgs/PoseWithCovariance", _covariances("write_ros")),
+    Output("covariance", (".cov.txt",), "the path as TUM text with the covariance of each pose", _covariance),
+    Output("ros-covariance", (".ros.txt",), "the same as geometry_msgs/PoseWithCovariance", _ros_covariance),
     Output("kitti", (".kitti.txt",), "the path as KITTI text, one line per frame", _kitti, True),
-    Output("nerfstudio", (".json",), "views as nerfstudio's transforms.json", _views("export_nerfstudio"), True),
-    Output("colmap", ("-colmap",), "a folder with COLMAP's text model in sparse/0", _views("export_colmap"), True),
+    Output("nerfstudio", (".json",), "views as nerfstudio's transforms.json", _nerfstudio, True),
+    Output("colmap", ("-colmap",), "a folder with COLMAP's text model in sparse/0", _colmap, True),
     Output("points", (".points.ply",), "the surface as points with normals", _points, True),
     Output("video", (".webm", ".mp4", ".gif", ".webp"), "a video: colour, depth, uncertainty", _video, True),
     Output("bag", (".mcap", "-bag"), "ROS 2 messages: path with covariance, loops, map", _bag, True),

@@ -15,7 +15,7 @@ from scipy.sparse.linalg import splu
 from scipy.spatial import Delaunay, cKDTree
 from scipy.spatial.distance import pdist
 
-from sigmasplat.api import ConfigError, Matrix, Mesh
+from sigmasplat.api import Matrix, Mesh
 
 Indices = NDArray[np.int64]
 
@@ -49,11 +49,8 @@ def filled(mesh: Mesh, largest_m: float) -> Mesh:
 
     New vertices follow the others. They have the colours of the edge, a standard deviation that grows with the distance
     from it (if the mesh has any), and `Mesh.filled` true. Outer borders and rims stay open. largest_m = 0 closes none.
-    Raises ConfigError if it is negative.
     """
-    if not largest_m >= 0:
-        raise ConfigError(f"--fill-gaps must be at least 0 m (0 = none), found {largest_m:g}")
-    if not largest_m or not len(mesh.faces):
+    if not largest_m > 0 or not len(mesh.faces):
         return mesh
     neighbours = _neighbours(mesh.faces.astype(np.int64), len(mesh.vertices))
     patches = [_patch(mesh, loop, neighbours) for loop in gaps(mesh, largest_m)]
@@ -132,7 +129,7 @@ def _patch(mesh: Mesh, loop: Indices, neighbours: csr_array) -> Patch | None:
         return Patch(loop, none, faces, none, none[:, 0])
     known = np.concatenate([loop, np.setdiff1d(neighbours[loop].indices, loop)])
     points = mesh.vertices[known].astype(np.float64)
-    pairs = _pairs(_neighbours(faces, len(disc)), _numbered(neighbours[loop], known))
+    pairs = _pairs(_neighbours(faces, len(disc)), csr_array(neighbours[loop][:, known]))
     new = np.arange(n, len(disc))
     placed = np.concatenate([points[:n], np.zeros((len(new), 3)), points[n:]])
     lengths = np.ones(pairs.shape[1])
@@ -199,13 +196,7 @@ def _neighbours(faces: Indices, vertices: int) -> csr_array:
     return csr_array(coo_array((np.ones(len(row)), (row, column)), shape=(vertices, vertices)))
 
 
-def _numbered(rows: csr_array, known: Indices) -> csr_array:
-    """Return rows [n, V] with only the columns of `known`, in their order."""
-    return csr_array(rows[:, known])
-
-
 def _joined(mesh: Mesh, patches: list[Patch]) -> Mesh:
-    """Return the mesh with patches."""
     if not patches:
         return mesh
     start, faces = len(mesh.vertices), [mesh.faces.astype(np.int64)]
@@ -234,27 +225,17 @@ def _dot(a: Matrix, b: Matrix) -> Matrix:
     return np.asarray(np.einsum("ij,ij->i", a, b))
 
 
-TRIANGLES = 300_000
-"""Default number of triangles of a mesh for viewers."""
 AGGRESSIVENESS = 5.0
 """Of fast-simplification, 0 to 10: lower values keep the shape better and take longer."""
-
-
-def refuse_budget(triangles: int) -> None:
-    """Raise ConfigError if a number of triangles is negative."""
-    if triangles < 0:
-        raise ConfigError(f"--triangles must be at least 0 (0 = all), found {triangles}")
 
 
 def decimated(mesh: Mesh, triangles: int) -> Mesh:
     """Return the mesh with at most `triangles` triangles; a mesh that has no more is returned unchanged.
 
     Flat parts get few large triangles, so the surface moves little. The colour and depth_std_m of a vertex are the
-    means of those of the original vertices that are nearest to it. triangles = 0 keeps all. Raises ConfigError if
-    triangles is negative.
+    means of those of the original vertices that are nearest to it. triangles = 0 keeps all.
     """
-    refuse_budget(triangles)
-    if not triangles or len(mesh.faces) <= triangles:
+    if triangles <= 0 or len(mesh.faces) <= triangles:
         return mesh
     from fast_simplification import simplify
 

@@ -9,7 +9,6 @@ metal, which is black without surroundings to reflect. COLOR_0 is linear by defi
 room is seen from inside and from outside, hence `doubleSided`.
 """
 
-import json
 import os
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -28,63 +27,30 @@ from sigmasplat.api import (
     read_header,
     replacing,
 )
-from sigmasplat.plugins.outputs.splats.gltf import glb_of, linear
+from sigmasplat.plugins.outputs.splats.gltf import UNLIT, glb, linear
 
-UINT16, UINT32, FLOAT32, VERTEX_TARGET, INDEX_TARGET = 5123, 5125, 5126, 34962, 34963
-"""Constants of the glTF 2.0 specification."""
 GRAY = 0.7
 Values = NDArray[np.floating]
 MATERIAL = {
     "name": "recorded light",
     "pbrMetallicRoughness": {"baseColorFactor": [1.0, 1.0, 1.0, 1.0], "metallicFactor": 0.0, "roughnessFactor": 1.0},
     "doubleSided": True,
-    "extensions": {"KHR_materials_unlit": {}},
+    "extensions": {UNLIT: {}},
 }
 
 
-def glb(mesh: Mesh) -> bytes:
+def _glb(mesh: Mesh, note: str) -> bytes:
     """Return a mesh whose y axis points up, as glTF requires, as the bytes of a GLB file.
 
     POSITION and NORMAL are float32, COLOR_0 is linear in normalised uint16 with alpha 1. depth_std_m becomes
     `_DEPTH_STD_M`: glTF requires an underscore before the names of own attributes.
     """
-    vertices = mesh.vertices.astype("<f4")
-    bounds = {"min": vertices.min(0).tolist(), "max": vertices.max(0).tolist()} if len(vertices) else {}
-    attributes: dict[str, tuple[NDArray[Any], dict[str, Any]]] = {
-        "POSITION": (vertices, {"componentType": FLOAT32, "type": "VEC3", **bounds}),
-        "NORMAL": (_normals(mesh), {"componentType": FLOAT32, "type": "VEC3"}),
-        "COLOR_0": (_linear_colors(mesh), {"componentType": UINT16, "type": "VEC4", "normalized": True}),
-    }
-    if mesh.depth_std_m is not None:
-        attributes["_DEPTH_STD_M"] = (mesh.depth_std_m.astype("<f4"), {"componentType": FLOAT32, "type": "SCALAR"})
-    if not len(mesh.faces):  # glTF has no empty accessors, and a scene without meshes is valid
-        return glb_of(json.dumps({"asset": _ASSET, "scene": 0, "scenes": [{}]}).encode(), b"")
-    arrays = [array for array, _ in attributes.values()] + [mesh.faces.astype("<u4")]
-    starts = np.cumsum([0, *(array.nbytes for array in arrays)]).tolist()
-    targets = [VERTEX_TARGET] * len(attributes) + [INDEX_TARGET]
-    indices = {"componentType": UINT32, "type": "SCALAR", "bufferView": len(attributes), "count": mesh.faces.size}
-    accessors = [
-        {"bufferView": view, "count": len(vertices), **kind} for view, (_, kind) in enumerate(attributes.values())
-    ]
-    primitive = {
-        "attributes": {name: number for number, name in enumerate(attributes)},
-        "indices": len(attributes),
-        "material": 0,
-    }
-    scene = {
-        "asset": _ASSET, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0, "name": "surface"}],
-        "meshes": [{"primitives": [primitive]}], "materials": [MATERIAL],
-        "extensionsUsed": ["KHR_materials_unlit"], "buffers": [{"byteLength": starts[-1]}],
-        "bufferViews": [
-            {"buffer": 0, "byteOffset": start, "byteLength": array.nbytes, "target": target}
-            for array, start, target in zip(arrays, starts, targets, strict=False)
-        ],
-        "accessors": [*accessors, indices],
+    attributes: dict[str, NDArray[Any]] = {
+        "POSITION": mesh.vertices.astype("<f4"), "NORMAL": _normals(mesh), "COLOR_0": _linear_colors(mesh)
     }  # fmt: skip
-    return glb_of(json.dumps(scene).encode(), b"".join(array.tobytes() for array in arrays))
-
-
-_ASSET = {"version": "2.0", "generator": "sigmasplat"}
+    if mesh.depth_std_m is not None:
+        attributes["_DEPTH_STD_M"] = mesh.depth_std_m.astype("<f4")
+    return glb(attributes, {}, MATERIAL, "surface", mesh.faces.astype("<u4").ravel())
 
 
 def _linear_colors(mesh: Mesh) -> NDArray[np.uint16]:
@@ -259,4 +225,4 @@ def color_bytes(colors: NDArray[np.floating]) -> NDArray[np.uint8]:
     return np.asarray(np.rint(np.clip(colors, 0.0, 1.0) * 255.0), np.uint8)
 
 
-_FORMATS = {".ply": _ply, ".obj": _obj, ".glb": lambda mesh, note: glb(mesh), ".stl": _stl}
+_FORMATS = {".ply": _ply, ".obj": _obj, ".glb": _glb, ".stl": _stl}

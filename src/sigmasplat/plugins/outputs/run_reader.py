@@ -114,7 +114,6 @@ class RunReader:
                     yield frame, self.run.submaps.picture(index, k)
 
     def _keyframes_of_sequence(self) -> Iterator[tuple[int, Picture]]:
-        """Read the keyframes from the sequence again."""
         s = self.config.input
         for i, record in enumerate(self.frames.log):
             if record["is_keyframe"]:

@@ -30,7 +30,7 @@ class ExportSource:
     def name(self) -> str:
         """Return the default name of exports: the run's name, or the file's name without its ending."""
         path = self.path.resolve()
-        return path.stem.removesuffix(".compressed") if path.is_file() else path.name
+        return path.stem if path.is_file() else path.name
 
     def run(self) -> "RunFolder":
         """Open the run. Raises RunError if there is no run, or if the source is a map."""

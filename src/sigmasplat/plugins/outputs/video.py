@@ -2,23 +2,21 @@
 
 import os
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from PIL import Image
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 
 from sigmasplat.api import (
-    BackendError,
     Camera,
-    ConfigError,
     FieldRenderer,
     GaussianField,
     Matrix,
@@ -27,15 +25,16 @@ from sigmasplat.api import (
     SigmaSplatError,
     Trajectory,
     evenly_spread,
-    install_package,
     no_progress,
     noted_up,
     replacing,
     se3,
 )
+from sigmasplat.plugins.evaluation.metrics.views import COVERED_ALPHA
+from sigmasplat.plugins.outputs.drawing import colormap
 from sigmasplat.plugins.outputs.drawing.colormap import Rgb
-from sigmasplat.plugins.outputs.drawing.film import FilmMaps, FilmScale, color_bytes, film_image, legend_strip
-from sigmasplat.plugins.outputs.floorplan.ground import SurfaceRenderer, floor_frame, sample_surfaces
+from sigmasplat.plugins.outputs.drawing.view_panels import ViewPanel, coloured, draw_view_strip
+from sigmasplat.plugins.outputs.floorplan.ground import Floats, SurfaceRenderer, floor_frame, sample_surfaces
 from sigmasplat.plugins.outputs.run_reader import RunReader
 
 SMOOTHING_S = 0.25
@@ -113,8 +112,6 @@ class VideoOptions:
     width_px: width of a panel (0: that of the run's images); fps: images per second; seconds: length (None: that of the
     path, within 4 to 20 s; 12 s for an orbit); path: along the run's path or on an orbit; panels: colour, depth and
     uncertainty side by side ("all"), or colour alone ("color").
-
-    Raises ConfigError on a size, rate or length out of range.
     """
 
     width_px: int = 0
@@ -122,18 +119,6 @@ class VideoOptions:
     seconds: float | None = None
     path: Literal["run", "orbit"] = "run"
     panels: Literal["all", "color"] = "all"
-
-    def __post_init__(self) -> None:
-        if not (self.width_px == 0 or 32 <= self.width_px <= 4096):
-            raise ConfigError(f"a video's panels must be 32 to 4096 pixels wide, found {self.width_px}")
-        if not 1.0 <= self.fps <= 120.0 or not (self.seconds is None or 0.04 <= self.seconds <= 3600.0):
-            raise ConfigError(
-                f"a video must have 1 to 120 images/s and last 0.04 s to 1 h, found {self.fps} and {self.seconds} s"
-            )
-        if self.path not in ("run", "orbit"):
-            raise ConfigError(f"a video's path must be 'run' or 'orbit', found {self.path!r}")
-        if self.panels not in ("all", "color"):
-            raise ConfigError(f"a video's panels must be 'all' or 'color', found {self.panels!r}")
 
     def images(self, path_s: float) -> int:
         """Return the number of images of the film, for a path that lasts `path_s` seconds."""
@@ -151,7 +136,7 @@ def export_video(
 ) -> int:
     """Write a video and return its number of images. Calls `progress(done, total)` at the start and after each image.
 
-    Raises RunError on an unknown ending, or without a map or path; BackendError without OpenCV for .webm and .mp4.
+    Raises RunError on an unknown ending, or without a map or path.
     """
     options = options or VideoOptions()
     check_ending(target)
@@ -163,11 +148,54 @@ def export_video(
         field, poses = orbit_view(field, path, camera, count, renderer, noted_up(reader.run.facts()))
     else:
         poses = smooth_path(path, count)
-    show = partial(_show, renderer, field, camera)
-    width = None if options.panels == "color" else camera.width
+    film = Film(field, camera, renderer)
     progress(0, count)
-    write_video(target, _images(show, poses, width, progress), options.fps)
+    write_video(target, film.images(poses, options.panels == "all", progress), options.fps)
     return count
+
+
+@dataclass(frozen=True, eq=False)
+class Film:
+    """A map, and how it is filmed: its camera and its renderer."""
+
+    field: GaussianField
+    camera: Camera
+    renderer: SurfaceRenderer
+
+    def images(self, poses: Matrix, panels: bool, progress: Progress = no_progress) -> Iterator[Rgb]:
+        """Yield an image for each pose [N, 4, 4]: colour, in `panels` with depth and √V beside it."""
+        ranges = self._ranges(poses) if panels else None
+        for done, pose in enumerate(poses, 1):
+            color, depth_m, deviation, mapped = self._maps(pose)
+            shown = ViewPanel("colour", np.asarray(np.rint(color * 255.0), np.uint8))
+            if ranges is None:
+                yield shown.pixels
+            else:
+                of_depth = coloured("depth", depth_m, mapped, ranges[0], colormap.VIRIDIS, " m")
+                of_color = coloured("uncertainty", deviation, mapped, ranges[1], colormap.INFERNO)
+                yield np.asarray(draw_view_strip([shown, of_depth, of_color], self.camera.width))
+            progress(done, len(poses))
+
+    def _ranges(self, poses: Matrix) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Return the colour ranges of a whole film from a few images: the 1st to the 99th percentile of depth, and 0 to
+        the 99th of √V."""
+        samples = zip(*(self._maps(pose) for pose in evenly_spread(list(poses), SAMPLES)), strict=True)
+        _, depth_m, deviation, mapped = (np.stack(maps) for maps in samples)
+        return colormap.value_range(depth_m, mapped), (0.0, colormap.value_range(deviation, mapped)[1])
+
+    def _maps(self, T_world_camera: Matrix) -> tuple[Floats, Floats, Floats, NDArray[np.bool_]]:
+        """Return colour [H, W, 3] in [0, 1], depth Σwz / Σw in m, √V of the mean over the channels, and where there is
+        a surface."""
+        with torch.inference_mode():
+            seen = self.renderer(self.field, self.camera, se3.inverse(T_world_camera))
+        alpha = seen.alpha.cpu()
+        maps = (
+            seen.color.cpu().clamp(0.0, 1.0),
+            seen.depth.cpu() / alpha.clamp(min=COVERED_ALPHA),
+            seen.variance.cpu().mean(-1).clamp(min=0.0).sqrt(),
+        )
+        color, depth_m, deviation = (np.asarray(values, np.float32) for values in maps)
+        return color, depth_m, deviation, np.asarray(alpha > COVERED_ALPHA)
 
 
 def film_camera(camera: Camera, width_px: int) -> Camera:
@@ -201,22 +229,6 @@ def orbit_view(
     return kept, orbit(center, T[2, :3], T[1, :3], radius_m, images)
 
 
-def _show(renderer: SurfaceRenderer, field: GaussianField, camera: Camera, T_world_camera: Matrix) -> FilmMaps:
-    with torch.inference_mode():
-        return FilmMaps.of(renderer(field, camera, se3.inverse(T_world_camera)))
-
-
-def _images(show: Callable[[Matrix], FilmMaps], poses: Matrix, width: int | None, progress: Progress) -> Iterator[Rgb]:
-    """Yield the images of a video: panels of this width, whose colour scale a few images determine; None: colour."""
-    draw: Callable[[FilmMaps], Rgb] = color_bytes
-    if width is not None:
-        scale = FilmScale.of([show(pose) for pose in evenly_spread(list(poses), SAMPLES)])
-        draw = partial(film_image, scale=scale, strip=legend_strip(scale, width))
-    for done, pose in enumerate(poses, 1):
-        yield draw(show(pose))
-        progress(done, len(poses))
-
-
 CODECS = {".webm": "VP90", ".mp4": "vp09"}
 ANIMATIONS = {".gif": "GIF", ".webp": "WEBP"}
 ENDINGS = (*CODECS, *ANIMATIONS)
@@ -226,7 +238,7 @@ NO_IMAGES = "a video needs at least one image, found none"
 def write_video(path: Path, images: Iterable[Rgb], fps: float) -> None:
     """Write images uint8 RGB [H, W, 3] of equal size as a video in the format of the path's ending, atomically.
 
-    Raises RunError on an unknown ending, an unwritable file or a missing codec; BackendError without OpenCV.
+    Raises RunError on an unknown ending, an unwritable file or a missing codec.
     """
     check_ending(path)
     kind = path.suffix.lower()
@@ -243,32 +255,23 @@ def write_video(path: Path, images: Iterable[Rgb], fps: float) -> None:
 
 
 def check_ending(path: Path) -> None:
-    """Raise RunError unless the path's ending is that of a video, BackendError if it needs OpenCV, which is missing."""
+    """Raise RunError unless the path's ending is that of a video."""
     if path.suffix.lower() not in ENDINGS:
         raise RunError(f"cannot write a video as {path.name}; give a name that ends in {', '.join(ENDINGS)}")
-    if path.suffix.lower() in CODECS:
-        _opencv()
-
-
-def _opencv() -> Any:
-    try:
-        import cv2
-    except ImportError as problem:
-        raise BackendError(
-            f"videos as .webm and .mp4 need OpenCV: {install_package('opencv-python-headless')}; or write .gif or .webp"
-        ) from problem
-    return cv2
 
 
 def _write_vp9(path: Path, images: Iterable[Rgb], fps: float, codec: str) -> None:
     """Encode with VP9, which needs even sizes: an odd last row or column is dropped."""
-    cv2, writer, size = _opencv(), None, (0, 0)
+    import cv2
+
+    writer, size = None, (0, 0)
     try:
         for image in images:
             if writer is None:
                 size = (image.shape[1] // 2 * 2, image.shape[0] // 2 * 2)
                 with _quiet():
-                    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*codec), fps, size)
+                    fourcc = cv2.VideoWriter.fourcc(*codec)
+                    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, fourcc, fps, size)
                 if not writer.isOpened():
                     raise RunError(
                         f"cannot write {path.name} with this OpenCV; choose .gif or .webp, or a writable place"

@@ -30,6 +30,7 @@ from sigmasplat.api import (
 from sigmasplat.plugins.evaluation.metrics.views import COVERED_ALPHA
 from sigmasplat.plugins.outputs.chosen_splats import sigmas
 from sigmasplat.plugins.outputs.drawing import colormap
+from sigmasplat.plugins.outputs.drawing.view_panels import colour_bar
 from sigmasplat.plugins.viewer.snapshot import Piece, field_without_moments
 
 Colouring = Literal["colour", "σ", "depth error"]
@@ -167,9 +168,8 @@ def _moved_extra(field: GaussianField, name: str, T_world_piece: Tensor) -> Tens
     return harmonics.turned(values, T_world_piece[:3, :3]) if name == "harmonics" else values
 
 
-Layer = Literal["colour", "depth", "normals", "V", "U", "opacity", "color error", "depth error"]
+Layer = Literal["colour", "depth", "V", "U", "color error", "depth error"]
 ErrorPart = Literal["all", "aleatoric", "epistemic"]
-GREY = np.array([(0, 0, 0), (255, 255, 255)], np.float64)
 LEGEND_SIZE, LEGEND_BAR, INK, PAPER = (280, 34), 14, (233, 237, 242), (36, 40, 46)
 
 
@@ -200,9 +200,8 @@ def render_layer(
 ) -> LayerImage:
     """Render a field and draw one layer of the result.
 
-    Layers: colour; depth D̂/A in m; normals of the surface at that depth (`surface_normals`); V: √V averaged over the
-    channels, colours being 0 to 1 (VarSplat §1); U: √U about that depth, in m (CG-SLAM eq. 10); opacity A. Depth,
-    normals, V and U are drawn only where A > ½.
+    Layers: colour; depth D̂/A in m; V: √V averaged over the channels, colours being 0 to 1 (VarSplat §1); U: √U about
+    that depth, in m (CG-SLAM eq. 10). Depth, V and U are drawn only where A > ½.
     """
     T_camera_world = se3.inverse(T_world_camera)
     with torch.no_grad():
@@ -212,12 +211,8 @@ def render_layer(
         depth_m = np.where(covered, _array(seen.depth) / np.maximum(alpha, COVERED_ALPHA), 0.0).astype(np.float32)
         if layer == "colour":
             return LayerImage((seen.color.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).cpu().numpy())
-        if layer == "opacity":
-            return LayerImage(colormap.apply(alpha, 0.0, 1.0, GREY), Legend(GREY, 0.0, 1.0, ""))
         if layer == "depth":
             return _mapped(depth_m, covered, colormap.value_range(depth_m, covered), colormap.VIRIDIS, " m")
-        if layer == "normals":
-            return LayerImage(_drawn_normals(surface_normals(depth_m, camera)))
         if layer == "V":
             return _from_zero(_array(seen.variance.mean(2).clamp(min=0.0).sqrt()), covered, "")
         spread = render(field, camera, T_camera_world, torch.from_numpy(depth_m), options, backend).uncertainty
@@ -251,37 +246,11 @@ def render_predicted(
     return _mapped(_array(shown.sqrt()), covered, ends, colormap.INFERNO, unit)
 
 
-def surface_normals(depth_m: Floats, camera: Camera) -> Floats:
-    """Return the unit normals [H, W, 3] of a depth image [H, W] m (0 = no surface), in the camera's frame, towards it.
-
-    A normal is the cross product of the differences between neighbouring surface points; 0 where one of them has no
-    depth.
-    """
-    v, u = np.mgrid[: depth_m.shape[0], : depth_m.shape[1]].astype(np.float32)
-    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1)
-    points = rays * depth_m[..., None]
-    along_u, along_v = np.gradient(points, axis=1), np.gradient(points, axis=0)
-    normals = np.cross(along_v, along_u)
-    padded = np.pad(depth_m > 0, 1, constant_values=True)
-    known = padded[1:-1, :-2] & padded[1:-1, 2:] & padded[:-2, 1:-1] & padded[2:, 1:-1] & (depth_m > 0)
-    length = np.linalg.norm(normals, axis=-1, keepdims=True)
-    return np.where(known[..., None] & (length > 0), normals / np.maximum(length, 1e-20), 0.0).astype(np.float32)
-
-
-def _drawn_normals(normals: Floats) -> colormap.Rgb:
-    """Draw normals as colours: red = to the right, green = up, blue = towards the camera."""
-    colors = 127.5 + 127.5 * normals * np.array([1.0, -1.0, -1.0], np.float32)
-    missing = (normals == 0.0).all(-1)
-    colors[missing] = colormap.NO_READING
-    return np.asarray(colors.round().astype(np.uint8))
-
-
 def draw_legend(legend: Legend) -> colormap.Rgb:
     """Draw a palette and the values at its ends, uint8 [34, 280, 3]."""
     width, height = LEGEND_SIZE
     image = Image.new("RGB", LEGEND_SIZE, PAPER)
-    ramp = colormap.apply(np.tile(np.linspace(0.0, 1.0, width), (LEGEND_BAR, 1)), 0.0, 1.0, legend.palette)
-    image.paste(Image.fromarray(ramp), (0, 0))
+    image.paste(Image.fromarray(colour_bar(legend.palette, width, LEGEND_BAR)), (0, 0))
     draw, font = ImageDraw.Draw(image), ImageFont.load_default(14)
     middle = (height + LEGEND_BAR) // 2
     draw.text((1, middle), f"{legend.low:.3g}{legend.unit}", INK, font, anchor="lm")

@@ -10,7 +10,7 @@ import viser
 from sigmasplat.plugins.outputs.drawing.colormap import NO_READING, Rgb
 from sigmasplat.plugins.viewer.layers import LEGEND_SIZE, Colouring, ErrorPart, Layer
 
-ViewMode = Literal["splats", "mesh", "colour", "depth", "normals", "V", "U", "opacity", "color error", "depth error"]
+ViewMode = Literal["splats", "mesh", "colour", "depth", "V", "U", "color error", "depth error"]
 VIEW_MODES: tuple[ViewMode, ...] = get_args(ViewMode)
 PREDICTED_MODES: tuple[ViewMode, ...] = ("color error", "depth error")
 """Only for maps with predicted errors."""
@@ -19,10 +19,8 @@ MODE_LABELS: dict[ViewMode, str] = {
     "mesh": "mesh",
     "colour": "colour, rendered by SigmaSplat",
     "depth": "depth",
-    "normals": "normals of the surface",
     "V": "√V: standard deviation of colour",
     "U": "√U: standard deviation of depth",
-    "opacity": "opacity",
     "color error": "predicted error of colour",
     "depth error": "predicted error of depth",
 }

@@ -171,5 +171,4 @@ def thumbnail(image: Rgb | None) -> Rgb | None:
 
 
 def _place(node: Any, T_world_node: Matrix) -> None:
-    """Set the pose of a node."""
     node.wxyz, node.position = se3.quaternion_from_rotation(T_world_node[:3, :3]), T_world_node[:3, 3]

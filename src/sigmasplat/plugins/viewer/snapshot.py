@@ -175,9 +175,9 @@ Bytes = NDArray[np.uint8]
 
 MAX_SEGMENTS = 5000
 MAX_KEYFRAMES = 100
-SUBMAP_COLOURS = (DARK.curves[ACCENT], DARK.curves[GREEN])
+SUBMAP_COLOURS = (DARK[ACCENT], DARK[GREEN])
 """Used alternately, so that neighbouring submaps differ."""
-TRUTH_COLOUR = DARK.curves[BLUE]
+TRUTH_COLOUR = DARK[BLUE]
 LOST_COLOUR = (255, 60, 60)
 
 

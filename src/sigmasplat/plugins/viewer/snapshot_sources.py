@@ -4,6 +4,7 @@ written by another process."""
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +26,7 @@ from sigmasplat.api import (
     RunFrames,
     SigmaSplatError,
     Source,
+    SubmapStore,
     outside_world,
     read_trajectory,
     states_at_end,
@@ -59,12 +61,11 @@ def finished_snapshot(run: RunFolder, source: Source | None = None, budget: int 
     frames, final, tensors = run.read_frames(), run.read_map(), run.read_checkpoint()[0]
     config, true_file = run.config(), run.path / TRUTH
     outside = frames.submaps_outside()
-    cache = SubmapCache(run, budget)
-    cache.load_all(np.asarray(tensors["T_world_submap"], np.float64))
+    cache, anchors = SubmapCache(run.submaps, budget), np.asarray(tensors["T_world_submap"], np.float64)
+    cache.load(lambda index, first: _row_of(anchors, index))
     pieces = list(cache.pieces.values())
-    if pieces and len(pieces) < len(tensors["T_world_submap"]):
-        active = GaussianField(tensors["params"])
-        pieces.append(Piece(len(pieces), thin(active, budget), np.asarray(tensors["T_world_submap"][-1])))
+    if pieces and len(pieces) < len(anchors):
+        pieces.append(Piece(len(pieces), thin(GaussianField(tensors["params"]), budget), anchors[-1]))
     pieces = [piece for piece in pieces if piece.submap not in outside]
     return Snapshot(
         run.path.resolve().name,
@@ -89,7 +90,8 @@ def running_snapshot(run: RunFolder, cache: "SubmapCache") -> Snapshot:
     """
     log = run.read_log() if (run.path / "log.jsonl").is_file() else []
     config, poses = run.config(), [np.array(record["T_world_camera"], np.float64) for record in log]
-    cache.load_new(poses)
+    earlier = np.array(run.facts().get("onto", {}).get("T_world_submap", [])).reshape(-1, 4, 4)  # of an earlier session
+    cache.load(lambda index, first: earlier[index] if index < len(earlier) else _row_of(poses, first))
     keyframes = tuple(row for row, record in enumerate(log) if record["is_keyframe"])
     lost, submaps = _lost_and_submaps(log)
     states = np.array([record.get("state", "") for record in log], str)
@@ -107,7 +109,7 @@ def follow_run(run: RunFolder, show: ShowSnapshot, stop: threading.Event, source
 
     Returns earlier if `stop` is set. Raises RunError if the run has ended without a map.
     """
-    cache = SubmapCache(run)
+    cache = SubmapCache(run.submaps)
     while run.facts().get("status") == "running":
         show(running_snapshot(run, cache))
         if stop.wait(EVERY_S):
@@ -116,30 +118,30 @@ def follow_run(run: RunFolder, show: ShowSnapshot, stop: threading.Event, source
 
 
 class SubmapCache:
-    """The finished submaps of a run that have been read so far, within a budget of splats, and their images.
+    """The finished submaps that have been read so far, within a budget of splats, and the images of their keyframes."""
 
-    earlier [E, 4, 4]: T_world_submap of the submaps of an earlier session that the run continues.
-    """
-
-    def __init__(self, run: RunFolder, budget: int = BUDGET) -> None:
-        self.store, self.budget = run.submaps, budget
-        self.earlier = np.array(run.facts().get("onto", {}).get("T_world_submap", [])).reshape(-1, 4, 4)
+    def __init__(self, store: SubmapStore, budget: int = BUDGET) -> None:
+        self.store, self.budget = store, budget
         self.pieces: dict[int, Piece] = {}
         self.camera: Camera | None = None
         self._keyframes: dict[int, tuple[int, int]] = {}
 
-    def load_new(self, T_world_camera: list[Matrix]) -> None:
-        """Read the submaps that were not read before and whose first keyframe has a pose."""
-        for index in range(len(self.pieces), len(self.store)):
-            if index < len(self.earlier):
-                self._add(index, lambda first, T=self.earlier[index]: T)  # type: ignore[misc]
-            else:
-                self._add(index, lambda first: T_world_camera[first] if first < len(T_world_camera) else None)
+    def load(self, pose_of: Callable[[int, int], Matrix | None]) -> None:
+        """Read the submaps that were not read before, up to the first one without a pose.
 
-    def load_all(self, T_world_submap: NDArray[np.float64]) -> None:
-        """Read all submaps that have a pose."""
-        for index in range(min(len(self.store), len(T_world_submap))):
-            self._add(index, lambda first, T=T_world_submap[index]: T)  # type: ignore[misc]
+        pose_of: returns T_world_submap from the numbers of a submap and of the frame of its first keyframe.
+        """
+        for index in range(len(self.pieces), len(self.store)):
+            submap = self.store.load(index)
+            T_world_submap = pose_of(index, submap.frames[0])
+            if T_world_submap is None:
+                return
+            self.camera = submap.camera
+            self.pieces[index] = Piece(index, thin(submap.field, self.budget), T_world_submap)
+            fitting = within_budget(tuple(self.pieces.values()), self.budget)
+            self.pieces = dict(zip(self.pieces, fitting, strict=True))
+            for k, row in enumerate(submap.frames):
+                self._keyframes.setdefault(row, (index, k))
 
     def image(self, row: int) -> Rgb | None:
         """Return the image of the keyframe at a row of the path, or None if its submap was not read."""
@@ -147,17 +149,9 @@ class SubmapCache:
             return None
         return self.store.picture(*self._keyframes[row]).color
 
-    def _add(self, index: int, anchor_of: Callable[[int], Matrix | None]) -> None:
-        submap = self.store.load(index)
-        T_world_submap = anchor_of(submap.frames[0])
-        if T_world_submap is None or index != len(self.pieces):
-            return
-        self.camera = submap.camera
-        self.pieces[index] = Piece(index, thin(submap.field, self.budget), T_world_submap)
-        fitting = within_budget(tuple(self.pieces.values()), self.budget)
-        self.pieces = dict(zip(self.pieces, fitting, strict=True))
-        for k, row in enumerate(submap.frames):
-            self._keyframes.setdefault(row, (index, k))
+
+def _row_of(poses: "Sequence[Matrix] | Matrix", row: int) -> Matrix | None:
+    return poses[row] if row < len(poses) else None
 
 
 def _mesh(run: RunFolder) -> Mesh | None:
@@ -229,8 +223,7 @@ class LiveView(Callback):
     ) -> None:  # fmt: skip
         self.slam, self.show, self.title, self.budget, self.every_s = slam, show, title, budget, every_s
         self._clock, self._due_s = clock, 0.0
-        self._finished: tuple[Piece, ...] = ()
-        self._keyframes: dict[int, tuple[int, int]] = {}
+        self._finished = SubmapCache(slam.store, int(budget * (1.0 - ACTIVE_SHARE)))
 
     def __call__(self, step: "Step") -> None:
         """Show a snapshot after a step if one is due."""
@@ -258,9 +251,11 @@ class LiveView(Callback):
         outside = submaps_outside(states, submaps)
         poses, keyframes = slam.atlas.T_world_camera(), tuple(slam.keyframe_indices)
         path = CameraPath(poses, lost, submaps, keyframes, outside_world(states))
-        self._add_finished()
+        anchors = slam.atlas.anchors
+        self._finished.load(lambda index, first: anchors[index])
+        placed = [replace(piece, T_world_piece=anchors[i].copy()) for i, piece in self._finished.pieces.items()]
         final = Piece(None, slam.field, uncertainty=slam.uncertainty).thinned(self.budget) if finished else None
-        pieces = tuple(piece for piece in (*self._finished, *self._active()) if piece.submap not in outside)
+        pieces = tuple(piece for piece in (*placed, *self._active()) if piece.submap not in outside)
         mapped = slam.mapper.keyframes
         return Snapshot(
             self.title, path, final, pieces, None,
@@ -273,9 +268,7 @@ class LiveView(Callback):
         for keyframe in tuple(self.slam.mapper.keyframes):
             if keyframe.index == row:
                 return keyframe.target.picture().color
-        if row not in self._keyframes:
-            return None
-        return self.slam.store.picture(*self._keyframes[row]).color
+        return self._finished.image(row)
 
     def _active(self) -> tuple[Piece, ...]:
         """Return a copy of the active submap, if there is one."""
@@ -284,13 +277,3 @@ class LiveView(Callback):
             return ()
         copied = thin(slam.mapper.field, int(self.budget * ACTIVE_SHARE))
         return (Piece(number, copied, slam.atlas.anchors[number].copy()),)
-
-    def _add_finished(self) -> None:
-        """Load the newly finished submaps, and update the poses of all submaps, since loops change them."""
-        slam, most = self.slam, int(self.budget * (1.0 - ACTIVE_SHARE))
-        for index in range(len(self._finished), len(slam.store)):
-            submap = slam.store.load(index)
-            self._finished = (*self._finished, Piece(index, thin(submap.field, most)))
-            self._keyframes |= {row: (index, k) for k, row in enumerate(submap.frames)}
-        placed = [Piece(p.submap, p.field, slam.atlas.anchors[i].copy()) for i, p in enumerate(self._finished)]
-        self._finished = within_budget(placed, most)

@@ -14,8 +14,17 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from sigmasplat.api import Camera, Matrix, Mesh, Progress, mesh_depth, no_progress, se3
-from sigmasplat.plugins.evaluation.metrics.reconstruction import COMPLETE_M, CORRECT_M, POINTS, f1
+from sigmasplat.plugins.evaluation.metrics.reconstruction import (
+    COMPLETE_M,
+    CORRECT_M,
+    POINTS,
+    f1,
+    mean,
+    nearest_m,
+    share,
+)
 from sigmasplat.plugins.evaluation.metrics.trajectory import align_rigid
+from sigmasplat.plugins.outputs.video import look_along
 
 Mask = NDArray[np.bool_]
 
@@ -75,21 +84,13 @@ def score_published(
     ours_sampled, theirs_sampled = ours.sampled(points, seed), theirs.sampled(points, seed + 1)
     accuracy, completion = nearest_m(ours_sampled, theirs_sampled), nearest_m(theirs_sampled, ours_sampled)
     ours_dense, theirs_dense = dense_points(ours, theirs, seed + 2)
-    precision = _share(nearest_m(ours_dense, theirs_dense), CORRECT_M)
-    recall = _share(nearest_m(theirs_dense, ours_dense), CORRECT_M)
+    precision = share(nearest_m(ours_dense, theirs_dense), CORRECT_M)
+    recall = share(nearest_m(theirs_dense, ours_dense), CORRECT_M)
     errors = depth_errors(ours, truth, seen_true, views=views, camera=camera, seed=seed, progress=progress)
     return PublishedScores(
-        _mean(accuracy), _mean(completion), (_mean(accuracy) + _mean(completion)) / 2, _share(completion, COMPLETE_M),
-        precision, recall, f1(precision, recall), _mean(errors), len(errors),
+        mean(accuracy), mean(completion), (mean(accuracy) + mean(completion)) / 2, share(completion, COMPLETE_M),
+        precision, recall, f1(precision, recall), mean(errors), len(errors),
     )  # fmt: skip
-
-
-def nearest_m(points: Matrix, among: Matrix) -> Matrix:
-    """Return the distance [N] of each point to the nearest of `among` [M, 3]; inf if M = 0."""
-    if not len(among):
-        return np.full(len(points), np.inf)
-    # This tree finds the same distances. It is faster for points that are far from every surface.
-    return np.asarray(cKDTree(among, compact_nodes=False, balanced_tree=False).query(points)[0])
 
 
 def dense_points(ours: Mesh, theirs: Mesh, seed: int) -> tuple[Matrix, Matrix]:
@@ -160,7 +161,8 @@ def random_views(
     rng, kept = np.random.default_rng(seed), 0
     for _ in range(DRAWS_PER_VIEW * views):
         place, toward = rng.uniform(-0.5, 0.5, (2, 3))
-        T = looking(center + axes @ (place * sides * BOX_SHARES), toward, axes[:, 0])
+        forward = toward / np.linalg.norm(toward)
+        T = look_along(center + axes @ (place * sides * BOX_SHARES), forward, axes[:, 0])
         depth_m, face = mesh_depth(truth, camera, se3.inverse(T))
         hit = face >= 0
         counted = hit & seen_true[face]
@@ -169,16 +171,6 @@ def random_views(
             kept += 1
         if kept == views:
             return
-
-
-def looking(position: Matrix, direction: Matrix, up: Matrix) -> Matrix:
-    """Return T_world_camera at a position, with the optical axis along `direction` and `up` as the image's −y."""
-    z = direction / np.linalg.norm(direction)
-    x = np.cross(z, up)
-    x /= max(float(np.linalg.norm(x)), 1e-12)
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = np.stack([x, np.cross(z, x), z], 1), position
-    return T
 
 
 def oriented_box(points: Matrix) -> tuple[Matrix, Matrix, Matrix]:
@@ -207,11 +199,3 @@ def _box_along(points: Matrix, normal: Matrix) -> tuple[Matrix, Matrix, Matrix]:
     axes = np.concatenate([plane @ np.array([[c, -s], [s, c]]), z[:, None]], 1)
     center = plane @ np.array(middle) + z * (height.min() + height.max()) / 2
     return center, axes, np.array([*lengths, height.max() - height.min()])
-
-
-def _mean(values: Matrix) -> float:
-    return float(values.mean()) if values.size else float("nan")
-
-
-def _share(distance_m: Matrix, limit_m: float) -> float:
-    return float((distance_m < limit_m).mean()) if distance_m.size else float("nan")

@@ -70,20 +70,6 @@ def aligned_truth(times_s: Matrix, estimate: Matrix, truth: Trajectory) -> tuple
     return rows, Trajectory(times_s[rows], T_estimate_truth @ truth.T_world_camera[truth_rows])
 
 
-def aligned_poses(T_truth_camera: Matrix, T_estimate_camera: Matrix) -> Matrix:
-    """Return T_estimate_truth [4, 4] from poses [K, 4, 4] of the same frames: the mean rotation, and the mean shift.
-
-    The alignment of the ATE uses positions only. On a short or straight path they do not fix the rotation, which would
-    move views and surfaces by more than their errors.
-    """
-    rotations = T_estimate_camera[:, :3, :3] @ T_truth_camera[:, :3, :3].swapaxes(1, 2)
-    u, _, vt = np.linalg.svd(rotations.sum(0))
-    found = np.eye(4)
-    found[:3, :3] = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    found[:3, 3] = (T_estimate_camera[:, :3, 3] - T_truth_camera[:, :3, 3] @ found[:3, :3].T).mean(0)
-    return found
-
-
 def truth_in_estimate(times_s: Matrix, estimate: Matrix, truth: Trajectory) -> Matrix:
     """Return T_estimate_truth [4, 4], the rigid alignment of the ATE: true positions to estimated ones [N, 3], m."""
     rows, truth_rows = associate(times_s, truth.timestamps_s)
@@ -132,7 +118,6 @@ def pair_poses(estimate: Trajectory, truth: Trajectory, max_difference_s: float 
 
 
 def _span(path: Trajectory) -> str:
-    """Describe the time span of a trajectory."""
     if not len(path):
         return "no poses"
     return f"{path.timestamps_s.min():.3f} … {path.timestamps_s.max():.3f} s ({len(path)} poses)"

@@ -6,7 +6,6 @@ common variance: the share of errors inside an interval is then of errors of sin
 channels is closer to V than any of them, so that its coverage would be wrong even for the true V.
 """
 
-from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -20,15 +19,6 @@ EPSILON = 1e-6
 
 LEVELS = np.arange(0.05, 1.0, 0.1)
 """The ten nominal coverages of AUCE: 5 %, 15 %, … 95 %."""
-
-
-@dataclass(frozen=True)
-class ReliabilityBin:
-    """One row of the reliability table: mean predicted variance, mean squared error, number of pixels."""
-
-    predicted: float
-    empirical: float
-    pixels: int
 
 
 def spearman(variance: Values, squared_error: Values) -> float:
@@ -46,17 +36,6 @@ def gaussian_nll(variance: Values, squared_error: Values, epsilon: float = EPSIL
     """
     v = _positive(variance, squared_error, epsilon)
     return float(np.mean(0.5 * squared_error / v + 0.5 * np.log(v))) if v.size else float("nan")
-
-
-def best_scale(variance: Values, squared_error: Values, epsilon: float = EPSILON) -> float:
-    """Return the factor T with which T (V+ε) has the highest Gaussian likelihood: the mean of r²/(V+ε); nan without
-    pixels.
-
-    It is the temperature of a calibration, and the mean squared z-score: 1 for a V that is right on average.
-    """
-    if not squared_error.size:
-        return float("nan")
-    return float(np.mean(squared_error / _positive(variance, squared_error, epsilon)))
 
 
 def coverage(variance: Values, squared_error: Values, levels: Values, epsilon: float = EPSILON) -> Values:
@@ -80,12 +59,14 @@ def auce(variance: Values, squared_error: Values, epsilon: float = EPSILON) -> f
     return float(np.abs(coverage(variance, squared_error, LEVELS, epsilon) - LEVELS).mean())
 
 
-def reliability(variance: Values, squared_error: Values, bins: int = 10) -> list[ReliabilityBin]:
-    """Split the pixels into `bins` equal shares by rising V, and return mean V and mean r² of each."""
+def reliability(variance: Values, squared_error: Values, bins: int = 10) -> list[dict[str, Any]]:
+    """Split the pixels into `bins` equal shares by rising V; return mean V (`predicted`), mean r² (`empirical`) and the
+    number of pixels of each."""
     v, e = variance.ravel().astype(np.float64), squared_error.ravel().astype(np.float64)
-    order = np.argsort(v, kind="stable")
-    parts = [rows for rows in np.array_split(order, bins) if len(rows)]
-    return [ReliabilityBin(float(v[rows].mean()), float(e[rows].mean()), len(rows)) for rows in parts]
+    parts = [rows for rows in np.array_split(np.argsort(v, kind="stable"), bins) if len(rows)]
+    return [
+        {"predicted": float(v[rows].mean()), "empirical": float(e[rows].mean()), "pixels": len(rows)} for rows in parts
+    ]
 
 
 def sparsification(order_by: Values, squared_error: Values, steps: int = 100) -> NDArray[np.float64]:
@@ -132,12 +113,6 @@ def calibration_scores(variance: Values, squared_error: Values, epsilon: float =
     }
 
 
-def ranking_scores(variance: Values, squared_error: Values) -> dict[str, float]:
-    """Return the scores that only depend on the order of V: ause, spearman, of errors averaged over their channels."""
-    mean = over_channels(variance, squared_error)
-    return {"ause": ause(variance, mean), "spearman": spearman(variance, mean)}
-
-
 def score(variance: Values, squared_error: Values) -> dict[str, Any]:
     """Return all scores of this module, the means of V and r², and the number of pixels, as plain values."""
     return {
@@ -147,7 +122,7 @@ def score(variance: Values, squared_error: Values) -> dict[str, Any]:
         "ause": ause(variance, squared_error),
         "mean_variance": float(variance.mean()) if variance.size else float("nan"),
         "mean_squared_error": float(squared_error.mean()) if variance.size else float("nan"),
-        "reliability": [asdict(row) for row in reliability(variance, squared_error)],
+        "reliability": reliability(variance, squared_error),
     }
 
 

@@ -314,5 +314,4 @@ def _mean(values: NDArray[np.float64]) -> float | None:
 
 
 def _array(values: Tensor) -> NDArray[np.float32]:
-    """Copy a tensor from any device to a numpy array."""
     return np.asarray(values.detach().cpu(), np.float32)

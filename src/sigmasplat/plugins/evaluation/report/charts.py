@@ -43,11 +43,11 @@ class LoopLink(NamedTuple):
 
 
 Log = list[dict[str, Any]]
+Plot = tuple[list[Chart], str]
+"""Charts and their caption."""
 
 
-def run_charts(
-    frames: RunFrames, truth: Matrix | None, loops: Sequence[dict[str, Any]] = ()
-) -> dict[str, tuple[list[Chart], str]]:
+def run_charts(frames: RunFrames, truth: Matrix | None, loops: Sequence[dict[str, Any]] = ()) -> dict[str, Plot]:
     """Return the charts of a run with captions, by name: trajectory; states if known; submaps if there are several;
     moving if anything moved; seconds if known. Without a valid frame there are only the seconds.
 
@@ -66,10 +66,7 @@ def run_charts(
     return found
 
 
-def _path_charts(
-    frames: RunFrames, truth: Matrix | None, loops: Sequence[dict[str, Any]]
-) -> dict[str, tuple[list[Chart], str]]:
-    """Return the charts of the valid poses."""
+def _path_charts(frames: RunFrames, truth: Matrix | None, loops: Sequence[dict[str, Any]]) -> dict[str, Plot]:
     estimate, log = frames.path.T_world_camera[:, :3, 3], frames.log
     before_lost = np.array([row + 1 < len(frames) and frames.states[row + 1] == LOST for row in frames.rows], np.bool_)
     caption = "In the frame of the first camera." + ("" if truth is None else " The true path is rigidly aligned.")
@@ -90,7 +87,6 @@ def _stages(log: Log) -> list[str]:
 
 
 def _known_links(frames: RunFrames, loops: Sequence[dict[str, Any]]) -> list[LoopLink]:
-    """Return the loops of which both frames have a pose."""
     place = {row: i for i, row in enumerate(frames.rows.tolist())}
     ends = [(place.get(loop["query_frame"]), place.get(loop["database_frame"]), loop["accepted"]) for loop in loops]
     return [LoopLink(a, b, bool(accepted)) for a, b, accepted in ends if a is not None and b is not None]

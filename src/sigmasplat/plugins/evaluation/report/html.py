@@ -1,19 +1,21 @@
 """Build report.html: a picture of the map, three verdicts and the next commands; the rest is folded. No scripts."""
 
 import html
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from sigmasplat.api import number
 from sigmasplat.plugins.evaluation.report import tables
 from sigmasplat.plugins.evaluation.report.advice import Advice
+from sigmasplat.plugins.evaluation.report.charts import Plot
 from sigmasplat.plugins.evaluation.report.summary import Verdict
 from sigmasplat.plugins.evaluation.report.view_strips import PanelFigure
+from sigmasplat.plugins.outputs.drawing.plot import svg
 from sigmasplat.plugins.outputs.floorplan.rescan import RescanRegion
 
 NARROW = "(max-width: 640px)"
-"""Pages this narrow show the narrow version of charts and plan."""
+"""Pages this narrow have one column."""
 VIEW_PANELS = 5
 """Number of panels of a view; fewer are not of one view, or of its predicted errors."""
 
@@ -55,6 +57,7 @@ figcaption { font-size: 14px; margin-top: 6px; }
 .view.large div:nth-child(-n+2) { grid-column: span 3; }
 .view img { border: 0; border-radius: 4px; margin: 4px 0; }
 .view span { color: #9aa2ac; }
+.chart { width: 100%; max-width: 620px; height: auto; }
 .bar { display: grid; grid-template-columns: auto 1fr auto; gap: 6px; align-items: center; white-space: nowrap; }
 .bar i { height: 8px; border-radius: 2px; }
 .regions { list-style: none; padding: 0; font-size: 15px; }
@@ -84,22 +87,27 @@ PREDICTED_EXPLANATION = (
 )
 
 
+PLAN_CAPTION = (
+    "The map from above: walls are light, objects grey, the free floor dark, floor that was not observed blue; the "
+    "camera path is green. Numbered circles are regions to scan again, the largest first."
+)
+
+
 @dataclass(frozen=True)
 class Contents:
     """What a report shows.
 
     verdicts: shown first; commands: what to do with the map; advice: what else to try; summary: sentences; rescan:
     sentences about what to scan again; regions: the same numbered regions as in the floor plan; strips: panels of views
-    by heading; plots: captions by name; seconds: time per stage; loops: the records of loops.json. `picture` turns the
-    name of a picture file into an address for the page. Each plot has four files: images/<name>-light.png,
-    <name>-dark.png, <name>-narrow-light.png and <name>-narrow-dark.png.
+    by heading; plots: charts by name; plan: panels of the floor plan; seconds: time per stage; loops: the records of
+    loops.json.
     """
 
     title: str
     subtitle: str
     metrics: dict[str, Any]
     strips: dict[str, list[list[PanelFigure]]] = field(default_factory=dict)
-    plots: dict[str, str] = field(default_factory=dict)
+    plots: dict[str, Plot] = field(default_factory=dict)
     config: str = ""
     warnings: list[str] = field(default_factory=list)
     loops: list[dict[str, Any]] = field(default_factory=list)
@@ -108,9 +116,9 @@ class Contents:
     summary: list[str] = field(default_factory=list)
     advice: list[Advice] = field(default_factory=list)
     rescan: list[str] = field(default_factory=list)
+    plan: list[PanelFigure] = field(default_factory=list)
     regions: Sequence[RescanRegion] = ()
     seconds: dict[str, float] = field(default_factory=dict)
-    picture: Callable[[str], str] = str
 
 
 def build_report(contents: Contents) -> str:
@@ -123,9 +131,9 @@ def build_report(contents: Contents) -> str:
         _advice(contents.commands),
         _part("What else to try", _advice(contents.advice)),
         _part("Where to scan again", _rescan(contents)),
-        _part("Trajectory", _figure(contents, "trajectory", "Trajectory")),
+        _part("Trajectory", _figure(contents, "trajectory")),
         _part("States of the frames", _states(contents)),
-        _part("What moved", _figure(contents, "moving", "What moved")),
+        _part("What moved", _figure(contents, "moving")),
         _part("Views", _strips(contents)),
         _part("Submaps and loops", _submaps(contents)),
         _part("Scores", _scores(contents)),
@@ -150,7 +158,7 @@ def _map(contents: Contents) -> str:
     views = next((found for found in contents.strips.values() if found), [])
     views = [panels for panels in views if len(panels) == VIEW_PANELS] or views
     if not views:
-        return _figure(contents, "plan", "Floor plan")
+        return _plan(contents)
     recorded, *rendered = views[len(views) // 2][:2]
     shown = [(panel, "The map") for panel in rendered] + [(recorded, "The recorded image")]
     figures = (
@@ -180,7 +188,7 @@ def _scores(contents: Contents) -> str:
 
 def _rescan(contents: Contents) -> str:
     """Show where to scan again: sentences, the floor plan, and the list of its numbered regions."""
-    if not contents.rescan and "plan" not in contents.plots:
+    if not contents.rescan and not contents.plan:
         return ""
     words = "".join(f"<p>{html.escape(sentence)}</p>" for sentence in contents.rescan)
     items = "".join(
@@ -188,7 +196,7 @@ def _rescan(contents: Contents) -> str:
         for number, region in enumerate(contents.regions, 1)
     )
     listed = f"<ol class=regions>{items}</ol>" if items else ""
-    return f"{words}{_figure(contents, 'plan', 'Floor plan')}{listed}"
+    return f"{words}{_plan(contents)}{listed}"
 
 
 def _time(contents: Contents) -> str:
@@ -201,11 +209,10 @@ def _time(contents: Contents) -> str:
     longest_first = sorted(seconds.items(), key=lambda item: -item[1])
     rows = [[stage, number(spent, 1), number(spent / total_s, 0, 100.0)] for stage, spent in longest_first]
     table = f"<div class=card>{_table([['stage', 'seconds', '%'], *rows])}</div>" if rows else ""
-    return f"{_figure(contents, 'seconds', 'Seconds per frame')}{table}"
+    return f"{_figure(contents, 'seconds')}{table}"
 
 
 def _advice(advice: list[Advice]) -> str:
-    """Show what to do, with commands. A click on a command selects all of it."""
     if not advice:
         return ""
     items = [
@@ -241,7 +248,6 @@ def _view(panels: list[PanelFigure]) -> str:
 
 
 def _panel(panel: PanelFigure) -> str:
-    """Show one panel of a view: title, picture, its colour bar and its caption."""
     low, high = (html.escape(end) for end in panel.ends)
     ramp = f"<i style='background: linear-gradient(90deg, {', '.join(panel.bar)})'></i>"
     below = f"<span class=bar>{low}{ramp}{high}</span>" if panel.bar else ""
@@ -251,39 +257,33 @@ def _panel(panel: PanelFigure) -> str:
 
 
 def _states(contents: Contents) -> str:
-    """Show the states of the frames: the chart and the table."""
     if "states" not in contents.plots:
         return ""
     table = f"<div class=card>{_table(tables.state_rows(contents.metrics))}</div>"
-    return f"{_figure(contents, 'states', 'States of the frames')}{table}"
+    return f"{_figure(contents, 'states')}{table}"
 
 
-def _figure(contents: Contents, name: str, title: str) -> str:
-    """Show a plot in the version that fits the page: light or dark, wide or narrow."""
+def _figure(contents: Contents, name: str) -> str:
+    """Show the charts of a plot and its caption; nothing if there is no such plot."""
     if name not in contents.plots:
         return ""
-    light, dark, narrow_light, narrow_dark = (
-        html.escape(contents.picture(f"images/{name}-{version}.png"))
-        for version in ("light", "dark", "narrow-light", "narrow-dark")
-    )
-    dark_page = "(prefers-color-scheme: dark)"
-    return (
-        f"<figure><picture><source media='{NARROW} and {dark_page}' srcset='{narrow_dark}'>"
-        f"<source media='{NARROW}' srcset='{narrow_light}'><source media='{dark_page}' srcset='{dark}'>"
-        f"<img src='{light}' alt='{title}'></picture>"
-        f"<figcaption>{html.escape(contents.plots[name])}</figcaption></figure>"
-    )
+    charts, caption = contents.plots[name]
+    drawn = "".join(map(svg, charts))
+    return f"<figure><div class=pair>{drawn}</div><figcaption>{html.escape(caption)}</figcaption></figure>"
+
+
+def _plan(contents: Contents) -> str:
+    return f"{_view(contents.plan)}<p class=soft>{PLAN_CAPTION}</p>" if contents.plan else ""
 
 
 def _submaps(contents: Contents) -> str:
-    """Show the submaps and the loops between them, if there are several submaps."""
     if (contents.metrics.get("submaps") or 1) < 2:
         return ""
     accepted = [loop for loop in contents.loops if loop.get("accepted")]
     refused = [loop for loop in contents.loops if not loop.get("accepted")]
     parts = [
         f"<p class=soft>{html.escape(tables.submap_sentence(contents.metrics))}</p>",
-        _figure(contents, "submaps", "Submaps and loops"),
+        _figure(contents, "submaps"),
     ]
     if accepted:
         parts.append(f"<div class=card><h3>Loops accepted</h3>{_table(tables.loop_rows(accepted))}</div>")

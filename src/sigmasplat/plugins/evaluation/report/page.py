@@ -2,7 +2,6 @@
 
 import json
 import shlex
-from collections.abc import Mapping
 from typing import Any
 
 from sigmasplat.api import (
@@ -19,36 +18,29 @@ from sigmasplat.api import (
     preset,
 )
 from sigmasplat.plugins.evaluation.report.advice import advice, next_commands
+from sigmasplat.plugins.evaluation.report.charts import Plot
 from sigmasplat.plugins.evaluation.report.html import Contents, build_report
 from sigmasplat.plugins.evaluation.report.summary import rescan_sentences, summary_sentences, verdicts
-from sigmasplat.plugins.evaluation.report.view_strips import PanelFigure, file_data_uri
-from sigmasplat.plugins.outputs.drawing import plot
+from sigmasplat.plugins.evaluation.report.view_strips import PanelFigure, panel_figure
 from sigmasplat.plugins.outputs.floorplan.floor_plan import FloorPlan, run_floor_plan
-from sigmasplat.plugins.outputs.floorplan.picture import draw_floor_plan, draw_narrow_floor_plan
+from sigmasplat.plugins.outputs.floorplan.picture import plan_panels
 
 LIKELY = 0.5
 """The page names valid frames whose `p_off` is larger."""
-SECONDS_SIZE = (plot.SIZE[0], 300)
 
 
 def write_page(
     run: RunFolder,
     metrics: dict[str, Any],
     strips: dict[str, list[list[PanelFigure]]],
-    plots: dict[str, str],
+    plots: dict[str, Plot],
     warnings: list[str],
     plan: FloorPlan | None = None,
     frames: RunFrames | None = None,
 ) -> None:
-    """Write report.html from metrics and pictures; `strips`: panels of views by heading, `plots`: captions by name,
-    `frames`: to name those whose pose is doubtful.
-
-    Raises RunError if a picture cannot be read or the page cannot be written.
-    """
+    """Write report.html from metrics and pictures; `strips`: panels of views by heading, `plots`: charts by name,
+    `frames`: to name those whose pose is doubtful. Raises RunError if the page cannot be written."""
     config, facts = run.config(), run.facts()
-    if plan is not None:
-        _write_plan(run, plan)
-        plots = plots | {"plan": "The map from above. Numbered circles are regions to scan again, the largest first."}
     unsure = [] if frames is None else [frames.log[i]["index"] for i in frames.rows if frames.p_off[i] > LIKELY]
     found = advice(metrics, rerun_command(config, facts), config.to_dict())
     contents = Contents(
@@ -65,28 +57,11 @@ def write_page(
         commands=next_commands(str(run.path)),
         advice=found[1:],
         rescan=rescan_sentences(metrics, plan),
+        plan=[panel_figure(panel) for panel in plan_panels(plan)] if plan else [],
         regions=plan.regions if plan else (),
         seconds=_seconds(run),
-        picture=lambda name: file_data_uri(run.path / name),
     )
     run.write_report(build_report(contents))
-
-
-def write_charts(run: RunFolder, charts: Mapping[str, tuple[list[plot.Chart], str]]) -> dict[str, str]:
-    """Draw charts into images/, wide and narrow, light and dark; return their captions by name."""
-    for name, (drawn, _) in charts.items():
-        for theme in (plot.LIGHT, plot.DARK):
-            size = SECONDS_SIZE if name == "seconds" else plot.SIZE
-            run.write_image(f"{name}-{theme.name}.png", plot.draw_charts(drawn, theme, size))
-            run.write_image(f"{name}-narrow-{theme.name}.png", plot.draw_narrow_charts(drawn, theme))
-    return {name: caption for name, (_, caption) in charts.items()}
-
-
-def _write_plan(run: RunFolder, plan: FloorPlan) -> None:
-    """Draw the floor plan into images/, wide and narrow, light and dark. The page lists the regions as text."""
-    for theme in (plot.LIGHT, plot.DARK):
-        run.write_image(f"plan-{theme.name}.png", draw_floor_plan(plan, theme, list_regions=False))
-        run.write_image(f"plan-narrow-{theme.name}.png", draw_narrow_floor_plan(plan, theme))
 
 
 def report_plan(run: RunFolder, path: Trajectory, camera: Camera) -> FloorPlan | None:

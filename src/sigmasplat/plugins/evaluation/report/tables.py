@@ -1,5 +1,6 @@
 """Turn metrics into rows of text: the key figures, and the tables of the report, whose first row is the head."""
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from sigmasplat.api import APART, LOST, RELOCALISED, SHIPPED, TRACKED, format_ranges, number, rate
@@ -32,6 +33,15 @@ def state_rows(metrics: dict[str, Any]) -> list[list[str]]:
     return [["state", "frames", "%", "which"]] + [
         [state, number(count, 0), number(count / max(frames, 1), 1, 100.0), where] for state, count, where in counts
     ]
+
+
+Lines = Sequence[tuple[str, str, int, float]]
+"""Of a table: label, key of the figure, digits, and the factor that brings it to the unit of the label."""
+
+
+def figure_rows(lines: Lines, *columns: Mapping[str, Any]) -> list[list[str]]:
+    """Return a row for each line, with its figure in each column; a dash where it is not known."""
+    return [[label, *(number(of.get(key), digits, factor) for of in columns)] for label, key, digits, factor in lines]
 
 
 def score_tables(metrics: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
@@ -74,35 +84,21 @@ def submap_sentence(metrics: dict[str, Any]) -> str:
     return f"The map has {metrics['submaps']} submaps. {tried}{after}"
 
 
+LOOP_LINES = (
+    ("similarity", "similarity", 3, 1.0), ("residual", "residual", 4, 1.0), ("overlap, %", "overlap", 0, 100.0),
+    ("shift, cm", "translation_m", 1, 100.0), ("rotation, °", "rotation_deg", 2, 1.0),
+)  # fmt: skip
+
+
 def loop_rows(loops: list[dict[str, Any]]) -> list[list[str]]:
     """Return one row per loop: submaps, frames, similarity, quality of fit, correction of the pose, verdict."""
-    head = [
-        "submaps",
-        "frames",
-        "similarity",
-        "residual",
-        "overlap, %",
-        "shift, cm",
-        "rotation, °",
-        "verdict",
-        "reason",
-    ]
-    return [head, *(_loop_row(loop) for loop in loops)]
-
-
-def _loop_row(loop: dict[str, Any]) -> list[str]:
-    reason = loop.get("reason") or ""
-    return [
-        f"{loop.get('query')} → {loop.get('database')}",
-        f"{loop.get('query_frame')} → {loop.get('database_frame')}",
-        number(loop.get("similarity"), 3),
-        number(loop.get("residual"), 4),
-        number(loop.get("overlap"), 0, 100.0),
-        number(loop.get("translation_m"), 1, 100.0),
-        number(loop.get("rotation_deg"), 2),
-        "accepted" if loop.get("accepted") else "refused",
-        "" if reason == "accepted" else reason,
-    ]
+    rows = [["submaps", "frames", *(label for label, *_ in LOOP_LINES), "verdict", "reason"]]
+    for loop in loops:
+        ends = [f"{loop.get(f'query{of}')} → {loop.get(f'database{of}')}" for of in ("", "_frame")]
+        reason, verdict = loop.get("reason") or "", "accepted" if loop.get("accepted") else "refused"
+        figures = [cell for _, cell in figure_rows(LOOP_LINES, loop)]
+        rows.append([*ends, *figures, verdict, "" if reason == "accepted" else reason])
+    return rows
 
 
 def _image_rows(metrics: dict[str, Any]) -> list[list[str]]:
@@ -117,9 +113,7 @@ def _image_rows(metrics: dict[str, Any]) -> list[list[str]]:
              ("PSNR, all pixels, dB", "psnr_image_db", 2, 1.0), ("MS-SSIM, all pixels", "ms_ssim", 4, 1.0)]  # fmt: skip
     network = metrics.get("lpips_network")
     lines.append((f"LPIPS ({network or 'no weights'}), all pixels", "lpips", 4, 1.0))
-    return [["", *columns]] + [
-        [label, *(number(kind.get(key), digits, scale) for kind in kinds)] for label, key, digits, scale in lines
-    ]
+    return [["", *columns], *figure_rows(lines, *kinds)]
 
 
 def _full_resolution_table(metrics: dict[str, Any]) -> tuple[str, list[list[str]]]:
@@ -165,47 +159,45 @@ def _failure_rows(metrics: dict[str, Any]) -> list[list[str]]:
     ]
 
 
+SURFACE_LINES = (
+    ("Accuracy, cm", "accuracy_m", 2, 100.0), ("Completion, cm", "completion_m", 2, 100.0),
+    ("Completion ratio (< 5 cm), %", "completion_ratio", 1, 100.0), ("Precision (< 1 cm), %", "precision", 1, 100.0),
+    ("Recall (< 1 cm), %", "recall", 1, 100.0), ("F1 (1 cm), %", "f1", 1, 100.0),
+)  # fmt: skip
+
+
 def _surface_rows(metrics: dict[str, Any]) -> list[list[str]]:
     found = metrics.get("reconstruction")
     if not found:
         return []
-    lines = [("Accuracy, cm", "accuracy_m", 2), ("Completion, cm", "completion_m", 2),
-             ("Completion ratio (< 5 cm), %", "completion_ratio", 1), ("Precision (< 1 cm), %", "precision", 1),
-             ("Recall (< 1 cm), %", "recall", 1), ("F1 (1 cm), %", "f1", 1),
-             ("Depth L1, novel views, cm", "depth_l1_m", 2), ("Depth covered, novel views, %", "depth_coverage", 1),
-             ("Splats to surface, cm", "splats_accuracy_m", 2), ("Surface to splats, cm", "splats_completion_m", 2),
-             ("Chamfer distance of splats, cm", "splats_chamfer_m", 2),
-             ("Floaters (> 10 cm) among opaque splats, %", "floaters", 2)]  # fmt: skip
-    return [["parts visible from keyframes", "mesh.ply, map.ply"]] + [
-        [label, number(found.get(key), digits, 100.0)] for label, key, digits in lines
-    ]
+    lines = [*SURFACE_LINES, ("Depth L1, novel views, cm", "depth_l1_m", 2, 100.0),
+             ("Depth covered, novel views, %", "depth_coverage", 1, 100.0),
+             ("Splats to surface, cm", "splats_accuracy_m", 2, 100.0),
+             ("Surface to splats, cm", "splats_completion_m", 2, 100.0),
+             ("Chamfer distance of splats, cm", "splats_chamfer_m", 2, 100.0),
+             ("Floaters (> 10 cm) among opaque splats, %", "floaters", 2, 100.0)]  # fmt: skip
+    return [["parts visible from keyframes", "mesh.ply, map.ply"], *figure_rows(lines, found)]
 
 
 def _published_rows(metrics: dict[str, Any]) -> list[list[str]]:
     found = metrics.get("reconstruction_published")
     if not found:
         return []
-    lines = [("Accuracy, cm", "accuracy_m", 2), ("Completion, cm", "completion_m", 2),
-             ("Chamfer distance, cm", "chamfer_m", 2), ("Completion ratio (< 5 cm), %", "completion_ratio", 1),
-             ("Precision (< 1 cm), %", "precision", 1), ("Recall (< 1 cm), %", "recall", 1), ("F1 (1 cm), %", "f1", 1),
-             ("Depth L1, random views, cm", "depth_l1_m", 2)]  # fmt: skip
-    return [["points on both surfaces", f"{number(found['depth_views'], 0)} random views"]] + [
-        [label, number(found.get(key), digits, 100.0)] for label, key, digits in lines
-    ]
+    lines = [*SURFACE_LINES, ("Chamfer distance, cm", "chamfer_m", 2, 100.0),
+             ("Depth L1, random views, cm", "depth_l1_m", 2, 100.0)]  # fmt: skip
+    return [["points on both surfaces", f"{number(found['depth_views'], 0)} random views"], *figure_rows(lines, found)]
 
 
 def _uncertainty_rows(scores: dict[str, Any] | None) -> list[list[str]]:
     if not scores:
         return []
-    return [
-        ["pixels with a depth reading", f"{number(scores['pixels'], 0)} pixels"],
-        ["Spearman of V and squared error", number(scores["spearman"], 3)],
-        ["Spearman, only covered pixels", number(scores.get("spearman_covered"), 3)],
-        ["AUSE (0 = perfect ranking)", number(scores["ause"], 3)],
-        ["Gaussian NLL", number(scores["nll"], 3)],
-        ["mean V, 10⁻³", number(scores["mean_variance"], 3, 1e3)],
-        ["mean squared error, 10⁻³", number(scores["mean_squared_error"], 3, 1e3)],
-    ]
+    lines = [("Spearman of V and squared error", "spearman", 3, 1.0),
+             ("Spearman, only covered pixels", "spearman_covered", 3, 1.0),
+             ("AUSE (0 = perfect ranking)", "ause", 3, 1.0), ("Gaussian NLL", "nll", 3, 1.0),
+             ("mean V, 10⁻³", "mean_variance", 3, 1e3),
+             ("mean squared error, 10⁻³", "mean_squared_error", 3, 1e3)]  # fmt: skip
+    head = ["pixels with a depth reading", f"{number(scores['pixels'], 0)} pixels"]
+    return [head, *figure_rows(lines, scores)]
 
 
 def _calibration_rows(scores: dict[str, Any] | None) -> list[list[str]]:
@@ -224,9 +216,7 @@ def _predictive_rows(scores: dict[str, Any] | None) -> list[list[str]]:
              ("Spearman of variance and squared error", "spearman", 3, 1.0),
              ("Gaussian NLL", "nll", 3, 1.0)]  # fmt: skip
     kinds = [scores.get(key) or {} for key in ("color", "depth")]
-    return [[f"{scores['views']} views", "colour", "depth"]] + [
-        [label, *(number(kind.get(key), digits, scale) for kind in kinds)] for label, key, digits, scale in lines
-    ]
+    return [[f"{scores['views']} views", "colour", "depth"], *figure_rows(lines, *kinds)]
 
 
 def _weight_rows(calibration: dict[str, Any] | None) -> list[list[str]]:
@@ -253,7 +243,4 @@ def _covariance_rows(scores: dict[str, Any] | None) -> list[list[str]]:
              ("Positions in their 90 % ellipsoid, %", "position_coverage_90", 1, 100.0),
              ("NEES, mean (ideal 6)", "nees_mean", 2, 1.0),
              ("k of the position (ideal 1)", "position_k", 2, 1.0)]  # fmt: skip
-    return [["", *kinds]] + [
-        [label, *(number(kind.get(key), digits, scale) for kind in kinds.values())]
-        for label, key, digits, scale in lines
-    ]
+    return [["", *kinds], *figure_rows(lines, *kinds.values())]

@@ -3,11 +3,10 @@
 import base64
 import io
 from dataclasses import dataclass
-from pathlib import Path
 
 from PIL import Image
 
-from sigmasplat.api import RunError, RunFolder
+from sigmasplat.api import RunFolder
 from sigmasplat.plugins.evaluation.metrics.views import ScoredView
 from sigmasplat.plugins.outputs.drawing.view_panels import (
     PANEL_WIDTH,
@@ -81,16 +80,4 @@ def data_uri(picture: Image.Image) -> str:
     """Return a picture as a data: URI, WebP."""
     buffer = io.BytesIO()
     picture.convert("RGB").save(buffer, "WEBP", quality=QUALITY, method=EFFORT)
-    return _uri("webp", buffer.getvalue())
-
-
-def file_data_uri(path: Path) -> str:
-    """Return a PNG file as a data: URI; it is not compressed again. Raises RunError if it cannot be read."""
-    try:
-        return _uri("png", path.read_bytes())
-    except OSError as problem:
-        raise RunError(f"cannot read picture {path}: {problem}") from problem
-
-
-def _uri(kind: str, content: bytes) -> str:
-    return f"data:image/{kind};base64,{base64.b64encode(content).decode('ascii')}"
+    return f"data:image/webp;base64,{base64.b64encode(buffer.getvalue()).decode('ascii')}"

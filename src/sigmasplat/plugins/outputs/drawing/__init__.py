@@ -1,1 +1,1 @@
-"""Draw charts, view strips, film images and contact sheets."""
+"""Draw charts, view strips and contact sheets."""

@@ -1,45 +1,33 @@
-"""Draw line charts with PIL, for a light and a dark page."""
+"""Draw line charts as SVG, in colours for a light and a dark page."""
 
 from dataclasses import dataclass, field
+from html import escape
 
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
 
 from sigmasplat.api import Matrix
 
 Colour = tuple[int, int, int]
-Box = tuple[float, float, float, float]
-
-DRAW_SCALE = 2
-"""Pictures are drawn this many times larger and then reduced, because PIL does not smooth lines."""
-SIZE = (1040, 430)
-NARROW_SIZE = (376, 300)
-"""Size of one chart on a page as narrow as a phone."""
+WIDTH, HEIGHT = 460, 300
+LEFT, TOP, RIGHT, BOTTOM = 58.0, 46.0, 446.0, 256.0
+"""Ends of the axes, in units of the SVG."""
 ACCENT, BLUE, GREEN, PURPLE, FAINT = range(5)
-"""Indices into `Theme.curves`."""
+"""Indices into `LIGHT` and `DARK`."""
+LIGHT: tuple[Colour, ...] = ((214, 90, 30), (40, 110, 190), (60, 150, 90), (130, 90, 170), (152, 160, 170))
+DARK: tuple[Colour, ...] = ((255, 140, 70), (100, 170, 250), (110, 200, 140), (190, 150, 230), (112, 120, 130))
 MOST = 1e100
 """Values that are not smaller are not drawn."""
 
 
-@dataclass(frozen=True)
-class Theme:
-    """Colours of a plot on a light or a dark page."""
-
-    name: str
-    background: Colour
-    text: Colour
-    grid: Colour
-    curves: tuple[Colour, ...]
+def _colours(colours: tuple[Colour, ...], text: str, grid: str) -> str:
+    own = "".join(f"--c{k}: rgb({r} {g} {b}); " for k, (r, g, b) in enumerate(colours))
+    return f".chart {{ {own}--text: {text}; --grid: {grid} }}"
 
 
-LIGHT = Theme(
-    "light", (255, 255, 255), (70, 78, 88), (226, 229, 233),
-    ((214, 90, 30), (40, 110, 190), (60, 150, 90), (130, 90, 170), (152, 160, 170)),
-)  # fmt: skip
-DARK = Theme(
-    "dark", (24, 27, 32), (176, 184, 194), (52, 57, 65),
-    ((255, 140, 70), (100, 170, 250), (110, 200, 140), (190, 150, 230), (112, 120, 130)),
-)  # fmt: skip
+STYLE = f"""{_colours(LIGHT, "#464e58", "#e2e5e9")}
+@media (prefers-color-scheme: dark) {{ {_colours(DARK, "#b0b8c2", "#343941")} }}
+.chart text {{ font: 12px system-ui, sans-serif; fill: var(--text) }} .chart .title {{ font-size: 15px }}
+.chart path {{ fill: none; stroke-linecap: round; stroke-linejoin: round }} .chart .grid {{ stroke: var(--grid) }}"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,23 +59,22 @@ class Chart:
     y_limits: tuple[float, float] | None = None
 
 
-def draw_charts(charts: list[Chart], theme: Theme, size: tuple[int, int] = SIZE) -> Image.Image:
-    """Draw charts side by side on one picture of `size` pixels."""
-    width, height = size[0] * DRAW_SCALE, size[1] * DRAW_SCALE
-    image = Image.new("RGB", (width, height), theme.background)
-    share = width / len(charts)
-    for i, chart in enumerate(charts):
-        _draw_chart(ImageDraw.Draw(image), chart, theme, (i * share, 0.0, (i + 1) * share, float(height)))
-    return image.resize(size, Image.Resampling.LANCZOS)
+def svg(chart: Chart) -> str:
+    """Return a chart as one SVG element, which is also a whole file."""
+    low, high = _limits(chart)
 
+    def place(points: Matrix) -> Matrix:
+        return np.asarray([LEFT, BOTTOM] + (points - low) / (high - low) * [RIGHT - LEFT, TOP - BOTTOM])
 
-def draw_narrow_charts(charts: list[Chart], theme: Theme) -> Image.Image:
-    """Draw charts one below the other on one picture, each of `NARROW_SIZE` pixels."""
-    width, height = NARROW_SIZE
-    image = Image.new("RGB", (width, height * len(charts)), theme.background)
-    for i, chart in enumerate(charts):
-        image.paste(draw_charts([chart], theme, NARROW_SIZE), (0, i * height))
-    return image
+    parts = [f"<style>{STYLE}</style>", *_grid(chart, low, high), *_head(chart)]
+    for curve in chart.curves:
+        parts.append(_path(curve, place(_drawable(curve.points))))
+    for words, point in chart.labels.items():
+        x, y = place(np.array(point))
+        parts.append(_text(x + 5, y - 5, words))
+    size = f"viewBox='0 0 {WIDTH} {HEIGHT}' width='{WIDTH}' height='{HEIGHT}'"
+    head = f"<svg class='chart' xmlns='http://www.w3.org/2000/svg' {size} role='img'>"
+    return f"{head}<title>{escape(chart.title)}</title>{''.join(parts)}</svg>"
 
 
 def nice_ticks(low: float, high: float, wanted: int = 5) -> Matrix:
@@ -103,7 +90,7 @@ def _drawable(points: Matrix) -> Matrix:
     return points[(np.abs(points) < MOST).all(1)]
 
 
-def _limits(chart: Chart, box: Box) -> tuple[Matrix, Matrix]:
+def _limits(chart: Chart) -> tuple[Matrix, Matrix]:
     """Return the range of both axes (low [2], high [2]) with a small margin; if `square`, with the same scale."""
     points = _drawable(np.concatenate([curve.points for curve in chart.curves]))
     if not len(points):
@@ -116,73 +103,43 @@ def _limits(chart: Chart, box: Box) -> tuple[Matrix, Matrix]:
     if chart.y_limits is not None:
         low[1], high[1] = chart.y_limits
     if chart.square:
-        pixels = np.array([box[2] - box[0], box[3] - box[1]])
-        half = 0.5 * pixels * ((high - low) / pixels).max()
+        size = np.array([RIGHT - LEFT, BOTTOM - TOP])
+        half = 0.5 * size * ((high - low) / size).max()
         middle = 0.5 * (low + high)
         low, high = middle - half, middle + half
     return low, high
 
 
-def _draw_chart(draw: ImageDraw.ImageDraw, chart: Chart, theme: Theme, cell: Box) -> None:
-    """Draw the title, grid, curves and legend of one chart in its cell."""
-    s = DRAW_SCALE
-    box = (cell[0] + 64 * s, cell[1] + 48 * s, cell[2] - 20 * s, cell[3] - 52 * s)
-    low, high = _limits(chart, box)
-
-    def place(points: Matrix) -> list[tuple[float, float]]:
-        unit = (points - low) / (high - low)
-        return [(box[0] + u * (box[2] - box[0]), box[3] - v * (box[3] - box[1])) for u, v in unit]
-
-    _draw_grid(draw, chart, theme, box, (low, high))
-    for curve in chart.curves:
-        _draw_curve(draw, curve, place(_drawable(curve.points)), theme)
-    font = ImageFont.load_default(13 * s)
-    for text, point in chart.labels.items():
-        x, y = place(np.array([point]))[0]
-        draw.text((x + 6 * s, y - 6 * s), text, theme.text, font, anchor="ls")
-    _draw_head(draw, chart, theme, box, cell[1] + 24 * s)
+def _path(curve: Curve, places: Matrix) -> str:
+    """Return one curve through places of the SVG. A dot is a line of no length; so is a single point."""
+    steps = [f"{x:.1f},{y:.1f}" for x, y in places]
+    alone = curve.dots or len(steps) == 1
+    drawn = "".join(f"M{step}h0" for step in steps) if alone else f"M{' '.join(steps)}" if steps else ""
+    return f"<path d='{drawn}' stroke='var(--c{curve.colour})' stroke-width='{6.0 if alone else curve.width:g}'/>"
 
 
-def _draw_curve(draw: ImageDraw.ImageDraw, curve: Curve, places: list[tuple[float, float]], theme: Theme) -> None:
-    """Draw one curve through pixel positions; a single point becomes a dot."""
-    s, colour = DRAW_SCALE, theme.curves[curve.colour]
-    if curve.dots or len(places) == 1:
-        for x, y in places:
-            draw.ellipse((x - 3 * s, y - 3 * s, x + 3 * s, y + 3 * s), fill=colour)
-    elif places:
-        draw.line(places, colour, round(curve.width * s), joint="curve")
+def _text(x: float, y: float, words: str, **attributes: str) -> str:
+    more = "".join(f" {name.replace('_', '-')}='{value}'" for name, value in attributes.items())
+    return f"<text x='{x:.1f}' y='{y:.1f}'{more}>{escape(words)}</text>"
 
 
-def _draw_grid(draw: ImageDraw.ImageDraw, chart: Chart, theme: Theme, box: Box, limits: tuple[Matrix, Matrix]) -> None:
-    """Draw grid lines with their numbers, and the label of the x axis."""
-    s, (low, high) = DRAW_SCALE, limits
-    font = ImageFont.load_default(13 * s)
-    for x in nice_ticks(low[0], high[0]):
-        at = box[0] + (x - low[0]) / (high[0] - low[0]) * (box[2] - box[0])
-        draw.line((at, box[1], at, box[3]), theme.grid, s)
-        draw.text((at, box[3] + 8 * s), f"{x + 0.0:g}", theme.text, font, anchor="mt")
-    for y in nice_ticks(low[1], high[1]):
-        at = box[3] - (y - low[1]) / (high[1] - low[1]) * (box[3] - box[1])
-        draw.line((box[0], at, box[2], at), theme.grid, s)
-        draw.text((box[0] - 8 * s, at), f"{y + 0.0:g}", theme.text, font, anchor="rm")
-    draw.text(((box[0] + box[2]) / 2, box[3] + 30 * s), chart.x_label, theme.text, font, anchor="mt")
+def _grid(chart: Chart, low: Matrix, high: Matrix) -> list[str]:
+    """Return grid lines with their numbers, and the label of the x axis."""
+    parts = []
+    for value in nice_ticks(low[0], high[0]):
+        x = LEFT + (value - low[0]) / (high[0] - low[0]) * (RIGHT - LEFT)
+        parts.append(f"<path class='grid' d='M{x:.1f},{TOP}V{BOTTOM}'/>")
+        parts.append(_text(x, BOTTOM + 16, f"{value + 0.0:g}", text_anchor="middle"))
+    for value in nice_ticks(low[1], high[1]):
+        y = BOTTOM - (value - low[1]) / (high[1] - low[1]) * (BOTTOM - TOP)
+        parts.append(f"<path class='grid' d='M{LEFT},{y:.1f}H{RIGHT}'/>")
+        parts.append(_text(LEFT - 6, y + 4, f"{value + 0.0:g}", text_anchor="end"))
+    return [*parts, _text((LEFT + RIGHT) / 2, BOTTOM + 36, chart.x_label, text_anchor="middle")]
 
 
-def _draw_head(draw: ImageDraw.ImageDraw, chart: Chart, theme: Theme, box: Box, middle: float) -> None:
-    """Draw the title and the label of the y axis on the left, the legend on the right; on two lines if they overlap."""
-    s = DRAW_SCALE
-    title, font = ImageFont.load_default(17 * s), ImageFont.load_default(14 * s)
+def _head(chart: Chart) -> list[str]:
+    """Return the title; below it the label of the y axis, and the legend if there are several curves."""
     named = [curve for curve in chart.curves if curve.name] if len(chart.curves) > 1 else []
-    after = box[0] + draw.textlength(chart.title, title) + 10 * s
-    legend_left = box[2] - sum(draw.textlength(curve.name, font) + 40 * s for curve in named)
-    first, second = middle, middle
-    if legend_left < after + draw.textlength(chart.y_label, font):
-        first, second, after = middle - 11 * s, middle + 10 * s, box[0]
-    draw.text((box[0], first), chart.title, theme.text, title, anchor="lm")
-    draw.text((after, second), chart.y_label, theme.text, font, anchor="lm")
-    right = box[2]
-    for curve in reversed(named):
-        draw.text((right, second), curve.name, theme.text, font, anchor="rm")
-        right -= draw.textlength(curve.name, font) + 8 * s
-        draw.line((right - 16 * s, second, right, second), theme.curves[curve.colour], 3 * s)
-        right -= 32 * s
+    legend = "".join(f"<tspan dx='12' fill='var(--c{c.colour})'>● {escape(c.name)}</tspan>" for c in named)
+    y_label = f"<text x='{LEFT}' y='36'>{escape(chart.y_label)}{legend}</text>"
+    return [f"<text class='title' x='{LEFT}' y='18'>{escape(chart.title)}</text>", y_label]

@@ -12,6 +12,8 @@ from sigmasplat.plugins.outputs.drawing import colormap
 
 BACKGROUND, TEXT, FAINT = (21, 24, 29), (233, 237, 242), (150, 158, 168)
 PANEL_WIDTH, GAP, HEAD, FOOT = 320, 10, 34, 38
+LEAST_WIDTH = 200
+"""Narrower panels have no texts."""
 PREDICTED_CAPTIONS = (
     "Difference between the image and the rendered colour.",
     "One standard deviation: 68 % of the errors should be smaller.",
@@ -45,14 +47,17 @@ class ViewPanel:
         return Image.fromarray(self.pixels).resize((width, height), how)
 
 
-def draw_view_strip(panels: Sequence[ViewPanel]) -> Image.Image:
-    """Draw panels side by side, an RGB picture `PANEL_WIDTH + GAP` = 330 pixels wide per panel."""
+def draw_view_strip(panels: Sequence[ViewPanel], width: int = PANEL_WIDTH) -> Image.Image:
+    """Draw panels of this width side by side, an RGB picture; panels too narrow for their texts only have pictures."""
     first = panels[0].pixels
-    height = round(PANEL_WIDTH * first.shape[0] / first.shape[1])
-    size = (len(panels) * (PANEL_WIDTH + GAP) + GAP, height + HEAD + FOOT)
-    strip = Image.new("RGB", size, BACKGROUND)
+    height = round(width * first.shape[0] / first.shape[1])
+    gap, head, foot = (GAP, HEAD, FOOT) if width >= LEAST_WIDTH else (0, 0, 0)
+    strip = Image.new("RGB", (len(panels) * (width + gap) + gap, height + head + foot), BACKGROUND)
     for i, panel in enumerate(panels):
-        _draw(strip, panel, GAP + i * (PANEL_WIDTH + GAP), height)
+        left = gap + i * (width + gap)
+        strip.paste(panel.picture(width, height), (left, head))
+        if head:
+            _draw_texts(strip, panel, left, width, height)
     return strip
 
 
@@ -67,9 +72,9 @@ def view_panels(view: ScoredView) -> list[ViewPanel]:
         ViewPanel(
             "rendered colour", _bytes(view.rendered), f"PSNR {score['psnr_db']:.1f} dB · SSIM {score['ssim']:.3f}"
         ),
-        _coloured("rendered depth", view.rendered_depth_m, mapped, depth_range, colormap.VIRIDIS, " m"),
-        _coloured("uncertainty, root of V", deviation, mapped, _from_zero(deviation, mapped), colormap.INFERNO),
-        _coloured("error, RMS", error, view.valid, _from_zero(error, view.valid), colormap.INFERNO),
+        coloured("rendered depth", view.rendered_depth_m, mapped, depth_range, colormap.VIRIDIS, " m"),
+        coloured("uncertainty, root of V", deviation, mapped, _from_zero(deviation, mapped), colormap.INFERNO),
+        coloured("error, RMS", error, view.valid, _from_zero(error, view.valid), colormap.INFERNO),
     ]
 
 
@@ -88,14 +93,14 @@ def predicted_panels(view: ScoredView, predicted: PredictedErrors) -> list[ViewP
     depth_m = 0.0, max(_from_zero(error_m, view.depth_compared)[1], _from_zero(total_m, mapped)[1])
     inferno = colormap.INFERNO
     panels = [
-        _coloured("colour error, RMS", error, view.valid, color, inferno),
-        _coloured("predicted colour error", total, everywhere, color, inferno),
-        _coloured("colour: aleatoric part", aleatoric, everywhere, color, inferno),
-        _coloured("colour: epistemic part", epistemic, everywhere, color, inferno),
-        _coloured("depth error", error_m, view.depth_compared, depth_m, inferno, " m"),
-        _coloured("predicted depth error", total_m, mapped, depth_m, inferno, " m"),
-        _coloured("depth: aleatoric part", aleatoric_m, mapped, depth_m, inferno, " m"),
-        _coloured("depth: epistemic part", epistemic_m, mapped, depth_m, inferno, " m"),
+        coloured("colour error, RMS", error, view.valid, color, inferno),
+        coloured("predicted colour error", total, everywhere, color, inferno),
+        coloured("colour: aleatoric part", aleatoric, everywhere, color, inferno),
+        coloured("colour: epistemic part", epistemic, everywhere, color, inferno),
+        coloured("depth error", error_m, view.depth_compared, depth_m, inferno, " m"),
+        coloured("predicted depth error", total_m, mapped, depth_m, inferno, " m"),
+        coloured("depth: aleatoric part", aleatoric_m, mapped, depth_m, inferno, " m"),
+        coloured("depth: epistemic part", epistemic_m, mapped, depth_m, inferno, " m"),
     ]
     return [replace(panel, caption=caption) for panel, caption in zip(panels, PREDICTED_CAPTIONS, strict=True)]
 
@@ -105,7 +110,7 @@ def _from_zero(values: NDArray[np.float32], valid: NDArray[np.bool_]) -> tuple[f
     return 0.0, colormap.value_range(values, valid)[1]
 
 
-def _coloured(
+def coloured(
     title: str,
     values: NDArray[np.float32],
     valid: NDArray[np.bool_],
@@ -113,28 +118,27 @@ def _coloured(
     colours: NDArray[np.float64],
     unit: str = "",
 ) -> ViewPanel:
-    """Apply a colour map, and label its range."""
+    """Return a panel of values [H, W] in a colour map, with its range."""
     digits = 2 if unit and limits[1] >= 1.0 else 3
     ends = (f"{limits[0]:.{digits}f}{unit}", f"{limits[1]:.{digits}f}{unit}")
     return ViewPanel(title, colormap.apply_masked(values, valid, *limits, colours), bar=colours, ends=ends)
 
 
 def _bytes(color: NDArray[np.float32]) -> colormap.Rgb:
-    """Convert colours in [0, 1] to 0 … 255."""
     return (np.clip(color, 0.0, 1.0) * 255.0).round().astype(np.uint8)
 
 
-def _draw(strip: Image.Image, panel: ViewPanel, left: int, height: int) -> None:
-    """Draw one panel in the strip: title above, picture, bar or caption below."""
-    draw = ImageDraw.Draw(strip)
+def _draw_texts(strip: Image.Image, panel: ViewPanel, left: int, width: int, height: int) -> None:
+    draw, middle, small = ImageDraw.Draw(strip), HEAD + height + FOOT // 2, ImageFont.load_default(16)
     draw.text((left + 2, HEAD // 2), panel.title, TEXT, ImageFont.load_default(18), anchor="lm")
-    strip.paste(panel.picture(PANEL_WIDTH, height), (left, HEAD))
-    middle = HEAD + height + FOOT // 2
-    small = ImageFont.load_default(16)
     if panel.bar is None:
         draw.text((left + 2, middle), panel.caption, FAINT, small, anchor="lm")
         return
     draw.text((left + 2, middle), panel.ends[0], FAINT, small, anchor="lm")
-    draw.text((left + PANEL_WIDTH - 2, middle), panel.ends[1], FAINT, small, anchor="rm")
-    ramp = colormap.apply(np.tile(np.linspace(0.0, 1.0, PANEL_WIDTH - 160), (10, 1)), 0.0, 1.0, panel.bar)
-    strip.paste(Image.fromarray(ramp), (left + 80, middle - 5))
+    draw.text((left + width - 2, middle), panel.ends[1], FAINT, small, anchor="rm")
+    strip.paste(Image.fromarray(colour_bar(panel.bar, width - 160, 10)), (left + 80, middle - 5))
+
+
+def colour_bar(palette: NDArray[np.float64], width: int, height: int) -> colormap.Rgb:
+    """Return a palette from its low to its high end, uint8 [height, width, 3]."""
+    return colormap.apply(np.tile(np.linspace(0.0, 1.0, width), (height, 1)), 0.0, 1.0, palette)

@@ -33,11 +33,17 @@ from sigmasplat.plugins.outputs.floorplan.ground import (
     floor_frame,
     sample_surfaces,
 )
-from sigmasplat.plugins.outputs.floorplan.rescan import RescanMaps, RescanRegion, find_rescan_regions
+from sigmasplat.plugins.outputs.floorplan.rescan import (
+    FLOOR_UNOBSERVED,
+    FREE,
+    OBJECT,
+    UNOBSERVED,
+    WALL,
+    RescanRegion,
+    find_rescan_regions,
+)
 
 CELL_M = 0.05
-UNOBSERVED, FLOOR_UNOBSERVED, FREE, OBJECT, WALL = range(5)
-"""Kinds of cells. FLOOR_UNOBSERVED: a ray passed above the cell, but its floor was not observed."""
 SIGNS = "?,.o#"
 """One sign per kind, for the rows of `FloorPlan.record`."""
 MEANINGS = ("not observed", "floor not observed", "free floor", "object", "wall or tall object")
@@ -62,30 +68,26 @@ class FloorPlan:
     """A map from above, cells [rows, columns] of size cell_m; row 0 is at the lowest y, column 0 at the lowest x.
 
     T_floor_world: z up, floor at 0, x and y along the walls; origin_m: x, y of the outer corner of row 0, column 0.
-    kind: UNOBSERVED, FLOOR_UNOBSERVED, FREE, OBJECT or WALL. color_sigma: mean √σ² of the splats in the cell (colour, 0
-    to 1); depth_sigma_m: mean standard deviation of depth of the surfaces in the cell; alpha: their mean opacity;
-    wrong_share: the share of their pixels whose colour is expected to be wrong (`WRONG_BY`). These four are nan in
-    cells without a surface. path_m [N, 2]: the camera path. regions: where to scan again, the largest first.
-
-    With predicted errors, depth_sigma_m is the predicted standard deviation. Without them it is the spread of the
-    splats along a ray, and wrong_share is None.
+    kind: UNOBSERVED, FLOOR_UNOBSERVED, FREE, OBJECT or WALL. alpha: mean opacity of the surfaces in the cell;
+    depth_sigma_m: their mean predicted standard deviation of depth; wrong_share: the share of their pixels whose colour
+    is expected to be wrong (`WRONG_BY`). They are nan in cells without a surface, and the last two also without
+    predicted errors. path_m [N, 2]: the camera path. regions: where to scan again, the largest first.
     """
 
     cell_m: float
     origin_m: Matrix
     T_floor_world: Matrix
     kind: NDArray[np.uint8]
-    color_sigma: Grid
-    depth_sigma_m: Grid
     alpha: Grid
+    depth_sigma_m: Grid
+    wrong_share: Grid
     path_m: Matrix
     regions: tuple[RescanRegion, ...]
-    wrong_share: Grid | None = None
 
     @property
     def predicted_errors(self) -> bool:
-        """Return whether the uncertainty consists of predicted errors."""
-        return self.wrong_share is not None
+        """Return whether the errors of the map are predicted."""
+        return bool(np.isfinite(self.wrong_share).any())
 
     def area_m2(self, *kinds: int) -> float:
         """Return the total area of the cells of these kinds."""
@@ -140,18 +142,10 @@ def floor_plan(
         grid.add_rays(to_floor(sample.points), to_floor(sample.T_world_camera[None, :3, 3])[0])
     for sample in samples:
         grid.add_points(to_floor(sample.points), sample)
-    kind, (alpha, depth_sigma_m, wrong) = grid.kinds(), grid.means()
-    wrong_share = None if predictor is None else wrong
-    color_sigma = grid.color_sigma(to_floor(field.means.numpy()), field)
-    color_sigma[np.isnan(alpha)] = np.nan
-    maps = RescanMaps(
-        kind == UNOBSERVED, kind == FLOOR_UNOBSERVED, kind == FREE, color_sigma, depth_sigma_m, alpha, wrong_share
-    )  # fmt: skip
-    regions = find_rescan_regions(maps, cell_m, grid.origin_m)
-    return FloorPlan(
-        cell_m, grid.origin_m, T_floor_world, kind, color_sigma, depth_sigma_m, alpha, path[:, :2], tuple(regions),
-        wrong_share,
-    )  # fmt: skip
+    kind, (alpha, depth_sigma_m, wrong_share) = grid.kinds(), grid.means()
+    regions = find_rescan_regions(kind, alpha, depth_sigma_m, wrong_share, cell_m, grid.origin_m)
+    maps = kind, alpha, depth_sigma_m, wrong_share
+    return FloorPlan(cell_m, grid.origin_m, T_floor_world, *maps, path[:, :2], tuple(regions))
 
 
 def run_floor_plan(
@@ -254,16 +248,3 @@ class _Cells:
         """Return means weighted by area, [3, rows, columns]: alpha, depth sigma, wrong share; nan without a surface."""
         means = np.divide(self.sums, self.weight, out=np.full_like(self.sums, np.nan), where=self.weight > 0)
         return np.asarray(means.reshape(3, *self.shape), np.float32)
-
-    def color_sigma(self, centers: Matrix, field: GaussianField) -> Grid:
-        """Return the mean colour σ of the splats in each cell, weighted by opacity and size; nan without splats."""
-        cell, inside = self.cell_index(centers)
-        inside &= (centers[:, 2] > -LOW_M) & (centers[:, 2] < HIGH_M)
-        scales = np.sort(field.scales.numpy()[inside], axis=1).astype(np.float64)
-        weight = field.opacities.numpy()[inside] * scales[:, 1] * scales[:, 2]
-        sigma = np.sqrt(field.variances.numpy()[inside].mean(1)).astype(np.float64)
-        size = self.shape[0] * self.shape[1]
-        total = np.bincount(cell[inside], weight, size)
-        sums = np.bincount(cell[inside], weight * sigma, size)
-        means = np.divide(sums, total, out=np.full(size, np.nan), where=total > 0)
-        return np.asarray(means.reshape(self.shape), np.float32)

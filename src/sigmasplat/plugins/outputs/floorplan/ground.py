@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -36,14 +35,8 @@ MAX_DEPTH_STEP = 0.05
 Floats = NDArray[np.float32]
 
 
-class SurfaceRenderer(Protocol):
-    """Renders a field from T_camera_world; with a reference depth [H, W], m, also U about it (`render.render`)."""
-
-    def __call__(
-        self, field: GaussianField, camera: Camera, T_camera_world: Matrix, depth_reference: Tensor | None = None
-    ) -> Render: ...
-
-
+SurfaceRenderer = Callable[[GaussianField, Camera, Matrix], Render]
+"""Renders a field from T_camera_world."""
 SurfacePredictor = Callable[[Camera, Matrix], Predicted]
 """Predicts the errors of a field from T_camera_world."""
 
@@ -53,9 +46,8 @@ class SurfaceSample:
     """Surfaces seen from one pose, one sample per pixel [P]; edges and pixels without a surface are left out.
 
     points, normals [P, 3] m in the world, normals towards the camera; area_m2: area of the surface in the pixel; alpha;
-    depth_sigma_m: the predicted standard deviation of depth; without a prediction √(U/A), the spread along the ray of
-    the splats that make up the depth. wrong_share: the predicted probability that the colour is off by more than
-    `WRONG_BY`, nan without a prediction.
+    depth_sigma_m: the predicted standard deviation of depth; wrong_share: the predicted probability that the colour is
+    off by more than `WRONG_BY`. Both are nan without a prediction.
     """
 
     T_world_camera: Matrix
@@ -91,18 +83,13 @@ def sample_surface(
     renderer: SurfaceRenderer,
     predictor: SurfacePredictor | None = None,
 ) -> SurfaceSample:
-    """Sample from one pose: render depth, then its predicted error, or its spread without a predictor."""
+    """Sample from one pose: render depth, and predict its error if a predictor is given."""
     T_camera_world = se3.inverse(T_world_camera)
     with torch.inference_mode():
         seen = renderer(field, camera, T_camera_world)
-        depth = (seen.depth / seen.alpha.clamp(min=COVERED_ALPHA)).float()
-        alpha, depth_m = _array(seen.alpha), _array(depth)
-        if predictor is None:
-            spread = renderer(field, camera, T_camera_world, depth_reference=depth).uncertainty
-            second = np.zeros_like(depth_m) if spread is None else _array(spread)
-            sigma_m = np.sqrt(np.maximum(second, 0.0) / np.maximum(alpha, COVERED_ALPHA))
-            wrong = np.full_like(depth_m, np.nan)
-        else:
+        alpha, depth_m = _array(seen.alpha), _array((seen.depth / seen.alpha.clamp(min=COVERED_ALPHA)).float())
+        sigma_m = wrong = np.full_like(depth_m, np.nan)
+        if predictor is not None:
             predicted = predictor(camera, T_camera_world)
             sigma_m = _array(predicted.depth_std_m)
             wrong = probability_wrong(_array(predicted.color))

@@ -13,11 +13,11 @@ from skimage.draw import polygon
 from sigmasplat.api import Matrix
 from sigmasplat.plugins.outputs.floorplan.ground import WRONG_BY
 
+UNOBSERVED, FLOOR_UNOBSERVED, FREE, OBJECT, WALL = range(5)
+"""Kinds of cells. FLOOR_UNOBSERVED: a ray passed above the cell, but its floor was not observed."""
 MAX_DEPTH_SIGMA_M = 0.05
 MAX_WRONG_SHARE = 0.5
-"""With predicted errors: the largest share of pixels whose colour is expected to be wrong."""
-MAX_COLOR_SIGMA_RATIO = 3.0
-"""Without predicted errors: relative to the median of the plan, because the size of σ depends on the training."""
+"""The largest share of pixels whose colour is expected to be wrong."""
 MIN_ALPHA = 0.9
 """As for surface fusion: below this alpha a surface is partly transparent."""
 MIN_AREA_M2 = 0.03
@@ -53,23 +53,6 @@ class RescanRegion:
         return f"{self.why}: {self.found} · {self.area_m2:.2f} {area_unit} · {where}"
 
 
-@dataclass(frozen=True, eq=False)
-class RescanMaps:
-    """Maps of a plan [rows, columns] that show where to scan again.
-
-    unobserved, floor_unobserved, free: cells of these kinds; the measurements are nan in cells without a surface.
-    wrong_share: as in `FloorPlan`; None without predicted errors.
-    """
-
-    unobserved: Mask
-    floor_unobserved: Mask
-    free: Mask
-    color_sigma: Grid
-    depth_sigma_m: Grid
-    alpha: Grid
-    wrong_share: Grid | None = None
-
-
 def unsure_rule(predicted_errors: bool) -> str:
     """Return a sentence that says when a region is unsure."""
     depth = f"{100.0 * MAX_DEPTH_SIGMA_M:g} cm"
@@ -79,16 +62,35 @@ def unsure_rule(predicted_errors: bool) -> str:
             f"than {100.0 * MAX_WRONG_SHARE:g} % of the pixels are expected wrong by more than {WRONG_BY:g} (colour, "
             "0 to 1)."
         )
-    return (
-        "This run has no predicted errors (uncertainty.probes), so a region is unsure if splats along a ray are more "
-        f"than {depth} apart, or if their learned colour deviation is {MAX_COLOR_SIGMA_RATIO:g} times the median."
-    )
+    return "This run has no predicted errors (uncertainty.probes), so the plan does not say where its map is unsure."
 
 
-def find_rescan_regions(maps: RescanMaps, cell_m: float, origin_m: Matrix) -> list[RescanRegion]:
-    """Return at most `MAX_REGIONS` regions of at least `MIN_AREA_M2`, the largest first."""
+def find_rescan_regions(
+    kind: NDArray[np.uint8], alpha: Grid, depth_sigma_m: Grid, wrong_share: Grid, cell_m: float, origin_m: Matrix
+) -> list[RescanRegion]:
+    """Return at most `MAX_REGIONS` regions of at least `MIN_AREA_M2`, the largest first.
+
+    kind, alpha, depth_sigma_m, wrong_share: cells of a plan [rows, columns] as in `FloorPlan`.
+    """
+    with np.errstate(invalid="ignore"):
+        thin = np.asarray(alpha < MIN_ALPHA)
+        deep, wrong = depth_sigma_m > MAX_DEPTH_SIGMA_M, wrong_share > MAX_WRONG_SHARE
+
+    def unsure(at: Mask) -> str:
+        depth = f"depth uncertain by {100.0 * np.nanmean(depth_sigma_m[at]):.0f} cm"
+        color = f"{100.0 * np.nanmean(wrong_share[at]):.0f} % of the pixels expected wrong by more than {WRONG_BY:g}"
+        return ", ".join(words for words, cause in ((depth, deep), (color, wrong)) if cause[at].any())
+
+    floor_unobserved = kind == FLOOR_UNOBSERVED
+    hidden = _hidden(kind == UNOBSERVED, (kind == FREE) | floor_unobserved, cell_m)
+    reasons: list[tuple[str, Mask, Describe]] = [
+        ("unseen", hidden, lambda at: "not observed"),
+        ("unseen", floor_unobserved, lambda at: "floor not observed"),
+        ("thin", thin, lambda at: f"surface {100.0 * (1.0 - np.nanmean(alpha[at])):.0f} % transparent"),
+        ("unsure", np.asarray((deep | wrong) & ~thin), unsure),
+    ]
     found = []
-    for why, mask, describe in _reasons(maps, cell_m):
+    for why, mask, describe in reasons:
         labels, count = ndimage.label(_open(mask), np.ones((3, 3)))
         for number in range(1, count + 1):
             at = labels == number
@@ -98,52 +100,6 @@ def find_rescan_regions(maps: RescanMaps, cell_m: float, origin_m: Matrix) -> li
                 center = (float(origin_m[0] + (column + 0.5) * cell_m), float(origin_m[1] + (row + 0.5) * cell_m))
                 found.append(RescanRegion(center, radius * cell_m, area_m2, why, describe(at)))
     return sorted(found, key=lambda region: -region.area_m2)[:MAX_REGIONS]
-
-
-def _reasons(maps: RescanMaps, cell_m: float) -> list[tuple[str, Mask, Describe]]:
-    """Return for each reason its name, its cells, and a function that describes a part of these cells."""
-    with np.errstate(invalid="ignore"):
-        thin = np.asarray(maps.alpha < MIN_ALPHA)
-    unsure, describe_unsure = _unsure(maps) if maps.wrong_share is None else _unsure_predicted(maps, maps.wrong_share)
-    return [
-        (
-            "unseen",
-            _hidden(maps.unobserved, maps.free | maps.floor_unobserved, cell_m),
-            lambda at: "not observed",
-        ),
-        ("unseen", maps.floor_unobserved, lambda at: "floor not observed"),
-        ("thin", thin, lambda at: f"surface {100.0 * (1.0 - np.nanmean(maps.alpha[at])):.0f} % transparent"),
-        ("unsure", np.asarray(unsure & ~thin), describe_unsure),
-    ]
-
-
-def _unsure_predicted(maps: RescanMaps, wrong_share: Grid) -> tuple[Mask, Describe]:
-    """Return the cells with a large predicted error, and a function that describes a part of them."""
-    with np.errstate(invalid="ignore"):
-        of_depth, of_color = maps.depth_sigma_m > MAX_DEPTH_SIGMA_M, wrong_share > MAX_WRONG_SHARE
-
-    def describe(at: Mask) -> str:
-        depth = f"depth uncertain by {100.0 * np.nanmean(maps.depth_sigma_m[at]):.0f} cm"
-        share = 100.0 * np.nanmean(wrong_share[at])
-        color = f"{share:.0f} % of the pixels expected wrong by more than {WRONG_BY:g}"
-        return ", ".join(words for words, cause in ((depth, of_depth), (color, of_color)) if cause[at].any())
-
-    return np.asarray(of_depth | of_color), describe
-
-
-def _unsure(maps: RescanMaps) -> tuple[Mask, Describe]:
-    """Return the cells with a large spread of depth or a large σ, and a function that describes a part of them."""
-    median_sigma = float(np.nanmedian(maps.color_sigma)) if np.isfinite(maps.color_sigma).any() else 1.0
-    with np.errstate(invalid="ignore"):
-        of_depth = maps.depth_sigma_m > MAX_DEPTH_SIGMA_M
-        of_color = maps.color_sigma > MAX_COLOR_SIGMA_RATIO * median_sigma
-
-    def describe(at: Mask) -> str:
-        depth = f"depth ± {100.0 * np.nanmean(maps.depth_sigma_m[at]):.1f} cm"
-        color = f"colour uncertainty {np.nanmean(maps.color_sigma[at]) / median_sigma:.1f} times the median"
-        return ", ".join(words for words, cause in ((depth, of_depth), (color, of_color)) if cause[at].any())
-
-    return np.asarray(of_depth | of_color), describe
 
 
 def _open(mask: Mask) -> Mask:
@@ -179,7 +135,6 @@ def _hidden(unobserved: Mask, empty: Mask, cell_m: float) -> Mask:
 
 
 def _hull(cells: Mask) -> Mask:
-    """Return the convex hull of cells."""
     out, places = np.zeros_like(cells), np.argwhere(cells)
     try:
         corners = places[ConvexHull(places).vertices]

@@ -1,1 +1,1 @@
-"""Read and write splats: PLY, compressed PLY, SPZ, .splat."""
+"""Read and write splats in the formats of other programs."""

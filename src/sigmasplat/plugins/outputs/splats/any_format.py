@@ -3,25 +3,25 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from sigmasplat.api import GaussianField, SourceError, guarded, open_binary, read_header, splat_ply as ply
-from sigmasplat.plugins.outputs.splats import compressed_ply, gltf, sog, splat, spz, usd
+from sigmasplat.api import GaussianField, SourceError, guarded, open_binary, splat_ply as ply
+from sigmasplat.plugins.outputs.splats import gltf, sog, splat, spz
 
-READABLE = ".ply, .compressed.ply, .splat, .spz, .sog, .glb, .gltf, .usda, .usdc or .usd"
+READABLE = ".ply, .splat, .spz, .sog or .glb"
 START = 4096
-"""The first bytes of a file, which decide its format. A .gltf nearly always says `asset` in them."""
+"""The first bytes of a file, which decide its format."""
 READERS: dict[bytes, Callable[[Path], GaussianField]] = {
     spz.GZIP: spz.read_field,
     spz.MAGIC: spz.read_field,
     sog.MAGIC: sog.read_field,
     gltf.MAGIC: gltf.read_field,
-    usd.BINARY: usd.read_field,
-    usd.TEXT: usd.read_field,
 }
 """Readers by the first bytes of a file."""
 OTHER_FILES = {
     b"version https://git-lfs": "is a Git LFS pointer, not the map itself; run: git lfs pull",
     b"<": "is a web page or XML, not the map itself; download the map again",
-    b"{": "is JSON; give the file with the splats",
+    b"{": "is JSON; give the file with the splats, of glTF the .glb",
+    b"PXR-USDC": "is OpenUSD, which is not read; save it as glTF or PLY",
+    b"#usda": "is OpenUSD, which is not read; save it as glTF or PLY",
     b"\x89PNG": "is an image; give the file with the splats",
 }
 """Messages about other files that users give by mistake, by their first bytes."""
@@ -30,8 +30,7 @@ OTHER_FILES = {
 def read_any(path: Path) -> GaussianField:
     """Read a map in any of the formats of `READABLE`; σ² that is not in the file becomes exp(−7).
 
-    Raises SourceError if it is missing, a folder, damaged, or of another format; SigmaSplatError if it is OpenUSD and
-    usd-core is not installed.
+    Raises SourceError if it is missing, a folder, damaged, or of another format.
     """
     if path.is_dir():
         raise SourceError(f"{path} is a folder, not a map; give a file: {READABLE}")
@@ -43,26 +42,20 @@ def _read_known(path: Path) -> GaussianField:
     with open_binary(path, "cannot read map") as file:
         start = file.read(START)
     if start[:3] == b"ply" and start[3:4].isspace():
-        return _read_ply(path)
+        if b"\nelement chunk " in start:
+            raise SourceError(f"{path} is SuperSplat's compressed PLY, which is not read; save it as SOG or as PLY")
+        return ply.read_field(path)
     for magic, read in READERS.items():
         if start.startswith(magic):
             return read(path)
     return _read_headerless(path, start)
 
 
-def _read_ply(path: Path) -> GaussianField:
-    with open_binary(path, "cannot read map") as file:
-        compressed = compressed_ply.is_compressed(read_header(file, path))
-    return compressed_ply.read_field(path) if compressed else ply.read_field(path)
-
-
 def _read_headerless(path: Path, start: bytes) -> GaussianField:
-    """Read a .splat file, which has no header, or a .gltf, which is JSON. Raises SourceError if it is neither."""
+    """Read a .splat file, which has no header. Raises SourceError if it is none."""
     try:
         return splat.read_field(path)
     except SourceError as problem:
-        if start.lstrip().startswith(b"{") and (b'"asset"' in start or path.suffix.lower() == ".gltf"):
-            return gltf.read_field(path)
         for magic, what in OTHER_FILES.items():
             if start.lstrip().startswith(magic):
                 raise SourceError(f"{path} {what}") from problem

@@ -1,4 +1,4 @@
-"""Read and write splats as glTF 2.0 with KHR_gaussian_splatting (release candidate): GLB, or .gltf with data inside.
+"""Read and write splats as glTF 2.0 with KHR_gaussian_splatting (release candidate); write GLB, also of meshes.
 
 One primitive of points with float32 attributes: POSITION, and KHR_gaussian_splatting:ROTATION (xyzw), SCALE (metres),
 OPACITY (0 to 1) and SH_DEGREE_l_COEF_n (degree 0 is (colour − ½)/C0). Our own attributes, which other readers skip:
@@ -9,11 +9,9 @@ rotates maps by 180° about x, the reader rotates them back. Sizes are checked b
 and compressed buffers cannot be read. Specification: KhronosGroup/glTF, extensions/2.0/Khronos/KHR_gaussian_splatting.
 """
 
-import base64
-import binascii
 import json
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -38,8 +36,9 @@ from sigmasplat.api import (
 
 FLOAT = 5126
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", FLOAT: "<f4"}
+NUMBERS = {np.dtype(code): number for number, code in COMPONENTS.items()}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
-DATA_URI = "data:application/octet-stream;base64,"
+TYPES = {width: name for name, width in WIDTHS.items()}
 UNMOVED = {
     "matrix": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1],
     "translation": [0, 0, 0], "rotation": [0, 0, 0, 1], "scale": [1, 1, 1],
@@ -48,7 +47,7 @@ UNMOVED = {
 
 @dataclass(frozen=True)
 class GltfFile:
-    """The JSON document of a file, and the data chunk of a GLB."""
+    """The JSON document and the data of a GLB."""
 
     path: Path
     document: Mapping[str, Any]
@@ -58,10 +57,7 @@ class GltfFile:
     def open(path: Path) -> "GltfFile":
         """Read a file. Raises SourceError if it is missing, damaged, or not glTF 2.0."""
         with open_binary(path, "cannot read map") as file:
-            data = file.read()
-        chunk = b""
-        if data.startswith(MAGIC):
-            data, chunk = _chunks(data, path)
+            data, chunk = _chunks(file.read(), path)
         try:
             document = json.loads(data)
             version = str(document["asset"]["version"])
@@ -70,11 +66,6 @@ class GltfFile:
         if not version.startswith("2."):
             raise SourceError(f"{path} is glTF {version}; only glTF 2.0 can be read")
         return GltfFile(path, document, chunk)
-
-    @staticmethod
-    def data_uri(data: bytes) -> str:
-        """Return a URI that contains the data of a buffer."""
-        return DATA_URI + base64.b64encode(data).decode("ascii")
 
     def damaged(self, what: str) -> SourceError:
         """Return the error of a file whose document is wrong."""
@@ -140,7 +131,9 @@ class GltfFile:
             raise self.damaged(f"the buffer of {name} is compressed; save the map without compression")
         stride = self._whole(view, "byteStride") or width * item.itemsize
         start, length = self._whole(view, "byteOffset") + at, self._whole(view, "byteLength") - at
-        data = self._buffer(view.get("buffer"))
+        if "uri" in self.entry("buffers", view.get("buffer")):
+            raise self.damaged(f"the data of {name} is in another file; save the map as one GLB")
+        data = self.chunk
         if stride < width * item.itemsize or size * stride - stride + width * item.itemsize > length * bool(size):
             raise self.damaged(f"{name} is larger than its part of the buffer")
         if start + length > len(data):
@@ -157,23 +150,6 @@ class GltfFile:
         if isinstance(found, bool) or not isinstance(found, int) or not 0 <= found < 1 << 53:
             raise self.damaged(f"{name} is not a whole number")
         return found
-
-    def _buffer(self, index: object) -> bytes:
-        """Return the data of a buffer: the chunk of a GLB, a data URI, or a file beside the document."""
-        uri = self.entry("buffers", index).get("uri")
-        if uri is None:
-            return self.chunk
-        if not isinstance(uri, str):
-            raise self.damaged("the URI of a buffer is not text")
-        if uri.startswith("data:"):
-            try:
-                return base64.b64decode(uri.partition(",")[2], validate=True)
-            except binascii.Error as problem:
-                raise self.damaged("the data of a buffer is not base64") from problem
-        if Path(uri).name != uri or uri in ("", ".", ".."):
-            raise self.damaged("the URI of a buffer is not a file in the same folder")
-        with open_binary(self.path.with_name(uri), f"cannot read the data of {self.path}:") as file:
-            return file.read()
 
 
 def _chunks(data: bytes, path: Path) -> tuple[bytes, bytes]:
@@ -194,53 +170,62 @@ def _chunks(data: bytes, path: Path) -> tuple[bytes, bytes]:
 
 NAME = "KHR_gaussian_splatting"
 MAGIC = b"glTF"
-UNSIGNED_BYTE, VERTICES = 5121, 34962
-TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+VERTICES, INDICES = 34962, 34963
+"""Kinds of buffer views."""
+UNLIT = "KHR_materials_unlit"
 JSON_CHUNK, DATA_CHUNK = b"JSON", b"BIN\0"
 
 
 def write_field(path: Path, field: GaussianField, *, std: SplatStd | None = None) -> None:
-    """Write the splats atomically: as text if the name ends in .gltf, else as GLB.
-
-    `std` adds its two attributes. Raises RunError if the file cannot be written.
-    """
-    views: list[dict[str, Any]] = []
-    accessors: list[dict[str, Any]] = []
-    attributes: dict[str, int] = {}
-    data = bytearray()
-    for name, values in _attributes(field, std):
-        attributes[name] = len(accessors)
-        views.append({"buffer": 0, "byteOffset": len(data), "byteLength": values.nbytes, "target": VERTICES})
-        kind = FLOAT if values.dtype == np.float32 else UNSIGNED_BYTE
-        accessor: dict[str, Any] = {"bufferView": len(accessors), "componentType": kind, "count": len(values)}
-        accessor["type"] = TYPES[values.shape[1]]
-        if kind == UNSIGNED_BYTE:
-            accessor["normalized"] = True
-        if name == "POSITION":
-            accessor |= {end: [float(x) for x in getattr(values, end)(0)] for end in ("min", "max") if len(values)}
-        accessors.append(accessor)
-        data += values.tobytes()
+    """Write the splats atomically as GLB; `std` adds its two attributes. Raises RunError if it cannot be written."""
     splatting = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
-    primitive = {"attributes": attributes, "mode": 0, "material": 0, "extensions": {NAME: splatting}}
-    document: dict[str, Any] = {
-        "asset": {"version": "2.0", "generator": "SigmaSplat"},
-        "extensionsUsed": [NAME, "KHR_materials_unlit"],
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "name": "map"}],
-        "materials": [{"name": "points", "extensions": {"KHR_materials_unlit": {}}}],
-    }
-    if len(field):
-        document["meshes"] = [{"primitives": [primitive]}]
-        document |= {"accessors": accessors, "bufferViews": views, "buffers": [{"byteLength": len(data)}]}
-    else:  # glTF has no accessor without elements
-        del document["nodes"][0]["mesh"]
+    material = {"name": "points", "extensions": {UNLIT: {}}}
+    data = glb(_attributes(field, std), {"mode": 0, "extensions": {NAME: splatting}}, material, "map")
     with replacing(path) as temporary:
-        temporary.write_bytes(_packed(document, bytes(data), path.suffix.lower() == ".gltf"))
+        temporary.write_bytes(data)
+
+
+def glb(
+    attributes: Mapping[str, NDArray[Any]], primitive: Mapping[str, Any], material: Mapping[str, Any], name: str,
+    indices: NDArray[np.uint32] | None = None,
+) -> bytes:  # fmt: skip
+    """Return the bytes of a GLB with one mesh: attributes [N] or [N, m] of its vertices, and indices of its triangles.
+
+    Integer attributes are normalised. primitive, material: their other entries. Without vertices, or with indices
+    that are empty, the scene is empty: glTF has no empty accessors.
+    """
+    document: dict[str, Any] = {"asset": {"version": "2.0", "generator": "SigmaSplat"}, "scene": 0, "scenes": [{}]}
+    arrays = [*attributes.values(), *([] if indices is None else [indices])]
+    if not all(array.size for array in arrays):
+        return _packed(document, b"")
+    starts = np.cumsum([0, *(array.nbytes + -array.nbytes % 4 for array in arrays)]).tolist()
+    accessors: list[dict[str, Any]] = [
+        {"bufferView": i, "componentType": NUMBERS[array.dtype], "count": len(array)}
+        | {"type": TYPES[1 if array.ndim == 1 else array.shape[1]]}
+        | ({"normalized": True} if array.dtype.kind == "u" and array is not indices else {})
+        for i, array in enumerate(arrays)
+    ]
+    accessors[0] |= {end: [float(x) for x in getattr(attributes["POSITION"], end)(0)] for end in ("min", "max")}
+    of_mesh = {"attributes": {key: i for i, key in enumerate(attributes)}, "material": 0, **primitive}
+    document |= {
+        "extensionsUsed": [*primitive.get("extensions", {}), UNLIT],
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "name": name}],
+        "meshes": [{"primitives": [of_mesh if indices is None else of_mesh | {"indices": len(attributes)}]}],
+        "materials": [material],
+        "accessors": accessors,
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": start, "byteLength": array.nbytes}
+            | {"target": INDICES if array is indices else VERTICES}
+            for start, array in zip(starts, arrays, strict=False)
+        ],
+        "buffers": [{"byteLength": starts[-1]}],
+    }
+    return _packed(document, b"".join(array.tobytes() + bytes(-array.nbytes % 4) for array in arrays))
 
 
 def read_field(path: Path) -> GaussianField:
-    """Read .glb or .gltf; without _SIGMA, σ² becomes exp(−7). Of several primitives of splats, the first one is read.
+    """Read a GLB; without _SIGMA, σ² becomes exp(−7). Of several primitives of splats, the first one is read.
 
     Raises SourceError if it is missing, damaged, truncated, has no splats, or if its node is moved or scaled.
     """
@@ -268,14 +253,14 @@ def read_field(path: Path) -> GaussianField:
     return values.turned_about_x().field(path, sigmas)
 
 
-def _attributes(field: GaussianField, std: SplatStd | None) -> Iterator[tuple[str, NDArray[Any]]]:
-    """Yield the names and values [N, m] of the attributes."""
+def _attributes(field: GaussianField, std: SplatStd | None) -> dict[str, NDArray[Any]]:
+    """Return the names and values of the attributes, POSITION first."""
     values = SplatValues.of(field).turned_about_x()
     own: dict[str, Doubles] = {
         "POSITION": values.means,
         f"{NAME}:ROTATION": np.roll(values.quats, -1, axis=1),
         f"{NAME}:SCALE": np.exp(values.log_scales),
-        f"{NAME}:OPACITY": values.opacities[:, None],
+        f"{NAME}:OPACITY": values.opacities,
         f"{NAME}:SH_DEGREE_0_COEF_0": (values.colors - 0.5) / SH_C0,
     }
     for degree in range(1, values.degree + 1):
@@ -284,12 +269,13 @@ def _attributes(field: GaussianField, std: SplatStd | None) -> Iterator[tuple[st
             own[f"{NAME}:SH_DEGREE_{degree}_COEF_{n}"] = values.harmonics[:, at : at + 3]
     own["_SIGMA"] = field.variances.detach().cpu().double().sqrt().numpy()
     if std is not None:
-        own["_DEPTH_STD_M"] = std.depth_std_m.cpu().double().numpy()[:, None]
-        own["_COLOR_STD"] = std.color_std.cpu().double().numpy()[:, None]
-    for name, array in own.items():
-        yield name, array.astype(np.float32)
+        own |= {
+            "_DEPTH_STD_M": std.depth_std_m.cpu().double().numpy(),
+            "_COLOR_STD": std.color_std.cpu().double().numpy(),
+        }
     colors = np.column_stack([linear(values.colors), values.opacities])
-    yield "COLOR_0", np.round(colors * 255.0).astype(np.uint8)
+    points = {"COLOR_0": np.round(colors * 255.0).astype(np.uint8)}
+    return {name: np.ascontiguousarray(array, "<f4") for name, array in own.items()} | points
 
 
 def linear(srgb: NDArray[np.floating]) -> Doubles:
@@ -298,18 +284,9 @@ def linear(srgb: NDArray[np.floating]) -> Doubles:
     return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
 
 
-def _packed(document: dict[str, Any], data: bytes, text: bool) -> bytes:
-    """Return the bytes of a .gltf with its data in a URI, or of a GLB."""
-    if text:
-        if data:
-            document["buffers"][0]["uri"] = GltfFile.data_uri(data)
-        return json.dumps(document).encode()
-    return glb_of(json.dumps(document, separators=(",", ":")).encode(), data)
-
-
-def glb_of(document: bytes, data: bytes) -> bytes:
+def _packed(document: Mapping[str, Any], data: bytes) -> bytes:
     """Return a GLB: the document as JSON and, if there are any, the data; the length of a chunk is a multiple of 4."""
-    chunks = [(JSON_CHUNK, document + b" " * (-len(document) % 4))]
-    chunks += [(DATA_CHUNK, data + bytes(-len(data) % 4))] * bool(data)
+    text = json.dumps(document, separators=(",", ":")).encode()
+    chunks = [(JSON_CHUNK, text + b" " * (-len(text) % 4)), *([(DATA_CHUNK, data)] if data else [])]
     body = b"".join(struct.pack("<I4s", len(chunk), kind) + chunk for kind, chunk in chunks)
     return struct.pack("<4sII", MAGIC, 2, 12 + len(body)) + body

@@ -254,7 +254,6 @@ def _harmonics(given: _Archive, pixels: Callable[[str, int], Pixels], size: int)
 
 
 def _packed_harmonics(values: SplatValues) -> tuple[dict[str, Any], dict[str, Pixels]]:
-    """Return the meta data and the images of the harmonics."""
     rows, labels = palette(values.harmonics, min(MAX_PALETTE, max(PALETTE_ROWS, len(values) // 4)))
     book, indices = levels(rows)
     each = count(values.degree)

@@ -70,7 +70,6 @@ def read_field(path: Path) -> GaussianField:
 
 
 def _check(rows: NDArray[np.void], norms: NDArray[np.float64], path: Path) -> None:
-    """Raise SourceError at the first splat that is not valid."""
     finite = np.isfinite(rows["mean"]).all(1) & np.isfinite(rows["scale"]).all(1) & (rows["scale"] >= 0.0).all(1)
     bad = np.flatnonzero(~(finite & (norms > UNIT[0]) & (norms < UNIT[1])))
     if len(bad):

@@ -1,4 +1,6 @@
-"""Read and write splats as Niantic's SPZ: 19 or 20 bytes per splat before compression; web, game and phone viewers.
+"""Read splats from Niantic's SPZ, versions 2 and 3, and write version 3: 20 bytes per splat before compression.
+
+Most current readers accept version 3: nianticlabs/spz, splat-transform, three.js, Spark, Babylon.js.
 
 Each kind of value is one stream for all splats: positions (24-bit fixed point), opacities (0 to 255), colours (f_dc ·
 0.15 + ½, 0 to 255), log scales (steps of 1/16 from −10), rotations, harmonics (steps of 1/128, 128 is 0). Rotations in
@@ -14,19 +16,16 @@ load-spz.cc.
 import gzip
 import struct
 import zlib
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
-import zstandard
 from numpy.typing import NDArray
 
 from sigmasplat.api import (
     DEGREES,
     SH_C0,
-    ConfigError,
     Doubles,
     GaussianField,
     RunError,
@@ -47,13 +46,10 @@ from sigmasplat.api import (
 
 MAGIC = b"NGSP"
 GZIP = b"\x1f\x8b\x08"
-VERSIONS = (2, 3, 4)
+VERSIONS = (2, 3)
 HEADER = struct.Struct("<4sIIBBBB")
-HEADER_OF_4 = struct.Struct("<4sIIBBBBI12x")
-STREAM = struct.Struct("<QQ")
-ZSTANDARD_LEVEL = 19
 MAX_RATIO = 1032
-"""Maximum compression ratio of Deflate. Zstandard has none; nianticlabs/spz refuses more than 1024 in version 4."""
+"""Maximum compression ratio of Deflate."""
 MAX_EXTENSION_BYTES = 1 << 20
 """Maximum number of bytes read after the splats, where a file may have extensions."""
 
@@ -77,7 +73,7 @@ class SpzHeader:
         if self.version not in VERSIONS or self.degree > DEGREES:
             raise SourceError(
                 f"{path} is SPZ version {self.version} with harmonics of degree {self.degree}; "
-                "save it as version 2 to 4 with degree 0 to 3, or as PLY"
+                "save it as version 3 with degree 0 to 3, or as PLY"
             )
         check_count(self.size, packed_size, path)
         needed = self.size * sum(self.widths)
@@ -85,24 +81,12 @@ class SpzHeader:
             raise SourceError(f"{path} is truncated: its header says {self.size} splats = {needed} bytes")
 
 
-def pack(header: SpzHeader, streams: Sequence[bytes]) -> bytes:
-    """Return the bytes of a file with this header and these six streams."""
-    values = (MAGIC, header.version, header.size, header.degree, header.fractional_bits, 0)
-    if header.version < 4:
-        return gzip.compress(b"".join([HEADER.pack(*values, 0), *streams]), compresslevel=9, mtime=0)
-    stored = [stream for stream in streams if stream]
-    packer = zstandard.ZstdCompressor(level=ZSTANDARD_LEVEL, write_checksum=True)
-    packed = [packer.compress(stream) for stream in stored]
-    table = [STREAM.pack(len(small), len(large)) for small, large in zip(packed, stored, strict=True)]
-    return b"".join([HEADER_OF_4.pack(*values, len(stored), HEADER_OF_4.size), *table, *packed])
-
-
 def unpack(file: BinaryIO, path: Path) -> tuple[SpzHeader, list[bytes]]:
-    """Read the header and the six streams. Raises SourceError if the file is damaged, truncated, or not SPZ."""
+    """Read the header and the six streams. Raises SourceError if the file is damaged, truncated, or not SPZ 2 or 3."""
     start = file.read(len(MAGIC))
     file.seek(0)
     if start == MAGIC:
-        return _unpack_zstandard(file, path)
+        raise SourceError(f"{path} is SPZ of version 4, which is not read; save it as version 3, or as PLY")
     try:
         return _unpack_gzip(file, path)
     except (EOFError, gzip.BadGzipFile, zlib.error) as problem:
@@ -130,39 +114,7 @@ def _unpack_gzip(file: BinaryIO, path: Path) -> tuple[SpzHeader, list[bytes]]:
     return header, streams
 
 
-def _unpack_zstandard(file: BinaryIO, path: Path) -> tuple[SpzHeader, list[bytes]]:
-    data = file.read(HEADER_OF_4.size)
-    if len(data) < HEADER_OF_4.size:
-        raise SourceError(f"{path} is truncated: its header of {HEADER_OF_4.size} bytes is incomplete")
-    _, version, size, degree, bits, _flags, given, table_at = HEADER_OF_4.unpack(data)
-    header = SpzHeader(version, size, degree, bits)
-    header.check(path, path.stat().st_size)
-    sizes = [size * width for width in header.widths]
-    stored = [plain for plain in sizes if plain]
-    file.seek(table_at)
-    table = file.read(STREAM.size * given)
-    entries = list(STREAM.iter_unpack(table)) if len(table) == STREAM.size * given else []
-    if table_at < HEADER_OF_4.size or [plain for _, plain in entries if plain] != stored:
-        raise SourceError(f"{path} is damaged or truncated: its table of streams does not match {size} splats")
-    found = iter([_decompress(file, small, plain, path) for small, plain in entries if plain])
-    return header, [next(found) if plain else b"" for plain in sizes]
-
-
-def _decompress(file: BinaryIO, packed_size: int, size: int, path: Path) -> bytes:
-    """Read one stream of version 4. Raises SourceError unless it has exactly `size` bytes."""
-    packed = file.read(min(packed_size, path.stat().st_size))
-    try:
-        if zstandard.frame_content_size(packed) in (-1, size):
-            stream = zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)
-            if len(packed) == packed_size and len(stream) == size:
-                return stream
-    except zstandard.ZstdError as problem:
-        raise SourceError(f"{path} is damaged or truncated: {problem}; copy or download it again") from problem
-    raise SourceError(f"{path} is damaged or truncated: a stream does not have {size} bytes; copy or download it again")
-
-
-DEFAULT_VERSION = 3
-"""Most current readers accept it: nianticlabs/spz, splat-transform, three.js, Spark, Babylon.js."""
+WRITTEN_VERSION = 3
 FRACTIONAL_BITS = 12
 """Positions have steps of a quarter of a millimetre up to 2 km from the origin; larger maps have coarser steps."""
 LARGEST_FIXED = (1 << 23) - 1
@@ -171,13 +123,8 @@ LOG_SCALE_START, LOG_SCALE_STEPS = -10.0, 16.0
 MAGNITUDES = (1 << 9) - 1
 
 
-def write_field(path: Path, field: GaussianField, *, version: int = DEFAULT_VERSION) -> None:
-    """Write the splats atomically as SPZ of version 2, 3 or 4.
-
-    Raises ConfigError on another version, RunError if the file cannot be written or a position is too large.
-    """
-    if version not in VERSIONS:
-        raise ConfigError(f"SPZ has versions 2, 3 and 4, found {version}")
+def write_field(path: Path, field: GaussianField) -> None:
+    """Write the splats atomically. Raises RunError if the file cannot be written or a position is too large."""
     values = SplatValues.of(field).turned_about_x()
     values = values.ordered(morton_order(values.means))
     bits = _fractional_bits(path, values.means)
@@ -187,16 +134,16 @@ def write_field(path: Path, field: GaussianField, *, version: int = DEFAULT_VERS
         opacity_bytes(values.opacities).tobytes(),
         to_bytes(colors * 255.0).tobytes(),
         to_bytes((values.log_scales - LOG_SCALE_START) * LOG_SCALE_STEPS).tobytes(),
-        _three_bytes(values.quats) if version == 2 else _packed_rotations(values.quats).tobytes(),
+        _packed_rotations(values.quats).tobytes(),
         to_bytes(np.round(values.harmonics * 128.0) + 128.0).tobytes(),
     ]
-    data = pack(SpzHeader(version, len(values), values.degree, bits), streams)
-    with replacing(path) as temporary, temporary.open("wb") as file:
-        file.write(data)
+    header = HEADER.pack(MAGIC, WRITTEN_VERSION, len(values), values.degree, bits, 0, 0)
+    with replacing(path) as temporary:
+        temporary.write_bytes(gzip.compress(b"".join([header, *streams]), compresslevel=9, mtime=0))
 
 
 def read_field(path: Path) -> GaussianField:
-    """Read an SPZ file of version 2, 3 or 4; σ² becomes exp(−7). Extensions are skipped.
+    """Read an SPZ file of version 2 or 3; σ² becomes exp(−7). Extensions are skipped.
 
     Raises SourceError if it is missing, damaged, truncated, of an unsupported version or degree, or not SPZ.
     """
@@ -235,12 +182,6 @@ def _fixed(positions: NDArray[np.uint8]) -> NDArray[np.int32]:
     """Convert signed 24-bit integers, lowest byte first [N, 9], to int32 [N, 3]."""
     low, middle, high = (positions[:, i::3].astype(np.int32) for i in range(3))
     return low | middle << 8 | (high ^ 128) - 128 << 16
-
-
-def _three_bytes(quats: Doubles) -> bytes:
-    """Pack unit quaternions wxyz [N, 4] into the x, y, z of version 2, with the sign that makes w positive."""
-    xyz = quats[:, 1:] * np.where(quats[:, :1] < 0.0, -1.0, 1.0)
-    return to_bytes((xyz + 1.0) * 127.5).tobytes()
 
 
 def _packed_rotations(quats: Doubles) -> NDArray[np.uint32]:
