@@ -48,7 +48,7 @@ COMMANDS = {
     "mesh": ("mesh", "make_mesh"),
     "export": ("export", "export"),
     "download": ("download", "download"),
-    "bench": ("bench", "bench"),
+    "bench": ("batch", "bench"),
     "doctor": ("installation", "doctor"),
     "completion": ("installation", "completion"),
 }
