@@ -8,7 +8,7 @@ from sigmasplat.config import Config
 from sigmasplat.config.scale import for_scene
 from sigmasplat.input.opening import open_source
 from sigmasplat.input.source import Source
-from sigmasplat.run.pose_scale import with_measured_scale, with_scaled_depth
+from sigmasplat.run.pose_scale import with_measured_scale
 
 
 def open_scene(path: str | Path, config: Config | None = None, given: Collection[str] = ()) -> tuple[Source, Config]:
@@ -19,10 +19,8 @@ def open_scene(path: str | Path, config: Config | None = None, given: Collection
     """
     config = config or Config()
     source, asked = open_source(path, config.input), config.input
-    if asked.poses and not asked.poses_scale:
+    if asked.poses and not (asked.poses_scale and (asked.predicted_scale or not source.predicted_depth)):
         config = with_measured_scale(source, config)
-    elif asked.poses and source.predicted_depth and not asked.predicted_scale:
-        config = with_scaled_depth(source, config)
     if config.input != asked:
         source = open_source(path, config.input)
     return source, config_for(source, config, given)
