@@ -228,7 +228,7 @@ def run_job(job: Job, folder: Path, screen: Screen) -> dict[str, Any]:
     source, config = open_scene(job.path, job.config, job.given)
     run = new_folder(folder, config, source, True, source_path=job.path)
     with screen.steps(len(source)) as callback:
-        outcome = Session(Slam(config, run.submaps), source, run, callback).execute()
+        outcome = Session(Slam(config, run.submaps), source, run, [callback]).execute()
     if outcome.status == "interrupted":
         raise KeyboardInterrupt
     with screen.counting("evaluation") as progress:

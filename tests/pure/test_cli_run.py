@@ -267,7 +267,7 @@ def test_the_progress_bar_shows_that_tracking_is_lost(corridor: Corridor) -> Non
     out = io.StringIO()
     folder = RunFolder.create(Path("direct"), BASE, "corridor")
     with Screen(Console(file=out, force_terminal=True, width=120)).steps(6) as callback:
-        Session(MadeUpSlam(BASE), corridor, folder, callback).execute()
+        Session(MadeUpSlam(BASE), corridor, folder, [callback]).execute()
     assert "LOST since frame 3" in out.getvalue()
 
 
@@ -505,7 +505,7 @@ def test_a_terminal_shows_progress_bars(corridor: Corridor) -> None:
     MadeUpSlam.tried = {4: [CLOSED]}
     folder = RunFolder.create(Path("direct"), BASE, "corridor")
     with screen.steps(6) as callback:
-        Session(MadeUpSlam(BASE), corridor, folder, callback).execute()
+        Session(MadeUpSlam(BASE), corridor, folder, [callback]).execute()
     said = out.getvalue()
     assert "SLAM" in said and "6/6" in said and "final map" in said and "2/2" in said and "loop closed" in said
 

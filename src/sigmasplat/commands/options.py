@@ -51,12 +51,7 @@ AllPoses = Annotated[
     flag("also write trajectory_all.txt with the poses of all frames, including lost ones"),
 ]
 Log = Annotated[
-    str,
-    arg(
-        "NAMES",
-        "also write the values of every frame to logs/ in RUN: csv, tensorboard, rerun, or several by commas",
-        "",
-    ),
+    Literal["rerun"] | None, arg("rerun", "also write the path and the values of every frame to logs/ in RUN", "")
 ]
 View = Annotated[bool, flag("show the run in the browser while it runs, and afterwards until Ctrl-C")]
 Host = Annotated[
@@ -120,7 +115,7 @@ class RunOptions:
     profile: Profile = False
     save_every: SaveEvery = 60.0
     all_poses: AllPoses = False
-    log: Log = ""
+    log: Log = None
     view: View = False
     host: Host = HOST
     port: Port = PORT

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, NamedTuple, overload
+from typing import Any, NamedTuple, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +18,6 @@ def _of_poses() -> Column:
 @dataclass(eq=False)
 class Poses(Records[Matrix]):
     """A list of poses [4, 4]; those that are read are copies. rows [N, 4, 4]."""
-
-    POSE_COLUMNS: ClassVar[slice] = slice(None)
 
     rows: Column = field(default_factory=_of_poses)
 
@@ -49,8 +47,6 @@ class KeyframePoses(Sequence[Sequence[Matrix]]):
     rows [K, 4, 4]: those of all submaps but the last; ends [S - 1]: number of keyframes up to the end of each of these
     submaps; newest: those of the last submap, None before the first one.
     """
-
-    POSE_COLUMNS: ClassVar[slice] = slice(None)
 
     rows: Column = field(default_factory=_of_poses)
     ends: Column = field(default_factory=lambda: Column.of(np.int64))
@@ -121,9 +117,6 @@ class Place(NamedTuple):
 @dataclass(eq=False)
 class Places(Records[Place]):
     """The places of all frames. rows [F, 18]: submap, keyframe, and T_keyframe_camera [4, 4] by rows."""
-
-    POSE_COLUMNS: ClassVar[slice] = slice(NUMBERS, NUMBERS + 16)
-    """The columns of `rows` that hold a pose."""
 
     rows: Column = field(default_factory=lambda: Column.of(np.float64, NUMBERS + 16))
 

@@ -81,8 +81,6 @@ FACTS: Mapping[str, Test] = {
     "up_world": _direction,
 }  # fmt: skip
 """Values of run.json that commands use."""
-STATE_FIELDS: Mapping[str, Test] = {"index": is_whole, "wall_s": is_number, "submaps": is_whole}
-"""Values of a saved state beside those of `Slam`."""
 
 
 def check_fields(values: Any, tests: Mapping[str, Test], required: tuple[str, ...], where: object) -> dict[str, Any]:

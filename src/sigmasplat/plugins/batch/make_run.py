@@ -67,9 +67,7 @@ def _make_and_score(
         run, start = _started(job, run.path, source, config, path)
         state = StateFile(start.slam, run, save_every_s)
         start.slam.saved_refinement = RefinementFile(start.slam, run, save_every_s)
-        outcome = Session(
-            start.slam, source, run, checkpointer=state, first_index=start.next_index, wall_s=start.wall_s
-        ).execute()
+        outcome = Session(start.slam, source, run, (), state, start.next_index, start.wall_s).execute()
         if outcome.status == "interrupted":
             raise KeyboardInterrupt
     refuse_other_model(run, source)
