@@ -17,7 +17,7 @@ import pytest
 import torch
 from rich.console import Console
 
-import sigmasplat.slam.continuation  # noqa: F401 - loaded with the real SLAM, which other tests of this process need
+import sigmasplat.run.finished_map  # noqa: F401 - loaded with the real SLAM, which other tests of this process need
 from command_line import exit_code
 from lpips_weights import write_weights
 from sigmasplat import cli
@@ -237,7 +237,7 @@ def test_a_run_writes_all_files(corridor: Corridor, capsys: pytest.CaptureFixtur
 
 def test_only_valid_poses_are_in_the_trajectory(corridor: Corridor, capsys: pytest.CaptureFixture[str]) -> None:
     MadeUpSlam.lost, MadeUpSlam.relocalised, MadeUpSlam.apart = {1, 3}, {2}, {3: 1, 4: 1, 5: 2}
-    assert exit_code("run", "corridor", "--no-eval", "--out", "mine", "--all-poses") == 0
+    assert exit_code("run", "corridor", "--no-eval", "--out", "mine") == 0
     run = RunFolder.open(Path("mine"))
     log = run.read_log()
     assert [record["state"] for record in log] == ["tracked", "lost", "relocalised", "lost", "apart", "apart"]
@@ -245,7 +245,7 @@ def test_only_valid_poses_are_in_the_trajectory(corridor: Corridor, capsys: pyte
     assert [record["lost"] for record in log] == [False, True, False, True, False, False]
     assert {record["p_off"] for record in log} == {0.25}
     assert run.read_trajectory().timestamps_s.tolist() == [0.0, 2.0]
-    assert len(read_trajectory(run.path / "trajectory_all.txt")) == 6
+    assert len(run.read_checkpoint()[0]["T_world_camera"]) == 6
     assert run.component_numbers() == [1, 2] and run.read_component(1).trajectory.timestamps_s.tolist() == [4.0]
     assert torch.allclose(run.read_component(2).field.means, MadeUpSlam.latest.field.means)
     assert "6 frames, 2 lost, 1 relocalised, 2 components apart (2 frames)" in capsys.readouterr().out
@@ -277,7 +277,7 @@ def test_a_component_that_joins_later_is_in_the_trajectory(corridor: Corridor) -
     run = RunFolder.open(Path("mine"))
     assert run.read_log()[3]["state"] == "apart", "the state of that time"
     assert run.read_frames().states == ("tracked", "tracked", "lost", "tracked", "tracked", "tracked")
-    assert run.component_numbers() == [] and not (run.path / "trajectory_all.txt").exists()
+    assert run.component_numbers() == []
     MadeUpSlam.joined = set()
     assert exit_code("run", "corridor", "--no-eval", "--out", "mine", "--overwrite") == 0
     assert run.component_numbers() == [1]

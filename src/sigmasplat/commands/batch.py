@@ -24,22 +24,6 @@ DataFolder = Annotated[str | None, arg("ROOT", "folder of the sequences", "")]
 Jobs = Annotated[From1, arg("N", "number of runs at the same time")]
 BatchFolder = Annotated[Path | None, arg("DIR", "folder of the results; finished runs in it are kept", "")]
 ReplaceRuns = Annotated[bool, flag("replace runs in DIR that have other settings or other code")]
-BatchSeeds = Annotated[From1, arg("N", "number of runs of each recording, with N seeds from --seed on")]
-Recordings = Annotated[
-    tuple[str, ...],
-    tyro.conf.Positional,
-    arg("FOLDER", "recordings: folders or synthetic[:frames=N,…]", "(at least one)"),
-]
-What = Annotated[Literal["table"], tyro.conf.Positional, arg("table", "what to make")]
-TableName = Annotated[
-    str,
-    tyro.conf.Positional,
-    arg("TABLE", "name of the table, path of a definition (.toml), or `list` to list all tables"),
-]
-TableScenes = Annotated[tuple[str, ...], arg("SCENE", "scenes to run", "(default: all of the table)")]
-TableSystems = Annotated[
-    tuple[str, ...], arg("SYSTEM", "systems of the table to run, or presets", "(default: those of the table)")
-]
 
 OK, FAILED = 0, 1
 DEFAULT_PRESET = default_preset()
@@ -47,11 +31,15 @@ OUT = Path("runs/batch")
 
 
 def batch(
-    recordings: Recordings,
+    recordings: Annotated[
+        tuple[str, ...],
+        tyro.conf.Positional,
+        arg("FOLDER", "recordings: folders or synthetic[:frames=N,…]", "(at least one)"),
+    ],
     preset: options.PresetName = DEFAULT_PRESET,
     settings: options.Settings = (),
     seed: options.Seed = None,
-    seeds: BatchSeeds = 1,
+    seeds: Annotated[From1, arg("N", "number of runs of each recording, with N seeds from --seed on")] = 1,
     input_options: InputOptionsFlat = DEFAULT_INPUT_OPTIONS,
     data: DataFolder = None,
     mesh: options.WithMesh = False,
@@ -86,11 +74,17 @@ def batch(
 
 
 def bench(
-    what: What,
-    table: TableName,
+    what: Annotated[Literal["table"], tyro.conf.Positional, arg("table", "what to make")],
+    table: Annotated[
+        str,
+        tyro.conf.Positional,
+        arg("TABLE", "name of the table, path of a definition (.toml), or `list` to list all tables"),
+    ],
     data: DataFolder = None,
-    scenes: TableScenes = (),
-    systems: TableSystems = (),
+    scenes: Annotated[tuple[str, ...], arg("SCENE", "scenes to run", "(default: all of the table)")] = (),
+    systems: Annotated[
+        tuple[str, ...], arg("SYSTEM", "systems of the table to run, or presets", "(default: those of the table)")
+    ] = (),
     seeds: options.Runs = 3,
     settings: options.Settings = (),
     limit: Limit = None,
@@ -165,7 +159,6 @@ def _names(paths: Sequence[str]) -> list[str]:
 
 
 def _show(screen: "Screen", made: "Batch") -> None:
-    """Print the main figures of every finished run."""
     from rich.table import Table
 
     from sigmasplat.plugins.batch.definition import Score

@@ -11,25 +11,22 @@ if TYPE_CHECKING:
     from sigmasplat.plugins.download.catalogue import PublicSet
     from sigmasplat.run.terminal import Screen
 
-SetName = Annotated[str, tyro.conf.Positional, arg("SET", "tum, replica, icl, 7scenes, bonn, redwood; lpips; or list")]
-Names = Annotated[
-    tuple[str, ...],
-    tyro.conf.Positional,
-    arg("NAME", "names of recordings; `download list SET` lists them", "(none if there is only one)"),
-]
-DataFolder = Annotated[Path, arg("DIR", "folder for the data sets")]
-ListOnly = Annotated[bool, flag("list data sets or recordings, download nothing", name="list")]
 Overwrite = Annotated[bool, flag("download existing recordings again")]
-KeepArchive = Annotated[bool, flag("keep the archives after unpacking")]
 
 
 def download(
-    dataset: SetName = "list",
-    names: Names = (),
-    out: DataFolder = Path("data"),
-    list_only: ListOnly = False,
+    dataset: Annotated[
+        str, tyro.conf.Positional, arg("SET", "tum, replica, icl, 7scenes, bonn, redwood; lpips; or list")
+    ] = "list",
+    names: Annotated[
+        tuple[str, ...],
+        tyro.conf.Positional,
+        arg("NAME", "names of recordings; `download list SET` lists them", "(none if there is only one)"),
+    ] = (),
+    out: Annotated[Path, arg("DIR", "folder for the data sets")] = Path("data"),
+    list_only: Annotated[bool, flag("list data sets or recordings, download nothing", name="list")] = False,
     overwrite: Overwrite = False,
-    keep_archive: KeepArchive = False,
+    keep_archive: Annotated[bool, flag("keep the archives after unpacking")] = False,
 ) -> int:
     """Download recordings of a public data set, or weights: resumable, verified, safely unpacked.
 

@@ -1,7 +1,6 @@
 """Find the images of a recording in the map of a finished run: sigmasplat localise."""
 
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sigmasplat.commands import options
@@ -43,7 +42,8 @@ def localise(
     from sigmasplat.run.terminal import Screen
     from sigmasplat.run_folder.runs import RunFolder
 
-    _refuse_ending(out)
+    if out and out.suffix not in ENDINGS:
+        raise ConfigError(f"--out must end in {' or '.join(ENDINGS)}, found {out.name}")
     refuse_existing(out, overwrite)
     screen, finished = Screen(), FinishedMap.of(RunFolder.open(run))
     config = search_settings(finished.config, settings, input_options)
@@ -73,20 +73,13 @@ def search_settings(config: "Config", settings: Sequence[str], input_options: In
     return override(config, working_images(config) | input_options.settings() | split_settings(settings))
 
 
-def _refuse_ending(out: Path | None) -> None:
-    if out and out.suffix not in ENDINGS:
-        raise ConfigError(f"--out must end in {' or '.join(ENDINGS)}, found {out.name}")
-
-
 def _located(localiser: "Localiser", source: "Source", progress: "Progress") -> Iterator["Localisation"]:
-    """Yield the result for each image that can be read."""
     for done, frame in enumerate(source, 1):
         yield localiser.locate(frame)
         progress(done, len(source))
 
 
 def _table(found: Sequence["Localisation"]) -> "Table":
-    """Return the results as a table, of all images or of some that are evenly spread."""
     from rich.table import Table
 
     table = Table("image", "verdict", "camera in the world, or why not")

@@ -236,15 +236,9 @@ def _announce(screen: "Screen", preset: str, source: "Source", folder: "RunFolde
 
 
 def _run_and_score(
-    screen: "Screen",
-    start: "StartPoint",
-    source: "Source",
-    folder: "RunFolder",
-    run_options: options.RunOptions,
-    viewer: "ViewerApp | None",
-    robot_options: RobotOptions,
-    realtime: bool = False,
-) -> int:
+    screen: "Screen", start: "StartPoint", source: "Source", folder: "RunFolder", run_options: options.RunOptions,
+    viewer: "ViewerApp | None", robot_options: RobotOptions, realtime: bool = False,
+) -> int:  # fmt: skip
     """Run the session, then score it, and keep showing it in the viewer until Ctrl-C; return the exit code.
 
     realtime: track frames when they arrive. Raises KeyboardInterrupt if Ctrl-C came before the first frame was done.
@@ -273,7 +267,7 @@ def _run_and_score(
     ):
         session = Session(
             system or start.slam, read, folder, [steps, log] if run_options.log else [steps], state, start.next_index,
-            start.wall_s, run_options.all_poses, _readers(start, source, viewer, robot),
+            start.wall_s, _readers(start, source, viewer, robot),
         )  # fmt: skip
         session.watch = robot.watch if robot else motion if not (system or source.live) else None
         session.later = system.between_frames if system else session.later

@@ -1,6 +1,6 @@
 """Define what a session calls with its progress."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -19,3 +19,8 @@ class Callback:
 
     def last_loops(self, loops: Sequence["Loop"]) -> None:
         """Handle the loops tried after the last step."""
+
+
+def run_now(task: Callable[[], None]) -> None:
+    """Run a task at once."""
+    task()

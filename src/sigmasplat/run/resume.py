@@ -12,8 +12,8 @@ from sigmasplat.files.reading import guarded
 from sigmasplat.final.refinement import Refined
 from sigmasplat.fit.adam import VectorAdam
 from sigmasplat.input.source import Source
+from sigmasplat.run.callbacks import run_now
 from sigmasplat.run.same_conditions import refuse_other_sequence
-from sigmasplat.run.session import run_now
 from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.run_folder.state import read_state, write_state
 from sigmasplat.slam.saved_state import CLASSES, fixed, restore, state_of

@@ -44,9 +44,4 @@ def scene_facts(source: Source) -> dict[str, Any]:
 def config_of_facts(facts: Mapping[str, Any], config: Config, given: Collection[str] = ()) -> Config:
     """Return the settings that a run with these facts (run.json) used if it was asked for `config`."""
     noise, predicted = facts.get("depth_noise_per_m"), bool(facts.get("predicted_depth"))
-    return for_scene(config, noted_scale(facts), noise, given, facts.get("sensor"), predicted)
-
-
-def noted_scale(facts: Mapping[str, Any]) -> float:
-    """Return the size of a run's scene from its facts (run.json), 1 for runs of older versions."""
-    return float(facts.get("scene_scale") or 1.0)
+    return for_scene(config, facts.get("scene_scale") or 1.0, noise, given, facts.get("sensor"), predicted)

@@ -20,12 +20,12 @@ from sigmasplat.data.trajectory import RELOCALISED
 from sigmasplat.errors import RunError
 from sigmasplat.files.lock import LOCK, locked, no_warning
 from sigmasplat.input.source import Source
-from sigmasplat.run.callbacks import Callback
+from sigmasplat.run.callbacks import Callback, run_now
 from sigmasplat.run.figures import profile
 from sigmasplat.run.same_conditions import start_facts
 from sigmasplat.run.signals import interrupt_event
 from sigmasplat.run_folder.frames import RunFrames
-from sigmasplat.run_folder.runs import ALL_POSES, RunFolder
+from sigmasplat.run_folder.runs import RunFolder
 
 if TYPE_CHECKING:
     from sigmasplat.realtime.system import RealTime
@@ -142,17 +142,12 @@ class Outcome:
         return line
 
 
-def run_now(task: Callable[[], None]) -> None:
-    """Run a task at once."""
-    task()
-
-
 @dataclass(eq=False)
 class Session:
     """A run of SLAM on a source, from its frame `first_index` on; a resumed run has already taken `wall_s` seconds.
 
     callbacks: called after each step and with the progress of the end; readers: called too, but `later`, because they
-    read the system and not only the step. all_poses: also write trajectory_all.txt, which has the poses of all frames.
+    read the system and not only the step.
     watch: gets each frame before its step. later: runs a task that no frame needs to wait for; at once by default,
     beside the frames in real time.
     """
@@ -164,7 +159,6 @@ class Session:
     state: "StateFile | None" = None
     first_index: int = 0
     wall_s: InitVar[float] = 0.0
-    all_poses: bool = False
     readers: Sequence[Callback] = ()
     watch: Callable[[Frame], object] | None = None
     later: Callable[[Callable[[], None]], None] = run_now
@@ -292,8 +286,6 @@ class Session:
         self.outcome.apart = tuple(len(component.trajectory) for component in components)
         valid = path.at(self.slam.valid())
         self.run.write_trajectory(valid)
-        if self.all_poses or (self.run.path / ALL_POSES).exists():
-            self.run.write_all_poses(path)
         self._write_loops()
         self.run.write_checkpoint(self.slam.checkpoint(), {"frames": str(self.outcome.frames)})
         log = self.run.read_log()
@@ -311,20 +303,14 @@ class Session:
         self.run.write_loops(loop.record() for loop in loops)
 
 
+LOGGED = (
+    "index", "timestamp_s", "is_keyframe", "lost", "state", "component", "p_off", "splats", "submap", "tracking",
+    "seconds", "T_world_camera",
+)  # fmt: skip
+
+
 def log_line(step: "Step") -> dict[str, Any]:
     """Return a step as a record of log.jsonl: T_world_camera as 4 rows, times in seconds, loops if any were tried."""
-    line = {
-        "index": step.index,
-        "timestamp_s": step.timestamp_s,
-        "is_keyframe": step.is_keyframe,
-        "lost": step.lost,
-        "state": step.state,
-        "component": step.component,
-        "p_off": step.p_off,
-        "splats": step.splats,
-        "submap": step.submap,
-        "tracking": dict(step.tracking),
-        "seconds": dict(step.seconds),
-        "T_world_camera": step.T_world_camera,
-    }
+    line = {name: getattr(step, name) for name in LOGGED}
+    line["seconds"] = dict(step.seconds)  # the session adds to it
     return line | {"loops": [loop.record() for loop in step.loops]} if step.loops else line

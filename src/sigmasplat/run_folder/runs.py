@@ -35,8 +35,6 @@ STATE = "state.safetensors"
 """The state from which an unfinished run resumes."""
 REFINEMENT = "refinement.safetensors"
 """The final map of an unfinished run between two steps of its refinement."""
-ALL_POSES = "trajectory_all.txt"
-"""The poses of all frames, written if requested."""
 FILES = (
     "config.json", "trajectory.txt", "map.ply", "checkpoint.safetensors", "log.jsonl", "loops.json",
     "metrics.json", "profile.json", "report.html", TRUTH, map_files.UNCERTAINTY_JSON, map_files.UNCERTAINTY_TENSORS,
@@ -148,7 +146,7 @@ class RunFolder:
 
     def _clear(self) -> None:
         """Remove the files of an earlier run, and keep files that the user added."""
-        for name in (*FILES, ALL_POSES, MESH, STATE, REFINEMENT):
+        for name in (*FILES, MESH, STATE, REFINEMENT):
             (self.path / name).unlink(missing_ok=True)
         for picture in self.images.glob("*.png"):
             picture.unlink()
@@ -230,8 +228,6 @@ class RunFolder:
     """Write trajectory.txt: the valid poses (TUM text, T_world_camera)."""
     read_trajectory = _reads("trajectory.txt", partial(tum.read_trajectory, may_be_empty=True))
     """Read trajectory.txt; it is empty if no pose is valid. Raises SourceError if it is damaged."""
-    write_all_poses = _writes(ALL_POSES, tum.write_trajectory)
-    """Write trajectory_all.txt: the poses of all frames, including lost ones and those of other components."""
 
     def read_frames(self) -> RunFrames:
         """Read log.jsonl and trajectory.txt together: the state of each frame at the end of the run, and its pose.

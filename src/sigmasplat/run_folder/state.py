@@ -64,7 +64,6 @@ def _version(classes: Mapping[str, type]) -> str:
 
 
 def _checksum(tensors: Mapping[str, Tensor]) -> str:
-    """Return a checksum of the bytes of all tensors."""
     found = 0
     for name in sorted(tensors):
         found = zlib.crc32(tensors[name].numpy().tobytes(), found)
@@ -72,7 +71,6 @@ def _checksum(tensors: Mapping[str, Tensor]) -> str:
 
 
 def _names(made: Any) -> list[str]:
-    """Return the names of the fields of a dataclass or a named tuple."""
     return [f.name for f in dataclasses.fields(made)] if dataclasses.is_dataclass(made) else list(made._fields)
 
 

@@ -149,11 +149,6 @@ class Steps(Records[Step]):
         return np.asarray(self.rows.used[:, 3] != 0)
 
     @property
-    def source_index(self) -> NDArray[np.int64]:
-        """Return the index of each frame in its source [F]."""
-        return self.rows.used[:, 0].astype(np.int64)
-
-    @property
     def submap(self) -> NDArray[np.int64]:
         """Return the submap of each frame [F]."""
         return self.rows.used[:, 5].astype(np.int64)

@@ -1,44 +1,16 @@
 """Make the missing runs of a batch: find their sequences, keep finished runs, and go on after a failure."""
 
-import threading
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sigmasplat.api import Progress, RunError
+from sigmasplat.api import RunError
 from sigmasplat.plugins.batch.executor import Executor
 from sigmasplat.plugins.batch.job import Job, has_other_run
 
 if TYPE_CHECKING:
     from sigmasplat.api import Screen
-
-LOOK_EVERY_S = 2.0
-
-
-@contextmanager
-def frames_counted(folders: Sequence[Path], total: int, show: Progress) -> Iterator[None]:
-    """Call `show(done, total)` with the frames of all runs from time to time, as read from their logs."""
-    ended = threading.Event()
-
-    def look() -> None:
-        while not ended.wait(LOOK_EVERY_S):
-            show(sum(map(_logged, folders)), total)
-
-    thread = threading.Thread(target=look, daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        thread.join()
-
-
-def _logged(folder: Path) -> int:
-    with suppress(OSError):
-        return (folder / "log.jsonl").read_bytes().count(b"\n")
-    return 0
 
 
 @dataclass
@@ -71,26 +43,22 @@ class Batch:
         done = self.finished()
         if done:
             screen.say(f"{len(done)} of {len(self.jobs)} runs are finished in {self.out}")
-        frames, left = 0, list[Job]()
+        left = list[Job]()
         found = executor.survey([job for job in self.jobs if job not in done])
         for job in (job for job in self.jobs if job.name in found):
-            frames_or_problem = found[job.name]
-            if isinstance(frames_or_problem, int):
-                frames += frames_or_problem
+            problem = found[job.name]
+            if problem is None:
                 left.append(job)
                 continue
-            if frames_or_problem not in self.missing.values():
-                screen.say(f"missing: {frames_or_problem}")
-            self.missing[job.name] = frames_or_problem
+            if problem not in self.missing.values():
+                screen.say(f"missing: {problem}")
+            self.missing[job.name] = problem
         if not left:
             return
-        with (
-            screen.counting("frames of all runs") as show,
-            frames_counted([self.out / job.name for job in left], frames, show),
-        ):
-            for count, (job, why) in enumerate(executor.make(left, self.out), 1 + len(done)):
+        with screen.counting("runs") as show:
+            for count, (job, why) in enumerate(executor.make(left, self.out), 1):
                 if why is not None:
                     self.failed[job.name] = why
-                how = "finished" if why is None else f"failed: {why}"
-                screen.say(f"[{count}/{len(self.jobs) - len(self.missing)}] {job.name} {how}")
+                screen.say(f"{job.name} {'finished' if why is None else f'failed: {why}'}")
+                show(count, len(left))
                 ended()

@@ -33,17 +33,18 @@ class Executor:
         self.running: set[subprocess.Popen[bytes]] = set()
         self.lock = threading.Lock()
 
-    def survey(self, jobs: Sequence[Job]) -> Mapping[str, int | str]:
-        """Return the number of frames of each job's sequence, or what is wrong with it, by the name of the job.
+    def survey(self, jobs: Sequence[Job]) -> Mapping[str, str | None]:
+        """Return what is wrong with each job's sequence, None if nothing is, by the name of the job.
 
         Every sequence is opened once, so that a wrong path is found now and not after hours.
         """
-        opened = dict[object, int | str]()
+        opened = dict[object, str | None]()
         for job in jobs:
             key = job.paths, job.config.input
             if key not in opened:
                 try:
-                    opened[key] = len(open_source(job.sequence(self.data), job.config.input))
+                    open_source(job.sequence(self.data), job.config.input)
+                    opened[key] = None
                 except SigmaSplatError as problem:
                     opened[key] = str(problem)
         return {job.name: opened[job.paths, job.config.input] for job in jobs}

@@ -62,7 +62,6 @@ def make_run(job: Job, folder: Path, data: str | None, save_every_s: float) -> N
 def _make_and_score(
     job: Job, run: RunFolder, source: Source, config: Config, path: str, save_every_s: float
 ) -> None:  # fmt: skip
-    """Make or resume the run unless it is complete, then score it."""
     if not (job.started_in(run.path) and run.facts().get("status") == "complete"):
         run, start = _started(job, run.path, source, config, path)
         state = StateFile(start.slam, run, save_every_s)

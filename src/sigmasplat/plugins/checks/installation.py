@@ -59,7 +59,6 @@ def check_kernels() -> Finding:
 
 
 def _remedy(problem: ImportError) -> str:
-    """Return the command that fixes an import error of the kernels."""
     if problem.name == "torch":
         return "pip install torch"
     if "libgomp" in str(problem):  # some builds of torch include it under another name
