@@ -221,9 +221,11 @@ def _sheet(frames: list[Frame]) -> Image.Image:
     columns = [
         (
             f"{frame.timestamp_s:.2f} s",
-            (frame.color * 255.0).round().astype(np.uint8),
-            colormap.apply_masked(frame.depth_m, frame.depth_m > 0, low, high, colormap.VIRIDIS),
-            overlay(frame),
+            [
+                (frame.color * 255.0).round().astype(np.uint8),
+                colormap.apply_masked(frame.depth_m, frame.depth_m > 0, low, high, colormap.VIRIDIS),
+                overlay(frame),
+            ],
         )
         for frame in chosen
     ]
@@ -233,15 +235,15 @@ def _sheet(frames: list[Frame]) -> Image.Image:
 WIDTH, GAP, HEAD, LINE = 260, 8, 28, 26
 
 
-def draw_contact_sheet(columns: Sequence[tuple[str, *tuple[colormap.Rgb, ...]]], rows: Sequence[str]) -> Image.Image:
+def draw_contact_sheet(columns: Sequence[tuple[str, Sequence[colormap.Rgb]]], rows: Sequence[str]) -> Image.Image:
     """Draw columns side by side, each a title and a picture uint8 [H, W, 3] for each row, with the name of each row
     above it. All pictures get the aspect of the first."""
-    first = columns[0][1]
+    first = columns[0][1][0]
     height = round(WIDTH * first.shape[0] / first.shape[1])
     size = (len(columns) * (WIDTH + GAP) + GAP, HEAD + len(rows) * (height + LINE) + GAP)
     made = Image.new("RGB", size, BACKGROUND)
     draw, font = ImageDraw.Draw(made), ImageFont.load_default(15)
-    for k, (title, *pictures) in enumerate(columns):
+    for k, (title, pictures) in enumerate(columns):
         left = GAP + k * (WIDTH + GAP)
         draw.text((left + 2, HEAD // 2), title, FAINT, font, anchor="lm")
         for r, picture in enumerate(pictures):
