@@ -245,7 +245,6 @@ def test_only_valid_poses_are_in_the_trajectory(corridor: Corridor, capsys: pyte
     assert [record["lost"] for record in log] == [False, True, False, True, False, False]
     assert {record["p_off"] for record in log} == {0.25}
     assert run.read_trajectory().timestamps_s.tolist() == [0.0, 2.0]
-    assert len(run.read_checkpoint()[0]["T_world_camera"]) == 6
     assert run.component_numbers() == [1, 2] and run.read_component(1).trajectory.timestamps_s.tolist() == [4.0]
     assert torch.allclose(run.read_component(2).field.means, MadeUpSlam.latest.field.means)
     assert "6 frames, 2 lost, 1 relocalised, 2 components apart (2 frames)" in capsys.readouterr().out
