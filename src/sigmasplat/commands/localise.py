@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from sigmasplat.commands import options
-from sigmasplat.commands.input_options import DEFAULT_INPUT_OPTIONS, InputOptions, InputOptionsFlat
+from sigmasplat.commands.input_options import DEFAULT_INPUT_OPTIONS, InputOptionsFlat
 from sigmasplat.commands.options import prepare_torch, refuse_existing, working_images
 from sigmasplat.config.scale import for_scene
 from sigmasplat.config.text import override, split_settings
@@ -13,7 +13,6 @@ from sigmasplat.errors import ConfigError, RunError
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from sigmasplat.config import Config
     from sigmasplat.input.source import Source
     from sigmasplat.run.localise import Localisation, Localiser
     from sigmasplat.types import Progress
@@ -46,7 +45,10 @@ def localise(
         raise ConfigError(f"--out must end in {' or '.join(ENDINGS)}, found {out.name}")
     refuse_existing(out, overwrite)
     screen, finished = Screen(), FinishedMap.of(RunFolder.open(run))
-    config = search_settings(finished.config, settings, input_options)
+    given = input_options.settings() | split_settings(settings)
+    config = override(
+        finished.config, working_images(finished.config) | given
+    )  # frames and calibration are not those of the run
     source = open_source(path, config.input)
     config = for_scene(config, 1.0, source.depth_noise_per_m, split_settings(settings))  # its lengths are the map's
     if source.live:
@@ -66,11 +68,6 @@ def localise(
         write_localisations(out, found)
         screen.say(f"results: {out}")
     return OK if count else NONE_FOUND
-
-
-def search_settings(config: "Config", settings: Sequence[str], input_options: InputOptions) -> "Config":
-    """Return a run's settings for another recording: frames and calibration are not those of the run."""
-    return override(config, working_images(config) | input_options.settings() | split_settings(settings))
 
 
 def _located(localiser: "Localiser", source: "Source", progress: "Progress") -> Iterator["Localisation"]:
