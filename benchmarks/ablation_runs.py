@@ -30,7 +30,7 @@ from sigmasplat.plugins.evaluation import evaluate as evaluation
 from sigmasplat.run.scene import open_scene
 from sigmasplat.run.session import Session, new_folder
 from sigmasplat.run.terminal import Screen
-from sigmasplat.run_folder.run_values import are_numbers, check_fields, is_kind, is_number, is_whole
+from sigmasplat.run_folder.run_values import check_fields
 from sigmasplat.slam.slam import Slam
 
 WEIGHTS = ("tracking.uncertainty", "loops.uncertainty", "registration.uncertainty", "final.uncertainty")
@@ -185,9 +185,8 @@ def _key(run: Mapping[str, Any]) -> tuple[str, str, int]:
 
 def _read(path: Path) -> dict[str, Any]:
     """Read the file of an ablation. Raises RunError if it cannot be read or is another file."""
-    text = is_kind(str)
-    stored = {"source": text, "path": text, "variant": text, "seed": is_whole, "wall_s": is_number,
-              "figures": are_numbers}  # fmt: skip
+    stored = {"source": str, "path": str, "variant": str, "seed": int, "wall_s": float,
+              "figures": {"": (float, None, bool)}}  # fmt: skip
     content = read_text(path, RunError)
     with guarded(path, "give another --name", RunError):
         found = json.loads(content)
@@ -228,7 +227,7 @@ def run_job(job: Job, folder: Path, screen: Screen) -> dict[str, Any]:
     source, config = open_scene(job.path, job.config, job.given)
     run = new_folder(folder, config, source, True, source_path=job.path)
     with screen.steps(len(source)) as callback:
-        outcome = Session(Slam(config, run.submaps), source, run, callback).execute()
+        outcome = Session(Slam(config, run.submaps), source, run, [callback]).execute()
     if outcome.status == "interrupted":
         raise KeyboardInterrupt
     with screen.counting("evaluation") as progress:

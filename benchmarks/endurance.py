@@ -112,7 +112,7 @@ def follow(path: str, scratch: Path, config: Config, seconds: float, save_every_
     run = RunFolder.create(scratch / "run", config, source.name)
     slam = Slam(config, run.submaps)
     watch = Watch(run, seconds)
-    outcome = Session(slam, source, run, watch, StateFile(slam, run, save_every_s)).execute()
+    outcome = Session(slam, source, run, [watch], StateFile(slam, run, save_every_s)).execute()
     return {
         "status": outcome.status, "frames": len(run.read_log()), "lost": outcome.lost, "submaps": outcome.submaps,
         "loops_accepted": outcome.loops_closed, "parts": watch.parts,

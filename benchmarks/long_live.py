@@ -135,7 +135,7 @@ def follow(path: str, scratch: Path, config: Config, frames: int, save_every_s: 
     system = RealTime(slam, covariances=False, should_stop=read.hurries)
     state.run_save = system.save
     samples = Samples(folder, frames - 3)  # a late frame may be dropped, but not three in a row at the end
-    outcome = Session(system, read, folder, samples, state, later=system.between_frames).execute()
+    outcome = Session(system, read, folder, [samples], state, later=system.between_frames).execute()
     log = folder.read_log()
     checked = {"status": outcome.status, "poses": len(folder.read_checkpoint()[0]["frame_submap"])}
     return {

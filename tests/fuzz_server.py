@@ -47,7 +47,7 @@ def warm_up() -> None:
     import sigmasplat
 
     for module in pkgutil.walk_packages(sigmasplat.__path__, "sigmasplat."):
-        if not any(part in module.name for part in (".cuda", "realsense", "__main__", "distributed", "cluster")):
+        if not any(part in module.name for part in (".cuda", "realsense", "__main__")):
             try:
                 importlib.import_module(module.name)
             except ImportError:

@@ -48,7 +48,7 @@ COMMANDS = {
     "mesh": ("mesh", "make_mesh"),
     "export": ("export", "export"),
     "download": ("download", "download"),
-    "bench": ("bench", "bench"),
+    "bench": ("batch", "bench"),
     "doctor": ("installation", "doctor"),
     "completion": ("installation", "completion"),
 }
@@ -158,7 +158,6 @@ def _problems(name: str, kind: Any, value: Any) -> Iterator[str]:
 
 
 def _option(name: str, kind: Any) -> str:
-    """Return the option's name on the command line."""
     extras = get_args(kind)[1:] if get_origin(kind) is Annotated else ()
     given = (getattr(extra, "name", None) for extra in extras)
     return "--" + (next((own for own in given if own), None) or name).replace("_", "-")

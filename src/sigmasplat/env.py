@@ -46,25 +46,15 @@ def switches() -> Switches:
 
 def read(environment: Mapping[str, str]) -> Switches:
     """Read the switches from a mapping such as `os.environ`; unset or empty means the default. Raises ConfigError."""
-    return Switches(
-        threads=_whole_number(environment, "SIGMASPLAT_THREADS"),
-        isa=cast(Isa, _choice(environment, "SIGMASPLAT_ISA", get_args(Isa))),
-        backend=environment.get("SIGMASPLAT_BACKEND", "").strip().lower() or "auto",
+    threads, isa, backend = (
+        environment.get(f"SIGMASPLAT_{name}", "").strip() for name in ("THREADS", "ISA", "BACKEND")
     )
-
-
-def _whole_number(environment: Mapping[str, str], name: str) -> int:
-    text = environment.get(name, "").strip() or "0"
-    if not (text.isascii() and text.isdecimal()):
-        raise ConfigError(f"{name} is {text!r}; give a whole number of threads, 0 for all cores")
-    return int(text)
-
-
-def _choice(environment: Mapping[str, str], name: str, allowed: tuple[str, ...]) -> str:
-    text = environment.get(name, "").strip().lower() or "auto"
-    if text not in allowed:
-        raise ConfigError(f"{name} is {text!r}; give one of {', '.join(allowed)}")
-    return text
+    if threads and not (threads.isascii() and threads.isdecimal()):
+        raise ConfigError(f"SIGMASPLAT_THREADS is {threads!r}; give a whole number of threads, 0 for all cores")
+    isa = isa.lower() or "auto"
+    if isa not in get_args(Isa):
+        raise ConfigError(f"SIGMASPLAT_ISA is {isa!r}; give one of {', '.join(get_args(Isa))}")
+    return Switches(int(threads or 0), cast(Isa, isa), backend.lower() or "auto")
 
 
 def install_package(requirement: str) -> str:

@@ -17,7 +17,7 @@ import pytest
 import torch
 from rich.console import Console
 
-import sigmasplat.slam.continuation  # noqa: F401 - loaded with the real SLAM, which other tests of this process need
+import sigmasplat.run.finished_map  # noqa: F401 - loaded with the real SLAM, which other tests of this process need
 from command_line import exit_code
 from lpips_weights import write_weights
 from sigmasplat import cli
@@ -236,7 +236,7 @@ def test_a_run_writes_all_files(corridor: Corridor, capsys: pytest.CaptureFixtur
 
 def test_only_valid_poses_are_in_the_trajectory(corridor: Corridor, capsys: pytest.CaptureFixture[str]) -> None:
     MadeUpSlam.lost, MadeUpSlam.relocalised, MadeUpSlam.apart = {1, 3}, {2}, {3: 1, 4: 1, 5: 2}
-    assert exit_code("run", "corridor", "--no-eval", "--out", "mine", "--all-poses") == 0
+    assert exit_code("run", "corridor", "--no-eval", "--out", "mine") == 0
     run = RunFolder.open(Path("mine"))
     log = run.read_log()
     assert [record["state"] for record in log] == ["tracked", "lost", "relocalised", "lost", "apart", "apart"]
@@ -244,7 +244,6 @@ def test_only_valid_poses_are_in_the_trajectory(corridor: Corridor, capsys: pyte
     assert [record["lost"] for record in log] == [False, True, False, True, False, False]
     assert {record["p_off"] for record in log} == {0.25}
     assert run.read_trajectory().timestamps_s.tolist() == [0.0, 2.0]
-    assert len(read_trajectory(run.path / "trajectory_all.txt")) == 6
     assert run.component_numbers() == [1, 2] and run.read_component(1).trajectory.timestamps_s.tolist() == [4.0]
     assert torch.allclose(run.read_component(2).field.means, MadeUpSlam.latest.field.means)
     assert "6 frames, 2 lost, 1 relocalised, 2 components apart (2 frames)" in capsys.readouterr().out
@@ -266,7 +265,7 @@ def test_the_progress_bar_shows_that_tracking_is_lost(corridor: Corridor) -> Non
     out = io.StringIO()
     folder = RunFolder.create(Path("direct"), BASE, "corridor")
     with Screen(Console(file=out, force_terminal=True, width=120)).steps(6) as callback:
-        Session(MadeUpSlam(BASE), corridor, folder, callback).execute()
+        Session(MadeUpSlam(BASE), corridor, folder, [callback]).execute()
     assert "LOST since frame 3" in out.getvalue()
 
 
@@ -276,7 +275,7 @@ def test_a_component_that_joins_later_is_in_the_trajectory(corridor: Corridor) -
     run = RunFolder.open(Path("mine"))
     assert run.read_log()[3]["state"] == "apart", "the state of that time"
     assert run.read_frames().states == ("tracked", "tracked", "lost", "tracked", "tracked", "tracked")
-    assert run.component_numbers() == [] and not (run.path / "trajectory_all.txt").exists()
+    assert run.component_numbers() == []
     MadeUpSlam.joined = set()
     assert exit_code("run", "corridor", "--no-eval", "--out", "mine", "--overwrite") == 0
     assert run.component_numbers() == [1]
@@ -495,7 +494,7 @@ def test_a_terminal_shows_progress_bars(corridor: Corridor) -> None:
     MadeUpSlam.tried = {4: [CLOSED]}
     folder = RunFolder.create(Path("direct"), BASE, "corridor")
     with screen.steps(6) as callback:
-        Session(MadeUpSlam(BASE), corridor, folder, callback).execute()
+        Session(MadeUpSlam(BASE), corridor, folder, [callback]).execute()
     said = out.getvalue()
     assert "SLAM" in said and "6/6" in said and "final map" in said and "2/2" in said and "loop closed" in said
 

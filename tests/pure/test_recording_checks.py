@@ -56,21 +56,17 @@ def test_a_still_camera_has_no_delay(shaken: Motion) -> None:
     assert still.delay_frames() is None and motion_warnings(still) == []
 
 
-def test_swapped_and_black_frames_and_jumps_are_found() -> None:
+def test_black_frames_and_jumps_are_found() -> None:
     x = np.arange(60) * 1.5
     texture = np.sin(np.arange(400) / 3.0) * np.sin(np.arange(400) / 11.0) / 2 + 0.5
     gray = np.stack([np.tile(np.interp(np.arange(80) + at, np.arange(400), texture), (8, 1)) for at in x])
     steady = Motion(np.arange(60) / 30.0, gray.astype(np.float32), np.full((60, 8, 80), 2.0, np.float32))
     assert motion_warnings(steady, 7) == []
-    order = np.arange(60)
-    order[[20, 21]] = order[[21, 20]]
-    swapped = "1 frames are swapped with the next (first: frame 27); remove or correct them"
-    assert motion_warnings(replace(steady, gray=steady.gray[order]), 7) == [swapped]
     dark = steady.gray.copy()
     dark[30:40] = 0.0
     assert motion_warnings(replace(steady, gray=dark), 7)[0].startswith("10 frames are black (first: frame 37)")
     far = np.concatenate([steady.gray[:25], 1.0 - steady.gray[25:, :, ::-1]])
-    for images in (steady.gray, steady.gray[order], dark, far):  # a run finds the same while it takes the frames
+    for images in (steady.gray, dark, far):  # a run finds the same while it takes the frames
         watch, whole = MotionWatch(), replace(steady, gray=images)
         for i, image in enumerate(images):
             color = np.repeat(image[..., None], 3, axis=2)

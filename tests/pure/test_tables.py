@@ -1,17 +1,13 @@
 """Tables of papers: every definition is valid, means and deviations follow from the runs, mistakes are one line."""
 
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from command_line import exit_code
-from sigmasplat.config import Config
 from sigmasplat.errors import ConfigError, SourceError
-from sigmasplat.plugins.batch.batch import Estimate, duration
 from sigmasplat.plugins.batch.definition import MEAN, Cell, Score, Table
-from sigmasplat.plugins.batch.executor import DataRoots
 from sigmasplat.plugins.batch.job import Job
 from sigmasplat.plugins.batch.scores import OURS, PAPER, Written, rows
 from sigmasplat.plugins.presets.base import BASE
@@ -117,9 +113,9 @@ def test_the_first_key_with_a_value_is_taken(table: Table) -> None:
 def test_text_of_a_table(table: Table) -> None:
     cells: list[Cell] = table.cells(1, {})
     made = Written(table, cells, rows(table, cells, {cells[0].job.name: ate(0.02)}), ["Missing: b."], {})
-    text, latex = made.markdown(), made.latex()
+    text = made.markdown()
     assert "| ATE [cm] ↓ | ours & theirs (ours) | 2.00 | – | 2.00 (1 of 2 scenes) |" in text and "- Missing: b." in text
-    assert r"ours \& theirs (paper) & 1.50 & -- & 2.00 \\" in latex
+    assert "| ATE [cm] ↓ | ours & theirs (paper) | 1.50 | – | 2.00 |" in text
     assert made.values()["rows"][2]["values"]["a"]["mean"] == pytest.approx(2)
 
 
@@ -144,24 +140,6 @@ def test_scenes_and_systems_can_be_chosen(table: Table) -> None:
         table.with_systems(["quick"])
 
 
-def test_the_time_left_follows_from_presets_and_lengths(table: Table) -> None:
-    a, b, c, d = (Job(name, (), Config(name=preset)) for name, preset in zip("abcd", ("x", "y", "x", "z"), strict=True))
-    estimate = Estimate({"a": 10, "b": 10, "c": 30, "d": 10}, slots=2)
-    assert estimate.left_s([c]) is None
-    estimate.add(a, 20)
-    estimate.add(b, 40)
-    assert estimate.left_s([c]) == pytest.approx(30) and estimate.left_s([c, d]) == pytest.approx(45)
-    assert [duration(s) for s in (45, 600, 12_000, 200_000)] == ["45 s", "10 min", "3 h 20 min", "2 d 7 h"]
-
-
-def test_workers_may_have_other_data() -> None:
-    roots = DataRoots.read(["/data", "laptop=/home/me/data", "node7=/scratch"])
-    assert roots.of("laptop", "somewhere") == "/home/me/data" and roots.of("3", "node7") == "/scratch"
-    assert roots.of("3", "node8") == "/data" and DataRoots.read([]).of("x") is None
-    with pytest.raises(ConfigError, match="--data is given twice"):
-        DataRoots.read(["/a", "/b"])
-
-
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
@@ -170,8 +148,6 @@ def test_workers_may_have_other_data() -> None:
         (["cgslam-replica", "--data", "/nowhere"], "no scene of cgslam-replica was found"),
         (["cgslam-replica", "--data", ".", "--jobs", "0"], "--jobs must be at least 1"),
         (["cgslam-replica", "--data", ".", "--seeds", "0"], "--seeds must be at least 1"),
-        (["cgslam-replica", "--data", "x=/data"], "--data names the worker x, which needs --scheduler"),
-        (["cgslam-replica", "--data", ".", "--scheduler", "tcp://127.0.0.1:9"], "--scheduler"),
         (["/no/such.toml", "--data", "."], "cannot read /no/such.toml: No such file"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
@@ -180,12 +156,9 @@ def test_mistakes_are_one_line(
     arguments: list[str], says: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    if "--scheduler" in arguments:
-        monkeypatch.setitem(sys.modules, "distributed", None)
     assert exit_code("bench", "table", *arguments) == 2
     said = capsys.readouterr().err
     assert says in said and said.count("\n") == 1
-    assert ("pip install 'sigmasplat[cluster]'" in said) == ("--scheduler" in arguments)
 
 
 def test_a_wrong_definition_is_refused(tmp_path: Path) -> None:

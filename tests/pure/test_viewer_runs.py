@@ -34,7 +34,6 @@ from sigmasplat.plugins.viewer.snapshot_sources import (
     finished_snapshot,
     running_snapshot,
 )
-from sigmasplat.run.callbacks import Callback, CallbackList
 from sigmasplat.run.session import Session
 from sigmasplat.run_folder.runs import TRUTH, RunFolder
 from sigmasplat.run_folder.submaps import DiskStore
@@ -216,12 +215,11 @@ def live_run(tmp_path: Path, clock: Clock, budget: int = 300_000) -> tuple[list[
     config, source, shown = settings(), open_source(ROOM), list[Snapshot]()
     slam = Slam(config, DiskStore(tmp_path / "submaps"))
     view = LiveView(slam, shown.append, "room", budget, every_s=2.0, clock=clock)
-    watch = CallbackList(Callback(), view)
     for i in range(FRAMES):
         clock.now_s += clock.frame_s
-        watch(slam.step(source.frame(i)))
-    slam.finish(watch.finishing)
-    watch.last_loops([])
+        view(slam.step(source.frame(i)))
+    slam.finish(view.finishing)
+    view.last_loops([])
     return shown, slam
 
 

@@ -18,10 +18,9 @@ from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.plugins.outputs.run_reader import RunReader
 from sigmasplat.plugins.sources import SyntheticRoom, open_source
 from sigmasplat.plugins.viewer.snapshot_sources import SubmapCache, finished_snapshot, running_snapshot
-from sigmasplat.run.finished_map import FinishedMap
+from sigmasplat.run.finished_map import FinishedMap, continued, take_over
 from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.run_folder.trajectory import write_trajectory
-from sigmasplat.slam.continuation import continued, take_over
 
 pytest.importorskip("sigmasplat.native._core", reason="sigmasplat.native._core is not built")
 

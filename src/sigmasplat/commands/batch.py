@@ -1,68 +1,29 @@
-"""Command `sigmasplat batch`: run SLAM on many recordings. torch is loaded only when it is needed."""
+"""Make many runs: sigmasplat batch, of recordings, and sigmasplat bench table, of the table of a paper.
 
-from collections.abc import Sequence
+torch is loaded only when it is needed.
+"""
+
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
 from sigmasplat.commands import options
-from sigmasplat.commands.input_options import DEFAULT_INPUT_OPTIONS, From1, InputOptionsFlat, arg, flag
+from sigmasplat.commands.input_options import DEFAULT_INPUT_OPTIONS, From1, InputOptionsFlat, Limit, arg, flag
 from sigmasplat.config.find_preset import default_preset
-from sigmasplat.config.text import full_path
+from sigmasplat.config.text import full_path, split_settings
 from sigmasplat.errors import ConfigError, SourceError
 
 if TYPE_CHECKING:
     from sigmasplat.plugins.batch.batch import Batch
     from sigmasplat.run.terminal import Screen
 
-DataFolders = Annotated[
-    tuple[str, ...],
-    tyro.conf.UseAppendAction,
-    arg(
-        "[WORKER=]ROOT",
-        "folder of the sequences; WORKER= names the worker or host of a cluster that has another one",
-        "(repeatable)",
-    ),
-]
-Jobs = Annotated[From1, arg("N", "number of runs at the same time on this machine")]
-Scheduler = Annotated[
-    str | None,
-    arg(
-        "ADDRESS",
-        "make the runs on the Dask cluster of this scheduler, for example tcp://10.0.0.1:8786",
-        "(default: on this machine)",
-    ),
-]
-BatchFolder = Annotated[
-    Path | None,
-    arg("DIR", "folder of the results; finished runs in it are kept", ""),
-]
-ReplaceRuns = Annotated[
-    bool,
-    flag("replace runs in DIR that have other settings or other code", name="overwrite"),
-]
-BatchSeeds = Annotated[From1, arg("N", "number of runs of each recording, with N seeds from --seed on")]
-Recordings = Annotated[
-    tuple[str, ...],
-    tyro.conf.Positional,
-    arg("FOLDER", "recordings: folders or synthetic[:frames=N,…]", "(at least one)"),
-]
-TableName = Annotated[
-    str,
-    tyro.conf.Positional,
-    arg("TABLE", "name of the table, path of a definition (.toml), or `list` to list all tables"),
-]
-TableScenes = Annotated[
-    tuple[str, ...],
-    arg("SCENE", "scenes to run", "(default: all of the table)", name="scenes"),
-]
-TableSystems = Annotated[
-    tuple[str, ...],
-    arg("SYSTEM", "systems of the table to run, or presets", "(default: those of the table)", name="systems"),
-]
-
+DataFolder = Annotated[str | None, arg("ROOT", "folder of the sequences", "")]
+Jobs = Annotated[From1, arg("N", "number of runs at the same time")]
+BatchFolder = Annotated[Path | None, arg("DIR", "folder of the results; finished runs in it are kept", "")]
+ReplaceRuns = Annotated[bool, flag("replace runs in DIR that have other settings or other code")]
 
 OK, FAILED = 0, 1
 DEFAULT_PRESET = default_preset()
@@ -70,25 +31,28 @@ OUT = Path("runs/batch")
 
 
 def batch(
-    recordings: Recordings,
+    recordings: Annotated[
+        tuple[str, ...],
+        tyro.conf.Positional,
+        arg("FOLDER", "recordings: folders or synthetic[:frames=N,…]", "(at least one)"),
+    ],
     preset: options.PresetName = DEFAULT_PRESET,
     settings: options.Settings = (),
     seed: options.Seed = None,
-    seeds: BatchSeeds = 1,
+    seeds: Annotated[From1, arg("N", "number of runs of each recording, with N seeds from --seed on")] = 1,
     input_options: InputOptionsFlat = DEFAULT_INPUT_OPTIONS,
-    data: DataFolders = (),
+    data: DataFolder = None,
     mesh: options.WithMesh = False,
     out: BatchFolder = None,
     overwrite: ReplaceRuns = False,
     jobs: Jobs = 1,
-    scheduler: Scheduler = None,
     save_every: options.SaveEvery = 60.0,
 ) -> int:
     """Run SLAM on many recordings, each in a run folder in DIR (default: runs/batch), and score them.
 
     Finished runs are kept, stopped ones resume. example: sigmasplat batch data/kitchen data/hall --jobs 2
     """
-    from sigmasplat.plugins.batch.batch import Batch, open_executor
+    from sigmasplat.plugins.batch.batch import Batch
     from sigmasplat.plugins.batch.job import Job
     from sigmasplat.run.terminal import Screen
 
@@ -102,16 +66,83 @@ def batch(
         for k in range(seeds)
     ]
     screen, made = Screen(), Batch(planned, out or OUT)
-    made.refuse_other_runs(overwrite)
-    try:
-        made.make(open_executor(data, jobs, scheduler, save_every, screen.say), screen, lambda: None)
-    except KeyboardInterrupt:
-        screen.say(f"stopped; repeat the command to make the other runs in {made.out}")
-        raise
+    _make(screen, made, data, jobs, save_every, overwrite, lambda: None)
     if len(made.missing) == len(planned):
         raise SourceError(next(iter(made.missing.values())))
     _show(screen, made)
     return FAILED if made.failed or made.missing else OK
+
+
+def bench(
+    what: Annotated[Literal["table"], tyro.conf.Positional, arg("table", "what to make")],
+    table: Annotated[
+        str,
+        tyro.conf.Positional,
+        arg("TABLE", "name of the table, path of a definition (.toml), or `list` to list all tables"),
+    ],
+    data: DataFolder = None,
+    scenes: Annotated[tuple[str, ...], arg("SCENE", "scenes to run", "(default: all of the table)")] = (),
+    systems: Annotated[
+        tuple[str, ...], arg("SYSTEM", "systems of the table to run, or presets", "(default: those of the table)")
+    ] = (),
+    seeds: options.Runs = 3,
+    settings: options.Settings = (),
+    limit: Limit = None,
+    out: BatchFolder = None,
+    overwrite: ReplaceRuns = False,
+    jobs: Jobs = 1,
+    save_every: options.SaveEvery = 60.0,
+) -> int:
+    """Make the table of a paper: scenes × systems × seeds, with the published numbers beside ours.
+
+    Finished runs are kept, stopped ones resume. Missing scenes are listed, and the others are run.
+
+    example: sigmasplat bench table list
+    """
+    from sigmasplat.plugins.presets.table_files import list_tables, read_table
+
+    if table == "list":
+        print("\n".join(f"{name:20} {read_table(name)['title']}" for name in list_tables()))
+        return OK
+    from sigmasplat.plugins.batch.batch import Batch
+    from sigmasplat.plugins.batch.definition import Table
+    from sigmasplat.plugins.batch.scores import Written
+    from sigmasplat.run.terminal import Screen
+
+    if not data:
+        raise ConfigError("no --data given; give the folder that contains the scenes of the data set")
+    chosen, changes = Table.read(table).with_systems(systems), split_settings(settings)
+    cells = chosen.cells(seeds, changes, limit, scenes)
+    screen, folder = Screen(), out or Path("runs") / chosen.name
+    made = Batch([cell.job for cell in cells], folder / "runs")
+
+    def write() -> str:
+        """Write the table with the runs that are finished, and return it as Markdown."""
+        written = Written.of(chosen, cells, made, seeds, changes, limit)
+        written.save(folder)
+        return written.markdown()
+
+    _make(screen, made, data, jobs, save_every, overwrite, write)
+    if len(made.missing) == len(cells):
+        raise SourceError(f"no scene of {chosen.name} was found; --data must be the folder that contains them")
+    print(write(), end="")
+    screen.say(f"{len(made.finished())} of {len(cells)} runs: {folder / 'table.md'}")
+    return FAILED if made.failed else OK
+
+
+def _make(
+    screen: "Screen", made: "Batch", data: str | None, jobs: int, save_every_s: float, overwrite: bool,
+    ended: Callable[[], object],
+) -> None:  # fmt: skip
+    """Make the missing runs of a batch; `ended` is called after each one."""
+    from sigmasplat.plugins.batch.executor import Executor
+
+    made.refuse_other_runs(overwrite)
+    try:
+        made.make(Executor(data, save_every_s, jobs), screen, ended)
+    except KeyboardInterrupt:
+        screen.say(f"stopped; repeat the command to make the other runs in {made.out}")
+        raise
 
 
 def _names(paths: Sequence[str]) -> list[str]:
@@ -128,7 +159,6 @@ def _names(paths: Sequence[str]) -> list[str]:
 
 
 def _show(screen: "Screen", made: "Batch") -> None:
-    """Print the main figures of every finished run."""
     from rich.table import Table
 
     from sigmasplat.plugins.batch.definition import Score

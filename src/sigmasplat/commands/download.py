@@ -6,41 +6,42 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from sigmasplat.commands.input_options import arg, flag
+from sigmasplat.errors import DownloadError, SourceError
 
 if TYPE_CHECKING:
     from sigmasplat.plugins.download.catalogue import PublicSet
     from sigmasplat.run.terminal import Screen
 
-SetName = Annotated[str, tyro.conf.Positional, arg("SET", "tum, replica, icl, 7scenes, bonn, redwood; lpips; or list")]
-Names = Annotated[
-    tuple[str, ...],
-    tyro.conf.Positional,
-    arg("NAME", "names of recordings; `download list SET` lists them", "(none if there is only one)"),
-]
-DataFolder = Annotated[Path, arg("DIR", "folder for the data sets")]
-ListOnly = Annotated[bool, flag("list data sets or recordings, download nothing", name="list")]
 Overwrite = Annotated[bool, flag("download existing recordings again")]
-KeepArchive = Annotated[bool, flag("keep the archives after unpacking")]
 
 
 def download(
-    dataset: SetName = "list",
-    names: Names = (),
-    out: DataFolder = Path("data"),
-    list_only: ListOnly = False,
+    dataset: Annotated[
+        str, tyro.conf.Positional, arg("SET", "tum, replica, icl, 7scenes, bonn, redwood; lpips; or list")
+    ] = "list",
+    names: Annotated[
+        tuple[str, ...],
+        tyro.conf.Positional,
+        arg("NAME", "names of recordings; `download list SET` lists them", "(none if there is only one)"),
+    ] = (),
+    out: Annotated[Path, arg("DIR", "folder for the data sets")] = Path("data"),
+    list_only: Annotated[bool, flag("list data sets or recordings, download nothing", name="list")] = False,
     overwrite: Overwrite = False,
-    keep_archive: KeepArchive = False,
+    keep_archive: Annotated[bool, flag("keep the archives after unpacking")] = False,
 ) -> int:
     """Download recordings of a public data set, or weights: resumable, verified, safely unpacked.
 
     example: sigmasplat download tum fr1/desk
     """
-    from sigmasplat.plugins.download import find_recording
+    from sigmasplat.plugins.download import describe_recordings, describe_sets, find_recording
+    from sigmasplat.plugins.sources import open_source
     from sigmasplat.run.terminal import Screen
 
     screen = Screen()
     if list_only or dataset == "list":
-        _list(screen, names if dataset == "list" else (dataset,))
+        listed = names if dataset == "list" else (dataset,)
+        for line in (line for name in listed for line in describe_recordings(name)) if listed else describe_sets():
+            screen.say(line)
         return 0
     for public_set, name in [find_recording(dataset, name) for name in names or ("",)]:
         target = _download(screen, public_set, name, out, overwrite, keep_archive)
@@ -48,16 +49,12 @@ def download(
             screen.say("next: sigmasplat eval RUN")
             continue
         start = target / public_set.recordings[name].start
-        _check_readable(start)
+        try:
+            open_source(start)
+        except SourceError as problem:
+            raise DownloadError(f"downloaded, but it cannot be run: {problem}") from problem
         screen.say(f"next: sigmasplat run {start}")
     return 0
-
-
-def _list(screen: "Screen", set_names: tuple[str, ...]) -> None:
-    from sigmasplat.plugins.download import describe_recordings, describe_sets
-
-    for line in (line for name in set_names for line in describe_recordings(name)) if set_names else describe_sets():
-        screen.say(line)
 
 
 def _download(
@@ -71,14 +68,3 @@ def _download(
     except KeyboardInterrupt:
         screen.say("the part downloaded so far is kept; the same command resumes the download")
         raise
-
-
-def _check_readable(folder: Path) -> None:
-    """Raise DownloadError if the downloaded folder cannot be opened as a sequence."""
-    from sigmasplat.errors import DownloadError, SourceError
-    from sigmasplat.plugins.sources import open_source
-
-    try:
-        open_source(folder)
-    except SourceError as problem:
-        raise DownloadError(f"downloaded, but it cannot be run: {problem}") from problem

@@ -15,21 +15,10 @@ CONTRADICTED_MOST = 0.05
 def warn_at_the_end(
     screen: "Screen", source: "Source", read: "Source", folder: "RunFolder", motion: "MotionWatch"
 ) -> None:
-    """Print what was wrong with the frames, and whether the scale of the result is arbitrary."""
-    _warn_of_skipped_frames(screen, source)
-    _warn_of_dropped_frames(screen, read)
-    _warn_if_never_recognised(screen, folder)
-    for warning in motion.warnings():
-        screen.warn(warning)
-    chosen = folder.config().input
-    if chosen.poses:
-        _warn_of_contradicted_poses(screen, folder)
-    if source.predicted_depth and not chosen.poses_scale_depth:
-        screen.say("the scale is arbitrary, because a network predicted depth: lengths are not in metres")
+    """Print what was wrong with the frames, and whether the scale of the result is arbitrary.
 
-
-def _warn_of_skipped_frames(screen: "Screen", source: "Source") -> None:
-    """Print how many frames are missing from the run, and why."""
+    source: the sequence; read: the one that was read from, in real time the arrivals of the other one.
+    """
     from sigmasplat.plugins.sources.live import LiveSource
 
     if source.skipped:
@@ -40,30 +29,20 @@ def _warn_of_skipped_frames(screen: "Screen", source: "Source") -> None:
             screen.warn(source.ending)
         if source.dropped:
             screen.say(f"{source.dropped} frames of the camera were dropped because SLAM was slower")
-
-
-def _warn_of_dropped_frames(screen: "Screen", read: "Source") -> None:
-    """Print how many frames were dropped in real time."""
     if read.arrived_s is not None and read.dropped:
         screen.warn(f"{read.dropped} frames were dropped because tracking was late")
-
-
-def _warn_if_never_recognised(screen: "Screen", folder: "RunFolder") -> None:
-    """Print a warning if no frame of a run with --onto is connected to the earlier map."""
-    onto = folder.facts().get("onto")
+    onto, chosen = folder.facts().get("onto"), folder.config().input
     if onto and not len(folder.read_trajectory()):
-        screen.warn(
-            f"the recording was never recognised in the map of {onto['run']}; its path and map are in "
-            f"{folder.path / 'components'}"
-        )
-
-
-def _warn_of_contradicted_poses(screen: "Screen", folder: "RunFolder") -> None:
-    """Print a warning if many given poses are probably wrong."""
-    frames = folder.read_log()
+        apart = folder.path / "components"
+        screen.warn(f"the recording was never recognised in the map of {onto['run']}; its path and map are in {apart}")
+    for warning in motion.warnings():
+        screen.warn(warning)
+    frames = folder.read_log() if chosen.poses else []
     wrong = sum((frame.get("p_off") or 0.0) > 0.5 for frame in frames)
     if wrong > CONTRADICTED_MOST * len(frames):
         screen.warn(
             f"the images contradict the given pose in {wrong} of {len(frames)} frames (p_off above 0.5); are they "
             "poses of the colour camera, camera to world, x right, y down, z forward?"
         )
+    if source.predicted_depth and not chosen.poses_scale_depth:
+        screen.say("the scale is arbitrary, because a network predicted depth: lengths are not in metres")

@@ -61,14 +61,13 @@ class EvalOptions:
 
 
 DEFAULT_EVAL_OPTIONS = EvalOptions()
-EvalOptionsFlat = Annotated[EvalOptions, tyro.conf.arg(name=""), tyro.conf.OmitArgPrefixes]
 
 
 def evaluate_run(
     run: options.RunPath,
     mesh: options.WithMesh = False,
     moved_to: options.MovedSource = None,
-    eval_options: EvalOptionsFlat = DEFAULT_EVAL_OPTIONS,
+    eval_options: Annotated[EvalOptions, tyro.conf.arg(name=""), tyro.conf.OmitArgPrefixes] = DEFAULT_EVAL_OPTIONS,
 ) -> int:
     """Score an existing run again. This replaces its metrics, pictures and report.
 

@@ -14,86 +14,70 @@ from sigmasplat.files.lock import output_locked
 from sigmasplat.plugins.outputs.formats import ExportSource, choose, listed, refuse_unused
 from sigmasplat.registry import Output, rows
 
-CellM = Annotated[float, Range(0.001, 1), arg("M", "cell size of the floor plan in metres")]
-FilmSize = Annotated[
-    int,
-    Range(32, 4096, or_zero=True),
-    arg("PX", "width of each panel of a video in pixels", "(default: that of the run's images)"),
-]
-FilmRate = Annotated[float, Range(1, 120), arg("N", "images per second of a video")]
-FilmSeconds = Annotated[
-    Number,
-    Range(0.04, 3600),
-    arg("S", "length of a video in seconds", "(default: that of the path, 4 to 20; orbit: 12)"),
-]
-FilmPath = Annotated[
-    Literal["run", "orbit"], arg(None, "camera path of a video: along the run's path, or in a circle above the room")
-]
-FilmPanels = Annotated[
-    Literal["all", "color"], arg(None, "panels of a video: colour, depth and uncertainty side by side, or colour alone")
-]
-
-
-FormatName = Annotated[
-    str | None,
-    arg("NAME", "format to write", "(default: by the ending of FILE, else ply)"),
-]
-SigmaBelow = Annotated[
-    From0,
-    arg("S", "keep only splats with σ below S, for colours 0 to 1; σ is learned, not calibrated", "(default: all)"),
-]
-StdBelowM = Annotated[
-    From0,
-    arg(
-        "M",
-        "keep only splats whose surface has a standard deviation of depth below M metres (depth_std_m, "
-        "docs/exports.md); needs a run with uncertainty.json",
-        "(default: all)",
-    ),
-]
-OpacityAbove = Annotated[
-    From0,
-    arg("A", "keep only splats with opacity above A", "(default: all)"),
-]
-Plain = Annotated[
-    bool,
-    flag("write PLY with only the 62 columns of 3DGS, without σ², for readers that accept no others"),
-]
-Pictures = Annotated[bool, flag("also write the images of the keyframes, and export only keyframes as views")]
-MaxSplats = Annotated[
-    Whole,
-    Range(1),
-    arg("N", "keep at most N splats, those that fill the most pixels of the run's views", "(default: all)"),
-]
-MapAxes = Annotated[
-    Literal["y-up", "z-up", "y-down", "camera"] | None,
-    arg(
-        "{y-up,z-up,y-down,camera}",
-        "axes of a map or of points: y-up, z-up and y-down are levelled; camera: those of the run's path; y-up "
-        "and camera only for SPZ and glTF",
-        "(default: y-up for points, SPZ and glTF, else y-down)",
-    ),
-]
-
 
 @dataclass(frozen=True)
 class ExportOptions:
     """Options that only some formats accept, under their names on the command line (`Output.options`)."""
 
-    sigma_below: SigmaBelow = None
-    std_below_m: StdBelowM = None
-    opacity_above: OpacityAbove = None
-    max_splats: MaxSplats = None
-    axes: MapAxes = None
-    plain: Plain = False
-    pictures: Pictures = False
+    sigma_below: Annotated[
+        From0,
+        arg("S", "keep only splats with σ below S, for colours 0 to 1; σ is learned, not calibrated", "(default: all)"),
+    ] = None
+    std_below_m: Annotated[
+        From0,
+        arg(
+            "M",
+            "keep only splats whose surface has a standard deviation of depth below M metres (depth_std_m, "
+            "docs/exports.md); needs a run with uncertainty.json",
+            "(default: all)",
+        ),
+    ] = None
+    opacity_above: Annotated[
+        From0,
+        arg("A", "keep only splats with opacity above A", "(default: all)"),
+    ] = None
+    max_splats: Annotated[
+        Whole,
+        Range(1),
+        arg("N", "keep at most N splats, those that fill the most pixels of the run's views", "(default: all)"),
+    ] = None
+    axes: Annotated[
+        Literal["y-up", "z-up", "y-down", "camera"] | None,
+        arg(
+            "{y-up,z-up,y-down,camera}",
+            "axes of a map or of points: y-up, z-up and y-down are levelled; camera: those of the run's path; y-up "
+            "and camera only for SPZ and glTF",
+            "(default: y-up for points, SPZ and glTF, else y-down)",
+        ),
+    ] = None
+    plain: Annotated[
+        bool,
+        flag("write PLY with only the 62 columns of 3DGS, without σ², for readers that accept no others"),
+    ] = False
+    pictures: Annotated[bool, flag("also write the images of the keyframes, and export only keyframes as views")] = (
+        False
+    )
     voxel_m: options.VoxelM = None
-    size: FilmSize = 0
-    fps: FilmRate = 25.0
-    seconds: FilmSeconds = None
-    path: FilmPath = "run"
-    panels: FilmPanels = "all"
-    cell_m: CellM = 0.05
+    size: Annotated[
+        int,
+        Range(32, 4096, or_zero=True),
+        arg("PX", "width of each panel of a video in pixels", "(default: that of the run's images)"),
+    ] = 0
+    fps: Annotated[float, Range(1, 120), arg("N", "images per second of a video")] = 25.0
+    seconds: Annotated[
+        Number,
+        Range(0.04, 3600),
+        arg("S", "length of a video in seconds", "(default: that of the path, 4 to 20; orbit: 12)"),
+    ] = None
+    path: Annotated[
+        Literal["run", "orbit"],
+        arg(None, "camera path of a video: along the run's path, or in a circle above the room"),
+    ] = "run"
+    panels: Annotated[
+        Literal["all", "color"],
+        arg(None, "panels of a video: colour, depth and uncertainty side by side, or colour alone"),
+    ] = "all"
+    cell_m: Annotated[float, Range(0.001, 1), arg("M", "cell size of the floor plan in metres")] = 0.05
     source: options.MovedSource = None
 
     def given(self) -> list[str]:
@@ -102,15 +86,17 @@ class ExportOptions:
 
 
 DEFAULT_EXPORT_OPTIONS = ExportOptions()
-ExportOptionsFlat = Annotated[ExportOptions, tyro.conf.arg(name=""), tyro.conf.OmitArgPrefixes]
 
 
 def export(
     run: options.RunOrMap,
     out: options.OutFile = None,
-    format: FormatName = None,
+    format: Annotated[
+        str | None,
+        arg("NAME", "format to write", "(default: by the ending of FILE, else ply)"),
+    ] = None,
     overwrite: options.Overwrite = False,
-    asked: ExportOptionsFlat = DEFAULT_EXPORT_OPTIONS,
+    asked: Annotated[ExportOptions, tyro.conf.arg(name=""), tyro.conf.OmitArgPrefixes] = DEFAULT_EXPORT_OPTIONS,
 ) -> int:
     """Write the map or the path of a run, or a map from a file, in a format of other programs.
 

@@ -40,20 +40,10 @@ Number = Annotated[float | None, _number(float)]
 From0 = Annotated[Number, Range(0)]
 From1 = Annotated[int, Range(1)]
 Limit = Annotated[Whole, Range(1), arg("N", "use at most N frames", "(default: all)")]
-PredictedDepth = Annotated[
-    Path | None,
-    arg(
-        "FOLDER",
-        "depth that a network predicted, one image per frame: for a video, for colour images, or instead of the "
-        "recorded depth. The scale of the result is arbitrary",
-        "",
-    ),
-]
 DepthModel = Annotated[
     Path | None,
     arg("FILE.onnx", "network that predicts depth from each colour image, used like --predicted-depth", ""),
 ]
-PredictedInverse = Annotated[bool, flag("predicted depth is inverse depth, as that of MiDaS or Depth Anything")]
 
 
 @dataclass(frozen=True)
@@ -91,9 +81,19 @@ class InputOptions:
             "",
         ),
     ] = None
-    predicted_depth: PredictedDepth = None
+    predicted_depth: Annotated[
+        Path | None,
+        arg(
+            "FOLDER",
+            "depth that a network predicted, one image per frame: for a video, for colour images, or instead of the "
+            "recorded depth. The scale of the result is arbitrary",
+            "",
+        ),
+    ] = None
     depth_model: DepthModel = None
-    predicted_inverse: PredictedInverse = False
+    predicted_inverse: Annotated[bool, flag("predicted depth is inverse depth, as that of MiDaS or Depth Anything")] = (
+        False
+    )
     fx: Annotated[
         From0,
         arg("PX", "horizontal focal length in pixels; also the vertical one unless --fy is given", ""),

@@ -10,23 +10,20 @@ from sigmasplat.config.find_preset import default_preset
 
 OK, WARNED = 0, 1
 SHEETS = Path("runs/inspect")
-SheetFile = Annotated[
-    Path | None,
-    arg("FILE", "contact sheet, PNG", "(default: runs/inspect/NAME.png)"),
-]
-
-JsonFile = Annotated[
-    Path | None,
-    arg("FILE", "write what was found as JSON", ""),
-]
 
 
 def inspect(
     path: options.SourcePath,
     input_options: InputOptionsFlat = DEFAULT_INPUT_OPTIONS,
     settings: options.Settings = (),
-    out: SheetFile = None,
-    json: JsonFile = None,
+    out: Annotated[
+        Path | None,
+        arg("FILE", "contact sheet, PNG", "(default: runs/inspect/NAME.png)"),
+    ] = None,
+    json: Annotated[
+        Path | None,
+        arg("FILE", "write what was found as JSON", ""),
+    ] = None,
 ) -> int:
     """Check a recording before a run: format, depth, poses, and problems; draws a contact sheet.
 

@@ -1,11 +1,10 @@
 """Find the images of a recording in the map of a finished run: sigmasplat localise."""
 
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sigmasplat.commands import options
-from sigmasplat.commands.input_options import DEFAULT_INPUT_OPTIONS, InputOptions, InputOptionsFlat
+from sigmasplat.commands.input_options import DEFAULT_INPUT_OPTIONS, InputOptionsFlat
 from sigmasplat.commands.options import prepare_torch, refuse_existing, working_images
 from sigmasplat.config.scale import for_scene
 from sigmasplat.config.text import override, split_settings
@@ -14,7 +13,6 @@ from sigmasplat.errors import ConfigError, RunError
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from sigmasplat.config import Config
     from sigmasplat.input.source import Source
     from sigmasplat.run.localise import Localisation, Localiser
     from sigmasplat.types import Progress
@@ -43,10 +41,14 @@ def localise(
     from sigmasplat.run.terminal import Screen
     from sigmasplat.run_folder.runs import RunFolder
 
-    _refuse_ending(out)
+    if out and out.suffix not in ENDINGS:
+        raise ConfigError(f"--out must end in {' or '.join(ENDINGS)}, found {out.name}")
     refuse_existing(out, overwrite)
     screen, finished = Screen(), FinishedMap.of(RunFolder.open(run))
-    config = search_settings(finished.config, settings, input_options)
+    given = input_options.settings() | split_settings(settings)
+    config = override(
+        finished.config, working_images(finished.config) | given
+    )  # frames and calibration are not those of the run
     source = open_source(path, config.input)
     config = for_scene(config, 1.0, source.depth_noise_per_m, split_settings(settings))  # its lengths are the map's
     if source.live:
@@ -68,25 +70,13 @@ def localise(
     return OK if count else NONE_FOUND
 
 
-def search_settings(config: "Config", settings: Sequence[str], input_options: InputOptions) -> "Config":
-    """Return a run's settings for another recording: frames and calibration are not those of the run."""
-    return override(config, working_images(config) | input_options.settings() | split_settings(settings))
-
-
-def _refuse_ending(out: Path | None) -> None:
-    if out and out.suffix not in ENDINGS:
-        raise ConfigError(f"--out must end in {' or '.join(ENDINGS)}, found {out.name}")
-
-
 def _located(localiser: "Localiser", source: "Source", progress: "Progress") -> Iterator["Localisation"]:
-    """Yield the result for each image that can be read."""
     for done, frame in enumerate(source, 1):
         yield localiser.locate(frame)
         progress(done, len(source))
 
 
 def _table(found: Sequence["Localisation"]) -> "Table":
-    """Return the results as a table, of all images or of some that are evenly spread."""
     from rich.table import Table
 
     table = Table("image", "verdict", "camera in the world, or why not")

@@ -12,17 +12,6 @@ from sigmasplat.errors import ConfigError
 if TYPE_CHECKING:
     from sigmasplat.plugins.outputs.axes import Axes
 
-
-MeshFile = Annotated[
-    Path | None,
-    arg("FILE", "file to write: .glb, .ply, .obj or .stl (no colours)", "(default: mesh.ply in RUN)"),
-]
-Triangles = Annotated[int, Range(0), arg("N", "largest number of triangles; 0 = no limit")]
-FillGaps = Annotated[
-    float,
-    Range(0),
-    arg("M", "close gaps that are at most M metres across by smooth patches, which have a high depth_std_m; 0 = none"),
-]
 MeshAxes = Annotated[
     Literal["y-up", "z-up", "y-down", "camera"] | None,
     arg(
@@ -37,10 +26,20 @@ MeshAxes = Annotated[
 def make_mesh(
     run: options.RunPath,
     voxel_m: options.VoxelM = None,
-    triangles: Triangles = 300_000,
+    triangles: Annotated[int, Range(0), arg("N", "largest number of triangles; 0 = no limit")] = 300_000,
     axes: MeshAxes = None,
-    fill_gaps: FillGaps = 0.0,
-    out: MeshFile = None,
+    fill_gaps: Annotated[
+        float,
+        Range(0),
+        arg(
+            "M",
+            "close gaps that are at most M metres across by smooth patches, which have a high depth_std_m; 0 = none",
+        ),
+    ] = 0.0,
+    out: Annotated[
+        Path | None,
+        arg("FILE", "file to write: .glb, .ply, .obj or .stl (no colours)", "(default: mesh.ply in RUN)"),
+    ] = None,
     overwrite: options.Overwrite = False,
     moved_to: options.MovedSource = None,
 ) -> int:
@@ -59,7 +58,9 @@ def make_mesh(
 
     screen, folder, target = Screen(), RunFolder.open(run), out or run / MESH
     check_ending(target)
-    chosen = _axes_of(target, axes, own=out is None)
+    if target.suffix.lower() == ".glb" and axes not in (None, "y-up"):
+        raise ConfigError(f"a GLB has y up by definition, so --axes {axes} cannot be used; leave --axes out")
+    chosen: Axes = axes or ("y-up" if out else "camera")  # the run's own mesh.ply has the axes of its other files
     refuse_existing(out, overwrite)
     source = source_of(folder, moved_to)
     prepare_torch()
@@ -80,10 +81,3 @@ def make_mesh(
         write_mesh(target, surface, f"sigmasplat, unit metre, axes {chosen}")
         screen.say(f"axes {chosen}, {len(surface.vertices):,} vertices, {len(surface.faces):,} triangles: {target}")
     return 0
-
-
-def _axes_of(target: Path, axes: "Axes | None", own: bool) -> "Axes":
-    """Return the axes of a file; the run's own mesh.ply has those of the run's other files unless they are given."""
-    if target.suffix.lower() == ".glb" and axes not in (None, "y-up"):
-        raise ConfigError(f"a GLB has y up by definition, so --axes {axes} cannot be used; leave --axes out")
-    return axes or ("camera" if own else "y-up")

@@ -43,21 +43,8 @@ SourcePath = Annotated[
 ]
 Runs = Annotated[From1, arg("N", "number of runs of each sequence, with seeds 0 to N − 1")]
 Overwrite = Annotated[bool, flag("replace an earlier result")]
-Profile = Annotated[bool, flag("print the time spent in each stage")]
 SaveEvery = Annotated[float, Range(0), arg("S", "save the state for `resume` every S seconds; 0 = at the end only")]
 RealTime = Annotated[bool, arg(None, "replay a recording at its own times, and track it in real time")]
-AllPoses = Annotated[
-    bool,
-    flag("also write trajectory_all.txt with the poses of all frames, including lost ones"),
-]
-Log = Annotated[
-    str,
-    arg(
-        "NAMES",
-        "also write the values of every frame to logs/ in RUN: csv, tensorboard, rerun, or several by commas",
-        "",
-    ),
-]
 View = Annotated[bool, flag("show the run in the browser while it runs, and afterwards until Ctrl-C")]
 Host = Annotated[
     str,
@@ -66,7 +53,6 @@ Host = Annotated[
 Port = Annotated[
     int, Range(0, 65535), arg("N", "port of the viewer; if it is busy, the next free one is used; 0 = any")
 ]
-Evaluate = Annotated[bool, flag("do not score the run: no metrics, no report", name="eval")]
 MovedSource = Annotated[
     str | None,
     arg("PATH", "path of the sequence if it has moved", "(default: its path in the run)", name="source"),
@@ -114,13 +100,14 @@ RunOrMap = Annotated[Path, tyro.conf.Positional, arg("RUN", "run folder or map f
 
 @dataclass(frozen=True)
 class RunOptions:
-    """Options of run and resume: scoring, profile, saving, all poses, logs, viewer."""
+    """Options of run and resume: scoring, profile, saving, logs, viewer."""
 
-    evaluate: Evaluate = True
-    profile: Profile = False
+    evaluate: Annotated[bool, flag("do not score the run: no metrics, no report", name="eval")] = True
+    profile: Annotated[bool, flag("print the time spent in each stage")] = False
     save_every: SaveEvery = 60.0
-    all_poses: AllPoses = False
-    log: Log = ""
+    log: Annotated[
+        Literal["rerun"] | None, arg("rerun", "also write the path and the values of every frame to logs/ in RUN", "")
+    ] = None
     view: View = False
     host: Host = HOST
     port: Port = PORT

@@ -23,14 +23,6 @@ Bag = Annotated[
     Path | None,
     arg("DIR", "also write a ROS 2 bag (MCAP): transforms, odometry, loops, map, images; needs no ROS", ""),
 ]
-Stream = Annotated[
-    Whole,
-    Range(0, 65535),
-    arg("PORT", "also stream the same messages over a WebSocket to Foxglove, usually 8765; 0 = any free port", ""),
-]
-BagImages = Annotated[
-    Literal["none", "keyframes", "all"], arg(None, "which images the bag and the stream contain, uncompressed")
-]
 
 
 @dataclass(frozen=True)
@@ -38,8 +30,14 @@ class RobotOptions:
     """Options of run and resume: bag and stream."""
 
     bag: Bag = None
-    stream: Stream = None
-    bag_images: BagImages = "keyframes"
+    stream: Annotated[
+        Whole,
+        Range(0, 65535),
+        arg("PORT", "also stream the same messages over a WebSocket to Foxglove, usually 8765; 0 = any free port", ""),
+    ] = None
+    bag_images: Annotated[
+        Literal["none", "keyframes", "all"], arg(None, "which images the bag and the stream contain, uncompressed")
+    ] = "keyframes"
 
 
 DEFAULT_ROBOT_OPTIONS = RobotOptions()

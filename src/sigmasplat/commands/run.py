@@ -3,8 +3,8 @@
 The order of a run: open the source, start the viewer, create the run folder, run the session (`run/session.py`), score.
 """
 
-from collections.abc import Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from collections.abc import Mapping
+from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from sigmasplat.input.source import Source
     from sigmasplat.plugins.robots.live import LiveRobot
     from sigmasplat.plugins.viewer.app import ViewerApp
-    from sigmasplat.realtime.system import RealTime
     from sigmasplat.run.callbacks import Callback
     from sigmasplat.run.finished_map import FinishedMap
     from sigmasplat.run.resume import StartPoint
@@ -92,12 +91,13 @@ def run(
     from sigmasplat.run.finished_map import FinishedMap, continue_map
     from sigmasplat.run.resume import StartPoint
     from sigmasplat.run.session import new_run
-    from sigmasplat.run.step_logs import log_names
+    from sigmasplat.run.step_logs import rerun
     from sigmasplat.run.terminal import Screen
     from sigmasplat.run_folder.runs import RunFolder
     from sigmasplat.slam.slam import Slam
 
-    log_names(run_options.log)
+    if run_options.log:
+        rerun()
     check_robot_output(robot_options)
     settings += () if final_seconds is None else (f"final.seconds={final_seconds:g}",)
     settings += () if final_width is None else (f"final.width={final_width}",)
@@ -131,11 +131,12 @@ def resume(
     """
     from sigmasplat.run.resume import resume as resumed
     from sigmasplat.run.same_conditions import other_instruction_set
-    from sigmasplat.run.step_logs import log_names
+    from sigmasplat.run.step_logs import rerun
     from sigmasplat.run.terminal import Screen
     from sigmasplat.run_folder.runs import RunFolder
 
-    log_names(run_options.log)
+    if run_options.log:
+        rerun()
     check_robot_output(robot_options)
     screen, folder = Screen(), RunFolder.open(run)
     source = source_of(folder, moved_to)
@@ -235,15 +236,9 @@ def _announce(screen: "Screen", preset: str, source: "Source", folder: "RunFolde
 
 
 def _run_and_score(
-    screen: "Screen",
-    start: "StartPoint",
-    source: "Source",
-    folder: "RunFolder",
-    run_options: options.RunOptions,
-    viewer: "ViewerApp | None",
-    robot_options: RobotOptions,
-    realtime: bool = False,
-) -> int:
+    screen: "Screen", start: "StartPoint", source: "Source", folder: "RunFolder", run_options: options.RunOptions,
+    viewer: "ViewerApp | None", robot_options: RobotOptions, realtime: bool = False,
+) -> int:  # fmt: skip
     """Run the session, then score it, and keep showing it in the viewer until Ctrl-C; return the exit code.
 
     realtime: track frames when they arrive. Raises KeyboardInterrupt if Ctrl-C came before the first frame was done.
@@ -253,6 +248,7 @@ def _run_and_score(
     from sigmasplat.realtime.system import RealTime
     from sigmasplat.run.resume import RefinementFile, StateFile
     from sigmasplat.run.session import Session
+    from sigmasplat.run.step_logs import RerunLog
 
     state = StateFile(start.slam, folder, run_options.save_every)
     start.slam.saved_refinement = RefinementFile(start.slam, folder, run_options.save_every)
@@ -261,15 +257,17 @@ def _run_and_score(
     if system:
         state.run_save = system.save
         folder.note(realtime=True)
+    motion = MotionWatch()
     with (
         robot_output(screen, start.slam, folder, robot_options, run_options.host) as robot,
-        _progress(screen, start, source, folder, run_options, viewer, robot, system) as callback,
+        screen.steps(None if source.live else len(source), start.next_index) as steps,
+        closing(RerunLog(folder, start.next_index)) as log,
     ):
         session = Session(
-            system or start.slam, read, folder, callback, state, start.next_index, start.wall_s, run_options.all_poses
-        )
-        motion = MotionWatch()
-        session.watch = robot.watch if robot else motion if not (system or source.live) else session.watch
+            system or start.slam, read, folder, [steps, log] if run_options.log else [steps], state, start.next_index,
+            start.wall_s, _readers(start, source, viewer, robot),
+        )  # fmt: skip
+        session.watch = robot.watch if robot else motion if not (system or source.live) else None
         session.later = system.between_frames if system else session.later
         outcome = session.execute()
     stopped = outcome.status == "interrupted"
@@ -293,25 +291,13 @@ def _run_and_score(
     return OK
 
 
-@contextmanager
-def _progress(
-    screen: "Screen", start: "StartPoint", source: "Source", folder: "RunFolder",
-    run_options: options.RunOptions, viewer: "ViewerApp | None", robot: "LiveRobot | None", system: "RealTime | None",
-) -> Iterator["Callback"]:  # fmt: skip
-    """Yield the callback that shows the session on the terminal, in the requested logs, in bag and stream if there is a
-    robot output, and in the viewer if there is one."""
-    from sigmasplat.run.callbacks import BetweenFrames, CallbackList
-    from sigmasplat.run.step_logs import log_names, step_logs
+def _readers(
+    start: "StartPoint", source: "Source", viewer: "ViewerApp | None", robot: "LiveRobot | None"
+) -> list["Callback"]:  # fmt: skip
+    """Return what reads the system while it runs: bag and stream if there is a robot output, and the viewer if any."""
+    readers: list[Callback] = [robot] if robot else []
+    if viewer is not None:
+        from sigmasplat.plugins.viewer.snapshot_sources import LiveView
 
-    with (
-        screen.steps(None if source.live else len(source), start.next_index) as steps,
-        step_logs(log_names(run_options.log), folder, start.next_index) as logs,
-    ):
-        readers: list[Callback] = [robot] if robot else []  # they read the system, not only the step
-        if viewer is not None:
-            from sigmasplat.plugins.viewer.snapshot_sources import LiveView
-
-            readers.append(LiveView(start.slam, viewer.show, source.name))
-        if system:
-            readers = [BetweenFrames(reader, system.between_frames) for reader in readers]
-        yield CallbackList(steps, *logs, *readers)
+        readers.append(LiveView(start.slam, viewer.show, source.name))
+    return readers

@@ -2,7 +2,7 @@
 
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING
 
 from sigmasplat.commands import options
@@ -29,9 +29,12 @@ def view(run: options.RunPath, host: options.Host = HOST, port: options.Port = P
     folder = RunFolder.open(run)
     check_has_map(folder)
     prepare_torch()
+    source = None  # without it, the run is shown without its images
+    with suppress(SigmaSplatError):
+        source = source_of(folder, None)
     with serve_viewer(Screen(), host, port) as viewer:
         try:
-            follow_run(folder, viewer.show, threading.Event(), source_if_available(folder))
+            follow_run(folder, viewer.show, threading.Event(), source)
             threading.Event().wait()
         except KeyboardInterrupt:
             pass
@@ -70,11 +73,3 @@ def keep_showing(screen: "Screen", viewer: "ViewerApp", folder: "RunFolder", sou
         threading.Event().wait()
     except KeyboardInterrupt:
         pass
-
-
-def source_if_available(folder: "RunFolder") -> "Source | None":
-    """Open the sequence of a run for its images; return None if it cannot be opened."""
-    try:
-        return source_of(folder, None)
-    except SigmaSplatError:
-        return None

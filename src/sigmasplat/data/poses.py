@@ -10,7 +10,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import Any, ClassVar, Generic, NamedTuple, TypeVar, overload
+from typing import Any, Generic, NamedTuple, TypeVar, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -146,8 +146,6 @@ def _of_poses() -> Column:
 class Poses(Records[Matrix]):
     """A list of poses [4, 4]; those that are read are copies. rows [N, 4, 4]."""
 
-    POSE_COLUMNS: ClassVar[slice] = slice(None)
-
     rows: Column = field(default_factory=_of_poses)
 
     def __setitem__(self, i: int, pose: Matrix) -> None:
@@ -176,8 +174,6 @@ class KeyframePoses(Sequence[Sequence[Matrix]]):
     rows [K, 4, 4]: those of all submaps but the last; ends [S - 1]: number of keyframes up to the end of each of these
     submaps; newest: those of the last submap, None before the first one.
     """
-
-    POSE_COLUMNS: ClassVar[slice] = slice(None)
 
     rows: Column = field(default_factory=_of_poses)
     ends: Column = field(default_factory=lambda: Column.of(np.int64))
@@ -248,9 +244,6 @@ class Place(NamedTuple):
 @dataclass(eq=False)
 class Places(Records[Place]):
     """The places of all frames. rows [F, 18]: submap, keyframe, and T_keyframe_camera [4, 4] by rows."""
-
-    POSE_COLUMNS: ClassVar[slice] = slice(NUMBERS, NUMBERS + 16)
-    """The columns of `rows` that hold a pose."""
 
     rows: Column = field(default_factory=lambda: Column.of(np.float64, NUMBERS + 16))
 

@@ -61,9 +61,6 @@ class TrackedHops(Records[RelativePose]):
     """The hops to all keyframes, submap by submap. rows [K, 59]: submap, then T_camera_before, covariance and bias by
     rows."""
 
-    POSE_COLUMNS: ClassVar[slice] = slice(1, 17)
-    """The columns of `rows` that hold a pose."""
-
     rows: Column = field(default_factory=lambda: Column.of(np.float64, 1 + 16 + 36 + 6))
 
     def append(self, submap: int, hop: RelativePose) -> None:

@@ -102,7 +102,6 @@ def _acquired(
 
 
 def _release(path: Path, file: int | None) -> None:
-    """Remove the file of a lock and end the lock."""
     if file is None:
         return
     with suppress(OSError):
@@ -112,7 +111,6 @@ def _release(path: Path, file: int | None) -> None:
 
 
 def _is(path: Path, file: int) -> bool:
-    """Return whether an open file still has this path."""
     try:
         return os.path.samestat(path.stat(), os.fstat(file))
     except OSError:
@@ -120,7 +118,6 @@ def _is(path: Path, file: int) -> bool:
 
 
 def _described(holder: str) -> str:
-    """Return which process holds a lock, from the text in its file, and the remedy."""
     number, _, host = holder.strip().partition(" ")
     if not number.isdecimal():
         return "another process; wait until it ends"

@@ -2,7 +2,6 @@
 
 import io
 import math
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from sigmasplat.errors import SigmaSplatError, SourceError
-from sigmasplat.files.reading import guarded, open_regular
+from sigmasplat.files.reading import guarded, open_regular, refuse_special
 
 FORMATS = ("JPEG", "PNG", "BMP", "PPM", "TIFF", "WEBP")
 """Formats of images in recordings. Others are refused: Pillow gives EPS, for example, to Ghostscript, which runs it."""
@@ -59,31 +58,23 @@ def check_pixels(path: Path, size: tuple[int, int], error: type[SigmaSplatError]
 
 def npy_shape(path: Path) -> tuple[int, ...]:
     """Return the shape of a .npy file from its header. Raises SourceError as `read_npy` does."""
-    with open_regular(path, most=MOST_BYTES) as file:
-        return _npy_header(path, file)[0]
+    return _mapped(path).shape
 
 
 def read_npy(path: Path) -> NDArray[Any]:
     """Read a .npy file. Raises SourceError if it is not one, holds objects, or is shorter than its header says."""
-    with open_regular(path, most=MOST_BYTES) as file:
-        shape, fortran, kind = _npy_header(path, file)
-        values = np.frombuffer(file.read(math.prod(shape) * kind.itemsize), kind)
-        return values.reshape(shape, order="F" if fortran else "C")
+    return np.array(_mapped(path))
 
 
-def _npy_header(path: Path, file: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Read shape, order and type, and check them against the size of the file."""
+def _mapped(path: Path) -> NDArray[Any]:
+    """Map a .npy file into memory, which refuses objects and short files."""
+    refuse_special(path, most=MOST_BYTES)
     with guarded(path, REMEDY, SourceError, "unreadable image"):
-        version = npy.read_magic(file)
-        read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
-        shape, fortran, kind = read(file)
-        if kind.hasobject or not kind.itemsize or len(shape) not in (2, 3) or min(shape) < 1:
-            raise ValueError(f"not a depth image: an array of {kind} with shape {shape}")
-        left = os.fstat(file.fileno()).st_size - file.tell()
-        if left < math.prod(shape) * kind.itemsize:
-            raise ValueError(f"its header says {kind} of shape {shape}, but only {left} bytes follow")
-    check_pixels(path, (shape[1], shape[0]))
-    return shape, fortran, kind
+        values = npy.open_memmap(path, mode="r")
+        if len(values.shape) not in (2, 3):
+            raise ValueError(f"not a depth image: an array of {values.dtype} with shape {values.shape}")
+    check_pixels(path, (values.shape[1], values.shape[0]))
+    return values
 
 
 @contextmanager

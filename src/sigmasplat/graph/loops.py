@@ -1,7 +1,7 @@
 """All pairs of submaps that were tried as loops, in columns."""
 
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,9 +61,6 @@ class Loops(Records[Loop]):
     overlap, localised, translation_m, rotation_deg, and T_query_database by rows; verdicts [L, 4]: accepted, number of
     the reason in `reasons`, chi2, weight.
     """
-
-    POSE_COLUMNS: ClassVar[slice] = slice(NUMBERS, NUMBERS + 16)
-    """The columns of `rows` that hold a pose."""
 
     rows: Column = field(default_factory=lambda: Column.of(np.float64, NUMBERS + 16))
     verdicts: Column = field(default_factory=lambda: Column.of(np.float64, 4))

@@ -14,7 +14,7 @@ from sigmasplat.fit.align import Alignment
 from sigmasplat.fit.pose import fit_pose_align
 from sigmasplat.graph.loops import Loops
 from sigmasplat.graph.newest_covariance import NO_ERRORS
-from sigmasplat.realtime.messages import Call, Offer, Search, Snapshot, TrackedFrame
+from sigmasplat.realtime.messages import Offer, Search, Snapshot, TrackedFrame
 from sigmasplat.slam.listeners import Before, Correction, correction_since
 from sigmasplat.slam.mapping_backend import MappingBackend
 from sigmasplat.slam.results import StepTimer
@@ -39,11 +39,11 @@ class BackEnd:
 
     def __init__(self, system: MappingBackend, publish: Callable[[Snapshot], None]) -> None:
         self.system, self.publish = system, publish
-        self.given: queue.SimpleQueue[TrackedFrame | Call] = queue.SimpleQueue()
+        self.given: queue.SimpleQueue[TrackedFrame | Callable[[], None]] = queue.SimpleQueue()
         self.last: Snapshot | None = None
         self.with_errors = False
         self._before = Before.of(system)
-        self._pending: deque[TrackedFrame | Call] = deque()
+        self._pending: deque[TrackedFrame | Callable[[], None]] = deque()
         self._spare, self._added = 0, 0
         self._undescribed: TrackedKeyframe | None = None
         self._found = -1
@@ -54,11 +54,11 @@ class BackEnd:
         while True:
             while self._take():
                 each = self._pending.popleft()
-                if isinstance(each, Call):
-                    each.run()
-                else:
+                if isinstance(each, TrackedFrame):
                     for _ in self._handled(each):
                         yield True
+                else:  # work between two frames, when all earlier frames are in the map
+                    each()
                 yield True
             for _ in self._spare_work():
                 yield True
@@ -74,7 +74,6 @@ class BackEnd:
                 return bool(self._pending)
 
     def _keyframe_waits(self) -> bool:
-        """Return whether another keyframe waits."""
         self._take()
         return any(isinstance(each, TrackedFrame) and each.offer is not None for each in self._pending)
 
@@ -96,7 +95,6 @@ class BackEnd:
         yield from self.system.closing(self.system.config.loops.slices_per_frame)
 
     def _place(self, each: TrackedFrame) -> None:
-        """Place a frame relative to the newest keyframe."""
         system, number = self.system, self._newest
         T_keyframe_camera = se3.inverse(each.poses[number]) @ each.T_submap_camera
         system.atlas.place_by_keyframe(T_keyframe_camera)
@@ -107,7 +105,6 @@ class BackEnd:
 
     @property
     def _newest(self) -> int:
-        """Return the frame number of the newest keyframe."""
         return self.system.mapper.keyframes[-1].index
 
     def _pose(self, each: TrackedFrame) -> Matrix:
@@ -238,7 +235,6 @@ class BackEnd:
         return self.system.loops, self._correction()
 
     def _correction(self) -> Correction | None:
-        """Return the correction since the last call, if a function wants it."""
         before, self._before = self._before, Before.of(self.system)
         return correction_since(self.system, before) if self.system.listeners.correction else None
 

@@ -91,11 +91,6 @@ class FrontEnd:
         self.found = snapshot.state
         self.tracker.continue_elsewhere(apart=snapshot.state == APART)
 
-    def adopt_newest(self, snapshot: Snapshot) -> None:
-        """Adopt a snapshot that follows others which were not adopted."""
-        if snapshot.frame in self.poses:
-            self.adopt(snapshot)
-
     def covariance(self, step: Step) -> Matrix:
         """Return the covariance [6, 6] of the newest step's pose, as `Slam.covariance`. Keyframes that are not mapped
         yet each add one motion."""

@@ -3,7 +3,7 @@
 A message is never changed after it was handed over. It holds copies of everything that its sender changes later.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from torch import Tensor
@@ -87,10 +87,3 @@ class TrackedFrame:
     offer: Offer | None = None
     search: Search | None = None
     shown: Target | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class Call:
-    """Work that is done between two frames, when all earlier frames are in the map."""
-
-    run: Callable[[], None] = field(default=lambda: None)

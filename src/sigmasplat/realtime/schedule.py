@@ -4,7 +4,6 @@ import gc
 import sys
 import threading
 from collections.abc import Iterator
-from typing import Protocol
 
 from sigmasplat import env
 from sigmasplat.native.threads import idle_kernel_workers, set_kernel_threads, yield_to_others
@@ -13,25 +12,9 @@ SWITCH_S = 0.0005
 """How long a thread may hold the interpreter lock while another one waits for it; Python's default is 5 ms."""
 
 
-class Schedule(Protocol):
-    """Decides when slices of work run. The work is an iterator without end: it yields True after a slice, and False
-    when nothing is left to do for now."""
-
-    def start(self, work: Iterator[bool]) -> None:
-        """Begin to run slices."""
-
-    def wake(self) -> None:
-        """Note that there is new work. Raises what a slice has raised."""
-
-    def settle(self) -> None:
-        """Return when nothing is left to do. Raises what a slice has raised."""
-
-    def stop(self) -> None:
-        """Run no more slices; return when none is running."""
-
-
 class MappingThread:
-    """Runs slices in a thread, which sleeps while nothing is to be done.
+    """Runs slices of work in a thread, which sleeps while nothing is to be done. The work is an iterator without end:
+    it yields True after a slice, and False when nothing is left to do for now.
 
     While it runs, Python's garbage collector leaves out what existed at its start (`gc.freeze`): searching the 200 000
     objects of the loaded libraries stops all threads for 160 ms.

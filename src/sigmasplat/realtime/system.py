@@ -1,23 +1,19 @@
 """SLAM in real time: a frame is tracked at once, and the work on the map never makes it wait."""
 
 import queue
-from collections.abc import Callable, Sequence
-
-import numpy as np
-from numpy.typing import NDArray
-from torch import Tensor
+from collections.abc import Callable
 
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.map_uncertainty import MapUncertainty
-from sigmasplat.data.trajectory import LOST, Component, Trajectory
+from sigmasplat.data.trajectory import LOST
 from sigmasplat.errors import SourceError
 from sigmasplat.graph.loops import Loops
 from sigmasplat.native.threads import set_kernel_threads
 from sigmasplat.realtime.back_end import BackEnd
 from sigmasplat.realtime.front_end import FrontEnd
-from sigmasplat.realtime.messages import Call, Snapshot
-from sigmasplat.realtime.schedule import MappingThread, Schedule
+from sigmasplat.realtime.messages import Snapshot
+from sigmasplat.realtime.schedule import MappingThread
 from sigmasplat.render.view import View
 from sigmasplat.slam.array_interface import ArrayInterface
 from sigmasplat.slam.listeners import Events
@@ -35,8 +31,8 @@ class RealTime(ArrayInterface):
     back snapshots of the map.
 
     Between `step` calls the state of `slam` belongs to the mapping thread: read it in a task (`between_frames`), or
-    after `settle`. The results depend on how fast the machine is, so they are not reproducible. schedule: when the work
-    on the map runs, by default on a thread; covariances: whether `track` and `covariance` return covariances, which
+    after `settle`. The results depend on how fast the machine is, so they are not reproducible. schedule: runs
+    the work on the map; covariances: whether `track` and `covariance` return covariances, which
     cost some milliseconds of work per keyframe; should_stop: whether the next frame waits or is due soon, then no
     further guess of a doubtful pose is tried. Functions of `on_keyframe`, `on_loop` and `on_correction` are called by
     the thread that calls `step`, when it learns of the event.
@@ -45,7 +41,7 @@ class RealTime(ArrayInterface):
     def __init__(
         self,
         slam: Slam,
-        schedule: Schedule | None = None,
+        schedule: MappingThread | None = None,
         covariances: bool = True,
         should_stop: ShouldStop = never,
     ) -> None:
@@ -61,6 +57,9 @@ class RealTime(ArrayInterface):
         self._schedule = MappingThread() if schedule is None else schedule
         self._view: View | None = None
         self._runs, self._threads = False, 0
+        # results, to be read after `settle`
+        self.trajectory, self.valid, self.components = slam.trajectory, slam.valid, slam.components
+        self.checkpoint = slam.checkpoint
 
     # ---- frames ----
 
@@ -137,7 +136,7 @@ class RealTime(ArrayInterface):
 
     def between_frames(self, task: Callable[[], None]) -> None:
         """Run a task on the mapping thread as soon as all frames so far are in the map. It may read `slam`."""
-        self._back_end.given.put(Call(task))
+        self._back_end.given.put(task)
         self._schedule.wake()
 
     def save(self, write: Callable[[], None]) -> None:
@@ -145,8 +144,9 @@ class RealTime(ArrayInterface):
         camera = self._front_end.copied()
 
         def save() -> None:
-            if self._back_end.last is not None and self._back_end.last is not camera.snapshot:
-                camera.adopt_newest(self._back_end.last)
+            last = self._back_end.last  # it may follow others that were not adopted
+            if last is not None and last is not camera.snapshot and last.frame in camera.poses:
+                camera.adopt(last)
             self._give_back(camera)
             write()
 
@@ -206,19 +206,3 @@ class RealTime(ArrayInterface):
     def refinement_steps(self) -> int | None:
         """Return the number of refinement steps of the final map, as `Slam.refinement_steps`."""
         return self.slam.refinement_steps
-
-    def trajectory(self) -> Trajectory:
-        """Return the poses of all frames, as `Slam.trajectory`, after `settle`."""
-        return self.slam.trajectory()
-
-    def valid(self) -> NDArray[np.bool_]:
-        """Return which poses are valid [F], as `Slam.valid`, after `settle`."""
-        return self.slam.valid()
-
-    def components(self) -> Sequence[Component]:
-        """Return the components that are not connected to the world, as `Slam.components`, after `settle`."""
-        return self.slam.components()
-
-    def checkpoint(self) -> dict[str, Tensor]:
-        """Return what is needed to read a run back, as `Slam.checkpoint`, after `settle`."""
-        return self.slam.checkpoint()

@@ -1,22 +1,22 @@
 """Read the map of a finished run, to find cameras in it or to continue it in another run."""
 
 import os
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from sigmasplat.config import Config
 from sigmasplat.config.scale import for_scene
+from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
-from sigmasplat.errors import RunError
+from sigmasplat.data.submap import SubmapStore
+from sigmasplat.errors import ConfigError, RunError
 from sigmasplat.input.source import Source
-from sigmasplat.run.scene import noted_scale
 from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.run_folder.submaps import DiskStore
-from sigmasplat.slam.continuation import continued, refuse_without_relocalisation, take_over
 from sigmasplat.slam.slam import Slam
 from sigmasplat.types import Matrix
 
@@ -84,7 +84,7 @@ class FinishedMap:
         of_map = ("input.min_depth_m", "input.max_depth_m")  # `config` has the map's already
         return for_scene(
             config,
-            noted_scale(self.run.facts()),
+            self.facts.get("scene_scale") or 1.0,
             source.depth_noise_per_m,
             {*given, *of_map},
             None,
@@ -136,3 +136,44 @@ def continue_map(earlier: FinishedMap, config: Config, source: Source, run: RunF
     anchors = [earlier.anchors[index] for index in earlier.members]
     run.note(onto={"run": str(earlier.run.path.resolve()), "submaps": len(anchors), "T_world_submap": anchors})
     return continued(config, run.submaps.in_background(), anchors)
+
+
+def take_over(earlier: SubmapStore, members: Sequence[int], frames: int, store: SubmapStore) -> None:
+    """Copy submaps of an earlier session, `members`, to the store of a new one.
+
+    frames: number of frames of the earlier session. Its frame numbers become negative: −1 is its last frame. So they
+    never equal those of the new session, and a third session continues to count backwards.
+    """
+    for index, member in enumerate(members):
+        submap = earlier.load(member)
+        numbers = tuple(frame - frames for frame in submap.frames)
+        pictures = [earlier.picture(member, k) for k in range(len(numbers))]
+        probe_numbers = tuple(frame - frames for frame in submap.probe_frames)
+        probes = [earlier.probe(member, k) for k in range(len(probe_numbers))]
+        store.save(replace(submap, index=index, frames=numbers, probe_frames=probe_numbers), pictures, probes)
+
+
+def continued(config: Config, store: SubmapStore, anchors: Sequence[Matrix]) -> Slam:
+    """Return a system that continues the map in `store`; anchors: T_world_submap [4, 4] of its submaps.
+
+    The world is that of the map. The first frame is searched for in it. If it is not found, a new component begins,
+    which joins when a place is recognised. Frames of another camera are resampled to the map's camera. Loops to the
+    submaps are tried, but their poses relative to each other stay fixed. Raises ConfigError if relocalisation is off.
+    """
+    refuse_without_relocalisation(config)
+    slam = Slam(config, store)
+    for index, T_world_submap in enumerate(anchors):
+        submap = store.load(index)
+        slam.atlas.add_finished(T_world_submap, list(submap.T_submap_camera))
+        pictures = (store.picture(index, k) for k in range(len(submap.frames)))
+        described = [slam.descriptor.describe(p.unit_color, p.depth_m) for p in pictures] if config.loops.close else []
+        slam.confidence.begun(None, 0.0)
+        slam.closer.add_finished(submap, described, se3.inverse(anchors[0]) @ T_world_submap)
+    slam.prepare(store.load(0).camera, resample=True)
+    return slam
+
+
+def refuse_without_relocalisation(config: Config) -> None:
+    """Raise ConfigError if relocalisation, which finds a camera in an earlier map, is off."""
+    if not config.recovery.relocalise:
+        raise ConfigError("to continue a map, relocalisation must be on: --set recovery.relocalise=on")

@@ -1,11 +1,5 @@
-"""Measure the unit of given poses: the images and their depth show the same motions in metres.
-
-The depth that a network predicts is too inexact to measure motions, and its scale is arbitrary. The given motions then
-show the depth of features in the unit of the poses (triangulation), and so the scale of predicted depth.
-"""
-
-from collections.abc import Callable
-from dataclasses import dataclass
+"""Measure the scale between given poses and depth: the given motions show the depth of features (triangulation) in the
+unit of the poses, and its ratio to the depth that was measured or predicted is the scale."""
 
 import numpy as np
 
@@ -13,16 +7,14 @@ from sigmasplat.config import Config
 from sigmasplat.data import se3
 from sigmasplat.errors import SourceError
 from sigmasplat.input.source import Source
-from sigmasplat.tracking.feature_image import FeatureImage, LateDetail, motion_by_features
+from sigmasplat.tracking.feature_image import FeatureImage, LateDetail
 from sigmasplat.tracking.features import Extractor, Features, make_extractor
 from sigmasplat.tracking.predicted_depth_fit import depth_at
 from sigmasplat.types import Matrix
 
 PLACES, STEPS = 12, (32, 16, 8, 4, 2, 1)
-"""Number of places of the sequence where motions are compared, and the numbers of frames that a motion may take,
-the first choice first."""
-LEAST_M, MOST_M = 0.05, 0.6
-"""A motion is compared if the images show this length, for a room; features measure longer ones less well."""
+"""Number of places of the sequence where depth is compared, and the numbers of frames that a motion may take, the first
+choice first."""
 FEWEST = 3
 """A scale is measured from at least this many motions."""
 LEAST_MATCHES, LEAST_PARALLAX_DEG, MOST_OFF_PX = 20, 1.5, 2.0
@@ -32,101 +24,50 @@ TOLERANCE = 0.1
 """Poses whose measured scale differs from 1 by less than this are taken to be in metres."""
 
 
-RatioAt = Callable[[int, Source, Config, Extractor], float | None]
-
-
-@dataclass(frozen=True)
-class PoseScale:
-    """factor: from the unit of given poses to metres, the median of some measured motions; spread: median relative
-    difference of these from it."""
-
-    factor: float
-    spread: float
-
-
 def with_measured_scale(source: Source, config: Config) -> Config:
-    """Return the settings with `input.poses_scale` as the images show it: metres, or the scale of predicted depth.
-    Raises SourceError if they do not show it."""
-    if source.predicted_depth:
-        return config.changed(input={"poses_scale": 1.0 / _scale_of_depth(source, config)})
+    """Return the settings with the scale that the images show: `input.poses_scale`, from the unit of given poses to
+    that of depth, if it is 0, else `input.predicted_scale`, from predicted depth to the unit of the poses.
+
+    Raises SourceError if they do not show it.
+    """
     measured = measured_scale(source, config)
     if measured is None:
-        raise SourceError(
-            f"{config.input.poses}: the images do not show the unit of the poses; give the factor to metres as "
-            "input.poses_scale, 1 for metres"
-        )
-    return config.changed(input={"poses_scale": measured.factor})
-
-
-def with_scaled_depth(source: Source, config: Config) -> Config:
-    """Return the settings with `input.predicted_scale`, the factor from predicted depth to the unit of given poses.
-    Raises SourceError if the images do not show it."""
-    return config.changed(input={"predicted_scale": _scale_of_depth(source, config)})
-
-
-def _scale_of_depth(source: Source, config: Config) -> float:
-    measured = measured_depth_scale(source, config)
-    if measured is None:
-        raise SourceError(
-            f"{config.input.poses}: the images do not show the scale of predicted depth in the unit of the poses; give "
-            "this factor as input.predicted_scale"
-        )
-    return measured.factor
+        of_poses = "unit of the poses; give the factor to metres as input.poses_scale, 1 for metres"
+        of_depth = "scale of predicted depth in the unit of the poses; give this factor as input.predicted_scale"
+        what = of_depth if source.predicted_depth else of_poses
+        raise SourceError(f"{config.input.poses}: the images do not show the {what}")
+    factor, _ = measured
+    return config.changed(
+        input={"predicted_scale": factor} if config.input.poses_scale else {"poses_scale": 1 / factor}
+    )
 
 
 def scale_warning(source: Source, config: Config) -> str | None:
     """Return what to say if the images show another scale of the given poses; None if they agree or show none."""
     measured = measured_scale(source, config)
-    if measured is None or abs(measured.factor - 1.0) < TOLERANCE + measured.spread:
+    if measured is None or abs(1.0 / measured[0] - 1.0) < TOLERANCE + measured[1]:
         return None
     return (
-        f"the images show motions {measured.factor:.2f} times as long as the given poses; are the poses in metres? "
+        f"the images show motions {1.0 / measured[0]:.2f} times as long as the given poses; are the poses in metres? "
         "--set input.poses_scale=0 measures their unit"
     )
 
 
-def measured_scale(source: Source, config: Config) -> PoseScale | None:
-    """Compare given motions with those that features and depth show; None if too few can be compared."""
-    return _measured(source, config, _ratio_at)
-
-
-def measured_depth_scale(source: Source, config: Config) -> PoseScale | None:
-    """Compare predicted depth with that which features and given motions show; None if too few can be compared. The
-    factor is from predicted depth to the unit of the poses."""
-    return _measured(source, config, _depth_ratio_at)
-
-
-def _measured(source: Source, config: Config, ratio_at: RatioAt) -> PoseScale | None:
-    extractor, ratios = make_extractor(config.features), list[float]()
+def measured_scale(source: Source, config: Config) -> tuple[float, float] | None:
+    """Return the factor from depth to the unit of the given poses, the median of some measured motions, and the median
+    relative difference of these from it; None if too few can be compared."""
+    extractor, found = make_extractor(config.features), list[float | None]()
     for first in np.unique(np.linspace(0, len(source) - 1, PLACES, endpoint=False).astype(int)).tolist():
-        ratio = ratio_at(first, source, config, extractor)
-        ratios += [] if ratio is None else [ratio]
+        found.append(_ratio_at(first, source, config, extractor))
+    ratios = np.array([ratio for ratio in found if ratio is not None])
     if len(ratios) < FEWEST:
         return None
     factor = float(np.median(ratios))
-    return PoseScale(factor, float(np.median(np.abs(np.array(ratios) / factor - 1.0))))
+    return factor, float(np.median(np.abs(ratios / factor - 1.0)))
 
 
 def _ratio_at(first: int, source: Source, config: Config, extractor: Extractor) -> float | None:
-    """Return the length in metres of the longest motion from a frame that can be measured, divided by its given length;
-    None if there is none."""
-    begin, room = _seen(source, first, config), source.scene_scale
-    if begin is None:
-        return None
-    for step in STEPS:
-        later = _seen(source, first + step, config) if first + step < len(source) else None
-        T_later_begin = None if later is None else motion_by_features(begin[0], later[0], extractor)
-        if later is None or T_later_begin is None:
-            continue
-        length_m = float(np.linalg.norm(T_later_begin[:3, 3]))
-        given = float(np.linalg.norm((se3.inverse(begin[1]) @ later[1])[:3, 3]))
-        if LEAST_M * room < length_m < MOST_M * room and given > 0:
-            return length_m / given
-    return None
-
-
-def _depth_ratio_at(first: int, source: Source, config: Config, extractor: Extractor) -> float | None:
-    """Return the depth of features of a frame in the unit of the given poses, divided by their predicted depth, the
+    """Return the depth of features of a frame in the unit of the given poses, divided by their depth in the frame, the
     median over the longest motion from it that shows enough of them; None if there is none."""
     begin = _seen(source, first, config)
     if begin is None:

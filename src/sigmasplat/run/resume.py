@@ -12,10 +12,8 @@ from sigmasplat.files.reading import guarded
 from sigmasplat.final.refinement import Refined
 from sigmasplat.fit.adam import VectorAdam
 from sigmasplat.input.source import Source
-from sigmasplat.run.callbacks import Checkpointer
+from sigmasplat.run.callbacks import run_now
 from sigmasplat.run.same_conditions import refuse_other_sequence
-from sigmasplat.run.session import run_now
-from sigmasplat.run_folder.run_values import STATE_FIELDS, check_fields
 from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.run_folder.state import read_state, write_state
 from sigmasplat.slam.saved_state import CLASSES, fixed, restore, state_of
@@ -29,9 +27,9 @@ MOST_TIME_SHARE = 0.05
 
 
 @dataclass(eq=False)
-class StateFile(Checkpointer):
-    """Checkpointer that writes state.safetensors into a run folder, at most every `every_s` seconds, and less often if
-    a save takes long (`MOST_TIME_SHARE`).
+class StateFile:
+    """Writes state.safetensors into a run folder, at most every `every_s` seconds, and less often if a save takes long
+    (`MOST_TIME_SHARE`).
 
     With every_s = 0 it writes only after the last frame. run_save: runs a save when the state belongs to the last
     frame; in real time that is later (`RealTime.save`). A state takes some tens of MB: it contains the images of the
@@ -123,7 +121,6 @@ def resume(run: RunFolder, source: Source) -> StartPoint:
     slam.prepare(run.submaps.load(0).camera if onto else camera, resample=bool(onto))
     with guarded(run.state, "run it again", RunError, "the state is damaged"):
         tree = read_state(run.state, CLASSES, fixed(slam))
-        check_fields(tree, STATE_FIELDS, tuple(STATE_FIELDS), run.state)
         restore(slam, tree)
         _truncate(run, frames=len(slam.steps), submaps=tree["submaps"])
     return StartPoint(slam, tree["index"] + 1, tree["wall_s"])

@@ -1,7 +1,7 @@
 """Compare the sequence and the machine of a resumed run with those it was started with."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator
 from dataclasses import asdict
 from typing import Any
 
@@ -42,42 +42,29 @@ def refuse_other_sequence(run: RunFolder, source: Source) -> None:
     """Raise RunError, with the first difference, unless a source has the camera and the frames of a run's start, and
     depth of the same network."""
     refuse_other_model(run, source)
-    facts = run.facts()
-    difference = _other_camera(facts, source) or _other_frame(run, source) or _other_length(facts, source)
-    if difference:
+    if difference := next(_differences(run, source), ""):
         raise RunError(
             f"{run.path} cannot be resumed, because its sequence has changed: {difference}; give the original one "
             "(--source PATH), or start again with: sigmasplat run"
         )
 
 
-def _other_camera(facts: Mapping[str, Any], source: Source) -> str:
-    noted = dict(facts.get("camera") or {})
-    found: dict[str, Any] = asdict(source.camera)
-    if "depth_units_per_metre" in facts:
-        noted["depth_units_per_metre"] = facts["depth_units_per_metre"]
-        found["depth_units_per_metre"] = source.depth_units_per_metre
-    for name, value in noted.items():
-        if not _same(value, found.get(name)):
-            return f"{name} is {_text(found.get(name))}, it was {_text(value)}"
-    return ""
-
-
-def _other_frame(run: RunFolder, source: Source) -> str:
-    """Compare the times of the logged frames."""
+def _differences(run: RunFolder, source: Source) -> Iterator[str]:
+    """Yield in what a source differs from that of a run: camera, depth unit, times of the logged frames, length."""
+    facts, found = run.facts(), start_facts(source)
+    units = {name: facts[name] for name in ("depth_units_per_metre",) if name in facts}
+    for name, value in ({**(facts.get("camera") or {})} | units).items():
+        now = (found | found["camera"]).get(name)
+        if not _same(value, now):
+            yield f"{name} is {_text(now)}, it was {_text(value)}"
     for record in run.read_log() if (run.path / "log.jsonl").is_file() else ():
         index, time_s = record["index"], record["timestamp_s"]
         if index >= len(source):
-            return f"it has {len(source)} frames, but frame {index} was already processed"
-        found_s = source.timestamp_s(index)
-        if abs(found_s - time_s) > SAME_TIME_S:
-            return f"frame {index} is of {found_s:.6f} s, it was of {time_s:.6f} s"
-    return ""
-
-
-def _other_length(facts: Mapping[str, Any], source: Source) -> str:
-    noted = facts.get("source_frames", len(source))
-    return "" if noted == len(source) else f"it has {len(source)} frames, it had {noted}"
+            yield f"it has {len(source)} frames, but frame {index} was already processed"
+        elif abs(source.timestamp_s(index) - time_s) > SAME_TIME_S:
+            yield f"frame {index} is of {source.timestamp_s(index):.6f} s, it was of {time_s:.6f} s"
+    if (noted := facts.get("source_frames", len(source))) != len(source):
+        yield f"it has {len(source)} frames, it had {noted}"
 
 
 def _same(noted: Any, found: Any) -> bool:

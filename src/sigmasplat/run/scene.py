@@ -8,7 +8,7 @@ from sigmasplat.config import Config
 from sigmasplat.config.scale import for_scene
 from sigmasplat.input.opening import open_source
 from sigmasplat.input.source import Source
-from sigmasplat.run.pose_scale import with_measured_scale, with_scaled_depth
+from sigmasplat.run.pose_scale import with_measured_scale
 
 
 def open_scene(path: str | Path, config: Config | None = None, given: Collection[str] = ()) -> tuple[Source, Config]:
@@ -19,10 +19,8 @@ def open_scene(path: str | Path, config: Config | None = None, given: Collection
     """
     config = config or Config()
     source, asked = open_source(path, config.input), config.input
-    if asked.poses and not asked.poses_scale:
+    if asked.poses and not (asked.poses_scale and (asked.predicted_scale or not source.predicted_depth)):
         config = with_measured_scale(source, config)
-    elif asked.poses and source.predicted_depth and not asked.predicted_scale:
-        config = with_scaled_depth(source, config)
     if config.input != asked:
         source = open_source(path, config.input)
     return source, config_for(source, config, given)
@@ -46,9 +44,4 @@ def scene_facts(source: Source) -> dict[str, Any]:
 def config_of_facts(facts: Mapping[str, Any], config: Config, given: Collection[str] = ()) -> Config:
     """Return the settings that a run with these facts (run.json) used if it was asked for `config`."""
     noise, predicted = facts.get("depth_noise_per_m"), bool(facts.get("predicted_depth"))
-    return for_scene(config, noted_scale(facts), noise, given, facts.get("sensor"), predicted)
-
-
-def noted_scale(facts: Mapping[str, Any]) -> float:
-    """Return the size of a run's scene from its facts (run.json), 1 for runs of older versions."""
-    return float(facts.get("scene_scale") or 1.0)
+    return for_scene(config, facts.get("scene_scale") or 1.0, noise, given, facts.get("sensor"), predicted)

@@ -1,15 +1,16 @@
 """Run SLAM on a sequence and keep the results in a run folder that stays readable however the run ends.
 
-The order: create the run folder; for each frame take a step, append a line to the log, call the callback, and sometimes
-write a checkpoint; make the final map; write the results. The command (`commands/run.py`) opens the source before that
-and scores the run afterwards.
+The order: create the run folder; for each frame take a step, append a line to the log, call the callbacks, and
+sometimes save the state; make the final map; write the results. The command (`commands/run.py`) opens the source before
+that and scores the run afterwards.
 """
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import InitVar, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,15 +20,16 @@ from sigmasplat.data.trajectory import RELOCALISED
 from sigmasplat.errors import RunError
 from sigmasplat.files.lock import LOCK, locked, no_warning
 from sigmasplat.input.source import Source
-from sigmasplat.run.callbacks import Callback, Checkpointer
+from sigmasplat.run.callbacks import Callback, run_now
 from sigmasplat.run.figures import profile
 from sigmasplat.run.same_conditions import start_facts
 from sigmasplat.run.signals import interrupt_event
 from sigmasplat.run_folder.frames import RunFrames
-from sigmasplat.run_folder.runs import ALL_POSES, RunFolder
+from sigmasplat.run_folder.runs import RunFolder
 
 if TYPE_CHECKING:
     from sigmasplat.realtime.system import RealTime
+    from sigmasplat.run.resume import StateFile
     from sigmasplat.slam.results import Step
     from sigmasplat.slam.slam import Slam
 
@@ -37,16 +39,11 @@ LOOPS_GROWTH = 1.05
 
 
 def new_folder(
-    out: Path | None, config: Config, source: Source, overwrite: bool = False, keep: Path | None = None, **facts: Any
-) -> RunFolder:
-    """Create a run folder and write facts to its run.json; the default is runs/SOURCE-PRESET, numbered if it exists.
-
-    keep: a run that must not be overwritten. Raises RunError if the folder cannot be written, is `keep`, is in use by
-    another process, or is not empty and may not be overwritten.
-    """
-    path = _new_path(out, config, source, overwrite, keep)
-    with locked(path):
-        return _created(path, config, source, overwrite, facts)
+    out: Path | None, config: Config, source: Source, overwrite: bool = False, **facts: Any
+) -> RunFolder:  # fmt: skip
+    """Create a run folder as `new_run` does, without its lock."""
+    with new_run(out, config, source, overwrite, **facts) as folder:
+        return folder
 
 
 @contextmanager
@@ -59,33 +56,26 @@ def new_run(
     warn: Callable[[str], None] = no_warning,
     **facts: Any,
 ) -> Iterator[RunFolder]:
-    """Yield a new run folder as `new_folder` does, and hold its lock during the block (`files.lock`).
+    """Yield a new run folder, whose run.json has facts, and hold its lock during the block (`files.lock`).
 
-    A folder without results is removed if the block fails (`removed_on_early_failure`). Raises as `new_folder`.
+    The default is runs/SOURCE-PRESET, numbered if it exists. keep: a run that must not be overwritten. A folder without
+    results is removed if the block fails. Raises RunError if the folder cannot be written, is `keep`, is in use by
+    another process, or is not empty and may not be overwritten.
     """
-    path = _new_path(out, config, source, overwrite, keep)
-    with locked(path, warn):
-        folder = _created(path, config, source, overwrite, facts)
-        with removed_on_early_failure(folder):
-            yield folder
-
-
-def _new_path(out: Path | None, config: Config, source: Source, overwrite: bool, keep: Path | None) -> Path:
-    """Return the path of a new run folder. Raises RunError if it is `keep`, or may not be written."""
     plain_name = "".join(c if c.isalnum() or c in "._-" else "-" for c in source.name).strip("-.") or "run"
     default = RUNS / f"{plain_name}-{config.name}"
     path = out or (default if overwrite else unused_path(default))
     if keep and path.resolve() == keep.resolve():
         raise RunError(f"output {path} is the run that --onto continues, which is never changed; give another --out")
     RunFolder.refuse_taken(path, overwrite)
-    return path
-
-
-def _created(path: Path, config: Config, source: Source, overwrite: bool, facts: dict[str, Any]) -> RunFolder:
-    facts = start_facts(source) | facts
-    folder = RunFolder.create(path, config, source.name, overwrite)
-    folder.note(**facts)
-    return folder
+    with locked(path, warn):
+        folder = RunFolder.create(path, config, source.name, overwrite)
+        folder.note(**start_facts(source) | facts)
+        try:
+            yield folder
+        except BaseException:
+            _remove_without_results(folder)
+            raise
 
 
 def unused_path(wanted: Path) -> Path:
@@ -97,46 +87,47 @@ def unused_path(wanted: Path) -> Path:
     return path
 
 
-@contextmanager
-def removed_on_early_failure(run: RunFolder) -> Iterator[None]:
-    """Remove a new run folder if the block fails before the run has results.
+def _remove_without_results(run: RunFolder) -> None:
+    """Remove a new run folder unless it holds a log, a recording or a file of the user's.
 
-    The folder stays if it holds a log, a recording or a file of the user's. An empty runs/ is removed too. Submaps that
-    were copied from an earlier run are removed.
+    An empty runs/ is removed too. Submaps that were copied from an earlier run are removed.
     """
-    try:
-        yield
-    except BaseException:
-        # run.json goes last: it marks the folder as ours, so that after a kill in between --overwrite still accepts it.
-        written_first = [run.path / "config.json", run.path / "run.json"]
-        copied = {run.submaps.folder, *run.submaps.folder.glob("*")}
-        lock = run.path / LOCK
-        if {*run.path.rglob("*")} <= {run.images, lock, *written_first, *copied}:
-            run.submaps.clear()
-            for file in (*written_first, lock):
-                file.unlink(missing_ok=True)
-            for folder in (run.images, run.path, RUNS):
-                with suppress(OSError):
-                    folder.rmdir()
-        raise
+    # run.json goes last: it marks the folder as ours, so that after a kill in between --overwrite still accepts it.
+    written_first, lock = [run.path / "config.json", run.path / "run.json"], run.path / LOCK
+    copied = {run.submaps.folder, *run.submaps.folder.glob("*")}
+    if {*run.path.rglob("*")} <= {run.images, lock, *written_first, *copied}:
+        run.submaps.clear()
+        for file in (*written_first, lock):
+            file.unlink(missing_ok=True)
+        for folder in (run.images, run.path, RUNS):
+            with suppress(OSError):
+                folder.rmdir()
 
 
-@dataclass(frozen=True)
+@dataclass
 class Outcome:
-    """How a session ended: "complete" or "interrupted", and its counts. wall_s covers the frames, not the final map.
+    """How a session ended: "complete", "interrupted" or "failed", and its counts.
 
-    apart: the number of frames of each component that is not connected to the world.
+    wall_s: seconds of the frames, without the final map; apart: the number of frames of each component that is not
+    connected to the world.
     """
 
-    status: str
-    frames: int
-    lost: int
-    wall_s: float
+    status: str = "failed"
+    frames: int = 0
+    lost: int = 0
+    wall_s: float = 0.0
     submaps: int = 1
     loops_closed: int = 0
     loops_refused: int = 0
     relocalised: int = 0
     apart: tuple[int, ...] = ()
+
+    def count(self, lost: bool, state: str, submap: int) -> None:
+        """Count a frame."""
+        self.frames += 1
+        self.lost += lost
+        self.relocalised += state == RELOCALISED
+        self.submaps = submap + 1
 
     def summary(self) -> str:
         """Return the counts as text."""
@@ -151,39 +142,31 @@ class Outcome:
         return line
 
 
-def ignore(frame: Frame) -> None:
-    """Do nothing with a frame."""
-
-
-def run_now(task: Callable[[], None]) -> None:
-    """Run a task at once."""
-    task()
-
-
 @dataclass(eq=False)
 class Session:
     """A run of SLAM on a source, from its frame `first_index` on; a resumed run has already taken `wall_s` seconds.
 
-    all_poses: also write trajectory_all.txt, which has the poses of all frames. watch: gets each frame before its step.
-    later: runs a task that no frame needs to wait for; at once by default, beside the frames in real time.
+    callbacks: called after each step and with the progress of the end; readers: called too, but `later`, because they
+    read the system and not only the step.
+    watch: gets each frame before its step. later: runs a task that no frame needs to wait for; at once by default,
+    beside the frames in real time.
     """
 
     slam: "Slam | RealTime"
     source: Source
     run: RunFolder
-    callback: Callback = field(default_factory=Callback)
-    checkpointer: Checkpointer = field(default_factory=Checkpointer)
+    callbacks: Sequence[Callback] = ()
+    state: "StateFile | None" = None
     first_index: int = 0
-    wall_s: float = 0.0
-    all_poses: bool = False
-    watch: Callable[[Frame], None] = ignore
+    wall_s: InitVar[float] = 0.0
+    readers: Sequence[Callback] = ()
+    watch: Callable[[Frame], object] | None = None
     later: Callable[[Callable[[], None]], None] = run_now
-    frames: int = field(default=0, init=False)
-    lost: int = field(default=0, init=False)
-    relocalised: int = field(default=0, init=False)
-    apart: tuple[int, ...] = field(default=(), init=False)
-    submaps: int = field(default=1, init=False)
+    outcome: Outcome = field(init=False)
     loops_written: int = field(default=0, init=False)
+
+    def __post_init__(self, wall_s: float) -> None:
+        self.outcome = Outcome(wall_s=wall_s)
 
     def execute(self) -> Outcome:
         """Process all frames, make the final map, and write trajectory, map, loops and checkpoint.
@@ -199,26 +182,29 @@ class Session:
             return self._execute()
 
     def _execute(self) -> Outcome:
+        outcome = self.outcome
         if self.first_index:
-            self._count_earlier_frames()
-        status = "failed"
+            for line in self.run.read_log():
+                outcome.count(line["lost"], line.get("state", ""), line["submap"])
         try:
             with interrupt_event() as interrupt:
                 complete = self._process_frames(interrupt)
                 if complete:
                     self._finish(interrupt)
-                status = "complete" if complete else "interrupted"
+                outcome.status = "complete" if complete else "interrupted"
         except KeyboardInterrupt:
-            status = "interrupted"
+            outcome.status = "interrupted"
         except Exception as problem:
-            if self.frames:
-                problem.add_note(f"the run up to frame {self.frames} is in {self.run.path}")
+            if outcome.frames:
+                problem.add_note(f"the run up to frame {outcome.frames} is in {self.run.path}")
             raise
         finally:
-            self._end(status)
-        if status == "complete":
-            self.checkpointer.delete()
-        return self._outcome(status)
+            self._end(outcome.status)
+        if self.state and outcome.status == "complete":
+            self.state.delete()
+        outcome.loops_closed = sum(loop.accepted for loop in self.slam.loops)
+        outcome.loops_refused = len(self.slam.loops) - outcome.loops_closed
+        return outcome
 
     def _end(self, status: str) -> None:
         """Write the results and the status.
@@ -227,7 +213,7 @@ class Session:
         written: the run can be resumed.
         """
         dropped = {} if self.source.arrived_s is None else {"dropped": self.source.dropped}
-        ending = {"wall_s": self.wall_s, "skipped": self.source.skipped, **dropped}
+        ending = {"wall_s": self.outcome.wall_s, "skipped": self.source.skipped, **dropped}
         self.run.note(status="failed" if status == "failed" else "interrupted", **ending)
         try:
             self._write_results()
@@ -236,31 +222,29 @@ class Session:
             raise
         self.run.note(status=status)
 
-    def _count_earlier_frames(self) -> None:
-        """Restore the counts of a resumed run from its log."""
-        log = self.run.read_log()
-        self.frames, self.lost = len(log), sum(line["lost"] for line in log)
-        self.relocalised = sum(line.get("state") == RELOCALISED for line in log)
-        self.submaps = 1 + (log[-1]["submap"] if log else 0)
-
     def _process_frames(self, interrupt: threading.Event) -> bool:
         """Step through the frames until they end or Ctrl-C stops them; return whether all frames were processed."""
-        earlier_s, started_s, frame = self.wall_s, time.perf_counter(), None
+        outcome, frame, began_s = self.outcome, None, time.perf_counter() - self.outcome.wall_s
         try:
             for frame in self.source.frames_from(self.first_index):
-                self.watch(frame)
+                if self.watch:
+                    self.watch(frame)
                 step = self.slam.step(frame)
                 self._log(step, frame, self.source.arrived_s)
-                self.wall_s = earlier_s + time.perf_counter() - started_s
-                self.callback(step)
-                self.checkpointer.after_frame(frame.index, self.wall_s)
+                outcome.wall_s = time.perf_counter() - began_s
+                for callback in self.callbacks:
+                    callback(step)
+                for reader in self.readers:
+                    self.later(partial(reader, step))
+                if self.state:
+                    self.state.after_frame(frame.index, outcome.wall_s)
                 if interrupt.is_set():
                     break
         finally:
-            self.wall_s = earlier_s + time.perf_counter() - started_s
+            outcome.wall_s = time.perf_counter() - began_s
             self.slam.settle()
-        if frame is not None:
-            self.checkpointer.save(frame.index, self.wall_s)
+        if self.state and frame is not None:
+            self.state.save(frame.index, outcome.wall_s)
         if self.source.live:
             interrupt.clear()  # this Ctrl-C has ended the live frames; the next one interrupts the final map
         return not interrupt.is_set()
@@ -276,39 +260,36 @@ class Session:
         self.run.log(line)
         if step.loops and len(self.slam.loops) >= LOOPS_GROWTH * self.loops_written:
             self.later(self._write_loops)
-        self.frames += 1
-        self.lost += step.lost
-        self.relocalised += step.state == RELOCALISED
-        self.submaps = step.submap + 1
+        self.outcome.count(step.lost, step.state, step.submap)
 
     def _finish(self, interrupt: threading.Event) -> None:
         """Make the final map and write how long it took. Raises KeyboardInterrupt after Ctrl-C."""
 
         def progress(done: int, total: int) -> None:
-            self.callback.finishing(done, total)
+            for callback in (*self.callbacks, *self.readers):
+                callback.finishing(done, total)
             if interrupt.is_set():
                 raise KeyboardInterrupt
 
         before, started_s = len(self.slam.loops), time.perf_counter()
         self.slam.finish(progress)
         self.run.note(finish_s=time.perf_counter() - started_s, final_steps=self.slam.refinement_steps)
-        self.callback.last_loops(self.slam.loops[before:])
+        for callback in (*self.callbacks, *self.readers):
+            callback.last_loops(self.slam.loops[before:])
 
     def _write_results(self) -> None:
         """Write the results of the frames so far. The maps are the last files because they take longest."""
-        if self.frames == 0:
+        if self.outcome.frames == 0:
             return
         self.run.sync_log()
         path, components = self.slam.trajectory(), self.slam.components()
-        self.apart = tuple(len(component.trajectory) for component in components)
+        self.outcome.apart = tuple(len(component.trajectory) for component in components)
         valid = path.at(self.slam.valid())
         self.run.write_trajectory(valid)
-        if self.all_poses or (self.run.path / ALL_POSES).exists():
-            self.run.write_all_poses(path)
         self._write_loops()
-        self.run.write_checkpoint(self.slam.checkpoint(), {"frames": str(self.frames)})
+        self.run.write_checkpoint(self.slam.checkpoint(), {"frames": str(self.outcome.frames)})
         log = self.run.read_log()
-        self.run.write_profile(profile(log, self.wall_s))
+        self.run.write_profile(profile(log, self.outcome.wall_s))
         if (up := RunFrames.of(log, valid).measured_up()) is not None:
             self.run.note(up_world=up.tolist())
         self.run.write_components(components)
@@ -321,27 +302,15 @@ class Session:
         self.loops_written = len(loops)
         self.run.write_loops(loop.record() for loop in loops)
 
-    def _outcome(self, status: str) -> Outcome:
-        closed = sum(loop.accepted for loop in self.slam.loops)
-        refused = len(self.slam.loops) - closed
-        counts = self.submaps, closed, refused, self.relocalised, self.apart
-        return Outcome(status, self.frames, self.lost, self.wall_s, *counts)
+
+LOGGED = (
+    "index", "timestamp_s", "is_keyframe", "lost", "state", "component", "p_off", "splats", "submap", "tracking",
+    "seconds", "T_world_camera",
+)  # fmt: skip
 
 
 def log_line(step: "Step") -> dict[str, Any]:
     """Return a step as a record of log.jsonl: T_world_camera as 4 rows, times in seconds, loops if any were tried."""
-    line = {
-        "index": step.index,
-        "timestamp_s": step.timestamp_s,
-        "is_keyframe": step.is_keyframe,
-        "lost": step.lost,
-        "state": step.state,
-        "component": step.component,
-        "p_off": step.p_off,
-        "splats": step.splats,
-        "submap": step.submap,
-        "tracking": dict(step.tracking),
-        "seconds": dict(step.seconds),
-        "T_world_camera": step.T_world_camera,
-    }
+    line = {name: getattr(step, name) for name in LOGGED}
+    line["seconds"] = dict(step.seconds)  # the session adds to it
     return line | {"loops": [loop.record() for loop in step.loops]} if step.loops else line

@@ -121,7 +121,6 @@ def _console(stderr: bool) -> Console:
 
 
 def _bar(bars: Bars, title: str, total: int | None) -> Show:
-    """Add a bar."""
     task = bars.add_task(title, total=total, text="")
     return lambda done, known, text: bars.update(task, completed=done, total=known or total, text=text)
 
@@ -190,8 +189,6 @@ class _StepShow(Callback):
 
 
 class _PlainShow:
-    """Print a line at the start, every few seconds, and at the end."""
-
     def __init__(
         self, say: Callable[[str], None], written: Callable[[int], str], title: str, total: int | None
     ) -> None:

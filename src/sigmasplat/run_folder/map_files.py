@@ -2,7 +2,7 @@
 not connected to the world (components/N/trajectory.txt and map.ply).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -25,8 +25,6 @@ from sigmasplat.files.tensors import open_tensors, write_tensors
 from sigmasplat.run_folder import splat_ply as ply
 from sigmasplat.run_folder.trajectory import write_trajectory
 
-ADDED_PARTS = frozenset({"extrapolated"})
-"""Parts that older files do not have."""
 UNCERTAINTY_JSON, UNCERTAINTY_TENSORS = "uncertainty.json", "uncertainty.safetensors"
 STD_TENSORS = ("depth_std_m", "color_std")
 
@@ -46,10 +44,7 @@ def write_uncertainty(folder: Path, uncertainty: MapUncertainty) -> None:
 
 
 def read_uncertainty(folder: Path) -> MapUncertainty | None:
-    """Read both files; None if there is no uncertainty.json. Raises RunError if one is damaged.
-
-    Files of older versions have no standard deviations of the splats.
-    """
+    """Read both files; None if there is no uncertainty.json. Raises RunError if one is damaged."""
     path = folder / UNCERTAINTY_JSON
     if not path.is_file():
         return None
@@ -58,8 +53,8 @@ def read_uncertainty(folder: Path) -> MapUncertainty | None:
         behind = values["background"]
         red, green, blue = map(float, behind["color"])
         known = Background((red, green, blue), float(behind["color_variance"]), float(behind["depth_variance_m2"]))
-        color = {name: _weight(values["color"], name) for name in COLOR_PARTS}
-        depth = {name: _weight(values["depth"], name) for name in DEPTH_PARTS}
+        color = {name: float(values["color"][name]) for name in COLOR_PARTS}
+        depth = {name: float(values["depth"][name]) for name in DEPTH_PARTS}
         temperature = {name: float(T) for name, T in values.get("temperature", {}).items()}
         probes = int(values["probes"])
     except (AttributeError, KeyError, TypeError, ValueError) as problem:
@@ -68,11 +63,6 @@ def read_uncertainty(folder: Path) -> MapUncertainty | None:
         found = {name: file.get_tensor(name) for name in STD_TENSORS if name in file.keys()}  # noqa: SIM118
         std = SplatStd(**found) if len(found) == len(STD_TENSORS) else None
         return MapUncertainty(file.get_tensor("variances"), known, Calibration(color, depth, temperature), probes, std)
-
-
-def _weight(weights: Mapping[str, float], name: str) -> float:
-    """Return the weight of a part; 0 for a part that runs of older versions do not have."""
-    return float(weights.get(name, 0.0) if name in ADDED_PARTS else weights[name])
 
 
 def refuse_misfit(folder: Path, uncertainty: MapUncertainty, splats: int) -> None:

@@ -1,7 +1,7 @@
 """Check the JSON files and the checkpoint of a run when they are read: a damaged file is named, with what is wrong."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,81 +11,55 @@ from torch import Tensor
 from sigmasplat.data.trajectory import APART, LOST, RELOCALISED, TRACKED
 from sigmasplat.errors import RunError
 
-Test = Callable[[Any], bool]
 MOST_NUMBER = 1e15
 REMEDY = "restore the file, or run it again"
+Kind = Any
+"""What a value may be, see `fits`."""
 
 
-def is_number(value: Any) -> bool:
-    """Return whether a value is a number of a usable size."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= MOST_NUMBER
-
-
-def is_whole(value: Any) -> bool:
-    """Return whether a value is a whole number of a usable size."""
-    return is_number(value) and isinstance(value, int)
-
-
-def _number_or_null(value: Any) -> bool:
-    return value is None or is_number(value)
-
-
-def are_numbers(value: Any) -> bool:
-    """Return whether a value is an object of numbers, null and flags."""
-    return isinstance(value, dict) and all(_number_or_null(item) or isinstance(item, bool) for item in value.values())
-
-
-def _pose(value: Any) -> bool:
-    rows = isinstance(value, list) and len(value) == 4 and all(isinstance(row, list) and len(row) == 4 for row in value)
-    return rows and all(is_number(item) for row in value for item in row)
+def fits(value: Any, kind: Kind) -> bool:
+    """Return whether a value from JSON is of a kind: None, a class, [kind of the items], {"": kind of the values}, a
+    tuple of kinds, or a test. Numbers have a usable size, and are not bool."""
+    if isinstance(kind, tuple):
+        return any(fits(value, one) for one in kind)
+    if isinstance(kind, list):
+        return isinstance(value, list) and all(fits(item, kind[0]) for item in value)
+    if isinstance(kind, dict):
+        return isinstance(value, dict) and all(fits(item, kind[""]) for item in value.values())
+    if kind is int or kind is float:
+        number = isinstance(value, int | kind) and not isinstance(value, bool)
+        return number and abs(value) <= MOST_NUMBER
+    if isinstance(kind, type):
+        return isinstance(value, kind)
+    return value is None if kind is None else bool(kind(value))
 
 
 def _vector(value: Any) -> bool:
-    return isinstance(value, list) and len(value) == 3 and all(is_number(item) for item in value)
+    return fits(value, [float]) and len(value) == 3
 
 
-def _direction(value: Any) -> bool:
-    return _vector(value) and math.hypot(*value) > 0.0
+def _pose(value: Any) -> bool:
+    return fits(value, [[float]]) and list(map(len, value)) == [4] * 4
 
 
-def _seconds(value: Any) -> bool:
-    return isinstance(value, dict) and all(is_number(item) for item in value.values())
-
-
-def _texts(value: Any) -> bool:
-    return isinstance(value, list) and all(isinstance(item, str) for item in value)
-
-
-def _records(value: Any) -> bool:
-    return isinstance(value, list) and all(isinstance(item, dict) for item in value)
-
-
-def is_kind(*kinds: type) -> Test:
-    """Return a test for instances of some types."""
-    return lambda value: isinstance(value, kinds)
-
-
-LOG: Mapping[str, Test] = {
-    "index": lambda value: is_whole(value) and value >= 0, "timestamp_s": is_number, "is_keyframe": is_kind(bool),
-    "lost": is_kind(bool), "state": lambda value: value in (TRACKED, RELOCALISED, LOST, APART), "component": is_whole,
-    "p_off": _number_or_null, "splats": is_whole, "submap": is_whole, "tracking": are_numbers, "seconds": _seconds,
-    "T_world_camera": _pose, "loops": _records, "specific_force_m_s2": _vector,
+LOG: Mapping[str, Kind] = {
+    "index": lambda value: fits(value, int) and value >= 0, "timestamp_s": float, "is_keyframe": bool, "lost": bool,
+    "state": lambda value: value in (TRACKED, RELOCALISED, LOST, APART), "component": int, "p_off": (float, None),
+    "splats": int, "submap": int, "tracking": {"": (float, None, bool)}, "seconds": {"": float},
+    "T_world_camera": _pose, "loops": [dict], "specific_force_m_s2": _vector,
 }  # fmt: skip
 """Values of a line of log.jsonl."""
-FACTS: Mapping[str, Test] = {
-    "source": is_kind(str), "source_path": is_kind(str), "status": is_kind(str), "skipped": _texts,
-    "wall_s": _number_or_null, "finish_s": _number_or_null, "final_steps": _number_or_null, "machine": is_kind(dict),
-    "onto": is_kind(dict), "camera": is_kind(dict), "source_frames": is_whole, "depth_units_per_metre": _number_or_null,
-    "isa": is_kind(str, type(None)), "scene_scale": _number_or_null, "depth_noise_per_m": _number_or_null,
-    "sensor": is_kind(str, type(None)), "predicted_depth": is_kind(bool), "depth_model": is_kind(dict),
-    "up_world": _direction,
+FACTS: Mapping[str, Kind] = {
+    "source": str, "source_path": str, "status": str, "skipped": [str], "wall_s": (float, None),
+    "finish_s": (float, None), "final_steps": (float, None), "machine": dict, "onto": dict, "camera": dict,
+    "source_frames": int, "depth_units_per_metre": (float, None), "isa": (str, None), "scene_scale": (float, None),
+    "depth_noise_per_m": (float, None), "sensor": (str, None), "predicted_depth": bool, "depth_model": dict,
+    "up_world": lambda value: _vector(value) and math.hypot(*value) > 0.0,
 }  # fmt: skip
 """Values of run.json that commands use."""
-STATE_FIELDS: Mapping[str, Test] = {"index": is_whole, "wall_s": is_number, "submaps": is_whole}
-"""Values of a saved state beside those of `Slam`."""
 
 
-def check_fields(values: Any, tests: Mapping[str, Test], required: tuple[str, ...], where: object) -> dict[str, Any]:
+def check_fields(values: Any, kinds: Mapping[str, Kind], required: tuple[str, ...], where: object) -> dict[str, Any]:
     """Return an object with the required fields. Raises RunError naming `where` if a field is missing or mistyped."""
     if not isinstance(values, dict):
         raise RunError(f"{where}: {_short(values)} is not an object; {REMEDY}")
@@ -93,7 +67,7 @@ def check_fields(values: Any, tests: Mapping[str, Test], required: tuple[str, ..
         if name not in values:
             raise RunError(f"{where}: field {name!r} is missing; {REMEDY}")
     for name, value in values.items():
-        if name in tests and not tests[name](value):
+        if name in kinds and not fits(value, kinds[name]):
             raise RunError(f"{where}: field {name!r} has the value {_short(value)}; {REMEDY}")
     checked: dict[str, Any] = values
     return checked
@@ -101,7 +75,7 @@ def check_fields(values: Any, tests: Mapping[str, Test], required: tuple[str, ..
 
 def check_profile(values: Any, path: Path) -> dict[str, float]:
     """Return the seconds of each stage of a run. Raises RunError naming the file if one is not a number."""
-    return check_fields(values, dict.fromkeys(values, is_number) if isinstance(values, dict) else {}, (), path)
+    return check_fields(values, dict.fromkeys(values, float) if isinstance(values, dict) else {}, (), path)
 
 
 class Record(dict[str, Any]):
@@ -134,26 +108,28 @@ def _short(value: Any) -> str:
     return text if len(text) <= 60 else f"{text[:60]} …"
 
 
-POSE, NUMBER = (4, 4), ()
-FINITE: Mapping[str, tuple[str, tuple[int, ...]]] = {
-    "timestamps_s": ("frames", NUMBER), "T_world_camera": ("frames", POSE), "T_world_camera_odometry": ("frames", POSE),
-    "T_submap_camera": ("frames", POSE), "T_keyframe_camera": ("frames", POSE), "exposure": ("frames", (3, 2)),
-    "T_world_submap": ("submaps", POSE),
-    "T_world_keyframe": ("places", POSE), "T_submap_keyframe": ("places", POSE),
-    "hop_T_camera_before": ("places", POSE), "hop_bias": ("places", (6,)),
-    "edge_T_a_b": ("edges", POSE), "edge_information": ("edges", (6, 6)), "edge_drift": ("edges", (6, 6)),
+POSE, FLOAT, INT, BOOL = (4, 4), "float", "int", "bool"
+TENSORS: Mapping[str, tuple[str, tuple[int, ...], str]] = {
+    "timestamps_s": ("frames", (), FLOAT), "T_world_camera": ("frames", POSE, FLOAT),
+    "T_world_camera_odometry": ("frames", POSE, FLOAT), "T_submap_camera": ("frames", POSE, FLOAT),
+    "T_keyframe_camera": ("frames", POSE, FLOAT), "exposure": ("frames", (3, 2), FLOAT),
+    "T_world_submap": ("submaps", POSE, FLOAT), "T_world_keyframe": ("places", POSE, FLOAT),
+    "T_submap_keyframe": ("places", POSE, FLOAT), "hop_T_camera_before": ("places", POSE, FLOAT),
+    "hop_bias": ("places", (6,), FLOAT), "hop_covariance": ("places", (6, 6), FLOAT),
+    "edge_T_a_b": ("edges", POSE, FLOAT), "edge_information": ("edges", (6, 6), FLOAT),
+    "edge_drift": ("edges", (6, 6), FLOAT), "edge_is_loop": ("edges", (), BOOL), "keyframes": ("keyframes", (), INT),
+    "frame_submap": ("frames", (), INT), "frame_keyframe": ("frames", (), INT), "keyframe_submap": ("places", (), INT),
+    "submap_component": ("submaps", (), INT), "edge_submaps": ("edges", (2,), INT),
+    "edge_keyframes": ("edges", (2,), INT),
 }  # fmt: skip
-"""Tensors of finite numbers: what their rows are, and the shape of a row. A place is a keyframe of a submap."""
-UNKNOWN: Mapping[str, tuple[str, tuple[int, ...]]] = {"hop_covariance": ("places", (6, 6))}
-"""Tensors in which inf means that a number is not known."""
-WHOLE: Mapping[str, tuple[str, tuple[int, ...], str]] = {
-    "keyframes": ("keyframes", NUMBER, "frames"), "frame_submap": ("frames", NUMBER, "submaps"),
-    "frame_keyframe": ("frames", NUMBER, "places"), "keyframe_submap": ("places", NUMBER, "submaps"),
-    "submap_component": ("submaps", NUMBER, "submaps"), "edge_submaps": ("edges", (2,), "submaps"),
-    "edge_keyframes": ("edges", (2,), "places"),
+"""What the rows of each tensor are, the shape of a row, and the type. A place is a keyframe of a submap."""
+MAY_BE_UNKNOWN = {"hop_covariance"}
+"""Tensors in which inf means that a number is not known; the others are finite."""
+COUNTED = {
+    "keyframes": "frames", "frame_submap": "submaps", "frame_keyframe": "places", "keyframe_submap": "submaps",
+    "submap_component": "submaps", "edge_submaps": "submaps", "edge_keyframes": "places",
 }  # fmt: skip
-"""Tensors of row numbers: what their rows are, the shape of a row, and what they count."""
-FLAGS: Mapping[str, tuple[str, tuple[int, ...]]] = {"edge_is_loop": ("edges", NUMBER)}
+"""What the row numbers in a tensor count."""
 
 
 class Tensors(dict[str, Tensor]):
@@ -171,7 +147,7 @@ def check_checkpoint(found: Mapping[str, Tensor], path: Path) -> Tensors:
     """Return the tensors of a checkpoint. Raises RunError if one has a wrong type or shape, is not finite, counts rows
     that do not exist, or does not fit to the others. Versions before this one wrote fewer tensors."""
     lengths = _checked_shapes(found, path)
-    for name, (_, _, counted) in WHOLE.items():
+    for name, counted in COUNTED.items():
         values, most = found.get(name), lengths.get(counted)
         if values is None or most is None or not values.numel():
             continue
@@ -188,27 +164,22 @@ def check_checkpoint(found: Mapping[str, Tensor], path: Path) -> Tensors:
 def _checked_shapes(found: Mapping[str, Tensor], path: Path) -> dict[str, int]:
     """Return how many frames, keyframes, places, submaps and edges there are; all tensors agree on it."""
     lengths, first = dict[str, int](), dict[str, str]()
-    kinds = {name: (rows, row) for name, (rows, row, _) in WHOLE.items()}
-    for name, (rows, row) in {**FINITE, **UNKNOWN, **kinds, **FLAGS}.items():
+    for name, (rows, row, kind) in TENSORS.items():
         if (tensor := found.get(name)) is None:
             continue
-        if not _has_type(name, tensor) or tensor.ndim != 1 + len(row) or tuple(tensor.shape[1:]) != row:
+        if (
+            not str(tensor.dtype).startswith(f"torch.{kind}")
+            or tensor.ndim != 1 + len(row)
+            or tuple(tensor.shape[1:]) != row
+        ):
             raise RunError(f"{path}: tensor {name!r} is {tensor.dtype} {list(tensor.shape)}; {REMEDY}")
-        if name in FINITE and not _is_finite(tensor):
+        if kind == FLOAT and name not in MAY_BE_UNKNOWN and not _is_finite(tensor):
             raise RunError(f"{path}: tensor {name!r} has nan, inf or very large numbers; {REMEDY}")
         if lengths.setdefault(rows, len(tensor)) != len(tensor):
             wrong = f"{len(tensor)} rows, and {first[rows]!r} has {lengths[rows]}"
             raise RunError(f"{path}: tensor {name!r} has {wrong}; {REMEDY}")
         first.setdefault(rows, name)
     return lengths
-
-
-def _has_type(name: str, tensor: Tensor) -> bool:
-    if name in FLAGS:
-        return tensor.dtype == torch.bool
-    if name in WHOLE:
-        return tensor.dtype in (torch.int32, torch.int64)
-    return tensor.is_floating_point()
 
 
 def _is_finite(tensor: Tensor) -> bool:

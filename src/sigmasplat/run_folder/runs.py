@@ -1,11 +1,12 @@
 """Write and read the folder of a run, which is valid at any time."""
 
 import shutil
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from PIL import Image
 from torch import Tensor
@@ -34,8 +35,6 @@ STATE = "state.safetensors"
 """The state from which an unfinished run resumes."""
 REFINEMENT = "refinement.safetensors"
 """The final map of an unfinished run between two steps of its refinement."""
-ALL_POSES = "trajectory_all.txt"
-"""The poses of all frames, written if requested."""
 FILES = (
     "config.json", "trajectory.txt", "map.ply", "checkpoint.safetensors", "log.jsonl", "loops.json",
     "metrics.json", "profile.json", "report.html", TRUTH, map_files.UNCERTAINTY_JSON, map_files.UNCERTAINTY_TENSORS,
@@ -45,6 +44,26 @@ COMPONENTS = "components"
 """Components that are not connected to the world."""
 FIRST_FILES = {part_of(Path("run.json")).name, LOCK}
 """The only files of a run that was killed before run.json."""
+
+Value = TypeVar("Value")
+
+
+def _reads(name: str, read: Callable[[Path], Value]) -> Callable[["RunFolder"], Value]:
+    """Return a method that reads a file of a run. It raises RunError if the file is missing."""
+
+    def method(run: "RunFolder") -> Value:
+        return read(run._existing(name))
+
+    return method
+
+
+def _writes(name: str, write: Callable[[Path, Value], None]) -> Callable[["RunFolder", Value], None]:
+    """Return a method that writes a file of a run. It raises RunError if the file cannot be written."""
+
+    def method(run: "RunFolder", value: Value) -> None:
+        write(run.path / name, value)
+
+    return method
 
 
 @dataclass(frozen=True)
@@ -127,7 +146,7 @@ class RunFolder:
 
     def _clear(self) -> None:
         """Remove the files of an earlier run, and keep files that the user added."""
-        for name in (*FILES, ALL_POSES, MESH, STATE, REFINEMENT):
+        for name in (*FILES, MESH, STATE, REFINEMENT):
             (self.path / name).unlink(missing_ok=True)
         for picture in self.images.glob("*.png"):
             picture.unlink()
@@ -165,9 +184,8 @@ class RunFolder:
         """Read the settings of the run. Raises ConfigError if they cannot be read."""
         return Config.load(self.path / "config.json")
 
-    def facts(self) -> dict[str, Any]:
-        """Read run.json: source, version, machine, status and facts of `note`. Raises RunError if it is damaged."""
-        return check_fields(self._read_values("run.json"), FACTS, (), self.path / "run.json")
+    facts = _reads("run.json", lambda path: check_fields(_object(path), FACTS, (), path))
+    """Read run.json: source, version, machine, status and facts of `note`. Raises RunError if it is damaged."""
 
     def note(self, **facts: Any) -> None:
         """Add or change facts in run.json, for instance status="complete" or "interrupted", wall_s=…"""
@@ -184,19 +202,15 @@ class RunFolder:
             self.state.unlink(missing_ok=True)
             self.refinement.unlink(missing_ok=True)
 
-    def log(self, record: dict[str, Any]) -> None:
-        """Append one line to log.jsonl. Raises RunError if the file cannot be written."""
-        append_line(self.path / "log.jsonl", record)
+    log = _writes("log.jsonl", append_line)
+    """Append one line to log.jsonl."""
+    read_log = _reads("log.jsonl", lambda path: check_log(read_lines(path), path))
+    """Read the lines of log.jsonl; an incomplete last line, left by an interruption, is skipped. Raises RunError if
+    another line is damaged or has a wrong value."""
 
     def sync_log(self) -> None:
         """Wait until the lines of log.jsonl are on the disk. Raises RunError if they cannot be written."""
         sync_file(self.path / "log.jsonl")
-
-    def read_log(self) -> list[dict[str, Any]]:
-        """Read the lines of log.jsonl; an incomplete last line, left by an interruption, is skipped.
-
-        Raises RunError if it is missing, or another line is damaged or has a wrong value."""
-        return check_log(read_lines(path := self._existing("log.jsonl")), path)
 
     def write_loops(self, records: Iterable[dict[str, Any]]) -> None:
         """Write loops.json: all tried pairs of submaps with their latest results."""
@@ -210,16 +224,10 @@ class RunFolder:
             raise RunError(f"{path} is not a list of loops")
         return loops
 
-    def write_trajectory(self, trajectory: Trajectory) -> None:
-        """Write trajectory.txt: the valid poses (TUM text, T_world_camera)."""
-        tum.write_trajectory(self.path / "trajectory.txt", trajectory)
-
-    def read_trajectory(self) -> Trajectory:
-        """Read trajectory.txt; it is empty if no pose is valid.
-
-        Raises RunError if it is missing, SourceError if it is damaged.
-        """
-        return tum.read_trajectory(self._existing("trajectory.txt"), may_be_empty=True)
+    write_trajectory = _writes("trajectory.txt", tum.write_trajectory)
+    """Write trajectory.txt: the valid poses (TUM text, T_world_camera)."""
+    read_trajectory = _reads("trajectory.txt", partial(tum.read_trajectory, may_be_empty=True))
+    """Read trajectory.txt; it is empty if no pose is valid. Raises SourceError if it is damaged."""
 
     def read_frames(self) -> RunFrames:
         """Read log.jsonl and trajectory.txt together: the state of each frame at the end of the run, and its pose.
@@ -227,13 +235,8 @@ class RunFolder:
         """
         return RunFrames.of(self.read_log(), self.read_trajectory())
 
-    def write_all_poses(self, trajectory: Trajectory) -> None:
-        """Write trajectory_all.txt: the poses of all frames, including lost ones and those of other components."""
-        tum.write_trajectory(self.path / ALL_POSES, trajectory)
-
-    def write_components(self, components: Sequence[Component]) -> None:
-        """Write components/, the path and map of each component that is not connected to the world; remove others."""
-        map_files.write_components(self.path / COMPONENTS, components)
+    write_components = _writes(COMPONENTS, map_files.write_components)
+    """Write components/, the path and map of each component that is not connected to the world; remove others."""
 
     def component_numbers(self) -> list[int]:
         """Return the numbers of the components that are not connected to the world, in ascending order."""
@@ -244,17 +247,14 @@ class RunFolder:
         trajectory, field = (self._existing(f"{COMPONENTS}/{number}/{name}") for name in map_files.COMPONENT_FILES)
         return Component(number, ply.read_field(field), tum.read_trajectory(trajectory))
 
-    def write_map(self, field: GaussianField) -> None:
-        """Write map.ply (3DGS PLY, world frame)."""
-        ply.write_field(self.path / "map.ply", field)
-
-    def read_map(self) -> GaussianField:
-        """Read map.ply. Raises RunError if it is missing, SourceError if it is damaged."""
-        return ply.read_field(self._existing("map.ply"))
-
-    def write_uncertainty(self, uncertainty: MapUncertainty) -> None:
-        """Write uncertainty.json and uncertainty.safetensors: how sure map.ply is."""
-        map_files.write_uncertainty(self.path, uncertainty)
+    write_map = _writes("map.ply", ply.write_field)
+    """Write map.ply (3DGS PLY, world frame)."""
+    read_map = _reads("map.ply", ply.read_field)
+    """Read map.ply. Raises SourceError if it is damaged."""
+    map_bytes = _reads("map.ply", lambda path: path.stat().st_size)
+    """Return the size of map.ply."""
+    write_uncertainty = _writes("", map_files.write_uncertainty)
+    """Write uncertainty.json and uncertainty.safetensors: how sure map.ply is."""
 
     def read_uncertainty(self) -> MapUncertainty | None:
         """Return how sure map.ply is; None if the run has not measured it. Raises RunError if a file is damaged."""
@@ -281,10 +281,6 @@ class RunFolder:
             map_files.refuse_misfit(self.path, uncertainty, len(field))
         return uncertainty
 
-    def map_bytes(self) -> int:
-        """Return the size of map.ply. Raises RunError if it is missing."""
-        return self._existing("map.ply").stat().st_size
-
     def write_checkpoint(self, tensors: dict[str, Tensor], text: dict[str, str]) -> None:
         """Write checkpoint.safetensors: named tensors and text."""
         write_tensors(self.path / "checkpoint.safetensors", tensors, text)
@@ -306,25 +302,16 @@ class RunFolder:
         poses = tensors.get("T_world_camera_odometry")
         return None if poses is None else Trajectory(tensors["timestamps_s"].numpy(), poses.numpy())
 
-    def write_metrics(self, metrics: dict[str, Any]) -> None:
-        """Write metrics.json; nan and inf become null."""
-        write_json(self.path / "metrics.json", metrics)
-
-    def write_profile(self, seconds: dict[str, float]) -> None:
-        """Write profile.json: seconds by stage."""
-        write_json(self.path / "profile.json", seconds)
-
-    def read_profile(self) -> dict[str, float]:
-        """Read profile.json. Raises RunError if it is missing or damaged."""
-        return check_profile(self._read_values("profile.json"), self.path / "profile.json")
-
-    def read_metrics(self) -> dict[str, Any]:
-        """Read metrics.json. Raises RunError if it is missing or damaged."""
-        return self._read_values("metrics.json")
-
-    def write_report(self, html: str) -> None:
-        """Write report.html."""
-        write_text(self.path / "report.html", html)
+    write_metrics = _writes("metrics.json", write_json)
+    """Write metrics.json; nan and inf become null."""
+    read_metrics = _reads("metrics.json", lambda path: _object(path))
+    """Read metrics.json. Raises RunError if it is damaged."""
+    write_profile = _writes("profile.json", write_json)
+    """Write profile.json: seconds by stage."""
+    read_profile = _reads("profile.json", lambda path: check_profile(_object(path), path))
+    """Read profile.json. Raises RunError if it is damaged."""
+    write_report = _writes("report.html", write_text)
+    """Write report.html."""
 
     def write_image(self, name: str, picture: Image.Image) -> None:
         """Write images/<name>, a PNG."""
@@ -336,8 +323,9 @@ class RunFolder:
             raise RunError(f"run {self.path} has no {name}; did it stop before writing it? run it again")
         return self.path / name
 
-    def _read_values(self, name: str) -> dict[str, Any]:
-        values = read_json(self._existing(name))
-        if not isinstance(values, dict):
-            raise RunError(f"{self.path / name} is not a JSON object")
-        return values
+
+def _object(path: Path) -> dict[str, Any]:
+    values = read_json(path)
+    if not isinstance(values, dict):
+        raise RunError(f"{path} is not a JSON object")
+    return values

@@ -56,7 +56,6 @@ def write_field(path: Path, field: GaussianField, *, plain: bool = False, std: S
 
 
 def _columns(field: GaussianField, plain: bool, std: SplatStd | None) -> list[str]:
-    """Return the names of a file's columns in their order."""
     with_harmonics = plain or "harmonics" in field.attributes
     rest = [f"{REST}{i}" for i in range(ATTRIBUTES["harmonics"] if with_harmonics else 0)]
     ours = [] if plain else [*PLY_COLUMNS["log_variances"], *(() if std is None else STD_COLUMNS)]
@@ -81,7 +80,6 @@ def _rows(field: GaussianField, std: SplatStd | None, columns: list[str], part: 
 
 
 def _fill(rows: NDArray[np.void], names: Sequence[str], values: NDArray[np.float32]) -> None:
-    """Set columns of rows [n] to values [n, m]."""
     for i, name in enumerate(names):
         rows[name] = values[:, i]
 

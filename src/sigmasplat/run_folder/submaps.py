@@ -145,7 +145,6 @@ class DiskStore:
             self.folder.rmdir()
 
     def _named(self, pattern: re.Pattern[str]) -> list[Path]:
-        """Return the files whose names match a pattern."""
         entries = self.folder.iterdir() if self.folder.is_dir() else ()
         return [path for path in entries if pattern.fullmatch(path.name)]
 

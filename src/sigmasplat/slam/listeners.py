@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import wraps
-from typing import Concatenate, Literal, ParamSpec, Protocol, TypeVar
+from typing import Any, Literal, Protocol, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +13,8 @@ from sigmasplat.graph.loops import Loop, Loops
 from sigmasplat.slam.results import Step, Steps
 from sigmasplat.types import Matrix
 
-Arguments = ParamSpec("Arguments")
-Result = TypeVar("Result")
 Event = TypeVar("Event")
+Method = TypeVar("Method", bound=Callable[..., Any])
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,9 +41,6 @@ class Observed(Protocol):
 
     @property
     def loops(self) -> Loops: ...
-
-
-System = TypeVar("System", bound=Observed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,13 +111,11 @@ class Events:
         listeners.call(keyframes, closed, corrections)
 
 
-def notifying(
-    method: Callable[Concatenate[System, Arguments], Result],
-) -> Callable[Concatenate[System, Arguments], Result]:
+def notifying(method: Method) -> Method:
     """Make a method of SLAM call the listeners after it has ended without an error."""
 
     @wraps(method)
-    def notified(slam: System, /, *args: Arguments.args, **named: Arguments.kwargs) -> Result:
+    def notified(slam: Observed, /, *args: Any, **named: Any) -> Any:
         if not slam.listeners:
             return method(slam, *args, **named)
         before = Before.of(slam)
@@ -129,7 +123,7 @@ def notifying(
         slam.listeners.notify(slam, before)
         return result
 
-    return notified
+    return cast(Method, notified)
 
 
 def correction_since(slam: Observed, before: Before) -> Correction | None:
@@ -155,10 +149,9 @@ def correction_since(slam: Observed, before: Before) -> Correction | None:
 def _called(functions: Sequence[Callable[[Event], object]], events: Sequence[Event]) -> list[Exception]:
     """Call every function with every event; return the exceptions they raise."""
     problems = []
-    for event in events:
-        for function in functions:
-            try:
-                function(event)
-            except Exception as problem:
-                problems.append(problem)
+    for function, event in ((function, event) for event in events for function in functions):
+        try:
+            function(event)
+        except Exception as problem:
+            problems.append(problem)
     return problems

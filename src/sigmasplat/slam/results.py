@@ -4,7 +4,6 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -124,9 +123,6 @@ class Steps(Records[Step]):
     component, p_off, and T_world_camera [4, 4] by rows; whole: the newest steps by number.
     """
 
-    POSE_COLUMNS: ClassVar[slice] = slice(NUMBERS, NUMBERS + 16)
-    """The columns of `rows` that hold a pose."""
-
     rows: Column = field(default_factory=lambda: Column.of(np.float64, NUMBERS + 16))
     whole: dict[int, Step] = field(default_factory=dict)
 
@@ -150,11 +146,6 @@ class Steps(Records[Step]):
     def lost(self) -> NDArray[np.bool_]:
         """Return whether each frame was lost [F]."""
         return np.asarray(self.rows.used[:, 3] != 0)
-
-    @property
-    def source_index(self) -> NDArray[np.int64]:
-        """Return the index of each frame in its source [F]."""
-        return self.rows.used[:, 0].astype(np.int64)
 
     @property
     def submap(self) -> NDArray[np.int64]:

@@ -226,7 +226,6 @@ class SlamState:
 
     @property
     def _describes(self) -> bool:
-        """Return whether any part compares keyframes by their descriptors."""
         m = self.config.mapping
         return (self.cuts and self.config.loops.close) or (m.window > 2 and m.covisibility == "descriptor")
 

@@ -84,7 +84,6 @@ def has_other_run(job: Job, folder: Path) -> bool:
 
 
 def _facts(folder: Path) -> Mapping[str, Any]:
-    """Return the facts of a run folder, none if it is not one."""
     try:
         return RunFolder(folder).facts()
     except SigmaSplatError:

@@ -62,14 +62,11 @@ def make_run(job: Job, folder: Path, data: str | None, save_every_s: float) -> N
 def _make_and_score(
     job: Job, run: RunFolder, source: Source, config: Config, path: str, save_every_s: float
 ) -> None:  # fmt: skip
-    """Make or resume the run unless it is complete, then score it."""
     if not (job.started_in(run.path) and run.facts().get("status") == "complete"):
         run, start = _started(job, run.path, source, config, path)
         state = StateFile(start.slam, run, save_every_s)
         start.slam.saved_refinement = RefinementFile(start.slam, run, save_every_s)
-        outcome = Session(
-            start.slam, source, run, checkpointer=state, first_index=start.next_index, wall_s=start.wall_s
-        ).execute()
+        outcome = Session(start.slam, source, run, (), state, start.next_index, start.wall_s).execute()
         if outcome.status == "interrupted":
             raise KeyboardInterrupt
     refuse_other_model(run, source)

@@ -7,8 +7,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from sigmasplat.api import RunFolder, make_folder, number, write_text
+from sigmasplat.api import RunFolder, machine, make_folder, number, write_text
+from sigmasplat.plugins.batch.batch import Batch
 from sigmasplat.plugins.batch.definition import MEAN, Cell, Score, Table
+from sigmasplat.plugins.batch.job import installed_code
 
 OURS, PAPER = "ours", "paper"
 
@@ -100,15 +102,6 @@ def _value(values: Sequence[float], scenes: int | None = None) -> Value:
     return Value(statistics.fmean(values), deviation, len(values), scenes)
 
 
-FILES = ("table.md", "table.tex", "table.json")
-LATEX = str.maketrans(
-    {
-        "±": r"$\pm$", "−": r"$-$", "–": "--", "\u202f": r"\,", "%": r"\%", "_": r"\_", "&": r"\&", "#": r"\#",
-        "²": r"$^2$", "σ": r"$\sigma$", "×": r"$\times$", "↑": r"$\uparrow$", "↓": r"$\downarrow$",
-    }
-)  # fmt: skip
-
-
 @dataclass(frozen=True)
 class Written:
     """A table with the scores of its finished runs. `lines` are the remarks below it: what is missing, conditions."""
@@ -121,20 +114,20 @@ class Written:
 
     @staticmethod
     def of(
-        table: Table, cells: Sequence[Cell], folder: Path, finished: set[str], remarks: Sequence[str],
-        conditions: Mapping[str, Any],
-    ) -> "Written":  # fmt: skip
-        """Read the scores of the finished runs, given by the names of their jobs."""
-        records = {cell.job.name: run_record(folder / cell.job.name) for cell in cells if cell.job.name in finished}
-        lines = [*remarks, *table.notes, *_sources(table)]
+        table: Table, cells: Sequence[Cell], batch: Batch, seeds: int, settings: Mapping[str, str], limit: int | None
+    ) -> "Written":
+        """Read the scores of the finished runs of a batch; settings, limit: what was changed for all runs."""
+        finished = {job.name for job in batch.finished()}
+        records = {cell.job.name: run_record(batch.out / cell.job.name) for cell in cells if cell.job.name in finished}
+        conditions = {"settings": dict(settings), "limit": limit, "seeds": seeds, "code": installed_code()}
+        lines = [*_remarks(table, cells, batch, conditions), *table.notes, *_sources(table)]
         return Written(table, cells, rows(table, cells, records), lines, conditions)
 
     def save(self, folder: Path) -> None:
-        """Write table.md, table.tex and table.json. Raises RunError if they cannot be written."""
+        """Write table.md and table.json. Raises RunError if they cannot be written."""
         make_folder(folder)
-        texts = self.markdown(), self.latex(), json.dumps(self.values(), indent=1, ensure_ascii=False) + "\n"
-        for name, text in zip(FILES, texts, strict=True):
-            write_text(folder / name, text)
+        write_text(folder / "table.md", self.markdown())
+        write_text(folder / "table.json", json.dumps(self.values(), indent=1, ensure_ascii=False) + "\n")
 
     @property
     def columns(self) -> list[str]:
@@ -160,19 +153,6 @@ class Written:
         lines += [_line(self.cells_of(row)) for row in self.rows]
         return "\n".join([*lines, "", *(f"- {line}" for line in self.lines)]) + "\n"
 
-    def latex(self) -> str:
-        """Return the table as LaTeX; it needs the package booktabs."""
-        head = ["score", "system", *self.columns]
-        lines = [r"\begin{tabular}{ll" + "r" * len(self.columns) + "}", r"\toprule", _latex_line(head)]
-        score = None
-        for row in self.rows:
-            if row.score != score:
-                lines.append(r"\midrule")
-            score = row.score
-            lines.append(_latex_line(self.cells_of(row)))
-        remarks = [f"% {line}" for line in (self.table.title, *self.lines)]
-        return "\n".join([*remarks, *lines, r"\bottomrule", r"\end{tabular}"]) + "\n"
-
     def values(self) -> dict[str, Any]:
         """Return the table as values for JSON: the conditions, the rows and the runs."""
         return {
@@ -192,6 +172,20 @@ class Written:
         }
 
 
+def _remarks(table: Table, cells: Sequence[Cell], batch: Batch, conditions: Mapping[str, Any]) -> list[str]:
+    """Return the conditions of our numbers, and what is missing, as lines below the table."""
+    seeds, limit, settings = (conditions[name] for name in ("seeds", "limit", "settings"))
+    spread = f"{seeds} seeds, mean ± standard deviation" if seeds > 1 else "one seed"
+    lines = [f"Ours: SigmaSplat {machine.package_version()} (code {conditions['code']}), {spread}."]
+    changed = [f"{name}={value}" for name, value in settings.items()] + [f"the first {limit} frames"] * bool(limit)
+    if changed:
+        of = "of the paper" if table.published else "of the table"
+        lines.append(f"Not the settings {of}: {', '.join(changed)}.")
+    absent = dict.fromkeys(cell.scene for cell in cells if cell.job.name in batch.missing)
+    lines += [f"Missing: {', '.join(absent)}."] if absent else []
+    return lines + [f"Failed: {name}: {why}" for name, why in batch.failed.items()]
+
+
 def _sources(table: Table) -> list[str]:
     """Return a line per source of published numbers, with the systems whose numbers are from there."""
     systems = dict[str, list[str]]()
@@ -202,7 +196,3 @@ def _sources(table: Table) -> list[str]:
 
 def _line(words: Sequence[str]) -> str:
     return "| " + " | ".join(words) + " |"
-
-
-def _latex_line(words: Sequence[str]) -> str:
-    return " & ".join(word.translate(LATEX) for word in words) + r" \\"

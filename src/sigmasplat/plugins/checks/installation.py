@@ -60,7 +60,6 @@ def check_kernels() -> Finding:
 
 
 def _remedy(problem: BaseException) -> str:
-    """Return the command that fixes an import error of the kernels."""
     if getattr(problem, "name", None) == "torch":
         return "pip install torch"
     if "libgomp" in str(problem):  # some builds of torch include it under another name

@@ -1,5 +1,5 @@
 """Check times and consecutive frames of a recording: unit, order, gaps; delay between colour and depth, jumps of the
-view, swapped and black frames.
+view, black frames.
 
 Every frame is reduced to a few thousand pixels. The motion energy of a frame is its mean change since the frame before,
 of colour and of depth. Both follow the motion of the camera, so that their best correlation is at the delay between
@@ -86,8 +86,6 @@ JUMP = 2.8
 """A view jumps if the image changes by more than this multiple of the median change around it."""
 JUMP_LEAST = 0.08
 """Smallest mean change of a jump, colours 0 to 1."""
-SWAPPED = 0.75
-"""Frames are swapped if the images before and after fit together with less than this share of the change."""
 BLACK = 0.02
 """A frame is black if 99 % of its pixels are below this, colours 0 to 1."""
 
@@ -141,13 +139,12 @@ class Motion:
 
 @dataclass(eq=False)
 class MotionWatch:
-    """Looks for swapped, black and jumping frames. It keeps three numbers per frame, and two images."""
+    """Looks for black and jumping frames. It keeps two numbers per frame, and one image."""
 
     numbers: list[int] = field(default_factory=list)
     black: list[int] = field(default_factory=list)
-    one: list[float] = field(default_factory=list)
-    two: list[float] = field(default_factory=list)
-    last: list[NDArray[np.float32]] = field(default_factory=list)
+    changes: list[float] = field(default_factory=list)
+    last: NDArray[np.float32] | None = None
 
     def __call__(self, frame: Frame) -> None:
         """Take the next frame into account."""
@@ -158,20 +155,18 @@ class MotionWatch:
         if float(np.percentile(gray, 99)) < BLACK:
             self.black.append(number)
         gray = gray - gray.mean()
-        for earlier, changes in zip(self.last[::-1], (self.one, self.two), strict=False):
-            changes.append(float(np.abs(gray - earlier).mean()))
+        if self.last is not None:
+            self.changes.append(float(np.abs(gray - self.last).mean()))
         self.numbers.append(number)
-        self.last = [*self.last[-1:], gray]
+        self.last = gray
 
     def warnings(self) -> list[str]:
         """Return warnings about the frames so far."""
-        one, two = np.array(self.one), np.array(self.two)
-        swapped, jumps = ([self.numbers[i] for i in found] for found in (_swapped_in(one, two), _jumps_in(one)))
-        warnings = [
-            f"{len(frames)} frames are {name} (first: frame {frames[0]}); remove or correct them"
-            for name, frames in {"black": self.black, "swapped with the next": swapped}.items()
-            if frames
-        ]
+        jumps, warnings = [self.numbers[i] for i in _jumps_in(np.array(self.changes))], []
+        if self.black:
+            warnings.append(
+                f"{len(self.black)} frames are black (first: frame {self.black[0]}); remove or correct them"
+            )
         if jumps:
             where = f"the view jumps {len(jumps)} times (first: before frame {jumps[0]})"
             warnings.append(f"{where}; tracking may be lost there")
@@ -189,18 +184,7 @@ def reduced(color: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(rows.mean((1, 3)), np.float32)
 
 
-def _swapped_in(one: Numbers, two: Numbers) -> list[int]:
-    """Return the frames that should be one place later, because the next frame fits the one before it clearly better:
-    from the changes to the next frame and to the one after it."""
-    if len(one) < 3:
-        return []
-    between = (one[1:-1] < one[:-2]) & (one[1:-1] < one[2:])
-    found = between & (two[:-1] < SWAPPED * one[:-2]) & (two[1:] < SWAPPED * one[2:])
-    return [int(i) + 1 for i in np.flatnonzero(found)]
-
-
 def _jumps_in(change: Numbers) -> list[int]:
-    """Return the frames before which the view jumps, from the changes to the next frame."""
     usual = ndimage.median_filter(change, size=min(21, len(change)), mode="nearest") if len(change) else change
     return [int(i) + 1 for i in np.flatnonzero((change > JUMP * usual) & (change > JUMP_LEAST))]
 
@@ -214,7 +198,6 @@ def _varying(energy: Numbers) -> Numbers:
 
 
 def _correlation(first: Numbers, second: Numbers, lag: int) -> float:
-    """Return the correlation of `first` with `second` that is `lag` samples later."""
     a = first[: len(first) - lag] if lag >= 0 else first[-lag:]
     b = second[lag:] if lag >= 0 else second[: len(second) + lag]
     return float(np.corrcoef(a, b)[0, 1]) if a.std() > 0 and b.std() > 0 else 0.0

@@ -117,7 +117,6 @@ def _readable(source: Source, numbers: Iterable[int], skipped: list[str]) -> Ite
 
 
 def _unused_warnings(source: Source) -> list[str]:
-    """Warn if many images are not used, with the reason of the first one."""
     unused = len(source.skipped)
     if unused <= MANY_UNUSED * (len(source) + unused):
         return []
@@ -163,7 +162,6 @@ def _imu_rows(frames: list[Frame]) -> list[tuple[str, str]]:
 
 
 def _depth_camera(source: Source, settings: InputConfig) -> str:
-    """Describe whether depth is in the pixels of the colour camera."""
     if source.depth_registered:
         return "separate; SigmaSplat registers depth to colour"
     if source.registrable and settings.register_depth == "off":
@@ -210,7 +208,6 @@ def _brightness_warnings(frames: list[Frame]) -> list[str]:
 
 
 def _suggested(format_name: str) -> str:
-    """Return the default preset, and the presets with the settings of the papers for this data set."""
     data_set = format_name.lower().replace("++", "pp")
     papers = [name for name in list_presets() if name.endswith(f"-{data_set}") and name.count("-") == 1]
     return default_preset() + (f" (settings of the papers, slow on CPUs: {', '.join(papers)})" if papers else "")
@@ -222,13 +219,13 @@ def _sheet(frames: list[Frame]) -> Image.Image:
     depths = np.concatenate([frame.depth_m.reshape(-1) for frame in chosen])
     low, high = colormap.value_range(depths, depths > 0)
     columns = [
-        SheetColumn(
+        (
             f"{frame.timestamp_s:.2f} s",
-            (
+            [
                 (frame.color * 255.0).round().astype(np.uint8),
                 colormap.apply_masked(frame.depth_m, frame.depth_m > 0, low, high, colormap.VIRIDIS),
                 overlay(frame),
-            ),
+            ],
         )
         for frame in chosen
     ]
@@ -238,25 +235,18 @@ def _sheet(frames: list[Frame]) -> Image.Image:
 WIDTH, GAP, HEAD, LINE = 260, 8, 28, 26
 
 
-@dataclass(frozen=True, eq=False)
-class SheetColumn:
-    """One column: its title, and a picture uint8 [H, W, 3] for each row."""
-
-    title: str
-    pictures: tuple[colormap.Rgb, ...]
-
-
-def draw_contact_sheet(columns: Sequence[SheetColumn], rows: Sequence[str]) -> Image.Image:
-    """Draw the columns side by side, with the name of each row above it. All pictures get the aspect of the first."""
-    first = columns[0].pictures[0]
+def draw_contact_sheet(columns: Sequence[tuple[str, Sequence[colormap.Rgb]]], rows: Sequence[str]) -> Image.Image:
+    """Draw columns side by side, each a title and a picture uint8 [H, W, 3] for each row, with the name of each row
+    above it. All pictures get the aspect of the first."""
+    first = columns[0][1][0]
     height = round(WIDTH * first.shape[0] / first.shape[1])
     size = (len(columns) * (WIDTH + GAP) + GAP, HEAD + len(rows) * (height + LINE) + GAP)
     made = Image.new("RGB", size, BACKGROUND)
     draw, font = ImageDraw.Draw(made), ImageFont.load_default(15)
-    for k, column in enumerate(columns):
+    for k, (title, pictures) in enumerate(columns):
         left = GAP + k * (WIDTH + GAP)
-        draw.text((left + 2, HEAD // 2), column.title, FAINT, font, anchor="lm")
-        for r, picture in enumerate(column.pictures):
+        draw.text((left + 2, HEAD // 2), title, FAINT, font, anchor="lm")
+        for r, picture in enumerate(pictures):
             small = Image.fromarray(np.ascontiguousarray(picture)).resize((WIDTH, height), Image.Resampling.LANCZOS)
             made.paste(small, (left, HEAD + r * (height + LINE) + LINE))
     for r, name in enumerate(rows):
