@@ -70,9 +70,9 @@ GROUPS: dict[str, Group] = {
         "cgslam-fast",
         {"redkitchen": ("input.limit=30",), "livingroom": ("input.limit=30",), "synthetic": ("input.limit=20",)},
         (
-            *DESCENT, "tracking.iterations=30", "tracking.lr_rotation=0.0015", "tracking.parametrisation=axis-angle",
+            *DESCENT, "tracking.iterations=30", "tracking.lr_rotation=0.0015", "tracking.descent=axis-angle",
             "tracking.weight_color=0.625", "tracking.uncertainty=false", "tracking.alpha_power=0",
-            "tracking.alpha_above=0.99", "tracking.outlier_factor=10", "tracking.average=kept",
+            "tracking.alpha_above=0.99", "tracking.outlier_factor=10",
         ),
         {
             "full": (),
@@ -80,8 +80,6 @@ GROUPS: dict[str, Group] = {
             "without both": TERMS_OFF,
             "without isotropy": ("mapping.weight_isotropy_ratio=0",),
             "without fading": ("primitives.uncertain_m2=0",),
-            "newest pose only": ("mapping.poses=newest",),
-            "quaternion": ("tracking.parametrisation=quaternion", f"tracking.lr_rotation={RATES['CG-SLAM'][0]}"),
             "without alignment": TERMS_OFF[:1],
             "without variance": TERMS_OFF[1:],
             DOUBLE: ("input.width=320", "seeding.first_uniform=38400", "seeding.first_gradient=15360"),
@@ -100,16 +98,10 @@ GROUPS: dict[str, Group] = {
 }  # fmt: skip
 """The variants of a group are made in this order, each on all sequences with all seeds. "double width": the others are
 the light form of it. In "submaps" nothing is left out: its maps are registered with several settings."""
-REGISTRATIONS: dict[str, tuple[str, ...]] = {
-    "mean over pixels": ("registration.color_mean=pixels",),
-    "mean over values": ("registration.color_mean=values",),
-}
-PLATEAUS: dict[str, tuple[str, ...]] = {
-    "no stop": ("registration.plateau_stop=0",),
-    "window 10": ("registration.plateau_stop=1e-4", "registration.plateau_window=10"),
-    "window 1": ("registration.plateau_stop=1e-4", "registration.plateau_window=1"),
-}
-"""Settings with which submaps of a run are registered, and with which held-back frames are localised."""
+REGISTRATIONS = {"mean over pixels": "pixels", "mean over values": "values"}
+PLATEAUS = {"no stop": (0.0, 10), "window 10": (1e-4, 10), "window 1": (1e-4, 1)}
+"""How submaps of a run are registered, and where the descent stops that localises held-back frames: at steps that lower
+the loss by less than this share, so many in a row."""
 RUNS = record.ROOT / "runs" / "bench" / "claims"
 
 

@@ -249,14 +249,6 @@ CGSLAM = (
         "without the path through the 2D covariance; " + DESCENT,
     ),
     Claim(
-        "an axis-angle is better than a quaternion", "stated, no number", "less",
-        in_claims("cgslam", ATE, "full", "quaternion"),
-    ),
-    Claim(
-        "bundle adjustment of all poses of the window lowers the ATE", "eq. 21; the code moves the newest pose only",
-        "less", in_claims("cgslam", ATE, "full", "newest pose only"),
-    ),
-    Claim(
         "the light form needs less time", "runtime, office0: 8.5 → 15.4 frames/s", "less",
         in_claims("cgslam", CPU, "full", "double width"), "160 against 320 pixels of width",
     ),

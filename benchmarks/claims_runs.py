@@ -1,6 +1,7 @@
 """Make the runs of claims.py in this process: a whole run, and what is measured of its maps."""
 
 import time
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,10 +13,11 @@ from localise import Search, disturbed
 from unseen_views import UnseenView, held_back_views
 from weights_runs import VIEWS, mean, registrations, rendered, true_submaps
 
+from sigmasplat.config import Config, RegistrationConfig
 from sigmasplat.data import se3
 from sigmasplat.fit.pose import fit_pose_adam
 from sigmasplat.fit.target import Target
-from sigmasplat.graph.registration import tracking_of
+from sigmasplat.graph.registration import LocalisationConfig, tracking_of
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.evaluation.metrics.reconstruction import score_splats
 from sigmasplat.plugins.evaluation.metrics.trajectory import align_rigid, associate, score_path
@@ -25,14 +27,14 @@ from sigmasplat.plugins.sources import open_source
 from sigmasplat.slam.slam import Slam
 
 Rows = list[dict[str, Any]]
-Settings = dict[str, tuple[str, ...]]
+Plateaus = dict[str, tuple[float, int]]
 SUBMAPS = "submaps"
 SEARCH = Search(off_m=0.02, off_deg=1.0, steps=100, weight_color=0.0)
 """How far held-back frames are moved before they are localised, and the number of steps at most."""
 LOCALISED = 6
 
 
-def rows(job: Job, registered: Settings, plateaus: Settings) -> Rows:
+def rows(job: Job, means: dict[str, str], plateaus: Plateaus) -> Rows:
     """Make a run; return its figures and, for the group of submaps, those of hops, registrations, localisations."""
     torch.set_num_threads(1)
     source, slam = open_source(job.path, job.config().input), Slam(job.config())
@@ -48,9 +50,18 @@ def rows(job: Job, registered: Settings, plateaus: Settings) -> Rows:
     found = [{"group": job.group, "variant": job.variant, "figures": figures}]
     if job.group == SUBMAPS:
         found += hop_ranks(slam, source)
-        found += registrations(job, slam, true_submaps(slam, source), registered)
+        found += registrations(
+            job, slam, true_submaps(slam, source), {name: averaged(job, mean) for name, mean in means.items()}
+        )
         found += localisations(job, slam, done, views, plateaus)
     return found
+
+
+def averaged(job: Job, color_mean: str) -> Config:
+    """Return the settings of a run whose registration averages colour errors in this way."""
+    config = job.config()
+    kind = type("Averaged", (RegistrationConfig,), {"color_mean": color_mean})
+    return replace(config, registration=kind(**vars(config.registration)))
 
 
 def path_figures(slam: Slam, done: FinishedRun, source: Source, views: list[UnseenView]) -> dict[str, Any]:
@@ -106,13 +117,15 @@ def hop_ranks(slam: Slam, source: Source) -> Rows:
     return [{"group": "hops", "variant": "covariance", "figures": {"rank": rank, "hops": len(pairs)}}]
 
 
-def localisations(job: Job, slam: Slam, done: FinishedRun, views: list[UnseenView], ways: Settings) -> Rows:
+def localisations(job: Job, slam: Slam, done: FinishedRun, views: list[UnseenView], ways: Plateaus) -> Rows:
     """Localise held-back frames in their submap by the descent of registration; return how far from their tracked
     pose they end, and the number of steps."""
     found, size = Rows(), (slam.view.sums.shape[1], slam.view.sums.shape[2])
-    for name, changes in ways.items():
-        settings, random = job.config(changes), np.random.default_rng(job.seed)
-        tracking, errors_m, steps = tracking_of(settings.registration, settings.tracking), [], []
+    for name, (share, window) in ways.items():
+        settings, random = job.config(), np.random.default_rng(job.seed)
+        usual, errors_m, steps = tracking_of(settings), [], []
+        kind = type("Stopping", (LocalisationConfig,), {"plateau_stop": share, "plateau_window": window})
+        tracking = kind(**vars(usual))
         for view in views[:LOCALISED]:
             T_camera_submap = se3.inverse(view.T_world_camera) @ done.anchors[view.submap]
             start = disturbed(T_camera_submap, SEARCH, random)

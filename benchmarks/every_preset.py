@@ -28,11 +28,11 @@ EVERY = (*list_presets(), *presets_by_scene())
 SMALL = {"input.width": 160}
 MOST = {
     "input.crop_px": 4, "mapping.every": 5, "mapping.first_iterations": 20, "mapping.iterations": 8,
-    "tracking.iterations": 10, "tracking.first_iterations": 20, "registration.iterations": 6,
-    "final.iterations": 40, "final.sh_every": 10,
+    "tracking.iterations": 10, "registration.iterations": 6,
+    "final.iterations": 40,
 }  # fmt: skip
 """Settings that are lowered to these values where the preset has larger ones."""
-CUT = {"submaps.frames": 15, "loops.min_interval": 2, "loops.near_m": 2.0, "loops.near_deg": 60.0}
+CUT = {"submaps.frames": 15, "loops.min_interval": 2, "loops.near_m": 2.0}
 """Settings of presets that cut submaps."""
 
 

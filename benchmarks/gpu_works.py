@@ -87,7 +87,7 @@ class GpuWorks:
             for plane in (view.g_sums, view.g_alpha, view.g_moment):
                 plane.fill_(1e-3)
         self.mapping = preset(default_preset()).mapping
-        self.tracking = TrackingConfig(method="adam", plateau_stop=0.0)
+        self.tracking = TrackingConfig(method="adam")
 
     def forward_all(self) -> None:
         """Render all: colour, depth, σ² + c², moment about the sensor's depth, alpha, median and dominant splat."""
@@ -122,7 +122,7 @@ class GpuWorks:
 
     def launched_tracking_iterations(self) -> None:
         """Descend the tracking loss for `TRACKING_ITERATIONS`, without a CUDA graph."""
-        launched = Launched(method="adam", plateau_stop=0.0)
+        launched = Launched(method="adam")
         fit_pose_adam(self.params, self.all, self.later, np.eye(4), launched, TRACKING_ITERATIONS)
 
 

@@ -25,7 +25,7 @@ from localise import WAYS, Search, disturbed, localise, shares, view_dependence
 from numpy.typing import NDArray
 from tables import Section, significant
 
-from sigmasplat.config import Config
+from sigmasplat.config import Config, FinalConfig
 from sigmasplat.config.find_preset import preset as preset_of
 from sigmasplat.config.text import override, split_settings
 from sigmasplat.data import se3
@@ -98,10 +98,11 @@ class Options:
         """Return the settings of a map with harmonics. Raises ConfigError for an unknown preset or degree."""
         if not 1 <= self.degree <= DEGREES:
             raise ConfigError(f"--degree of the harmonics must be 1 to {DEGREES}, found {self.degree}")
-        every = max(1, self.refinement // 10)
-        final = (f"final.iterations={self.refinement}", f"final.sh_degree={self.degree}", f"final.sh_every={every}")
+        final = (f"final.iterations={self.refinement}", f"final.sh_degree={self.degree}")
         settings = split_settings((*self.map_settings(), *final)) | {"seed": str(seed)}
-        return override(preset_of(self.preset), settings)
+        config = override(preset_of(self.preset), settings)
+        gaining = type("Gaining", (FinalConfig,), {"sh_every": max(1, self.refinement // 10)})
+        return replace(config, final=gaining(**vars(config.final)))
 
     def search(self) -> Search:
         """Return the settings for localising single frames."""

@@ -7,9 +7,9 @@ numbers of iterations run with few, on small images.
 PLAIN = ("final.iterations=0", "uncertainty.probes=0")
 FEW = (
     "input.width=160", "input.crop_px=4", "mapping.first_iterations=20", "mapping.iterations=8",
-    "tracking.iterations=10", "registration.iterations=6", "final.iterations=30", "final.sh_every=10",
+    "tracking.iterations=10", "registration.iterations=6", "final.iterations=30",
 )  # fmt: skip
-CUTS = ("submaps.frames=5", "loops.min_interval=1", "loops.near_m=2", "loops.near_deg=60")
+CUTS = ("submaps.frames=5", "loops.min_interval=1", "loops.near_m=2")
 """Settings of presets that cut submaps."""
 
 

@@ -57,7 +57,7 @@ class Options:
     sources: Annotated[tuple[str, ...], arg(help="sequences with their sensor: NAME=SENSOR")] = (
         "redkitchen=kinect-v1", "hololens=time-of-flight", "cubicles=kinect-v1", "livingroom=kinect-v1",
     )  # fmt: skip
-    variants: Annotated[tuple[str, ...], arg(help="none = without the model; tracking; tracking+mapping")] = (
+    variants: Annotated[tuple[str, ...], arg(help="none = without the model; tracking")] = (
         "none", "tracking",
     )  # fmt: skip
     pairs: Annotated[int, arg(help="pairs of frames that are aligned")] = 60
@@ -103,8 +103,6 @@ def jobs_of(options: Options) -> list[tuple[str, str, accuracy.Job]]:
         for seed in options.seeds:
             for variant in options.variants:
                 settings = (f"input.sensor={GENERIC if variant == 'none' else sensor}", *options.settings)
-                if "mapping" in variant.split("+"):
-                    settings = ("mapping.sensor_noise=true", *settings)
                 where = Path(name).name, accuracy.located(name)
                 jobs.append(
                     (sensor, variant, accuracy.Job(*where, options.preset, seed, settings, options.limit, code))

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from unseen_views import UnseenView, held_back_views
 from weights import Job
 
+from sigmasplat.config import Config
 from sigmasplat.data import se3
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.submap import StorePart
@@ -59,7 +60,7 @@ def rows(job: Job, weights: dict[str, tuple[str, ...]]) -> Rows:
         return found
     truth = true_submaps(slam, source)
     found += final_maps(job, slam, done, views, weights)
-    found += registrations(job, slam, truth, weights)
+    found += registrations(job, slam, truth, {name: job.config(settings) for name, settings in weights.items()})
     return found + gates(job, slam, truth, weights)
 
 
@@ -167,16 +168,16 @@ def apart(ours: Matrix, theirs: Matrix) -> tuple[Matrix, Matrix]:
     return distance_m, np.arccos(np.clip(cosine, -1.0, 1.0))
 
 
-def registrations(job: Job, slam: Slam, truth: list[Matrix], weights: dict[str, tuple[str, ...]]) -> Rows:
-    """Register pairs of submaps from poses with errors; return the error of each weight's results where all weights
+def registrations(job: Job, slam: Slam, truth: list[Matrix], ways: dict[str, Config]) -> Rows:
+    """Register pairs of submaps from poses with errors; return the error of each way's results where all ways
     accept."""
     chosen = pairs_of(truth)
     chosen = [chosen[int(k)] for k in np.unique(np.linspace(0, len(chosen) - 1, min(PAIRS, len(chosen))).round())]
     random = np.random.default_rng(job.seed)
     starts = [se3.exp(random.normal(size=6) * np.repeat([START_M, START_RAD], 3)) for _ in chosen]
     errors: dict[str, list[tuple[float, float] | None]] = {}
-    for name, settings in weights.items():
-        registrar = Registrar(job.config(settings), slam.store, slam.view, slam.tracker.extractor)
+    for name, config in ways.items():
+        registrar = Registrar(config, slam.store, slam.view, slam.tracker.extractor)
         errors[name] = []
         for (_, i, j, q, d), start in zip(chosen, starts, strict=True):
             a, b = slam.store.load(i), slam.store.load(j)

@@ -102,7 +102,7 @@ loops.near_m=0.5
 --set
 submaps.frames=2
 --set
-seeding.scale_factor=0.5
+seeding.shape=pixel
 --calibration
 INPUT
 --register-depth

@@ -143,7 +143,7 @@ def followed(config: TrackingConfig, iterations: int, room: int | None = None, w
 @pytest.mark.parametrize("parametrisation", ["quaternion", "axis-angle"])
 def test_a_pose_is_found_without_the_host(parametrisation: Any, room: int | None) -> None:
     """As the Python loop finds it; captured, whose failure would be a warning, and not: the same bytes."""
-    config = dataclasses.replace(TRACKING, parametrisation=parametrisation)
+    config = changed(TRACKING, parametrisation=parametrisation)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         captured = [followed(config, 20, room) for _ in range(3)]
@@ -159,12 +159,12 @@ def test_a_pose_is_found_without_the_host(parametrisation: Any, room: int | None
 
 def test_a_descent_stops_where_the_loop_stops() -> None:
     crawling = dataclasses.replace(TRACKING, lr_rotation=1e-9, lr_translation=1e-9, exposure=False)
-    assert followed(dataclasses.replace(crawling, plateau_stop=1e-3, plateau_window=5), 100).steps == 6
+    assert followed(changed(crawling, plateau_stop=1e-3, plateau_window=5), 100).steps == 6
 
 
 @pytest.mark.parametrize("average", ["image", "kept"])
 def test_the_tracking_loss_is_as_defined(average: Any) -> None:
-    s, config, exposure = crowd(), dataclasses.replace(TRACKING, average=average), torch.tensor([0.12, -0.03])
+    s, config, exposure = crowd(), changed(TRACKING, average=average), torch.tensor([0.12, -0.03])
     view = CudaView(s.camera, OPTIONS)
     target = target_of(s.camera, (s.camera.height, s.camera.width)).to(view.alpha.device)
     view.forward(params_of(s).cuda(), s.T_camera_world.numpy())

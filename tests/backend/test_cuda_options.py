@@ -219,7 +219,7 @@ def test_each_device_has_its_step() -> None:
 
 
 def test_several_keyframes_are_refused_as_on_the_cpu() -> None:
-    with pytest.raises(ConfigError, match="frames_per_step must be 1"):
+    with pytest.raises(ConfigError, match="a step on several keyframes needs"):
         fitted(CudaView(WIDE, OPTIONS, True, CPU), MappingConfig(weight_nll_color=1e-2), 2, degree=1)
 
 

@@ -119,7 +119,7 @@ def test_nothing_kept_is_no_loss_and_no_gradient(average: Any, uncertainty: bool
     view.forward(wall(), se3.exp(OFF) @ TRUTH)
     target = damaged(view)
     target.depth.zero_()
-    config = dataclasses.replace(PAPER, average=average, uncertainty=uncertainty)
+    config = changed(PAPER, average=average, uncertainty=uncertainty)
     found = launched(view, target, config).found  # type: ignore[attr-defined]
     assert found.tolist() == [0.0, 0.0, 0.0] and torch.count_nonzero(view.g_sums) == 0  # NaN is not zero
 
@@ -268,11 +268,11 @@ def test_where_the_camera_looks_back_an_axis_is_as_good(on_the_cpu: Emulator) ->
 @pytest.mark.parametrize("name", ["ours", "paper"])
 def test_it_stops_where_the_loop_stops(name: str) -> None:
     crawling = dataclasses.replace(WAYS[name], lr_rotation=1e-9, lr_translation=1e-9)
-    flat = dataclasses.replace(crawling, plateau_stop=1e-3, plateau_window=5)
+    flat = changed(crawling, plateau_stop=1e-3, plateau_window=5)
     got, want = both_ways(flat, 30)
     assert got.steps == want.steps == 6
     fast = dataclasses.replace(WAYS[name], lr_rotation=1e-3, lr_translation=3e-3)
-    got, want = both_ways(dataclasses.replace(fast, plateau_stop=1e-2, plateau_window=2), 30)
+    got, want = both_ways(changed(fast, plateau_stop=1e-2, plateau_window=2), 30)
     assert_same_descent(got, want, 1e-5)
     assert 3 < got.steps < 30
 

@@ -32,15 +32,10 @@ def both_ways(
     weights: dict[str, float],
     variance: bool,
     valid_share: float = 0.8,
-    weighed: bool = False,
 ) -> Any:
-    """Evaluate fused and by definition: (loss, gradient planes) of each, the image part; weighed: readings have
-    different weights."""
+    """Evaluate fused and by definition: (loss, gradient planes) of each, the image part."""
     view = view_on(kernels, camera, variance)
     target = target_of(camera, tuple(view.alpha.shape), valid_share)
-    if weighed:
-        target.depth_std = 0.5 * target.depth**3  # weights 2 / z
-        target = target.weighed_by_std(1.0)
     draw_planes(view, target)
     exact = SimpleNamespace(
         sums=view.sums.double(), g_sums=torch.zeros_like(view.sums).double(), moment=view.moment.double(),
@@ -78,15 +73,6 @@ def test_each_term_alone(kernels: str, name: str) -> None:
     weights = dict.fromkeys(WEIGHTS, 0.0) | {name: 0.7}
     (got, gradient), (want, want_gradient) = both_ways(kernels, WIDE, weights, True)
     assert got == pytest.approx(want, rel=1e-5) and abs(got) > 1e-3
-    assert_same_vector(gradient, want_gradient, what=name)
-
-
-@pytest.mark.parametrize("name", ["depth", "mean_depth", "moment"])
-def test_terms_of_depth_weigh_each_reading(kernels: str, name: str) -> None:
-    weights = dict.fromkeys(WEIGHTS, 0.0) | {name: 0.7}
-    (plain, _), _ = both_ways(kernels, WIDE, weights, True)
-    (got, gradient), (want, want_gradient) = both_ways(kernels, WIDE, weights, True, weighed=True)
-    assert got == pytest.approx(want, rel=1e-5) and abs(got - plain) > 1e-3 * plain
     assert_same_vector(gradient, want_gradient, what=name)
 
 

@@ -173,7 +173,7 @@ def test_a_mapping_iteration_waits_once(stand_in: StandIn, images: int, degree: 
 QUICK = {
     "input.width": "48", "mapping.first_iterations": "5", "mapping.iterations": "2", "mapping.every": "2",
     "seeding.first_uniform": "200", "seeding.first_gradient": "200", "submaps.frames": "3", "loops.min_interval": "1",
-    "loops.min_similarity": "0.0", "loops.similarity_floor": "0.0", "registration.iterations": "2",
+    "loops.min_similarity": "0.0", "registration.iterations": "2",
     "final.iterations": "3", "render.depth": "center",  # a device has no other
 }  # fmt: skip
 RUNS = {
@@ -186,10 +186,10 @@ RUNS = {
     },
     "cgslam-fast": {"submaps.frames": "0"},
     "cgslam-loops-fast": {
-        "mapping.frames_per_step": "2", "primitives.split_gradient": "1e-6", "primitives.clone": "yes",
+        "mapping.adjustment": "window", "mapping.window": "2", "primitives.densify": "split+clone",
     },
-    "varsplat-fast": {"final.sh_degree": "1", "final.sh_every": "2", "seeding.scale_from": "neighbours"},
-    "varsplat-fast from a mesh": {"final.seed_from": "mesh", "final.spacing_m": "0.1"},
+    "varsplat-fast": {"final.sh_degree": "1", "seeding.shape": "neighbours"},
+    "varsplat-fast from a mesh": {"final.seed_from": "mesh"},
 }  # fmt: skip
 FRAMES = 5
 
@@ -197,7 +197,12 @@ FRAMES = 5
 def settings(run: str, backend: str, **changes: str) -> Config:
     named = {name.replace("__", "."): value for name, value in changes.items()}
     config = override(preset(run.split()[0]), QUICK | {"backend": backend} | RUNS[run] | named)
-    return dataclasses.replace(config, tracking=changed(config.tracking, cuda_graphs=False))
+    return dataclasses.replace(
+        config,
+        tracking=changed(config.tracking, cuda_graphs=False),
+        primitives=changed(config.primitives, split_gradient=min(config.primitives.split_gradient, 1e-6)),
+        final=changed(config.final, sh_every=2),
+    )
 
 
 def followed(config: Config) -> Slam:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from constants import changed
-from paper_settings import RegistrationConfig, TrackingConfig
+from paper_settings import RegistrationConfig, TrackingConfig, paper_settings
 from sigmasplat.data import se3
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.frame import Frame
@@ -182,7 +182,9 @@ def test_registration_minimises_the_loss_of_the_paper(tracked: TrackingConfig, v
     params[::3, 10] = 0.0  # some splats are half transparent
     view.forward(params, TRUTH)
     h, w = CAMERA.height, CAMERA.width
-    fits_of(view).tracking_loss(view, target, tracking_of(RegistrationConfig(), tracked), PLAIN)
+    fits_of(view).tracking_loss(
+        view, target, tracking_of(paper_settings(registration=RegistrationConfig(), tracking=tracked)), PLAIN
+    )
     sums = view.sums[:, :h, :w].clone().requires_grad_()
     maps, alpha = sums.double(), view.alpha[:h, :w].double()
     used = (target.depth_image > 0) & (alpha > 0.95)
@@ -199,7 +201,7 @@ def test_registration_minimises_the_loss_of_the_paper(tracked: TrackingConfig, v
 def test_descent_that_stands_still_stops(view: View) -> None:
     crawling = dataclasses.replace(STEPS, lr_rotation=1e-9, lr_translation=1e-9)
     assert descended(view, crawling, iterations=9).iterations == 9
-    flat = dataclasses.replace(crawling, plateau_stop=1e-3, plateau_window=4)
+    flat = changed(crawling, plateau_stop=1e-3, plateau_window=4)
     assert descended(view, flat, iterations=9).iterations == 5
 
 
@@ -211,6 +213,6 @@ def test_descent_goes_on_after_one_step_without_progress() -> None:
         view.g_sums.zero_()
         return next(losses), torch.zeros(2)
 
-    config = dataclasses.replace(STEPS, plateau_stop=1e-4, plateau_window=3)
+    config = changed(STEPS, plateau_stop=1e-4, plateau_window=3)
     found = descend(wall(), view, seen_from(view, TRUTH), TRUTH, config, 9, scripted)
     assert (found.steps, found.loss) == (8, 7.0)

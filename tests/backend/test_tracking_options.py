@@ -152,7 +152,7 @@ def test_nothing_kept_is_no_loss_and_no_gradient(view: View, average: Any, uncer
     target.depth.zero_()
     view.forward(wall(), se3.exp(OFF) @ TRUTH)
     view.g_sums.fill_(torch.nan)
-    config = dataclasses.replace(PAPER, average=average, uncertainty=uncertainty)
+    config = changed(PAPER, average=average, uncertainty=uncertainty)
     loss, g_exposure = fits_of(view).tracking_loss(view, target, config, EXPOSURE)
     assert loss == 0.0 and g_exposure.tolist() == [0.0, 0.0]
     assert torch.count_nonzero(view.g_sums) == 0  # NaN is not zero
@@ -234,7 +234,7 @@ def test_the_second_frame_may_take_longer_and_turn_faster(
     target = seen_from(view, TRUTH)
     live = Pyramid.of(gray_of(target.image.numpy()), target.depth_image.numpy(), CAMERA)
     frame = Frame(0, 0.0, target.image.numpy(), target.depth_image.numpy(), CAMERA)
-    config = dataclasses.replace(PAPER, iterations=15, first_iterations=first)
+    config = changed(PAPER, iterations=15, first_iterations=first)
     follower = tracker.Tracker(config)
     for _ in range(2):
         follower.track(field, view, PreparedFrame(target, live, frame=frame, whole=frame))

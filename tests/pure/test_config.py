@@ -105,7 +105,7 @@ def test_every_number_has_a_range_and_every_default_is_in_it() -> None:
         ("tracking", "exposure", None),
         ("loops", "weights", 3),
         ("tracking", "alpha_power", -0.5),
-        ("seeding", "scale_factor", 0.0),
+        ("primitives", "split_scale_m", -1.0),
         ("uncertainty", "probes", -1),
     ],
 )
@@ -235,9 +235,11 @@ def test_a_saved_setting_that_is_gone_is_dropped_if_its_value_is_the_one_that_is
 def test_a_saved_setting_that_follows_another_one_is_dropped_if_the_other_one_gives_its_value() -> None:
     """A run folder of an earlier version holds both; each preset has the values that its earlier runs saved."""
     old = {
-        "final.lr_decay": {"epochs": 0.05, "random": 1.0}, "recovery.new_map_after": {True: 20, False: 0},
-        "seeding.alpha_below": {40.0: 0.6, 0.0: 0.5}, "mapping.freeze_until": {True: "half", False: "end"},
-        "tracking.first_lr_rotation": {200: 3e-3, 0: 0.0}, "tracking.sensor_noise": {True: True, False: False},
+        "final.lr_decay": {"epochs": 0.05, "steady": 1.0, "falling": 1.0},
+        "recovery.new_map_after": {True: 20, False: 0},
+        "seeding.alpha_below": {40.0: 0.6, 0.0: 0.5}, "tracking.sensor_noise": {True: True, False: False},
+        "mapping.freeze_until": {"code": "half", "old-frozen": "end", "free": "end"},
+        "tracking.first_lr_rotation": {"axis-angle-start": 3e-3, "amsgrad": 0.0, "quaternion": 0.0},
     }  # fmt: skip
     assert set(old) <= set(FOLLOWS)
     for name in ("sigma", "varsplat-fast", "cgslam-released-replica", "varsplat-released-room0"):
@@ -249,11 +251,34 @@ def test_a_saved_setting_that_follows_another_one_is_dropped_if_the_other_one_gi
         assert Config.from_dict(saved) == preset(name)
     saved["final"]["lr_decay"] = 0.7
     with pytest.raises(
-        ConfigError, match=r"^setting final\.lr_decay is gone: its value follows final\.order, found 0\.7$"
+        ConfigError, match=r"^setting final\.lr_decay is gone: its value follows final\.schedule, found 0\.7$"
     ):
         Config.from_dict(saved)
-    with pytest.raises(ConfigError, match=r"^setting final\.lr_decay is gone: its value follows final\.order$"):
+    with pytest.raises(ConfigError, match=r"^setting final\.lr_decay is gone: its value follows final\.schedule$"):
         override(preset("sigma"), {"final.lr_decay": "0.05"})
+
+
+@pytest.mark.parametrize(
+    "name", ["sigma", "varsplat-fast", "cgslam-tum", "cgslam-released-fr1-desk", "varsplat-released-room0"]
+)
+def test_settings_that_one_choice_replaced_choose_it(name: str) -> None:
+    """A run folder of an earlier version has the values instead of the choice."""
+    config, saved = preset(name), preset(name).to_dict()
+    chosen = {
+        leader for leader in FOLLOWS.values() if isinstance(saved[leader.split(".")[0]][leader.split(".")[1]], str)
+    }
+    assert {"tracking.descent", "final.schedule", "seeding.shape", "registration.method"} <= chosen
+    for old, leader in FOLLOWS.items():
+        (section, setting), (of, choice) = old.split("."), leader.split(".")
+        if leader in chosen and leader != "loops.descriptor":
+            saved[of].pop(choice, None)
+            saved[section][setting] = getattr(getattr(config, section), setting)
+    assert Config.from_dict(saved) == config
+    saved["registration"]["lr_rotation"] = 0.5
+    with pytest.raises(
+        ConfigError, match=r"setting registration\.lr_rotation is gone: its value follows registration\.method"
+    ):
+        Config.from_dict(saved)
 
 
 def test_another_value_of_a_setting_that_is_gone_is_refused_in_one_line() -> None:

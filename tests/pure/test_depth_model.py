@@ -11,13 +11,19 @@ import pytest
 from depth_networks import BYTES, FLOAT, HALF, network, node, weighted
 from paper_settings import InputConfig
 from sigmasplat.errors import ConfigError, SourceError
-from sigmasplat.plugins.predicted_depth import source as predicted
+from sigmasplat.plugins.predicted_depth import depth_model, source as predicted
 from sigmasplat.plugins.predicted_depth.depth_model import DepthModel
 from sigmasplat.plugins.sources import open_source
 
 ROOM = "synthetic:frames=60,width=64,height=48"
-PLAIN = InputConfig(depth_model_colors="unit", depth_model_size=28)
+PLAIN = InputConfig(depth_model_colors="unit")
 WEIGHTS = np.array([1.0, 2.0, 4.0], np.float32)
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Networks of any size get images whose shorter side has 28 pixels, not 518."""
+    monkeypatch.setattr(depth_model, "STEPS", ((14, 28), (32, 28)))
 
 
 def image(height: int = 28, width: int = 42) -> np.ndarray:
@@ -77,12 +83,13 @@ def test_the_numbers_that_a_network_expects(tmp_path: Path, colors: Any, least: 
     np.testing.assert_allclose(found[[0, -1], 0], [least @ WEIGHTS, most @ WEIGHTS], rtol=1e-5)
 
 
-def test_a_network_of_any_size_gets_multiples_of_14_or_of_the_32_that_it_needs(tmp_path: Path) -> None:
+def test_a_network_of_any_size_gets_multiples_of_14_or_of_the_32_that_it_needs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.undo()
     color = image(480, 640)
     any_size = InputConfig()
     assert predicted_by(weighted(tmp_path / "14.onnx"), color, any_size).shape == (518, 686)
-    smaller = replace(any_size, depth_model_size=100)
-    assert predicted_by(weighted(tmp_path / "14.onnx"), color, smaller).shape == (98, 140)
     assert predicted_by(weighted(tmp_path / "rows.onnx", (1, 3, 280, "w")), color, any_size).shape == (280, 378)
     halved = [node("MaxPool", "red", "small", kernel_shape=[32, 32], strides=[32, 32]),
               node("Resize", "small none scales", "large", mode="nearest"),
@@ -102,14 +109,14 @@ def test_an_output_that_always_has_one_size_is_used(tmp_path: Path) -> None:
     assert predicted_by(path, image()).shape == (30, 40)
 
 
-def test_the_output_is_the_one_with_depth_in_its_name_or_the_given_one(tmp_path: Path) -> None:
+def test_the_output_is_the_one_with_depth_in_its_name(tmp_path: Path) -> None:
     nodes = [node("ReduceMax", "image", "Predicted_Depth", axes=[1]), node("ReduceMin", "image", "other", axes=[1])]
     path, color = network(tmp_path / "n.onnx", nodes, (1, 3, "h", "w"), outputs=["other", "Predicted_Depth"]), image()
     np.testing.assert_array_equal(predicted_by(path, color), color.max(-1))
-    chosen = replace(PLAIN, depth_model_output="other")
-    np.testing.assert_array_equal(predicted_by(path, color, chosen), color.min(-1))
-    with pytest.raises(SourceError, match="no output 'third'; give one of other, Predicted_Depth"):
-        predicted_by(path, color, replace(PLAIN, depth_model_output="third"))
+    unclear = network(tmp_path / "two.onnx", [*nodes[1:], node("ReduceMax", "image", "most", axes=[1])],
+                      (1, 3, "h", "w"), outputs=["other", "most"])  # fmt: skip
+    with pytest.raises(SourceError, match=r'not clear which output is depth \(other, most\); name one with "depth"'):
+        predicted_by(unclear, color)
 
 
 def test_depth_of_a_recording_is_that_of_its_colour_at_the_size_of_a_room_and_predicted_once(
@@ -178,7 +185,7 @@ def external(path: Path) -> None:
         (lambda path: network(path, [node("Identity", "image", "depth")], (1, 3, "h", 42)), "output depth is"),
         (lambda path: network(path, [node("ReduceMean", "image", "depth", axes=[2, 3])], (1, 3, 9, 9)), "not depth"),
         (lambda path: network(path, [node("Abs", "image", "a"), node("Neg", "image", "b")], (1, 3, "h", "w"),
-                              outputs=["a", "b"]), "it is not clear which output is depth; give one of a, b"),
+                              outputs=["a", "b"]), r"it is not clear which output is depth \(a, b\)"),
         (lambda path: network(path, [node("MatMul", "image weights", "depth")], (1, 3, "h", "w"),
                               constants={"weights": np.ones((5, 5), np.float32)}), "the network fails for"),
         (lambda path: weighted(path, bias=float("nan")), "holds [0-9]+ NaN or inf pixels"),
@@ -192,13 +199,13 @@ def test_what_is_no_network_for_depth_is_refused_in_one_line(
     weighted(path)
     change(path)
     with pytest.raises(SourceError, match=message) as found:
-        open_source(ROOM, depth_model=str(path), depth_model_colors="unit", depth_model_size=28)
+        open_source(ROOM, depth_model=str(path), depth_model_colors="unit")
     assert "\n" not in str(found.value) and len(str(found.value)) < 500
     assert capfd.readouterr() == ("", ""), "onnxruntime prints nothing"
 
 
 def test_a_frame_for_which_the_network_fails_is_skipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    source = open_source(ROOM, depth_model=weighted(tmp_path / "n.onnx"), depth_model_size=28, limit=4)
+    source = open_source(ROOM, depth_model=weighted(tmp_path / "n.onnx"), limit=4)
     predict, bad = DepthModel.predict, np.rint(open_source(ROOM).frame(2).color)
     monkeypatch.setattr(
         DepthModel,

@@ -53,7 +53,8 @@ def make_closer(
     monkeypatch.setattr(closer, "Registrar", Registered)
     Registered.truth = [np.linalg.matrix_power(STEP, k % 4) for k in range(9)]
     Registered.lies = lies
-    config = paper_settings(loops=LoopConfig(**{"min_interval": 2, "min_similarity": 1.0, **changes}))
+    usual = {"min_interval": 2, "min_similarity": 1.0, "similarity_floor": 0.0}
+    config = paper_settings(loops=LoopConfig(**(usual | changes)))
     return LoopCloser(config, MemoryStore())
 
 
@@ -115,7 +116,7 @@ def test_a_submap_is_near_where_its_keyframes_are_not_where_it_begins(
     monkeypatch: pytest.MonkeyPatch, ends_at_m: float, tried: bool
 ) -> None:
     """The first submap ends near the fourth one, which is 3.06 m from where the first one begins."""
-    made, atlas = make_closer(monkeypatch, {}, near_m=0.5, near_deg=30.0, min_interval=3), Atlas()
+    made, atlas = make_closer(monkeypatch, {}, near_m=0.5, min_interval=3), Atlas()
     drift = se3.exp(np.array([1.02, 0, 0, 0, 0, 0.0]))
     for k in range(4):
         if k:

@@ -113,7 +113,7 @@ def test_splats_that_contradict_readings_are_removed_when_the_last_step_is_made(
     monkeypatch.setattr(settings.DensifyConfig, "faded_opacity", 0.05)  # below the opacity that recovers
     seeding = changed(EVERY_PIXEL, opacity=0.95)
     uncertain = DensifyConfig(uncertain_m2=0.025)
-    fit = replace(NO_FIT, iterations=2, every=5, prune_opacity=0.01, lr_means=0.0, lr_opacity_logits=0.0)
+    fit = changed(NO_FIT, iterations=2, every=5, prune_opacity=0.01, lr_means=0.0, lr_opacity_logits=0.0)
     counts = list[int]()
     for divided in (False, True):
         config = paper_settings(seeding=seeding, mapping=replace(fit, divided=divided), primitives=uncertain)
@@ -145,7 +145,7 @@ def test_the_first_keyframe_alone_is_fixed() -> None:
 
 @pytest.mark.parametrize("frozen", [False, True])
 def test_old_colours_are_frozen_where_asked(frozen: bool) -> None:
-    made = mapper(mapping=replace(NO_FIT, iterations=2, freeze_old_colors=frozen))
+    made = mapper(mapping=changed(NO_FIT, iterations=2, freeze_old_colors=frozen))
     made.map(view(), 0, target(), np.eye(4))
     old, colors = len(made.field), COLUMNS["colors"]
     before = made.field.params.clone()

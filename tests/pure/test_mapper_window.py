@@ -80,14 +80,14 @@ def looked_at(monkeypatch: pytest.MonkeyPatch) -> list[list[int]]:
 
 def test_only_the_window_is_looked_at_all_of_it_in_every_step(looked_at: list[list[int]]) -> None:
     """From the start one goes far away and comes back: then the first keyframe shares most, not the ones far off."""
-    mapped(mapper(replace(FITTED, window=3, covisibility="splats")), (0.0, 3.0, 3.2, 3.1, 0.05))
+    mapped(mapper(replace(FITTED, window=3)), (0.0, 3.0, 3.2, 3.1, 0.05))
     last = looked_at[-FITTED.iterations :]
     assert all(sorted(batch) == [0, 3, 4] for batch in last), "the newest, the one before it, the one that shares most"
 
 
 def test_a_submap_that_inherits_splats_chooses_its_window_by_them(looked_at: list[list[int]]) -> None:
     """The first keyframe of such a submap is not fitted, but later windows compare it with the newest keyframe."""
-    before = mapper(replace(FITTED, window=3, covisibility="splats"))
+    before = mapper(replace(FITTED, window=3))
     before.config = before.config.changed(submaps={"inherit": True})
     made = mapped(mapped(before, (0.0,)).successor(view(), np.eye(4)), (0.0, 3.0, 3.2, 3.1, 0.05))
     assert [keyframe.index for keyframe in made.keyframes] == [0, 1, 2, 3, 4]
@@ -95,7 +95,7 @@ def test_a_submap_that_inherits_splats_chooses_its_window_by_them(looked_at: lis
 
 
 def test_one_of_the_window_a_step(looked_at: list[list[int]]) -> None:
-    mapped(mapper(replace(FITTED, window=2, frames_per_step=1, iterations=30)), (0.0, 0.1, 0.2))
+    mapped(mapper(changed(FITTED, window=2, frames_per_step=1, iterations=30)), (0.0, 0.1, 0.2))
     assert {len(batch) for batch in looked_at} == {1}
     assert {batch[0] for batch in looked_at[-30:]} == {1, 2}
 
@@ -111,7 +111,7 @@ def test_several_drawn_together_are_different_ones() -> None:
 
 @pytest.mark.parametrize(("poses", "moving"), [("all", {1, 2}), ("newest", {2})])
 def test_whose_poses_move(poses: Any, moving: set[int]) -> None:
-    made = mapped(mapper(replace(FITTED, poses=poses)), (0.0, 0.1))
+    made = mapped(mapper(changed(FITTED, poses=poses)), (0.0, 0.1))
     before = [k.T_world_camera.copy() for k in made.keyframes] + [shifted(0.2)]
     made.map(view(), 2, target(), shifted(0.2))
     moved = {k.index for k, T in zip(made.keyframes, before, strict=True) if not np.array_equal(k.T_world_camera, T)}
@@ -122,7 +122,7 @@ def test_poses_move_in_the_second_half_only() -> None:
     """Of two steps the first leaves poses alone: after it the pose has had one step of Adam, not two."""
     steps = {}
     for start in ("start", "half"):
-        made = mapper(replace(FITTED, iterations=2, poses_from=start))  # type: ignore[arg-type]
+        made = mapper(changed(FITTED, iterations=2, poses_from=start))
         mapped(made, (0.0, 0.1))
         steps[start] = made.keyframes[1].motion.steps
     assert steps == {"start": 2, "half": 1}
@@ -138,9 +138,8 @@ def floater(made: Mapper) -> int:
     return int(made.field.ids[-1])
 
 
-@pytest.mark.parametrize("owner", ["dominant", "median"])
-def test_a_floater_is_doubted_and_goes_the_wall_stays(owner: Any) -> None:
-    made = mapped(mapper(replace(FITTED, iterations=20), DensifyConfig(uncertain_m2=0.025, owner=owner)), (0.0,))
+def test_a_floater_is_doubted_and_goes_the_wall_stays() -> None:
+    made = mapped(mapper(replace(FITTED, iterations=20), DensifyConfig(uncertain_m2=0.025)), (0.0,))
     made.config = replace(made.config, seeding=changed(SEEDS, depth_error_factor=0.0))
     wall, floating = set(made.field.ids.tolist()), floater(made)
     made.map(view(), 1, target(), shifted(0.02))

@@ -1,13 +1,16 @@
 """Covariance of a path: marginals, loops, and the choice of world, against dense inverses and solved graphs."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
 
-from paper_settings import FinalConfig
+from constants import changed
+from paper_settings import FinalConfig, RenderConfig, paper_settings
+from sigmasplat.config import Config
 from sigmasplat.data import se3
 from sigmasplat.data.atlas import Atlas
 from sigmasplat.data.relative_pose import UNKNOWN_HOP, Kind, RelativePose, TrackedHops
@@ -267,18 +270,28 @@ def test_a_frame_that_is_no_keyframe_adds_the_error_of_its_own_motion() -> None:
     np.testing.assert_allclose(hop, Loopy().covariances[0][1], rtol=1e-6, atol=1e-14)
 
 
+def settings(final: Any) -> Config:
+    return paper_settings(final=final)
+
+
 def test_refinement_moves_poses_as_far_as_the_path_may_be_wrong() -> None:
     path = Loopy().covariance(Loopy().loop)
     std_m = np.median([np.sqrt(np.trace(path.of_frame(frame)[:3, :3])) for frame in range(len(path))])
     final = FinalConfig(pose_reach_m=1e-4, pose_reach_most_m=1.0, lr_pose_translation=3e-5, lr_pose_rotation=2e-5)
-    found = reaching(final, path)
+    found = reaching(settings(final), path)
     assert 1e-3 < found.pose_reach_m == pytest.approx(0.5 * std_m)
     for name in ("lr_pose_translation", "lr_pose_rotation"):
         assert getattr(found, name) / getattr(final, name) == pytest.approx(found.pose_reach_m / 1e-4)
-    assert reaching(replace(final, pose_reach_most_m=2e-4), path).pose_reach_m == 2e-4
+    assert reaching(settings(changed(final, pose_reach_most_m=2e-4)), path).pose_reach_m == 2e-4
     unknown = Loopy().covariance(None, hops=False)
-    assert reaching(final, unknown) == final, "the errors of descent are not estimated"
-    exact = replace(final, pose_reach_m=0.1)
-    assert reaching(exact, path) == exact, "an exact path keeps its reach"
-    for off in (replace(final, pose_reach_most_m=0.0), replace(final, pose_reach_m=0.0)):
-        assert reaching(off, path) == off
+    kept = reaching(settings(final), unknown)
+    assert kept.pose_reach_m == 1e-4 and kept.lr_pose_rotation == 2e-5, "the errors of descent are not estimated"
+    exact = changed(final, pose_reach_m=0.1)
+    assert reaching(settings(exact), path).pose_reach_m == 0.1, "an exact path keeps its reach"
+    still = changed(final, pose_reach_most_m=0.0)
+    assert reaching(settings(still), path).pose_reach_m == 1e-4
+    off = changed(final, pose_reach_m=0.0)
+    assert reaching(settings(off), path) is off
+    large = replace(settings(final), render=RenderConfig(scene_scale=10.0))
+    grown = reaching(large, unknown)
+    assert (grown.pose_reach_m, grown.lr_pose_translation, grown.lr_pose_rotation) == pytest.approx((1e-3, 3e-4, 2e-5))

@@ -82,7 +82,6 @@ COMMON: dict[str, Any] = {
     "mapping.freeze_old_colors": False,
     "mapping.prune_opacity": 0.005,
     "primitives.uncertain_m2": 0.025,
-    "primitives.owner": "dominant",
     "primitives.faded_opacity": 0.07,
     "primitives.least_opacity": 15 / 255,
     "primitives.split_gradient": 0.002,
@@ -187,7 +186,7 @@ def test_released_presets_share_the_settings_of_the_code() -> None:
         assert (m.weight_alignment, m.weight_isotropy_ratio, m.weight_moment) == (0.25, 0.1, 0.15), scene
         assert (m.poses, m.poses_from, m.covisibility) == ("newest", "half", "descriptor"), scene
         assert (m.lr_pose_rotation, m.lr_pose_translation) == (0.0015, 0.00215), scene
-        assert (p.uncertain_m2, p.owner, p.clone, p.split_gradient) == (0.0, "median", False, 0.002), scene
+        assert (p.uncertain_m2, p.clone, p.split_gradient) == (0.0, False, 0.002), scene
         assert (t.first_iterations, t.first_lr_rotation) == (200, 0.003), scene
         assert not config.render.covariance_pose_gradient, scene
         assert config.loops.descriptor == "netvlad-or-grid" and not config.loops.close, scene
@@ -245,7 +244,7 @@ def test_each_released_varsplat_preset_holds_the_row_of_its_scene() -> None:
         tau, tau_loops, nll_depth, crop = map(float, numbers)
         assert (config.tracking.tau, config.loops.tau, config.registration.tau) == (tau, tau_loops, 3.0), scene
         assert (config.mapping.weight_nll_depth, config.input.crop_px) == (nll_depth * 1e-4, crop), scene
-        assert config.mapping.exposure == config.tracking.exposure == (dataset == "scannet"), scene
+        assert config.mapping.exposure and config.tracking.exposure == (dataset == "scannet"), scene
         assert (
             config.loops.min_interval, config.registration.target, config.input.limit
         ) == PER_DATASET[dataset], scene  # fmt: skip
@@ -253,15 +252,22 @@ def test_each_released_varsplat_preset_holds_the_row_of_its_scene() -> None:
 
 def test_released_varsplat_presets_differ_from_the_papers_by_the_methods_of_the_code_alone() -> None:
     rows = {"tracking.tau", "loops.tau", "registration.tau", "mapping.weight_nll_depth", "input.crop_px"}
-    rows |= {"loops.min_interval", "registration.target", "input.limit", "input.max_depth_m", "mapping.exposure"}
+    rows |= {"loops.min_interval", "registration.method", "input.limit", "input.max_depth_m"}
+    rows |= {"seeding.outliers"}
     methods = {
-        "seeding.outlier_first": False, "mapping.freeze_new_colors": True, "tracking.amsgrad": True,
-        "submaps.uncertainty_m": 0.0, "loops.most": 0, "final.lr_means_last": 1.6e-6,
+        "mapping.colors": "code", "tracking.descent": "amsgrad", "submaps.uncertainty_m": 0.0, "loops.most": 0,
+        "final.schedule": "falling",
     }  # fmt: skip
     for scene, (dataset, *_) in VARSPLAT_SCENES.items():
         released, paper = preset(f"varsplat-released-{scene}"), preset(f"varsplat-{dataset}")
         assert {name: value_of(released, name) for name in methods} == methods, scene
         assert changed_settings(released, paper) - rows == set(methods), scene
+        assert released.tracking.amsgrad and not paper.tracking.amsgrad and released.final.lr_means_last == 1.6e-6, (
+            scene
+        )
+        before = paper.seeding.outlier_neighbours
+        assert released.seeding.outlier_neighbours == before and released.seeding.outlier_first == (before == 0), scene
+        assert released.mapping.freeze_old_colors and released.mapping.freeze_new_colors, scene
         assert released.mapping.freeze_old_colors and released.input.min_depth_m == 0.0, scene
 
 
@@ -366,14 +372,13 @@ def test_sigma_adds_to_fast_and_removes_nothing() -> None:
     uncertainty = {"mapping.iterations", "mapping.weight_moment", "primitives.uncertain_m2", "uncertainty.probes"}
     assert added == uncertainty | {
         "input.denoise_depth", "tracking.features", "tracking.verify",
-        "final.iterations", "final.merge_m", "final.order", "mapping.lr_log_scales", "seeding.scale_factor",
+        "final.iterations", "final.schedule", "mapping.lr_log_scales", "seeding.shape",
         "mapping.divided", "mapping.first_iterations", "mapping.lr_pose_translation",
         "mapping.lr_pose_rotation",
-        "registration.to_keyframe", "registration.iterations", "loops.slices_per_frame",
-        "final.lr_pose_translation", "final.lr_pose_rotation", "final.pose_reach_m", "final.pose_reach_most_m",
-        "recovery.relocalise", "surface.depth", "moving.find",
-        "mapping.weight_depth", "mapping.weight_mean_depth", "render.depth", "seeding.thickness",
-        "final.sh_degree", "final.sh_every", "final.exposure",
+        "registration.method", "registration.iterations",
+        "final.move_poses", "recovery.relocalise", "surface.depth", "moving.find",
+        "mapping.weight_depth", "mapping.weight_mean_depth", "render.depth",
+        "final.sh_degree",
     }  # fmt: skip
     assert sigma.mapping.weight_nll_color == fast.mapping.weight_nll_color > 0
     assert sigma.tracking.uncertainty and sigma.loops.uncertainty and sigma.registration.uncertainty
@@ -455,13 +460,9 @@ NEW = [
     "mapping.weight_alignment",
     "mapping.weight_moment",
     "mapping.lr_means_first",
-    "mapping.poses",
-    "mapping.poses_from",
+    "mapping.adjustment",
     "mapping.window",
-    "mapping.frames_per_step",
-    "tracking.parametrisation",
-    "tracking.first_iterations",
-    "tracking.average",
+    "tracking.descent",
     "tracking.align_depth_by",
 ]
 

@@ -17,9 +17,7 @@ from sigmasplat.data.frame import Frame
 from sigmasplat.fit.field import fit_field
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.mapping.densify import depths, fade, splat_uncertainty, still_uncertain
-from sigmasplat.render import reference
 from sigmasplat.render.backend import make_view
-from sigmasplat.render.kernels import features_of
 from sigmasplat.render.render import render
 from sigmasplat.render.view import View
 
@@ -75,18 +73,13 @@ def wall_and_floater() -> GaussianField:
     return GaussianField.from_values(torch.from_numpy(means), scales, torch.full((n, 3), 0.5), opacities=0.9)
 
 
-def plain_uncertainty(field: GaussianField, keyframes: list[Keyframe], owner: str) -> tuple[Array, Array]:
+def plain_uncertainty(field: GaussianField, keyframes: list[Keyframe]) -> tuple[Array, Array]:
     """Do eq. 13 pixel by pixel, on the definition's maps."""
     total, count = np.zeros(len(field)), np.zeros(len(field))
     for frame in keyframes:
         T = np.linalg.inv(frame.T_world_camera)
         shown = render(field, CAMERA, T, options=OPTIONS, backend="reference")
         owners, weights = shown.dominant_id, shown.dominant_weight
-        if owner == "median":
-            p = reference.project(field.means, field.quats, field.scales, torch.as_tensor(T), CAMERA, OPTIONS)
-            features = features_of(field.colors, p.z, field.variances)
-            b = reference.blend(*p, field.opacities, features, None, CAMERA, OPTIONS)
-            owners, weights = b.median_id, b.median_weight
         for row in range(CAMERA.height):
             for column in range(CAMERA.width):
                 reading, i = float(frame.target.depth[row, column]), int(owners[row, column])
@@ -97,38 +90,29 @@ def plain_uncertainty(field: GaussianField, keyframes: list[Keyframe], owner: st
     return total / np.maximum(count, 1), count
 
 
-@pytest.mark.parametrize("owner", ["dominant", "median"])
-def test_uncertainty_agrees_with_a_loop_over_pixels(view: View, owner: str) -> None:
+def test_uncertainty_agrees_with_a_loop_over_pixels(view: View) -> None:
     field, keyframes = cloud(), window(view)
-    found, pixels = splat_uncertainty(field, view, keyframes, owner)  # type: ignore[arg-type]
-    expected, count = plain_uncertainty(field, keyframes, owner)
+    found, pixels = splat_uncertainty(field, view, keyframes)
+    expected, count = plain_uncertainty(field, keyframes)
     assert (count > 0).sum() > 10 and (count == 0).sum() > 10
     np.testing.assert_array_equal(pixels.numpy(), count)
     np.testing.assert_allclose(found.numpy(), expected, rtol=1e-4, atol=1e-7)
 
 
-def test_median_and_dominant_owners_are_not_the_same(view: View) -> None:
-    field, keyframes = cloud(), window(view)
-    by_weight, _ = splat_uncertainty(field, view, keyframes, "dominant")
-    by_median, _ = splat_uncertainty(field, view, keyframes, "median")
-    assert not torch.equal(by_weight, by_median)
-
-
 def test_the_window_is_a_mean_over_all_its_pixels(view: View) -> None:
     field, keyframes = cloud(), window(view)
-    one_by_one = [splat_uncertainty(field, view, [frame], "dominant") for frame in keyframes]
-    together, pixels = splat_uncertainty(field, view, keyframes, "dominant")
+    one_by_one = [splat_uncertainty(field, view, [frame]) for frame in keyframes]
+    together, pixels = splat_uncertainty(field, view, keyframes)
     total = sum((u * n for u, n in one_by_one), torch.zeros(len(field)))
     torch.testing.assert_close(together * pixels, total)
-    nothing, none = splat_uncertainty(field, view, [], "dominant")
+    nothing, none = splat_uncertainty(field, view, [])
     assert nothing.tolist() == none.tolist() == [0] * len(field)
 
 
-@pytest.mark.parametrize("owner", ["dominant", "median"])
-def test_a_floater_is_uncertain_and_the_wall_is_not(view: View, owner: str) -> None:
+def test_a_floater_is_uncertain_and_the_wall_is_not(view: View) -> None:
     field = wall_and_floater()
     keyframes = [keyframe(view, se3.exp(np.array([x, 0.0, 0.0, 0.0, 0.0, 0.0])), 2.0) for x in (0.0, 0.3, -0.2)]
-    found, pixels = splat_uncertainty(field, view, keyframes, owner)  # type: ignore[arg-type]
+    found, pixels = splat_uncertainty(field, view, keyframes)
     assert float(found[-1]) > 10 * UNCERTAIN_M2 and int(pixels[-1]) > 3
     assert float(found[:-1].max()) < 1e-6 and int((pixels[:-1] > 0).sum()) > PIXELS // 2
 
@@ -137,11 +121,11 @@ def test_pixels_without_reading_change_nothing(view: View) -> None:
     field, holes = wall_and_floater(), np.full((CAMERA.height, CAMERA.width), 2.0)
     owned = render(field, CAMERA, np.eye(4), options=OPTIONS, backend="reference").dominant_id.numpy() == PIXELS
     holes[owned] = 0.0
-    found, pixels = splat_uncertainty(field, view, [keyframe(view, np.eye(4), holes)], "dominant")
+    found, pixels = splat_uncertainty(field, view, [keyframe(view, np.eye(4), holes)])
     assert owned.any() and int(pixels[-1]) == 0 and float(found[-1]) == 0.0
     assert int(pixels.sum()) == int((~owned).sum())
     blind = keyframe(view, se3.exp(np.array([0.1, 0.0, 0.2, 0.0, 0.1, 0.0])), 0.0)
-    again, _ = splat_uncertainty(field, view, [blind, keyframe(view, np.eye(4), holes)], "dominant")
+    again, _ = splat_uncertainty(field, view, [blind, keyframe(view, np.eye(4), holes)])
     assert torch.equal(again, found)
 
 
@@ -149,15 +133,15 @@ def test_moving_field_and_cameras_together_changes_nothing(view: View) -> None:
     field, keyframes = cloud(), window(view)
     move = se3.exp(np.array([0.5, -0.3, 0.8, 0.4, -1.1, 0.7]))
     moved = [replace(frame, T_world_camera=move @ frame.T_world_camera) for frame in keyframes]
-    found, pixels = splat_uncertainty(field, view, keyframes, "dominant")
-    carried, pixels_then = splat_uncertainty(field.moved(torch.from_numpy(move)), view, moved, "dominant")
+    found, pixels = splat_uncertainty(field, view, keyframes)
+    carried, pixels_then = splat_uncertainty(field.moved(torch.from_numpy(move)), view, moved)
     assert int((pixels != pixels_then).sum()) <= 2, "rounding may turn a pixel or two"
     same = pixels == pixels_then
     torch.testing.assert_close(carried[same], found[same], rtol=1e-3, atol=1e-5)
 
 
 def test_an_empty_field_has_no_uncertainty(view: View) -> None:
-    found, pixels = splat_uncertainty(GaussianField.empty(), view, window(view), "median")
+    found, pixels = splat_uncertainty(GaussianField.empty(), view, window(view))
     assert len(found) == len(pixels) == 0
 
 
@@ -226,7 +210,7 @@ def test_a_faded_splat_of_the_wall_comes_back_and_a_floater_does_not(view: View)
     faded = fade(field, torch.tensor([lonely, PIXELS]), 0.07)
     still = changed(MappingConfig(), weight_nll_color=0.0, lr_means=0.0, lr_log_scales=0.0, lr_quats=0.0, lr_colors=0.0)
     fit_field(field, view, [[frame]] * 15, still)
-    uncertainty, _ = splat_uncertainty(field, view, [frame], "dominant")
+    uncertainty, _ = splat_uncertainty(field, view, [frame])
     opacity = field.opacities
     assert float(opacity[lonely]) > 0.07 > float(opacity[-1]), "the images decide"
     gone = still_uncertain(field, faded, uncertainty, UNCERTAIN_M2, 15 / 255)

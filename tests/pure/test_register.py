@@ -10,6 +10,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
+from constants import changed
 from paper_settings import RegistrationConfig, RenderConfig, SeedConfig, TrackingConfig, paper_settings
 from sigmasplat.config import Config
 from sigmasplat.data import se3
@@ -38,6 +39,7 @@ CONFIG = paper_settings(
     tracking=TrackingConfig(method="align", align_weight_color=0.1),
     registration=RegistrationConfig(iterations=10, lr_translation=1e-3, lr_rotation=1e-3, tau=10.0),
 )
+TO_KEYFRAME = replace(CONFIG, registration=changed(CONFIG.registration, to_keyframe=True))
 
 
 def piece(store: MemoryStore, frames: Sequence[int], brighter: float = 1.0) -> Submap:
@@ -106,7 +108,7 @@ def test_the_images_that_submaps_render_register_them_without_the_recorded_ones(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(MemoryStore, "picture", None)
-    config = CONFIG.changed(registration={"target": "rendered"})
+    config = replace(CONFIG, registration=changed(CONFIG.registration, target="rendered"))
     error = se3.exp(np.array([0.1, -0.05, 0.05, 0.03, 0.06, -0.02]))
     found, truth = registered((0, 5), (3, 8), error, config=config)
     assert found.accepted, found.reason
@@ -117,7 +119,7 @@ def test_the_images_that_submaps_render_register_them_without_the_recorded_ones(
 def test_a_loop_that_maps_show_but_no_recorded_image_is_refused() -> None:
     """The images of one submap have readings on the left, those of the other one on the right."""
     error = se3.exp(np.array([0.02, -0.01, 0.01, 0.01, 0.01, -0.01]))
-    to_keyframe = CONFIG.changed(registration={"to_keyframe": True})
+    to_keyframe = TO_KEYFRAME
     halves = slice(0, 75), slice(85, 160)
     by_maps, _ = registered((0, 5), (3, 8), error, unread=halves)
     by_images, _ = registered((0, 5), (3, 8), error, config=to_keyframe, unread=halves)
@@ -142,7 +144,7 @@ def test_a_submap_whose_splats_are_too_near_does_not_bias_the_pose_relative_to_i
     monkeypatch.setitem(globals(), "make_splats", too_near)
     error = se3.exp(np.array([0.02, -0.01, 0.01, 0.01, 0.01, -0.01]))
     to_map, truth = registered((0, 5), (3, 8), error)
-    to_keyframe, _ = registered((0, 5), (3, 8), error, config=CONFIG.changed(registration={"to_keyframe": True}))
+    to_keyframe, _ = registered((0, 5), (3, 8), error, config=TO_KEYFRAME)
     assert to_map.accepted and to_keyframe.accepted
     assert off(to_keyframe.T_a_b, truth)[0] < 0.3 * off(to_map.T_a_b, truth)[0]
 
@@ -150,7 +152,7 @@ def test_a_submap_whose_splats_are_too_near_does_not_bias_the_pose_relative_to_i
 def test_a_pose_relative_to_a_keyframe_needs_no_descent() -> None:
     error = se3.exp(np.array([0.02, -0.01, 0.01, 0.01, 0.01, -0.01]))
     found = [
-        registered((0, 5), (3, 8), error, config=CONFIG.changed(registration={"to_keyframe": True, "iterations": n}))[0]
+        registered((0, 5), (3, 8), error, config=TO_KEYFRAME.changed(registration={"iterations": n}))[0]
         for n in (0, 50)
     ]
     assert all(each.accepted and each.localised == 4 for each in found)

@@ -18,7 +18,7 @@ from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.frame_arrays import frame_from_arrays
-from sigmasplat.data.images import alignment_std, generic_std, modelled_std, relative_weights
+from sigmasplat.data.images import alignment_std, generic_std, modelled_std
 from sigmasplat.data.submap import Picture
 from sigmasplat.errors import ConfigError, SourceError
 from sigmasplat.fit.align import align, balanced
@@ -171,16 +171,6 @@ def test_errors_that_readings_share_count_in_alignment_only() -> None:
     np.testing.assert_array_equal(modelled_std(depth_m, alone, CAMERA), modelled_std(depth_m, shared, CAMERA))
     np.testing.assert_allclose(alignment_std(depth_m, shared), np.hypot(0.001, 0.002) * depth_m**2, rtol=1e-6)
     assert sensor_model(str(shared)) == shared
-
-
-def test_losses_prefer_sure_readings() -> None:
-    depth_m = wall(0.0)
-    depth_m[:10] = 0.0
-    std_m = generic_std(depth_m, 0.003)
-    std_m[:, 80:] *= 4
-    weight = relative_weights(std_m, generic_std(depth_m, 0.003))
-    assert weight[60, 0] == pytest.approx(1.0) and weight[60, 100] == pytest.approx(0.25) and not weight[:10].any()
-    assert (relative_weights(std_m / 100, generic_std(depth_m, 0.003))[10:] == 4.0).all(), "no reading rules the map"
 
 
 def test_the_noise_of_a_recording_is_measured(tmp_path: Path) -> None:

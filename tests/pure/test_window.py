@@ -84,7 +84,7 @@ def test_a_window_is_small_while_keyframes_are_few() -> None:
         assert indices(choose_window(keyframes, 4, "splats")) == [3, 2, 1][:count]
 
 
-def test_descriptors_choose_by_what_they_compare() -> None:
+def test_descriptors_choose_by_their_similarity() -> None:
     keyframes = [keyframe(k, pose(x=0.6 * k)) for k in range(5)]
     angles = [0.1, 1.2, 0.7, 0.0, 0.0]
     keyframes = [
@@ -96,9 +96,9 @@ def test_descriptors_choose_by_what_they_compare() -> None:
 def test_what_is_missing_is_named() -> None:
     keyframes = [keyframe(k) for k in range(3)]
     for by in ("splats", "descriptor"):
-        with pytest.raises(SigmaSplatError, match=f"keyframe [02] .*covisibility={by}"):
-            choose_window(keyframes, 3, by)  # type: ignore[arg-type]
-        assert indices(choose_window(keyframes, 2, by)) == [2, 1]  # type: ignore[arg-type]
+        with pytest.raises(SigmaSplatError, match=f"keyframe [02] .*window by {by}"):
+            choose_window(keyframes, 3, by)
+        assert indices(choose_window(keyframes, 2, by)) == [2, 1]
 
 
 def test_splats_that_dominate_are_named_by_their_ids() -> None:

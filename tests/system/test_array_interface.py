@@ -211,7 +211,7 @@ class Recorder:
 
 LOOPS = SETTINGS | {
     "input.width": "80", "submaps.frames": "8",
-    "loops.close": "true", "loops.near_m": "5", "loops.near_deg": "180",
+    "loops.close": "true", "loops.near_m": "5",
     "loops.min_interval": "1",
 }  # fmt: skip
 
@@ -275,8 +275,8 @@ def test_a_function_that_fails_leaves_the_state_valid(run: Slam) -> None:
 
 def test_real_time_gives_the_same_poses_and_covariances_if_mapping_keeps_up(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(RealTimeConfig, "spare_iterations", 0)
-    same = CUTS | {"realtime.keyframe_deg": "0"}
-    usual, system = Slam(settings=same), RealTime(Slam(settings=same), AtOnce())
+    monkeypatch.setattr(RealTimeConfig, "keyframe_deg", 0.0)
+    usual, system = Slam(settings=CUTS), RealTime(Slam(settings=CUTS), AtOnce())
     for i in range(14):
         rgb, depth = images(i)
         a, b = (each.track(rgb, depth, K, i / 30, depth_scale=1000) for each in (usual, system))
@@ -292,10 +292,11 @@ def test_real_time_gives_the_same_poses_and_covariances_if_mapping_keeps_up(monk
 
 
 @pytest.mark.parametrize("schedule", [AtOnce(), Drawn(3), None], ids=["at once", "drawn", "thread"])
-def test_real_time_calls_functions_on_the_thread_of_the_caller(schedule: Any) -> None:
+def test_real_time_calls_functions_on_the_thread_of_the_caller(schedule: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(RealTimeConfig, "keyframe_deg", 0.0)
     # Frames of a thread take so long that it closes a loop before the last one.
     size, count = ({}, 26) if schedule else ({"input.width": "160"}, 40)
-    system = RealTime(Slam(settings=LOOPS | size | {"realtime.keyframe_deg": "0"}), schedule)
+    system = RealTime(Slam(settings=LOOPS | size), schedule)
     seen, threads = Recorder(system), set[int]()
     for listen in (system.on_keyframe, system.on_loop, system.on_correction):
         listen(lambda event: threads.add(threading.get_ident()))
@@ -314,8 +315,9 @@ def test_real_time_calls_functions_on_the_thread_of_the_caller(schedule: Any) ->
     assert moved or (not early and schedule is None)
 
 
-def test_loops_that_close_after_the_last_keyframe_are_reported_in_real_time() -> None:
-    system = RealTime(Slam(settings=LOOPS | {"realtime.keyframe_deg": "0"}), AtOnce())
+def test_loops_that_close_after_the_last_keyframe_are_reported_in_real_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(RealTimeConfig, "keyframe_deg", 0.0)
+    system = RealTime(Slam(settings=LOOPS), AtOnce())
     seen, closed = Recorder(system), False
     for i in range(60):
         before = len(system.slam.loops)

@@ -47,10 +47,10 @@ RUNS: list[Any] = [
     pytest.param("cgslam-fast", SMALL, 0.004, 26.0, id="fast"),
     pytest.param("sigma", SMALL, 0.004, 26.0, id="sigma"),
     pytest.param("cgslam-replica", PAPER, 0.02, 24.0, id="paper", marks=pytest.mark.slow),
-    pytest.param("cgslam-fast", SMALL | {"mapping.covisibility": "descriptor"}, 0.004, 26.0, id="by-descriptor"),
+    pytest.param("cgslam-fast", SMALL | {"mapping.adjustment": "window-newest"}, 0.004, 26.0, id="by-descriptor"),
     pytest.param(
         "cgslam-released-replica",
-        PAPER | {"tracking.first_iterations": "60"},
+        PAPER,
         0.02,
         24.0,
         id="released",

@@ -39,9 +39,9 @@ QUICK = SMALL | {
 }  # fmt: skip
 
 
-def config(spare_iterations: int = 8, **changes: str) -> Config:
+def config(spare_iterations: int = 8, keyframe_deg: float = 5.0, **changes: str) -> Config:
     made = override(preset("sigma"), QUICK | {name.replace("__", "."): value for name, value in changes.items()})
-    return replace(made, realtime=changed(made.realtime, spare_iterations=spare_iterations))
+    return replace(made, realtime=changed(made.realtime, spare_iterations=spare_iterations, keyframe_deg=keyframe_deg))
 
 
 def error_m(system: RealTime) -> float:
@@ -56,7 +56,7 @@ FITTED = {"tracking__fit_depth": "true", "mapping__divided": "false"}
 
 @pytest.mark.parametrize("more", [{}, FITTED], ids=["measured", "predicted"])
 def test_the_results_are_those_of_a_recording_if_mapping_always_ends_before_the_next_frame(more: dict) -> None:
-    same = config(spare_iterations=0, realtime__keyframe_deg="0", **more)
+    same = config(spare_iterations=0, keyframe_deg=0.0, **more)
     usual, system = Slam(same), RealTime(Slam(same), AtOnce())
     for frame in frames(FRAMES):
         usual.step(frame)
@@ -127,15 +127,13 @@ def test_a_keyframe_is_a_matter_of_motion() -> None:
 
 def test_a_fast_camera_makes_no_more_keyframes_than_in_a_recording() -> None:
     """Each keyframe adds an error to the path."""
-    system = RealTime(
-        Slam(config(realtime__keyframe_deg="0.5", mapping__every="4", mapping__overlap_below="0")), AtOnce()
-    )
+    system = RealTime(Slam(config(keyframe_deg=0.5, mapping__every="4", mapping__overlap_below="0")), AtOnce())
     assert [step.index for step in map(system.step, frames(14)) if step.is_keyframe] == [0, 4, 8, 12]
 
 
 def test_the_first_map_is_left_unfinished_at_a_cut_if_a_keyframe_waits() -> None:
     """Otherwise all later keyframes wait for it, and none of them is fitted."""
-    often = config(mapping__first_iterations="400", mapping__every="4", realtime__keyframe_deg="0.5")
+    often = config(mapping__first_iterations="400", mapping__every="4", keyframe_deg=0.5)
     system = RealTime(Slam(often), Late(slices=6))
     steps = [system.step(frame) for frame in frames(50)]
     assert max(step.tracking.get("waiting", 0) for step in steps) <= 3
@@ -145,7 +143,7 @@ def test_the_first_map_is_left_unfinished_at_a_cut_if_a_keyframe_waits() -> None
 
 def test_a_map_that_falls_behind_is_still_fitted_and_cut() -> None:
     """If every keyframe has another one behind it, and all but the last were only added, one submap would hold all."""
-    often = config(mapping__every="2", realtime__keyframe_deg="0.5")
+    often = config(mapping__every="2", keyframe_deg=0.5)
     system = RealTime(Slam(often), Late(slices=0))
     steps = [system.step(frame) for frame in frames(40)]
     system.settle()
@@ -158,7 +156,7 @@ def test_a_map_that_falls_behind_is_still_fitted_and_cut() -> None:
 
 def test_a_keyframe_is_aligned_again_when_the_weights_of_the_one_before_it_are_known() -> None:
     """Else the path would be that of an alignment without weights."""
-    same = config(spare_iterations=0, mapping__every="4", realtime__keyframe_deg="0", submaps__frames="1000")
+    same = config(spare_iterations=0, mapping__every="4", keyframe_deg=0.0, submaps__frames="1000")
     usual, late = Slam(same), RealTime(Slam(same), Late(slices=3))
     for frame in frames(FRAMES):
         usual.step(frame)
@@ -178,7 +176,7 @@ def test_too_many_waiting_keyframes_are_refused_and_counted(monkeypatch: pytest.
         def wake(self) -> None:
             pass
 
-    often = config(realtime__keyframe_deg="0.5", mapping__every="1")
+    often = config(keyframe_deg=0.5, mapping__every="1")
     monkeypatch.setattr(type(often.realtime), "waiting_most", 3)
     system = RealTime(Slam(often), Never())
     steps = [system.step(frame) for frame in frames(20)]

@@ -45,8 +45,8 @@ SETTINGS = {
     "input.width": "160", "mapping.first_iterations": "40", "mapping.iterations": "10", "final.iterations": "4",
     "submaps.distance_m": "0", "submaps.uncertainty_m": "0", "submaps.frames": "10",
     "loops.min_interval": "1", "loops.min_similarity": "0.3",
-    "mapping.lr_pose_translation": "2e-4", "mapping.lr_pose_rotation": "1e-4", "registration.to_keyframe": "false",
-    "loops.slices_per_frame": "0",
+    "mapping.lr_pose_translation": "2e-4", "mapping.lr_pose_rotation": "1e-4", "registration.method": "few-steps",
+    "mapping.divided": "false",
 }  # fmt: skip
 """Mapping moves the keyframes of this short walk, so that the loop has something to correct. The walk is too short for
 a search for loops that is divided over its frames."""

@@ -55,14 +55,6 @@ class InputConfig(Section, name="input"):
     """Numbers that the network expects: imagenet = colour in [0, 1] minus ImageNet's mean, over its standard deviation
     (MiDaS v2.1, Depth Anything); half = colour in [−1, 1] (DPT, ZoeDepth, Depth Pro); unit = colour in [0, 1];
     bytes = colour in [0, 255]. A network that takes 8-bit numbers gets bytes."""
-    depth_model_size: Annotated[int, Range(14, 4096, or_zero=True)] = 0
-    """Shorter side of the images in pixels, for networks that take any size; sides are rounded to multiples of 14 or
-    32. 0 = 518 if multiples of 14 work, otherwise 384."""
-    depth_model_output: str = ""
-    """Name of the network's output that is depth; empty = the only one, or the only one with "depth" in its name."""
-    depth_model_threads: Annotated[int, Range(1, 256)] = 1
-    """Number of threads of the network. It may change the last bits of its depth. One thread predicts while another one
-    tracks the frame before."""
     poses: str = ""
     """Path of a file with known camera poses, which are used as they are: TUM text, KITTI text, images.txt of COLMAP,
     or transforms.json; or of a folder with a matrix per frame; "recorded" = those that the device estimated itself,
@@ -96,13 +88,6 @@ class InputConfig(Section, name="input"):
     """Smaller depth readings are ignored: below its range a sensor returns noise."""
     max_depth_m: Above0 = 8.0
     """Larger depth readings are ignored: their errors grow with the square of the depth."""
-    stereo_disparities: Count = 0
-    """Range of disparities that stereo matching searches, in pixels, rounded up to a multiple of 16. It limits the
-    smallest depth to f·b / range. 0 = an eighth of the image width."""
-    stereo_std_px: Above0 = 0.15
-    """Standard deviation σ_d of the disparity in pixels. Stereo depth z has σ_z = z²·σ_d / (f·b)."""
-    stereo_max_std: Above0 = 0.05
-    """Stereo depth is ignored where its standard deviation σ_z is larger than this share of it."""
     sensor: str = "auto"
     """Model of the standard deviation of depth readings: kinect-v1, realsense-stereo, lidar-iphone, time-of-flight;
     generic = the law of `render.depth_noise_per_m`; or a model as in `base:0.001,z2:0.0015` (parts: base, z1, z2, edge,

@@ -8,7 +8,7 @@ import math
 import numbers
 from collections.abc import Iterator, Mapping
 from functools import cache
-from typing import Annotated, Any, ClassVar, Literal, get_args, get_origin
+from typing import Annotated, Any, ClassVar, Generic, Literal, TypeVar, get_args, get_origin
 
 from sigmasplat.errors import ConfigError
 
@@ -51,6 +51,7 @@ Share = Annotated[float, Range(0, 1)]
 WIDTHS_PX = Range(8, 8192, or_zero=True)
 
 
+T = TypeVar("T")
 PLAIN = frozenset({bool, int, float, str})
 _VALID: set[tuple[type, str, type, object]] = set()
 """Values of settings that were valid: presets are made from each other, and most of their values are the same."""
@@ -75,6 +76,22 @@ class Section:
     def problems(self) -> list[str]:
         """Describe each invalid value, [] if all are valid. Subclasses add the conditions between several values."""
         return list(problems_of(self, f"{self.section}."))
+
+
+class FromRow(Generic[T]):
+    """A value that belongs to the choice which another setting of the section names: that of the same name in the
+    choice's row of a table."""
+
+    def __init__(self, setting: str, table: Mapping[str, Any]) -> None:
+        self.setting, self.table, self.name = setting, table, ""
+
+    def __set_name__(self, section: type, name: str) -> None:
+        self.name = name
+
+    def __get__(self, section: Any, kind: type) -> T:
+        row = self.table[next(iter(self.table)) if section is None else getattr(section, self.setting)]
+        value: T = getattr(row, self.name)
+        return value
 
 
 def refuse(problems: list[str]) -> None:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
-from sigmasplat.config.ranges import AtLeastOne, Count, NotNegative, Section
+from sigmasplat.config.ranges import Count, Section
 
 
 @dataclass(frozen=True)
@@ -13,7 +13,7 @@ class FeatureConfig(Section, name="features"):
     kind: Literal["sift", "orb", "xfeat"] = "sift"
     """Kind of features: sift = RootSIFT; orb = faster, finds fewer poses; xfeat = a neural network with its own
     matcher, finds the most poses and is the slowest. It needs the extra `xfeat`."""
-    count: AtLeastOne = 1200
+    count: ClassVar[int] = 1200
     """Maximum number of features per image; the strongest are used. More features find more poses and take more
     time."""
     width: ClassVar[int] = 640
@@ -94,7 +94,7 @@ class RealTimeConfig(Section, name="realtime"):
 
     live: bool = True
     """Whether live cameras run in real time; off = a frame waits until the one before it is mapped."""
-    keyframe_deg: NotNegative = 5.0
+    keyframe_deg: ClassVar[float] = 5.0
     """A frame becomes a keyframe when the image has moved by this angle since the last keyframe: rotation plus
     translation divided by the mean depth. There are not more keyframes than in a recording (`mapping.every`), because
     each adds an error to the path, unless the overlap is low. 0 = by the number of frames, as in a recording."""

@@ -14,21 +14,16 @@ POWERS = {
         "weight_depth": -1, "weight_mean_depth": -1, "weight_alignment": -1, "weight_isotropy": -1,
         "weight_moment": -2, "lr_means": 1, "lr_means_first": 1, "lr_pose_translation": 1,
     },
-    "primitives": {"uncertain_m2": 2, "split_scale_m": 1, "most_scale_m": 1},
+    "primitives": {"uncertain_m2": 2, "split_scale_m": 1},
     "tracking": {"lr_translation": 1},
     "submaps": {"distance_m": 1, "uncertainty_m": 1},
     "loops": {"near_m": 1},
-    "registration": {"lr_translation": 1},
-    "final": {
-        "lr_pose_translation": 1, "pose_reach_m": 1, "pose_reach_most_m": 1, "lr_means_last": 1, "spacing_m": 1,
-        "merge_m": 1,
-    },
 }  # fmt: skip
 """The power of a length in each setting. Weights of losses in metres have −1, so that a loss keeps its value."""
 
 POSES_STAY: Mapping[str, Mapping[str, object]] = {
     "mapping": {"lr_pose_translation": 0.0, "lr_pose_rotation": 0.0},
-    "final": {"lr_pose_translation": 0.0, "lr_pose_rotation": 0.0},
+    "final": {"move_poses": False},
     "loops": {"close": False},
 }
 """Settings for given poses (`input.poses`): nothing moves them."""

@@ -2,13 +2,14 @@
 
 import sys
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal, NamedTuple
 
 from sigmasplat.config.ranges import (
     WIDTHS_PX,
     Above0,
     AtLeastOne,
     Count,
+    FromRow,
     NotNegative,
     Range,
     Section,
@@ -57,18 +58,12 @@ class LoopConfig(Section, name="loops"):
     own submap, where k is this share of their number."""
     min_interval: AtLeastOne = 2
     """Two submaps are tested as a loop only if their numbers differ by at least this."""
-    similarity_floor: NotNegative = 0.8  # the built-in descriptor needs it: it describes shapes, not places
-    """Pairs of keyframes with a similarity of at most this are never tested."""
     near_m: NotNegative = 0.5  # the built-in descriptor rarely recognises a place from another side
     """Keyframes closer than this by the current poses are tested too, whatever their similarity; 0 = off (paper)."""
-    near_deg: Annotated[float, Range(0, 180)] = 30.0
+    near_deg: ClassVar[float] = 30.0
     """Maximum rotation between the keyframes of a pair that `near_m` selects."""
     most: Count = 3  # registering a pair costs as much as thirty frames
     """Maximum number of pairs registered per finished submap, the most similar first; 0 = no limit."""
-    slices_per_frame: Count = 3
-    """Each frame that is not a keyframe continues the search for the loops of finished submaps by this many slices for
-    each submap that waits, so that no frame takes long. A slice is one alignment. 0 = the frame that ends the submap
-    makes the whole search."""
     uncertainty: bool = True
     """Whether similarity is multiplied by a gate from the variance-weighted opacity ratio; off = LoopSplat."""
     tau: Above0 = 10.0
@@ -76,6 +71,36 @@ class LoopConfig(Section, name="loops"):
     splats more sharply."""
     weight_max: ClassVar[float] = 3.0
     """Bounds of the splat weights in the opacity ratio: at most this, at least 1 / this."""
+
+    @property
+    def similarity_floor(self) -> float:
+        """Pairs of keyframes with a similarity of at most this are never tested. The built-in descriptor needs it: it
+        describes shapes, not places."""
+        return 0.8 if self.descriptor == "grid" else 0.0
+
+
+class RegistrationRow(NamedTuple):
+    """What belongs to a way of localising keyframes."""
+
+    lr_rotation: float
+    """Learning rate of rotation, as `tracking.lr_rotation`."""
+    lr_translation: float
+    """Learning rate of translation, metres per step, times the scale of the scene."""
+    color_mean: str
+    """How the colour errors are averaged: over pixels and channels (values); or over pixels, with the sum over the
+    three channels, which weights colour three times as much (pixels)."""
+    target: str = "recorded"
+    """Which image of a keyframe is localised: the recorded one, or the one that its own submap renders (rendered)."""
+
+
+REGISTRATIONS = {
+    "keyframe": RegistrationRow(0.001, 0.001, "pixels"),
+    "few-steps": RegistrationRow(0.001, 0.001, "pixels"),
+    "paper": RegistrationRow(0.015, 0.005, "values"),
+    "paper-fine": RegistrationRow(0.003, 0.001, "values"),
+    "rendered": RegistrationRow(0.015, 0.005, "values", "rendered"),
+}
+"""The values that belong to each `registration.method`: of the paper, its code, or ours."""
 
 
 @dataclass(frozen=True)
@@ -86,29 +111,16 @@ class RegistrationConfig(Section, name="registration"):
     """Number of keyframes of each submap that are localised in the other one."""
     iterations: Count = 0  # descent hardly ever finds what alignment does not, and takes half of a search
     """Maximum number of Adam steps per keyframe, after alignment; each step is a render. 0 = only alignment."""
-    lr_rotation: NotNegative = 0.001
-    """Learning rate of rotation in registration, as `tracking.lr_rotation`."""
-    lr_translation: NotNegative = 0.001
-    """Learning rate of translation in registration, metres per step."""
-    plateau_stop: NotNegative = 1e-4
-    """The steps of registration end when `plateau_window` steps have not lowered the loss by this share; 0 = run every
-    iteration."""
-    plateau_window: AtLeastOne = 10
-    """Number of steps within which the loss of registration must fall by the share `plateau_stop`."""
-    target: Literal["recorded", "rendered"] = "recorded"
-    """Which image of a keyframe is localised in the other submap: the recorded one, or the one that its own submap
-    renders at its pose (VarSplat's code for ScanNet)."""
-    to_keyframe: bool = True
-    """Whether a localised keyframe is finally aligned to the recorded image of the other submap's nearest keyframe
-    (ours): the surfaces of a young map are biased. A loop that only the maps show is rejected. off = the pose relative
-    to the map is used (paper)."""
+    method: Literal["keyframe", "few-steps", "paper", "paper-fine", "rendered"] = "keyframe"
+    """How a keyframe is localised in the other submap. keyframe: against the map, and finally against the recorded
+    image of the nearest keyframe there (ours), because the surfaces of a young map are biased; a loop that only the
+    maps show is rejected. The others use the pose relative to the map (paper): few-steps = with small Adam steps;
+    paper, paper-fine = with those of VarSplat for real images and for Replica; rendered = as paper, with the image that
+    its own submap renders instead of the recorded one (VarSplat's code for ScanNet)."""
     exposure: ClassVar[bool] = True
     """Whether a factor and an offset of the colour are fitted too, because submaps may differ in exposure."""
     weight_color: ClassVar[float] = 0.95
     """λ_c, the weight of the colour loss in registration; the depth loss has 1 − λ_c."""
-    color_mean: Literal["values", "pixels"] = "pixels"
-    """How the colour errors of registration are averaged: values = over pixels and channels (paper); pixels = over
-    pixels, with the sum over the three channels, which weights colour three times as much."""
     uncertainty: bool = True
     """Whether pixels are weighted by the V of the other submap; off = LoopSplat."""
     tau: Above0 = 10.0
@@ -132,6 +144,68 @@ class RegistrationConfig(Section, name="registration"):
     """Localisations agree if their rotations differ from one of them by at most this. A loop is rejected if fewer than
     two agree."""
 
+    lr_rotation = FromRow[float]("method", REGISTRATIONS)
+    lr_translation = FromRow[float]("method", REGISTRATIONS)
+    color_mean = FromRow[str]("method", REGISTRATIONS)
+    target = FromRow[str]("method", REGISTRATIONS)
+
+    @property
+    def to_keyframe(self) -> bool:
+        """Whether a localised keyframe is finally aligned to the recorded image of the nearest keyframe."""
+        return self.method == "keyframe"
+
+
+class Schedule(NamedTuple):
+    """What belongs to a way of refining the final map. The values that a row leaves out are the paper's."""
+
+    order: str = "random"
+    """Order of the keyframes: drawn for each step (random), or each once before any is used again (epochs)."""
+    exposure: bool = False
+    """Whether the exposure of each keyframe relative to the map is fitted: a gain and an offset for each channel."""
+    sh_every: int = 1000
+    """Number of steps after which the degree of view-dependent colour rises by one."""
+    merge_m: float = 0.02
+    """Edge in metres of the voxels in which merging keeps the splats of one submap, times the scale of the scene."""
+    lr_means_last: float = 0.0
+    """Learning rate of positions in the last step, metres, times the scale of the scene; it decays exponentially from
+    `mapping.lr_means` (3DGS). 0 = `mapping.lr_means` throughout."""
+    lr_factor: float = 1.0
+    """Factor on the learning rates of mapping (`mapping.lr_…`) in the first step, except that of positions."""
+    lr_log_scales: float = 0.0
+    """Learning rate of sizes in the first step. 0 = `lr_factor` times `mapping.lr_log_scales`."""
+    lr_decay: float = 1.0
+    """Rates of splats and poses in the last step, as a share of those in the first; they decay exponentially."""
+    beta2: float = 0.999
+    """Decay β₂ of Adam's second moment."""
+    prune_weight_px: float = 0.0
+    """Before and after, splats are removed if their weights in every keyframe sum to less than this, in pixels."""
+    weight_moment: bool = True
+    """Whether the depth uncertainty U stays in the loss (`mapping.weight_moment`)."""
+    max_axis_ratio: float = 0.0
+    """Largest ratio of a splat's longest axis to its shortest; refinement lengthens shorter axes. 0 = no limit."""
+    max_needle_ratio: float = 0.0
+    """Largest ratio of a splat's longest axis to its second longest; refinement shortens the longest. 0 = no limit."""
+
+
+SCHEDULES = {
+    "steady": Schedule(),
+    "falling": Schedule(lr_means_last=1.6e-6),
+    "epochs": Schedule(
+        order="epochs", exposure=True, sh_every=100,
+        merge_m=0.05,  # 40 % fewer splats than with 0.02, and no seams between neighbouring voxels
+        lr_factor=12.0,  # the rates of mapping are too small for 1000 steps: shapes hardly change
+        lr_log_scales=0.08,  # with half of it, views are up to 0.2 dB less sharp
+        lr_decay=0.05,
+        # The size of a step follows the last hundred gradients: each keyframe has about a dozen steps, and 0.999
+        # remembers gradients of the merged map.
+        beta2=0.99,
+        prune_weight_px=0.5,
+        weight_moment=False,  # it does not improve a map of few steps, and costs an eighth of the time
+        max_axis_ratio=19.0, max_needle_ratio=8.0,
+    ),
+}  # fmt: skip
+"""The values that belong to each `final.schedule`: of the paper, its code, and ours."""
+
 
 @dataclass(frozen=True)
 class FinalConfig(Section, name="final"):
@@ -142,39 +216,22 @@ class FinalConfig(Section, name="final"):
     (paper)."""
     iterations: Count = 1000
     """Number of refinement steps over all keyframes; 0 = no refinement."""
-    lr_pose_translation: NotNegative = 0.0003
-    """Learning rate of keyframe positions during refinement, in metres; the poses of frames follow their keyframes. 0 =
-    fixed (paper)."""
-    lr_pose_rotation: NotNegative = 0.0002
-    """Learning rate of keyframe rotations during refinement, in rad; 0 = fixed (paper)."""
-    pose_reach_m: NotNegative = 0.001  # without a limit, refinement bends a path that tracking found to a millimetre
-    """About how far refinement can move a keyframe from its tracked pose, in metres: each step takes back
-    the share `final.lr_pose_translation` / `final.pose_reach_m` of this motion and turn. 0 = without limit."""
-    pose_reach_most_m: NotNegative = 0.01  # where tracking is less sure, views are 0.2 to 0.3 dB sharper
-    """If above `final.pose_reach_m`, the reach is half the median standard deviation of the keyframe positions, limited
-    to the range from `final.pose_reach_m` to this value, in metres. The learning rates of poses grow in proportion. 0 =
-    the reach is always `final.pose_reach_m`."""
+    move_poses: bool = True
+    """Whether refinement moves keyframes, and with them the poses of frames, off = fixed (paper): about half the median
+    standard deviation of their positions at most, from 1 mm to 1 cm."""
     seconds: NotNegative = 0.0
     """Time budget of the refinement in seconds: it ends at the latest then, even if steps are left, and learning rates
     fall in time. The result then depends on the speed of the machine. 0 = no limit."""
-    exposure: bool = True
-    """Whether the exposure of each keyframe relative to the map is fitted during refinement: a gain and an offset for
-    each colour channel. Frames between keyframes get an interpolated exposure."""
-    order: Literal["random", "epochs"] = "epochs"
-    """Order of the keyframes in refinement, and what belongs to it: random = drawn for each of many steps at the rates
-    of mapping (paper); epochs = every keyframe once, in random order, before any is used again, for few steps at rates
-    that fall, without U, without hidden splats, and with limits on the shapes of splats (ours)."""
-    lr_means_last: NotNegative = 0.0
-    """Learning rate of positions in the last refinement step; it decays exponentially from `mapping.lr_means` (3DGS). 0
-    = `mapping.lr_means` throughout."""
+    schedule: Literal["steady", "falling", "epochs"] = "epochs"
+    """How refinement runs. steady: keyframes drawn for each of many steps at the rates of mapping (paper); falling: the
+    same with a rate of positions that falls to 1.6e-6 m (VarSplat's code); epochs: every keyframe once, in random
+    order, before any is used again, for few steps at rates that fall, without U, without hidden splats, with limits on
+    the shapes of splats, with the exposure of each keyframe, a gain and an offset for each channel, fitted too, and
+    from a map that keeps the splats of one submap in voxels of 5 cm instead of 2 cm (ours)."""
     sh_degree: Annotated[int, Range(0, 3)] = 3
     """Degree of view-dependent colour reached during refinement, 0 to 3."""
-    sh_every: AtLeastOne = 100
-    """Number of refinement steps after which the degree of view-dependent colour rises by one."""
-    spacing_m: Above0 = 0.02
-    """Distance between the splats seeded on the mesh."""
-    merge_m: Above0 = 0.05  # 40 % fewer splats than with 0.02, and no seams between neighbouring voxels
-    """Edge in metres of the voxels in which merging keeps the splats of one submap only."""
+    spacing_m: ClassVar[float] = 0.02
+    """Distance between the splats seeded on the mesh, in metres, times the scale of the scene."""
     max_splats: Count = 0
     """Largest number of splats of the final map; those that contribute least to the images of keyframes are removed. 0
     = no limit."""
@@ -193,56 +250,41 @@ class FinalConfig(Section, name="final"):
     """Whether variance is used to merge submaps and still learned during refinement; off = paper."""
 
     @property
-    def short(self) -> bool:
-        """Return whether refinement has few steps (`order`)."""
-        return self.order == "epochs"
+    def lr_pose_translation(self) -> float:
+        """Learning rate of keyframe positions, metres, times the scale of the scene; 0 = fixed."""
+        return 0.0003 if self.move_poses else 0.0
 
     @property
-    def lr_factor(self) -> float:
-        """Factor on the learning rates of mapping (`mapping.lr_…`) in the first refinement step, except that of
-        positions. The rates of mapping are too small for 1000 steps: shapes hardly change."""
-        return 12.0 if self.short else 1.0
+    def lr_pose_rotation(self) -> float:
+        """Learning rate of keyframe rotations, rad; 0 = fixed."""
+        return 0.0002 if self.move_poses else 0.0
 
     @property
-    def lr_log_scales(self) -> float:
-        """Learning rate of sizes in the first refinement step; with half of it, views are up to 0.2 dB less sharp. 0 =
-        `final.lr_factor` times `mapping.lr_log_scales`."""
-        return 0.08 if self.short else 0.0
+    def pose_reach_m(self) -> float:
+        """About how far refinement can move a keyframe from its tracked pose, in metres, times the scale of the scene:
+        each step takes back the share `lr_pose_translation` / `pose_reach_m` of this motion and turn. Without a limit,
+        refinement bends a path that tracking found to a millimetre. `final_map.reaching` raises it."""
+        return 0.001 if self.move_poses else 0.0
 
     @property
-    def lr_decay(self) -> float:
-        """Learning rates of splats and poses in the last refinement step, as a share of those in the first; they decay
-        exponentially. 1 = constant."""
-        return 0.05 if self.short else 1.0
+    def pose_reach_most_m(self) -> float:
+        """The largest reach, in metres, times the scale of the scene. Where tracking is less sure, views are 0.2 to
+        0.3 dB sharper with it."""
+        return 0.01 if self.move_poses else 0.0
 
-    @property
-    def beta2(self) -> float:
-        """Decay β₂ of Adam's second moment during refinement. With 0.99 the size of a step follows the last hundred
-        gradients: each keyframe has about a dozen steps, and 0.999 remembers gradients of the merged map."""
-        return 0.99 if self.short else 0.999
-
-    @property
-    def prune_weight_px(self) -> float:
-        """Before and after refinement, splats are removed if their weights in every keyframe sum to less than this, in
-        pixels. 0 = none are removed."""
-        return 0.5 if self.short else 0.0
-
-    @property
-    def weight_moment(self) -> bool:
-        """Whether the depth uncertainty U stays in the loss of refinement (`mapping.weight_moment`). It does not
-        improve a map of few steps, and costs an eighth of the time."""
-        return not self.short
-
-    @property
-    def max_axis_ratio(self) -> float:
-        """Largest ratio of a splat's longest axis to its shortest; refinement lengthens shorter axes. 0 = no limit."""
-        return 19.0 if self.short else 0.0
-
-    @property
-    def max_needle_ratio(self) -> float:
-        """Largest ratio of a splat's longest axis to its second longest; refinement shortens the longest. 0 = no
-        limit."""
-        return 8.0 if self.short else 0.0
+    order = FromRow[str]("schedule", SCHEDULES)
+    exposure = FromRow[bool]("schedule", SCHEDULES)
+    sh_every = FromRow[int]("schedule", SCHEDULES)
+    merge_m = FromRow[float]("schedule", SCHEDULES)
+    lr_means_last = FromRow[float]("schedule", SCHEDULES)
+    lr_factor = FromRow[float]("schedule", SCHEDULES)
+    lr_log_scales = FromRow[float]("schedule", SCHEDULES)
+    lr_decay = FromRow[float]("schedule", SCHEDULES)
+    beta2 = FromRow[float]("schedule", SCHEDULES)
+    prune_weight_px = FromRow[float]("schedule", SCHEDULES)
+    weight_moment = FromRow[bool]("schedule", SCHEDULES)
+    max_axis_ratio = FromRow[float]("schedule", SCHEDULES)
+    max_needle_ratio = FromRow[float]("schedule", SCHEDULES)
 
     @property
     def width_px(self) -> int:

@@ -154,8 +154,6 @@ SMOOTHED_PX = 5
 """Normals are those of a surface that is averaged over a window of this width: their noise must be far below 1."""
 LEAST_COSINE = 0.2
 """Smallest cos θ: normals of surfaces seen at less than 12° are not measured well enough."""
-MOST_WEIGHT = 4.0
-"""Largest weight of a reading in a loss."""
 
 
 def modelled_std(depth_m: Floats, model: SensorModel, camera: Camera) -> Floats:
@@ -232,14 +230,3 @@ def cosines(depth_m: Floats, camera: Camera) -> Floats:
     cosine = w / np.maximum(ray * np.sqrt((normal**2).sum(0)), np.float32(1e-12))
     cosine = np.clip(cosine, LEAST_COSINE, 1.0)
     return np.where(known, cosine, np.float32(1.0)).astype(np.float32)
-
-
-def relative_weights(std_m: Floats, usual_std_m: Floats) -> Floats:
-    """Return weights of readings [H, W] in a loss of absolute errors: how many times as sure each is as usual, at most
-    `MOST_WEIGHT`; 0 without a reading.
-
-    The loss was balanced against colour for usual readings. If depth were followed without a limit, views would become
-    unsharp.
-    """
-    weight = np.divide(usual_std_m, std_m, out=np.zeros_like(std_m), where=std_m > 0)
-    return np.minimum(weight, np.float32(MOST_WEIGHT))

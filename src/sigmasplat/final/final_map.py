@@ -2,7 +2,7 @@
 §7)."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -73,10 +73,7 @@ def final_map(
         return FinalMap(field)
     if found is None:
         field.keep(torch.from_numpy(z_order(field.means.numpy())))
-    on_device, keyframes = (
-        field.to(view.sums.device),
-        KeyframeReader(store, anchors, view, config.input.sensor if config.mapping.sensor_noise else None),
-    )
+    on_device, keyframes = field.to(view.sums.device), KeyframeReader(store, anchors, view)
     if found is not None:
         keyframes.take(found)
         random.bit_generator.state = found.numbers
@@ -123,20 +120,20 @@ def merged(store: SubmapStore, anchors: Sequence[Matrix], config: Config) -> Gau
         log_variance = part.params[:, COLUMNS["log_variances"]].mean(1)
         waiting.append(OwnedSplats(part, np.full(len(part), index), log_variance))
         if _count(waiting) >= max(AT_ONCE, _count(kept)):
-            kept, waiting = [_without_duplicates([*kept, *waiting], config.final)], []
-    return _without_duplicates([*kept, *waiting], config.final).field
+            kept, waiting = [_without_duplicates([*kept, *waiting], config)], []
+    return _without_duplicates([*kept, *waiting], config).field
 
 
 def _count(parts: Sequence[OwnedSplats]) -> int:
     return sum(len(part.field) for part in parts)
 
 
-def _without_duplicates(parts: Sequence[OwnedSplats], final: FinalConfig) -> OwnedSplats:
+def _without_duplicates(parts: Sequence[OwnedSplats], config: Config) -> OwnedSplats:
     """Return the splats of parts that survive, in their order."""
     field = GaussianField.side_by_side(part.field for part in parts)
     owner, log_variance = np.concatenate([part.owner for part in parts]), torch.cat([p.log_variance for p in parts])
-    weigh = np.asarray(log_variance.double()) if final.uncertainty else None
-    keep = survivors(field.means.numpy(), owner, weigh, final.merge_m)
+    weigh = np.asarray(log_variance.double()) if config.final.uncertainty else None
+    keep = survivors(field.means.numpy(), owner, weigh, config.final.merge_m * config.render.scene_scale)
     field.keep(torch.from_numpy(keep))
     return OwnedSplats(field, owner[keep], log_variance[torch.from_numpy(keep)])
 
@@ -195,11 +192,12 @@ def seeded_on_surface(store: SubmapStore, anchors: Sequence[Matrix], config: Con
     mesh = fuse(fusion_views(store, anchors), count_keyframes(store), config, weigh=final.uncertainty)
     if not len(mesh.vertices):
         raise SigmaSplatError("the submaps have no surface for the seeds of the final map; use final.seed_from=submaps")
-    points, colors = thinned_vertices(mesh, final.spacing_m)
+    spacing_m = final.spacing_m * config.render.scene_scale
+    points, colors = thinned_vertices(mesh, spacing_m)
     log_variances = torch.full((len(points), 3), INITIAL_LOG_VARIANCE)
     if final.uncertainty:
         log_variances = nearest_log_variances(points, store, anchors)
-    scales = torch.full((len(points), 3), final.spacing_m)
+    scales = torch.full((len(points), 3), spacing_m)
     return GaussianField.from_values(
         torch.from_numpy(points).float(), scales, torch.from_numpy(colors).float(), log_variances=log_variances
     )
@@ -237,21 +235,33 @@ KEYFRAMES_MOST = 40
 """The standard deviation is the median of at most this many keyframes, evenly spread: each one costs milliseconds."""
 
 
-def reaching(final: FinalConfig, path: PathCovariance) -> FinalConfig:
+@dataclass(frozen=True)
+class ReachingFinalConfig(FinalConfig):
+    """The settings of a refinement with a reach of its own (`reaching`)."""
+
+    lr_pose_translation: float = 0.0
+    lr_pose_rotation: float = 0.0
+    pose_reach_m: float = 0.0
+
+
+def reaching(config: Config, path: PathCovariance) -> FinalConfig:
     """Return the settings of a refinement with a reach that follows from the errors of the path (ours).
 
-    With `pose_reach_most_m`, the reach is `SHARE` times the median standard deviation of keyframe positions, from
-    `pose_reach_m` to `pose_reach_most_m`. The learning rates of poses grow in the same proportion. If tracking has
-    estimated the errors of less than half of the hops, as tracking by descent does, the reach stays `pose_reach_m`.
+    The reach is `SHARE` times the median standard deviation of keyframe positions, from `pose_reach_m` to
+    `pose_reach_most_m`. The learning rates of poses grow in the same proportion. If tracking has estimated the errors
+    of less than half of the hops, as tracking by descent does, the reach stays `pose_reach_m`.
     """
-    if not final.pose_reach_m or final.pose_reach_most_m <= final.pose_reach_m or not is_estimated(path):
+    final, scale, factor = config.final, config.render.scene_scale, 1.0
+    if not final.pose_reach_m:
         return final
-    reach_m = min(max(SHARE * position_std_m(path), final.pose_reach_m), final.pose_reach_most_m)
-    factor = reach_m / final.pose_reach_m
-    return replace(
-        final,
+    reach_m, most_m = final.pose_reach_m * scale, final.pose_reach_most_m * scale
+    if most_m > reach_m and is_estimated(path):
+        least_m, reach_m = reach_m, min(max(SHARE * position_std_m(path), reach_m), most_m)
+        factor = reach_m / least_m
+    return ReachingFinalConfig(
+        **vars(final),
         pose_reach_m=reach_m,
-        lr_pose_translation=factor * final.lr_pose_translation,
+        lr_pose_translation=factor * (final.lr_pose_translation * scale),
         lr_pose_rotation=factor * final.lr_pose_rotation,
     )
 

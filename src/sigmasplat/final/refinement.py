@@ -14,7 +14,6 @@ from sigmasplat.config import Config, FinalConfig, MappingConfig
 from sigmasplat.data import se3
 from sigmasplat.data.camera import NEUTRAL, centred
 from sigmasplat.data.field import COLUMNS, GaussianField
-from sigmasplat.data.images import std_by_model
 from sigmasplat.data.submap import SubmapStore
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.fit.adam import BETA2, Rates, VectorAdam
@@ -84,14 +83,12 @@ class KeyframeReader:
 
     anchors: T_world_submap [4, 4] of each submap; `places`: submap and number of each keyframe; `poses`: their
     T_world_camera [4, 4], which `refine` may move; `motions`: Adam's state of each pose; `exposures` [K, 3, 2]: those
-    of the images relative to the map, as fitted last; `left`: the keyframes left in the current epoch; `sensor`: the
-    text of the model by which depth is weighed, None: all readings weigh the same. Raises
+    of the images relative to the map, as fitted last; `left`: the keyframes left in the current epoch. Raises
     SigmaSplatError if there is no keyframe, or a submap's camera is not the view's.
     """
 
-    def __init__(self, store: SubmapStore, anchors: Sequence[Matrix], view: View, sensor: str | None = None) -> None:
-        self.store, self.camera, self.sensor = store, view.camera, sensor
-        self.noise_per_m = view.options.depth_noise_per_m
+    def __init__(self, store: SubmapStore, anchors: Sequence[Matrix], view: View) -> None:
+        self.store, self.camera = store, view.camera
         self.size = (view.alpha.shape[0], view.alpha.shape[1])
         self.places: list[tuple[int, int]] = []
         self.poses: list[Matrix] = []
@@ -130,7 +127,7 @@ class KeyframeReader:
         return keyframe
 
     def draw(self, order: str, random: np.random.Generator) -> int:
-        """Return the number of the next keyframe: uniformly drawn, or the next one of an epoch (`final.order`)."""
+        """Return the number of the next keyframe: uniformly drawn, or the next one of an epoch (`final.schedule`)."""
         if order == "random":
             return int(random.integers(len(self)))
         self.left = self.left or random.permutation(len(self)).tolist()
@@ -168,10 +165,7 @@ class KeyframeReader:
         return [found[submap_of == index] for index in range(len(self.store))]
 
     def _read(self, i: int) -> Target:
-        picture = self.store.picture(*self.places[i])
-        std_m = None if self.sensor is None else std_by_model(picture.depth_m, self.camera, self.sensor)
-        target = Target.of_picture(picture, self.camera, self.size, std_m)
-        return target if std_m is None else target.weighed_by_std(self.noise_per_m)
+        return Target.of_picture(self.store.picture(*self.places[i]), self.camera, self.size)
 
 
 def refine(
@@ -201,7 +195,7 @@ def refine(
         until_event = min(every - done % every for every in (final.prune_every, final.sh_every))
         steps = range(done, min(done + until_event, final.iterations))
         degree = min(final.sh_degree, done // final.sh_every)
-        rates = decaying(mapping, final, done, clock) if _changes_rates(final) else None
+        rates = decaying(mapping, final, done, clock, config.render.scene_scale) if _changes_rates(final) else None
         drawn = _draw(keyframes, steps, config, random, progress, clock, view)
         losses += (fitted := fit_field(field, view, drawn, mapping, schedule=rates, degree=degree).losses)
         done += len(fitted)
@@ -260,7 +254,9 @@ def _changes_rates(final: FinalConfig) -> bool:
     return bool(own) or (final.lr_factor, final.lr_decay, final.beta2) != (1.0, 1.0, BETA2)
 
 
-def decaying(mapping: MappingConfig, final: FinalConfig, done: int, clock: Clock) -> Iterator[Rates]:
+def decaying(
+    mapping: MappingConfig, final: FinalConfig, done: int, clock: Clock, scene_scale: float = 1.0
+) -> Iterator[Rates]:
     """Yield the rates of the refinement steps after `done`.
 
     All rates start at `final.lr_factor` times those of mapping, that of the means at the one of mapping, that of the
@@ -275,7 +271,8 @@ def decaying(mapping: MappingConfig, final: FinalConfig, done: int, clock: Clock
             rates.per_column[COLUMNS["log_scales"]] = final.lr_log_scales
         rates.per_column.mul_(final.lr_decay**share)
         if final.lr_means_last:
-            rates.per_column[COLUMNS["means"]] = mapping.lr_means ** (1.0 - share) * final.lr_means_last**share
+            last = final.lr_means_last * scene_scale
+            rates.per_column[COLUMNS["means"]] = mapping.lr_means ** (1.0 - share) * last**share
         yield rates
 
 

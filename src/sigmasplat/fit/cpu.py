@@ -150,7 +150,7 @@ class CompiledStep(TorchStep):
         alpha, g_alpha = (v.alpha, v.g_alpha) if weights.get("mean_depth") else (None, None)
         _core.mapping_losses(
             v.sums, median, moment, alpha, target.color, target.depth, height, of_pixels.tolist(),
-            target.valid_pixels, v.g_sums, g_median, g_moment, g_alpha, self.parts, target.depth_weight,
+            target.valid_pixels, v.g_sums, g_median, g_moment, g_alpha, self.parts,
         )  # fmt: skip
         loss = float(np.dot(of_pixels, self.parts))
         if weights["ssim"]:

@@ -6,8 +6,7 @@ weight.
 
 Maps: color, color_target [H, W, 3] in [0, 1]; depth D̂ = Σwz, depth_target [H, W] m; alpha A = Σw [H, W];
 variance [H, W, 3] (V, VarSplat §1); moment [H, W] m² (U, CG-SLAM eq. 10); median_depth [H, W] m, 0 = none (CG-SLAM
-eq. 8); valid [H, W] bool, pixels with a depth reading; depth_weight [H, W]: how sure each reading is, 1 on average,
-optional; scales [N, 3] m.
+eq. 8); valid [H, W] bool, pixels with a depth reading; scales [N, 3] m.
 
 Every image term is a mean over valid pixels (and channels), except SSIM, which is a mean over all pixels of the masked
 images. Without valid pixels a term is 0 with zero gradient, never NaN.
@@ -66,11 +65,6 @@ def mean_over(values: Tensor, valid: Tensor) -> Tensor:
     return masked(values, valid).sum() / (valid.sum() * channels).clamp(min=1)
 
 
-def weighed(values: Tensor, weight: Tensor | None) -> Tensor:
-    """Return values [H, W] times a weight [H, W]; without a weight, the values."""
-    return values if weight is None else values * weight
-
-
 @term
 def l1(color: Tensor, color_target: Tensor, valid: Tensor) -> Tensor:
     """Return the mean of |Ĉ − C| of colours [H, W, 3] in [0, 1] over valid [H, W] × 3 (VarSplat §2, L_color)."""
@@ -107,16 +101,14 @@ def _blur(planes: Tensor) -> Tensor:
 
 
 @term
-def depth(depth: Tensor, depth_target: Tensor, valid: Tensor, depth_weight: Tensor | None = None) -> Tensor:
+def depth(depth: Tensor, depth_target: Tensor, valid: Tensor) -> Tensor:
     """Return the mean of |D̂ − D| of depths [H, W] m over valid [H, W] with a reading, m (VarSplat §2, L_depth)."""
     valid = valid & (depth_target > 0)
-    return mean_over(weighed(masked(depth - depth_target, valid).abs(), depth_weight), valid)
+    return mean_over(masked(depth - depth_target, valid).abs(), valid)
 
 
 @term
-def mean_depth(
-    depth: Tensor, alpha: Tensor, depth_target: Tensor, valid: Tensor, depth_weight: Tensor | None = None
-) -> Tensor:
+def mean_depth(depth: Tensor, alpha: Tensor, depth_target: Tensor, valid: Tensor) -> Tensor:
     """Return the mean of |D̂/A − D| over valid [H, W] with a reading, m; 0 where the alpha A is at most `COVERED`.
 
     D̂/A is the mean depth of the splats of a pixel. D̂ alone is too small wherever light passes the map, and a loss on it
@@ -124,7 +116,7 @@ def mean_depth(
     """
     counted = valid & (depth_target > 0) & (alpha > COVERED)
     error = masked(masked(depth, counted) / masked(alpha, counted, fill=1.0) - depth_target, counted)
-    return weighed(error.abs(), depth_weight).sum() / valid.sum().clamp(min=1)
+    return error.abs().sum() / valid.sum().clamp(min=1)
 
 
 @term
@@ -171,9 +163,9 @@ def gaussian_nll(residual: Tensor, variance: Tensor, valid: Tensor) -> Tensor:
 
 
 @term
-def moment(moment: Tensor, valid: Tensor, depth_weight: Tensor | None = None) -> Tensor:
+def moment(moment: Tensor, valid: Tensor) -> Tensor:
     """Return the mean of |U| of the moment [H, W] m² over valid [H, W], m² (CG-SLAM, L_var)."""
-    return mean_over(weighed(masked(moment, valid).abs(), depth_weight), valid)
+    return mean_over(masked(moment, valid).abs(), valid)
 
 
 @term

@@ -64,8 +64,6 @@ def image_gradients(view: View, target: Target, weights: Weights) -> tuple[Tenso
         "depth_target": target.depth_image,
         "valid": target.depth_image > 0,
     }
-    if target.depth_weight is not None:
-        maps["depth_weight"] = target.depth_weight[:h, :w]
     if len(v.sums) >= 7:
         maps["variance"] = variance_of(sums)
     loss = losses.total(used, maps)
@@ -202,7 +200,7 @@ class ViewDependentStep:
 
     def accumulator(self, field: GaussianField) -> Accumulator:
         """Raise ConfigError: this step takes one image only."""
-        raise ConfigError("mapping.frames_per_step must be 1 with view-dependent colour")
+        raise ConfigError("a step on several keyframes needs colours without view dependence (mapping.adjustment)")
 
     def _through_colors(self, own: Tensor, harmonics: Tensor, g_shown: Tensor) -> tuple[Tensor, Tensor]:
         """Propagate the gradient of view-dependent colours [n, 3] to harmonics [n, width] and, by the direction, to

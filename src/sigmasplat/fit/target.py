@@ -11,7 +11,6 @@ from torch import Tensor
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.frame import Detail, Frame, Photo
-from sigmasplat.data.images import generic_std, relative_weights
 from sigmasplat.data.submap import Picture
 from sigmasplat.fit.adam import VectorAdam
 from sigmasplat.native import _core
@@ -46,8 +45,7 @@ class Target:
     """The image that a view should render: color [3, rows, columns], depth [rows, columns] m (0 = no reading or
     padding).
 
-    depth_std [rows, columns]: the standard deviation of each reading, m, None if it is unknown; depth_weight [rows,
-    columns]: weight of each reading in the loss, 1 on average, None: all 1.
+    depth_std [rows, columns]: the standard deviation of each reading, m, None if it is unknown.
     """
 
     camera: Camera
@@ -55,7 +53,6 @@ class Target:
     depth: Tensor
     valid_pixels: int
     depth_std: Tensor | None = None
-    depth_weight: Tensor | None = None
     _on_device: "Target | None" = dataclass_field(default=None, init=False, repr=False)
 
     def to(self, device: torch.device) -> "Target":
@@ -63,9 +60,9 @@ class Target:
         if self.depth.device == device:
             return self
         if self._on_device is None or self._on_device.depth.device != device:
-            planes = (None if p is None else p.to(device) for p in (self.depth_std, self.depth_weight))
+            std = None if self.depth_std is None else self.depth_std.to(device)
             color, depth = self.color.to(device), self.depth.to(device)
-            self._on_device = Target(self.camera, color, depth, self.valid_pixels, *planes)
+            self._on_device = Target(self.camera, color, depth, self.valid_pixels, std)
         return self._on_device
 
     @staticmethod
@@ -92,28 +89,19 @@ class Target:
             return None
         return np.asarray(self.depth_std[: self.camera.height, : self.camera.width].numpy())
 
-    def weighed_by_std(self, noise_per_m: float) -> "Target":
-        """Return the target whose loss weighs each reading by its standard deviation, if that is known, relative to
-        noise_per_m · z²."""
-        std = self.depth_std_image
-        if std is None:
-            return self
-        weights = relative_weights(std, generic_std(self.depth_image.numpy(), noise_per_m))
-        return replace(self, depth_weight=padded(weights, (self.depth.shape[0], self.depth.shape[1])))
-
     def with_depth(self, depth_m: NDArray[np.float32]) -> "Target":
         """Return the same colour with other depth [H, W], m."""
         depth = torch.zeros_like(self.depth)
         depth[: self.camera.height, : self.camera.width] = torch.from_numpy(depth_m)
         readings = int((depth_m > 0).sum())
-        return Target(self.camera, self.color, depth, readings, self.depth_std, self.depth_weight)
+        return Target(self.camera, self.color, depth, readings, self.depth_std)
 
     def without_exposure(self, exposure: NDArray[np.float64]) -> "Target":
         """Return the same depth with the colours in the exposure of the map (`data.camera`), in [0, 1]."""
         gain, offset = torch.from_numpy(exposure).float().T[..., None, None]
         color, inside = torch.zeros_like(self.color), np.s_[:, : self.camera.height, : self.camera.width]
         color[inside] = ((self.color[inside] - offset) / gain).clamp_(0.0, 1.0)
-        return Target(self.camera, color, self.depth, self.valid_pixels, self.depth_std, self.depth_weight)
+        return Target(self.camera, color, self.depth, self.valid_pixels, self.depth_std)
 
     def picture(self) -> Picture:
         """Return the image; colour is rounded to 256 steps, as a camera delivers it."""
@@ -121,11 +109,9 @@ class Target:
         return Picture(np.ascontiguousarray(color), self.depth_image.numpy().copy())
 
     @staticmethod
-    def of_picture(
-        picture: Picture, camera: Camera, size: tuple[int, int], std_m: NDArray[np.float32] | None = None
-    ) -> "Target":
-        """Make the target of an earlier keyframe's picture; std_m [H, W]: the standard deviation of its readings."""
-        return Target.of(Frame(0, 0.0, picture.unit_color, picture.depth_m, camera, depth_std_m=std_m), size)
+    def of_picture(picture: Picture, camera: Camera, size: tuple[int, int]) -> "Target":
+        """Make the target of an earlier keyframe's picture."""
+        return Target.of(Frame(0, 0.0, picture.unit_color, picture.depth_m, camera), size)
 
 
 def padded(image: NDArray[np.float32] | None, size: tuple[int, int]) -> Tensor | None:

@@ -3,13 +3,14 @@
 import dataclasses
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from sigmasplat.config import Config, RegistrationConfig, TrackingConfig
+from sigmasplat.config import Config, TrackingConfig
 from sigmasplat.data import se3
 from sigmasplat.data.submap import Picture, Submap, SubmapStore
 from sigmasplat.fit.align import align
@@ -65,7 +66,7 @@ class Registrar:
     def __init__(self, config: Config, store: SubmapStore, view: View, extractor: Extractor | None = None) -> None:
         self.config, self.store, self.view, self.verify = config.registration, store, view, config.tracking.verify
         self.by_features = FeatureGuesses(store, extractor, config.seed)
-        self.tracking = tracking_of(config.registration, config.tracking)
+        self.tracking = tracking_of(config)
         self._images: dict[tuple[int, int], tuple[Target, Pyramid]] = {}
         self._references: dict[tuple[int, int], Reference] = {}
 
@@ -164,7 +165,7 @@ class Registrar:
 
     def _at_keyframe(self, other: Submap, target: Target, live: Pyramid, found: PoseFit) -> PoseFit | None:
         """Align a keyframe that was found in a submap to the recorded image of its nearest keyframe there; return None
-        if this is not wanted (`registration.to_keyframe`) or the result is not valid.
+        if this is not wanted (`registration.method`) or the result is not valid.
 
         The map's surfaces are biased while it is young, and all keyframes that are localised in it then agree on a
         wrong pose. Readings are not.
@@ -253,23 +254,30 @@ def rendered_picture(maps: PoseMaps) -> Picture:
     return Picture(color.cpu().numpy(), depth_m.cpu().numpy())
 
 
-def tracking_of(registration: RegistrationConfig, tracking: TrackingConfig) -> TrackingConfig:
+class LocalisationConfig(TrackingConfig):
+    """The settings for localising keyframes: fits stop at a plateau of the loss."""
+
+    plateau_stop: ClassVar[float] = 1e-4
+
+
+def tracking_of(config: Config) -> TrackingConfig:
     """Return the settings for localising keyframes: alignment as in tracking, the loss and its descent as in
     registration.
 
     The loss is a mean over all pixels (VarSplat §5). Tracking sums the colour errors over the channels; where
     registration takes their mean, the weight of colour is a third of that. Adam does not depend on the loss's scale.
     """
-    r = registration
+    r, tracking = config.registration, config.tracking
     weight_color = r.weight_color
     if r.color_mean == "values":
         weight_color /= weight_color + 3.0 * (1.0 - weight_color)
-    return dataclasses.replace(
+    same = dataclasses.replace(
         tracking, uncertainty=r.uncertainty, tau=r.tau, weight_color=weight_color,
-        lr_rotation=r.lr_rotation, lr_translation=r.lr_translation, exposure=r.exposure, plateau_stop=r.plateau_stop,
-        plateau_window=r.plateau_window, alpha_power=1.0, alpha_above=OPAQUE, outlier_factor=0.0,
-        average="image", parametrisation="quaternion", align_depth_by="V", amsgrad=False,
+        lr_rotation=r.lr_rotation, lr_translation=r.lr_translation * config.render.scene_scale,
+        exposure=r.exposure, alpha_power=1.0, alpha_above=OPAQUE, outlier_factor=0.0,
+        descent="quaternion", align_depth_by="V",
     )  # fmt: skip
+    return LocalisationConfig(**vars(same))
 
 
 def score(fit: PoseFit) -> float:

@@ -5,7 +5,6 @@ is measured against depth readings (CG-SLAM §4).
 """
 
 from collections.abc import Iterable, Sequence
-from typing import Literal
 
 import numpy as np
 import torch
@@ -107,21 +106,19 @@ def _scatter(field: GaussianField, random: np.random.Generator) -> None:
     field.params[:, SCALES] -= float(np.log(CHILD_SCALE))
 
 
-def splat_uncertainty(
-    field: GaussianField, view: View, keyframes: Sequence[Keyframe], owner: Literal["dominant", "median"]
-) -> tuple[Tensor, Tensor]:
+def splat_uncertainty(field: GaussianField, view: View, keyframes: Sequence[Keyframe]) -> tuple[Tensor, Tensor]:
     """Return each splat's uncertainty ν [N] in m², float64, and the number of pixels n [N] used (CG-SLAM eq. 13).
 
-    ν = Σ w (D − z)² / n over the pixels with a reading D that the splat owns, in all keyframes; z is the depth of its
-    centre, w its weight. ν is 0 for a splat that owns no pixel. Renders each keyframe once; afterwards the view holds
-    the last one.
+    ν = Σ w (D − z)² / n over the pixels with a reading D that the splat dominates, in all keyframes; z is the depth of
+    its centre, w its weight. ν is 0 for a splat that dominates no pixel. Renders each keyframe once; afterwards the
+    view holds the last one.
     """
     spread = torch.zeros(len(field), dtype=torch.float64, device=field.params.device)
     count = torch.zeros_like(spread, dtype=torch.int64)
     for keyframe in keyframes:
         T_camera_world = se3.inverse(keyframe.T_world_camera)
         view.forward(field.params, T_camera_world, layers=True)
-        rows, weights, readings = (x.to(field.params.device) for x in _owned(view, keyframe, owner))
+        rows, weights, readings = (x.to(field.params.device) for x in _dominated(view, keyframe))
         off = readings - depths(field.means.double(), T_camera_world)[rows]
         # On a device that sums in parallel, torch sorts the indices first, so that the sums are the same every time.
         spread += torch.zeros_like(spread).index_put_((rows,), weights * (off * off), accumulate=True)
@@ -161,14 +158,12 @@ def depths(points: Tensor, T_camera_world: Matrix) -> Tensor:
     return a * points[:, 0] + b * points[:, 1] + c * points[:, 2] + d
 
 
-def _owned(view: View, keyframe: Keyframe, owner: str) -> tuple[Tensor, Tensor, Tensor]:
-    """Return, for each pixel with an owner and a reading: the owner's row, its weight, the reading in m."""
+def _dominated(view: View, keyframe: Keyframe) -> tuple[Tensor, Tensor, Tensor]:
+    """Return, for each pixel with a splat and a reading: the row of the splat with the largest weight, its weight, the
+    reading in m."""
     camera, layers = view.camera, view.layers
-    ids, weights = {
-        "dominant": (layers.dominant_id, layers.dominant_weight),
-        "median": (layers.median_id, layers.median_weight),
-    }[owner]
-    rows, weight = (plane[: camera.height, : camera.width] for plane in (ids, weights))
+    planes = layers.dominant_id, layers.dominant_weight
+    rows, weight = (plane[: camera.height, : camera.width] for plane in planes)
     reading = keyframe.target.to(rows.device).depth_image
     judged = ((rows >= 0) & (reading > 0)).nonzero(as_tuple=True)
     return rows[judged].long(), weight[judged].double(), reading[judged].double()

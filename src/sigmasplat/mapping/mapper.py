@@ -318,7 +318,7 @@ class Mapper:
         """Return how far each splat [N] is from the depth readings of the window, or of the newest keyframe if there is
         no window, m²."""
         keyframes = window if self.config.mapping.window else window[:1]
-        return splat_uncertainty(self.field, view, keyframes, self.config.primitives.owner)[0]
+        return splat_uncertainty(self.field, view, keyframes)[0]
 
     def _prune(self, view: View, also: Tensor | None = None) -> None:
         """Remove splats that are too faint or too large, and those marked in `also` [N]."""

@@ -1,7 +1,7 @@
 """Choose the keyframes that are fitted together: the newest, the one before, and the most co-visible others."""
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Literal, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -19,7 +19,7 @@ Ids = NDArray[np.int64]
 Scores = NDArray[np.float64]
 
 
-def choose_window(keyframes: Sequence[Keyframe], size: int, by: Literal["splats", "descriptor"]) -> list[Keyframe]:
+def choose_window(keyframes: Sequence[Keyframe], size: int, by: str) -> list[Keyframe]:
     """Return the newest keyframe, the one before it, then the most co-visible others, best first (CG-SLAM §7).
 
     keyframes: in the order of time; size ≥ 1: the most to return. Between equal scores the later keyframe wins. Raises
@@ -83,10 +83,7 @@ def _descriptor(keyframe: Keyframe) -> NDArray[np.float32]:
 
 
 def _nothing(keyframe: Keyframe, missing: str, by: str) -> SigmaSplatError:
-    return SigmaSplatError(
-        f"keyframe {keyframe.index} has no {missing}, which mapping.covisibility={by} needs; "
-        "use mapping.covisibility=splats, which every keyframe of a window has"
-    )
+    return SigmaSplatError(f"keyframe {keyframe.index} has no {missing}, which a window by {by} needs")
 
 
 def draw_keyframes(

@@ -16,7 +16,7 @@ from sigmasplat.graph.loops import Loops
 from sigmasplat.graph.newest_covariance import NO_ERRORS
 from sigmasplat.realtime.messages import Offer, Search, Snapshot, TrackedFrame
 from sigmasplat.slam.listeners import Before, Correction, correction_since
-from sigmasplat.slam.mapping_backend import MappingBackend
+from sigmasplat.slam.mapping_backend import SLICES_PER_FRAME, MappingBackend
 from sigmasplat.slam.results import StepTimer
 from sigmasplat.tracking.pose_validation import is_better
 from sigmasplat.tracking.prepared_frame import PreparedFrame, TrackedKeyframe, mapped_keyframe
@@ -92,7 +92,7 @@ class BackEnd:
         if each.search is not None:
             yield from self._search(each, each.search)
         yield from self.system.refining(self.system.mapper.pending_now, self._keyframe_waits)
-        yield from self.system.closing(self.system.config.loops.slices_per_frame)
+        yield from self.system.closing(SLICES_PER_FRAME)
 
     def _place(self, each: TrackedFrame) -> None:
         system, number = self.system, self._newest
@@ -134,7 +134,7 @@ class BackEnd:
         system, number = self.system, each.number
         self._timer = system.start_timer()
         seen, first = offer.seen, not system.steps
-        if system.config.mapping.exposure:
+        if system.config.tracking.exposure and system.config.mapping.exposure:
             seen = seen.without_exposure(offer.exposure)
         if first:
             place = system.begin_first(seen)

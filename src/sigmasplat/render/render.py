@@ -1,7 +1,7 @@
 """Render a field from a camera: two kernels, then formulas on their sums (DESIGN §3)."""
 
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -127,6 +127,13 @@ class FieldRenderer:
         return render(copied, camera, T_camera_world, depth_reference, options, self.backend)
 
 
+@dataclass(frozen=True)
+class SmallerImageConfig(RenderConfig):
+    """Rendering of a map in images that are smaller than those it was refined on."""
+
+    low_pass_px2: float = 0.0
+
+
 def as_refined(options: RenderConfig, camera: Camera, refined_fx: float | None) -> RenderConfig:
     """Return the settings that show a map in an image of `camera`.
 
@@ -138,4 +145,5 @@ def as_refined(options: RenderConfig, camera: Camera, refined_fx: float | None) 
     """
     if refined_fx is None or camera.fx >= refined_fx:
         return options
-    return replace(options, low_pass_px2=options.low_pass_px2 * (camera.fx / refined_fx) ** 2)
+    low_pass_px2 = options.low_pass_px2 * (camera.fx / refined_fx) ** 2
+    return SmallerImageConfig(**(vars(options) | {"low_pass_px2": low_pass_px2}))

@@ -24,6 +24,9 @@ from sigmasplat.tracking.recovery import usable
 from sigmasplat.tracking.relocaliser import INDEX_AT_MOST, KnownMap, Relocation
 from sigmasplat.types import Matrix, ShouldStop, Task, completed, never
 
+SLICES_PER_FRAME = 3
+"""Each frame that is not a keyframe continues the search for the loops of finished submaps by this many slices for each
+submap that waits (`mapping.divided`). A slice is one alignment."""
 LAST_TRIES = 3
 """Number of keyframes per submap that is apart with which other components are searched at the end."""
 
@@ -154,7 +157,7 @@ class MappingBackend(SlamState):
 
     def finish_submap(self, should_stop: ShouldStop = never) -> Task[None]:
         """Move the active submap to the store, in slices, and look for its loops, or leave that to the next frames
-        (`loops.slices_per_frame`). Pending steps are made before, unless `should_stop` returns True."""
+        (`mapping.divided`). Pending steps are made before, unless `should_stop` returns True."""
         yield from self.refining(self.mapper.pending, should_stop)
         submap, pictures = self.mapper.finished(len(self.store))
         submap, probes = self.validation_views.of(submap)
@@ -165,7 +168,7 @@ class MappingBackend(SlamState):
         known = [descriptor for descriptor in descriptors if descriptor is not None]
         yield
         self.closer.pending.append(PendingSearch(submap.index, known))
-        if not self.config.loops.slices_per_frame:
+        if not self.config.mapping.divided:
             yield from self.closing()
 
     def closing(self, at_most: int | None = None) -> Task[None]:

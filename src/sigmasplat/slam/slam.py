@@ -18,7 +18,7 @@ from sigmasplat.graph.path_covariance import PathCovariance
 from sigmasplat.render.render import as_refined
 from sigmasplat.slam.array_interface import ArrayInterface
 from sigmasplat.slam.listeners import notifying
-from sigmasplat.slam.mapping_backend import MappingBackend
+from sigmasplat.slam.mapping_backend import SLICES_PER_FRAME, MappingBackend
 from sigmasplat.slam.results import Step, StepTimer, make_step
 from sigmasplat.tracking.frame_estimate import FrameEstimate
 from sigmasplat.tracking.keyframe_rule import becomes_keyframe, is_held_back, is_mappable, may_validate
@@ -80,7 +80,7 @@ class Slam(MappingBackend, ArrayInterface):
         store, anchors = StorePart(self.store, members), [self.atlas.anchors[s] for s in members]
         refining, measuring = (part_of(progress, first, total) for first in (0, steps))
         known = PathCovariance.of_keyframes(self.atlas, self.closer.valid)
-        config = replace(self.config, final=reaching(self.config.final, known))
+        config = replace(self.config, final=reaching(self.config, known))
         final = final_map(store, anchors, config, self.view, self.random, refining, self.saved_refinement)
         self._final, self.refinement_steps = final.field, final.steps
         refined = RefinedStore(store, final.keyframe_poses, final.keyframe_exposures)
@@ -110,7 +110,8 @@ class Slam(MappingBackend, ArrayInterface):
         connected, pose = len(self.steps) > 0 and estimate.state == TRACKED, estimate.T_submap_camera
         seen = fitted_keyframe(self.tracker, self.mapper.field, self.view, seen, pose, connected)
         seen = seen.without(self.tracker.front)
-        return seen.without_exposure(estimate.exposure) if self.config.mapping.exposure else seen
+        found = self.config.tracking.exposure and self.config.mapping.exposure
+        return seen.without_exposure(estimate.exposure) if found else seen
 
     def _begin(self, seen: PreparedFrame) -> FrameEstimate:
         """Start the first submap at the first frame. Its camera is the world, unless there are earlier submaps: then
@@ -170,7 +171,7 @@ class Slam(MappingBackend, ArrayInterface):
         """Make the steps that this frame does of the pending work: of the map, and of the search for loops."""
         completed(self.refining(self.mapper.pending_now))
         with self._timer.stage("loops"):
-            completed(self.closing(self.config.loops.slices_per_frame))
+            completed(self.closing(SLICES_PER_FRAME))
 
     def _mapped(self, seen: PreparedFrame, T_submap_camera: Matrix, hop: RelativePose = UNKNOWN_HOP) -> Matrix:
         """Map a keyframe, and track the next frames relative to it; return its pose."""

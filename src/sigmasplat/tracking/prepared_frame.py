@@ -136,8 +136,6 @@ def observe(whole: Frame, working: Frame, view: View, config: Config, extractor:
     if ignored is not None:
         working = replace(working, depth_m=np.where(ignored, np.float32(0.0), working.depth_m))
     target = Target.of(working, (view.sums.shape[1], view.sums.shape[2]))
-    if config.mapping.sensor_noise:
-        target = target.weighed_by_std(config.render.depth_noise_per_m)
     live, image = live_image(view, working.color, working.depth_m, target), None
     if extractor is not None:
         image = FeatureImage(LateDetail(whole, config.features.width), working.depth_m, working.camera)

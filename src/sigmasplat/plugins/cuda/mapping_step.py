@@ -113,7 +113,7 @@ class CudaStep(TorchStep):
         moment, on_moment = (v.moment, v.g_moment) if weights.get("moment") else (None, None)
         alpha, on_alpha = (v.alpha, v.g_alpha) if weights.get("mean_depth") else (None, None)
         maps = v.sums, target.color, target.depth, median, moment, alpha
-        planes = (*maps, v.g_sums, on_median, on_moment, on_alpha, target.depth_weight)
+        planes = (*maps, v.g_sums, on_median, on_moment, on_alpha, None)
         blocks = blocks_for(self._pixels)
         sums = v.raster.empty(blocks, 1, dtype=torch.float64)
         v.raster.launch_fit(

@@ -81,13 +81,13 @@ class ImageInput:
         check_pixels(path, (width or 1, height or 1))
         return cls(only.name, numbers, batch, channels_first, height, width)
 
-    def sizes(self, height: int, width: int, side: int) -> list[Size]:
-        """Return the sizes (height, width) to try for an image, the first choice first; side: as in the settings."""
+    def sizes(self, height: int, width: int) -> list[Size]:
+        """Return the sizes (height, width) to try for an image, the first choice first."""
         if self.height and self.width:
             return [(self.height, self.width)]
         found = []
         for multiple, usual in STEPS:
-            scale = (side or usual) / min(height, width)
+            scale = usual / min(height, width)
             scale = self.height / height if self.height else self.width / width if self.width else scale
             rows, columns = (max(1, round(each * scale / multiple)) * multiple for each in (height, width))
             found.append((self.height or rows, self.width or columns))
@@ -120,16 +120,16 @@ class DepthModel:
         data = read_bytes(path, most=MOST_BYTES)
         runtime = import_optional("onnxruntime", "onnx", f"{path}: a depth model")
         self.path, self.name, self.sha256 = path, path.name, hashlib.sha256(data).hexdigest()
-        self._colors, self._side = settings.depth_model_colors, settings.depth_model_size
+        self._colors = settings.depth_model_colors
         with self._guarded("not a usable ONNX file", "export or download it again"):
             # From bytes: onnxruntime then reads no second file, and what runs is what was hashed. Its fallback only
             # prints and tries the same again.
-            options, cpu = _options(runtime, settings.depth_model_threads), ["CPUExecutionProvider"]
+            options, cpu = _options(runtime), ["CPUExecutionProvider"]
             self._session = runtime.InferenceSession(data, options, providers=cpu, enable_fallback=False)
             described = self._session.get_inputs(), self._session.get_outputs()  # copied: their text may be damaged
             inputs, outputs = ([Tensor(str(t.name), str(t.type), tuple(t.shape)) for t in each] for each in described)
         self._input = ImageInput.of(path, inputs)
-        self._output = _chosen_output(path, outputs, settings.depth_model_output)
+        self._output = _chosen_output(path, outputs)
         self._size_of: dict[tuple[int, ...], Size] = {}
 
     def predict(self, color: Floats) -> Floats:
@@ -146,7 +146,7 @@ class DepthModel:
         one that works, and its output: a network may need multiples of 32, or always give one size."""
         found: list[tuple[Size, Floats]] = []
         problem: SourceError | None = None
-        for size in self._input.sizes(color.shape[0], color.shape[1], self._side):
+        for size in self._input.sizes(*color.shape[:2]):
             try:
                 found.append((size, self._run(color, size)))
             except SourceError as error:
@@ -166,8 +166,8 @@ class DepthModel:
         shape = tuple(side for side in values.shape if side != 1)
         if len(shape) != 2 or min(shape) < LEAST_PX or values.dtype.kind not in "uif":
             raise SourceError(
-                f"{self.path}: output {_listed([self._output])} is {values.dtype} {values.shape}, not depth; give the "
-                "network's output of one number for each pixel as input.depth_model_output"
+                f"{self.path}: output {_listed([self._output])} is {values.dtype} {values.shape}, not depth; export "
+                "the network with one number for each pixel as its output"
             )
         check_pixels(self.path, shape[::-1])
         return values.reshape(shape).astype(np.float32)
@@ -184,10 +184,10 @@ class DepthModel:
             raise SourceError(f"{self.path}: {what} ({text}); {remedy}") from problem
 
 
-def _options(runtime: Any, threads: int) -> Any:
-    """Return the options of a session whose results depend on nothing but the number of threads."""
+def _options(runtime: Any) -> Any:
+    """Return the options of a session on one thread, whose results depend on nothing but its input."""
     options = runtime.SessionOptions()
-    options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
+    options.intra_op_num_threads, options.inter_op_num_threads = 1, 1
     options.execution_mode = runtime.ExecutionMode.ORT_SEQUENTIAL
     options.use_deterministic_compute = True
     options.log_severity_level = QUIET
@@ -195,15 +195,16 @@ def _options(runtime: Any, threads: int) -> Any:
     return options
 
 
-def _chosen_output(path: Path, outputs: Sequence[Tensor], wanted: str) -> str:
+def _chosen_output(path: Path, outputs: Sequence[Tensor]) -> str:
+    """Return the name of the only output, or of the only one with "depth" in its name. Raises SourceError if there is
+    none."""
     names = [each.name for each in outputs]
-    found = [name for name in names if name == wanted] if wanted else names
-    if len(found) > 1:
-        found = [name for name in names if "depth" in name.lower()]
+    found = names if len(names) == 1 else [name for name in names if "depth" in name.lower()]
     if len(found) == 1:
         return found[0]
-    why = f"no output {wanted!r}" if wanted else "it is not clear which output is depth"
-    raise SourceError(f"{path}: {why}; give one of {_listed(names)} as input.depth_model_output")
+    raise SourceError(
+        f'{path}: it is not clear which output is depth ({_listed(names)}); name one with "depth", or export it alone'
+    )
 
 
 def _listed(names: Iterable[str]) -> str:

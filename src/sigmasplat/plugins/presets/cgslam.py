@@ -33,30 +33,24 @@ PAPER = BASE.changed(
         "weight_isotropy_ratio": 0.1,
         "weight_nll_color": 0.0,
         "weight_nll_depth": 0.0,
-        "lr_opacity_logits": 0.05,
         "lr_pose_translation": 2.15e-3,
         "lr_pose_rotation": 1.5e-3,
-        "poses": "all",
-        "poses_from": "half",
+        "adjustment": "window",
         "prune_opacity": 0.005,
         "window": 4,
-        "covisibility": "splats",  # paper (for its speed) and code use NetVLAD, whose weights are a download
-        "frames_per_step": 0,
     },
     primitives={
         "uncertain_m2": 0.025,
-        "split_gradient": 0.002,
-        "clone": True,
+        "densify": "split+clone",
     },
     tracking={
-        "parametrisation": "axis-angle",
+        "descent": "axis-angle",
         "lr_rotation": 1.5e-3,
         "lr_translation": 2.15e-3,
         "uncertainty": False,
         "alpha_power": 0.0,
         "alpha_above": 0.99,
         "outlier_factor": 10.0,
-        "average": "kept",
     },
     submaps={},
     loops={"close": False, "uncertainty": False},
@@ -70,7 +64,7 @@ def sized(config: Config, extent: float, first: float = 3e-4, last: float = 2.5e
     """Set the values that the code gives in units of the scene's extent: rates of means and scales, sizes of splats."""
     return config.changed(
         mapping={"lr_means_first": first * extent, "lr_means": last * extent, "lr_log_scales": log_scales * extent},
-        primitives={"split_scale_m": 0.01 * extent, "most_scale_m": 0.1 * extent},
+        primitives={"split_scale_m": 0.01 * extent},
     )
 
 
@@ -124,8 +118,8 @@ FAST = dataclasses.replace(
     varsplat.without_variance(varsplat.FAST).changed(
         mapping={
             "weight_l1": 0.7, "weight_ssim": 0.1, "weight_depth": 0.25, "weight_alignment": 0.25,
-            "weight_isotropy": 0.0, "weight_isotropy_ratio": 0.1, "weight_moment": 0.15, "poses": "all",
-            "poses_from": "half", "window": 4, "covisibility": "splats", "frames_per_step": 1,
+            "weight_isotropy": 0.0, "weight_isotropy_ratio": 0.1, "weight_moment": 0.15,
+            "adjustment": "single-late", "window": 4,
         },
         primitives={"uncertain_m2": 0.025},
         tracking={"align_depth_by": "U", "uncertainty": True},

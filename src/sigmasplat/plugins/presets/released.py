@@ -8,8 +8,8 @@ arguments are given by position, so w_max is used as tau). Deviations: docs/vars
 
 CG-SLAM: bundle adjustment moves only the newest pose, with a gradient without the path through the covariance. The
 window is chosen by the similarity of NetVLAD; without a file of weights (`loops.weights`) the built-in descriptor is
-used, with a warning. Uncertain splats are not pruned, the splat at the median depth owns a pixel, no splat is cloned,
-and the second frame has its own number of iterations.
+used, with a warning. Uncertain splats are not pruned, no splat is cloned, and the second frame has its own number of
+iterations.
 """
 
 import tomllib
@@ -27,8 +27,7 @@ VARSPLAT_DATA: dict[str, dict[str, dict[str, Any]]] = {
     "replica": {"loops": {"min_interval": 3}, "input": {"max_depth_m": 10.0}},
     "tum": {"loops": {"min_interval": 4}, "input": {"max_depth_m": 13.5}},
     "scannet": {
-        "loops": {"min_interval": 5}, "input": {"max_depth_m": 66.0}, "registration": {"target": "rendered"},
-        "mapping": {"exposure": True},
+        "loops": {"min_interval": 5}, "input": {"max_depth_m": 66.0}, "registration": {"method": "rendered"},
     },
     "scannetpp": {"loops": {"min_interval": 2}, "input": {"max_depth_m": 66.0, "limit": 250}},
 }  # fmt: skip
@@ -37,18 +36,19 @@ VARSPLAT_DATA: dict[str, dict[str, dict[str, Any]]] = {
 def _varsplat(row: dict[str, Any]) -> Config:
     """Return the settings of a scene of VarSplat's code."""
     like: str = row["like"]
-    return varsplat.DATASETS[like].changed(**VARSPLAT_DATA[like]).changed(
+    base = varsplat.DATASETS[like]
+    return base.changed(**VARSPLAT_DATA[like]).changed(
         input={"crop_px": row["crop_px"]},
-        seeding={"outlier_first": False},
+        seeding={"outliers": "remove-later" if base.seeding.outliers == "remove" else "keep"},
         mapping={
-            "freeze_new_colors": True,
+            "colors": "code",
             "weight_nll_depth": 1e-4 if row["nll_depth"] else 0.0,
         },
-        tracking={"amsgrad": True, "tau": row["tau_tracking"]},
+        tracking={"descent": "amsgrad", "tau": row["tau_tracking"]},
         submaps={"uncertainty_m": 0.0},
         loops={"most": 0, "tau": row["tau_loops"]},
         registration={"tau": 3.0},
-        final={"lr_means_last": 1.6e-6},
+        final={"schedule": "falling"},
     )  # fmt: skip
 
 
@@ -57,16 +57,16 @@ def _cgslam(row: dict[str, Any]) -> Config:
     config = cgslam.DATASETS[row["like"]].changed(
         mapping={
             "every": row["every"], "iterations": row["map_iterations"], "window": row["window"],
-            "covisibility": "descriptor", "weight_l1": row["map_color"] - 0.1, "weight_depth": row["map_depth"],
-            "weight_alignment": 0.25, "weight_moment": 0.15, "poses": "newest",
+            "adjustment": "window-newest", "weight_l1": row["map_color"] - 0.1, "weight_depth": row["map_depth"],
+            "weight_alignment": 0.25, "weight_moment": 0.15,
         },
         tracking={
             "iterations": row["iterations"], "lr_rotation": row["lr_rotation"],
             "lr_translation": row["lr_translation"],
-            "weight_color": cgslam.color_share(row["color"], row["depth"]), "first_iterations": 200,
+            "weight_color": cgslam.color_share(row["color"], row["depth"]), "descent": "axis-angle-start",
         },
         render={"covariance_pose_gradient": False},
-        primitives={"uncertain_m2": 0.0, "owner": "median", "clone": False},
+        primitives={"uncertain_m2": 0.0, "densify": "split"},
         loops={"descriptor": "netvlad-or-grid"},
     )  # fmt: skip
     rates = dict(zip(("first", "last"), row.get("lr_means", ()), strict=False))

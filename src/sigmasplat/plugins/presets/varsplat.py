@@ -17,7 +17,7 @@ PAPER = BASE.changed(
     input={"min_depth_m": 0.0},
     render={"near_m": 0.2},
     seeding={"first_gradient": 50_000, "depth_error_factor": 40.0},
-    mapping={"iterations": 100, "weight_nll_color": 1e-4, "freeze_old_colors": True},
+    mapping={"iterations": 100, "weight_nll_color": 1e-4, "colors": "old-frozen"},
     submaps={"distance_m": 0.5, "uncertainty_m": UNCERTAIN_M},
     loops={"descriptor": "netvlad-or-grid"},
     final={"seed_from": "mesh", "iterations": 30_000, "sh_degree": 3, "uncertainty": False},  # §7 does not use V
@@ -26,19 +26,19 @@ PAPER = BASE.changed(
 # Synthetic data with exact depth; the PNGs end at 10 m.
 REPLICA = PAPER.changed(
     input={"max_depth_m": 10.0},
-    seeding={"first_uniform": 600_000, "later_max": 0, "min_distance_m": 1e-7**0.5, "outlier_neighbours": 0},
+    seeding={"first_uniform": 600_000, "later_max": 0, "min_distance_m": 1e-7**0.5},
     mapping={"every": 5, "first_iterations": 1000, "weight_nll_depth": 1e-4, "prune_opacity": 0.1},
     tracking={
         "iterations": 60, "lr_rotation": 2e-4, "lr_translation": 2e-3, "weight_color": 0.95, "tau": 10.0,
         "alpha_above": 0.0, "outlier_factor": 50.0,
     },
-    registration={"lr_translation": 1e-3, "lr_rotation": 3e-3, "tau": 10.0},
+    registration={"method": "paper-fine", "tau": 10.0},
 )  # fmt: skip
 
 # Kinect v1. Ours: max_depth_m, because readings scatter by 10 cm beyond it.
 TUM = PAPER.changed(
     input={"max_depth_m": 8.0, "crop_px": 16},
-    seeding={"first_uniform": 100_000, "later_max": 30_000, "min_distance_m": 1e-4**0.5, "outlier_neighbours": 40},
+    seeding={"first_uniform": 100_000, "later_max": 30_000, "min_distance_m": 1e-4**0.5, "outliers": "remove"},
     mapping={"every": 1, "first_iterations": 100, "weight_nll_depth": 0.0, "prune_opacity": 0.5},
     tracking={
         "iterations": 200, "lr_rotation": 2e-3, "lr_translation": 1e-2, "weight_color": 0.6, "tau": 50.0,
@@ -60,7 +60,7 @@ SCANNET = TUM.changed(
 # Images of a DSLR with the depth of a laser scan, in millimetres: the PNGs end at 66 m.
 SCANNETPP = PAPER.changed(
     input={"max_depth_m": 66.0},
-    seeding={"first_uniform": 400_000, "later_max": 100_000, "min_distance_m": 1e-8**0.5, "outlier_neighbours": 0},
+    seeding={"first_uniform": 400_000, "later_max": 100_000, "min_distance_m": 1e-8**0.5},
     mapping={
         "every": 2, "first_iterations": 500, "iterations": 500, "weight_nll_depth": 1e-4, "prune_opacity": 0.5,
     },
@@ -83,20 +83,17 @@ FAST = BASE.changed(
         "first_edges": False,  # sampling by gradient finds the same pixels
         "later_max": 0,
         "depth_error_least_m": 0.1,  # 40 × a median of 2 mm alone would treat sensor noise as a new surface
-        "scale_from": "pixel",  # searching the map for neighbours costs more than fitting a keyframe
-        "scale_factor": 0.8,
+        "shape": "pixel",
         "max_splats": 250_000,
     },
     mapping={
         "every": 5,  # as for Replica; mapping every frame would take five times as long
         "overlap_below": 0.7,  # more keyframes when the camera moves fast
         "iterations": 18,  # what two cores can do while the camera runs
-        "newest_probability": 0.2,  # with so few iterations, 0.4 degrades older keyframes: 1 dB on redkitchen
+        "few_steps": True,
         "first_iterations": 150,  # until about then, a new map renders surfaces a centimetre too close
         "weight_nll_color": 1e-2,  # ×100: V then predicts the errors better; it also affects shapes and poses a little
-        "lr_log_variances": 2e-2,  # twenty iterations must change σ² as much as hundreds do in the paper
         "lr_means": 2e-4,
-        "lr_opacity_logits": 0.02,  # seeds start nearly opaque, and steps of 0.05 would scatter their opacities
         "lr_log_scales": 1e-2,
         "lr_pose_translation": 2e-4,  # the new keyframe adapts to the map: a third less ATE on livingroom
         "lr_pose_rotation": 1e-4,
@@ -114,16 +111,13 @@ FAST = BASE.changed(
         "inherit": True,  # starting a submap empty costs two seconds of first iterations
     },
     loops={
-        "similarity_floor": 0.8,  # the built-in descriptor needs it: it describes shapes, not places
         "near_m": 0.5,  # the built-in descriptor rarely recognises a place from another side
         "most": 3,  # registering a pair costs as much as thirty frames
     },
     registration={
         "iterations": 6,  # four keyframes per pair, and each step is a render; Gauss–Newton has done most of the work
-        "lr_translation": 1e-3,
-        "lr_rotation": 1e-3,
+        "method": "few-steps",
         "tau": 10.0,
-        "color_mean": "pixels",
     },
     final={"iterations": 1500},  # half a minute; 500 lose 2 dB on livingroom
 )

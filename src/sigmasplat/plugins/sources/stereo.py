@@ -124,7 +124,7 @@ class StereoSource(RecordedSource):
         rectification = StereoRectification.of(cameras)
         if rectification.baseline_m <= 0:
             raise SourceError(f"{name}: the second camera is not to the right of the first one; swap both")
-        matcher = StereoMatcher(rectification.camera, rectification.baseline_m, settings)
+        matcher = StereoMatcher(rectification.camera, rectification.baseline_m)
         rig = StereoRig((cameras.left.width, cameras.left.height), rectification, matcher)
         images = pairs(rig) if callable(pairs) else [StereoPair(*pair, rig) for pair in pairs]
         if truth is not None:

@@ -15,7 +15,6 @@ from sigmasplat.api import (
     Calibration,
     Camera,
     Distortion,
-    InputConfig,
     Matrix,
     SourceError,
     check_positive,
@@ -164,14 +163,18 @@ SUBPIXELS = 16.0
 REACH_PX, MOST_BEND_PX = 2, 0.6
 """Readings are removed where the disparity differs by more than `MOST_BEND_PX` from the mean of its neighbours at this
 distance, or next to such places, before or after the refinement: those are edges and wrong matches."""
+STD_PX = 0.15
+"""Standard deviation σ_d of the disparity where matching is sure. Stereo depth z has σ_z = z²·σ_d / (f·b)."""
+MAX_STD = 0.05
+"""Depth is ignored where its standard deviation σ_z is larger than this share of it."""
 STD_MATCH, STD_HOLE, STD_RANGE, STD_BEND = 1.04, 3.8, 0.51, 7.15
-"""Parts of σ_d in units of `input.stereo_std_px`. For each gray value by which the images differ after the refinement:
+"""Parts of σ_d in units of `STD_PX`. For each gray value by which the images differ after the refinement:
 divided by the gradient that decides it; at a pixel without a reading, where the surface ends, falling by e every
 `HOLE_PX`; for each pixel in the range of disparities around, as a near surface looks wider than it is. Besides: for
 each pixel by which the disparity bends. Fitted to exact depth of synthetic rooms (seeds 1 to 4; baselines of 6, 10 and
 18 cm)."""
 TAILS = 2.0
-"""Root mean square of the errors in the disparity relative to `input.stereo_std_px`: a few are much larger than σ_d."""
+"""Root mean square of the errors in the disparity relative to `STD_PX`: a few are much larger than σ_d."""
 LEAST_TEXTURE = 0.5
 """Smallest gradient that is divided by, in gray values per pixel."""
 HOLE_PX, AROUND_PX, MOST_RANGE_PX = 8.0, 13, 2.0
@@ -230,12 +233,10 @@ class StereoRectification:
 class StereoMatcher:
     """Depth by semi-global matching (Hirschmüller 2008, OpenCV's five directions, one thread)."""
 
-    def __init__(self, camera: Camera, baseline_m: float, settings: InputConfig) -> None:
+    def __init__(self, camera: Camera, baseline_m: float) -> None:
         """Prepare for rectified images of `camera`, whose right one is `baseline_m` to the right."""
         self._camera, self._focal_baseline = camera, camera.fx * baseline_m
-        self._count = settings.stereo_disparities or max(16, -(-camera.width // 128) * 16)
-        self._count = -(-self._count // 16) * 16
-        self._std_px, self._max_std = settings.stereo_std_px, settings.stereo_max_std
+        self._count = max(16, -(-camera.width // 128) * 16)
 
     def depth_and_std_m(self, left: Bytes, right: Bytes) -> tuple[Floats, Floats]:
         """Match two rectified RGB images [H, W, 3]: depth z of the left one, m [H, W], 0 = no reading, and its standard
@@ -256,15 +257,15 @@ class StereoMatcher:
         bend_px = _bend(fine.disparity, matched)
         seen = smooth & (bend_px <= MOST_BEND_PX)
         depth_m = np.divide(self._focal_baseline, fine.disparity, out=np.zeros_like(found), where=seen)
-        std_px = self._std_px * _relative_std(fine, matched, smooth, bend_px)
+        std_px = STD_PX * _relative_std(fine, matched, smooth, bend_px)
         std_m = depth_m * depth_m * std_px / self._focal_baseline
-        usable = std_m <= self._max_std * depth_m
+        usable = std_m <= MAX_STD * depth_m
         return np.where(usable, depth_m, 0.0).astype(np.float32), np.where(usable, std_m, 0.0).astype(np.float32)
 
     @property
     def noise_per_m(self) -> float:
         """Return the root mean square error of readings, relative to z²."""
-        return TAILS * self._std_px / self._focal_baseline
+        return TAILS * STD_PX / self._focal_baseline
 
     def _matcher(self) -> Any:
         cv2 = opencv()
@@ -289,7 +290,7 @@ def scene_scale(depth_of: Callable[[int], Floats], frames: int) -> float:
 
 
 def _relative_std(fine: Subpixel, matched: NDArray[np.bool_], smooth: NDArray[np.bool_], bend_px: Floats) -> Floats:
-    """Return σ_d in units of `input.stereo_std_px` [H, W]; matched: pixels with a disparity, smooth: refined ones."""
+    """Return σ_d in units of `STD_PX` [H, W]; matched: pixels with a disparity, smooth: refined ones."""
     cv2, window = opencv(), np.ones((AROUND_PX, AROUND_PX))
     far, near = (np.where(matched, sign * fine.disparity, np.float32(-1e6)) for sign in (-1.0, 1.0))
     range_px = cv2.dilate(near, window) + cv2.dilate(far.astype(np.float32), window)

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from sigmasplat.api import (
     Camera,
     Frame,
-    InputConfig,
     Matrix,
     Mesh,
     Source,
@@ -86,7 +85,7 @@ class SyntheticRoom(Source):
         self._exposure_change, self._drift = exposure_change, drift / 1000
         self._test_views = test_views
         self.computed_depth, self._baseline_m = stereo > 0, stereo / 100
-        self._matcher = StereoMatcher(camera, self._baseline_m, InputConfig()) if stereo else None
+        self._matcher = StereoMatcher(camera, self._baseline_m) if stereo else None
         self.depth_noise_per_m = self._matcher.noise_per_m if self._matcher else None
         self._T_world_camera = camera_path(frames, loops, rooms, seed, overrun / 100)
         self.mover = moving_ball(self._T_world_camera, camera, mover / 100) if mover else None
