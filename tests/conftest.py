@@ -1,5 +1,6 @@
 """Fixtures for every test folder: where real sequences lie, and a tiny recorded sequence to damage."""
 
+import gc
 import json
 import os
 import signal
@@ -18,6 +19,9 @@ from PIL import Image
 
 import sigmasplat  # noqa: F401 - before any test imports torch: idle OpenMP threads then sleep (sigmasplat.env), 5× faster
 
+# Imports and the collection of tests make millions of objects that stay: the collector would walk them again and again.
+gc.disable()
+
 # A shell that starts tests in the background has them ignore Ctrl-C, which some of them are about.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -27,6 +31,12 @@ pytest.register_assert_rewrite("benchmark_results", "command_line", "run_process
 
 TINY_SIZE = (32, 24)  # width, height
 TINY_DEPTH_M = 2.0
+
+
+def pytest_collection_finish() -> None:
+    """Let the collector walk from now on what tests make, and nothing that is there already."""
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture(autouse=True, scope="session")
