@@ -84,16 +84,19 @@ text { font: 13px system-ui, sans-serif; fill: #1f2328 }
 """
 
 
-def imported(tree: ast.AST) -> Iterator[str]:
-    """Yield every module, or name in one, that a file imports, dotted; at the top or inside a function. A name of the
+@cache
+def imported(tree: ast.AST) -> tuple[str, ...]:
+    """Return every module, or name in one, that a file imports, dotted; at the top or inside a function. A name of the
     API is that of its home."""
+    found = list[str]()
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
+            found += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, "imports are absolute, so that the layers can be read"
             homes = api_homes() if node.module == "sigmasplat.api" else {}
-            yield from (f"{homes.get(alias.name, node.module)}.{alias.name}" for alias in node.names)
+            found += [f"{homes.get(alias.name, node.module)}.{alias.name}" for alias in node.names]
+    return tuple(found)
 
 
 @cache
@@ -103,6 +106,7 @@ def api_homes() -> dict[str, str]:
     return {alias.name: str(node.module) for node in body if isinstance(node, ast.ImportFrom) for alias in node.names}
 
 
+@cache
 def parsed(path: Path) -> ast.AST:
     """Parse a file. Of the registry only what it imports when it runs: its rows name types of all layers."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
