@@ -11,6 +11,7 @@ from command_line import exit_code
 from paper_settings import InputConfig
 from sigmasplat.data.camera import Camera
 from sigmasplat.input.rectification import DepthRegistration
+from sigmasplat.plugins.checks import recording
 from sigmasplat.plugins.checks.depth import edge_agreement, outlines
 from sigmasplat.plugins.checks.recording import inspect_source
 from sigmasplat.plugins.sources import open_source
@@ -23,6 +24,12 @@ SEEN = InputConfig(stride=12)
 @pytest.fixture(scope="module")
 def frames():
     return list(open_source(ROOM, SEEN))
+
+
+@pytest.fixture
+def without_comparison(monkeypatch):
+    """Leave out the comparison of edges, the longest part of an inspection."""
+    monkeypatch.setattr(recording, "edge_agreement", lambda frames: None)
 
 
 def unregistered(frame):
@@ -77,6 +84,7 @@ def test_rows_describe_the_recording(tiny_tum):
     assert np.asarray(found.sheet).std() > 10
 
 
+@pytest.mark.usefixtures("without_comparison")
 def test_a_given_depth_scale_is_questioned(tiny_tum):
     rows = dict(inspect_source(tiny_tum, InputConfig(depth_scale=2500.0)).rows)
     assert rows["depth unit"] == "2500 per metre"
@@ -90,6 +98,7 @@ def damage(folder, value, share):
         Image.fromarray(depth).save(path)
 
 
+@pytest.mark.usefixtures("without_comparison")
 @pytest.mark.parametrize(
     "value, share, words",
     [(2000, 0.8, "80% of the pixels have no depth"), (20, 0, "depth's scale looks wrong"), (9500, 0, "beyond 8 m")],
@@ -99,12 +108,14 @@ def test_depth_that_degrades_a_map_gives_a_warning(tiny_tum, value, share, words
     assert any(words in warning for warning in inspect_source(tiny_tum, InputConfig()).warnings)
 
 
+@pytest.mark.usefixtures("without_comparison")
 def test_changing_brightness_gives_a_warning(tiny_tum):
     for i, path in enumerate(sorted((tiny_tum / "rgb").iterdir())):
         Image.fromarray(np.full((24, 32, 3), 60 + 120 * (i % 2), np.uint8)).save(path)
     assert any("tracking.exposure" in warning for warning in inspect_source(tiny_tum, InputConfig()).warnings)
 
 
+@pytest.mark.usefixtures("without_comparison")
 def test_a_recording_with_unknown_camera_is_inspected_with_a_typical_one(tiny_tum):
     (tiny_tum / "calibration.json").unlink()
     found = inspect_source(tiny_tum, InputConfig(depth_scale=1000.0))
@@ -112,6 +123,7 @@ def test_a_recording_with_unknown_camera_is_inspected_with_a_typical_one(tiny_tu
     assert dict(found.rows)["size"] == "32×24 pixels"
 
 
+@pytest.mark.usefixtures("without_comparison")
 def test_an_unreadable_frame_is_skipped_and_counted(tiny_tum):
     (tiny_tum / "rgb/2.png").write_bytes(b"x")
     assert "1 files" in dict(inspect_source(tiny_tum, InputConfig()).rows)["skipped"]
@@ -142,7 +154,7 @@ class Unregistered:
 
 
 def test_unregistered_depth_is_detected_and_the_suggested_fix_works(tmp_path):
-    room = open_source("synthetic:frames=120,width=320,height=240", stride=15)
+    room = open_source(ROOM, stride=24)
     write_tum(Unregistered(room), tmp_path / "two")
     first = inspect_source(tmp_path / "two", InputConfig())
     assert any("not registered to colour" in warning and "T_color_depth" in warning for warning in first.warnings)
@@ -160,12 +172,16 @@ def test_unregistered_depth_is_detected_and_the_suggested_fix_works(tmp_path):
     assert dict(off.rows)["depth camera"] == "separate; depth is not registered (--register-depth off)"
 
 
-@pytest.mark.parametrize("name", ["redkitchen", "cubicles", "hololens", "livingroom"])
+@pytest.mark.parametrize(
+    "name",
+    ["cubicles", *(pytest.param(name, marks=pytest.mark.slow) for name in ("redkitchen", "hololens", "livingroom"))],
+)
 def test_real_registered_recordings_have_no_warnings(data_folder, name):
     found = inspect_source(data_folder(name), InputConfig())
     assert found.warnings == [] and found.agreement.registered
 
 
+@pytest.mark.slow
 def test_unregistered_depth_of_a_real_recording_is_detected(data_folder):
     """Raw depth of 7-Scenes: without --register-depth there is a warning that names it, with it none."""
     folder = data_folder("redkitchen_raw")
