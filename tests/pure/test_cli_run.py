@@ -33,6 +33,7 @@ from sigmasplat.input.source import Source
 from sigmasplat.plugins.outputs.mesh_files import write_mesh
 from sigmasplat.plugins.presets.base import BASE
 from sigmasplat.run.session import Session
+from sigmasplat.run.signals import ENDING
 from sigmasplat.run.terminal import Screen
 from sigmasplat.run_folder.frames import noted_up
 from sigmasplat.run_folder.runs import RunFolder
@@ -310,11 +311,13 @@ def test_lost_frames_are_printed(corridor: Corridor, capsys: pytest.CaptureFixtu
 
 
 @pytest.mark.skipif(not hasattr(signal, "raise_signal"), reason="needs signals")
-def test_ctrl_c_finishes_the_frame_and_leaves_a_valid_folder(
-    corridor: Corridor, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("number", ENDING)
+def test_signals_that_end_a_process_finish_the_frame_and_leave_a_valid_folder(
+    corridor: Corridor, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, number: signal.Signals
 ) -> None:
-    before = signal.getsignal(signal.SIGINT)
-    MadeUpSlam.at = {3: lambda: os.kill(os.getpid(), signal.SIGINT)}
+    monkeypatch.setattr(os, "isatty", lambda _: False)  # a closed terminal would be silent from then on
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL), signal.getsignal(number)
+    MadeUpSlam.at = {3: lambda: os.kill(os.getpid(), number)}
     assert exit_code("run", "corridor", "--out", "cut") == 130
     run = RunFolder.open(Path("cut"))
     assert run.facts()["status"] == "interrupted"
@@ -322,7 +325,16 @@ def test_ctrl_c_finishes_the_frame_and_leaves_a_valid_folder(
     assert len(run.read_map()) == 2
     assert run.read_checkpoint()[0]
     assert "interrupted after 4 frames" in capsys.readouterr().out
-    assert signal.getsignal(signal.SIGINT) is before
+    assert signal.getsignal(number) is before[1]
+    signal.signal(signal.SIGHUP, before[0])
+
+
+def test_a_sighup_that_is_ignored_stays_ignored(corridor: Corridor) -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    MadeUpSlam.at = {3: lambda: os.kill(os.getpid(), signal.SIGHUP)}
+    assert exit_code("run", "corridor", "--out", "whole") == 0
+    assert signal.signal(signal.SIGHUP, before) is signal.SIG_IGN
+    assert RunFolder.open(Path("whole")).facts()["status"] == "complete"
 
 
 def test_a_second_ctrl_c_stops_at_once(corridor: Corridor) -> None:
