@@ -57,7 +57,7 @@ def job_result(source: str, seed: int, problem: str | None = None, **figures: fl
 def test_every_program_explains_itself(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     words = {"cpu": "--quick", "accuracy": "--seeds", "tracking": "--experiments", "tables": "--check",
              "loops": "--experiments", "long_run": "--scratch", "pose_gradient": "--refinement",
-             "systems": "--presets", "consistency": "--variants"}  # fmt: skip
+             "systems": "--presets", "consistency": "--variants", "ablation": "--no-reference"}  # fmt: skip
     parses = re.compile(r"^    .*\b(program\.start|tyro\.cli)\(.*(main|Options)", re.MULTILINE)
     last_lines = {path: path.read_text(encoding="utf-8").partition("__main__")[2] for path in BENCHMARKS.glob("*.py")}
     programs = [path for path, text in last_lines.items() if parses.search(text)]
@@ -69,7 +69,7 @@ def test_every_program_explains_itself(monkeypatch: pytest.MonkeyPatch, capsys: 
         said = capsys.readouterr()
         assert left.value.code == 0, f"{path.name}: {said.err}"
         assert said.out.startswith("usage: ") and words.get(path.stem, "--help") in said.out, path.name
-        assert "example: " in said.out or path.stem not in ("systems", "consistency")
+        assert "example: " in said.out or path.stem not in ("systems", "consistency", "peers", "picture")
 
 
 def test_machines_have_file_names() -> None:

@@ -2,7 +2,6 @@
 
 import importlib
 import json
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -24,13 +23,6 @@ ROOM = "synthetic:frames=6,width=64,height=48"
 
 def run(system: str, source: str, ate_m: float | None, **rest: Any) -> dict[str, Any]:
     return {"system": system, "source": source, "problem": None, "frames": 6, "ate_m": ate_m, **rest}
-
-
-@pytest.mark.parametrize("program", ["peers", "picture"])
-def test_the_program_explains_itself(program: str) -> None:
-    command = [sys.executable, BENCHMARKS / f"{program}.py", "--help"]
-    answer = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
-    assert "example: " in answer.stdout
 
 
 def test_frames_without_a_pose_are_counted_and_not_scored(tmp_path: Path) -> None:

@@ -227,6 +227,7 @@ def test_given_motions_show_the_depth_of_features_and_which_matches_are_wrong() 
     assert (triangulated(first, first, np.eye(4)) == 0).all(), "no parallax"
 
 
+@pytest.mark.slow
 def test_a_run_with_poses_and_predicted_depth_has_the_scale_of_the_poses(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -137,6 +137,7 @@ def test_no_such_folder(tmp_path: Path) -> None:
         open_source(ROOM, predicted_depth=str(tmp_path / "none"))
 
 
+@pytest.mark.slow
 def test_a_run_of_colour_images_ends_with_a_map_and_says_that_its_scale_is_arbitrary(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
