@@ -1,6 +1,7 @@
 """Run `sigmasplat run` in a separate process, to interrupt or kill it."""
 
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -47,3 +48,14 @@ def lines(out: Path) -> int:
     """Count the complete lines of the log."""
     log = out / "log.jsonl"
     return log.read_text().count("\n") if log.exists() else 0
+
+
+@contextmanager
+def files_of_at_most(size: int) -> Iterator[None]:
+    """Let no file grow beyond a size, as on a full disk."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))

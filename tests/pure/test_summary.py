@@ -68,6 +68,8 @@ def test_a_good_run_in_words() -> None:
         ({"failures": {"silent": 7}}, "7 poses are off by more than 10 cm"),
         ({"ate": None}, "no ground truth"),
         ({"status": "interrupted"}, "The run is interrupted"),
+        ({"onto": "/first", "believed": 500}, "It continues the map of /first: poses are in the world of that run"),
+        ({"onto": "/first", "believed": 0}, "never recognised in the map of /first"),
         ({"held_out": {"psnr_db": 17.0}}, "Poor: 17.0 dB PSNR"),
         ({"held_out": None}, "because none was held back"),
         (

@@ -16,6 +16,7 @@ from sigmasplat.run_folder.runs import RunFolder
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
 
+@pytest.mark.slow
 def test_ctrl_c_leaves_a_usable_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "run"
     with running(out) as process:
@@ -87,7 +88,7 @@ def test_ctrl_c_during_refinement_keeps_the_unrefined_map(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("moment", [pytest.param("folder", marks=pytest.mark.slow), "log"])
-def test_a_killed_run_is_read_or_refused_in_one_line(
+def test_a_killed_run_is_read_or_refused_in_one_line_and_can_be_repeated_with_overwrite(
     tmp_path: Path, moment: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "run"
@@ -113,25 +114,8 @@ def test_a_killed_run_is_read_or_refused_in_one_line(
         refusal = capsys.readouterr().err
         assert refusal.startswith("sigmasplat: ") and refusal.count("\n") == 1, refusal
 
-
-@pytest.mark.parametrize("moment", ["folder", pytest.param("log", marks=pytest.mark.slow)])
-def test_a_killed_run_can_be_repeated_with_overwrite(tmp_path: Path, moment: str) -> None:
-    out = tmp_path / "run"
-    with running(out) as process:
-        wait_for(process, out.exists if moment == "folder" else lambda: lines(out) >= 1)
-        process.kill()
-        process.wait(timeout=PATIENCE_S)
-    short = (
-        "--set",
-        "input.width=80",
-        "--set",
-        "mapping.first_iterations=2",
-        "--set",
-        "final.iterations=2",
-        "--limit",
-        "1",
-        "--no-eval",
-    )
+    short = ("--set", "input.width=80", "--set", "mapping.first_iterations=2", "--set", "final.iterations=2",
+             "--limit", "1", "--no-eval")  # fmt: skip
     room = "synthetic:frames=2,width=80,height=60"
     assert exit_code("run", room, "--out", str(out), "--overwrite", *short) == 0
     assert RunFolder.open(out).facts()["status"] == "complete" and len(RunFolder.open(out).read_log()) == 1

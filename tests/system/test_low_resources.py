@@ -16,7 +16,7 @@ import pytest
 import torch
 
 from command_line import exit_code
-from run_process import PATIENCE_S, QUICK, ROOM, lines, running, wait_for
+from run_process import PATIENCE_S, QUICK, ROOM, files_of_at_most, lines, running, wait_for
 from sigmasplat.errors import RunError
 from sigmasplat.files.tensors import write_tensors
 from sigmasplat.run_folder.runs import RunFolder
@@ -47,10 +47,11 @@ def refusal(text: str) -> str:
     return line
 
 
-def test_results_that_cannot_be_written_make_the_run_failed(tmp_path: Path) -> None:
+def test_results_that_cannot_be_written_make_the_run_failed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "run"
-    ended = limited(resource.RLIMIT_FSIZE, 30_000, *run_of(out, 3))
-    assert ended.returncode == 2 and "cannot write" in refusal(ended.stderr)
+    with files_of_at_most(30_000):
+        assert exit_code(*run_of(out, 3)) == 2
+    assert "cannot write" in refusal(capsys.readouterr().err)
     assert RunFolder(out).facts()["status"] == "failed"
     assert not [path for path in out.rglob("*") if path.name.startswith(".")]
 
@@ -113,7 +114,8 @@ def test_too_little_address_space_is_refused_at_once(tmp_path: Path) -> None:
     assert ended.returncode == 2 and "700 MB" in refusal(ended.stderr)
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGHUP, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_sigterm_and_sighup_keep_the_last_frame(tmp_path: Path, number: signal.Signals) -> None:
     out = tmp_path / "run"
     with running(out) as process:
@@ -127,6 +129,7 @@ def test_sigterm_and_sighup_keep_the_last_frame(tmp_path: Path, number: signal.S
     assert 3 <= len(run.read_log()) == len(run.read_trajectory()) < 200 and len(run.read_map())
 
 
+@pytest.mark.slow
 def test_an_ignored_sighup_stays_ignored(tmp_path: Path) -> None:
     out = tmp_path / "run"
     command = ["nohup", sys.executable, "-m", "sigmasplat.cli", *run_of(out, 8, "final.iterations=2")]

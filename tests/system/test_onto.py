@@ -27,7 +27,8 @@ pytest.importorskip("sigmasplat.native._core", reason="sigmasplat.native._core i
 WALK = "synthetic:frames=200,width=160,height=120"
 SHORT = ("--set", "mapping.first_iterations=30", "--set", "mapping.iterations=8", "--set", "final.iterations=5",
          "--set", "submaps.frames=12", "--set", "registration.iterations=3")  # fmt: skip
-FIRST, SECOND = ("--limit", "24"), ("--start", "0.5", "--limit", "20")
+FRAMES = 14
+FIRST, SECOND = ("--limit", "24"), ("--start", "0.5", "--limit", str(FRAMES))
 SECOND_BEGINS = 15
 """Number of the first frame of the second part in the walk."""
 
@@ -38,7 +39,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("onto")
     first, second = str(folder / "first"), str(folder / "second")
     assert exit_code("run", WALK, *FIRST, "--out", first, "--no-eval", *SHORT) == 0
-    assert exit_code("run", WALK, *SECOND, "--onto", first, "--out", second, *SHORT) == 0
+    assert exit_code("run", WALK, *SECOND, "--onto", first, "--out", second, "--no-eval", *SHORT) == 0
     return folder
 
 
@@ -51,13 +52,11 @@ def test_the_second_part_has_poses_in_the_first_world(place: Path) -> None:
     truth = open_source(WALK).truth()
     assert truth is not None
     path = RunFolder(place / "second").read_trajectory()
-    assert len(path) == 20
-    frames = SECOND_BEGINS + np.arange(20)
+    assert len(path) == FRAMES
+    frames = SECOND_BEGINS + np.arange(FRAMES)
     expected = se3.inverse(truth.T_world_camera[0]) @ truth.T_world_camera[frames]
     errors_m = np.linalg.norm((path.T_world_camera - expected)[:, :3, 3], axis=1)
     assert float(np.sqrt(np.mean(errors_m**2))) < 0.05
-    report = (place / "second" / "report.html").read_text()
-    assert "continues the map of" in report
 
 
 @pytest.mark.slow
@@ -90,11 +89,12 @@ def test_readers_use_the_frames_of_the_new_session_only(place: Path) -> None:
     second = RunFolder(place / "second")
     reader = RunReader(second, lambda: open_source(WALK))
     found = [frame for frame, _ in reader.keyframes()]
-    assert len(found) == reader.count_keyframes() and min(found) == 0 and max(found) < 20
+    assert len(found) == reader.count_keyframes() and min(found) == 0 and max(found) < FRAMES
     snapshot = finished_snapshot(second)
-    assert len(snapshot.path) == 20 and {piece.submap for piece in snapshot.pieces} == set(range(len(second.submaps)))
+    assert len(snapshot.path) == FRAMES
+    assert {piece.submap for piece in snapshot.pieces} == set(range(len(second.submaps)))
     cache = SubmapCache(second.submaps)
-    assert len(running_snapshot(second, cache).path) == 20 and len(cache.pieces) == len(second.submaps)
+    assert len(running_snapshot(second, cache).path) == FRAMES and len(cache.pieces) == len(second.submaps)
 
 
 def test_the_earlier_run_is_not_changed(place: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

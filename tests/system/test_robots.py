@@ -1,12 +1,11 @@
 """Runs that write a bag and stream: what a robot receives, and that no consumer changes the run."""
 
 import json
-import resource
 import socket
 import struct
 import threading
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
@@ -19,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from command_line import exit_code
 from ros_reading import covariance, decoded, image, links, points, pose, read_bag, seconds
+from run_process import files_of_at_most
 from sigmasplat.config import Config
 from sigmasplat.config.find_preset import default_preset, preset
 from sigmasplat.config.text import override
@@ -197,7 +197,8 @@ def test_the_final_map_is_given_as_points_and_as_a_grid(recorded: tuple[Slam, Pa
     assert up[2] > 0.7, "z of the floor is nearly that of the map, whose first camera was nearly level"
 
 
-@pytest.mark.parametrize("measured", [True, pytest.param(False, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("measured", [True, False])
 def test_the_accelerometer_levels_the_floor_of_a_camera_held_sideways(tmp_path: Path, measured: bool) -> None:
     frames, up_world = turned_by_90_degrees(there_and_back(), measured)
     followed([BagSink(tmp_path / "bag")], frames=frames)
@@ -237,17 +238,6 @@ def test_a_resumed_run_writes_a_bag_of_its_own_frames(tmp_path: Path, monkeypatc
     assert not bag["/tf"] and len(bag["/tf_static"]) >= 1, "all frames were done already"
     (cloud,) = bag["/sigmasplat/cloud"]
     assert seconds(cloud) == pytest.approx(RunFolder(tmp_path / "run").read_log()[-1]["timestamp_s"], abs=1e-8)
-
-
-@contextmanager
-def files_of_at_most(size: int) -> Iterator[None]:
-    """Let no file grow beyond a size, as on a full disk."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 @pytest.mark.slow
