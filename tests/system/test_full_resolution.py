@@ -74,6 +74,7 @@ def held_out_psnr(
     return float(np.mean(found))
 
 
+@pytest.mark.slow
 def test_the_last_stage_is_sharper_at_both_sizes(slam: Slam) -> None:
     """Held-out frames at the size of the recording, where it also beats an enlarged image of the map before, and at
     working size, where the map needs the low-pass of the photos."""

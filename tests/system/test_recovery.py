@@ -143,6 +143,7 @@ def test_nothing_is_mapped_where_the_camera_is_lost(kidnapped: Recorded) -> None
     assert not any(step.is_keyframe for step in kidnapped[0].steps if step.lost)
 
 
+@pytest.mark.slow
 def test_the_same_run_has_the_same_bytes_on_two_threads(kidnapped: Recorded) -> None:
     before = _core.threads(), torch.get_num_threads()
     _core.set_threads(2)

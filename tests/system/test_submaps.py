@@ -151,6 +151,7 @@ def test_one_submap_is_refined_too(monkeypatch: pytest.MonkeyPatch) -> None:
     assert slam.field is not slam.mapper.field
 
 
+@pytest.mark.slow
 def test_the_final_map_shows_frames_as_well_as_its_parts_and_the_path_stays_true(run: Slam) -> None:
     """Frames that are not keyframes are compared with the final map and with their submap."""
     slam = followed(settings(final__iterations="300"))

@@ -206,6 +206,7 @@ def test_other_kernels_are_announced_when_a_run_is_resumed(
     assert warning.startswith("warning: ") and warning.count("\n") == 1 and "SIGMASPLAT_ISA=altivec" in warning
 
 
+@pytest.mark.slow
 def test_two_runs_at_once_have_their_own_folders(tmp_path: Path) -> None:
     first, second = tmp_path / "first", tmp_path / "second"
     few = ("input.limit=12", "final.iterations=4")

@@ -42,6 +42,7 @@ from unseen_views import held_back_views
 from view_predictors import PREDICTORS, see
 
 from paper_settings import RenderConfig
+from sigmasplat.config import Config
 from sigmasplat.config.find_preset import preset
 from sigmasplat.config.text import override
 from sigmasplat.data import se3
@@ -221,7 +222,14 @@ def test_samples_have_every_predictor_and_both_maps(run: FinishedRun) -> None:
     assert failures["frames"] == 13 and failures["off"] == 0
 
 
-def test_the_benchmark_writes_scores_tables_and_pictures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_benchmark_writes_scores_tables_and_pictures(
+    run: FinishedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def finished(config: Config, *_: object) -> FinishedRun:
+        assert config == quick_job().config
+        return run
+
+    monkeypatch.setattr(uncertainty, "run_slam", finished)
     options = uncertainty.Options(
         (ROOM,), settings=QUICK, seeds=1, limit=13, hold_every=4, views=3, name="tiny", runs=tmp_path, out=tmp_path
     )

@@ -179,6 +179,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     return run
 
 
+@pytest.mark.slow
 def test_a_finished_run_shows_its_map_and_its_uncertainty(finished: RunFolder, tmp_path: Path) -> None:
     with sigmasplat("view", str(finished.path)) as (process, url), browser(url, tmp_path / "profile") as page:
         assert url.startswith("http://127.0.0.1:")
