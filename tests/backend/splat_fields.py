@@ -41,9 +41,9 @@ def params_of(s: Scene) -> Tensor:
     return field.params.float()
 
 
-def crowd(seed: int = 0, kind: str = "random") -> Scene:
+def crowd(seed: int = 0, kind: str = "random", count: int = CROWD) -> Scene:
     """Make a scene large enough that threads share it."""
-    return make(kind, CROWD, BIG, seed)
+    return make(kind, count, BIG, seed)
 
 
 def plane_gradients(camera: Camera, k: int, seed: int = 3) -> tuple[Tensor, Tensor]:

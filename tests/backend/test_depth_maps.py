@@ -69,15 +69,19 @@ def test_rows_pull_and_twist_follow_the_definition(kind: str, variance: bool) ->
     assert_same_vector(got[2], want[2], what="twist")
 
 
+MANY = 700
+"""Splats of a crowd: the definition takes as long for each."""
+
+
 @cache
 def exact_crowd() -> tuple[Tensor, Tensor, Tensor]:
     """Return what the definition, which is slow, carries for a crowd."""
-    s = crowd()
+    s = crowd(count=MANY)
     return carried(exact_view(s.camera, True), params_of(s).double(), s)
 
 
 def test_many_splats_on_threads(isa: str) -> None:
-    s, want = crowd(), exact_crowd()
+    s, want = crowd(count=MANY), exact_crowd()
     got = carried(CpuView(s.camera, OPTIONS), params_of(s), s)
     for name, columns in COLUMNS.items():
         assert_same_vector(got[0][:, columns], want[0][:, columns], 1e-3, f"{isa} {name}")
@@ -217,7 +221,7 @@ def exact_step(n: int) -> tuple[Tensor, Tensor, Tensor, float, float]:
     return stepped(view, params_of(crowd())[:n].double(), TorchStep(view))
 
 
-@pytest.mark.parametrize("n", [16, 17, 2003])
+@pytest.mark.parametrize("n", [16, 17, 700, pytest.param(2003, marks=pytest.mark.slow)])
 def test_a_step_with_every_term_follows_its_definition(isa: str, n: int) -> None:
     """Rows, twist, pull and what the shape terms cost, with splats out of view."""
     view, want = CpuView(crowd().camera, OPTIONS), exact_step(n)

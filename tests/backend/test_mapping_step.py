@@ -125,7 +125,7 @@ def three_exact_steps(n: int) -> tuple[GaussianField, list[tuple[Any, float, tor
     return want, three_steps(view, want, TorchStep(view), n)
 
 
-@pytest.mark.parametrize("n", [0, 7, 16, 17, 700, 2003])
+@pytest.mark.parametrize("n", [0, 7, 16, 17, 700, pytest.param(2003, marks=pytest.mark.slow)])
 def test_a_step_follows_its_definition(every_kernels: str, n: int) -> None:
     """Rows, moments, twist and shape terms over three steps, with splats out of view and rows that come back to it."""
     (got, exact), (want, wanted) = fields(n), three_exact_steps(n)

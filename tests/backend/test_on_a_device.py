@@ -215,11 +215,7 @@ def followed(config: Config) -> Slam:
 
 @pytest.mark.parametrize(
     "run",
-    [
-        run if run in ("sigma", "varsplat-fast") else pytest.param(run, marks=pytest.mark.slow)
-        for run in RUNS
-        if run != "cgslam-fast"
-    ],
+    [run if run == "sigma" else pytest.param(run, marks=pytest.mark.slow) for run in RUNS if run != "cgslam-fast"],
 )
 def test_slam_runs(device: torch.device, run: str) -> None:
     ours, theirs = (followed(settings(run, backend)) for backend in ("cuda", "cpu"))
@@ -267,6 +263,7 @@ def test_what_is_written_is_read_as_from_the_host(device: torch.device, tmp_path
         torch.testing.assert_close(again.checkpoint()[name], written, rtol=0, atol=0, equal_nan=True)
 
 
+@pytest.mark.slow
 def test_a_run_is_written_and_evaluated(device: torch.device, tmp_path: Path) -> None:
     settings = QUICK | {"backend": "cuda", "input.width": "32", "input.limit": "4"}
     words = [word for name, value in settings.items() for word in ("--set", f"{name}={value}")]

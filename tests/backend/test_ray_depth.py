@@ -56,15 +56,19 @@ def test_planes_and_gradients_follow_the_definition(kind: str, variance: bool, m
         assert_same_vector(got[name], value, 1e-3 if name == "planes" else 2e-4, name)
 
 
+MANY = 700
+"""Splats of a crowd: the definition takes as long for each."""
+
+
 @cache
 def exact_crowd() -> dict[str, Tensor]:
     """Return what the definition, which is slow, carries for a crowd."""
-    s = crowd()
+    s = crowd(count=MANY)
     return carried(exact_view(s.camera, True, RAY), params_of(s).double(), s, True)
 
 
 def test_every_instruction_set_follows_it(isa: str) -> None:
-    s = crowd()
+    s = crowd(count=MANY)
     got = carried(CpuView(s.camera, RAY), params_of(s), s, True)
     for name, value in exact_crowd().items():
         assert_same_vector(got[name], value, 2e-3, f"{isa} {name}")
