@@ -40,6 +40,14 @@ def pytest_collection_finish() -> None:
 
 
 @pytest.fixture(autouse=True, scope="session")
+def files_are_not_synced() -> Iterator[None]:
+    """Do not wait for the disk, 5 ms for each file that a run writes: after the tests nobody needs them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", os.fstat)  # as fsync does, it refuses what is no file
+        yield
+
+
+@pytest.fixture(autouse=True, scope="session")
 def views_of_the_room() -> Iterator[None]:
     """Render each view of the synthetic room once: many runs of this process begin with the same frames."""
     from sigmasplat.plugins.sources import synthetic
