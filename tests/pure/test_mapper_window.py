@@ -21,7 +21,7 @@ from sigmasplat.mapping.mapper import Mapper
 from sigmasplat.mapping.window import draw_keyframes
 from sigmasplat.render.reference import ReferenceView
 
-CAMERA = Camera(24, 18, 22.0, 22.0, 11.5, 8.5)
+CAMERA = Camera(16, 12, 44.0 / 3, 44.0 / 3, 7.5, 5.5)
 SEEDS = SeedConfig(
     first_uniform=10_000, first_gradient=0, first_edges=False, scale_from="pixel", later_max=0, opacity=0.9,
     density=1.0, push_back=1.0,
