@@ -94,7 +94,7 @@ def small(seed: int) -> tuple[Array, list[RelativePose]]:
 
 
 def test_two_false_loops_of_six_do_no_harm() -> None:
-    for seed in range(8):
+    for seed in range(4):
         truth, drifted, edges = scene(seed)
         found = optimise(drifted, edges)
         with_true_loops = node_error(truth, optimise(drifted, edges[:-2], confidence=1.0).T_world_node)
@@ -147,7 +147,7 @@ def test_a_loop_is_valid_up_to_the_quantile_of_chi_squared() -> None:
 # Large graphs are solved in another way, to the same solution.
 
 
-@pytest.mark.parametrize(("true_loops", "false_loops", "factorises"), [(3, 0, True), (3, 2, True), (600, 20, False)])
+@pytest.mark.parametrize(("true_loops", "false_loops", "factorises"), [(3, 0, True), (3, 2, True), (300, 10, False)])
 def test_a_large_graph_has_the_solution_that_factorisations_find(
     monkeypatch: pytest.MonkeyPatch, true_loops: int, false_loops: int, factorises: bool
 ) -> None:
