@@ -271,7 +271,8 @@ def test_a_run_that_fails_is_a_problem_with_its_last_line(tmp_path: Path, monkey
     assert "nothing-here" in gone["problem"] and not list((tmp_path / "scratch").iterdir())
 
 
-@pytest.mark.parametrize("disturbed", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("disturbed", [False, True])
 def test_a_row_is_run_and_scored(disturbed: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(runs, "environment", lambda _: {**os.environ, **runs.ONE_THREAD})  # the installed package
     how: dict[str, Any] = {"disturbance": "clean", "severity": 1, "frames": 3} if disturbed else {}

@@ -291,7 +291,9 @@ def test_real_time_gives_the_same_poses_and_covariances_if_mapping_keeps_up(monk
     assert np.array_equal(usual.trajectory().T_world_camera, system.trajectory().T_world_camera)
 
 
-@pytest.mark.parametrize("schedule", [AtOnce(), Drawn(3), None], ids=["at once", "drawn", "thread"])
+@pytest.mark.parametrize(
+    "schedule", [AtOnce(), pytest.param(Drawn(3), marks=pytest.mark.slow), None], ids=["at once", "drawn", "thread"]
+)
 def test_real_time_calls_functions_on_the_thread_of_the_caller(schedule: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(RealTimeConfig, "keyframe_deg", 0.0)
     # Frames of a thread take so long that it closes a loop before the last one.

@@ -43,7 +43,9 @@ def expected() -> np.ndarray:
     return se3.inverse(truth.T_world_camera[0]) @ truth.T_world_camera[list(NUMBERS)]
 
 
-@pytest.mark.parametrize("name", ["sigma", "varsplat-fast", "cgslam-fast"])
+@pytest.mark.parametrize(
+    "name", ["sigma", *(pytest.param(name, marks=pytest.mark.slow) for name in ("varsplat-fast", "cgslam-fast"))]
+)
 def test_the_path_is_the_given_one_also_where_nothing_can_be_tracked(name: str) -> None:
     slam = Slam(config(name, **{"tracking.features": "false", "mapping.first_iterations": "20"}))
     steps = [slam.step(posed(i)) for i in range(len(NUMBERS))]

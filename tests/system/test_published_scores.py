@@ -83,6 +83,7 @@ def test_replicas_layout_has_all_scores_of_the_papers(
     assert exit_code("eval", str(tmp_path / "run"), "--lpips", str(tmp_path)) == 2
 
 
+@pytest.mark.slow
 def test_test_views_of_scannetpp_are_scored_apart_from_training_views(room: SyntheticRoom, tmp_path: Path) -> None:
     dslr = tmp_path / "0a5c013435" / "dslr"
     away = room.test_views()

@@ -163,6 +163,7 @@ def test_a_run_resumes_with_the_same_bytes_after_a_relocalisation(kidnapped: Rec
     assert slam.relocaliser.indexed == whole.relocaliser.indexed
 
 
+@pytest.mark.slow
 def test_nothing_still_is_taken_for_moving_after_a_relocalisation() -> None:
     slam = followed([*AHEAD, BLACK, BLACK, *BACK[:4]], settings(moving__find="true"))
     assert "relocalised" in states(slam)

@@ -59,7 +59,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium (apt-get install chromium)")
-@pytest.mark.parametrize("width", SCREENS)
+@pytest.mark.parametrize("width", [PHONE_PX, pytest.param(1280, marks=pytest.mark.slow)])
 def test_the_report_fits_a_phone_and_a_screen(run: Path, tmp_path: Path, width: int) -> None:
     assert CHROMIUM is not None
     frame, height = tmp_path / "frame.html", SCREENS[width]

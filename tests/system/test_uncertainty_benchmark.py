@@ -222,6 +222,7 @@ def test_samples_have_every_predictor_and_both_maps(run: FinishedRun) -> None:
     assert failures["frames"] == 13 and failures["off"] == 0
 
 
+@pytest.mark.slow
 def test_the_benchmark_writes_scores_tables_and_pictures(
     run: FinishedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
