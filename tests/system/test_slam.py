@@ -216,7 +216,7 @@ def test_aligning_tracks() -> None:
     assert lost(slam) == [] and error_m(slam) < 0.01
 
 
-@pytest.mark.parametrize("method", ["align", "adam"])
+@pytest.mark.parametrize("method", ["align", pytest.param("adam", marks=pytest.mark.slow)])
 def test_the_definition_in_torch_runs_the_same_slam(method: str) -> None:
     room = SyntheticRoom(frames=200, width=48, height=36)
     some = [room.frame(i) for i in range(2)]
