@@ -97,8 +97,7 @@ def test_a_run_killed_in_its_final_map_gives_the_same_bytes(tmp_path: Path) -> N
     assert not run.refinement.exists()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name, after", [("sigma", 13), ("cgslam-fast", 7)])
+@pytest.mark.parametrize("name, after", [("sigma", 13), pytest.param("cgslam-fast", 7, marks=pytest.mark.slow)])
 def test_a_resumed_run_gives_the_same_bytes(tmp_path: Path, name: str, after: int) -> None:
     assert exit_code(*arguments(tmp_path / "whole", name)) == 0
     assert killed(tmp_path / "cut", name, after) < FRAMES
