@@ -54,7 +54,7 @@ def test_a_preset_is_values_and_a_setting_is_a_field(package: Path, run: Callabl
         encoding="utf-8",
     )
     replace(presets / "varsplat.py", '"fast": FAST}', '"fast": FAST, "office": TUM}')
-    frames = package / "config" / "frames.py"
+    frames = package / "config" / "tracking.py"
     source = frames.read_text(encoding="utf-8")
     method = source.index("\n    method: ", source.index("class TrackingConfig")) + 1
     field = '    patience_s: float = 0.0\n    """Seconds to wait for a frame."""\n'

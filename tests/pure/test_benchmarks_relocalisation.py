@@ -54,7 +54,7 @@ def test_what_is_right(centimetres: float, degrees: float, right: bool) -> None:
 
 def test_a_frame_is_found_in_a_map_of_the_same_path(room: SyntheticRoom) -> None:
     config: Config = preset("sigma")
-    known = known_map.TrueMap(room, room.truth().T_world_camera, config, FeatureConfig(count=600))
+    known = known_map.TrueMap(room, room.truth().T_world_camera, config, FeatureConfig())
     found = known.search(62)
     assert found["found"] and relocalisation.is_right(found) and abs(found["keyframe"] - 62) > known_map.APART
 

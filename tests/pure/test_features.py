@@ -159,9 +159,14 @@ def test_pixel_centres_are_at_integers(kind: str, texture: NDArray[np.uint8]) ->
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_features_are_sorted_and_limited(kind: str, texture: NDArray[np.uint8]) -> None:
+def test_features_are_sorted_and_limited(
+    kind: str, texture: NDArray[np.uint8], monkeypatch: pytest.MonkeyPatch
+) -> None:
     image = np.ascontiguousarray(texture[:240, :320])
-    many, few = extractor(kind, count=200).find(image, CAMERA), extractor(kind, count=50).find(image, CAMERA)
+    monkeypatch.setattr(FeatureConfig, "count", 200)
+    many = extractor(kind).find(image, CAMERA)
+    monkeypatch.setattr(FeatureConfig, "count", 50)
+    few = extractor(kind).find(image, CAMERA)
     assert len(few) <= 50 < len(many) <= 200
     assert many.points.shape == (len(many), 2) and many.sigma_px.shape == (len(many),)
     assert (many.sigma_px > 0).all() and many.points.dtype == np.float32
