@@ -64,6 +64,9 @@ class LoopConfig(Section, name="loops"):
     """Maximum rotation between the keyframes of a pair that `near_m` selects."""
     most: Count = 3  # registering a pair costs as much as thirty frames
     """Maximum number of pairs registered per finished submap, the most similar first; 0 = no limit."""
+    alignments: Count = 8
+    """At the end each keyframe is aligned to at most this many earlier ones that see the same, and all poses are solved
+    together (ours), unless `close` is off or poses are given; 0 = off: loops move whole submaps only (papers)."""
     uncertainty: bool = True
     """Whether similarity is multiplied by a gate from the variance-weighted opacity ratio; off = LoopSplat."""
     tau: Above0 = 10.0

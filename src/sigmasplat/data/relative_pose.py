@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from sigmasplat.data.poses import Column, Records
 from sigmasplat.types import Matrix
 
-Kind = Literal["hop", "odometry", "loop", "relocalisation", "join"]
+Kind = Literal["hop", "odometry", "loop", "relocalisation", "join", "alignment"]
 """hop: from a keyframe to the one before, as tracking found it; odometry: to the next submap at a cut; loop: judged by
-the pose graph, unlike the others; relocalisation: to the place where the camera was found; join: between components."""
+the pose graph, unlike the others; relocalisation: to the place where the camera was found; join: between components;
+alignment: between keyframes that see the same."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -176,7 +176,10 @@ class RefinedStore(ReadOnlyStore):
     exposures: Sequence[Matrix] | None = None
 
     def load(self, index: int) -> Submap:
-        submap = self.store.load(index)
+        return self.moved(self.store.load(index), index)
+
+    def moved(self, submap: Submap, index: int) -> Submap:
+        """Return a submap of the store with the moved poses."""
         if self.keyframe_poses is None:
             return submap
         poses = np.array(self.keyframe_poses[index]).reshape(-1, 4, 4)

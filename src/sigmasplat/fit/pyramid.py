@@ -64,10 +64,16 @@ class Pyramid:
 
     def coarse(self, levels: int) -> "Pyramid":
         """Return the coarsest `levels` sizes, for a quick alignment."""
-        first = max(0, len(self.cameras) - levels)
+        return self._sizes(slice(max(0, len(self.cameras) - levels), None))
+
+    def finest(self) -> "Pyramid":
+        """Return the finest size alone, for an alignment that coarse sizes cannot pull away."""
+        return self._sizes(slice(1))
+
+    def _sizes(self, which: slice) -> "Pyramid":
         return replace(
-            self, gray=self.gray[first:], depth=self.depth[first:], weight=self.weight[first:],
-            weight_depth=self.weight_depth[first:], cameras=self.cameras[first:], noise=self.noise[first:],
+            self, gray=self.gray[which], depth=self.depth[which], weight=self.weight[which],
+            weight_depth=self.weight_depth[which], cameras=self.cameras[which], noise=self.noise[which],
         )  # fmt: skip
 
     def hiding(self, hidden: Any) -> "Pyramid":

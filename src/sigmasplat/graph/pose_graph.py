@@ -98,7 +98,7 @@ def optimise(
     judged_first = graph.loop & ~np.array(rejected, bool) if len(rejected) else graph.loop
     T, weights, graduating = _graduate(graph, start, chi2_limit, judged_first)
     valid = np.where(graph.loop, weights >= PRUNE_WEIGHT, True)
-    T, finishing = _minimise(graph, T, valid.astype(np.float64), max_iterations)
+    T, finishing = minimise(graph, T, valid.astype(np.float64), max_iterations)
     chi2 = graph.chi2(T)
     verdicts = tuple(
         LoopVerdict(edge.a, edge.b, float(weights[i]), float(chi2[i]), bool(valid[i]))
@@ -179,14 +179,14 @@ def _graduate(
     enough = ROUGHLY if graph.is_large else SETTLED
     while True:
         weights = np.where(graph.loop, 1.0 / (1.0 + chi2 / (mu * chi2_limit)) ** 2, 1.0)
-        T, taken = _minimise(graph, T, weights, STEPS_PER_MU, SETTLED if mu == 1.0 else enough)
+        T, taken = minimise(graph, T, weights, STEPS_PER_MU, SETTLED if mu == 1.0 else enough)
         chi2, steps = graph.chi2(T), steps + taken
         if mu == 1.0:
             return T, 1.0 / (1.0 + chi2 / chi2_limit) ** 2, steps
         mu = max(mu / GRADUATION, 1.0)
 
 
-def _minimise(
+def minimise(
     graph: PoseGraph, T: Matrix, weights: Matrix, max_iterations: int, enough: float = SETTLED
 ) -> tuple[Matrix, int]:
     """Minimise Σ w eᵀΩe by Levenberg–Marquardt from poses T; return the poses and the number of steps tried.

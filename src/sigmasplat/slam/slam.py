@@ -8,9 +8,10 @@ import numpy as np
 from sigmasplat.data import se3
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.relative_pose import UNKNOWN_HOP, RelativePose
-from sigmasplat.data.submap import RefinedStore, StorePart
+from sigmasplat.data.submap import RefinedStore, StorePart, SubmapStore
 from sigmasplat.data.trajectory import APART, RELOCALISED, TRACKED
 from sigmasplat.final.final_map import final_map, reaching
+from sigmasplat.final.followed_store import solved_keyframes
 from sigmasplat.final.uncertainty import final_uncertainty
 from sigmasplat.fit.pose import PoseFit
 from sigmasplat.graph.loops import Loop
@@ -77,9 +78,15 @@ class Slam(MappingBackend, ArrayInterface):
         self._connect_components()
         self.closer.solve_all(self.atlas)
         members = self.atlas.members(0)
-        store, anchors = StorePart(self.store, members), [self.atlas.anchors[s] for s in members]
+        part = StorePart(self.store, members)
+        store: SubmapStore = part
         refining, measuring = (part_of(progress, first, total) for first in (0, steps))
         known = PathCovariance.of_keyframes(self.atlas, self.closer.valid)
+        loops = self.config.loops
+        if loops.close and loops.alignments and not self.config.input.poses:
+            store, poses = solved_keyframes(self.atlas, known, part, self.view, loops.alignments)
+            self.atlas.refined = dict(zip(members, poses, strict=True))
+        anchors = [self.atlas.anchors[s] for s in members]
         config = replace(self.config, final=reaching(self.config, known))
         final = final_map(store, anchors, config, self.view, self.random, refining, self.saved_refinement)
         self._final, self.refinement_steps = final.field, final.steps

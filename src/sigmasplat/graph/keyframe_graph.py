@@ -1,0 +1,225 @@
+"""The graph of keyframes: each is aligned to several earlier ones that see the same, and all poses are solved together.
+
+Nodes are keyframes. Edges are relative poses with covariance: the hop from the keyframe before, closed loops, and
+direct alignments to earlier keyframes (Kerl et al., IROS 2013). The redundancy also measures how good the edges are:
+the variance of each kind of edge is multiplied by a factor that its residuals ask for (Förstner 1979).
+"""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2 as chi2_distribution
+
+from sigmasplat.data import se3
+from sigmasplat.data.relative_pose import Kind, RelativePose
+from sigmasplat.fit.align import Alignment, align
+from sigmasplat.fit.compare import Comparison, compare
+from sigmasplat.fit.pyramid import Pyramid
+from sigmasplat.graph.normal_equations import factorised
+from sigmasplat.graph.path_covariance import PathCovariance
+from sigmasplat.graph.pose_graph import PoseGraph, minimise, most_chi2
+from sigmasplat.tracking.drift import UNKNOWN
+from sigmasplat.tracking.pose_validation import confirmed
+from sigmasplat.types import Matrix
+
+NEAR = 0.5
+"""Views are near if between them the image moves by at most this share of its width: then half of it is in both."""
+APART = 4
+"""Other keyframes that a keyframe is aligned to are this many keyframes apart: neighbours share most errors."""
+NEAREST = 3
+"""The nearest views are taken whatever their distance in time; one of them is the keyframe before."""
+UNDECIDED = 1e-3
+"""The finest size alone replaces coarse to fine only if it agrees better by more than this."""
+MEDIAN_CHI2 = float(chi2_distribution.median(6))
+ROUNDS, STEPS = 10, 5
+"""Rounds of weighting and factors, and steps of the solution in each."""
+PROBES = 600
+"""Redundancies of larger systems than this are estimated with this many random signs (Hutchinson 1990)."""
+
+
+@dataclass(frozen=True, eq=False)
+class KeyframeSolution:
+    """T_world_keyframe [K, 4, 4], and the factor on the variance of each kind of edge."""
+
+    T_world_keyframe: Matrix
+    factors: dict[Kind, float]
+
+
+# ---- edges ----
+
+
+def aligned(reference: Pyramid, live: Pyramid, T_live_reference: Matrix) -> tuple[Alignment, Comparison]:
+    """Align two images coarse to fine, and at the finest size alone; return what agrees better at full resolution.
+
+    Coarse sizes reach far, but where the scene repeats they pull the pose away, and fine sizes cannot come back. Gray
+    and depth count alike, each in units of its noise.
+    """
+    pairs = (reference, live), (reference.finest(), live.finest())
+    found = [align(*pair, T_live_reference) for pair in pairs]
+    seen = [compare(reference, live, motion.T_live_reference) for motion in found]
+    best = int(agreement(seen[1]) > agreement(seen[0]) + UNDECIDED)
+    return found[best], seen[best]
+
+
+def agreement(seen: Comparison) -> float:
+    """Return how well two images agree: the share of close depths times the correlation of gray values, if known."""
+    return seen.close if np.isnan(seen.correlation) else seen.close * seen.correlation
+
+
+def edge_between(a: int, b: int, reference: Pyramid, live: Pyramid, T_b_a: Matrix) -> RelativePose | None:
+    """Align keyframe b to keyframe a from a guess T_b_a [4, 4]; None if the images do not confirm the result."""
+    motion, seen = aligned(reference, live, T_b_a)
+    covariance = motion.covariance + np.diag(motion.bias**2)
+    if motion.degenerate or not confirmed(seen) or not np.isfinite(covariance).all():
+        return None
+    return RelativePose(b, a, motion.T_live_reference, np.asarray(np.linalg.inv(covariance)), "alignment")
+
+
+def partners(T_world_keyframe: Matrix, depth_m: float, width_rad: float, most: int) -> list[int]:
+    """Return at most `most` earlier keyframes that the newest of T_world_keyframe [K, 4, 4] is aligned to: the one
+    before and the nearest views, then near views that are spread over time.
+
+    depth_m: mean depth of the newest; width_rad: angle of view.
+    """
+    newest = len(T_world_keyframe) - 1
+    T_newest_other = se3.inverse(T_world_keyframe[newest]) @ T_world_keyframe[:newest]
+    moved = np.linalg.norm(T_newest_other[:, :3, 3], axis=1) / (depth_m * width_rad)
+    moved += np.linalg.norm(se3.log_stack(T_newest_other)[:, 3:], axis=1) / width_rad
+    near = [k for k in np.argsort(moved, kind="stable").tolist() if moved[k] < NEAR and k != newest - 1]
+    chosen = [newest - 1, *near[: NEAREST - 1]]
+    for k in near[NEAREST - 1 :]:
+        if len(chosen) < most and all(abs(k - other) >= APART for other in (*chosen, newest)):
+            chosen.append(k)
+    return chosen[:most]
+
+
+def alignments(T_world_keyframe: Matrix, image: Callable[[int], Pyramid], most: int) -> list[RelativePose]:
+    """Align each keyframe to at most `most` earlier ones, from poses [K, 4, 4]; return what the images confirm."""
+    found = list[RelativePose | None]()
+    for b in range(1, len(T_world_keyframe) if most else 0):
+        live, camera = image(b), image(b).cameras[0]
+        width_rad = 2.0 * float(np.arctan(camera.width / (2.0 * camera.fx)))
+        T_b_world = se3.inverse(T_world_keyframe[b])
+        for a in partners(T_world_keyframe[: b + 1], float(live.readings[0]), width_rad, most):
+            found.append(edge_between(a, b, image(a), live, T_b_world @ T_world_keyframe[a]))
+    return [edge for edge in found if edge is not None]
+
+
+# ---- solution ----
+
+
+def solve(T_world_keyframe: Matrix, edges: Sequence[RelativePose], fixed: int = 1) -> KeyframeSolution:
+    """Find the poses [K, 4, 4] that agree best with all edges; the first `fixed` ones stay.
+
+    The loss is pseudo-Huber at the scale of the χ² test of loops. It is convex: drift that far edges contradict cannot
+    pass for outliers, as it does with a loss that lets them go. The factor of a kind makes the median χ² of its edges
+    that of χ² with as many degrees of freedom as the edges are redundant; a prior worth one edge keeps the factor of a
+    kind without redundancy at 1. With a chain alone the poses are returned unchanged.
+    """
+    kinds = sorted({edge.kind for edge in edges})
+    factors: dict[Kind, float] = dict.fromkeys(kinds, 1.0)
+    if len(edges) < len(T_world_keyframe) or fixed == len(T_world_keyframe):
+        return KeyframeSolution(T_world_keyframe, factors)
+    of_kind = {kind: np.array([edge.kind == kind for edge in edges]) for kind in kinds}
+    graph = PoseGraph(len(T_world_keyframe), edges, fixed)
+    claimed, scale = graph.information, most_chi2()
+    T = se3.inverse(T_world_keyframe[:1]) @ T_world_keyframe
+    for _ in range(ROUNDS):
+        factor = np.sum([factors[kind] * rows for kind, rows in of_kind.items()], axis=0)
+        graph.information = claimed / factor[:, None, None]
+        weights = (1.0 + graph.chi2(T) / scale) ** -0.5
+        T, _ = minimise(graph, T, weights, STEPS)
+        chi2 = graph.chi2(T) * factor
+        for (kind, rows), free in zip(of_kind.items(), redundancies(graph, T, weights, of_kind.values()), strict=True):
+            redundant = float(np.clip(free / 6.0, 1e-3 * rows.sum(), rows.sum()))  # in numbers of edges
+            measured = float(np.median(chi2[rows])) / MEDIAN_CHI2 * float(rows.sum()) / redundant
+            factors[kind] = (redundant * measured + 1.0) / (redundant + 1.0)
+    solved = se3.orthonormalise(T_world_keyframe[0] @ T)
+    solved[:fixed] = T_world_keyframe[:fixed]
+    return KeyframeSolution(solved, factors)
+
+
+def redundancies(graph: PoseGraph, T: Matrix, weights: Matrix, groups: Iterable[Matrix]) -> list[float]:
+    """Return how many degrees of freedom the residuals of each group of edges [E] have in a solution: the trace of
+    I − J H⁻¹ Jᵀ w Ω over the group."""
+    H, _ = graph.normal_equations(T, weights)
+    size = H.shape[0]
+    signs = np.eye(size)
+    if size > PROBES:
+        signs = np.random.default_rng(0).choice([-1.0, 1.0], (size, PROBES)) / np.sqrt(PROBES)
+    solved = factorised(H).solve(signs)
+    return [
+        6.0 * float(group.sum()) - float((solved * (graph.normal_equations(T, weights * group)[0] @ signs)).sum())
+        for group in groups
+    ]
+
+
+# ---- the graph of a run ----
+
+
+@dataclass(frozen=True, eq=False)
+class KeyframeNodes:
+    """The keyframes of one component as nodes. A keyframe that two submaps share is one node.
+
+    rows [N]: the row of each node in `path`, the later one of two copies, in the order of the frames; node [K]: the
+    node of each row, −1 in other components; fixed: how many nodes, the first ones, do not move.
+    """
+
+    path: PathCovariance
+    rows: NDArray[np.int64]
+    node: NDArray[np.int64]
+    fixed: int
+
+    @staticmethod
+    def of(path: PathCovariance, frames: Mapping[int, Sequence[int]]) -> "KeyframeNodes":
+        """Return the nodes of the submaps `frames`, which gives the frame numbers of their keyframes. Those of earlier
+        sessions, below 0, do not move."""
+        submaps = path.keyframe_submap
+        wanted = np.flatnonzero(np.isin(submaps, list(frames)))
+        numbers = np.concatenate([np.array(frames[s], np.int64) for s in sorted(frames)])
+        known, copies = np.unique(numbers, return_inverse=True)
+        rows, node = np.zeros(len(known), np.int64), np.full(len(submaps), -1)
+        rows[copies], node[wanted] = wanted, copies
+        return KeyframeNodes(path, rows, node, max(1, int((known < 0).sum())))
+
+    @property
+    def T_world_keyframe(self) -> Matrix:
+        """Return the poses of the nodes [N, 4, 4]."""
+        path = self.path
+        return np.asarray(path.anchors[path.keyframe_submap[self.rows]] @ path.T_submap_keyframe[self.rows])
+
+    def edges(self) -> list[RelativePose]:
+        """Return what the run knows between the nodes: hops, closed loops, and links between submaps that do not share
+        a keyframe."""
+        path, submap, T = self.path, self.path.keyframe_submap, self.path.T_submap_keyframe
+        first = np.searchsorted(submap, np.arange(len(path.anchors)))
+        found = []
+        for row in np.flatnonzero(self.node >= 0)[1:].tolist():
+            if submap[row] == submap[row - 1]:
+                known = path.hops.known(row)
+                information = np.asarray(np.linalg.inv(UNKNOWN if known is None else known))
+                T_row_before = se3.inverse(T[row]) @ T[row - 1]
+                found.append(RelativePose(self.node[row], self.node[row - 1], T_row_before, information, "hop"))
+        for edge in path.edges:
+            a, b = (int(first[s]) + k for s, k in zip((edge.a, edge.b), edge.keyframes, strict=True))
+            if self.node[a] < 0 or self.node[a] == self.node[b] or self._share(edge):
+                continue
+            T_a_b, A = se3.inverse(T[a]) @ edge.T_a_b @ T[b], se3.adjoint(se3.inverse(T[a]))
+            information = np.asarray(np.linalg.inv(A @ edge.measured @ A.T))
+            found.append(RelativePose(self.node[a], self.node[b], T_a_b, information, edge.kind))
+        return found
+
+    def _share(self, edge: RelativePose) -> bool:
+        """Return whether the two submaps of an edge share a keyframe, whose node connects them exactly."""
+        of_a, of_b = (self.node[self.path.keyframe_submap == s] for s in (edge.a, edge.b))
+        return edge.kind == "odometry" and bool(np.isin(of_b, of_a).any())
+
+    def spread(self, T_world_node: Matrix) -> Matrix:
+        """Return the poses of all rows [K, 4, 4], T_world_keyframe, given those of the nodes; other components stay."""
+        path = self.path
+        poses = path.anchors[path.keyframe_submap] @ path.T_submap_keyframe
+        known = self.node >= 0
+        poses[known] = T_world_node[self.node[known]]
+        return np.asarray(poses)
