@@ -90,13 +90,30 @@ def test_frames_follow_the_refined_poses_of_their_keyframes() -> None:
     assert np.allclose(atlas.T_world_keyframes_of([1])[1], [atlas.anchors[1] @ T for T in atlas.refined[1]])
 
 
-def test_probe_views_follow_their_keyframe_in_the_final_map() -> None:
+def test_corrections_change_steadily_from_keyframe_to_keyframe() -> None:
+    """Ten frames, keyframes at 0, 4 and 8: the second one moves by 8 mm, so each frame before it by 2 mm more."""
+    atlas = Atlas()
+    atlas.begin_submap()
+    T = [se3.exp(np.array([0.1 * i, 0.0, 0.0, 0.0, 0.0, 0.0])) for i in range(10)]
+    for i in range(10):
+        if i % 4 == 0:
+            atlas.keyframe_poses[-1].append(T[i])
+        atlas.place_frame(T[i])
+    aside = se3.exp(np.array([0.0, 0.008, 0.0, 0.0, 0.0, 0.0]))
+    atlas.refined = {0: [T[0], aside @ T[4], aside @ T[8]]}
+    moved_mm = 1000.0 * atlas.T_world_camera()[:, 1, 3]
+    assert np.allclose(moved_mm, [0, 2, 4, 6, 8, 8, 8, 8, 8, 8])
+
+
+def test_probe_views_follow_as_frames_do_in_the_final_map() -> None:
     T, probe, moved = np.array([motion(1), motion(2)]), motion(3), [motion(4), motion(5)]
     store, picture = MemoryStore(), Picture(np.zeros((3, 4, 3), np.uint8), np.ones((3, 4), np.float32))
     store.save(Submap(0, GaussianField.empty(), (0, 8), T, CAMERA, (5,), probe[None]), [picture] * 2, [picture])
     submap = RefinedStore(store, [moved]).load(0)
     assert np.allclose(submap.T_submap_camera, moved)
-    assert np.allclose(submap.T_submap_probe[0], moved[0] @ se3.inverse(T[0]) @ probe)
+    first, last = (new @ se3.inverse(old) for new, old in zip(moved, T, strict=True))
+    at_frame_5 = se3.exp(5 / 8 * se3.log(last @ se3.inverse(first))) @ first  # of 8 frames between the keyframes
+    assert np.allclose(submap.T_submap_probe[0], at_frame_5 @ probe)
     with pytest.raises(SigmaSplatError, match="submap 1 cannot be saved in a store that is only read"):
         RefinedStore(store, [moved]).save(Submap(1, GaussianField.empty(), (0,), T[:1], CAMERA), [picture])
 

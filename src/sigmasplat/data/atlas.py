@@ -100,7 +100,20 @@ class Atlas:
         """Return the poses of all frames [F, 4, 4]; without `loops` those of tracking alone."""
         if not loops:
             return self._frames(self._in_world(self.odometry, {}))
-        return self._frames(self._in_world(self.anchors, self.refined))
+        if not self.refined:
+            return self._frames(self._in_world(self.anchors, {}))
+        tracked, moved = self.keyframe_poses.stacked(), self._in_world(self.anchors, self.refined)
+        return self._corrections(moved @ se3.inverse(tracked)) @ self._frames(tracked)
+
+    def _corrections(self, of_keyframes: Matrix) -> Matrix:
+        """Return the motion of each frame [F, 4, 4], given those [K, 4, 4] of the keyframes: that of its keyframe; it
+        changes steadily to that of the next one in its submap, so that the path does not jump at keyframes."""
+        first, places = np.cumsum([0, *self.keyframe_poses.counts]), self.places.first(len(self.places))
+        row = first[places.submap] + places.keyframe
+        after = np.minimum(row + 1, first[places.submap + 1] - 1)
+        begins = np.append(np.flatnonzero(np.diff(row, prepend=-1)), len(row))  # frames of one keyframe are in a row
+        share = np.concatenate([np.empty(0), *(np.arange(frames) / frames for frames in np.diff(begins))])
+        return se3.interpolated(of_keyframes[row], of_keyframes[after], share)
 
     @property
     def T_submap_camera(self) -> Matrix:

@@ -176,6 +176,11 @@ def rotation_angle(R: Matrix) -> float:
     return math.atan2(math.hypot(h - f, c - g, d - b), a + e + i - 1.0)  # 2 sin and 2 cos
 
 
+def interpolated(T: Matrix, T_next: Matrix, share: Matrix) -> Matrix:
+    """Return the poses [N, 4, 4] that are a share [N] of the way from T to T_next, along a screw motion."""
+    return np.asarray(exp_stack(share[:, None] * log_stack(T_next @ inverse(T))) @ T)
+
+
 def orthonormalise(T: Matrix) -> Matrix:
     """Project the rotation of a pose [..., 4, 4] onto SO(3), so that errors do not accumulate over many products."""
     u, _, vt = np.linalg.svd(T[..., :3, :3])

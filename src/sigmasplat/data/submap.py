@@ -165,7 +165,7 @@ class StorePart(ReadOnlyStore):
 @dataclass(frozen=True, eq=False)
 class RefinedStore(ReadOnlyStore):
     """The submaps of a store as the final map sees them: with the poses of their keyframes that its refinement has
-    moved, and with images in the exposure of the map. Probe views follow their keyframe; their
+    moved, and with images in the exposure of the map. Probe views follow as frames do; their
     exposure is interpolated between those of keyframes.
 
     keyframe_poses: T_submap_camera [4, 4] of each submap's keyframes, None: not moved. The splats of the submaps fit
@@ -182,10 +182,12 @@ class RefinedStore(ReadOnlyStore):
         """Return a submap of the store with the moved poses."""
         if self.keyframe_poses is None:
             return submap
-        poses = np.array(self.keyframe_poses[index]).reshape(-1, 4, 4)
-        keyframe = np.searchsorted(submap.frames, submap.probe_frames, side="right") - 1
-        before = submap.T_submap_camera[keyframe]
-        probes = poses[keyframe] @ se3.inverse(before) @ submap.T_submap_probe
+        poses, frames = np.array(self.keyframe_poses[index]).reshape(-1, 4, 4), np.array(submap.frames, np.int64)
+        motions, at = poses @ se3.inverse(submap.T_submap_camera), np.array(submap.probe_frames, np.int64)
+        keyframe = np.searchsorted(frames, at, side="right") - 1
+        after = np.minimum(keyframe + 1, len(frames) - 1)
+        share = (at - frames[keyframe]) / np.maximum(frames[after] - frames[keyframe], 1) * (after > keyframe)
+        probes = se3.interpolated(motions[keyframe], motions[after], share) @ submap.T_submap_probe
         return replace(submap, T_submap_camera=poses, T_submap_probe=probes)
 
     def picture(self, index: int, keyframe: int) -> Picture:
