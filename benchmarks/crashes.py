@@ -32,7 +32,7 @@ from tables import Section
 from sigmasplat.errors import SigmaSplatError, SourceError
 from sigmasplat.files.tensors import open_tensors
 from sigmasplat.plugins.outputs.mesh_files import read_mesh
-from sigmasplat.plugins.outputs.splats.any_format import read_any
+from sigmasplat.plugins.outputs.splats.read_any import read_any
 from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.run_folder.trajectory import read_trajectory
 

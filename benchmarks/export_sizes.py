@@ -35,7 +35,7 @@ from sigmasplat.plugins.evaluation.metrics import views
 from sigmasplat.plugins.evaluation.reconstruct import FusionInput
 from sigmasplat.plugins.evaluation.view_scoring import working_frame
 from sigmasplat.plugins.outputs.formats import PLUGIN, ExportSource, choose
-from sigmasplat.plugins.outputs.splats.any_format import read_any
+from sigmasplat.plugins.outputs.splats.read_any import read_any
 from sigmasplat.render import FieldRenderer
 from sigmasplat.run_folder.runs import RunFolder
 

@@ -1,8 +1,9 @@
 """Compare the blend kernels with what the processor can do: arithmetic, and reads from its caches.
 
-Counted, at random blocks of pixels: the splats that each block tests and composites, by the rules of `native/blend.h`.
-Timed: the two blend stages of a forward and a backward pass, with one thread, on the maps of cpu.py. Measured for
-comparison: the largest rate of a matrix product, and of reading arrays in the second cache and in memory.
+Counted, at random blocks of pixels: the splats that each block tests and composites, by the rules of
+`native/raster_blend.h`. Timed: the two blend stages of a forward and a backward pass, with one thread, on the maps of
+cpu.py. Measured for comparison: the largest rate of a matrix product, and of reading arrays in the second cache and in
+memory.
 Writes benchmarks/results/roofline-<machine>.json and prints a table. Do not use the machine for anything else.
 
 example: python benchmarks/roofline.py --quick

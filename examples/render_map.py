@@ -18,7 +18,7 @@ from PIL import Image
 from sigmasplat import Camera, SigmaSplatError
 from sigmasplat.data import se3
 from sigmasplat.plugins.outputs.drawing import colormap
-from sigmasplat.plugins.outputs.splats.any_format import read_any
+from sigmasplat.plugins.outputs.splats.read_any import read_any
 from sigmasplat.render import render
 from sigmasplat.run_folder.runs import RunFolder
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from constants import made
 from sigmasplat import config
-from sigmasplat.plugins.presets.base import BASE, BASE_VALUES
+from sigmasplat.plugins.presets.shared_by_papers import BASE, BASE_VALUES
 
 RenderConfig = partial(made, config.RenderConfig, **BASE_VALUES["render"])
 SeedConfig = partial(made, config.SeedConfig, **BASE_VALUES["seeding"])

@@ -11,7 +11,7 @@ from sigmasplat.data.frame import Frame
 from sigmasplat.data.submap import Picture, Submap
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.input.source import Source
-from sigmasplat.plugins.presets.base import BASE
+from sigmasplat.plugins.presets.shared_by_papers import BASE
 from sigmasplat.run_folder.runs import RunFolder
 
 FRAMES, LOST = 6, 3

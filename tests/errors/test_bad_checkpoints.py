@@ -17,7 +17,7 @@ from sigmasplat.data.relative_pose import UNKNOWN_HOP, RelativePose
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import RunError, SigmaSplatError
 from sigmasplat.plugins.outputs.floorplan.floor_plan import floor_plan
-from sigmasplat.plugins.presets.base import BASE
+from sigmasplat.plugins.presets.shared_by_papers import BASE
 from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.slam.slam_state import checkpoint_of
 

@@ -16,7 +16,7 @@ from sigmasplat import cli
 from sigmasplat.data.field import GaussianField
 from sigmasplat.errors import SourceError
 from sigmasplat.plugins.outputs.splats import gltf, sog, splat, spz
-from sigmasplat.plugins.outputs.splats.any_format import read_any
+from sigmasplat.plugins.outputs.splats.read_any import read_any
 from sigmasplat.run_folder import splat_ply as ply
 
 WRITERS = {

@@ -8,7 +8,7 @@ from safetensors import SafetensorError
 
 from sigmasplat.errors import ConfigError, RunError
 from sigmasplat.files import tensors
-from sigmasplat.plugins.presets.base import BASE
+from sigmasplat.plugins.presets.shared_by_papers import BASE
 from sigmasplat.run_folder.runs import RunFolder
 
 

@@ -21,8 +21,8 @@ from sigmasplat import cli
 from sigmasplat.config import Config
 from sigmasplat.errors import ConfigError, RunError, SourceError
 from sigmasplat.input.lists import associate
-from sigmasplat.plugins.outputs.splats.any_format import read_any
-from sigmasplat.plugins.presets.base import BASE
+from sigmasplat.plugins.outputs.splats.read_any import read_any
+from sigmasplat.plugins.presets.shared_by_papers import BASE
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.run_folder.runs import RunFolder
 

@@ -9,7 +9,7 @@ import pytest
 
 from changed_settings import changed_settings
 from sigmasplat.config.find_preset import list_presets, preset, presets_by_scene
-from sigmasplat.plugins.presets.base import BASE
+from sigmasplat.plugins.presets.shared_by_papers import BASE
 
 DOCS = Path(__file__).parents[2] / "docs"
 SYSTEMS = ("varsplat", "cgslam")

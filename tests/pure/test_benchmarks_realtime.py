@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from benchmark_results import laid_out
-from sigmasplat.plugins.presets.base import BASE
+from sigmasplat.plugins.presets.shared_by_papers import BASE
 from sigmasplat.run_folder.runs import RunFolder
 
 realtime, replayed = importlib.import_module("realtime"), importlib.import_module("replayed")

@@ -11,7 +11,7 @@ import pytest
 
 from benchmark_results import laid_out
 from sigmasplat.errors import ConfigError
-from sigmasplat.plugins.presets.base import BASE
+from sigmasplat.plugins.presets.shared_by_papers import BASE
 from sigmasplat.run_folder.runs import RunFolder
 
 accuracy, consistency, systems, tables = map(

@@ -31,7 +31,7 @@ from sigmasplat.data.trajectory import Component, Trajectory
 from sigmasplat.errors import SigmaSplatError, SourceError
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.outputs.mesh_files import write_mesh
-from sigmasplat.plugins.presets.base import BASE
+from sigmasplat.plugins.presets.shared_by_papers import BASE
 from sigmasplat.run.session import Session
 from sigmasplat.run.signals import ENDING
 from sigmasplat.run.terminal import Screen

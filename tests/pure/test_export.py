@@ -14,8 +14,8 @@ from sigmasplat.data.map_uncertainty import SHIPPED, Background, MapUncertainty,
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.files.ply_elements import read_header
 from sigmasplat.plugins.outputs.formats import PLUGIN, ExportSource, choose, listed, owners
-from sigmasplat.plugins.outputs.splats.any_format import read_any
-from sigmasplat.plugins.presets.base import BASE
+from sigmasplat.plugins.outputs.splats.read_any import read_any
+from sigmasplat.plugins.presets.shared_by_papers import BASE
 from sigmasplat.registry import Output
 from sigmasplat.run_folder import splat_ply as ply
 from sigmasplat.run_folder.runs import RunFolder

@@ -12,7 +12,7 @@ from sigmasplat.data.field import GaussianField, Rows
 from sigmasplat.data.harmonics import count
 from sigmasplat.data.map_uncertainty import SplatStd
 from sigmasplat.plugins.outputs.splats import gltf, sog
-from sigmasplat.plugins.outputs.splats.any_format import read_any
+from sigmasplat.plugins.outputs.splats.read_any import read_any
 from sigmasplat.run_folder import splat_ply as ply
 from sigmasplat.run_folder.splat_values import SplatValues
 

@@ -17,7 +17,7 @@ from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import RunError
 from sigmasplat.files import atomic
 from sigmasplat.files.json_files import to_json
-from sigmasplat.plugins.presets.base import BASE
+from sigmasplat.plugins.presets.shared_by_papers import BASE
 from sigmasplat.run_folder.runs import RunFolder
 
 CONFIG = replace(BASE, name="test", seed=7, input=InputConfig(width=160))

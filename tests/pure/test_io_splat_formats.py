@@ -15,7 +15,8 @@ from room_map import psnr_db, room_map
 from sigmasplat.data.field import GaussianField, Rows
 from sigmasplat.data.harmonics import count
 from sigmasplat.errors import RunError
-from sigmasplat.plugins.outputs.splats import any_format, gltf, sog, splat, spz
+from sigmasplat.plugins.outputs.splats import gltf, sog, splat, spz
+from sigmasplat.plugins.outputs.splats.read_any import read_any
 from sigmasplat.plugins.outputs.splats.sog import levels
 from sigmasplat.run_folder import splat_ply as ply
 from sigmasplat.run_folder.splat_values import SplatValues, from_smallest_three, morton_order, smallest_three
@@ -34,7 +35,7 @@ COMPRESSED = [".splat", ".spz", ".sog"]
 def again(path: Path, field: GaussianField) -> GaussianField:
     """Write a field in the format of the path's ending, and read it from a file without an ending."""
     WRITERS[path.suffix](path, field)
-    return any_format.read_any(path.rename(path.with_name("map")))
+    return read_any(path.rename(path.with_name("map")))
 
 
 def some(n: int = 300, degree: int = 0, seed: int = 0) -> GaussianField:
@@ -61,7 +62,7 @@ def test_ply_gives_the_same_render(tmp_path: Path, degree: int) -> None:
     field = room_map(degree)
     assert psnr_db(again(tmp_path / "a.ply", field), field) > 60.0
     ply.write_field(tmp_path / "plain.ply", field, plain=True)
-    assert psnr_db(any_format.read_any(tmp_path / "plain.ply"), field) > 60.0
+    assert psnr_db(read_any(tmp_path / "plain.ply"), field) > 60.0
 
 
 @pytest.mark.parametrize(("ending", "degree"), [(".spz", 0), (".spz", 3), (".sog", 0)])
@@ -144,7 +145,7 @@ def test_splat_files_may_begin_with_any_bytes(tmp_path: Path) -> None:
     for start in [b"<", b"{", b" \n<", b"\x1f\x8b"]:
         splat.write_field(tmp_path / "a.splat", some(3))
         (tmp_path / "b").write_bytes(start + (tmp_path / "a.splat").read_bytes()[len(start) :])
-        assert len(any_format.read_any(tmp_path / "b")) == 3
+        assert len(read_any(tmp_path / "b")) == 3
 
 
 def test_spz_has_the_documented_layout(tmp_path: Path) -> None:
@@ -207,7 +208,7 @@ def test_spz_of_version_2_is_read(tmp_path: Path) -> None:
         ]
     )
     (tmp_path / "a.spz").write_bytes(gzip.compress(body))
-    back = any_format.read_any(tmp_path / "a.spz")
+    back = read_any(tmp_path / "a.spz")
     assert back.means[0].tolist() == [1.0, 2.0, -0.5] and back.params[0, 7:10].tolist() == [-4.0, -3.0, -2.0]
     assert float(back.opacities) == pytest.approx(0.8)
     assert back.colors[0].tolist() == pytest.approx([0.5 + 0.0036878, 0.5 + 0.0036878, 0.5 + 0.283935], abs=1e-5)

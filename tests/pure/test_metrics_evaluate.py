@@ -26,7 +26,7 @@ from sigmasplat.plugins.evaluation.evaluate import evaluate
 from sigmasplat.plugins.evaluation.metrics.lpips import Lpips
 from sigmasplat.plugins.evaluation.report.view_strips import data_uri
 from sigmasplat.plugins.outputs.drawing.view_panels import FOOT, GAP, HEAD, PANEL_WIDTH
-from sigmasplat.plugins.presets.base import BASE
+from sigmasplat.plugins.presets.shared_by_papers import BASE
 from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.run_folder.submaps import DiskStore
 

@@ -13,7 +13,7 @@ from sigmasplat.config import Config
 from sigmasplat.config.find_preset import FAMILIES, default_preset, list_presets, preset, presets_by_scene
 from sigmasplat.config.text import override
 from sigmasplat.errors import ConfigError
-from sigmasplat.plugins.presets.base import BASE
+from sigmasplat.plugins.presets.shared_by_papers import BASE
 
 DATASETS = ("replica", "tum", "scannet")
 EVERY = [*list_presets(), *presets_by_scene()]

@@ -27,7 +27,7 @@ from sigmasplat.fit.target import Target
 from sigmasplat.input.calibration import read_calibration
 from sigmasplat.mapping.seeding import make_splats
 from sigmasplat.plugins.checks.depth import measure_noise
-from sigmasplat.plugins.presets.base import BASE
+from sigmasplat.plugins.presets.shared_by_papers import BASE
 from sigmasplat.tracking.prepared_frame import view_of, working_frame
 
 CAMERA = Camera(160, 120, 140.0, 140.0, 79.5, 59.5)

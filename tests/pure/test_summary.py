@@ -23,7 +23,7 @@ from sigmasplat.plugins.evaluation.report.summary import (
 from sigmasplat.plugins.evaluation.report.tables import score_tables, state_rows
 from sigmasplat.plugins.evaluation.report.view_strips import PanelFigure, data_uri
 from sigmasplat.plugins.outputs.floorplan.rescan import RescanRegion
-from sigmasplat.plugins.presets.base import BASE
+from sigmasplat.plugins.presets.shared_by_papers import BASE
 from sigmasplat.run_folder.runs import RunFolder
 
 GOOD = {

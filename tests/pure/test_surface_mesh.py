@@ -13,7 +13,7 @@ from sigmasplat.data.submap import Picture
 from sigmasplat.errors import ConfigError
 from sigmasplat.final.fusion import FusionView, fuse, with_readings
 from sigmasplat.plugins.outputs.mesh_editing import decimated
-from sigmasplat.plugins.presets.base import BASE
+from sigmasplat.plugins.presets.shared_by_papers import BASE
 
 VOXEL_M = 0.04
 

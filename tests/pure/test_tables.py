@@ -10,7 +10,7 @@ from sigmasplat.errors import ConfigError, SourceError
 from sigmasplat.plugins.batch.definition import MEAN, Cell, Score, Table
 from sigmasplat.plugins.batch.job import Job
 from sigmasplat.plugins.batch.scores import OURS, PAPER, Written, rows
-from sigmasplat.plugins.presets.base import BASE
+from sigmasplat.plugins.presets.shared_by_papers import BASE
 from sigmasplat.plugins.presets.table_files import list_tables
 
 WANTED = {

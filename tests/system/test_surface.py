@@ -28,7 +28,7 @@ from sigmasplat.plugins.evaluation.evaluate import evaluate
 from sigmasplat.plugins.evaluation.metrics.reconstruction import distances
 from sigmasplat.plugins.evaluation.reconstruct import FusionInput
 from sigmasplat.plugins.outputs.mesh_files import read_mesh
-from sigmasplat.plugins.presets.base import BASE
+from sigmasplat.plugins.presets.shared_by_papers import BASE
 from sigmasplat.plugins.sources import SyntheticRoom, open_source
 from sigmasplat.run_folder.runs import RunFolder
 

@@ -1,5 +1,5 @@
-// The interface of the kernels: one table of functions per instruction set. kernels.cpp fills it; bind.cpp chooses at
-// run time.
+// The interface of the kernels: one table of functions per instruction set. per_instruction_set.cpp fills it;
+// bind.cpp chooses at run time.
 #pragma once
 #include <cstddef>
 #include <cstdint>

@@ -52,7 +52,7 @@ class ExportSource:
 
         Raises RunError if there is no run, SourceError if the map cannot be read.
         """
-        from sigmasplat.plugins.outputs.splats.any_format import read_any
+        from sigmasplat.plugins.outputs.splats.read_any import read_any
 
         if self.path.is_file() or (not self.path.exists() and self.path.suffix != ""):
             return read_any(self.path), None

@@ -1,9 +1,10 @@
-"""The presets: a row for each name. The values of a published system are in a module of its own."""
+"""The presets of the papers: a row for each name. The values of a system are in a module of its own. A preset that has
+nothing to do with them is a module with its own row: `sigma`."""
 
 from functools import partial
 
 from sigmasplat.api import Config, Preset
-from sigmasplat.plugins.presets import cgslam, released, varsplat
+from sigmasplat.plugins.presets import cgslam, released_code, varsplat
 
 
 def _made(config: Config) -> Config:
@@ -11,7 +12,9 @@ def _made(config: Config) -> Config:
 
 
 PLUGIN = (
-    Preset("sigma", Config),
     *(Preset(name, partial(_made, config)) for name, config in (varsplat.PRESETS | cgslam.PRESETS).items()),
-    *(Preset(name, partial(released.released, name), partial(released.scenes, name)) for name in released.FAMILIES),
+    *(
+        Preset(name, partial(released_code.released, name), partial(released_code.scenes, name))
+        for name in released_code.FAMILIES
+    ),
 )

@@ -13,7 +13,7 @@ import dataclasses
 
 from sigmasplat.api import Config
 from sigmasplat.plugins.presets import varsplat
-from sigmasplat.plugins.presets.base import BASE
+from sigmasplat.plugins.presets.shared_by_papers import BASE
 
 PAPER = BASE.changed(
     input={"min_depth_m": 0.0},  # as in the code, no reading is removed

@@ -1,5 +1,5 @@
 """Presets of VarSplat and LoopSplat. Numbers that the papers do not give are those of the released code; methods that
-only the code has are in `released`.
+only the code has are in `released_code`.
 
 `varsplat-*` follow VarSplat (arXiv 2603.09673) §2–3. `loopsplat-*` are the same without any uncertainty weight, which
 is the front end of LoopSplat (arXiv 2408.10154). `*-fast` are ours, sized for two CPU cores. Where each number comes
@@ -7,7 +7,7 @@ from: docs/varsplat.md.
 """
 
 from sigmasplat.api import Config
-from sigmasplat.plugins.presets.base import BASE
+from sigmasplat.plugins.presets.shared_by_papers import BASE
 
 UNCERTAIN_M = 0.02
 """The rule of accumulated uncertainty is the paper's, the limit is ours."""
