@@ -12,6 +12,7 @@ from typing import Any
 
 import record
 from board_runs import Row, environment
+from checkouts import IN_PLACE, install_kernels
 
 from sigmasplat.errors import ConfigError
 from sigmasplat.files import machine
@@ -101,11 +102,12 @@ def compile_kernels(checkout: Path) -> None:
         return
     print(f"compiling the kernels of {checkout}", file=sys.stderr, flush=True)
     build = str(checkout / "build" / "inplace")
-    configure = ["cmake", "-S", str(checkout), "-B", build, "-G", "Ninja", "-DSIGMASPLAT_INPLACE=ON"]
+    configure = ["cmake", "-S", str(checkout), "-B", build, "-G", "Ninja", IN_PLACE]
     for words in ([*configure, f"-DPython_EXECUTABLE={sys.executable}"], ["cmake", "--build", build, "-j", "2"]):
         ended = subprocess.run(words, env=environment(checkout), capture_output=True, text=True)
         if ended.returncode:
             raise ConfigError(f"the kernels cannot be compiled: {(ended.stderr or ended.stdout).strip()[-300:]}")
+    install_kernels(Path(build), checkout)
 
 
 def refuse_other_package(checkout: Path) -> None:

@@ -18,6 +18,8 @@ import record
 from sigmasplat.errors import RunError
 
 MODULE = "_core*.so"
+IN_PLACE = "-DSIGMASPLAT_INPLACE=ON"
+"""With it, older commits compile their kernels into the source tree; later ones do not know it."""
 START = """
 import os, runpy, sys
 sys.meta_path[:] = [finder for finder in sys.meta_path if "Redirecting" not in type(finder).__name__]
@@ -115,13 +117,20 @@ def _compile_kernels(tree: Path) -> None:
     """Compile a tree's kernels in place, as `make native` does. Raises RunError with the last line of the compiler."""
     print(f"compiling the kernels of {tree.parents[1].name[:9]}", file=sys.stderr, flush=True)
     build = tree.parent / "kernels"
-    configure = ["-S", str(tree), "-B", str(build), "-G", "Ninja", "-DSIGMASPLAT_INPLACE=ON"]
+    configure = ["-S", str(tree), "-B", str(build), "-G", "Ninja", IN_PLACE]
     configure += [f"-DPython_EXECUTABLE={sys.executable}", f"-DCMAKE_MAKE_PROGRAM={_tool('ninja')}"]
     for words in (configure, ["--build", str(build)]):
         ended = subprocess.run([_tool("cmake"), *words], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
         if ended.returncode:
             last = ended.stdout.strip().splitlines()[-1:] or ["no message"]
             raise RunError(f"the kernels of the other commit do not compile: {last[0]}")
+    install_kernels(build, tree)
+
+
+def install_kernels(build: Path, tree: Path) -> None:
+    """Copy compiled kernels from a build folder into a source tree. Older commits do this by themselves."""
+    for library in build.glob(MODULE):
+        shutil.copy(library, tree / "src" / "sigmasplat" / "native")
 
 
 def _tool(name: str) -> str:
