@@ -75,6 +75,16 @@ def test_named_tests_files_settings_and_presets_exist() -> None:
     assert {path: names for path, names in found.items() if names} == {}
 
 
+def test_folders_that_contributors_are_sent_to_exist() -> None:
+    named = set(
+        re.findall(r"`([a-z_/]+/|[a-z_/]+/[a-z_]+\.py)`", (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8"))
+    )
+    assert len(named) > 15
+    assert {name for name in named if not any((ROOT / at / name).exists() for at in ("", "src/sigmasplat"))} <= {
+        "site/"
+    }
+
+
 def test_the_functions_beside_equations_exist() -> None:
     """Every function beside a file in the papers' documents is defined there."""
     for document in ("varsplat.md", "cgslam.md"):
