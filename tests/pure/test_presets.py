@@ -371,7 +371,7 @@ def test_sigma_adds_to_fast_and_removes_nothing() -> None:
     added = changed_settings(sigma, fast)
     uncertainty = {"mapping.iterations", "mapping.weight_moment", "primitives.uncertain_m2", "uncertainty.probes"}
     assert added == uncertainty | {
-        "input.denoise_depth", "loops.alignments", "tracking.features", "tracking.verify",
+        "input.denoise_depth", "tracking.features", "tracking.verify",
         "final.iterations", "final.schedule", "mapping.lr_log_scales", "seeding.shape",
         "mapping.divided", "mapping.first_iterations", "mapping.lr_pose_translation",
         "mapping.lr_pose_rotation",

@@ -64,9 +64,9 @@ class LoopConfig(Section, name="loops"):
     """Maximum rotation between the keyframes of a pair that `near_m` selects."""
     most: Count = 3  # registering a pair costs as much as thirty frames
     """Maximum number of pairs registered per finished submap, the most similar first; 0 = no limit."""
-    alignments: Count = 8
+    alignments: ClassVar[int] = 8
     """At the end each keyframe is aligned to at most this many earlier ones that see the same, and all poses are solved
-    together (ours), unless `close` is off or poses are given; 0 = off: loops move whole submaps only (papers)."""
+    together (ours), if `final.move_poses` is on; not if `close` is off, nor if poses are given."""
     uncertainty: bool = True
     """Whether similarity is multiplied by a gate from the variance-weighted opacity ratio; off = LoopSplat."""
     tau: Above0 = 10.0
@@ -220,8 +220,9 @@ class FinalConfig(Section, name="final"):
     iterations: Count = 1000
     """Number of refinement steps over all keyframes; 0 = no refinement."""
     move_poses: bool = True
-    """Whether refinement moves keyframes, and with them the poses of frames, off = fixed (paper): about half the median
-    standard deviation of their positions at most, from 1 mm to 1 cm."""
+    """Whether keyframes, and with them frames, move at the end (ours); off = the path stays the tracked one (paper).
+    First the graph of keyframes moves them (`loops`), then refinement: by about half the median standard deviation of
+    their positions at most, from 1 mm to 1 cm."""
     seconds: NotNegative = 0.0
     """Time budget of the refinement in seconds: it ends at the latest then, even if steps are left, and learning rates
     fall in time. The result then depends on the speed of the machine. 0 = no limit."""

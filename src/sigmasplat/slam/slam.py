@@ -83,7 +83,7 @@ class Slam(MappingBackend, ArrayInterface):
         refining, measuring = (part_of(progress, first, total) for first in (0, steps))
         known = PathCovariance.of_keyframes(self.atlas, self.closer.valid)
         loops = self.config.loops
-        if loops.close and loops.alignments and not self.config.input.poses:
+        if loops.close and self.config.final.move_poses and not self.config.input.poses:
             store, poses = solved_keyframes(self.atlas, known, part, self.view, loops.alignments)
             self.atlas.refined = dict(zip(members, poses, strict=True))
         anchors = [self.atlas.anchors[s] for s in members]

@@ -59,7 +59,6 @@ BASE_VALUES: dict[str, dict[str, object]] = {
     "loops": {
         "near_m": 0.0,
         "most": 4,
-        "alignments": 0,
     },
     "registration": {
         "iterations": 100,
