@@ -86,9 +86,8 @@ def note(figures: dict[str, Any], verdicts: dict[str, list[str]], compared: bool
     unread = {f"{r['name']}, {r['code']}: {line}" for r in figures["rows"] for line in r.get("unread", ())}
     said += [f"Not read: {line}." for line in sorted(unread)]
     said.append(
-        "Hops: motion from frame to frame, rms. k: the variances of windows are k times too small (median NEES of the "
-        "position / 2.37). Lost: not believed. Silent: believed and off by more than 10 cm. PSNR and "
-        "depth L1: 20 held-out views in their submaps. CPU: from the first to the last frame, one thread."
+        "Hops: motion from frame to frame, rms. k: the variances of windows are k times too small (median NEES / 2.37)."
+        " Silent: believed and off by more than 10 cm. PSNR, depth L1: 20 held-out views. CPU: one thread."
     )
     return " ".join(said)
 

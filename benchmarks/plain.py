@@ -188,7 +188,7 @@ def sections(measured: dict[str, Any]) -> list[tables.Section]:
         ]
         for row in measured["figures"]["rows"]
     ]  # fmt: skip
-    return [tables.Section("Plain system", head, rows, "One thread per process. Nothing is random.")]
+    return [tables.Section("Plain system", head, rows, "One thread.")]
 
 
 def main(options: Options) -> int:
