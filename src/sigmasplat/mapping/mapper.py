@@ -160,8 +160,9 @@ class Mapper:
         return fit
 
     def _left_of_half(self, view: View, should_stop: ShouldStop, at_most: int | None = None) -> Task[FieldFit]:
-        """Make steps that are left of the second half, if there is one."""
-        if self.half is None:
+        """Make steps that are left of the second half, if there is one. A submap that has inherited one, but no splats,
+        has no keyframe yet."""
+        if self.half is None or not self.keyframes:
             return FieldFit()
         rates = repeat(Rates.of(self.config.mapping))
         return (yield from self._second_half(view, self._window(view), self.half, rates, should_stop, at_most))

@@ -11,7 +11,7 @@ issues 7 and 27; nerfstudio, record3d_utils.py. Depth has fewer pixels than colo
 
 import re
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -130,7 +130,7 @@ class ExrImagePair(ImagePair):
     openexr: Any
 
     def read_depth(self, units_per_metre: float) -> NDArray[np.float32]:
-        channels = self._opened().channels()
+        channels = self._read(lambda file: file.channels())
         name = next((name for name in ("R", "Y", "Z") if name in channels), next(iter(channels)))
         depth_m = np.asarray(channels[name].pixels, np.float32)
         return depth_to_metres(self.depth, without_nan(depth_m), units_per_metre)
@@ -139,15 +139,16 @@ class ExrImagePair(ImagePair):
         return image_size(self.color), self._size()
 
     def _size(self) -> Size:
-        low, high = self._opened(header_only=True).header()["dataWindow"]
+        low, high = self._read(lambda file: file.header()["dataWindow"], header_only=True)
         return int(high[0] - low[0]) + 1, int(high[1] - low[1]) + 1
 
-    def _opened(self, header_only: bool = False) -> Any:
+    def _read(self, part: Callable[[Any], Any], header_only: bool = False) -> Any:
+        """Return a part of the file. Raises SourceError if it cannot be read."""
         if not header_only:
             check_pixels(self.depth, self._size(), SourceError)
         refuse_special(self.depth)
         try:
-            return self.openexr.File(str(self.depth), separate_channels=True, header_only=header_only)
+            return part(self.openexr.File(str(self.depth), separate_channels=True, header_only=header_only))
         except Exception as error:  # the library can raise any C++ exception
             raise SourceError(f"{self.depth}: unreadable EXR file ({error}); export it again") from error
 
