@@ -21,8 +21,8 @@ class Atlas:
     odometry: the same poses from tracking alone; no loop changes them.
     keyframe_poses: T_submap_camera of each submap's keyframes; those of the last submap change while it is mapped.
     hops: one per keyframe: how tracking found it from the keyframe before it in the submap. places: one per frame.
-    refined: T_submap_camera of the keyframes of each submap in the final map, after its refinement has moved them; the
-    world poses of keyframes and of their frames then come from these.
+    refined: T_submap_camera of the keyframes of each submap in the final map, as the graph of keyframes and refinement
+    have moved them; the world poses of keyframes and of their frames then come from these.
     exposures: those of the same keyframes [K, 3, 2] relative to the final map (`data.camera`).
     components: one number per submap. Submaps of a component are connected, and their anchors are in one frame: the
     world for component 0, else the first camera of the component. A component joins another when a place is recognised.

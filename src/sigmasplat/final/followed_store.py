@@ -1,6 +1,7 @@
 """Finished submaps after the graph of keyframes has moved their keyframes: the splats move with them."""
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -70,18 +71,13 @@ def solved_keyframes(
     camera = view.camera
     frames = {s: store.load(i).frames for i, s in enumerate(store.members)}
     nodes = KeyframeNodes.of(path, frames)
-    kept = dict[int, Pyramid]()
 
+    @lru_cache(max(1, CACHE_BYTES // (16 * camera.width * camera.height)))
     def image(node: int) -> Pyramid:
-        if node not in kept:
-            row = nodes.rows[node]
-            submap = int(path.keyframe_submap[row])
-            keyframe = int(row - np.searchsorted(path.keyframe_submap, submap))
-            if len(kept) * 16 * camera.width * camera.height > CACHE_BYTES:
-                kept.pop(next(iter(kept)))
-            picture = store.picture(store.members.index(submap), keyframe)
-            kept[node] = picture_images(view, picture, camera)[1]
-        return kept[node]
+        row = nodes.rows[node]
+        submap = int(path.keyframe_submap[row])
+        keyframe = int(row - np.searchsorted(path.keyframe_submap, submap))
+        return picture_images(view, store.picture(store.members.index(submap), keyframe), camera)[1]
 
     T = nodes.T_world_keyframe
     edges = nodes.edges() + alignments(T, image, most)

@@ -74,7 +74,7 @@ class PendingSearch:
 
 @dataclass(eq=False)
 class LoopCloser:
-    """Keeps the descriptors of finished submaps and all edges between them. Only this class moves anchors.
+    """Keeps the descriptors of finished submaps and all edges between them. During a run only this class moves anchors.
 
     edges: trusted ones, such as odometry, and registered loops, each with its row in `loops`, -1 for a trusted one.
     solved: the number of submaps when the whole pose graph was last solved. In between, and in a graph

@@ -98,7 +98,7 @@ def partners(T_world_keyframe: Matrix, depth_m: float, width_rad: float, most: i
 def alignments(T_world_keyframe: Matrix, image: Callable[[int], Pyramid], most: int) -> list[RelativePose]:
     """Align each keyframe to at most `most` earlier ones, from poses [K, 4, 4]; return what the images confirm."""
     found = list[RelativePose | None]()
-    for b in range(1, len(T_world_keyframe) if most else 0):
+    for b in range(1, len(T_world_keyframe)):
         live, camera = image(b), image(b).cameras[0]
         width_rad = 2.0 * float(np.arctan(camera.width / (2.0 * camera.fx)))
         T_b_world = se3.inverse(T_world_keyframe[b])
