@@ -170,6 +170,17 @@ def test_what_another_thing_hides_in_part_does_not_stand_free() -> None:
     assert not any(inside[25:35, 35:45].any() for inside in free_standing(thinned(depth_m, 2)))
 
 
+@pytest.mark.parametrize(("far_depth", "things"), [(True, 1), (False, 0)])
+def test_what_hides_most_of_the_readings_is_the_scene(far_depth: bool, things: int) -> None:
+    """Where hardly anything but a near box has depth, its motion is that of the camera."""
+    seen = sight(MOVED_M, MOVED_M)
+    depth_m, around = seen.target.depth_image.numpy().copy(), np.zeros((CAMERA.height, CAMERA.width), np.bool_)
+    around[34:87, 52:108] = True  # with these readings the box stands free
+    depth_m[~around & (not far_depth)] = 0.0
+    found = suspected(keyframe(), seen.with_depth(depth_m), fitted(seen, BETWEEN_M), CONFIG, every=True)
+    assert len(list(found)) == things
+
+
 def look(watch: DynamicDetector, contradicted: bool = False, urgent: bool = False) -> tuple[DynamicDetector, bool]:
     """Return the watch after a look for the box that has drawn a pose, and whether it finds it."""
     seen = sight(MOVED_M, MOVED_M)

@@ -30,8 +30,9 @@ from sigmasplat.tracking.pose_validation import agrees_more, differs, disagrees,
 from sigmasplat.tracking.prepared_frame import PreparedFrame
 from sigmasplat.types import Matrix
 
-OBJECT_SHARE, MOST_OBJECTS = (0.02, 0.7), 3
-"""Share of the image of a thing that stands free, and how many are considered."""
+OBJECT_SHARE, MOST_OBJECTS = (0.02, 0.5), 3
+"""Share of the readings that a thing hides, and how many things are considered. What hides more than half of them is
+the scene: the motion of the camera is that of most of the image."""
 RING, FREE_AROUND = 3, 0.6
 """Something stands free if at least this share of the pixels at this distance around it is farther."""
 SHIFTED = 1e-3
@@ -58,7 +59,9 @@ def suspected(
     live_m = seen.target.depth_image.numpy()
     for inside in free_standing(thinned(live_m, STEP)):
         if every or _may_have_drawn(_front(*with_margin(inside, STEP, live_m), live_m), keyframe, seen, fit, config):
-            yield _front(*enlarged(inside, STEP, live_m), live_m)
+            thing = _front(*enlarged(inside, STEP, live_m), live_m)
+            if np.count_nonzero(live_m[thing.hidden]) <= OBJECT_SHARE[1] * np.count_nonzero(live_m):
+                yield thing
 
 
 def _may_have_drawn(
@@ -93,7 +96,7 @@ def free_standing(depth: Depth) -> Iterator[Mask]:
     """Yield the things that stand free in `thinned` depth [h, w], m, in front of farther surfaces all around, as masks
     [h, w]: the largest first, at most `MOST_OBJECTS`."""
     regions, boxes = boxed(smooth(depth))
-    sizes, found = boxes[:, -1] / depth.size, 0
+    sizes, found = boxes[:, -1] / max(np.count_nonzero(depth), 1), 0
     for region in np.argsort(-sizes, kind="stable"):
         if sizes[region] < OBJECT_SHARE[0] or found == MOST_OBJECTS:
             break
