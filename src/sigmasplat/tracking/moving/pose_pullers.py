@@ -96,7 +96,7 @@ def free_standing(depth: Depth) -> Iterator[Mask]:
     """Yield the things that stand free in `thinned` depth [h, w], m, in front of farther surfaces all around, as masks
     [h, w]: the largest first, at most `MOST_OBJECTS`."""
     regions, boxes = boxed(smooth(depth))
-    sizes, found = boxes[:, -1] / max(np.count_nonzero(depth), 1), 0
+    sizes, found = boxes[:, -1] / max(int(np.count_nonzero(depth)), 1), 0
     for region in np.argsort(-sizes, kind="stable"):
         if sizes[region] < OBJECT_SHARE[0] or found == MOST_OBJECTS:
             break
