@@ -55,7 +55,8 @@ SHIFT_STEP = 4
 def suspected(
     keyframe: Reference, seen: PreparedFrame, fit: PoseFit, config: TrackingConfig, every: bool
 ) -> Iterator[DynamicMask]:
-    """Yield the things in front that may have pulled a pose; with `every`, all that stand free."""
+    """Yield the things in front that may have pulled a pose; with `every`, all that stand free. None hides most of the
+    readings."""
     live_m = seen.target.depth_image.numpy()
     for inside in free_standing(thinned(live_m, STEP)):
         if every or _may_have_drawn(_front(*with_margin(inside, STEP, live_m), live_m), keyframe, seen, fit, config):
