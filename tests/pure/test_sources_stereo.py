@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from ablation_runs import run_job
 
-from bag_recordings import Recorder
 from command_line import exit_code
 from layouts import save, save_text, tum_line
 from sigmasplat.config.find_preset import preset
@@ -217,85 +216,3 @@ def test_every_caller_gets_the_settings_of_the_scene_and_keeps_those_that_are_gi
     onto = RunFolder(tmp_path / "onto").config()
     assert onto.input.max_depth_m == config.input.max_depth_m
     assert onto.submaps.distance_m == config.submaps.distance_m and onto.render.depth_noise_per_m == 0.003
-
-
-def transforms(folder, named):
-    c, frames = ROOM.camera, []
-    turn = np.diag([1.0, -1.0, -1.0, 1.0])
-    for i in range(2):
-        T = ROOM.truth().T_world_camera[i]
-        beside = np.eye(4)
-        beside[0, 3] = BASELINE_M
-        for part, image, pose in (("left", LEFT[i], T), ("right", RIGHT[i], T @ beside)):
-            save(folder / "images" / part / f"{i + 9}.png", image)
-            frames.append({"file_path": f"images/{part}/{i + 9}.png", "transform_matrix": (pose @ turn).tolist()})
-    if named:
-        frames = [
-            left | {"right_file_path": right["file_path"]}
-            for left, right in zip(frames[::2], frames[1::2], strict=True)
-        ]
-    camera = {"fl_x": c.fx, "fl_y": c.fy, "cx": c.cx + 0.5, "cy": c.cy + 0.5, "baseline_m": BASELINE_M}
-    save_text(folder / "transforms.json", json.dumps(camera | {"frames": frames}))
-    return folder
-
-
-@pytest.mark.parametrize("named", [True, False])
-def test_transforms_with_left_and_right_images_are_a_stereo_pair(named, tmp_path):
-    source, same = open_source(transforms(tmp_path / "nerf", named)), open_source(tum_like(tmp_path / "tum"))
-    assert len(source) == 2 and source.computed_depth
-    assert np.array_equal(source.frame(1).color, same.frame(1).color)
-    np.testing.assert_allclose(source.frame(1).depth_m, same.frame(1).depth_m, rtol=1e-4)
-    np.testing.assert_allclose(source.truth().T_world_camera, ROOM.truth().T_world_camera[:2], atol=1e-5)
-
-
-def test_cameras_that_move_apart_are_no_pair(tmp_path):
-    folder = transforms(tmp_path, False)
-    fields = json.loads((folder / "transforms.json").read_text())
-    fields["frames"][-1]["transform_matrix"][0][3] += 0.05
-    save_text(folder / "transforms.json", json.dumps(fields))
-    with pytest.raises(SourceError, match="move relative to each other"):
-        open_source(folder)
-
-
-def infrared(recorder, baseline_in_info):
-    c = ROOM.camera
-    for side, images, x_m in ((1, LEFT, 0.0), (2, RIGHT, BASELINE_M)):
-        topic, frame = f"/camera/infra{side}/image_rect_raw", f"camera_infra{side}_optical_frame"
-        for i, image in enumerate(images):
-            gray = opencv().cvtColor(image, opencv().COLOR_RGB2GRAY)
-            recorder.image(topic, 1.0 + i / 30, gray, "mono8", frame, late_s=0.001 * side)
-        recorder.info(
-            f"/camera/infra{side}/camera_info", 1.0, (c.width, c.height), (c.fx - 1, c.fy - 1, c.cx, c.cy), frame
-        )
-        recorder.messages[-1][3].p[3] = -c.fx * x_m if baseline_in_info else 0.0
-    if not baseline_in_info:
-        T = np.eye(4)
-        T[0, 3] = BASELINE_M
-        recorder.transform("/tf_static", 1.0, "camera_infra1_optical_frame", "camera_infra2_optical_frame", T)
-    return recorder
-
-
-@pytest.mark.parametrize("baseline_in_info", [True, False])
-def test_the_infrared_pair_of_a_bag_is_a_stereo_pair(baseline_in_info, tmp_path):
-    pytest.importorskip("rosbags", reason="bags need the extra ros")
-    source = open_source(infrared(Recorder(), baseline_in_info).write(tmp_path / "walk"))
-    depth_m, exact_m = source.frame(1).depth_m, ROOM.exact_depth_of(1)
-    read = depth_m > 0
-    assert len(source) == 2 and source.timestamp_s(1) == pytest.approx(1.0 + 1 / 30) and read.mean() > 0.3
-    assert np.median(np.abs(depth_m - exact_m)[read] / exact_m[read]) < 0.03
-    colors = source.frame(0).color
-    assert np.array_equal(colors[..., 0], colors[..., 2])
-
-
-def test_depth_of_a_bag_comes_before_its_infrared_pair(tmp_path):
-    pytest.importorskip("rosbags", reason="bags need the extra ros")
-    recorder, depth_mm = infrared(Recorder(), True), np.full(LEFT[0].shape[:2], 1500, np.uint16)
-    for i, image in enumerate(LEFT):
-        recorder.image("/camera/color/image_raw", 1.0 + i / 30, image, "rgb8", "color")
-        recorder.image("/camera/aligned_depth_to_color/image_raw", 1.0 + i / 30, depth_mm, "16UC1", "color")
-    c = ROOM.camera
-    recorder.info("/camera/color/camera_info", 1.0, (c.width, c.height), (c.fx, c.fy, c.cx, c.cy), "color")
-    path = recorder.write(tmp_path / "walk")
-    assert not open_source(path).computed_depth
-    names = [f"/camera/infra{side}/image_rect_raw" for side in (1, 2)]
-    assert open_source(path, color_topic=names[0], depth_topic=names[1]).computed_depth

@@ -206,9 +206,11 @@ def read_bag_calibration(bag: Bag, color: ImageTopic, depth: ImageTopic, setting
 
 def read_optics(bag: Bag, topic: ImageTopic) -> Optics | None:
     """Read the CameraInfo of an image topic; None if it is missing or empty. Raises SourceError if it is damaged."""
-    if (found := _info(bag, topic)) is None:
+    infos = {info.name for info in bag.topics_of_type("sensor_msgs/msg/CameraInfo")}
+    names = (f"{topic.camera}/camera_info", f"{topic.base.removesuffix('/image/data')}/info/camera_info")
+    if (name := next((name for name in names if name in infos), None)) is None:
         return None
-    name, info = found
+    info = bag.first_message(name)
     rectified, where = "rect" in topic.base.rpartition("/")[2], bag.path / name.lstrip("/")
     k = np.asarray(_field(info, "p")).reshape(3, 4)[:, :3]
     if not rectified or k[0, 0] <= 0:
@@ -218,20 +220,6 @@ def read_optics(bag: Bag, topic: ImageTopic) -> Optics | None:
     width, height = int(info.width) or topic.size[0], int(info.height) or topic.size[1]
     camera = build_camera(where, width, height, [float(v) for v in (k[0, 0], k[1, 1], k[0, 2], k[1, 2])])
     return camera, None if rectified else _lens(f"{bag.path}: {name}", info)
-
-
-def _info(bag: Bag, topic: ImageTopic) -> tuple[str, Message] | None:
-    """Return the CameraInfo of an image topic with the name of its own topic."""
-    infos = {info.name for info in bag.topics_of_type("sensor_msgs/msg/CameraInfo")}
-    names = (f"{topic.camera}/camera_info", f"{topic.base.removesuffix('/image/data')}/info/camera_info")
-    name = next((name for name in names if name in infos), None)
-    return None if name is None else (name, bag.first_message(name))
-
-
-def read_projection(bag: Bag, topic: ImageTopic) -> Matrix | None:
-    """Return the projection P [3, 4] of an image topic's CameraInfo, None without one."""
-    found = _info(bag, topic)
-    return None if found is None else np.asarray(_field(found[1], "p"), np.float64).reshape(3, 4)
 
 
 def _depth_units(bag: Bag, depth: ImageTopic) -> float:

@@ -181,7 +181,6 @@ COLOR_ORDER = {
 }
 """Positions of red, green and blue in a pixel."""
 DEPTH_TYPE = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
-GRAY = ("mono8", "8UC1")
 HEADER_BYTES = 12
 
 
@@ -204,13 +203,10 @@ def message_size(path: Path, message: Message) -> tuple[int, int]:
     return image_size(path, data[start:])
 
 
-def decode_color_message(path: Path, message: Message, gray: bool = False) -> NDArray[np.uint8]:
-    """Return 8-bit RGB [H, W, 3]; gray: also of gray images, such as infrared. Raises SourceError naming `path` if the
-    message is damaged or not such an image."""
+def decode_color_message(path: Path, message: Message) -> NDArray[np.uint8]:
+    """Return 8-bit RGB [H, W, 3]. Raises SourceError naming `path` if the message is damaged or not colour."""
     if not hasattr(message, "encoding"):
         return read_color(path, message.data.tobytes())
-    if gray and message.encoding in GRAY:
-        return np.repeat(_pixels(path, message, "u1", 1), 3, axis=2)
     if message.encoding not in COLOR_ORDER:
         raise _encoding(path, "colour", message.encoding, COLOR_ORDER)
     pixels = _pixels(path, message, "u1", 4 if message.encoding in ("rgba8", "bgra8", "8UC4") else 3)

@@ -6,11 +6,6 @@ for the timestamps; images are read on demand.
 Gyroscope and accelerometer come from sensor_msgs/Imu, in the axes of the colour camera: from /tf_static between the
 frames that the messages name, or from the transforms of RealSense's SDK. The clock is that of the headers, as for the
 images, or the recording time if the headers fit no image.
-
-If the bag has no depth, or if input.depth_topic names the right one of two infrared topics, the infrared pair of a
-RealSense is read as a stereo pair. The rectified images of ROS (infra1/image_rect_raw) and the streams of RealSense's
-SDK (Infrared_1) have CameraInfo; the baseline is in P of the right camera, in the transforms of the SDK's streams, or
-in /tf_static.
 """
 
 from collections.abc import Sequence
@@ -30,29 +25,21 @@ from sigmasplat.api import (
     Matrix,
     RecordedSource,
     Size,
-    SourceError,
     SourceFormat,
     accelerometer_from_samples,
     associate,
-    given_intrinsics,
     gyroscope_from_samples,
     no_pairs,
-    pair_times,
     refuse_other_units,
 )
 from sigmasplat.plugins.sources.bag_cameras import (
     ImageTopic,
-    Optics,
     color_topic,
     depth_topic,
-    image_topics,
     lookup_transform,
     read_bag_calibration,
-    read_optics,
-    read_projection,
     read_truth,
     sdk_transform,
-    topic_by_name,
 )
 from sigmasplat.plugins.sources.bag_messages import (
     Bag,
@@ -64,8 +51,6 @@ from sigmasplat.plugins.sources.bag_messages import (
     is_bag,
     message_size,
 )
-from sigmasplat.plugins.sources.stereo import StereoPair, StereoRig, StereoSource
-from sigmasplat.plugins.sources.stereo_matching import StereoCameras
 
 IMU = "sensor_msgs/msg/Imu"
 Values = NDArray[np.float64]
@@ -137,127 +122,30 @@ def _axes(bag: Bag, color: ImageTopic, name: str) -> Matrix | None:
     return None if T is None else T[:3, :3]
 
 
-PAIRS = (("infra1", "infra2"), ("Infrared_1", "Infrared_2"), ("/left/", "/right/"))
-"""Parts of the names of left and right topics: RealSense with ROS, RealSense's SDK, other stereo cameras."""
-
-
 @dataclass(frozen=True)
-class BagPair(ImagePair):
+class BagImagePair(ImagePair):
     """Two messages of a bag; the paths contain bag, topic and time."""
 
     bag: Bag
     topics: tuple[str, str]
     entries: tuple[Entry, Entry]
 
-    def message(self, path: Path) -> Message:
-        """Read the message that `color` or `depth` names. Raises SourceError if it is damaged."""
-        which = int(path == self.depth)
-        return self.bag.read(self.topics[which], self.entries[which])
-
-    def sizes(self) -> tuple[Size, Size]:
-        return message_size(self.color, self.message(self.color)), message_size(self.depth, self.message(self.depth))
-
-
-@dataclass(frozen=True)
-class BagImagePair(BagPair):
-    """Colour and depth."""
-
     def read_color(self) -> NDArray[np.uint8]:
-        return decode_color_message(self.color, self.message(self.color))
+        return decode_color_message(self.color, self._message(0))
 
     def read_depth(self, units_per_metre: float) -> NDArray[np.float32]:
-        return decode_depth_message(self.depth, self.message(self.depth), units_per_metre)
-
-
-@dataclass(frozen=True)
-class BagStereoPair(StereoPair, BagPair):
-    """A left and a right image."""
-
-    def decoded(self, path: Path) -> NDArray[np.uint8]:
-        """Read an image, RGB [H, W, 3]. Raises SourceError naming topic and time."""
-        return decode_color_message(path, self.message(path), gray=True)
+        return decode_depth_message(self.depth, self._message(1), units_per_metre)
 
     def sizes(self) -> tuple[Size, Size]:
-        return BagPair.sizes(self)
+        return message_size(self.color, self._message(0)), message_size(self.depth, self._message(1))
 
-
-def stereo_topics(bag: Bag, settings: InputConfig) -> tuple[ImageTopic, ImageTopic] | None:
-    """Return the left and the right topic of a bag that is read as stereo, else None.
-
-    With both topics requested, they are the pair if the second one is not depth. Without, there must be no depth.
-    """
-    if settings.color_topic and settings.depth_topic:
-        left, right = (topic_by_name(bag, name) for name in (settings.color_topic, settings.depth_topic))
-        is_right = any(of_right in right.name for _, of_right in PAIRS)
-        return None if right.kind == "depth" and not is_right else (left, right)
-    if settings.color_topic or settings.depth_topic:
-        return None
-    if any(
-        "depth" in topic.name.lower() or not any(side in topic.name for pair in PAIRS for side in pair)
-        for topic in image_topics(bag, "depth")
-    ):
-        return None
-    found = {topic.name: topic for kind in ("", "colour", "depth") for topic in image_topics(bag, kind)}
-    for of_left, of_right in PAIRS:
-        for name in sorted(found, key=lambda name: ("compressed" in name, "rect" not in name, name)):
-            if of_left in name and name.replace(of_left, of_right) in found:
-                return found[name], found[name.replace(of_left, of_right)]
-    return None
-
-
-def open_stereo_bag(bag: Bag, left: ImageTopic, right: ImageTopic, settings: InputConfig) -> StereoSource:
-    """Open two topics of a bag as a stereo pair. Raises SourceError if cameras or baseline are unknown."""
-    cameras, topics = _stereo_cameras(bag, left, right, settings), (left.name, right.name)
-    found = bag.index(*topics)
-    entries = found[left.name], found[right.name]
-    left_s, right_s = (_times_s(part, False) for part in entries)
-    lefts, rights = (_message_paths(bag, name, t) for name, t in zip(topics, (left_s, right_s), strict=True))
-    indices, alone = pair_times(bag.path, {"left": left_s, "right": right_s})
-
-    def pairs(rig: StereoRig) -> list[StereoPair]:
-        return [
-            BagStereoPair(float(left_s[i]), lefts[i], rights[j], bag, topics, (entries[0][i], entries[1][j]), rig)
-            for i, j in indices
-        ]
-
-    skipped = [f"{lefts[i]}: no right image within {MAX_GAP_S:g} s" for i in alone]
-    truth = read_truth(bag, left.frame, False)
-    return StereoSource(bag.path.resolve().stem, pairs, cameras, settings, truth, skipped)
-
-
-def _stereo_cameras(bag: Bag, left: ImageTopic, right: ImageTopic, settings: InputConfig) -> StereoCameras:
-    optics: list[Optics] = []
-    for topic in (left, right):
-        if (known := read_optics(bag, topic)) is None:
-            raise SourceError(f"{bag.path}: {topic.name} has no camera_info; record it beside the images")
-        optics.append(known)
-    T_right_left = _rig(bag, left, right)
-    (left_camera, right_camera), lenses = zip(*optics, strict=True)
-    lenses = lenses if settings.undistort else (None, None)
-    return StereoCameras(given_intrinsics(left_camera, settings), right_camera, T_right_left, *lenses)
-
-
-def _rig(bag: Bag, left: ImageTopic, right: ImageTopic) -> Matrix:
-    if (found := sdk_transform(bag, right, left)) is not None:
-        return found
-    P, T_right_left = read_projection(bag, right), np.eye(4)
-    if P is not None and P[0, 0] > 0 and P[0, 3] < 0:
-        T_right_left[0, 3] = P[0, 3] / P[0, 0]
-        return T_right_left
-    found = lookup_transform(bag, right.frame, left.frame) if left.frame and right.frame else None
-    if found is None or not np.linalg.norm(found[:3, 3]):
-        raise SourceError(
-            f"{bag.path}: the baseline of {left.name} and {right.name} is unknown; record camera_info with P, or "
-            "/tf_static"
-        )
-    return found
+    def _message(self, which: int) -> Message:
+        return self.bag.read(self.topics[which], self.entries[which])
 
 
 def open_bag(place: str, settings: InputConfig) -> RecordedSource:
     """Open a bag. Raises SourceError if it is damaged, its topics are ambiguous, or its cameras are unknown."""
     bag = Bag(Path(place))
-    if pair := stereo_topics(bag, settings):
-        return open_stereo_bag(bag, *pair, settings)
     color, depth = color_topic(bag, settings.color_topic), depth_topic(bag, settings.depth_topic)
     calibration, topics = read_bag_calibration(bag, color, depth, settings), (color.name, depth.name)
     found = bag.index(*topics)

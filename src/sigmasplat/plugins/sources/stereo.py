@@ -10,7 +10,7 @@ Depth belongs to the left image. It is computed from both images when a frame is
 """
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -91,12 +91,8 @@ class StereoPair(ImagePair):
         left, right = self.read_color(), self.rig.rectification.right(self._read(self.depth))
         return left, *self.rig.matcher.depth_and_std_m(left, right)
 
-    def decoded(self, path: Path) -> NDArray[np.uint8]:
-        """Read one of the two recorded images, RGB [H, W, 3]. Raises SourceError naming the file."""
-        return read_color(path)
-
     def _read(self, path: Path) -> NDArray[np.uint8]:
-        image, (width, height) = self.decoded(path), self.rig.size
+        image, (width, height) = read_color(path), self.rig.size
         if image.shape[:2] != (height, width):
             raise SourceError(
                 f"{path} is {image.shape[1]}×{image.shape[0]} but the calibration is for {width}×{height}; "
@@ -111,11 +107,10 @@ class StereoSource(RecordedSource):
     computed_depth = True
 
     def __init__(
-        self, name: str, pairs: Sequence[Pair] | Callable[[StereoRig], Sequence[StereoPair]], cameras: StereoCameras,
-        settings: InputConfig, truth: Trajectory | None, skipped: Sequence[str] = (),
+        self, name: str, pairs: Sequence[Pair], cameras: StereoCameras, settings: InputConfig,
+        truth: Trajectory | None, skipped: Sequence[str] = (),
     ) -> None:  # fmt: skip
-        """Prepare rectification and matching. `pairs` are files, or a function that makes the pairs; `truth` is the
-        path of the recorded left camera.
+        """Prepare rectification and matching. `truth` is the path of the recorded left camera.
 
         Raises SourceError if the images do not match the calibration, or no frame has depth.
         """
@@ -126,7 +121,7 @@ class StereoSource(RecordedSource):
             raise SourceError(f"{name}: the second camera is not to the right of the first one; swap both")
         matcher = StereoMatcher(rectification.camera, rectification.baseline_m)
         rig = StereoRig((cameras.left.width, cameras.left.height), rectification, matcher)
-        images = pairs(rig) if callable(pairs) else [StereoPair(*pair, rig) for pair in pairs]
+        images = [StereoPair(*pair, rig) for pair in pairs]
         if truth is not None:
             truth = Trajectory(truth.timestamps_s, truth.T_world_camera @ rectification.T_left_rectified)
         super().__init__(name, images, Calibration(rectification.camera, 1.0), settings, truth, skipped)
