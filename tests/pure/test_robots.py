@@ -30,7 +30,7 @@ from sigmasplat.slam.slam_state import path_errors
 
 pytest.importorskip("rosbags", reason="rosbags is not installed (extra `ros`)")
 from sigmasplat.plugins.robots.bag import BagSink
-from sigmasplat.plugins.robots.ros_messages import ODOMETRY, POSE, TF, Encoded, Points, RosMessages, Topic, stamp_of
+from sigmasplat.plugins.robots.ros_messages import ODOMETRY, POSE, TF, Encoded, Points, RosMessages, stamp_of
 
 Array = NDArray[np.float64]
 MESSAGES = RosMessages()
@@ -241,17 +241,12 @@ def test_grids_are_the_cells_of_the_plan() -> None:
 class SlowSink:
     """Waits in its first write until it is released; fails at the writes in `failing`."""
 
-    name, missed = "bag", 0
-
     def __init__(self, failing: tuple[int, ...] = ()) -> None:
         self.failing, self.kept = failing, list[Encoded]()
         self.began, self.released = threading.Event(), threading.Event()
         self.closed = self.aborted = False
 
     def open(self, messages: RosMessages) -> None: ...
-
-    def wants(self, *topics: Topic) -> bool:
-        return True
 
     def write(self, message: Encoded) -> None:
         self.began.set()
@@ -274,17 +269,17 @@ def numbered(i: int) -> list[Encoded]:
 def test_a_slow_sink_loses_messages_and_never_blocks() -> None:
     sink = SlowSink()
     outlet = Outlet(sink, MESSAGES)
-    outlet.offer(lambda messages: numbered(0), ODOMETRY)
+    outlet.offer(lambda messages: numbered(0))
     assert sink.began.wait(60)
     for i in range(2 * MOST_BULKY):
-        outlet.offer(lambda messages, i=i: numbered(1 + i), ODOMETRY, bulky=True)
+        outlet.offer(lambda messages, i=i: numbered(1 + i), bulky=True)
     assert outlet.dropped == MOST_BULKY
     for i in range(MOST_JOBS):
-        outlet.offer(lambda messages, i=i: numbered(1000 + i), ODOMETRY)
+        outlet.offer(lambda messages, i=i: numbered(1000 + i))
     assert outlet.dropped == 2 * MOST_BULKY, "images are dropped before poses"
     sink.released.set()
     outlet.close()
-    assert outlet.record() == {"written": 1 + MOST_JOBS, "dropped": 2 * MOST_BULKY, "missed": 0, "failure": ""}
+    assert outlet.record() == {"written": 1 + MOST_JOBS, "dropped": 2 * MOST_BULKY, "failure": ""}
     assert [m.stamp_ns for m in sink.kept[:3]] == [0, 1, 2] and sink.closed and not sink.aborted
 
 
@@ -293,9 +288,9 @@ def test_a_failed_sink_ends_and_the_offers_go_on() -> None:
     sink.released.set()
     outlet = Outlet(sink, MESSAGES)
     for i in range(10):
-        outlet.offer(lambda messages, i=i: numbered(i), ODOMETRY)
+        outlet.offer(lambda messages, i=i: numbered(i))
     outlet.close()
-    outlet.offer(lambda messages: numbered(99), ODOMETRY)
+    outlet.offer(lambda messages: numbered(99))
     assert outlet.failure == "No space left on device" and sink.aborted and not sink.closed
     assert (outlet.written, outlet.dropped) == (2, 11 - 3)
 
@@ -304,7 +299,7 @@ def test_a_sink_that_hangs_is_left_alone_at_the_end() -> None:
     sink = SlowSink()
     outlet = Outlet(sink, MESSAGES)
     for i in range(3):
-        outlet.offer(lambda messages, i=i: numbered(i), ODOMETRY)
+        outlet.offer(lambda messages, i=i: numbered(i))
     assert sink.began.wait(60)
     outlet.close(timeout_s=0.01)
     assert "not finished" in outlet.failure and outlet.dropped == 2

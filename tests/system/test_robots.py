@@ -1,11 +1,6 @@
-"""Runs that write a bag and stream: what a robot receives, and that no consumer changes the run."""
+"""Runs that write a bag: what a robot receives, and that the bag changes nothing in the run."""
 
-import json
-import socket
-import struct
-import threading
 from collections.abc import Sequence
-from contextlib import ExitStack
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
@@ -17,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from command_line import exit_code
-from ros_reading import covariance, decoded, image, links, points, pose, read_bag, seconds
+from ros_reading import covariance, links, points, pose, read_bag, seconds
 from run_process import files_of_at_most
 from sigmasplat.config import Config
 from sigmasplat.config.find_preset import default_preset, preset
@@ -31,15 +26,10 @@ from small_room import frame_at, walk
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 pytest.importorskip("rosbags", reason="rosbags is not installed (extra `ros`)")
-pytest.importorskip("websockets", reason="websockets is not installed (extra `foxglove`)")
-from websockets.exceptions import InvalidStatus
-from websockets.sync.client import ClientConnection, connect
-
 from sigmasplat.plugins.robots.bag import BagSink
 from sigmasplat.plugins.robots.live import LiveRobot
-from sigmasplat.plugins.robots.outlet import Outlet, Sink
-from sigmasplat.plugins.robots.ros_messages import TOPICS, RosMessages
-from sigmasplat.plugins.robots.stream import MOST_REQUEST_BYTES, SUBPROTOCOLS, StreamSink
+from sigmasplat.plugins.robots.outlet import Outlet
+from sigmasplat.plugins.robots.ros_messages import RosMessages
 
 SETTINGS = {
     "input.width": "160", "mapping.first_iterations": "40", "mapping.iterations": "10", "final.iterations": "4",
@@ -67,20 +57,23 @@ def settings() -> Config:
     return override(preset(default_preset()), SETTINGS)
 
 
-def followed(
-    sinks: list[Sink], warnings: list[str] | None = None, frames: Sequence[Frame] | None = None
-) -> tuple[Slam, list[Outlet]]:
-    """Run with these sinks."""
-    slam, outlets = Slam(settings()), [Outlet(sink, MESSAGES) for sink in sinks]
-    robot = LiveRobot(slam, outlets, [].append if warnings is None else warnings.append, "all")
+def followed(folder: Path | None, frames: Sequence[Frame] | None = None) -> tuple[Slam, Outlet | None]:
+    """Run, and write a bag to a folder if there is one."""
+    slam = Slam(settings())
+    outlet = None if folder is None else Outlet(BagSink(folder), MESSAGES)
+    robot = None if outlet is None else LiveRobot(slam, outlet, [].append, "all")
     for frame in there_and_back() if frames is None else frames:
-        robot.watch(frame)
-        robot(slam.step(frame))
+        if robot is not None:
+            robot.watch(frame)
+        step = slam.step(frame)
+        if robot is not None:
+            robot(step)
     before = len(slam.loops)
     slam.finish()
-    robot.last_loops(slam.loops[before:])
-    robot.close()
-    return slam, outlets
+    if robot is not None:
+        robot.last_loops(slam.loops[before:])
+        robot.close()
+    return slam, outlet
 
 
 def turned_by_90_degrees(frames: Sequence[Frame], measured: bool) -> tuple[list[Frame], np.ndarray]:
@@ -110,26 +103,27 @@ def contents(slam: Slam) -> dict[str, bytes]:
 @cache
 def plain() -> dict[str, bytes]:
     """Return what a run leaves behind without any consumer."""
-    return contents(followed([])[0])
+    return contents(followed(None)[0])
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Slam, Path, list[Outlet]]:
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Slam, Path, Outlet]:
     folder = tmp_path_factory.mktemp("robots") / "bag"
-    slam, outlets = followed([BagSink(folder)])
-    return slam, folder, outlets
+    slam, outlet = followed(folder)
+    assert outlet is not None
+    return slam, folder, outlet
 
 
 # ---- the bag ----
 
 
-def test_a_bag_changes_nothing_in_the_run(recorded: tuple[Slam, Path, list[Outlet]]) -> None:
-    slam, _, (outlet,) = recorded
+def test_a_bag_changes_nothing_in_the_run(recorded: tuple[Slam, Path, Outlet]) -> None:
+    slam, _, outlet = recorded
     assert contents(slam) == plain()
     assert outlet.failure == "" and outlet.written > 5 * (FRAMES - outlet.dropped)
 
 
-def test_a_loop_moves_map_to_odom_and_the_odometry_is_continuous(recorded: tuple[Slam, Path, list[Outlet]]) -> None:
+def test_a_loop_moves_map_to_odom_and_the_odometry_is_continuous(recorded: tuple[Slam, Path, Outlet]) -> None:
     slam, folder, _ = recorded
     bag = read_bag(folder)
     transforms, odometry = [links(message) for message in bag["/tf"]], bag["/sigmasplat/odometry"]
@@ -159,7 +153,7 @@ def _truth(slam: Slam) -> np.ndarray:
     return walk().truth().T_world_camera[order]
 
 
-def test_covariances_are_known_as_documented(recorded: tuple[Slam, Path, list[Outlet]]) -> None:
+def test_covariances_are_known_as_documented(recorded: tuple[Slam, Path, Outlet]) -> None:
     slam, folder, _ = recorded
     bag = read_bag(folder)
     first = next(i for i, step in enumerate(slam.steps) if i and step.is_keyframe)
@@ -177,7 +171,7 @@ def test_covariances_are_known_as_documented(recorded: tuple[Slam, Path, list[Ou
         assert message.header.frame_id == "map" and np.linalg.eigvalsh(covariance(message)).min() > 0
 
 
-def test_the_final_map_is_given_as_points_and_as_a_grid(recorded: tuple[Slam, Path, list[Outlet]]) -> None:
+def test_the_final_map_is_given_as_points_and_as_a_grid(recorded: tuple[Slam, Path, Outlet]) -> None:
     slam, folder, _ = recorded
     bag = read_bag(folder)
     clouds, static = bag["/sigmasplat/cloud"], links(bag["/tf_static"][-1])
@@ -201,7 +195,7 @@ def test_the_final_map_is_given_as_points_and_as_a_grid(recorded: tuple[Slam, Pa
 @pytest.mark.parametrize("measured", [True, False])
 def test_the_accelerometer_levels_the_floor_of_a_camera_held_sideways(tmp_path: Path, measured: bool) -> None:
     frames, up_world = turned_by_90_degrees(there_and_back(), measured)
-    followed([BagSink(tmp_path / "bag")], frames=frames)
+    followed(tmp_path / "bag", frames=frames)
     static = links(read_bag(tmp_path / "bag")["/tf_static"][-1])
     T_floor_world = np.linalg.inv(static["map", "floor"]) @ static["map", "sigmasplat_world"]
     off_deg = np.rad2deg(np.arccos(T_floor_world[2, :3] @ up_world))
@@ -259,21 +253,14 @@ def test_a_full_disk_ends_the_bag_and_not_the_run(tmp_path: Path, capsys: pytest
 
 def test_mistakes_are_one_line_and_leave_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "taken").mkdir()
-    with socket.create_server(("127.0.0.1", 0)) as busy:
-        port = str(busy.getsockname()[1])
-        for given in (
-            ("--bag", str(tmp_path / "taken")),
-            ("--bag", str(tmp_path / "bag.mcap")),
-            ("--bag", str(tmp_path / "no" / "bag")),
-            ("--stream", "70000"),
-            ("--stream", port),
-        ):
-            assert exit_code("run", ROOM, "--out", str(tmp_path / "run"), "--no-eval", *TINY, *given) == 2
-            assert capsys.readouterr().err.count("\n") == 1
+    for place in ("taken", "bag.mcap", "no/bag"):
+        given = ("--bag", str(tmp_path / place))
+        assert exit_code("run", ROOM, "--out", str(tmp_path / "run"), "--no-eval", *TINY, *given) == 2
+        assert capsys.readouterr().err.count("\n") == 1
     assert [path.name for path in tmp_path.iterdir()] == ["taken"]
 
 
-def test_mcaps_own_reader_decodes_the_same(recorded: tuple[Slam, Path, list[Outlet]]) -> None:
+def test_mcaps_own_reader_decodes_the_same(recorded: tuple[Slam, Path, Outlet]) -> None:
     pytest.importorskip("mcap_ros2", reason="mcap-ros2-support is not installed (make install-dev)")
     from mcap.reader import make_reader
     from mcap_ros2.decoder import DecoderFactory
@@ -292,210 +279,3 @@ def test_mcaps_own_reader_decodes_the_same(recorded: tuple[Slam, Path, list[Outl
         assert all(np.array_equal(T, links(other)[name]) for name, T in links(one).items())
     assert bytes(seen["/sigmasplat/cloud"][-1].data) == bag["/sigmasplat/cloud"][-1].data.tobytes()
     assert list(seen["/map"][0].data) == bag["/map"][0].data.tolist()
-
-
-# ---- the stream ----
-
-
-def client_of(stream: StreamSink, **more: Any) -> ClientConnection:
-    return connect(stream.url, subprotocols=list(SUBPROTOCOLS[:1]), max_size=None, compression=None, **more)
-
-
-def subscribe(client: ClientConnection) -> dict[int, dict[str, Any]]:
-    """Subscribe to all channels; return them by subscription."""
-    assert json.loads(client.recv(10))["op"] == "serverInfo"
-    channels = json.loads(client.recv(10))["channels"]
-    wanted = [{"id": 100 + channel["id"], "channelId": channel["id"]} for channel in channels]
-    client.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
-    return {100 + channel["id"]: channel for channel in channels}
-
-
-class Listener(threading.Thread):
-    """A client that subscribes to everything and keeps what it receives."""
-
-    def __init__(self, stream: StreamSink) -> None:
-        super().__init__(daemon=True)
-        self.client = client_of(stream)
-        self.channels = subscribe(self.client)
-        self.received = list[bytes]()
-        self.start()
-
-    def run(self) -> None:
-        self.received = [message for message in self.client if isinstance(message, bytes)]
-
-    def messages(self) -> dict[str, list[tuple[int, Any]]]:
-        found: dict[str, list[tuple[int, Any]]] = {topic.name: [] for topic in TOPICS}
-        for data in self.received:
-            code, subscription, time_ns = struct.unpack_from("<BIQ", data)
-            channel = self.channels[subscription]
-            assert code == 1
-            found[channel["topic"]].append((time_ns, decoded(data[13:], channel["schemaName"])))
-        return found
-
-
-def test_a_client_receives_what_a_bag_holds(recorded: tuple[Slam, Path, list[Outlet]]) -> None:
-    stream = StreamSink(MESSAGES, port=0)
-    listener = Listener(stream)
-    slam, (outlet,) = followed([stream])
-    listener.join(30)
-    assert contents(slam) == plain() and outlet.failure == ""
-    found, bag = listener.messages(), read_bag(recorded[1])
-    for topic in ("/tf", "/sigmasplat/odometry"):
-        assert len(found[topic]) == FRAMES
-    for (time_ns, message), kept in zip(found["/tf"], bag["/tf"], strict=True):
-        assert time_ns * 1e-9 == pytest.approx(seconds(kept.transforms[0]), abs=1e-8)
-        for name, T in links(message).items():
-            np.testing.assert_array_equal(T, links(kept)[name])
-    np.testing.assert_array_equal(found["/map"][-1][1].data, bag["/map"][-1].data)
-    pictures = {time_ns: image(message) for time_ns, message in found["/camera/color/image_raw"]}
-    assert pictures, "images are dropped if the thread is late, but not all"
-    for frame in there_and_back():
-        if round(frame.timestamp_s * 1e9) in pictures:
-            np.testing.assert_array_equal(pictures[round(frame.timestamp_s * 1e9)], np.rint(255 * frame.color))
-
-
-def raw_client(stream: StreamSink, *lines: str) -> socket.socket:
-    """Open a WebSocket by hand, with more lines in the request."""
-    found = socket.socket()
-    found.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-    found.settimeout(10)
-    found.connect(("127.0.0.1", stream.port))
-    key = "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ=="
-    request = [
-        "GET / HTTP/1.1",
-        "Host: x",
-        "Upgrade: websocket",
-        "Connection: Upgrade",
-        key,
-        "Sec-WebSocket-Version: 13",
-    ]
-    found.sendall("\r\n".join([*request, f"Sec-WebSocket-Protocol: {SUBPROTOCOLS[0]}", *lines, "", ""]).encode())
-    return found
-
-
-def framed(payload: bytes, code: int = 1) -> bytes:
-    """Return a masked frame of a client."""
-    size = bytes([0x80 | len(payload)]) if len(payload) < 126 else b"\xfe" + struct.pack(">H", len(payload))
-    return bytes([0x80 | code]) + size + b"\0\0\0\0" + payload
-
-
-@pytest.mark.slow
-def test_malicious_and_slow_clients_change_nothing() -> None:
-    stream, garbage = StreamSink(MESSAGES, port=0), np.random.default_rng(0)
-    requests = [
-        b"{", b"[]", b"null", b'"x"', b'{"op":"subscribe"}', b'{"op":"subscribe","subscriptions":7}',
-        b'{"op":"subscribe","subscriptions":[{"id":-1,"channelId":99999}]}', b"[" * 20_000,
-        b'{"op":"subscribe","subscriptions":[{"id":1e999,"channelId":1}]}',
-        b'{"op":"unsubscribe","subscriptionIds":[{}]}',
-        b'{"op":"subscribe","subscriptions":[{"id":true,"channelId":true}]}', b'{"op":"advertise","channels":[{}]}',
-    ]  # fmt: skip
-    with ExitStack() as stack:
-        for _ in range(3):  # no WebSocket at all
-            other = stack.enter_context(socket.create_connection(("127.0.0.1", stream.port)))
-            other.sendall(garbage.bytes(5000))
-        silent = stack.enter_context(socket.create_connection(("127.0.0.1", stream.port)))  # never sends anything
-        hostile = stack.enter_context(raw_client(stream))
-        for request in requests:
-            hostile.sendall(framed(request))
-            hostile.sendall(framed(request, code=2))
-        broken = stack.enter_context(raw_client(stream))
-        broken.sendall(garbage.bytes(3000))
-        deaf = stack.enter_context(raw_client(stream))  # subscribes to images many times and never reads
-        images = [number for number, topic in enumerate(TOPICS, 1) if topic.name.endswith("image_raw")]
-        wanted = [{"id": i, "channelId": images[i % len(images)]} for i in range(len(TOPICS))]
-        deaf.sendall(framed(json.dumps({"op": "subscribe", "subscriptions": wanted}).encode()))
-        listener = Listener(stream)
-        slam, (outlet,) = followed([stream])
-        listener.join(30)
-        assert contents(slam) == plain()
-        assert outlet.failure == "" and outlet.record()["missed"] > 0, "the client that never reads has missed messages"
-        assert len(listener.messages()["/tf"]) == FRAMES, "and the client that reads has them all"
-        assert silent.fileno() >= 0
-
-
-@pytest.mark.parametrize(
-    ("origin", "allowed"),
-    [
-        (None, True), ("https://app.foxglove.dev", True), ("http://localhost:8080", True), ("http://127.0.0.1", True),
-        ("file://", True), ("https://evil.example", False), ("http://app.foxglove.dev", False), ("null", False),
-        ("https://app.foxglove.dev.evil.example", False), ("http://localhost.evil.example", False), ("http://[", False),
-    ],
-)  # fmt: skip
-def test_only_own_pages_and_programs_may_read(origin: str | None, allowed: bool) -> None:
-    stream = StreamSink(MESSAGES, port=0)
-    try:
-        if allowed:
-            with client_of(stream, origin=origin) as client:
-                assert json.loads(client.recv(10))["op"] == "serverInfo"
-        else:
-            with pytest.raises(InvalidStatus) as refused:
-                client_of(stream, origin=origin)
-            assert refused.value.response.status_code == 403
-    finally:
-        stream.close()
-
-
-def test_the_stream_listens_on_this_machine_only_and_refuses_long_messages() -> None:
-    stream = StreamSink(MESSAGES, port=0)
-    try:
-        assert stream.url == f"ws://127.0.0.1:{stream.port}"
-        with client_of(stream) as client:
-            subscribe(client)
-            client.send("x" * (MOST_REQUEST_BYTES + 1))
-            with pytest.raises(Exception, match="1009"):
-                while True:
-                    client.recv(10)
-        with pytest.raises(InvalidStatus):
-            connect(stream.url)  # no subprotocol
-    finally:
-        stream.close()
-
-
-def test_a_late_client_gets_the_latched_messages() -> None:
-    stream = StreamSink(MESSAGES, port=0)
-    outlet = Outlet(stream, MESSAGES)
-    sent = MESSAGES.transforms(TOPICS[1], 7, [("camera_link", "camera_optical_frame", np.eye(4))])
-    done = threading.Event()
-
-    def job(messages: RosMessages) -> list:
-        return [sent]
-
-    outlet.offer(job, TOPICS[1])
-    outlet.offer(lambda messages: done.set() or [], TOPICS[1])
-    assert done.wait(10)
-    with client_of(stream) as client:
-        channels = subscribe(client)
-        data = client.recv(10)
-        assert isinstance(data, bytes) and struct.unpack_from("<BIQ", data) == (1, 102, 7)
-        assert channels[102]["topic"] == "/tf_static" and data[13:] == sent.data
-    outlet.close()
-
-
-def test_the_protocol_is_that_of_foxgloves_sdk() -> None:
-    foxglove = pytest.importorskip("foxglove", reason="foxglove-sdk is not installed (19 MB, MIT)")
-    context = foxglove.Context()
-    server = foxglove.start_server(name="SigmaSplat", port=0, context=context, session_id="run")
-    stream = StreamSink(MESSAGES, port=0)
-    try:
-        with connect(f"ws://127.0.0.1:{server.port}", subprotocols=list(SUBPROTOCOLS[:1])) as theirs:
-            with client_of(stream) as ours:
-                told, expected = json.loads(ours.recv(10)), json.loads(theirs.recv(10))
-                assert {**expected, "metadata": {}} == told
-                channels = json.loads(ours.recv(10))["channels"]
-            made = [
-                foxglove.Channel(
-                    c["topic"], message_encoding=c["encoding"], context=context,
-                    schema=foxglove.Schema(
-                        name=c["schemaName"], encoding=c["schemaEncoding"], data=c["schema"].encode()
-                    ),
-                )
-                for c in channels
-            ]  # fmt: skip
-            found = []
-            while len(found) < len(made):
-                found += json.loads(theirs.recv(10))["channels"]
-            known = {c["topic"]: {k: v for k, v in c.items() if k != "id"} for c in found}
-            assert known == {c["topic"]: {k: v for k, v in c.items() if k != "id"} for c in channels}
-    finally:
-        stream.close()
-        server.stop()

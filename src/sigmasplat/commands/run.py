@@ -86,7 +86,7 @@ def run(
     """Run SLAM on a sequence, or on a camera until Ctrl-C: trajectory, map, uncertainty, report.
 
     example: sigmasplat run data/kitchen --limit 200 --set input.width=480
-    for robots: sigmasplat run data/kitchen --bag kitchen-bag --stream 8765
+    for robots: sigmasplat run data/kitchen --bag kitchen-bag
     """
     from sigmasplat.run.finished_map import FinishedMap, continue_map
     from sigmasplat.run.resume import StartPoint
@@ -259,7 +259,7 @@ def _run_and_score(
         folder.note(realtime=True)
     motion = MotionWatch()
     with (
-        robot_output(screen, start.slam, folder, robot_options, run_options.host) as robot,
+        robot_output(screen, start.slam, folder, robot_options) as robot,
         screen.steps(None if source.live else len(source), start.next_index) as steps,
         closing(RerunLog(folder, start.next_index)) as log,
     ):
@@ -294,7 +294,7 @@ def _run_and_score(
 def _readers(
     start: "StartPoint", source: "Source", viewer: "ViewerApp | None", robot: "LiveRobot | None"
 ) -> list["Callback"]:  # fmt: skip
-    """Return what reads the system while it runs: bag and stream if there is a robot output, and the viewer if any."""
+    """Return what reads the system while it runs: the bag and the viewer, if they are asked for."""
     readers: list[Callback] = [robot] if robot else []
     if viewer is not None:
         from sigmasplat.plugins.viewer.snapshot_sources import LiveView

@@ -38,9 +38,6 @@ CHUNK_BYTES = 65_536
 class BagSink:
     """A bag in a new folder, with all topics, also those without messages. Chunks are compressed with Zstandard."""
 
-    name = "bag"
-    missed = 0
-
     def __init__(self, folder: Path) -> None:
         """Raises SourceError without the rosbags package, RunError if the folder exists or cannot be made."""
         self.rosbag2 = import_optional("rosbags.rosbag2", ros.EXTRA, "a ROS bag")
@@ -66,10 +63,6 @@ class BagSink:
             self.connections[topic.name] = self.writer.add_connection(
                 topic.name, topic.msgtype, typestore=messages.store, offered_qos_profiles=[self._quality(topic)]
             )
-
-    def wants(self, *topics: Topic) -> bool:
-        """Return True: a bag keeps every message."""
-        return True
 
     def write(self, message: Encoded) -> None:
         """Write a message; its recording time is its stamp. Raises OSError if the disk is full."""

@@ -1,4 +1,4 @@
-"""Give a run that goes on to outlets: transforms, odometry, loops, images, and the map as points and as a grid."""
+"""Write a run that goes on to a bag: transforms, odometry, loops, images, and the map as points and as a grid."""
 
 import contextlib
 from array import array
@@ -24,8 +24,8 @@ from sigmasplat.api import (
 from sigmasplat.plugins.outputs.floorplan.floor_plan import FloorPlan, map_floor_plan
 from sigmasplat.plugins.robots import ros_messages as ros
 from sigmasplat.plugins.robots.odometry import LiveOdometry, has_motion
-from sigmasplat.plugins.robots.outlet import Job, Outlet
-from sigmasplat.plugins.robots.ros_messages import MAX_POINTS, Encoded, Points, RosMessages, Topic
+from sigmasplat.plugins.robots.outlet import Outlet
+from sigmasplat.plugins.robots.ros_messages import MAX_POINTS, Encoded, Points, RosMessages
 
 Images = Literal["none", "keyframes", "all"]
 SUBMAP_POINTS = 20_000
@@ -35,22 +35,20 @@ STATIC = ((ros.MAP, ros.WORLD, ros.T_MAP_WORLD), (ros.LINK, ros.OPTICAL, ros.T_L
 
 
 class LiveRobot(Callback):
-    """Gives messages to outlets.
+    """Gives messages to an outlet.
 
-    It copies small data in the thread of the run. Messages are made and written on the threads of the outlets. images:
-    of which frames images are given. warn: prints a line if an outlet fails.
+    It copies small data in the thread of the run. Messages are made and written on the thread of the outlet. images:
+    of which frames images are given. warn: prints a line if the outlet fails.
     """
 
-    def __init__(
-        self, slam: Slam, outlets: Sequence[Outlet], warn: Callable[[str], None], images: Images = "keyframes"
-    ) -> None:
-        self.slam, self.outlets, self.warn, self.images = slam, outlets, warn, images
+    def __init__(self, slam: Slam, outlet: Outlet, warn: Callable[[str], None], images: Images = "keyframes") -> None:
+        self.slam, self.outlet, self.warn, self.images = slam, outlet, warn, images
         self.odometry = LiveOdometry(slam.atlas)
         self._frames = dict[int, Frame]()
         self._rows, self._forces_m_s2 = array("q"), array("d")  # of the steps with a force on their frame
         self._submaps = list[Callable[[], Points]]()  # in their own frames, each read once
         self._stamp_ns = -1
-        self._failed = set[str]()
+        self._warned = False
 
     def watch(self, frame: Frame) -> None:
         """Keep a frame until its step, if its images or the force on it may be wanted."""
@@ -58,7 +56,7 @@ class LiveRobot(Callback):
             self._frames[frame.index] = frame
 
     def __call__(self, step: Step) -> None:
-        """Give the messages of a step to the outlets."""
+        """Give the messages of a step to the outlet."""
         self._now(step.timestamp_s)
         self._offer_images(step, self._frame_of(step))
         moved = has_motion(step.state, step.tracking)
@@ -68,7 +66,7 @@ class LiveRobot(Callback):
         if any(loop.accepted for loop in step.loops):
             self._offer_loop(len(self.slam.steps) - 1)
         self._offer_submaps(step.submap)
-        self._report_failures()
+        self._report_failure()
 
     def last_loops(self, loops: Sequence[Loop]) -> None:
         """Give the final map, and the last pose if the last loops have moved it."""
@@ -78,16 +76,11 @@ class LiveRobot(Callback):
         self._offer_final_map()
 
     def close(self) -> None:
-        """Write what waits, and report outlets that failed."""
-        for outlet in self.outlets:
-            outlet.close()
-        self._report_failures()
+        """Write what waits, and report if the outlet failed."""
+        self.outlet.close()
+        self._report_failure()
 
-    # ---- in the thread of the run; jobs are called on the threads of the outlets ----
-
-    def _offer(self, job: Job, *topics: Topic, bulky: bool = False) -> None:
-        for outlet in self.outlets:
-            outlet.offer(job, *topics, bulky=bulky)
+    # ---- in the thread of the run; jobs are called on the thread of the outlet ----
 
     def _now(self, timestamp_s: float) -> None:
         """Set the time of the next messages; the first time, give the static transforms."""
@@ -97,7 +90,7 @@ class LiveRobot(Callback):
 
     def _offer_static(self, links: Sequence[tuple[str, str, Matrix]]) -> None:
         stamp_ns = self._stamp_ns
-        self._offer(lambda messages: [messages.transforms(ros.TF_STATIC, stamp_ns, links)], ros.TF_STATIC)
+        self.outlet.offer(lambda messages: [messages.transforms(ros.TF_STATIC, stamp_ns, links)])
 
     def _frame_of(self, step: Step) -> Frame | None:
         """Return the frame of a step if it was kept, and note the force on it; forget those that real time dropped."""
@@ -114,8 +107,7 @@ class LiveRobot(Callback):
         wanted = self.images == "all" or (self.images == "keyframes" and step.is_keyframe)
         if frame is not None and wanted:
             image = self._stamp_ns, frame.camera, frame.color, frame.depth_m
-            topics = ros.COLOR, ros.COLOR_INFO, ros.DEPTH, ros.DEPTH_INFO
-            self._offer(lambda messages: messages.images(*image), *topics, bulky=True)
+            self.outlet.offer(lambda messages: messages.images(*image), bulky=True)
 
     def _offer_pose(self, step: Step, T_odom_camera: Matrix) -> None:
         """Give the transforms and the odometry of a frame that is not lost.
@@ -134,7 +126,7 @@ class LiveRobot(Callback):
             odometry = messages.odometry(stamp_ns, ros.ODOM, ros.LINK, T_odom_link, covariance)
             return [messages.transforms(ros.TF, stamp_ns, links), odometry]
 
-        self._offer(job, ros.TF, ros.ODOMETRY)
+        self.outlet.offer(job)
 
     def _offer_loop(self, row: int) -> None:
         """Give the pose of a frame in the map with its covariance; this is computed on the outlet's thread."""
@@ -150,7 +142,7 @@ class LiveRobot(Callback):
             covariance = ros.ros_covariance(path.of_frame(row), ros.T_MAP_WORLD, T_map_link)
             return [messages.pose(ros.LOOP, stamp_ns, ros.MAP, T_map_link, covariance)]
 
-        self._offer(job, ros.LOOP)
+        self.outlet.offer(job)
 
     def _offer_submaps(self, finished: int) -> None:
         """Give the points of all finished submaps of the world, when one more is finished; they are read on the thread
@@ -172,7 +164,7 @@ class LiveRobot(Callback):
             return [messages.cloud(stamp_ns, ros.MAP, Points.joined(moved))]
 
         if parts:
-            self._offer(job, ros.CLOUD)
+            self.outlet.offer(job)
 
     def _read_points(self, submap: int) -> Points:
         return ros.points_of(self.slam.store.load(submap).field, None, SUBMAP_POINTS)
@@ -184,12 +176,12 @@ class LiveRobot(Callback):
         def job(messages: RosMessages) -> list[Encoded]:
             return [messages.cloud(stamp_ns, ros.MAP, ros.points_of(field, std).moved(ros.T_MAP_WORLD))]
 
-        self._offer(job, ros.CLOUD)
+        self.outlet.offer(job)
         plan = self._floor_plan()
         if plan is not None:
             floor = (ros.MAP, ros.FLOOR, ros.T_MAP_WORLD @ se3.inverse(ros.levelled_map(plan.T_floor_world)))
             self._offer_static((*STATIC, floor))
-            self._offer(partial(ros.grids, plan, stamp_ns, ros.FLOOR), ros.GRID, ros.GRID_STD)
+            self.outlet.offer(partial(ros.grids, plan, stamp_ns, ros.FLOOR))
 
     def _floor_plan(self) -> FloorPlan | None:
         slam = self.slam
@@ -205,9 +197,7 @@ class LiveRobot(Callback):
             )  # fmt: skip
         return None
 
-    def _report_failures(self) -> None:
-        for outlet in self.outlets:
-            name = outlet.sink.name
-            if outlet.failure and name not in self._failed:
-                self._failed.add(name)
-                self.warn(f"the {name} ended ({outlet.failure}) after {outlet.written} messages; the run goes on")
+    def _report_failure(self) -> None:
+        if self.outlet.failure and not self._warned:
+            self._warned = True
+            self.warn(f"the bag ended ({self.outlet.failure}) after {self.outlet.written} messages; the run goes on")

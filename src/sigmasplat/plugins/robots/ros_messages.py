@@ -171,11 +171,6 @@ class RosMessages:
         self._nodes = import_optional("rosbags.interfaces", EXTRA, "ROS messages").Nodetype
         self.store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
 
-    def schema(self, topic: Topic) -> str:
-        """Return the definition of a topic's message type, with the types that it contains."""
-        definition: str = self.store.generate_msgdef(topic.msgtype, ros_version=2)[0]
-        return definition
-
     def transforms(self, topic: Topic, stamp_ns: int, links: Sequence[tuple[str, str, Matrix]]) -> Encoded:
         """Make a message of transforms (parent, child, T_parent_child [4, 4])."""
         stamped = [
