@@ -44,7 +44,6 @@ from sigmasplat.data.imu import (
     Gyroscope as Gyroscope,
     accelerometer_from_samples as accelerometer_from_samples,
     gyroscope_from_samples as gyroscope_from_samples,
-    up_of_path as up_of_path,
 )
 from sigmasplat.data.map_uncertainty import SHIPPED as SHIPPED, MapUncertainty as MapUncertainty, SplatStd as SplatStd
 from sigmasplat.data.mesh import Mesh as Mesh, mesh_depth as mesh_depth

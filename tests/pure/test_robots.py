@@ -23,8 +23,8 @@ from sigmasplat.data.trajectory import LOST as LOST_STATE, RELOCALISED, TRACKED
 from sigmasplat.graph.path_covariance import PathCovariance
 from sigmasplat.plugins.outputs.floorplan.floor_plan import FloorPlan
 from sigmasplat.plugins.outputs.floorplan.rescan import FREE, OBJECT, UNOBSERVED, WALL
+from sigmasplat.plugins.robots.live import MOST_BULKY, MOST_JOBS, Outlet
 from sigmasplat.plugins.robots.odometry import LiveOdometry, has_motion, odometry_poses
-from sigmasplat.plugins.robots.outlet import MOST_BULKY, MOST_JOBS, Outlet
 from sigmasplat.plugins.robots.ros_messages import T_LINK_OPTICAL, grids, levelled_map, link_pose, ros_covariance
 from sigmasplat.slam.slam_state import path_errors
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 Bag = Annotated[
     Path | None,
-    arg("DIR", "also write a ROS 2 bag (MCAP): transforms, odometry, loops, map, images; needs no ROS", ""),
+    arg("DIR", "also write a ROS 2 bag (MCAP): transforms, odometry, loops, images; needs no ROS", ""),
 ]
 
 
@@ -55,8 +55,7 @@ def robot_output(
         yield None
         return
     from sigmasplat.plugins.robots.bag import BagSink
-    from sigmasplat.plugins.robots.live import LiveRobot
-    from sigmasplat.plugins.robots.outlet import Outlet
+    from sigmasplat.plugins.robots.live import LiveRobot, Outlet
     from sigmasplat.plugins.robots.ros_messages import RosMessages
 
     outlet = Outlet(BagSink(asked.bag), RosMessages())

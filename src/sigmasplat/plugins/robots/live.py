@@ -1,37 +1,111 @@
-"""Write a run that goes on to a bag: transforms, odometry, loops, images, and the map as points and as a grid."""
+"""Write a run that goes on to a bag: transforms, odometry, loops, images.
 
-import contextlib
-from array import array
-from collections.abc import Callable, Sequence
-from functools import cache, partial
-from typing import Literal
+Messages are made and written on a thread of their own, so that a slow or full disk costs the run nothing. The run
+offers jobs and never waits. If the thread is late, jobs are dropped and counted; images are dropped first. An error of
+the disk ends the bag, and the run goes on.
+"""
 
-import numpy as np
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, Literal
 
-from sigmasplat.api import (
-    Callback,
-    Frame,
-    Loop,
-    Matrix,
-    PathCovariance,
-    SigmaSplatError,
-    Slam,
-    Step,
-    path_errors,
-    se3,
-    up_of_path,
-)
-from sigmasplat.plugins.outputs.floorplan.floor_plan import FloorPlan, map_floor_plan
+from sigmasplat.api import Callback, Frame, Loop, Matrix, PathCovariance, Slam, Step, path_errors
 from sigmasplat.plugins.robots import ros_messages as ros
+from sigmasplat.plugins.robots.bag import BagSink
 from sigmasplat.plugins.robots.odometry import LiveOdometry, has_motion
-from sigmasplat.plugins.robots.outlet import Outlet
-from sigmasplat.plugins.robots.ros_messages import MAX_POINTS, Encoded, Points, RosMessages
+from sigmasplat.plugins.robots.ros_messages import Encoded, RosMessages
+
+Job = Callable[[RosMessages], Iterable[Encoded]]
+"""Makes messages. It runs on the outlet's thread, so it may read only data that the run no longer changes."""
+MOST_JOBS, MOST_BULKY = 256, 16
+"""At most this many jobs wait, and at most this many with images: 5 MB each at 640×480."""
+CLOSE_S = 30.0
+"""At the end, the thread has this many seconds to write what waits."""
+
+
+class Outlet:
+    """A thread with a bounded queue in front of a bag.
+
+    written: number of messages; dropped: number of jobs that were dropped because the thread was late, or because the
+    bag had failed; failure: why it failed, "" if it did not.
+    """
+
+    def __init__(self, sink: BagSink, messages: RosMessages) -> None:
+        self.sink, self.messages = sink, messages
+        self.written, self.dropped, self.failure = 0, 0, ""
+        self._jobs = deque[tuple[Job, bool]]()
+        self._bulky = 0
+        self._closing = False
+        self._changed = threading.Condition()
+        self._thread = threading.Thread(target=self._work, name="sigmasplat-bag", daemon=True)
+        self._thread.start()
+
+    def offer(self, job: Job, bulky: bool = False) -> None:
+        """Add a job that makes messages; drop it if too many wait. Never waits for the bag."""
+        with self._changed:
+            if self.failure or self._closing or len(self._jobs) >= MOST_JOBS or (bulky and self._bulky >= MOST_BULKY):
+                self.dropped += 1
+                return
+            self._jobs.append((job, bulky))
+            self._bulky += bulky
+            self._changed.notify()
+
+    def close(self, timeout_s: float = CLOSE_S) -> None:
+        """Write what waits and complete the bag, for at most `timeout_s`; then drop the rest."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify()
+        self._thread.join(timeout_s)
+        if self._thread.is_alive():
+            with self._changed:
+                self._fail(f"not finished {timeout_s:g} s after the run")
+
+    def record(self) -> dict[str, Any]:
+        """Return counts and failure as values for run.json."""
+        return {"written": self.written, "dropped": self.dropped, "failure": self.failure}
+
+    def _work(self) -> None:
+        """Write until the end. The bag is opened at the first job, so that a run without frames leaves no file."""
+        try:
+            if (job := self._next()) is None:
+                return
+            self.sink.open(self.messages)
+            while job is not None:
+                for message in job(self.messages):
+                    self.sink.write(message)
+                    self.written += 1
+                job = self._next()
+            if not self.failure:
+                self.sink.close()
+        except Exception as problem:
+            with self._changed:
+                self._fail(_reason(problem))
+            self.sink.abort()
+
+    def _next(self) -> Job | None:
+        with self._changed:
+            self._changed.wait_for(lambda: bool(self._jobs) or self._closing)
+            if not self._jobs:
+                return None
+            job, bulky = self._jobs.popleft()
+            self._bulky -= bulky
+            return job
+
+    def _fail(self, reason: str) -> None:
+        self.failure = self.failure or reason
+        self.dropped += len(self._jobs)
+        self._jobs.clear()
+
+
+def _reason(problem: Exception) -> str:
+    if isinstance(problem, OSError) and problem.strerror:
+        return problem.strerror
+    return f"{type(problem).__name__}: {problem}".splitlines()[0]
+
 
 Images = Literal["none", "keyframes", "all"]
-SUBMAP_POINTS = 20_000
-"""At most this many points of each submap while the run goes on; fewer if there are many submaps."""
 STATIC = ((ros.MAP, ros.WORLD, ros.T_MAP_WORLD), (ros.LINK, ros.OPTICAL, ros.T_LINK_OPTICAL))
-"""Each message of static transforms contains all of them, because late subscribers get only the last one."""
 
 
 class LiveRobot(Callback):
@@ -45,14 +119,12 @@ class LiveRobot(Callback):
         self.slam, self.outlet, self.warn, self.images = slam, outlet, warn, images
         self.odometry = LiveOdometry(slam.atlas)
         self._frames = dict[int, Frame]()
-        self._rows, self._forces_m_s2 = array("q"), array("d")  # of the steps with a force on their frame
-        self._submaps = list[Callable[[], Points]]()  # in their own frames, each read once
         self._stamp_ns = -1
         self._warned = False
 
     def watch(self, frame: Frame) -> None:
-        """Keep a frame until its step, if its images or the force on it may be wanted."""
-        if self.images != "none" or frame.specific_force_m_s2 is not None:
+        """Keep a frame until its step, if its images may be wanted."""
+        if self.images != "none":
             self._frames[frame.index] = frame
 
     def __call__(self, step: Step) -> None:
@@ -65,15 +137,13 @@ class LiveRobot(Callback):
             self._offer_pose(step, T_odom_camera)
         if any(loop.accepted for loop in step.loops):
             self._offer_loop(len(self.slam.steps) - 1)
-        self._offer_submaps(step.submap)
         self._report_failure()
 
     def last_loops(self, loops: Sequence[Loop]) -> None:
-        """Give the final map, and the last pose if the last loops have moved it."""
+        """Give the last pose if the last loops have moved it."""
         self._now(self.slam.steps[-1].timestamp_s)
         if any(loop.accepted for loop in loops):
             self._offer_loop(len(self.slam.steps) - 1)
-        self._offer_final_map()
 
     def close(self) -> None:
         """Write what waits, and report if the outlet failed."""
@@ -86,21 +156,15 @@ class LiveRobot(Callback):
         """Set the time of the next messages; the first time, give the static transforms."""
         first, self._stamp_ns = self._stamp_ns < 0, ros.stamp_of(timestamp_s)
         if first:
-            self._offer_static(STATIC)
-
-    def _offer_static(self, links: Sequence[tuple[str, str, Matrix]]) -> None:
-        stamp_ns = self._stamp_ns
-        self.outlet.offer(lambda messages: [messages.transforms(ros.TF_STATIC, stamp_ns, links)])
+            stamp_ns = self._stamp_ns
+            self.outlet.offer(lambda messages: [messages.transforms(ros.TF_STATIC, stamp_ns, STATIC)])
 
     def _frame_of(self, step: Step) -> Frame | None:
-        """Return the frame of a step if it was kept, and note the force on it; forget those that real time dropped."""
+        """Return the frame of a step if it was kept; forget those that real time dropped."""
         frame = self._frames.pop(step.index, None)
         for index in list(self._frames):  # a copy: in real time `watch` runs on another thread
             if index < step.index:
                 del self._frames[index]
-        if frame is not None and frame.specific_force_m_s2 is not None:
-            self._rows.append(len(self.slam.steps) - 1)
-            self._forces_m_s2.extend(frame.specific_force_m_s2)
         return frame
 
     def _offer_images(self, step: Step, frame: Frame | None) -> None:
@@ -143,59 +207,6 @@ class LiveRobot(Callback):
             return [messages.pose(ros.LOOP, stamp_ns, ros.MAP, T_map_link, covariance)]
 
         self.outlet.offer(job)
-
-    def _offer_submaps(self, finished: int) -> None:
-        """Give the points of all finished submaps of the world, when one more is finished; they are read on the thread
-        of the outlet."""
-        if len(self._submaps) == finished:
-            return
-        atlas = self.slam.atlas
-        self._submaps += [cache(partial(self._read_points, s)) for s in range(len(self._submaps), finished)]
-        parts = [
-            (points, ros.T_MAP_WORLD @ atlas.anchors[s])
-            for s, points in enumerate(self._submaps)
-            if not atlas.components[s]
-        ]
-        stamp_ns = self._stamp_ns
-
-        def job(messages: RosMessages) -> list[Encoded]:
-            each = MAX_POINTS // len(parts)
-            moved = [points().thinned(each).moved(T) for points, T in parts]
-            return [messages.cloud(stamp_ns, ros.MAP, Points.joined(moved))]
-
-        if parts:
-            self.outlet.offer(job)
-
-    def _read_points(self, submap: int) -> Points:
-        return ros.points_of(self.slam.store.load(submap).field, None, SUBMAP_POINTS)
-
-    def _offer_final_map(self) -> None:
-        field, known, stamp_ns = self.slam.field, self.slam.uncertainty, self._stamp_ns
-        std = None if known is None or known.std is None else known.std.depth_std_m
-
-        def job(messages: RosMessages) -> list[Encoded]:
-            return [messages.cloud(stamp_ns, ros.MAP, ros.points_of(field, std).moved(ros.T_MAP_WORLD))]
-
-        self.outlet.offer(job)
-        plan = self._floor_plan()
-        if plan is not None:
-            floor = (ros.MAP, ros.FLOOR, ros.T_MAP_WORLD @ se3.inverse(ros.levelled_map(plan.T_floor_world)))
-            self._offer_static((*STATIC, floor))
-            self.outlet.offer(partial(ros.grids, plan, stamp_ns, ros.FLOOR))
-
-    def _floor_plan(self) -> FloorPlan | None:
-        slam = self.slam
-        whole, valid = slam.trajectory(), slam.valid()
-        path, rows = whole.at(valid), np.array(self._rows, np.intp)
-        known, forces = valid[rows], np.array(self._forces_m_s2).reshape(-1, 3)
-        up_world = up_of_path(whole.T_world_camera[rows[known]], forces[known])
-        if not len(path):
-            return None
-        with contextlib.suppress(SigmaSplatError):
-            return map_floor_plan(
-                slam.field, slam.uncertainty, slam.config, path, slam.view.camera, up_world=up_world
-            )  # fmt: skip
-        return None
 
     def _report_failure(self) -> None:
         if self.outlet.failure and not self._warned:

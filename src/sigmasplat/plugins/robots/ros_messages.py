@@ -4,8 +4,7 @@ Stamps are the times of the frames, nanoseconds. Coordinate frames are those of 
 forward, y left, z up; optical frames z forward):
 
     map ─ odom ─ camera_link ─ camera_optical_frame
-     ├─ sigmasplat_world      the world of SigmaSplat: the camera of the first frame
-     └─ floor                 live only, after the final map: as `levelled_map`
+     └─ sigmasplat_world      the world of SigmaSplat: the camera of the first frame
 
 Only map → odom contains corrections (loops, relocalisation, mapping), so odom → camera_link is continuous.
 """
@@ -24,7 +23,7 @@ from sigmasplat.plugins.outputs.floorplan.rescan import FREE, OBJECT, WALL
 from sigmasplat.plugins.outputs.views import opaque_rows
 
 MAP, ODOM, LINK, OPTICAL = "map", "odom", "camera_link", "camera_optical_frame"
-WORLD, FLOOR = "sigmasplat_world", "floor"
+WORLD = "sigmasplat_world"
 
 T_LINK_OPTICAL = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """From optical axes (x right, y down, z forward) to those of a body (x forward, y left, z up); the origin is shared."""
@@ -120,19 +119,6 @@ class Points:
         """Return the points transformed by T [4, 4]."""
         positions = self.positions.astype(np.float64) @ T[:3, :3].T + T[:3, 3]
         return Points(positions.astype(np.float32), self.colors, self.opacities, self.depth_std_m)
-
-    def thinned(self, most: int) -> "Points":
-        """Return at most `most` points, spread evenly over the rows."""
-        if len(self.positions) <= most:
-            return self
-        rows = np.linspace(0, len(self.positions) - 1, most).astype(int)
-        return Points(self.positions[rows], self.colors[rows], self.opacities[rows], self.depth_std_m[rows])
-
-    @staticmethod
-    def joined(parts: "Sequence[Points]") -> "Points":
-        """Return the points of all parts, at least one."""
-        names = ("positions", "colors", "opacities", "depth_std_m")
-        return Points(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
 def stamp_of(timestamp_s: float) -> int:
@@ -265,12 +251,12 @@ UNOBSERVED, EMPTY, OCCUPIED = -1, 0, 100
 CM_PER_M = 100.0
 
 
-def points_of(field: GaussianField, depth_std_m: Tensor | None, most: int = MAX_POINTS) -> Points:
-    """Return the centres of the opaque splats as a copy, evenly thinned to `most`.
+def points_of(field: GaussianField, depth_std_m: Tensor | None) -> Points:
+    """Return the centres of the opaque splats as a copy, evenly thinned to `MAX_POINTS`.
 
     depth_std_m [N]: standard deviation of the depth that each splat shows; None if it was not measured.
     """
-    rows = opaque_rows(field, most)
+    rows = opaque_rows(field, MAX_POINTS)
     std = np.full(len(rows), np.nan, np.float32) if depth_std_m is None else depth_std_m.cpu().numpy()[rows]
     means, colors, opacities = (
         values.detach().cpu().numpy()[rows] for values in (field.means, field.colors, field.opacities)
