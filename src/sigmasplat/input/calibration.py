@@ -26,8 +26,7 @@ class Calibration:
     camera, distortion: of the colour image, None for no distortion; depth_units_per_metre: of whole-number depth;
     depth_camera, depth_distortion: of depth images that are not registered to colour, None if they are registered;
     T_color_depth [4, 4]: transforms points of the depth camera to the colour camera, metres;
-    register_by_default: whether unregistered depth is moved to colour if input.register_depth is "auto"; sensor: the
-    depth sensor or its model (`config.sensors`), None if it is unknown.
+    sensor: the depth sensor or its model (`config.sensors`), None if it is unknown.
     """
 
     camera: Camera
@@ -36,7 +35,6 @@ class Calibration:
     depth_camera: Camera | None = None
     depth_distortion: Distortion | None = None
     T_color_depth: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
-    register_by_default: bool = True
     sensor: str | None = None
 
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
 
 from sigmasplat.data import se3
 from sigmasplat.data.trajectory import Trajectory
@@ -195,26 +196,17 @@ def refuse_other_units(path: Path, times_s: Mapping[str, Times]) -> None:
 
 def nearest_gaps_s(first_s: Times, second_s: Times) -> Times:
     """Return the time from each of the first times to the nearest of the second, seconds [N]."""
-    ordered = np.sort(second_s)
-    after = np.clip(np.searchsorted(ordered, first_s), 1, max(len(ordered) - 1, 1))
-    before, later = ordered[after - 1], ordered[np.minimum(after, len(ordered) - 1)]
-    return np.asarray(np.minimum(np.abs(first_s - before), np.abs(first_s - later)))
+    return np.asarray(cKDTree(second_s[:, None]).query(first_s[:, None])[0])
 
 
 def _near_pairs(first_s: Times, second_s: Times, tolerance_s: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    order = np.argsort(second_s, kind="stable")
-    ordered = second_s[order]
-    low = np.searchsorted(ordered, first_s - tolerance_s, "left")
-    high = np.searchsorted(ordered, first_s + tolerance_s, "right")
-    most = MOST_CANDIDATES * (len(first_s) + len(second_s))
-    if (found := int((high - low).sum())) > most:
+    first, second = (cKDTree(times_s[:, None]) for times_s in (first_s, second_s))
+    found = int(first.count_neighbors(second, tolerance_s, 1))
+    if found > MOST_CANDIDATES * (len(first_s) + len(second_s)):
         raise SourceError(
             f"{len(first_s)} and {len(second_s)} images have {found} pairs of times within {tolerance_s:g} s, so their "
             "times do not pair them; give every image its own time, in seconds"
         )
-    rows = np.repeat(np.arange(len(first_s)), high - low)
-    starts = np.repeat(low, high - low)
-    within = np.arange(len(rows)) - np.repeat(np.cumsum(high - low) - (high - low), high - low)
-    columns = order[starts + within]
-    near = np.abs(first_s[rows] - second_s[columns]) < tolerance_s
-    return rows[near], columns[near]
+    pairs = first.sparse_distance_matrix(second, tolerance_s, 1, "ndarray")
+    near = pairs[pairs["v"] < tolerance_s]
+    return near["i"], near["j"]

@@ -155,8 +155,7 @@ Image = NDArray[np.float32]
 
 def registers_depth(calibration: Calibration, settings: InputConfig) -> bool:
     """Return whether depth is moved to the colour camera: if the depth camera is known and the settings allow it."""
-    wanted = calibration.register_by_default if settings.register_depth == "auto" else settings.register_depth == "on"
-    return wanted and calibration.depth_camera is not None
+    return settings.register_depth != "off" and calibration.depth_camera is not None
 
 
 class Rectification:
