@@ -73,14 +73,6 @@ def test_licence_and_size_are_printed_first(server: FileServer, tmp_path: Path) 
     assert said[1].startswith("terms: free (http://page)") and said[2] == "bytes"
 
 
-def test_an_archive_can_be_kept_and_is_used_again(server: FileServer, tmp_path: Path) -> None:
-    downloaded(public_set(server), tmp_path, keep_archive=True)
-    assert (tmp_path / "test/desk.tgz").read_bytes() == server.files["/desk.tgz"]
-    requests = list(server.ranges)
-    assert downloaded(public_set(server), tmp_path, overwrite=True) == FILES
-    assert server.ranges == requests
-
-
 def test_overwrite_replaces_the_whole_folder(server: FileServer, tmp_path: Path) -> None:
     downloaded(public_set(server), tmp_path)
     (tmp_path / "test/desk/left over").write_text("")
@@ -207,9 +199,9 @@ def test_names_may_be_written_in_several_ways() -> None:
 @pytest.mark.parametrize(
     ("asked", "says"),
     [
-        (("tumm", ""), "no data set 'tumm'; did you mean tum?"),
+        (("tumm", ""), "no data set 'tumm' (did you mean tum?)"),
         (("kitchen", ""), "no data set 'kitchen'; there are 7scenes, bonn"),
-        (("tum", "fr1/dsk"), "no recording 'fr1/dsk' in tum; did you mean fr1/desk"),
+        (("tum", "fr1/dsk"), "no recording 'fr1/dsk' in tum (did you mean fr1/desk"),
         (("7scenes", ""), "give a recording of 7scenes; there are chess, fire"),
         (("replica", "room0"), "replica is one archive, without a recording 'room0'"),
         (("scannet", "scene0000_00"), "ScanNet is available only on request: apply at http"),

@@ -25,9 +25,7 @@ def download(
         arg("NAME", "names of recordings; `download list SET` lists them", "(none if there is only one)"),
     ] = (),
     out: Annotated[Path, arg("DIR", "folder for the data sets")] = Path("data"),
-    list_only: Annotated[bool, flag("list data sets or recordings, download nothing", name="list")] = False,
     overwrite: Overwrite = False,
-    keep_archive: Annotated[bool, flag("keep the archives after unpacking")] = False,
 ) -> int:
     """Download recordings of a public data set, or weights: resumable, verified, safely unpacked.
 
@@ -38,13 +36,12 @@ def download(
     from sigmasplat.run.terminal import Screen
 
     screen = Screen()
-    if list_only or dataset == "list":
-        listed = names if dataset == "list" else (dataset,)
-        for line in (line for name in listed for line in describe_recordings(name)) if listed else describe_sets():
+    if dataset == "list":
+        for line in (line for name in names for line in describe_recordings(name)) if names else describe_sets():
             screen.say(line)
         return 0
     for public_set, name in [find_recording(dataset, name) for name in names or ("",)]:
-        target = _download(screen, public_set, name, out, overwrite, keep_archive)
+        target = _download(screen, public_set, name, out, overwrite)
         if not public_set.sequences:
             screen.say("next: sigmasplat eval RUN")
             continue
@@ -57,14 +54,12 @@ def download(
     return 0
 
 
-def _download(
-    screen: "Screen", public_set: "PublicSet", name: str, out: Path, overwrite: bool, keep_archive: bool
-) -> Path:
+def _download(screen: "Screen", public_set: "PublicSet", name: str, out: Path, overwrite: bool) -> Path:
     from sigmasplat.plugins.download import download_recording
 
     try:
         with screen.transfers() as progress:
-            return download_recording(public_set, name, out, progress, screen.say, overwrite, keep_archive)
+            return download_recording(public_set, name, out, progress, screen.say, overwrite)
     except KeyboardInterrupt:
         screen.say("the part downloaded so far is kept; the same command resumes the download")
         raise

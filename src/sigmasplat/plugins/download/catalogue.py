@@ -1,6 +1,5 @@
 """The public data sets of sets.toml (addresses, sizes, licences): list them, and find them by name."""
 
-import difflib
 import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -9,7 +8,7 @@ from urllib.parse import urlsplit
 
 from rich.filesize import decimal
 
-from sigmasplat.api import DownloadError
+from sigmasplat.api import DownloadError, nearest
 
 
 @dataclass(frozen=True)
@@ -111,7 +110,7 @@ def find_recording(set_name: str, recording: str = "") -> tuple[PublicSet, str]:
     known = names.get(_normalised(recording, public_set.prefix))
     if known is None:
         wanted = f"no recording {recording!r} in {set_name}" if recording else f"give a recording of {set_name}"
-        raise DownloadError(f"{wanted}; {_suggestion(recording, list(public_set.recordings))}")
+        raise DownloadError(f"{wanted}{_suggestion(recording, list(public_set.recordings))}")
     return public_set, known
 
 
@@ -142,7 +141,7 @@ def _find_set(set_name: str) -> PublicSet:
     if isinstance(entry, PublicSet):
         return entry
     if entry is None:
-        raise DownloadError(f"no data set {set_name!r}; {_suggestion(set_name, sorted(SETS))}")
+        raise DownloadError(f"no data set {set_name!r}{_suggestion(set_name, sorted(SETS))}")
     raise DownloadError(
         f"{entry.title} is available only on request: apply at {entry.page}, then `sigmasplat run FOLDER`"
     )
@@ -155,5 +154,5 @@ def _normalised(name: str, prefix: str) -> str:
 
 
 def _suggestion(wanted: str, names: list[str]) -> str:
-    near = difflib.get_close_matches(wanted, names, n=3) if wanted else []
-    return f"did you mean {' or '.join(near)}?" if near else f"there are {', '.join(names)}"
+    """Return the nearest name, else all names."""
+    return nearest(wanted, names) or f"; there are {', '.join(names)}"

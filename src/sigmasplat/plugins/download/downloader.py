@@ -37,7 +37,7 @@ Log = Callable[[str], None]
 
 def download_recording(
     public_set: PublicSet, name: str, out: Path, progress: FileProgress, log: Log = lambda line: None,
-    overwrite: bool = False, keep_archive: bool = False,
+    overwrite: bool = False,
 ) -> Path:  # fmt: skip
     """Download a recording of a data set, unless it exists already; return its folder below `out`.
 
@@ -68,7 +68,7 @@ def download_recording(
             )
         marks = {"title": public_set.title, "recording": name, "licence": public_set.licence, "page": public_set.page}
         (fresh / MARKER).write_text(json.dumps(marks | {"from": [a.url for a in recording.archives]}, indent=1) + "\n")
-    for path in [] if keep_archive else archives:
+    for path in archives:
         path.unlink(missing_ok=True)
     return target
 
