@@ -154,7 +154,6 @@ from sigmasplat.input.calibration import (
     build_camera as build_camera,
     check_positive as check_positive,
     freiburg_calibration as freiburg_calibration,
-    given_intrinsics as given_intrinsics,
     json_number as json_number,
     read_camera as read_camera,
     read_distortion as read_distortion,
