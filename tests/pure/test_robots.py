@@ -108,7 +108,7 @@ def walked(corrections: bool) -> tuple[list[Array], list[Array]]:
             atlas.keyframe_poses[-1][-1] = se3.exp(np.full(6, 1e-3)) @ atlas.keyframe_poses[-1][-1]
             T = se3.exp(np.full(6, 1e-3)) @ T  # tracking follows the keyframe
         grown(atlas, T, RelativePose.hop(np.eye(4), some_covariance(i), np.zeros(6)) if is_keyframe else None)
-        T_odom.append(odometry.step(True, False, is_keyframe).copy())
+        T_odom.append(odometry.step(True, False).copy())
         T_world.append(atlas.anchors[-1] @ T)
     return T_odom, T_world
 
@@ -122,19 +122,17 @@ def test_corrections_do_not_move_the_odometry() -> None:
     assert [i + 1 for i, moved in enumerate(moves) if moved] == [12, 20, 24]
 
 
-def test_motion_without_tracking_is_left_out_and_its_covariance_is_not_known() -> None:
+def test_motion_without_tracking_is_left_out() -> None:
     atlas = Atlas()
     atlas.begin_submap()
     odometry = LiveOdometry(atlas)
     hop = RelativePose.hop(np.eye(4), some_covariance(0), np.zeros(6))
-    known, at = [], []
+    at = []
     relocalised, tracked, gone = (False, False), (True, False), (False, True)
     for i, (moved, lost) in enumerate([tracked, tracked, gone, tracked, relocalised, tracked]):
         grown(atlas, se3.exp(np.array([0.1 * i, 0, 0, 0, 0, 0])), hop)
-        at.append(float(odometry.step(moved, lost, is_keyframe=True)[0, 3]))
-        known.append(odometry.covariance is not None)
+        at.append(float(odometry.step(moved, lost)[0, 3]))
     assert at == pytest.approx([0.0, 0.1, 0.1, 0.3, 0.3, 0.4])
-    assert known == [True, True, True, True, False, False]
     assert has_motion(TRACKED, {}) and not has_motion(LOST_STATE, {}) and not has_motion(RELOCALISED, {})
     assert not has_motion("apart", {"inliers": 40.0})
 
@@ -151,32 +149,6 @@ def test_a_finished_path_has_the_same_odometry() -> None:
     np.testing.assert_array_equal(poses[4], poses[3])
     np.testing.assert_array_equal(poses[5], poses[4])
     assert tracked.tolist() == [True, True, True, True, False, False]
-
-
-def test_the_live_covariance_is_that_of_the_finished_path_if_mapping_agrees_with_tracking() -> None:
-    atlas, rng = Atlas(), np.random.default_rng(1)
-    atlas.begin_submap()
-    odometry, bias = LiveOdometry(atlas), np.full(6, 1e-4)
-    T, edges, keyframes = np.eye(4), [], []
-    for i in range(9):
-        motion = se3.exp(rng.normal(size=6) * 0.1)
-        before, T = T, T @ motion
-        hop = UNKNOWN_HOP if i == 0 else RelativePose.hop(se3.inverse(T) @ before, some_covariance(i), bias)
-        if i == 0:
-            T = np.eye(4)
-        atlas.set_keyframes([*atlas.keyframe_poses[-1], T], hop)
-        if i == 4:
-            edges.append(RelativePose(0, 1, T, np.eye(6)))
-            atlas.begin_submap(T)
-            T = np.eye(4)
-            atlas.set_keyframes([T], UNKNOWN_HOP)
-        atlas.place_frame(T)
-        keyframes.append(i)
-        odometry.step(True, False, is_keyframe=True)
-        path = PathCovariance.of(path_errors(atlas, keyframes, edges))
-        assert path is not None and odometry.covariance is not None
-        np.testing.assert_allclose(odometry.covariance, path.of_frame(i), rtol=1e-6, atol=1e-12)
-    assert np.sqrt(odometry.covariance[0, 0]) > 1e-3
 
 
 # ---- messages ----

@@ -68,11 +68,6 @@ class TrackedHops(Records[RelativePose]):
         """Append the hop to the next keyframe, which is in a submap that is not before the last one."""
         self.rows.append([submap, *hop.T_a_b.ravel(), *hop.covariance.ravel(), *hop.bias])
 
-    def begins_submap(self, i: int) -> bool:
-        """Return whether a keyframe is the first one of its submap; no hop leads to it."""
-        submap = self.rows.used[:, 0]
-        return bool(i == 0 or submap[i] != submap[i - 1])
-
     @property
     def T_camera_before(self) -> Matrix:
         """Return the motion of each hop [K, 4, 4]."""

@@ -132,7 +132,7 @@ class LiveRobot(Callback):
         self._now(step.timestamp_s)
         self._offer_images(step, self._frame_of(step))
         moved = has_motion(step.state, step.tracking)
-        T_odom_camera = self.odometry.step(moved, step.lost, step.is_keyframe)
+        T_odom_camera = self.odometry.step(moved, step.lost)
         if not step.lost:
             self._offer_pose(step, T_odom_camera)
         if any(loop.accepted for loop in step.loops):
@@ -182,12 +182,10 @@ class LiveRobot(Callback):
         links = ros.camera_links(
             T_odom_link, None if step.component else ros.link_pose(ros.T_MAP_WORLD @ step.T_world_camera)
         )
-        known = self.odometry.covariance
-        covariance = None if known is None else ros.ros_covariance(known, ros.T_LINK_OPTICAL, T_odom_link)
         stamp_ns = self._stamp_ns
 
         def job(messages: RosMessages) -> list[Encoded]:
-            odometry = messages.odometry(stamp_ns, ros.ODOM, ros.LINK, T_odom_link, covariance)
+            odometry = messages.odometry(stamp_ns, ros.ODOM, ros.LINK, T_odom_link, None)
             return [messages.transforms(ros.TF, stamp_ns, links), odometry]
 
         self.outlet.offer(job)

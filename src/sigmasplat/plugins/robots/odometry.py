@@ -1,4 +1,4 @@
-"""Odometry of a run: the sum of its tracked motions, which no correction changes, and the covariance of this sum."""
+"""Odometry of a run: the sum of its tracked motions, which no correction changes."""
 
 from collections.abc import Mapping, Sequence
 
@@ -42,75 +42,32 @@ def odometry_poses(
 
 
 class LiveOdometry:
-    """Odometry of a run that goes on: T_odom_camera [4, 4], the identity at the first frame that it is given.
-
-    covariance [6, 6]: of the left twist (ρ, φ), m and rad, of T_odom_camera; None if it is not known. It sums the
-    errors of hops between keyframes that tracking estimates: those of alignment are independent, the systematic ones
-    are the same in all hops. It does not contain what is measured only at the end of a run: the disagreement between
-    tracking and mapping (`graph.path_covariance`).
-    """
+    """Odometry of a run that goes on: T_odom_camera [4, 4], the identity at the first frame that it is given."""
 
     def __init__(self, atlas: Atlas) -> None:
         self.atlas = atlas
         self.T_odom_camera = np.eye(4)
-        self.covariance: Matrix | None = np.zeros((6, 6))
-        self._independent, self._systematic = np.zeros((6, 6)), np.zeros((6, 6))
-        self._last_hop: Matrix | None = None
-        self._known = True
         self._last: int | None = None
-        self._counted: int | None = None
 
-    def step(self, moved: bool, lost: bool, is_keyframe: bool) -> Matrix:
+    def step(self, moved: bool, lost: bool) -> Matrix:
         """Add the motion to the newest frame of the atlas; return T_odom_camera.
 
         moved: its `has_motion`; a lost frame adds no motion.
         """
         newest = len(self.atlas.places) - 1
-        if self._counted is None:
-            self._counted, self._last = len(self.atlas.hops), newest
-            return self.T_odom_camera
-        if not lost:
-            motion = self._motion() if moved else None
-            self._known &= motion is not None
-            if motion is not None:
-                self.T_odom_camera = se3.orthonormalise(self.T_odom_camera @ motion)
-            self._last = newest
-        self._add_new_hops()
-        self.covariance = self._covariance(is_keyframe)
+        if self._last is not None and moved and not lost:
+            self.T_odom_camera = se3.orthonormalise(self.T_odom_camera @ self._motion(self._last))
+        self._last = newest if self._last is None or not lost else self._last
         return self.T_odom_camera
 
-    def _motion(self) -> Matrix | None:
-        """Return the motion to the newest frame from the last one that was not lost; None if they are in different
+    def _motion(self, last: int) -> Matrix:
+        """Return the motion to the newest frame from the last one that was not lost; none if they are in different
         components.
 
         Both poses are read now, so that changes of their keyframes by mapping are no motion.
         """
-        assert self._last is not None
-        atlas, (before, now) = self.atlas, (self.atlas.places[self._last], self.atlas.places[-1])
+        atlas, (before, now) = self.atlas, (self.atlas.places[last], self.atlas.places[-1])
         if atlas.components[before.submap] != atlas.components[now.submap]:
-            return None
+            return np.eye(4)
         T = [atlas.odometry[s] @ atlas.keyframe_poses[s][k] @ T_keyframe for s, k, T_keyframe in (before, now)]
         return np.asarray(se3.inverse(T[0]) @ T[1])
-
-    def _add_new_hops(self) -> None:
-        assert self._counted is not None
-        hops, first = self.atlas.hops, self._counted
-        self._counted = len(hops)
-        new = [hops[k] for k in range(first, self._counted) if not hops.begins_submap(k)]
-        A = -se3.adjoint(self.T_odom_camera)
-        for hop in new:
-            self._known &= bool(np.isfinite(hop.covariance).all())
-            self._independent = self._independent + A @ hop.covariance @ A.T
-            self._systematic = self._systematic + A * hop.bias
-            self._last_hop = hop.covariance + np.diag(hop.bias**2)
-
-    def _covariance(self, is_keyframe: bool) -> Matrix | None:
-        """Return the covariance of the newest frame: that of the newest keyframe, and the motion from it, which is as
-        uncertain as the hop to this keyframe."""
-        if not self._known or (self._last_hop is None and not is_keyframe):
-            return None
-        covariance = self._independent + self._systematic @ self._systematic.T
-        if not is_keyframe and self._last_hop is not None:
-            A = se3.adjoint(self.T_odom_camera)
-            covariance = covariance + A @ self._last_hop @ A.T
-        return np.asarray(covariance)
