@@ -31,7 +31,6 @@ class Device:
         self.plugged_in = True
         self.frames_until_unplugged = 10**9
         self.missed_between = self.repeats = 0
-        self.must_align = True
         self.asked: list[tuple[Any, ...]] = []
         self.serial = ""
         self.started = self.stopped = 0
@@ -114,9 +113,6 @@ class _Profile:
     def get_intrinsics(self) -> SimpleNamespace:
         return self.device.intrinsics()
 
-    def get_extrinsics_to(self, other: "_Profile") -> SimpleNamespace:
-        return SimpleNamespace(rotation=np.eye(3).reshape(-1).tolist(), translation=[0.0, 0.0, 0.0])
-
 
 class _Align:
     def __init__(self, to: Any) -> None:
@@ -134,7 +130,7 @@ class _Frames:
         return self._frame(np.rint(self.device.seen(self.number).color * 255).astype(np.uint8))
 
     def get_depth_frame(self) -> Any:
-        assert self.aligned or not self.device.must_align, "depth is aligned to colour only after align.process()"
+        assert self.aligned, "depth is aligned to colour only after align.process()"
         return self._frame(np.rint(self.device.seen(self.number).depth_m / self.device.scale_m).astype(np.uint16))
 
     def _frame(self, data: np.ndarray) -> Any:

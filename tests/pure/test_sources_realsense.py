@@ -86,16 +86,6 @@ def test_a_repeated_colour_image_is_used_once(device: Device) -> None:
     assert np.diff([frame.timestamp_s for frame in opened(limit=4)]) == pytest.approx([1 / 30] * 3)
 
 
-def test_depth_is_registered_by_option(device: Device) -> None:
-    device.must_align = False
-    source = opened(limit=1, register_depth="on")
-    frame = next(iter(source))
-    seen = device.room.frame(WARM_UP_FRAMES + 1)
-    inner = np.s_[2:-2, 2:-2]
-    assert source.camera == device.room.camera
-    assert np.median(np.abs(frame.depth_m - seen.depth_m)[inner]) < 0.001
-
-
 def test_stride_and_time_count_from_the_first_frame(device: Device) -> None:
     times = [frame.timestamp_s for frame in opened(stride=2, start_s=0.12, end_s=0.3)]
     begin_s = (WARM_UP_FRAMES + 1) / 30

@@ -2,7 +2,7 @@
 
 "realsense" or "realsense:width=848,height=480,fps=30,serial=012345678901". Intrinsics, lens distortion and depth unit
 come from the device. The SDK moves depth to the colour camera's pixels, but keeps the distances along the axis of the
-depth camera, which differ by some millimetres. With input.register_depth=on depth is registered exactly, but slower.
+depth camera, which differ by some millimetres.
 """
 
 import weakref
@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sigmasplat.api import (
     Calibration,
@@ -43,7 +42,7 @@ class RealSense(LiveSource):
         """Read the calibration. Raises SourceError if the settings need more than the camera provides."""
         color = profile.get_stream(sdk.stream.color).as_video_stream_profile()
         calibration = _calibration(sdk, profile, color, settings)
-        self._rectified = Rectification("realsense", calibration, settings)
+        self._rectified = Rectification("realsense", calibration, replace(settings, register_depth="off"))
         super().__init__("realsense", self._rectified.camera, settings)
         self._units = calibration.depth_units_per_metre
         self.depth_units_per_metre, self._align, self._pipeline = self._units, sdk.align(sdk.stream.color), pipeline
@@ -55,7 +54,7 @@ class RealSense(LiveSource):
         index = 0
         try:
             for frames in self._framesets():
-                both = frames if self._rectified.moves_depth else self._align.process(frames)
+                both = self._align.process(frames)
                 color, depth = both.get_color_frame(), both.get_depth_frame()
                 # If only one of both is new, the SDK repeats the other one.
                 if not color or not depth or color.get_frame_number() == last:
@@ -116,13 +115,7 @@ def _calibration(sdk: Any, profile: Any, color: Any, settings: InputConfig) -> C
     camera, lens = _optics(sdk, color.get_intrinsics())
     units = round(1.0 / float(profile.get_device().first_depth_sensor().get_depth_scale()), 3)
     size = (camera.width, camera.height)
-    found = resolve_calibration(Path("realsense"), Calibration(camera, units, lens), size, settings, units)
-    if settings.register_depth != "on" or settings.calibration:
-        return found
-    depth = profile.get_stream(sdk.stream.depth).as_video_stream_profile()
-    camera, lens = _optics(sdk, depth.get_intrinsics())
-    T_color_depth = _transform(depth.get_extrinsics_to(color))
-    return replace(found, depth_camera=camera, depth_distortion=lens, T_color_depth=T_color_depth)
+    return resolve_calibration(Path("realsense"), Calibration(camera, units, lens), size, settings, units)
 
 
 def _parsed(text: str) -> dict[str, Any]:
@@ -149,14 +142,6 @@ def _optics(sdk: Any, intrinsics: Any) -> tuple[Camera, Distortion | None]:
             f"realsense: lens model {intrinsics.model} of the camera is not supported; give --calibration FILE"
         )
     return camera, values
-
-
-def _transform(extrinsics: Any) -> NDArray[np.float64]:
-    """Return the SDK's extrinsics as a 4×4 matrix; the SDK stores the rotation by columns."""
-    T = np.eye(4)
-    T[:3, :3] = np.array(extrinsics.rotation, np.float64).reshape(3, 3).T
-    T[:3, 3] = extrinsics.translation
-    return T
 
 
 PLUGIN = SourceFormat(
