@@ -1,4 +1,5 @@
-"""Read and record sequences in the layout of the TUM RGB-D benchmark; read the Bonn RGB-D Dynamic Dataset.
+"""Read and record sequences in the layout of the TUM RGB-D benchmark; read the Bonn RGB-D Dynamic Dataset, ICL-NUIM's
+TUM-compatible sequences, and other folders with an association file.
 
 rgb.txt  depth.txt  groundtruth.txt     lines of "t path" or "t tx ty tz qx qy qz qw", comments after #
 calibration.json                        optional: fx fy cx cy width height depth_scale [distortion]
@@ -8,6 +9,16 @@ Bonn (recognised by `bonn` in the folder's path) has the same lists, another cam
 capture's markers. Its page publishes the intrinsics, and how to convert the motion-capture poses T to camera poses:
 T_world_camera = T_ROS · T · T_ROS · T_m (used there for the first pose of a run, to align a model with the laser scan).
 The published T_m is not rigid: its axes have length 1.059. Here its rotation is orthonormalised, its offset unchanged.
+
+ICL-NUIM, and any folder with such a list:
+
+rgb/0.png  depth/0.png  associations.txt     lines "number depth/0.png number rgb/0.png", depth first; depth · 5000
+livingRoom0.gt.freiburg, traj0.gt.freiburg   lines "number tx ty tz qx qy qz qw", the image's number
+
+The scenes were rendered with a camera whose y axis points up, in a left-handed world: hence fy = −480 in the published
+K. The PNG images are stored upright, so fy = +480 for a camera with y down. The ground-truth path is still in the
+mirrored world. With F = diag(1, −1, 1, 1), T_ours = F · T · F is its reflection about the xz plane, a rigid motion
+(nvidia-isaac/cuVSLAM converts it in the same way, and its scores confirm it).
 """
 
 import json
@@ -21,6 +32,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from sigmasplat.api import (
+    FRAMES_PER_SECOND,
     MAX_GAP_S,
     TUM_UNITS_PER_METRE,
     UINT16_MAX,
@@ -36,6 +48,7 @@ from sigmasplat.api import (
     SourceFormat,
     Trajectory,
     exists,
+    first_file,
     folder_source,
     freiburg_calibration,
     nearest_gaps_s,
@@ -43,6 +56,7 @@ from sigmasplat.api import (
     parse_numbers,
     read_groundtruth,
     read_lines,
+    read_poses,
     se3,
 )
 
@@ -190,6 +204,47 @@ def open_bonn(path: str, settings: InputConfig) -> RecordedSource:
     return open_tum(path, settings, BONN, camera_path)
 
 
+ICL_NUIM = Calibration(Camera(640, 480, 481.2, 480.0, 319.5, 239.5), TUM_UNITS_PER_METRE)
+LIST_NAMES = ("associations.txt", "association.txt", "associate.txt")
+MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
+
+
+def open_icl_nuim(path: str, settings: InputConfig) -> RecordedSource:
+    """Open a folder. Raises SourceError if its list, images or ground-truth poses cannot be used."""
+    folder = Path(path)
+    listed = first_file(folder, LIST_NAMES)
+    if listed is None:
+        raise SourceError(
+            f"{folder}: text depth is not supported; take the set's TUM-compatible PNGs (…_frei_png.tar.gz)"
+        )
+    images = _listed_pairs(listed)
+    mirrored = next(iter(sorted(folder.glob("*.gt.freiburg"))), None)
+    rendered = mirrored is not None or "frei_png" in folder.resolve().name
+    known = ICL_NUIM if rendered else freiburg_calibration(folder)
+    truth = read_poses(mirrored) if mirrored else read_groundtruth(folder)
+    if mirrored and truth:
+        truth = Trajectory(truth.timestamps_s / FRAMES_PER_SECOND, MIRROR @ truth.T_world_camera @ MIRROR)
+    return folder_source(folder, settings, images, known, TUM_UNITS_PER_METRE, truth)
+
+
+def _listed_pairs(path: Path) -> list[ImagePair]:
+    """Read the list; the path with "depth" in it is the depth image."""
+    images = []
+    for line, words in read_lines(path):
+        if len(words) != 4 or ("depth" in words[1]) == ("depth" in words[3]):
+            raise SourceError(
+                f"{path}:{line}: expected 'time depth/image time rgb/image', found {' '.join(words)[:60]!r}"
+            )
+        times = parse_numbers(path, line, [words[0], words[2]])
+        color, depth = (3, 1) if "depth" in words[1] else (1, 3)
+        images.append(ImagePair(times[color // 2], path.parent / words[color], path.parent / words[depth]))
+    if not images:
+        raise SourceError(f"{path}: lists no images")
+    if all(image.timestamp_s.is_integer() for image in images):  # frame numbers, not seconds
+        images = [ImagePair(i.timestamp_s / FRAMES_PER_SECOND, i.color, i.depth) for i in images]
+    return sorted(images, key=lambda image: image.timestamp_s)
+
+
 def _has_lists(path: str) -> bool:
     return (Path(path) / "rgb.txt").is_file() or (Path(path) / "depth.txt").is_file()
 
@@ -198,7 +253,12 @@ def _is_bonn(path: str) -> bool:
     return _has_lists(path) and any("bonn" in part.lower() for part in Path(path).resolve().parts[-3:])
 
 
+def _is_icl_nuim(path: str) -> bool:
+    return first_file(Path(path), LIST_NAMES) is not None or any(Path(path).glob("scene_*_0000.depth"))
+
+
 PLUGIN = (
     SourceFormat("TUM", "rgb.txt and depth.txt", _has_lists, open_tum, priority=1),
     SourceFormat("Bonn dynamic", "TUM's lists under rgbd_bonn_…", _is_bonn, open_bonn, priority=2, sensor="kinect-v1"),
+    SourceFormat("ICL-NUIM", "associations.txt", _is_icl_nuim, open_icl_nuim, priority=1),
 )
