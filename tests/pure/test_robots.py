@@ -25,7 +25,7 @@ from sigmasplat.plugins.outputs.floorplan.floor_plan import FloorPlan
 from sigmasplat.plugins.outputs.floorplan.rescan import FREE, OBJECT, UNOBSERVED, WALL
 from sigmasplat.plugins.robots.live import MOST_BULKY, MOST_JOBS, Outlet
 from sigmasplat.plugins.robots.odometry import LiveOdometry, has_motion, odometry_poses
-from sigmasplat.plugins.robots.ros_messages import T_LINK_OPTICAL, grids, levelled_map, link_pose, ros_covariance
+from sigmasplat.plugins.robots.ros_messages import T_LINK_OPTICAL, grid_of, levelled_map, link_pose, ros_covariance
 from sigmasplat.slam.slam_state import path_errors
 
 pytest.importorskip("rosbags", reason="rosbags is not installed (extra `ros`)")
@@ -189,22 +189,21 @@ def test_points_keep_position_colour_and_confidence() -> None:
     np.testing.assert_array_equal(rows["opacity"], cloud.opacities)
 
 
-def test_grids_are_the_cells_of_the_plan() -> None:
+def test_the_grid_has_the_cells_of_the_plan() -> None:
     kind = np.array([[UNOBSERVED, FREE, OBJECT], [FREE, WALL, UNOBSERVED]], np.uint8)
     std = np.array([[np.nan, 0.013, 0.02], [0.004, 7.0, np.nan]], np.float32)
     nothing = np.zeros_like(std)
     plan = FloorPlan(0.05, np.array([-1.0, 2.0]), np.eye(4), kind, nothing, std, nothing, np.zeros((0, 2)), ())
-    occupied, sure = (decoded(m.data, m.topic.msgtype) for m in grids(plan, 0, "map", MESSAGES))
+    sent = grid_of(plan, 0, "map", MESSAGES)
+    occupied = decoded(sent.data, sent.topic.msgtype)
     assert occupied.info.resolution == pytest.approx(0.05)
     assert (occupied.info.origin.orientation.w, occupied.header.frame_id) == (1.0, "map")
-    for message, wanted in ((occupied, {"?": -1, "f": 0, "o": 100}), (sure, {"?": -1, "f": 1, "o": 2})):
-        cells = message.data.reshape(message.info.height, message.info.width)
-        corner = message.info.origin.position
-        for name, x_right, y_ahead in (("?", -0.975, 2.025), ("f", -0.925, 2.025), ("o", -0.875, 2.025)):
-            column, row = int((y_ahead - corner.x) / 0.05), int((-x_right - corner.y) / 0.05)
-            assert cells[row, column] == wanted[name]
-        assert cells.shape == (3, 2)
-    assert sorted(sure.data.tolist()) == [-1, -1, 0, 1, 2, 100]
+    cells, wanted, corner = occupied.data.reshape(3, 2), {"?": -1, "f": 0, "o": 100}, occupied.info.origin.position
+    assert (occupied.info.height, occupied.info.width) == (3, 2)
+    for name, x_right, y_ahead in (("?", -0.975, 2.025), ("f", -0.925, 2.025), ("o", -0.875, 2.025)):
+        column, row = int((y_ahead - corner.x) / 0.05), int((-x_right - corner.y) / 0.05)
+        assert cells[row, column] == wanted[name]
+    assert sorted(occupied.data.tolist()) == [-1, -1, 0, 0, 100, 100]
 
 
 # ---- the writer's thread ----

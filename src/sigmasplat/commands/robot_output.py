@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 Bag = Annotated[
     Path | None,
-    arg("DIR", "also write a ROS 2 bag (MCAP): transforms, odometry, loops, images; needs no ROS", ""),
+    arg("DIR", "also write a ROS 2 bag (MCAP): transforms, odometry, images; needs no ROS", ""),
 ]
 
 

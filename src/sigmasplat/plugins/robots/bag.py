@@ -158,14 +158,14 @@ def _messages(reader: RunReader, messages: RosMessages, pictures: bool, progress
         first_ns, ros.MAP, ros.points_of(field, None if std is None else std.depth_std_m).moved(T_map_world)
     )
     if plan is not None:
-        yield from ros.grids(plan, first_ns, ros.MAP, messages)
+        yield ros.grid_of(plan, first_ns, ros.MAP, messages)
     yield from _frames(reader, messages, T_map_world, pictures)
 
 
 def _frames(reader: RunReader, messages: RosMessages, T_map_world: Matrix, pictures: bool) -> Iterator[Encoded]:
-    """Yield the messages of the frames: transforms, odometry, pose with covariance, loops, images of keyframes."""
+    """Yield the messages of the frames: transforms, odometry, pose with covariance, images of keyframes."""
     images = reader.keyframes() if pictures else iter(())
-    loops, picture = _loop_frames(reader), next(images, None)
+    picture = next(images, None)
     tensors = reader.run.read_checkpoint()[0]
     T_odom_camera, tracked = _odometry(reader, tensors)
     path = PathCovariance.of(tensors)
@@ -187,8 +187,7 @@ def _frames(reader: RunReader, messages: RosMessages, T_map_world: Matrix, pictu
         yield messages.odometry(stamp_ns, ros.ODOM, ros.LINK, T_odom_link, covariance)
         if T_map_link is not None:
             covariance = None if path is None else ros.ros_covariance(path.of_frame(row), T_map_world, T_map_link)
-            for topic in (ros.POSE, ros.LOOP) if row in loops else (ros.POSE,):
-                yield messages.pose(topic, stamp_ns, ros.MAP, T_map_link, covariance)
+            yield messages.pose(ros.POSE, stamp_ns, ros.MAP, T_map_link, covariance)
 
 
 def _odometry(reader: RunReader, tensors: Mapping[str, Tensor]) -> tuple[Matrix, NDArray[np.bool_]]:
@@ -204,16 +203,6 @@ def _odometry(reader: RunReader, tensors: Mapping[str, Tensor]) -> tuple[Matrix,
     lost = [state == LOST for state in frames.states]
     moved = [has_motion(s, r.get("tracking", {})) for s, r in zip(frames.states, frames.log, strict=True)]
     return odometry_poses(chain[: len(frames)], moved, lost, components)
-
-
-def _loop_frames(reader: RunReader) -> set[int]:
-    """Return the rows of the log at which a loop was found that is accepted at the end."""
-    accepted = {(loop["query"], loop["database"]) for loop in reader.run.read_loops() if loop["accepted"]}
-    return {
-        row
-        for row, record in enumerate(reader.frames.log)
-        if any((loop["query"], loop["database"]) in accepted for loop in record.get("loops", ()))
-    }
 
 
 def _floor(reader: RunReader, progress: Progress) -> tuple[FloorPlan | None, Matrix]:

@@ -1,4 +1,4 @@
-"""Write a run that goes on to a bag: transforms, odometry, loops, images.
+"""Write a run that goes on to a bag: transforms, odometry, images.
 
 Messages are made and written on a thread of their own, so that a slow or full disk costs the run nothing. The run
 offers jobs and never waits. If the thread is late, jobs are dropped and counted; images are dropped first. An error of
@@ -7,10 +7,10 @@ the disk ends the bag, and the run goes on.
 
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from typing import Any, Literal
 
-from sigmasplat.api import Callback, Frame, Loop, Matrix, PathCovariance, Slam, Step, path_errors
+from sigmasplat.api import Callback, Frame, Matrix, Slam, Step
 from sigmasplat.plugins.robots import ros_messages as ros
 from sigmasplat.plugins.robots.bag import BagSink
 from sigmasplat.plugins.robots.odometry import LiveOdometry, has_motion
@@ -116,7 +116,7 @@ class LiveRobot(Callback):
     """
 
     def __init__(self, slam: Slam, outlet: Outlet, warn: Callable[[str], None], images: Images = "keyframes") -> None:
-        self.slam, self.outlet, self.warn, self.images = slam, outlet, warn, images
+        self.outlet, self.warn, self.images = outlet, warn, images
         self.odometry = LiveOdometry(slam.atlas)
         self._frames = dict[int, Frame]()
         self._stamp_ns = -1
@@ -135,15 +135,7 @@ class LiveRobot(Callback):
         T_odom_camera = self.odometry.step(moved, step.lost)
         if not step.lost:
             self._offer_pose(step, T_odom_camera)
-        if any(loop.accepted for loop in step.loops):
-            self._offer_loop(len(self.slam.steps) - 1)
         self._report_failure()
-
-    def last_loops(self, loops: Sequence[Loop]) -> None:
-        """Give the last pose if the last loops have moved it."""
-        self._now(self.slam.steps[-1].timestamp_s)
-        if any(loop.accepted for loop in loops):
-            self._offer_loop(len(self.slam.steps) - 1)
 
     def close(self) -> None:
         """Write what waits, and report if the outlet failed."""
@@ -187,22 +179,6 @@ class LiveRobot(Callback):
         def job(messages: RosMessages) -> list[Encoded]:
             odometry = messages.odometry(stamp_ns, ros.ODOM, ros.LINK, T_odom_link, None)
             return [messages.transforms(ros.TF, stamp_ns, links), odometry]
-
-        self.outlet.offer(job)
-
-    def _offer_loop(self, row: int) -> None:
-        """Give the pose of a frame in the map with its covariance; this is computed on the outlet's thread."""
-        slam, stamp_ns = self.slam, self._stamp_ns
-        if not slam.atlas.in_world[row]:
-            return
-        errors = path_errors(slam.atlas, slam.keyframe_indices, slam.closer.valid)
-
-        def job(messages: RosMessages) -> list[Encoded]:
-            path = PathCovariance.of(errors)
-            assert path is not None
-            T_map_link = ros.link_pose(ros.T_MAP_WORLD @ path.T_world_camera[row])
-            covariance = ros.ros_covariance(path.of_frame(row), ros.T_MAP_WORLD, T_map_link)
-            return [messages.pose(ros.LOOP, stamp_ns, ros.MAP, T_map_link, covariance)]
 
         self.outlet.offer(job)
 

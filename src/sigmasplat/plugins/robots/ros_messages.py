@@ -85,16 +85,14 @@ TF = Topic("/tf", "tf2_msgs/msg/TFMessage")
 TF_STATIC = Topic("/tf_static", "tf2_msgs/msg/TFMessage", True)
 ODOMETRY = Topic("/sigmasplat/odometry", "nav_msgs/msg/Odometry")
 POSE = Topic("/sigmasplat/pose", "geometry_msgs/msg/PoseWithCovarianceStamped")
-LOOP = Topic("/sigmasplat/loop_closure", "geometry_msgs/msg/PoseWithCovarianceStamped")
 CLOUD = Topic("/sigmasplat/cloud", "sensor_msgs/msg/PointCloud2", True)
 GRID = Topic("/map", "nav_msgs/msg/OccupancyGrid", True)
-GRID_STD = Topic("/sigmasplat/map_depth_std_cm", "nav_msgs/msg/OccupancyGrid", True)
 COLOR = Topic("/camera/color/image_raw", "sensor_msgs/msg/Image")
 COLOR_INFO = Topic("/camera/color/camera_info", "sensor_msgs/msg/CameraInfo")
 DEPTH = Topic("/camera/aligned_depth_to_color/image_raw", "sensor_msgs/msg/Image")
 DEPTH_INFO = Topic("/camera/aligned_depth_to_color/camera_info", "sensor_msgs/msg/CameraInfo")
 TOPICS = (
-    TF, TF_STATIC, ODOMETRY, POSE, LOOP, CLOUD, GRID, GRID_STD, COLOR, COLOR_INFO, DEPTH, DEPTH_INFO,
+    TF, TF_STATIC, ODOMETRY, POSE, CLOUD, GRID, COLOR, COLOR_INFO, DEPTH, DEPTH_INFO,
 )  # fmt: skip
 
 
@@ -248,7 +246,6 @@ class RosMessages:
 MAX_POINTS = 200_000
 UNOBSERVED, EMPTY, OCCUPIED = -1, 0, 100
 """Values of nav_msgs/OccupancyGrid."""
-CM_PER_M = 100.0
 
 
 def points_of(field: GaussianField, depth_std_m: Tensor | None) -> Points:
@@ -264,23 +261,16 @@ def points_of(field: GaussianField, depth_std_m: Tensor | None) -> Points:
     return Points(means.astype(np.float32), colors.astype(np.float32), opacities, std.astype(np.float32))
 
 
-def grids(plan: FloorPlan, stamp_ns: int, frame: str, messages: RosMessages) -> list[Encoded]:
-    """Make two nav_msgs/OccupancyGrid of a floor plan: what is occupied, and how sure its surfaces are.
+def grid_of(plan: FloorPlan, stamp_ns: int, frame: str, messages: RosMessages) -> Encoded:
+    """Make nav_msgs/OccupancyGrid of a floor plan: 0 free floor, 100 object or wall, −1 not observed, also where only
+    the floor was not observed.
 
-    The first: 0 free floor, 100 object or wall, −1 not observed, also where only the floor was not observed. The
-    second: the standard deviation of depth of the surfaces in a cell in cm, at most 100; −1 without a surface.
-    frame: the frame with the axes of `levelled_map`. The grids are not rotated in it, because navigation software
-    ignores the rotation of a grid.
+    frame: the frame with the axes of `levelled_map`. The grid is not rotated in it, because navigation software ignores
+    the rotation of a grid.
     """
     occupied = np.full(plan.kind.shape, UNOBSERVED, np.int8)
     occupied[plan.kind == FREE] = EMPTY
     occupied[(plan.kind == OBJECT) | (plan.kind == WALL)] = OCCUPIED
-    known = np.isfinite(plan.depth_sigma_m)
-    std_cm = np.rint(CM_PER_M * np.minimum(np.where(known, plan.depth_sigma_m, 0.0), 1.0))
     T_frame_grid = np.eye(4)  # x ahead is y of the plan, y left is −x of the plan
     T_frame_grid[:2, 3] = plan.origin_m[1], -(plan.origin_m[0] + plan.cell_m * plan.kind.shape[1])
-    layers = ((GRID, occupied), (GRID_STD, np.where(known, std_cm, UNOBSERVED).astype(np.int8)))
-    return [
-        messages.grid(topic, stamp_ns, frame, np.ascontiguousarray(cells.T[::-1]), plan.cell_m, T_frame_grid)
-        for topic, cells in layers
-    ]
+    return messages.grid(GRID, stamp_ns, frame, np.ascontiguousarray(occupied.T[::-1]), plan.cell_m, T_frame_grid)
