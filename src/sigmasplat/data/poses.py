@@ -167,7 +167,7 @@ class Poses(Records[Matrix]):
 
 
 @dataclass(eq=False)
-class KeyframePoses(Sequence[Sequence[Matrix]]):
+class KeyframePoses(Records[Sequence[Matrix]]):
     """T_submap_camera [4, 4] of the keyframes of each submap. Those of the last submap may change; the others are
     final.
 
@@ -182,19 +182,11 @@ class KeyframePoses(Sequence[Sequence[Matrix]]):
     def __len__(self) -> int:
         return len(self.ends) + (self.newest is not None)
 
-    @overload
-    def __getitem__(self, i: int) -> Sequence[Matrix]: ...
-    @overload
-    def __getitem__(self, i: slice) -> Sequence[Sequence[Matrix]]: ...
-    def __getitem__(self, i: int | slice) -> Sequence[Matrix] | Sequence[Sequence[Matrix]]:
-        known = range(len(self))
-        return [self._of(s) for s in known[i]] if isinstance(i, slice) else self._of(known[i])
-
-    def _of(self, submap: int) -> Sequence[Matrix]:
-        if submap == len(self.ends):
+    def _record(self, i: int) -> Sequence[Matrix]:
+        if i == len(self.ends):
             return self.last
-        first = int(self.ends.values[submap - 1]) if submap else 0
-        return list(self.rows.used[first : int(self.ends.values[submap])].copy())
+        first = int(self.ends.values[i - 1]) if i else 0
+        return list(self.rows.used[first : int(self.ends.values[i])].copy())
 
     @property
     def last(self) -> list[Matrix]:
