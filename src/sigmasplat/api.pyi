@@ -155,10 +155,7 @@ from sigmasplat.input.calibration import (
     check_positive as check_positive,
     freiburg_calibration as freiburg_calibration,
     json_number as json_number,
-    read_camera as read_camera,
-    read_distortion as read_distortion,
     read_json_object as read_json_object,
-    read_rigid_transform as read_rigid_transform,
     resolve_calibration as resolve_calibration,
     unlikely_camera as unlikely_camera,
 )

@@ -1,4 +1,4 @@
-"""Stereo pairs become RGB-D: lists, rectification, depth errors against exact depth, and the scene's scale."""
+"""Stereo pairs become RGB-D: lists, depth errors against exact depth, and the scene's scale."""
 
 import json
 from dataclasses import replace
@@ -20,7 +20,6 @@ from sigmasplat.plugins.batch.job import Job
 from sigmasplat.plugins.batch.make_run import make_run
 from sigmasplat.plugins.checks.recording import inspect_source
 from sigmasplat.plugins.sources import open_source, stereo
-from sigmasplat.plugins.sources.stereo_matching import StereoCameras, StereoRectification
 from sigmasplat.run.scene import open_scene
 from sigmasplat.run.terminal import Screen
 from sigmasplat.run_folder.runs import RunFolder
@@ -85,40 +84,26 @@ def test_depth_does_not_depend_on_the_number_of_threads():
     assert np.array_equal(*found)
 
 
-def test_rectification_aligns_the_rows_of_a_turned_and_distorted_pair():
-    camera = ROOM.camera
-    turn = opencv().Rodrigues(np.array([0.02, -0.03, 0.015]))[0]
-    T_right_left = np.eye(4)
-    T_right_left[:3, :3], T_right_left[:3, 3] = turn, turn @ [-0.1, 0.004, -0.002]
-    lens = (-0.1, 0.02, 0.001, -0.001, 0.0)
-    pair = StereoCameras(camera, replace(camera, fx=camera.fx * 1.02), T_right_left, lens, lens)
-    found = StereoRectification.of(pair)
-    assert found.baseline_m == pytest.approx(np.linalg.norm([0.1, 0.004, 0.002]), rel=1e-6)
-    points = np.array([[0.2, 0.1, 2.0], [-0.5, 0.3, 3.0], [0.1, -0.4, 1.5]])  # in the recorded left camera
-    rectified = points @ found.T_left_rectified[:3, :3]
-    column, row = (found.camera.fx * rectified[:, 0] / rectified[:, 2] + found.camera.cx,
-                   found.camera.fy * rectified[:, 1] / rectified[:, 2] + found.camera.cy)  # fmt: skip
-    disparity = found.camera.fx * found.baseline_m / rectified[:, 2]
-    in_right = (points @ T_right_left[:3, :3].T) + T_right_left[:3, 3]
-    K = np.array([[pair.right.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
-    seen = opencv().projectPoints(in_right, np.zeros(3), np.zeros(3), K, np.array(lens))[0][:, 0]
-    for u, v, d, recorded in zip(column, row, disparity, seen, strict=True):
-        at = [opencv().remap(plane, np.float32([[u - d]]), np.float32([[v]]), 1)[0, 0] for plane in found.maps[1]]
-        np.testing.assert_allclose(at, recorded, atol=0.05)
-
-
-def test_a_pair_without_baseline_or_with_swapped_cameras_is_refused(tmp_path):
+def test_a_pair_without_baseline_or_with_a_lens_is_refused(tmp_path):
     folder = tum_like(tmp_path)
     fields = json.loads((folder / "calibration.json").read_text())
-    del fields["baseline_m"]
-    save_text(folder / "calibration.json", json.dumps(fields))
-    with pytest.raises(SourceError, match="baseline_m"):
-        open_source(folder)
-    T = np.eye(4)
-    T[0, 3] = 0.1
-    save_text(folder / "calibration.json", json.dumps(fields | {"T_right_left": T.tolist()}))
-    with pytest.raises(SourceError, match="swap"):
-        open_source(folder)
+    for change, words in (
+        ({"baseline_m": None}, "baseline_m"),
+        ({"baseline_m": -0.1}, "it must be above 0"),
+        ({"distortion": [-0.1, 0.02, 0.001, -0.001, 0.0]}, "must be rectified"),
+    ):
+        changed = {name: value for name, value in (fields | change).items() if value is not None}
+        save_text(folder / "calibration.json", json.dumps(changed))
+        with pytest.raises(SourceError, match=words):
+            open_source(folder)
+
+
+def test_images_of_another_size_are_refused(tmp_path):
+    folder = tum_like(tmp_path)
+    save(folder / "right" / "1.png", RIGHT[1][:-2])
+    source = open_source(folder)
+    with pytest.raises(SourceError, match="but the calibration is for"):
+        source.frame(1)
 
 
 def deep(folder):

@@ -1,67 +1,16 @@
-"""Compute depth from a stereo pair: rectify both images, match them, refine below a pixel, convert disparity to depth.
+"""Compute depth from a rectified stereo pair: match both images, refine below a pixel, convert disparity to depth.
 
 Semi-global matching prefers some fractions of a pixel, by up to 0.2 px; `refine` removes that.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.api import (
-    Calibration,
-    Camera,
-    Distortion,
-    Matrix,
-    SourceError,
-    check_positive,
-    json_number,
-    opencv,
-    read_camera,
-    read_distortion,
-    read_json_object,
-    read_rigid_transform,
-    se3,
-)
-
-
-@dataclass(frozen=True, eq=False)
-class StereoCameras:
-    """Two cameras, rectified or not. T_right_left [4, 4] transforms points of the left camera to the right one, m."""
-
-    left: Camera
-    right: Camera
-    T_right_left: Matrix
-    left_distortion: Distortion | None = None
-    right_distortion: Distortion | None = None
-
-    @property
-    def rectified(self) -> bool:
-        """Return whether the rows of both images correspond without any remapping."""
-        x, y, z = self.T_right_left[:3, 3]
-        parallel = np.allclose(self.T_right_left[:3, :3], np.eye(3), atol=1e-6) and max(abs(y), abs(z)) < 1e-4 * abs(x)
-        return self.left == self.right and parallel and not (self.left_distortion or self.right_distortion)
-
-
-def read_stereo_cameras(path: Path, left: Calibration) -> StereoCameras:
-    """Read what `calibration.json` says of the right camera: baseline_m; or right_camera and T_right_left.
-
-    Without right_camera, the right camera equals the left one. Raises SourceError naming file and field.
-    """
-    fields, camera, lens = read_json_object(path), left.camera, left.distortion
-    inner = fields.get("right_camera")
-    if inner is not None:
-        if not isinstance(inner, dict):
-            raise SourceError(f'{path}: field "right_camera" is {inner!r}, expected an object with fx, fy, cx, cy')
-        camera, lens = read_camera(path, inner, (camera.width, camera.height)), read_distortion(path, inner)
-    T_right_left = read_rigid_transform(path, fields, "T_right_left")
-    if "T_right_left" not in fields:
-        T_right_left[0, 3] = -check_positive(path, "baseline_m", json_number(path, fields, "baseline_m"))
-    return StereoCameras(left.camera, camera, T_right_left, left.distortion, lens)
-
+from sigmasplat.api import Camera, opencv
 
 Bytes = NDArray[np.uint8]
 Floats = NDArray[np.float32]
@@ -144,8 +93,6 @@ def _window(image: Floats, powers_x: int = 0, powers_y: int = 0) -> Floats:
     return np.asarray(cv2.sepFilter2D(image, cv2.CV_32F, *along, borderType=cv2.BORDER_CONSTANT), np.float32)
 
 
-Maps = tuple[Floats, Floats]
-
 BLOCK_PX = 5
 """Edge of the matched blocks."""
 SMALL_STEP, LARGE_STEP = 8 * BLOCK_PX**2, 32 * BLOCK_PX**2
@@ -187,55 +134,12 @@ SMALL_SCENE = 2.0
 """Scenes below this multiple of `INDOOR_MEDIAN_M` use the default settings."""
 
 
-@dataclass(frozen=True, eq=False)
-class StereoRectification:
-    """Maps both images to one pinhole camera with a baseline along its x axis (Fusiello et al. 2000; OpenCV).
-
-    camera: of both rectified images; T_left_rectified [4, 4]: rotation from the rectified to the recorded left camera.
-    """
-
-    camera: Camera
-    baseline_m: float
-    T_left_rectified: Matrix = field(default_factory=lambda: np.eye(4))
-    maps: tuple[Maps, Maps] | None = None
-
-    @classmethod
-    def of(cls, cameras: StereoCameras) -> "StereoRectification":
-        """Return the rectification of two cameras; without remapping if they are rectified."""
-        if cameras.rectified:
-            return cls(cameras.left, float(-cameras.T_right_left[0, 3]))
-        cv2, size = opencv(), (cameras.left.width, cameras.left.height)
-        inner = [(_matrix(cameras.left), np.array(cameras.left_distortion or (0.0,) * 5))]
-        inner += [(_matrix(cameras.right), np.array(cameras.right_distortion or (0.0,) * 5))]
-        R, t = cameras.T_right_left[:3, :3].copy(), cameras.T_right_left[:3, 3:].copy()
-        R_left, R_right, P_left, P_right, *_ = cv2.stereoRectify(
-            *inner[0], *inner[1], size, R, t, flags=cv2.CALIB_ZERO_DISPARITY, alpha=0
-        )
-        maps = tuple(
-            cv2.initUndistortRectifyMap(*camera, rotation, projection[:, :3], size, cv2.CV_32FC1)
-            for camera, rotation, projection in zip(inner, (R_left, R_right), (P_left, P_right), strict=True)
-        )
-        camera = Camera(*size, *(float(P_left[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2))))
-        T_left_rectified = np.eye(4)
-        T_left_rectified[:3, :3] = R_left.T
-        baseline_m = float(-P_right[0, 3] / P_right[0, 0])
-        return cls(camera, baseline_m, se3.orthonormalise(T_left_rectified), maps)
-
-    def left(self, image: Bytes) -> Bytes:
-        """Rectify the left image, uint8 [H, W] or [H, W, 3]."""
-        return image if self.maps is None else _remapped(image, self.maps[0])
-
-    def right(self, image: Bytes) -> Bytes:
-        """Rectify the right image, uint8 [H, W] or [H, W, 3]."""
-        return image if self.maps is None else _remapped(image, self.maps[1])
-
-
 class StereoMatcher:
     """Depth by semi-global matching (Hirschmüller 2008, OpenCV's five directions, one thread)."""
 
     def __init__(self, camera: Camera, baseline_m: float) -> None:
         """Prepare for rectified images of `camera`, whose right one is `baseline_m` to the right."""
-        self._camera, self._focal_baseline = camera, camera.fx * baseline_m
+        self.camera, self._focal_baseline = camera, camera.fx * baseline_m
         self._count = max(16, -(-camera.width // 128) * 16)
 
     def depth_and_std_m(self, left: Bytes, right: Bytes) -> tuple[Floats, Floats]:
@@ -319,12 +223,3 @@ def _bend(disparity: Floats, seen: NDArray[np.bool_]) -> Floats:
     along_column = np.abs(known - 0.5 * (padded[:h, k : k + w] + padded[2 * k :, k : k + w]))
     bend = np.nan_to_num(np.fmax(along_row, along_column), nan=2.0 * MOST_BEND_PX)
     return np.asarray(cv2.dilate(bend, np.ones((2 * k + 1, 2 * k + 1))), np.float32)
-
-
-def _matrix(camera: Camera) -> Matrix:
-    return np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
-
-
-def _remapped(image: Bytes, maps: Maps) -> Bytes:
-    cv2 = opencv()
-    return np.asarray(cv2.remap(image, *maps, cv2.INTER_LINEAR), np.uint8)
