@@ -15,7 +15,7 @@ from sigmasplat.data.frame import Frame
 from sigmasplat.data.frame_arrays import color_from_bytes
 from sigmasplat.data.images import resized_color
 from sigmasplat.data.imu import Accelerometer, Gyroscope
-from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.data.trajectory import Trajectory, evenly_spaced
 from sigmasplat.errors import SourceError
 from sigmasplat.input.calibration import Calibration, refuse_impossible_camera, resolve_calibration
 from sigmasplat.input.images import FRAMES_PER_SECOND, image_size, pair_images, read_color, read_depth
@@ -37,7 +37,7 @@ def depth_warning(source: Source, samples: int = 5) -> str | None:
     """
     if source.depth_model:
         return None
-    medians = list(_medians_m(source, _spread(len(source), samples)))
+    medians = list(_medians_m(source, evenly_spaced(len(source), samples)))
     if medians and source.computed_depth:
         return None
     if not medians:
@@ -55,7 +55,7 @@ def depth_warning(source: Source, samples: int = 5) -> str | None:
 def refuse_without_depth(source: Source, samples: int = 5) -> None:
     """Raise SourceError if no frame has a depth reading; reads a few frames, and all frames only if those are blank.
     Nothing is read if a network predicts depth: it has predicted that of the first frame."""
-    if source.depth_model or any(_medians_m(source, [*_spread(len(source), samples), *range(len(source))])):
+    if source.depth_model or any(_medians_m(source, [*evenly_spaced(len(source), samples), *range(len(source))])):
         return
     problem = "frame 0 has no pixel above 0"
     try:
@@ -66,10 +66,6 @@ def refuse_without_depth(source: Source, samples: int = 5) -> None:
         f"{source.name}: depth is zero or unreadable in all {len(source)} frames; "
         f"check the depth files (first problem: {problem})"
     )
-
-
-def _spread(count: int, samples: int) -> list[int]:
-    return sorted({int(i) for i in np.linspace(0, count - 1, min(samples, count)).round()})
 
 
 def _medians_m(source: Source, indices: Iterable[int]) -> Iterator[float]:

@@ -8,28 +8,28 @@ cam_params.json                                                here or in the pa
 import re
 from pathlib import Path
 
-import numpy as np
-
 from sigmasplat.api import (
     FRAMES_PER_SECOND,
     Calibration,
     Camera,
     InputConfig,
-    Matrix,
     RecordedSource,
     SourceError,
     SourceFormat,
     Trajectory,
     build_camera,
+    build_trajectory,
     check_positive,
+    checked_pose,
     exists,
     first_file,
     folder_source,
     json_number,
     numbered_pairs,
+    parse_numbers,
     read_json_object,
     read_text,
-    se3,
+    to_matrix,
 )
 
 CAMERA = Calibration(Camera(1200, 680, 600.0, 600.0, 599.5, 339.5), 6553.5)
@@ -74,18 +74,10 @@ def _truth(path: Path, numbers: list[int]) -> Trajectory | None:
         raise SourceError(
             f"{path}: {len(lines)} poses, but the last image has number {numbers[-1]}; is the file truncated?"
         )
-    poses = [_pose(f"{path}:{number + 1}", lines[number].strip()) for number in numbers]
-    return Trajectory(np.array(numbers) / FRAMES_PER_SECOND, np.stack(poses))
-
-
-def _pose(where: str, line: str) -> Matrix:
-    try:
-        T = np.array([float(word) for word in line.split()]).reshape(4, 4)
-    except ValueError as error:
-        raise SourceError(f"{where}: expected 16 numbers (row-major camera-to-world), found {line[:80]!r}") from error
-    if not se3.is_rigid(T):
-        raise SourceError(f"{where}: not a finite rigid pose: {line[:80]}")
-    return T
+    rows = ((n, parse_numbers(path, n + 1, lines[n].split())) for n in numbers)
+    return build_trajectory(
+        (n / FRAMES_PER_SECOND, checked_pose(f"{path}:{n + 1}", to_matrix(f"{path}:{n + 1}", row))) for n, row in rows
+    )
 
 
 PLUGIN = SourceFormat(

@@ -36,8 +36,9 @@ from sigmasplat.api import (
     folder_source,
     gyroscope_from_samples,
     image_size,
+    parse_numbers,
     read_depth,
-    read_text,
+    read_lines,
     read_values,
     se3,
 )
@@ -145,15 +146,10 @@ def _calibration(folder: Path, rows: Rows, size: Size) -> Calibration | None:
 
 
 def _matrix(path: Path) -> list[float]:
-    try:
-        rows = np.array(
-            [[float(word) for word in line.split(",")] for line in read_text(path).split("\n") if line.strip()]
-        )
-    except ValueError as error:
-        raise SourceError(f"{path}: expected a 3×3 matrix of numbers ({error}); copy it again") from error
-    if rows.shape != (3, 3):
-        raise SourceError(f"{path}: expected a 3×3 matrix, found {rows.shape}; copy it again")
-    return [float(v) for v in (rows[0, 0], rows[1, 1], rows[0, 2], rows[1, 2])]
+    rows = [parse_numbers(path, line, words) for line, words in read_lines(path)]
+    if [len(row) for row in rows] != [3, 3, 3]:
+        raise SourceError(f"{path}: expected a 3×3 matrix, found rows of {[len(row) for row in rows]}; copy it again")
+    return [rows[0][0], rows[1][1], rows[0][2], rows[1][2]]
 
 
 def _truth(rows: Rows, numbers: list[int]) -> Trajectory | None:
