@@ -207,6 +207,6 @@ def _near_pairs(first_s: Times, second_s: Times, tolerance_s: float) -> tuple[ND
             f"{len(first_s)} and {len(second_s)} images have {found} pairs of times within {tolerance_s:g} s, so their "
             "times do not pair them; give every image its own time, in seconds"
         )
-    pairs = first.sparse_distance_matrix(second, tolerance_s, 1, "ndarray")
+    pairs = first.sparse_distance_matrix(second, tolerance_s, 1, output_type="ndarray")
     near = pairs[pairs["v"] < tolerance_s]
     return near["i"], near["j"]

@@ -6,9 +6,11 @@ import time
 from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from queue import Empty, SimpleQueue
 from statistics import median
 
 from sigmasplat.api import Camera, Frame, InputConfig, Source, SourceError, Trajectory, Wrapped, read_ahead
@@ -24,7 +26,9 @@ USUAL, FEW = 20, 5
 
 Arrival = tuple[Frame, float]
 """A frame, and the time when it arrived."""
-Waiting = Callable[[float, threading.Event], None]
+Waiting = SimpleQueue[Arrival | BaseException | None]
+"""Frames that wait for the consumer; then None, or the error that ended them."""
+Wait = Callable[[float, threading.Event], None]
 """Waits for a time, but no longer than until an event is set."""
 
 
@@ -43,12 +47,12 @@ class Arrivals(Wrapped):
     """
 
     def __init__(
-        self, whole: Source, clock: Callable[[], float] = time.perf_counter, wait: Waiting = wait_until,
+        self, whole: Source, clock: Callable[[], float] = time.perf_counter, wait: Wait = wait_until,
     ) -> None:  # fmt: skip
         super().__init__(whole)
         self.live, self.paced = whole.live, not whole.live
         self._clock, self._wait = clock, wait
-        self._queue = _Newest()
+        self._waiting, self._usual_s = Waiting(), math.inf
 
     def __len__(self) -> int:
         return len(self._whole)
@@ -56,83 +60,54 @@ class Arrivals(Wrapped):
     def hurries(self) -> bool:
         """Return whether the next frame has arrived already, or is due soon. What is begun then makes that frame
         late."""
-        late = self.arrived_s is not None and self._clock() - self.arrived_s > DUE * self._queue.usual_s
-        return late or bool(self._queue.frames)
+        late = self.arrived_s is not None and self._clock() - self.arrived_s > DUE * self._usual_s
+        return late or not self._waiting.empty()
 
     def frame(self, i: int) -> Frame:
         return self._whole.frame(i)
 
     def frames_from(self, first: int) -> Iterator[Frame]:
         """Yield frames as they arrive. Raises as the source does."""
-        queue = self._queue = _Newest()
-        thread = threading.Thread(target=self._deliver, args=(first, queue), name="camera", daemon=True)
+        waiting, stop = Waiting(), threading.Event()
+        self._waiting, self._usual_s = waiting, math.inf
+        thread = threading.Thread(target=self._deliver, args=(first, waiting, stop), name="camera", daemon=True)
         thread.start()
         try:
-            while (arrival := queue.get()) is not None:
+            while (arrival := waiting.get()) is not None:
+                if isinstance(arrival, BaseException):
+                    raise arrival
                 frame, self.arrived_s = arrival
                 yield frame
         finally:
-            queue.stop.set()
+            stop.set()
             thread.join()
-            self.dropped += queue.dropped
 
-    def _deliver(self, first: int, queue: "_Newest") -> None:
-        begin_s: float | None = None
+    def _deliver(self, first: int, waiting: Waiting, stop: threading.Event) -> None:
+        """Put the frames into the queue, then None or the error that ended them."""
+        begin_s, end, times_s = None, None, deque[float](maxlen=USUAL + 1)
         frames = self._whole.frames_from(first)
         try:
             for frame in frames:
                 if begin_s is None:
                     begin_s = self._clock() - frame.timestamp_s
                 if self.paced:
-                    self._wait(begin_s + frame.timestamp_s, queue.stop)
-                if queue.stop.is_set():
+                    self._wait(begin_s + frame.timestamp_s, stop)
+                if stop.is_set():
                     return
-                queue.put((frame, self._clock()))
-            queue.end(None)
+                if waiting.qsize() >= WAITING_MOST:
+                    with suppress(Empty):  # the consumer was faster
+                        waiting.get_nowait()
+                        self.dropped += 1
+                times_s.append(self._clock())
+                if len(times_s) > FEW:
+                    self._usual_s = median(later - earlier for earlier, later in pairwise(times_s))
+                waiting.put((frame, times_s[-1]))
         except BaseException as error:  # passed to the consumer's thread, which raises it
-            queue.end(error)
+            end = error
         finally:
+            waiting.put(end)
             if hasattr(frames, "close"):
                 frames.close()
-
-
-class _Newest:
-    """The frames that wait for the consumer; usual_s: the usual time between them, infinite if it is not known."""
-
-    def __init__(self) -> None:
-        self.stop, self.dropped, self.usual_s = threading.Event(), 0, math.inf
-        self._arrived_s = deque[float](maxlen=USUAL + 1)
-        self._changed, self.frames = threading.Condition(), deque[Arrival]()
-        self._ended = False
-        self._error: BaseException | None = None
-
-    def put(self, arrival: Arrival) -> None:
-        """Add a frame; drop the oldest if too many wait."""
-        with self._changed:
-            if len(self.frames) == WAITING_MOST:
-                self.frames.popleft()
-                self.dropped += 1
-            self.frames.append(arrival)
-            self._arrived_s.append(arrival[1])
-            if len(self._arrived_s) > FEW:
-                self.usual_s = median(later - earlier for earlier, later in pairwise(self._arrived_s))
-            self._changed.notify()
-
-    def end(self, error: BaseException | None) -> None:
-        """Note that no frame follows, and why."""
-        with self._changed:
-            self._ended, self._error = True, error
-            self._changed.notify()
-
-    def get(self) -> Arrival | None:
-        """Wait for a frame; return None after the last one. Raises what the source raised."""
-        with self._changed:
-            self._changed.wait_for(lambda: self.frames or self._ended)
-            if self.frames:
-                return self.frames.popleft()
-            if self._error is not None:
-                raise self._error
-            return None
 
 
 class _NoLength(SourceError, TypeError):
