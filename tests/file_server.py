@@ -6,8 +6,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
-ETAG = '"one"'
-
 
 class Request(BaseHTTPRequestHandler):
     """One request; `server.files` are the files, `server.acts` the behaviour for the next requests."""
@@ -64,28 +62,19 @@ def serving() -> Iterator[FileServer]:
         thread.join()
 
 
-def _span(request: Request, etag: str) -> int | None:
-    """Return the first requested byte, None for the whole file: no range, or of another version."""
-    asked = request.headers.get("Range", "")
-    if not asked or request.headers.get("If-Range", etag) != etag:
-        return None
-    return int(asked.removeprefix("bytes=").rstrip("-"))
-
-
-def _open(request: Request, etag: str = ETAG) -> bytes:
+def _open(request: Request) -> bytes:
     """Send the headers of a correct response; return its body."""
-    body = request.body()
-    start = _span(request, etag)
-    if start is None:
-        request.start(Content_Length=len(body), ETag=etag)
+    body, asked = request.body(), request.headers.get("Range", "")
+    if not asked:
+        request.start(Content_Length=len(body))
         return body
-    span = f"bytes {start}-{len(body) - 1}/{len(body)}"
-    request.start(206, Content_Length=len(body) - start, Content_Range=span, ETag=etag)
+    start = int(asked.removeprefix("bytes=").rstrip("-"))
+    request.start(206, Content_Length=len(body) - start, Content_Range=f"bytes {start}-{len(body) - 1}/{len(body)}")
     return body[start:]
 
 
 def whole(request: Request) -> None:
-    """Answer correctly: ranges, versions, 404."""
+    """Answer correctly: ranges, 404."""
     if request.path not in request.server.files:
         return status(404)(request)
     request.wfile.write(_open(request))
@@ -96,21 +85,16 @@ def drop_after(count: int) -> Act:
     return lambda request: request.wfile.write(_open(request)[:count]) and None
 
 
-def other_version(request: Request) -> None:
-    """Answer with another version of the file."""
-    request.wfile.write(_open(request, '"two"'))
-
-
 def without_ranges(request: Request) -> None:
     """Send the whole file even if a range was requested."""
-    request.start(Content_Length=len(request.body()), ETag=ETAG)
+    request.start(Content_Length=len(request.body()))
     request.wfile.write(request.body())
 
 
 def wrong_range(request: Request) -> None:
     """Send another range than requested."""
     body = request.body()
-    request.start(206, Content_Length=3, Content_Range=f"bytes 0-2/{len(body)}", ETag=ETAG)
+    request.start(206, Content_Length=3, Content_Range=f"bytes 0-2/{len(body)}")
     request.wfile.write(body[:3])
 
 

@@ -117,7 +117,7 @@ def test_a_foreign_folder(server: FileServer, capsys: pytest.CaptureFixture[str]
 
 def test_out_is_a_file(server: FileServer, capsys: pytest.CaptureFixture[str]) -> None:
     Path("data").write_text("")
-    assert "cannot write data/tiny: " in refused(capsys, "tiny", "desk")
+    assert "data/tiny: cannot be written (" in refused(capsys, "tiny", "desk")
 
 
 def test_all_names_are_checked_before_the_download(server: FileServer, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,6 +1,5 @@
 """For every behaviour of the server, the file is complete or absent, and no byte is requested twice."""
 
-import fcntl
 import resource
 import urllib.request
 from collections.abc import Iterator
@@ -99,31 +98,10 @@ def test_ctrl_c_keeps_the_partial_file(server: FileServer, tmp_path: Path) -> No
     server.acts = [acts.drop_after(4000)]
     with pytest.raises(KeyboardInterrupt):
         fetch(server.url("/a.tgz"), tmp_path / "a.tgz", interrupt, lambda *sizes: None)
-    assert left_in(tmp_path) == {"a.tgz.part", "a.tgz.part.version"}
+    assert left_in(tmp_path) == {"a.tgz.part"}
     fetched(server, tmp_path / "a.tgz")
     assert (tmp_path / "a.tgz").read_bytes() == BODY
     assert server.ranges[-1].startswith("bytes=")
-
-
-def test_two_versions_of_a_file_are_never_joined(server: FileServer, tmp_path: Path) -> None:
-    server.acts = [acts.drop_after(3000), acts.status(404)]
-    with pytest.raises(DownloadError):
-        fetched(server, tmp_path / "a.tgz")
-    server.files["/a.tgz"] = BODY[::-1]
-    server.acts = [acts.other_version]
-    fetched(server, tmp_path / "a.tgz")
-    assert server.ranges[-1] == "bytes=3000-"
-    assert (tmp_path / "a.tgz").read_bytes() == BODY[::-1]
-
-
-@pytest.mark.parametrize("note", [None, "", "{", 'http://elsewhere/\n"one"\n'])
-def test_a_part_of_unknown_origin_is_not_used(note: str | None, server: FileServer, tmp_path: Path) -> None:
-    (tmp_path / "a.tgz.part").write_bytes(b"something else")
-    if note is not None:
-        (tmp_path / "a.tgz.part.version").write_text(note)
-    fetched(server, tmp_path / "a.tgz")
-    assert server.ranges == [""]
-    assert (tmp_path / "a.tgz").read_bytes() == BODY
 
 
 @pytest.mark.parametrize(
@@ -181,15 +159,6 @@ def test_a_size_can_be_refused_before_writing(server: FileServer, tmp_path: Path
     with pytest.raises(DownloadError, match="too large"):
         fetch(server.url("/a.tgz"), tmp_path / "a.tgz", lambda *counts: None, check_size)
     assert not (tmp_path / "a.tgz.part").exists()
-
-
-def test_two_processes_cannot_write_one_file(server: FileServer, tmp_path: Path) -> None:
-    with (tmp_path / "a.tgz.part").open("wb") as part:
-        part.write(b"mine")
-        fcntl.flock(part, fcntl.LOCK_EX)
-        with pytest.raises(DownloadError, match="another process"):
-            fetched(server, tmp_path / "a.tgz")
-    assert (tmp_path / "a.tgz.part").read_bytes() == b"mine"
 
 
 def test_a_redirect_from_https_stays_encrypted(

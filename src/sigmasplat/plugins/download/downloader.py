@@ -12,14 +12,14 @@ import tarfile
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import IO, TYPE_CHECKING
 
 from rich.filesize import decimal
 
-from sigmasplat.api import DownloadError
+from sigmasplat.api import DownloadError, guarded
 from sigmasplat.plugins.download.catalogue import PublicSet, RemoteFile, format_size
 from sigmasplat.plugins.download.fetch import fetch
 
@@ -54,7 +54,7 @@ def download_recording(
             return target
     log(f"{public_set.title} {name}".rstrip() + f": {format_size(recording.size_bytes)} → {target}")
     log(f"terms: {public_set.licence} ({public_set.page}); by downloading you accept them")
-    with _writing(target.parent):
+    with _writable(target.parent):
         target.parent.mkdir(parents=True, exist_ok=True)
     archives = [_verified_file(public_set, archive, target.parent, progress) for archive in recording.archives]
     with _replacing(target) as fresh:
@@ -133,29 +133,23 @@ def _remove_wrapper_folder(folder: Path) -> None:
         wrapping.rename(folder)
 
 
+def _writable(place: Path) -> AbstractContextManager[None]:
+    return guarded(place, "free some space, or give another --out", DownloadError, "cannot be written")
+
+
 @contextmanager
 def _replacing(target: Path) -> Iterator[Path]:
     """Yield a temporary folder beside `target`; it replaces `target` if the block succeeds, else it is removed."""
     fresh = target.with_name(f".{target.name}.unpacking")
     shutil.rmtree(fresh, ignore_errors=True)
     try:
-        with _writing(target):
+        with _writable(target):
             fresh.mkdir()
             yield fresh
             shutil.rmtree(target, ignore_errors=True)
             fresh.rename(target)
     finally:
         shutil.rmtree(fresh, ignore_errors=True)
-
-
-@contextmanager
-def _writing(place: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as problem:
-        raise DownloadError(
-            f"cannot write {place}: {problem.strerror or problem}; free some space, or give another --out"
-        ) from problem
 
 
 def _check_disk_space(folder: Path, needed_bytes: int) -> None:

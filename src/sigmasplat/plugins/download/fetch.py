@@ -1,22 +1,20 @@
 """Fetch a file over HTTP, with resume and retries; the file gets its final name only when it is complete.
 
-NAME.part            the bytes downloaded so far
-NAME.part.version    address and version (ETag or date) of the remote file, a line each
+NAME.part contains the bytes downloaded so far. Parts of two versions of a file can be joined only if the file changes
+during a download; the checks of the archive find that.
 """
 
-import fcntl
 import http.client
 import os
 import time
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, TYPE_CHECKING
 from urllib.parse import urlsplit
 
-from sigmasplat.api import DownloadError
+from sigmasplat.api import DownloadError, guarded
 
 if TYPE_CHECKING:
     from sigmasplat.api import Progress
@@ -43,15 +41,14 @@ def fetch(url: str, target: Path, progress: "Progress", check_size: CheckSize) -
 
     The part downloaded so far is kept on Ctrl-C and on every error. Raises DownloadError.
     """
-    part, note = (target.with_name(f"{target.name}.part{ending}") for ending in ("", ".version"))
-    with _writing(target), part.open("ab") as file:
-        _lock(file)
-        failures = 0
+    part, failures = target.with_name(f"{target.name}.part"), 0
+    kept = "the part downloaded so far is kept"
+    with guarded(target, kept, DownloadError, "cannot be written"), part.open("ab") as file:
         try:
             while True:
                 before = file.tell()
                 try:
-                    _continue(url, file, note, progress, check_size)
+                    _continue(url, file, progress, check_size)
                     break
                 except _Broken as broken:
                     failures = 0 if file.tell() - before >= GAIN_BYTES else failures + 1
@@ -65,32 +62,12 @@ def fetch(url: str, target: Path, progress: "Progress", check_size: CheckSize) -
         finally:
             if not file.tell():
                 part.unlink(missing_ok=True)
-            if not part.exists():
-                note.unlink(missing_ok=True)
 
 
-@contextmanager
-def _writing(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as problem:
-        raise DownloadError(
-            f"cannot write {path}: {problem.strerror or problem}; the part downloaded so far is kept"
-        ) from problem
-
-
-def _lock(file: IO[bytes]) -> None:
-    with suppress(OSError):  # a file system without locks
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as problem:
-            raise DownloadError(f"{file.name} is being downloaded by another process; wait for it") from problem
-
-
-def _continue(url: str, file: IO[bytes], note: Path, progress: "Progress", check_size: CheckSize) -> None:
+def _continue(url: str, file: IO[bytes], progress: "Progress", check_size: CheckSize) -> None:
     """Request the missing bytes and write them. Raises _Broken if not all of them come."""
     host, done, total = urlsplit(url).hostname, file.tell(), None
-    with _requested(url, done, note) as response:
+    with _requested(url, file) as response:
         headers = response.headers
         if headers.get_content_type() == "text/html":
             raise DownloadError(f"{host} answers with a web page, not the file; is there a login page in between?")
@@ -98,13 +75,9 @@ def _continue(url: str, file: IO[bytes], note: Path, progress: "Progress", check
         if not length.isdigit() and not response.chunked:  # the end would look like a broken connection
             raise DownloadError(f"{host} does not send the length of the file, so its end could not be recognised")
         if response.status != http.client.PARTIAL_CONTENT:
-            file.seek(0)
-            file.truncate()
-            etag = str(headers.get("ETag", ""))  # If-Range takes a strong one, or the date
-            version = etag if etag.startswith('"') else str(headers.get("Last-Modified", ""))
-            note.write_text(f"{url}\n{version}\n", encoding="utf-8")
+            file.truncate(file.seek(0))
         elif not str(headers.get("Content-Range", "")).startswith(f"bytes {done}-"):
-            note.unlink()
+            file.truncate(file.seek(0))
             raise _Broken(f"{host} sent another part of the file than requested")
         total = file.tell() + int(length) if length.isdigit() else None
         check_size(total, file.tell())
@@ -115,16 +88,12 @@ def _continue(url: str, file: IO[bytes], note: Path, progress: "Progress", check
         raise _Broken(f"{host} closed the connection after {file.tell():,} of {total:,} bytes")
 
 
-def _requested(url: str, done: int, note: Path) -> http.client.HTTPResponse:
-    """Request the rest of the version in `note` after `done` bytes; everything if that is not known. Return the
-    response before its body is read."""
-    host, version = urlsplit(url).hostname, ""
+def _requested(url: str, file: IO[bytes]) -> http.client.HTTPResponse:
+    """Request what the file lacks. Return the response before its body is read."""
+    host, done = urlsplit(url).hostname, file.tell()
     headers = {"User-Agent": "sigmasplat", "Accept-Encoding": "identity"}
-    if done and note.is_file():
-        noted, _, version = note.read_text(encoding="utf-8", errors="replace").rstrip("\n").partition("\n")
-        version = version if noted == url else ""
-    if version:
-        headers |= {"Range": f"bytes={done}-", "If-Range": version}
+    if done:
+        headers["Range"] = f"bytes={done}-"
     try:
         response: http.client.HTTPResponse = urllib.request.urlopen(
             urllib.request.Request(url, headers=headers), timeout=TIMEOUT_S
@@ -132,7 +101,7 @@ def _requested(url: str, done: int, note: Path) -> http.client.HTTPResponse:
     except urllib.error.HTTPError as refusal:
         why = f"HTTP {refusal.code} {refusal.reason}".rstrip()
         if refusal.code == RANGE_NOT_SATISFIABLE:
-            note.unlink(missing_ok=True)
+            file.truncate(file.seek(0))
         if refusal.code in RETRIED_CODES:
             raise _Broken(f"{host} is busy or out of service ({why}); try later") from refusal
         raise DownloadError(f"{url} is not available ({why}); it may have moved or require a login") from refusal

@@ -22,8 +22,8 @@ mirrored world. With F = diag(1, −1, 1, 1), T_ours = F · T · F is its reflec
 """
 
 import json
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import asdict
 from pathlib import Path
 
@@ -51,6 +51,7 @@ from sigmasplat.api import (
     first_file,
     folder_source,
     freiburg_calibration,
+    guarded,
     nearest_gaps_s,
     pair_times,
     parse_numbers,
@@ -171,12 +172,8 @@ class TumWriter:
                 with (self.folder / f"{part}.txt").open("a", encoding="utf-8") as file:
                     file.write(f"{'' if file.tell() else HEAD}{stem} {part}/{stem}.png\n")
 
-    @contextmanager
-    def _writing(self) -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            raise RunError(f"cannot write the sequence to {self.folder} ({error})") from error
+    def _writing(self) -> AbstractContextManager[None]:
+        return guarded(self.folder, "choose a writable place", RunError, "the sequence cannot be written")
 
 
 BONN = Calibration(
