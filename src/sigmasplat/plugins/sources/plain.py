@@ -1,32 +1,62 @@
-"""Read a plain folder of colour and depth images; this format is tried last.
+"""Read plain folders of colour and depth images, and those of Open3D's reconstruction system and of Redwood.
 
 color|colour|rgb|image|images/   depth|depths/     paired by name, else by the number in it, else by order
 calibration.json                                   fx fy cx cy [width height depth_scale …], or --fx on the command line
 groundtruth.txt                                    optional: "t tx ty tz qx qy qz qw", t as for the images
 
-Names such as 12.033333.png are times in seconds; otherwise frames are 1/30 s apart. Depth is in mm by default.
+Names such as 12.033333.png are times in seconds; otherwise frames are 1/30 s apart. Depth is in mm by default. This
+format is tried last. Open3D and Redwood, recognised by these files:
+
+color|rgb|image/000000.jpg  depth/000000.png              paired by the number in the name
+rgb/0000001-000000033000.jpg  depth/0000001-0000….png     Redwood: number and time in µs; paired by time
+intrinsic.json | camera_intrinsic.json                    width, height, intrinsic_matrix (9 numbers by columns);
+                                                          and depth_scale, fps if written by Open3D's recorders
+trajectory.log | NAME.log                                 per pose three numbers and 4 matrix rows, camera to world
+
+Without an intrinsic file, PrimeSense's factory values are used (Redwood's camera); depth in mm.
 """
 
+import re
 from pathlib import Path
+
+import numpy as np
 
 from sigmasplat.api import (
     COLOR_ENDINGS,
     COLOR_FOLDERS,
     DEPTH_ENDINGS,
     DEPTH_FOLDERS,
+    FRAMES_PER_SECOND,
+    MAX_GAP_S,
     MM_PER_METRE,
+    Calibration,
+    Camera,
     ImagePair,
     InputConfig,
     RecordedSource,
     SourceError,
     SourceFormat,
+    Trajectory,
+    build_camera,
+    build_trajectory,
+    check_positive,
+    checked_pose,
+    first_file,
     first_subfolder,
     folder_source,
     index_by_number,
+    json_number,
     list_images,
+    numbered_pairs,
+    open_regular,
     pair_images,
+    pair_times,
+    parse_numbers,
     read_groundtruth,
+    read_json_object,
+    read_lines,
     times_of_names,
+    to_matrix,
     without_depth,
 )
 
@@ -64,10 +94,110 @@ def _pairs(folder: Path, colors: list[Path], depths: list[Path]) -> tuple[list[t
     return [(color_by_number[n], depth_by_number[n]) for n in keys], skipped
 
 
-PLUGIN = SourceFormat(
-    "plain folder",
-    "color/ (or rgb/, images/) and depth/",
-    lambda path: first_subfolder(Path(path), (*COLOR_FOLDERS, *DEPTH_FOLDERS)) is not None,
-    open_plain,
-    priority=-1,
+INTRINSIC_NAMES = ("intrinsic.json", "intrinsics.json", "camera_intrinsic.json", "camera_intrinsics.json")
+PRIMESENSE = Calibration(Camera(640, 480, 525.0, 525.0, 319.5, 239.5), MM_PER_METRE)
+"""Open3D's PrimeSenseDefault."""
+
+_TIMED = re.compile(r"([0-9]+)-([0-9]{9,})")
+
+
+def open_redwood(path: str, settings: InputConfig) -> RecordedSource:
+    """Open a folder. Raises SourceError if images, camera or trajectory cannot be used."""
+    folder = Path(path)
+    file = first_file(folder, INTRINSIC_NAMES)
+    fields = read_json_object(file) if file else {}
+    rate = check_positive(file or folder, "fps", json_number(file or folder, fields, "fps", FRAMES_PER_SECOND))
+    colors = list_images(first_subfolder(folder, COLOR_FOLDERS), COLOR_ENDINGS)
+    depths = list_images(folder / "depth", DEPTH_ENDINGS)
+    found = _timed_pairs(folder, colors, depths)
+    if found is None:
+        names = f"{'|'.join(COLOR_FOLDERS)}/*.jpg", "depth/*.png"
+        numbered, skipped = numbered_pairs(folder, index_by_number(colors), index_by_number(depths), *names, rate)
+        found = [*numbered.values()], skipped
+    images, skipped = found
+    known = _recorded(file, fields) if file else PRIMESENSE
+    truth = _truth(folder, images)
+    return folder_source(folder, settings, images, known, known.depth_units_per_metre, truth, skipped)
+
+
+def _timed_pairs(folder: Path, colors: list[Path], depths: list[Path]) -> tuple[list[ImagePair], list[str]] | None:
+    """Pair images by the time in their names, None if the names contain no time."""
+    if not (colors and depths and all(_TIMED.fullmatch(path.stem) for path in colors + depths)):
+        return None
+    color_s, depth_s = (np.array([int(p.stem.split("-")[1]) * 1e-6 for p in paths]) for paths in (colors, depths))
+    pairs, alone = pair_times(folder, {"colour": color_s, "depth": depth_s})
+    skipped = [f"{colors[i]}: no depth within {MAX_GAP_S:g} s" for i in alone]
+    return [ImagePair(float(depth_s[j]), colors[i], depths[j]) for i, j in pairs], skipped
+
+
+def _recorded(path: Path, fields: dict[str, object]) -> Calibration:
+    values = fields.get("intrinsic_matrix")
+    if not isinstance(values, list) or len(values) != 9:
+        raise SourceError(f'{path}: field "intrinsic_matrix" is {values!r}, expected 9 numbers by columns')
+    fx, fy, cx, cy = (json_number(path, {"intrinsic_matrix": values[i]}, "intrinsic_matrix") for i in (0, 4, 6, 7))
+    width, height = (int(json_number(path, fields, key)) for key in ("width", "height"))
+    units = check_positive(path, "depth_scale", json_number(path, fields, "depth_scale", MM_PER_METRE))
+    return Calibration(build_camera(path, width, height, [fx, fy, cx, cy]), units)
+
+
+def _truth(folder: Path, images: list[ImagePair]) -> Trajectory | None:
+    """Read the log; the first number of a pose is the index of its depth image, from 0."""
+    path = _log_in(folder)
+    if path is None:
+        return None
+    rows = [(line, parse_numbers(path, line, words)) for line, words in read_lines(path)]
+    if len(rows) % 5 or any(len(row) != (3 if i % 5 == 0 else 4) for i, (_, row) in enumerate(rows)):
+        raise SourceError(f"{path}: each pose needs 5 lines: three numbers, then 4 rows of 4; is the file truncated?")
+    depths = list_images(folder / "depth", DEPTH_ENDINGS)
+    times = {image.depth: image.timestamp_s for image in images}
+    timed = []
+    for start in range(0, len(rows), 5):
+        line, (index, *_) = rows[start]
+        time = times.get(depths[int(index)]) if 0 <= index < len(depths) else None
+        if time is not None:
+            where = f"{path}:{line}"
+            timed.append((time, checked_pose(where, to_matrix(where, [row for _, row in rows[start + 1 : start + 5]]))))
+    return build_trajectory(timed)
+
+
+def _log_in(folder: Path) -> Path | None:
+    """Return trajectory.log, else the only log that starts like a trajectory and is not odometry."""
+    if (folder / "trajectory.log").is_file():
+        return folder / "trajectory.log"
+    logs = [path for path in folder.glob("*.log") if "odom" not in path.name and _begins_as_trajectory(path)]
+    return logs[0] if len(logs) == 1 else None
+
+
+def _begins_as_trajectory(path: Path) -> bool:
+    if not path.is_file():
+        return False
+    with open_regular(path) as file:
+        words = file.readline(200).decode("utf-8", "replace").split()
+    return len(words) == 3 and all(word.isdecimal() for word in words)
+
+
+def _is_redwood(path: str) -> bool:
+    folder = Path(path)
+    colors = first_subfolder(folder, COLOR_FOLDERS)
+    if colors is None and not (folder / "depth").is_dir():
+        return False
+    timed = colors is not None and any(_TIMED.fullmatch(entry.stem) for entry in colors.iterdir())
+    return timed or first_file(folder, INTRINSIC_NAMES) is not None or _log_in(folder) is not None
+
+
+PLUGIN = (
+    SourceFormat(
+        "Redwood / Open3D",
+        "color/, depth/ and camera_intrinsic.json or trajectory.log",
+        _is_redwood,
+        open_redwood,
+        sensor="kinect-v1",
+    ),
+    SourceFormat(
+        "plain folder",
+        "color/ (or rgb/, images/) and depth/",
+        lambda path: first_subfolder(Path(path), (*COLOR_FOLDERS, *DEPTH_FOLDERS)) is not None,
+        open_plain,
+        priority=-1,
+    ),
 )
