@@ -2,7 +2,6 @@
 
 import json
 import struct
-import threading
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,14 +22,13 @@ from sigmasplat.data.trajectory import LOST as LOST_STATE, RELOCALISED, TRACKED
 from sigmasplat.graph.path_covariance import PathCovariance
 from sigmasplat.plugins.outputs.floorplan.floor_plan import FloorPlan
 from sigmasplat.plugins.outputs.floorplan.rescan import FREE, OBJECT, UNOBSERVED, WALL
-from sigmasplat.plugins.robots.live import MOST_BULKY, MOST_JOBS, Outlet
 from sigmasplat.plugins.robots.odometry import LiveOdometry, has_motion, odometry_poses
 from sigmasplat.plugins.robots.ros_messages import T_LINK_OPTICAL, grid_of, levelled_map, link_pose, ros_covariance
 from sigmasplat.slam.slam_state import path_errors
 
 pytest.importorskip("rosbags", reason="rosbags is not installed (extra `ros`)")
 from sigmasplat.plugins.robots.bag import BagSink
-from sigmasplat.plugins.robots.ros_messages import ODOMETRY, POSE, TF, Encoded, Points, RosMessages, stamp_of
+from sigmasplat.plugins.robots.ros_messages import POSE, TF, Points, RosMessages, stamp_of
 
 Array = NDArray[np.float64]
 MESSAGES = RosMessages()
@@ -206,75 +204,7 @@ def test_the_grid_has_the_cells_of_the_plan() -> None:
     assert sorted(occupied.data.tolist()) == [-1, -1, 0, 0, 100, 100]
 
 
-# ---- the writer's thread ----
-
-
-class SlowSink:
-    """Waits in its first write until it is released; fails at the writes in `failing`."""
-
-    def __init__(self, failing: tuple[int, ...] = ()) -> None:
-        self.failing, self.kept = failing, list[Encoded]()
-        self.began, self.released = threading.Event(), threading.Event()
-        self.closed = self.aborted = False
-
-    def open(self, messages: RosMessages) -> None: ...
-
-    def write(self, message: Encoded) -> None:
-        self.began.set()
-        assert self.released.wait(60)
-        if len(self.kept) in self.failing:
-            raise OSError(28, "No space left on device")
-        self.kept.append(message)
-
-    def close(self) -> None:
-        self.closed = True
-
-    def abort(self) -> None:
-        self.aborted = True
-
-
-def numbered(i: int) -> list[Encoded]:
-    return [Encoded(ODOMETRY, i, b"")]
-
-
-def test_a_slow_sink_loses_messages_and_never_blocks() -> None:
-    sink = SlowSink()
-    outlet = Outlet(sink, MESSAGES)
-    outlet.offer(lambda messages: numbered(0))
-    assert sink.began.wait(60)
-    for i in range(2 * MOST_BULKY):
-        outlet.offer(lambda messages, i=i: numbered(1 + i), bulky=True)
-    assert outlet.dropped == MOST_BULKY
-    for i in range(MOST_JOBS):
-        outlet.offer(lambda messages, i=i: numbered(1000 + i))
-    assert outlet.dropped == 2 * MOST_BULKY, "images are dropped before poses"
-    sink.released.set()
-    outlet.close()
-    assert outlet.record() == {"written": 1 + MOST_JOBS, "dropped": 2 * MOST_BULKY, "failure": ""}
-    assert [m.stamp_ns for m in sink.kept[:3]] == [0, 1, 2] and sink.closed and not sink.aborted
-
-
-def test_a_failed_sink_ends_and_the_offers_go_on() -> None:
-    sink = SlowSink(failing=(2,))
-    sink.released.set()
-    outlet = Outlet(sink, MESSAGES)
-    for i in range(10):
-        outlet.offer(lambda messages, i=i: numbered(i))
-    outlet.close()
-    outlet.offer(lambda messages: numbered(99))
-    assert outlet.failure == "No space left on device" and sink.aborted and not sink.closed
-    assert (outlet.written, outlet.dropped) == (2, 11 - 3)
-
-
-def test_a_sink_that_hangs_is_left_alone_at_the_end() -> None:
-    sink = SlowSink()
-    outlet = Outlet(sink, MESSAGES)
-    for i in range(3):
-        outlet.offer(lambda messages, i=i: numbered(i))
-    assert sink.began.wait(60)
-    outlet.close(timeout_s=0.01)
-    assert "not finished" in outlet.failure and outlet.dropped == 2
-    sink.released.set()
+# ---- the bag ----
 
 
 def test_a_bag_that_was_not_completed_holds_its_messages(tmp_path: Path) -> None:

@@ -50,20 +50,15 @@ def robot_output(
     screen: "Screen", slam: "Slam", folder: "RunFolder", asked: RobotOptions
 ) -> Iterator["LiveRobot | None"]:
     """Yield the callback that feeds the bag, None if it is not requested; at the end complete it and note in run.json
-    how many messages were written and dropped."""
+    how many messages were written."""
     if asked.bag is None:
         yield None
         return
-    from sigmasplat.plugins.robots.bag import BagSink
-    from sigmasplat.plugins.robots.live import LiveRobot, Outlet
-    from sigmasplat.plugins.robots.ros_messages import RosMessages
+    from sigmasplat.plugins.robots.live import LiveRobot
 
-    outlet = Outlet(BagSink(asked.bag), RosMessages())
-    robot = LiveRobot(slam, outlet, screen.warn, asked.bag_images)
+    robot = LiveRobot(slam, asked.bag, screen.warn, asked.bag_images)
     try:
         yield robot
     finally:
         robot.close()
-        folder.note(bag=outlet.record())
-        if outlet.dropped and not outlet.failure:
-            screen.warn(f"the bag was too slow: {outlet.dropped} of its messages were dropped")
+        folder.note(bag=robot.record())
