@@ -17,18 +17,19 @@ from ros_reading import covariance, decoded, image, links, matrix, points, pose,
 from sigmasplat.data import se3
 from sigmasplat.data.atlas import Atlas
 from sigmasplat.data.camera import Camera
+from sigmasplat.data.field import GaussianField
 from sigmasplat.data.relative_pose import UNKNOWN_HOP, RelativePose
 from sigmasplat.data.trajectory import LOST as LOST_STATE, RELOCALISED, TRACKED
 from sigmasplat.graph.path_covariance import PathCovariance
 from sigmasplat.plugins.outputs.floorplan.floor_plan import FloorPlan
 from sigmasplat.plugins.outputs.floorplan.rescan import FREE, OBJECT, UNOBSERVED, WALL
 from sigmasplat.plugins.robots.odometry import LiveOdometry, has_motion, odometry_poses
-from sigmasplat.plugins.robots.ros_messages import T_LINK_OPTICAL, grid_of, levelled_map, link_pose, ros_covariance
+from sigmasplat.plugins.robots.ros_messages import T_LINK_OPTICAL, levelled_map, link_pose, ros_covariance
 from sigmasplat.slam.slam_state import path_errors
 
 pytest.importorskip("rosbags", reason="rosbags is not installed (extra `ros`)")
 from sigmasplat.plugins.robots.bag import BagSink
-from sigmasplat.plugins.robots.ros_messages import POSE, TF, Points, RosMessages, stamp_of
+from sigmasplat.plugins.robots.ros_messages import POSE, TF, RosMessages, stamp_of
 
 Array = NDArray[np.float64]
 MESSAGES = RosMessages()
@@ -161,9 +162,7 @@ def test_messages_hold_what_they_are_given() -> None:
     np.testing.assert_allclose(pose(read), T, atol=1e-12)
     np.testing.assert_array_equal(covariance(read), C)
     assert read.twist.covariance[0] == -1.0
-    unknown, certain = (
-        decoded(MESSAGES.pose(POSE, 0, "map", T, c).data, POSE.msgtype) for c in (None, np.zeros((6, 6)))
-    )
+    unknown, certain = (decoded(MESSAGES.pose(0, "map", T, c).data, POSE.msgtype) for c in (None, np.zeros((6, 6))))
     assert covariance(unknown)[0, 0] == -1.0 and (np.linalg.eigvalsh(covariance(certain)) > 0).all()
     tf = MESSAGES.transforms(TF, 5, [("map", "odom", T)])
     np.testing.assert_allclose(links(decoded(tf.data, TF.msgtype))["map", "odom"], T, atol=1e-12)
@@ -172,19 +171,23 @@ def test_messages_hold_what_they_are_given() -> None:
 
 def test_points_keep_position_colour_and_confidence() -> None:
     rng = np.random.default_rng(0)
-    cloud = Points(*(rng.random(shape).astype(np.float32) for shape in ((50, 3), (50, 3), 50, 50)))
-    cloud.depth_std_m[3] = np.nan
-    T = some_pose(7)
-    sent = MESSAGES.cloud(0, "map", cloud.moved(T))
-    rows = points(decoded(sent.data, sent.topic.msgtype))
-    np.testing.assert_allclose(
-        np.stack([rows["x"], rows["y"], rows["z"]], 1), cloud.positions @ T[:3, :3].T + T[:3, 3], atol=1e-5
-    )
-    packed = rows["rgb"].view(np.uint32)
-    rgb = np.stack([packed >> 16 & 255, packed >> 8 & 255, packed & 255], 1)
-    np.testing.assert_array_equal(rgb, np.rint(255 * cloud.colors))
-    np.testing.assert_array_equal(rows["depth_std"], cloud.depth_std_m)
-    np.testing.assert_array_equal(rows["opacity"], cloud.opacities)
+    means, colors, std = (torch.from_numpy(rng.random(shape).astype(np.float32)) for shape in ((50, 3), (50, 3), 50))
+    opacities = torch.linspace(0.3, 0.9, 50)
+    std[30] = np.nan
+    field = GaussianField.from_values(means, torch.full((50, 3), 0.01), colors, opacities=opacities)
+    T, kept = some_pose(7), (field.opacities >= 0.5).numpy()
+    for known in (std, None):
+        sent = MESSAGES.cloud(0, "map", field, known, T)
+        rows = points(decoded(sent.data, sent.topic.msgtype))
+        assert 25 < len(rows) < 40
+        np.testing.assert_allclose(
+            np.stack([rows["x"], rows["y"], rows["z"]], 1), (means.numpy() @ T[:3, :3].T + T[:3, 3])[kept], atol=1e-5
+        )
+        packed = rows["rgb"].view(np.uint32)
+        rgb = np.stack([packed >> 16 & 255, packed >> 8 & 255, packed & 255], 1)
+        np.testing.assert_array_equal(rgb, np.rint(255 * colors.numpy()[kept]))
+        np.testing.assert_array_equal(rows["depth_std"], std.numpy()[kept] if known is not None else np.nan)
+        np.testing.assert_array_equal(rows["opacity"], field.opacities.numpy()[kept])
 
 
 def test_the_grid_has_the_cells_of_the_plan() -> None:
@@ -192,7 +195,7 @@ def test_the_grid_has_the_cells_of_the_plan() -> None:
     std = np.array([[np.nan, 0.013, 0.02], [0.004, 7.0, np.nan]], np.float32)
     nothing = np.zeros_like(std)
     plan = FloorPlan(0.05, np.array([-1.0, 2.0]), np.eye(4), kind, nothing, std, nothing, np.zeros((0, 2)), ())
-    sent = grid_of(plan, 0, "map", MESSAGES)
+    sent = MESSAGES.grid(0, "map", plan)
     occupied = decoded(sent.data, sent.topic.msgtype)
     assert occupied.info.resolution == pytest.approx(0.05)
     assert (occupied.info.origin.orientation.w, occupied.header.frame_id) == (1.0, "map")

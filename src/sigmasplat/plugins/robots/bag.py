@@ -154,11 +154,9 @@ def _messages(reader: RunReader, messages: RosMessages, pictures: bool, progress
     static = [(ros.MAP, ros.WORLD, T_map_world), (ros.LINK, ros.OPTICAL, ros.T_LINK_OPTICAL)]
     yield messages.transforms(ros.TF_STATIC, first_ns, static)
     field, std = reader.run.read_splat_std() or (reader.run.read_map(), None)
-    yield messages.cloud(
-        first_ns, ros.MAP, ros.points_of(field, None if std is None else std.depth_std_m).moved(T_map_world)
-    )
+    yield messages.cloud(first_ns, ros.MAP, field, None if std is None else std.depth_std_m, T_map_world)
     if plan is not None:
-        yield ros.grid_of(plan, first_ns, ros.MAP, messages)
+        yield messages.grid(first_ns, ros.MAP, plan)
     yield from _frames(reader, messages, T_map_world, pictures)
 
 
@@ -187,7 +185,7 @@ def _frames(reader: RunReader, messages: RosMessages, T_map_world: Matrix, pictu
         yield messages.odometry(stamp_ns, ros.ODOM, ros.LINK, T_odom_link, covariance)
         if T_map_link is not None:
             covariance = None if path is None else ros.ros_covariance(path.of_frame(row), T_map_world, T_map_link)
-            yield messages.pose(ros.POSE, stamp_ns, ros.MAP, T_map_link, covariance)
+            yield messages.pose(stamp_ns, ros.MAP, T_map_link, covariance)
 
 
 def _odometry(reader: RunReader, tensors: Mapping[str, Tensor]) -> tuple[Matrix, NDArray[np.bool_]]:

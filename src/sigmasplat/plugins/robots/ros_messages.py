@@ -10,7 +10,6 @@ Only map → odom contains corrections (loops, relocalisation, mapping), so odom
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -96,27 +95,17 @@ TOPICS = (
 )  # fmt: skip
 
 
+MAX_POINTS = 200_000
+UNOBSERVED, EMPTY, OCCUPIED = -1, 0, 100
+"""Values of nav_msgs/OccupancyGrid."""
+
+
 class Encoded(NamedTuple):
     """A message as CDR bytes, with its topic and the time of its frame."""
 
     topic: Topic
     stamp_ns: int
     data: bytes
-
-
-@dataclass(frozen=True, eq=False)
-class Points:
-    """Points of a map: positions [N, 3] m, colors [N, 3] in [0, 1], opacities [N], depth_std_m [N] (nan: not known)."""
-
-    positions: NDArray[np.float32]
-    colors: NDArray[np.float32]
-    opacities: NDArray[np.float32]
-    depth_std_m: NDArray[np.float32]
-
-    def moved(self, T: Matrix) -> "Points":
-        """Return the points transformed by T [4, 4]."""
-        positions = self.positions.astype(np.float64) @ T[:3, :3].T + T[:3, 3]
-        return Points(positions.astype(np.float32), self.colors, self.opacities, self.depth_std_m)
 
 
 def stamp_of(timestamp_s: float) -> int:
@@ -172,37 +161,55 @@ class RosMessages:
         pose, twist = _pose_with_covariance(T, covariance), {"covariance": np.array(UNKNOWN)}
         return self._encoded(ODOMETRY, stamp_ns, parent, child_frame_id=child, pose=pose, twist=twist)
 
-    def pose(self, topic: Topic, stamp_ns: int, parent: str, T: Matrix, covariance: Matrix | None) -> Encoded:
+    def pose(self, stamp_ns: int, parent: str, T: Matrix, covariance: Matrix | None) -> Encoded:
         """Make geometry_msgs/PoseWithCovarianceStamped, arguments as for `odometry`."""
-        return self._encoded(topic, stamp_ns, parent, pose=_pose_with_covariance(T, covariance))
+        return self._encoded(POSE, stamp_ns, parent, pose=_pose_with_covariance(T, covariance))
 
-    def cloud(self, stamp_ns: int, frame: str, points: Points) -> Encoded:
-        """Make sensor_msgs/PointCloud2 with the fields x, y, z, rgb, opacity, depth_std (m, nan if not known)."""
-        names = ("x", "y", "z", "rgb", "opacity", "depth_std")
-        rows = np.zeros(len(points.positions), [(name, "<f4") for name in names])
-        for i, name in enumerate(names[:3]):
-            rows[name] = points.positions[:, i]
-        red, green, blue = (np.rint(255.0 * np.clip(points.colors, 0.0, 1.0))).astype(np.uint32).T
+    def cloud(
+        self, stamp_ns: int, frame: str, field: GaussianField, depth_std_m: Tensor | None, T_frame_field: Matrix
+    ) -> Encoded:
+        """Make sensor_msgs/PointCloud2 of the centres of the opaque splats, evenly thinned to `MAX_POINTS`: x, y, z,
+        rgb, opacity, depth_std (m, nan if not known).
+
+        depth_std_m [N]: standard deviation of the depth that each splat shows; None if it was not measured.
+        """
+        names, chosen = ("x", "y", "z", "rgb", "opacity", "depth_std"), opaque_rows(field, MAX_POINTS)
+        means, colors, opacities = (
+            values.detach().cpu().numpy()[chosen] for values in (field.means, field.colors, field.opacities)
+        )
+        rows = np.zeros(len(chosen), [(name, "<f4") for name in names])
+        positions = means.astype(np.float64) @ T_frame_field[:3, :3].T + T_frame_field[:3, 3]
+        rows["x"], rows["y"], rows["z"] = positions.T
+        red, green, blue = (np.rint(255.0 * np.clip(colors, 0.0, 1.0))).astype(np.uint32).T
         rows["rgb"] = (red << 16 | green << 8 | blue).view("<f4")
-        rows["opacity"], rows["depth_std"] = points.opacities, points.depth_std_m
+        rows["opacity"] = opacities
+        rows["depth_std"] = np.nan if depth_std_m is None else depth_std_m.cpu().numpy()[chosen]
         size = rows.dtype.itemsize
         fields = [{"name": name, "offset": 4 * i, "datatype": 7, "count": 1} for i, name in enumerate(names)]
         return self._encoded(
             CLOUD, stamp_ns, frame, height=1, width=len(rows), fields=fields, point_step=size,
             row_step=size * len(rows), data=np.frombuffer(rows.tobytes(), np.uint8),
-            is_dense=bool(np.isfinite(points.positions).all()),
+            is_dense=bool(np.isfinite(positions).all()),
         )  # fmt: skip
 
-    def grid(
-        self, topic: Topic, stamp_ns: int, frame: str, cells: NDArray[np.int8], cell_m: float, T_frame_grid: Matrix
-    ) -> Encoded:
-        """Make nav_msgs/OccupancyGrid: cells [rows, columns], 0 to 100, −1 not known; T_frame_grid: the pose of the
-        outer corner of row 0, column 0; columns grow along its x axis, rows along y."""
+    def grid(self, stamp_ns: int, frame: str, plan: FloorPlan) -> Encoded:
+        """Make nav_msgs/OccupancyGrid of a floor plan: 0 free floor, 100 object or wall, −1 not observed, also where
+        only the floor was not observed.
+
+        frame: the frame with the axes of `levelled_map`. The grid is not rotated in it, because navigation software
+        ignores the rotation of a grid. Columns grow along x, rows along y.
+        """
+        occupied = np.full(plan.kind.shape, UNOBSERVED, np.int8)
+        occupied[plan.kind == FREE] = EMPTY
+        occupied[(plan.kind == OBJECT) | (plan.kind == WALL)] = OCCUPIED
+        cells, T_frame_grid = np.ascontiguousarray(occupied.T[::-1]), np.eye(4)
+        # x ahead is y of the plan, y left is −x of the plan
+        T_frame_grid[:2, 3] = plan.origin_m[1], -(plan.origin_m[0] + plan.cell_m * plan.kind.shape[1])
         info = {
-            "map_load_time": _header(stamp_ns, "")["stamp"], "resolution": cell_m, "width": cells.shape[1],
+            "map_load_time": _header(stamp_ns, "")["stamp"], "resolution": plan.cell_m, "width": cells.shape[1],
             "height": cells.shape[0], "origin": _pose(T_frame_grid),
         }  # fmt: skip
-        return self._encoded(topic, stamp_ns, frame, info=info, data=cells.reshape(-1))
+        return self._encoded(GRID, stamp_ns, frame, info=info, data=cells.reshape(-1))
 
     def images(
         self, stamp_ns: int, camera: Camera, color: NDArray[np.float32], depth_m: NDArray[np.float32]
@@ -241,36 +248,3 @@ class RosMessages:
                 value = "" if detail[0] == "string" else 0
             fields[name] = value
         return self.store.types[kind](**fields)
-
-
-MAX_POINTS = 200_000
-UNOBSERVED, EMPTY, OCCUPIED = -1, 0, 100
-"""Values of nav_msgs/OccupancyGrid."""
-
-
-def points_of(field: GaussianField, depth_std_m: Tensor | None) -> Points:
-    """Return the centres of the opaque splats as a copy, evenly thinned to `MAX_POINTS`.
-
-    depth_std_m [N]: standard deviation of the depth that each splat shows; None if it was not measured.
-    """
-    rows = opaque_rows(field, MAX_POINTS)
-    std = np.full(len(rows), np.nan, np.float32) if depth_std_m is None else depth_std_m.cpu().numpy()[rows]
-    means, colors, opacities = (
-        values.detach().cpu().numpy()[rows] for values in (field.means, field.colors, field.opacities)
-    )
-    return Points(means.astype(np.float32), colors.astype(np.float32), opacities, std.astype(np.float32))
-
-
-def grid_of(plan: FloorPlan, stamp_ns: int, frame: str, messages: RosMessages) -> Encoded:
-    """Make nav_msgs/OccupancyGrid of a floor plan: 0 free floor, 100 object or wall, −1 not observed, also where only
-    the floor was not observed.
-
-    frame: the frame with the axes of `levelled_map`. The grid is not rotated in it, because navigation software ignores
-    the rotation of a grid.
-    """
-    occupied = np.full(plan.kind.shape, UNOBSERVED, np.int8)
-    occupied[plan.kind == FREE] = EMPTY
-    occupied[(plan.kind == OBJECT) | (plan.kind == WALL)] = OCCUPIED
-    T_frame_grid = np.eye(4)  # x ahead is y of the plan, y left is −x of the plan
-    T_frame_grid[:2, 3] = plan.origin_m[1], -(plan.origin_m[0] + plan.cell_m * plan.kind.shape[1])
-    return messages.grid(GRID, stamp_ns, frame, np.ascontiguousarray(occupied.T[::-1]), plan.cell_m, T_frame_grid)
