@@ -23,12 +23,12 @@ from sigmasplat.data.trajectory import LOST as LOST_STATE, RELOCALISED, TRACKED
 from sigmasplat.graph.path_covariance import PathCovariance
 from sigmasplat.plugins.outputs.floorplan.floor_plan import FloorPlan
 from sigmasplat.plugins.outputs.floorplan.rescan import FREE, OBJECT, UNOBSERVED, WALL
-from sigmasplat.plugins.robots.odometry import LiveOdometry, has_motion, odometry_poses
 from sigmasplat.plugins.robots.ros_messages import T_LINK_OPTICAL, levelled_map, link_pose, ros_covariance
 from sigmasplat.slam.slam_state import path_errors
 
 pytest.importorskip("rosbags", reason="rosbags is not installed (extra `ros`)")
-from sigmasplat.plugins.robots.bag import BagSink
+from sigmasplat.plugins.robots.bag import BagSink, has_motion, odometry_poses
+from sigmasplat.plugins.robots.live import LiveOdometry
 from sigmasplat.plugins.robots.ros_messages import POSE, TF, RosMessages, stamp_of
 
 Array = NDArray[np.float64]

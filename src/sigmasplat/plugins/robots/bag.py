@@ -4,7 +4,7 @@ A bag is a folder with metadata.yaml and one MCAP file, or the MCAP file alone."
 
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from torch import Tensor
 
 from sigmasplat.api import (
     LOST,
+    RELOCALISED,
     Matrix,
     PathCovariance,
     Progress,
@@ -24,12 +25,12 @@ from sigmasplat.api import (
     import_optional,
     no_progress,
     noted_up,
+    se3,
 )
 from sigmasplat.plugins.outputs.axes import level_cameras
 from sigmasplat.plugins.outputs.floorplan.floor_plan import FloorPlan, run_floor_plan
 from sigmasplat.plugins.outputs.run_reader import RunReader
 from sigmasplat.plugins.robots import ros_messages as ros
-from sigmasplat.plugins.robots.odometry import has_motion, odometry_poses
 from sigmasplat.plugins.robots.ros_messages import Encoded, RosMessages, Topic
 
 CHUNK_BYTES = 65_536
@@ -186,6 +187,40 @@ def _frames(reader: RunReader, messages: RosMessages, T_map_world: Matrix, pictu
         if T_map_link is not None:
             covariance = None if path is None else ros.ros_covariance(path.of_frame(row), T_map_world, T_map_link)
             yield messages.pose(stamp_ns, ros.MAP, T_map_link, covariance)
+
+
+FOUND_BY_FEATURES = "inliers"
+"""A step has this value if relocalisation decided its pose."""
+
+
+def has_motion(state: str, tracking: Mapping[str, float]) -> bool:
+    """Return whether tracking measured the motion to a frame from an earlier one, given the values of its step.
+
+    A lost frame has only a guess, and a relocalised one was found without an earlier frame. A frame that is tracked
+    again after lost ones has a motion: it is tracked from the same keyframe as the frames before them.
+    """
+    return state not in (LOST, RELOCALISED) and FOUND_BY_FEATURES not in tracking
+
+
+def odometry_poses(
+    T_chain_camera: Matrix, moved: Sequence[bool], lost: Sequence[bool], components: Sequence[int]
+) -> tuple[Matrix, NDArray[np.bool_]]:
+    """Return T_odom_camera [F, 4, 4] of a finished path, the identity at the first frame, and whether all motions up to
+    each frame were tracked [F].
+
+    T_chain_camera [F, 4, 4]: poses without corrections by loops; moved [F]: `has_motion` of each frame; lost [F];
+    components [F]. Motion that was not tracked is left out. A lost frame stays at the pose of the frame before.
+    """
+    poses, last = [np.eye(4)] if len(T_chain_camera) else [], 0
+    tracked = np.ones(len(T_chain_camera), np.bool_)
+    for i in range(1, len(T_chain_camera)):
+        tracked[i] = lost[i] or (moved[i] and components[i] == components[last])
+        pose = poses[-1]
+        if tracked[i] and not lost[i]:
+            pose = se3.orthonormalise(pose @ se3.inverse(T_chain_camera[last]) @ T_chain_camera[i])
+        poses.append(pose)
+        last = last if lost[i] else i
+    return np.array(poses).reshape(-1, 4, 4), np.logical_and.accumulate(tracked)
 
 
 def _odometry(reader: RunReader, tensors: Mapping[str, Tensor]) -> tuple[Matrix, NDArray[np.bool_]]:

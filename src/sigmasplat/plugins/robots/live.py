@@ -4,14 +4,47 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
-from sigmasplat.api import Callback, Frame, Matrix, Slam, Step
+import numpy as np
+
+from sigmasplat.api import Atlas, Callback, Frame, Matrix, Slam, Step, se3
 from sigmasplat.plugins.robots import ros_messages as ros
-from sigmasplat.plugins.robots.bag import BagSink
-from sigmasplat.plugins.robots.odometry import LiveOdometry, has_motion
+from sigmasplat.plugins.robots.bag import BagSink, has_motion
 from sigmasplat.plugins.robots.ros_messages import Encoded, RosMessages
 
 Images = Literal["none", "keyframes", "all"]
 STATIC = ((ros.MAP, ros.WORLD, ros.T_MAP_WORLD), (ros.LINK, ros.OPTICAL, ros.T_LINK_OPTICAL))
+
+
+class LiveOdometry:
+    """Odometry of a run that goes on: T_odom_camera [4, 4], the identity at the first frame that it is given."""
+
+    def __init__(self, atlas: Atlas) -> None:
+        self.atlas = atlas
+        self.T_odom_camera = np.eye(4)
+        self._last: int | None = None
+
+    def step(self, moved: bool, lost: bool) -> Matrix:
+        """Add the motion to the newest frame of the atlas; return T_odom_camera.
+
+        moved: its `has_motion`; a lost frame adds no motion.
+        """
+        newest = len(self.atlas.places) - 1
+        if self._last is not None and moved and not lost:
+            self.T_odom_camera = se3.orthonormalise(self.T_odom_camera @ self._motion(self._last))
+        self._last = newest if self._last is None or not lost else self._last
+        return self.T_odom_camera
+
+    def _motion(self, last: int) -> Matrix:
+        """Return the motion to the newest frame from the last one that was not lost; none if they are in different
+        components.
+
+        Both poses are read now, so that changes of their keyframes by mapping are no motion.
+        """
+        atlas, (before, now) = self.atlas, (self.atlas.places[last], self.atlas.places[-1])
+        if atlas.components[before.submap] != atlas.components[now.submap]:
+            return np.eye(4)
+        T = [atlas.odometry[s] @ atlas.keyframe_poses[s][k] @ T_keyframe for s, k, T_keyframe in (before, now)]
+        return np.asarray(se3.inverse(T[0]) @ T[1])
 
 
 class LiveRobot(Callback):
