@@ -156,24 +156,22 @@ class LiveSource(Source):
         """Yield the newest frame repeatedly, numbered from 0; stop the camera at the end."""
 
     def _recorded(self) -> Iterator[Frame]:
-        for index, frame in enumerate(self._wanted()):
+        """Yield every stride-th frame between start_s and end_s, seconds after the first frame; record each."""
+        settings, index, begin_s = self._settings, 0, None
+        for count, frame in enumerate(self.captured()):
+            begin_s = frame.timestamp_s if begin_s is None else begin_s
+            elapsed_s = frame.timestamp_s - begin_s
+            if settings.end_s and elapsed_s >= settings.end_s:
+                return
+            if elapsed_s < settings.start_s or count % settings.stride:
+                continue
             numbered = replace(frame, index=index)
             if self._writer:
                 self._writer.add(numbered)
             yield numbered
-            if index + 1 == self._settings.limit:
+            index += 1
+            if index == settings.limit:
                 return
-
-    def _wanted(self) -> Iterator[Frame]:
-        """Yield every stride-th frame between start_s and end_s, seconds after the first frame."""
-        begin_s: float | None = None
-        for count, frame in enumerate(self.captured()):
-            begin_s = frame.timestamp_s if begin_s is None else begin_s
-            elapsed_s = frame.timestamp_s - begin_s
-            if self._settings.end_s and elapsed_s >= self._settings.end_s:
-                return
-            if elapsed_s >= self._settings.start_s and count % self._settings.stride == 0:
-                yield frame
 
     def _once(self) -> str:
         return f"{self.name}: a live camera delivers each frame once; run it, then read the folder with its recording"

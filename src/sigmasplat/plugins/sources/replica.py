@@ -9,6 +9,7 @@ import re
 from pathlib import Path
 
 from sigmasplat.api import (
+    COLOR_ENDINGS,
     FRAMES_PER_SECOND,
     Calibration,
     Camera,
@@ -24,7 +25,9 @@ from sigmasplat.api import (
     exists,
     first_file,
     folder_source,
+    index_by_number,
     json_number,
+    list_images,
     numbered_pairs,
     parse_numbers,
     read_json_object,
@@ -49,12 +52,8 @@ def open_replica(path: str, settings: InputConfig) -> RecordedSource:
 
 def _numbered(folder: Path, stem: str) -> dict[int, Path]:
     """Map the number in the name of each `results/<stem>NNN.*` image to its path."""
-    found = {}
-    for path in sorted((folder / "results").glob(f"{stem}*")):
-        match = re.fullmatch(rf"{stem}(\d+)\.(jpg|jpeg|png|npy|tiff?)", path.name.lower())
-        if match:
-            found[int(match.group(1))] = path
-    return dict(sorted(found.items()))
+    images = list_images(folder / "results", (*COLOR_ENDINGS, ".npy"))
+    return index_by_number(path for path in images if re.fullmatch(rf"{stem}\d+", path.stem.lower()))
 
 
 def _calibration(path: Path) -> Calibration:

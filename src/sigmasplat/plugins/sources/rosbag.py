@@ -11,7 +11,6 @@ images, or the recording time if the headers fit no image.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,14 +55,7 @@ IMU = "sensor_msgs/msg/Imu"
 Values = NDArray[np.float64]
 
 
-class Imu(NamedTuple):
-    """What moves with the camera; None = not measured."""
-
-    gyroscope: Gyroscope | None
-    accelerometer: Accelerometer | None
-
-
-def read_bag_imu(bag: Bag, color: ImageTopic, frame_times_s: Values) -> Imu:
+def read_bag_imu(bag: Bag, color: ImageTopic, frame_times_s: Values) -> tuple[Gyroscope | None, Accelerometer | None]:
     """Return gyroscope and accelerometer, each of the first topic that has its values in axes whose rotation to the
     colour camera is known. Cameras may publish them in two topics.
 
@@ -90,7 +82,7 @@ def read_bag_imu(bag: Bag, color: ImageTopic, frame_times_s: Values) -> Imu:
                 accelerometer = pulls
         if gyroscope and accelerometer:
             break
-    return Imu(gyroscope, accelerometer)
+    return gyroscope, accelerometer
 
 
 def _measured(bag: Bag, name: str) -> tuple[Values, Values]:
@@ -163,8 +155,10 @@ def open_bag(place: str, settings: InputConfig) -> RecordedSource:
     ]
     alone = sorted(set(range(len(colors))) - set(pairs[:, 0].tolist()))
     skipped = [f"{colors[i]}: no depth within {MAX_GAP_S:g} s" for i in alone]
-    imu = read_bag_imu(bag, color, color_s)
-    return RecordedSource(bag.path.resolve().stem, images, calibration, settings, truth, skipped, **imu._asdict())
+    gyroscope, accelerometer = read_bag_imu(bag, color, color_s)
+    return RecordedSource(
+        bag.path.resolve().stem, images, calibration, settings, truth, skipped, None, gyroscope, accelerometer
+    )
 
 
 def _paired(entries: tuple[Sequence[Entry], Sequence[Entry]]) -> tuple[NDArray[np.intp], bool]:
