@@ -24,7 +24,7 @@ from sigmasplat.plugins.download.catalogue import SETS, PublicRecording, PublicS
 from sigmasplat.plugins.download.downloader import MARKER
 
 FILES = {"rgb.txt": b"# colour\n", "rgb/1.png": bytes(i * i % 251 for i in range(5000))}
-PUBLIC = [entry for entry in SETS.values() if isinstance(entry, PublicSet)]
+PUBLIC = [entry for entry in SETS.values() if entry.recordings]
 
 
 @pytest.fixture

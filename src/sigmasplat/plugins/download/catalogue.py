@@ -2,7 +2,7 @@
 
 import tomllib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from urllib.parse import urlsplit
 
@@ -49,50 +49,35 @@ class PublicRecording:
 
 @dataclass(frozen=True)
 class PublicSet:
-    """A data set that can be downloaded without registration.
+    """A data set; without recordings it is available only on request.
 
-    folder: below the data folder; recordings: by short name, "" if there is only one; disk_ratio: bytes on disk during
-    unpacking, per byte of the archive; prefix: optional prefix of the short names; sequences: whether the recordings
-    are sequences, not weights.
+    page: about it, and where to apply; folder: below the data folder; recordings: by short name, "" if there is only
+    one; disk_ratio: bytes on disk during unpacking, per byte of the archive; prefix: optional prefix of the short
+    names; sequences: whether the recordings are sequences, not weights.
     """
 
     title: str
     page: str
-    licence: str
-    folder: str
-    recordings: Mapping[str, PublicRecording]
+    licence: str = ""
+    folder: str = ""
+    recordings: Mapping[str, PublicRecording] = field(default_factory=dict)
     disk_ratio: float = 1.3
     prefix: str = ""
     sequences: bool = True
 
 
-@dataclass(frozen=True)
-class RestrictedSet:
-    """A data set available only on request; page: where to apply."""
-
-    title: str
-    page: str
-
-
-def _read_sets(text: str) -> dict[str, PublicSet | RestrictedSet]:
-    """Read sets.toml; a set without recordings is available only on request."""
-    found: dict[str, PublicSet | RestrictedSet] = {}
+def _read_sets(text: str) -> dict[str, PublicSet]:
+    found = {}
     for name, fields in tomllib.loads(text).items():
-        address, recordings = fields.pop("address", ""), fields.pop("recordings", None)
-        if recordings is None:
-            found[name] = RestrictedSet(**fields)
-            continue
-        made = {}
-        for short, row in recordings.items():
+        address, made = fields.pop("address", ""), {}
+        for short, row in fields.pop("recordings", {}).items():
             files = tuple(RemoteFile(address + file.pop("at"), **file) for file in row.pop("files"))
             made[short] = PublicRecording(archives=files, **row)
         found[name] = PublicSet(recordings=made, **fields)
     return found
 
 
-SETS: Mapping[str, PublicSet | RestrictedSet] = _read_sets(
-    Path(__file__).with_name("sets.toml").read_text(encoding="utf-8")
-)
+SETS: Mapping[str, PublicSet] = _read_sets(Path(__file__).with_name("sets.toml").read_text(encoding="utf-8"))
 
 
 def find_recording(set_name: str, recording: str = "") -> tuple[PublicSet, str]:
@@ -117,7 +102,7 @@ def find_recording(set_name: str, recording: str = "") -> tuple[PublicSet, str]:
 def describe_sets() -> Iterator[str]:
     """Yield a line per data set: name, title, number of recordings, licence."""
     for name, entry in sorted(SETS.items()):
-        if isinstance(entry, PublicSet):
+        if entry.recordings:
             many = len(entry.recordings)
             count = f"{many} recordings" if many > 1 else f"one archive, {format_size(entry.recordings[''].size_bytes)}"
             yield f"{name:<10} {entry.title} · {count} · {entry.licence}"
@@ -138,13 +123,13 @@ def format_size(size_bytes: int | None) -> str:
 
 def _find_set(set_name: str) -> PublicSet:
     entry = SETS.get(set_name.lower())
-    if isinstance(entry, PublicSet):
-        return entry
     if entry is None:
         raise DownloadError(f"no data set {set_name!r}{_suggestion(set_name, sorted(SETS))}")
-    raise DownloadError(
-        f"{entry.title} is available only on request: apply at {entry.page}, then `sigmasplat run FOLDER`"
-    )
+    if not entry.recordings:
+        raise DownloadError(
+            f"{entry.title} is available only on request: apply at {entry.page}, then `sigmasplat run FOLDER`"
+        )
+    return entry
 
 
 def _normalised(name: str, prefix: str) -> str:
