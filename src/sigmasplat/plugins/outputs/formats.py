@@ -204,7 +204,7 @@ PLUGIN = (
     Output("colmap", ("-colmap",), "a folder with COLMAP's text model in sparse/0", _colmap, True),
     Output("points", (".points.ply",), "the surface as points with normals", _points, True),
     Output("video", (".webm", ".mp4", ".gif", ".webp"), "a video: colour, depth, uncertainty", _video, True),
-    Output("bag", (".mcap", "-bag"), "ROS 2 messages: path with covariance, loops, map", _bag, True),
+    Output("bag", (".mcap", "-bag"), "ROS 2 messages: path with covariance, map", _bag, True),
     Output("plan", (".plan.png", ".png"), "a floor plan with regions to scan again", _plan, True),
 )
 """The formats of this package. The first one is the default."""
