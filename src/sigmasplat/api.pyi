@@ -36,7 +36,7 @@ from sigmasplat.data.frame_arrays import (
     color_from_bytes as color_from_bytes,
     frame_from_arrays as frame_from_arrays,
 )
-from sigmasplat.data.harmonics import DEGREES as DEGREES, count as count
+from sigmasplat.data.harmonics import count as count
 from sigmasplat.data.images import resized_color as resized_color
 from sigmasplat.data.imu import (
     GRAVITY_M_S2 as GRAVITY_M_S2,
@@ -270,16 +270,10 @@ from sigmasplat.run_folder.splat_values import (
     SH_C0 as SH_C0,
     Doubles as Doubles,
     SplatValues as SplatValues,
-    check_count as check_count,
-    from_smallest_three as from_smallest_three,
-    log_scales_of as log_scales_of,
     morton_order as morton_order,
-    opacities_of as opacities_of,
     opacity_bytes as opacity_bytes,
-    rotations_of as rotations_of,
     smallest_three as smallest_three,
     to_bytes as to_bytes,
-    unit as unit,
 )
 from sigmasplat.run_folder.trajectory import (
     read_trajectory as read_trajectory,

@@ -98,7 +98,7 @@ def export(
     overwrite: options.Overwrite = False,
     asked: Annotated[ExportOptions, tyro.conf.arg(name=""), tyro.conf.OmitArgPrefixes] = DEFAULT_EXPORT_OPTIONS,
 ) -> int:
-    """Write the map or the path of a run, or a map from a file, in a format of other programs.
+    """Write the map or the path of a run, or a map from a PLY, in a format of other programs.
 
     {formats}
 

@@ -95,7 +95,7 @@ PosesFile = Annotated[
     Path | None,
     arg("FILE", "file to write: .jsonl (all results) or .txt (poses as TUM text)", "(default: none)"),
 ]
-RunOrMap = Annotated[Path, tyro.conf.Positional, arg("RUN", "run folder or map file")]
+RunOrMap = Annotated[Path, tyro.conf.Positional, arg("RUN", "run folder, or a map as PLY")]
 
 
 @dataclass(frozen=True)

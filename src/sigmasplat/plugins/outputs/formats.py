@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 Bound = float | None
-SPLAT, SPZ, SOG, GLTF = (f"sigmasplat.plugins.outputs.splats.{name}" for name in ("splat", "spz", "sog", "gltf"))
+SPZ, SOG, GLTF = (f"sigmasplat.plugins.outputs.splats.{name}" for name in ("spz", "sog", "gltf"))
 
 
 def owners(formats: tuple[Output, ...]) -> dict[str, Output]:
@@ -192,7 +192,6 @@ _covariance, _ros_covariance = (partial(_covariances, write) for write in ("writ
 _nerfstudio, _colmap = (partial(_views, write) for write in ("export_nerfstudio", "export_colmap"))
 PLUGIN = (
     Output("ply", (".ply",), "3DGS PLY with σ², for every viewer", _ply),
-    Output("splat", (".splat",), "32 bytes per splat, for web viewers", partial(_splats, SPLAT, "y-down", False)),
     Output("spz", (".spz",), "Niantic's SPZ, less than a fifth of the size", partial(_splats, SPZ, "y-up", False)),
     Output("sog", (".sog",), "SuperSplat's SOG, the smallest", partial(_splats, SOG, "y-down", False)),
     Output("gltf", (".glb",), "glTF with splats (KHR) and σ", partial(_splats, GLTF, "y-up", True)),
