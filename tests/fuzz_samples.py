@@ -57,7 +57,7 @@ READ = (RUN,) * 9 + (INSPECT,)
 EXPORTS = tuple(("export", INPUT, "--out", f"{OUT}{ending}") for ending in (".ply", ".spz", ".glb"))
 OF_RUN = tuple(
     ("export", INPUT, "--format", name, "--out", OUT)
-    for name in ("trajectory", "nerfstudio", "colmap", "spz", "bag", "points")
+    for name in ("trajectory", "nerfstudio", "colmap", "spz", "bag", "covariance")
 )
 OF_FINISHED = (
     ("eval", INPUT),

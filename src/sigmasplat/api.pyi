@@ -262,7 +262,7 @@ from sigmasplat.run.same_conditions import refuse_other_model as refuse_other_mo
 from sigmasplat.run.scene import config_of_facts as config_of_facts, open_scene as open_scene
 from sigmasplat.run.session import Session as Session, new_folder as new_folder
 from sigmasplat.run.terminal import Screen as Screen
-from sigmasplat.run_folder import splat_ply as splat_ply, trajectory as trajectory
+from sigmasplat.run_folder import splat_ply as splat_ply
 from sigmasplat.run_folder.frames import RunFrames as RunFrames, noted_up as noted_up
 from sigmasplat.run_folder.run_values import MOST_NUMBER as MOST_NUMBER, frame_seconds as frame_seconds
 from sigmasplat.run_folder.runs import MESH as MESH, TRUTH as TRUTH, RunFolder as RunFolder
@@ -277,7 +277,7 @@ from sigmasplat.run_folder.splat_values import (
 )
 from sigmasplat.run_folder.trajectory import (
     read_trajectory as read_trajectory,
-    write_kitti_poses as write_kitti_poses,
+    write_square as write_square,
     write_trajectory as write_trajectory,
 )
 from sigmasplat.slam.results import Step as Step
