@@ -91,9 +91,7 @@ from sigmasplat.files.ply_elements import (
 )
 from sigmasplat.files.reading import (
     DAMAGED as DAMAGED,
-    MOST_CHARACTERS as MOST_CHARACTERS,
     MOST_JSON_BYTES as MOST_JSON_BYTES,
-    cause as cause,
     csv_rows as csv_rows,
     exists as exists,
     guarded as guarded,
@@ -258,7 +256,6 @@ from sigmasplat.run.resume import (
     StateFile as StateFile,
     resume as resume,
 )
-from sigmasplat.run.same_conditions import refuse_other_model as refuse_other_model
 from sigmasplat.run.scene import config_of_facts as config_of_facts, open_scene as open_scene
 from sigmasplat.run.session import Session as Session, new_folder as new_folder
 from sigmasplat.run.terminal import Screen as Screen
