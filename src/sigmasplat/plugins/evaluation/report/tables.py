@@ -212,6 +212,7 @@ def _predictive_rows(scores: dict[str, Any] | None) -> list[list[str]]:
         return []
     lines = [("Pixels", "pixels", 0, 1.0), ("Within 1 standard deviation, % (ideal 68)", "coverage_68", 1, 100.0),
              ("Within 1.96 standard deviations, % (95)", "coverage_95", 1, 100.0),
+             ("Factor that makes it 68 % (ideal 1)", "z_68", 2, 1.0),
              ("AUCE (0 = right size)", "auce", 3, 1.0), ("AUSE (0 = perfect ranking)", "ause", 3, 1.0),
              ("Spearman of variance and squared error", "spearman", 3, 1.0),
              ("Gaussian NLL", "nll", 3, 1.0)]  # fmt: skip
