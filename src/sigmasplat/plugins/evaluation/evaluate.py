@@ -50,7 +50,6 @@ from sigmasplat.plugins.evaluation.view_scoring import (
     refined_fx,
     score_full_resolution,
     score_test_views,
-    show_moving,
 )
 
 Log = list[dict[str, Any]]
@@ -109,7 +108,6 @@ def evaluate(
     metrics["pose_covariance"] = score_pose_covariance(run, frames, known)
     metrics["calibration"] = _calibration(run) if standard else None
     metrics["test_views"] = None if scale else score_test_views(scoring, config.input, strips)
-    show_moving(strips, source, config.input, run.submaps, records)
     run.write_metrics(metrics)
     plan = report_plan(run, path, source.camera) if standard else None
     figures, warnings = strips.figures, [str(problem)] if problem else []
