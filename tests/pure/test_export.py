@@ -72,7 +72,7 @@ def test_the_format_can_be_given_by_name(export: Callable[..., str]) -> None:
 
 def test_splats_outside_the_bounds_are_dropped_and_counted(export: Callable[..., str]) -> None:
     said = export("walk", "--out", "a.ply", "--sigma-below", "0.055", "--opacity-above", "0.1")
-    assert said.startswith("a.ply: 4 splats, axes y-down") and "; dropped 6 of 10: 5 for σ, 1 for opacity" in said
+    assert said.startswith("a.ply: 4 splats, axes y-down") and "; dropped 6 of 10" in said
     kept = ply.read_field(Path("a.ply"))
     assert kept.variances.max() < 0.055**2 and kept.opacities.min() > 0.1
     assert "dropped 0 of 10" in export("walk", "--out", "b.ply", "--opacity-above", "0")
@@ -115,7 +115,7 @@ def test_splats_with_a_large_standard_deviation_of_depth_are_dropped(
     said = export("walk", "--out", f"a.{ending}", "--std-below-m", str(bound))
     kept, total = int(wanted.sum()), len(wanted)
     assert 0 < kept < total and f": {kept} splats" in said
-    assert f"; dropped {total - kept} of {total}: {total - kept} for " in said
+    assert f"; dropped {total - kept} of {total}" in said
     found = read_any(Path(f"a.{ending}")).means
     theirs = RunFolder.open(Path("walk")).read_map().means[wanted]
     np.testing.assert_allclose(sorted(found[:, 0].tolist()), sorted(theirs[:, 0].tolist()), atol=2e-3)
