@@ -26,9 +26,6 @@ from sigmasplat.data.field import (
     INITIAL_LOG_VARIANCE as INITIAL_LOG_VARIANCE,
     GaussianField as GaussianField,
     Rows as Rows,
-    left_factor as left_factor,
-    quaternion_of as quaternion_of,
-    transformed as transformed,
 )
 from sigmasplat.data.frame import Frame as Frame, photo_size as photo_size
 from sigmasplat.data.frame_arrays import (

@@ -19,8 +19,7 @@ from sigmasplat.data.trajectory import Component
 from sigmasplat.errors import RunError
 from sigmasplat.plugins.evaluation.reconstruct import FusionInput
 from sigmasplat.plugins.outputs.drawing.view_panels import FOOT, GAP, HEAD
-from sigmasplat.plugins.outputs.floorplan.floor_plan import floor_plan
-from sigmasplat.plugins.outputs.floorplan.picture import export_plan, write_plan
+from sigmasplat.plugins.outputs.floorplan.picture import export_plan
 from sigmasplat.plugins.outputs.mesh_files import write_mesh
 from sigmasplat.plugins.outputs.run_reader import RunReader
 from sigmasplat.plugins.outputs.video import VideoOptions, export_video, film_camera, orbit_view
@@ -177,8 +176,7 @@ def test_the_length_and_the_size_of_a_film(reader: RunReader, tmp_path: Path) ->
 
 
 def test_the_plan_is_an_image_and_a_json_file(reader: RunReader, tmp_path: Path) -> None:
-    plan = floor_plan(reader.run.read_map(), reader.valid_path(), reader.camera, renderer=seer(WORLD))
-    write_plan(plan, tmp_path / "plan.png")
+    plan = export_plan(reader, tmp_path / "plan.png")
     with Image.open(tmp_path / "plan.png") as drawn:
         assert drawn.format == "PNG" and drawn.size[0] > 600
     record = json.loads((tmp_path / "plan.json").read_text())

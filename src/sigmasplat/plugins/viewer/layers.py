@@ -11,20 +11,14 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from sigmasplat.api import (
-    ATTRIBUTES,
-    COLUMNS,
     Camera,
     GaussianField,
     MapUncertainty,
     Matrix,
     RenderConfig,
-    harmonics,
-    left_factor,
     predicted,
-    quaternion_of,
     render,
     se3,
-    transformed,
     variance_parts,
 )
 from sigmasplat.plugins.evaluation.metrics.views import COVERED_ALPHA
@@ -131,18 +125,8 @@ def covariances(quats_wxyz: Floats, scales: Floats) -> Floats:
 
 def merge_pieces(pieces: Sequence[Piece], visible: VisibilityFilter) -> GaussianField:
     """Return the visible splats of all pieces as one field in the world frame."""
-    parts = [(piece, visible.mask(piece)) for piece in pieces]
-    params = [piece.field.params[kept] for piece, kept in parts] or [GaussianField.empty().params]
-    names = {name for piece, _ in parts for name in piece.field.attributes}
-    attributes: dict[str, list[Tensor]] = {name: [] for name in sorted(names)}
-    for (piece, kept), rows in zip(parts, params, strict=False):
-        T = torch.from_numpy(piece.T_world_piece).to(rows)
-        _move(rows, T)
-        for name, all_rows in attributes.items():
-            all_rows.append(_moved_extra(piece.field, name, T)[kept])
-    return field_without_moments(
-        torch.cat(params), {name: torch.cat(all_rows) for name, all_rows in attributes.items()}
-    )
+    parts = (piece.field.part(visible.mask(piece)).moved(torch.from_numpy(piece.T_world_piece)) for piece in pieces)
+    return GaussianField.side_by_side(parts)
 
 
 def merged_uncertainty(pieces: Sequence[Piece], visible: VisibilityFilter) -> MapUncertainty | None:
@@ -151,21 +135,6 @@ def merged_uncertainty(pieces: Sequence[Piece], visible: VisibilityFilter) -> Ma
         return None
     known = pieces[0].uncertainty
     return known.at(visible.mask(pieces[0]))
-
-
-def _move(params: Tensor, T_world_piece: Tensor) -> None:
-    """Transform parameter rows to the world in place: `GaussianField.moved` without the optimiser's state."""
-    means, quats, R = params[:, COLUMNS["means"]], params[:, COLUMNS["quats"]], T_world_piece[:3, :3]
-    params[:, COLUMNS["means"]] = transformed(means, R) + T_world_piece[:3, 3]
-    params[:, COLUMNS["quats"]] = transformed(quats, left_factor(quaternion_of(R)))
-
-
-def _moved_extra(field: GaussianField, name: str, T_world_piece: Tensor) -> Tensor:
-    """Return an attribute of the splats in the world frame; zeros if this piece does not have it."""
-    if name not in field.attributes:
-        return field.params.new_zeros(len(field), ATTRIBUTES[name])
-    values = field.attributes[name].params
-    return harmonics.turned(values, T_world_piece[:3, :3]) if name == "harmonics" else values
 
 
 Layer = Literal["colour", "depth", "V", "U", "color error", "depth error"]
