@@ -138,7 +138,6 @@ def merged_uncertainty(pieces: Sequence[Piece], visible: VisibilityFilter) -> Ma
 
 
 Layer = Literal["colour", "depth", "V", "U", "color error", "depth error"]
-ErrorPart = Literal["all", "aleatoric", "epistemic"]
 LEGEND_SIZE, LEGEND_BAR, INK, PAPER = (280, 34), 14, (233, 237, 242), (36, 40, 46)
 
 
@@ -192,12 +191,11 @@ def render_layer(
 
 def render_predicted(
     field: GaussianField, known: MapUncertainty, camera: Camera, T_world_camera: Matrix, layer: Layer,
-    part: ErrorPart, options: RenderConfig, backend: str,
+    options: RenderConfig, backend: str,
 ) -> LayerImage:  # fmt: skip
-    """Draw the predicted standard deviation of colour ("color error") or of depth in m ("depth error"), or a part.
+    """Draw the predicted standard deviation of colour ("color error") or of depth in m ("depth error").
 
-    The scale ends at the 99th percentile of the whole error, so that the parts can be compared. Depth is drawn only
-    where A > ½; colour is predicted where the map is empty too.
+    Depth is drawn only where A > ½; colour is predicted where the map is empty too.
     """
     T_camera_world = se3.inverse(T_world_camera)
     with torch.no_grad():
@@ -205,14 +203,8 @@ def render_predicted(
         found = predicted(parts, known.calibration)
     covered = _array(parts.alpha) > COVERED_ALPHA
     if layer == "color error":
-        aleatoric, epistemic = found.color_aleatoric, found.color_epistemic
-        covered, unit = np.ones_like(covered), ""
-    else:
-        aleatoric, epistemic, unit = found.depth_aleatoric_m2, found.depth_epistemic_m2, " m"
-    total = aleatoric + epistemic
-    shown = {"all": total, "aleatoric": aleatoric, "epistemic": epistemic}[part]
-    ends = 0.0, colormap.value_range(_array(total.sqrt()), covered)[1]
-    return _mapped(_array(shown.sqrt()), covered, ends, colormap.INFERNO, unit)
+        return _from_zero(_array(found.color.sqrt()), np.ones_like(covered), "")
+    return _from_zero(_array(found.depth_std_m), covered, " m")
 
 
 def draw_legend(legend: Legend) -> colormap.Rgb:
