@@ -43,7 +43,7 @@ from sigmasplat.data.imu import (
     gyroscope_from_samples as gyroscope_from_samples,
     up_of_path as up_of_path,
 )
-from sigmasplat.data.map_uncertainty import SHIPPED as SHIPPED, MapUncertainty as MapUncertainty, SplatStd as SplatStd
+from sigmasplat.data.map_uncertainty import MapUncertainty as MapUncertainty, SplatStd as SplatStd
 from sigmasplat.data.mesh import Mesh as Mesh, mesh_depth as mesh_depth
 from sigmasplat.data.submap import Picture as Picture, SubmapStore as SubmapStore
 from sigmasplat.data.trajectory import (
