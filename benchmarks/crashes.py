@@ -27,12 +27,12 @@ import record
 import tyro
 from crash_process import Ended, Kill
 from PIL import Image
+from splat_readers import read_any
 from tables import Section
 
 from sigmasplat.errors import SigmaSplatError, SourceError
 from sigmasplat.files.tensors import open_tensors
 from sigmasplat.plugins.outputs.mesh_files import read_mesh
-from sigmasplat.plugins.outputs.splats.read_any import read_any
 from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.run_folder.trajectory import read_trajectory
 

@@ -1,6 +1,6 @@
 """Measure what each format of a map costs: size, size per square metre, held-out PSNR after reading back, and time.
 
-The map of a finished run is exported in every format of splats, read back with our reader and rendered at the run's
+The map of a finished run is exported in every format of splats, read back and rendered at the run's
 held-out views. The rows with fewer splats are exported with --max-splats. The area is that of the surface that
 `sigmasplat mesh` extracts with voxels of 4 cm.
 Writes benchmarks/results/export-sizes-<machine>.json and prints a table.
@@ -21,6 +21,7 @@ import numpy as np
 import program
 import record
 import tyro
+from splat_readers import read_any
 from tables import Section, significant
 
 from sigmasplat.commands.export import ExportOptions
@@ -35,7 +36,6 @@ from sigmasplat.plugins.evaluation.metrics import views
 from sigmasplat.plugins.evaluation.reconstruct import FusionInput
 from sigmasplat.plugins.evaluation.view_scoring import working_frame
 from sigmasplat.plugins.outputs.formats import PLUGIN, ExportSource, choose
-from sigmasplat.plugins.outputs.splats.read_any import read_any
 from sigmasplat.render import FieldRenderer
 from sigmasplat.run_folder.runs import RunFolder
 
@@ -45,7 +45,6 @@ GOAL_MB, GOAL_SHARE = 3.0, 0.99
 VARIANTS: tuple[tuple[str, str, Mapping[str, Any]], ...] = (
     ("PLY", ".ply", {}),
     ("PLY, --plain", ".ply", {"plain": True}),
-    (".splat", ".splat", {}),
     ("SPZ", ".spz", {}),
     ("SOG", ".sog", {}),
     ("glTF", ".glb", {}),

@@ -1,8 +1,8 @@
 """Render a map's colour and uncertainty, side by side, from one pose of its path.
 
 python examples/render_map.py RUN [PICTURE.png] [ROW]      RUN a run folder, ROW a row of its trajectory (default: 0)
-python examples/render_map.py MAP [PICTURE.png]            MAP a file: .ply, .spz, .sog, .glb, …; the view
-                                                           is from the origin of its coordinates
+python examples/render_map.py MAP [PICTURE.png]            MAP a PLY; the view is from the origin of its
+                                                           coordinates
 
 The right half is √V, with V averaged over the channels: dark = certain, bright = uncertain. Where the map is empty
 (A < ½) V is meaningless; those pixels are slate gray.
@@ -18,9 +18,9 @@ from PIL import Image
 from sigmasplat import Camera, SigmaSplatError
 from sigmasplat.data import se3
 from sigmasplat.plugins.outputs.drawing import colormap
-from sigmasplat.plugins.outputs.splats.read_any import read_any
 from sigmasplat.render import render
 from sigmasplat.run_folder.runs import RunFolder
+from sigmasplat.run_folder.splat_ply import read_field
 
 CAMERA = Camera(width=320, height=240, fx=260.0, fy=260.0, cx=159.5, cy=119.5)
 """Any pinhole camera works; it need not be the one that recorded the map."""
@@ -29,7 +29,7 @@ CAMERA = Camera(width=320, height=240, fx=260.0, fy=260.0, cx=159.5, cy=119.5)
 def main(run: str, picture: str = "view.png", row: str = "0") -> None:
     """Render a map from a pose of its run's trajectory and save colour and uncertainty as one PNG."""
     if Path(run).is_file():
-        field, T_world_camera = read_any(Path(run)), np.eye(4)
+        field, T_world_camera = read_field(Path(run)), np.eye(4)
     else:
         folder = RunFolder.open(Path(run))
         field, T_world_camera = folder.read_map(), folder.read_trajectory().T_world_camera[int(row)]

@@ -10,7 +10,6 @@ import resource
 import shutil
 import signal
 import sys
-import threading
 import time
 import traceback
 from collections.abc import Sequence
@@ -81,17 +80,16 @@ def _lines(path: Path) -> list[str]:
 
 
 def _show_once() -> None:
-    """Make `view` end when it has shown a run, as with Ctrl-C."""
+    """Make `view` end when it has read a run, as with Ctrl-C."""
     from sigmasplat.plugins.viewer import snapshot_sources
 
-    follow = snapshot_sources.follow_run
+    read = snapshot_sources.finished_snapshot
 
-    def follow_once(run: Any, show: Any, stop: threading.Event, source: Any = None) -> None:
-        stop.set()
-        follow(run, show, stop, source)
+    def read_once(run: Any, source: Any = None) -> None:
+        read(run, source)
         raise KeyboardInterrupt
 
-    snapshot_sources.follow_run = follow_once
+    snapshot_sources.finished_snapshot = read_once
 
 
 def run_command(arguments: Sequence[str], folder: Path) -> Ending:

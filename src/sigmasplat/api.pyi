@@ -26,9 +26,6 @@ from sigmasplat.data.field import (
     INITIAL_LOG_VARIANCE as INITIAL_LOG_VARIANCE,
     GaussianField as GaussianField,
     Rows as Rows,
-    left_factor as left_factor,
-    quaternion_of as quaternion_of,
-    transformed as transformed,
 )
 from sigmasplat.data.frame import Frame as Frame, photo_size as photo_size
 from sigmasplat.data.frame_arrays import (
@@ -36,7 +33,7 @@ from sigmasplat.data.frame_arrays import (
     color_from_bytes as color_from_bytes,
     frame_from_arrays as frame_from_arrays,
 )
-from sigmasplat.data.harmonics import DEGREES as DEGREES, count as count
+from sigmasplat.data.harmonics import count as count
 from sigmasplat.data.images import resized_color as resized_color
 from sigmasplat.data.imu import (
     GRAVITY_M_S2 as GRAVITY_M_S2,
@@ -45,7 +42,7 @@ from sigmasplat.data.imu import (
     accelerometer_from_samples as accelerometer_from_samples,
     gyroscope_from_samples as gyroscope_from_samples,
 )
-from sigmasplat.data.map_uncertainty import SHIPPED as SHIPPED, MapUncertainty as MapUncertainty, SplatStd as SplatStd
+from sigmasplat.data.map_uncertainty import MapUncertainty as MapUncertainty, SplatStd as SplatStd
 from sigmasplat.data.mesh import Mesh as Mesh, mesh_depth as mesh_depth
 from sigmasplat.data.submap import Picture as Picture, SubmapStore as SubmapStore
 from sigmasplat.data.trajectory import (
@@ -90,9 +87,7 @@ from sigmasplat.files.ply_elements import (
 )
 from sigmasplat.files.reading import (
     DAMAGED as DAMAGED,
-    MOST_CHARACTERS as MOST_CHARACTERS,
     MOST_JSON_BYTES as MOST_JSON_BYTES,
-    cause as cause,
     csv_rows as csv_rows,
     exists as exists,
     guarded as guarded,
@@ -253,11 +248,10 @@ from sigmasplat.run.resume import (
     StateFile as StateFile,
     resume as resume,
 )
-from sigmasplat.run.same_conditions import refuse_other_model as refuse_other_model
 from sigmasplat.run.scene import config_of_facts as config_of_facts, open_scene as open_scene
 from sigmasplat.run.session import Session as Session, new_folder as new_folder
 from sigmasplat.run.terminal import Screen as Screen
-from sigmasplat.run_folder import splat_ply as splat_ply, trajectory as trajectory
+from sigmasplat.run_folder import splat_ply as splat_ply
 from sigmasplat.run_folder.frames import RunFrames as RunFrames, noted_up as noted_up
 from sigmasplat.run_folder.run_values import MOST_NUMBER as MOST_NUMBER, frame_seconds as frame_seconds
 from sigmasplat.run_folder.runs import MESH as MESH, TRUTH as TRUTH, RunFolder as RunFolder
@@ -265,20 +259,14 @@ from sigmasplat.run_folder.splat_values import (
     SH_C0 as SH_C0,
     Doubles as Doubles,
     SplatValues as SplatValues,
-    check_count as check_count,
-    from_smallest_three as from_smallest_three,
-    log_scales_of as log_scales_of,
     morton_order as morton_order,
-    opacities_of as opacities_of,
     opacity_bytes as opacity_bytes,
-    rotations_of as rotations_of,
     smallest_three as smallest_three,
     to_bytes as to_bytes,
-    unit as unit,
 )
 from sigmasplat.run_folder.trajectory import (
     read_trajectory as read_trajectory,
-    write_kitti_poses as write_kitti_poses,
+    write_square as write_square,
     write_trajectory as write_trajectory,
 )
 from sigmasplat.slam.results import Step as Step

@@ -543,7 +543,6 @@ def test_options_of_eval_reach_the_evaluation(corridor: Corridor, capsys: pytest
     assert exit_code("run", "corridor", "--out", "mine") == 0
     plain = {
         "mesh": False, "true_mesh": None, "random_views": 1000, "full_resolution": False, "lpips": None,
-        "fill_gaps_m": 0.0,
     }  # fmt: skip
     assert plain == GIVEN and "LPIPS" not in capsys.readouterr().out
     write_mesh(Path("wall.ply"), Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32)))

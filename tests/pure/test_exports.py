@@ -19,11 +19,11 @@ from sigmasplat.data.trajectory import Component
 from sigmasplat.errors import RunError
 from sigmasplat.plugins.evaluation.reconstruct import FusionInput
 from sigmasplat.plugins.outputs.drawing.view_panels import FOOT, GAP, HEAD
-from sigmasplat.plugins.outputs.floorplan.floor_plan import floor_plan
-from sigmasplat.plugins.outputs.floorplan.picture import export_plan, write_plan
+from sigmasplat.plugins.outputs.floorplan.picture import export_plan
+from sigmasplat.plugins.outputs.mesh_files import write_mesh
 from sigmasplat.plugins.outputs.run_reader import RunReader
 from sigmasplat.plugins.outputs.video import VideoOptions, export_video, film_camera, orbit_view
-from sigmasplat.plugins.outputs.views import export_colmap, export_nerfstudio, export_points, splat_points
+from sigmasplat.plugins.outputs.views import export_colmap, export_nerfstudio, splat_points
 
 
 @pytest.fixture(params=["submaps", "in one piece"])
@@ -76,15 +76,15 @@ def test_surface_normals_point_into_the_room(reader: RunReader, tmp_path: Path) 
     trimesh = pytest.importorskip("trimesh", reason="the [dev] extra is not installed")
     renderer = _from_any_submap(reader)
     surface = FusionInput.at(reader.run, reader.camera).surface(voxel_m=0.05, renderer=renderer)
-    count = export_points(surface, tmp_path / "cloud.ply")
-    cloud = trimesh.load(tmp_path / "cloud.ply")
-    assert len(cloud.vertices) == count > 500
+    write_mesh(tmp_path / "mesh.ply", surface)
+    cloud = trimesh.load(tmp_path / "mesh.ply", process=False)
+    assert len(cloud.vertices) == len(surface.vertices) > 500
     rows = cloud.metadata["_ply_raw"]["vertex"]["data"]
     normals = np.stack([rows[name].ravel() for name in ("nx", "ny", "nz")], 1) @ T_ROOM[:3, :3].T
     at = cloud.vertices @ T_ROOM[:3, :3].T + T_ROOM[:3, 3]
     floor = (np.abs(at[:, 2]) < 0.02) & (np.abs(at[:, :2] - 0.3).max(1) < 0.8)
     assert floor.sum() > 50 and np.quantile(normals[floor, 2], 0.1) > 0.9, "except at the edges of the surface"
-    assert np.abs(cloud.colors[:, :3].astype(int) - 128).max() <= 1
+    assert np.abs(cloud.visual.vertex_colors[:, :3].astype(int) - 128).max() <= 1
 
 
 def test_a_surface_has_the_standard_deviation_of_the_nearest_opaque_splat(reader: RunReader) -> None:
@@ -176,8 +176,7 @@ def test_the_length_and_the_size_of_a_film(reader: RunReader, tmp_path: Path) ->
 
 
 def test_the_plan_is_an_image_and_a_json_file(reader: RunReader, tmp_path: Path) -> None:
-    plan = floor_plan(reader.run.read_map(), reader.valid_path(), reader.camera, renderer=seer(WORLD))
-    write_plan(plan, tmp_path / "plan.png")
+    plan = export_plan(reader, tmp_path / "plan.png")
     with Image.open(tmp_path / "plan.png") as drawn:
         assert drawn.format == "PNG" and drawn.size[0] > 600
     record = json.loads((tmp_path / "plan.json").read_text())

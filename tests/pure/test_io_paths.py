@@ -9,9 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.trajectory import Trajectory
-from sigmasplat.errors import RunError
 from sigmasplat.plugins.outputs import views
-from sigmasplat.run_folder.trajectory import write_kitti_poses
 
 CAMERA = Camera(64, 48, 50.0, 51.0, 30.25, 24.75)
 NAMES = [f"frame-{i:06d}.png" for i in range(7)]
@@ -41,16 +39,6 @@ def ahead(T_world_camera: np.ndarray) -> np.ndarray:
     """Return points in front of a camera, in the world frame."""
     points = np.random.default_rng(3).uniform([-1, -1, 1], [1, 1, 4], (20, 3))
     return points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
-
-
-def test_kitti_rows_are_the_matrices(tmp_path: Path) -> None:
-    path = some_path()
-    write_kitti_poses(tmp_path / "poses.txt", path.T_world_camera)
-    rows = np.loadtxt(tmp_path / "poses.txt")
-    assert rows.shape == (7, 12)
-    np.testing.assert_allclose(rows.reshape(-1, 3, 4), path.T_world_camera[:, :3], atol=1e-11)
-    with pytest.raises(RunError, match="cannot write"):
-        write_kitti_poses(tmp_path / "no" / "poses.txt", path.T_world_camera)
 
 
 def test_transforms_are_opengl_cameras(tmp_path: Path) -> None:

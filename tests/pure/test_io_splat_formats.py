@@ -10,26 +10,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from splat_readers import from_smallest_three, read_any
 
 from room_map import psnr_db, room_map
 from sigmasplat.data.field import GaussianField, Rows
 from sigmasplat.data.harmonics import count
 from sigmasplat.errors import RunError
-from sigmasplat.plugins.outputs.splats import gltf, sog, splat, spz
-from sigmasplat.plugins.outputs.splats.read_any import read_any
+from sigmasplat.plugins.outputs.splats import gltf, sog, spz
 from sigmasplat.plugins.outputs.splats.sog import levels
 from sigmasplat.run_folder import splat_ply as ply
-from sigmasplat.run_folder.splat_values import SplatValues, from_smallest_three, morton_order, smallest_three
+from sigmasplat.run_folder.splat_values import SplatValues, morton_order, smallest_three
 
 Writer = Callable[[Path, GaussianField], None]
 WRITERS: dict[str, Writer] = {
     ".ply": ply.write_field,
-    ".splat": splat.write_field,
     ".spz": spz.write_field,
     ".sog": sog.write_field,
     ".glb": gltf.write_field,
 }
-COMPRESSED = [".splat", ".spz", ".sog"]
+COMPRESSED = [".spz", ".sog"]
 
 
 def again(path: Path, field: GaussianField) -> GaussianField:
@@ -74,17 +73,6 @@ def test_a_quarter_of_the_size_gives_nearly_the_same_render(tmp_path: Path, endi
     assert len(back) == len(field) and psnr_db(back, field) > 35.0
 
 
-def test_splat_files_give_nearly_the_same_render_without_harmonics(tmp_path: Path) -> None:
-    """32 bytes per splat: 0.4 of a PLY without harmonics, an eighth of a PLY with them; harmonics are lost."""
-    field = room_map()
-    assert psnr_db(again(tmp_path / "a.splat", field), field) > 35.0
-    assert (tmp_path / "map").stat().st_size == 32 * len(field)
-    shiny = room_map(3)
-    dull = again(tmp_path / "b.splat", shiny)
-    del shiny.attributes["harmonics"]
-    assert not dull.attributes and psnr_db(dull, shiny) > 35.0
-
-
 @pytest.mark.parametrize("ending", COMPRESSED)
 def test_values_that_a_format_cannot_hold_are_as_in_a_new_map(tmp_path: Path, ending: str) -> None:
     back = again(tmp_path / f"a{ending}", some())
@@ -125,27 +113,6 @@ def test_extremes_stay_finite(tmp_path: Path) -> None:
         back = again(tmp_path / f"a{ending}", field)
         assert torch.isfinite(back.params).all() and torch.isfinite(back.scales).all()
         assert back.opacities.max() > 0.998 and back.opacities.min() < 0.002
-
-
-def test_splat_has_the_documented_layout(tmp_path: Path) -> None:
-    field = GaussianField.from_values(
-        torch.tensor([[9.0, 9.0, 9.0], [1.0, 2.0, 3.0]]), torch.tensor([[0.01] * 3, [0.1, 0.2, 0.3]]),
-        torch.tensor([[0.0] * 3, [1.0, 0.5, 1.2]]), 
-        quats=torch.tensor([[1.0, 0, 0, 0], [1.0, 1.0, -1.0, 1.0]]), opacities=0.8,
-    )  # fmt: skip
-    splat.write_field(tmp_path / "a.splat", field)
-    data = (tmp_path / "a.splat").read_bytes()
-    assert len(data) == 64
-    first = struct.unpack("<6f8B", data[:32])
-    assert first[:6] == pytest.approx((1.0, 2.0, 3.0, 0.1, 0.2, 0.3)), "the splat that covers most comes first"
-    assert first[6:] == (255, 128, 255, 204, 192, 192, 64, 192)
-
-
-def test_splat_files_may_begin_with_any_bytes(tmp_path: Path) -> None:
-    for start in [b"<", b"{", b" \n<", b"\x1f\x8b"]:
-        splat.write_field(tmp_path / "a.splat", some(3))
-        (tmp_path / "b").write_bytes(start + (tmp_path / "a.splat").read_bytes()[len(start) :])
-        assert len(read_any(tmp_path / "b")) == 3
 
 
 def test_spz_has_the_documented_layout(tmp_path: Path) -> None:
@@ -194,26 +161,6 @@ def test_codebooks_are_as_fine_as_their_values() -> None:
     few = np.array([[0.0, 1.0], [0.0, 1.0]])
     book, index = levels(few)
     assert (book[index] == few).all()
-
-
-def test_spz_of_version_2_is_read(tmp_path: Path) -> None:
-    """A handmade file: rotations of three bytes without w, and an unknown extension after the splats."""
-    body = b"".join(
-        [
-            struct.pack("<IIIBBBB", 0x5053474E, 2, 1, 0, 8, 2, 0),
-            *((value & 0xFFFFFF).to_bytes(3, "little") for value in (256, -512, 128)),
-            bytes([204, 128, 128, 166, 96, 112, 128]),
-            bytes([191, 128, 64]),
-            b"an extension",
-        ]
-    )
-    (tmp_path / "a.spz").write_bytes(gzip.compress(body))
-    back = read_any(tmp_path / "a.spz")
-    assert back.means[0].tolist() == [1.0, 2.0, -0.5] and back.params[0, 7:10].tolist() == [-4.0, -3.0, -2.0]
-    assert float(back.opacities) == pytest.approx(0.8)
-    assert back.colors[0].tolist() == pytest.approx([0.5 + 0.0036878, 0.5 + 0.0036878, 0.5 + 0.283935], abs=1e-5)
-    w = math.sqrt(1 - (191 / 127.5 - 1) ** 2 - (128 / 127.5 - 1) ** 2 - (64 / 127.5 - 1) ** 2)
-    assert back.quats[0].tolist() == pytest.approx([w, 191 / 127.5 - 1, 1 - 128 / 127.5, 1 - 64 / 127.5], abs=1e-6)
 
 
 def test_spz_of_a_large_map_has_coarser_positions(tmp_path: Path) -> None:

@@ -270,7 +270,7 @@ def test_a_run_of_keyframes_only_is_judged_on_training_views(run: RunFolder) -> 
     assert metrics["held_out"] == {"views": 0} and metrics["ate"] is None
     assert metrics["uncertainty"]["judged_on"] == "training" and metrics["uncertainty"]["pixels"] > 0
     page = (run.path / "report.html").read_text()
-    assert "Uncertainty V, training" in page and "at training views" in page
+    assert "Uncertainty V, training" in page
 
 
 def test_truth_of_another_recording_is_reported_after_everything_is_written(run: RunFolder) -> None:

@@ -17,7 +17,7 @@ from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.graph.path_covariance import PathCovariance, recorded
 from sigmasplat.plugins.evaluation.metrics.trajectory import score_covariances
 from sigmasplat.run_folder.runs import RunFolder
-from sigmasplat.run_folder.trajectory import KNOWN, write_ros, write_square, write_trajectory
+from sigmasplat.run_folder.trajectory import KNOWN, write_square, write_trajectory
 
 Array = NDArray[np.float64]
 CALIBRATED = 2.366
@@ -73,16 +73,14 @@ def test_coverage_and_nees_of_right_and_of_small_covariances() -> None:
     assert score_covariances(np.empty((0, 4, 4)), np.empty((0, 4, 4)), np.empty((0, 6, 6))) is None
 
 
-def test_the_files_hold_the_spread_in_the_camera_and_in_the_world(tmp_path: Path) -> None:
-    """Draw poses around one pose: the first file describes their spread in the camera's axes, the second in the
-    world's."""
+def test_the_file_holds_the_spread_in_the_camera(tmp_path: Path) -> None:
+    """Draw poses around one pose: the file describes their spread in the camera's axes."""
     rng = np.random.default_rng(3)
     A = 1e-3 * rng.normal(size=(6, 6))
     T = se3.exp(np.array([2.0, -1.0, 3.0, 0.4, -0.8, 0.2]))
     drawn = se3.exp_stack(rng.normal(size=(100_000, 6)) @ A.T) @ T
     path = Trajectory(np.zeros(1), T[None])
     write_square(tmp_path / "a.cov.txt", path, (A @ A.T)[None])
-    write_ros(tmp_path / "a.ros.txt", path, (A @ A.T)[None])
 
     lower = np.loadtxt(tmp_path / "a.cov.txt")[8:]
     assert len(lower) == 21
@@ -90,12 +88,6 @@ def test_the_files_hold_the_spread_in_the_camera_and_in_the_world(tmp_path: Path
     square[np.tril_indices(6)] = lower
     in_camera = np.cov(se3.log_stack(se3.inverse(T) @ drawn).T)
     np.testing.assert_allclose(square, np.tril(in_camera), atol=0.02 * in_camera.max())
-
-    ros = np.loadtxt(tmp_path / "a.ros.txt")[8:].reshape(6, 6)
-    turns = se3.log_stack(drawn @ se3.inverse(T))[:, 3:]
-    in_world = np.cov(np.hstack([drawn[:, :3, 3] - T[:3, 3], turns]).T)
-    np.testing.assert_allclose(ros, in_world, atol=0.02 * in_world.max())
-    assert "frame_id: world" in (tmp_path / "a.ros.txt").read_text()
 
 
 def with_errors(folder: Path) -> tuple[RunFolder, PathCovariance]:
@@ -126,19 +118,18 @@ def test_a_run_is_exported_with_the_covariance_of_its_valid_poses(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run, errors = with_errors(tmp_path / "kitchen")
-    for name in ("path.cov.txt", "path.ros.txt"):
-        assert exit_code("export", str(run.path), "--out", str(tmp_path / name)) == 0
+    assert exit_code("export", str(run.path), "--out", str(tmp_path / "path.cov.txt")) == 0
     said = capsys.readouterr().out
     assert "path.cov.txt: 5 poses with their covariance; left out: 1 lost" in said
-    rows, ros = np.loadtxt(tmp_path / "path.cov.txt"), np.loadtxt(tmp_path / "path.ros.txt")
+    rows = np.loadtxt(tmp_path / "path.cov.txt")
     valid = np.delete(np.arange(len(PATH)), LOST)
-    assert rows.shape == (5, 29) and ros.shape == (5, 44)
+    assert rows.shape == (5, 29)
     np.testing.assert_allclose(rows[:, 1:4], PATH.T_world_camera[valid, :3, 3], atol=1e-9)
-    np.testing.assert_allclose(ros[0, 8:].reshape(6, 6), KNOWN, atol=1e-20)
     np.testing.assert_allclose(rows[0, 8:], KNOWN[np.tril_indices(6)], atol=1e-20)
-    for row, frame in zip(ros[1:], valid[1:], strict=True):
-        J = se3.displacement(PATH.T_world_camera[frame])
-        np.testing.assert_allclose(row[8:].reshape(6, 6), J @ errors.of_frame(int(frame)) @ J.T, rtol=1e-6, atol=1e-14)
+    for row, frame in zip(rows[1:], valid[1:], strict=True):
+        A = se3.adjoint(se3.inverse(PATH.T_world_camera[frame]))
+        expected = A @ errors.of_frame(int(frame)) @ A.T
+        np.testing.assert_allclose(row[8:], expected[np.tril_indices(6)], rtol=1e-6, atol=1e-11)
 
 
 def test_a_run_without_errors_of_its_path_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -23,7 +23,6 @@ pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built
 from sigmasplat.plugins.viewer.app import ViewerApp  # noqa: E402
 from sigmasplat.plugins.viewer.panel import (  # noqa: E402
     COLOURINGS,
-    ERROR_PARTS,
     FINAL_MAP,
     MODE_LABELS,
     PREDICTED_MODES,
@@ -135,15 +134,12 @@ def test_predicted_errors_are_offered_for_the_final_map_only(
     wait_until(lambda: "0.05 m" in panel.hidden_text.content)
     assert panel.facts.content != everything and f"{int(half.sum()):,} of {len(field):,}" in panel.facts.content
     for mode in PREDICTED_MODES:
+        before = len(client)
         panel.mode.value = MODE_LABELS[mode]
-        wait_until(lambda: panel.error_part.visible)
-        for part in ERROR_PARTS.values():
-            before = len(client)
-            panel.error_part.value = part
-            wait_until(lambda before=before: len(client) > before)  # type: ignore[misc]
+        wait_until(lambda before=before: len(client) > before)  # type: ignore[misc]
     panel.part.value = SUBMAPS
     wait_until(lambda: not panel.max_std.visible)
-    assert panel.mode.value == MODE_LABELS["splats"] and not panel.error_part.visible
+    assert panel.mode.value == MODE_LABELS["splats"]
     assert panel.part.value != FINAL_MAP and "viewer:" not in capsys.readouterr().err, "no error while drawing"
 
 

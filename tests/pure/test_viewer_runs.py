@@ -32,7 +32,6 @@ from sigmasplat.plugins.viewer.snapshot_sources import (
     SubmapCache,
     check_has_map,
     finished_snapshot,
-    running_snapshot,
 )
 from sigmasplat.run.session import Session
 from sigmasplat.run_folder.runs import TRUTH, RunFolder
@@ -91,33 +90,24 @@ def test_keyframe_images_come_from_the_submaps_or_from_the_sequence(finished: Ru
     np.testing.assert_allclose(read / 255.0, source.frame(other).color, atol=0.003)
 
 
-def test_an_unfinished_run_is_shown_from_its_log_and_finished_submaps(finished: RunFolder) -> None:
-    cache = SubmapCache(finished.submaps)
-    shown = running_snapshot(finished, cache)
-    whole = merge_pieces(shown.pieces, VisibilityFilter())
-    torch.testing.assert_close(
-        whole.params, merge_pieces(finished_snapshot(finished).pieces, VisibilityFilter()).params, rtol=1e-5, atol=1e-5
-    )
-    assert shown.live and shown.final is None and len(shown.path) == FRAMES
-    again = running_snapshot(finished, cache)
-    assert [a.field for a in again.pieces] == [
-        b.field for b in shown.pieces
-    ]  # the same objects, so nothing is sent again
-    row = shown.path.keyframes[1]
-    np.testing.assert_array_equal(shown.image(row), finished_snapshot(finished).image(row))  # type: ignore[arg-type]
-    assert (
-        sum(len(p.field) for p in running_snapshot(finished, SubmapCache(finished.submaps, budget=500)).pieces) <= 500
-    )
+def test_submaps_are_read_once_and_within_the_budget(finished: RunFolder) -> None:
+    anchors, cache = finished.read_checkpoint()[0]["T_world_submap"].numpy(), SubmapCache(finished.submaps)
+    cache.load(anchors[:2])
+    before = dict(cache.pieces)
+    cache.load(anchors)
+    assert list(before) == [0, 1] and list(cache.pieces) == [0, 1, 2]
+    assert all(cache.pieces[i].field is before[i].field for i in before), "the same objects: nothing is sent again"
+    small = SubmapCache(finished.submaps, budget=500)
+    small.load(anchors)
+    assert sum(len(piece.field) for piece in small.pieces.values()) <= 500
 
 
-def test_a_new_run_shows_nothing_and_an_ended_run_without_a_map_is_refused(tmp_path: Path) -> None:
+def test_a_run_without_a_map_is_refused(tmp_path: Path) -> None:
     run = RunFolder.create(tmp_path / "run", settings(), "room")
-    shown = running_snapshot(run, SubmapCache(run.submaps))
-    assert len(shown.path) == 0 and shown.pieces == () and shown.visible_pieces(True, 0) == ()
-    check_has_map(run)
-    run.note(status="failed")
-    with pytest.raises(RunError, match="has no map to show"):
-        check_has_map(run)
+    for status in ("running", "failed"):
+        run.note(status=status)
+        with pytest.raises(RunError, match=rf"has no map to show \(status: {status}\)"):
+            check_has_map(run)
 
 
 def test_the_stored_true_path_is_aligned_and_gives_the_same_ate(finished: RunFolder) -> None:
@@ -169,14 +159,12 @@ def test_lost_frames_and_submaps_apart_of_a_finished_run(finished: RunFolder, tm
     in_world = [record["submap"] < 2 for record in finished.read_log()]
     run.write_trajectory(path.at(np.array(in_world) & (np.arange(FRAMES) != 2)))
     run.write_components([Component(1, run.read_map(), path.at(~np.array(in_world)))])
-    for shown in (finished_snapshot(run), running_snapshot(run, SubmapCache(run.submaps))):
-        assert [piece.submap for piece in shown.pieces] == [0, 1]
-        assert shown.path.inside.tolist() == in_world and np.flatnonzero(shown.path.lost).tolist() == [2, FRAMES - 1]
     shown = finished_snapshot(run)
+    assert [piece.submap for piece in shown.pieces] == [0, 1]
+    assert shown.path.inside.tolist() == in_world and np.flatnonzero(shown.path.lost).tolist() == [2, FRAMES - 1]
     np.testing.assert_allclose(shown.path.T_world_camera[2], path.T_world_camera[2], atol=1e-9)
     _, total = FusionInput.of(run, open_source(ROOM).camera).views()
     assert total == sum(len(run.submaps.load(i).frames) for i in (0, 1))
-    assert running_snapshot(finished, SubmapCache(finished.submaps)).path.inside.all()
 
 
 def test_a_run_of_an_old_release_is_shown_evaluated_and_exported(finished: RunFolder, tmp_path: Path) -> None:
@@ -192,12 +180,10 @@ def test_a_run_of_an_old_release_is_shown_evaluated_and_exported(finished: RunFo
     metrics = evaluate(run, open_source(ROOM), views_per_kind=1, strips_per_kind=0)
     assert (metrics["frames"], metrics["believed"], metrics["lost"], metrics["apart"]) == (FRAMES, FRAMES - 1, 1, 0)
     assert metrics["failures"]["auroc"] is None or np.isnan(metrics["failures"]["auroc"])
-    for name, said in (("path.txt", "13 poses; left out: 1 lost"), ("path.kitti.txt", "13 poses; left out: 1 lost")):
-        chosen = choose(PLUGIN, None, tmp_path / name)
-        assert chosen.write(ExportSource(run.path), tmp_path / name).startswith(said)
+    chosen = choose(PLUGIN, None, tmp_path / "path.txt")
+    said = chosen.write(ExportSource(run.path), tmp_path / "path.txt")
+    assert said.startswith("13 poses; left out: 1 lost")
     assert len(read_trajectory(tmp_path / "path.txt")) == FRAMES - 1
-    rows = np.loadtxt(tmp_path / "path.kitti.txt")
-    assert len(rows) == FRAMES and np.flatnonzero(np.isnan(rows).any(1)).tolist() == [2]
 
 
 class Clock:

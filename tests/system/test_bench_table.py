@@ -16,8 +16,8 @@ import pytest
 import paper_data
 from command_line import exit_code
 from lpips_weights import write_weights
+from sigmasplat.plugins.batch.batch import Executor
 from sigmasplat.plugins.batch.definition import Table
-from sigmasplat.plugins.batch.executor import Executor
 from sigmasplat.plugins.batch.job import Job
 from sigmasplat.plugins.batch.make_run import make_run
 from sigmasplat.plugins.batch.scores import run_record

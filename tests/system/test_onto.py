@@ -17,7 +17,7 @@ from sigmasplat.data.submap import MemoryStore
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.plugins.outputs.run_reader import RunReader
 from sigmasplat.plugins.sources import SyntheticRoom, open_source
-from sigmasplat.plugins.viewer.snapshot_sources import SubmapCache, finished_snapshot, running_snapshot
+from sigmasplat.plugins.viewer.snapshot_sources import finished_snapshot
 from sigmasplat.run.finished_map import FinishedMap, continued, take_over
 from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.run_folder.trajectory import write_trajectory
@@ -93,8 +93,6 @@ def test_readers_use_the_frames_of_the_new_session_only(place: Path) -> None:
     snapshot = finished_snapshot(second)
     assert len(snapshot.path) == FRAMES
     assert {piece.submap for piece in snapshot.pieces} == set(range(len(second.submaps)))
-    cache = SubmapCache(second.submaps)
-    assert len(running_snapshot(second, cache).path) == FRAMES and len(cache.pieces) == len(second.submaps)
 
 
 def test_the_earlier_run_is_not_changed(place: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -135,7 +135,7 @@ def _make(
     ended: Callable[[], object],
 ) -> None:  # fmt: skip
     """Make the missing runs of a batch; `ended` is called after each one."""
-    from sigmasplat.plugins.batch.executor import Executor
+    from sigmasplat.plugins.batch.batch import Executor
 
     made.refuse_other_runs(overwrite)
     try:

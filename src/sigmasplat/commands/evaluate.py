@@ -9,7 +9,6 @@ import tyro
 from sigmasplat.commands import options
 from sigmasplat.commands.input_options import arg, flag
 from sigmasplat.commands.options import prepare_torch, source_of
-from sigmasplat.config.ranges import Range
 from sigmasplat.env import LPIPS_FOLDER
 
 if TYPE_CHECKING:
@@ -34,11 +33,6 @@ class EvalOptions:
     random_views: Annotated[
         int, arg("N", "number of random views that score the depth of mesh.ply; papers use 1000")
     ] = 1000
-    fill_gaps: Annotated[
-        float,
-        Range(0),
-        arg("M", "score mesh.ply also with gaps up to M metres closed (see mesh --fill-gaps); 0 = do not"),
-    ] = 0.0
     full_resolution: Annotated[bool, flag("also score the views at the resolution of the recording")] = False
     lpips: Annotated[
         Path | None,
@@ -109,10 +103,9 @@ def score(
         true_mesh = read_mesh(eval_options.true_mesh) if eval_options.true_mesh else None
         with screen.counting("evaluation") as progress:
             metrics = evaluate(
-                folder, source, mesh=mesh or true_mesh is not None or eval_options.fill_gaps > 0,
-                true_mesh=true_mesh,
+                folder, source, mesh=mesh or true_mesh is not None, true_mesh=true_mesh,
                 random_views=eval_options.random_views, full_resolution=eval_options.full_resolution,
-                fill_gaps_m=eval_options.fill_gaps, lpips=lpips, progress=progress,
+                lpips=lpips, progress=progress,
             )  # fmt: skip
         screen.results(result_sentence(metrics), key_figures(metrics))
     except Exception as problem:

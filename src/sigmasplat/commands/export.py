@@ -45,9 +45,9 @@ class ExportOptions:
         Literal["y-up", "z-up", "y-down", "camera"] | None,
         arg(
             "{y-up,z-up,y-down,camera}",
-            "axes of a map or of points: y-up, z-up and y-down are levelled; camera: those of the run's path; y-up "
+            "axes of a map: y-up, z-up and y-down are levelled; camera: those of the run's path; y-up "
             "and camera only for SPZ and glTF",
-            "(default: y-up for points, SPZ and glTF, else y-down)",
+            "(default: y-up for SPZ and glTF, else y-down)",
         ),
     ] = None
     plain: Annotated[
@@ -57,7 +57,6 @@ class ExportOptions:
     pictures: Annotated[bool, flag("also write the images of the keyframes, and export only keyframes as views")] = (
         False
     )
-    voxel_m: options.VoxelM = None
     size: Annotated[
         int,
         Range(32, 4096, or_zero=True),
@@ -98,7 +97,7 @@ def export(
     overwrite: options.Overwrite = False,
     asked: Annotated[ExportOptions, tyro.conf.arg(name=""), tyro.conf.OmitArgPrefixes] = DEFAULT_EXPORT_OPTIONS,
 ) -> int:
-    """Write the map or the path of a run, or a map from a file, in a format of other programs.
+    """Write the map or the path of a run, or a map from a PLY, in a format of other programs.
 
     {formats}
 

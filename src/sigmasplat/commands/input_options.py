@@ -40,10 +40,6 @@ Number = Annotated[float | None, _number(float)]
 From0 = Annotated[Number, Range(0)]
 From1 = Annotated[int, Range(1)]
 Limit = Annotated[Whole, Range(1), arg("N", "use at most N frames", "(default: all)")]
-DepthModel = Annotated[
-    Path | None,
-    arg("FILE.onnx", "network that predicts depth from each colour image, used like --predicted-depth", ""),
-]
 
 
 @dataclass(frozen=True)
@@ -90,7 +86,6 @@ class InputOptions:
             "",
         ),
     ] = None
-    depth_model: DepthModel = None
     predicted_inverse: Annotated[bool, flag("predicted depth is inverse depth, as that of MiDaS or Depth Anything")] = (
         False
     )
@@ -114,12 +109,7 @@ class InputOptions:
         names = {"start": "start_s", "end": "end_s", "hold_out": "hold_every"}
         given = {field.name: getattr(self, field.name) for field in fields(self)}
         given["register_depth"] = None if self.register_depth == "auto" else self.register_depth
-        for name in (
-            "calibration",
-            "masks",
-            "predicted_depth",
-            "depth_model",
-        ):  # a later eval may run in another folder
+        for name in ("calibration", "masks", "predicted_depth"):  # a later eval may run in another folder
             given[name] = given[name] and given[name].absolute()
         if self.poses not in (None, RECORDED_POSES):
             given["poses"] = Path(self.poses).absolute()

@@ -95,7 +95,7 @@ PosesFile = Annotated[
     Path | None,
     arg("FILE", "file to write: .jsonl (all results) or .txt (poses as TUM text)", "(default: none)"),
 ]
-RunOrMap = Annotated[Path, tyro.conf.Positional, arg("RUN", "run folder or map file")]
+RunOrMap = Annotated[Path, tyro.conf.Positional, arg("RUN", "run folder, or a map as PLY")]
 
 
 @dataclass(frozen=True)
@@ -135,18 +135,14 @@ def working_images(config: Config) -> dict[str, str]:
 
 
 def source_of(folder: "RunFolder", moved_to: str | None) -> "Source":
-    """Open the sequence of a run. Raises RunError if the run does not contain its path, or if depth is predicted by
-    another network than in the run."""
+    """Open the sequence of a run. Raises RunError if the run does not contain its path."""
     from sigmasplat.plugins.sources import open_source
-    from sigmasplat.run.same_conditions import refuse_other_model
 
     facts = folder.facts()
     path = moved_to or facts.get("source_path")
     if not path:
         raise RunError(f"run {folder.path} does not contain the path of its sequence; give --source PATH")
-    source = open_source(path, folder.config().input)
-    refuse_other_model(folder, source)
-    return source
+    return open_source(path, folder.config().input)
 
 
 def refuse_existing(target: Path | None, overwrite: bool) -> None:

@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 
 
 def view(run: options.RunPath, host: options.Host = HOST, port: options.Port = PORT) -> int:
-    """Show a run in the browser: map, path, uncertainty. An unfinished run is updated until it ends.
+    """Show a run in the browser: map, path, uncertainty.
 
     example: sigmasplat view runs/kitchen-sigma
     """
-    from sigmasplat.plugins.viewer.snapshot_sources import check_has_map, follow_run
+    from sigmasplat.plugins.viewer.snapshot_sources import check_has_map, finished_snapshot
     from sigmasplat.run.terminal import Screen
     from sigmasplat.run_folder.runs import RunFolder
 
@@ -32,12 +32,9 @@ def view(run: options.RunPath, host: options.Host = HOST, port: options.Port = P
     source = None  # without it, the run is shown without its images
     with suppress(SigmaSplatError):
         source = source_of(folder, None)
-    with serve_viewer(Screen(), host, port) as viewer:
-        try:
-            follow_run(folder, viewer.show, threading.Event(), source)
-            threading.Event().wait()
-        except KeyboardInterrupt:
-            pass
+    with serve_viewer(Screen(), host, port) as viewer, suppress(KeyboardInterrupt):
+        viewer.show(finished_snapshot(folder, source))
+        threading.Event().wait()
     return 0
 
 

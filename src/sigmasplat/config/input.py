@@ -48,13 +48,6 @@ class InputConfig(Section, name="input"):
     predicted_scale: NotNegative = 0.0
     """Factor from predicted depth to metres, used with `input.poses` only; 0 = measured from the poses and the images,
     unless `input.poses_scale` is 0."""
-    depth_model: str = ""
-    """Path of an ONNX file with a network that predicts depth from colour. Its depth is used as that of
-    `input.predicted_depth`; empty = none."""
-    depth_model_colors: Literal["imagenet", "half", "unit", "bytes"] = "imagenet"
-    """Numbers that the network expects: imagenet = colour in [0, 1] minus ImageNet's mean, over its standard deviation
-    (MiDaS v2.1, Depth Anything); half = colour in [−1, 1] (DPT, ZoeDepth, Depth Pro); unit = colour in [0, 1];
-    bytes = colour in [0, 255]. A network that takes 8-bit numbers gets bytes."""
     poses: str = ""
     """Path of a file with known camera poses, which are used as they are: TUM text, KITTI text, images.txt of COLMAP,
     or transforms.json; or of a folder with a matrix per frame; "recorded" = those that the device estimated itself,
@@ -106,8 +99,6 @@ class InputConfig(Section, name="input"):
             return found
         if self.end_s and self.end_s <= self.start_s:
             found.append(f"input.end_s must be after input.start_s, found {self.start_s:g} to {self.end_s:g} s")
-        if self.predicted_depth and self.depth_model:
-            found.append("input.predicted_depth and input.depth_model exclude each other; give one of them")
         found += sensor_problems(self.sensor)
         if self.max_depth_m <= self.min_depth_m:
             found.append(

@@ -63,7 +63,7 @@ def header_of(*elements: tuple[str, int, Iterable[str]], comment: str = "") -> b
 def read_header(file: BinaryIO, path: Path) -> list[Element]:
     """Read the header: the elements in the order of their rows. Raises SourceError if it is not a binary PLY."""
     if file.readline(8).strip() != b"ply":
-        raise SourceError(f"{path} is not a PLY file (its first line is not 'ply')")
+        raise SourceError(f"{path} is not a PLY file (its first line is not 'ply'); give a binary PLY")
     lines = _header_lines(file, path)
     order = BYTE_ORDERS.get(lines[0][1]) if lines and lines[0][0] == "format" and len(lines[0]) > 1 else None
     if order is None:

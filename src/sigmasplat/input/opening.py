@@ -116,7 +116,7 @@ def _whole(path: str | Path, settings: InputConfig) -> Source:
     """Open a whole sequence: with its own depth; with predicted depth instead; or images without depth, with predicted
     depth."""
     predicted: Any = None
-    if settings.predicted_depth or settings.depth_model:
+    if settings.predicted_depth:
         predicted = importlib.import_module("sigmasplat.plugins.predicted_depth.source")
         if predicted.lacks_depth(Path(path), _sure_format(path) is not None):
             return cast(Source, predicted.open_color_only(Path(path), settings))
@@ -128,7 +128,7 @@ def _whole(path: str | Path, settings: InputConfig) -> Source:
 
 def format_name(path: str | Path, settings: InputConfig) -> str:
     """Return the name of the format that `open_source` reads. Raises SourceError if none recognises the path."""
-    if not (settings.predicted_depth or settings.depth_model):
+    if not settings.predicted_depth:
         return format_of(path).name
     known = _sure_format(path)
     return f"{known.name if known else 'colour only'}, with predicted depth"

@@ -31,12 +31,9 @@ KNOWN_UNITS_PER_METRE = {1000.0: "millimetres", 5000.0: "TUM's unit", 6553.5: "R
 def depth_warning(source: Source, samples: int = 5) -> str | None:
     """Return a warning if the depth scale looks wrong, with the median and a suggestion; None if it is plausible.
 
-    It is also None if the source computes depth in metres from a stereo pair, because streets are deeper than rooms,
-    and if a network predicts it while frames are read: the first frame has set its scale. The
-    median is over all readings of `samples` frames spread evenly; unreadable frames are left out.
+    It is also None if the source computes depth in metres from a stereo pair, because streets are deeper than rooms.
+    The median is over all readings of `samples` frames spread evenly; unreadable frames are left out.
     """
-    if source.depth_model:
-        return None
     medians = list(_medians_m(source, evenly_spaced(len(source), samples)))
     if medians and source.computed_depth:
         return None
@@ -53,9 +50,8 @@ def depth_warning(source: Source, samples: int = 5) -> str | None:
 
 
 def refuse_without_depth(source: Source, samples: int = 5) -> None:
-    """Raise SourceError if no frame has a depth reading; reads a few frames, and all frames only if those are blank.
-    Nothing is read if a network predicts depth: it has predicted that of the first frame."""
-    if source.depth_model or any(_medians_m(source, [*evenly_spaced(len(source), samples), *range(len(source))])):
+    """Raise SourceError if no frame has a depth reading; reads a few frames, and all frames only if those are blank."""
+    if any(_medians_m(source, [*evenly_spaced(len(source), samples), *range(len(source))])):
         return
     problem = "frame 0 has no pixel above 0"
     try:

@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -42,7 +42,7 @@ def read_ahead(items: Iterable[Item], length: int = 4) -> Iterator[Item]:
 
 
 FACTS = (
-    "depth_units_per_metre", "depth_registered", "registrable", "computed_depth", "predicted_depth", "depth_model",
+    "depth_units_per_metre", "depth_registered", "registrable", "computed_depth", "predicted_depth",
     "scene_scale", "depth_noise_per_m", "sensor",
 )  # fmt: skip
 """What a source that wraps another one has in common with it."""
@@ -57,8 +57,7 @@ class Source(ABC):
     depth_registered: whether the source itself moved depth to the colour camera; registrable: whether it could do so,
     because the depth camera is known;
     computed_depth: whether the source computes depth itself, from a stereo pair; predicted_depth: whether a network
-    predicted depth, so that its scale is arbitrary; depth_model: name and SHA-256 of the file with that network, None
-    if depth comes from elsewhere;
+    predicted depth, so that its scale is arbitrary;
     scene_scale: size of the scene relative to a room, above 1 outdoors; depth_noise_per_m: standard deviation
     of depth, times z²; None if it is unknown (`config.scale.for_scene` uses both);
     sensor: the depth sensor (`config.sensors`), None if it is unknown;
@@ -75,7 +74,6 @@ class Source(ABC):
     registrable: bool = False
     computed_depth: bool = False
     predicted_depth: bool = False
-    depth_model: Mapping[str, str] | None = None
     scene_scale: float = 1.0
     depth_noise_per_m: float | None = None
     sensor: str | None = None

@@ -27,21 +27,8 @@ def start_facts(source: Source) -> dict[str, Any]:
     return facts | scene_facts(source)
 
 
-def refuse_other_model(run: RunFolder, source: Source) -> None:
-    """Raise RunError if a network predicted the depth of a run, and another one would predict that of a source."""
-    noted, found = run.facts().get("depth_model"), source.depth_model or {}
-    if noted and noted.get("sha256") != found.get("sha256"):
-        before, now = (str(model.get("sha256"))[:12] for model in (noted, found))
-        raise RunError(
-            f"{run.path} was made with another depth model: {run.config().input.depth_model} has the SHA-256 {now}…, "
-            f"that of the run had {before}…; put the original file there, or start again with: sigmasplat run"
-        )
-
-
 def refuse_other_sequence(run: RunFolder, source: Source) -> None:
-    """Raise RunError, with the first difference, unless a source has the camera and the frames of a run's start, and
-    depth of the same network."""
-    refuse_other_model(run, source)
+    """Raise RunError, with the first difference, unless a source has the camera and the frames of a run's start."""
     if difference := next(_differences(run, source), ""):
         raise RunError(
             f"{run.path} cannot be resumed, because its sequence has changed: {difference}; give the original one "

@@ -33,12 +33,11 @@ def config_for(source: Source, config: Config, given: Collection[str] = ()) -> C
 
 def scene_facts(source: Source) -> dict[str, Any]:
     """Return what run.json keeps of the scene: its size, the noise of depth, the sensor, and if a network
-    predicted depth this fact, and the file of the network if it is known."""
+    predicted depth this fact."""
     facts: dict[str, Any] = {
         "scene_scale": source.scene_scale, "depth_noise_per_m": source.depth_noise_per_m, "sensor": source.sensor
     }  # fmt: skip
-    facts |= {"predicted_depth": True} if source.predicted_depth else {}
-    return facts | ({"depth_model": dict(source.depth_model)} if source.depth_model else {})
+    return facts | ({"predicted_depth": True} if source.predicted_depth else {})
 
 
 def config_of_facts(facts: Mapping[str, Any], config: Config, given: Collection[str] = ()) -> Config:

@@ -1,4 +1,4 @@
-"""Convert fields to the arrays that splat files are packed from, and back."""
+"""Convert fields to the arrays that splat files are packed from, and check those that were read."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from sigmasplat.data.field import ATTRIBUTES, COLUMNS, INITIAL_LOG_VARIANCE, WIDTH, GaussianField, Rows
+from sigmasplat.data.field import ATTRIBUTES, COLUMNS, GaussianField
 from sigmasplat.data.harmonics import DEGREES, count, turned
 from sigmasplat.errors import SourceError
 
@@ -32,23 +32,12 @@ def smallest_three(quats: Doubles) -> tuple[NDArray[np.intp], Doubles]:
     return which, positive[np.arange(4) != which[:, None]].reshape(-1, 3)
 
 
-def from_smallest_three(which: NDArray[np.intp], others: Doubles) -> Doubles:
-    """Return unit quaternions [N, 4] from the result of `smallest_three`."""
-    quats: Doubles = np.empty((len(which), 4))
-    quats[np.arange(4) != which[:, None]] = others.ravel()
-    quats[np.arange(len(which)), which] = np.sqrt(np.maximum(1.0 - (others**2).sum(1), 0.0))
-    return unit(quats)
-
-
 SH_C0 = 0.28209479177387814
 """Y₀₀ = 1/(2√π): the constant spherical harmonic."""
 R_RUB_RDF = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
 """Rotates axes x right, y down, z forward to x right, y up, z back, and back."""
 Number = TypeVar("Number", bound=np.generic)
-MORTON_BITS, ROUNDING, SMALLEST_SCALE_M = 20, 1e-6, 1e-12
-
-MOST_REPEATED = 1_000_000
-"""Number of splats that any compressed file may announce."""
+MORTON_BITS, ROUNDING = 20, 1e-6
 
 
 @dataclass(frozen=True)
@@ -100,24 +89,6 @@ class SplatValues:
         quats = self.quats * np.array([1.0, *xyz])
         return replace(self, means=self.means * xyz, quats=quats, harmonics=self.harmonics * signs)
 
-    def field(self, path: Path, sigmas: Doubles | None = None) -> GaussianField:
-        """Return a field of the values read from `path`. sigmas [N, 3]: σ of each channel; σ² is initial without them,
-        and where they are 0. Raises SourceError unless all values are finite."""
-        params = np.full((len(self), WIDTH), INITIAL_LOG_VARIANCE, np.float32)
-        for name in ("means", "quats", "log_scales", "colors"):
-            params[:, COLUMNS[name]] = getattr(self, name)
-        if sigmas is not None:
-            log_variances = np.where(sigmas > 0.0, 2.0 * np.log(np.maximum(sigmas, 1e-18)), INITIAL_LOG_VARIANCE)
-            params[:, COLUMNS["log_variances"]] = log_variances
-        params[:, 10] = np.log(self.opacities) - np.log1p(-self.opacities)
-        check_values(params, path)
-        field = GaussianField(torch.from_numpy(params))
-        if self.degree:
-            harmonics = np.zeros((len(self), ATTRIBUTES["harmonics"]), np.float32)
-            harmonics[:, : self.harmonics.shape[1]] = self.harmonics
-            field.attributes["harmonics"] = Rows(torch.from_numpy(harmonics))
-        return field
-
 
 def _harmonics(field: GaussianField) -> Doubles:
     """Return a field's harmonics without the highest degrees that are 0 up to rounding."""
@@ -144,23 +115,6 @@ def opacity_bytes(opacities: Doubles) -> NDArray[np.uint8]:
     return to_bytes(opacities * 255.0)
 
 
-def opacities_of(values: NDArray[np.uint8]) -> Doubles:
-    """Convert bytes to opacities; 0 and 255 become slightly larger and smaller, so that logits are finite."""
-    return np.clip(values / 255.0, 0.25 / 255.0, 1.0 - 0.25 / 255.0)
-
-
-def log_scales_of(scales_m: Doubles) -> Doubles:
-    """Return the logarithms of scales in metres; those of 0 are finite."""
-    return np.asarray(np.log(np.maximum(scales_m, SMALLEST_SCALE_M)))
-
-
-def rotations_of(xyzw: Doubles, path: Path) -> Doubles:
-    """Return the unit quaternions wxyz [N, 4] of a file's xyzw. Raises SourceError if one is far from unit length."""
-    if (np.linalg.norm(xyzw, axis=1) < 0.5).any():
-        raise SourceError(f"{path} is damaged: a rotation is not a unit quaternion")
-    return unit(np.roll(xyzw, 1, axis=1))
-
-
 def morton_order(points: Doubles) -> NDArray[np.intp]:
     """Return the rows of points [N, 3] in Morton order: points that are close in space are close in the file."""
     if not len(points):
@@ -173,15 +127,6 @@ def morton_order(points: Doubles) -> NDArray[np.intp]:
         for axis in range(3):
             code |= ((cells[:, axis] >> np.uint64(bit)) & np.uint64(1)) << np.uint64(3 * bit + axis)
     return np.argsort(code, kind="stable")
-
-
-def check_count(count: int, packed_size: int, path: Path) -> None:
-    """Raise SourceError if a compressed file of `packed_size` bytes announces more splats than it can hold: a splat
-    needs 8 bytes or more, but equal splats, as in tests, compress further."""
-    if count > max(MOST_REPEATED, packed_size):
-        raise SourceError(
-            f"{path} is damaged: its header says {count} splats, which do not fit into {packed_size} bytes"
-        )
 
 
 def check_values(params: NDArray[np.float32], path: Path) -> None:

@@ -70,15 +70,6 @@ def _parse(line: str, where: str) -> list[float]:
     return values
 
 
-def write_kitti_poses(path: Path, T_world_camera: Matrix) -> None:
-    """Write poses [F, 4, 4] as KITTI text, 3×4 matrices with 12 significant digits; nan for a frame without a pose.
-
-    Raises RunError if the file cannot be written.
-    """
-    rows = (T[:3].ravel().tolist() for T in T_world_camera)
-    write_text(path, "".join(" ".join(f"{value:.12g}" for value in row) + "\n" for row in rows))
-
-
 WORLD = (
     "world = camera of the first frame, whose pose is known (written as 0.01 mm, 0.01 mrad); "
     "axes x right, y down, z forward"
@@ -101,38 +92,14 @@ def write_square(path: Path, trajectory: Trajectory, covariance: Matrix) -> None
         "TANGENT_CONVENTION": "right_perturbation", "TANGENT_ORDER": "translation_rotation",
         "ROTATION_PARAM": "axis_angle",
     }  # fmt: skip
-    A, covariance = se3.adjoint(se3.inverse(trajectory.T_world_camera)), _definite(covariance)
+    A = se3.adjoint(se3.inverse(trajectory.T_world_camera))
+    covariance = np.where(np.any(covariance, (1, 2), keepdims=True), covariance, KNOWN)
     rows, columns = np.tril_indices(6)
     header = [f"#%{key} {value}" for key, value in facts.items()] + [
         f"# {COLUMNS} c11 c21 c22 c31 … c66 (seconds, metres, camera to world; covariance in m, rad)",
         f"# {WORLD}",
     ]
-    _write(path, header, trajectory, (A @ covariance @ np.swapaxes(A, 1, 2))[:, rows, columns])
-
-
-def write_ros(path: Path, trajectory: Trajectory, covariance: Matrix) -> None:
-    """Write TUM text with 36 more numbers per line: the covariance as in geometry_msgs/PoseWithCovariance.
-
-    The matrix is row-major, in the order x, y, z, rotation about x, y, z; all axes are those of the world. Raises
-    RunError if the file cannot be written.
-    """
-    J, covariance = se3.displacement(trajectory.T_world_camera), _definite(covariance)
-    header = [
-        f"# {COLUMNS} c11 c12 … c66 (seconds, metres, camera to world; covariance in m, rad)",
-        "# covariance: 6×6, row-major, as in geometry_msgs/PoseWithCovariance: x, y, z, rotation about x, y, z",
-        "# frame_id: world; the axes of position and rotation are those of the world, not of the camera",
-        "# child_frame_id: camera (optical: x right, y down, z forward)",
-        f"# {WORLD}",
-    ]
-    _write(path, header, trajectory, (J @ covariance @ np.swapaxes(J, 1, 2)).reshape(-1, 36))
-
-
-def _definite(covariance: Matrix) -> Matrix:
-    """Replace covariances [N, 6, 6] of 0 by `KNOWN`."""
-    return np.where(np.any(covariance, (1, 2), keepdims=True), covariance, KNOWN)
-
-
-def _write(path: Path, header: list[str], trajectory: Trajectory, numbers: Matrix) -> None:
+    numbers = (A @ covariance @ np.swapaxes(A, 1, 2))[:, rows, columns]
     lines = [
         f"{pose_line(t, T)} " + " ".join(f"{value:.12g}" for value in row)
         for t, T, row in zip(trajectory.timestamps_s, trajectory.T_world_camera, numbers.tolist(), strict=True)

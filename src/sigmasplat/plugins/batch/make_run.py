@@ -31,7 +31,6 @@ from sigmasplat.api import (
     new_folder,
     open_scene,
     out_of_memory,
-    refuse_other_model,
     resume,
 )
 from sigmasplat.plugins.batch.job import Job
@@ -69,7 +68,6 @@ def _make_and_score(
         outcome = Session(start.slam, source, run, (), state, start.next_index, start.wall_s).execute()
         if outcome.status == "interrupted":
             raise KeyboardInterrupt
-    refuse_other_model(run, source)
     started_s = time.perf_counter()
     lpips, _ = find_lpips(env.LPIPS_FOLDER)
     evaluate(run, source, mesh=job.mesh, lpips=lpips)

@@ -50,7 +50,6 @@ from sigmasplat.plugins.evaluation.view_scoring import (
     refined_fx,
     score_full_resolution,
     score_test_views,
-    show_moving,
 )
 
 Log = list[dict[str, Any]]
@@ -69,7 +68,6 @@ def evaluate(
     true_mesh: Mesh | None = None,
     random_views: int = VIEWS,
     full_resolution: bool = False,
-    fill_gaps_m: float = 0.0,
     lpips: Lpips | None = None,
     progress: Progress = no_progress,
 ) -> dict[str, Any]:
@@ -83,7 +81,7 @@ def evaluate(
     `full_resolution` the views are also scored at the size of the recording, else at that of the final map's last
     stage. Calls `progress(done, total)` with views. With `mesh` the keyframes are fused into mesh.ply, which is scored
     against `true_mesh`, in the world frame of the truth, or the source's true surface, with `random_views` for its
-    depth, and also with gaps up to `fill_gaps_m` closed. Raises RunError if the run stopped before it had a map;
+    depth. Raises RunError if the run stopped before it had a map;
     SourceError if truth and run share no timestamps, after everything else has been written.
     """
     frames, field = _read_frames(run), run.read_map()
@@ -105,12 +103,11 @@ def evaluate(
     metrics["full_resolution"] = score_full_resolution(scoring, config, full_resolution, progress)
     if mesh:
         surface = None if scale else true_mesh or reconstruct.known_surface(source)  # it is in metres
-        how = surface, known, random_views, fill_gaps_m, renderer, progress
+        how = surface, known, random_views, renderer, progress
         metrics |= reconstruct.fuse_and_score(run, source.camera, *how)
     metrics["pose_covariance"] = score_pose_covariance(run, frames, known)
     metrics["calibration"] = _calibration(run) if standard else None
     metrics["test_views"] = None if scale else score_test_views(scoring, config.input, strips)
-    show_moving(strips, source, config.input, run.submaps, records)
     run.write_metrics(metrics)
     plan = report_plan(run, path, source.camera) if standard else None
     figures, warnings = strips.figures, [str(problem)] if problem else []

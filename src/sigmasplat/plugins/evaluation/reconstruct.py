@@ -38,7 +38,6 @@ from sigmasplat.plugins.evaluation.metrics import reconstruction
 from sigmasplat.plugins.evaluation.metrics.published_reconstruction import VIEWS, score_published
 from sigmasplat.plugins.evaluation.metrics.reconstruction import score_splats
 from sigmasplat.plugins.evaluation.metrics.trajectory import align_rigid, associate, pair_poses
-from sigmasplat.plugins.outputs.mesh_editing import filled
 from sigmasplat.plugins.outputs.mesh_files import read_mesh, write_mesh
 
 OPAQUE = 0.5
@@ -137,18 +136,17 @@ def fuse_and_score(
     true_surface: Mesh | None,
     true_path: Trajectory | None,
     random_views: int = VIEWS,
-    fill_gaps_m: float = 0.0,
     renderer: Renderer | None = None,
     progress: Progress = no_progress,
 ) -> dict[str, Any]:
     """Write the run's mesh.ply and return its scores, as `score` does; they are None if the true surface or the true
-    path is unknown. fill_gaps_m: score the mesh also with gaps closed; mesh.ply keeps its gaps."""
+    path is unknown."""
     fusion_input = FusionInput.of(run, camera)
     mesh = fusion_input.surface(None, renderer, progress)
     write_mesh(run.path / MESH, mesh)
     if true_surface is None or true_path is None:
         return {"reconstruction": None, "reconstruction_published": None}
-    return score(fusion_input, mesh, true_surface, true_path, random_views, fill_gaps_m, progress)
+    return score(fusion_input, mesh, true_surface, true_path, random_views, progress)
 
 
 def score(
@@ -157,14 +155,12 @@ def score(
     true_surface: Mesh,
     true_path: Trajectory,
     random_views: int = VIEWS,
-    fill_gaps_m: float = 0.0,
     progress: Progress = no_progress,
 ) -> dict[str, Any]:
     """Score a run's mesh and its splats against the true surface, after the same alignment as for the ATE.
 
-    Returns `reconstruction`, our scores, and `reconstruction_published`, those of the papers' protocol; with
-    fill_gaps_m also `reconstruction_filled`, the scores with gaps up to this size closed. The training views are the
-    true poses of the keyframes. Raises SourceError if path and truth share no timestamps.
+    Returns `reconstruction`, our scores, and `reconstruction_published`, those of the papers' protocol. The training
+    views are the true poses of the keyframes. Raises SourceError if path and truth share no timestamps.
     """
     frames, tensors = fusion_input.run.read_frames(), fusion_input.checkpoint
     ours, theirs = pair_poses(frames.path, true_path)
@@ -183,18 +179,4 @@ def score(
     opacities = field.opacities.numpy().astype(np.float64)
     of_splats = score_splats(centers, opacities, *reference, seen=(seen_true, seen_splats))
     published = score_published(found, truth, seen_true, seen_found, views=random_views, progress=progress)
-    scores = {"reconstruction": asdict(of_mesh) | asdict(of_splats), "reconstruction_published": asdict(published)}
-    if fill_gaps_m:
-        scores["reconstruction_filled"] = _score_filled(found, fill_gaps_m, reference, seen_true, progress)
-    return scores
-
-
-def _score_filled(
-    found: Mesh, fill_gaps_m: float, reference: tuple[Mesh, Camera, Matrix], seen_true: NDArray[np.bool_],
-    progress: Progress,
-) -> dict[str, Any]:  # fmt: skip
-    """Score a mesh in the frame of the truth with its gaps closed; views and rules are those of `score`."""
-    closed = filled(found, fill_gaps_m)
-    _, seen = reconstruction.visible_parts(reference[0], closed.corners.mean(1), *reference[1:], progress)
-    scores = asdict(reconstruction.score(closed, *reference, seen=(seen_true, seen), progress=progress))
-    return {"gap_m": fill_gaps_m, "new_vertices": len(closed.vertices) - len(found.vertices)} | scores
+    return {"reconstruction": asdict(of_mesh) | asdict(of_splats), "reconstruction_published": asdict(published)}

@@ -1,7 +1,6 @@
 """Write the splats of a run or of a map file: those within bounds or of most weight in its views, in given axes."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -30,22 +29,6 @@ if TYPE_CHECKING:
     from sigmasplat.plugins.outputs.source import ExportSource
 
 
-@dataclass(frozen=True)
-class FilterResult:
-    """The mask of the kept splats, bool [N], and the number of dropped splats by reason: σ; standard deviation of
-    depth, but not σ; only opacity."""
-
-    kept: Tensor
-    by_sigma: int
-    by_opacity: int
-    by_std: int = 0
-
-    @property
-    def dropped(self) -> int:
-        """Return the number of dropped splats."""
-        return self.by_sigma + self.by_std + self.by_opacity
-
-
 def sigmas(field: GaussianField) -> Tensor:
     """Return σ of each splat [N]: the root of σ² averaged over the colour channels, for colours in [0, 1]."""
     return field.variances.mean(1).sqrt()
@@ -63,20 +46,19 @@ def filter_splats(
     opacity_above: float | None = None,
     std_below_m: float | None = None,
     std: SplatStd | None = None,
-) -> FilterResult:
-    """Select splats with σ < `sigma_below`, opacity > `opacity_above` and depth_std_m of `std` < `std_below_m`.
+) -> Tensor:
+    """Return the mask [N] of splats with σ < `sigma_below`, opacity > `opacity_above` and depth_std_m < `std_below_m`.
 
     None sets no bound. Raises SigmaSplatError on `std_below_m` without `std`.
     """
     if std_below_m is not None and std is None:
         raise SigmaSplatError("std_below_m needs the standard deviations of the splats (RunFolder.read_splat_std)")
-    every = torch.ones(len(field), dtype=torch.bool, device=field.params.device)
-    certain = every if sigma_below is None else sigmas(field) < sigma_below
-    accurate = every if std_below_m is None or std is None else std.depth_std_m.to(every.device) < std_below_m
-    opaque = every if opacity_above is None else field.opacities > opacity_above
-    kept = certain & accurate
-    dropped = int((~certain).sum()), int((kept & ~opaque).sum()), int((certain & ~accurate).sum())
-    return FilterResult(kept & opaque, *dropped)
+    kept = torch.ones(len(field), dtype=torch.bool, device=field.params.device)
+    if sigma_below is not None:
+        kept &= sigmas(field) < sigma_below
+    if std_below_m is not None and std is not None:
+        kept &= std.depth_std_m.to(kept.device) < std_below_m
+    return kept if opacity_above is None else kept & (field.opacities > opacity_above)
 
 
 MOST_VIEWS = 60
@@ -126,12 +108,11 @@ def write_splats(
     field, std = source.splats()
     _check_known(source.path, field, std, sigma_below, std_below_m, max_splats)
     total, bounds = len(field), {"sigma_below": sigma_below, "opacity_above": opacity_above, "std_below_m": std_below_m}
-    result = filter_splats(field, **bounds, std=std)
-    if total and result.dropped == total:
+    kept = filter_splats(field, **bounds, std=std)
+    if total and not kept.any():
         medians = f"{sigmas(field).median():.3g} and {field.opacities.median():.3g}"
         medians += "" if std is None else f", of depth_std_m {std.depth_std_m.median():.3g} m"
         raise RunError(f"no splat of {source.path} is left (median σ and opacity are {medians}); use weaker bounds")
-    kept = result.kept
     if max_splats is not None and int(kept.sum()) > max_splats:
         inside = field.moved(torch.eye(4))  # makes a copy
         inside.keep(kept)
@@ -142,11 +123,8 @@ def write_splats(
     field = field if np.array_equal(T, np.eye(4)) else field.moved(torch.from_numpy(T))
     print(f"writing {len(field):,} splats …", flush=True)
     write(field, std)
-    reasons = [f"{result.by_std:,} for the standard deviation of depth"] * (std_below_m is not None)
-    if any(bound is not None for bound in bounds.values()):
-        reasons.append(f"{result.by_sigma:,} for σ, {result.by_opacity:,} for opacity")
-    reasons += [f"{total - result.dropped - len(field):,} for --max-splats"] * (max_splats is not None)
-    dropped = f"; dropped {total - len(field):,} of {total:,}: {', '.join(reasons)}" if reasons else ""
+    bounded = any(bound is not None for bound in (*bounds.values(), max_splats))
+    dropped = f"; dropped {total - len(field):,} of {total:,}" if bounded else ""
     return f"{len(field):,} splats, axes {axes}{note}{dropped}"
 
 

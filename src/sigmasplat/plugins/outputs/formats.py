@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 Bound = float | None
-SPLAT, SPZ, SOG, GLTF = (f"sigmasplat.plugins.outputs.splats.{name}" for name in ("splat", "spz", "sog", "gltf"))
+SPZ, SOG, GLTF = (f"sigmasplat.plugins.outputs.splats.{name}" for name in ("spz", "sog", "gltf"))
 
 
 def owners(formats: tuple[Output, ...]) -> dict[str, Output]:
@@ -111,27 +111,13 @@ def _trajectory(source: ExportSource, target: Path) -> str:
     return f"{len(path):,} poses{reader.left_out() if has_log else ''}"
 
 
-def _covariances(write: str, source: ExportSource, target: Path) -> str:
-    from sigmasplat.api import trajectory
+def _covariance(source: ExportSource, target: Path) -> str:
+    from sigmasplat.api import write_square
 
     reader = source.reader()
     path = reader.valid_path()
-    getattr(trajectory, write)(target, path, reader.covariances())
+    write_square(target, path, reader.covariances())
     return f"{len(path):,} poses with their covariance{reader.left_out()}"
-
-
-def _kitti(source: ExportSource, target: Path) -> str:
-    """Write one line per frame, since the line number is the frame number; nan for frames without a valid pose."""
-    import numpy as np
-
-    from sigmasplat.api import write_kitti_poses
-
-    reader = source.reader()
-    poses = np.full((len(reader.frames), 4, 4), np.nan)
-    poses[reader.valid_frames()] = reader.valid_path().T_world_camera
-    write_kitti_poses(target, poses)
-    left_out = reader.left_out()
-    return f"{len(reader.frames.rows):,} poses{left_out}{' (written as nan)' if left_out else ''}"
 
 
 def _views(write: str, source: ExportSource, target: Path, *, pictures: bool) -> str:
@@ -144,19 +130,6 @@ def _views(write: str, source: ExportSource, target: Path, *, pictures: bool) ->
     with _counting("pictures") as progress:
         count = getattr(views, write)(reader, target, True, progress)
         return f"{count:,} views with their pictures{reader.left_out(keyframes=True)}"
-
-
-def _points(source: ExportSource, target: Path, *, voxel_m: float | None, axes: "Axes | None") -> str:
-    from sigmasplat.plugins.evaluation.reconstruct import FusionInput
-    from sigmasplat.plugins.outputs.axes import levelled, transform_to
-    from sigmasplat.plugins.outputs.views import export_points
-
-    reader, chosen = source.reader(), axes or "y-up"
-    with _counting("surface") as progress:
-        surface = FusionInput.at(reader.run, reader.camera).surface(voxel_m, progress=progress)
-    if chosen != "camera":
-        surface = surface.moved(transform_to(chosen, levelled(reader)))
-    return f"{export_points(surface, target):,} points, axes {chosen}"
 
 
 def _video(
@@ -188,21 +161,16 @@ def _bag(source: ExportSource, target: Path, *, pictures: bool) -> str:
     return f"{sum(counts.values()):,} messages of {len(counts)} topics{reader.left_out()}"
 
 
-_covariance, _ros_covariance = (partial(_covariances, write) for write in ("write_square", "write_ros"))
 _nerfstudio, _colmap = (partial(_views, write) for write in ("export_nerfstudio", "export_colmap"))
 PLUGIN = (
     Output("ply", (".ply",), "3DGS PLY with σ², for every viewer", _ply),
-    Output("splat", (".splat",), "32 bytes per splat, for web viewers", partial(_splats, SPLAT, "y-down", False)),
     Output("spz", (".spz",), "Niantic's SPZ, less than a fifth of the size", partial(_splats, SPZ, "y-up", False)),
     Output("sog", (".sog",), "SuperSplat's SOG, the smallest", partial(_splats, SOG, "y-down", False)),
     Output("gltf", (".glb",), "glTF with splats (KHR) and σ", partial(_splats, GLTF, "y-up", True)),
     Output("trajectory", (".txt",), "the path as TUM text", _trajectory),
     Output("covariance", (".cov.txt",), "the path as TUM text with the covariance of each pose", _covariance),
-    Output("ros-covariance", (".ros.txt",), "the same as geometry_msgs/PoseWithCovariance", _ros_covariance),
-    Output("kitti", (".kitti.txt",), "the path as KITTI text, one line per frame", _kitti, True),
     Output("nerfstudio", (".json",), "views as nerfstudio's transforms.json", _nerfstudio, True),
     Output("colmap", ("-colmap",), "a folder with COLMAP's text model in sparse/0", _colmap, True),
-    Output("points", (".points.ply",), "the surface as points with normals", _points, True),
     Output("video", (".webm", ".mp4", ".gif", ".webp"), "a video: colour, depth, uncertainty", _video, True),
     Output("bag", (".mcap", "-bag"), "ROS 2 messages: path with covariance, map", _bag, True),
     Output("plan", (".plan.png", ".png"), "a floor plan with regions to scan again", _plan, True),

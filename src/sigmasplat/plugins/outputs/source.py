@@ -1,4 +1,4 @@
-"""What is exported: a run folder, or a file that holds a map. Imports that load torch are inside the functions."""
+"""What is exported: a run folder, or a map's PLY. Imports that load torch are inside the functions."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ def _no_sequence(run: "RunFolder") -> "Source":
 
 @dataclass(frozen=True)
 class ExportSource:
-    """What is exported: a run folder, or a file that holds a map.
+    """What is exported: a run folder, or a PLY that holds a map.
 
     open_sequence: opens the sequence of a run, for keyframe images that the run did not keep.
     """
@@ -52,9 +52,9 @@ class ExportSource:
 
         Raises RunError if there is no run, SourceError if the map cannot be read.
         """
-        from sigmasplat.plugins.outputs.splats.read_any import read_any
+        from sigmasplat.api import splat_ply
 
         if self.path.is_file() or (not self.path.exists() and self.path.suffix != ""):
-            return read_any(self.path), None
+            return splat_ply.read_field(self.path), None
         run = self.run()
         return run.read_splat_std() or (run.read_map(), None)

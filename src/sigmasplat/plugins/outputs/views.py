@@ -20,7 +20,6 @@ from sigmasplat.api import (
     Camera,
     GaussianField,
     Matrix,
-    Mesh,
     Progress,
     RunError,
     header_of,
@@ -38,16 +37,6 @@ Points = NDArray[np.floating]
 
 MAX_POINTS = 100_000
 MIN_OPACITY = 0.5
-
-
-def export_points(surface: Mesh, target: Path) -> int:
-    """Write the vertices of a run's surface (`FusionInput.surface`), about one per voxel; return their number.
-
-    Raises RunError if the file cannot be written.
-    """
-    colors = surface.vertices * 0.0 + 0.7 if surface.colors is None else surface.colors
-    write_points(target, surface.vertices, colors, surface.normals(), surface.depth_std_m)
-    return len(surface.vertices)
 
 
 def splat_points(field: GaussianField, most: int = MAX_POINTS) -> tuple[Matrix, Matrix]:

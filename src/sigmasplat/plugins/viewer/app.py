@@ -199,7 +199,7 @@ class ViewerApp:
                 client.scene.set_background_image(None)
             return None
         pose, splats = camera_pose(c), ([(IdentityKey(p.field), p.T_world_piece.tobytes()) for p in pieces], visible)
-        state = (controls.layer, controls.error_part, pose.tobytes(), c.fov, c.aspect, splats)
+        state = (controls.layer, pose.tobytes(), c.fov, c.aspect, splats)
         drawn, rows = self._drawn.get(key), LIVE_ROWS if snapshot.live else ROWS
         sharp_rows = rows if snapshot.live else max(rows, min(SHARP_ROWS, c.image_height))
         rows = sharp_rows if self._sharp else rows
@@ -213,7 +213,7 @@ class ViewerApp:
             (field, known), how = self._merged[1], (snapshot.options, snapshot.backend)
             made: LayerImage
             if controls.layer in PREDICTED_MODES and known is not None:
-                made = layers.render_predicted(field, known, camera, pose, controls.layer, controls.error_part, *how)
+                made = layers.render_predicted(field, known, camera, pose, controls.layer, *how)
             else:
                 made = layers.render_layer(field, camera, pose, controls.layer, *how)
             if client.client_id not in self.server.get_clients():

@@ -11,20 +11,14 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from sigmasplat.api import (
-    ATTRIBUTES,
-    COLUMNS,
     Camera,
     GaussianField,
     MapUncertainty,
     Matrix,
     RenderConfig,
-    harmonics,
-    left_factor,
     predicted,
-    quaternion_of,
     render,
     se3,
-    transformed,
     variance_parts,
 )
 from sigmasplat.plugins.evaluation.metrics.views import COVERED_ALPHA
@@ -131,18 +125,8 @@ def covariances(quats_wxyz: Floats, scales: Floats) -> Floats:
 
 def merge_pieces(pieces: Sequence[Piece], visible: VisibilityFilter) -> GaussianField:
     """Return the visible splats of all pieces as one field in the world frame."""
-    parts = [(piece, visible.mask(piece)) for piece in pieces]
-    params = [piece.field.params[kept] for piece, kept in parts] or [GaussianField.empty().params]
-    names = {name for piece, _ in parts for name in piece.field.attributes}
-    attributes: dict[str, list[Tensor]] = {name: [] for name in sorted(names)}
-    for (piece, kept), rows in zip(parts, params, strict=False):
-        T = torch.from_numpy(piece.T_world_piece).to(rows)
-        _move(rows, T)
-        for name, all_rows in attributes.items():
-            all_rows.append(_moved_extra(piece.field, name, T)[kept])
-    return field_without_moments(
-        torch.cat(params), {name: torch.cat(all_rows) for name, all_rows in attributes.items()}
-    )
+    parts = (piece.field.part(visible.mask(piece)).moved(torch.from_numpy(piece.T_world_piece)) for piece in pieces)
+    return GaussianField.side_by_side(parts)
 
 
 def merged_uncertainty(pieces: Sequence[Piece], visible: VisibilityFilter) -> MapUncertainty | None:
@@ -153,23 +137,7 @@ def merged_uncertainty(pieces: Sequence[Piece], visible: VisibilityFilter) -> Ma
     return known.at(visible.mask(pieces[0]))
 
 
-def _move(params: Tensor, T_world_piece: Tensor) -> None:
-    """Transform parameter rows to the world in place: `GaussianField.moved` without the optimiser's state."""
-    means, quats, R = params[:, COLUMNS["means"]], params[:, COLUMNS["quats"]], T_world_piece[:3, :3]
-    params[:, COLUMNS["means"]] = transformed(means, R) + T_world_piece[:3, 3]
-    params[:, COLUMNS["quats"]] = transformed(quats, left_factor(quaternion_of(R)))
-
-
-def _moved_extra(field: GaussianField, name: str, T_world_piece: Tensor) -> Tensor:
-    """Return an attribute of the splats in the world frame; zeros if this piece does not have it."""
-    if name not in field.attributes:
-        return field.params.new_zeros(len(field), ATTRIBUTES[name])
-    values = field.attributes[name].params
-    return harmonics.turned(values, T_world_piece[:3, :3]) if name == "harmonics" else values
-
-
 Layer = Literal["colour", "depth", "V", "U", "color error", "depth error"]
-ErrorPart = Literal["all", "aleatoric", "epistemic"]
 LEGEND_SIZE, LEGEND_BAR, INK, PAPER = (280, 34), 14, (233, 237, 242), (36, 40, 46)
 
 
@@ -223,12 +191,11 @@ def render_layer(
 
 def render_predicted(
     field: GaussianField, known: MapUncertainty, camera: Camera, T_world_camera: Matrix, layer: Layer,
-    part: ErrorPart, options: RenderConfig, backend: str,
+    options: RenderConfig, backend: str,
 ) -> LayerImage:  # fmt: skip
-    """Draw the predicted standard deviation of colour ("color error") or of depth in m ("depth error"), or a part.
+    """Draw the predicted standard deviation of colour ("color error") or of depth in m ("depth error").
 
-    The scale ends at the 99th percentile of the whole error, so that the parts can be compared. Depth is drawn only
-    where A > ½; colour is predicted where the map is empty too.
+    Depth is drawn only where A > ½; colour is predicted where the map is empty too.
     """
     T_camera_world = se3.inverse(T_world_camera)
     with torch.no_grad():
@@ -236,14 +203,8 @@ def render_predicted(
         found = predicted(parts, known.calibration)
     covered = _array(parts.alpha) > COVERED_ALPHA
     if layer == "color error":
-        aleatoric, epistemic = found.color_aleatoric, found.color_epistemic
-        covered, unit = np.ones_like(covered), ""
-    else:
-        aleatoric, epistemic, unit = found.depth_aleatoric_m2, found.depth_epistemic_m2, " m"
-    total = aleatoric + epistemic
-    shown = {"all": total, "aleatoric": aleatoric, "epistemic": epistemic}[part]
-    ends = 0.0, colormap.value_range(_array(total.sqrt()), covered)[1]
-    return _mapped(_array(shown.sqrt()), covered, ends, colormap.INFERNO, unit)
+        return _from_zero(_array(found.color.sqrt()), np.ones_like(covered), "")
+    return _from_zero(_array(found.depth_std_m), covered, " m")
 
 
 def draw_legend(legend: Legend) -> colormap.Rgb:

@@ -8,7 +8,7 @@ import numpy as np
 import viser
 
 from sigmasplat.plugins.outputs.drawing.colormap import NO_READING, Rgb
-from sigmasplat.plugins.viewer.layers import LEGEND_SIZE, Colouring, ErrorPart, Layer
+from sigmasplat.plugins.viewer.layers import LEGEND_SIZE, Colouring, Layer
 
 ViewMode = Literal["splats", "mesh", "colour", "depth", "V", "U", "color error", "depth error"]
 VIEW_MODES: tuple[ViewMode, ...] = get_args(ViewMode)
@@ -25,11 +25,6 @@ MODE_LABELS: dict[ViewMode, str] = {
     "depth error": "predicted error of depth",
 }
 COLOURINGS: dict[Colouring, str] = {"colour": "colour", "σ": "σ", "depth error": "predicted error of depth"}
-ERROR_PARTS: dict[ErrorPart, str] = {
-    "all": "all",
-    "aleatoric": "aleatoric: noise and detail",
-    "epistemic": "epistemic: more views reduce it",
-}
 MOST_STD_M = 0.3
 """End of the slider for predicted errors of depth; there, no splat is hidden."""
 FINAL_MAP, SUBMAPS = "final map", "submaps"
@@ -42,7 +37,6 @@ class ControlState:
     mode: ViewMode
     colouring: Colouring
     final_map: bool
-    error_part: ErrorPart
     hidden_share: float
     min_opacity: float
     max_std_m: float
@@ -79,10 +73,6 @@ class ControlPanel:
     def _add_map_controls(self, gui: viser.GuiApi) -> None:
         with gui.add_folder("Map"):
             self.mode: Any = gui.add_dropdown("show", _mode_options(frozenset((*PREDICTED_MODES, "mesh"))))
-            self.error_part = gui.add_dropdown(
-                "part of the error", tuple(ERROR_PARTS.values()), visible=False,
-                hint="one standard deviation of the whole predicted error or of a part, on the scale of the whole",
-            )  # fmt: skip
             self.colouring: Any = gui.add_dropdown(
                 "splat colour",
                 _colouring_options(predicted=False),
@@ -119,7 +109,7 @@ class ControlPanel:
 
     def _controls(self) -> tuple[Any, ...]:
         return (
-            self.mode, self.error_part, self.colouring, self.part, self.hidden, self.max_std, self.min_opacity,
+            self.mode, self.colouring, self.part, self.hidden, self.max_std, self.min_opacity,
             self.row, self.follow, self.path, self.keyframes, self.thumbnails, self.true_path,
         )  # fmt: skip
 
@@ -129,7 +119,6 @@ class ControlPanel:
             next(mode for mode in VIEW_MODES if MODE_LABELS[mode] == self.mode.value),
             next(name for name, label in COLOURINGS.items() if label == self.colouring.value),
             self.part.value == FINAL_MAP,
-            next(name for name, label in ERROR_PARTS.items() if label == self.error_part.value),
             self.hidden.value / 100.0,
             float(self.min_opacity.value),
             float(self.max_std.value) if self.max_std.visible and self.max_std.value < MOST_STD_M else float("inf"),
@@ -163,7 +152,6 @@ class ControlPanel:
             if control.options != options:
                 control.options = options
         self.max_std.visible = known
-        self.error_part.visible = known and self.mode.value in {MODE_LABELS[mode] for mode in PREDICTED_MODES}
 
     def show_texts(self, facts: str, hidden: str, frame: str) -> None:
         """Show texts about the run, about the hidden splats, and about the selected frame."""

@@ -1,7 +1,5 @@
-"""Take snapshots at a bounded rate: of a system that runs in this process, or of a run folder, either finished or still
-written by another process."""
+"""Take snapshots: of a run folder, and at a bounded rate of a system that runs in this process."""
 
-import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -62,7 +60,7 @@ def finished_snapshot(run: RunFolder, source: Source | None = None, budget: int 
     config, true_file = run.config(), run.path / TRUTH
     outside = frames.submaps_outside()
     cache, anchors = SubmapCache(run.submaps, budget), np.asarray(tensors["T_world_submap"], np.float64)
-    cache.load(lambda index, first: _row_of(anchors, index))
+    cache.load(anchors)
     pieces = list(cache.pieces.values())
     if pieces and len(pieces) < len(anchors):
         pieces.append(Piece(len(pieces), thin(GaussianField(tensors["params"]), budget), anchors[-1]))
@@ -82,41 +80,6 @@ def finished_snapshot(run: RunFolder, source: Source | None = None, budget: int 
     )
 
 
-def running_snapshot(run: RunFolder, cache: "SubmapCache") -> Snapshot:
-    """Read the snapshot of an unfinished run: the path of its log, and its finished submaps.
-
-    A submap has the logged pose of its first keyframe; submaps that are not connected to the world are left out.
-    `cache` holds the submaps that were read before.
-    """
-    log = run.read_log() if (run.path / "log.jsonl").is_file() else []
-    config, poses = run.config(), [np.array(record["T_world_camera"], np.float64) for record in log]
-    earlier = np.array(run.facts().get("onto", {}).get("T_world_submap", [])).reshape(-1, 4, 4)  # of an earlier session
-    cache.load(lambda index, first: earlier[index] if index < len(earlier) else _row_of(poses, first))
-    keyframes = tuple(row for row, record in enumerate(log) if record["is_keyframe"])
-    lost, submaps = _lost_and_submaps(log)
-    states = np.array([record.get("state", "") for record in log], str)
-    outside = submaps_outside(states, submaps)
-    path = CameraPath(np.array(poses).reshape(-1, 4, 4), lost, submaps, keyframes, outside_world(states))
-    pieces = tuple(piece for piece in cache.pieces.values() if piece.submap not in outside)
-    return Snapshot(
-        run.path.resolve().name, path, None, pieces, None, cache.camera or DEFAULT_CAMERA,
-        cache.image, config.render, config.backend, live=True, status="running",
-    )  # fmt: skip
-
-
-def follow_run(run: RunFolder, show: ShowSnapshot, stop: threading.Event, source: Source | None = None) -> None:
-    """Show an unfinished run repeatedly until it ends, then show the finished run and return.
-
-    Returns earlier if `stop` is set. Raises RunError if the run has ended without a map.
-    """
-    cache = SubmapCache(run.submaps)
-    while run.facts().get("status") == "running":
-        show(running_snapshot(run, cache))
-        if stop.wait(EVERY_S):
-            return
-    show(finished_snapshot(run, source))
-
-
 class SubmapCache:
     """The finished submaps that have been read so far, within a budget of splats, and the images of their keyframes."""
 
@@ -126,18 +89,12 @@ class SubmapCache:
         self.camera: Camera | None = None
         self._keyframes: dict[int, tuple[int, int]] = {}
 
-    def load(self, pose_of: Callable[[int, int], Matrix | None]) -> None:
-        """Read the submaps that were not read before, up to the first one without a pose.
-
-        pose_of: returns T_world_submap from the numbers of a submap and of the frame of its first keyframe.
-        """
-        for index in range(len(self.pieces), len(self.store)):
+    def load(self, T_world_submap: Sequence[Matrix] | Matrix) -> None:
+        """Read the submaps that were not read before and have a pose."""
+        for index in range(len(self.pieces), min(len(self.store), len(T_world_submap))):
             submap = self.store.load(index)
-            T_world_submap = pose_of(index, submap.frames[0])
-            if T_world_submap is None:
-                return
             self.camera = submap.camera
-            self.pieces[index] = Piece(index, thin(submap.field, self.budget), T_world_submap)
+            self.pieces[index] = Piece(index, thin(submap.field, self.budget), T_world_submap[index])
             fitting = within_budget(tuple(self.pieces.values()), self.budget)
             self.pieces = dict(zip(self.pieces, fitting, strict=True))
             for k, row in enumerate(submap.frames):
@@ -148,10 +105,6 @@ class SubmapCache:
         if row not in self._keyframes:
             return None
         return self.store.picture(*self._keyframes[row]).color
-
-
-def _row_of(poses: "Sequence[Matrix] | Matrix", row: int) -> Matrix | None:
-    return poses[row] if row < len(poses) else None
 
 
 def _mesh(run: RunFolder) -> Mesh | None:
@@ -200,9 +153,12 @@ def _image(cache: SubmapCache, log: Log, run: RunFolder, source: Source | None, 
 
 
 def check_has_map(run: RunFolder) -> None:
-    """Raise RunError if a run has ended without a map."""
-    if run.facts().get("status") != "running" and not (run.path / "map.ply").is_file():
-        raise RunError(f"run {run.path} has no map to show: it stopped before its first frame; run it again")
+    """Raise RunError if a run has no map: it is not finished, or it ended without one."""
+    if not (run.path / "map.ply").is_file():
+        raise RunError(
+            f"run {run.path} has no map to show (status: {run.facts().get('status')}); a run writes it at its end, "
+            "`sigmasplat run --view` shows it from the start"
+        )
 
 
 MAX_TIME_SHARE = 0.02
@@ -252,7 +208,7 @@ class LiveView(Callback):
         poses, keyframes = slam.atlas.T_world_camera(), tuple(slam.keyframe_indices)
         path = CameraPath(poses, lost, submaps, keyframes, outside_world(states))
         anchors = slam.atlas.anchors
-        self._finished.load(lambda index, first: anchors[index])
+        self._finished.load(anchors)
         placed = [replace(piece, T_world_piece=anchors[i].copy()) for i, piece in self._finished.pieces.items()]
         final = Piece(None, slam.field, uncertainty=slam.uncertainty).thinned(self.budget) if finished else None
         pieces = tuple(piece for piece in (*placed, *self._active()) if piece.submap not in outside)

@@ -97,10 +97,9 @@ PLAN_CAPTION = (
 class Contents:
     """What a report shows.
 
-    verdicts: shown first; commands: what to do with the map; advice: what else to try; summary: sentences; rescan:
-    sentences about what to scan again; regions: the same numbered regions as in the floor plan; strips: panels of views
-    by heading; plots: charts by name; plan: panels of the floor plan; seconds: time per stage; loops: the records of
-    loops.json.
+    verdicts: shown first; commands: what to do with the map; advice: what else to try; rescan: sentences about what to
+    scan again; regions: the same numbered regions as in the floor plan; strips: panels of views by heading; plots:
+    charts by name; plan: panels of the floor plan; seconds: time per stage; loops: the records of loops.json.
     """
 
     title: str
@@ -113,7 +112,6 @@ class Contents:
     loops: list[dict[str, Any]] = field(default_factory=list)
     verdicts: list[Verdict] = field(default_factory=list)
     commands: list[Advice] = field(default_factory=list)
-    summary: list[str] = field(default_factory=list)
     advice: list[Advice] = field(default_factory=list)
     rescan: list[str] = field(default_factory=list)
     plan: list[PanelFigure] = field(default_factory=list)
@@ -176,14 +174,13 @@ def _verdict(verdict: Verdict) -> str:
 
 
 def _scores(contents: Contents) -> str:
-    """Show the summary, and all scores of images, path, surface and uncertainty."""
+    """Show all scores of images, path, surface and uncertainty."""
     body = "".join(
         f"<div class=card><h3>{title}</h3>{_table(rows)}</div>"
         for title, rows in tables.score_tables(contents.metrics)
         if rows[1:]
     )
-    summary = f"<p>{html.escape(' '.join(contents.summary))}</p>" if contents.summary else ""
-    return f"{summary}<div class=pair>{body}</div>"
+    return f"<div class=pair>{body}</div>"
 
 
 def _rescan(contents: Contents) -> str:

@@ -20,7 +20,7 @@ from sigmasplat.api import (
 from sigmasplat.plugins.evaluation.report.advice import advice, next_commands
 from sigmasplat.plugins.evaluation.report.charts import Plot
 from sigmasplat.plugins.evaluation.report.html import Contents, build_report
-from sigmasplat.plugins.evaluation.report.summary import rescan_sentences, summary_sentences, verdicts
+from sigmasplat.plugins.evaluation.report.summary import rescan_sentences, verdicts
 from sigmasplat.plugins.evaluation.report.view_strips import PanelFigure, panel_figure
 from sigmasplat.plugins.outputs.floorplan.floor_plan import FloorPlan, run_floor_plan
 from sigmasplat.plugins.outputs.floorplan.picture import plan_panels
@@ -52,7 +52,6 @@ def write_page(
         config=json.dumps(config.to_dict(), indent=2),
         warnings=warnings,
         loops=run.read_loops(),
-        summary=summary_sentences(metrics, _machine(run)),
         verdicts=verdicts(metrics, unsure, found),
         commands=next_commands(str(run.path)),
         advice=found[1:],

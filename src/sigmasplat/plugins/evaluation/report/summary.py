@@ -1,19 +1,18 @@
-"""Describe the scores of a run in sentences: three verdicts, what was made, where to scan again."""
+"""Describe the scores of a run in sentences: three verdicts, the result, where to scan again."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
-from sigmasplat.api import format_ranges, number, rate
+from sigmasplat.api import format_ranges, number
 from sigmasplat.plugins.evaluation.report.advice import PSNR_WORDS, Advice, Metrics
 from sigmasplat.plugins.outputs.floorplan.rescan import unsure_rule
 
 if TYPE_CHECKING:
     from sigmasplat.plugins.outputs.floorplan.floor_plan import FloorPlan
 
-RANK_WORDS = ((0.5, "well"), (0.3, "fairly well"), (0.1, "weakly"))
 DEPTH_WORDS = ((0.01, "very accurate"), (0.03, "good"))
-NOMINAL, CALIBRATED = 0.683, 0.05
-"""Coverage of one standard deviation, and the largest difference from it that counts as calibrated."""
+CALIBRATED = 0.05
+"""Largest difference of a coverage from its nominal value that counts as calibrated."""
 
 
 class Verdict(NamedTuple):
@@ -34,7 +33,7 @@ def verdicts(metrics: Metrics, unsure: Sequence[int], advice: Sequence[Advice]) 
     todo = Verdict("Next", "Try this" if advice else "Use the map", words, command)
     meaning = " ".join([*_images(metrics), *_depth(metrics)])
     known = f"{path_words(metrics)}, {len(unsure)} of them doubtful" if unsure else path_words(metrics)
-    path = " ".join([_path(metrics, unsure), *_pose_covariance(metrics)])
+    path = " ".join([_path(metrics, unsure) + _continued(metrics), *_pose_covariance(metrics)])
     return [Verdict("Path", known, path), Verdict("Map", map_words(metrics), meaning), todo]
 
 
@@ -64,29 +63,6 @@ def result_sentence(metrics: Metrics) -> str:
     apart = f", of which {metrics['apart']} are in components/" if metrics.get("apart") else ""
     words = map_words(metrics)
     return f"{path_words(metrics)}{apart}{error}; the map is {words[0].lower()}{words[1:]}."
-
-
-def summary_sentences(metrics: Metrics, machine: str = "") -> list[str]:
-    """Return what the verdicts do not say: what was made, and whether the uncertainty is right."""
-    return [
-        _overview(metrics, machine),
-        *_uncertainty(metrics),
-        *_predicted_errors(metrics),
-    ]
-
-
-def _overview(metrics: Metrics, machine: str) -> str:
-    speed = metrics.get("frames_per_s")
-    how = f" at {rate(speed)}" if speed else ""
-    status = metrics.get("status")
-    unfinished = (
-        "" if status in (None, "complete") else f" The run is {status}: this report covers the frames up to that point."
-    )
-    return (
-        f"SigmaSplat made a camera path and a map of {number(metrics.get('splats'), 0)} splats from "
-        f"{number(metrics.get('frames'), 0)} colour and depth images of {metrics.get('source')}{how}"
-        f"{f' on {machine}' if machine else ''}.{_continued(metrics)}{unfinished}"
-    )
 
 
 def _continued(metrics: Metrics) -> str:
@@ -157,56 +133,6 @@ def _depth(metrics: Metrics) -> list[str]:
         f"The depth of the map differs from the measured depth by {number(error_m, 1, 100.0)} cm on average: {rating}."
         f"{missing}"
     ]
-
-
-def _uncertainty(metrics: Metrics) -> list[str]:
-    judged = metrics.get("uncertainty") or {}
-    rank = judged.get("spearman")
-    if rank is None:
-        return []
-    rating = next(
-        (f"V predicts {words} where" for least, words in RANK_WORDS if rank >= least), "V does not show where"
-    )
-    views = " at training views, because no view was held back" if judged.get("judged_on") == "training" else ""
-    return [f"The uncertainty {rating} the rendered colours are wrong{views} (rank correlation {number(rank, 2)})."]
-
-
-def _predicted_errors(metrics: Metrics) -> list[str]:
-    found = metrics.get("predictive") or {}
-    measured = {name: found[key] for key, name in (("color", "colour"), ("depth", "depth")) if found.get(key)}
-    if not measured:
-        return _unknown_errors(metrics)
-    shares = ", ".join(f"{number(of['coverage_68'], 0, 100.0)} % ({name})" for name, of in measured.items())
-    verdicts = [_verdict(name, of) for name, of in measured.items()]
-    return [
-        f"{_calibrated_on(metrics)}68 % of the errors should be within one predicted standard deviation: measured "
-        f"{shares}. {' '.join(verdicts)}"
-    ]
-
-
-def _calibrated_on(metrics: Metrics) -> str:
-    probes = (metrics.get("calibration") or {}).get("probes")
-    if probes is None:
-        return ""
-    if not probes:
-        return "The run kept no probe view, so predicted errors have the weights of the preset. "
-    return f"Predicted errors were calibrated on {probes} probe views, to which no map was fitted. "
-
-
-def _verdict(name: str, scores: Metrics) -> str:
-    """Return whether a predicted error has the right size, and the factor that corrects it."""
-    off = scores["coverage_68"] - NOMINAL
-    if abs(off) <= CALIBRATED:
-        return f"The predicted error of {name} has the right size."
-    size, factor = "small" if off < 0 else "large", scores.get("z_68")
-    correction = "" if factor is None else f"; multiply it by {number(factor, 2)}"
-    return f"The predicted error of {name} is too {size}{correction}."
-
-
-def _unknown_errors(metrics: Metrics) -> list[str]:
-    if "calibration" not in metrics or metrics["calibration"] is not None:
-        return []
-    return ["The run has no predicted errors of colour and depth: the size of V is not calibrated."]
 
 
 def _pose_covariance(metrics: Metrics) -> list[str]:

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from sigmasplat.api import APART, LOST, RELOCALISED, SHIPPED, TRACKED, format_ranges, number, rate
+from sigmasplat.api import APART, LOST, RELOCALISED, TRACKED, format_ranges, number, rate
 
 
 def key_figures(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
@@ -57,9 +57,7 @@ def score_tables(metrics: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
         ("Surface, by the protocol of published systems", _published_rows(metrics)),
         (f"Uncertainty V, {views}", _uncertainty_rows(metrics.get("uncertainty"))),
         (f"Uncertainty V, {kind}, final map", _uncertainty_rows(metrics.get("uncertainty_final"))),
-        (f"Calibration of V, {views}", _calibration_rows(metrics.get("uncertainty"))),
         ("Predicted errors, held-out, final map", _predictive_rows(metrics.get("predictive"))),
-        ("Calibration of predicted errors", _weight_rows(metrics.get("calibration"))),
         ("Covariance of poses", _covariance_rows(metrics.get("pose_covariance"))),
     ]
 
@@ -200,37 +198,17 @@ def _uncertainty_rows(scores: dict[str, Any] | None) -> list[list[str]]:
     return [head, *figure_rows(lines, scores)]
 
 
-def _calibration_rows(scores: dict[str, Any] | None) -> list[list[str]]:
-    rows = (scores or {}).get("reliability") or []
-    return [["decile of V", "mean V, 10⁻³", "squared error, 10⁻³"]] + [
-        [str(i), number(row["predicted"], 3, 1e3), number(row["empirical"], 3, 1e3)] for i, row in enumerate(rows, 1)
-    ]
-
-
 def _predictive_rows(scores: dict[str, Any] | None) -> list[list[str]]:
     if not scores:
         return []
     lines = [("Pixels", "pixels", 0, 1.0), ("Within 1 standard deviation, % (ideal 68)", "coverage_68", 1, 100.0),
              ("Within 1.96 standard deviations, % (95)", "coverage_95", 1, 100.0),
+             ("Factor that makes it 68 % (ideal 1)", "z_68", 2, 1.0),
              ("AUCE (0 = right size)", "auce", 3, 1.0), ("AUSE (0 = perfect ranking)", "ause", 3, 1.0),
              ("Spearman of variance and squared error", "spearman", 3, 1.0),
              ("Gaussian NLL", "nll", 3, 1.0)]  # fmt: skip
     kinds = [scores.get(key) or {} for key in ("color", "depth")]
     return [[f"{scores['views']} views", "colour", "depth"], *figure_rows(lines, *kinds)]
-
-
-def _weight_rows(calibration: dict[str, Any] | None) -> list[list[str]]:
-    """Return the fitted weight of each part of the predicted variances, and that of the preset; the temperatures."""
-    if not calibration:
-        return []
-    parts = dict.fromkeys([*calibration["color"], *calibration["depth"]])
-    columns = [calibration["color"], SHIPPED.color, calibration["depth"], SHIPPED.depth]
-    temperatures = calibration.get("temperature", {}), SHIPPED.temperature
-    return (
-        [[f"weights, {calibration['probes']} probe views", "colour", "… preset", "depth", "… preset"]]
-        + [[part, *("" if part not in weights else f"{weights[part]:.2g}" for weights in columns)] for part in parts]
-        + [["temperature", *(f"{of.get(name, 1.0):.2g}" for name in ("color", "depth") for of in temperatures)]]
-    )
 
 
 def _covariance_rows(scores: dict[str, Any] | None) -> list[list[str]]:

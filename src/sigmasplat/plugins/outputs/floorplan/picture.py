@@ -70,19 +70,11 @@ def export_plan(
     if target.suffix.lower() != ".png":
         raise RunError(f"cannot write a floor plan as {target.name}; give a name that ends in .png")
     plan = run_floor_plan(reader.run, reader.valid_path(), reader.camera, cell_m=cell_m, progress=progress)
-    write_plan(plan, target)
-    return plan
-
-
-def write_plan(plan: FloorPlan, target: Path) -> None:
-    """Write the image to `target` (.png) and the data beside it (.json).
-
-    Raises RunError if a file cannot be written.
-    """
     picture = draw_floor_plan(plan)
     with replacing(target) as temporary:
         picture.save(temporary, "PNG")
     write_json(target.with_suffix(".json"), plan.record())
+    return plan
 
 
 def plan_panels(plan: FloorPlan) -> list[ViewPanel]:

@@ -1,4 +1,4 @@
-"""Read and write splats as PlayCanvas's SOG, version 2: a zip of meta.json and lossless WebP images.
+"""Write splats as PlayCanvas's SOG, version 2: a zip of meta.json and lossless WebP images.
 
 One pixel per splat, in the same order in all images; the splats are in Morton order, because similar neighbours
 compress better. Images: means_l and means_u, the low and high bytes of positions (16 bits between `mins` and `maxs`, of
@@ -13,30 +13,22 @@ each channel. Axes as in 3DGS's PLY. The format cannot hold σ². Layout: PlayCa
 import io
 import json
 import zipfile
-import zlib
-from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 from scipy.cluster.vq import vq
 
 from sigmasplat.api import (
-    DEGREES,
     SH_C0,
     Doubles,
     GaussianField,
-    SourceError,
     SplatValues,
-    check_count,
     count,
-    from_smallest_three,
     morton_order,
-    opacities_of,
     opacity_bytes,
-    open_binary,
     replacing,
     smallest_three,
     to_bytes,
@@ -94,9 +86,6 @@ MAGIC = b"PK\x03\x04"
 FIRST_TAG = 252
 PALETTE_ROWS, MAX_PALETTE = 64, 8192
 STEPS = 65535.0
-MAX_META_BYTES = 1 << 20
-MAX_RATIO = 1024
-"""Maximum number of pixels per byte of the file: an image of one colour must not fill the memory."""
 ZIP_TIME = (1980, 1, 1, 0, 0, 0)
 
 Pixels = NDArray[np.uint8]
@@ -135,122 +124,6 @@ def write_field(path: Path, field: GaussianField) -> None:
         for name, pixels in images.items():
             archive.writestr(zipfile.ZipInfo(name, ZIP_TIME), _webp(pixels))
         archive.writestr(zipfile.ZipInfo("meta.json", ZIP_TIME), json.dumps(meta), zipfile.ZIP_DEFLATED)
-
-
-def read_field(path: Path) -> GaussianField:
-    """Read a SOG file; σ² becomes exp(−7).
-
-    Raises SourceError if it is missing, damaged, truncated, not of version 2, or another zip.
-    """
-    with open_binary(path, "cannot read map") as file:
-        try:
-            with zipfile.ZipFile(file) as archive:
-                return _read(_Archive(archive, path)).field(path)
-        except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError, zlib.error) as problem:
-            raise SourceError(f"{path} is damaged or truncated: {problem}; copy or download it again") from problem
-
-
-class _Archive:
-    """The zip: meta.json and its images, with sizes that are checked before anything is decoded."""
-
-    def __init__(self, archive: zipfile.ZipFile, path: Path) -> None:
-        self.archive, self.path = archive, path
-        self.packed_size = path.stat().st_size
-        try:
-            self.meta = json.loads(self._member("meta.json", MAX_META_BYTES))
-        except (ValueError, RecursionError) as problem:
-            raise self.damaged("meta.json is not JSON") from problem
-        if not isinstance(self.meta, Mapping) or self.meta.get("version") != 2:
-            raise SourceError(f"{path} is not a SOG file of version 2; save it again with SuperSplat, or as PLY")
-
-    def damaged(self, what: str) -> SourceError:
-        return SourceError(f"{self.path} is damaged, or not a SOG file: {what}")
-
-    def numbers(self, group: str, name: str, size: int) -> Doubles:
-        """Return a list of exactly `size` finite numbers of the meta data. Raises SourceError."""
-        try:
-            found = np.asarray(self.meta[group][name], np.float64)
-        except (KeyError, TypeError, ValueError, OverflowError) as problem:
-            raise self.damaged(f"meta.json has no numbers {group}.{name}") from problem
-        if found.shape != (size,) or not np.isfinite(found).all():
-            raise self.damaged(f"{group}.{name} in meta.json must have {size} finite numbers")
-        return found
-
-    def whole(self, *names: str, most: int) -> int:
-        """Return a whole number from 0 to `most` of the meta data. Raises SourceError."""
-        found: Any = self.meta
-        for name in names:
-            found = found.get(name) if isinstance(found, Mapping) else None
-        if not isinstance(found, int) or isinstance(found, bool) or not 0 <= found <= most:
-            raise self.damaged(f"{'.'.join(names)} in meta.json must be a whole number from 0 to {most}")
-        return found
-
-    def image(self, group: str, index: int, fits: Callable[[int, int], bool]) -> Pixels:
-        """Decode an image [pixels, 4] of the meta data whose width and height fit. Raises SourceError."""
-        try:
-            name = self.meta[group]["files"][index]
-        except (KeyError, TypeError, IndexError) as problem:
-            raise self.damaged(f"meta.json has no file {index} of {group}") from problem
-        data = self._member(name, self.packed_size * MAX_RATIO)
-        try:
-            with Image.open(io.BytesIO(data), formats=["WEBP"]) as picture:
-                if not fits(*picture.size):
-                    raise self.damaged(f"{name} has {picture.size[0]} × {picture.size[1]} pixels")
-                return np.asarray(picture.convert("RGBA")).reshape(-1, 4)
-        except (UnidentifiedImageError, OSError, ValueError, Image.DecompressionBombError) as problem:
-            raise self.damaged(f"{name} is not a WebP image") from problem
-
-    def _member(self, name: object, most: int) -> bytes:
-        try:
-            info = self.archive.getinfo(str(name))
-        except KeyError as problem:
-            raise self.damaged(f"it has no {name}") from problem
-        if info.file_size > most:
-            raise self.damaged(f"{name} says it has {info.file_size} bytes")
-        with self.archive.open(info) as member:
-            return member.read(most)
-
-
-def _read(given: _Archive) -> SplatValues:
-    size = given.whole("count", most=given.packed_size * MAX_RATIO)
-    check_count(size, given.packed_size, given.path)
-
-    def pixels(group: str, index: int = 0) -> Pixels:
-        """Return the pixels of the splats. Other writers round width and height up to multiples of four."""
-        return given.image(group, index, lambda w, h: size <= w * h <= 2 * size + 4096)[:size]
-
-    low, high = given.numbers("means", "mins", 3), given.numbers("means", "maxs", 3)
-    steps = pixels("means", 0)[:, :3] + 256.0 * pixels("means", 1)[:, :3]
-    logs = low + (high - low) * steps / STEPS
-    if np.abs(logs).max(initial=0.0) > 80.0:
-        raise given.damaged("positions are not finite")
-    quats, sh0 = pixels("quats"), pixels("sh0")
-    tags = quats[:, 3].astype(np.intp) - FIRST_TAG
-    if (tags < 0).any():
-        raise given.damaged("a rotation has no index of its largest component")
-    return SplatValues(
-        np.sign(logs) * np.expm1(np.abs(logs)),
-        from_smallest_three(tags, (quats[:, :3] / 255.0 - 0.5) / np.sqrt(0.5)),
-        given.numbers("scales", "codebook", LEVELS)[pixels("scales")[:, :3]],
-        opacities_of(sh0[:, 3]),
-        given.numbers("sh0", "codebook", LEVELS)[sh0[:, :3]] * SH_C0 + 0.5,
-        _harmonics(given, pixels, size) if "shN" in given.meta else np.empty((size, 0)),
-    )
-
-
-def _harmonics(given: _Archive, pixels: Callable[[str, int], Pixels], size: int) -> Doubles:
-    """Return harmonics [N, 3·k], columns 3·i + channel. Raises SourceError."""
-    each = count(given.whole("shN", "bands", most=DEGREES))
-    rows = given.whole("shN", "count", most=1 << 16)
-    lines = -(-rows // PALETTE_ROWS)
-    wide = PALETTE_ROWS * each
-    table = given.image("shN", 0, lambda w, h: w == wide and lines <= h <= 2 * lines + 64)
-    labels = pixels("shN", 1)[:, :2].astype(np.intp) @ np.array([1, 256])
-    if (labels >= rows).any():
-        raise given.damaged("the harmonics of a splat are not in the palette")
-    book = given.numbers("shN", "codebook", LEVELS)[table[:, :3]]
-    harmonics: Doubles = book.reshape(-1, 3 * each)[labels].reshape(size, 3 * each)
-    return harmonics
 
 
 def _packed_harmonics(values: SplatValues) -> tuple[dict[str, Any], dict[str, Pixels]]:
