@@ -100,14 +100,11 @@ RunOrMap = Annotated[Path, tyro.conf.Positional, arg("RUN", "run folder or map f
 
 @dataclass(frozen=True)
 class RunOptions:
-    """Options of run and resume: scoring, profile, saving, logs, viewer."""
+    """Options of run and resume: scoring, profile, saving, viewer."""
 
     evaluate: Annotated[bool, flag("do not score the run: no metrics, no report", name="eval")] = True
     profile: Annotated[bool, flag("print the time spent in each stage")] = False
     save_every: SaveEvery = 60.0
-    log: Annotated[
-        Literal["rerun"] | None, arg("rerun", "also write the path and the values of every frame to logs/ in RUN", "")
-    ] = None
     view: View = False
     host: Host = HOST
     port: Port = PORT

@@ -4,7 +4,7 @@ The order of a run: open the source, start the viewer, create the run folder, ru
 """
 
 from collections.abc import Mapping
-from contextlib import AbstractContextManager, closing, nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -91,13 +91,10 @@ def run(
     from sigmasplat.run.finished_map import FinishedMap, continue_map
     from sigmasplat.run.resume import StartPoint
     from sigmasplat.run.session import new_run
-    from sigmasplat.run.step_logs import rerun
     from sigmasplat.run.terminal import Screen
     from sigmasplat.run_folder.runs import RunFolder
     from sigmasplat.slam.slam import Slam
 
-    if run_options.log:
-        rerun()
     check_robot_output(robot_options)
     settings += () if final_seconds is None else (f"final.seconds={final_seconds:g}",)
     settings += () if final_width is None else (f"final.width={final_width}",)
@@ -131,12 +128,9 @@ def resume(
     """
     from sigmasplat.run.resume import resume as resumed
     from sigmasplat.run.same_conditions import other_instruction_set
-    from sigmasplat.run.step_logs import rerun
     from sigmasplat.run.terminal import Screen
     from sigmasplat.run_folder.runs import RunFolder
 
-    if run_options.log:
-        rerun()
     check_robot_output(robot_options)
     screen, folder = Screen(), RunFolder.open(run)
     source = source_of(folder, moved_to)
@@ -248,7 +242,6 @@ def _run_and_score(
     from sigmasplat.realtime.system import RealTime
     from sigmasplat.run.resume import RefinementFile, StateFile
     from sigmasplat.run.session import Session
-    from sigmasplat.run.step_logs import RerunLog
 
     state = StateFile(start.slam, folder, run_options.save_every)
     start.slam.saved_refinement = RefinementFile(start.slam, folder, run_options.save_every)
@@ -261,10 +254,9 @@ def _run_and_score(
     with (
         robot_output(screen, start.slam, folder, robot_options, run_options.host) as robot,
         screen.steps(None if source.live else len(source), start.next_index) as steps,
-        closing(RerunLog(folder, start.next_index)) as log,
     ):
         session = Session(
-            system or start.slam, read, folder, [steps, log] if run_options.log else [steps], state, start.next_index,
+            system or start.slam, read, folder, [steps], state, start.next_index,
             start.wall_s, _readers(start, source, viewer, robot),
         )  # fmt: skip
         session.watch = robot.watch if robot else motion if not (system or source.live) else None

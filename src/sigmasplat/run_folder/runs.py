@@ -1,6 +1,5 @@
 """Write and read the folder of a run, which is valid at any time."""
 
-import shutil
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -150,7 +149,6 @@ class RunFolder:
             (self.path / name).unlink(missing_ok=True)
         for picture in self.images.glob("*.png"):
             picture.unlink()
-        shutil.rmtree(self.logs, ignore_errors=True)
         self.remove_leftovers()
         self.submaps.clear()
         self.write_components(())
@@ -159,11 +157,6 @@ class RunFolder:
     def images(self) -> Path:
         """Return the folder of images, images/."""
         return self.path / "images"
-
-    @property
-    def logs(self) -> Path:
-        """Return the folder of logs for other programs, logs/, which `run --log` writes."""
-        return self.path / "logs"
 
     @property
     def submaps(self) -> DiskStore:
