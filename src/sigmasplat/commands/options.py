@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
 
 PresetName = Annotated[str, arg("NAME", f"preset of settings to start from: {', '.join(FAMILIES)}")]
-Shell = Annotated[Literal["bash", "zsh"], tyro.conf.Positional, arg("{bash,zsh}", "the shell that you use")]
 Settings = Annotated[
     tuple[str, ...],
     tyro.conf.UseAppendAction,
