@@ -253,7 +253,6 @@ from sigmasplat.render.view import Layers as Layers, View as View
 from sigmasplat.run.callbacks import Callback as Callback
 from sigmasplat.run.figures import format_ranges as format_ranges, number as number, rate as rate
 from sigmasplat.run.resume import (
-    RefinementFile as RefinementFile,
     StartPoint as StartPoint,
     StateFile as StateFile,
     resume as resume,

@@ -31,8 +31,6 @@ from two_submaps import (
     LOG_VARIANCES,
     SPACING_M,
     WALL_M,
-    InMemory,
-    Interrupted,
     color_at,
     config,
     look,
@@ -248,26 +246,6 @@ def test_a_pose_comes_to_rest_at_the_reach_and_the_first_one_stays() -> None:
     assert moved_m[0.0] > 0.06, "without a limit the pose goes where its picture asks"
     assert 0.3 * reach_m < moved_m[reach_m] < 1.5 * reach_m
     assert moved_m[1e-9] < 1e-9, "a reach far below the rate holds the pose"
-
-
-FREE = {
-    "lr_pose_translation": 2e-3, "lr_pose_rotation": 1e-3, "pose_reach_m": 4e-3, "order": "epochs", "lr_decay": 0.1,
-}  # fmt: skip
-
-
-def test_a_stopped_refinement_continues_to_the_same_bytes() -> None:
-    settings = config(iterations=40, prune_every=7, **FREE)
-    view = ReferenceView(CAMERA, settings.render)
-    whole = final_map(make_store(0.1), ANCHORS, settings, view, np.random.default_rng(0))
-    saved = InMemory(stop=3)
-    with pytest.raises(Interrupted):
-        final_map(make_store(0.1), ANCHORS, settings, view, np.random.default_rng(0), saved=saved)
-    again = final_map(
-        make_store(0.1), ANCHORS, settings, view, np.random.default_rng(5), saved=InMemory(0, saved.states)
-    )
-    assert torch.equal(again.field.params, whole.field.params) and again.steps == whole.steps == 40
-    np.testing.assert_array_equal(again.keyframe_poses, whole.keyframe_poses)
-    assert not np.array_equal(whole.keyframe_poses[1], make_store().submaps[1].T_submap_camera), "poses have moved"
 
 
 def test_epochs_use_every_keyframe_equally_often() -> None:

@@ -240,11 +240,10 @@ def _run_and_score(
     from sigmasplat.plugins.checks.motion import MotionWatch
     from sigmasplat.plugins.sources.live import Arrivals, LiveSource
     from sigmasplat.realtime.system import RealTime
-    from sigmasplat.run.resume import RefinementFile, StateFile
+    from sigmasplat.run.resume import StateFile
     from sigmasplat.run.session import Session
 
     state = StateFile(start.slam, folder, run_options.save_every)
-    start.slam.saved_refinement = RefinementFile(start.slam, folder, run_options.save_every)
     read = Arrivals(source) if realtime else source
     system = RealTime(start.slam, covariances=False, should_stop=read.hurries) if isinstance(read, Arrivals) else None
     if system:

@@ -21,7 +21,7 @@ from sigmasplat.data.tsdf import packed
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.final.full_resolution import refine_on_photos, working_seconds
 from sigmasplat.final.fusion import count_keyframes, fuse, fusion_views
-from sigmasplat.final.refinement import Clock, KeyframeReader, SavedRefinement, refine
+from sigmasplat.final.refinement import Clock, KeyframeReader, refine
 from sigmasplat.graph.path_covariance import PathCovariance
 from sigmasplat.mapping.moving import carved, without_moving
 from sigmasplat.render.view import View
@@ -52,37 +52,28 @@ def final_map(
     view: View,
     random: np.random.Generator,
     progress: Progress = no_progress,
-    saved: SavedRefinement | None = None,
 ) -> FinalMap:
     """Return the map in the world: made from submaps at `anchors` (T_world_submap [4, 4] each), then refined with
     `view`.
 
-    Calls `progress(steps done, total)`. With `saved`, refinement continues after the last saved step, and the result
-    has the same bytes as that of an uninterrupted refinement. Memory contains this map, one submap and some pictures.
+    Calls `progress(steps done, total)`. Memory contains this map, one submap and some pictures.
     Raises SigmaSplatError if there is no submap, a submap has no anchor, or its camera is not the view's.
     """
     _refuse_misfits(store, anchors)
     seed = seeded_on_surface if config.final.seed_from == "mesh" else merged
-    found = None if saved is None else saved.load()
     if config.moving.find:
         store = without_moving(store, anchors, config.moving)
-    field = seed(store, anchors, config) if found is None else found.field
-    if config.moving.find and found is None:
+    field = seed(store, anchors, config)
+    if config.moving.find:
         carved(field, store, anchors, config.moving)
     if not config.final.iterations:
         return FinalMap(field)
-    if found is None:
-        field.keep(torch.from_numpy(z_order(field.means.numpy())))
+    field.keep(torch.from_numpy(z_order(field.means.numpy())))
     on_device, keyframes = field.to(view.sums.device), KeyframeReader(store, anchors, view)
-    if found is not None:
-        keyframes.take(found)
-        random.bit_generator.state = found.numbers
-    done, spent_s = (found.done, found.spent_s) if found else (0, 0.0)
-    clock = Clock(working_seconds(keyframes, config.final), spent_s)
-    if done <= config.final.iterations:
-        done += len(refine(on_device, keyframes, config, view, random, progress, done, saved, clock))
+    clock = Clock(working_seconds(keyframes, config.final))
+    done = len(refine(on_device, keyframes, config, view, random, progress, clock))
     clock = clock.next_stage(config.final.seconds)
-    done, refined_fx = refine_on_photos(on_device, keyframes, config, view, random, progress, done, saved, clock)
+    done, refined_fx = refine_on_photos(on_device, keyframes, config, view, random, progress, done, clock)
     moves = config.final.lr_pose_translation or config.final.lr_pose_rotation
     poses = keyframes.poses_in(anchors) if moves else None
     exposures = keyframes.exposures_in_submaps() if config.final.exposure else None

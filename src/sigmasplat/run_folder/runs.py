@@ -32,8 +32,6 @@ MESH = "mesh.ply"
 """The surface, written by `sigmasplat mesh`."""
 STATE = "state.safetensors"
 """The state from which an unfinished run resumes."""
-REFINEMENT = "refinement.safetensors"
-"""The final map of an unfinished run between two steps of its refinement."""
 FILES = (
     "config.json", "trajectory.txt", "map.ply", "checkpoint.safetensors", "log.jsonl", "loops.json",
     "metrics.json", "profile.json", "report.html", TRUTH, map_files.UNCERTAINTY_JSON, map_files.UNCERTAINTY_TENSORS,
@@ -145,7 +143,7 @@ class RunFolder:
 
     def _clear(self) -> None:
         """Remove the files of an earlier run, and keep files that the user added."""
-        for name in (*FILES, MESH, STATE, REFINEMENT):
+        for name in (*FILES, MESH, STATE):
             (self.path / name).unlink(missing_ok=True)
         for picture in self.images.glob("*.png"):
             picture.unlink()
@@ -168,11 +166,6 @@ class RunFolder:
         """Return the path of the state from which an unfinished run resumes."""
         return self.path / STATE
 
-    @property
-    def refinement(self) -> Path:
-        """Return the path of the partly refined final map from which an unfinished run resumes."""
-        return self.path / REFINEMENT
-
     def config(self) -> Config:
         """Read the settings of the run. Raises ConfigError if they cannot be read."""
         return Config.load(self.path / "config.json")
@@ -193,7 +186,6 @@ class RunFolder:
         remove_leftovers(self.path, self.images, self.submaps.folder, *(self.path / COMPONENTS).glob("*"))
         if self.facts().get("status") == "complete":
             self.state.unlink(missing_ok=True)
-            self.refinement.unlink(missing_ok=True)
 
     log = _writes("log.jsonl", append_line)
     """Append one line to log.jsonl."""

@@ -88,7 +88,7 @@ class Slam(MappingBackend, ArrayInterface):
             self.atlas.refined = dict(zip(members, poses, strict=True))
         anchors = [self.atlas.anchors[s] for s in members]
         config = replace(self.config, final=reaching(self.config, known))
-        final = final_map(store, anchors, config, self.view, self.random, refining, self.saved_refinement)
+        final = final_map(store, anchors, config, self.view, self.random, refining)
         self._final, self.refinement_steps = final.field, final.steps
         refined = RefinedStore(store, final.keyframe_poses, final.keyframe_exposures)
         if final.keyframe_poses is not None:
