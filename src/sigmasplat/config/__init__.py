@@ -12,7 +12,6 @@ from sigmasplat.config.frames import DensifyConfig, MappingConfig, RenderConfig,
 from sigmasplat.config.input import RECORDED_POSES, InputConfig
 from sigmasplat.config.ranges import Count, Section, kinds_of, problems_of, refuse, shown
 from sigmasplat.config.run import (
-    FeatureConfig,
     MovingConfig,
     RealTimeConfig,
     RecoveryConfig,
@@ -26,7 +25,7 @@ from sigmasplat.files.reading import read_json
 from sigmasplat.registry import Backend, named
 
 __all__ = [
-    "RECORDED_POSES", "Config", "DensifyConfig", "FeatureConfig", "FinalConfig", "InputConfig", "LoopConfig",
+    "RECORDED_POSES", "Config", "DensifyConfig", "FinalConfig", "InputConfig", "LoopConfig",
     "MappingConfig", "MovingConfig", "RealTimeConfig", "RecoveryConfig", "RegistrationConfig", "RenderConfig",
     "SeedConfig", "SubmapConfig", "SurfaceConfig", "TrackingConfig", "UncertaintyConfig",
 ]  # fmt: skip
@@ -54,7 +53,6 @@ class Config:
     mapping: MappingConfig = field(default_factory=MappingConfig)
     primitives: DensifyConfig = field(default_factory=DensifyConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
-    features: FeatureConfig = field(default_factory=FeatureConfig)
     recovery: RecoveryConfig = field(default_factory=RecoveryConfig)
     moving: MovingConfig = field(default_factory=MovingConfig)
     submaps: SubmapConfig = field(default_factory=SubmapConfig)

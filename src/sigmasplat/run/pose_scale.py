@@ -8,7 +8,7 @@ from sigmasplat.data import se3
 from sigmasplat.errors import SourceError
 from sigmasplat.input.source import Source
 from sigmasplat.tracking.feature_image import FeatureImage, LateDetail
-from sigmasplat.tracking.features import Extractor, Features, make_extractor
+from sigmasplat.tracking.features import FEATURE_WIDTH, Extractor, Features
 from sigmasplat.tracking.predicted_depth_fit import depth_at
 from sigmasplat.types import Matrix
 
@@ -56,7 +56,7 @@ def scale_warning(source: Source, config: Config) -> str | None:
 def measured_scale(source: Source, config: Config) -> tuple[float, float] | None:
     """Return the factor from depth to the unit of the given poses, the median of some measured motions, and the median
     relative difference of these from it; None if too few can be compared."""
-    extractor, found = make_extractor(config.features), list[float | None]()
+    extractor, found = Extractor(), list[float | None]()
     for first in np.unique(np.linspace(0, len(source) - 1, PLACES, endpoint=False).astype(int)).tolist():
         found.append(_ratio_at(first, source, config, extractor))
     ratios = np.array([ratio for ratio in found if ratio is not None])
@@ -119,5 +119,5 @@ def _seen(source: Source, i: int, config: Config) -> tuple[FeatureImage, Matrix]
         return None
     c = config.input
     working = frame.prepared(c.width or frame.camera.width, c.min_depth_m, c.max_depth_m, c.crop_px)
-    image = FeatureImage(LateDetail(frame, config.features.width), working.depth_m, working.camera)
+    image = FeatureImage(LateDetail(frame, FEATURE_WIDTH), working.depth_m, working.camera)
     return image, np.asarray(frame.T_given_camera)
