@@ -12,7 +12,6 @@ from sigmasplat.config.sensors import sensor_model
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera, gray_exposure, unexposed
 from sigmasplat.data.frame import Frame, Photo, photo_size
-from sigmasplat.data.images import std_by_model
 from sigmasplat.data.submap import Picture
 from sigmasplat.errors import SourceError
 from sigmasplat.fit.backends import fits_of
@@ -114,19 +113,18 @@ def view_of(camera: Camera, config: Config) -> View:
 
 
 def working_frame(frame: Frame, config: Config, camera: Camera | None = None) -> Frame:
-    """Return a frame at working size, with depth denoised if the settings say so, and with the standard deviation of
-    its readings if `input.sensor` names a model; if `camera` is given and differs, the frame is resampled to it."""
+    """Return a frame at working size, with depth denoised if the settings say so; if `camera` is given and differs, the
+    frame is resampled to it."""
     i = config.input
     working = frame.prepared(i.width, i.min_depth_m, i.max_depth_m, i.crop_px)
     if camera is not None and working.camera != camera:
         working = frame.seen_by(camera).prepared(0, i.min_depth_m, i.max_depth_m)
-    depth_m, std_m, r = working.depth_m, working.depth_std_m, config.render
+    depth_m, r = working.depth_m, config.render
     if config.tracking.fit_depth:
         depth_m = smoothed(depth_m)
     elif i.denoise_depth:
         depth_m = denoised(depth_m, r.depth_noise_per_m, r.scene_scale)
-    modelled = std_by_model(depth_m, working.camera, i.sensor)
-    return working.with_depth(depth_m, std_m if modelled is None else modelled)
+    return working.with_depth(depth_m)
 
 
 def observe(whole: Frame, working: Frame, view: View, config: Config, extractor: Extractor | None) -> PreparedFrame:

@@ -185,7 +185,7 @@ class WithPredictedDepth(Subset):
 
     def frame(self, i: int) -> Frame:
         frame = super().frame(i)
-        return replace(frame, depth_m=self._depth_of(i, lambda: frame.color), depth_std_m=None)
+        return replace(frame, depth_m=self._depth_of(i, lambda: frame.color))
 
     def depth_of(self, i: int) -> Floats:
         return self._depth_of(self._checked_index(i), lambda: self._color_of(i))
