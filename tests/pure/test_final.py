@@ -257,24 +257,21 @@ def test_epochs_use_every_keyframe_equally_often() -> None:
     assert sorted(drawn[:6]) == sorted(drawn[6:]) == list(range(6)) and drawn[:6] != drawn[6:]
 
 
-def test_splats_that_no_keyframe_shows_are_removed_and_the_budget_holds() -> None:
-    """A second wall hides behind the first; after that, the splats that contribute least go first."""
+def test_splats_that_no_keyframe_shows_are_removed() -> None:
+    """A second wall hides behind the first."""
     view, hidden = ReferenceView(CAMERA, CONFIG.render), wall(-0.5, 0.5)
     keyframes = KeyframeReader(make_store(), ANCHORS, view)
     hidden.params[:, 2] += 0.5
     front = wall(-1.4, 1.6)
     front.params[:, COLUMNS["opacity_logits"]] = 8.0
     front.params[:, COLUMNS["log_scales"]] += 0.5
-    for most in (0, 100):
-        field = front.copy_to(torch.device("cpu"))
-        field.append(hidden)
-        weights = largest_weights(field, view, keyframes)
-        prune_by_weight(field, view, keyframes, 0.5, most)
-        kept = torch.isin(torch.arange(len(weights)), field.ids)
-        assert float(field.means[:, 2].max()) < WALL_M + 0.1 and len(field) > 50
-        assert bool((weights[kept] >= 0.5).all()) and (len(field) == 100) is bool(most)
-        if most:
-            assert float(weights[kept].min()) >= float(weights[~kept].max())
+    field = front.copy_to(torch.device("cpu"))
+    field.append(hidden)
+    weights = largest_weights(field, view, keyframes)
+    prune_by_weight(field, view, keyframes, 0.5)
+    kept = torch.isin(torch.arange(len(weights)), field.ids)
+    assert float(field.means[:, 2].max()) < WALL_M + 0.1 and len(field) > 50
+    assert bool((weights[kept] >= 0.5).all()) and bool((weights[~kept] < 0.5).all())
 
 
 def test_a_time_budget_ends_refinement_early(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from constants import changed
+from map_now import map_now
 from paper_settings import DensifyConfig, MappingConfig, RenderConfig, SeedConfig, paper_settings
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
@@ -62,7 +63,7 @@ def mapper(mapping: MappingConfig = FITTED, primitives: Any = None, **seeding: A
 
 def mapped(made: Mapper, places_m: Sequence[float]) -> Mapper:
     for index, x_m in enumerate(places_m):
-        made.map(view(), index, target(), shifted(x_m))
+        map_now(made, view(), index, target(), shifted(x_m))
     return made
 
 
@@ -116,7 +117,7 @@ def test_several_drawn_together_are_different_ones() -> None:
 def test_whose_poses_move(poses: Any, moving: set[int]) -> None:
     made = mapped(mapper(changed(FITTED, poses=poses)), (0.0, 0.1))
     before = [k.T_world_camera.copy() for k in made.keyframes] + [shifted(0.2)]
-    made.map(view(), 2, target(), shifted(0.2))
+    map_now(made, view(), 2, target(), shifted(0.2))
     moved = {k.index for k, T in zip(made.keyframes, before, strict=True) if not np.array_equal(k.T_world_camera, T)}
     assert moved == moving, "the first keyframe holds the gauge"
 
@@ -145,7 +146,7 @@ def test_a_floater_is_doubted_and_goes_the_wall_stays() -> None:
     made = mapped(mapper(replace(FITTED, iterations=20), DensifyConfig(uncertain_m2=0.025)), (0.0,))
     made.config = replace(made.config, seeding=changed(SEEDS, depth_error_factor=0.0))
     wall, floating = set(made.field.ids.tolist()), floater(made)
-    made.map(view(), 1, target(), shifted(0.02))
+    map_now(made, view(), 1, target(), shifted(0.02))
     left = set(made.field.ids.tolist())
     assert floating not in left
     assert len(wall - left) < 0.02 * len(wall)
@@ -154,7 +155,7 @@ def test_a_floater_is_doubted_and_goes_the_wall_stays() -> None:
 def test_without_doubt_the_floater_stays() -> None:
     made = mapped(mapper(), (0.0,))
     floating = floater(made)
-    made.map(view(), 1, target(), shifted(0.02))
+    map_now(made, view(), 1, target(), shifted(0.02))
     assert floating in made.field.ids.tolist()
 
 
@@ -173,7 +174,7 @@ def test_old_colours_stay_frozen_when_rows_move() -> None:
     made = mapped(mapper(mapping, DensifyConfig(split_gradient=1e-7, split_scale_m=0.2), opacity=0.5), (0.0,))
     made.field.params[:40, COLUMNS["log_scales"]] = float(np.log(0.3))
     old = dict(zip(made.field.ids.tolist(), made.field.colors.clone(), strict=True))
-    made.map(view(), 1, target(), shifted(0.4))
+    map_now(made, view(), 1, target(), shifted(0.4))
     kept = [k for k, i in enumerate(made.field.ids.tolist()) if i in old]
     assert 0 < len(kept) < len(old), "some were split"
     for k in kept:
@@ -184,7 +185,7 @@ def test_too_large_splats_go() -> None:
     made = mapped(mapper(primitives=DensifyConfig(most_scale_m=0.5)), (0.0,))
     made.field.params[3, COLUMNS["log_scales"]] = float(np.log(0.8))
     large = int(made.field.ids[3])
-    made.map(view(), 1, target(), shifted(0.02))
+    map_now(made, view(), 1, target(), shifted(0.02))
     assert large not in made.field.ids.tolist()
 
 
@@ -204,7 +205,7 @@ def test_what_the_camera_comes_close_to_is_split_as_far_as_the_budget_goes() -> 
     close = {}
     for split_px, budget in ((0.0, 0), (6.0, 0), (6.0, 500)):
         made = mapped(mapper(primitives=DensifyConfig(split_radius_px=split_px), max_splats=budget), (0.0,))
-        made.map(view(), 1, target(2.0 / 3.0), se3.exp(np.array([0.0, 0.0, 4.0 / 3.0, 0.0, 0.0, 0.0])))
+        map_now(made, view(), 1, target(2.0 / 3.0), se3.exp(np.array([0.0, 0.0, 4.0 / 3.0, 0.0, 0.0, 0.0])))
         close[split_px, budget] = len(made.field)
     count = CAMERA.width * CAMERA.height
     assert close[0.0, 0] < 1.1 * count and close[6.0, 0] > close[0.0, 0] + 0.08 * count

@@ -99,10 +99,9 @@ RunOrMap = Annotated[Path, tyro.conf.Positional, arg("RUN", "run folder or map f
 
 @dataclass(frozen=True)
 class RunOptions:
-    """Options of run and resume: scoring, profile, saving, viewer."""
+    """Options of run and resume: scoring, saving, viewer."""
 
     evaluate: Annotated[bool, flag("do not score the run: no metrics, no report", name="eval")] = True
-    profile: Annotated[bool, flag("print the time spent in each stage")] = False
     save_every: SaveEvery = 60.0
     view: View = False
     host: Host = HOST

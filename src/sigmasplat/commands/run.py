@@ -264,8 +264,6 @@ def _run_and_score(
     stopped = outcome.status == "interrupted"
     if stopped and not outcome.frames:
         raise KeyboardInterrupt  # the folder has no results, and no state to resume from
-    if run_options.profile:
-        screen.profile(folder.read_profile())
     warn_at_the_end(screen, source, read, folder, motion)
     if stopped:
         kept = f"interrupted after {outcome.summary()}; the trajectory, map and checkpoint so far are in {folder.path}"

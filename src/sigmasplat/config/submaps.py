@@ -236,9 +236,6 @@ class FinalConfig(Section, name="final"):
     """Degree of view-dependent colour reached during refinement, 0 to 3."""
     spacing_m: ClassVar[float] = 0.02
     """Distance between the splats seeded on the mesh, in metres, times the scale of the scene."""
-    max_splats: Count = 0
-    """Largest number of splats of the final map; those that contribute least to the images of keyframes are removed. 0
-    = no limit."""
     prune_every: ClassVar[int] = 500
     """Number of refinement steps between removals of splats with low opacity (`prune_opacity`)."""
     prune_opacity: ClassVar[float] = 0.005

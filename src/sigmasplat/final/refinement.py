@@ -149,7 +149,7 @@ def refine(
     """
     final, mapping, losses, done = config.final, refinement(config), list[float](), 0
     clock = clock or Clock(final.seconds)
-    prune_by_weight(field, view, keyframes, final.prune_weight_px, final.max_splats)
+    prune_by_weight(field, view, keyframes, final.prune_weight_px)
     while done < final.iterations and not clock.is_over:
         until_event = min(every - done % every for every in (final.prune_every, final.sh_every))
         steps = range(done, min(done + until_event, final.iterations))
@@ -161,7 +161,7 @@ def refine(
         limit_shapes(field, final.max_axis_ratio, final.max_needle_ratio)
         if done % final.prune_every == 0:
             field.keep(field.opacities > final.prune_opacity)
-    prune_by_weight(field, view, keyframes, final.prune_weight_px, final.max_splats)
+    prune_by_weight(field, view, keyframes, final.prune_weight_px)
     progress(final.iterations, final.iterations)
     return losses
 

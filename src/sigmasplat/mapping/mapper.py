@@ -13,7 +13,6 @@ from torch import Tensor
 from sigmasplat.config import Config
 from sigmasplat.data import se3
 from sigmasplat.data.field import GaussianField, Rows
-from sigmasplat.data.frame import Detail, Photo
 from sigmasplat.data.submap import Picture, Submap
 from sigmasplat.fit.adam import Rates
 from sigmasplat.fit.field import DensifyStats, FieldFit, fitting
@@ -33,7 +32,7 @@ from sigmasplat.mapping.moving import carve, mask_keyframes
 from sigmasplat.mapping.seeding import first_pixels, later_pixels, make_splats, thin_out
 from sigmasplat.mapping.window import choose_window, dominating, draw_keyframes
 from sigmasplat.render.view import View
-from sigmasplat.types import ShouldStop, Task, completed, never
+from sigmasplat.types import ShouldStop, Task, never
 
 RECENT = 10
 """Splats are carved away by the newest keyframes, at most this many."""
@@ -79,28 +78,11 @@ class Mapper:
         c = self.config.mapping
         return min(self.pending, c.first_per_frame if self.first_pending else c.half_per_frame)
 
-    def map(
-        self,
-        view: View,
-        index: int,
-        target: Target,
-        T_world_camera: NDArray[np.float64],
-        descriptor: NDArray[np.float32] | None = None,
-        detail: Detail | None = None,
-        photo: Photo | None = None,
-    ) -> FieldFit:
-        """Map one keyframe: seed, choose the window of keyframes, fit, densify and prune, fit again, prune again.
-
-        The first keyframe of a submap that inherits splats is already mapped; it is only added to the list.
-        """
-        keyframe = Keyframe(index, target, T_world_camera, descriptor=descriptor, detail=detail, photo=photo)
-        fit = completed(self.mapping(view, keyframe))
-        fit.join(completed(self._left_of_half(view, never)))
-        return fit
-
     def mapping(self, view: View, newest: Keyframe, should_stop: ShouldStop = never) -> Task[FieldFit]:
-        """Map a keyframe as `map` does, in slices of one iteration. With `mapping.in_halves` the second half of
-        the iterations is left to `refining`, and what `refining` has not made is made before the next keyframe.
+        """Map one keyframe: seed, choose the window of keyframes, fit, densify and prune, fit again, prune again, in
+        slices of one iteration. With `mapping.in_halves` the second half of the iterations is left to `refining`, and
+        what `refining` has not made is made before the next keyframe. The first keyframe of a submap that inherits
+        splats is already mapped; it is only added to the list.
 
         should_stop: asked before each iteration; if it returns True, the rest of a part's iterations is left out after
         `LEAST_SHARE` of them.
