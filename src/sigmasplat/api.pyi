@@ -289,9 +289,9 @@ from sigmasplat.slam.results import Step as Step
 from sigmasplat.slam.slam import Slam as Slam
 from sigmasplat.slam.slam_state import path_errors as path_errors
 from sigmasplat.types import Matrix as Matrix, Progress as Progress, no_progress as no_progress
-from sigmasplat.uncertainty.blended_values import blend_values as blend_values
 from sigmasplat.uncertainty.predictive import (
     Predicted as Predicted,
+    blend_values as blend_values,
     predict as predict,
     predicted as predicted,
     variance_parts as variance_parts,

@@ -189,7 +189,7 @@ def _opened(
 def _say_of_scale(screen: "Screen", asked: "Config", source: "Source", config: "Config") -> None:
     """Print the measured unit of given poses, or that of predicted depth in theirs, or a warning if poses do not seem
     to be in metres."""
-    from sigmasplat.run.pose_scale import scale_warning
+    from sigmasplat.run.scene import scale_warning
 
     poses, factor = config.input.poses, config.input.poses_scale
     if not asked.input.poses_scale:

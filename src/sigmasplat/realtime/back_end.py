@@ -14,7 +14,7 @@ from sigmasplat.fit.align import Alignment
 from sigmasplat.fit.pose import fit_pose_align
 from sigmasplat.graph.loops import Loops
 from sigmasplat.graph.newest_covariance import NO_ERRORS
-from sigmasplat.realtime.messages import Offer, Search, Snapshot, TrackedFrame
+from sigmasplat.realtime.front_end import Offer, Search, Snapshot, TrackedFrame
 from sigmasplat.slam.listeners import Before, Correction, correction_since
 from sigmasplat.slam.mapping_backend import SLICES_PER_FRAME, MappingBackend
 from sigmasplat.slam.results import StepTimer
