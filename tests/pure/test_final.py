@@ -19,7 +19,7 @@ from sigmasplat.data.submap import MemoryStore, Submap
 from sigmasplat.errors import ConfigError, SigmaSplatError
 from sigmasplat.final import final_map as final
 from sigmasplat.final.final_map import final_map, merged, survivors, z_order
-from sigmasplat.final.fusion import FusionView, count_keyframes, fuse, fusion_views
+from sigmasplat.final.fusion import count_keyframes, fuse, fusion_views
 from sigmasplat.final.refinement import KeyframeReader, refine
 from sigmasplat.fit.adam import ATTRIBUTE_RATES
 from sigmasplat.mapping.densify import largest_weights, prune_by_weight
@@ -137,9 +137,8 @@ def test_the_z_order_visits_a_cube_of_cells_completely_before_the_next() -> None
 # ---- seeding on the surface ----
 
 
-@pytest.mark.parametrize("uncertainty", [True, False])
-def test_mesh_seeds_cover_the_surface(uncertainty: bool) -> None:
-    field = refined(make_store(), config(seed_from="mesh", uncertainty=uncertainty))
+def test_mesh_seeds_cover_the_surface() -> None:
+    field = refined(make_store(), config(seed_from="mesh"))
     x, y, z = field.means.numpy().T
     assert np.abs(z - WALL_M).max() < 0.02 and len(field) > 100
     mesh = fuse(fusion_views(make_store(), ANCHORS), 6, config(), voxel_m=0.01)
@@ -150,11 +149,7 @@ def test_mesh_seeds_cover_the_surface(uncertainty: bool) -> None:
     assert np.abs(field.colors.numpy()[inside] - color_at(x, y)[inside]).mean() < 0.08
     torch.testing.assert_close(field.scales, torch.full_like(field.scales, SPACING_M))
     torch.testing.assert_close(field.opacities, torch.full((len(field),), 0.5))
-    s = field.params[:, COLUMNS["log_variances"]]
-    if uncertainty:
-        assert (s[x < -0.3] == LOG_VARIANCES[0]).all() and (s[x > 0.5] == LOG_VARIANCES[1]).all()
-    else:
-        assert (s == -7.0).all()
+    assert (field.params[:, COLUMNS["log_variances"]] == -7.0).all()
 
 
 def test_standpoints_are_the_keyframes_in_field_and_world() -> None:
@@ -166,24 +161,6 @@ def test_standpoints_are_the_keyframes_in_field_and_world() -> None:
     T_camera_submap = se3.inverse(poses(1)[1]) @ ANCHORS[1]
     np.testing.assert_allclose(found[4].T_camera_field, T_camera_submap, atol=1e-12)
     assert found[4].field is store.submaps[1].field
-
-
-def test_weighing_by_variance_prefers_the_map_of_lower_variance() -> None:
-    """Two maps of a wall 4 cm apart, one very unsure on a third of it: there the weighted surface is the other's."""
-    near, far = wall(-1.4, 1.6), wall(-1.4, 1.6)
-    far.params[:, 2] += 0.04
-    far.params[far.means[:, 0] < -0.3, COLUMNS["log_variances"]] = 0.0
-    for field in (near, far):
-        field.params[:, COLUMNS["colors"]] = 0.5
-    at = [FusionView(field, CAMERA, np.eye(4), np.eye(4)) for field in (near, far)]
-    settings = replace(CONFIG, tracking=changed(CONFIG.tracking, tau=1.0, weight_max=100.0))
-    left = {}
-    for weigh in (False, True):
-        mesh = fuse(at, 2, settings, voxel_m=0.02, weigh=weigh)
-        x, y, z = mesh.vertices.T
-        left[weigh] = float(np.median(z[(x < -0.5) & (np.abs(y) < 0.4)]))
-    assert left[False] == pytest.approx(WALL_M + 0.02, abs=6e-3)
-    assert left[True] == pytest.approx(WALL_M, abs=6e-3)
 
 
 # ---- refinement ----

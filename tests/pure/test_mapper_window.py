@@ -19,7 +19,6 @@ from sigmasplat.fit.adam import Rates
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.mapping import mapper as mapper_module
 from sigmasplat.mapping.mapper import Mapper
-from sigmasplat.mapping.window import draw_keyframes
 from sigmasplat.render.reference import ReferenceView
 
 CAMERA = Camera(16, 12, 44.0 / 3, 44.0 / 3, 7.5, 5.5)
@@ -102,15 +101,6 @@ def test_one_of_the_window_a_step(looked_at: list[list[int]]) -> None:
     mapped(mapper(changed(FITTED, window=2, frames_per_step=1, iterations=30)), (0.0, 0.1, 0.2))
     assert {len(batch) for batch in looked_at} == {1}
     assert {batch[0] for batch in looked_at[-30:]} == {1, 2}
-
-
-def test_several_drawn_together_are_different_ones() -> None:
-    drawn = list(draw_keyframes(range(6), 200, 0.3, np.random.default_rng(0), together=3))
-    assert all(len(set(batch)) == 3 for batch in drawn) and {k for batch in drawn for k in batch} == set(range(6))
-    led = sum(batch[0] == 5 for batch in drawn) / 200
-    assert 0.2 < led < 0.4, "the newest leads with its probability"
-    everything = list(draw_keyframes(range(3), 4, 0.3, np.random.default_rng(0), together=9))
-    assert everything == [[0, 1, 2]] * 4
 
 
 @pytest.mark.parametrize(("poses", "moving"), [("all", {1, 2}), ("newest", {2})])

@@ -8,12 +8,11 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from sigmasplat.config import Config, FinalConfig
 from sigmasplat.data.atlas import Atlas
-from sigmasplat.data.field import COLUMNS, INITIAL_LOG_VARIANCE, GaussianField
+from sigmasplat.data.field import COLUMNS, GaussianField
 from sigmasplat.data.mesh import Mesh
 from sigmasplat.data.submap import SubmapStore
 from sigmasplat.data.trajectory import Component, Trajectory, evenly_spread
@@ -176,22 +175,15 @@ def z_order(points: Matrix) -> NDArray[np.int64]:
 def seeded_on_surface(store: SubmapStore, anchors: Sequence[Matrix], config: Config) -> GaussianField:
     """Place splats on the fused surface of the submaps, with distance and size `spacing_m` (VarSplat §7).
 
-    anchors: T_world_submap [4, 4] of each submap. A splat gets the σ² of the nearest submap splat, or the initial σ² if
-    `final.uncertainty` is off. Raises SigmaSplatError if there is no surface.
+    anchors: T_world_submap [4, 4] of each submap. Raises SigmaSplatError if there is no surface.
     """
-    final = config.final
-    mesh = fuse(fusion_views(store, anchors), count_keyframes(store), config, weigh=final.uncertainty)
+    mesh = fuse(fusion_views(store, anchors), count_keyframes(store), config)
     if not len(mesh.vertices):
         raise SigmaSplatError("the submaps have no surface for the seeds of the final map; use final.seed_from=submaps")
-    spacing_m = final.spacing_m * config.render.scene_scale
+    spacing_m = config.final.spacing_m * config.render.scene_scale
     points, colors = thinned_vertices(mesh, spacing_m)
-    log_variances = torch.full((len(points), 3), INITIAL_LOG_VARIANCE)
-    if final.uncertainty:
-        log_variances = nearest_log_variances(points, store, anchors)
     scales = torch.full((len(points), 3), spacing_m)
-    return GaussianField.from_values(
-        torch.from_numpy(points).float(), scales, torch.from_numpy(colors).float(), log_variances=log_variances
-    )
+    return GaussianField.from_values(torch.from_numpy(points).float(), scales, torch.from_numpy(colors).float())
 
 
 def thinned_vertices(mesh: Mesh, spacing_m: float) -> tuple[Matrix, Matrix]:
@@ -202,21 +194,6 @@ def thinned_vertices(mesh: Mesh, spacing_m: float) -> tuple[Matrix, Matrix]:
     sums = [np.bincount(cell, column) for column in (*mesh.vertices.T, *colors.T)]
     means = np.stack(sums, 1) / counts[:, None]
     return means[:, :3], means[:, 3:]
-
-
-def nearest_log_variances(points: Matrix, store: SubmapStore, anchors: Sequence[Matrix]) -> Tensor:
-    """Return log σ² [M, 3] of the splat nearest to each point [M, 3] m; anchors: T_world_submap [4, 4] of each
-    submap."""
-    found, distance = torch.full((len(points), 3), INITIAL_LOG_VARIANCE), np.full(len(points), np.inf)
-    for index in range(len(store)):
-        part = _in_world(store, anchors, index)
-        if not len(part):
-            continue
-        away, which = map(np.asarray, cKDTree(part.means.numpy()).query(points))
-        nearer = away < distance
-        found[nearer] = part.params[which[nearer], COLUMNS["log_variances"]]
-        distance[nearer] = away[nearer]
-    return found
 
 
 SHARE = 0.5

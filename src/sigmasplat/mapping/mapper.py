@@ -208,8 +208,8 @@ class Mapper:
     ) -> Task[FieldFit]:
         """Fit the field to the window, in slices; splats with ids below `frozen_below` keep their colours."""
         c = self.config.mapping
-        together = c.frames_per_step or len(window)
-        batches = draw_keyframes(window[::-1], steps, c.newest_probability, self.random, together)
+        drawn = draw_keyframes(window[::-1], steps, c.newest_probability, self.random)
+        batches = drawn if c.frames_per_step else repeat(window[::-1], steps)
         frozen = int((self.field.ids < frozen_below).sum())
         wanted = stats if self.config.primitives.split_gradient > 0 else None
         shortened = _shortened(batches, round(steps * least_share), should_stop)
