@@ -15,7 +15,7 @@ from sigmasplat.config.find_preset import (
     preset as preset,
     presets_by_scene as presets_by_scene,
 )
-from sigmasplat.config.sensors import AUTO as AUTO, SensorModel as SensorModel, sensor_model as sensor_model
+from sigmasplat.config.sensors import SensorModel as SensorModel
 from sigmasplat.config.text import differences as differences, override as override
 from sigmasplat.data import harmonics as harmonics, se3 as se3
 from sigmasplat.data.atlas import Atlas as Atlas
@@ -141,7 +141,6 @@ from sigmasplat.fit.mapping_step import (
     ViewDependentStep as ViewDependentStep,
     render_for as render_for,
 )
-from sigmasplat.fit.pyramid import NOISE_PER_M as NOISE_PER_M
 from sigmasplat.fit.target import Target as Target, luma as luma
 from sigmasplat.fit.tracking_loss import reference_maps as reference_maps, tracking_params as tracking_params
 from sigmasplat.graph.loops import Loop as Loop

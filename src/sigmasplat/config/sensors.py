@@ -33,9 +33,6 @@ SENSORS = {
     "time-of-flight": SensorModel(base=0.0012, z1=0.0005, z2=0.00025),
 }
 """Models of σ by sensor."""
-GENERIC = "generic"
-"""The law of `render.depth_noise_per_m`, σ = noise · z², for sensors that are not known."""
-AUTO = "auto"
 
 
 def sensor_model(name: str) -> SensorModel | None:
