@@ -38,7 +38,7 @@ ROOM = "synthetic:frames=120,width=160,height=120,noise=1"
 SETTINGS = {
     "input.width": "80", "input.limit": "24", "mapping.first_iterations": "30", "mapping.iterations": "8",
     "mapping.every": "3", "submaps.frames": "12", "final.iterations": "60", "registration.iterations": "2",
-    "final.width": "camera", "final.width_iterations": "100",
+    "final.width": "8192", "final.width_iterations": "100",
 }  # fmt: skip
 SAME = ("trajectory.txt", "map.ply", "checkpoint.safetensors")
 
@@ -103,7 +103,7 @@ def test_the_last_stage_is_sharper_at_both_sizes(slam: Slam) -> None:
 def test_keyframes_keep_photos_only_for_the_last_stage(slam: Slam) -> None:
     photo = slam.store.picture(0, 0).photo
     assert photo is not None and photo.camera.width == 160
-    config = settings(width="working")
+    config = settings(width="0")
     plain, source = Slam(config), open_source(ROOM, config.input)
     plain.step(source.frame(0))
     plain.finish()

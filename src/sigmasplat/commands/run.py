@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 from sigmasplat.commands import options
 from sigmasplat.commands.end_of_run import warn_at_the_end
 from sigmasplat.commands.evaluate import score
-from sigmasplat.commands.input_options import DEFAULT_INPUT_OPTIONS, InputOptions, InputOptionsFlat, arg
+from sigmasplat.commands.input_options import DEFAULT_INPUT_OPTIONS, InputOptions, InputOptionsFlat, Whole, arg
 from sigmasplat.commands.options import configured, prepare_torch, source_of
 from sigmasplat.commands.robot_output import (
     DEFAULT_ROBOT_OPTIONS,
@@ -23,6 +23,7 @@ from sigmasplat.commands.robot_output import (
 )
 from sigmasplat.commands.view import keep_showing, serve_viewer
 from sigmasplat.config.find_preset import default_preset
+from sigmasplat.config.ranges import WIDTHS_PX
 from sigmasplat.config.text import full_path, split_settings
 from sigmasplat.errors import ConfigError
 
@@ -41,12 +42,13 @@ OK, INTERRUPTED = 0, 130
 DEFAULT_PRESET = default_preset()
 DEMO_FOLDER, DEMO_FRAMES = Path("runs/demo"), 120
 FinalWidth = Annotated[
-    str | None,
+    Whole,
+    WIDTHS_PX,
     arg(
-        "working|camera|PIXELS",
-        "width of the images that the final map is refined on at the end: as tracking, as the camera, or a number "
-        "of pixels; short form of --set final.width=…",
-        "(default: that of the preset)",
+        "PX",
+        "width in pixels of the images that the final map is refined on at the end, at most the recorded width "
+        "(8192: as recorded); short form of --set final.width=PX",
+        "(default: 0, no larger than in tracking)",
     ),
 ]
 

@@ -97,7 +97,7 @@ class PreparedFrame:
 
     def photo(self, config: Config) -> Photo | None:
         """Return the colour at the size of the final map's last stage; None if working images are as large."""
-        size = photo_size(self.whole.camera, config.input.width, config.input.crop_px, config.final.width_px)
+        size = photo_size(self.whole.camera, config.input.width, config.input.crop_px, config.final.width)
         return None if size is None else Photo.of(self.whole, *size)
 
 
