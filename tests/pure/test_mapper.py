@@ -146,7 +146,7 @@ def test_the_first_keyframe_alone_is_fixed() -> None:
 
 @pytest.mark.parametrize("frozen", [False, True])
 def test_old_colours_are_frozen_where_asked(frozen: bool) -> None:
-    made = mapper(mapping=changed(NO_FIT, iterations=2, freeze_old_colors=frozen))
+    made = mapper(mapping=changed(NO_FIT, iterations=2, colors="old-frozen" if frozen else "free"))
     map_now(made, view(), 0, target(), np.eye(4))
     old, colors = len(made.field), COLUMNS["colors"]
     before = made.field.params.clone()
@@ -156,22 +156,23 @@ def test_old_colours_are_frozen_where_asked(frozen: bool) -> None:
     assert not torch.equal(made.field.params[:old, COLUMNS["means"]], before[:, COLUMNS["means"]])
 
 
-@pytest.mark.parametrize("until", ["end", "half"])
-def test_all_colours_are_frozen_to_the_end_or_to_half_of_the_steps(until: str) -> None:
-    mapping = changed(NO_FIT, iterations=6, first_iterations=6, freeze_new_colors=True, freeze_until=until)
+@pytest.mark.parametrize("steps", [2, 6])
+def test_all_colours_are_frozen_in_the_first_half_of_the_steps(steps: int) -> None:
+    mapping = changed(NO_FIT, iterations=steps, first_iterations=steps, colors="code")
     made = mapper(changed(EVERY_PIXEL, opacity=0.6), mapping)
-    map_now(made, view(), 0, target(), np.eye(4))
+    slices = made.mapping(view(), keyframe(0))
+    while made.half is None:  # the first half and what comes between the halves
+        next(slices)
     seeds = target().image.reshape(-1, 3)
-    assert torch.equal(made.field.params[:, COLUMNS["colors"]], seeds) == (until == "end")
-    before = made.field.params[:, COLUMNS["colors"]].clone()
-    map_now(made, view(), 1, target(object_columns=5), np.eye(4))
-    assert torch.equal(made.field.params[: len(before), COLUMNS["colors"]], before) == (until == "end")
+    assert torch.equal(made.field.params[:, COLUMNS["colors"]], seeds)
+    completed(slices)
+    assert not torch.equal(made.field.params[:, COLUMNS["colors"]], seeds)
 
 
 def test_a_keyframe_forgets_adams_moments_where_asked() -> None:
     """Without a step at the second keyframe, only forgetting changes the moments of the first one."""
     for fresh in (False, True):
-        mapping = changed(NO_FIT, first_iterations=3, fresh_adam=fresh)
+        mapping = changed(NO_FIT, first_iterations=3, colors="code" if fresh else "free")
         made = mapper(changed(EVERY_PIXEL, opacity=0.95), mapping)
         map_now(made, view(), 0, target(), np.eye(4))
         assert made.field.steps == 3 and bool(made.field.moment2.any())

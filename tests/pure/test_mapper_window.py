@@ -160,7 +160,7 @@ def test_hot_splats_are_split_within_the_budget() -> None:
 
 def test_old_colours_stay_frozen_when_rows_move() -> None:
     """Splits of old splats shift rows between the halves: frozen are those that are old, wherever they stand."""
-    mapping = changed(FITTED, freeze_old_colors=True, lr_colors=0.05)
+    mapping = changed(FITTED, colors="old-frozen", lr_colors=0.05)
     made = mapped(mapper(mapping, DensifyConfig(split_gradient=1e-7, split_scale_m=0.2), opacity=0.5), (0.0,))
     made.field.params[:40, COLUMNS["log_scales"]] = float(np.log(0.3))
     old = dict(zip(made.field.ids.tolist(), made.field.colors.clone(), strict=True))

@@ -99,7 +99,7 @@ class Mapper:
         self._leave_out_moving()
         self._seed(view, newest.target, newest.T_world_camera)
         yield
-        if c.fresh_adam:
+        if c.colors == "code":
             self.field.forget()
         steps = c.iterations if begun else c.first_iterations
         rates = iter([Rates.of(c)] * steps if begun else Rates.falling(c, steps))
@@ -218,12 +218,10 @@ class Mapper:
     def _frozen_below(self, first_new: int, until: str) -> int:
         """Return the id below which splats keep their colours until half or the end of a keyframe's steps; `first_new`
         is the id of the first new splat."""
-        c = self.config.mapping
-        if until == "end" and c.freeze_until == "half":
-            return 0
-        if c.freeze_new_colors:
-            return self.field.next_id
-        return first_new if c.freeze_old_colors else 0
+        colors = self.config.mapping.colors
+        if colors == "code":
+            return self.field.next_id if until == "half" else 0
+        return first_new if colors == "old-frozen" else 0
 
     def _choose_movable(self, poses: bool) -> None:
         """Mark the keyframes whose poses the next fit may move: all, the newest, or none."""

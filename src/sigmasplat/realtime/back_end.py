@@ -134,7 +134,7 @@ class BackEnd:
         system, number = self.system, each.number
         self._timer = system.start_timer()
         seen, first = offer.seen, not system.steps
-        if system.config.tracking.exposure and system.config.mapping.exposure:
+        if system.config.tracking.exposure and system.config.mapping.colors == "code":
             seen = seen.without_exposure(offer.exposure)
         if first:
             place = system.begin_first(seen)

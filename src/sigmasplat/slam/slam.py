@@ -117,7 +117,7 @@ class Slam(MappingBackend, ArrayInterface):
         connected, pose = len(self.steps) > 0 and estimate.state == TRACKED, estimate.T_submap_camera
         seen = fitted_keyframe(self.tracker, self.mapper.field, self.view, seen, pose, connected)
         seen = seen.without(self.tracker.front)
-        found = self.config.tracking.exposure and self.config.mapping.exposure
+        found = self.config.tracking.exposure and self.config.mapping.colors == "code"
         return seen.without_exposure(estimate.exposure) if found else seen
 
     def _begin(self, seen: PreparedFrame) -> FrameEstimate:

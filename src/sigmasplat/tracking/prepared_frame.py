@@ -108,7 +108,7 @@ def view_of(camera: Camera, config: Config) -> View:
     learned = bool(mapping.weight_nll_color or mapping.weight_nll_depth)
     read = tracking.uncertainty and tracking.align_depth_by == "V"
     view = make_view(config.backend, camera, config.render, variance=learned or read)
-    view.sensor = sensor_model(config.input.sensor) if tracking.sensor_noise else None
+    view.sensor = sensor_model(config.input.sensor) if tracking.verify else None
     return view
 
 
