@@ -95,7 +95,7 @@ class Recorder:
 def run(arguments: Sequence[str], watched: Path, scratch: Path, kill: Kill | None = None) -> Ended:
     """Run `sigmasplat` with these arguments in a fork of this process, which must not have used torch's threads.
 
-    The state is saved after every frame and every step of the final map.
+    The state is saved after every frame.
     """
     for name in LOADED:
         importlib.import_module(f"sigmasplat.{name}")

@@ -38,7 +38,7 @@ from sigmasplat.run_folder.trajectory import read_trajectory
 
 arg = tyro.conf.arg
 KILLED = -9
-RESULTS = ("refinement", "map.ply", "uncertainty", "checkpoint", "profile", "trajectory")
+RESULTS = ("map.ply", "uncertainty", "checkpoint", "profile", "trajectory")
 FRAMES, MOST_AGAIN, MOST_CRASHES, LONGEST_DELAY_S = 12, 1, 3, 0.003
 ROOM = "synthetic:frames=60,width=64,height=48"
 SETTINGS = {

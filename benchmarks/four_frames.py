@@ -36,13 +36,14 @@ from sigmasplat.data.frame import Frame
 from sigmasplat.errors import SourceError
 from sigmasplat.files.machine import code_digest
 from sigmasplat.fit.field import fit_field
-from sigmasplat.fit.target import Target
+from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.input.source import Source
 from sigmasplat.mapping.mapper import Mapper
 from sigmasplat.plugins.evaluation.metrics.image import psnr
 from sigmasplat.plugins.evaluation.metrics.trajectory import associate
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.render import render
+from sigmasplat.types import completed, never
 
 try:
     from sigmasplat.render.backend import make_view
@@ -133,7 +134,8 @@ def fit(sequence: TrueSequence, config: Config, fitted: Sequence[int], steps: in
     T_map_world = se3.inverse(sequence.pose(fitted[0]))
     for i in fitted:
         target = Target.of(denoised(sequence.frame(i), config), (view.alpha.shape[0], view.alpha.shape[1]))
-        mapper.map(view, i, target, T_map_world @ sequence.pose(i))
+        completed(mapper.mapping(view, Keyframe(i, target, T_map_world @ sequence.pose(i))))
+        completed(mapper._left_of_half(view, never))
     made = {"mapped": GaussianField(mapper.field.params.clone())}
     drawn = ([mapper.keyframes[int(random.integers(len(fitted)))]] for _ in range(steps))
     fit_field(mapper.field, view, drawn, config.mapping)

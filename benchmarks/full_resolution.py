@@ -1,8 +1,8 @@
 """Compare final maps with and without the last stage of refinement, which uses images of the camera's own size.
 
-Sequences × seeds; each is run twice, with `final.width=working` and `camera`. Held-out views are scored at working size
-and at the camera's size, in the exposure of their frames, as metrics.json has them. The map without the stage is scored
-twice at the camera's size: rendered there, and with its working images enlarged (bicubic). Writes
+Sequences × seeds; each is run twice, with `final.width` 0 and 8192, the camera's. Held-out views are scored at working
+size and at the camera's size, in the exposure of their frames, as metrics.json has them. The map without the stage is
+scored twice at the camera's size: rendered there, and with its working images enlarged (bicubic). Writes
 benchmarks/results/<name>-<machine>.json and prints a table.
 
 example: python benchmarks/full_resolution.py --sources livingroom --seeds 0
@@ -76,7 +76,7 @@ class Enlarged:
         return replace(large, color=torch.from_numpy(np.asarray(color)))
 
 
-def finished_run(source: str, seed: int, width: str, options: Options) -> RunFolder:
+def finished_run(source: str, seed: int, width: int, options: Options) -> RunFolder:
     """Run SLAM with a size of the last stage. Raises SigmaSplatError if the run fails."""
     folder = options.runs / f"{record.slug(Path(source).name)}-{seed}-{width}"
     folder.parent.mkdir(parents=True, exist_ok=True)
@@ -101,7 +101,7 @@ def measured(source: str, seed: int, options: Options) -> dict[str, Any]:
     recorded, working = open_source(accuracy.located(source)).camera.width, preset(default_preset()).input.width
     if recorded <= working:
         raise SigmaSplatError(f"{source}: images are {recorded} pixels wide; give images wider than {working} pixels")
-    before, after = (finished_run(source, seed, width, options) for width in ("working", "camera"))
+    before, after = (finished_run(source, seed, width, options) for width in (0, 8192))
     known = open_source(accuracy.located(source), before.config().input)
     rendered = evaluate(before, known, full_resolution=True)
     enlarged = evaluate(before, known, renderer=Enlarged(before.config()), full_resolution=True)

@@ -1,14 +1,13 @@
 """Search for a camera in a map of keyframes with true poses, by the relocalisation of SLAM: for relocalisation.py."""
 
 import time
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from tracking import relative_error
 
-from sigmasplat.config import Config, FeatureConfig
+from sigmasplat.config import Config
 from sigmasplat.data import se3
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.frame import Frame
@@ -18,7 +17,7 @@ from sigmasplat.fit.target import Target
 from sigmasplat.input.source import Source
 from sigmasplat.render.backend import make_view
 from sigmasplat.tracking.feature_image import FeatureImage, detail_of
-from sigmasplat.tracking.features import make_extractor
+from sigmasplat.tracking.features import FEATURE_WIDTH, Extractor
 from sigmasplat.tracking.prepared_frame import PreparedFrame
 from sigmasplat.tracking.relocaliser import KnownMap, Relocaliser
 
@@ -31,9 +30,9 @@ class TrueMap:
     """Keyframes with their images and true poses. Each is a submap of its own without splats, so that each can be left
     out of a search."""
 
-    def __init__(self, source: Source, poses: Matrix, config: Config, features: FeatureConfig) -> None:
-        self.source, self.poses, self.config = source, poses, replace(config, features=features)
-        self.extractor = make_extractor(features)
+    def __init__(self, source: Source, poses: Matrix, config: Config) -> None:
+        self.source, self.poses, self.config = source, poses, config
+        self.extractor = Extractor()
         self.relocaliser = Relocaliser(self.config, self.extractor)
         self.view = make_view(config.backend, self._working(source.frame(0)).camera, config.render)
         self.keyframes = list(range(0, len(poses), EVERY))
@@ -42,7 +41,7 @@ class TrueMap:
             frame = source.frame(i)
             small = self._working(frame)
             color = np.rint(small.color * 255.0).astype(np.uint8)
-            picture = Picture(color, small.depth_m, detail_of(frame, features.width))
+            picture = Picture(color, small.depth_m, detail_of(frame, FEATURE_WIDTH))
             self.store.save(Submap(number, GaussianField.empty(), (i,), np.eye(4)[None], small.camera), [picture])
 
     def search(self, i: int) -> dict[str, Any]:
@@ -75,6 +74,6 @@ class TrueMap:
         """Return a frame in the forms that the search needs."""
         small = self._working(frame)
         target = Target.of(small, (self.view.sums.shape[1], self.view.sums.shape[2]))
-        image = FeatureImage(detail_of(frame, self.config.features.width), small.depth_m, small.camera)
+        image = FeatureImage(detail_of(frame, FEATURE_WIDTH), small.depth_m, small.camera)
         live = live_image(self.view, small.color, small.depth_m, target)
         return PreparedFrame(target, live, image, frame=small, whole=frame)

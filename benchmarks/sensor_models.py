@@ -22,7 +22,7 @@ from tables import Section, significant
 import sigmasplat
 from sigmasplat.commands.options import Settings
 from sigmasplat.config.find_preset import default_preset, preset
-from sigmasplat.config.sensors import GENERIC, sensor_model
+from sigmasplat.config.sensors import sensor_model
 from sigmasplat.data import se3
 from sigmasplat.files.machine import INSTALLED, code_digest
 from sigmasplat.fit.align import align
@@ -102,7 +102,7 @@ def jobs_of(options: Options) -> list[tuple[str, str, accuracy.Job]]:
     for name, sensor in (given.split("=", 1) for given in options.sources):
         for seed in options.seeds:
             for variant in options.variants:
-                settings = (f"input.sensor={GENERIC if variant == 'none' else sensor}", *options.settings)
+                settings = (f"input.sensor={'generic' if variant == 'none' else sensor}", *options.settings)
                 where = Path(name).name, accuracy.located(name)
                 jobs.append(
                     (sensor, variant, accuracy.Job(*where, options.preset, seed, settings, options.limit, code))

@@ -18,8 +18,8 @@ from sigmasplat.fit.target import Keyframe
 from sigmasplat.render import FieldRenderer, Render
 from sigmasplat.render.backend import on_device
 from sigmasplat.types import Matrix
-from sigmasplat.uncertainty.blended_values import BlendedValues, blend_values
 from sigmasplat.uncertainty.calibration import squared_errors
+from sigmasplat.uncertainty.predictive import BlendedValues, blend_values
 
 GRADIENT_STEPS = 6
 """Steps of conjugate gradients for the ridge regression."""

@@ -66,12 +66,11 @@ def path_length_m(run: RunFolder) -> float:
 def measure_depth(room: int, baseline_cm: int, frames: tuple[int, ...]) -> dict[str, Any]:
     """Return the shares of errors of stereo depth within 1 and 1.96 σ_z, and the share of pixels with depth."""
     source = open_source(f"synthetic:frames={max(frames) + 1},noise=1,seed={room},stereo={baseline_cm}")
-    assert isinstance(source, SyntheticRoom)
+    assert isinstance(source, SyntheticRoom) and source._matcher
     ratios, covered = [], []
     for i in frames:
-        frame = source.frame(i)
-        depth_m, std_m = frame.depth_m, frame.depth_std_m
-        assert std_m is not None
+        left = np.rint(source.frame(i).color * 255.0).astype(np.uint8)
+        depth_m, std_m = source._matcher.depth_and_std_m(left, source.right_image(i))
         read = depth_m > 0
         ratios.append(np.abs(depth_m - source.exact_depth_of(i))[read] / std_m[read])
         covered.append(read.mean())

@@ -50,7 +50,7 @@ def made_run(folder: Path, submaps: bool) -> RunFolder:
     run = RunFolder.create(folder, BASE, "walls")
     for i in range(FRAMES):
         run.log({"index": i, "timestamp_s": i / 10, "is_keyframe": i in (0, 2, 4), "lost": i == LOST, "seconds": {}})
-    run.write_trajectory(PATH)
+    run.write_trajectory(PATH.at(np.arange(FRAMES) != LOST))
     run.write_map(splats(WORLD))
     tensors = {
         "timestamps_s": torch.from_numpy(PATH.timestamps_s),

@@ -1,7 +1,6 @@
 """Two submaps before one wall, on plain torch: what the tests of the final map share."""
 
-from copy import deepcopy
-from dataclasses import dataclass, field as dataclass_field, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -12,7 +11,6 @@ from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import COLUMNS, GaussianField
 from sigmasplat.data.submap import MemoryStore, Picture, Submap
-from sigmasplat.final.refinement import Refined
 from sigmasplat.render import render
 
 CAMERA = Camera(20, 15, 16.0, 16.0, 9.5, 7.0)
@@ -63,23 +61,3 @@ def make_store(spoil: float = 0.0) -> MemoryStore:
         T = np.array([se3.inverse(ANCHORS[index]) @ pose for pose in poses(index)])
         store.save(Submap(index, field, (0, 1, 2), T, CAMERA), [look(pose, world) for pose in poses(index)])
     return store
-
-
-class Interrupted(Exception):
-    pass
-
-
-@dataclass
-class InMemory:
-    """Keeps a deep copy of every state that it is offered, and stops after `stop` of them."""
-
-    stop: int = 0
-    states: list[Refined] = dataclass_field(default_factory=list)
-
-    def save(self, state: Refined) -> None:
-        self.states.append(deepcopy(state))
-        if len(self.states) == self.stop:
-            raise Interrupted
-
-    def load(self) -> Refined | None:
-        return self.states[-1] if self.states else None

@@ -15,7 +15,7 @@ from sigmasplat.config.find_preset import (
     preset as preset,
     presets_by_scene as presets_by_scene,
 )
-from sigmasplat.config.sensors import AUTO as AUTO, SensorModel as SensorModel, sensor_model as sensor_model
+from sigmasplat.config.sensors import SensorModel as SensorModel
 from sigmasplat.config.text import differences as differences, override as override
 from sigmasplat.data import harmonics as harmonics, se3 as se3
 from sigmasplat.data.atlas import Atlas as Atlas
@@ -135,7 +135,6 @@ from sigmasplat.fit.mapping_step import (
     ViewDependentStep as ViewDependentStep,
     render_for as render_for,
 )
-from sigmasplat.fit.pyramid import NOISE_PER_M as NOISE_PER_M
 from sigmasplat.fit.target import Target as Target, luma as luma
 from sigmasplat.fit.tracking_loss import reference_maps as reference_maps, tracking_params as tracking_params
 from sigmasplat.graph.loops import Loop as Loop
@@ -243,7 +242,6 @@ from sigmasplat.render.view import Layers as Layers, View as View
 from sigmasplat.run.callbacks import Callback as Callback
 from sigmasplat.run.figures import format_ranges as format_ranges, number as number, rate as rate
 from sigmasplat.run.resume import (
-    RefinementFile as RefinementFile,
     StartPoint as StartPoint,
     StateFile as StateFile,
     resume as resume,
@@ -272,9 +270,9 @@ from sigmasplat.run_folder.trajectory import (
 from sigmasplat.slam.results import Step as Step
 from sigmasplat.slam.slam import Slam as Slam
 from sigmasplat.types import Matrix as Matrix, Progress as Progress, no_progress as no_progress
-from sigmasplat.uncertainty.blended_values import blend_values as blend_values
 from sigmasplat.uncertainty.predictive import (
     Predicted as Predicted,
+    blend_values as blend_values,
     predict as predict,
     predicted as predicted,
     variance_parts as variance_parts,

@@ -50,7 +50,6 @@ COMMANDS = {
     "download": ("download", "download"),
     "bench": ("batch", "bench"),
     "doctor": ("installation", "doctor"),
-    "completion": ("installation", "completion"),
 }
 """Module in `sigmasplat.commands` and function of each command. Only the command that is used is imported."""
 

@@ -21,7 +21,7 @@ from sigmasplat.fit.compare import (
 )
 from sigmasplat.fit.interface import DEPTH_STEP_M
 from sigmasplat.fit.pyramid import HIDDEN_M, NOISE_PER_M, Pyramid
-from sigmasplat.fit.target import Target, padded
+from sigmasplat.fit.target import Target
 from sigmasplat.tracking.moving.free_space import AROUND_PX, CLEAR_M, CLEAR_RELATIVE, on_image
 from sigmasplat.tracking.moving.windows import least_around
 from sigmasplat.types import Matrix
@@ -186,4 +186,4 @@ def target_in_torch(frame: Frame, size: tuple[int, int]) -> Target:
     color, depth = torch.zeros(3, *size), torch.zeros(size)
     color[:, :h, :w] = torch.tensor(frame.color).movedim(-1, 0)
     depth[:h, :w] = torch.tensor(frame.depth_m)
-    return Target(frame.camera, color, depth, int((frame.depth_m > 0).sum()), padded(frame.depth_std_m, size))
+    return Target(frame.camera, color, depth, int((frame.depth_m > 0).sum()))

@@ -7,7 +7,7 @@ from torch import Tensor
 from paper_settings import RenderConfig
 from sigmasplat.data.field import COLUMNS, GaussianField
 from sigmasplat.render.backend import gather, make_view, on_device
-from sigmasplat.uncertainty.blended_values import BlendedValues, blend_values
+from sigmasplat.uncertainty.predictive import BlendedValues, blend_values
 from splat_fields import params_of
 from splat_scenes import KINDS, WIDE, Scene, assert_same_vector, scene
 

@@ -13,7 +13,6 @@ from image_definitions import (
     halved_color_in_numpy,
     halved_depth_in_numpy,
     halved_in_numpy,
-    nearest_depth,
     noise_scale_in_numpy,
     resized_depth_in_numpy,
     target_in_torch,
@@ -52,8 +51,6 @@ def depth(noise_m: float = 0.004) -> Image:
 def test_resized_depth_has_the_bytes_of_its_definition(isa: str, size: tuple[int, int]) -> None:
     expected = resized_depth_in_numpy(depth(), *size)
     assert np.array_equal(images.resized_depth(depth(), *size), expected), isa
-    std_m = depth(0.1) * np.float32(0.01)
-    assert np.array_equal(images.resized_std(std_m, expected), np.where(expected > 0, nearest_depth(std_m, *size), 0))
     kept = (expected >= 1.5) & (expected <= 2.3)
     assert np.array_equal(images.resized_depth(depth(), *size, 1.5, 2.3), np.where(kept, expected, 0))
 

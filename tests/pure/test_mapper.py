@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from constants import changed
+from map_now import map_now
 from paper_settings import DensifyConfig, MappingConfig, RenderConfig, SeedConfig, paper_settings
 from sigmasplat import config as settings
 from sigmasplat.data.camera import Camera
@@ -45,7 +46,7 @@ def test_seeds_are_as_wide_as_they_lie_apart() -> None:
     pixel_m = 2.0 / CAMERA.fx
     for share, spacing in ((1, 1.0), (4, 2.0)):
         made = mapper(changed(EVERY_PIXEL, first_uniform=PIXELS // share))
-        made.map(view(), 0, target(), np.eye(4))
+        map_now(made, view(), 0, target(), np.eye(4))
         assert len(made.field) == PIXELS // share
         assert float(made.field.scales.mean()) == pytest.approx(spacing * pixel_m, rel=1e-3)
 
@@ -53,17 +54,17 @@ def test_seeds_are_as_wide_as_they_lie_apart() -> None:
 def test_the_budget_of_splats_is_kept() -> None:
     for budget, splats in ((123, 123), (PIXELS + 20, PIXELS + 20), (0, PIXELS + 60)):
         made = mapper(changed(EVERY_PIXEL, max_splats=budget, opacity=0.95))
-        made.map(view(), 0, target(), np.eye(4))
-        made.map(view(), 1, target(object_columns=5), np.eye(4))
+        map_now(made, view(), 0, target(), np.eye(4))
+        map_now(made, view(), 1, target(object_columns=5), np.eye(4))
         assert len(made.field) == splats
 
 
 def test_what_the_map_explains_is_not_seeded_again() -> None:
     made = mapper(changed(EVERY_PIXEL, opacity=0.95))
-    made.map(view(), 0, target(), np.eye(4))
-    made.map(view(), 1, target(), np.eye(4))
+    map_now(made, view(), 0, target(), np.eye(4))
+    map_now(made, view(), 1, target(), np.eye(4))
     assert len(made.field) == PIXELS
-    made.map(view(), 2, target(object_columns=5), np.eye(4))
+    map_now(made, view(), 2, target(object_columns=5), np.eye(4))
     assert len(made.field) == PIXELS + 5 * 12
     new = made.field.means[PIXELS:]
     assert float(new[:, 2].max()) < 1.1 and float(new[:, 0].max()) < 0.0, "the object, and nothing else"
@@ -102,7 +103,7 @@ def test_a_keyframe_that_comes_early_finds_the_steps_of_the_one_before_made() ->
     completed(made.refining(view(), made.pending_now, never))
     completed(made.mapping(view(), keyframe(1)))
     assert (made.field.steps, made.pending) == (8 + 4, 4)
-    assert len(made.map(view(), 2, target(), np.eye(4)).losses) == 8 and made.field.steps == 8 + 8 + 8
+    assert len(map_now(made, view(), 2, target(), np.eye(4)).losses) == 8 and made.field.steps == 8 + 8 + 8
 
 
 def test_splats_that_contradict_readings_are_removed_when_the_last_step_is_made(
@@ -118,7 +119,7 @@ def test_splats_that_contradict_readings_are_removed_when_the_last_step_is_made(
     for divided in (False, True):
         config = paper_settings(seeding=seeding, mapping=replace(fit, divided=divided), primitives=uncertain)
         made = Mapper(config, np.random.default_rng(0))
-        made.map(view(), 0, target(object_columns=16), np.eye(4))
+        map_now(made, view(), 0, target(object_columns=16), np.eye(4))
         near = len(made.field)
         completed(made.mapping(view(), keyframe(1)))
         if divided:
@@ -131,50 +132,51 @@ def test_splats_that_contradict_readings_are_removed_when_the_last_step_is_made(
 
 def test_faded_splats_are_pruned() -> None:
     made = mapper(changed(EVERY_PIXEL, opacity=0.05))
-    made.map(view(), 0, target(), np.eye(4))
+    map_now(made, view(), 0, target(), np.eye(4))
     assert len(made.field) == 0 and len(made.keyframes) == 1
 
 
 def test_the_first_keyframe_alone_is_fixed() -> None:
     made = mapper()
     for index in range(3):
-        made.map(view(), index, target(), np.eye(4))
+        map_now(made, view(), index, target(), np.eye(4))
     assert [keyframe.fixed for keyframe in made.keyframes] == [True, False, False]
     assert [keyframe.index for keyframe in made.keyframes] == [0, 1, 2]
 
 
 @pytest.mark.parametrize("frozen", [False, True])
 def test_old_colours_are_frozen_where_asked(frozen: bool) -> None:
-    made = mapper(mapping=changed(NO_FIT, iterations=2, freeze_old_colors=frozen))
-    made.map(view(), 0, target(), np.eye(4))
+    made = mapper(mapping=changed(NO_FIT, iterations=2, colors="old-frozen" if frozen else "free"))
+    map_now(made, view(), 0, target(), np.eye(4))
     old, colors = len(made.field), COLUMNS["colors"]
     before = made.field.params.clone()
-    fit = made.map(view(), 1, target(object_columns=5), np.eye(4))
+    fit = map_now(made, view(), 1, target(object_columns=5), np.eye(4))
     assert len(fit.losses) == 2 and len(made.field) > old
     assert torch.equal(made.field.params[:old, colors], before[:, colors]) is frozen
     assert not torch.equal(made.field.params[:old, COLUMNS["means"]], before[:, COLUMNS["means"]])
 
 
-@pytest.mark.parametrize("until", ["end", "half"])
-def test_all_colours_are_frozen_to_the_end_or_to_half_of_the_steps(until: str) -> None:
-    mapping = changed(NO_FIT, iterations=6, first_iterations=6, freeze_new_colors=True, freeze_until=until)
+@pytest.mark.parametrize("steps", [2, 6])
+def test_all_colours_are_frozen_in_the_first_half_of_the_steps(steps: int) -> None:
+    mapping = changed(NO_FIT, iterations=steps, first_iterations=steps, colors="code")
     made = mapper(changed(EVERY_PIXEL, opacity=0.6), mapping)
-    made.map(view(), 0, target(), np.eye(4))
+    slices = made.mapping(view(), keyframe(0))
+    while made.half is None:  # the first half and what comes between the halves
+        next(slices)
     seeds = target().image.reshape(-1, 3)
-    assert torch.equal(made.field.params[:, COLUMNS["colors"]], seeds) == (until == "end")
-    before = made.field.params[:, COLUMNS["colors"]].clone()
-    made.map(view(), 1, target(object_columns=5), np.eye(4))
-    assert torch.equal(made.field.params[: len(before), COLUMNS["colors"]], before) == (until == "end")
+    assert torch.equal(made.field.params[:, COLUMNS["colors"]], seeds)
+    completed(slices)
+    assert not torch.equal(made.field.params[:, COLUMNS["colors"]], seeds)
 
 
 def test_a_keyframe_forgets_adams_moments_where_asked() -> None:
     """Without a step at the second keyframe, only forgetting changes the moments of the first one."""
     for fresh in (False, True):
-        mapping = changed(NO_FIT, first_iterations=3, fresh_adam=fresh)
+        mapping = changed(NO_FIT, first_iterations=3, colors="code" if fresh else "free")
         made = mapper(changed(EVERY_PIXEL, opacity=0.95), mapping)
-        made.map(view(), 0, target(), np.eye(4))
+        map_now(made, view(), 0, target(), np.eye(4))
         assert made.field.steps == 3 and bool(made.field.moment2.any())
-        made.map(view(), 1, target(), np.eye(4))
+        map_now(made, view(), 1, target(), np.eye(4))
         assert bool(made.field.moment2.any()) == (not fresh) and made.field.steps == (0 if fresh else 3)
 
 

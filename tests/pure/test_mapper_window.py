@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from constants import changed
+from map_now import map_now
 from paper_settings import DensifyConfig, MappingConfig, RenderConfig, SeedConfig, paper_settings
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
@@ -18,7 +19,6 @@ from sigmasplat.fit.adam import Rates
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.mapping import mapper as mapper_module
 from sigmasplat.mapping.mapper import Mapper
-from sigmasplat.mapping.window import draw_keyframes
 from sigmasplat.render.reference import ReferenceView
 
 CAMERA = Camera(16, 12, 44.0 / 3, 44.0 / 3, 7.5, 5.5)
@@ -62,7 +62,7 @@ def mapper(mapping: MappingConfig = FITTED, primitives: Any = None, **seeding: A
 
 def mapped(made: Mapper, places_m: Sequence[float]) -> Mapper:
     for index, x_m in enumerate(places_m):
-        made.map(view(), index, target(), shifted(x_m))
+        map_now(made, view(), index, target(), shifted(x_m))
     return made
 
 
@@ -103,20 +103,11 @@ def test_one_of_the_window_a_step(looked_at: list[list[int]]) -> None:
     assert {batch[0] for batch in looked_at[-30:]} == {1, 2}
 
 
-def test_several_drawn_together_are_different_ones() -> None:
-    drawn = list(draw_keyframes(range(6), 200, 0.3, np.random.default_rng(0), together=3))
-    assert all(len(set(batch)) == 3 for batch in drawn) and {k for batch in drawn for k in batch} == set(range(6))
-    led = sum(batch[0] == 5 for batch in drawn) / 200
-    assert 0.2 < led < 0.4, "the newest leads with its probability"
-    everything = list(draw_keyframes(range(3), 4, 0.3, np.random.default_rng(0), together=9))
-    assert everything == [[0, 1, 2]] * 4
-
-
 @pytest.mark.parametrize(("poses", "moving"), [("all", {1, 2}), ("newest", {2})])
 def test_whose_poses_move(poses: Any, moving: set[int]) -> None:
     made = mapped(mapper(changed(FITTED, poses=poses)), (0.0, 0.1))
     before = [k.T_world_camera.copy() for k in made.keyframes] + [shifted(0.2)]
-    made.map(view(), 2, target(), shifted(0.2))
+    map_now(made, view(), 2, target(), shifted(0.2))
     moved = {k.index for k, T in zip(made.keyframes, before, strict=True) if not np.array_equal(k.T_world_camera, T)}
     assert moved == moving, "the first keyframe holds the gauge"
 
@@ -145,7 +136,7 @@ def test_a_floater_is_doubted_and_goes_the_wall_stays() -> None:
     made = mapped(mapper(replace(FITTED, iterations=20), DensifyConfig(uncertain_m2=0.025)), (0.0,))
     made.config = replace(made.config, seeding=changed(SEEDS, depth_error_factor=0.0))
     wall, floating = set(made.field.ids.tolist()), floater(made)
-    made.map(view(), 1, target(), shifted(0.02))
+    map_now(made, view(), 1, target(), shifted(0.02))
     left = set(made.field.ids.tolist())
     assert floating not in left
     assert len(wall - left) < 0.02 * len(wall)
@@ -154,7 +145,7 @@ def test_a_floater_is_doubted_and_goes_the_wall_stays() -> None:
 def test_without_doubt_the_floater_stays() -> None:
     made = mapped(mapper(), (0.0,))
     floating = floater(made)
-    made.map(view(), 1, target(), shifted(0.02))
+    map_now(made, view(), 1, target(), shifted(0.02))
     assert floating in made.field.ids.tolist()
 
 
@@ -169,11 +160,11 @@ def test_hot_splats_are_split_within_the_budget() -> None:
 
 def test_old_colours_stay_frozen_when_rows_move() -> None:
     """Splits of old splats shift rows between the halves: frozen are those that are old, wherever they stand."""
-    mapping = changed(FITTED, freeze_old_colors=True, lr_colors=0.05)
+    mapping = changed(FITTED, colors="old-frozen", lr_colors=0.05)
     made = mapped(mapper(mapping, DensifyConfig(split_gradient=1e-7, split_scale_m=0.2), opacity=0.5), (0.0,))
     made.field.params[:40, COLUMNS["log_scales"]] = float(np.log(0.3))
     old = dict(zip(made.field.ids.tolist(), made.field.colors.clone(), strict=True))
-    made.map(view(), 1, target(), shifted(0.4))
+    map_now(made, view(), 1, target(), shifted(0.4))
     kept = [k for k, i in enumerate(made.field.ids.tolist()) if i in old]
     assert 0 < len(kept) < len(old), "some were split"
     for k in kept:
@@ -184,7 +175,7 @@ def test_too_large_splats_go() -> None:
     made = mapped(mapper(primitives=DensifyConfig(most_scale_m=0.5)), (0.0,))
     made.field.params[3, COLUMNS["log_scales"]] = float(np.log(0.8))
     large = int(made.field.ids[3])
-    made.map(view(), 1, target(), shifted(0.02))
+    map_now(made, view(), 1, target(), shifted(0.02))
     assert large not in made.field.ids.tolist()
 
 
@@ -204,7 +195,7 @@ def test_what_the_camera_comes_close_to_is_split_as_far_as_the_budget_goes() -> 
     close = {}
     for split_px, budget in ((0.0, 0), (6.0, 0), (6.0, 500)):
         made = mapped(mapper(primitives=DensifyConfig(split_radius_px=split_px), max_splats=budget), (0.0,))
-        made.map(view(), 1, target(2.0 / 3.0), se3.exp(np.array([0.0, 0.0, 4.0 / 3.0, 0.0, 0.0, 0.0])))
+        map_now(made, view(), 1, target(2.0 / 3.0), se3.exp(np.array([0.0, 0.0, 4.0 / 3.0, 0.0, 0.0, 0.0])))
         close[split_px, budget] = len(made.field)
     count = CAMERA.width * CAMERA.height
     assert close[0.0, 0] < 1.1 * count and close[6.0, 0] > close[0.0, 0] + 0.08 * count

@@ -153,16 +153,6 @@ def rewritten_log(run: RunFolder, change: Callable[[dict[str, Any]], dict[str, A
     (run.path / "log.jsonl").write_text("".join(json.dumps(line | change(line)) + "\n" for line in lines))
 
 
-def test_lost_frames_of_an_old_run_are_not_scored(run: RunFolder) -> None:
-    """Old releases wrote the poses of lost frames to trajectory.txt, and no states to the log."""
-    rewritten_log(run, lambda line: {"lost": line["index"] in (6, 7)})
-    renderer = KnownErrors()
-    metrics = score(run, HandMade(truth_of()), renderer=renderer)
-    assert metrics["lost_frames"] == [6, 7] and metrics["lost"] == 2 and metrics["frames"] == FRAMES
-    assert metrics["believed"] == metrics["ate"]["pairs"] == FRAMES - 2 and not {6, 7} & set(renderer.seen)
-    assert metrics["apart"] == 0 and metrics["components"] == []
-
-
 STATES = {6: "lost", 7: "relocalised", 12: "lost", 13: "apart", 14: "apart", 15: "lost", 16: "tracked"}
 
 
@@ -255,12 +245,6 @@ def test_views_are_sampled_evenly(run: RunFolder) -> None:
     score(run, HandMade(None), renderer=renderer, views_per_kind=3, progress=lambda *at: calls.append(at))
     assert sorted(renderer.seen) == [0, 1, 8, 10, 16, 19]
     assert calls == [(i, 6) for i in range(1, 7)]
-
-
-def test_an_interrupted_run_is_scored_up_to_its_last_pose(run: RunFolder) -> None:
-    run.write_trajectory(Trajectory(TIMES[:9], poses()[:9]))
-    metrics = score(run, HandMade(truth_of()))
-    assert metrics["frames"] == 9 and metrics["ate"]["pairs"] == 9
 
 
 def test_a_run_of_keyframes_only_is_judged_on_training_views(run: RunFolder) -> None:

@@ -1,4 +1,4 @@
-"""The distribution: metadata, extras, Dockerfile, command line, completion, and the compiled module."""
+"""The distribution: metadata, extras, Dockerfile, command line, and the compiled module."""
 
 import os
 import re
@@ -13,13 +13,10 @@ import pytest
 
 import sigmasplat
 from module_files import module_from
-from sigmasplat.cli import COMMANDS
-from sigmasplat.config.find_preset import list_presets, presets_by_scene
 from sigmasplat.files.machine import package_version
 from sigmasplat.plugins.checks import installation
 
 ROOT = Path(__file__).parents[2]
-VARSPLAT = {name for name in [*list_presets(), *presets_by_scene()] if name.startswith("varsplat-")}
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 EXTRAS = PROJECT["project"]["optional-dependencies"]
 PYTHONS = [
@@ -238,49 +235,6 @@ def test_the_module_runs_and_prints_its_version() -> None:
     assert (answer.returncode, answer.stdout) == (0, f"sigmasplat {sigmasplat.__version__}\n")
     assert not re.search(r"\|\s+torch$", answer.stderr, re.MULTILINE)
     assert "usage: sigmasplat " in python("-m", "sigmasplat", "--help").stdout
-
-
-@pytest.fixture(scope="module")
-def bash_script() -> str:
-    answer = python("-X", "importtime", "-m", "sigmasplat", "completion", "bash")
-    assert answer.returncode == 0, answer.stderr
-    assert not re.search(r"\|\s+torch$", answer.stderr, re.MULTILINE)
-    return answer.stdout
-
-
-@pytest.mark.skipif(not shutil.which("bash"), reason="no bash here")
-@pytest.mark.parametrize(
-    ("words", "offered"),
-    [
-        (["doct"], {"doctor"}),
-        ([""], set(COMMANDS) | {"-h", "--help"}),
-        (["run", "--se"], {"--set", "--seed"}),
-        (["run", "--preset", "varsplat-"], VARSPLAT),
-        (["run", "some/fold"], set()),  # bash then offers files: `complete -o default`
-        (["completion", "x"], set()),
-    ],
-    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
-)
-def test_bash_completes(bash_script: str, words: list[str], offered: set[str], tmp_path: Path) -> None:
-    (tmp_path / "script").write_text(bash_script)
-    ask = """
-        source "$1"; shift
-        COMP_WORDS=(sigmasplat "$@") COMP_CWORD=$#
-        declared=$(complete -p sigmasplat)
-        [[ $declared == *"-o default"* ]] || exit 3
-        function=${declared##*-F }; ${function%% *}
-        for word in "${COMPREPLY[@]}"; do printf '%s\\n' "$word"; done
-    """
-    command = ["bash", "--norc", "-c", ask, "ask", str(tmp_path / "script"), *words]
-    answer = subprocess.run(command, capture_output=True, text=True, timeout=60)
-    assert answer.returncode == 0, answer.stderr
-    assert set(answer.stdout.split()) == offered
-
-
-def test_zsh_has_a_script_and_other_shells_are_refused() -> None:
-    assert python("-m", "sigmasplat", "completion", "zsh").stdout.startswith("#compdef sigmasplat\n")
-    refused = python("-m", "sigmasplat", "completion", "fish")
-    assert refused.returncode == 2 and "bash" in refused.stderr + refused.stdout
 
 
 # --- the compiled module ------------------------------------------------------------------------------------------

@@ -79,7 +79,7 @@ COMMON: dict[str, Any] = {
     "mapping.window": 4,
     "mapping.covisibility": "splats",
     "mapping.frames_per_step": 0,
-    "mapping.freeze_old_colors": False,
+    "mapping.colors": "free",
     "mapping.prune_opacity": 0.005,
     "primitives.uncertain_m2": 0.025,
     "primitives.faded_opacity": 0.07,
@@ -244,7 +244,7 @@ def test_each_released_varsplat_preset_holds_the_row_of_its_scene() -> None:
         tau, tau_loops, nll_depth, crop = map(float, numbers)
         assert (config.tracking.tau, config.loops.tau, config.registration.tau) == (tau, tau_loops, 3.0), scene
         assert (config.mapping.weight_nll_depth, config.input.crop_px) == (nll_depth * 1e-4, crop), scene
-        assert config.mapping.exposure and config.tracking.exposure == (dataset == "scannet"), scene
+        assert config.mapping.colors == "code" and config.tracking.exposure == (dataset == "scannet"), scene
         assert (
             config.loops.min_interval, config.registration.target, config.input.limit
         ) == PER_DATASET[dataset], scene  # fmt: skip
@@ -267,8 +267,7 @@ def test_released_varsplat_presets_differ_from_the_papers_by_the_methods_of_the_
         )
         before = paper.seeding.outlier_neighbours
         assert released.seeding.outlier_neighbours == before and released.seeding.outlier_first == (before == 0), scene
-        assert released.mapping.freeze_old_colors and released.mapping.freeze_new_colors, scene
-        assert released.mapping.freeze_old_colors and released.input.min_depth_m == 0.0, scene
+        assert paper.mapping.colors == "old-frozen" and released.input.min_depth_m == 0.0, scene
 
 
 # ---- the papers' values

@@ -26,7 +26,7 @@ from sigmasplat.mapping.seeding import make_splats
 from sigmasplat.render.backend import make_view
 from sigmasplat.tracking import drift
 from sigmasplat.tracking.drift import floor, hop_errors
-from sigmasplat.tracking.features import Extractor, Features, make_extractor
+from sigmasplat.tracking.features import Extractor, Features
 from sigmasplat.types import completed
 from small_room import frame_at, walk
 
@@ -169,8 +169,7 @@ class Counting:
     """An extractor that counts in how many images it looks for features."""
 
     def __init__(self) -> None:
-        self.inner, self.images = make_extractor(CONFIG.features), 0
-        self.config = self.inner.config
+        self.inner, self.images = Extractor(), 0
 
     def find(self, gray: NDArray[np.uint8], camera: Camera) -> Features:
         self.images += 1

@@ -23,7 +23,7 @@ from sigmasplat.render.backend import make_view
 from sigmasplat.render.view import View
 from sigmasplat.run_folder.submaps import DiskStore
 from sigmasplat.tracking.feature_image import FeatureImage, detail_of, gray_levels, pose_by_features
-from sigmasplat.tracking.features import Extractor, make_extractor
+from sigmasplat.tracking.features import Extractor
 from sigmasplat.tracking.prepared_frame import PreparedFrame
 from sigmasplat.tracking.relocaliser import KnownMap, Relocaliser, Relocation
 
@@ -50,7 +50,7 @@ def view() -> View:
 
 @cache
 def extractor() -> Extractor:
-    return make_extractor(CONFIG.features)
+    return Extractor()
 
 
 @cache

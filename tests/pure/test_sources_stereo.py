@@ -63,8 +63,8 @@ def test_standard_deviations_cover_the_errors_on_exact_depth():
     room = open_source("synthetic:frames=40,stereo=10,noise=1")
     ratios = []
     for i in (3, 23):
-        frame = room.frame(i)
-        depth_m, std_m = frame.depth_m, frame.depth_std_m
+        left = np.rint(room.frame(i).color * 255.0).astype(np.uint8)
+        depth_m, std_m = room._matcher.depth_and_std_m(left, room.right_image(i))
         read = depth_m > 0
         assert np.array_equal(read, std_m > 0) and (std_m <= 0.05 * depth_m + 1e-6).all()
         ratios.append((np.abs(depth_m - room.exact_depth_of(i)) / np.where(read, std_m, 1))[read])

@@ -21,7 +21,6 @@ from sigmasplat.data.trajectory import Component
 from sigmasplat.errors import ConfigError, RunError, SigmaSplatError
 from sigmasplat.plugins.evaluation.evaluate import evaluate
 from sigmasplat.plugins.evaluation.reconstruct import FusionInput
-from sigmasplat.plugins.outputs.formats import PLUGIN, ExportSource, choose
 from sigmasplat.plugins.sources import SyntheticRoom, open_source
 from sigmasplat.plugins.viewer.layers import VisibilityFilter, merge_pieces
 from sigmasplat.plugins.viewer.server import free_port, is_loopback, open_server, url_of
@@ -165,25 +164,6 @@ def test_lost_frames_and_submaps_apart_of_a_finished_run(finished: RunFolder, tm
     np.testing.assert_allclose(shown.path.T_world_camera[2], path.T_world_camera[2], atol=1e-9)
     _, total = FusionInput.of(run, open_source(ROOM).camera).views()
     assert total == sum(len(run.submaps.load(i).frames) for i in (0, 1))
-
-
-def test_a_run_of_an_old_release_is_shown_evaluated_and_exported(finished: RunFolder, tmp_path: Path) -> None:
-    """Its log has no states, and its trajectory contains the pose of a lost frame."""
-    new = ("state", "component", "p_off")
-    run = rewritten(
-        finished,
-        tmp_path / "run",
-        lambda record: {k: v for k, v in record.items() if k not in new} | {"lost": record["index"] == 2},
-    )
-    shown = finished_snapshot(run)
-    assert shown.path.inside.all() and len(shown.path) == FRAMES and np.flatnonzero(shown.path.lost).tolist() == [2]
-    metrics = evaluate(run, open_source(ROOM), views_per_kind=1, strips_per_kind=0)
-    assert (metrics["frames"], metrics["believed"], metrics["lost"], metrics["apart"]) == (FRAMES, FRAMES - 1, 1, 0)
-    assert metrics["failures"]["auroc"] is None or np.isnan(metrics["failures"]["auroc"])
-    chosen = choose(PLUGIN, None, tmp_path / "path.txt")
-    said = chosen.write(ExportSource(run.path), tmp_path / "path.txt")
-    assert said.startswith("13 poses; left out: 1 lost")
-    assert len(read_trajectory(tmp_path / "path.txt")) == FRAMES - 1
 
 
 class Clock:

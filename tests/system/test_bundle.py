@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from map_now import map_now
 from sigmasplat.config import Config
 from sigmasplat.config.find_preset import default_preset, preset
 from sigmasplat.config.text import override
@@ -63,7 +64,7 @@ STILL = {"mapping__lr_pose_translation": "0", "mapping__lr_pose_rotation": "0"}
 def take_in(mapper: Mapper, i: int, T_world_camera: Array) -> Keyframe:
     """Map frame i as a keyframe that stands at a pose; return it as mapping leaves it."""
     view = make_view("cpu", room().camera, mapper.config.render)
-    mapper.map(view, i, Target.of(room().frame(i), (view.alpha.shape[0], view.alpha.shape[1])), T_world_camera)
+    map_now(mapper, view, i, Target.of(room().frame(i), (view.alpha.shape[0], view.alpha.shape[1])), T_world_camera)
     return mapper.keyframes[-1]
 
 

@@ -115,7 +115,7 @@ def test_a_frame_seen_by_another_camera_has_the_same_surface() -> None:
     [
         (["--out", "found.csv"], "--out must end in .jsonl or .txt"),
         (["--fx", "400"], "sees less than half"),
-        (["--set", "features.kind=surf"], "features.kind must be one of"),
+        (["--set", "tracking.method=guess"], "tracking.method must be one of"),
     ],
 )
 def test_a_refusal_is_one_line(

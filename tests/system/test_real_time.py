@@ -23,8 +23,7 @@ from sigmasplat.data.submap import MemoryStore
 from sigmasplat.data.trajectory import LOST, RELOCALISED
 from sigmasplat.errors import RunError
 from sigmasplat.plugins.evaluation.metrics.trajectory import ate
-from sigmasplat.realtime.schedule import MappingThread
-from sigmasplat.realtime.system import RealTime
+from sigmasplat.realtime.system import MappingThread, RealTime
 from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.slam.saved_state import restore, state_of
 from sigmasplat.slam.slam import Slam
@@ -243,7 +242,7 @@ def test_what_fails_at_the_start_of_the_mapping_thread_reaches_the_caller(monkey
         time.sleep(0.2)  # `settle` is called before it fails
         raise MemoryError("no thread can be made")
 
-    monkeypatch.setattr("sigmasplat.realtime.schedule.set_kernel_threads", fail)
+    monkeypatch.setattr("sigmasplat.realtime.system.set_kernel_threads", fail)
     schedule = MappingThread()
     schedule.start(iter([False]))
     with pytest.raises(MemoryError, match="no thread"):

@@ -51,7 +51,7 @@ def test_a_second_process_is_refused_until_the_first_one_ends(
             assert str(out) in line and f"process {process.pid}" in line and "kill" in line
         assert len(RunFolder.open(out).read_log()) >= 2
         process.send_signal(signal.SIGSTOP)
-        assert f"kill -CONT {process.pid}" in refusal(capsys, "resume", str(out))
+        assert f"kill {process.pid}" in refusal(capsys, "resume", str(out))
         process.kill()
         process.wait(timeout=PATIENCE_S)
     assert exit_code("run", ROOM, "--out", str(out), "--overwrite", *SHORT) == 0

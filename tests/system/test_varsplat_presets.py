@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from constants import changed
 from sigmasplat.config import Config
 from sigmasplat.config.find_preset import list_presets, preset, presets_by_scene
 from sigmasplat.config.text import override
@@ -48,7 +47,7 @@ def test_a_darker_frame_is_mapped_in_the_exposure_of_the_map(corrected: bool) ->
     dark = replace(bright[2], color=bright[2].color * np.float32(0.6))
     settings = {"tracking.iterations": "60", "mapping.first_iterations": "60", "submaps.frames": "0"}
     config = override(short("varsplat-released-scene0000"), settings | {"input.width": "96"})
-    slam = Slam(replace(config, mapping=changed(config.mapping, exposure=corrected)))
+    slam = Slam(replace(config, mapping=replace(config.mapping, colors="code" if corrected else "old-frozen")))
     for frame in (*bright[:2], dark):
         slam.step(frame)
     assert slam.keyframe_indices == [0, 1, 2]

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
 
 PresetName = Annotated[str, arg("NAME", f"preset of settings to start from: {', '.join(FAMILIES)}")]
-Shell = Annotated[Literal["bash", "zsh"], tyro.conf.Positional, arg("{bash,zsh}", "the shell that you use")]
 Settings = Annotated[
     tuple[str, ...],
     tyro.conf.UseAppendAction,
@@ -100,14 +99,10 @@ RunOrMap = Annotated[Path, tyro.conf.Positional, arg("RUN", "run folder, or a ma
 
 @dataclass(frozen=True)
 class RunOptions:
-    """Options of run and resume: scoring, profile, saving, logs, viewer."""
+    """Options of run and resume: scoring, saving, viewer."""
 
     evaluate: Annotated[bool, flag("do not score the run: no metrics, no report", name="eval")] = True
-    profile: Annotated[bool, flag("print the time spent in each stage")] = False
     save_every: SaveEvery = 60.0
-    log: Annotated[
-        Literal["rerun"] | None, arg("rerun", "also write the path and the values of every frame to logs/ in RUN", "")
-    ] = None
     view: View = False
     host: Host = HOST
     port: Port = PORT

@@ -4,7 +4,7 @@ The order of a run: open the source, start the viewer, create the run folder, ru
 """
 
 from collections.abc import Mapping
-from contextlib import AbstractContextManager, closing, nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 from sigmasplat.commands import options
 from sigmasplat.commands.end_of_run import warn_at_the_end
 from sigmasplat.commands.evaluate import score
-from sigmasplat.commands.input_options import DEFAULT_INPUT_OPTIONS, InputOptions, InputOptionsFlat, arg
+from sigmasplat.commands.input_options import DEFAULT_INPUT_OPTIONS, InputOptions, InputOptionsFlat, Whole, arg
 from sigmasplat.commands.options import configured, prepare_torch, source_of
 from sigmasplat.commands.robot_output import (
     DEFAULT_ROBOT_OPTIONS,
@@ -23,6 +23,7 @@ from sigmasplat.commands.robot_output import (
 )
 from sigmasplat.commands.view import keep_showing, serve_viewer
 from sigmasplat.config.find_preset import default_preset
+from sigmasplat.config.ranges import WIDTHS_PX
 from sigmasplat.config.text import full_path, split_settings
 from sigmasplat.errors import ConfigError
 
@@ -41,12 +42,13 @@ OK, INTERRUPTED = 0, 130
 DEFAULT_PRESET = default_preset()
 DEMO_FOLDER, DEMO_FRAMES = Path("runs/demo"), 120
 FinalWidth = Annotated[
-    str | None,
+    Whole,
+    WIDTHS_PX,
     arg(
-        "working|camera|PIXELS",
-        "width of the images that the final map is refined on at the end: as tracking, as the camera, or a number "
-        "of pixels; short form of --set final.width=…",
-        "(default: that of the preset)",
+        "PX",
+        "width in pixels of the images that the final map is refined on at the end, at most the recorded width "
+        "(8192: as recorded); short form of --set final.width=PX",
+        "(default: 0, no larger than in tracking)",
     ),
 ]
 
@@ -91,13 +93,10 @@ def run(
     from sigmasplat.run.finished_map import FinishedMap, continue_map
     from sigmasplat.run.resume import StartPoint
     from sigmasplat.run.session import new_run
-    from sigmasplat.run.step_logs import rerun
     from sigmasplat.run.terminal import Screen
     from sigmasplat.run_folder.runs import RunFolder
     from sigmasplat.slam.slam import Slam
 
-    if run_options.log:
-        rerun()
     check_robot_output(robot_options)
     settings += () if final_seconds is None else (f"final.seconds={final_seconds:g}",)
     settings += () if final_width is None else (f"final.width={final_width}",)
@@ -131,12 +130,9 @@ def resume(
     """
     from sigmasplat.run.resume import resume as resumed
     from sigmasplat.run.same_conditions import other_instruction_set
-    from sigmasplat.run.step_logs import rerun
     from sigmasplat.run.terminal import Screen
     from sigmasplat.run_folder.runs import RunFolder
 
-    if run_options.log:
-        rerun()
     check_robot_output(robot_options)
     screen, folder = Screen(), RunFolder.open(run)
     source = source_of(folder, moved_to)
@@ -195,7 +191,7 @@ def _opened(
 def _say_of_scale(screen: "Screen", asked: "Config", source: "Source", config: "Config") -> None:
     """Print the measured unit of given poses, or that of predicted depth in theirs, or a warning if poses do not seem
     to be in metres."""
-    from sigmasplat.run.pose_scale import scale_warning
+    from sigmasplat.run.scene import scale_warning
 
     poses, factor = config.input.poses, config.input.poses_scale
     if not asked.input.poses_scale:
@@ -246,12 +242,10 @@ def _run_and_score(
     from sigmasplat.plugins.checks.motion import MotionWatch
     from sigmasplat.plugins.sources.live import Arrivals, LiveSource
     from sigmasplat.realtime.system import RealTime
-    from sigmasplat.run.resume import RefinementFile, StateFile
+    from sigmasplat.run.resume import StateFile
     from sigmasplat.run.session import Session
-    from sigmasplat.run.step_logs import RerunLog
 
     state = StateFile(start.slam, folder, run_options.save_every)
-    start.slam.saved_refinement = RefinementFile(start.slam, folder, run_options.save_every)
     read = Arrivals(source) if realtime else source
     system = RealTime(start.slam, covariances=False, should_stop=read.hurries) if isinstance(read, Arrivals) else None
     if system:
@@ -261,10 +255,9 @@ def _run_and_score(
     with (
         robot_output(screen, start.slam, folder, robot_options) as robot,
         screen.steps(None if source.live else len(source), start.next_index) as steps,
-        closing(RerunLog(folder, start.next_index)) as log,
     ):
         session = Session(
-            system or start.slam, read, folder, [steps, log] if run_options.log else [steps], state, start.next_index,
+            system or start.slam, read, folder, [steps], state, start.next_index,
             start.wall_s, _readers(start, source, viewer, robot),
         )  # fmt: skip
         session.watch = robot.watch if robot else motion if not (system or source.live) else None
@@ -273,8 +266,6 @@ def _run_and_score(
     stopped = outcome.status == "interrupted"
     if stopped and not outcome.frames:
         raise KeyboardInterrupt  # the folder has no results, and no state to resume from
-    if run_options.profile:
-        screen.profile(folder.read_profile())
     warn_at_the_end(screen, source, read, folder, motion)
     if stopped:
         kept = f"interrupted after {outcome.summary()}; the trajectory, map and checkpoint so far are in {folder.path}"

@@ -248,31 +248,6 @@ class MappingConfig(Section, name="mapping"):
         return 0.02 if self.few_steps else 0.0025
 
     @property
-    def freeze_old_colors(self) -> bool:
-        """Whether splats older than the keyframe keep their colours."""
-        return self.colors != "free"
-
-    @property
-    def freeze_new_colors(self) -> bool:
-        """Whether the new splats of a keyframe keep the colour of their pixel (VarSplat's code)."""
-        return self.colors == "code"
-
-    @property
-    def exposure(self) -> bool:
-        """Whether keyframes are mapped in the exposure of the map, if `tracking.exposure` finds it."""
-        return self.colors == "code"
-
-    @property
-    def freeze_until(self) -> str:
-        """How long colours are frozen: in all steps of a keyframe (end), or only in the first half (half)."""
-        return "half" if self.freeze_new_colors else "end"
-
-    @property
-    def fresh_adam(self) -> bool:
-        """Whether each keyframe starts with a new Adam optimiser, without earlier moments (VarSplat's code)."""
-        return self.freeze_new_colors
-
-    @property
     def first_per_frame(self) -> int:
         """Return how many steps of the first keyframe a later frame makes (`divided`)."""
         return max(self.iterations, self.first_iterations // FIRST_FRAMES)

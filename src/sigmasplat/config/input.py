@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from sigmasplat.config.ranges import WIDTHS_PX, Above0, AtLeastOne, Count, NotNegative, Range, Section
-from sigmasplat.config.sensors import sensor_problems
 
 RECORDED_POSES = "recorded"
 """Value of `input.poses` for the poses that the recording device estimated itself."""
@@ -81,10 +80,9 @@ class InputConfig(Section, name="input"):
     """Smaller depth readings are ignored: below its range a sensor returns noise."""
     max_depth_m: Above0 = 8.0
     """Larger depth readings are ignored: their errors grow with the square of the depth."""
-    sensor: str = "auto"
-    """Model of the standard deviation of depth readings: kinect-v1, realsense-stereo, lidar-iphone, time-of-flight;
-    generic = the law of `render.depth_noise_per_m`; or a model as in `base:0.001,z2:0.0015` (parts: base, z1, z2, edge,
-    grazing, most). auto = that of the sensor if the source knows it, otherwise generic. `inspect` measures one."""
+    sensor: Literal["auto", "generic", "kinect-v1", "realsense-stereo", "lidar-iphone", "time-of-flight"] = "auto"
+    """Model of the standard deviation of depth readings: that of a sensor (`config.sensors`); generic = the law of
+    `render.depth_noise_per_m`; auto = that of the sensor if the source knows it, otherwise generic."""
     denoise_depth: bool = True
     """Whether depth images that are noisier than those of a structured-light sensor are smoothed."""
 
@@ -99,7 +97,6 @@ class InputConfig(Section, name="input"):
             return found
         if self.end_s and self.end_s <= self.start_s:
             found.append(f"input.end_s must be after input.start_s, found {self.start_s:g} to {self.end_s:g} s")
-        found += sensor_problems(self.sensor)
         if self.max_depth_m <= self.min_depth_m:
             found.append(
                 "input.max_depth_m must be above input.min_depth_m, "

@@ -4,7 +4,6 @@ from collections.abc import Collection, Mapping
 from typing import Any
 
 from sigmasplat.config import Config
-from sigmasplat.config.sensors import AUTO
 
 POWERS = {
     "input": {"min_depth_m": 1, "max_depth_m": 1},
@@ -53,7 +52,7 @@ def for_scene(
     config = scaled(config, scene_scale, given)
     if config.input.poses:
         config = config.changed(**_not_given(POSES_STAY, given))
-    if sensor is not None and config.input.sensor == AUTO:
+    if sensor is not None and config.input.sensor == "auto":
         config = config.changed(input={"sensor": sensor})
     if predicted_depth:
         depth_noise_per_m = depth_noise_per_m or PREDICTED_NOISE_PER_M

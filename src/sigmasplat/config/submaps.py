@@ -1,6 +1,5 @@
 """Settings of the work per submap: when to start a new one, loops, registration, the final map."""
 
-import sys
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal, NamedTuple
 
@@ -14,9 +13,7 @@ from sigmasplat.config.ranges import (
     Range,
     Section,
     Share,
-    shown,
 )
-from sigmasplat.errors import ConfigError
 
 
 @dataclass(frozen=True)
@@ -236,17 +233,14 @@ class FinalConfig(Section, name="final"):
     """Degree of view-dependent colour reached during refinement, 0 to 3."""
     spacing_m: ClassVar[float] = 0.02
     """Distance between the splats seeded on the mesh, in metres, times the scale of the scene."""
-    max_splats: Count = 0
-    """Largest number of splats of the final map; those that contribute least to the images of keyframes are removed. 0
-    = no limit."""
     prune_every: ClassVar[int] = 500
     """Number of refinement steps between removals of splats with low opacity (`prune_opacity`)."""
     prune_opacity: ClassVar[float] = 0.005
     """Splats with at most this opacity, 0 to 1, are removed during refinement."""
-    width: str = "working"
-    """Width of the images in the last stage of refinement: working = no such stage, only working images are used;
-    camera = as recorded; or a number of pixels, at most the recorded width. If it is above `input.width`, the colour of
-    each keyframe is kept at this size."""
+    width: Annotated[int, WIDTHS_PX] = 0
+    """Width of the images in the last stage of refinement in pixels, at most the recorded width, so that 8192 is the
+    camera's; 0 = no such stage, only working images are used. If it is above `input.width`, the colour of each keyframe
+    is kept at this size."""
     width_iterations: Count = 8000
     """Number of refinement steps of the stage with images of `width`, after those of `iterations`, if `iterations` is
     above 0. Two thirds of them use working images, so that the map stays sharp at that size too."""
@@ -289,26 +283,3 @@ class FinalConfig(Section, name="final"):
     weight_moment = FromRow[bool]("schedule", SCHEDULES)
     max_axis_ratio = FromRow[float]("schedule", SCHEDULES)
     max_needle_ratio = FromRow[float]("schedule", SCHEDULES)
-
-    @property
-    def width_px(self) -> int:
-        """Return `width` in pixels; 0 = working, a very large number = camera. Raises ConfigError on other text."""
-        named = {"working": 0, "camera": sys.maxsize}
-        if self.width in named:
-            return named[self.width]
-        pixels = int(self.width) if self.width.isdecimal() and len(self.width) < 6 else -1
-        if pixels not in WIDTHS_PX:
-            raise ConfigError(
-                f"final.width must be working, camera or a number of pixels ({WIDTHS_PX}), found {shown(self.width)}"
-            )
-        return pixels
-
-    def problems(self) -> list[str]:
-        """Describe each invalid value, and a `width` that is neither a word nor a number of pixels."""
-        found = super().problems()
-        if isinstance(self.width, str):
-            try:
-                _ = self.width_px
-            except ConfigError as problem:
-                found.append(str(problem))
-        return found

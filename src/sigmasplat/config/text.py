@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
-from sigmasplat.config import FOLLOWS, SECTIONS, Config, gone, said_gone
+from sigmasplat.config import SECTIONS, Config
 from sigmasplat.config.ranges import kinds_of, problem_of, refuse, shown, unpacked
 from sigmasplat.errors import ConfigError, nearest
 
@@ -61,8 +61,6 @@ def _kind(config: Config, section: str, field: str, name: str) -> Any:
     """Return the type of a setting with its range; `name` is the full name that the user gave. Raises ConfigError."""
     if section and section not in SECTIONS:
         raise ConfigError(f"unknown setting {name!r}{nearest(section, SECTIONS)}; sections: {', '.join(SECTIONS)}")
-    if name in gone() or name in FOLLOWS:
-        raise ConfigError(said_gone(name))
     kinds = kinds_of(SECTIONS[section] if section else type(config))
     if field not in kinds or (not section and field in SECTIONS):
         known = [known for known in kinds if section or known not in SECTIONS]
@@ -76,16 +74,7 @@ def _converted(name: str, kind: Any, text: str) -> Any:
     if get_origin(base) is Literal:
         return _chosen(name, {str(value): value for value in get_args(base)}, text)
     if base is bool:
-        words = {
-            "true": True,
-            "1": True,
-            "yes": True,
-            "on": True,
-            "false": False,
-            "0": False,
-            "no": False,
-            "off": False,
-        }
+        words = dict.fromkeys(("true", "1", "yes", "on"), True) | dict.fromkeys(("false", "0", "no", "off"), False)
         return _chosen(name, words, text.lower())
     if base is str:
         return text

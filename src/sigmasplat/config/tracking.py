@@ -118,11 +118,6 @@ class TrackingConfig(Section, name="tracking"):
         return replace(self, iterations=self.first_iterations, lr_rotation=self.first_lr_rotation)
 
     @property
-    def sensor_noise(self) -> bool:
-        """Whether alignment uses the model of `input.sensor`: with `verify`."""
-        return self.verify
-
-    @property
     def outlier_factor_color(self) -> float:
         """Colour counts only where its error, summed over channels, is below this multiple of its median; 0 = off."""
         return 10.0 if self.average == "kept" else 0.0

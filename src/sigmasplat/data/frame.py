@@ -12,7 +12,7 @@ from PIL import Image
 
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
-from sigmasplat.data.images import interpolated_depth, resized_color, resized_depth, resized_std, within
+from sigmasplat.data.images import interpolated_depth, resized_color, resized_depth, within
 from sigmasplat.errors import SourceError
 from sigmasplat.types import Matrix
 
@@ -48,16 +48,15 @@ class Frame:
     color: float32 [H, W, 3] in [0, 1]; depth_m: float32 [H, W] along the optical axis in metres, 0 = no reading;
     camera: the pinhole of both; timestamp_s: seconds; index: position in the source; R_inertial_camera [3, 3]: rotation
     from the camera's axes to fixed axes, the same for all frames, measured by a gyroscope; None = not measured. Only
-    the rotation between two frames is used, so any fixed axes will do; depth_std_m: float32 [H, W], the standard
-    deviation of each depth reading, metres, if the sensor knows it; ignored: pixels of the frame as it was read
+    the rotation between two frames is used, so any fixed axes will do; ignored: pixels of the frame as it was read
     (`ignored_by` resamples them) whose colour is not used either, None = none; they have no depth; T_given_camera
     [4, 4]: pose of the camera in fixed axes, metres, which is used as it is; None = the pose is estimated. Only the
     motion between two frames is used; specific_force_m_s2 [3]: measured by an accelerometer along the camera's axes,
     9.81 upwards at rest, from which a run finds the vertical direction; None = not measured. The frame keeps read-only
     views of the arrays and does not copy them: do not write to them later (`frame_from_arrays` copies). Raises
     SourceError if an array is not float32, on inconsistent shapes, values that are not finite, colour in 0…255,
-    negative depth, a reading whose standard deviation is not above 0, a matrix that is not a rotation, a pose that is
-    not rigid, or a force that is not three finite numbers.
+    negative depth, a matrix that is not a rotation, a pose that is not rigid, or a force that is not three finite
+    numbers.
     """
 
     index: int
@@ -66,7 +65,6 @@ class Frame:
     depth_m: NDArray[np.float32]
     camera: Camera
     R_inertial_camera: Matrix | None = None
-    depth_std_m: NDArray[np.float32] | None = None
     ignored: NDArray[np.bool_] | None = None
     T_given_camera: Matrix | None = None
     specific_force_m_s2: NDArray[np.float64] | None = None
@@ -74,7 +72,7 @@ class Frame:
     def __post_init__(self) -> None:
         for problem in self._problems():
             raise SourceError(f"frame {self.index}: {problem}")
-        self._keep(self.color, self.depth_m, self.depth_std_m)
+        self._keep(self.color, self.depth_m)
 
     def _problems(self) -> Iterator[str]:
         """Yield what is wrong with the frame. Each check needs those before it."""
@@ -99,16 +97,7 @@ class Frame:
             yield color_range(low, high)
         if nearest_m < 0.0:
             yield f"depth is negative ({nearest_m:.3f} m); 0 means no reading"
-        std_m, force = self.depth_std_m, self.specific_force_m_s2
-        if std_m is not None:
-            if not isinstance(std_m, np.ndarray) or std_m.dtype != np.float32 or std_m.shape != self.depth_m.shape:
-                yield f"depth_std_m is {described(std_m)}; give float32, one value per pixel of depth"
-            wrong = int((~(np.isfinite(std_m) & (std_m > 0)) & (self.depth_m > 0)).sum())
-            if wrong:
-                yield (
-                    f"{wrong} depth readings have a standard deviation that is not above 0; give finite metres above "
-                    "0, or depth 0 where there is no reading"
-                )
+        force = self.specific_force_m_s2
         if self.R_inertial_camera is not None and not se3.is_rotation(self.R_inertial_camera):
             yield "R_inertial_camera is not a rotation [3, 3]; give None if it is not measured"
         if self.T_given_camera is not None and not se3.is_rigid(self.T_given_camera):
@@ -121,14 +110,9 @@ class Frame:
         """Return what is known of the pose apart from the images."""
         return PosePrior(self.R_inertial_camera, self.T_given_camera)
 
-    def _keep(
-        self, color: NDArray[np.float32], depth_m: NDArray[np.float32], depth_std_m: NDArray[np.float32] | None
-    ) -> None:
+    def _keep(self, color: NDArray[np.float32], depth_m: NDArray[np.float32]) -> None:
         """Keep read-only views of the images; the caller's arrays stay writeable."""
-        for name, array in (("color", color), ("depth_m", depth_m), ("depth_std_m", depth_std_m)):
-            if array is None:
-                object.__setattr__(self, name, None)
-                continue
+        for name, array in (("color", color), ("depth_m", depth_m)):
             view = np.ascontiguousarray(array).view()
             view.setflags(write=False)
             object.__setattr__(self, name, view)
@@ -138,8 +122,7 @@ class Frame:
         if (width, height) == (self.camera.width, self.camera.height):
             return self
         color, depth_m = resized_color(self.color, width, height), resized_depth(self.depth_m, width, height)
-        std_m = resized_std(self.depth_std_m, depth_m)
-        return self._with_images(color, depth_m, self.camera.resized(width, height), std_m)
+        return self._with_images(color, depth_m, self.camera.resized(width, height))
 
     def prepared(self, width: int, min_depth_m: float, max_depth_m: float, crop_px: int = 0) -> "Frame":
         """Return the working frame: the size of `Camera.prepared`, and depth 0 outside the range.
@@ -158,24 +141,17 @@ class Frame:
         if color is self.color and depth_m is self.depth_m and not crop_px:
             return self
         inner = np.s_[crop_px : crop_px + camera.height, crop_px : crop_px + camera.width]
-        std_m = resized_std(self.depth_std_m, depth_m)
-        return self._with_images(color[inner], depth_m[inner], camera, None if std_m is None else std_m[inner])
+        return self._with_images(color[inner], depth_m[inner], camera)
 
-    def with_depth(self, depth_m: NDArray[np.float32], depth_std_m: NDArray[np.float32] | None) -> "Frame":
-        """Return the frame with depth, and its standard deviation, that were made from its own."""
-        return self._with_images(self.color, depth_m, self.camera, depth_std_m)
+    def with_depth(self, depth_m: NDArray[np.float32]) -> "Frame":
+        """Return the frame with depth that was made from its own."""
+        return self._with_images(self.color, depth_m, self.camera)
 
-    def _with_images(
-        self,
-        color: NDArray[np.float32],
-        depth_m: NDArray[np.float32],
-        camera: Camera,
-        depth_std_m: NDArray[np.float32] | None,
-    ) -> "Frame":
+    def _with_images(self, color: NDArray[np.float32], depth_m: NDArray[np.float32], camera: Camera) -> "Frame":
         """Return the frame with images that were made from its own: their values need no check."""
         frame = copy.copy(self)
         object.__setattr__(frame, "camera", camera)
-        frame._keep(color, depth_m, depth_std_m)
+        frame._keep(color, depth_m)
         return frame
 
     def ignored_by(self, camera: Camera) -> NDArray[np.bool_] | None:
@@ -199,9 +175,8 @@ class Frame:
         columns, rows = camera.pixels_in(self.camera.resized(width, height))
         color = _interpolated(_interpolated(resized_color(self.color, width, height), rows).swapaxes(0, 1), columns)
         u, v = (np.rint(pixels) for pixels in camera.pixels_in(self.camera))
-        std = None if self.depth_std_m is None else _at(self.depth_std_m, v, u)
         color = np.ascontiguousarray(color.swapaxes(0, 1))
-        return replace(self, color=color, depth_m=_at(self.depth_m, v, u), camera=camera, depth_std_m=std)
+        return replace(self, color=color, depth_m=_at(self.depth_m, v, u), camera=camera)
 
 
 def described(value: object) -> str:

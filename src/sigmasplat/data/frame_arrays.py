@@ -56,7 +56,6 @@ def frame_from_arrays(
     depth_scale: float | None = None,
     color_order: ColorOrder = "rgb",
     R_inertial_camera: Matrix | None = None,
-    depth_std: Array | None = None,
     T_given_camera: Matrix | None = None,
 ) -> Frame:
     """Convert one pair of images to a `Frame`; the arrays are copied.
@@ -64,19 +63,15 @@ def frame_from_arrays(
     rgb [H, W, 3]: uint8, or float in [0, 1]; its channels are in `color_order`. depth [H, W]: along the optical axis, 0
     = no reading; float in metres, or whole numbers with `depth_scale`, the units per metre (1000 for millimetres). K:
     of the undistorted images, a 3×3 matrix, (fx, fy, cx, cy) in pixels, or a `Camera`. timestamp: seconds.
-    R_inertial_camera, T_given_camera: as in `Frame`. depth_std [H, W]: the standard deviation of each reading, in the
-    unit of depth. Raises SourceError with the remedy if an argument has the wrong type, shape, unit or range, and
-    ConfigError if K is not a camera.
+    R_inertial_camera, T_given_camera: as in `Frame`. Raises SourceError with the remedy if an argument has the wrong
+    type, shape, unit or range, and ConfigError if K is not a camera.
     """
     if color_order not in get_args(ColorOrder):
         raise SourceError(f"color_order is {color_order!r}; give 'rgb' or 'bgr'")
     color = color_from_array(rgb, color_order)
     depth_m = depth_from_array(depth, depth_scale)
     camera = camera_from(K, color.shape[1], color.shape[0])
-    std_m = None if depth_std is None else depth_from_array(depth_std, depth_scale)
-    frame = Frame(
-        index, seconds_from(timestamp), color, depth_m, camera, R_inertial_camera, std_m, None, T_given_camera
-    )
+    frame = Frame(index, seconds_from(timestamp), color, depth_m, camera, R_inertial_camera, None, T_given_camera)
     _check_unit(frame, depth_scale)
     return frame
 

@@ -123,15 +123,4 @@ def _described(holder: str) -> str:
         return "another process; wait until it ends"
     if host and host != socket.gethostname():
         return f"process {number} on {host}; wait until it ends"
-    if _is_stopped(number):
-        return f"process {number}, which is stopped; continue it (kill -CONT {number}) or end it (kill -KILL {number})"
     return f"process {number}; wait until it ends, or stop it (kill {number})"
-
-
-def _is_stopped(number: str) -> bool:
-    """Return whether a process is stopped (Ctrl-Z); False if that is unknown."""
-    try:
-        state = Path(f"/proc/{number}/stat").read_text(encoding="utf-8", errors="replace")
-    except OSError:
-        return False
-    return state.rpartition(")")[2].split()[:1] in (["T"], ["t"])

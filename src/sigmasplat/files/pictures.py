@@ -12,7 +12,7 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
-from sigmasplat.errors import SigmaSplatError, SourceError
+from sigmasplat.errors import SourceError
 from sigmasplat.files.reading import guarded, open_regular, refuse_special
 
 FORMATS = ("JPEG", "PNG", "BMP", "PPM", "TIFF", "WEBP")
@@ -24,33 +24,28 @@ REMEDY = "download or copy it again"
 
 
 @contextmanager
-def open_image(
-    path: Path,
-    data: bytes | None = None,
-    formats: tuple[str, ...] = FORMATS,
-    error: type[SigmaSplatError] = SourceError,
-) -> Iterator[Image.Image]:
+def open_image(path: Path, data: bytes | None = None) -> Iterator[Image.Image]:
     """Open an image file, or `data` of one that `path` names, and yield it before its pixels are decoded.
 
-    Raises `error` naming the file if it is not one of the formats, has more than `MOST_PIXELS`, or if the block cannot
+    Raises SourceError naming the file if it is not of `FORMATS`, has more than `MOST_PIXELS`, or if the block cannot
     decode it.
     """
-    with _opened(path, data, error) as file, guarded(path, REMEDY, error, "unreadable image"):
+    with _opened(path, data) as file, guarded(path, REMEDY, SourceError, "unreadable image"):
         try:
-            image = Image.open(file, formats=formats)
+            image = Image.open(file, formats=FORMATS)
         except (Image.DecompressionBombError, UnidentifiedImageError) as problem:
             bomb = isinstance(problem, Image.DecompressionBombError)
-            why = "too many pixels" if bomb else f"not {', '.join(formats)}, or damaged"
-            raise error(f"{path}: unreadable image ({why}); {'reduce it' if bomb else REMEDY}") from problem
+            why = "too many pixels" if bomb else f"not {', '.join(FORMATS)}, or damaged"
+            raise SourceError(f"{path}: unreadable image ({why}); {'reduce it' if bomb else REMEDY}") from problem
         with image:
-            check_pixels(path, image.size, error)
+            check_pixels(path, image.size)
             yield image
 
 
-def check_pixels(path: Path, size: tuple[int, int], error: type[SigmaSplatError] = SourceError) -> None:
-    """Raise `error` if an image of `size` (width, height) has more than `MOST_PIXELS`."""
+def check_pixels(path: Path, size: tuple[int, int]) -> None:
+    """Raise SourceError if an image of `size` (width, height) has more than `MOST_PIXELS`."""
     if math.prod(size) > MOST_PIXELS:
-        raise error(
+        raise SourceError(
             f"{path}: unreadable image ({size[0]}×{size[1]} pixels, the limit is {MOST_PIXELS / 1e6:.0f} megapixels); "
             "reduce it"
         )
@@ -78,9 +73,9 @@ def _mapped(path: Path) -> NDArray[Any]:
 
 
 @contextmanager
-def _opened(path: Path, data: bytes | None, error: type[SigmaSplatError]) -> Iterator[BinaryIO]:
+def _opened(path: Path, data: bytes | None) -> Iterator[BinaryIO]:
     if data is not None:
         yield io.BytesIO(data)
         return
-    with open_regular(path, error, MOST_BYTES) as file:
+    with open_regular(path, most=MOST_BYTES) as file:
         yield file

@@ -146,17 +146,15 @@ def read_json(path: Path, error: type[SigmaSplatError] = SourceError, most: int 
     return parse_json(read_text(path, error, most), path, error)
 
 
-def csv_rows(
-    path: Path, error: type[SigmaSplatError] = SourceError, most: int = MOST_TEXT_BYTES, errors: str = "strict"
-) -> Iterator[tuple[int, list[str]]]:
+def csv_rows(path: Path, errors: str = "strict") -> Iterator[tuple[int, list[str]]]:
     """Yield (line number from 1, words without spaces around them) of every CSV line that is not empty.
 
-    Raises `error` as `read_text` does, or naming the line if it is not CSV or has a field above 131 kB.
+    Raises SourceError as `read_text` does, or naming the line if it is not CSV or has a field above 131 kB.
     """
-    lines = csv.reader(read_text(path, error, most, errors).split("\n"))
+    lines = csv.reader(read_text(path, errors=errors).split("\n"))
     try:
         for words in lines:
             if words:
                 yield lines.line_num, [word.strip() for word in words]
     except csv.Error as problem:
-        raise error(f"{path}:{lines.line_num}: not readable as CSV ({problem}); copy it again") from problem
+        raise SourceError(f"{path}:{lines.line_num}: not readable as CSV ({problem}); copy it again") from problem

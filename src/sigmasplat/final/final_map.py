@@ -8,12 +8,11 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from sigmasplat.config import Config, FinalConfig
 from sigmasplat.data.atlas import Atlas
-from sigmasplat.data.field import COLUMNS, INITIAL_LOG_VARIANCE, GaussianField
+from sigmasplat.data.field import COLUMNS, GaussianField
 from sigmasplat.data.mesh import Mesh
 from sigmasplat.data.submap import SubmapStore
 from sigmasplat.data.trajectory import Component, Trajectory, evenly_spread
@@ -21,7 +20,7 @@ from sigmasplat.data.tsdf import packed
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.final.full_resolution import refine_on_photos, working_seconds
 from sigmasplat.final.fusion import count_keyframes, fuse, fusion_views
-from sigmasplat.final.refinement import Clock, KeyframeReader, SavedRefinement, refine
+from sigmasplat.final.refinement import Clock, KeyframeReader, refine
 from sigmasplat.graph.path_covariance import PathCovariance
 from sigmasplat.mapping.moving import carved, without_moving
 from sigmasplat.render.view import View
@@ -52,37 +51,28 @@ def final_map(
     view: View,
     random: np.random.Generator,
     progress: Progress = no_progress,
-    saved: SavedRefinement | None = None,
 ) -> FinalMap:
     """Return the map in the world: made from submaps at `anchors` (T_world_submap [4, 4] each), then refined with
     `view`.
 
-    Calls `progress(steps done, total)`. With `saved`, refinement continues after the last saved step, and the result
-    has the same bytes as that of an uninterrupted refinement. Memory contains this map, one submap and some pictures.
+    Calls `progress(steps done, total)`. Memory contains this map, one submap and some pictures.
     Raises SigmaSplatError if there is no submap, a submap has no anchor, or its camera is not the view's.
     """
     _refuse_misfits(store, anchors)
     seed = seeded_on_surface if config.final.seed_from == "mesh" else merged
-    found = None if saved is None else saved.load()
     if config.moving.find:
         store = without_moving(store, anchors, config.moving)
-    field = seed(store, anchors, config) if found is None else found.field
-    if config.moving.find and found is None:
+    field = seed(store, anchors, config)
+    if config.moving.find:
         carved(field, store, anchors, config.moving)
     if not config.final.iterations:
         return FinalMap(field)
-    if found is None:
-        field.keep(torch.from_numpy(z_order(field.means.numpy())))
+    field.keep(torch.from_numpy(z_order(field.means.numpy())))
     on_device, keyframes = field.to(view.sums.device), KeyframeReader(store, anchors, view)
-    if found is not None:
-        keyframes.take(found)
-        random.bit_generator.state = found.numbers
-    done, spent_s = (found.done, found.spent_s) if found else (0, 0.0)
-    clock = Clock(working_seconds(keyframes, config.final), spent_s)
-    if done <= config.final.iterations:
-        done += len(refine(on_device, keyframes, config, view, random, progress, done, saved, clock))
+    clock = Clock(working_seconds(keyframes, config.final))
+    done = len(refine(on_device, keyframes, config, view, random, progress, clock))
     clock = clock.next_stage(config.final.seconds)
-    done, refined_fx = refine_on_photos(on_device, keyframes, config, view, random, progress, done, saved, clock)
+    done, refined_fx = refine_on_photos(on_device, keyframes, config, view, random, progress, done, clock)
     moves = config.final.lr_pose_translation or config.final.lr_pose_rotation
     poses = keyframes.poses_in(anchors) if moves else None
     exposures = keyframes.exposures_in_submaps() if config.final.exposure else None
@@ -185,22 +175,15 @@ def z_order(points: Matrix) -> NDArray[np.int64]:
 def seeded_on_surface(store: SubmapStore, anchors: Sequence[Matrix], config: Config) -> GaussianField:
     """Place splats on the fused surface of the submaps, with distance and size `spacing_m` (VarSplat §7).
 
-    anchors: T_world_submap [4, 4] of each submap. A splat gets the σ² of the nearest submap splat, or the initial σ² if
-    `final.uncertainty` is off. Raises SigmaSplatError if there is no surface.
+    anchors: T_world_submap [4, 4] of each submap. Raises SigmaSplatError if there is no surface.
     """
-    final = config.final
-    mesh = fuse(fusion_views(store, anchors), count_keyframes(store), config, weigh=final.uncertainty)
+    mesh = fuse(fusion_views(store, anchors), count_keyframes(store), config)
     if not len(mesh.vertices):
         raise SigmaSplatError("the submaps have no surface for the seeds of the final map; use final.seed_from=submaps")
-    spacing_m = final.spacing_m * config.render.scene_scale
+    spacing_m = config.final.spacing_m * config.render.scene_scale
     points, colors = thinned_vertices(mesh, spacing_m)
-    log_variances = torch.full((len(points), 3), INITIAL_LOG_VARIANCE)
-    if final.uncertainty:
-        log_variances = nearest_log_variances(points, store, anchors)
     scales = torch.full((len(points), 3), spacing_m)
-    return GaussianField.from_values(
-        torch.from_numpy(points).float(), scales, torch.from_numpy(colors).float(), log_variances=log_variances
-    )
+    return GaussianField.from_values(torch.from_numpy(points).float(), scales, torch.from_numpy(colors).float())
 
 
 def thinned_vertices(mesh: Mesh, spacing_m: float) -> tuple[Matrix, Matrix]:
@@ -211,21 +194,6 @@ def thinned_vertices(mesh: Mesh, spacing_m: float) -> tuple[Matrix, Matrix]:
     sums = [np.bincount(cell, column) for column in (*mesh.vertices.T, *colors.T)]
     means = np.stack(sums, 1) / counts[:, None]
     return means[:, :3], means[:, 3:]
-
-
-def nearest_log_variances(points: Matrix, store: SubmapStore, anchors: Sequence[Matrix]) -> Tensor:
-    """Return log σ² [M, 3] of the splat nearest to each point [M, 3] m; anchors: T_world_submap [4, 4] of each
-    submap."""
-    found, distance = torch.full((len(points), 3), INITIAL_LOG_VARIANCE), np.full(len(points), np.inf)
-    for index in range(len(store)):
-        part = _in_world(store, anchors, index)
-        if not len(part):
-            continue
-        away, which = map(np.asarray, cKDTree(part.means.numpy()).query(points))
-        nearer = away < distance
-        found[nearer] = part.params[which[nearer], COLUMNS["log_variances"]]
-        distance[nearer] = away[nearer]
-    return found
 
 
 SHARE = 0.5

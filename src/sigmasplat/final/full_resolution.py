@@ -10,7 +10,7 @@ import numpy as np
 from sigmasplat.config import Config, FinalConfig, MappingConfig
 from sigmasplat.data.camera import Camera, centred
 from sigmasplat.data.field import GaussianField
-from sigmasplat.final.refinement import Clock, KeyframeReader, SavedRefinement, refinement
+from sigmasplat.final.refinement import Clock, KeyframeReader, refinement
 from sigmasplat.fit.adam import Rates
 from sigmasplat.fit.field import fit_field
 from sigmasplat.fit.target import Keyframe, Target
@@ -91,7 +91,6 @@ def refine_on_photos(
     random: np.random.Generator,
     progress: Progress,
     done: int,
-    saved: SavedRefinement | None,
     clock: Clock,
 ) -> tuple[int, float | None]:
     """Fit the field to photos of keyframes, if there are any, and to their working images, in turns, at fixed poses.
@@ -99,7 +98,7 @@ def refine_on_photos(
     view: that of the working images. `done`: the number of steps that the field has already had; those of this stage
     are counted from `final.iterations` on. Returns their number at the end, which is lower if the time of `clock` is
     spent, and the focal length of the photos, pixels (None: the field was not fitted to photos). Rates fall in time if
-    it is short. Calls `progress(steps done, total)`. `saved` is offered the state every `TURN_STEPS`.
+    it is short. Calls `progress(steps done, total)`.
     """
     final = config.final
     if not final.width_iterations or clock.is_over or (large := photo_view(keyframes, view, config)) is None:
@@ -118,8 +117,6 @@ def refine_on_photos(
         fit_field(field, of_view, _draw(images, steps, final, random, progress, clock), mapping, rates, degree=degree)
         field.keep(field.opacities > final.prune_opacity)
         done = steps.stop
-        if saved is not None:
-            saved.save(keyframes.state(done, field, clock.spent_s, random))
     progress(total, total)
     return done, large.camera.fx
 

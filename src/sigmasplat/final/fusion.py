@@ -19,7 +19,6 @@ from sigmasplat.data.field import GaussianField
 from sigmasplat.data.mesh import Mesh
 from sigmasplat.data.submap import Picture, SubmapStore
 from sigmasplat.data.tsdf import Tsdf, extract_surface
-from sigmasplat.fit.tracking_loss import uncertainty_weights
 from sigmasplat.render import FieldRenderer, Render
 from sigmasplat.types import Matrix, Progress, no_progress
 
@@ -106,16 +105,14 @@ def fuse(
     config: Config,
     *,
     voxel_m: float | None = None,
-    weigh: bool = False,
     renderer: Renderer | None = None,
     progress: Progress = no_progress,
 ) -> Mesh:
     """Fuse depth and colour, rendered at `total` views, into a mesh in the world.
 
     A view with a picture is fused with its readings (`with_readings`). Depth outside the range of the input settings is
-    ignored. weigh: weight the other pixels by their colour uncertainty, w̃ with the τ of tracking (VarSplat §3). Calls
-    `progress(views done, total)`. voxel_m None: 1 cm, times the scale of the scene. Raises ConfigError unless it is
-    above 0.
+    ignored. Calls `progress(views done, total)`. voxel_m None: 1 cm, times the scale of the scene. Raises ConfigError
+    unless it is above 0.
     """
     voxel_m = VOXEL_M * config.render.scene_scale if voxel_m is None else voxel_m
     volume = Tsdf(voxel_m, TRUNCATION_VOXELS * voxel_m)
@@ -124,7 +121,7 @@ def fuse(
         with torch.inference_mode():
             seen = renderer(at.field, at.camera, at.T_camera_field)
         depth_m, color = surface_of(seen, config)
-        weight = certainty(seen, config) if weigh else None
+        weight = None
         if at.picture is not None:
             depth_m, color, weight = with_readings(depth_m, color, at.picture)
         volume.integrate(depth_m, color, at.camera, at.T_world_camera, weight)
@@ -178,12 +175,6 @@ def _inverse_variance(depth_m: Floats) -> Floats:
     (Nguyen 2012)."""
     sigma = 1.2 + 1.9 * (depth_m - np.float32(0.4)) ** 2
     return np.where(depth_m > 0, (np.float32(1.2 + 1.9 * 0.36) / sigma) ** 2, np.float32(0.0)).astype(np.float32)
-
-
-def certainty(seen: Render, config: Config) -> Floats:
-    """Return a weight per pixel [H, W] from the render's variance V: w̃, averaged over the colour channels."""
-    c, opaque = config.tracking, seen.alpha >= LEAST_ALPHA
-    return _array(uncertainty_weights(seen.variance, opaque, c.tau, c.weight_max).mean(-1))
 
 
 def _array(values: Tensor) -> Floats:

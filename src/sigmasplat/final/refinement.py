@@ -5,7 +5,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field as dataclass_field, replace
 from functools import lru_cache
 from math import log
-from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -50,32 +49,6 @@ EXPOSURE_FROM = 0.1
 """Exposures are fitted from this share of the refinement on: the merged map has the colours of single submaps."""
 CACHE_BYTES = 128 << 20
 """Memory for prepared pictures; other pictures are read again when they are drawn."""
-
-
-@dataclass(eq=False)
-class Refined:
-    """A refinement between two steps: the steps done, the map, the keyframes' poses T_world_camera [4, 4] with their
-    Adam states, their exposures [K, 3, 2], the keyframes left in this epoch, the seconds spent, and the state of the
-    random numbers."""
-
-    done: int
-    field: GaussianField
-    poses: list[Matrix]
-    motions: list[VectorAdam]
-    exposures: Matrix
-    left: list[int]
-    spent_s: float
-    numbers: dict[str, Any]
-
-
-class SavedRefinement(Protocol):
-    """Keeps the refinement of a final map between its steps, so that a stopped run does not repeat them."""
-
-    def save(self, state: Refined) -> None:
-        """Save a refinement if a save is due."""
-
-    def load(self) -> Refined | None:
-        """Return the saved refinement; None if nothing is saved."""
 
 
 class KeyframeReader:
@@ -142,16 +115,6 @@ class KeyframeReader:
             T = se3.orthonormalise(T @ se3.exp(share * se3.log(se3.inverse(T) @ tracked)))
         self.poses[moved.index] = T
 
-    def state(self, done: int, field: GaussianField, spent_s: float, random: np.random.Generator) -> Refined:
-        """Return a refinement after `done` steps, to be saved."""
-        numbers = dict(random.bit_generator.state)
-        return Refined(done, field, self.poses, self.motions, self.exposures, list(self.left), spent_s, numbers)
-
-    def take(self, state: Refined) -> None:
-        """Take over the keyframes' part of a saved refinement."""
-        self.poses, self.motions, self.left = state.poses, state.motions, state.left
-        self.exposures = state.exposures
-
     def poses_in(self, anchors: Sequence[Matrix]) -> list[list[Matrix]]:
         """Return T_submap_camera [4, 4] of the keyframes of each submap; anchors: T_world_submap [4, 4] of each."""
         found: list[list[Matrix]] = [[] for _ in range(len(self.store))]
@@ -175,22 +138,18 @@ def refine(
     view: View,
     random: np.random.Generator,
     progress: Progress,
-    done: int = 0,
-    saved: SavedRefinement | None = None,
     clock: "Clock | None" = None,
 ) -> list[float]:
     """Fit the field to all keyframes, one per step, and their poses with it; return the loss of each step.
 
     Poses move at the rates `final.lr_pose_translation` and `final.lr_pose_rotation`, about `final.pose_reach_m` at
     most; `keyframes.poses` has the moved ones. Splats are pruned before, regularly, and at the end. Their shapes are
-    limited (`slam.shape_limits`). Every `sh_every` steps, colours gain one degree of view dependence. `done`: the
-    number of steps that the field has already had. `clock`: None = from now on, with the budget `final.seconds`.
-    `saved` is offered the state after each pruning and each new degree.
+    limited (`limit_shapes`). Every `sh_every` steps, colours gain one degree of view dependence. `clock`: None = from
+    now on, with the budget `final.seconds`.
     """
-    final, mapping, losses = config.final, refinement(config), list[float]()
+    final, mapping, losses, done = config.final, refinement(config), list[float](), 0
     clock = clock or Clock(final.seconds)
-    if not done:
-        prune_by_weight(field, view, keyframes, final.prune_weight_px, final.max_splats)
+    prune_by_weight(field, view, keyframes, final.prune_weight_px)
     while done < final.iterations and not clock.is_over:
         until_event = min(every - done % every for every in (final.prune_every, final.sh_every))
         steps = range(done, min(done + until_event, final.iterations))
@@ -202,9 +161,7 @@ def refine(
         limit_shapes(field, final.max_axis_ratio, final.max_needle_ratio)
         if done % final.prune_every == 0:
             field.keep(field.opacities > final.prune_opacity)
-        if saved is not None and done == steps.stop:
-            saved.save(keyframes.state(done, field, clock.spent_s, random))
-    prune_by_weight(field, view, keyframes, final.prune_weight_px, final.max_splats)
+    prune_by_weight(field, view, keyframes, final.prune_weight_px)
     progress(final.iterations, final.iterations)
     return losses
 
@@ -213,19 +170,18 @@ def refine(
 class Clock:
     """Measures a stage of a refinement against its time budget.
 
-    ends_s: the stage ends after this many seconds of the whole refinement; 0 = without a budget. earlier_s: seconds of
-    an earlier start of the same refinement. begins_s: seconds of the refinement before this stage.
+    ends_s: the stage ends after this many seconds of the whole refinement; 0 = without a budget. begins_s: seconds of
+    the refinement before this stage.
     """
 
     ends_s: float
-    earlier_s: float = 0.0
     begins_s: float = 0.0
     started_s: float = dataclass_field(default_factory=lambda: time.perf_counter())
 
     @property
     def spent_s(self) -> float:
         """Return the seconds of the refinement so far."""
-        return self.earlier_s + time.perf_counter() - self.started_s
+        return time.perf_counter() - self.started_s
 
     @property
     def share(self) -> float:

@@ -44,15 +44,12 @@ def gradient_magnitude(gray: Image) -> Image:
 class Target:
     """The image that a view should render: color [3, rows, columns], depth [rows, columns] m (0 = no reading or
     padding).
-
-    depth_std [rows, columns]: the standard deviation of each reading, m, None if it is unknown.
     """
 
     camera: Camera
     color: Tensor
     depth: Tensor
     valid_pixels: int
-    depth_std: Tensor | None = None
     _on_device: "Target | None" = dataclass_field(default=None, init=False, repr=False)
 
     def to(self, device: torch.device) -> "Target":
@@ -60,9 +57,8 @@ class Target:
         if self.depth.device == device:
             return self
         if self._on_device is None or self._on_device.depth.device != device:
-            std = None if self.depth_std is None else self.depth_std.to(device)
             color, depth = self.color.to(device), self.depth.to(device)
-            self._on_device = Target(self.camera, color, depth, self.valid_pixels, std)
+            self._on_device = Target(self.camera, color, depth, self.valid_pixels)
         return self._on_device
 
     @staticmethod
@@ -70,7 +66,7 @@ class Target:
         """Make the target of a frame on planes of `size` = (rows, columns), at least the frame's size."""
         color, depth = torch.empty(3, *size), torch.empty(size)
         readings = _core.image_planes(frame.color, frame.depth_m, color.numpy(), depth.numpy())
-        return Target(frame.camera, color, depth, readings, padded(frame.depth_std_m, size))
+        return Target(frame.camera, color, depth, readings)
 
     @property
     def image(self) -> Tensor:
@@ -82,26 +78,19 @@ class Target:
         """Return the depth as [H, W], metres."""
         return self.depth[: self.camera.height, : self.camera.width]
 
-    @property
-    def depth_std_image(self) -> NDArray[np.float32] | None:
-        """Return the standard deviation of the readings as [H, W], metres; None if it is unknown."""
-        if self.depth_std is None:
-            return None
-        return np.asarray(self.depth_std[: self.camera.height, : self.camera.width].numpy())
-
     def with_depth(self, depth_m: NDArray[np.float32]) -> "Target":
         """Return the same colour with other depth [H, W], m."""
         depth = torch.zeros_like(self.depth)
         depth[: self.camera.height, : self.camera.width] = torch.from_numpy(depth_m)
         readings = int((depth_m > 0).sum())
-        return Target(self.camera, self.color, depth, readings, self.depth_std)
+        return Target(self.camera, self.color, depth, readings)
 
     def without_exposure(self, exposure: NDArray[np.float64]) -> "Target":
         """Return the same depth with the colours in the exposure of the map (`data.camera`), in [0, 1]."""
         gain, offset = torch.from_numpy(exposure).float().T[..., None, None]
         color, inside = torch.zeros_like(self.color), np.s_[:, : self.camera.height, : self.camera.width]
         color[inside] = ((self.color[inside] - offset) / gain).clamp_(0.0, 1.0)
-        return Target(self.camera, color, self.depth, self.valid_pixels, self.depth_std)
+        return Target(self.camera, color, self.depth, self.valid_pixels)
 
     def picture(self) -> Picture:
         """Return the image; colour is rounded to 256 steps, as a camera delivers it."""
@@ -112,15 +101,6 @@ class Target:
     def of_picture(picture: Picture, camera: Camera, size: tuple[int, int]) -> "Target":
         """Make the target of an earlier keyframe's picture."""
         return Target.of(Frame(0, 0.0, picture.unit_color, picture.depth_m, camera), size)
-
-
-def padded(image: NDArray[np.float32] | None, size: tuple[int, int]) -> Tensor | None:
-    """Return an image [H, W] on a plane of `size` = (rows, columns), 0 outside it; None stays None."""
-    if image is None:
-        return None
-    plane = torch.zeros(size)
-    plane[: image.shape[0], : image.shape[1]] = torch.tensor(image)
-    return plane
 
 
 @dataclass(eq=False)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.config import InputConfig
-from sigmasplat.config.sensors import sensor_problems
+from sigmasplat.config.ranges import kinds_of, problem_of
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.errors import ConfigError, SourceError
@@ -26,7 +26,7 @@ class Calibration:
     camera, distortion: of the colour image, None for no distortion; depth_units_per_metre: of whole-number depth;
     depth_camera, depth_distortion: of depth images that are not registered to colour, None if they are registered;
     T_color_depth [4, 4]: transforms points of the depth camera to the colour camera, metres;
-    sensor: the depth sensor or its model (`config.sensors`), None if it is unknown.
+    sensor: the depth sensor (`config.sensors`), None if it is unknown.
     """
 
     camera: Camera
@@ -84,8 +84,8 @@ def read_calibration(path: Path, size: tuple[int, int], default_units_per_metre:
     fields = read_json_object(path)
     units = json_number(path, fields, "depth_scale", default_units_per_metre)
     lens, sensor = read_distortion(path, fields), fields.get("sensor")
-    if problems := sensor_problems(sensor) if isinstance(sensor, str) else [f"sensor is {sensor!r}"] * bool(sensor):
-        raise SourceError(f'{path}: field "sensor": {problems[0]}')
+    if sensor and (problem := problem_of(kinds_of(InputConfig)["sensor"], sensor)):
+        raise SourceError(f'{path}: field "sensor" {problem}')
     scale = check_positive(path, "depth_scale", units)
     calibration = Calibration(read_camera(path, fields, size), scale, lens, sensor=sensor)
     inner = fields.get("depth_camera")

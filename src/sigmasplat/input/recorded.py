@@ -159,16 +159,14 @@ class RecordedSource(Source):
     def frame(self, i: int) -> Frame:
         """Read frame i: colour and depth of one camera, lens distortion removed."""
         files = self._images[self._checked_index(i)]
-        recorded, depth_m, std_m = files.read(self.depth_units_per_metre)
+        recorded, depth_m, _ = files.read(self.depth_units_per_metre)
         color = color_from_bytes(recorded)
         check_image_sizes(self._rectified, files.color, color.shape[1::-1], files.depth, depth_m.shape[::-1])
         color, depth_m = self._rectified(color, depth_m)
         color = resized_color(color, self.camera.width, self.camera.height)
         R_inertial_camera = None if self._gyroscope is None else self._gyroscope.R_inertial_camera(files.timestamp_s)
         force = None if self._accelerometer is None else self._accelerometer.at(files.timestamp_s)
-        return Frame(
-            i, files.timestamp_s, color, depth_m, self.camera, R_inertial_camera, std_m, specific_force_m_s2=force
-        )
+        return Frame(i, files.timestamp_s, color, depth_m, self.camera, R_inertial_camera, specific_force_m_s2=force)
 
     def depth_of(self, i: int) -> NDArray[np.float32]:
         files = self._images[self._checked_index(i)]

@@ -137,19 +137,11 @@ def largest_weights(field: GaussianField, view: View, keyframes: Iterable[Keyfra
     return largest
 
 
-def prune_by_weight(
-    field: GaussianField, view: View, keyframes: Iterable[Keyframe], least_px: float, most: int
-) -> None:
+def prune_by_weight(field: GaussianField, view: View, keyframes: Iterable[Keyframe], least_px: float) -> None:
     """Remove the splats whose weights sum to less than `least_px` pixels in every keyframe (2DGS-SLAM: in the nearest
-    one), and then those with the smallest sums until `most` are left; 0 turns either off."""
-    if not least_px and not (most and len(field) > most):
-        return
-    weights = largest_weights(field, view, keyframes)
-    keep = weights >= least_px
-    if most and int(keep.sum()) > most:
-        order = torch.where(keep, weights, -1.0).sort(descending=True, stable=True).indices
-        keep[order[most:]] = False
-    field.keep(keep)
+    one); 0 = none."""
+    if least_px:
+        field.keep(largest_weights(field, view, keyframes) >= least_px)
 
 
 def depths(points: Tensor, T_camera_world: Matrix) -> Tensor:

@@ -13,7 +13,6 @@ from torch import Tensor
 from sigmasplat.config import Config
 from sigmasplat.data import se3
 from sigmasplat.data.field import GaussianField, Rows
-from sigmasplat.data.frame import Detail, Photo
 from sigmasplat.data.submap import Picture, Submap
 from sigmasplat.fit.adam import Rates
 from sigmasplat.fit.field import DensifyStats, FieldFit, fitting
@@ -33,7 +32,7 @@ from sigmasplat.mapping.moving import carve, mask_keyframes
 from sigmasplat.mapping.seeding import first_pixels, later_pixels, make_splats, thin_out
 from sigmasplat.mapping.window import choose_window, dominating, draw_keyframes
 from sigmasplat.render.view import View
-from sigmasplat.types import ShouldStop, Task, completed, never
+from sigmasplat.types import ShouldStop, Task, never
 
 RECENT = 10
 """Splats are carved away by the newest keyframes, at most this many."""
@@ -79,28 +78,11 @@ class Mapper:
         c = self.config.mapping
         return min(self.pending, c.first_per_frame if self.first_pending else c.half_per_frame)
 
-    def map(
-        self,
-        view: View,
-        index: int,
-        target: Target,
-        T_world_camera: NDArray[np.float64],
-        descriptor: NDArray[np.float32] | None = None,
-        detail: Detail | None = None,
-        photo: Photo | None = None,
-    ) -> FieldFit:
-        """Map one keyframe: seed, choose the window of keyframes, fit, densify and prune, fit again, prune again.
-
-        The first keyframe of a submap that inherits splats is already mapped; it is only added to the list.
-        """
-        keyframe = Keyframe(index, target, T_world_camera, descriptor=descriptor, detail=detail, photo=photo)
-        fit = completed(self.mapping(view, keyframe))
-        fit.join(completed(self._left_of_half(view, never)))
-        return fit
-
     def mapping(self, view: View, newest: Keyframe, should_stop: ShouldStop = never) -> Task[FieldFit]:
-        """Map a keyframe as `map` does, in slices of one iteration. With `mapping.in_halves` the second half of
-        the iterations is left to `refining`, and what `refining` has not made is made before the next keyframe.
+        """Map one keyframe: seed, choose the window of keyframes, fit, densify and prune, fit again, prune again, in
+        slices of one iteration. With `mapping.in_halves` the second half of the iterations is left to `refining`, and
+        what `refining` has not made is made before the next keyframe. The first keyframe of a submap that inherits
+        splats is already mapped; it is only added to the list.
 
         should_stop: asked before each iteration; if it returns True, the rest of a part's iterations is left out after
         `LEAST_SHARE` of them.
@@ -117,7 +99,7 @@ class Mapper:
         self._leave_out_moving()
         self._seed(view, newest.target, newest.T_world_camera)
         yield
-        if c.fresh_adam:
+        if c.colors == "code":
             self.field.forget()
         steps = c.iterations if begun else c.first_iterations
         rates = iter([Rates.of(c)] * steps if begun else Rates.falling(c, steps))
@@ -226,8 +208,8 @@ class Mapper:
     ) -> Task[FieldFit]:
         """Fit the field to the window, in slices; splats with ids below `frozen_below` keep their colours."""
         c = self.config.mapping
-        together = c.frames_per_step or len(window)
-        batches = draw_keyframes(window[::-1], steps, c.newest_probability, self.random, together)
+        drawn = draw_keyframes(window[::-1], steps, c.newest_probability, self.random)
+        batches = drawn if c.frames_per_step else repeat(window[::-1], steps)
         frozen = int((self.field.ids < frozen_below).sum())
         wanted = stats if self.config.primitives.split_gradient > 0 else None
         shortened = _shortened(batches, round(steps * least_share), should_stop)
@@ -236,12 +218,10 @@ class Mapper:
     def _frozen_below(self, first_new: int, until: str) -> int:
         """Return the id below which splats keep their colours until half or the end of a keyframe's steps; `first_new`
         is the id of the first new splat."""
-        c = self.config.mapping
-        if until == "end" and c.freeze_until == "half":
-            return 0
-        if c.freeze_new_colors:
-            return self.field.next_id
-        return first_new if c.freeze_old_colors else 0
+        colors = self.config.mapping.colors
+        if colors == "code":
+            return self.field.next_id if until == "half" else 0
+        return first_new if colors == "old-frozen" else 0
 
     def _choose_movable(self, poses: bool) -> None:
         """Mark the keyframes whose poses the next fit may move: all, the newest, or none."""

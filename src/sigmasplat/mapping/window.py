@@ -8,7 +8,6 @@ import torch
 from numpy.typing import NDArray
 
 from sigmasplat.data.field import GaussianField
-from sigmasplat.errors import SigmaSplatError
 from sigmasplat.fit.target import Keyframe
 from sigmasplat.render.view import View
 from sigmasplat.tracking.descriptors import similarity
@@ -22,8 +21,7 @@ Scores = NDArray[np.float64]
 def choose_window(keyframes: Sequence[Keyframe], size: int, by: str) -> list[Keyframe]:
     """Return the newest keyframe, the one before it, then the most co-visible others, best first (CG-SLAM §7).
 
-    keyframes: in the order of time; size ≥ 1: the most to return. Between equal scores the later keyframe wins. Raises
-    SigmaSplatError if a keyframe lacks the data that `by` compares.
+    keyframes: in the order of time; size ≥ 1: the most to return. Between equal scores the later keyframe wins.
     """
     latest, older = list(keyframes[-2:]), keyframes[:-2]
     window = latest[::-1][:size]
@@ -56,11 +54,15 @@ def covisible_splats(newest: Ids, others: Sequence[Ids]) -> Scores:
 
 
 def _by_splats(newest: Keyframe, others: Sequence[Keyframe]) -> Scores:
-    return covisible_splats(_seen(newest), [_seen(keyframe) for keyframe in others])
+    seen = [keyframe.visible_ids for keyframe in (newest, *others) if keyframe.visible_ids is not None]
+    assert len(seen) == len(others) + 1, "a window by splats needs the splats that each keyframe sees"
+    return covisible_splats(seen[0], seen[1:])
 
 
 def _by_descriptor(newest: Keyframe, others: Sequence[Keyframe]) -> Scores:
-    return similarity(np.stack([_descriptor(keyframe) for keyframe in others]), _descriptor(newest)[None]).ravel()
+    known = [keyframe.descriptor for keyframe in (newest, *others) if keyframe.descriptor is not None]
+    assert len(known) == len(others) + 1, "a window by descriptors needs that of each keyframe"
+    return similarity(np.stack(known[1:]), known[0][None]).ravel()
 
 
 SCORES: dict[str, Callable[[Keyframe, Sequence[Keyframe]], Scores]] = {
@@ -70,43 +72,11 @@ SCORES: dict[str, Callable[[Keyframe, Sequence[Keyframe]], Scores]] = {
 """Co-visibility of keyframes with the newest one, by method."""
 
 
-def _seen(keyframe: Keyframe) -> Ids:
-    if keyframe.visible_ids is None:
-        raise _nothing(keyframe, "list of visible splats", "splats")
-    return keyframe.visible_ids
-
-
-def _descriptor(keyframe: Keyframe) -> NDArray[np.float32]:
-    if keyframe.descriptor is None:
-        raise _nothing(keyframe, "descriptor", "descriptor")
-    return keyframe.descriptor
-
-
-def _nothing(keyframe: Keyframe, missing: str, by: str) -> SigmaSplatError:
-    return SigmaSplatError(f"keyframe {keyframe.index} has no {missing}, which a window by {by} needs")
-
-
 def draw_keyframes(
-    keyframes: Sequence[Item],
-    iterations: int,
-    newest_probability: float,
-    random: np.random.Generator,
-    together: int = 1,
+    keyframes: Sequence[Item], iterations: int, newest_probability: float, random: np.random.Generator
 ) -> Iterator[list[Item]]:
-    """Draw keyframes for each iteration: the newest with the given probability, else a random older one (VarSplat §2).
-
-    together > 1: draw that many different keyframes, or all of them if there
-    are fewer (CG-SLAM §7).
-    """
-    everything = list(keyframes)
-    older = everything[:-1]
+    """Draw a keyframe for each iteration: the newest with the given probability, else a random older one (VarSplat
+    §2)."""
+    *older, newest = keyframes
     for _ in range(iterations):
-        if together >= len(everything) > 1:
-            yield everything
-            continue
-        newest = not older or random.random() < newest_probability
-        drawn = [len(older)] if newest else [int(random.integers(len(older)))]
-        if together > 1:
-            others = [i for i in range(len(everything)) if i != drawn[0]]
-            drawn += [int(i) for i in random.choice(others, min(together - 1, len(others)), replace=False)]
-        yield [everything[i] for i in drawn]
+        yield [newest if not older or random.random() < newest_probability else older[int(random.integers(len(older)))]]

@@ -14,7 +14,7 @@ from sigmasplat.fit.align import Alignment
 from sigmasplat.fit.pose import fit_pose_align
 from sigmasplat.graph.loops import Loops
 from sigmasplat.graph.newest_covariance import NO_ERRORS
-from sigmasplat.realtime.messages import Offer, Search, Snapshot, TrackedFrame
+from sigmasplat.realtime.front_end import Offer, Search, Snapshot, TrackedFrame
 from sigmasplat.slam.listeners import Before, Correction, correction_since
 from sigmasplat.slam.mapping_backend import SLICES_PER_FRAME, MappingBackend
 from sigmasplat.slam.results import StepTimer
@@ -134,7 +134,7 @@ class BackEnd:
         system, number = self.system, each.number
         self._timer = system.start_timer()
         seen, first = offer.seen, not system.steps
-        if system.config.tracking.exposure and system.config.mapping.exposure:
+        if system.config.tracking.exposure and system.config.mapping.colors == "code":
             seen = seen.without_exposure(offer.exposure)
         if first:
             place = system.begin_first(seen)

@@ -59,9 +59,3 @@ def profile(steps: Sequence[Mapping[str, Any]], wall_s: float) -> dict[str, floa
     total["other"] = max(inside - sum(total.values()), 0.0)
     total["io"] = max(wall_s - inside, 0.0)
     return total
-
-
-def shares(seconds: Mapping[str, float]) -> list[tuple[str, float, float]]:
-    """Return (stage, seconds, share of the total) of each stage, largest first."""
-    whole = sum(seconds.values()) or 1.0
-    return sorted(((name, s, s / whole) for name, s in seconds.items()), key=lambda row: -row[1])

@@ -17,7 +17,7 @@ from sigmasplat.fit.compare import Comparison
 from sigmasplat.run.finished_map import FinishedMap
 from sigmasplat.run_folder.trajectory import write_trajectory
 from sigmasplat.tracking.depth_filters import frame_filter
-from sigmasplat.tracking.features import make_extractor
+from sigmasplat.tracking.features import Extractor
 from sigmasplat.tracking.prepared_frame import observe, view_of, working_frame
 from sigmasplat.tracking.recovery import usable
 from sigmasplat.tracking.relocaliser import KnownMap, Relocaliser, Relocation, SearchResult
@@ -68,10 +68,10 @@ class Localiser:
     """Finds images in the map of a finished run. The images may come from another camera with a similar view."""
 
     def __init__(self, finished: FinishedMap, config: Config) -> None:
-        """Prepare the search. Raises ConfigError if the packages of the features are not installed."""
+        """Prepare the search. Raises ConfigError if OpenCV cannot be imported."""
         self.finished, self.config = finished, config
         self.filtered = frame_filter(config.input.filters)
-        self.extractor = make_extractor(config.features)
+        self.extractor = Extractor()
         self.view = view_of(finished.camera, config)
         self.relocaliser = Relocaliser(config, self.extractor)
         self.known = KnownMap(finished.store, finished.keyframe_poses, (), GaussianField.empty())

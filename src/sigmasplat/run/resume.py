@@ -4,13 +4,10 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from sigmasplat.data.field import GaussianField, Rows
 from sigmasplat.errors import RunError
 from sigmasplat.files.atomic import write_text
 from sigmasplat.files.json_files import read_text
 from sigmasplat.files.reading import guarded
-from sigmasplat.final.refinement import Refined
-from sigmasplat.fit.adam import VectorAdam
 from sigmasplat.input.source import Source
 from sigmasplat.run.callbacks import run_now
 from sigmasplat.run.same_conditions import refuse_other_sequence
@@ -18,9 +15,6 @@ from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.run_folder.state import read_state, write_state
 from sigmasplat.slam.saved_state import CLASSES, fixed, restore, state_of
 from sigmasplat.slam.slam import Slam
-
-REFINEMENT_CLASSES: tuple[type, ...] = (GaussianField, Refined, Rows, VectorAdam)
-"""The classes that a partly refined final map contains."""
 
 MOST_TIME_SHARE = 0.05
 """Maximum share of the run's time that is spent on saves: a state grows with the number of frames."""
@@ -59,40 +53,8 @@ class StateFile:
         self.took_s = self.last_s - started_s
 
     def delete(self) -> None:
-        """Delete the state of a complete run, and its partly refined final map."""
+        """Delete the state of a complete run."""
         self.run.state.unlink(missing_ok=True)
-        self.run.refinement.unlink(missing_ok=True)
-
-
-@dataclass(eq=False)
-class RefinementFile:
-    """Saves the partly refined final map in refinement.safetensors of a run folder, at most every `every_s` seconds.
-
-    With every_s = 0 nothing is saved. A file of another number of frames is not used.
-    """
-
-    slam: Slam
-    run: RunFolder
-    every_s: float = 0.0
-    last_s: float = field(default_factory=time.perf_counter)
-
-    def save(self, state: Refined) -> None:
-        """Save a refinement if a save is due. Raises RunError if it cannot be written."""
-        if not self.every_s or time.perf_counter() - self.last_s < self.every_s:
-            return
-        write_state(self.run.refinement, {"frames": len(self.slam.steps), "refined": state}, REFINEMENT_CLASSES, {})
-        self.last_s = time.perf_counter()
-
-    def load(self) -> Refined | None:
-        """Return the saved refinement; None if nothing usable is saved."""
-        if not self.run.refinement.is_file():
-            return None
-        with guarded(self.run.refinement, "delete it, or run it again", RunError, "damaged"):
-            tree = read_state(self.run.refinement, REFINEMENT_CLASSES, {})
-            if tree["frames"] != len(self.slam.steps):
-                return None
-        refined: Refined = tree["refined"]
-        return refined
 
 
 @dataclass(frozen=True)

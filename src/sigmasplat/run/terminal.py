@@ -1,7 +1,7 @@
 """Show a run on a terminal, or as plain lines if the output is not a terminal."""
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from typing import TYPE_CHECKING
@@ -20,7 +20,6 @@ from rich.table import Table
 
 from sigmasplat.data.trajectory import APART, RELOCALISED
 from sigmasplat.run.callbacks import Callback
-from sigmasplat.run.figures import shares
 from sigmasplat.types import Progress
 
 if TYPE_CHECKING:
@@ -105,15 +104,6 @@ class Screen:
             self.say(result)
         for number, command in enumerate(commands):
             self.say(f"{'      ' if number else 'next: '}{command}")
-
-    def profile(self, seconds: Mapping[str, float]) -> None:
-        """Print the time of each stage."""
-        table = Table("stage", "seconds", "share")
-        for column in table.columns[1:]:
-            column.justify = "right"
-        for stage, spent, share in shares(seconds):
-            table.add_row(stage, f"{spent:.2f}", f"{share:.1%}")
-        self.out.print(table)
 
 
 def _console(stderr: bool) -> Console:

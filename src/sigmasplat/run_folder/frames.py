@@ -35,22 +35,10 @@ class RunFrames:
 
     @staticmethod
     def of(log: Log, trajectory: Trajectory) -> "RunFrames":
-        """Combine a log and the poses of trajectory.txt.
-
-        In runs of old releases the log has no states and the trajectory contains the lost frames too. Their poses are
-        not valid. If their trajectory is shorter than the log, only the frames before its end count.
-        """
+        """Combine a log and the poses of trajectory.txt."""
         rows, poses = _common(log, trajectory.timestamps_s)
-        if not any("state" in record for record in log):
-            log = log[: rows[-1] + 1] if len(rows) else []
-        kept = np.array([not _is_lost(log[row]) for row in rows], np.bool_)
-        rows, poses = rows[kept], poses[kept]
-        valid = np.isin(np.arange(len(log)), rows)
-        logged = [
-            LOST if _is_lost(record) or ("state" not in record and not posed) else record.get("state", TRACKED)
-            for record, posed in zip(log, valid, strict=True)
-        ]
-        states = states_at_end(logged, valid)
+        logged = [LOST if record.get("lost") else record.get("state", TRACKED) for record in log]
+        states = states_at_end(logged, np.isin(np.arange(len(log)), rows))
         return RunFrames(log, tuple(states.tolist()), rows, trajectory.at(poses))
 
     def __len__(self) -> int:
@@ -101,10 +89,6 @@ def noted_up(facts: Mapping[str, Any]) -> NDArray[np.float64] | None:
     return None if up is None else np.array(up) / np.linalg.norm(up)
 
 
-def _is_lost(record: dict[str, Any]) -> bool:
-    return bool(record.get("lost"))
-
-
 def _common(log: Log, times_s: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Return the rows of the log that have a pose, and the rows of their poses.
 
@@ -114,7 +98,7 @@ def _common(log: Log, times_s: NDArray[np.float64]) -> tuple[NDArray[np.intp], N
     for row, record in enumerate(log):
         if pose == len(times_s):
             break
-        if "state" in record and _is_lost(record):
+        if record.get("lost"):
             continue
         if abs(record["timestamp_s"] - times_s[pose]) <= SAME_TIME_S:
             pairs.append((row, pose))

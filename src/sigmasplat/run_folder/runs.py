@@ -1,6 +1,5 @@
 """Write and read the folder of a run, which is valid at any time."""
 
-import shutil
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -33,8 +32,6 @@ MESH = "mesh.ply"
 """The surface, written by `sigmasplat mesh`."""
 STATE = "state.safetensors"
 """The state from which an unfinished run resumes."""
-REFINEMENT = "refinement.safetensors"
-"""The final map of an unfinished run between two steps of its refinement."""
 FILES = (
     "config.json", "trajectory.txt", "map.ply", "checkpoint.safetensors", "log.jsonl", "loops.json",
     "metrics.json", "profile.json", "report.html", TRUTH, map_files.UNCERTAINTY_JSON, map_files.UNCERTAINTY_TENSORS,
@@ -146,11 +143,10 @@ class RunFolder:
 
     def _clear(self) -> None:
         """Remove the files of an earlier run, and keep files that the user added."""
-        for name in (*FILES, MESH, STATE, REFINEMENT):
+        for name in (*FILES, MESH, STATE):
             (self.path / name).unlink(missing_ok=True)
         for picture in self.images.glob("*.png"):
             picture.unlink()
-        shutil.rmtree(self.logs, ignore_errors=True)
         self.remove_leftovers()
         self.submaps.clear()
         self.write_components(())
@@ -161,11 +157,6 @@ class RunFolder:
         return self.path / "images"
 
     @property
-    def logs(self) -> Path:
-        """Return the folder of logs for other programs, logs/, which `run --log` writes."""
-        return self.path / "logs"
-
-    @property
     def submaps(self) -> DiskStore:
         """Return the store of finished submaps, submaps/; it is empty if the run has a single map."""
         return DiskStore(self.path / "submaps")
@@ -174,11 +165,6 @@ class RunFolder:
     def state(self) -> Path:
         """Return the path of the state from which an unfinished run resumes."""
         return self.path / STATE
-
-    @property
-    def refinement(self) -> Path:
-        """Return the path of the partly refined final map from which an unfinished run resumes."""
-        return self.path / REFINEMENT
 
     def config(self) -> Config:
         """Read the settings of the run. Raises ConfigError if they cannot be read."""
@@ -200,7 +186,6 @@ class RunFolder:
         remove_leftovers(self.path, self.images, self.submaps.folder, *(self.path / COMPONENTS).glob("*"))
         if self.facts().get("status") == "complete":
             self.state.unlink(missing_ok=True)
-            self.refinement.unlink(missing_ok=True)
 
     log = _writes("log.jsonl", append_line)
     """Append one line to log.jsonl."""

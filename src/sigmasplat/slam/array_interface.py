@@ -46,7 +46,6 @@ class ArrayInterface(ABC):
         depth_scale: float | None = None,
         color_order: ColorOrder = "rgb",
         R_inertial_camera: Matrix | None = None,
-        depth_std: Array | None = None,
         T_given_camera: Matrix | None = None,
     ) -> Step:
         """Process one pair of images from your own camera: `step` for arrays, with the covariance of the pose.
@@ -56,7 +55,6 @@ class ArrayInterface(ABC):
         per metre (1000 for millimetres). Both are numpy arrays or torch tensors; they are copied, never changed. K: of
         the undistorted images, a 3×3 matrix, (fx, fy, cx, cy) in pixels, or a `Camera`; the same for all frames.
         timestamp: seconds, increasing. R_inertial_camera [3, 3]: rotation measured by a gyroscope, as in `Frame`.
-        depth_std [H, W]: the standard deviation of each reading, in the unit of depth, if the sensor knows it.
         T_given_camera [4, 4]: the pose of the camera, if you know it: it is used as it is, as in `Frame`.
 
         Raises SourceError with the remedy if an argument is not as described; the state is then unchanged, and the
@@ -65,8 +63,7 @@ class ArrayInterface(ABC):
         newest = self.newest_step()
         frame = frame_from_arrays(
             rgb, depth, K, timestamp, index=0 if newest is None else newest.index + 1, depth_scale=depth_scale,
-            color_order=color_order, R_inertial_camera=R_inertial_camera, depth_std=depth_std,
-            T_given_camera=T_given_camera,
+            color_order=color_order, R_inertial_camera=R_inertial_camera, T_given_camera=T_given_camera,
         )  # fmt: skip
         if newest is not None and frame.timestamp_s <= newest.timestamp_s:
             order = "repeats" if frame.timestamp_s == newest.timestamp_s else "is before"

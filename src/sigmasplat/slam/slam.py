@@ -88,7 +88,7 @@ class Slam(MappingBackend, ArrayInterface):
             self.atlas.refined = dict(zip(members, poses, strict=True))
         anchors = [self.atlas.anchors[s] for s in members]
         config = replace(self.config, final=reaching(self.config, known))
-        final = final_map(store, anchors, config, self.view, self.random, refining, self.saved_refinement)
+        final = final_map(store, anchors, config, self.view, self.random, refining)
         self._final, self.refinement_steps = final.field, final.steps
         refined = RefinedStore(store, final.keyframe_poses, final.keyframe_exposures)
         if final.keyframe_poses is not None:
@@ -117,7 +117,7 @@ class Slam(MappingBackend, ArrayInterface):
         connected, pose = len(self.steps) > 0 and estimate.state == TRACKED, estimate.T_submap_camera
         seen = fitted_keyframe(self.tracker, self.mapper.field, self.view, seen, pose, connected)
         seen = seen.without(self.tracker.front)
-        found = self.config.tracking.exposure and self.config.mapping.exposure
+        found = self.config.tracking.exposure and self.config.mapping.colors == "code"
         return seen.without_exposure(estimate.exposure) if found else seen
 
     def _begin(self, seen: PreparedFrame) -> FrameEstimate:

@@ -21,7 +21,6 @@ from sigmasplat.data.submap import MemoryStore, OnDisk, SubmapStore
 from sigmasplat.data.trajectory import LOST, Component, Trajectory
 from sigmasplat.errors import SourceError
 from sigmasplat.final.final_map import components_apart, merged_field
-from sigmasplat.final.refinement import SavedRefinement
 from sigmasplat.graph.closer import LoopCloser, make_descriptor
 from sigmasplat.graph.confidence import Confidence
 from sigmasplat.graph.loops import Loop, Loops
@@ -83,8 +82,6 @@ class SlamState:
         self._final: GaussianField | None = None
         self.refinement_steps: int | None = None
         """Number of refinement steps of the final map; None before `finish`."""
-        self.saved_refinement: SavedRefinement | None = None
-        """Where `finish` saves the refinement of the final map and continues it; None = nowhere."""
         self.uncertainty: MapUncertainty | None = None
         """How sure the final map is; None before `finish`, or without probe views (`uncertainty.probes`)."""
         self._timer = StepTimer()

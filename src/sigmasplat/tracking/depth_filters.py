@@ -66,11 +66,8 @@ def _masked(frame: Frame, mask: Mask) -> Frame:
 
 
 def _filtered(frame: Frame, row: DepthFilter) -> Frame:
-    """Return the frame with the filter's depth; a reading where there was none is as sure as the median reading."""
+    """Return the frame with the filter's depth."""
     depth_m, size = np.asarray(row.filtered(frame), np.float32), frame.depth_m.shape
     if depth_m.shape != size:
         raise ConfigError(f"depth filter {row.name!r} returned {depth_m.shape}; return {size}")
-    std_m = frame.depth_std_m
-    if std_m is not None:
-        std_m = np.where(std_m > 0, std_m, np.median(std_m[frame.depth_m > 0]) if (frame.depth_m > 0).any() else 1.0)
-    return replace(frame, depth_m=depth_m, depth_std_m=None if std_m is None else std_m.astype(np.float32))
+    return replace(frame, depth_m=depth_m)

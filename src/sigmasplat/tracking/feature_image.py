@@ -123,7 +123,7 @@ def pose_by_features(reference: Landmarks, live: FeatureImage, extractor: Extrac
     seen = live.features(extractor)
     pairs = extractor.match(reference.features, seen)
     depth_m = depth_readings(seen, live.depth_m, live.camera)
-    return pose_from_landmarks(reference, seen, pairs, seed, depth_m, extractor.config)
+    return pose_from_landmarks(reference, seen, pairs, seed, depth_m)
 
 
 def motion_by_features(reference: FeatureImage | None, live: FeatureImage, extractor: Extractor) -> Matrix | None:

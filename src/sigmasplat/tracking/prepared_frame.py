@@ -12,7 +12,6 @@ from sigmasplat.config.sensors import sensor_model
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera, gray_exposure, unexposed
 from sigmasplat.data.frame import Frame, Photo, photo_size
-from sigmasplat.data.images import std_by_model
 from sigmasplat.data.submap import Picture
 from sigmasplat.errors import SourceError
 from sigmasplat.fit.backends import fits_of
@@ -23,7 +22,7 @@ from sigmasplat.render.backend import make_view
 from sigmasplat.render.view import View
 from sigmasplat.tracking.depth_filters import denoised
 from sigmasplat.tracking.feature_image import FeatureImage, LateDetail
-from sigmasplat.tracking.features import Extractor
+from sigmasplat.tracking.features import FEATURE_WIDTH, Extractor
 from sigmasplat.tracking.moving.dynamic_mask import DynamicMask
 from sigmasplat.tracking.predicted_depth_fit import smoothed
 from sigmasplat.types import Matrix
@@ -98,7 +97,7 @@ class PreparedFrame:
 
     def photo(self, config: Config) -> Photo | None:
         """Return the colour at the size of the final map's last stage; None if working images are as large."""
-        size = photo_size(self.whole.camera, config.input.width, config.input.crop_px, config.final.width_px)
+        size = photo_size(self.whole.camera, config.input.width, config.input.crop_px, config.final.width)
         return None if size is None else Photo.of(self.whole, *size)
 
 
@@ -109,24 +108,23 @@ def view_of(camera: Camera, config: Config) -> View:
     learned = bool(mapping.weight_nll_color or mapping.weight_nll_depth)
     read = tracking.uncertainty and tracking.align_depth_by == "V"
     view = make_view(config.backend, camera, config.render, variance=learned or read)
-    view.sensor = sensor_model(config.input.sensor) if tracking.sensor_noise else None
+    view.sensor = sensor_model(config.input.sensor) if tracking.verify else None
     return view
 
 
 def working_frame(frame: Frame, config: Config, camera: Camera | None = None) -> Frame:
-    """Return a frame at working size, with depth denoised if the settings say so, and with the standard deviation of
-    its readings if `input.sensor` names a model; if `camera` is given and differs, the frame is resampled to it."""
+    """Return a frame at working size, with depth denoised if the settings say so; if `camera` is given and differs, the
+    frame is resampled to it."""
     i = config.input
     working = frame.prepared(i.width, i.min_depth_m, i.max_depth_m, i.crop_px)
     if camera is not None and working.camera != camera:
         working = frame.seen_by(camera).prepared(0, i.min_depth_m, i.max_depth_m)
-    depth_m, std_m, r = working.depth_m, working.depth_std_m, config.render
+    depth_m, r = working.depth_m, config.render
     if config.tracking.fit_depth:
         depth_m = smoothed(depth_m)
     elif i.denoise_depth:
         depth_m = denoised(depth_m, r.depth_noise_per_m, r.scene_scale)
-    modelled = std_by_model(depth_m, working.camera, i.sensor)
-    return working.with_depth(depth_m, std_m if modelled is None else modelled)
+    return working.with_depth(depth_m)
 
 
 def observe(whole: Frame, working: Frame, view: View, config: Config, extractor: Extractor | None) -> PreparedFrame:
@@ -138,7 +136,7 @@ def observe(whole: Frame, working: Frame, view: View, config: Config, extractor:
     target = Target.of(working, (view.sums.shape[1], view.sums.shape[2]))
     live, image = live_image(view, working.color, working.depth_m, target), None
     if extractor is not None:
-        image = FeatureImage(LateDetail(whole, config.features.width), working.depth_m, working.camera)
+        image = FeatureImage(LateDetail(whole, FEATURE_WIDTH), working.depth_m, working.camera)
     return PreparedFrame(target, live, image, ignored, frame=working, whole=whole)
 
 

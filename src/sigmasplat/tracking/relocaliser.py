@@ -22,7 +22,7 @@ from sigmasplat.fit.target import Keyframe
 from sigmasplat.render.view import View
 from sigmasplat.tracking.drift import floor, symmetric
 from sigmasplat.tracking.feature_image import FeatureImage, pose_by_features
-from sigmasplat.tracking.features import Extractor, Features, Landmarks, matches_by_descriptor
+from sigmasplat.tracking.features import VOTE_RATIO, Extractor, Features, Landmarks, matched_by_distance
 from sigmasplat.tracking.pose_validation import MOST_SPREAD_M, recognised, score
 from sigmasplat.tracking.prepared_frame import PreparedFrame, TrackedKeyframe
 from sigmasplat.types import Matrix, Task, completed
@@ -206,7 +206,7 @@ class Relocaliser:
         live = seen.image.features(self.extractor)
         live, searched = live.take(np.arange(min(STRONGEST, len(live)))), set(self.indexed)
         votes = [
-            (len(matches_by_descriptor(self._strongest[where], live, self.extractor)), where)
+            (len(matched_by_distance(self._strongest[where].descriptors, live.descriptors, VOTE_RATIO)), where)
             for where in wanted
             if where in searched
         ]

@@ -20,8 +20,7 @@ from sigmasplat.data.field import COLUMNS, GaussianField
 from sigmasplat.data.map_uncertainty import Background, MapUncertainty, SplatStd
 from sigmasplat.fit.target import Keyframe
 from sigmasplat.render.backend import on_device
-from sigmasplat.uncertainty.blended_values import blend_values
-from sigmasplat.uncertainty.predictive import COVERED, directions_toward, predicted, variance_parts
+from sigmasplat.uncertainty.predictive import COVERED, blend_values, directions_toward, predicted, variance_parts
 
 SQUARE_OF_MEAN = (3.0 * math.pi / 8.0, math.pi / 2.0)
 """Variance over squared mean absolute residual, of colour and of depth: that of independent Gaussian channels."""

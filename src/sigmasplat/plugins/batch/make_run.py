@@ -17,7 +17,6 @@ import torch
 
 from sigmasplat.api import (
     Config,
-    RefinementFile,
     RunFolder,
     Session,
     SigmaSplatError,
@@ -64,7 +63,6 @@ def _make_and_score(
     if not (job.started_in(run.path) and run.facts().get("status") == "complete"):
         run, start = _started(job, run.path, source, config, path)
         state = StateFile(start.slam, run, save_every_s)
-        start.slam.saved_refinement = RefinementFile(start.slam, run, save_every_s)
         outcome = Session(start.slam, source, run, (), state, start.next_index, start.wall_s).execute()
         if outcome.status == "interrupted":
             raise KeyboardInterrupt

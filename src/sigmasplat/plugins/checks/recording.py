@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from sigmasplat.api import (
-    AUTO,
     CameraUnknown,
     Frame,
     InputConfig,
@@ -22,7 +21,7 @@ from sigmasplat.api import (
     list_presets,
     unlikely_camera,
 )
-from sigmasplat.plugins.checks.depth import EdgeAgreement, edge_agreement, measure_noise, overlay
+from sigmasplat.plugins.checks.depth import EdgeAgreement, edge_agreement, overlay
 from sigmasplat.plugins.checks.motion import Motion, motion_warnings, rate, time_warnings, times_of
 from sigmasplat.plugins.outputs.drawing import colormap
 from sigmasplat.plugins.outputs.drawing.view_panels import BACKGROUND, FAINT, TEXT
@@ -44,19 +43,17 @@ MAX_BRIGHTNESS_STEP = 0.2
 
 @dataclass(frozen=True, eq=False)
 class Inspection:
-    """Results: rows of (name, value), warnings with a fix, a contact sheet, the check of depth registration, and the
-    noise of depth (`SensorNoise.record`)."""
+    """Results: rows of (name, value), warnings with a fix, a contact sheet, and the check of depth registration."""
 
     title: str
     rows: list[tuple[str, str]]
     warnings: list[str]
     sheet: Image.Image
     agreement: EdgeAgreement | None
-    noise: dict[str, Any] | None = None
 
     def record(self) -> dict[str, Any]:
         """Return what was found as values for JSON."""
-        return {"title": self.title, "found": dict(self.rows), "warnings": self.warnings, "depth_noise": self.noise}
+        return {"title": self.title, "found": dict(self.rows), "warnings": self.warnings}
 
 
 def inspect_source(path: str | Path, settings: InputConfig, samples: int = SAMPLES) -> Inspection:
@@ -67,9 +64,6 @@ def inspect_source(path: str | Path, settings: InputConfig, samples: int = SAMPL
     if not frames:
         raise SourceError(f"{source.name}: none of {samples} sampled frames can be read; check the image files")
     agreement = None if source.computed_depth else edge_agreement(frames)  # stereo depth has the left image's pixels
-    noise = None if source.predicted_depth else measure_noise(frames)
-    not_measured = "not measured: depth is predicted" if source.predicted_depth else "unknown: too few flat surfaces"
-    sensor = (source.sensor or AUTO) if settings.sensor == AUTO else settings.sensor
     times_s = times_of(source)
     first = max(0, (len(source) - CONSECUTIVE) // 2)
     consecutive = range(first, min(first + CONSECUTIVE, len(source)))
@@ -87,15 +81,14 @@ def inspect_source(path: str | Path, settings: InputConfig, samples: int = SAMPL
         ("format", name),
         *_size_rows(source, frames[0], times_s),
         *_depth_rows(source, frames, settings),
-        ("depth noise", noise.row(sensor) if noise else not_measured),
+        ("depth sensor", source.sensor or "unknown"),
         ("colour–depth alignment", "unknown: no outlines in depth" if agreement is None else agreement.sentence()),
         ("poses", source.described_truth() or "none: the error of the path cannot be measured"),
         *_imu_rows(frames),
         ("skipped", f"{len(source.skipped)} files (first: {source.skipped[0]})" if source.skipped else "nothing"),
         ("suggested preset", _suggested(name)),
     ]
-    record = None if noise is None else noise.record(sensor)
-    return Inspection(source.name, rows, warnings, _sheet(frames), agreement, record)
+    return Inspection(source.name, rows, warnings, _sheet(frames), agreement)
 
 
 def _opened(path: str | Path, settings: InputConfig) -> tuple[Source, list[str]]:

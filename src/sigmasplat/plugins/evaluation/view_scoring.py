@@ -65,8 +65,8 @@ def full_width(config: Config, camera: Camera) -> int | None:
     camera: of the recording.
     """
     final, settings = config.final, config.input
-    size = photo_size(camera, settings.width, settings.crop_px, final.width_px)
-    return min(final.width_px, camera.width) if size and final.iterations and final.width_iterations else None
+    size = photo_size(camera, settings.width, settings.crop_px, final.width)
+    return min(final.width, camera.width) if size and final.iterations and final.width_iterations else None
 
 
 def refined_fx(config: Config, camera: Camera) -> float | None:

@@ -133,7 +133,7 @@ class WithPredictedDepth(Subset):
         _say_predicted(self)
 
     def frame(self, i: int) -> Frame:
-        return replace(super().frame(i), depth_m=self.depth_of(i), depth_std_m=None)
+        return replace(super().frame(i), depth_m=self.depth_of(i))
 
     def depth_of(self, i: int) -> Floats:
         return self._predicted.depth_of(self._checked_index(i), self.camera.width, self.camera.height)

@@ -145,7 +145,7 @@ class ExrImagePair(ImagePair):
     def _read(self, part: Callable[[Any], Any], header_only: bool = False) -> Any:
         """Return a part of the file. Raises SourceError if it cannot be read."""
         if not header_only:
-            check_pixels(self.depth, self._size(), SourceError)
+            check_pixels(self.depth, self._size())
         refuse_special(self.depth)
         try:
             return part(self.openexr.File(str(self.depth), separate_channels=True, header_only=header_only))

@@ -104,10 +104,10 @@ class SyntheticRoom(Source):
             color, depth_m = measured_color(color, rng), measured_depth(depth_m, self.camera, rng)
         if self.predicted_depth:
             depth_m = predicted_depth(depth_m, i, self._seed, np.random.default_rng((self._seed, i, 12)))
-        bytes_, std_m = np.rint(color * 255.0).astype(np.uint8), None
+        bytes_ = np.rint(color * 255.0).astype(np.uint8)
         if self._matcher:
-            depth_m, std_m = self._matcher.depth_and_std_m(bytes_, self.right_image(i))
-        return Frame(i, self.timestamp_s(i), color_from_bytes(bytes_), depth_m, self.camera, depth_std_m=std_m)
+            depth_m, _ = self._matcher.depth_and_std_m(bytes_, self.right_image(i))
+        return Frame(i, self.timestamp_s(i), color_from_bytes(bytes_), depth_m, self.camera)
 
     def right_image(self, i: int) -> NDArray[np.uint8]:
         """Render the right image of frame i of the stereo pair, RGB [H, W, 3]: the baseline to the right of the left

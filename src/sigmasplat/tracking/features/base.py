@@ -1,12 +1,11 @@
-"""Sparse features, their matches, and landmarks: features with depth."""
+"""Sparse features (RootSIFT of OpenCV), their matches, and landmarks: features with depth."""
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.config import FeatureConfig
 from sigmasplat.data.camera import Camera
 from sigmasplat.env import opencv
 from sigmasplat.types import Matrix
@@ -14,6 +13,15 @@ from sigmasplat.types import Matrix
 Gray = NDArray[np.uint8]
 Pairs = NDArray[np.intp]
 
+COUNT = 1200
+"""Maximum number of features per image; the strongest are used. More features find more poses and take more time."""
+FEATURE_WIDTH = 640
+"""Images wider than this are reduced to this width before detection."""
+CONTRAST = 0.02
+"""Half of OpenCV's contrast threshold: indoor walls have weak texture."""
+RATIO, VOTE_RATIO = 0.9, 0.85
+"""A match is used if its descriptor distance is below this multiple of the distance to the second-best candidate (Lowe
+2004); it counts as a vote for a keyframe below the second one."""
 DESCRIPTOR_STEP = 1.0 / 512.0
 """Float descriptors are multiples of this. Their products and sums are then exact in float32, so that matches do not
 depend on the order of summation, hence not on the number of threads."""
@@ -24,9 +32,8 @@ class Features:
     """The features of one image, strongest first.
 
     points [N, 2]: pixels (u, v), centres at integers; sigma_px [N]: standard deviation of a point per axis;
-    descriptors: [N, D] float32 of about unit norm, multiples of `DESCRIPTOR_STEP` (sift, xfeat), or [N, 32] uint8
-    (orb); camera: the pinhole of the image in which they were found. It is smaller than the frame's if the image was
-    reduced.
+    descriptors: [N, D] float32 of about unit norm, multiples of `DESCRIPTOR_STEP`; camera: the pinhole of the image in
+    which they were found. It is smaller than the frame's if the image was reduced.
     """
 
     points: NDArray[np.float32]
@@ -42,37 +49,41 @@ class Features:
         return Features(self.points[rows], self.sigma_px[rows], self.descriptors[rows], self.camera)
 
 
-class Extractor(Protocol):
-    """One kind of features: finds them in an image and matches those of two images."""
+class Extractor:
+    """RootSIFT (Lowe 2004; Arandjelović & Zisserman 2012), matched by mutual nearest neighbours and ratio."""
 
-    config: FeatureConfig
+    def __init__(self) -> None:
+        # The precise upscale puts pixel centres at integers; without it all points are shifted by ¼ pixel.
+        self._sift = opencv().SIFT_create(nfeatures=COUNT, contrastThreshold=CONTRAST, enable_precise_upscale=True)
 
     def find(self, gray: Gray, camera: Camera) -> Features:
-        """Find features in an image [H, W]; camera is its pinhole."""
-        ...
+        """Find features in an image [H, W]; camera is its pinhole. sigma_px grows with the scale of the feature."""
+        gray, camera = reduced(gray, camera)
+        keypoints, raw = self._sift.detectAndCompute(gray, None)
+        if not keypoints:
+            points, sigma_px, descriptors = (np.zeros(size, np.float32) for size in ((0, 2), 0, (0, 128)))
+            return Features(points, sigma_px, descriptors, camera)
+        values = np.array([(*p.pt, p.response, p.size, p.angle) for p in keypoints], np.float64)
+        # strongest first, ties by position
+        order = np.lexsort((values[:, 4], values[:, 3], values[:, 0], values[:, 1], -values[:, 2]))[:COUNT]
+        raw, points, diameter = raw[order], values[order, :2].astype(np.float32), values[order, 3].astype(np.float32)
+        root = np.sqrt(raw / np.maximum(raw.sum(1, keepdims=True), 1e-9))
+        descriptors = np.asarray(np.rint(root / DESCRIPTOR_STEP) * DESCRIPTOR_STEP, np.float32)
+        # A keypoint's diameter is twice the standard deviation of its Gaussian.
+        return Features(points, 0.5 + 0.1 * diameter, descriptors, camera)
 
     def match(self, a: Features, b: Features) -> Pairs:
         """Return matches [M, 2]: rows of a and rows of b, each used at most once, ordered by row of a."""
-        ...
+        return matched_by_distance(a.descriptors, b.descriptors, RATIO)
 
 
-def reduced(gray: Gray, camera: Camera, width: int) -> tuple[Gray, Camera]:
-    """Return the image and its camera at most `width` pixels wide; 0 = unchanged."""
-    if not width or camera.width <= width:
+def reduced(gray: Gray, camera: Camera) -> tuple[Gray, Camera]:
+    """Return the image and its camera at most `FEATURE_WIDTH` pixels wide."""
+    if camera.width <= FEATURE_WIDTH:
         return np.ascontiguousarray(gray), camera
-    small = camera.prepared(width)
+    small = camera.prepared(FEATURE_WIDTH)
     cv2 = opencv()
     return cv2.resize(gray, (small.width, small.height), interpolation=cv2.INTER_AREA), small
-
-
-def rounded(descriptors: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Return descriptors of unit norm as float32 multiples of `DESCRIPTOR_STEP`."""
-    return np.asarray(np.rint(descriptors / DESCRIPTOR_STEP) * DESCRIPTOR_STEP, np.float32)
-
-
-def no_features(camera: Camera, descriptors: NDArray[Any]) -> Features:
-    """Return the features of an image in which none was found; descriptors [0, D] gives their form."""
-    return Features(np.zeros((0, 2), np.float32), np.zeros(0, np.float32), descriptors, camera)
 
 
 def matched_by_distance(a: NDArray[np.float32], b: NDArray[np.float32], ratio: float) -> Pairs:

@@ -5,13 +5,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.config import FeatureConfig
 from sigmasplat.data import se3
 from sigmasplat.env import opencv
 from sigmasplat.tracking.features.base import Features, Landmarks, depth_sigma_m
 from sigmasplat.types import Matrix
 
 LEAST_INLIERS = 8
+RANSAC_PX = 3.0
+"""A match supports a pose if its reprojection error is below this, in pixels of an image 640 pixels wide; it scales
+with the width."""
+RANSAC_TRIES = 1000
+"""Maximum number of minimal samples per pose. Fewer are drawn if a pose is found with `CONFIDENCE` sooner."""
 CONFIDENCE = 0.999
 STEPS = 10
 CAUCHY = 2.4
@@ -45,19 +49,17 @@ def pose_from_landmarks(
     pairs: NDArray[np.intp],
     seed: int,
     live_depth_m: NDArray[np.floating] | None = None,
-    config: FeatureConfig | None = None,
 ) -> PnP | None:
     """Find the motion from the landmarks' camera to the features' camera; None with fewer than 8 inliers.
 
     pairs [M, 2]: rows of landmarks and features; live_depth_m [N]: depth of each feature, 0 = no reading
     (`depth_readings`): it makes distances to surfaces more exact. The same input and seed give the same bits.
     """
-    config = config or FeatureConfig()
-    gate_px = config.ransac_px * features.camera.width / 640.0
+    gate_px = RANSAC_PX * features.camera.width / 640.0
     if len(pairs) < LEAST_INLIERS:
         return None
     problem = _Problem(landmarks, features, pairs, live_depth_m)
-    T = _ransac(problem, seed, gate_px, config.ransac_tries)
+    T = _ransac(problem, seed, gate_px, RANSAC_TRIES)
     if T is None:
         return None
     # A second round includes matches that only the improved pose supports.
