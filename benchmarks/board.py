@@ -1,4 +1,4 @@
-"""Say in a few minutes what a change did to path, map, failures and time: eleven recordings, one seed.
+"""Say in a few minutes what a change did to path, map, failures and time: twelve recordings, one seed.
 
 Two processes of one thread run every row with the command line of the checkout, without the final map. Results are kept
 in --cache by commit and by the bytes of src, so that only new code is run. With BEFORE, a revision, that commit's own
@@ -40,6 +40,7 @@ ROWS = (
     Row("cubicles", "cubicles"),
     Row("cabinet58", "cabinet58"),
     Row("room, noisy", f"{accuracy.SYNTHETIC},noise=1"),
+    Row("corridor", "synthetic:corridor"),
     Row("redkitchen, kidnapped", "redkitchen", "kidnapped", 2, frames=40, limit=130, start_s=16.0),
     Row("livingroom, 4 × faster", "livingroom", "speed", 2, frames=60, limit=240),
     Row("fr1_xyz, depth late", "fr1_xyz", "desync", 2, frames=80, limit=90),

@@ -212,7 +212,10 @@ def test_a_calibration_that_is_not_a_json_object(tiny_tum, text):
     assert "calibration.json" in refusal(tiny_tum)
 
 
-@pytest.mark.parametrize("option", ["frames=0", "frames=x", "speed=2", "rooms=0", "seed=-1", "width"])
+@pytest.mark.parametrize(
+    "option",
+    ["frames=0", "frames=x", "frames=--2", "speed=2", "rooms=0", "seed=-1", "width", "corridors", "corridor=", "seed"],
+)
 def test_a_bad_option_of_the_synthetic_room(option):
     assert "synthetic room" in refusal(f"synthetic:{option}")
 

@@ -51,8 +51,8 @@ def no_noise(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_board_has_the_rows_of_the_issue_and_unknown_ones_are_refused(tmp_path: Path) -> None:
     plain = [each.source for each in board.ROWS if not each.disturbance]
     assert plain[:6] == ["fr1_xyz", "livingroom", "redkitchen", "hololens", "cubicles", "cabinet58"]
-    assert "noise=1" in plain[6] and len(plain) == 7
-    assert len({each.disturbance for each in board.ROWS}) == 5 and len(board.ROWS) == 11
+    assert "noise=1" in plain[6] and plain[7:] == ["synthetic:corridor"]
+    assert len({each.disturbance for each in board.ROWS}) == 5 and len(board.ROWS) == 12
     assert runs.named(("cubicles",), board.ROWS) == [board.ROWS[4]]
     with pytest.raises(ConfigError, match=r"no row 'kitchen'; there are 'fr1_xyz', "):
         runs.named(("kitchen",), board.ROWS)

@@ -25,13 +25,15 @@ from sigmasplat.plugins.sources.room.capture import (
     measured_depth,
     predicted_depth,
 )
+from sigmasplat.plugins.sources.room.corridor import corridor_path, furnish_corridor, sections
 from sigmasplat.plugins.sources.room.furnish import furnish_rooms, mask_of, mover as moving_ball
 from sigmasplat.plugins.sources.room.render import RoomScene, build_scene, render_scene
 from sigmasplat.plugins.sources.room.shapes import triangulate
 from sigmasplat.plugins.sources.stereo_matching import StereoMatcher
 
 FRAMES_PER_SECOND = 30.0
-FOCAL_PER_WIDTH = 0.8
+FOCAL_PER_WIDTH, WIDE_FOCAL_PER_WIDTH = 0.8, 0.5
+"""Focal length of a room's and of a corridor's camera: a view of 64° and of 90°."""
 EXPOSURE_SWING = 0.08
 AWAY_M, AWAY_RAD = np.array([0.45, 0.25, 0.45]), np.deg2rad([12.0, 40.0, 8.0])
 """Largest motion of a test view from the path, camera x, y, z, and rotation about them."""
@@ -46,13 +48,15 @@ class SyntheticRoom(Source):
 
     frames, width, height: length and image size, pixels; seed: appearance of the room, start of the path and all noise;
     noise: whether depth and colour have sensor noise; loops: rounds of the path; exposure_change: whether the image
-    gain varies by ±8 % over the sequence; rooms: number of rooms, joined by doorways; overrun: how far the path
-    continues past its start, percent of a round; drift: standard deviation of the depth calibration's slow drift
-    (`room.capture.drifted_depth`), tenths of a percent of the depth; test_views: number of exact views away from the
-    path (`SyntheticRoom.test_views`); stereo: if above 0, depth is computed from a stereo pair with this baseline in cm
-    instead of being exact (`right_image`); mover: the share of the image, in percent on average, that a ball covers
-    which moves through the room by itself (`Mover`); scored views and the true surface show the room without it;
-    predicted: whether depth is that of an imagined network, with a smooth scale error (`room.capture.predicted_depth`).
+    gain varies by ±8 % over the sequence (None: in rooms, not in a corridor); rooms: number of rooms, joined by
+    doorways; overrun: how far the path continues past its start, percent of a round; drift: standard deviation of the
+    depth calibration's slow drift (`room.capture.drifted_depth`), tenths of a percent of the depth; test_views: number
+    of exact views away from the path (`SyntheticRoom.test_views`); stereo: if above 0, depth is computed from a stereo
+    pair with this baseline in cm instead of being exact (`right_image`); mover: the share of the image, in percent on
+    average, that a ball covers which moves through the room by itself (`Mover`); scored views and the true surface show
+    the room without it; predicted: whether depth is that of an imagined network, with a smooth scale error
+    (`room.capture.predicted_depth`); corridor: whether there is a long corridor with plain walls instead of rooms, seen
+    by a wide lens that moves 80 mm a frame (`room.corridor`); it has one way and no ball.
 
     A path with loops to close: frames=720,rooms=2,overrun=20,noise=1,drift=6. A round of 600 frames is a slow pace. The
     way back looks in other directions than the way out, so drift accumulates over a whole round; the last 120 frames
@@ -63,8 +67,8 @@ class SyntheticRoom(Source):
 
     def __init__(
         self, frames: int = 200, width: int = 320, height: int = 240, seed: int = 0, noise: bool = False,
-        loops: int = 1, exposure_change: bool = True, rooms: int = 1, overrun: int = 0, drift: int = 0,
-        test_views: int = 0, stereo: int = 0, mover: int = 0, predicted: bool = False,
+        loops: int = 1, exposure_change: bool | None = None, rooms: int = 1, overrun: int = 0, drift: int = 0,
+        test_views: int = 0, stereo: int = 0, mover: int = 0, predicted: bool = False, corridor: bool = False,
     ) -> None:  # fmt: skip
         """Compute the camera path, no image yet. Raises SourceError unless counts and sizes are ≥ 1, the rest ≥ 0."""
         counts = {"frames": frames, "width": width, "height": height, "loops": loops, "rooms": rooms}
@@ -72,22 +76,27 @@ class SyntheticRoom(Source):
         for key, value in (counts | others).items():
             if value < (key in counts):
                 raise SourceError(f"synthetic room: {key} must be at least {int(key in counts)}, found {value}")
+        if corridor and (rooms, loops, overrun, mover) != (1, 1, 0, 0):
+            raise SourceError("synthetic room: a corridor has one way; leave out rooms, loops, overrun and mover")
         if not 0 <= mover <= MOST_MOVER or (mover and rooms > 1):
             found = f"{mover} and rooms={rooms}" if rooms > 1 else str(mover)
             raise SourceError(f"synthetic room: mover is 0 to {MOST_MOVER} percent and needs rooms=1, found {found}")
-        focal_px = FOCAL_PER_WIDTH * width
+        focal_px = (WIDE_FOCAL_PER_WIDTH if corridor else FOCAL_PER_WIDTH) * width
         camera = Camera(width, height, focal_px, focal_px, (width - 1) / 2, (height - 1) / 2)
         super().__init__("synthetic", camera)
         if predicted and stereo:
             raise SourceError("synthetic room: depth is either predicted or from stereo; leave out predicted or stereo")
         self.predicted_depth = predicted
-        self._seed, self._noise, self._rooms = seed, noise, rooms
-        self._exposure_change, self._drift = exposure_change, drift / 1000
+        self._seed, self._noise, self._corridor = seed, noise, corridor
+        self._rooms = sections(frames) if corridor else rooms
+        self._exposure_change = not corridor if exposure_change is None else exposure_change
+        self._drift = drift / 1000
         self._test_views = test_views
         self.computed_depth, self._baseline_m = stereo > 0, stereo / 100
         self._matcher = StereoMatcher(camera, self._baseline_m) if stereo else None
         self.depth_noise_per_m = self._matcher.noise_per_m if self._matcher else None
-        self._T_world_camera = camera_path(frames, loops, rooms, seed, overrun / 100)
+        path = corridor_path(frames, seed) if corridor else camera_path(frames, loops, rooms, seed, overrun / 100)
+        self._T_world_camera = path
         self.mover = moving_ball(self._T_world_camera, camera, mover / 100) if mover else None
 
     def __len__(self) -> int:
@@ -136,7 +145,7 @@ class SyntheticRoom(Source):
         return mask_of(self.mover.shape(i), self.camera, self._T_world_camera[i], depth_m)
 
     def _scene(self, i: int) -> RoomScene:
-        room = build_scene(self._rooms, self._seed)
+        room = build_scene(self._rooms, self._seed, self._corridor)
         return room if self.mover is None else RoomScene([*room.shapes, self.mover.shape(i)], room.lights)
 
     def test_views(self) -> Source | None:
@@ -148,7 +157,7 @@ class SyntheticRoom(Source):
     def views_away(self, count: int, away_m: Matrix, away_rad: Matrix) -> Source:
         """Return exact views (no noise, gain 1) near the path: moved by at most away_m [3] along the axes of the camera
         and rotated by a vector of at most away_rad [3]."""
-        scene = build_scene(self._rooms, self._seed)
+        scene = build_scene(self._rooms, self._seed, self._corridor)
         random = np.random.default_rng((self._seed, 11))
         return _ViewsAway(self.camera, scene, random, self._T_world_camera, count, (away_m, away_rad))
 
@@ -158,7 +167,8 @@ class SyntheticRoom(Source):
 
     def true_surface(self) -> Mesh:
         """Return the surfaces of all shapes in the room's frame, including hidden parts."""
-        return triangulate([shape for shapes in furnish_rooms(self._rooms, self._seed) for shape in shapes])
+        furnish = furnish_corridor if self._corridor else furnish_rooms
+        return triangulate([shape for shapes in furnish(self._rooms, self._seed) for shape in shapes])
 
     def _exposed(self, i: int, T_world_camera: Matrix) -> tuple[Floats, Floats]:
         """Return colour and depth of frame i from a pose; the exposure gain makes one sine period over the sequence."""
@@ -207,13 +217,18 @@ class _ViewsAway(Source):
 
 
 def open_synthetic(text: str) -> SyntheticRoom:
-    """Build a room from "synthetic" or "synthetic:frames=200,seed=1,noise=1". Raises SourceError on other options."""
+    """Build a room from "synthetic", "synthetic:frames=200,noise=1" or "synthetic:corridor".
+
+    Raises SourceError on other options.
+    """
     options: dict[str, Any] = {}
     for part in filter(None, text.partition(":")[2].split(",")):
-        key, _, value = (word.strip() for word in part.partition("="))
-        if key not in _OPTIONS or not value.lstrip("-").isdecimal():
+        key, equals, value = (word.strip() for word in part.partition("="))
+        number = key in _OPTIONS and type(_OPTIONS[key].default) is int
+        value = value if equals or number else "1"  # a word alone says yes
+        if key not in _OPTIONS or not value.removeprefix("-").isdecimal():
             raise SourceError(f"synthetic room: unknown option {part!r}; give whole numbers for {', '.join(_OPTIONS)}")
-        options[key] = type(_OPTIONS[key].default)(int(value))
+        options[key] = int(value) if number else bool(int(value))
     return SyntheticRoom(**options)
 
 

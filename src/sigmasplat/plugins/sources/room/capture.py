@@ -25,12 +25,12 @@ def camera_path(frames: int, loops: int, rooms: int, seed: int, overrun: float =
     u = np.arange(frames) / max(frames - 1, 1)
     phase = 2 * np.pi * np.random.default_rng((seed, 3)).uniform()
     all_turns = loops + overrun
-    positions, yaw_rad = _ellipse(all_turns * u, phase) if rooms == 1 else _corridor((all_turns * u) % 1.0, rooms)
+    positions, yaw_rad = _ellipse(all_turns * u, phase) if rooms == 1 else _through_rooms((all_turns * u) % 1.0, rooms)
     turns = 2 * np.pi * all_turns * u
     positions[:, 2] = 1.42 + 0.07 * np.sin(2 * turns + phase) + 0.16 * np.sin(2 * np.pi * u) * (loops > 1)
     pitch_rad = np.deg2rad(-11.0 + 5.0 * np.sin(2 * turns))
     roll_rad = np.deg2rad(1.5) * np.sin(3 * turns)
-    return np.stack([_pose(*values) for values in zip(positions, yaw_rad, pitch_rad, roll_rad, strict=True)])
+    return np.stack([pose(*values) for values in zip(positions, yaw_rad, pitch_rad, roll_rad, strict=True)])
 
 
 def _ellipse(loop: Matrix, phase: float) -> tuple[Matrix, Matrix]:
@@ -40,7 +40,7 @@ def _ellipse(loop: Matrix, phase: float) -> tuple[Matrix, Matrix]:
     return -ahead, yaw_rad
 
 
-def _corridor(loop: Matrix, rooms: int) -> tuple[Matrix, Matrix]:
+def _through_rooms(loop: Matrix, rooms: int) -> tuple[Matrix, Matrix]:
     """Return positions and yaw on a closed spline through all rooms and back, at constant speed."""
     doors = [HALF_X_M + k * PITCH_M for k in range(rooms - 1)]
     out: list[tuple[float, float]] = [(0.0, -0.75)]
@@ -71,7 +71,7 @@ def _smooth_yaw(ahead: Matrix, length_m: float) -> Matrix:
     return np.asarray(turn + np.append(calm, calm[0]))
 
 
-def _pose(position: Matrix, yaw_rad: float, pitch_rad: float, roll_rad: float) -> Matrix:
+def pose(position: Matrix, yaw_rad: float, pitch_rad: float, roll_rad: float) -> Matrix:
     """Return the pose with this yaw (from +x about z), pitch (up is positive) and roll about the viewing direction."""
     forward = np.array([np.cos(pitch_rad) * np.cos(yaw_rad), np.cos(pitch_rad) * np.sin(yaw_rad), np.sin(pitch_rad)])
     right = np.array([np.sin(yaw_rad), -np.cos(yaw_rad), 0.0])

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, map_coordinates
 
 from sigmasplat.api import Camera, se3
+from sigmasplat.plugins.sources.room.corridor import furnish_corridor
 from sigmasplat.plugins.sources.room.furnish import HALF_X_M, HALF_Y_M, HEIGHT_M, PITCH_M, WALL_M, furnish_rooms
 from sigmasplat.plugins.sources.room.shapes import (
     Indices,
@@ -32,6 +33,8 @@ WINDOW_M = (-0.85, -HALF_Y_M + 0.1, 1.6)
 LAMP_COLOR = np.array([[1.0], [0.93], [0.82]], np.float32) * np.float32(1.35)
 WINDOW_COLOR = np.array([[0.86], [0.95], [1.08]], np.float32) * np.float32(0.75)
 AMBIENT_COLOR = np.array([[0.46], [0.47], [0.48]], np.float32)
+BRIGHT = 2.6
+"""Share of the surroundings' light in an evenly lit corridor: no place of a room has more than 1."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +66,13 @@ def _lamp_light(towards: Floats, normals: Floats, reach_m: float) -> Floats:
     cosine = dot(towards, normals) / np.sqrt(distance2 + 1e-6)
     wrapped = np.maximum((cosine + 0.15) / 1.15, 0.0)
     return np.asarray(wrapped * (reach_m * reach_m * 1.6 / (reach_m * reach_m + distance2)), np.float32)
+
+
+def even_light(number: int) -> Light:
+    """Return the same light everywhere in one section of a corridor: shades would show where the camera is."""
+    shares = np.zeros((3, 2, 2, 2), np.float32)
+    shares[0] = BRIGHT
+    return Light(number * PITCH_M, 1.0, shares)
 
 
 def light_room(number: int, shapes: Sequence[Shape]) -> Light:
@@ -135,8 +145,11 @@ class RoomScene:
 
 
 @lru_cache(maxsize=4)
-def build_scene(rooms: int, seed: int) -> RoomScene:
-    """Build and light the rooms, about a second per room; the result is cached."""
+def build_scene(rooms: int, seed: int, corridor: bool = False) -> RoomScene:
+    """Build and light the rooms, about a second per room, or as many sections of a corridor; the result is cached."""
+    if corridor:
+        sections = furnish_corridor(rooms, seed)
+        return RoomScene([shape for shapes in sections for shape in shapes], [even_light(k) for k in range(rooms)])
     built = furnish_rooms(rooms, seed)
     neighbours = [built[max(k - 1, 0)] + built[k] if k else built[k] for k in range(rooms)]
     lights = [light_room(k, shapes) for k, shapes in enumerate(neighbours)]
