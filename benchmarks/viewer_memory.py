@@ -31,6 +31,7 @@ from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.frame import Frame
+from sigmasplat.data.relative_pose import UNKNOWN_HOP, RelativePose
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.mapping.mapper import Mapper
 from sigmasplat.plugins.viewer.snapshot import field_without_moments
@@ -122,7 +123,9 @@ class Growing:
         seen = Frame(frame, 0.05 * frame, color, np.full((CAMERA.height, CAMERA.width), 2.0, np.float32), CAMERA)
         target = Target.of(seen, (CAMERA.height, CAMERA.width))
         slam.mapper.keyframes.append(Keyframe(frame, target, pose, not slam.mapper.keyframes))
-        slam.atlas.keyframe_poses[-1].append(pose)
+        known = slam.atlas.keyframe_poses.last
+        hop = RelativePose.hop(se3.inverse(pose) @ known[-1]) if known else UNKNOWN_HOP
+        slam.atlas.set_keyframes([*known, pose], hop)
         slam.keyframe_indices.append(frame)
         self.field.params[:, :3] += 1e-3 * torch.sin(torch.tensor(frame))
         slam.mapper.field = field_without_moments(self.field.params[:grown], {})

@@ -27,7 +27,9 @@ def two_submaps() -> tuple[Atlas, list[np.ndarray]]:
         atlas.begin_submap(anchor if submap else None)
         for frame in range(2):
             T_submap_camera = motion(10 * submap + frame)
-            atlas.keyframe_poses[-1].append(motion(50 + frame) if frame else np.eye(4))
+            new = motion(50 + frame) if frame else np.eye(4)
+            hop = RelativePose.hop(se3.inverse(new) @ atlas.keyframe_poses.last[-1]) if frame else UNKNOWN_HOP
+            atlas.set_keyframes([*atlas.keyframe_poses.last, new], hop)
             atlas.place_frame(T_submap_camera)
             world.append(anchor @ T_submap_camera)
     return atlas, world
@@ -97,12 +99,16 @@ def test_corrections_change_steadily_from_keyframe_to_keyframe() -> None:
     T = [se3.exp(np.array([0.1 * i, 0.0, 0.0, 0.0, 0.0, 0.0])) for i in range(10)]
     for i in range(10):
         if i % 4 == 0:
-            atlas.keyframe_poses[-1].append(T[i])
+            hop = RelativePose.hop(se3.inverse(T[i]) @ T[i - 4]) if i else UNKNOWN_HOP
+            atlas.set_keyframes([*atlas.keyframe_poses.last, T[i]], hop)
         atlas.place_frame(T[i])
     aside = se3.exp(np.array([0.0, 0.008, 0.0, 0.0, 0.0, 0.0]))
     atlas.refined = {0: [T[0], aside @ T[4], aside @ T[8]]}
     moved_mm = 1000.0 * atlas.T_world_camera()[:, 1, 3]
     assert np.allclose(moved_mm, [0, 2, 4, 6, 8, 8, 8, 8, 8, 8])
+    atlas.refined, atlas.follows = {}, True
+    atlas.keyframe_poses.last[1:] = [aside @ T[4], aside @ T[8]]  # the growing graph has moved them
+    assert np.allclose(1000.0 * atlas.T_world_camera()[:, 1, 3], moved_mm)
 
 
 def test_probe_views_follow_as_frames_do_in_the_final_map() -> None:
@@ -155,7 +161,7 @@ def three_components() -> Atlas:
     atlas = Atlas()
     for s in range(5):
         atlas.begin_submap(None if s in (0, 2, 4) else motion(s))
-        atlas.keyframe_poses[-1].append(np.eye(4))
+        atlas.set_keyframes([np.eye(4)], UNKNOWN_HOP)
         for frame in range(2):
             atlas.place_frame(motion(20 * s + frame))
     return atlas

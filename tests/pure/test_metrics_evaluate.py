@@ -533,9 +533,9 @@ def test_full_resolution_has_its_own_scores(run: RunFolder) -> None:
     assert "full resolution" not in (run.path / "report.html").read_text()
 
 
-@pytest.mark.parametrize("width, scored", [("working", None), ("24", None), ("36", 30), ("camera", 40), ("999", 40)])
+@pytest.mark.parametrize("width, scored", [(0, None), (24, None), (36, 30), (8192, 40), (999, 40)])
 def test_a_map_refined_on_larger_images_is_scored_at_their_size_too(
-    run: RunFolder, width: str, scored: int | None
+    run: RunFolder, width: int, scored: int | None
 ) -> None:
     final = replace(CONFIG.final, iterations=10, width=width)
     config = replace(CONFIG, input=InputConfig(width=24, max_depth_m=4.0, crop_px=2), final=final)

@@ -14,7 +14,7 @@ from sigmasplat.config import SECTIONS
 from sigmasplat.config.find_preset import preset
 from sigmasplat.config.ranges import kinds_of
 from sigmasplat.config.scale import for_scene
-from sigmasplat.config.sensors import SENSORS, SensorModel, sensor_model
+from sigmasplat.config.sensors import RENDERED, SENSORS, SensorModel, sensor_model
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.frame import Frame
@@ -55,7 +55,7 @@ def test_shipped_models_are_those_of_the_papers() -> None:
 
 def test_a_sensor_is_named_and_everything_else_is_refused() -> None:
     assert sensor_model("auto") is None and sensor_model("generic") is None
-    assert get_args(kinds_of(SECTIONS["input"])["sensor"]) == ("auto", "generic", *SENSORS)
+    assert get_args(kinds_of(SECTIONS["input"])["sensor"]) == ("auto", "generic", *SENSORS, RENDERED)
     for wrong in ("kinect", "z2:0.001", ""):
         with pytest.raises(ConfigError, match=r"input\.sensor must be one of auto, generic, kinect-v1"):
             InputConfig(sensor=wrong)

@@ -153,7 +153,7 @@ def test_every_caller_gets_the_settings_of_the_scene_and_keeps_those_that_are_gi
     source, config = open_scene(folder, usual, ["render.near_m"])
     assert config.render.scene_scale == source.scene_scale and config.render.near_m == 0.05
     assert config.submaps.distance_m == source.scene_scale * usual.submaps.distance_m
-    assert open_scene("synthetic:frames=2,width=64,height=48", usual)[1] == usual
+    assert open_scene("synthetic:frames=2,width=64,height=48", usual)[1] == usual.changed(input={"sensor": "rendered"})
     no_scores = lambda run, *_, **__: run.write_metrics({})  # noqa: E731
     monkeypatch.setattr("sigmasplat.plugins.batch.make_run.evaluate", no_scores)
     monkeypatch.setattr("sigmasplat.plugins.evaluation.evaluate.evaluate", no_scores)

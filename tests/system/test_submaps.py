@@ -127,11 +127,12 @@ def test_the_same_bytes_again_and_from_disk(run: Slam, tmp_path: Path) -> None:
     assert len(list(tmp_path.iterdir())) == 3
 
 
-def test_the_path_without_loops_is_that_of_a_run_without_loops(run: Slam) -> None:
-    other = followed(settings(loops__close="false", final__move_poses="false"))
-    assert any(loop.accepted for loop in run.loops)
-    assert np.array_equal(run.atlas.T_world_camera(loops=False), other.trajectory().T_world_camera)
-    assert not np.array_equal(run.trajectory().T_world_camera, other.trajectory().T_world_camera)
+def test_the_path_without_loops_is_that_of_a_run_without_loops() -> None:
+    """Without the graph of keyframes, which aligns also to keyframes that a loop has moved."""
+    one, other = (followed(settings(loops__close=close, final__move_poses="false")) for close in ("true", "false"))
+    assert any(loop.accepted for loop in one.loops)
+    assert np.array_equal(one.atlas.T_world_camera(loops=False), other.trajectory().T_world_camera)
+    assert not np.array_equal(one.trajectory().T_world_camera, other.trajectory().T_world_camera)
 
 
 def test_no_rule_means_one_submap_and_an_empty_store() -> None:

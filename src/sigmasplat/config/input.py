@@ -80,9 +80,12 @@ class InputConfig(Section, name="input"):
     """Smaller depth readings are ignored: below its range a sensor returns noise."""
     max_depth_m: Above0 = 8.0
     """Larger depth readings are ignored: their errors grow with the square of the depth."""
-    sensor: Literal["auto", "generic", "kinect-v1", "realsense-stereo", "lidar-iphone", "time-of-flight"] = "auto"
+    sensor: Literal[
+        "auto", "generic", "kinect-v1", "realsense-stereo", "lidar-iphone", "time-of-flight", "rendered"
+    ] = "auto"
     """Model of the standard deviation of depth readings: that of a sensor (`config.sensors`); generic = the law of
-    `render.depth_noise_per_m`; auto = that of the sensor if the source knows it, otherwise generic."""
+    `render.depth_noise_per_m`; rendered = the same law, with an exact calibration and exact times; auto = that of the
+    sensor if the source knows it, otherwise generic."""
     denoise_depth: bool = True
     """Whether depth images that are noisier than those of a structured-light sensor are smoothed."""
 

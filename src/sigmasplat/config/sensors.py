@@ -35,6 +35,10 @@ SENSORS = {
 """Models of σ by sensor."""
 
 
+RENDERED = "rendered"
+"""Images of a renderer: their calibration and their times are exact; readings follow the generic law."""
+
+
 def sensor_model(name: str) -> SensorModel | None:
     """Return the model of a sensor that `input.sensor` names; None for the generic law."""
     return SENSORS.get(name)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from sigmasplat.data import se3
 from sigmasplat.data.camera import between
 from sigmasplat.data.poses import Column, KeyframePoses, Place, Places, Poses
-from sigmasplat.data.relative_pose import UNKNOWN_HOP, RelativePose, TrackedHops
+from sigmasplat.data.relative_pose import UNKNOWN_HOP, RelativePose, SolvedGraph, TrackedHops
 from sigmasplat.types import Matrix
 
 
@@ -23,6 +23,7 @@ class Atlas:
     hops: one per keyframe: how tracking found it from the keyframe before it in the submap. places: one per frame.
     refined: T_submap_camera of the keyframes of each submap in the final map, as the graph of keyframes and refinement
     have moved them; the world poses of keyframes and of their frames then come from these.
+    graph: of the keyframes of the world, once it is solved. follows: whether keyframes move while the graph grows.
     exposures: those of the same keyframes [K, 3, 2] relative to the final map (`data.camera`).
     components: one number per submap. Submaps of a component are connected, and their anchors are in one frame: the
     world for component 0, else the first camera of the component. A component joins another when a place is recognised.
@@ -36,6 +37,8 @@ class Atlas:
     components: list[int] = field(default_factory=list)
     refined: dict[int, list[Matrix]] = field(default_factory=dict)
     exposures: dict[int, Matrix] = field(default_factory=dict)
+    graph: SolvedGraph | None = None
+    follows: bool = False
 
     def begin_submap(self, T_parent_submap: Matrix | None = None, parent: int = -1) -> None:
         """Append a submap at its pose in a parent submap, the last one by default; without a pose, a new component
@@ -58,8 +61,8 @@ class Atlas:
 
     def set_keyframes(self, keyframe_poses: list[Matrix], hop: RelativePose) -> None:
         """Set T_submap_camera [4, 4] of the last submap's keyframes, with a new one at the end, and the hop to it."""
-        self.keyframe_poses.newest = keyframe_poses
         self.hops.append(len(self.anchors) - 1, hop)
+        self.keyframe_poses.newest = keyframe_poses
 
     def join(self, a: int, b: int, T_a_b: Matrix) -> None:
         """Join the components of two submaps, given T_a_b [4, 4]: the one with the higher number moves to the other."""
@@ -98,22 +101,17 @@ class Atlas:
 
     def T_world_camera(self, loops: bool = True) -> Matrix:
         """Return the poses of all frames [F, 4, 4]; without `loops` those of tracking alone."""
-        if not loops:
-            return self._frames(self._in_world(self.odometry, {}))
-        if not self.refined:
-            return self._frames(self._in_world(self.anchors, {}))
-        tracked, moved = self.keyframe_poses.stacked(), self._in_world(self.anchors, self.refined)
-        return self._corrections(moved @ se3.inverse(tracked)) @ self._frames(tracked)
+        return self._frames(self._in_world(*((self.anchors, self.refined) if loops else (self.odometry, {}))))
 
-    def _corrections(self, of_keyframes: Matrix) -> Matrix:
-        """Return the motion of each frame [F, 4, 4], given those [K, 4, 4] of the keyframes: that of its keyframe; it
-        changes steadily to that of the next one in its submap, so that the path does not jump at keyframes."""
-        first, places = np.cumsum([0, *self.keyframe_poses.counts]), self.places.first(len(self.places))
-        row = first[places.submap] + places.keyframe
-        after = np.minimum(row + 1, first[places.submap + 1] - 1)
-        begins = np.append(np.flatnonzero(np.diff(row, prepend=-1)), len(row))  # frames of one keyframe are in a row
-        share = np.concatenate([np.empty(0), *(np.arange(frames) / frames for frames in np.diff(begins))])
-        return se3.interpolated(of_keyframes[row], of_keyframes[after], share)
+    def rates(self, frames: NDArray[np.int64]) -> Matrix:
+        """Return how the camera moves in the time of a frame, at some frames of the world [N]: twists [N, 6] in its
+        axes; 0 for frames below 0, which are of an earlier session."""
+        T, known, last = self.T_world_camera(), self.in_world, len(self.places) - 1
+        at = np.maximum(frames, 0)
+        before, after = np.maximum(at - 1, 0), np.minimum(at + 1, last)
+        before, after = np.where(known[before], before, at), np.where(known[after], after, at)
+        moved = se3.log_stack(se3.inverse(T[before]) @ T[after]) / np.maximum(after - before, 1)[:, None]
+        return np.asarray(moved * (frames >= 0)[:, None])
 
     @property
     def T_submap_camera(self) -> Matrix:
@@ -140,9 +138,12 @@ class Atlas:
 
     def _frames(self, keyframe_poses: Matrix) -> Matrix:
         """Return the poses of all frames [F, 4, 4], given those [K, 4, 4] of the keyframes."""
-        first = np.cumsum([0, *self.keyframe_poses.counts])
         places = self.places.first(len(self.places))  # another thread may append some
-        return np.asarray(keyframe_poses[first[places.submap] + places.keyframe] @ places.T_keyframe_camera)
+        first = np.cumsum([0, *self.keyframe_poses.counts])
+        row, last = first[places.submap] + places.keyframe, first[places.submap + 1] - 1
+        if not (self.follows or self.refined):
+            return np.asarray(keyframe_poses[row] @ places.T_keyframe_camera)
+        return frame_poses(keyframe_poses, self.hops.T_camera_before, row, last, places.T_keyframe_camera)
 
     def frame_exposures(self) -> Matrix:
         """Return the exposures of all frames [F, 3, 2] relative to the final map, interpolated between keyframes."""
@@ -154,3 +155,28 @@ class Atlas:
         rows = np.array([row for row, _ in known], np.int64)
         exposures = np.array([exposure for _, exposure in known]).reshape(-1, 3, 2)
         return between(rows, exposures, np.arange(len(self.places)))
+
+
+def between_keyframes(row: NDArray[np.int64], last: NDArray[np.int64]) -> tuple[NDArray[np.int64], Matrix]:
+    """Return the row of the keyframe after each frame [F], and its share in the frame's motion: 0 at the keyframe.
+
+    row [F]: of the frame's own keyframe, in the order of the frames; last [F]: that of the last one of its submap.
+    """
+    begins = np.append(np.flatnonzero(np.diff(row, prepend=-1)), len(row))  # frames of one keyframe are in a row
+    share = np.concatenate([np.empty(0), *(np.arange(frames) / frames for frames in np.diff(begins))])
+    return np.minimum(row + 1, last), share
+
+
+def frame_poses(
+    T_keyframe: Matrix, T_camera_before: Matrix, row: NDArray[np.int64], last: NDArray[np.int64], T_own: Matrix
+) -> Matrix:
+    """Return the poses of frames [F, 4, 4], which tracking found at T_own [F, 4, 4] from keyframes at [K, 4, 4].
+
+    The next keyframe is not where tracking found it, at T_camera_before [K, 4, 4], because mapping and the graph of
+    keyframes have moved both. The frames between take their share of this motion, so that the path does not jump. row,
+    last: of `between_keyframes`.
+    """
+    after, share = between_keyframes(row, last)
+    T_tracked = T_keyframe[row] @ se3.inverse(T_camera_before[after])
+    moved = se3.exp_stack((share * (after > row))[:, None] * se3.log_stack(T_keyframe[after] @ se3.inverse(T_tracked)))
+    return np.asarray(moved @ T_keyframe[row] @ T_own)

@@ -28,6 +28,11 @@ class Camera:
         if self.width < 1 or self.height < 1 or not np.isfinite(numbers).all() or self.fx <= 0 or self.fy <= 0:
             raise ConfigError(f"not a camera: {self} (sizes and focal lengths must be positive and finite)")
 
+    @property
+    def width_rad(self) -> float:
+        """Return the horizontal angle of view, if the principal point is in the middle."""
+        return 2.0 * float(np.arctan(self.width / (2.0 * self.fx)))
+
     def resized(self, width: int, height: int) -> "Camera":
         """Return the camera of the same view sampled at another size. The corner (−½, −½) stays fixed."""
         if (width, height) == (self.width, self.height):

@@ -83,10 +83,35 @@ class TrackedHops(Records[RelativePose]):
         """Return the bias of each hop [K, 6]."""
         return self.rows.used[:, 53:].copy()
 
+    def all(self) -> "Hops":
+        """Return copies of the values of all hops."""
+        return Hops(self.T_camera_before, self.covariance, self.bias)
+
     def _record(self, i: int) -> RelativePose:
         row = self.rows.used[i]
         T_camera_before, covariance = row[1:17].reshape(4, 4).copy(), row[17:53].reshape(6, 6).copy()
         return RelativePose.hop(T_camera_before, covariance, row[53:].copy())
+
+
+@dataclass(eq=False)
+class Alignments(Records[RelativePose]):
+    """Alignments between keyframes, in the order in which they were made. rows [E, 60]: b, which is later, and a, then
+    T_b_a, information and bias by rows."""
+
+    rows: Column = field(default_factory=lambda: Column.of(np.float64, 2 + 16 + 36 + 6))
+
+    def append(self, edge: RelativePose) -> None:
+        """Append an alignment from its later keyframe, `edge.a`, to an earlier one."""
+        self.rows.append([edge.a, edge.b, *edge.T_a_b.ravel(), *edge.information.ravel(), *edge.bias])
+
+    def touching(self, first: int) -> list[RelativePose]:
+        """Return the alignments of keyframes from row `first` on."""
+        return self[int(np.searchsorted(self.rows.used[:, 0], first)) :]
+
+    def _record(self, i: int) -> RelativePose:
+        row = self.rows.used[i].copy()
+        T_a_b, information = row[2:18].reshape(4, 4), row[18:54].reshape(6, 6)
+        return RelativePose(int(row[0]), int(row[1]), T_a_b, information, "alignment", bias=row[54:])
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,10 +123,33 @@ class Hops:
     covariance: Matrix
     bias: Matrix
 
+    def followed_by(self, hop: RelativePose) -> "Hops":
+        """Return the hops with one more at the end."""
+        more = (hop.T_a_b, hop.covariance, hop.bias)
+        return Hops(*(np.concatenate([rows, one[None]]) for rows, one in zip(vars(self).values(), more, strict=True)))
+
     def known(self, row: int) -> Matrix | None:
         """Return the covariance [6, 6] that tracking estimated for one hop, with its bias; None if it is not known."""
         covariance = self.covariance[row]
         return covariance + np.diag(self.bias[row] ** 2) if np.isfinite(covariance).all() else None
+
+
+@dataclass(frozen=True, eq=False)
+class SolvedGraph:
+    """The edges that determined the final poses of keyframes, as numbers: a keyframe that submaps share is one node.
+
+    node [K]: the node of each keyframe, −1: not in the graph. T_world_node [N, 4, 4], of which the first `fixed` are
+    given. ends [E, 2]: nodes a and b of each edge; T_a_b [E, 4, 4]; information [E, 6, 6]: with the factor and weight
+    of the solution; shared [E, 6, 9]: one standard deviation of each error that all edges share (`graph_errors`).
+    """
+
+    node: NDArray[np.int64]
+    T_world_node: Matrix
+    fixed: int
+    ends: NDArray[np.int64]
+    T_a_b: Matrix
+    information: Matrix
+    shared: Matrix
 
 
 NUMBERS = 5

@@ -1,7 +1,7 @@
 """Finished submaps after the graph of keyframes has moved their keyframes: the splats move with them."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import numpy as np
 import torch
@@ -13,14 +13,11 @@ from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.submap import RefinedStore, StorePart, Submap
 from sigmasplat.fit.pyramid import Pyramid
-from sigmasplat.fit.references import picture_images
+from sigmasplat.graph.graph_errors import shared_errors
+from sigmasplat.graph.growing_graph import GrowingGraph
 from sigmasplat.graph.keyframe_graph import KeyframeNodes, alignments, solve
 from sigmasplat.graph.path_covariance import PathCovariance
-from sigmasplat.render.view import View
 from sigmasplat.types import Matrix
-
-CACHE_BYTES = 1 << 28
-"""Images of keyframes that are kept while the graph is made."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,27 +58,27 @@ def nearest_view(points: Matrix, T_world_camera: Matrix, camera: Camera) -> NDAr
 
 
 def solved_keyframes(
-    atlas: Atlas, path: PathCovariance, store: StorePart, view: View, most: int
+    atlas: Atlas,
+    path: PathCovariance,
+    store: StorePart,
+    image: Callable[[int], Pyramid],
+    graph: GrowingGraph,
+    rendered: bool,
 ) -> tuple[FollowedStore, list[list[Matrix]]]:
-    """Align the keyframes of a component to each other (at most `most` each) and solve their graph; return the submaps
-    as it has moved them, and the new poses T_submap_camera [4, 4] of each submap's keyframes.
+    """Solve the whole graph of the keyframes of a component; return the submaps as it has moved them, and the new poses
+    T_submap_camera [4, 4] of each submap's keyframes.
 
-    The anchors of the submaps, but for the first one, move by the mean motion of their keyframes.
+    Keyframes are aligned to those that they turned out to be near to; image: that of a row. The anchors of the submaps,
+    but for the first one, move by the mean motion of their keyframes. The atlas keeps the graph, whose errors are those
+    of the path. rendered: whether calibration and times are exact.
     """
-    camera = view.camera
-    frames = {s: store.load(i).frames for i, s in enumerate(store.members)}
-    nodes = KeyframeNodes.of(path, frames)
-
-    @lru_cache(max(1, CACHE_BYTES // (16 * camera.width * camera.height)))
-    def image(node: int) -> Pyramid:
-        row = nodes.rows[node]
-        submap = int(path.keyframe_submap[row])
-        keyframe = int(row - np.searchsorted(path.keyframe_submap, submap))
-        return picture_images(view, store.picture(store.members.index(submap), keyframe), camera)[1]
-
-    T = nodes.T_world_keyframe
-    edges = nodes.edges() + alignments(T, image, most)
-    poses, tracked = nodes.spread(solve(T, edges, nodes.fixed).T_world_keyframe), nodes.spread(T)
+    nodes = KeyframeNodes.of(path, {s: store.load(i).frames for i, s in enumerate(store.members)})
+    T, aligned = nodes.T_world_keyframe, nodes.numbered(graph.edges)
+    more = alignments(T, lambda node: image(int(nodes.rows[node])), graph.most, aligned)
+    edges = [*nodes.edges(), *aligned, *more]
+    solved = solve(T, edges, nodes.fixed)
+    atlas.graph = nodes.solved(solved, edges, shared_errors(edges, atlas.rates(nodes.frames), rendered))
+    poses, tracked = nodes.spread(solved.T_world_keyframe), nodes.spread(T)
     in_submaps = list[list[Matrix]]()
     for s in store.members:
         rows = path.keyframe_submap == s

@@ -6,14 +6,14 @@ the variance of each kind of edge is multiplied by a factor that its residuals a
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2 as chi2_distribution
 
 from sigmasplat.data import se3
-from sigmasplat.data.relative_pose import Kind, RelativePose
+from sigmasplat.data.relative_pose import Hops, Kind, RelativePose, SolvedGraph
 from sigmasplat.fit.align import Alignment, align
 from sigmasplat.fit.compare import Comparison, compare
 from sigmasplat.fit.pyramid import Pyramid
@@ -41,10 +41,12 @@ PROBES = 600
 
 @dataclass(frozen=True, eq=False)
 class KeyframeSolution:
-    """T_world_keyframe [K, 4, 4], and the factor on the variance of each kind of edge."""
+    """T_world_keyframe [K, 4, 4], the factor on the variance of each kind of edge, and the information [E, 6, 6] of the
+    edges with factor and weight; empty if the edges do not determine more than a chain."""
 
     T_world_keyframe: Matrix
     factors: dict[Kind, float]
+    information: Matrix
 
 
 # ---- edges ----
@@ -74,7 +76,17 @@ def edge_between(a: int, b: int, reference: Pyramid, live: Pyramid, T_b_a: Matri
     covariance = motion.covariance + np.diag(motion.bias**2)
     if motion.degenerate or not confirmed(seen) or not np.isfinite(covariance).all():
         return None
-    return RelativePose(b, a, motion.T_live_reference, np.asarray(np.linalg.inv(covariance)), "alignment")
+    information = np.asarray(np.linalg.inv(covariance))
+    return RelativePose(b, a, motion.T_live_reference, information, "alignment", bias=motion.bias)
+
+
+def hop_between(a: int, b: int, hops: Hops, row: int, T_a_b: Matrix) -> RelativePose:
+    """Return the hop to the keyframe in a row as tracking found it, or T_a_b [4, 4] with no certainty where tracking
+    could not tell its error."""
+    known = hops.known(row)
+    if known is None:
+        return RelativePose(a, b, T_a_b, np.asarray(np.linalg.inv(UNKNOWN)), "hop")
+    return RelativePose(a, b, hops.T_camera_before[row], np.asarray(np.linalg.inv(known)), "hop", bias=hops.bias[row])
 
 
 def partners(T_world_keyframe: Matrix, depth_m: float, width_rad: float, most: int) -> list[int]:
@@ -84,9 +96,11 @@ def partners(T_world_keyframe: Matrix, depth_m: float, width_rad: float, most: i
     depth_m: mean depth of the newest; width_rad: angle of view.
     """
     newest = len(T_world_keyframe) - 1
-    T_newest_other = se3.inverse(T_world_keyframe[newest]) @ T_world_keyframe[:newest]
-    moved = np.linalg.norm(T_newest_other[:, :3, 3], axis=1) / (depth_m * width_rad)
-    moved += np.linalg.norm(se3.log_stack(T_newest_other)[:, 3:], axis=1) / width_rad
+    away_m = np.linalg.norm(T_world_keyframe[:newest, :3, 3] - T_world_keyframe[newest, :3, 3], axis=1)
+    moved = away_m / (depth_m * width_rad)
+    close = np.flatnonzero(moved < NEAR)
+    turned = se3.log_stack(se3.inverse(T_world_keyframe[newest]) @ T_world_keyframe[close])[:, 3:]
+    moved[close] += np.linalg.norm(turned, axis=1) / width_rad
     near = [k for k in np.argsort(moved, kind="stable").tolist() if moved[k] < NEAR and k != newest - 1]
     chosen = [newest - 1, *near[: NEAREST - 1]]
     for k in near[NEAREST - 1 :]:
@@ -95,15 +109,20 @@ def partners(T_world_keyframe: Matrix, depth_m: float, width_rad: float, most: i
     return chosen[:most]
 
 
-def alignments(T_world_keyframe: Matrix, image: Callable[[int], Pyramid], most: int) -> list[RelativePose]:
-    """Align each keyframe to at most `most` earlier ones, from poses [K, 4, 4]; return what the images confirm."""
-    found = list[RelativePose | None]()
+def alignments(
+    T_world_keyframe: Matrix, image: Callable[[int], Pyramid], most: int, known: Sequence[RelativePose] = ()
+) -> list[RelativePose]:
+    """Align each keyframe to at most `most` earlier ones, from poses [K, 4, 4]; return what the images confirm.
+
+    known: alignments that need not be made again, nor those to keyframes that are near in time to theirs.
+    """
+    found, ends = list[RelativePose | None](), np.array([(e.a, e.b) for e in known], np.int64).reshape(-1, 2)
     for b in range(1, len(T_world_keyframe)):
-        live, camera = image(b), image(b).cameras[0]
-        width_rad = 2.0 * float(np.arctan(camera.width / (2.0 * camera.fx)))
-        T_b_world = se3.inverse(T_world_keyframe[b])
-        for a in partners(T_world_keyframe[: b + 1], float(live.readings[0]), width_rad, most):
-            found.append(edge_between(a, b, image(a), live, T_b_world @ T_world_keyframe[a]))
+        live, T_b_world = image(b), se3.inverse(T_world_keyframe[b])
+        aligned_to = ends[ends[:, 0] == b, 1]
+        for a in partners(T_world_keyframe[: b + 1], float(live.readings[0]), live.cameras[0].width_rad, most):
+            if not (np.abs(aligned_to - a) < APART).any():
+                found.append(edge_between(a, b, image(a), live, T_b_world @ T_world_keyframe[a]))
     return [edge for edge in found if edge is not None]
 
 
@@ -120,8 +139,8 @@ def solve(T_world_keyframe: Matrix, edges: Sequence[RelativePose], fixed: int = 
     """
     kinds = sorted({edge.kind for edge in edges})
     factors: dict[Kind, float] = dict.fromkeys(kinds, 1.0)
-    if len(edges) < len(T_world_keyframe) or fixed == len(T_world_keyframe):
-        return KeyframeSolution(T_world_keyframe, factors)
+    if len(edges) <= len(T_world_keyframe) - fixed or fixed == len(T_world_keyframe):
+        return KeyframeSolution(T_world_keyframe, factors, np.empty((0, 6, 6)))
     of_kind = {kind: np.array([edge.kind == kind for edge in edges]) for kind in kinds}
     graph = PoseGraph(len(T_world_keyframe), edges, fixed)
     claimed, scale = graph.information, most_chi2()
@@ -138,7 +157,7 @@ def solve(T_world_keyframe: Matrix, edges: Sequence[RelativePose], fixed: int = 
             factors[kind] = (redundant * measured + 1.0) / (redundant + 1.0)
     solved = se3.orthonormalise(T_world_keyframe[0] @ T)
     solved[:fixed] = T_world_keyframe[:fixed]
-    return KeyframeSolution(solved, factors)
+    return KeyframeSolution(solved, factors, graph.information * (1.0 + graph.chi2(T) / scale)[:, None, None] ** -0.5)
 
 
 def redundancies(graph: PoseGraph, T: Matrix, weights: Matrix, groups: Iterable[Matrix]) -> list[float]:
@@ -163,12 +182,13 @@ def redundancies(graph: PoseGraph, T: Matrix, weights: Matrix, groups: Iterable[
 class KeyframeNodes:
     """The keyframes of one component as nodes. A keyframe that two submaps share is one node.
 
-    rows [N]: the row of each node in `path`, the later one of two copies, in the order of the frames; node [K]: the
-    node of each row, −1 in other components; fixed: how many nodes, the first ones, do not move.
+    rows [N]: the row of each node in `path`, the later one of two copies, in the order of the frames; frames [N]: their
+    numbers; node [K]: the node of each row, −1 in other components; fixed: how many nodes, the first ones, do not move.
     """
 
     path: PathCovariance
     rows: NDArray[np.int64]
+    frames: NDArray[np.int64]
     node: NDArray[np.int64]
     fixed: int
 
@@ -182,7 +202,7 @@ class KeyframeNodes:
         known, copies = np.unique(numbers, return_inverse=True)
         rows, node = np.zeros(len(known), np.int64), np.full(len(submaps), -1)
         rows[copies], node[wanted] = wanted, copies
-        return KeyframeNodes(path, rows, node, max(1, int((known < 0).sum())))
+        return KeyframeNodes(path, rows, known, node, max(1, int((known < 0).sum())))
 
     @property
     def T_world_keyframe(self) -> Matrix:
@@ -198,10 +218,8 @@ class KeyframeNodes:
         found = []
         for row in np.flatnonzero(self.node >= 0)[1:].tolist():
             if submap[row] == submap[row - 1]:
-                known = path.hops.known(row)
-                information = np.asarray(np.linalg.inv(UNKNOWN if known is None else known))
-                T_row_before = se3.inverse(T[row]) @ T[row - 1]
-                found.append(RelativePose(self.node[row], self.node[row - 1], T_row_before, information, "hop"))
+                a, b = self.node[[row, row - 1]].tolist()
+                found.append(hop_between(a, b, path.hops, row, se3.inverse(T[row]) @ T[row - 1]))
         for edge in path.edges:
             a, b = (int(first[s]) + k for s, k in zip((edge.a, edge.b), edge.keyframes, strict=True))
             if self.node[a] < 0 or self.node[a] == self.node[b] or self._share(edge):
@@ -210,6 +228,11 @@ class KeyframeNodes:
             information = np.asarray(np.linalg.inv(A @ edge.measured @ A.T))
             found.append(RelativePose(self.node[a], self.node[b], T_a_b, information, edge.kind))
         return found
+
+    def numbered(self, alignments: Iterable[RelativePose]) -> list[RelativePose]:
+        """Return alignments between rows as edges between their nodes."""
+        ends = ((int(self.node[edge.a]), int(self.node[edge.b]), edge) for edge in alignments)
+        return [replace(edge, a=a, b=b) for a, b, edge in ends if min(a, b) >= 0 and a != b]
 
     def _share(self, edge: RelativePose) -> bool:
         """Return whether the two submaps of an edge share a keyframe, whose node connects them exactly."""
@@ -223,3 +246,12 @@ class KeyframeNodes:
         known = self.node >= 0
         poses[known] = T_world_node[self.node[known]]
         return np.asarray(poses)
+
+    def solved(self, solution: KeyframeSolution, edges: Sequence[RelativePose], shared: Matrix) -> SolvedGraph | None:
+        """Return the graph as the errors of the path need it; None if it has not moved the chain. shared: errors as of
+        `SolvedGraph`."""
+        if not len(solution.information):
+            return None
+        ends = np.array([(edge.a, edge.b) for edge in edges], np.int64)
+        T_a_b = np.array([edge.T_a_b for edge in edges])
+        return SolvedGraph(self.node, solution.T_world_keyframe, self.fixed, ends, T_a_b, solution.information, shared)

@@ -8,7 +8,7 @@ from sigmasplat.data import se3
 from sigmasplat.data.atlas import Atlas
 from sigmasplat.data.relative_pose import RelativePose
 from sigmasplat.graph.closer import LoopCloser
-from sigmasplat.graph.path_covariance import Factors, PathCovariance
+from sigmasplat.graph.path_covariance import PathCovariance
 from sigmasplat.tracking.drift import hop_errors
 from sigmasplat.types import Matrix
 
@@ -37,12 +37,9 @@ NO_ERRORS = PoseErrors(np.zeros((6, 6)), FIRST_HOP)
 
 @dataclass(eq=False)
 class NewestCovariance:
-    """Computes the errors of new poses. Those of the keyframes are computed again only after a keyframe, the factors of
-    `PathCovariance` only after a closed loop."""
+    """Computes the errors of new poses. Those of the keyframes are computed again only after a keyframe."""
 
     _state: bytes = b""
-    _loops: int = 0
-    _factors: Factors | None = None
     _errors: PoseErrors = NO_ERRORS
 
     def errors(self, atlas: Atlas, closer: LoopCloser) -> PoseErrors:
@@ -51,12 +48,9 @@ class NewestCovariance:
         counts = np.array([submap, keyframe, atlas.keyframe_poses.total, *atlas.components])
         state = counts.tobytes() + (atlas.anchors[-1] @ atlas.keyframe_poses.last[-1]).tobytes()
         if state != self._state:
-            edges = closer.valid
-            loops = int(edges.is_loop.sum())
-            known = self._factors if loops == self._loops else None
-            path = PathCovariance.of_keyframes(atlas, edges, known)
+            path = PathCovariance.of_keyframes(atlas, closer.valid)
             self._errors = PoseErrors(path.of_keyframe(submap, keyframe), newest_hop(atlas))
-            self._state, self._loops, self._factors = state, loops, path.factors
+            self._state = state
         return self._errors
 
 

@@ -5,8 +5,8 @@ All errors are small. Three kinds of error move a hop:
   keyframes after they were tracked: independent from hop to hop;
 - the mean of this disagreement over all hops: the same in all hops, in the camera's axes;
 - the systematic error of alignment, which its estimate does not contain (`fit.align.BIAS_PX`): the same in all hops.
-The disagreement is measured in the run itself, so no constant describes how well tracking and mapping agree. Closed
-loops measure two more numbers in the run: factors on the variances of loops and of the systematic error (`Factors`).
+The disagreement is measured in the run itself, so no constant describes how well tracking and mapping agree. Once the
+graph of keyframes is solved, the errors of its edges take the place of those of the hops (`graph_errors`).
 
 A pose is a linear function of all errors, and so is the motion between two poses. The closed loops are part of this
 function: it is the pose graph's solution.
@@ -15,7 +15,7 @@ function: it is the pose graph's solution.
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -25,20 +25,18 @@ from scipy.sparse.csgraph import breadth_first_order
 from torch import Tensor
 
 from sigmasplat.data import se3
-from sigmasplat.data.atlas import Atlas
+from sigmasplat.data.atlas import Atlas, between_keyframes
 from sigmasplat.data.poses import Places
-from sigmasplat.data.relative_pose import Edges, Hops, RelativePose
-from sigmasplat.data.trajectory import evenly_spread
+from sigmasplat.data.relative_pose import Edges, Hops, RelativePose, SolvedGraph
+from sigmasplat.graph import graph_errors
+from sigmasplat.graph.graph_errors import GraphErrors, Part, root
 from sigmasplat.graph.pose_graph import Sensitivity
-from sigmasplat.graph.variance_factors import variance_factors
 from sigmasplat.tracking.drift import UNKNOWN
 from sigmasplat.types import Matrix
 
 Numbers = NDArray[np.int64]
 BIAS, MEAN = -2, -1
 """Columns of the errors that are the same in all hops."""
-LOOPS_MOST = 40
-"""At most this many loops, evenly spread, determine `Factors`: a few already do, and the time grows with the cube."""
 
 
 def recorded(atlas: Atlas, edges: Sequence[RelativePose]) -> dict[str, Tensor]:
@@ -58,16 +56,9 @@ def recorded(atlas: Atlas, edges: Sequence[RelativePose]) -> dict[str, Tensor]:
         "edge_is_loop": known.is_loop,
         "edge_keyframes": known.keyframes,
         "edge_drift": known.drift,
+        **graph_errors.written(atlas.graph),
     }
     return {name: torch.from_numpy(array) for name, array in arrays.items()}
-
-
-class Factors(NamedTuple):
-    """Factors on variances, measured in a run: of its loops, whose claimed covariance is careful, and of the systematic
-    error. Both are 1 without a loop."""
-
-    loops: float = 1.0
-    bias: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +67,8 @@ class PathCovariance:
 
     anchors [S, 4, 4]: T_world_submap; components [S]; frame_submap, frame_keyframe [F], the latter counted in its
     submap, T_keyframe_camera [F, 4, 4], is_keyframe [F]; keyframe_submap [K], T_submap_keyframe [K, 4, 4]; hops to the
-    keyframes; edges: the trusted ones and the accepted loops; known_factors: `factors`, None = computed on reading.
+    keyframes; edges: the trusted ones and the accepted loops.
+    graph: that of the keyframes, if it determined their final poses; T_final [F, 4, 4]: the final poses of the frames.
     """
 
     anchors: Matrix
@@ -89,18 +81,18 @@ class PathCovariance:
     T_submap_keyframe: Matrix
     hops: Hops
     edges: tuple[RelativePose, ...]
-    known_factors: Factors | None = None
+    graph: SolvedGraph | None = None
+    T_final: Matrix | None = None
 
     @staticmethod
-    def of_keyframes(atlas: Atlas, edges: Sequence[RelativePose], factors: Factors | None = None) -> "PathCovariance":
-        """Return the errors of the keyframes alone, without other frames; factors: known ones, so that they need not be
-        computed."""
+    def of_keyframes(atlas: Atlas, edges: Sequence[RelativePose]) -> "PathCovariance":
+        """Return the errors of the keyframes alone, without other frames."""
         read = {name: tensor.numpy() for name, tensor in recorded(replace(atlas, places=Places()), edges).items()}
         none, anchors, components = np.empty(0, np.int64), np.array(atlas.anchors), np.array(atlas.components, np.int64)
         return PathCovariance(
             anchors, components, none, none, read["T_keyframe_camera"], none.astype(bool),
             read["keyframe_submap"], read["T_submap_keyframe"],
-            Hops(read["hop_T_camera_before"], read["hop_covariance"], read["hop_bias"]), tuple(edges), factors,
+            Hops(read["hop_T_camera_before"], read["hop_covariance"], read["hop_bias"]), tuple(edges),
         )  # fmt: skip
 
     @staticmethod
@@ -122,6 +114,7 @@ class PathCovariance:
                 RelativePose(a, b, T, information, "loop" if loop else "odometry", *drift)
                 for (a, b), T, information, loop, *drift in edges
             ),
+            graph_errors.read(read), read.get("T_world_camera"),
         )  # fmt: skip
 
     def __len__(self) -> int:
@@ -154,36 +147,9 @@ class PathCovariance:
     @cached_property
     def T_world_camera(self) -> Matrix:
         """Return the poses of the frames [F, 4, 4]."""
+        if self.T_final is not None:
+            return self.T_final
         return np.asarray(self.anchors[self.frame_submap] @ self.T_submap_keyframe[self._row] @ self.T_keyframe_camera)
-
-    @cached_property
-    def factors(self) -> Factors:
-        """Return the factors on variances that make the disagreement of the loops with the chain of hops most probable.
-
-        A loop from a to b and the chain both measure T_a_b. The twist between the two is the loop's error minus that of
-        the chain. Loops between neighbouring submaps share most of the chain, so they show the errors of loops alone.
-        """
-        if self.known_factors is not None:
-            return self.known_factors
-        loops = [number for number, edge in enumerate(self.edges) if edge.loop]
-        if not loops:
-            return Factors()
-        chosen = evenly_spread(loops, LOOPS_MOST)
-        chain, twists, errors = self.without_loops(), [], []
-        claimed = np.zeros((len(chosen), 6, len(chosen), 6))
-        for i, edge in enumerate(self.edges[number] for number in chosen):
-            T_a_world = se3.inverse(chain.anchors[edge.a])
-            twists.append(se3.log(T_a_world @ chain.anchors[edge.b] @ se3.inverse(edge.T_a_b)))
-            error = chain._error_of_submap(edge.b) - chain._error_of_submap(edge.a)
-            error = np.einsum("ij,jnk->ink", se3.adjoint(T_a_world), error)
-            chain._add_drift(error, -np.eye(6), edge)
-            errors.append(error)
-            claimed[i, :, i] = edge.measured
-        size = 6 * len(chosen)
-        joint = np.concatenate(errors)
-        bias, rest = joint[:, BIAS], np.delete(joint, BIAS, 1).reshape(size, -1)
-        parts = [claimed.reshape(size, size), bias @ bias.T]
-        return Factors(*variance_factors(np.concatenate(twists), rest @ rest.T, parts))
 
     def without_loops(self) -> "PathCovariance":
         """Return the path as the trusted edges alone give it: odometry, and places where the camera was found."""
@@ -196,7 +162,7 @@ class PathCovariance:
             order, before = breadth_first_order(connected, first)
             for submap in order[1:]:
                 anchors[submap] = anchors[before[submap]] @ motions[before[submap], submap]
-        return replace(self, anchors=anchors, edges=edges)
+        return replace(self, anchors=anchors, edges=edges, graph=None, T_final=None)
 
     # ---- rows of keyframes ----
 
@@ -222,7 +188,24 @@ class PathCovariance:
         frames share, and the covariance [6, 6] of the rest."""
         A = se3.adjoint(self.T_world_camera[frame])
         own = np.zeros((6, 6)) if self.is_keyframe[frame] else A @ self._hop_of_frame(frame) @ A.T
-        return self._error_of_keyframe(int(self._row[frame])), own
+        row, share = int(self._row[frame]), float(self._after[1][frame])
+        if self.graph is None or self.graph.node[row] < 0:
+            return self._error_of_keyframe(row), own
+        rows = row, int(self._after[0][frame])
+        before, after = (self._graph_errors.of(int(self.graph.node[r])) for r in rows)
+        return (1.0 - share) * before + share * after, own
+
+    @cached_property
+    def _graph_errors(self) -> GraphErrors:
+        assert self.graph is not None
+        return GraphErrors(self.graph)
+
+    @cached_property
+    def _after(self) -> tuple[Numbers, Matrix]:
+        """Return the row of the keyframe after each frame [F], and its share in the frame's motion: the graph's
+        corrections are interpolated (`Atlas`)."""
+        last = np.searchsorted(self.keyframe_submap, self.frame_submap, side="right") - 1
+        return between_keyframes(self._row, last)
 
     def _hop_of_frame(self, frame: int) -> Matrix:
         """Return the covariance [6, 6] of a frame's motion from its keyframe.
@@ -242,14 +225,11 @@ class PathCovariance:
         submap = int(self.keyframe_submap[row])
         error = self._error_of_submap(submap).copy()
         self._add_hops(error, se3.adjoint(self.anchors[submap]), self._rows_of_hops(submap, row))
-        loops = len(self.keyframe_submap) + np.flatnonzero([edge.loop for edge in self.edges])
-        error[:, loops] *= np.sqrt(self.factors.loops)
-        error[:, BIAS] *= np.sqrt(self.factors.bias)
         return error.reshape(6, -1)
 
     @lru_cache(maxsize=8)  # noqa: B019
     def _error_of_submap(self, submap: int) -> Matrix:
-        """Return the error of an anchor as a matrix [6, n, 6], before `factors`: n is K hops, then all edges, then
+        """Return the error of an anchor as a matrix [6, n, 6]: n is K hops, then all edges, then
         `_shared`."""
         count = len(self.keyframe_submap)
         error = np.zeros((6, count + len(self.edges) + len(self._shared), 6))
@@ -262,7 +242,7 @@ class PathCovariance:
             if self._is_chain(edge):
                 self._add_hops(error, A @ G, self._rows_of_hops(edge.a))
             else:
-                error[:, count + number] += A @ G @ _root(edge.measured)
+                error[:, count + number] += A @ G @ root(edge.measured)
                 self._add_drift(error, A @ G, edge)
         return error
 
@@ -294,7 +274,7 @@ class PathCovariance:
         """Return the independent errors of the hops [K, 6, 6], in the frames of their submaps."""
         spread = self._disagreement[1]
         known = np.isfinite(self.hops.covariance).all((1, 2), keepdims=True)
-        roots = _root(np.where(known, self.hops.covariance + spread, UNKNOWN))
+        roots = root(np.where(known, self.hops.covariance + spread, UNKNOWN))
         return np.asarray(-se3.adjoint(self.T_submap_keyframe) @ roots)
 
     @cached_property
@@ -306,33 +286,18 @@ class PathCovariance:
         return A * self.hops.bias[:, None], A @ mean
 
     @cached_property
-    def _graphs(self) -> "dict[int, _Graph]":
+    def _graphs(self) -> dict[int, Part]:
         return {int(component): self._graph(int(component)) for component in np.unique(self.components)}
 
-    def _graph(self, component: int) -> "_Graph":
+    def _graph(self, component: int) -> Part:
         submaps = np.flatnonzero(self.components == component).tolist()
         node = {submap: i for i, submap in enumerate(submaps)}
         numbers = [i for i, edge in enumerate(self.edges) if edge.a in node]
         edges = [replace(e, a=node[e.a], b=node[e.b]) for e in (self.edges[i] for i in numbers)]
         poses = se3.inverse(self.anchors[submaps[:1]]) @ self.anchors[submaps]
-        return _Graph(submaps, numbers, Sensitivity(poses, edges) if edges else None)
+        return Part(submaps, numbers, Sensitivity(poses, edges) if edges else None)
 
     def _is_chain(self, edge: RelativePose) -> bool:
         """Return whether an edge leads to the last keyframe of its submap: then its error is that of the hops."""
         last = self._rows_of_hops(edge.a).stop - 1
         return not edge.loop and np.array_equal(edge.T_a_b, self.T_submap_keyframe[last])
-
-
-@dataclass(frozen=True, eq=False)
-class _Graph:
-    """The submaps of a component, the numbers of its edges, and how their errors move the submaps, if it has edges."""
-
-    submaps: list[int]
-    edges: list[int]
-    sensitivity: Sensitivity | None
-
-
-def _root(covariance: Matrix) -> Matrix:
-    """Return W [..., 6, 6] with W Wᵀ = a covariance, which may be singular."""
-    values, vectors = np.linalg.eigh(covariance)
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :])

@@ -214,15 +214,15 @@ def minimise(
 
 
 class Sensitivity:
-    """How the errors of the edges move the nodes of a solved graph, to first order; node 0 does not move.
+    """How the errors of the edges move the nodes of a solved graph, to first order; the first `fixed` do not move.
 
     Each edge has an error ξ: the true motion is exp(ξ) T_a_b. The solution then has the error ε = Σ G ξ: the true pose
     of a node is exp(ε) T_world_node. The normal equations are factorised once. A node costs one sparse solution with
     six right-hand sides, and one product per edge.
     """
 
-    def __init__(self, T_world_node: Matrix, edges: Sequence[RelativePose]) -> None:
-        self.graph = graph = PoseGraph(len(T_world_node), edges)
+    def __init__(self, T_world_node: Matrix, edges: Sequence[RelativePose], fixed: int = 1) -> None:
+        self.graph = graph = PoseGraph(len(T_world_node), edges, fixed)
         e = graph.residuals(T_world_node)
         H, _ = graph.normal_equations(T_world_node, np.ones(len(edges)))
         self._solver = factorised(H)
@@ -231,10 +231,11 @@ class Sensitivity:
     def of(self, node: int) -> Matrix:
         """Return G [E, 6, 6] of a node, one block per edge."""
         columns = np.zeros((self.graph.nodes, 6, 6))  # H⁻¹ between every node and this one
-        if node:
-            unit = np.zeros((6 * (self.graph.nodes - 1), 6))
-            unit[6 * (node - 1) : 6 * node] = np.eye(6)
-            columns[1:] = self._solver.solve(unit).reshape(-1, 6, 6)
+        free = node - self.graph.fixed
+        if free >= 0:
+            unit = np.zeros((6 * (self.graph.nodes - self.graph.fixed), 6))
+            unit[6 * free : 6 * free + 6] = np.eye(6)
+            columns[self.graph.fixed :] = self._solver.solve(unit).reshape(-1, 6, 6)
         return np.asarray(np.swapaxes(columns[self.graph.b] - columns[self.graph.a], 1, 2) @ self._pull)
 
     def covariance(self, node: int) -> Matrix:

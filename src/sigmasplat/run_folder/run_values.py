@@ -120,14 +120,20 @@ TENSORS: Mapping[str, tuple[str, tuple[int, ...], str]] = {
     "edge_drift": ("edges", (6, 6), FLOAT), "edge_is_loop": ("edges", (), BOOL), "keyframes": ("keyframes", (), INT),
     "frame_submap": ("frames", (), INT), "frame_keyframe": ("frames", (), INT), "keyframe_submap": ("places", (), INT),
     "submap_component": ("submaps", (), INT), "edge_submaps": ("edges", (2,), INT),
-    "edge_keyframes": ("edges", (2,), INT),
+    "edge_keyframes": ("edges", (2,), INT), "graph_node": ("places", (), INT),
+    "graph_T_world_node": ("nodes", POSE, FLOAT), "graph_ends": ("alignments", (2,), INT),
+    "graph_T_a_b": ("alignments", POSE, FLOAT), "graph_information": ("alignments", (6, 6), FLOAT),
+    "graph_shared": ("alignments", (6, 9), FLOAT), "graph_fixed": ("graphs", (), INT),
 }  # fmt: skip
 """What the rows of each tensor are, the shape of a row, and the type. A place is a keyframe of a submap."""
 MAY_BE_UNKNOWN = {"hop_covariance"}
 """Tensors in which inf means that a number is not known; the others are finite."""
+MAY_BE_NONE = {"graph_node"}
+"""Tensors of row numbers in which −1 means none."""
 COUNTED = {
     "keyframes": "frames", "frame_submap": "submaps", "frame_keyframe": "places", "keyframe_submap": "submaps",
     "submap_component": "submaps", "edge_submaps": "submaps", "edge_keyframes": "places",
+    "graph_node": "nodes", "graph_ends": "nodes", "graph_fixed": "nodes",
 }  # fmt: skip
 """What the row numbers in a tensor count."""
 
@@ -152,8 +158,9 @@ def check_checkpoint(found: Mapping[str, Tensor], path: Path) -> Tensors:
         if values is None or most is None or not values.numel():
             continue
         low, high = int(values.min()), int(values.max())
-        if low < 0 or high >= most:
-            found_number = low if low < 0 else high
+        least = -1 if name in MAY_BE_NONE else 0
+        if low < least or high >= most:
+            found_number = low if low < least else high
             raise RunError(
                 f"{path}: tensor {name!r} has the number {found_number}, but there are {most} {counted}; {REMEDY}"
             )

@@ -13,9 +13,11 @@ from sigmasplat.data import se3
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.relative_pose import UNKNOWN_HOP, RelativePose
 from sigmasplat.fit.align import Alignment
+from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.target import Keyframe
 from sigmasplat.graph.closer import PendingSearch
 from sigmasplat.graph.confidence import std_of
+from sigmasplat.graph.growing_graph import WINDOW
 from sigmasplat.mapping.mapper import Mapper
 from sigmasplat.slam.slam_state import SlamState
 from sigmasplat.tracking.drift import Drift
@@ -27,6 +29,8 @@ from sigmasplat.types import Matrix, ShouldStop, Task, completed, never
 SLICES_PER_FRAME = 3
 """Each frame that is not a keyframe continues the search for the loops of finished submaps by this many slices for each
 submap that waits (`mapping.divided`). A slice is one alignment."""
+SAME = 1e-9
+"""Keyframes whose poses differ by less are copies of one, which two submaps share."""
 LAST_TRIES = 3
 """Number of keyframes per submap that is apart with which other components are searched at the end."""
 
@@ -49,10 +53,44 @@ class MappingBackend(SlamState):
         should_stop: as in `Mapper.mapping`.
         """
         keyframe = self._keyframe(seen, index, T_submap_camera)
+        if self.follows and self.mapper.keyframes:
+            with self._timer.stage("graph"):
+                yield from self._align(keyframe, hop, should_stop)
         with self._timer.stage("map"):
             fit = yield from self.mapper.mapping(self.view, keyframe, should_stop)
         self._timer.add(fit.seconds, prefix="map_")
         return self._placed(index, hop)
+
+    def keyframe_image(self, row: int) -> Pyramid:
+        """Return the images of a keyframe of a finished submap; row: in `Atlas.T_world_keyframes`."""
+        ends = np.cumsum(self.atlas.keyframe_poses.counts)
+        submap = int(np.searchsorted(ends, row, side="right"))
+        k = int(row - ends[submap] + self.atlas.keyframe_poses.counts[submap])
+        return self.images.of(row, self.view, lambda: self.store.picture(submap, k))
+
+    def _align(self, keyframe: Keyframe, hop: RelativePose, should_stop: ShouldStop) -> Task[None]:
+        """Align a keyframe to earlier ones that see the same, in slices, and move the newest keyframes of the active
+        submap to where all agree best."""
+        atlas, anchor, active = self.atlas, self.atlas.anchors[-1], [*self.mapper.keyframes, keyframe]
+        T_world_keyframe = np.stack([*atlas.T_world_keyframes, anchor @ keyframe.T_world_camera])
+        newest = len(T_world_keyframe) - 1
+        usable = np.repeat(atlas.components, atlas.keyframe_poses.counts) == atlas.components[-1]
+        usable &= (np.abs(T_world_keyframe[1:] - T_world_keyframe[:-1]) > SAME).any((1, 2))  # of two copies the second
+        rows = np.append(np.flatnonzero(usable), newest)
+
+        def image(row: int) -> Pyramid:
+            k = row - newest - 1
+            if -k > len(active):
+                return self.keyframe_image(row)
+            target = active[k].target
+            return self.images.of(row, self.view, target.picture, target.valid_pixels)
+
+        yield from self.graph.aligning(T_world_keyframe, rows, image, should_stop)
+        first = max(newest + 1 - WINDOW, newest + 2 - len(active))
+        poses = self.graph.solved(T_world_keyframe, atlas.hops.all().followed_by(hop), first)
+        moved = se3.orthonormalise(se3.inverse(anchor) @ poses)
+        for each, T_submap_camera in zip(active[first - newest - 1 :], moved, strict=True):
+            each.T_world_camera = T_submap_camera
 
     def add_keyframe(self, seen: PreparedFrame, index: int, T_submap_camera: Matrix, hop: RelativePose) -> Matrix:
         """Add frame number `index` to the keyframes of the active submap without fitting the map; return its pose."""
@@ -159,6 +197,8 @@ class MappingBackend(SlamState):
         """Move the active submap to the store, in slices, and look for its loops, or leave that to the next frames
         (`mapping.divided`). Pending steps are made before, unless `should_stop` returns True."""
         yield from self.refining(self.mapper.pending, should_stop)
+        for row, keyframe in enumerate(self.mapper.keyframes, len(self.atlas.keyframe_poses.rows)):
+            self.images.settle(row, keyframe.target.valid_pixels)
         submap, pictures = self.mapper.finished(len(self.store))
         submap, probes = self.validation_views.of(submap)
         yield

@@ -7,7 +7,7 @@ from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField, Rows
 from sigmasplat.data.frame import Detail, Photo, PosePrior
 from sigmasplat.data.poses import Column, KeyframePoses, Places, Poses
-from sigmasplat.data.relative_pose import Edges, RelativePose, TrackedHops
+from sigmasplat.data.relative_pose import Alignments, Edges, RelativePose, TrackedHops
 from sigmasplat.data.submap import Picture
 from sigmasplat.fit.adam import VectorAdam
 from sigmasplat.fit.pyramid import Pyramid
@@ -16,6 +16,7 @@ from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.graph.candidates import DescribedSubmaps
 from sigmasplat.graph.closer import LoopCloser, PendingSearch
 from sigmasplat.graph.confidence import Confidence
+from sigmasplat.graph.growing_graph import GrowingGraph
 from sigmasplat.graph.loops import Loop, Loops
 from sigmasplat.mapping.mapper import Mapper, SecondHalf
 from sigmasplat.mapping.validation_views import ValidationView, ValidationViews
@@ -33,9 +34,10 @@ from sigmasplat.tracking.relocaliser import Relocaliser
 from sigmasplat.tracking.tracker import Tracker
 
 CLASSES: tuple[type, ...] = (
-    Atlas, Camera, Column, Confidence, DepthFit, DepthHistory, DepthShape, DescribedSubmaps, Detail, Drift,
-    DynamicDetector, DynamicMask, Edges, FeatureImage, GaussianField, Keyframe, KeyframePoses, Loop, LoopCloser, Loops,
-    Mapper, PendingSearch, Photo, Picture, Places, PosePrior, Poses, Pyramid, Recovery, Reference, RelativePose,
+    Alignments, Atlas, Camera, Column, Confidence, DepthFit, DepthHistory, DepthShape, DescribedSubmaps, Detail, Drift,
+    DynamicDetector, DynamicMask, Edges, FeatureImage, GaussianField, GrowingGraph, Keyframe, KeyframePoses, Loop,
+    LoopCloser, Loops, Mapper, PendingSearch, Photo, Picture, Places, PosePrior, Poses, Pyramid, Recovery, Reference,
+    RelativePose,
     Relocaliser, RememberedDepth, Rows, SecondHalf, Step, Steps, Target, TrackedHops, Tracker, TrackingStatistics,
     ValidationView, ValidationViews, VectorAdam,
 )  # fmt: skip
@@ -44,7 +46,7 @@ CLASSES: tuple[type, ...] = (
 
 REMEMBERED = (
     "atlas", "mapper", "tracker", "drift", "steps", "keyframe_indices", "closer", "recovery", "relocaliser",
-    "confidence", "validation_views",
+    "confidence", "validation_views", "graph",
 )  # fmt: skip
 """The attributes of `Slam` that change from frame to frame, except its random numbers."""
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from sigmasplat.config.sensors import RENDERED
 from sigmasplat.data import se3
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.relative_pose import UNKNOWN_HOP, RelativePose
@@ -82,9 +83,10 @@ class Slam(MappingBackend, ArrayInterface):
         store: SubmapStore = part
         refining, measuring = (part_of(progress, first, total) for first in (0, steps))
         known = PathCovariance.of_keyframes(self.atlas, self.closer.valid)
-        loops = self.config.loops
-        if loops.close and self.config.final.move_poses and not self.config.input.poses:
-            store, poses = solved_keyframes(self.atlas, known, part, self.view, loops.alignments)
+        if self.follows:
+            store, poses = solved_keyframes(
+                self.atlas, known, part, self.keyframe_image, self.graph, self.config.input.sensor == RENDERED
+            )
             self.atlas.refined = dict(zip(members, poses, strict=True))
         anchors = [self.atlas.anchors[s] for s in members]
         config = replace(self.config, final=reaching(self.config, known))
@@ -139,7 +141,7 @@ class Slam(MappingBackend, ArrayInterface):
         if not lost:
             estimate.mapped = not held_back and self._is_keyframe(fit)
             if estimate.mapped:
-                estimate.hop = self.hop_to(fit.T_camera_world, self.tracker.hop(fit, seen.live))
+                estimate.hop = self.hop_to(se3.inverse(estimate.T_submap_camera), self.tracker.hop(fit, seen.live))
                 if self.cuts:
                     estimate.drift_m = self.add_drift(estimate.T_submap_camera, estimate.hop)
             if not held_back:

@@ -23,6 +23,7 @@ from sigmasplat.errors import SourceError
 from sigmasplat.final.final_map import components_apart, merged_field
 from sigmasplat.graph.closer import LoopCloser, make_descriptor
 from sigmasplat.graph.confidence import Confidence
+from sigmasplat.graph.growing_graph import GrowingGraph, KeyframeImages
 from sigmasplat.graph.loops import Loop, Loops
 from sigmasplat.graph.newest_covariance import NewestCovariance, PoseErrors
 from sigmasplat.graph.path_covariance import recorded
@@ -64,7 +65,7 @@ class SlamState:
         self.filtered = frame_filter(self.config.input.filters)
         self.random = np.random.default_rng(self.config.seed)
         self.store = MemoryStore() if store is None else store
-        self.atlas = Atlas()
+        self.atlas = Atlas(follows=self.follows)
         self.extractor = extractor_of(self.config)
         self.tracker = Tracker.of(self.config, self.extractor)
         self.mapper = Mapper(self.config, self.random)
@@ -73,6 +74,7 @@ class SlamState:
         self.descriptor = make_descriptor(self.config.loops)
         self.closer = LoopCloser(self.config, self.store, self.tracker.extractor)
         self.recovery = Recovery(self.config.recovery)
+        self.graph, self.images = GrowingGraph(self.config.loops.alignments), KeyframeImages()
         self.confidence = Confidence()
         self.relocaliser = Relocaliser(self.config, self.extractor)
         self.steps = Steps()
@@ -129,7 +131,7 @@ class SlamState:
 
     @property
     def _columns(self) -> tuple[Column, ...]:
-        return *self.atlas.columns, self.steps.rows, *self.closer.columns
+        return *self.atlas.columns, self.steps.rows, self.graph.edges.rows, *self.closer.columns
 
     def trajectory(self) -> Trajectory:
         """Return the poses of all frames so far, including lost ones (the log marks them).
@@ -220,6 +222,12 @@ class SlamState:
         """Return whether any rule may end a submap."""
         s = self.config.submaps
         return bool(s.distance_m or s.angle_deg or s.frames or s.uncertainty_m)
+
+    @property
+    def follows(self) -> bool:
+        """Return whether keyframes are aligned to each other, and the map follows their graph."""
+        c = self.config
+        return c.loops.close and c.final.move_poses and not c.input.poses
 
     @property
     def _describes(self) -> bool:

@@ -84,4 +84,5 @@ PLUGIN = SourceFormat(
     "results/frame*.jpg and results/depth*.png",
     lambda path: bool(_numbered(Path(path), "frame") or _numbered(Path(path), "depth")),
     open_replica,
+    sensor="rendered",
 )

@@ -86,7 +86,7 @@ class SyntheticRoom(Source):
         super().__init__("synthetic", camera)
         if predicted and stereo:
             raise SourceError("synthetic room: depth is either predicted or from stereo; leave out predicted or stereo")
-        self.predicted_depth = predicted
+        self.predicted_depth, self.sensor = predicted, None if drift or predicted else "rendered"
         self._seed, self._noise, self._corridor = seed, noise, corridor
         self._rooms = sections(frames) if corridor else rooms
         self._exposure_change = not corridor if exposure_change is None else exposure_change

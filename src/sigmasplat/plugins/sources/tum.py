@@ -221,7 +221,9 @@ def open_icl_nuim(path: str, settings: InputConfig) -> RecordedSource:
     truth = read_poses(mirrored) if mirrored else read_groundtruth(folder)
     if mirrored and truth:
         truth = Trajectory(truth.timestamps_s / FRAMES_PER_SECOND, MIRROR @ truth.T_world_camera @ MIRROR)
-    return folder_source(folder, settings, images, known, TUM_UNITS_PER_METRE, truth)
+    source = folder_source(folder, settings, images, known, TUM_UNITS_PER_METRE, truth)
+    source.sensor = source.sensor or ("rendered" if rendered else None)
+    return source
 
 
 def _listed_pairs(path: Path) -> list[ImagePair]:

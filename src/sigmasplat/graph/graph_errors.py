@@ -1,0 +1,97 @@
+"""The errors of keyframes in their solved graph, as linear functions of the errors of its edges."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property, lru_cache
+from typing import Any
+
+import numpy as np
+
+from sigmasplat.data import se3
+from sigmasplat.data.relative_pose import RelativePose, SolvedGraph
+from sigmasplat.graph.pose_graph import Sensitivity
+from sigmasplat.types import Matrix
+
+CALIBRATION = 0.01
+"""Standard deviation of the scale of depth and of the focal length, as a share: factory values of depth cameras are
+off by 0.5 to 2 % (Khoshelham & Elberink 2012; Zhou & Koltun 2014)."""
+STAMP = 12.0**-0.5
+"""Standard deviation of the time of a frame, in frames: it lies anywhere between two of them."""
+PREFIX = "graph_"
+"""Begins the names of the arrays of a `SolvedGraph` in a checkpoint."""
+
+
+@dataclass(frozen=True, eq=False)
+class GraphErrors:
+    """Two kinds of error move the nodes. That of an edge's measurement, whose size the redundancy of the graph has
+    measured, is independent from edge to edge. Others are the same in all edges, and no redundancy shows them."""
+
+    graph: SolvedGraph
+
+    @lru_cache(maxsize=64)  # noqa: B019 - the object lives as long as one evaluation or export
+    def of(self, node: int) -> Matrix:
+        """Return the error of T_world_node: a matrix [6, 6 E + 9] to multiply with standard normal twists that all
+        nodes share."""
+        G = self._sensitivity.of(node)
+        independent, same = G @ self._roots, (G @ self.graph.shared).sum(0)
+        return np.concatenate([np.swapaxes(independent, 0, 1).reshape(6, -1), same], 1)
+
+    @cached_property
+    def _sensitivity(self) -> Sensitivity:
+        g = self.graph
+        rows = zip(g.ends.tolist(), g.T_a_b, g.information, strict=True)
+        edges = [RelativePose(a, b, T_a_b, information) for (a, b), T_a_b, information in rows]
+        return Sensitivity(g.T_world_node, edges, g.fixed)
+
+    @cached_property
+    def _roots(self) -> Matrix:
+        """Return W [E, 6, 6] with W Wᵀ = the covariance of each edge."""
+        return np.swapaxes(np.linalg.inv(np.linalg.cholesky(self.graph.information)), 1, 2)
+
+
+def shared_errors(edges: Sequence[RelativePose], rates: Matrix, rendered: bool) -> Matrix:
+    """Return one standard deviation of each error that all edges share [E, 6, 9], as twists of T_a_b: the systematic
+    error of alignment in six directions; of the scale of depth, the focal length, and the time of a frame.
+
+    rates [N, 6]: the motion of each node's camera in the time of a frame, a twist in its axes. The last three are those
+    of a camera whose calibration nobody has checked: parameters that are considered, not estimated (Schmidt 1966).
+    Rendered images do not have them.
+    """
+    if not edges:
+        return np.empty((0, 6, 9))
+    T_a_b, bias = (np.array([getattr(edge, name) for edge in edges]) for name in ("T_a_b", "bias"))
+    a, b = np.array([(edge.a, edge.b) for edge in edges]).T
+    t, turned = T_a_b[:, :3, 3], se3.log_stack(T_a_b)[:, 3:]
+    longer = np.concatenate([t, np.zeros_like(t)], 1) * (0.0 if rendered else CALIBRATION)
+    wider = np.concatenate([np.cross(t, turned), turned], 1) * (0.0 if rendered else CALIBRATION)
+    late = (se3.adjoint(T_a_b) @ rates[b][..., None])[..., 0] - rates[a]
+    late *= 0.0 if rendered else STAMP
+    return np.concatenate([bias[:, None] * np.eye(6), np.stack([longer, wider, late], 2)], 2)
+
+
+def written(graph: SolvedGraph | None) -> dict[str, Any]:
+    """Return the arrays that a checkpoint keeps of a graph, if there is one."""
+    return {} if graph is None else {PREFIX + f.name: np.atleast_1d(getattr(graph, f.name)) for f in fields(graph)}
+
+
+def read(arrays: Mapping[str, Any]) -> SolvedGraph | None:
+    """Return the graph that a checkpoint keeps; None if it has none, as that of an older version."""
+    if f"{PREFIX}node" not in arrays:
+        return None
+    values = {f.name: arrays[PREFIX + f.name] for f in fields(SolvedGraph)}
+    return SolvedGraph(**values | {"fixed": int(values["fixed"][0])})
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """The submaps of a component, the numbers of its edges, and how their errors move the submaps, if it has edges."""
+
+    submaps: list[int]
+    edges: list[int]
+    sensitivity: Sensitivity | None
+
+
+def root(covariance: Matrix) -> Matrix:
+    """Return W [..., 6, 6] with W Wᵀ = a covariance, which may be singular."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :])
