@@ -13,8 +13,8 @@ from sigmasplat.graph.pose_graph import Sensitivity
 from sigmasplat.types import Matrix
 
 CALIBRATION = 0.01
-"""Standard deviation of the scale of depth and of the focal length, as a share: factory values of depth cameras are
-off by 0.5 to 2 % (Khoshelham & Elberink 2012; Zhou & Koltun 2014)."""
+"""Standard deviation of the scale of depth and of the focal length, as a share. It is assumed (ours): files do not say
+how well a camera was calibrated."""
 STAMP = 12.0**-0.5
 """Standard deviation of the time of a frame, in frames: it lies anywhere between two of them."""
 PREFIX = "graph_"

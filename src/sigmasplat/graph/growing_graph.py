@@ -1,7 +1,7 @@
 """The graph of keyframes while it grows: each new keyframe is aligned to earlier ones, and the newest are solved.
 
-This is a window of the graph that the end of a run solves as a whole (`keyframe_graph`), as in keyframe SLAM with a
-sliding window: CG-SLAM adjusts a window of keyframes with the map (§3.4 of its text), here relative poses stand for it.
+This is a window of the graph that the end of a run solves as a whole (`keyframe_graph`). CG-SLAM adjusts a window of
+keyframes together with the map; here the relative poses stand for the map.
 """
 
 from collections.abc import Callable
