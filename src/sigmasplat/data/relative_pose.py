@@ -49,6 +49,11 @@ class RelativePose:
         return self.kind == "loop"
 
     @property
+    def total_covariance(self) -> Matrix | None:
+        """Return the covariance [6, 6] of a hop with its bias; None if it is not known."""
+        return self.covariance + np.diag(self.bias**2) if np.isfinite(self.covariance).all() else None
+
+    @property
     def measured(self) -> Matrix:
         """Return the covariance [6, 6] of the measurement alone, without drift."""
         return np.asarray(np.linalg.inv(self.information) - self.drift)
@@ -82,10 +87,6 @@ class TrackedHops(Records[RelativePose]):
     def bias(self) -> Matrix:
         """Return the bias of each hop [K, 6]."""
         return self.rows.used[:, 53:].copy()
-
-    def all(self) -> "Hops":
-        """Return copies of the values of all hops."""
-        return Hops(self.T_camera_before, self.covariance, self.bias)
 
     def _record(self, i: int) -> RelativePose:
         row = self.rows.used[i]
@@ -123,15 +124,13 @@ class Hops:
     covariance: Matrix
     bias: Matrix
 
-    def followed_by(self, hop: RelativePose) -> "Hops":
-        """Return the hops with one more at the end."""
-        more = (hop.T_a_b, hop.covariance, hop.bias)
-        return Hops(*(np.concatenate([rows, one[None]]) for rows, one in zip(vars(self).values(), more, strict=True)))
+    def hop(self, row: int) -> RelativePose:
+        """Return one hop."""
+        return RelativePose.hop(self.T_camera_before[row], self.covariance[row], self.bias[row])
 
     def known(self, row: int) -> Matrix | None:
         """Return the covariance [6, 6] that tracking estimated for one hop, with its bias; None if it is not known."""
-        covariance = self.covariance[row]
-        return covariance + np.diag(self.bias[row] ** 2) if np.isfinite(covariance).all() else None
+        return self.hop(row).total_covariance
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,14 +4,14 @@ This is a window of the graph that the end of a run solves as a whole (`keyframe
 keyframes together with the map; here the relative poses stand for the map.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.data import se3
-from sigmasplat.data.relative_pose import Alignments, Hops, RelativePose
+from sigmasplat.data.relative_pose import Alignments, RelativePose
 from sigmasplat.data.submap import Picture
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import picture_images
@@ -55,12 +55,13 @@ class GrowingGraph:
                 return
             yield
 
-    def solved(self, T_world_keyframe: Matrix, hops: Hops, first: int) -> Matrix:
+    def solved(self, T_world_keyframe: Matrix, hops: Sequence[RelativePose], first: int) -> Matrix:
         """Return the poses [n, 4, 4] of the keyframes from row `first` on that agree best with their edges to each
-        other and to earlier keyframes, which stay; those of T_world_keyframe [K, 4, 4] are the first guess."""
+        other and to earlier keyframes, which stay; those of T_world_keyframe [K, 4, 4] are the first guess. hops: one
+        to each of them."""
         T = T_world_keyframe
-        chain = range(first, len(T))
-        edges = [hop_between(row, row - 1, hops, row, se3.inverse(T[row]) @ T[row - 1]) for row in chain]
+        rows_of_hops = zip(range(first, len(T)), hops, strict=True)
+        edges = [hop_between(row, row - 1, hop, se3.inverse(T[row]) @ T[row - 1]) for row, hop in rows_of_hops]
         edges += self.edges.touching(first)
         rows = np.unique([*(edge.a for edge in edges), *(edge.b for edge in edges)])
         node = {row: i for i, row in enumerate(rows.tolist())}

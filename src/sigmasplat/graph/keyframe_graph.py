@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2 as chi2_distribution
 
 from sigmasplat.data import se3
-from sigmasplat.data.relative_pose import Hops, Kind, RelativePose, SolvedGraph
+from sigmasplat.data.relative_pose import Kind, RelativePose, SolvedGraph
 from sigmasplat.fit.align import Alignment, align
 from sigmasplat.fit.compare import Comparison, compare
 from sigmasplat.fit.pyramid import Pyramid
@@ -80,13 +80,13 @@ def edge_between(a: int, b: int, reference: Pyramid, live: Pyramid, T_b_a: Matri
     return RelativePose(b, a, motion.T_live_reference, information, "alignment", bias=motion.bias)
 
 
-def hop_between(a: int, b: int, hops: Hops, row: int, T_a_b: Matrix) -> RelativePose:
-    """Return the hop to the keyframe in a row as tracking found it, or T_a_b [4, 4] with no certainty where tracking
+def hop_between(a: int, b: int, hop: RelativePose, T_a_b: Matrix) -> RelativePose:
+    """Return a hop as an edge between nodes, as tracking found it, or T_a_b [4, 4] with no certainty where tracking
     could not tell its error."""
-    known = hops.known(row)
+    known = hop.total_covariance
     if known is None:
         return RelativePose(a, b, T_a_b, np.asarray(np.linalg.inv(UNKNOWN)), "hop")
-    return RelativePose(a, b, hops.T_camera_before[row], np.asarray(np.linalg.inv(known)), "hop", bias=hops.bias[row])
+    return RelativePose(a, b, hop.T_a_b, np.asarray(np.linalg.inv(known)), "hop", bias=hop.bias)
 
 
 def partners(T_world_keyframe: Matrix, depth_m: float, width_rad: float, most: int) -> list[int]:
@@ -219,7 +219,7 @@ class KeyframeNodes:
         for row in np.flatnonzero(self.node >= 0)[1:].tolist():
             if submap[row] == submap[row - 1]:
                 a, b = self.node[[row, row - 1]].tolist()
-                found.append(hop_between(a, b, path.hops, row, se3.inverse(T[row]) @ T[row - 1]))
+                found.append(hop_between(a, b, path.hops.hop(row), se3.inverse(T[row]) @ T[row - 1]))
         for edge in path.edges:
             a, b = (int(first[s]) + k for s, k in zip((edge.a, edge.b), edge.keyframes, strict=True))
             if self.node[a] < 0 or self.node[a] == self.node[b] or self._share(edge):

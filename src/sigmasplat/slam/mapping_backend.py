@@ -87,7 +87,7 @@ class MappingBackend(SlamState):
 
         yield from self.graph.aligning(T_world_keyframe, rows, image, should_stop)
         first = max(newest + 1 - WINDOW, newest + 2 - len(active))
-        poses = self.graph.solved(T_world_keyframe, atlas.hops.all().followed_by(hop), first)
+        poses = self.graph.solved(T_world_keyframe, [*atlas.hops[first:], hop], first)
         moved = se3.orthonormalise(se3.inverse(anchor) @ poses)
         for each, T_submap_camera in zip(active[first - newest - 1 :], moved, strict=True):
             each.T_world_camera = T_submap_camera
