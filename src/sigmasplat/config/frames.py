@@ -153,8 +153,9 @@ class MappingConfig(Section, name="mapping"):
 
     every: AtLeastOne = 5  # mapping every frame would take five times as long
     """A frame becomes a keyframe this many frames after the last keyframe."""
-    overlap_below: NotNegative = 0.7  # more keyframes when the camera moves fast
-    """A frame also becomes a keyframe if its overlap with the newest keyframe is below this; 0 = off."""
+    overlap_below: NotNegative = 0.75  # more keyframes when the camera moves fast
+    """A frame also becomes a keyframe if its overlap with the newest keyframe is below this, or if the image has moved
+    by an eighth of its width; 0 = off."""
     iterations: Count = 8  # the final map is as good as with 15; the submaps have up to 1 dB less
     """Optimisation steps per keyframe: the first setting to change to trade speed for quality."""
     first_iterations: Count = 80  # the rendered depth has no bias from here on; without D̂/A it takes 150

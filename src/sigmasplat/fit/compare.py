@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sigmasplat.fit.align import Alignment, align
 from sigmasplat.fit.pyramid import HIDDEN_M, NOISE_PER_M, Pyramid
 from sigmasplat.native import _core
 from sigmasplat.types import Matrix
@@ -25,6 +26,8 @@ CLOSE_SIGMA, CLOSE_M = 3.0, 0.02
 LEAST_PIXELS = 50
 FLAT = 0.01
 """A gray image with a smaller standard deviation (0 to 1) has no texture to compare."""
+UNDECIDED = 1e-3
+"""The finest size alone replaces coarse to fine only if it agrees better by more than this."""
 
 
 @dataclass(frozen=True)
@@ -66,6 +69,25 @@ def compare(reference: Pyramid, live: Pyramid, T_live_reference: Matrix) -> Comp
         return NOTHING
     common, close, front, behind, residual, correlation, points, covered = found.tolist()
     return Comparison(common, close, front, behind, residual, correlation, int(points), covered)
+
+
+def best_alignment(
+    reference: Pyramid, live: Pyramid, T_live_reference: Matrix, weight_color: float = 0.5
+) -> tuple[Alignment, Comparison]:
+    """Align two images coarse to fine, and at the finest size alone; return what agrees better at full resolution.
+
+    Coarse sizes reach far, but where the scene repeats they pull the pose away, and fine sizes cannot come back.
+    """
+    pairs = (reference, live), (reference.finest(), live.finest())
+    found = [align(*pair, T_live_reference, weight_color=weight_color) for pair in pairs]
+    seen = [compare(reference, live, motion.T_live_reference) for motion in found]
+    best = int(agreement(seen[1]) > agreement(seen[0]) + UNDECIDED)
+    return found[best], seen[best]
+
+
+def agreement(seen: Comparison) -> float:
+    """Return how well two images agree: the share of close depths times the correlation of gray values, if known."""
+    return seen.close if np.isnan(seen.correlation) else seen.close * seen.correlation
 
 
 def noise_scale(depth: NDArray[np.float32], noise_per_m: float = NOISE_PER_M, scene_scale: float = 1.0) -> float:

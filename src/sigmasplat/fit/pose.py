@@ -13,7 +13,7 @@ from sigmasplat.data import se3
 from sigmasplat.data.camera import NEUTRAL
 from sigmasplat.fit.align import Alignment, align
 from sigmasplat.fit.backends import fits_of
-from sigmasplat.fit.compare import Comparison
+from sigmasplat.fit.compare import Comparison, best_alignment
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference
 from sigmasplat.fit.target import Target
@@ -77,10 +77,13 @@ def fit_pose_align(
     the final cost and `first_loss` is NaN.
     """
     guess = T_camera_world @ se3.inverse(reference.T_camera_world)
-    found = align(
-        reference.pyramid, live, guess, config.align_iterations * moves, config.align_weight_color, config.align_stop,
-        config.plateau_stop,
-    )  # fmt: skip
+    if config.verify and moves:
+        found = best_alignment(reference.pyramid, live, guess, config.align_weight_color)[0]
+    else:
+        found = align(
+            reference.pyramid, live, guess, config.align_iterations * moves, config.align_weight_color,
+            config.align_stop, config.plateau_stop,
+        )  # fmt: skip
     return PoseFit(
         found.T_live_reference @ reference.T_camera_world,
         found.agreement,

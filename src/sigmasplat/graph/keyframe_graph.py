@@ -14,8 +14,7 @@ from scipy.stats import chi2 as chi2_distribution
 
 from sigmasplat.data import se3
 from sigmasplat.data.relative_pose import Kind, RelativePose, SolvedGraph
-from sigmasplat.fit.align import Alignment, align
-from sigmasplat.fit.compare import Comparison, compare
+from sigmasplat.fit.compare import best_alignment
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.graph.normal_equations import factorised
 from sigmasplat.graph.path_covariance import PathCovariance
@@ -30,8 +29,6 @@ APART = 4
 """Other keyframes that a keyframe is aligned to are this many keyframes apart: neighbours share most errors."""
 NEAREST = 3
 """The nearest views are taken whatever their distance in time; one of them is the keyframe before."""
-UNDECIDED = 1e-3
-"""The finest size alone replaces coarse to fine only if it agrees better by more than this."""
 MEDIAN_CHI2 = float(chi2_distribution.median(6))
 ROUNDS, STEPS = 10, 5
 """Rounds of weighting and factors, and steps of the solution in each."""
@@ -52,27 +49,9 @@ class KeyframeSolution:
 # ---- edges ----
 
 
-def aligned(reference: Pyramid, live: Pyramid, T_live_reference: Matrix) -> tuple[Alignment, Comparison]:
-    """Align two images coarse to fine, and at the finest size alone; return what agrees better at full resolution.
-
-    Coarse sizes reach far, but where the scene repeats they pull the pose away, and fine sizes cannot come back. Gray
-    and depth count alike, each in units of its noise.
-    """
-    pairs = (reference, live), (reference.finest(), live.finest())
-    found = [align(*pair, T_live_reference) for pair in pairs]
-    seen = [compare(reference, live, motion.T_live_reference) for motion in found]
-    best = int(agreement(seen[1]) > agreement(seen[0]) + UNDECIDED)
-    return found[best], seen[best]
-
-
-def agreement(seen: Comparison) -> float:
-    """Return how well two images agree: the share of close depths times the correlation of gray values, if known."""
-    return seen.close if np.isnan(seen.correlation) else seen.close * seen.correlation
-
-
 def edge_between(a: int, b: int, reference: Pyramid, live: Pyramid, T_b_a: Matrix) -> RelativePose | None:
     """Align keyframe b to keyframe a from a guess T_b_a [4, 4]; None if the images do not confirm the result."""
-    motion, seen = aligned(reference, live, T_b_a)
+    motion, seen = best_alignment(reference, live, T_b_a)
     covariance = motion.covariance + np.diag(motion.bias**2)
     if motion.degenerate or not confirmed(seen) or not np.isfinite(covariance).all():
         return None

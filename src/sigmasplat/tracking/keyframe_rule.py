@@ -10,6 +10,10 @@ from sigmasplat.tracking.frame_estimate import FrameEstimate
 from sigmasplat.tracking.recovery import Recovery
 from sigmasplat.tracking.tracker import Tracker
 
+MOVED = 0.125
+"""A view has changed if the image has moved by this share of its width, by rotation and by translation at the mean
+depth."""
+
 
 def is_mappable(fit: PoseFit, tracker: Tracker, recovery: Recovery) -> bool:
     """Return whether the pose of the frame tracked last is certain enough to map the frame."""
@@ -19,23 +23,20 @@ def is_mappable(fit: PoseFit, tracker: Tracker, recovery: Recovery) -> bool:
 def becomes_keyframe(fit: PoseFit, tracker: Tracker, since: int, config: MappingConfig, most_deg: float = 0.0) -> bool:
     """Return whether the frame tracked last becomes a keyframe, `since` frames after the last one.
 
-    most_deg > 0: after `every` frames, the image must also have moved by more than this angle.
+    It does when the view has changed, so that the next frames still see most of their reference: in a low overlap, or
+    by `MOVED`. It does also after `every` frames (VarSplat §2); with most_deg > 0 only if the image has moved by more
+    than this angle.
     """
-    if tracker.detector.renews(fit.comparison, tracker.front):
+    if tracker.detector.renews(fit.comparison, tracker.front) or fit.overlap < config.overlap_below:
         return True
-    if not most_deg or tracker.keyframe is None:
-        return is_keyframe(since, config.every, fit.overlap, config.overlap_below)
-    depth_m = 1.0 if fit.alignment is None else fit.alignment.depth_m
-    T_keyframe_camera = tracker.keyframe.T_camera_world @ se3.inverse(fit.T_camera_world)
-    moved_rad = se3.angle_between(np.eye(4), T_keyframe_camera, depth_m)
-    moved = since >= config.every and bool(np.rad2deg(moved_rad) > most_deg)
-    return moved or fit.overlap < config.overlap_below
-
-
-def is_keyframe(frames_since: int, every: int, overlap: float, overlap_below: float) -> bool:
-    """Return whether to map a frame: `every` frames after the last keyframe (VarSplat §2), or when the overlap is
-    low."""
-    return frames_since >= every or overlap < overlap_below
+    moved_rad, width_rad = 0.0, np.inf
+    if tracker.keyframe is not None and fit.alignment is not None:
+        T_keyframe_camera = tracker.keyframe.T_camera_world @ se3.inverse(fit.T_camera_world)
+        moved_rad = se3.angle_between(np.eye(4), T_keyframe_camera, fit.alignment.depth_m)
+        width_rad = tracker.keyframe.pyramid.cameras[0].width_rad
+    if config.overlap_below and moved_rad > MOVED * width_rad:
+        return True
+    return since >= config.every and not np.rad2deg(moved_rad) < most_deg
 
 
 def is_held_back(index: int, every: int) -> bool:
