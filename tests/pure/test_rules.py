@@ -2,9 +2,11 @@
 
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
+from sigmasplat.config import MappingConfig
 from sigmasplat.fit.pose import PoseFit
 from sigmasplat.mapping.window import draw_keyframes
 from sigmasplat.tracking.keyframe_rule import is_held_back, is_keyframe
@@ -18,14 +20,31 @@ def fit(agreement: float, overlap: float) -> PoseFit:
     return PoseFit(np.eye(4), agreement, overlap, NAN, 0.0, 1)
 
 
+def keyframe(since: int, overlap: float, moved_rad: float = 0.0, least_deg: float = 0.0, every: int = 5) -> bool:
+    return is_keyframe(since, overlap, moved_rad, 1.0, MappingConfig(every=every, overlap_below=0.7), least_deg)
+
+
 def test_a_keyframe_is_due_after_a_number_of_frames_or_at_low_overlap() -> None:
     due = {(4, 1.0): False, (5, 1.0): True, (6, 1.0): True, (1, 0.71): False, (1, 0.69): True, (1, 0.0): True}
-    assert {(frames, overlap): is_keyframe(frames, 5, overlap, 0.7) for frames, overlap in due} == due
+    assert {case: keyframe(*case) for case in due} == due
 
 
-def test_overlap_zero_switches_that_rule_off() -> None:
-    assert not is_keyframe(1, 5, 0.0, 0.0)
-    assert is_keyframe(1, 1, 1.0, 0.0), "every frame, as TUM's preset has it"
+def test_a_keyframe_is_due_when_the_view_has_moved_by_an_eighth_of_its_width() -> None:
+    """A fast camera must not be tracked relative to a view of five frames ago."""
+    assert keyframe(1, 1.0, 0.13) and not keyframe(1, 1.0, 0.12)
+
+
+def test_a_live_camera_at_rest_makes_no_keyframes() -> None:
+    still, moves = np.deg2rad([4.9, 5.1])
+    assert not keyframe(100, 1.0, still, least_deg=5.0) and keyframe(5, 1.0, moves, least_deg=5.0)
+    assert not keyframe(4, 1.0, moves, least_deg=5.0), "not more often than in a recording"
+    assert keyframe(1, 0.69, still, least_deg=5.0), "unless the overlap is low"
+
+
+def test_overlap_zero_switches_the_rules_of_views_off() -> None:
+    papers = MappingConfig(every=5, overlap_below=0.0)
+    assert not is_keyframe(1, 0.0, 0.9, 1.0, papers)
+    assert is_keyframe(1, 1.0, 0.0, 1.0, replace(papers, every=1)), "every frame, as TUM's preset has it"
 
 
 def test_the_last_of_each_n_frames_is_held_back() -> None:

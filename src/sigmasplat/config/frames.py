@@ -186,7 +186,7 @@ class MappingConfig(Section, name="mapping"):
     """Weight of the loss max(s) / min(s) − 1 of the scales s (CG-SLAM eq. 17)."""
     weight_alignment: NotNegative = 0.0
     """Weight of the loss |D̂ − median depth| (CG-SLAM eq. 16)."""
-    weight_moment: NotNegative = 0.1
+    weight_moment: NotNegative = 0.0
     """Weight of the loss U, the variance of the splats' depths about the sensor's depth (CG-SLAM eq. 10)."""
     weight_nll_color: NotNegative = 0.01  # V predicts the errors better than with the paper's 1e-4
     """Weight of the negative log-likelihood of the colour error under V, which trains σ² (VarSplat §2); 0 = σ² is not

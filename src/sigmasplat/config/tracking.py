@@ -61,7 +61,7 @@ class TrackingConfig(Section, name="tracking"):
     """Learning rate of translation, metres per step."""
     weight_color: Share = 0.6
     """λ_c, the weight of the colour loss; the depth loss has 1 − λ_c."""
-    uncertainty: bool = True
+    uncertainty: bool = False  # alignment to recorded images gains nothing by it
     """Whether pixels are weighted by exp(−(log V − median)/τ); off = LoopSplat."""
     tau: Above0 = 10.0
     """τ of the pixel weights, in units of log V: at 50, a V of ten times the median lowers the weight by 5 %. A smaller

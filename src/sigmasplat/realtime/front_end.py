@@ -213,9 +213,9 @@ class FrontEnd:
 
     def _offer(self, fit: PoseFit, seen: PreparedFrame, view: View, estimate: FrameEstimate) -> Offer | None:
         """Return the frame as a keyframe, if it becomes one; track the next frames relative to it."""
-        since, most_deg = self.frames - self.newest, self.config.realtime.keyframe_deg
+        since, least_deg = self.frames - self.newest, self.config.realtime.keyframe_deg
         if not is_mappable(fit, self.tracker, self.recovery) or not becomes_keyframe(
-            fit, self.tracker, since, self.config.mapping, most_deg
+            fit, self.tracker, since, self.config.mapping, least_deg
         ):
             return None
         alignment = self.tracker.hop(fit, seen.live)

@@ -20,23 +20,30 @@ def is_mappable(fit: PoseFit, tracker: Tracker, recovery: Recovery) -> bool:
     return not tracker.lost and recovery.is_steady and tracker.is_certain(fit)
 
 
-def becomes_keyframe(fit: PoseFit, tracker: Tracker, since: int, config: MappingConfig, most_deg: float = 0.0) -> bool:
-    """Return whether the frame tracked last becomes a keyframe, `since` frames after the last one.
-
-    It does when the view has changed, so that the next frames still see most of their reference: in a low overlap, or
-    by `MOVED`. It does also after `every` frames (VarSplat §2); with most_deg > 0 only if the image has moved by more
-    than this angle.
-    """
-    if tracker.detector.renews(fit.comparison, tracker.front) or fit.overlap < config.overlap_below:
+def becomes_keyframe(fit: PoseFit, tracker: Tracker, since: int, config: MappingConfig, least_deg: float = 0.0) -> bool:
+    """Return whether the frame tracked last becomes a keyframe, `since` frames after the last one; least_deg: as in
+    `is_keyframe`."""
+    if tracker.detector.renews(fit.comparison, tracker.front):
         return True
-    moved_rad, width_rad = 0.0, np.inf
+    moved_rad, width_rad = 0.0, np.pi
     if tracker.keyframe is not None and fit.alignment is not None:
         T_keyframe_camera = tracker.keyframe.T_camera_world @ se3.inverse(fit.T_camera_world)
         moved_rad = se3.angle_between(np.eye(4), T_keyframe_camera, fit.alignment.depth_m)
         width_rad = tracker.keyframe.pyramid.cameras[0].width_rad
-    if config.overlap_below and moved_rad > MOVED * width_rad:
-        return True
-    return since >= config.every and not np.rad2deg(moved_rad) < most_deg
+    return is_keyframe(since, fit.overlap, moved_rad, width_rad, config, least_deg)
+
+
+def is_keyframe(
+    since: int, overlap: float, moved_rad: float, width_rad: float, config: MappingConfig, least_deg: float = 0.0
+) -> bool:
+    """Return whether to map a frame: when the view has changed, so that the next frames see most of their reference, or
+    `config.every` frames after the last keyframe (VarSplat §2) if the image has moved by least_deg since.
+
+    moved_rad: how far it has moved; width_rad: the angle of view.
+    """
+    changed = overlap < config.overlap_below or moved_rad > MOVED * width_rad
+    due = since >= config.every and np.rad2deg(moved_rad) >= least_deg
+    return due or bool(config.overlap_below and changed)
 
 
 def is_held_back(index: int, every: int) -> bool:

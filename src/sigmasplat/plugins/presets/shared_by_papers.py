@@ -41,6 +41,7 @@ BASE_VALUES: dict[str, dict[str, object]] = {
     "tracking": {
         "method": "adam",
         "align_weight_color": 0.5,
+        "uncertainty": True,
         "tau": 50.0,
         "features": False,
         "verify": False,
