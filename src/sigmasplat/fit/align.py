@@ -201,6 +201,21 @@ def align(
     )
 
 
+def gray_share(reference: Pyramid, live: Pyramid, T_live_reference: Matrix) -> float:
+    """Return the weight of gray, 0 to 1, that is due to it by how well gray and depth agree at a guess [4, 4].
+
+    Each is weighted by the inverse of its size: the root of its mean cost at the finest size, where its Huber width is
+    the unit. The inverse of the variance would be right if residuals were nothing but noise. Errors of other kinds do
+    not become smaller with it, as in `balanced`.
+    """
+    cost = []
+    for weight in (1.0, 0.0):
+        pair = Pair(reference, live, weight)
+        sums = normal_equations(pair.kernels, pair.level(0), [T_live_reference])[0].sums
+        cost.append(math.sqrt(sums[0] / max(sums[1], 1.0)))
+    return cost[1] / max(cost[0] + cost[1], 1e-9)
+
+
 def align_to_all(
     references: Sequence[Pyramid],
     live: Pyramid,

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.fit.align import Alignment, align
+from sigmasplat.fit.align import Alignment, align, gray_share
 from sigmasplat.fit.pyramid import HIDDEN_M, NOISE_PER_M, Pyramid
 from sigmasplat.native import _core
 from sigmasplat.types import Matrix
@@ -72,14 +72,16 @@ def compare(reference: Pyramid, live: Pyramid, T_live_reference: Matrix) -> Comp
 
 
 def best_alignment(
-    reference: Pyramid, live: Pyramid, T_live_reference: Matrix, weight_color: float = 0.5
+    reference: Pyramid, live: Pyramid, T_live_reference: Matrix, weight_color: float | None = None
 ) -> tuple[Alignment, Comparison]:
     """Align two images coarse to fine, and at the finest size alone; return what agrees better at full resolution.
 
     Coarse sizes reach far, but where the scene repeats they pull the pose away, and fine sizes cannot come back.
+    weight_color: as of `align`; None: measured (`gray_share`).
     """
+    weight = gray_share(reference, live, T_live_reference) if weight_color is None else weight_color
     pairs = (reference, live), (reference.finest(), live.finest())
-    found = [align(*pair, T_live_reference, weight_color=weight_color) for pair in pairs]
+    found = [align(*pair, T_live_reference, weight_color=weight) for pair in pairs]
     seen = [compare(reference, live, motion.T_live_reference) for motion in found]
     best = int(agreement(seen[1]) > agreement(seen[0]) + UNDECIDED)
     return found[best], seen[best]
