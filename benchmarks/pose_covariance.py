@@ -72,7 +72,7 @@ class Options:
 def measure(path: str, options: Options) -> dict[str, Any]:
     """Run one sequence and score its poses. Raises SourceError if it cannot be read or has no truth."""
     config = override(preset_of(options.preset), {"final.iterations": "0", "input.width": str(options.width)})
-    source, slam = open_source(path, limit=options.limit), Slam(config)
+    source, slam = open_source(path, limit=options.limit or 0), Slam(config)
     truth = source.truth()
     if truth is None:
         raise SourceError(f"{path} has no ground truth")
