@@ -3,7 +3,8 @@
 Two processes of one thread run every row with the command line of the checkout, without the final map. Results are kept
 in --cache by commit and by the bytes of src, so that only new code is run. With BEFORE, a revision, that commit's own
 code runs in a worktree and stands beside; differences beyond the noise (board_tables.py) are marked better or worse.
-Both are scored by today's code. Writes benchmarks/results/<name>-<machine>.json and prints a table. Linux only.
+Both are scored by today's code. plain.py runs once for each of its versions and is a column beside them; a row where
+SigmaSplat is worse than it is marked. Writes benchmarks/results/<name>-<machine>.json and prints a table. Linux only.
 
 example: python benchmarks/board.py HEAD~1
 """
@@ -23,7 +24,7 @@ import board_runs
 import program
 import record
 import tyro
-from board_code import Code, Kept, current, revision
+from board_code import Code, Kept, current, plain_system, revision
 from board_runs import Row
 from disturbances import plan
 from disturbed_recordings import with_truth
@@ -101,12 +102,13 @@ def measure(options: Options) -> dict[str, Any]:
     for line in left_out:
         print(f"left out: {line}", file=sys.stderr, flush=True)
     codes = [current(), *([revision(options.before)] if options.before else [])]
-    kept = {code: Kept.of(code, options.cache) for code in codes}
+    peer = plain_system()
+    kept = {code: Kept.of(code, options.cache) for code in (*codes, peer)}
     tasks = [
         Task(code, row, seed)
         for row in sorted(rows, key=lambda row: board_runs.COST_S.get(row.name, 0.0), reverse=True)
-        for code in codes
-        for seed in options.seeds
+        for code in (*codes, peer)
+        for seed in (options.seeds if code is not peer else (0,))
         if options.fresh or kept[code].found(row, seed) is None
     ]
     run_all(tasks, kept)
@@ -118,8 +120,9 @@ def measure(options: Options) -> dict[str, Any]:
     ]
     return {
         "rows": found,
+        "plain": {row.name: kept[peer].results[row.key(0)] for row in rows},
         "left_out": left_out,
-        "codes": [{"name": code.name, "commit": code.commit, "digest": code.digest} for code in codes],
+        "codes": [{"name": code.name, "commit": code.commit, "digest": code.digest} for code in (*codes, peer)],
         "runs_made": len(tasks),
         "duration_s": round(time.perf_counter() - start, 1),
         "load_average_after": os.getloadavg()[0],

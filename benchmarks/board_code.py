@@ -10,6 +10,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
+import plain
 import record
 from board_runs import Row, environment
 from checkouts import IN_PLACE, install_kernels
@@ -20,23 +21,26 @@ from sigmasplat.files import machine
 MEASURED = ("src", "CMakeLists.txt")
 """What figures of a run depend on."""
 KERNELS = "_core*.so"
-NOW, BEFORE = "now", "before"
+NOW, BEFORE, PLAIN = "now", "before", "plain"
 
 
 @dataclass(frozen=True)
 class Code:
-    """The code of this checkout ("now") or of a commit: equal digests mean equal sources."""
+    """The code of this checkout ("now") or of a commit, or the plain system: equal digests mean equal sources."""
 
     name: str
     commit: str
     digest: str
 
-    def ready(self, stack: ExitStack, scratch: Path) -> Path:
-        """Return a checkout of this code whose kernels are compiled; a worktree ends with the stack.
+    def ready(self, stack: ExitStack, scratch: Path) -> Path | None:
+        """Return a checkout of this code whose kernels are compiled; a worktree ends with the stack. None for the plain
+        system, which this program runs itself.
 
         Raises ConfigError if it cannot be made, or if Python would import another package.
         """
         checkout = record.ROOT
+        if self.name == PLAIN:
+            return None
         if self.name == BEFORE:
             checkout = scratch / "before"
             git("worktree", "add", "--detach", str(checkout), self.commit)
@@ -64,6 +68,11 @@ def revision(name: str) -> Code:
 def digest_of(commit: str) -> str:
     """Return the digest of the sources of a commit."""
     return sha256(git("rev-parse", *(f"{commit}:{path}" for path in MEASURED)).encode()).hexdigest()[:12]
+
+
+def plain_system() -> Code:
+    """Return the code of plain.py. What it takes from src is not in its digest: it is a fixed peer, and runs once."""
+    return Code(PLAIN, git("rev-parse", "HEAD"), PLAIN + sha256(Path(plain.__file__).read_bytes()).hexdigest()[:12])
 
 
 def current() -> Code:

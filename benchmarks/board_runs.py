@@ -16,11 +16,13 @@ import accuracy
 import board_scores
 import cv2
 import numpy as np
+import plain
 import robustness_scores
 import torch
 from disturbances import plan
-from disturbed_recordings import original, write
+from disturbed_recordings import FRAMES_PER_SECOND, original, write
 
+from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import ConfigError, SigmaSplatError
 from sigmasplat.native.threads import set_kernel_threads
 
@@ -79,8 +81,9 @@ def one_thread() -> None:
     cv2.setNumThreads(1)
 
 
-def perform(row: Row, seed: int, checkout: Path, scratch: Path) -> dict[str, Any]:
-    """Run a row with the code of a checkout and score it; `problem` says why that failed."""
+def perform(row: Row, seed: int, checkout: Path | None, scratch: Path) -> dict[str, Any]:
+    """Run a row with the code of a checkout, or with the plain system (None), and score it; `problem` says why that
+    failed."""
     start = time.perf_counter()
     with TemporaryDirectory(dir=scratch) as folder:
         try:
@@ -91,18 +94,23 @@ def perform(row: Row, seed: int, checkout: Path, scratch: Path) -> dict[str, Any
     return result | {"wall_s": round(time.perf_counter() - start, 2)}
 
 
-def run_recording(row: Row, seed: int, checkout: Path, folder: Path) -> dict[str, Any]:
+def run_recording(row: Row, seed: int, checkout: Path | None, folder: Path) -> dict[str, Any]:
     """Run a recording as it is; return its figures."""
     path, limit = accuracy.located(row.source), ["--limit", str(row.limit)] if row.limit else []
+    if checkout is None:
+        return plain.run(path, row.limit)
     cpu_s = run([path, "--seed", str(seed), *limit], checkout, folder)
     return board_scores.score(folder / "run", path, row.limit) | {"cpu_s": cpu_s}
 
 
-def run_disturbed(row: Row, seed: int, checkout: Path, folder: Path) -> dict[str, Any]:
+def run_disturbed(row: Row, seed: int, checkout: Path | None, folder: Path) -> dict[str, Any]:
     """Write a disturbed recording without truth and run it; return its figures."""
     from_ = original(accuracy.located(row.source), row.start_s, folder / "frames", row.limit)
     planned = plan(row.disturbance, row.severity, EVENT_SEED, row.frames, len(from_))
     write(from_, planned, row.disturbance, row.severity, EVENT_SEED, folder / "recording")
+    if checkout is None:
+        times_s = np.arange(len(planned)) / FRAMES_PER_SECOND
+        return plain.run(str(folder / "recording"), 0, Trajectory(times_s, from_.T_world_camera[planned.color]))
     cpu_s = run([str(folder / "recording"), "--seed", str(seed)], checkout, folder)
     shown = [planned.color] + [planned.depth] * bool((planned.depth != planned.color).any())
     read = robustness_scores.read_run(folder / "run", len(planned))

@@ -22,6 +22,9 @@ def itself(value: float) -> float:
     return value
 
 
+PLAIN_HEADING, BEHIND = "plain system", "worse than the plain system"
+
+
 @dataclass(frozen=True)
 class Quantity:
     """A figure of the board: its heading, the unit of the table, and the least difference that is not noise.
@@ -61,7 +64,8 @@ def sections(measured: dict[str, Any]) -> list[Section]:
     now, before = ({r["name"]: r for r in mean_rows(figures["rows"], code)} for code in ("now", "before"))
     noise = record.latest(NOISE)
     spread = seeds_spread(noise["figures"]["rows"]) if noise else {}
-    rows, verdicts = [], {"better": list[str](), "worse": list[str]()}
+    rows, verdicts = [], {"better": list[str](), "worse": list[str](), BEHIND: list[str]()}
+    plain = {name: run.get("ate_m") for name, run in figures.get("plain", {}).items()}
     for name, run in now.items():
         cells = [name, str(run["frames"])]
         for figure, quantity in QUANTITIES.items():
@@ -69,8 +73,14 @@ def sections(measured: dict[str, Any]) -> list[Section]:
             cells.append(text)
             if verdict:
                 verdicts[verdict].append(f"{name}: {quantity.heading.split(',')[0]}")
+        if plain:
+            ours, theirs, deviation = run["ate_m"], plain.get(name), spread.get((name, "ate_m"))
+            behind = ours and theirs and verdict_of(QUANTITIES["ate_m"], ours, theirs, deviation) == "worse"
+            cells.insert(3, written(QUANTITIES["ate_m"], theirs) + " **ours is worse**" * bool(behind))
+            verdicts[BEHIND] += [name] * bool(behind)
         rows.append(cells)
     head = ["recording", "frames", *(quantity.heading for quantity in QUANTITIES.values())]
+    head[3:3] = [PLAIN_HEADING] * bool(plain)
     failed = failed_runs(figures["rows"], lambda r: "{name}, {code}, seed {seed}".format(**r))
     return [s for s in (Section("Board", head, rows, note(figures, verdicts, bool(before))), failed) if s.rows]
 
@@ -78,8 +88,8 @@ def sections(measured: dict[str, Any]) -> list[Section]:
 def note(figures: dict[str, Any], verdicts: dict[str, list[str]], compared: bool) -> str:
     """Return what stands below the table: verdicts, codes, what is left out, what figures mean."""
     said = []
-    if compared:
-        said += [f"{verdict}: {'; '.join(found) or 'nothing'}." for verdict, found in verdicts.items()]
+    shown = {"better": compared, "worse": compared, BEHIND: "plain" in figures}
+    said += [f"{verdict}: {'; '.join(found) or 'nothing'}." for verdict, found in verdicts.items() if shown[verdict]]
     codes = ", ".join(f"{c['name']} {c['commit'][:9]} (sources {c['digest']})" for c in figures["codes"])
     said.append(f"Code: {codes}. {figures['runs_made']} runs in {figures['duration_s']:.0f} s; the others were kept.")
     said += [f"Left out: {line}." for line in figures["left_out"]]

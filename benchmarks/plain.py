@@ -37,7 +37,10 @@ from sigmasplat.plugins.sources import open_source
 from sigmasplat.types import Matrix
 
 arg = tyro.conf.arg
-SOURCES = ("fr1_xyz", "livingroom", "redkitchen", "hololens", "cubicles", "cabinet58", f"{accuracy.SYNTHETIC},noise=1")
+SOURCES = (
+    "fr1_xyz", "livingroom", "redkitchen", "hololens", "cubicles", "cabinet58", f"{accuracy.SYNTHETIC},noise=1",
+    "synthetic:corridor",
+)  # fmt: skip
 GRAY = np.array([0.299, 0.587, 0.114], np.float32)
 FAR, LEAST_COMMON = 0.15, 0.75
 """A frame becomes a keyframe when its view has changed by this share of the depth plus radians, or when it sees less
@@ -150,10 +153,13 @@ def minimised(T: Matrix, edges: Sequence[RelativePose]) -> Matrix:
     return np.asarray(first @ T)
 
 
-def run(path: str, limit: int = 0) -> dict[str, Any]:
-    """Run the plain system on a recording with truth; return its figures. Raises ConfigError without truth."""
+def run(path: str, limit: int = 0, truth: Trajectory | None = None) -> dict[str, Any]:
+    """Run the plain system on a recording; return its figures. truth: if the recording has none itself.
+
+    Raises ConfigError without truth.
+    """
     source, settings = open_source(path, limit=limit), preset(default_preset()).input
-    truth = source.truth()
+    truth = truth or source.truth()
     if truth is None:
         raise ConfigError(f"{path} has no true path; the plain system is only scored")
     system, spent_s = PlainSystem(), 0.0

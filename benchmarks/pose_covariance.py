@@ -7,7 +7,7 @@ Writes benchmarks/results/pose_covariance-<machine>.json and prints a table.
 example: python benchmarks/pose_covariance.py --sources synthetic:frames=200,noise=1 --width 240
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -30,6 +30,21 @@ from sigmasplat.slam.slam import Slam
 arg = tyro.conf.arg
 NOISY = f"{accuracy.SYNTHETIC},noise=1"
 POOLED = "mean of the rooms with noise"
+Column = tuple[str, str, float]
+"""Heading, figure, and factor to the unit of the heading."""
+COLUMNS: tuple[Column, ...] = (
+    ("NEES, mean", "nees_mean", 1.0),
+    ("… median", "nees_median", 1.0),
+    ("in the 90 % ellipsoid, %", "coverage_90", 100.0),
+    ("position: in its 90 % ellipsoid, %", "position_coverage_90", 100.0),
+    ("… k", "position_k", 1.0),
+)
+WITH_TRUTH: tuple[Column, ...] = (
+    ("with the truth's own error, %", "coverage_90_with_truth", 100.0),
+    ("… position, %", "position_coverage_90_with_truth", 100.0),
+    ("… position, k", "position_k_with_truth", 1.0),
+)
+"""Only where a truth was measured."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +62,9 @@ class Options:
     preset: Annotated[str, arg(help="preset to start from")] = default_preset()
     width: Annotated[int, arg(help="width of the working images, pixels; 0 = as recorded")] = 0
     limit: Annotated[int | None, arg(help="number of frames at most")] = None
+    truth_std: Annotated[
+        tuple[float, float] | None, arg(help="own error of a true pose, m and °, where the recording does not say")
+    ] = None
     name: Annotated[str, arg(help="name of the results")] = "pose-covariance"
     out: Annotated[Path, arg(help="folder of the results")] = record.RESULTS
 
@@ -54,10 +72,12 @@ class Options:
 def measure(path: str, options: Options) -> dict[str, Any]:
     """Run one sequence and score its poses. Raises SourceError if it cannot be read or has no truth."""
     config = override(preset_of(options.preset), {"final.iterations": "0", "input.width": str(options.width)})
-    source, slam = open_source(path, limit=options.limit), Slam(config)
+    source, slam = open_source(path, limit=options.limit or 0), Slam(config)
     truth = source.truth()
     if truth is None:
         raise SourceError(f"{path} has no ground truth")
+    if options.truth_std and truth.std is None:
+        truth = replace(truth, std=(options.truth_std[0], float(np.deg2rad(options.truth_std[1]))))
     for frame in source:
         slam.step(frame)
     slam.finish()
@@ -72,39 +92,35 @@ def measure(path: str, options: Options) -> dict[str, Any]:
 def sections(measured: dict[str, Any]) -> list[Section]:
     """Return one table: rows for each sequence and kind of motion."""
     found = measured["figures"]["sources"]
-    rows = [cells(MOTIONS[kind], kind, [run]) for run in found for kind in MOTIONS]
+    measured_truth = any(run.get("truth_std_m") for run in found)
+    columns = [*COLUMNS, *(WITH_TRUTH if measured_truth else ())]
+    rows = [cells(MOTIONS[kind], kind, [run], columns) for run in found for kind in MOTIONS]
     for row, run in zip(rows, [run for run in found for _ in MOTIONS], strict=True):
         row.insert(0, run["source"])
     noisy = [run for run in found if "noise=1" in run["source"]]
     if len(noisy) > 1:
-        rows += [[POOLED, *cells(MOTIONS[kind], kind, noisy)] for kind in MOTIONS]
-    head = ["sequence", "motion", "motions", "NEES, mean", "… median", "in the 90 % ellipsoid, %"]
-    head += ["position: in its 90 % ellipsoid, %", "… k"]
+        rows += [[POOLED, *cells(MOTIONS[kind], kind, noisy, columns)] for kind in MOTIONS]
+    head = ["sequence", "motion", "motions", *(heading for heading, *_ in columns)]
     note = (
         "NEES should be 6 on average (median 5.35), k = 1 (the variances of the position are k times too small). "
         "Motions of 50 frames and from the start overlap: a run has few independent ones."
     )
+    if measured_truth:
+        known = {run["source"]: run for run in found if run.get("truth_std_m")}
+        each = (f"{name} {1e3 * run['truth_std_m']:g} mm, {run['truth_std_deg']:.2g}°" for name, run in known.items())
+        note += f" Last columns: with the truth's own error, of each true pose, in the covariance: {'; '.join(each)}."
     return [Section("Covariance of poses", head, rows, note)]
 
 
-def cells(name: str, kind: str, runs: list[dict[str, Any]]) -> list[str]:
-    """Return the cells of one kind of motion, as means over runs."""
+def cells(name: str, kind: str, runs: list[dict[str, Any]], columns: list[Column]) -> list[str]:
+    """Return the cells of one kind of motion, as means over the runs that have the figure."""
     scores = [run[kind] for run in runs if run[kind]]
-    if not scores:
-        return [name, "0", *["–"] * 5]
 
-    def mean(figure: str, factor: float = 1.0) -> str:
-        return significant(factor * float(np.mean([score[figure] for score in scores])))
+    def mean(figure: str, factor: float) -> str:
+        values = [score[figure] for score in scores if figure in score]
+        return significant(factor * float(np.mean(values)) if values else None)
 
-    return [
-        name,
-        str(sum(score["count"] for score in scores)),
-        mean("nees_mean"),
-        mean("nees_median"),
-        mean("coverage_90", 100.0),
-        mean("position_coverage_90", 100.0),
-        mean("position_k"),
-    ]
+    return [name, str(sum(score["count"] for score in scores)), *(mean(*column[1:]) for column in columns)]
 
 
 def measure_all(options: Options) -> dict[str, Any]:

@@ -32,11 +32,11 @@ def row(name: str, of: str = "now", seed: int = 0, **changes: Any) -> dict[str, 
     return {"code": of, "name": name, "seed": seed, **GOOD, **changes}
 
 
-def table(rows: list[dict[str, Any]], left_out: tuple[str, ...] = ()) -> Any:
+def table(rows: list[dict[str, Any]], left_out: tuple[str, ...] = (), **more: Any) -> Any:
     """Return the board of some rows."""
     codes = [{"name": name, "commit": 40 * "a", "digest": "b"} for name in ("now", "before")]
     figures = {"rows": rows, "left_out": [*left_out], "codes": codes, "runs_made": 1, "duration_s": 2.0}
-    return laid_out("board", figures)
+    return laid_out("board", figures | more)
 
 
 @pytest.fixture(autouse=True)
@@ -125,6 +125,16 @@ def test_a_figure_on_one_side_only_has_no_verdict_and_a_failed_row_is_listed() -
     assert list(made["Failed"].rows) == [["hall, now, seed 0", "gone"]]
 
 
+def test_rows_that_are_worse_than_the_plain_system_are_marked() -> None:
+    names = ("room", "hall", "attic")
+    assert "plain" not in table([row("room")])["Board"].note
+    plain = dict(zip(names, ({"ate_m": 0.015}, {"ate_m": 0.0199}, {"problem": "gone"}), strict=True))
+    made = table([row(name) for name in names], plain=plain)["Board"]
+    assert made.columns[2:5] == ["ATE, cm", "plain system", "hops, mm"]
+    assert [cells[3] for cells in made.rows] == ["1.50 **ours is worse**", "1.99", "–"]
+    assert "worse than the plain system: room." in made.note and "better: " not in made.note
+
+
 # ---- results kept by commit ----
 
 
@@ -190,8 +200,10 @@ def test_only_new_code_is_run(checkout: Path, tmp_path: Path, monkeypatch: pytes
     (checkout / "src" / "sigmasplat" / "new.py").write_text("x = 1")
     assert board.measure(replace(options, before="HEAD"))["runs_made"] == 1
     assert board.measure(replace(options, seeds=(0, 1)))["runs_made"] == 1
-    assert made == [("now", 0), ("now", 0), ("now", 1)]
-    assert board.measure(replace(options, fresh=True))["runs_made"] == 1
+    assert made == [("now", 0), ("plain", 0), ("now", 0), ("now", 1)]  # the plain system runs once
+    measured = board.measure(replace(options, fresh=True))
+    assert measured["runs_made"] == 2 and measured["plain"]["room"]["ate_m"] == GOOD["ate_m"]
+    assert [each["name"] for each in measured["codes"]] == ["now", "plain"]
 
 
 def test_a_commit_runs_in_a_worktree_with_its_own_package(
@@ -269,6 +281,15 @@ def test_a_run_that_fails_is_a_problem_with_its_last_line(tmp_path: Path, monkey
     assert failed["problem"] == "ValueError: the last line" and failed["wall_s"] >= 0
     gone = runs.perform(replace(ROOM, source="nothing-here", disturbance="clean"), 0, record.ROOT, tmp_path / "scratch")
     assert "nothing-here" in gone["problem"] and not list((tmp_path / "scratch").iterdir())
+
+
+@pytest.mark.parametrize("disturbed", [False, True])
+def test_the_plain_system_runs_any_row_without_a_checkout(disturbed: bool, tmp_path: Path) -> None:
+    how: dict[str, Any] = {"disturbance": "clean", "severity": 1, "frames": 3} if disturbed else {}
+    walk = replace(ROOM, source="synthetic:frames=200,width=64,height=48", limit=4, **how)
+    assert code.Code("plain", "", "").ready(ExitStack(), tmp_path) is None
+    found = runs.perform(walk, 0, None, tmp_path)
+    assert found["problem"] is None and found["frames"] == (3 if disturbed else 4) and 0 < found["ate_m"] < 0.02
 
 
 @pytest.mark.slow

@@ -5,6 +5,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from benchmark_results import laid_out
+
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
 uncertainty, tables = map(importlib.import_module, ("uncertainty", "tables"))
 
@@ -75,6 +77,21 @@ def test_poses_and_failures_have_tables_of_their_own() -> None:
     ]  # fmt: skip
     assert [row[1] for row in of_failures.rows] == ["200 ± 0"] and of_failures.rows[0][3] == "0.970 ± 0.000"
     assert all(len(section.columns) == len(row) for section in (of_poses, of_failures) for row in section.rows)
+
+
+def test_the_own_error_of_a_measured_truth_has_columns_beside_those_without_it() -> None:
+    motion = {"count": 39, "nees_mean": 6.0, "nees_median": 5.0, "coverage_90": 0.2}
+    motion |= {"position_coverage_90": 0.1, "position_k": 9.0}
+    beside = {"coverage_90_with_truth": 0.8, "position_coverage_90_with_truth": 0.7, "position_k_with_truth": 1.5}
+    kinds = ("hops", "windows", "from_start")
+    room = {"source": "room", **dict.fromkeys(kinds, motion), "windows": None}
+    desk = {"source": "desk", "truth_std_m": 0.004, "truth_std_deg": 0.3, **dict.fromkeys(kinds, motion | beside)}
+    alone = laid_out("pose_covariance", {"sources": [room]})["Covariance of poses"]
+    both = laid_out("pose_covariance", {"sources": [room, desk]})["Covariance of poses"]
+    assert alone.rows[0][2:] == ["39", "6.00", "5.00", "20.0", "10.0", "9.00"]
+    assert alone.rows[1] == ["room", "50 frames", "0", *["–"] * 5]
+    assert both.rows[3][5:] == ["20.0", "10.0", "9.00", "80.0", "70.0", "1.50"] and both.rows[0][8:] == ["–"] * 3
+    assert "desk 4 mm, 0.3°" in both.note and "own error" not in alone.note
 
 
 def test_options_say_what_to_measure(tmp_path: Path) -> None:

@@ -1,7 +1,9 @@
 """Paths with covariances: the files that `sigmasplat export` writes, what they mean, and how they are scored."""
 
 import json
+from itertools import accumulate
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -16,6 +18,7 @@ from sigmasplat.data.relative_pose import RelativePose
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.graph.path_covariance import PathCovariance, recorded
 from sigmasplat.plugins.evaluation.metrics.trajectory import score_covariances
+from sigmasplat.plugins.evaluation.path_scores import score_path_covariance
 from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.run_folder.trajectory import KNOWN, write_square, write_trajectory
 
@@ -71,6 +74,48 @@ def test_coverage_and_nees_of_right_and_of_small_covariances() -> None:
     assert right.position_nees_median == pytest.approx(CALIBRATED, rel=0.1)
     assert small.nees_mean == pytest.approx(9.0 * right.nees_mean) and small.coverage_90 < 0.4
     assert score_covariances(np.empty((0, 4, 4)), np.empty((0, 4, 4)), np.empty((0, 6, 6))) is None
+
+
+class Chain:
+    """A path of independent hops, each with the covariance `hop` [6, 6] of its left twist."""
+
+    def __init__(self, T_hops: Array, hop: Array) -> None:
+        self.T_world_camera = np.array([*accumulate(T_hops, np.matmul, initial=np.eye(4))])
+        self.hop = hop
+
+    def between(self, a: int, b: int) -> Array:
+        A = se3.adjoint(se3.inverse(self.T_world_camera[a]) @ self.T_world_camera[a:b])
+        return np.asarray((A @ self.hop @ np.swapaxes(A, 1, 2)).sum(0))
+
+
+def score_with_truth(std: tuple[float, float] | None, error: tuple[float, float]) -> dict[str, Any]:
+    """Score a path with known covariance against a truth of which each pose has an error of its own; std: as said."""
+    rng, frames, hop = np.random.default_rng(5), np.arange(400), np.repeat([2e-4, 1e-4], 3)
+    T_hops = se3.exp_stack(rng.normal(size=(len(frames) - 1, 6)) * np.repeat([0.03, 0.02], 3))
+    estimate = Chain(T_hops, np.diag(hop**2))
+    true = Chain(se3.exp_stack(rng.normal(size=(len(T_hops), 6)) * hop) @ T_hops, estimate.hop).T_world_camera
+    measured = true @ se3.exp_stack(rng.normal(size=(len(true), 6)) * np.repeat(error, 3))
+    path, truth = Trajectory(frames / 30.0, estimate.T_world_camera), Trajectory(frames / 30.0, measured, std)
+    return score_path_covariance(cast(PathCovariance, estimate), path, frames, frames.tolist(), truth)
+
+
+def test_with_the_own_error_of_the_truth_a_right_covariance_covers() -> None:
+    found = score_with_truth((0.004, 0.005), (0.004, 0.005))
+    assert found["truth_std_m"] == 0.004 and found["truth_std_deg"] == pytest.approx(np.rad2deg(0.005))
+    for kind in ("hops", "windows"):
+        scores = found[kind]
+        assert scores["coverage_90"] < 0.5 and scores["position_coverage_90"] < 0.5 and scores["position_k"] > 3.0
+        assert scores["coverage_90_with_truth"] == pytest.approx(0.9, abs=0.04), kind
+        assert scores["position_coverage_90_with_truth"] == pytest.approx(0.9, abs=0.04), kind
+        assert scores["position_k_with_truth"] == pytest.approx(1.0, abs=0.2), kind
+
+
+@pytest.mark.parametrize("std", [(0.0, 0.0), None])
+def test_an_exact_or_unknown_truth_adds_nothing(std: tuple[float, float] | None) -> None:
+    found = score_with_truth(std, (0.0, 0.0))
+    assert found["truth_std_m"] == found["truth_std_deg"] == (0.0 if std else None)
+    assert found["hops"]["coverage_90"] == pytest.approx(0.9, abs=0.04)
+    assert not [name for name in found["hops"] if name.endswith("_with_truth")]
 
 
 def test_the_file_holds_the_spread_in_the_camera(tmp_path: Path) -> None:

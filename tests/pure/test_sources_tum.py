@@ -84,6 +84,12 @@ def test_calibration_json_overrides_the_folders_name(tiny_tum):
     assert open_source(renamed).camera.fx == 30.0
 
 
+def test_only_the_truth_of_tums_own_recordings_is_known_to_be_motion_capture(tiny_tum):
+    assert open_source(tiny_tum).truth().std is None
+    renamed = tiny_tum.rename(tiny_tum.with_name("freiburg1_desk"))
+    assert open_source(renamed, limit=2).truth().std == (0.004, pytest.approx(np.deg2rad(0.3)))
+
+
 def undistort(points, coefficients):
     """Invert `distort` by fixed-point iteration."""
     ideal = points.copy()

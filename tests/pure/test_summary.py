@@ -77,6 +77,17 @@ def test_a_good_run_in_words() -> None:
             "measured 0 %. It is too small, in this recording by a factor of 124.7.",
         ),
         ({"pose_covariance": {"window_frames": 50, "windows": {"position_coverage_90": 1.0}}}, "It is too large."),
+        (
+            {
+                "pose_covariance": {
+                    "window_frames": 50,
+                    "truth_std_m": 0.004,
+                    "truth_std_deg": 0.3,
+                    "windows": {"position_coverage_90": 0.2, "position_coverage_90_with_truth": 0.61},
+                }
+            },
+            "It is too small. With the own error of the true path, 4 mm and 0.3° a pose, 61 % are within.",
+        ),
         ({"lost": 2, "relocalised_frames": [9]}, "which have no pose. It found its place in the map again at image 9."),
         (
             {"held_out": {"psnr_db": 24.0, "depth_l1_m": 0.01, "depth_coverage": 0.7}},

@@ -54,7 +54,7 @@ def in_units_of_run(truth: Trajectory, scale: float | None) -> Trajectory:
         return truth
     poses = truth.T_world_camera.copy()
     poses[:, :3, 3] /= scale
-    return Trajectory(truth.timestamps_s, poses)
+    return Trajectory(truth.timestamps_s, poses, truth.std and (truth.std[0] / scale, truth.std[1]))
 
 
 def in_metres(scores: dict[str, Any], scale: float | None) -> dict[str, Any]:
@@ -126,6 +126,8 @@ def final_positions(run: RunFolder, frames: RunFrames) -> NDArray[np.float64]:
 WINDOW_FRAMES = 50
 MOTIONS = {"hops": "keyframe to keyframe", "windows": f"{WINDOW_FRAMES} frames", "from_start": "from the start"}
 """Kinds of motions, and their names in tables."""
+WITH_TRUTH = ("coverage_90", "position_coverage_90", "position_k")
+"""Scores that are also given with the truth's own error, as `…_with_truth`."""
 
 
 def score_pose_covariance(run: RunFolder, frames: RunFrames, truth: Trajectory | None) -> dict[str, Any] | None:
@@ -148,11 +150,12 @@ def score_path_covariance(
     """Score motions from each keyframe to the next, over 50 frames, and from the first frame (`CovarianceScore`).
 
     path: poses of the valid frames; rows: their numbers [B]; keyframes: the numbers of all keyframes. Only frames with
-    a true pose count. Motions do not depend on the world frame, so no alignment is needed.
+    a true pose count. Motions do not depend on the world frame, so no alignment is needed. The truth's own error
+    (`std`) counts as an error of the poses; where it is known, scores with it in the covariance stand beside.
     """
     matched, true_rows = associate(path.timestamps_s, truth.timestamps_s)
     T_world_camera = dict(zip(rows[matched].tolist(), truth.T_world_camera[true_rows], strict=True))
-    known = list(T_world_camera)
+    known, own = list(T_world_camera), np.diag(np.repeat(np.square(truth.std or (0.0, 0.0)), 3))
     pairs = {
         "hops": list(pairwise(frame for frame in keyframes if frame in T_world_camera)),
         "windows": [(frame, frame + WINDOW_FRAMES) for frame in known if frame + WINDOW_FRAMES in T_world_camera],
@@ -165,7 +168,13 @@ def score_path_covariance(
             for poses in (errors.T_world_camera, T_world_camera)
         )
         covariance = np.array([errors.between(a, b) for a, b in between]).reshape(-1, 6, 6)
-        score = score_covariances(estimate, true, covariance)
-        return None if score is None else asdict(score)
+        score, A = score_covariances(estimate, true, covariance), se3.adjoint(estimate)
+        truths = score_covariances(estimate, true, covariance + own + A @ own @ np.swapaxes(A, 1, 2))
+        if score is None or truths is None:
+            return None
+        beside = {f"{name}_with_truth": getattr(truths, name) for name in WITH_TRUTH} if own.any() else {}
+        return asdict(score) | beside
 
-    return {"window_frames": WINDOW_FRAMES} | {name: scored(between) for name, between in pairs.items()}
+    std_m, std_deg = (truth.std[0], float(np.rad2deg(truth.std[1]))) if truth.std else (None, None)
+    facts = {"window_frames": WINDOW_FRAMES, "truth_std_m": std_m, "truth_std_deg": std_deg}
+    return facts | {name: scored(between) for name, between in pairs.items()}

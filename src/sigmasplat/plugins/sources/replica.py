@@ -6,6 +6,7 @@ cam_params.json                                                here or in the pa
 """
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 from sigmasplat.api import (
@@ -74,9 +75,10 @@ def _truth(path: Path, numbers: list[int]) -> Trajectory | None:
             f"{path}: {len(lines)} poses, but the last image has number {numbers[-1]}; is the file truncated?"
         )
     rows = ((n, parse_numbers(path, n + 1, lines[n].split())) for n in numbers)
-    return build_trajectory(
+    truth = build_trajectory(
         (n / FRAMES_PER_SECOND, checked_pose(f"{path}:{n + 1}", to_matrix(f"{path}:{n + 1}", row))) for n, row in rows
     )
+    return truth and replace(truth, std=(0.0, 0.0))
 
 
 PLUGIN = SourceFormat(

@@ -163,7 +163,7 @@ class SyntheticRoom(Source):
 
     def truth(self) -> Trajectory:
         """Return the exact pose of every frame, in the room's frame (z up)."""
-        return Trajectory(np.arange(len(self)) / FRAMES_PER_SECOND, self._T_world_camera.copy())
+        return Trajectory(np.arange(len(self)) / FRAMES_PER_SECOND, self._T_world_camera.copy(), (0.0, 0.0))
 
     def true_surface(self) -> Mesh:
         """Return the surfaces of all shapes in the room's frame, including hidden parts."""

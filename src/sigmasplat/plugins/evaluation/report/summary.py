@@ -145,8 +145,18 @@ def _pose_covariance(metrics: Metrics) -> list[str]:
     by = "" if factor is None or abs(off) <= CALIBRATED else f", in this recording by a factor of {number(factor, 1)}"
     return [
         f"90 % of the position errors over {covariance['window_frames']} frames should be within the covariance of the "
-        f"poses: measured {number(found['position_coverage_90'], 0, 100.0)} %. It {size}{by}."
+        f"poses: measured {number(found['position_coverage_90'], 0, 100.0)} %. It {size}{by}.",
+        *_with_truth(covariance, found),
     ]
+
+
+def _with_truth(covariance: Metrics, found: Metrics) -> list[str]:
+    """Return the share within the covariance of poses and truth together, if the truth's own error is known."""
+    share = found.get("position_coverage_90_with_truth")
+    if share is None:
+        return []
+    own = f"{number(covariance['truth_std_m'], 0, 1e3)} mm and {number(covariance['truth_std_deg'], 1)}° a pose"
+    return [f"With the own error of the true path, {own}, {number(share, 0, 100.0)} % are within."]
 
 
 def rescan_sentences(metrics: Metrics, plan: "FloorPlan | None") -> list[str]:

@@ -217,8 +217,13 @@ def _covariance_rows(scores: dict[str, Any] | None) -> list[list[str]]:
     kinds = {name: found for name, found in known.items() if found}
     if not kinds:
         return []
+    own = "… with the truth's own error"
     lines = [("Motions", "count", 0, 1.0), ("Poses in their 90 % ellipsoid, %", "coverage_90", 1, 100.0),
+             (own, "coverage_90_with_truth", 1, 100.0),
              ("Positions in their 90 % ellipsoid, %", "position_coverage_90", 1, 100.0),
+             (own, "position_coverage_90_with_truth", 1, 100.0),
              ("NEES, mean (ideal 6)", "nees_mean", 2, 1.0),
-             ("k of the position (ideal 1)", "position_k", 2, 1.0)]  # fmt: skip
+             ("k of the position (ideal 1)", "position_k", 2, 1.0),
+             (own, "position_k_with_truth", 2, 1.0)]  # fmt: skip
+    lines = [line for line in lines if any(line[1] in found for found in kinds.values())]
     return [["", *kinds], *figure_rows(lines, *kinds.values())]
