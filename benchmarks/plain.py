@@ -27,8 +27,8 @@ from sigmasplat.data.frame import Frame
 from sigmasplat.data.relative_pose import RelativePose
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import ConfigError
+from sigmasplat.fit.compare import best_alignment
 from sigmasplat.fit.pyramid import Pyramid
-from sigmasplat.graph.keyframe_graph import aligned
 from sigmasplat.graph.normal_equations import factorised
 from sigmasplat.graph.pose_graph import PoseGraph
 from sigmasplat.plugins.evaluation.metrics.trajectory import ate
@@ -50,6 +50,7 @@ EDGES, NEAR, APART, LONG = 6, 0.7, 20, 30
 this many frames ago; views are near up to this change (share of the depth plus rotation / 0.6 rad)."""
 LEAST_CLOSE, LEAST_CORRELATION, LEAST_OVERLAP = 0.85, 0.6, 0.25
 """An edge needs this agreement; that to the keyframe before is always kept."""
+WEIGHT_GRAY = 0.5
 ROBUST_CHI2, ROUNDS = 15.0, 12
 """Scale of the Geman–McClure loss of an edge, and steps of the solution."""
 FIGURES = {"front_end_ate_m": 100.0, "ate_m": 100.0, "cpu_s": 1000.0, "graph_cpu_s": 1.0}
@@ -85,7 +86,7 @@ class PlainSystem:
             return
         velocity = se3.inverse(self.poses[-2]) @ self.poses[-1] if len(self.poses) > 1 else np.eye(4)
         guess = se3.inverse(self.poses[-1] @ velocity) @ self.poses[self.keyframe]
-        found, seen = aligned(self.images[self.keyframe], self.images[-1], guess)
+        found, seen = best_alignment(self.images[self.keyframe], self.images[-1], guess, WEIGHT_GRAY)
         self.poses.append(self.poses[self.keyframe] @ se3.inverse(found.T_live_reference))
         moved = view_change(found.T_live_reference, found.depth_m, 1.0)
         if moved > FAR or seen.common < LEAST_COMMON:
@@ -113,7 +114,7 @@ class PlainSystem:
         for i in range(1, len(keyframes)):
             for j in partners(i, keyframes, T, float(self.images[keyframes[i]].readings[0])):
                 images = self.images[keyframes[j]], self.images[keyframes[i]]
-                motion, seen = aligned(*images, se3.inverse(T[i]) @ T[j])
+                motion, seen = best_alignment(*images, se3.inverse(T[i]) @ T[j], WEIGHT_GRAY)
                 agrees = seen.close >= LEAST_CLOSE and seen.correlation > LEAST_CORRELATION
                 if j != i - 1 and not (agrees and motion.overlap >= LEAST_OVERLAP and not motion.degenerate):
                     continue

@@ -62,7 +62,7 @@ class Options:
     preset: Annotated[str, arg(help="preset to start from")] = default_preset()
     width: Annotated[int, arg(help="width of the working images, pixels; 0 = as recorded")] = 0
     limit: Annotated[int | None, arg(help="number of frames at most")] = None
-    truth_std: Annotated[
+    truth_error: Annotated[
         tuple[float, float] | None, arg(help="own error of a true pose, m and °, where the recording does not say")
     ] = None
     name: Annotated[str, arg(help="name of the results")] = "pose-covariance"
@@ -76,8 +76,8 @@ def measure(path: str, options: Options) -> dict[str, Any]:
     truth = source.truth()
     if truth is None:
         raise SourceError(f"{path} has no ground truth")
-    if options.truth_std and truth.std is None:
-        truth = replace(truth, std=(options.truth_std[0], float(np.deg2rad(options.truth_std[1]))))
+    if options.truth_error and truth.error_rms is None:
+        truth = replace(truth, error_rms=(options.truth_error[0], float(np.deg2rad(options.truth_error[1]))))
     for frame in source:
         slam.step(frame)
     slam.finish()
@@ -92,7 +92,7 @@ def measure(path: str, options: Options) -> dict[str, Any]:
 def sections(measured: dict[str, Any]) -> list[Section]:
     """Return one table: rows for each sequence and kind of motion."""
     found = measured["figures"]["sources"]
-    measured_truth = any(run.get("truth_std_m") for run in found)
+    measured_truth = any(run.get("truth_error_m") for run in found)
     columns = [*COLUMNS, *(WITH_TRUTH if measured_truth else ())]
     rows = [cells(MOTIONS[kind], kind, [run], columns) for run in found for kind in MOTIONS]
     for row, run in zip(rows, [run for run in found for _ in MOTIONS], strict=True):
@@ -106,8 +106,10 @@ def sections(measured: dict[str, Any]) -> list[Section]:
         "Motions of 50 frames and from the start overlap: a run has few independent ones."
     )
     if measured_truth:
-        known = {run["source"]: run for run in found if run.get("truth_std_m")}
-        each = (f"{name} {1e3 * run['truth_std_m']:g} mm, {run['truth_std_deg']:.2g}°" for name, run in known.items())
+        known = {run["source"]: run for run in found if run.get("truth_error_m")}
+        each = (
+            f"{name} {1e3 * run['truth_error_m']:g} mm, {run['truth_error_deg']:.2g}°" for name, run in known.items()
+        )
         note += f" Last columns: with the truth's own error, of each true pose, in the covariance: {'; '.join(each)}."
     return [Section("Covariance of poses", head, rows, note)]
 

@@ -85,7 +85,7 @@ def test_the_own_error_of_a_measured_truth_has_columns_beside_those_without_it()
     beside = {"coverage_90_with_truth": 0.8, "position_coverage_90_with_truth": 0.7, "position_k_with_truth": 1.5}
     kinds = ("hops", "windows", "from_start")
     room = {"source": "room", **dict.fromkeys(kinds, motion), "windows": None}
-    desk = {"source": "desk", "truth_std_m": 0.004, "truth_std_deg": 0.3, **dict.fromkeys(kinds, motion | beside)}
+    desk = {"source": "desk", "truth_error_m": 0.004, "truth_error_deg": 0.3, **dict.fromkeys(kinds, motion | beside)}
     alone = laid_out("pose_covariance", {"sources": [room]})["Covariance of poses"]
     both = laid_out("pose_covariance", {"sources": [room, desk]})["Covariance of poses"]
     assert alone.rows[0][2:] == ["39", "6.00", "5.00", "20.0", "10.0", "9.00"]

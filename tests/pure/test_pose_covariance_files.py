@@ -88,20 +88,20 @@ class Chain:
         return np.asarray((A @ self.hop @ np.swapaxes(A, 1, 2)).sum(0))
 
 
-def score_with_truth(std: tuple[float, float] | None, error: tuple[float, float]) -> dict[str, Any]:
-    """Score a path with known covariance against a truth of which each pose has an error of its own; std: as said."""
+def score_with_truth(rms: tuple[float, float] | None, error: tuple[float, float]) -> dict[str, Any]:
+    """Score a path with known covariance against a truth of which each pose has an error of its own; rms: as said."""
     rng, frames, hop = np.random.default_rng(5), np.arange(400), np.repeat([2e-4, 1e-4], 3)
     T_hops = se3.exp_stack(rng.normal(size=(len(frames) - 1, 6)) * np.repeat([0.03, 0.02], 3))
     estimate = Chain(T_hops, np.diag(hop**2))
     true = Chain(se3.exp_stack(rng.normal(size=(len(T_hops), 6)) * hop) @ T_hops, estimate.hop).T_world_camera
-    measured = true @ se3.exp_stack(rng.normal(size=(len(true), 6)) * np.repeat(error, 3))
-    path, truth = Trajectory(frames / 30.0, estimate.T_world_camera), Trajectory(frames / 30.0, measured, std)
+    measured = true @ se3.exp_stack(rng.normal(size=(len(true), 6)) * np.repeat(error, 3) / np.sqrt(3.0))
+    path, truth = Trajectory(frames / 30.0, estimate.T_world_camera), Trajectory(frames / 30.0, measured, rms)
     return score_path_covariance(cast(PathCovariance, estimate), path, frames, frames.tolist(), truth)
 
 
 def test_with_the_own_error_of_the_truth_a_right_covariance_covers() -> None:
     found = score_with_truth((0.004, 0.005), (0.004, 0.005))
-    assert found["truth_std_m"] == 0.004 and found["truth_std_deg"] == pytest.approx(np.rad2deg(0.005))
+    assert found["truth_error_m"] == 0.004 and found["truth_error_deg"] == pytest.approx(np.rad2deg(0.005))
     for kind in ("hops", "windows"):
         scores = found[kind]
         assert scores["coverage_90"] < 0.5 and scores["position_coverage_90"] < 0.5 and scores["position_k"] > 3.0
@@ -110,10 +110,10 @@ def test_with_the_own_error_of_the_truth_a_right_covariance_covers() -> None:
         assert scores["position_k_with_truth"] == pytest.approx(1.0, abs=0.2), kind
 
 
-@pytest.mark.parametrize("std", [(0.0, 0.0), None])
-def test_an_exact_or_unknown_truth_adds_nothing(std: tuple[float, float] | None) -> None:
-    found = score_with_truth(std, (0.0, 0.0))
-    assert found["truth_std_m"] == found["truth_std_deg"] == (0.0 if std else None)
+@pytest.mark.parametrize("rms", [(0.0, 0.0), None])
+def test_an_exact_or_unknown_truth_adds_nothing(rms: tuple[float, float] | None) -> None:
+    found = score_with_truth(rms, (0.0, 0.0))
+    assert found["truth_error_m"] == found["truth_error_deg"] == (0.0 if rms else None)
     assert found["hops"]["coverage_90"] == pytest.approx(0.9, abs=0.04)
     assert not [name for name in found["hops"] if name.endswith("_with_truth")]
 

@@ -81,8 +81,8 @@ def test_a_good_run_in_words() -> None:
             {
                 "pose_covariance": {
                     "window_frames": 50,
-                    "truth_std_m": 0.004,
-                    "truth_std_deg": 0.3,
+                    "truth_error_m": 0.004,
+                    "truth_error_deg": 0.3,
                     "windows": {"position_coverage_90": 0.2, "position_coverage_90_with_truth": 0.61},
                 }
             },

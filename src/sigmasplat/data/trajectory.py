@@ -32,14 +32,14 @@ MOST_M = 1e9
 class Trajectory:
     """Poses over time: timestamps_s float64 [N], T_world_camera float64 [N, 4, 4] (camera to world, metres).
 
-    std: of a true path, the standard deviations of each coordinate of a position, m, and of a rotation, rad; errors of
-    two poses are independent. 0 = exact, None = unknown.
+    error_rms: of a true path, the root mean square lengths of the errors of a position, m, and of a rotation, rad;
+    errors of two poses are independent. 0 = exact, None = unknown.
     Raises SourceError if a pose is not finite or not rigid, or farther than `MOST_M` from the origin.
     """
 
     timestamps_s: NDArray[np.float64]
     T_world_camera: NDArray[np.float64]
-    std: tuple[float, float] | None = None
+    error_rms: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         if self.T_world_camera.shape != (len(self.timestamps_s), 4, 4):

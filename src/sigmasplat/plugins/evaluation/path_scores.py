@@ -54,7 +54,7 @@ def in_units_of_run(truth: Trajectory, scale: float | None) -> Trajectory:
         return truth
     poses = truth.T_world_camera.copy()
     poses[:, :3, 3] /= scale
-    return Trajectory(truth.timestamps_s, poses, truth.std and (truth.std[0] / scale, truth.std[1]))
+    return Trajectory(truth.timestamps_s, poses, truth.error_rms and (truth.error_rms[0] / scale, truth.error_rms[1]))
 
 
 def in_metres(scores: dict[str, Any], scale: float | None) -> dict[str, Any]:
@@ -151,11 +151,11 @@ def score_path_covariance(
 
     path: poses of the valid frames; rows: their numbers [B]; keyframes: the numbers of all keyframes. Only frames with
     a true pose count. Motions do not depend on the world frame, so no alignment is needed. The truth's own error
-    (`std`) counts as an error of the poses; where it is known, scores with it in the covariance stand beside.
+    (`error_rms`) counts as an error of the poses; where it is known, scores with it in the covariance stand beside.
     """
     matched, true_rows = associate(path.timestamps_s, truth.timestamps_s)
     T_world_camera = dict(zip(rows[matched].tolist(), truth.T_world_camera[true_rows], strict=True))
-    known, own = list(T_world_camera), np.diag(np.repeat(np.square(truth.std or (0.0, 0.0)), 3))
+    known, own = list(T_world_camera), np.diag(np.repeat(np.square(truth.error_rms or (0.0, 0.0)) / 3.0, 3))
     pairs = {
         "hops": list(pairwise(frame for frame in keyframes if frame in T_world_camera)),
         "windows": [(frame, frame + WINDOW_FRAMES) for frame in known if frame + WINDOW_FRAMES in T_world_camera],
@@ -175,6 +175,6 @@ def score_path_covariance(
         beside = {f"{name}_with_truth": getattr(truths, name) for name in WITH_TRUTH} if own.any() else {}
         return asdict(score) | beside
 
-    std_m, std_deg = (truth.std[0], float(np.rad2deg(truth.std[1]))) if truth.std else (None, None)
-    facts = {"window_frames": WINDOW_FRAMES, "truth_std_m": std_m, "truth_std_deg": std_deg}
+    std_m, std_deg = (truth.error_rms[0], float(np.rad2deg(truth.error_rms[1]))) if truth.error_rms else (None, None)
+    facts = {"window_frames": WINDOW_FRAMES, "truth_error_m": std_m, "truth_error_deg": std_deg}
     return facts | {name: scored(between) for name, between in pairs.items()}

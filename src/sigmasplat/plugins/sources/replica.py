@@ -78,7 +78,7 @@ def _truth(path: Path, numbers: list[int]) -> Trajectory | None:
     truth = build_trajectory(
         (n / FRAMES_PER_SECOND, checked_pose(f"{path}:{n + 1}", to_matrix(f"{path}:{n + 1}", row))) for n, row in rows
     )
-    return truth and replace(truth, std=(0.0, 0.0))
+    return truth and replace(truth, error_rms=(0.0, 0.0))
 
 
 PLUGIN = SourceFormat(

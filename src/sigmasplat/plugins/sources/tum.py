@@ -62,8 +62,8 @@ from sigmasplat.api import (
 )
 
 MOTION_CAPTURE = 0.004, float(np.deg2rad(0.3))
-"""Standard deviations of a true pose, m and rad: on fr1/xyz calibrated paths differ from the truth by 5 to 6 mm,
-whatever the time between two poses."""
+"""Errors of a true pose, rms, m and rad: on fr1/xyz calibrated paths differ from the truth by 5 to 6 mm, √2 times as
+much, whatever the time between two poses."""
 
 
 def open_tum(
@@ -92,7 +92,7 @@ def open_tum(
     truth = read_groundtruth(folder)
     truth = camera_path(truth) if truth and camera_path else truth
     known = camera or freiburg_calibration(folder)
-    truth = replace(truth, std=MOTION_CAPTURE) if truth and known else truth
+    truth = replace(truth, error_rms=MOTION_CAPTURE) if truth and known else truth
     gyroscope = read_gyroscope(folder / "gyroscope.txt") if exists(folder / "gyroscope.txt") else None
     return folder_source(folder, settings, images, known, TUM_UNITS_PER_METRE, truth, skipped, gyroscope=gyroscope)
 
@@ -227,7 +227,7 @@ def open_icl_nuim(path: str, settings: InputConfig) -> RecordedSource:
     if mirrored and truth:
         truth = Trajectory(truth.timestamps_s / FRAMES_PER_SECOND, MIRROR @ truth.T_world_camera @ MIRROR)
     if truth and known:
-        truth = replace(truth, std=(0.0, 0.0) if rendered else MOTION_CAPTURE)
+        truth = replace(truth, error_rms=(0.0, 0.0) if rendered else MOTION_CAPTURE)
     source = folder_source(folder, settings, images, known, TUM_UNITS_PER_METRE, truth)
     source.sensor = source.sensor or ("rendered" if rendered else None)
     return source

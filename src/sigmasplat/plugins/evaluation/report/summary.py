@@ -155,7 +155,7 @@ def _with_truth(covariance: Metrics, found: Metrics) -> list[str]:
     share = found.get("position_coverage_90_with_truth")
     if share is None:
         return []
-    own = f"{number(covariance['truth_std_m'], 0, 1e3)} mm and {number(covariance['truth_std_deg'], 1)}° a pose"
+    own = f"{number(covariance['truth_error_m'], 0, 1e3)} mm and {number(covariance['truth_error_deg'], 1)}° a pose"
     return [f"With the own error of the true path, {own}, {number(share, 0, 100.0)} % are within."]
 
 
