@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from sigmasplat.data.mesh import Mesh
-from sigmasplat.plugins.outputs.mesh_files import read_mesh, write_mesh
-from sigmasplat.plugins.outputs.splats.gltf import linear
+from sigmasplat.plugins.outputs.mesh_files import linear, read_mesh, write_mesh
 from sigmasplat.plugins.outputs.views import write_points
 
 trimesh = pytest.importorskip("trimesh", reason="the [dev] extra is not installed")

@@ -12,7 +12,6 @@ from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.map_uncertainty import SHIPPED, Background, MapUncertainty, SplatStd
-from sigmasplat.plugins.outputs.chosen_splats import sigmas
 from sigmasplat.plugins.outputs.drawing import colormap
 from sigmasplat.plugins.viewer import snapshot as lines
 from sigmasplat.plugins.viewer.layers import (
@@ -26,6 +25,7 @@ from sigmasplat.plugins.viewer.layers import (
     palette_range,
     render_layer,
     render_predicted,
+    sigmas,
     sorted_depth_stds,
     sorted_sigmas,
     splat_arrays,

@@ -6,9 +6,8 @@ Imports that load torch are inside the functions, so that `sigmasplat export --h
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
-from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from sigmasplat.api import ConfigError, Output
 from sigmasplat.plugins.outputs.source import ExportSource as ExportSource
@@ -19,7 +18,6 @@ if TYPE_CHECKING:
 
 
 Bound = float | None
-SPZ, SOG, GLTF = (f"sigmasplat.plugins.outputs.splats.{name}" for name in ("spz", "sog", "gltf"))
 
 
 def owners(formats: tuple[Output, ...]) -> dict[str, Output]:
@@ -67,30 +65,23 @@ def refuse_unused(chosen: Output, formats: tuple[Output, ...], given: list[str])
             )
 
 
-def _splats(
-    module: str, own: "Axes", keeps_std: bool, source: ExportSource, target: Path, *, sigma_below: Bound,
-    std_below_m: Bound, opacity_above: Bound, max_splats: int | None, axes: "Axes | None", **more: Any,
-) -> str:  # fmt: skip
-    """Write the chosen splats with `write_field` of a module; own: the axes of its format, keeps_std: it has `std`."""
+def _spz(source: ExportSource, target: Path, *, std_below_m: Bound, opacity_above: Bound, axes: "Axes | None") -> str:
     from sigmasplat.plugins.outputs.chosen_splats import write_splats
+    from sigmasplat.plugins.outputs.spz import write_field
 
-    def write(field: "GaussianField", std: "SplatStd | None") -> None:
-        import_module(module).write_field(target, field, **more, **({"std": std} if keeps_std else {}))
-
-    return write_splats(
-        source, own, write, sigma_below=sigma_below, std_below_m=std_below_m, opacity_above=opacity_above,
-        max_splats=max_splats, axes=axes,
-    )  # fmt: skip
+    return write_splats(source, "y-up", lambda field, std: write_field(target, field), std_below_m, opacity_above, axes)
 
 
 def _ply(
-    source: ExportSource, target: Path, *, sigma_below: Bound, std_below_m: Bound, opacity_above: Bound,
-    max_splats: int | None, axes: "Axes | None", plain: bool,
-) -> str:  # fmt: skip
-    return _splats(
-        "sigmasplat.run_folder.splat_ply", "y-down", True, source, target, sigma_below=sigma_below,
-        std_below_m=std_below_m, opacity_above=opacity_above, max_splats=max_splats, axes=axes, plain=plain,
-    )  # fmt: skip
+    source: ExportSource, target: Path, *, std_below_m: Bound, opacity_above: Bound, axes: "Axes | None", plain: bool
+) -> str:
+    from sigmasplat.api import splat_ply
+    from sigmasplat.plugins.outputs.chosen_splats import write_splats
+
+    def write(field: "GaussianField", std: "SplatStd | None") -> None:
+        splat_ply.write_field(target, field, plain=plain, std=std)
+
+    return write_splats(source, "y-down", write, std_below_m, opacity_above, axes)
 
 
 @contextmanager
@@ -164,9 +155,7 @@ def _bag(source: ExportSource, target: Path, *, pictures: bool) -> str:
 _nerfstudio, _colmap = (partial(_views, write) for write in ("export_nerfstudio", "export_colmap"))
 PLUGIN = (
     Output("ply", (".ply",), "3DGS PLY with σ², for every viewer", _ply),
-    Output("spz", (".spz",), "Niantic's SPZ, less than a fifth of the size", partial(_splats, SPZ, "y-up", False)),
-    Output("sog", (".sog",), "SuperSplat's SOG, the smallest", partial(_splats, SOG, "y-down", False)),
-    Output("gltf", (".glb",), "glTF with splats (KHR) and σ", partial(_splats, GLTF, "y-up", True)),
+    Output("spz", (".spz",), "Niantic's SPZ, less than a fifth of the size", _spz),
     Output("trajectory", (".txt",), "the path as TUM text", _trajectory),
     Output("covariance", (".cov.txt",), "the path as TUM text with the covariance of each pose", _covariance),
     Output("nerfstudio", (".json",), "views as nerfstudio's transforms.json", _nerfstudio, True),

@@ -9,7 +9,10 @@ metal, which is black without surroundings to reflect. COLOR_0 is linear by defi
 room is seen from inside and from outside, hence `doubleSided`.
 """
 
+import json
 import os
+import struct
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -27,10 +30,14 @@ from sigmasplat.api import (
     read_header,
     replacing,
 )
-from sigmasplat.plugins.outputs.splats.gltf import UNLIT, glb, linear
 
 GRAY = 0.7
 Values = NDArray[np.floating]
+NUMBERS = {np.dtype(code): number for code, number in (("<u1", 5121), ("<u2", 5123), ("<u4", 5125), ("<f4", 5126))}
+TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
+VERTICES, INDICES = 34962, 34963
+"""Kinds of buffer views."""
+UNLIT = "KHR_materials_unlit"
 MATERIAL = {
     "name": "recorded light",
     "pbrMetallicRoughness": {"baseColorFactor": [1.0, 1.0, 1.0, 1.0], "metallicFactor": 0.0, "roughnessFactor": 1.0},
@@ -50,13 +57,54 @@ def _glb(mesh: Mesh, note: str) -> bytes:
     }  # fmt: skip
     if mesh.depth_std_m is not None:
         attributes["_DEPTH_STD_M"] = mesh.depth_std_m.astype("<f4")
-    return glb(attributes, {}, MATERIAL, "surface", mesh.faces.astype("<u4").ravel())
+    arrays = [*attributes.values(), mesh.faces.astype("<u4").ravel()]
+    document: dict[str, Any] = {"asset": {"version": "2.0", "generator": "SigmaSplat"}, "scene": 0, "scenes": [{}]}
+    if not all(array.size for array in arrays):  # glTF has no empty accessors
+        return _packed(document, b"")
+    starts = np.cumsum([0, *(array.nbytes + -array.nbytes % 4 for array in arrays)]).tolist()
+    accessors: list[dict[str, Any]] = [
+        {"bufferView": i, "componentType": NUMBERS[array.dtype], "count": len(array)}
+        | {"type": TYPES[1 if array.ndim == 1 else array.shape[1]]}
+        | ({"normalized": True} if array.dtype == np.uint16 else {})
+        for i, array in enumerate(arrays)
+    ]
+    accessors[0] |= {end: [float(x) for x in getattr(mesh.vertices, end)(0)] for end in ("min", "max")}
+    of_mesh = {"attributes": {key: i for i, key in enumerate(attributes)}, "material": 0, "indices": len(attributes)}
+    document |= {
+        "extensionsUsed": [UNLIT],
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "name": "surface"}],
+        "meshes": [{"primitives": [of_mesh]}],
+        "materials": [MATERIAL],
+        "accessors": accessors,
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": start, "byteLength": array.nbytes}
+            | {"target": VERTICES if i < len(attributes) else INDICES}
+            for i, (start, array) in enumerate(zip(starts, arrays, strict=False))
+        ],
+        "buffers": [{"byteLength": starts[-1]}],
+    }
+    return _packed(document, b"".join(array.tobytes() + bytes(-array.nbytes % 4) for array in arrays))
+
+
+def _packed(document: Mapping[str, Any], data: bytes) -> bytes:
+    """Return a GLB: the document as JSON and, if there are any, the data; the length of a chunk is a multiple of 4."""
+    text = json.dumps(document, separators=(",", ":")).encode()
+    chunks = [(b"JSON", text + b" " * (-len(text) % 4)), *([(b"BIN\0", data)] if data else [])]
+    body = b"".join(struct.pack("<I4s", len(chunk), kind) + chunk for kind, chunk in chunks)
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body
+
+
+def linear(srgb: Values) -> NDArray[np.float64]:
+    """Convert sRGB in [0, 1] to linear light (IEC 61966-2-1)."""
+    values = np.asarray(srgb, np.float64)
+    return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
 
 
 def _linear_colors(mesh: Mesh) -> NDArray[np.uint16]:
     srgb = np.full(mesh.vertices.shape, GRAY) if mesh.colors is None else mesh.colors
     rgba = np.ones((len(srgb), 4))
-    rgba[:, :3] = linear(srgb)
+    rgba[:, :3] = linear(np.clip(srgb, 0.0, 1.0))
     return np.rint(rgba * 65535.0).astype("<u2")
 
 

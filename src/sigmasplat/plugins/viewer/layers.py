@@ -22,13 +22,18 @@ from sigmasplat.api import (
     variance_parts,
 )
 from sigmasplat.plugins.evaluation.metrics.views import COVERED_ALPHA
-from sigmasplat.plugins.outputs.chosen_splats import sigmas
 from sigmasplat.plugins.outputs.drawing import colormap
 from sigmasplat.plugins.outputs.drawing.view_panels import colour_bar
 from sigmasplat.plugins.viewer.snapshot import Piece, field_without_moments
 
 Colouring = Literal["colour", "σ", "depth error"]
 Floats = NDArray[np.float32]
+
+
+def sigmas(field: GaussianField) -> Tensor:
+    """Return σ of each splat [N]: the root of σ² averaged over the colour channels, for colours in [0, 1]."""
+    return field.variances.mean(1).sqrt()
+
 
 MIN_VISIBLE_OPACITY = 0.1
 """Splats with a lower opacity are ignored when the range of σ or of the depth error is computed."""
