@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from box_room import CAMERA, HIGH, LOW, seer, splats
 from room_run import FRAMES, LOST, PATH, T_ROOM, WORLD, Walls, made_run, picture
@@ -23,7 +24,7 @@ from sigmasplat.plugins.outputs.floorplan.picture import export_plan
 from sigmasplat.plugins.outputs.mesh_files import write_mesh
 from sigmasplat.plugins.outputs.run_reader import RunReader
 from sigmasplat.plugins.outputs.video import VideoOptions, export_video, film_camera, orbit_view
-from sigmasplat.plugins.outputs.views import export_colmap, export_nerfstudio, splat_points
+from sigmasplat.plugins.outputs.views import export_colmap, splat_points
 
 
 @pytest.fixture(params=["submaps", "in one piece"])
@@ -31,37 +32,34 @@ def reader(tmp_path: Path, request: pytest.FixtureRequest) -> RunReader:
     return RunReader(made_run(tmp_path / "run", request.param == "submaps"), Walls)
 
 
-def positions(path: Path) -> np.ndarray:
-    frames = json.loads(path.read_text())["frames"]
-    return np.array([frame["transform_matrix"] for frame in frames])[:, :3, 3]
+def images(model: Path) -> list[list[str]]:
+    """Return the words of each image's line."""
+    return [line.split() for line in (model / "sparse/0/images.txt").read_text().split("\n")[1:-1:2]]
+
+
+def positions(model: Path) -> np.ndarray:
+    rows = np.array([[float(word) for word in line[1:8]] for line in images(model)])
+    R = Rotation.from_quat(np.roll(rows[:, :4], -1, axis=1)).inv()
+    return -R.apply(rows[:, 4:])
 
 
 def test_views_without_images_are_all_frames_that_were_not_lost(reader: RunReader, tmp_path: Path) -> None:
     kept = [i for i in range(FRAMES) if i != LOST]
-    export_nerfstudio(reader, tmp_path / "out.json")
-    np.testing.assert_allclose(positions(tmp_path / "out.json"), PATH.T_world_camera[kept, :3, 3], atol=1e-9)
     export_colmap(reader, tmp_path / "model")
-    names = (tmp_path / "model/sparse/0/images.txt").read_text().split("\n")[1:-1:2]
-    assert [name.split()[-1] for name in names] == [f"frame-{i:06d}.png" for i in kept]
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["model", "out.json", "run"]
+    assert [line[-1] for line in images(tmp_path / "model")] == [f"frame-{i:06d}.png" for i in kept]
+    np.testing.assert_allclose(positions(tmp_path / "model"), PATH.T_world_camera[kept, :3, 3], atol=1e-9)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["model", "run"]
 
 
 def test_images_are_those_of_the_keyframes_each_once(reader: RunReader, tmp_path: Path) -> None:
     out = tmp_path / "scene"
-    out.mkdir()
-    export_nerfstudio(reader, out / "transforms.json", images=True)
-    read = json.loads((out / "transforms.json").read_text())
-    assert [frame["file_path"] for frame in read["frames"]] == [f"images/frame-{i:06d}.png" for i in (0, 2, 4)]
-    np.testing.assert_allclose(positions(out / "transforms.json"), PATH.T_world_camera[[0, 2, 4], :3, 3], atol=1e-9)
-    for i, frame in zip((0, 2, 4), read["frames"], strict=True):
-        np.testing.assert_array_equal(np.asarray(Image.open(out / frame["file_path"])), picture(i).color)
-        depth = np.asarray(Image.open(out / frame["depth_file_path"]))
-        assert depth.dtype == np.uint16 and depth[0, 0] == 0
-        np.testing.assert_allclose(depth * read["depth_unit_scale_factor"], picture(i).depth_m, atol=5.1e-4)
-    assert (out / read["ply_file_path"]).is_file() and (read["w"], read["h"]) == (40, 30)
     export_colmap(reader, out, images=True)
-    assert len((out / "sparse/0/images.txt").read_text().split("\n")) == 8
-    assert sorted(p.name for p in (out / "images").iterdir()) == [f"frame-{i:06d}.png" for i in (0, 2, 4)]
+    names = [f"frame-{i:06d}.png" for i in (0, 2, 4)]
+    assert [line[-1] for line in images(out)] == sorted(p.name for p in (out / "images").iterdir()) == names
+    np.testing.assert_allclose(positions(out), PATH.T_world_camera[[0, 2, 4], :3, 3], atol=1e-9)
+    for i, name in zip((0, 2, 4), names, strict=True):
+        np.testing.assert_array_equal(np.asarray(Image.open(out / "images" / name)), picture(i).color)
+    assert (out / "sparse/0/cameras.txt").read_text().split("\n")[1].startswith("1 PINHOLE 40 30 ")
 
 
 def test_splat_centres_are_thinned_evenly(reader: RunReader) -> None:
@@ -200,8 +198,7 @@ def reader_apart(tmp_path: Path) -> RunReader:
 
 def test_frames_apart_are_not_exported(reader_apart: RunReader, tmp_path: Path) -> None:
     reader, out = reader_apart, tmp_path / "out"
-    out.mkdir()
-    assert export_nerfstudio(reader, out / "t.json") == 3 and reader.left_out() == "; left out: 1 lost, 2 apart"
+    assert export_colmap(reader, tmp_path / "all") == 3 and reader.left_out() == "; left out: 1 lost, 2 apart"
     assert export_colmap(reader, out, images=True) == 2 and reader.left_out(keyframes=True) == "; left out: 1 apart"
     assert sorted(p.name for p in (out / "images").iterdir()) == ["frame-000000.png", "frame-000002.png"]
     _, keyframes = FusionInput.at(reader.run, reader.camera).views()
@@ -215,7 +212,7 @@ def test_runs_without_a_pose_are_refused(reader: RunReader, tmp_path: Path) -> N
     log = reader.run.path / "log.jsonl"
     log.write_text(log.read_text().replace('"lost": false', '"lost": true'))
     with pytest.raises(RunError, match="has no frame whose pose is known"):
-        export_nerfstudio(reader, tmp_path / "t.json")
+        export_colmap(reader, tmp_path / "model")
     (reader.run.path / "trajectory.txt").unlink()
     with pytest.raises(RunError, match=r"no trajectory\.txt"):
         export_colmap(RunReader(reader.run, Walls), tmp_path / "model")

@@ -5,7 +5,6 @@ Imports that load torch are inside the functions, so that `sigmasplat export --h
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -111,15 +110,15 @@ def _covariance(source: ExportSource, target: Path) -> str:
     return f"{len(path):,} poses with their covariance{reader.left_out()}"
 
 
-def _views(write: str, source: ExportSource, target: Path, *, pictures: bool) -> str:
-    from sigmasplat.plugins.outputs import views
+def _colmap(source: ExportSource, target: Path, *, pictures: bool) -> str:
+    from sigmasplat.plugins.outputs.views import export_colmap
 
     reader = source.reader()
     if not pictures:
-        count = getattr(views, write)(reader, target)
+        count = export_colmap(reader, target)
         return f"{count:,} views, no pictures (--pictures){reader.left_out()}"
     with _counting("pictures") as progress:
-        count = getattr(views, write)(reader, target, True, progress)
+        count = export_colmap(reader, target, True, progress)
         return f"{count:,} views with their pictures{reader.left_out(keyframes=True)}"
 
 
@@ -152,13 +151,11 @@ def _bag(source: ExportSource, target: Path, *, pictures: bool) -> str:
     return f"{sum(counts.values()):,} messages of {len(counts)} topics{reader.left_out()}"
 
 
-_nerfstudio, _colmap = (partial(_views, write) for write in ("export_nerfstudio", "export_colmap"))
 PLUGIN = (
     Output("ply", (".ply",), "3DGS PLY with σ², for every viewer", _ply),
     Output("spz", (".spz",), "Niantic's SPZ, less than a fifth of the size", _spz),
     Output("trajectory", (".txt",), "the path as TUM text", _trajectory),
     Output("covariance", (".cov.txt",), "the path as TUM text with the covariance of each pose", _covariance),
-    Output("nerfstudio", (".json",), "views as nerfstudio's transforms.json", _nerfstudio, True),
     Output("colmap", ("-colmap",), "a folder with COLMAP's text model in sparse/0", _colmap, True),
     Output("video", (".webm", ".mp4", ".gif", ".webp"), "a video: colour, depth, uncertainty", _video, True),
     Output("bag", (".mcap", "-bag"), "ROS 2 messages: path with covariance, map", _bag, True),

@@ -207,37 +207,31 @@ def _ply(mesh: Mesh, note: str) -> bytes:
     if it is known, uchar filled (1 = closes a gap) if gaps were closed, faces as lists of int."""
     faces = np.zeros(len(mesh.faces), np.dtype([("count", "u1"), ("corners", "<i4", 3)]))
     faces["count"], faces["corners"] = 3, mesh.faces
-    vertices = vertex_rows(mesh.vertices, _bytes(mesh), mesh.normals(), mesh.depth_std_m, mesh.filled)
+    vertices = _vertex_rows(mesh)
+    columns = [
+        f"{'uchar' if vertices.dtype[name].itemsize == 1 else 'float'} {name}" for name in vertices.dtype.names or ()
+    ]
     corners = ("face", len(faces), ["list uchar int vertex_indices"])
-    return header_of(vertex_header(vertices), corners, comment=note) + vertices.tobytes() + faces.tobytes()
+    return header_of(("vertex", len(vertices), columns), corners, comment=note) + vertices.tobytes() + faces.tobytes()
 
 
-def vertex_rows(
-    positions: Values, colors: NDArray[np.uint8], normals: Values | None, depth_std_m: Values | None,
-    filled: NDArray[np.bool_] | None = None,
-) -> NDArray[np.void]:  # fmt: skip
-    """Return vertices as rows of a PLY, with the columns that are given."""
+def _vertex_rows(mesh: Mesh) -> NDArray[np.void]:
+    """Return the vertices as rows of a PLY, with the columns that are known."""
     groups = {
-        "x y z": positions, "nx ny nz": normals, "red green blue": colors, "depth_std_m": depth_std_m,
-        "filled": filled,
+        "x y z": mesh.vertices, "nx ny nz": mesh.normals(), "red green blue": _bytes(mesh),
+        "depth_std_m": mesh.depth_std_m, "filled": mesh.filled,
     }  # fmt: skip
-    columns = {
+    columns: dict[str, NDArray[Any]] = {
         name: values if values.ndim == 1 else values[:, k]
         for names, values in groups.items()
         if values is not None
         for k, name in enumerate(names.split())
     }
     kinds = {name: "<f4" if values.dtype.kind == "f" else "u1" for name, values in columns.items()}
-    rows = np.zeros(len(positions), list(kinds.items()))
+    rows = np.zeros(len(mesh.vertices), list(kinds.items()))
     for name, values in columns.items():
         rows[name] = values
     return rows
-
-
-def vertex_header(rows: NDArray[np.void]) -> tuple[str, int, list[str]]:
-    """Return the element of `vertex_rows` for the header."""
-    kinds = {name: "uchar" if rows.dtype[name].itemsize == 1 else "float" for name in rows.dtype.names or ()}
-    return "vertex", len(rows), [f"{kind} {name}" for name, kind in kinds.items()]
 
 
 def _obj(mesh: Mesh, note: str) -> bytes:

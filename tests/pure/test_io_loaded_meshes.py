@@ -1,4 +1,4 @@
-"""Files of points and meshes, loaded by trimesh."""
+"""Files of meshes, loaded by trimesh."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -8,7 +8,6 @@ import pytest
 
 from sigmasplat.data.mesh import Mesh
 from sigmasplat.plugins.outputs.mesh_files import linear, read_mesh, write_mesh
-from sigmasplat.plugins.outputs.views import write_points
 
 trimesh = pytest.importorskip("trimesh", reason="the [dev] extra is not installed")
 
@@ -20,26 +19,6 @@ def ball() -> Mesh:
     return Mesh(
         np.add(made.vertices, [1, 2, 3]).astype(np.float32), made.faces.astype(np.int32), colors.astype(np.float32)
     )
-
-
-@pytest.mark.parametrize("normals", [True, False])
-def test_points_are_loaded_with_normals_and_colours(tmp_path: Path, normals: bool) -> None:
-    mesh = ball()
-    write_points(tmp_path / "a.ply", mesh.vertices, mesh.colors, mesh.normals() if normals else None)
-    cloud = trimesh.load(tmp_path / "a.ply")
-    assert isinstance(cloud, trimesh.PointCloud)
-    np.testing.assert_array_equal(cloud.vertices.astype(np.float32), mesh.vertices)
-    np.testing.assert_array_equal(cloud.colors[:, :3], np.rint(mesh.colors * 255))
-    rows = cloud.metadata["_ply_raw"]["vertex"]["data"]
-    assert ("nx" in rows.dtype.names) is normals
-    if normals:
-        found = np.stack([rows[name].ravel() for name in ("nx", "ny", "nz")], 1)
-        np.testing.assert_allclose(found, mesh.normals(), atol=1e-6)
-
-
-def test_a_file_without_points_can_be_written(tmp_path: Path) -> None:
-    write_points(tmp_path / "a.ply", np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3)))
-    assert b"element vertex 0\n" in (tmp_path / "a.ply").read_bytes()
 
 
 def test_normals_of_a_ball_point_outwards_and_unused_vertices_have_none() -> None:
@@ -58,12 +37,12 @@ def test_vertices_are_loaded_with_their_standard_deviation(tmp_path: Path) -> No
     for name in ("a.ply", "a.glb", "a.obj"):
         write_mesh(tmp_path / name, known)
     write_mesh(tmp_path / "without.obj", mesh)
-    write_points(tmp_path / "points.ply", known.vertices, known.colors, known.normals(), known.depth_std_m)
-    for name in ("a.ply", "points.ply"):
-        loaded = trimesh.load(tmp_path / name, process=False)
-        rows = loaded.metadata["_ply_raw"]["vertex"]["data"]
-        np.testing.assert_array_equal(rows["depth_std_m"].ravel(), known.depth_std_m)
-        np.testing.assert_array_equal(loaded.vertices.astype(np.float32), mesh.vertices)
+    loaded = trimesh.load(tmp_path / "a.ply", process=False)
+    rows = loaded.metadata["_ply_raw"]["vertex"]["data"]
+    np.testing.assert_array_equal(rows["depth_std_m"].ravel(), known.depth_std_m)
+    normals = np.stack([rows[name].ravel() for name in ("nx", "ny", "nz")], 1)
+    np.testing.assert_allclose(normals, mesh.normals(), atol=1e-6)
+    np.testing.assert_array_equal(loaded.vertices.astype(np.float32), mesh.vertices)
     loaded = trimesh.load(tmp_path / "a.glb", process=False, force="mesh")
     np.testing.assert_array_equal(loaded.vertex_attributes["_DEPTH_STD_M"].ravel(), known.depth_std_m)
     np.testing.assert_array_equal(loaded.faces, mesh.faces)
