@@ -4,18 +4,14 @@ A bag is a folder with metadata.yaml and one MCAP file, or the MCAP file alone."
 
 import os
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from torch import Tensor
 
 from sigmasplat.api import (
-    LOST,
-    RELOCALISED,
     Matrix,
     PathCovariance,
     Progress,
@@ -25,7 +21,6 @@ from sigmasplat.api import (
     import_optional,
     no_progress,
     noted_up,
-    se3,
 )
 from sigmasplat.plugins.outputs.axes import level_cameras
 from sigmasplat.plugins.outputs.floorplan.floor_plan import FloorPlan, run_floor_plan
@@ -162,13 +157,10 @@ def _messages(reader: RunReader, messages: RosMessages, pictures: bool, progress
 
 
 def _frames(reader: RunReader, messages: RosMessages, T_map_world: Matrix, pictures: bool) -> Iterator[Encoded]:
-    """Yield the messages of the frames: transforms, odometry, pose with covariance, images of keyframes."""
+    """Yield the messages of the frames: transform and pose with covariance of valid ones, images of keyframes."""
     images = reader.keyframes() if pictures else iter(())
     picture = next(images, None)
-    tensors = reader.run.read_checkpoint()[0]
-    T_odom_camera, tracked = _odometry(reader, tensors)
-    path = PathCovariance.of(tensors)
-    chain = None if path is None else path.without_loops()
+    path = PathCovariance.of(reader.run.read_checkpoint()[0])
     valid_links = ros.link_pose(T_map_world @ reader.valid_path().T_world_camera)
     valid = dict(zip(reader.valid_frames(), valid_links, strict=True))
     for row, record in enumerate(reader.frames.log):
@@ -176,66 +168,10 @@ def _frames(reader: RunReader, messages: RosMessages, T_map_world: Matrix, pictu
         if picture is not None and picture[0] == row:
             yield from messages.images(stamp_ns, reader.camera, picture[1].unit_color, picture[1].depth_m)
             picture = next(images, None)
-        if reader.frames.states[row] == LOST:
-            continue
-        T_odom_link, T_map_link = ros.link_pose(ros.T_LINK_OPTICAL @ T_odom_camera[row]), valid.get(row)
-        covariance = None
-        if chain is not None and tracked[row]:
-            covariance = ros.ros_covariance(chain.of_frame(row), ros.T_LINK_OPTICAL, T_odom_link)
-        yield messages.transforms(ros.TF, stamp_ns, ros.camera_links(T_odom_link, T_map_link))
-        yield messages.odometry(stamp_ns, ros.ODOM, ros.LINK, T_odom_link, covariance)
-        if T_map_link is not None:
-            covariance = None if path is None else ros.ros_covariance(path.of_frame(row), T_map_world, T_map_link)
-            yield messages.pose(stamp_ns, ros.MAP, T_map_link, covariance)
-
-
-FOUND_BY_FEATURES = "inliers"
-"""A step has this value if relocalisation decided its pose."""
-
-
-def has_motion(state: str, tracking: Mapping[str, float]) -> bool:
-    """Return whether tracking measured the motion to a frame from an earlier one, given the values of its step.
-
-    A lost frame has only a guess, and a relocalised one was found without an earlier frame. A frame that is tracked
-    again after lost ones has a motion: it is tracked from the same keyframe as the frames before them.
-    """
-    return state not in (LOST, RELOCALISED) and FOUND_BY_FEATURES not in tracking
-
-
-def odometry_poses(
-    T_chain_camera: Matrix, moved: Sequence[bool], lost: Sequence[bool], components: Sequence[int]
-) -> tuple[Matrix, NDArray[np.bool_]]:
-    """Return T_odom_camera [F, 4, 4] of a finished path, the identity at the first frame, and whether all motions up to
-    each frame were tracked [F].
-
-    T_chain_camera [F, 4, 4]: poses without corrections by loops; moved [F]: `has_motion` of each frame; lost [F];
-    components [F]. Motion that was not tracked is left out. A lost frame stays at the pose of the frame before.
-    """
-    poses, last = [np.eye(4)] if len(T_chain_camera) else [], 0
-    tracked = np.ones(len(T_chain_camera), np.bool_)
-    for i in range(1, len(T_chain_camera)):
-        tracked[i] = lost[i] or (moved[i] and components[i] == components[last])
-        pose = poses[-1]
-        if tracked[i] and not lost[i]:
-            pose = se3.orthonormalise(pose @ se3.inverse(T_chain_camera[last]) @ T_chain_camera[i])
-        poses.append(pose)
-        last = last if lost[i] else i
-    return np.array(poses).reshape(-1, 4, 4), np.logical_and.accumulate(tracked)
-
-
-def _odometry(reader: RunReader, tensors: Mapping[str, Tensor]) -> tuple[Matrix, NDArray[np.bool_]]:
-    """Return T_odom_camera [F, 4, 4] of all frames, and whether all motions up to each frame were tracked [F]."""
-    frames = reader.frames
-    chain = tensors.get("T_world_camera_odometry", tensors["T_world_camera"]).numpy()
-    if len(chain) < len(frames):
-        run = reader.run.path
-        raise RunError(f"{run}: {len(chain)} poses in the checkpoint for {len(frames)} frames; run it again")
-    components = [0] * len(frames)
-    if "submap_component" in tensors:
-        components = tensors["submap_component"][tensors["frame_submap"]].tolist()
-    lost = [state == LOST for state in frames.states]
-    moved = [has_motion(s, r.get("tracking", {})) for s, r in zip(frames.states, frames.log, strict=True)]
-    return odometry_poses(chain[: len(frames)], moved, lost, components)
+        if row in valid:
+            covariance = None if path is None else ros.ros_covariance(path.of_frame(row), T_map_world, valid[row])
+            yield messages.transforms(ros.TF, stamp_ns, [(ros.MAP, ros.LINK, valid[row])])
+            yield messages.pose(stamp_ns, ros.MAP, valid[row], covariance)
 
 
 def _floor(reader: RunReader, progress: Progress) -> tuple[FloorPlan | None, Matrix]:
