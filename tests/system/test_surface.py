@@ -168,7 +168,6 @@ def test_evaluation_scores_the_mesh_in_the_truths_frame(run: RunFolder) -> None:
     metrics = evaluate(run, WallAhead(), renderer=KnownView(off_m=0.005), strips_per_kind=0, mesh=True, random_views=0)
     found = metrics["reconstruction"]
     assert found["accuracy_m"] == pytest.approx(0.005, rel=0.05) and found["precision"] > 0.999
-    assert found["depth_l1_m"] == pytest.approx(0.005, rel=0.2)
     assert 0.5 < found["recall"] < found["completion_ratio"] < 0.9, (
         "the map has low alpha on the left and is too far away at the top"
     )

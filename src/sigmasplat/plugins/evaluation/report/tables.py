@@ -168,9 +168,7 @@ def _surface_rows(metrics: dict[str, Any]) -> list[list[str]]:
     found = metrics.get("reconstruction")
     if not found:
         return []
-    lines = [*SURFACE_LINES, ("Depth L1, novel views, cm", "depth_l1_m", 2, 100.0),
-             ("Depth covered, novel views, %", "depth_coverage", 1, 100.0),
-             ("Splats to surface, cm", "splats_accuracy_m", 2, 100.0),
+    lines = [*SURFACE_LINES, ("Splats to surface, cm", "splats_accuracy_m", 2, 100.0),
              ("Surface to splats, cm", "splats_completion_m", 2, 100.0),
              ("Chamfer distance of splats, cm", "splats_chamfer_m", 2, 100.0),
              ("Floaters (> 10 cm) among opaque splats, %", "floaters", 2, 100.0)]  # fmt: skip
