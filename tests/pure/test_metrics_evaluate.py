@@ -545,7 +545,7 @@ def test_a_map_refined_on_larger_images_is_scored_at_their_size_too(
 
 
 def test_lpips_is_scored_with_its_weights_only(run: RunFolder, tmp_path: Path) -> None:
-    write_weights(tmp_path / "weights", "alex")
+    write_weights(tmp_path / "weights")
     lpips = Lpips.load(tmp_path / "weights")
     metrics = score(run, HandMade(None), renderer=Gray(), lpips=lpips)
     gray = np.full((36, 48, 3), 0.45, np.float32)
