@@ -371,7 +371,7 @@ def test_submaps_are_on_the_page(cut_run: RunFolder) -> None:
     page = (cut_run.path / "report.html").read_text()
     named = shown(cut_run, page)
     assert named == {p.name for p in cut_run.images.iterdir()}
-    assert "Submaps from above" in page and "view-held-out-submap-000001.png" in named
+    assert "Submaps; loops accepted" in page and "view-held-out-submap-000001.png" in named
     assert "held-out views, in their submaps" in page and "overlap &lt;0.2" in page
 
 
@@ -395,7 +395,7 @@ def test_a_refined_single_submap_has_its_own_scores(run: RunFolder, iterations: 
     assert metrics["submaps"] == 1
     for name in ("held_out_submaps", "training_submaps", "uncertainty_final"):
         assert (metrics[name] is not None) == bool(iterations)
-    assert "Submaps and loops" not in (run.path / "report.html").read_text()
+    assert "Submaps; loops" not in (run.path / "report.html").read_text()
 
 
 def lose_a_file(run: RunFolder) -> None:

@@ -221,7 +221,6 @@ def test_tables_show_coverage_or_the_advice_that_there_are_no_predicted_errors()
 def test_the_page_is_one_file(tmp_path) -> None:
     run = RunFolder.create(tmp_path / "run", replace(BASE, name="made-up"), "kitchen")
     run.note(status="complete", source_path="data/kitchen")
-    run.write_profile({"blend": 6.0, "io": 2.0})
     write_page(
         run,
         GOOD | {"uncertainty": None},
@@ -230,7 +229,7 @@ def test_the_page_is_one_file(tmp_path) -> None:
         ["careful"],
     )
     page = (run.path / "report.html").read_text()
-    for words in ("All 500 images have a pose", "careful", "sigmasplat view", "75", "Settings (config.json)"):
+    for words in ("All 500 images have a pose", "careful", "sigmasplat view", "Settings (config.json)"):
         assert words in page
     assert page.count("data:image/webp;base64,") == 2 and page.count("<svg") == 2
     assert "images/" not in page and "http" not in page.replace("http://www.w3.org/2000/svg", "")

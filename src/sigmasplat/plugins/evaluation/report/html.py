@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from sigmasplat.api import number
 from sigmasplat.plugins.evaluation.report import tables
 from sigmasplat.plugins.evaluation.report.advice import Advice
 from sigmasplat.plugins.evaluation.report.charts import Plot
@@ -99,7 +98,7 @@ class Contents:
 
     verdicts: shown first; commands: what to do with the map; advice: what else to try; rescan: sentences about what to
     scan again; regions: the same numbered regions as in the floor plan; strips: panels of views by heading; plots:
-    charts by name; plan: panels of the floor plan; seconds: time per stage; loops: the records of loops.json.
+    charts by name; plan: panels of the floor plan.
     """
 
     title: str
@@ -109,14 +108,12 @@ class Contents:
     plots: dict[str, Plot] = field(default_factory=dict)
     config: str = ""
     warnings: list[str] = field(default_factory=list)
-    loops: list[dict[str, Any]] = field(default_factory=list)
     verdicts: list[Verdict] = field(default_factory=list)
     commands: list[Advice] = field(default_factory=list)
     advice: list[Advice] = field(default_factory=list)
     rescan: list[str] = field(default_factory=list)
     plan: list[PanelFigure] = field(default_factory=list)
     regions: Sequence[RescanRegion] = ()
-    seconds: dict[str, float] = field(default_factory=dict)
 
 
 def build_report(contents: Contents) -> str:
@@ -131,11 +128,8 @@ def build_report(contents: Contents) -> str:
         _part("Where to scan again", _rescan(contents)),
         _part("Trajectory", _figure(contents, "trajectory")),
         _part("States of the frames", _states(contents)),
-        _part("What moved", _figure(contents, "moving")),
         _part("Views", _strips(contents)),
-        _part("Submaps and loops", _submaps(contents)),
         _part("Scores", _scores(contents)),
-        _part("Time", _time(contents)),
         _part("Settings (config.json)", contents.config and f"<pre>{html.escape(contents.config)}</pre>"),
     ]
     head = "<meta charset=utf-8><meta name=viewport content='width=device-width, initial-scale=1'>"
@@ -194,19 +188,6 @@ def _rescan(contents: Contents) -> str:
     )
     listed = f"<ol class=regions>{items}</ol>" if items else ""
     return f"{words}{_plan(contents)}{listed}"
-
-
-def _time(contents: Contents) -> str:
-    """Show where the time went: per frame, and in total per stage, including the final map."""
-    if "seconds" not in contents.plots and not contents.seconds:
-        return ""
-    finish_s = contents.metrics.get("finish_s")
-    seconds = contents.seconds | ({} if finish_s is None else {"final map": finish_s})
-    total_s = sum(seconds.values()) or 1.0
-    longest_first = sorted(seconds.items(), key=lambda item: -item[1])
-    rows = [[stage, number(spent, 1), number(spent / total_s, 0, 100.0)] for stage, spent in longest_first]
-    table = f"<div class=card>{_table([['stage', 'seconds', '%'], *rows])}</div>" if rows else ""
-    return f"{_figure(contents, 'seconds')}{table}"
 
 
 def _advice(advice: list[Advice]) -> str:
@@ -271,23 +252,6 @@ def _figure(contents: Contents, name: str) -> str:
 
 def _plan(contents: Contents) -> str:
     return f"{_view(contents.plan)}<p class=soft>{PLAN_CAPTION}</p>" if contents.plan else ""
-
-
-def _submaps(contents: Contents) -> str:
-    if (contents.metrics.get("submaps") or 1) < 2:
-        return ""
-    accepted = [loop for loop in contents.loops if loop.get("accepted")]
-    refused = [loop for loop in contents.loops if not loop.get("accepted")]
-    parts = [
-        f"<p class=soft>{html.escape(tables.submap_sentence(contents.metrics))}</p>",
-        _figure(contents, "submaps"),
-    ]
-    if accepted:
-        parts.append(f"<div class=card><h3>Loops accepted</h3>{_table(tables.loop_rows(accepted))}</div>")
-    if refused:
-        rows = _table(tables.loop_rows(refused))
-        parts.append(f"<details class=card><summary>{len(refused)} loops tried and refused</summary>{rows}</details>")
-    return "".join(parts)
 
 
 def _table(rows: list[list[str]]) -> str:
