@@ -26,7 +26,6 @@ from sigmasplat.plugins.viewer.layers import (
     render_layer,
     render_predicted,
     sigmas,
-    sorted_depth_stds,
     sorted_sigmas,
     splat_arrays,
     visibility_filter,
@@ -238,17 +237,15 @@ def uncertain(count: int, seed: int = 0) -> Piece:
     return Piece(None, field_of(count, seed), uncertainty=known)
 
 
-def test_splats_with_a_large_depth_error_are_hidden_and_coloured_in_metres() -> None:
+def test_splats_with_a_large_depth_error_are_hidden() -> None:
     piece = uncertain(200)
     std_m = piece.uncertainty.std.depth_std_m  # type: ignore[union-attr]
     limit_m = float(std_m.median())
     visible = VisibilityFilter(max_std_m=limit_m)
     assert torch.equal(visible.mask(piece), std_m <= limit_m)
     assert visible.mask(Piece(0, piece.field)).all(), "submaps have no predicted error"
-    high = palette_range(sorted_depth_stds([piece]))[1]
-    drawn = splat_arrays(piece, "depth error", (0.0, high), visible)
-    expected = colormap.apply(std_m[std_m <= limit_m].numpy(), 0.0, high, colormap.INFERNO)
-    np.testing.assert_array_equal(drawn.colors, expected)
+    drawn = splat_arrays(piece, "colour", (0.0, 1.0), visible)
+    np.testing.assert_array_equal(drawn.centers, piece.field.means[std_m <= limit_m].numpy())
     merged, known = merge_pieces([piece], visible), merged_uncertainty([piece], visible)
     assert known is not None and len(known.splats) == len(merged) == len(drawn)
     assert merged_uncertainty([piece, piece], visible) is None

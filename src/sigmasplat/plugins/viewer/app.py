@@ -57,9 +57,7 @@ class ViewerApp:
         self.scene = ViserScene(server, self._clicked)
         self._snapshot: Snapshot | None = None
         self._drawn: dict[Any, Any] = {}
-        self._values: tuple[list[IdentityKey], dict[str, Floats]] = (
-            [], {"σ": layers.sorted_sigmas(()), "depth error": layers.sorted_depth_stds(())}
-        )  # fmt: skip
+        self._sigmas: tuple[list[IdentityKey], Floats] = [], layers.sorted_sigmas(())
         self._merged: tuple[Any, Any] = (None, None)
         self._wake, self._stop = threading.Event(), threading.Event()
         self._sharp, self._can_sharpen = False, False
@@ -108,23 +106,20 @@ class ViewerApp:
         self.panel.adapt(len(path), snapshot.live, snapshot.true_positions is not None, has_final and has_submaps)
         controls = self.panel.state()
         pieces = snapshot.visible_pieces(controls.final_map, controls.row)
-        self.panel.offer(any(piece.uncertainty is not None for piece in pieces), snapshot.mesh is not None)
+        self.panel.offer(any(piece.uncertainty is not None for piece in pieces))
         controls = self.panel.state()
-        ordered = self._values_of(pieces)
-        visible = layers.visibility_filter(
-            ordered["σ"], controls.hidden_share, controls.min_opacity, controls.max_std_m
-        )  # fmt: skip
-        span = layers.palette_range(ordered["depth error" if controls.colouring == "depth error" else "σ"])
+        ordered = self._sigmas_of(pieces)
+        visible = layers.visibility_filter(ordered, controls.hidden_share, controls.min_opacity, controls.max_std_m)
+        span = layers.palette_range(ordered)
         with self.server.atomic():
             self._draw_path(snapshot, controls)
             self._draw_splats(pieces, controls, span, visible)
-            self._draw_mesh(snapshot, controls)
         self._draw_keyframes(snapshot, controls)
         self._show_texts(snapshot, controls, pieces, visible)
         self._follow(snapshot, controls)
         legend = None
-        if controls.mode == "splats" and controls.colouring != "colour":
-            legend = Legend(INFERNO, *span, " m" if controls.colouring == "depth error" else "")
+        if controls.mode == "splats" and controls.colouring == "σ":
+            legend = Legend(INFERNO, *span, "")
         for client in self.server.get_clients().values():
             legend = self._draw_layer(client, snapshot, controls, pieces, visible) or legend
         if self._is_new("legend", legend and legend[1:]):
@@ -137,15 +132,12 @@ class ViewerApp:
         self._drawn[what] = state
         return True
 
-    def _values_of(self, pieces: tuple[Piece, ...]) -> dict[str, Floats]:
-        """Return σ and depth errors of the splats in ascending order."""
+    def _sigmas_of(self, pieces: tuple[Piece, ...]) -> Floats:
+        """Return σ of the splats in ascending order."""
         fields = [IdentityKey(piece.field) for piece in pieces]
-        if self._values[0] != fields:
-            self._values = (
-                fields,
-                {"σ": layers.sorted_sigmas(pieces), "depth error": layers.sorted_depth_stds(pieces)},
-            )
-        return self._values[1]
+        if self._sigmas[0] != fields:
+            self._sigmas = fields, layers.sorted_sigmas(pieces)
+        return self._sigmas[1]
 
     def _draw_path(self, snapshot: Snapshot, controls: ControlState) -> None:
         path, row = snapshot.path, controls.row
@@ -176,17 +168,12 @@ class ViewerApp:
         else:
             self.scene.place_splats({piece.name: piece.T_world_piece for piece in pieces})
 
-    def _draw_mesh(self, snapshot: Snapshot, controls: ControlState) -> None:
-        mesh = snapshot.mesh if controls.mode == "mesh" else None
-        if self._is_new("mesh", IdentityKey(mesh)):
-            self.scene.show_mesh(mesh)
-
     def _draw_keyframes(self, snapshot: Snapshot, controls: ControlState) -> None:
         path = snapshot.path
-        if self._is_new("keyframes", (IdentityKey(path), controls.row, controls.keyframes, controls.thumbnails)):
+        if self._is_new("keyframes", (IdentityKey(path), controls.row, controls.keyframes)):
             rows = lines.keyframes_to_show(path, controls.row) if controls.keyframes else ()
             poses = {row: path.T_world_camera[row] for row in rows}
-            self.scene.show_keyframes(snapshot.camera, poses, snapshot.image if controls.thumbnails else None)
+            self.scene.show_keyframes(snapshot.camera, poses)
 
     def _draw_layer(
         self, client: viser.ClientHandle, snapshot: Snapshot, controls: ControlState, pieces: tuple[Piece, ...],
@@ -272,8 +259,7 @@ class ViewerApp:
             self._go(client, snapshot, min(self.panel.state().row, len(snapshot.path) - 1))
 
     def _go(self, client: viser.ClientHandle, snapshot: Snapshot, row: int) -> None:
-        """Move a browser's camera to the pose of a frame; hide the thumbnails, which would cover the view."""
-        self.panel.thumbnails.value = False
+        """Move a browser's camera to the pose of a frame."""
         move_camera(client, snapshot.path.T_world_camera[row])
         self.changed()
 

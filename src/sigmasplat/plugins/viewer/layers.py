@@ -26,7 +26,7 @@ from sigmasplat.plugins.outputs.drawing import colormap
 from sigmasplat.plugins.outputs.drawing.view_panels import colour_bar
 from sigmasplat.plugins.viewer.snapshot import Piece, field_without_moments
 
-Colouring = Literal["colour", "σ", "depth error"]
+Colouring = Literal["colour", "σ"]
 Floats = NDArray[np.float32]
 
 
@@ -36,7 +36,7 @@ def sigmas(field: GaussianField) -> Tensor:
 
 
 MIN_VISIBLE_OPACITY = 0.1
-"""Splats with a lower opacity are ignored when the range of σ or of the depth error is computed."""
+"""Splats with a lower opacity are ignored when the range of σ is computed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,18 +70,10 @@ class VisibilityFilter:
 
 def sorted_sigmas(pieces: Sequence[Piece]) -> Floats:
     """Return σ of all visible splats in ascending order; of all splats if none is visible."""
-    return _sorted([(piece, sigmas(piece.field)) for piece in pieces])
-
-
-def sorted_depth_stds(pieces: Sequence[Piece]) -> Floats:
-    """Return depth_std_m of the splats of all pieces that have it, selected and sorted as `sorted_sigmas`."""
-    return _sorted([(piece, piece.depth_std_m) for piece in pieces if piece.depth_std_m is not None])
-
-
-def _sorted(values: Sequence[tuple[Piece, Tensor]]) -> Floats:
-    found = [of_piece[piece.field.opacities >= MIN_VISIBLE_OPACITY].numpy() for piece, of_piece in values]
+    known = [(sigmas(piece.field), piece.field.opacities >= MIN_VISIBLE_OPACITY) for piece in pieces]
+    found = [values[shown].numpy() for values, shown in known]
     if not sum(map(len, found)):
-        found = [of_piece.numpy() for _, of_piece in values]
+        found = [values.numpy() for values, _ in known]
     return np.sort(np.concatenate([np.empty(0, np.float32), *found]))
 
 
@@ -103,18 +95,11 @@ def palette_range(ordered: Floats) -> tuple[float, float]:
 def splat_arrays(
     piece: Piece, colouring: Colouring, span: tuple[float, float], visible: VisibilityFilter
 ) -> SplatArrays:
-    """Return the visible splats in their own colours, or coloured by σ or depth error over the range `span`.
-
-    Splats without a known depth error are grey.
-    """
+    """Return the visible splats in their own colours, or coloured by σ over the range `span`."""
     mask = visible.mask(piece)
     chosen = field_without_moments(piece.field.params[mask], {})
     if colouring == "σ":
         colors = colormap.apply(sigmas(chosen).numpy(), *span, colormap.INFERNO)
-    elif colouring == "depth error" and piece.depth_std_m is None:
-        colors = np.full((len(chosen), 3), colormap.NO_READING, np.uint8)
-    elif colouring == "depth error" and piece.depth_std_m is not None:
-        colors = colormap.apply(piece.depth_std_m[mask].numpy(), *span, colormap.INFERNO)
     else:
         colors = np.asarray((chosen.colors.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8))
     return SplatArrays(

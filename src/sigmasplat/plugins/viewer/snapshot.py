@@ -18,7 +18,6 @@ from sigmasplat.api import (
     GaussianField,
     MapUncertainty,
     Matrix,
-    Mesh,
     RenderConfig,
     Rows,
     evenly_spaced,
@@ -95,8 +94,7 @@ class Snapshot:
 
     final: the final map, None before it is made; pieces: the submaps, which may be missing if there is a final map.
     true_positions [M, 3] m in the run's world, None unless an evaluation has stored them. image(row) returns the image
-    of the keyframe at a row of the path, or None if it was not kept. mesh: the surface that `sigmasplat mesh` has
-    written, None without one.
+    of the keyframe at a row of the path, or None if it was not kept.
     """
 
     title: str
@@ -110,7 +108,6 @@ class Snapshot:
     backend: str = "auto"
     live: bool = False
     status: str = ""
-    mesh: Mesh | None = None
 
     def visible_pieces(self, final_map: bool, row: int) -> tuple[Piece, ...]:
         """Return the final map if it exists and is requested, else the submaps started up to frame `row`."""
