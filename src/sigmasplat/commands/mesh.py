@@ -38,7 +38,7 @@ def make_mesh(
     ] = 0.0,
     out: Annotated[
         Path | None,
-        arg("FILE", "file to write: .glb, .ply, .obj or .stl (no colours)", "(default: mesh.ply in RUN)"),
+        arg("FILE", "file to write: .glb, .ply or .stl (no colours)", "(default: mesh.ply in RUN)"),
     ] = None,
     overwrite: options.Overwrite = False,
     moved_to: options.MovedSource = None,

@@ -1,4 +1,4 @@
-"""Write surfaces as PLY, OBJ or GLB with a normal and a colour per vertex, or as STL; read PLY.
+"""Write surfaces as PLY or GLB with a normal and a colour per vertex, or as STL; read PLY.
 
 PLY and GLB also contain depth_std_m, if it is known; PLY also `filled`, the vertices that only close gaps. The unit is
 the metre.
@@ -121,7 +121,7 @@ NOTE = "sigmasplat, unit metre"
 def write_mesh(path: Path, mesh: Mesh, note: str = NOTE) -> None:
     """Write a mesh in the format of the path's ending, atomically; the axes of the vertices stay as they are.
 
-    Vertices for GLB have y up, as glTF requires. note: one line of ASCII for the header of PLY, OBJ and STL, for
+    Vertices for GLB have y up, as glTF requires. note: one line of ASCII for the header of PLY and STL, for
     instance its axes. Raises RunError on an unknown ending or if the file cannot be written.
     """
     check_ending(path)
@@ -234,17 +234,6 @@ def _vertex_rows(mesh: Mesh) -> NDArray[np.void]:
     return rows
 
 
-def _obj(mesh: Mesh, note: str) -> bytes:
-    """Return the mesh as Wavefront OBJ; the colour follows each vertex, as MeshLab and Blender read it."""
-    rows = np.concatenate([mesh.vertices.astype(np.float64), _bytes(mesh) / 255.0], 1)
-    normals = mesh.normals()
-    vertices = ("v %.5f %.5f %.5f %.4f %.4f %.4f\n" * len(rows)) % tuple(rows.ravel().tolist())
-    directions = ("vn %.4f %.4f %.4f\n" * len(rows)) % tuple(normals.ravel().tolist())
-    corners = np.repeat(mesh.faces.ravel() + 1, 2)  # a vertex and its normal have the same number
-    faces = ("f %d//%d %d//%d %d//%d\n" * len(mesh.faces)) % tuple(corners.tolist())
-    return (f"# {note}\n" + vertices + directions + faces).encode("ascii")
-
-
 def _stl(mesh: Mesh, note: str) -> bytes:
     """Return the mesh as binary STL, which has neither colours nor shared vertices."""
     corners = mesh.corners
@@ -267,4 +256,4 @@ def color_bytes(colors: NDArray[np.floating]) -> NDArray[np.uint8]:
     return np.asarray(np.rint(np.clip(colors, 0.0, 1.0) * 255.0), np.uint8)
 
 
-_FORMATS = {".ply": _ply, ".obj": _obj, ".glb": _glb, ".stl": _stl}
+_FORMATS = {".ply": _ply, ".glb": _glb, ".stl": _stl}
