@@ -1,6 +1,7 @@
 """Charts, view strips and the page: colours match their bar, strips show their panels, the page is complete."""
 
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 from xml.etree import ElementTree
 
@@ -21,7 +22,6 @@ from sigmasplat.plugins.outputs.drawing.view_panels import (
     HEAD,
     PANEL_WIDTH,
     draw_view_strip,
-    predicted_panels,
     view_panels,
 )
 from sigmasplat.plugins.outputs.floorplan.rescan import (
@@ -55,9 +55,9 @@ def some_view(seed: int = 0) -> ScoredView:
     )
 
 
-def some_prediction() -> PredictedErrors:
-    """Predict a standard deviation of 0.5 for colour, aleatoric 0.3 and epistemic 0.4, and of 0.2 m for depth."""
-    return PredictedErrors(*(np.full((30, 40), value, np.float32) for value in (0.09, 0.16, 0.04, 0.01)))
+def predicted_view() -> ScoredView:
+    """Predict a standard deviation of 0.5 for colour, and of 0.2 m for depth."""
+    return replace(some_view(), predicted=PredictedErrors(*(np.full((30, 40), v, np.float32) for v in (0.25, 0.04))))
 
 
 @pytest.mark.parametrize("colours", [colormap.VIRIDIS, colormap.INFERNO])
@@ -90,7 +90,7 @@ def test_scores_of_a_view_use_pixels_with_a_depth_reading() -> None:
 
 def test_the_font_has_every_character_of_the_panels() -> None:
     font = ImageFont.load_default(20)
-    panels = [*view_panels(some_view()), *predicted_panels(some_view(), some_prediction())]
+    panels = [*view_panels(some_view()), *view_panels(predicted_view())]
     texts = [word for panel in panels for word in (panel.title, panel.caption, *panel.ends)]
     texts += [region.sentence("sq m") for region in regions_of_every_kind()]
     assert {text.split(":")[0] for text in texts} >= {"unseen", "thin", "unsure"}
@@ -130,13 +130,11 @@ def test_a_strip_shows_the_five_panels_of_a_view() -> None:
 
 
 def test_predicted_errors_are_shown_at_the_scale_of_the_errors() -> None:
-    """The largest colour error of the view is about 0.1, the prediction 0.5; depth errors are 0.1 m, predicted 0.2."""
-    panels = predicted_panels(some_view(), some_prediction())
-    assert [panel.ends[1] for panel in panels] == ["0.500"] * 4 + ["0.200 m"] * 4
-    assert all(panel.caption.endswith(".") for panel in panels)
-    color, aleatoric, epistemic = (panels[i].pixels.astype(float).sum(-1) for i in (1, 2, 3))
-    assert (color > epistemic).all() and (epistemic > aleatoric).all(), "brighter is less certain"
-    assert (panels[5].pixels[20:] == colormap.NO_READING).all(), "the map has no depth there"
+    """The largest colour error of the view is about 0.1, the prediction 0.5, also where the map is empty."""
+    *_, predicted, error = view_panels(predicted_view())
+    assert predicted.title == "predicted colour error" and predicted.ends[1] == error.ends[1] == "0.500"
+    brightest = colormap.INFERNO[-1].astype(np.uint8)
+    assert (predicted.pixels == brightest).all() and error.pixels[10:].sum(-1).max() < brightest.sum()
 
 
 def test_ticks_are_round_and_few() -> None:

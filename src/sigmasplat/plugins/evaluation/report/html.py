@@ -80,12 +80,6 @@ pre { white-space: pre-wrap; overflow-wrap: anywhere; margin: 0;
 """.replace("NARROW", NARROW)
 
 
-PREDICTED_EXPLANATION = (
-    "<p class=soft>Below each held-out view: its errors, and the predicted errors, one standard deviation each. Their "
-    "aleatoric part is noise and detail that the map cannot show; more or better views reduce the epistemic part.</p>"
-)
-
-
 PLAN_CAPTION = (
     "The map from above: walls are light, objects grey, the free floor dark, floor that was not observed blue; the "
     "camera path is green. Numbered circles are regions to scan again, the largest first."
@@ -207,10 +201,9 @@ def _strips(contents: Contents) -> str:
     explanation = (
         "<p class=soft>Images are rendered at the estimated poses. The map predicts V, the variance of colour along "
         "each ray. The root of V and the RMS error have separate colour scales. Where both look alike, V predicts "
-        "the error well. Slate pixels: no depth reading, or no surface in the map.</p>"
+        "the error well. If the run has predicted errors, held-out views show them instead, one standard deviation "
+        "in the colours of the error. Slate pixels: no depth reading, or no surface in the map.</p>"
     )
-    if contents.metrics.get("calibration"):
-        explanation += PREDICTED_EXPLANATION
     parts = [explanation]
     for kind, strips in contents.strips.items():
         if strips:
