@@ -263,8 +263,7 @@ METRICS = {
     "training": {"views": 40, "psnr_db": 31.25, "ssim": 0.95, "depth_l1_m": 0.01, "depth_coverage": 0.99},
     "held_out": {"views": 40, "psnr_db": 29.5, "ssim": 0.94, "depth_l1_m": 0.012, "depth_coverage": 0.98},
     "uncertainty": {"pixels": 8, "spearman": 0.412, "spearman_covered": 0.5, "nll": -2.5, "ause": 0.2,
-                    "mean_variance": 0.001, "mean_squared_error": 0.002,
-                    "reliability": [{"predicted": 1e-3, "empirical": 2e-3, "pixels": 8}]},
+                    "mean_variance": 0.001, "mean_squared_error": 0.002},
 }  # fmt: skip
 
 
