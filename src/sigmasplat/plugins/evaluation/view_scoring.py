@@ -17,6 +17,7 @@ from sigmasplat.api import (
     Frame,
     InputConfig,
     Progress,
+    Renderer,
     Source,
     SourceError,
     evenly_spread,
@@ -44,7 +45,7 @@ class ViewScoring:
     input: InputConfig
     maps: views.MapSources
     chosen: Mapping[str, list[dict[str, Any]]]
-    renderer: views.Renderer
+    renderer: Renderer
     most: int
     T_estimate_truth: NDArray[np.float64] | None
     lpips: Lpips | None = None

@@ -217,11 +217,11 @@ def _ply(mesh: Mesh, note: str) -> bytes:
 
 def _vertex_rows(mesh: Mesh) -> NDArray[np.void]:
     """Return the vertices as rows of a PLY, with the columns that are known."""
-    groups = {
+    groups: dict[str, NDArray[Any] | None] = {
         "x y z": mesh.vertices, "nx ny nz": mesh.normals(), "red green blue": _bytes(mesh),
         "depth_std_m": mesh.depth_std_m, "filled": mesh.filled,
     }  # fmt: skip
-    columns: dict[str, NDArray[Any]] = {
+    columns = {
         name: values if values.ndim == 1 else values[:, k]
         for names, values in groups.items()
         if values is not None

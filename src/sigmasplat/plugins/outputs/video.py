@@ -21,6 +21,7 @@ from sigmasplat.api import (
     GaussianField,
     Matrix,
     Progress,
+    Renderer,
     RunError,
     SigmaSplatError,
     Trajectory,
@@ -34,7 +35,7 @@ from sigmasplat.plugins.evaluation.metrics.views import COVERED_ALPHA
 from sigmasplat.plugins.outputs.drawing import colormap
 from sigmasplat.plugins.outputs.drawing.colormap import Rgb
 from sigmasplat.plugins.outputs.drawing.view_panels import ViewPanel, coloured, draw_view_strip
-from sigmasplat.plugins.outputs.floorplan.ground import Floats, SurfaceRenderer, floor_frame, sample_surfaces
+from sigmasplat.plugins.outputs.floorplan.ground import Floats, floor_frame, sample_surfaces
 from sigmasplat.plugins.outputs.run_reader import RunReader
 
 SMOOTHING_S = 0.25
@@ -131,7 +132,7 @@ def export_video(
     target: Path,
     options: VideoOptions | None = None,
     *,
-    renderer: SurfaceRenderer | None = None,
+    renderer: Renderer | None = None,
     progress: Progress = no_progress,
 ) -> int:
     """Write a video and return its number of images. Calls `progress(done, total)` at the start and after each image.
@@ -160,7 +161,7 @@ class Film:
 
     field: GaussianField
     camera: Camera
-    renderer: SurfaceRenderer
+    renderer: Renderer
 
     def images(self, poses: Matrix, panels: bool, progress: Progress = no_progress) -> Iterator[Rgb]:
         """Yield an image for each pose [N, 4, 4]: colour, in `panels` with depth and √V beside it."""
@@ -209,7 +210,7 @@ def orbit_view(
     path: Trajectory,
     camera: Camera,
     images: int,
-    renderer: SurfaceRenderer,
+    renderer: Renderer,
     up_world: Matrix | None = None,
 ) -> tuple[GaussianField, Matrix]:
     """Return the map without its ceiling, and poses [images, 4, 4] on a circle above it from which it is visible;

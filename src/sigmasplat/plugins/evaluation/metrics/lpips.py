@@ -66,7 +66,7 @@ class Lpips:
                 raise ConfigError(f"{path}: not the weights of AlexNet for LPIPS ({what}); download it again") from None
             if not all(torch.isfinite(tensor).all() for tensor in module.state_dict().values()):
                 raise ConfigError(f"{path}: holds NaN or inf; download the file again")
-        return Lpips(features.float(), tuple(head.weight.float().flatten() for head in heads))
+        return Lpips(features.float(), tuple(weight.float().flatten() for weight in heads.parameters()))
 
     def distance(self, rendered: Pixels, recorded: Pixels) -> float:
         """Return the distance of two images [H, W, 3] in [0, 1], 0 if they are equal: the sum over the layers.

@@ -15,7 +15,7 @@ from sigmasplat.api import (
     Matrix,
     Predicted,
     Progress,
-    Render,
+    Renderer,
     SigmaSplatError,
     Trajectory,
     evenly_spaced,
@@ -35,8 +35,6 @@ MAX_DEPTH_STEP = 0.05
 Floats = NDArray[np.float32]
 
 
-SurfaceRenderer = Callable[[GaussianField, Camera, Matrix], Render]
-"""Renders a field from T_camera_world."""
 SurfacePredictor = Callable[[Camera, Matrix], Predicted]
 """Predicts the errors of a field from T_camera_world."""
 
@@ -63,7 +61,7 @@ def sample_surfaces(
     field: GaussianField,
     trajectory: Trajectory,
     camera: Camera,
-    renderer: SurfaceRenderer,
+    renderer: Renderer,
     max_poses: int = MAX_POSES,
     progress: Progress = no_progress,
     predictor: SurfacePredictor | None = None,
@@ -80,7 +78,7 @@ def sample_surface(
     field: GaussianField,
     camera: Camera,
     T_world_camera: Matrix,
-    renderer: SurfaceRenderer,
+    renderer: Renderer,
     predictor: SurfacePredictor | None = None,
 ) -> SurfaceSample:
     """Sample from one pose: render depth, and predict its error if a predictor is given."""
