@@ -17,7 +17,6 @@ from sigmasplat.api import (
     Frame,
     InputConfig,
     Progress,
-    Renderer,
     Source,
     SourceError,
     evenly_spread,
@@ -45,7 +44,7 @@ class ViewScoring:
     input: InputConfig
     maps: views.MapSources
     chosen: Mapping[str, list[dict[str, Any]]]
-    renderer: Renderer
+    renderer: views.Renderer
     most: int
     T_estimate_truth: NDArray[np.float64] | None
     lpips: Lpips | None = None

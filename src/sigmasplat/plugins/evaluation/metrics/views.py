@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sigmasplat.api import Camera, Frame, GaussianField, Predicted, Render, Renderer, SubmapStore, exposed, se3
+from sigmasplat.api import Camera, Frame, GaussianField, Predicted, Render, SubmapStore, exposed, se3
 from sigmasplat.plugins.evaluation.metrics import uncertainty
 from sigmasplat.plugins.evaluation.metrics.image import SSIM_LEAST_PX, depth_l1, ms_ssim, psnr, similarity_factors, ssim
 from sigmasplat.plugins.evaluation.metrics.lpips import Lpips
@@ -100,6 +100,8 @@ class ScoredView:
         }
 
 
+Renderer = Callable[[GaussianField, Camera, NDArray[np.float64]], Render]
+"""Renders a field from T_camera_world."""
 Predictor = Callable[[Camera, NDArray[np.float64]], Predicted]
 """Predicts the variances of a view of the final map from T_camera_world."""
 HELD_OUT = "held-out"

@@ -3,6 +3,7 @@
 import html
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from sigmasplat.plugins.evaluation.report import tables
@@ -13,72 +14,10 @@ from sigmasplat.plugins.evaluation.report.view_strips import PanelFigure
 from sigmasplat.plugins.outputs.drawing.plot import svg
 from sigmasplat.plugins.outputs.floorplan.rescan import RescanRegion
 
-NARROW = "(max-width: 640px)"
-"""Pages this narrow have one column."""
 VIEW_PANELS = 5
 """Number of panels of a view; fewer are not of one view, or of its predicted errors."""
 
-STYLE = """
-:root { color-scheme: light dark; --page: #f6f7f9; --card: #ffffff; --ink: #1b1f24; --soft: #5c6670; --line: #e1e4e8;
-  --accent: #c2501b; --unsure: #d65a1e; --unseen: #286ebe; --thin: #825aaa; }
-@media (prefers-color-scheme: dark) {
-  :root { --page: #101317; --card: #181b20; --ink: #e8ebef; --soft: #99a3ad; --line: #2c3138;
-    --accent: #ff8c46; --unsure: #ff8c46; --unseen: #64aafa; --thin: #be96e6; } }
-* { box-sizing: border-box; }
-body { margin: 0; background: var(--page); color: var(--ink); overflow-wrap: break-word;
-  font: 16px/1.55 system-ui, -apple-system, "Segoe UI", "Helvetica Neue", sans-serif; }
-main { max-width: 1180px; margin: 0 auto; padding: 28px 24px 60px; }
-h1 { font-size: 30px; line-height: 1.2; letter-spacing: -0.02em; margin: 0 0 4px; }
-h2 { font-size: 17px; margin: 0; }
-h3 { font-size: 15px; margin: 0 0 12px; }
-p { max-width: 74ch; margin: 0 0 12px; }
-.soft, figcaption, th { color: var(--soft); }
-.alarm { color: var(--accent); font-weight: 600; }
-.card { background: var(--card); border: 1px solid var(--line); border-radius: 10px; padding: 14px 16px;
-  overflow-x: auto; }
-.map { display: grid; grid-template-columns: 1fr 1fr; gap: 12px; margin-top: 16px; }
-.map img { max-height: 430px; object-fit: contain; background: #15181d; }
-.judged { display: grid; grid-template-columns: repeat(3, 1fr); gap: 12px; margin-bottom: 12px; }
-.judged b { display: block; font-size: 19px; line-height: 1.3; margin-bottom: 6px; }
-.judged p { font-size: 14.5px; }
-.pair { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(420px, 100%), 1fr)); gap: 12px;
-  align-items: start; }
-table { border-collapse: collapse; width: 100%; font-size: 14.5px; font-variant-numeric: tabular-nums; }
-th, td { text-align: right; padding: 6px 10px; border-bottom: 1px solid var(--line); font-weight: 400; }
-th:first-child, td:first-child { text-align: left; padding-left: 0; }
-tr:last-child td { border-bottom: 0; }
-figure { margin: 0 0 14px; }
-figure img { display: block; width: 100%; height: auto; border-radius: 10px; border: 1px solid var(--line); }
-figcaption { font-size: 14px; margin-top: 6px; }
-.view { display: grid; grid-template-columns: repeat(auto-fit, minmax(150px, 1fr)); gap: 10px;
-  background: #15181d; color: #e9edf2; border-radius: 10px; padding: 10px; font-size: 13px; line-height: 1.4; }
-.view.large { grid-template-columns: repeat(6, 1fr); } .view.large div { grid-column: span 2; }
-.view.large div:nth-child(-n+2) { grid-column: span 3; }
-.view img { border: 0; border-radius: 4px; margin: 4px 0; }
-.view span { color: #9aa2ac; }
-.chart { width: 100%; max-width: 620px; height: auto; }
-.bar { display: grid; grid-template-columns: auto 1fr auto; gap: 6px; align-items: center; white-space: nowrap; }
-.bar i { height: 8px; border-radius: 2px; }
-.regions { list-style: none; padding: 0; font-size: 15px; }
-.regions li { display: grid; grid-template-columns: 26px 1fr; gap: 10px; align-items: start; }
-.regions b { width: 24px; height: 24px; border-radius: 50%; color: var(--card); font-size: 13px; line-height: 24px;
-  text-align: center; }
-.regions .unseen b { background: var(--unseen); } .regions .thin b { background: var(--thin); }
-.regions .unsure b { background: var(--unsure); }
-ul { max-width: 74ch; padding-left: 20px; } li { margin-bottom: 10px; }
-li pre { background: var(--card); border: 1px solid var(--line); border-radius: 8px; padding: 8px 12px;
-  margin-top: 4px; user-select: all; }
-details { margin-top: 12px; } summary { cursor: pointer; } summary h2 { display: inline; }
-.part { border-bottom: 1px solid var(--line); padding-bottom: 12px; } .part > summary + * { margin-top: 16px; }
-.part > pre { max-height: 60vh; overflow: auto; }
-pre { white-space: pre-wrap; overflow-wrap: anywhere; margin: 0;
-  font: 13px/1.5 ui-monospace, "SF Mono", Menlo, Consolas, monospace; }
-@media NARROW {
-  main { padding: 20px 12px 56px; } h1 { font-size: 24px; } .map, .judged { grid-template-columns: 1fr; }
-  .view.large div, .view.large div:nth-child(-n+2) { grid-column: span 6; }
-  th, td { padding: 6px; } .card { padding: 12px; } }
-""".replace("NARROW", NARROW)
-
+STYLE = Path(__file__).with_name("page.css").read_text(encoding="utf-8")
 
 PLAN_CAPTION = (
     "The map from above: walls are light, objects grey, the free floor dark, floor that was not observed blue; the "

@@ -15,7 +15,6 @@ from sigmasplat.api import (
     GaussianField,
     Matrix,
     Progress,
-    Renderer,
     RunFolder,
     SigmaSplatError,
     Trajectory,
@@ -25,6 +24,7 @@ from sigmasplat.api import (
     render,
     se3,
 )
+from sigmasplat.plugins.evaluation.metrics.views import Renderer
 from sigmasplat.plugins.outputs.floorplan.ground import (
     SurfacePredictor,
     SurfaceSample,

@@ -15,14 +15,13 @@ from sigmasplat.api import (
     Matrix,
     Predicted,
     Progress,
-    Renderer,
     SigmaSplatError,
     Trajectory,
     evenly_spaced,
     no_progress,
     se3,
 )
-from sigmasplat.plugins.evaluation.metrics.views import COVERED_ALPHA
+from sigmasplat.plugins.evaluation.metrics.views import COVERED_ALPHA, Renderer
 
 WIDTH_PX = 160
 """Width of the rendered images: at 5 m a pixel is about 4 cm wide."""
