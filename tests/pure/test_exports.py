@@ -10,6 +10,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from box_room import CAMERA, HIGH, LOW, seer, splats
+from films import read_film
 from room_run import FRAMES, LOST, PATH, T_ROOM, WORLD, Walls, made_run, picture
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
@@ -128,11 +129,11 @@ def test_films_follow_the_path_or_an_orbit(reader: RunReader, tmp_path: Path, pa
     calls: list[tuple[int, int]] = []
     options = VideoOptions(width_px=64, fps=5.0, seconds=1.0, path=path)
     count = export_video(
-        reader, tmp_path / "film.gif", options, renderer=seer(WORLD), progress=lambda *at: calls.append(at)
+        reader, tmp_path / "film.webm", options, renderer=seer(WORLD), progress=lambda *at: calls.append(at)
     )
-    with Image.open(tmp_path / "film.gif") as film:
-        assert (film.size, film.n_frames, count) == ((3 * 64, 48), 5, 5)
-        first = np.asarray(film.convert("RGB"))
+    frames, _ = read_film(tmp_path / "film.webm")
+    first = frames[0]
+    assert (first.shape, len(frames), count) == ((48, 3 * 64, 3), 5, 5)
     assert calls == [(i, 5) for i in range(6)]
     assert np.abs(first[8:40, 4:60].astype(int) - 128).max() < 12, "colour on the left"
     assert first[8:40, 64:128].std(axis=(0, 1)).max() > 10, "depth in the middle"
@@ -140,10 +141,9 @@ def test_films_follow_the_path_or_an_orbit(reader: RunReader, tmp_path: Path, pa
 
 def test_a_film_of_colour_alone_has_one_panel_and_no_legend(reader: RunReader, tmp_path: Path) -> None:
     options = VideoOptions(width_px=64, fps=5.0, seconds=1.0, panels="color")
-    assert export_video(reader, tmp_path / "film.gif", options, renderer=seer(WORLD)) == 5
-    with Image.open(tmp_path / "film.gif") as film:
-        assert film.size == (64, 48)
-        assert np.abs(np.asarray(film.convert("RGB")).astype(int) - 128).max() < 12
+    assert export_video(reader, tmp_path / "film.webm", options, renderer=seer(WORLD)) == 5
+    first = read_film(tmp_path / "film.webm")[0][0]
+    assert first.shape == (48, 64, 3) and np.abs(first.astype(int) - 128).max() < 12
 
 
 def test_the_orbit_view_removes_the_ceiling_and_shows_the_whole_room() -> None:
@@ -165,10 +165,9 @@ def test_the_length_and_the_size_of_a_film(reader: RunReader, tmp_path: Path) ->
     assert VideoOptions(path="orbit", fps=10.0).images(500.0) == 120
     camera = film_camera(Camera(321, 241, 200.0, 200.0, 160.0, 120.0), 0)
     assert (camera.width, camera.height) == (320, 240)
-    export_video(reader, tmp_path / "film.gif", VideoOptions(200, 5.0, 0.2), renderer=seer(WORLD))
-    with Image.open(tmp_path / "film.gif") as film:
-        assert film.size == (3 * 200 + 4 * GAP, 150 + HEAD + FOOT), "panels with titles and colour bars"
-        shown = np.asarray(film.convert("RGB")).astype(int)
+    export_video(reader, tmp_path / "film.webm", VideoOptions(200, 5.0, 0.2), renderer=seer(WORLD))
+    shown = read_film(tmp_path / "film.webm")[0][0].astype(int)
+    assert shown.shape == (150 + HEAD + FOOT, 3 * 200 + 4 * GAP, 3), "panels with titles and colour bars"
     bar = shown[HEAD + 150 + FOOT // 2, 2 * GAP + 200 + 80 : 2 * GAP + 400 - 80]
     assert (np.ptp(bar, axis=0) > 60).all() and shown[:HEAD, 2 * GAP + 200 :].max() > 150
 
