@@ -20,10 +20,8 @@ pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built
 
 from sigmasplat.plugins.viewer.app import ViewerApp  # noqa: E402
 from sigmasplat.plugins.viewer.panel import (  # noqa: E402
-    FINAL_MAP,
     MODE_LABELS,
     PREDICTED_MODES,
-    SUBMAPS,
     VIEW_MODES,
 )
 from sigmasplat.plugins.viewer.server import HOST, close, open_server  # noqa: E402
@@ -122,7 +120,7 @@ def test_predicted_errors_are_offered_for_the_final_map_only(
     variances = torch.where(half[:, None], torch.tensor([0.01, 1e-4, 1e-4]), torch.tensor([0.01, 0.04, 0.04]))
     std = SplatStd(torch.where(half, 0.01, 0.2), torch.full((len(field),), 0.1))
     known = MapUncertainty(variances, Background((0.5, 0.5, 0.5), 0.1, 1.0), SHIPPED, 4, std)
-    app.show(Snapshot("room", EMPTY_PATH, Piece(None, field, uncertainty=known), (Piece(0, field),)))
+    app.show(Snapshot("room", EMPTY_PATH, Piece(None, field, uncertainty=known)))
     wait_until(lambda: panel.max_std.visible)
     everything = panel.facts.content
     panel.max_std.value = 0.05
@@ -133,7 +131,8 @@ def test_predicted_errors_are_offered_for_the_final_map_only(
         panel.mode.value = MODE_LABELS[mode]
         wait_until(lambda before=before: len(client) > before)  # type: ignore[misc]
     wait_until(lambda: panel.legend.visible)
-    panel.part.value = SUBMAPS
+    app.show(Snapshot("room", EMPTY_PATH, None, (Piece(0, field),)))
     wait_until(lambda: not panel.max_std.visible)
-    assert panel.mode.value == MODE_LABELS["splats"]
-    assert panel.part.value != FINAL_MAP and "viewer:" not in capsys.readouterr().err, "no error while drawing"
+    assert panel.mode.value == MODE_LABELS["splats"] and "viewer:" not in capsys.readouterr().err, (
+        "no error while drawing"
+    )

@@ -147,10 +147,10 @@ def test_the_timeline_shows_the_submaps_started_by_then_and_the_final_map_comple
     pieces = tuple(Piece(i, field_of(3, seed=i)) for i in range(3))
     final = Piece(None, field_of(9))
     snapshot = Snapshot("run", path_of(30), final, pieces)
-    assert snapshot.visible_pieces(True, 0) == (final,) and snapshot.visible_pieces(False, 29) == pieces
-    assert snapshot.visible_pieces(False, 9) == pieces[:1] and snapshot.visible_pieces(False, 10) == pieces[:2]
-    assert Snapshot("run", path_of(30), final).visible_pieces(False, 0) == (final,)
-    assert Snapshot("run", pieces=pieces).visible_pieces(True, 0) == pieces
+    assert snapshot.visible_pieces(0) == (final,)
+    growing = Snapshot("run", path_of(30), None, pieces)
+    assert [growing.visible_pieces(row) for row in (9, 10, 29)] == [pieces[:1], pieces[:2], pieces]
+    assert Snapshot("run", pieces=pieces).visible_pieces(0) == pieces
 
 
 def test_the_path_is_drawn_up_to_a_frame_in_submap_colours_with_lost_frames_in_red() -> None:

@@ -102,10 +102,9 @@ class ViewerApp:
 
     def _draw(self, snapshot: Snapshot) -> None:
         path = snapshot.path
-        has_final, has_submaps = snapshot.final is not None, bool(snapshot.pieces)
-        self.panel.adapt(len(path), snapshot.live, snapshot.true_positions is not None, has_final and has_submaps)
+        self.panel.adapt(len(path), snapshot.live, snapshot.true_positions is not None)
         controls = self.panel.state()
-        pieces = snapshot.visible_pieces(controls.final_map, controls.row)
+        pieces = snapshot.visible_pieces(controls.row)
         self.panel.offer(any(piece.uncertainty is not None for piece in pieces))
         controls = self.panel.state()
         ordered = self._sigmas_of(pieces)

@@ -25,7 +25,6 @@ MODE_LABELS: dict[ViewMode, str] = {
 }
 MOST_STD_M = 0.3
 """End of the slider for predicted errors of depth; there, no splat is hidden."""
-FINAL_MAP, SUBMAPS = "final map", "submaps"
 
 
 @dataclass(frozen=True)
@@ -34,7 +33,6 @@ class ControlState:
 
     mode: ViewMode
     colouring: Colouring
-    final_map: bool
     hidden_share: float
     min_opacity: float
     max_std_m: float
@@ -75,9 +73,6 @@ class ControlPanel:
                 get_args(Colouring),
                 hint="the splats' own colours, or σ of their colour: bright = uncertain",
             )
-            self.part = gui.add_dropdown(
-                "map", (FINAL_MAP, SUBMAPS), hint="the final map, or the submaps from which it was made"
-            )
             self.legend = gui.add_image(np.zeros((*LEGEND_SIZE[::-1], 3), np.uint8), visible=False, format="png")
             self.hidden = gui.add_slider(
                 "hide uncertain", 0, 99, 1, 0, hint="hide this percentage of the splats: those with the largest σ"
@@ -105,7 +100,7 @@ class ControlPanel:
 
     def _controls(self) -> tuple[Any, ...]:
         return (
-            self.mode, self.colouring, self.part, self.hidden, self.max_std, self.min_opacity,
+            self.mode, self.colouring, self.hidden, self.max_std, self.min_opacity,
             self.row, self.follow, self.path, self.keyframes, self.true_path,
         )  # fmt: skip
 
@@ -114,7 +109,6 @@ class ControlPanel:
         return ControlState(
             next(mode for mode in VIEW_MODES if MODE_LABELS[mode] == self.mode.value),
             self.colouring.value,
-            self.part.value == FINAL_MAP,
             self.hidden.value / 100.0,
             float(self.min_opacity.value),
             float(self.max_std.value) if self.max_std.visible and self.max_std.value < MOST_STD_M else float("inf"),
@@ -125,7 +119,7 @@ class ControlPanel:
             self.follow.value,
         )
 
-    def adapt(self, frames: int, live: bool, truth_known: bool, can_choose_map: bool) -> None:
+    def adapt(self, frames: int, live: bool, truth_known: bool) -> None:
         """Adapt the controls to the snapshot; a timeline at its end stays there while frames are added."""
         last = max(frames - 1, 1)
         at_end = self.row.value >= self.row.max
@@ -135,7 +129,7 @@ class ControlPanel:
             self.row.max = last
             if at_end:
                 self.row.value = last
-        self.follow.visible, self.true_path.visible, self.part.visible = live, truth_known, can_choose_map
+        self.follow.visible, self.true_path.visible = live, truth_known
 
     def offer(self, known: bool) -> None:
         """Offer the controls of predicted errors if the shown map has them (`known`)."""

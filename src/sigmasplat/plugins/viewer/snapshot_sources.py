@@ -14,7 +14,6 @@ from sigmasplat.api import (
     TRUTH,
     Callback,
     Camera,
-    GaussianField,
     Matrix,
     RunError,
     RunFolder,
@@ -52,18 +51,13 @@ def finished_snapshot(run: RunFolder, budget: int = BUDGET) -> Snapshot:
     """
     frames, final, tensors = run.read_frames(), run.read_map(), run.read_checkpoint()[0]
     config, true_file = run.config(), run.path / TRUTH
-    outside = frames.submaps_outside()
-    cache, anchors = SubmapCache(run.submaps, budget), np.asarray(tensors["T_world_submap"], np.float64)
-    cache.load(anchors)
-    pieces = list(cache.pieces.values())
-    if pieces and len(pieces) < len(anchors):
-        pieces.append(Piece(len(pieces), thin(GaussianField(tensors["params"]), budget), anchors[-1]))
-    pieces = [piece for piece in pieces if piece.submap not in outside]
+    cache = SubmapCache(run.submaps, budget)
+    cache.load(np.asarray(tensors["T_world_submap"], np.float64))  # for the images of keyframes
     return Snapshot(
         run.path.resolve().name,
         _final_path(frames, tensors),
         Piece(None, without_moments(final), uncertainty=run.uncertainty_of(final)),
-        within_budget(pieces, budget),
+        (),
         read_trajectory(true_file).T_world_camera[:, :3, 3] if true_file.is_file() else None,
         cache.camera or DEFAULT_CAMERA,
         cache.image,
