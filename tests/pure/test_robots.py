@@ -219,8 +219,8 @@ def test_a_bag_that_was_not_completed_holds_its_messages(tmp_path: Path) -> None
 
 def test_a_run_is_exported_as_a_bag(tmp_path: Path) -> None:
     run = made_run(tmp_path / "run", submaps=True)
-    assert exit_code("export", str(run.path), "--out", str(tmp_path / "run-bag"), "--pictures") == 0
-    found = read_bag(tmp_path / "run-bag")
+    assert exit_code("export", str(run.path), "--out", str(tmp_path / "run.mcap"), "--pictures") == 0
+    found = read_bag(tmp_path / "run.mcap")
     kept = [i for i in range(FRAMES) if i != LOST]
     static = links(found["/tf_static"][0])
     T_map_world, T_link_optical = static["map", "sigmasplat_world"], static["camera_link", "camera_optical_frame"]
@@ -244,12 +244,11 @@ def test_a_run_is_exported_as_a_bag(tmp_path: Path) -> None:
     np.testing.assert_array_equal(turned, values)
     assert (cells.data == 0).any() and cells.header.frame_id == "map"
     assert abs(cells.info.origin.position.z) < 1e-6
-    assert exit_code("export", str(run.path), "--out", str(tmp_path / "run-bag")) == 2
-    assert exit_code("export", str(run.path), "--out", str(tmp_path / "run-bag"), "--overwrite") == 0
-    assert "/camera/color/image_raw" not in {k for k, v in read_bag(tmp_path / "run-bag").items() if v}
-    assert exit_code("export", str(run.path), "--out", str(tmp_path / "run.mcap")) == 0
-    assert (tmp_path / "run.mcap").is_file() and len(read_bag(tmp_path / "run.mcap")["/tf"]) == len(kept)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["run", "run-bag", "run.mcap", "run.plan.json", "run.plan.png"]
+    assert exit_code("export", str(run.path), "--out", str(tmp_path / "run.mcap")) == 2
+    assert exit_code("export", str(run.path), "--out", str(tmp_path / "run.mcap"), "--overwrite") == 0
+    assert "/camera/color/image_raw" not in {k for k, v in read_bag(tmp_path / "run.mcap").items() if v}
+    assert len(read_bag(tmp_path / "run.mcap")["/tf"]) == len(kept)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["run", "run.mcap", "run.plan.json", "run.plan.png"]
 
 
 def test_the_grid_and_the_points_lie_in_the_same_map(tmp_path: Path) -> None:

@@ -1,9 +1,11 @@
-"""Write ROS 2 messages as a bag, through the rosbags package (Apache-2.0): of a running or of a finished run.
+"""Write ROS 2 messages, through the rosbags package (Apache-2.0).
 
-A bag is a folder with metadata.yaml and one MCAP file, or the MCAP file alone."""
+A run that goes on writes a bag: a folder with metadata.yaml and one MCAP file. A finished run is exported as that file
+alone."""
 
 import os
 import shutil
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -21,6 +23,7 @@ from sigmasplat.api import (
     import_optional,
     no_progress,
     noted_up,
+    replacing,
 )
 from sigmasplat.plugins.outputs.axes import level_cameras
 from sigmasplat.plugins.outputs.floorplan.floor_plan import FloorPlan, run_floor_plan
@@ -95,51 +98,34 @@ class BagSink:
         )  # fmt: skip
 
 
-FILE_ENDING = ".mcap"
-
-
 def export_bag(
     reader: RunReader, target: Path, *, pictures: bool = False, progress: Progress = no_progress
 ) -> dict[str, int]:
-    """Write a bag, or one MCAP file if `target` ends in .mcap; return the number of messages of each topic.
+    """Write an MCAP file; return the number of messages of each topic.
 
     pictures: also write the images of the keyframes. Calls `progress(poses done, total)` while the floor plan is made.
     Raises RunError if the run has no path or map, or if the target cannot be written; SourceError without the rosbags
     package.
     """
-    messages = RosMessages()
-    one_file = target.suffix == FILE_ENDING
-    folder = target.with_name(f".{target.name}.part")
-    shutil.rmtree(folder, ignore_errors=True)
-    counts = dict[str, int]()
-    try:
-        folder.mkdir()
-        bag = folder / target.name.removesuffix(FILE_ENDING)
-        sink = BagSink(bag)
-        sink.open(messages)
+    messages, counts = RosMessages(), Counter[str]()
+    with replacing(target) as temporary:
+        folder = temporary.with_name(f"{temporary.name}-bag")  # of its files only the MCAP file is kept
         try:
-            for message in _messages(reader, messages, pictures, progress):
-                sink.write(message)
-                counts[message.topic.name] = counts.get(message.topic.name, 0) + 1
-            sink.close()
-        except BaseException:
-            sink.abort()
-            raise
-        _remove_earlier(target)
-        (bag / f"{bag.name}{FILE_ENDING}" if one_file else bag).rename(target)
-    except OSError as problem:
-        raise RunError(f"cannot write {target}: {problem.strerror or problem}; choose a writable place") from problem
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
+            shutil.rmtree(folder, ignore_errors=True)  # of a process that was killed
+            sink = BagSink(folder)
+            sink.open(messages)
+            try:
+                for message in _messages(reader, messages, pictures, progress):
+                    sink.write(message)
+                    counts[message.topic.name] += 1
+                sink.close()
+            except BaseException:
+                sink.abort()
+                raise
+            (folder / f"{folder.name}.mcap").replace(temporary)
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
     return counts
-
-
-def _remove_earlier(target: Path) -> None:
-    if not target.is_dir():
-        return target.unlink(missing_ok=True)
-    for name in ("metadata.yaml", f"{target.name}{FILE_ENDING}"):
-        (target / name).unlink(missing_ok=True)
-    target.rmdir()
 
 
 def _messages(reader: RunReader, messages: RosMessages, pictures: bool, progress: Progress) -> Iterator[Encoded]:

@@ -147,11 +147,11 @@ def floor_frame(samples: Sequence[SurfaceSample], up_world: Matrix | None = None
     points, normals, area = _subsampled(samples)
     poses = np.stack([sample.T_world_camera for sample in samples])
     if up_world is None:
-        up = up_direction(normals, area, _unit(-poses[:, :3, 1].sum(0), -poses[0, :3, 1]))
+        up = up_direction(normals, area, unit(-poses[:, :3, 1].sum(0), -poses[0, :3, 1]))
     else:
         up = up_direction(normals, area, up_world, MEASURED_COS)
     height_m = floor_height(points @ up, normals @ up, area, float((poses[:, :3, 3] @ up).min()))
-    ahead = _horizontal(poses[0], up)
+    ahead = horizontal(poses[0], up)
     ahead = along_walls(normals, area, up, ahead)
     R = np.stack([np.cross(ahead, up), ahead, up])
     foot = poses[0, :3, 3] - (poses[0, :3, 3] @ up - height_m) * up
@@ -189,7 +189,7 @@ def up_direction(normals: Matrix, area: Matrix, about_up: Matrix, within_cos: fl
     for _ in range(3):
         cosine = normals @ up
         agree = np.abs(cosine) > PARALLEL_COS
-        up = _unit((np.sign(cosine) * area)[agree] @ normals[agree], up)
+        up = unit((np.sign(cosine) * area)[agree] @ normals[agree], up)
     return np.asarray(up * np.sign(up @ about_up))
 
 
@@ -239,16 +239,16 @@ def along_walls(normals: Matrix, area: Matrix, up: Matrix, ahead: Matrix) -> Mat
     return np.asarray(np.cos(turn) * ahead + np.sin(turn) * aside)
 
 
-def _horizontal(T_world_camera: Matrix, up: Matrix) -> Matrix:
+def horizontal(T_world_camera: Matrix, up: Matrix) -> Matrix:
     """Return the horizontal viewing direction of a camera; looking straight down, that of the image's upper edge."""
     for direction in (T_world_camera[:3, 2], -T_world_camera[:3, 1]):
         level = direction - (direction @ up) * up
         if np.linalg.norm(level) > 0.3:
             break
-    return _unit(level, level)
+    return unit(level, level)
 
 
-def _unit(vector: Matrix, otherwise: Matrix) -> Matrix:
+def unit(vector: Matrix, otherwise: Matrix) -> Matrix:
     """Return a vector scaled to length 1, or `otherwise` if its length is 0."""
     length = float(np.linalg.norm(vector))
     return np.asarray(vector / length) if length > 1e-9 else otherwise
