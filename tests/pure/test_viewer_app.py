@@ -90,7 +90,7 @@ def test_a_growing_run_is_shown_and_the_controls_follow(
     assert panel.row.value == FRAMES - 1, "the timeline stays at its end"
     assert not panel.legend.visible, "the splats' own colours need no legend"
 
-    panel.colouring.value = "σ"
+    panel.colouring.value = "uncertainty"
     wait_until(lambda: panel.legend.visible)
     texts = panel.hidden_text.content
     panel.hidden.value = 50
@@ -114,17 +114,18 @@ def test_a_growing_run_is_shown_and_the_controls_follow(
 def test_predicted_errors_are_offered_for_the_final_map_only(
     app: ViewerApp, client: list[int], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The errors have a legend, and the slider hides splats with a larger error."""
+    """The errors have a legend, and hiding the most uncertain ones hides the splats with the larger error."""
     field, panel = room_map(), app.panel
     half = torch.arange(len(field)) % 2 == 0
     variances = torch.where(half[:, None], torch.tensor([0.01, 1e-4, 1e-4]), torch.tensor([0.01, 0.04, 0.04]))
     std = SplatStd(torch.where(half, 0.01, 0.2), torch.full((len(field),), 0.1))
     known = MapUncertainty(variances, Background((0.5, 0.5, 0.5), 0.1, 1.0), SHIPPED, 4, std)
     app.show(Snapshot("room", EMPTY_PATH, Piece(None, field, uncertainty=known)))
-    wait_until(lambda: panel.max_std.visible)
+    offered = lambda: {MODE_LABELS[mode] for mode in PREDICTED_MODES} <= {*panel.mode.options}  # noqa: E731
+    wait_until(offered)
     everything = panel.facts.content
-    panel.max_std.value = 0.05
-    wait_until(lambda: "0.05 m" in panel.hidden_text.content)
+    panel.hidden.value = 60
+    wait_until(lambda: "error of depth above" in panel.hidden_text.content and " m" in panel.hidden_text.content)
     assert panel.facts.content != everything and f"{int(half.sum()):,} of {len(field):,}" in panel.facts.content
     for mode in PREDICTED_MODES:
         before = len(client)
@@ -132,7 +133,7 @@ def test_predicted_errors_are_offered_for_the_final_map_only(
         wait_until(lambda before=before: len(client) > before)  # type: ignore[misc]
     wait_until(lambda: panel.legend.visible)
     app.show(Snapshot("room", EMPTY_PATH, None, (Piece(0, field),)))
-    wait_until(lambda: not panel.max_std.visible)
+    wait_until(lambda: not offered())
     assert panel.mode.value == MODE_LABELS["splats"] and "viewer:" not in capsys.readouterr().err, (
         "no error while drawing"
     )

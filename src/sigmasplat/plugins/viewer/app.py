@@ -57,7 +57,7 @@ class ViewerApp:
         self.scene = ViserScene(server, self._clicked)
         self._snapshot: Snapshot | None = None
         self._drawn: dict[Any, Any] = {}
-        self._sigmas: tuple[list[IdentityKey], Floats] = [], layers.sorted_sigmas(())
+        self._unsure: tuple[list[IdentityKey], Floats] = [], layers.sorted_uncertainties(())
         self._merged: tuple[Any, Any] = (None, None)
         self._wake, self._stop = threading.Event(), threading.Event()
         self._sharp, self._can_sharpen = False, False
@@ -105,20 +105,22 @@ class ViewerApp:
         self.panel.adapt(len(path), snapshot.live, snapshot.true_positions is not None)
         controls = self.panel.state()
         pieces = snapshot.visible_pieces(controls.row)
-        self.panel.offer(any(piece.uncertainty is not None for piece in pieces))
+        known = any(piece.uncertainty is not None for piece in pieces)
+        unit = " m" * any(piece.depth_std_m is not None for piece in pieces)
+        self.panel.offer(known)
         controls = self.panel.state()
-        ordered = self._sigmas_of(pieces)
-        visible = layers.visibility_filter(ordered, controls.hidden_share, controls.min_opacity, controls.max_std_m)
+        ordered = self._uncertainties_of(pieces)
+        visible = layers.visibility_filter(ordered, controls.hidden_share, controls.min_opacity)
         span = layers.palette_range(ordered)
         with self.server.atomic():
             self._draw_path(snapshot, controls)
             self._draw_splats(pieces, controls, span, visible)
         self._draw_keyframes(snapshot, controls)
-        self._show_texts(snapshot, controls, pieces, visible)
+        self._show_texts(snapshot, controls, pieces, visible, unit)
         self._follow(snapshot, controls)
         legend = None
-        if controls.mode == "splats" and controls.colouring == "σ":
-            legend = Legend(INFERNO, *span, "")
+        if controls.mode == "splats" and controls.colouring == "uncertainty":
+            legend = Legend(INFERNO, *span, unit)
         for client in self.server.get_clients().values():
             legend = self._draw_layer(client, snapshot, controls, pieces, visible) or legend
         if self._is_new("legend", legend and legend[1:]):
@@ -131,12 +133,12 @@ class ViewerApp:
         self._drawn[what] = state
         return True
 
-    def _sigmas_of(self, pieces: tuple[Piece, ...]) -> Floats:
-        """Return σ of the splats in ascending order."""
+    def _uncertainties_of(self, pieces: tuple[Piece, ...]) -> Floats:
+        """Return the uncertainties of the splats in ascending order."""
         fields = [IdentityKey(piece.field) for piece in pieces]
-        if self._sigmas[0] != fields:
-            self._sigmas = fields, layers.sorted_sigmas(pieces)
-        return self._sigmas[1]
+        if self._unsure[0] != fields:
+            self._unsure = fields, layers.sorted_uncertainties(pieces)
+        return self._unsure[1]
 
     def _draw_path(self, snapshot: Snapshot, controls: ControlState) -> None:
         path, row = snapshot.path, controls.row
@@ -211,7 +213,12 @@ class ViewerApp:
         return legend
 
     def _show_texts(
-        self, snapshot: Snapshot, controls: ControlState, pieces: tuple[Piece, ...], visible: VisibilityFilter
+        self,
+        snapshot: Snapshot,
+        controls: ControlState,
+        pieces: tuple[Piece, ...],
+        visible: VisibilityFilter,
+        unit: str,
     ) -> None:
         path = snapshot.path
         splats, kept = sum(len(p.field) for p in pieces), sum(int(visible.mask(p).sum()) for p in pieces)
@@ -224,9 +231,8 @@ class ViewerApp:
             f"{int(path.lost.sum())} lost{apart}, {submaps} submap{'s' * (submaps != 1)}  \n"
             f"{kept:,} of {splats:,} splats shown"
         )
-        limits = [f"σ above {visible.max_sigma:.3g}"] if visible.max_sigma < float("inf") else []
-        limits += [f"error of depth above {visible.max_std_m:g} m"] if visible.max_std_m < float("inf") else []
-        hidden = f"hidden: {', '.join(limits)}" if limits else ""
+        what = "error of depth" if unit else "σ"
+        hidden = f"hidden: {what} above {visible.most:.3g}{unit}" if visible.most < float("inf") else ""
         self.panel.show_texts(facts, hidden, _frame_text(snapshot, controls.row))
 
     def _follow(self, snapshot: Snapshot, controls: ControlState) -> None:

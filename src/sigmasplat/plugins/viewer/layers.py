@@ -26,17 +26,18 @@ from sigmasplat.plugins.outputs.drawing import colormap
 from sigmasplat.plugins.outputs.drawing.view_panels import colour_bar
 from sigmasplat.plugins.viewer.snapshot import Piece, field_without_moments
 
-Colouring = Literal["colour", "σ"]
+Colouring = Literal["colour", "uncertainty"]
 Floats = NDArray[np.float32]
 
 
-def sigmas(field: GaussianField) -> Tensor:
-    """Return σ of each splat [N]: the root of σ² averaged over the colour channels, for colours in [0, 1]."""
-    return field.variances.mean(1).sqrt()
+def uncertainties(piece: Piece) -> Tensor:
+    """Return how unsure each splat is [N]: its depth_std_m, m, if that is known, else σ, the root of the mean σ² of the
+    colour channels (colours in [0, 1])."""
+    return piece.field.variances.mean(1).sqrt() if piece.depth_std_m is None else piece.depth_std_m
 
 
 MIN_VISIBLE_OPACITY = 0.1
-"""Splats with a lower opacity are ignored when the range of σ is computed."""
+"""Splats with a lower opacity are ignored when the range of uncertainties is computed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,36 +56,31 @@ class SplatArrays:
 
 @dataclass(frozen=True)
 class VisibilityFilter:
-    """Hides splats whose σ is above `max_sigma`, whose opacity is below `min_opacity`, or whose depth_std_m is above
-    `max_std_m`, if it is known."""
+    """Hides splats whose uncertainty is above `most`, or whose opacity is below `min_opacity`."""
 
-    max_sigma: float = float("inf")
+    most: float = float("inf")
     min_opacity: float = 0.0
-    max_std_m: float = float("inf")
 
     def mask(self, piece: Piece) -> Tensor:
         """Return which splats are shown, bool [N]."""
-        shown = (sigmas(piece.field) <= self.max_sigma) & (piece.field.opacities >= self.min_opacity)
-        return shown if piece.depth_std_m is None else shown & (piece.depth_std_m <= self.max_std_m)
+        return (uncertainties(piece) <= self.most) & (piece.field.opacities >= self.min_opacity)
 
 
-def sorted_sigmas(pieces: Sequence[Piece]) -> Floats:
-    """Return σ of all visible splats in ascending order; of all splats if none is visible."""
-    known = [(sigmas(piece.field), piece.field.opacities >= MIN_VISIBLE_OPACITY) for piece in pieces]
+def sorted_uncertainties(pieces: Sequence[Piece]) -> Floats:
+    """Return the uncertainties of all visible splats in ascending order; of all splats if none is visible."""
+    known = [(uncertainties(piece), piece.field.opacities >= MIN_VISIBLE_OPACITY) for piece in pieces]
     found = [values[shown].numpy() for values, shown in known]
     if not sum(map(len, found)):
         found = [values.numpy() for values, _ in known]
     return np.sort(np.concatenate([np.empty(0, np.float32), *found]))
 
 
-def visibility_filter(
-    ordered: Floats, hidden_share: float, min_opacity: float, max_std_m: float = float("inf")
-) -> VisibilityFilter:
-    """Return the filter that hides this share of the splats, those with the largest σ; `ordered` is sorted."""
-    max_sigma = float("inf")
+def visibility_filter(ordered: Floats, hidden_share: float, min_opacity: float) -> VisibilityFilter:
+    """Return the filter that hides this share of the splats, the most uncertain ones; `ordered` is sorted."""
+    most = float("inf")
     if hidden_share > 0.0 and len(ordered):
-        max_sigma = float(np.quantile(ordered, max(1.0 - hidden_share, 0.0)))
-    return VisibilityFilter(max_sigma, min_opacity, max_std_m)
+        most = float(np.quantile(ordered, max(1.0 - hidden_share, 0.0)))
+    return VisibilityFilter(most, min_opacity)
 
 
 def palette_range(ordered: Floats) -> tuple[float, float]:
@@ -95,11 +91,11 @@ def palette_range(ordered: Floats) -> tuple[float, float]:
 def splat_arrays(
     piece: Piece, colouring: Colouring, span: tuple[float, float], visible: VisibilityFilter
 ) -> SplatArrays:
-    """Return the visible splats in their own colours, or coloured by σ over the range `span`."""
+    """Return the visible splats in their own colours, or coloured by uncertainty over the range `span`."""
     mask = visible.mask(piece)
     chosen = field_without_moments(piece.field.params[mask], {})
-    if colouring == "σ":
-        colors = colormap.apply(sigmas(chosen).numpy(), *span, colormap.INFERNO)
+    if colouring == "uncertainty":
+        colors = colormap.apply(uncertainties(piece)[mask].numpy(), *span, colormap.INFERNO)
     else:
         colors = np.asarray((chosen.colors.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8))
     return SplatArrays(

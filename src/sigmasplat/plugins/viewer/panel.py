@@ -23,8 +23,6 @@ MODE_LABELS: dict[ViewMode, str] = {
     "color error": "predicted error of colour",
     "depth error": "predicted error of depth",
 }
-MOST_STD_M = 0.3
-"""End of the slider for predicted errors of depth; there, no splat is hidden."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +33,6 @@ class ControlState:
     colouring: Colouring
     hidden_share: float
     min_opacity: float
-    max_std_m: float
     row: int
     path: bool
     keyframes: bool
@@ -71,16 +68,12 @@ class ControlPanel:
             self.colouring: Any = gui.add_dropdown(
                 "splat colour",
                 get_args(Colouring),
-                hint="the splats' own colours, or σ of their colour: bright = uncertain",
+                hint="the splats' own colours, or how unsure they are: bright = uncertain",
             )
             self.legend = gui.add_image(np.zeros((*LEGEND_SIZE[::-1], 3), np.uint8), visible=False, format="png")
             self.hidden = gui.add_slider(
-                "hide uncertain", 0, 99, 1, 0, hint="hide this percentage of the splats: those with the largest σ"
+                "hide uncertain", 0, 99, 1, 0, hint="hide this percentage of the splats: the most uncertain ones"
             )
-            self.max_std = gui.add_slider(
-                "hide above, m", 0.005, MOST_STD_M, 0.005, MOST_STD_M, visible=False,
-                hint="hide splats with a larger predicted standard deviation of depth; at the right end none is hidden",
-            )  # fmt: skip
             self.min_opacity = gui.add_slider(
                 "minimum opacity", 0.0, 0.99, 0.01, 0.0, hint="hide splats with a lower opacity"
             )
@@ -100,7 +93,7 @@ class ControlPanel:
 
     def _controls(self) -> tuple[Any, ...]:
         return (
-            self.mode, self.colouring, self.hidden, self.max_std, self.min_opacity,
+            self.mode, self.colouring, self.hidden, self.min_opacity,
             self.row, self.follow, self.path, self.keyframes, self.true_path,
         )  # fmt: skip
 
@@ -111,7 +104,6 @@ class ControlPanel:
             self.colouring.value,
             self.hidden.value / 100.0,
             float(self.min_opacity.value),
-            float(self.max_std.value) if self.max_std.visible and self.max_std.value < MOST_STD_M else float("inf"),
             int(self.row.value),
             self.path.value,
             self.keyframes.value,
@@ -132,11 +124,10 @@ class ControlPanel:
         self.follow.visible, self.true_path.visible = live, truth_known
 
     def offer(self, known: bool) -> None:
-        """Offer the controls of predicted errors if the shown map has them (`known`)."""
+        """Offer to show predicted errors if the shown map has them (`known`)."""
         options = _mode_options(known)
         if self.mode.options != options:
             self.mode.options = options
-        self.max_std.visible = known
 
     def show_texts(self, facts: str, hidden: str, frame: str) -> None:
         """Show texts about the run, about the hidden splats, and about the selected frame."""
