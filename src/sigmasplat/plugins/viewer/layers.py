@@ -21,7 +21,7 @@ from sigmasplat.api import (
     se3,
     variance_parts,
 )
-from sigmasplat.plugins.evaluation.metrics.views import COVERED_ALPHA
+from sigmasplat.plugins.evaluation.metrics.views import COVERED_ALPHA, as_array
 from sigmasplat.plugins.outputs.drawing import colormap
 from sigmasplat.plugins.outputs.drawing.view_panels import colour_bar
 from sigmasplat.plugins.viewer.snapshot import Piece, field_without_moments
@@ -160,18 +160,18 @@ def render_layer(
     T_camera_world = se3.inverse(T_world_camera)
     with torch.no_grad():
         seen = render(field, camera, T_camera_world, None, options, backend)
-        alpha = _array(seen.alpha)
+        alpha = as_array(seen.alpha)
         covered = alpha > COVERED_ALPHA
-        depth_m = np.where(covered, _array(seen.depth) / np.maximum(alpha, COVERED_ALPHA), 0.0).astype(np.float32)
+        depth_m = np.where(covered, as_array(seen.depth) / np.maximum(alpha, COVERED_ALPHA), 0.0).astype(np.float32)
         if layer == "colour":
             return LayerImage((seen.color.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).cpu().numpy())
         if layer == "depth":
             return _mapped(depth_m, covered, colormap.value_range(depth_m, covered), colormap.VIRIDIS, " m")
         if layer == "V":
-            return _from_zero(_array(seen.variance.mean(2).clamp(min=0.0).sqrt()), covered, "")
+            return _from_zero(as_array(seen.variance.mean(2).clamp(min=0.0).sqrt()), covered, "")
         spread = render(field, camera, T_camera_world, torch.from_numpy(depth_m), options, backend).uncertainty
         assert spread is not None
-        about = np.sqrt(np.maximum(_array(spread), 0.0) / np.maximum(alpha, COVERED_ALPHA))
+        about = np.sqrt(np.maximum(as_array(spread), 0.0) / np.maximum(alpha, COVERED_ALPHA))
         return _from_zero(about, covered, " m")
 
 
@@ -187,10 +187,10 @@ def render_predicted(
     with torch.no_grad():
         parts = variance_parts(field, known.splats, known.background, camera, T_camera_world, options, backend)
         found = predicted(parts, known.calibration)
-    covered = _array(parts.alpha) > COVERED_ALPHA
+    covered = as_array(parts.alpha) > COVERED_ALPHA
     if layer == "color error":
-        return _from_zero(_array(found.color.sqrt()), np.ones_like(covered), "")
-    return _from_zero(_array(found.depth_std_m), covered, " m")
+        return _from_zero(as_array(found.color.sqrt()), np.ones_like(covered), "")
+    return _from_zero(as_array(found.depth_std_m), covered, " m")
 
 
 def draw_legend(legend: Legend) -> colormap.Rgb:
@@ -203,10 +203,6 @@ def draw_legend(legend: Legend) -> colormap.Rgb:
     draw.text((1, middle), f"{legend.low:.3g}{legend.unit}", INK, font, anchor="lm")
     draw.text((width - 1, middle), f"{legend.high:.3g}{legend.unit}", INK, font, anchor="rm")
     return np.asarray(image)
-
-
-def _array(values: Tensor) -> Floats:
-    return np.asarray(values.cpu(), np.float32)
 
 
 def _from_zero(values: Floats, valid: NDArray[np.bool_], unit: str) -> LayerImage:

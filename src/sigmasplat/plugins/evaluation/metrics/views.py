@@ -26,6 +26,11 @@ class PredictedErrors(NamedTuple):
     reading_m2: NDArray[np.float32]
 
 
+def as_array(values: Tensor) -> NDArray[np.float32]:
+    """Return values of any device as an array."""
+    return np.asarray(values.detach().cpu(), np.float32)
+
+
 @dataclass(frozen=True, eq=False)
 class ScoredView:
     """A recorded image and its rendering at the estimated pose, float32.
@@ -181,7 +186,7 @@ def render_views(
             final = scored_view(frame, rendered, kind, exposure=maps.exposure(record))
             if maps.predict is not None and kind == HELD_OUT:
                 found = maps.predict(frame.camera, T_camera_world)
-                final = replace(final, predicted=PredictedErrors(_array(found.color), _array(found.reading_m2)))
+                final = replace(final, predicted=PredictedErrors(as_array(found.color), as_array(found.reading_m2)))
             before = None
             T_camera_submap = maps.T_camera_submap(record)
             if submap is not None and T_camera_submap is not None:
@@ -199,12 +204,12 @@ def scored_view(
 ) -> ScoredView:
     """Pair a frame with its rendering, in the frame's exposure [3, 2] if given. Depth is Σwz/Σw where the map covers
     the pixel, else 0."""
-    alpha, neutral = _array(rendered.alpha), np.clip(_array(rendered.color), 0.0, 1.0)
-    shown = neutral if exposure is None else exposed(_array(rendered.color), exposure)
-    depth = np.where(alpha > COVERED_ALPHA, _array(rendered.depth) / np.maximum(alpha, COVERED_ALPHA), 0.0)
+    alpha, neutral = as_array(rendered.alpha), np.clip(as_array(rendered.color), 0.0, 1.0)
+    shown = neutral if exposure is None else exposed(as_array(rendered.color), exposure)
+    depth = np.where(alpha > COVERED_ALPHA, as_array(rendered.depth) / np.maximum(alpha, COVERED_ALPHA), 0.0)
     return ScoredView(
         frame.index, kind, frame.color, frame.depth_m, shown, depth.astype(np.float32), alpha,
-        _array(rendered.variance), notes, neutral=neutral,
+        as_array(rendered.variance), notes, neutral=neutral,
     )  # fmt: skip
 
 
@@ -293,7 +298,3 @@ def _mean(values: NDArray[np.float64]) -> float | None:
     """Return the mean of the values that are not nan; None if all are nan."""
     existing = values[~np.isnan(values)]
     return float(existing.mean()) if len(existing) else None
-
-
-def _array(values: Tensor) -> NDArray[np.float32]:
-    return np.asarray(values.detach().cpu(), np.float32)

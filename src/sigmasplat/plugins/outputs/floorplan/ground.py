@@ -7,7 +7,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.special import erfc
-from torch import Tensor
 
 from sigmasplat.api import (
     Camera,
@@ -21,7 +20,7 @@ from sigmasplat.api import (
     no_progress,
     se3,
 )
-from sigmasplat.plugins.evaluation.metrics.views import COVERED_ALPHA, Renderer
+from sigmasplat.plugins.evaluation.metrics.views import COVERED_ALPHA, Renderer, as_array
 
 WIDTH_PX = 160
 """Width of the rendered images: at 5 m a pixel is about 4 cm wide."""
@@ -84,12 +83,12 @@ def sample_surface(
     T_camera_world = se3.inverse(T_world_camera)
     with torch.inference_mode():
         seen = renderer(field, camera, T_camera_world)
-        alpha, depth_m = _array(seen.alpha), _array((seen.depth / seen.alpha.clamp(min=COVERED_ALPHA)).float())
+        alpha, depth_m = as_array(seen.alpha), as_array((seen.depth / seen.alpha.clamp(min=COVERED_ALPHA)).float())
         sigma_m = wrong = np.full_like(depth_m, np.nan)
         if predictor is not None:
             predicted = predictor(camera, T_camera_world)
-            sigma_m = _array(predicted.depth_std_m)
-            wrong = probability_wrong(_array(predicted.color))
+            sigma_m = as_array(predicted.depth_std_m)
+            wrong = probability_wrong(as_array(predicted.color))
     inner = np.s_[1:-1, 1:-1]
     on = _smooth(depth_m, alpha > COVERED_ALPHA)
     points = camera.rays() * depth_m[..., None]
@@ -116,10 +115,6 @@ def _smooth(depth_m: Floats, covered: NDArray[np.bool_]) -> NDArray[np.bool_]:
         near = np.s_[rows : rows + z.shape[0], columns : columns + z.shape[1]]
         on &= covered[near] & (np.abs(depth_m[near] - z) < MAX_DEPTH_STEP * z)
     return on
-
-
-def _array(values: Tensor) -> Floats:
-    return np.asarray(values.detach().cpu(), np.float32)
 
 
 MAX_TILT_COS = np.cos(np.deg2rad(40.0))
