@@ -158,8 +158,7 @@ $(VENV)/wheel-tools: $(VENV)/build-tools
 
 # The tests find them there, or in the folder SIGMASPLAT_READERS; without them, tests/pure/test_external_readers.py skips.
 readers:
-	npm install --silent --no-audit --no-fund --prefix build/readers @playcanvas/splat-transform@3 gltf-validator@2 \
-		@gltf-transform/core@4
+	npm install --silent --no-audit --no-fund --prefix build/readers @playcanvas/splat-transform@3
 
 clean:
 	rm -rf $(VENV) build dist site .mypy_cache .ruff_cache .pytest_cache .hypothesis

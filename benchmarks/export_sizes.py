@@ -1,7 +1,7 @@
 """Measure what each format of a map costs: size, size per square metre, held-out PSNR after reading back, and time.
 
 The map of a finished run is exported in every format of splats, read back and rendered at the run's
-held-out views. The rows with fewer splats are exported with --max-splats. The area is that of the surface that
+held-out views. The area is that of the surface that
 `sigmasplat mesh` extracts with voxels of 4 cm.
 Writes benchmarks/results/export-sizes-<machine>.json and prints a table.
 
@@ -10,7 +10,7 @@ example: sigmasplat run data/redkitchen --hold-out 10 --out runs/kitchen; python
 
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -46,12 +46,8 @@ VARIANTS: tuple[tuple[str, str, Mapping[str, Any]], ...] = (
     ("PLY", ".ply", {}),
     ("PLY, --plain", ".ply", {"plain": True}),
     ("SPZ", ".spz", {}),
-    ("SOG", ".sog", {}),
-    ("glTF", ".glb", {}),
 )
 """Names of rows, endings and options of the export."""
-SHARES = (0.75, 0.5)
-"""Shares of the splats that are kept by --max-splats in additional rows of SOG."""
 
 
 @dataclass(frozen=True)
@@ -92,13 +88,6 @@ class HeldOutViews:
         return float(views.mean_scores(scores.rows)["psnr_db"])
 
 
-def variants(splats: int) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
-    """Yield the rows: name, ending and options."""
-    yield from VARIANTS
-    for share in SHARES:
-        yield f"SOG, {share:.0%} of the splats", ".sog", {"max_splats": round(share * splats)}
-
-
 def measure(options: Options) -> dict[str, Any]:
     """Export a run in every format and score it. A format whose library is missing is reported and left out."""
     run = RunFolder.open(options.run)
@@ -107,7 +96,7 @@ def measure(options: Options) -> dict[str, Any]:
     field = run.read_map()
     area_m2 = area(FusionInput.at(run, exported.reader().camera).surface(VOXEL_M))
     rows = []
-    for name, ending, given in variants(len(field)):
+    for name, ending, given in VARIANTS:
         try:
             rows.append({"format": name} | write_and_read(exported, ending, given, held_out))
         except SigmaSplatError as problem:

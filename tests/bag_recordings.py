@@ -89,9 +89,9 @@ class Recorder:
         self.add(topic, time_s, self.make("tf2_msgs/msg/TFMessage", transforms=[stamped]))
         return stamped
 
-    def pose(self, time_s: float, T: np.ndarray, norm: float = 1.0) -> Any:
+    def pose(self, time_s: float, T: np.ndarray) -> Any:
         """Create a PoseStamped."""
-        x, y, z, w = xyzw(T) * norm
+        x, y, z, w = xyzw(T)
         pose = self.make(
             "geometry_msgs/msg/Pose",
             position=self.make("geometry_msgs/msg/Point", **dict(zip("xyz", map(float, T[:3, 3]), strict=True))),

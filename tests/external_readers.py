@@ -1,12 +1,10 @@
 """Other programs that read maps: programs of Node from the folder SIGMASPLAT_READERS (`make readers`)."""
 
 import csv
-import json
 import os
 import shutil
 import subprocess
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -31,11 +29,6 @@ def run_node(*arguments: str | Path) -> str:
     done = subprocess.run(command, cwd=FOLDER, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
     return done.stdout
-
-
-def script(code: str, *arguments: Path) -> Any:
-    """Run a module of Node that prints JSON; `process.argv.slice(1)` are the arguments."""
-    return json.loads(run_node("--input-type=module", "--eval", code, "--", *arguments))
 
 
 def convert(given: Path, target: Path, *options: str) -> Path:

@@ -85,8 +85,8 @@ def _show_once() -> None:
 
     read = snapshot_sources.finished_snapshot
 
-    def read_once(run: Any, source: Any = None) -> None:
-        read(run, source)
+    def read_once(run: Any) -> None:
+        read(run)
         raise KeyboardInterrupt
 
     snapshot_sources.finished_snapshot = read_once

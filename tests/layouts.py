@@ -140,23 +140,6 @@ def scannet(place: Path, s: Sample) -> Path:
     return folder
 
 
-def scannet_frames(place: Path, s: Sample) -> Path:
-    """The layout of SensReader/c++: one folder with an information file."""
-    folder = place / "scene0001_00"
-    for n in range(FRAMES):
-        stem = folder / f"frame-{n:06d}"
-        save(stem.with_suffix(".color.jpg"), s.color[n].repeat(2, 0).repeat(2, 1), quality=100, subsampling=0)
-        save(stem.with_suffix(".depth.pgm"), s.depth_mm[n])
-        save_text(stem.with_suffix(".pose.txt"), rows(s.T_world_camera[n]))
-    flat = {kind: " ".join(map(str, intrinsic(c).ravel())) for kind, c in (("Color", LARGE), ("Depth", SMALL_CAMERA))}
-    lines = ["m_versionNumber = 4", "m_sensorName = StructureSensor", "m_colorWidth = 64", "m_depthShift = 1000"]
-    for kind, values in flat.items():
-        lines += [f"m_calibration{kind}Intrinsic = {values}"]
-        lines += [f"m_calibration{kind}Extrinsic = {' '.join(map(str, np.eye(4).ravel()))}"]
-    save_text(folder / "_info.txt", "\n".join(lines) + "\n")
-    return folder
-
-
 def transforms(c: Camera, frames: list[dict[str, Any]], **more: Any) -> str:
     fields = {"fl_x": c.fx, "fl_y": c.fy, "cx": c.cx + 0.5, "cy": c.cy + 0.5, "w": c.width, "h": c.height}
     return json.dumps({**fields, **more, "frames": frames})
@@ -284,7 +267,6 @@ LAYOUTS = {
     "scannet": Layout(
         "ScanNet", scannet, SMALL_CAMERA, times_s=[n * 7 / 30 for n in range(FRAMES)], exact=False, posed=[0, 1, 3]
     ),
-    "scannet_frames": Layout("ScanNet", scannet_frames, SMALL_CAMERA, exact=False),
     "scannetpp": Layout("ScanNet++", scannetpp, SMALL_CAMERA, exact=False, train=[0, 1, 2], posed=[0, 1, 2]),
     "seven_scenes": Layout("7-Scenes", seven_scenes, Camera(640, 480, 585.0, 585.0, 320.0, 240.0), VGA),
     "icl_nuim": Layout(

@@ -5,10 +5,8 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from sigmasplat.plugins.evaluation.metrics.lpips import Net
-
-CHANNELS = {"alex": (64, 192, 384, 256, 256), "vgg": (64, 128, 256, 512, 512)}
-TRUNK_FILES = {"alex": "alexnet-owt-7be5be79.pth", "vgg": "vgg16-397923af.pth"}
+CHANNELS = (64, 192, 384, 256, 256)
+TRUNK_FILE = "alexnet-owt-7be5be79.pth"
 
 
 def alexnet() -> nn.Sequential:
@@ -22,31 +20,16 @@ def alexnet() -> nn.Sequential:
     )  # fmt: skip
 
 
-def vgg16() -> nn.Sequential:
-    """Return torchvision's `vgg16().features`."""
-    layers, inputs = list[nn.Module](), 3
-    for outputs in (64, 64, 0, 128, 128, 0, 256, 256, 256, 0, 512, 512, 512, 0, 512, 512, 512, 0):
-        if outputs:
-            layers += [nn.Conv2d(inputs, outputs, kernel_size=3, padding=1), nn.ReLU()]
-            inputs = outputs
-        else:
-            layers.append(nn.MaxPool2d(kernel_size=2, stride=2))
-    return nn.Sequential(*layers)
-
-
-NETWORKS = {"alex": alexnet, "vgg": vgg16}
-
-
-def write_weights(folder: Path, net: Net) -> tuple[nn.Sequential, list[Tensor]]:
-    """Write both files of a network with random weights, as torchvision and lpips save them; return what they hold."""
+def write_weights(folder: Path) -> tuple[nn.Sequential, list[Tensor]]:
+    """Write both files of AlexNet with random weights, as torchvision and lpips save them; return what they hold."""
     torch.manual_seed(3)
-    features = NETWORKS[net]()
+    features = alexnet()
     for layer in features:
         if isinstance(layer, nn.Conv2d):
             nn.init.kaiming_normal_(layer.weight)  # features of the last layers then still differ
     folder.mkdir(parents=True, exist_ok=True)
     trunk = {f"features.{name}": tensor for name, tensor in features.state_dict().items()}
-    torch.save(trunk | {"classifier.6.bias": torch.zeros(1000)}, folder / TRUNK_FILES[net])
-    linear = [torch.rand(1, channels, 1, 1) for channels in CHANNELS[net]]
-    torch.save({f"lin{i}.model.1.weight": weight for i, weight in enumerate(linear)}, folder / f"{net}.pth")
+    torch.save(trunk | {"classifier.6.bias": torch.zeros(1000)}, folder / TRUNK_FILE)
+    linear = [torch.rand(1, channels, 1, 1) for channels in CHANNELS]
+    torch.save({f"lin{i}.model.1.weight": weight for i, weight in enumerate(linear)}, folder / "alex.pth")
     return features, linear

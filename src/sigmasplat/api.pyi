@@ -23,7 +23,6 @@ from sigmasplat.data.camera import Camera as Camera, exposed as exposed
 from sigmasplat.data.field import (
     ATTRIBUTES as ATTRIBUTES,
     COLUMNS as COLUMNS,
-    INITIAL_LOG_VARIANCE as INITIAL_LOG_VARIANCE,
     GaussianField as GaussianField,
     Rows as Rows,
 )
@@ -33,7 +32,6 @@ from sigmasplat.data.frame_arrays import (
     color_from_bytes as color_from_bytes,
     frame_from_arrays as frame_from_arrays,
 )
-from sigmasplat.data.harmonics import count as count
 from sigmasplat.data.images import resized_color as resized_color
 from sigmasplat.data.imu import (
     GRAVITY_M_S2 as GRAVITY_M_S2,
@@ -230,7 +228,7 @@ from sigmasplat.registry import (
     SourceFormat as SourceFormat,
 )
 from sigmasplat.render import FieldRenderer as FieldRenderer, Render as Render, reference as reference, render as render
-from sigmasplat.render.backend import backend_module as backend_module, make_view as make_view, on_device as on_device
+from sigmasplat.render.backend import backend_module as backend_module, make_view as make_view
 from sigmasplat.render.kernels import (
     blend_with as blend_with,
     pose_gradient as pose_gradient,
@@ -272,7 +270,6 @@ from sigmasplat.slam.slam import Slam as Slam
 from sigmasplat.types import Matrix as Matrix, Progress as Progress, no_progress as no_progress
 from sigmasplat.uncertainty.predictive import (
     Predicted as Predicted,
-    blend_values as blend_values,
     predict as predict,
     predicted as predicted,
     variance_parts as variance_parts,

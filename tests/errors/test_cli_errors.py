@@ -46,7 +46,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
         (["run", "/no/such/place", "--set", "mapping.every=0", "--set", "input.width=1"], "input.width must be 0 or"),
         (["run", "/no/such/place", "--set", "mapping.every=0", "--set", "input.width=1"], "mapping.every must be at"),
         (["export", "/no/such/run", "--fps", "-30"], "--fps must be between 1 and 120, found -30"),
-        (["export", "/no/such/run", "--sigma-below", "-1"], "--sigma-below must be at least 0"),
+        (["export", "/no/such/run", "--std-below-m", "-1"], "--std-below-m must be at least 0"),
         (["mesh", "/no/such/run", "--voxel-m", "nan"], "--voxel-m must be finite and above 0"),
         (["bench", "table", "tum", "--seeds", "0"], "--seeds must be at least 1"),
         (["batch", "/no/such/place", "--jobs", "0"], "--jobs must be at least 1"),
@@ -126,7 +126,7 @@ def test_the_overview_describes_each_command_and_imports_none() -> None:
 @pytest.mark.parametrize(
     "mistyped",
     ["run x --fx 57O", "run x --limit many", "run x --stride 1.5", "run x --seed None", "run x --register-depth None",
-     "inspect x --depth-scale 1OOO", "export x --sigma-below small"],
+     "inspect x --depth-scale 1OOO", "export x --std-below-m small"],
 )  # fmt: skip
 def test_the_message_for_a_mistyped_number_has_no_parser_types(
     mistyped: str, capsys: pytest.CaptureFixture[str]

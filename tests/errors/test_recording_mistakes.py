@@ -163,12 +163,6 @@ def rvl(recorder: Recorder, seen: Scene) -> None:
         )
 
 
-def lost_pose(recorder: Recorder, seen: Scene) -> None:
-    aligned(recorder, seen)
-    for t, T in zip(seen.times_s, seen.poses, strict=True):
-        recorder.add("/pose", t, recorder.pose(t, T, norm=0.0))
-
-
 def cut_bag(place: Path) -> Path:
     path = bag(aligned)(place)
     path.write_bytes(path.read_bytes()[:-700])
@@ -221,7 +215,6 @@ ROS: dict[str, Mistake] = {
     ),
     "a fisheye lens": (bag(fisheye), {}, ("lens model equidistant", "image_rect_color")),
     "depth as RVL": (bag(rvl), {}, ("depth", "RVL", "republish")),
-    "poses that are not rigid": (bag(lost_pose), {}, ("/pose at 1000.000 s", "not rigid")),
     "a truncated recording": (cut_bag, {}, ("walk.bag: unreadable bag", "rosbag reindex")),
     "recorder killed": (never_closed, {}, ("not indexed", "rosbag reindex")),
     "only half of the folder copied": (half_copied, {}, ("walk: unreadable bag", ".db3", "copy it again")),

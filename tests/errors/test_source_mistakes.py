@@ -144,13 +144,6 @@ MISTAKES: dict[str, dict[str, tuple[Damage, tuple[str, ...]]]] = {
         "a pose that is not rigid": (with_text("pose/7.txt", SCALED_ROWS), ("7.txt", "not a rigid")),
         "depth as a colour image": (painted("depth/*"), ("not a depth image",)),
     },
-    "scannet_frames": {
-        "only colour": (without("*.depth.pgm"), LISTS),
-        "only depth": (without("*.color.jpg"), ("no colour images in",)),
-        "a matrix damaged": (with_text("_info.txt", "m_calibrationColorIntrinsic = 1 2 3"), ("_info.txt", "4×4")),
-        "an empty information file": (with_text("_info.txt", ""), ("camera unknown",)),
-        "a truncated pose": (with_text("frame-000001.pose.txt", "1 0 0"), ("frame-000001.pose.txt", "4×4")),
-    },
     "scannetpp": {
         "images not undistorted": (without("dslr/undistorted_images"), ("no undistorted_images/", "dslr.undistort")),
         "depth of the fisheye": (rendered_elsewhere, ("no undistorted_depths/", "render_depth")),

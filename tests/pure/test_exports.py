@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from box_room import CAMERA, HIGH, LOW, seer, splats
+from films import read_film
 from room_run import FRAMES, LOST, PATH, T_ROOM, WORLD, Walls, made_run, picture
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
@@ -23,7 +25,7 @@ from sigmasplat.plugins.outputs.floorplan.picture import export_plan
 from sigmasplat.plugins.outputs.mesh_files import write_mesh
 from sigmasplat.plugins.outputs.run_reader import RunReader
 from sigmasplat.plugins.outputs.video import VideoOptions, export_video, film_camera, orbit_view
-from sigmasplat.plugins.outputs.views import export_colmap, export_nerfstudio, splat_points
+from sigmasplat.plugins.outputs.views import export_colmap, splat_points
 
 
 @pytest.fixture(params=["submaps", "in one piece"])
@@ -31,37 +33,34 @@ def reader(tmp_path: Path, request: pytest.FixtureRequest) -> RunReader:
     return RunReader(made_run(tmp_path / "run", request.param == "submaps"), Walls)
 
 
-def positions(path: Path) -> np.ndarray:
-    frames = json.loads(path.read_text())["frames"]
-    return np.array([frame["transform_matrix"] for frame in frames])[:, :3, 3]
+def images(model: Path) -> list[list[str]]:
+    """Return the words of each image's line."""
+    return [line.split() for line in (model / "sparse/0/images.txt").read_text().split("\n")[1:-1:2]]
+
+
+def positions(model: Path) -> np.ndarray:
+    rows = np.array([[float(word) for word in line[1:8]] for line in images(model)])
+    R = Rotation.from_quat(np.roll(rows[:, :4], -1, axis=1)).inv()
+    return -R.apply(rows[:, 4:])
 
 
 def test_views_without_images_are_all_frames_that_were_not_lost(reader: RunReader, tmp_path: Path) -> None:
     kept = [i for i in range(FRAMES) if i != LOST]
-    export_nerfstudio(reader, tmp_path / "out.json")
-    np.testing.assert_allclose(positions(tmp_path / "out.json"), PATH.T_world_camera[kept, :3, 3], atol=1e-9)
     export_colmap(reader, tmp_path / "model")
-    names = (tmp_path / "model/sparse/0/images.txt").read_text().split("\n")[1:-1:2]
-    assert [name.split()[-1] for name in names] == [f"frame-{i:06d}.png" for i in kept]
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["model", "out.json", "run"]
+    assert [line[-1] for line in images(tmp_path / "model")] == [f"frame-{i:06d}.png" for i in kept]
+    np.testing.assert_allclose(positions(tmp_path / "model"), PATH.T_world_camera[kept, :3, 3], atol=1e-9)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["model", "run"]
 
 
 def test_images_are_those_of_the_keyframes_each_once(reader: RunReader, tmp_path: Path) -> None:
     out = tmp_path / "scene"
-    out.mkdir()
-    export_nerfstudio(reader, out / "transforms.json", images=True)
-    read = json.loads((out / "transforms.json").read_text())
-    assert [frame["file_path"] for frame in read["frames"]] == [f"images/frame-{i:06d}.png" for i in (0, 2, 4)]
-    np.testing.assert_allclose(positions(out / "transforms.json"), PATH.T_world_camera[[0, 2, 4], :3, 3], atol=1e-9)
-    for i, frame in zip((0, 2, 4), read["frames"], strict=True):
-        np.testing.assert_array_equal(np.asarray(Image.open(out / frame["file_path"])), picture(i).color)
-        depth = np.asarray(Image.open(out / frame["depth_file_path"]))
-        assert depth.dtype == np.uint16 and depth[0, 0] == 0
-        np.testing.assert_allclose(depth * read["depth_unit_scale_factor"], picture(i).depth_m, atol=5.1e-4)
-    assert (out / read["ply_file_path"]).is_file() and (read["w"], read["h"]) == (40, 30)
     export_colmap(reader, out, images=True)
-    assert len((out / "sparse/0/images.txt").read_text().split("\n")) == 8
-    assert sorted(p.name for p in (out / "images").iterdir()) == [f"frame-{i:06d}.png" for i in (0, 2, 4)]
+    names = [f"frame-{i:06d}.png" for i in (0, 2, 4)]
+    assert [line[-1] for line in images(out)] == sorted(p.name for p in (out / "images").iterdir()) == names
+    np.testing.assert_allclose(positions(out), PATH.T_world_camera[[0, 2, 4], :3, 3], atol=1e-9)
+    for i, name in zip((0, 2, 4), names, strict=True):
+        np.testing.assert_array_equal(np.asarray(Image.open(out / "images" / name)), picture(i).color)
+    assert (out / "sparse/0/cameras.txt").read_text().split("\n")[1].startswith("1 PINHOLE 40 30 ")
 
 
 def test_splat_centres_are_thinned_evenly(reader: RunReader) -> None:
@@ -130,11 +129,11 @@ def test_films_follow_the_path_or_an_orbit(reader: RunReader, tmp_path: Path, pa
     calls: list[tuple[int, int]] = []
     options = VideoOptions(width_px=64, fps=5.0, seconds=1.0, path=path)
     count = export_video(
-        reader, tmp_path / "film.gif", options, renderer=seer(WORLD), progress=lambda *at: calls.append(at)
+        reader, tmp_path / "film.webm", options, renderer=seer(WORLD), progress=lambda *at: calls.append(at)
     )
-    with Image.open(tmp_path / "film.gif") as film:
-        assert (film.size, film.n_frames, count) == ((3 * 64, 48), 5, 5)
-        first = np.asarray(film.convert("RGB"))
+    frames, _ = read_film(tmp_path / "film.webm")
+    first = frames[0]
+    assert (first.shape, len(frames), count) == ((48, 3 * 64, 3), 5, 5)
     assert calls == [(i, 5) for i in range(6)]
     assert np.abs(first[8:40, 4:60].astype(int) - 128).max() < 12, "colour on the left"
     assert first[8:40, 64:128].std(axis=(0, 1)).max() > 10, "depth in the middle"
@@ -142,10 +141,9 @@ def test_films_follow_the_path_or_an_orbit(reader: RunReader, tmp_path: Path, pa
 
 def test_a_film_of_colour_alone_has_one_panel_and_no_legend(reader: RunReader, tmp_path: Path) -> None:
     options = VideoOptions(width_px=64, fps=5.0, seconds=1.0, panels="color")
-    assert export_video(reader, tmp_path / "film.gif", options, renderer=seer(WORLD)) == 5
-    with Image.open(tmp_path / "film.gif") as film:
-        assert film.size == (64, 48)
-        assert np.abs(np.asarray(film.convert("RGB")).astype(int) - 128).max() < 12
+    assert export_video(reader, tmp_path / "film.webm", options, renderer=seer(WORLD)) == 5
+    first = read_film(tmp_path / "film.webm")[0][0]
+    assert first.shape == (48, 64, 3) and np.abs(first.astype(int) - 128).max() < 12
 
 
 def test_the_orbit_view_removes_the_ceiling_and_shows_the_whole_room() -> None:
@@ -167,10 +165,9 @@ def test_the_length_and_the_size_of_a_film(reader: RunReader, tmp_path: Path) ->
     assert VideoOptions(path="orbit", fps=10.0).images(500.0) == 120
     camera = film_camera(Camera(321, 241, 200.0, 200.0, 160.0, 120.0), 0)
     assert (camera.width, camera.height) == (320, 240)
-    export_video(reader, tmp_path / "film.gif", VideoOptions(200, 5.0, 0.2), renderer=seer(WORLD))
-    with Image.open(tmp_path / "film.gif") as film:
-        assert film.size == (3 * 200 + 4 * GAP, 150 + HEAD + FOOT), "panels with titles and colour bars"
-        shown = np.asarray(film.convert("RGB")).astype(int)
+    export_video(reader, tmp_path / "film.webm", VideoOptions(200, 5.0, 0.2), renderer=seer(WORLD))
+    shown = read_film(tmp_path / "film.webm")[0][0].astype(int)
+    assert shown.shape == (150 + HEAD + FOOT, 3 * 200 + 4 * GAP, 3), "panels with titles and colour bars"
     bar = shown[HEAD + 150 + FOOT // 2, 2 * GAP + 200 + 80 : 2 * GAP + 400 - 80]
     assert (np.ptp(bar, axis=0) > 60).all() and shown[:HEAD, 2 * GAP + 200 :].max() > 150
 
@@ -200,8 +197,7 @@ def reader_apart(tmp_path: Path) -> RunReader:
 
 def test_frames_apart_are_not_exported(reader_apart: RunReader, tmp_path: Path) -> None:
     reader, out = reader_apart, tmp_path / "out"
-    out.mkdir()
-    assert export_nerfstudio(reader, out / "t.json") == 3 and reader.left_out() == "; left out: 1 lost, 2 apart"
+    assert export_colmap(reader, tmp_path / "all") == 3 and reader.left_out() == "; left out: 1 lost, 2 apart"
     assert export_colmap(reader, out, images=True) == 2 and reader.left_out(keyframes=True) == "; left out: 1 apart"
     assert sorted(p.name for p in (out / "images").iterdir()) == ["frame-000000.png", "frame-000002.png"]
     _, keyframes = FusionInput.at(reader.run, reader.camera).views()
@@ -215,7 +211,7 @@ def test_runs_without_a_pose_are_refused(reader: RunReader, tmp_path: Path) -> N
     log = reader.run.path / "log.jsonl"
     log.write_text(log.read_text().replace('"lost": false', '"lost": true'))
     with pytest.raises(RunError, match="has no frame whose pose is known"):
-        export_nerfstudio(reader, tmp_path / "t.json")
+        export_colmap(reader, tmp_path / "model")
     (reader.run.path / "trajectory.txt").unlink()
     with pytest.raises(RunError, match=r"no trajectory\.txt"):
         export_colmap(RunReader(reader.run, Walls), tmp_path / "model")

@@ -1,6 +1,5 @@
 """Paths in other programs' formats, checked by independent readers; COLMAP's also by its own reader."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -39,37 +38,6 @@ def ahead(T_world_camera: np.ndarray) -> np.ndarray:
     """Return points in front of a camera, in the world frame."""
     points = np.random.default_rng(3).uniform([-1, -1, 1], [1, 1, 4], (20, 3))
     return points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
-
-
-def test_transforms_are_opengl_cameras(tmp_path: Path) -> None:
-    """Project points as nerfstudio does: x right, y up, view along −z, pixels measured from the corner."""
-    path, file = some_path(), tmp_path / "transforms.json"
-    views.write_transforms(
-        file,
-        CAMERA,
-        NAMES,
-        path.T_world_camera,
-        path.timestamps_s.tolist(),
-        depth_names=NAMES,
-        points_name="points.ply",
-    )
-    read = json.loads(file.read_text())
-    assert (read["w"], read["h"], read["camera_model"]) == (64, 48, "OPENCV") and read["ply_file_path"] == "points.ply"
-    assert read["depth_unit_scale_factor"] == 1e-3 and all(read[name] == 0 for name in ("k1", "k2", "p1", "p2"))
-    assert [f["file_path"] for f in read["frames"]] == [f["depth_file_path"] for f in read["frames"]] == NAMES
-    for frame, T, t in zip(read["frames"], path.T_world_camera, path.timestamps_s, strict=True):
-        points = ahead(T)
-        x, y, z = (np.linalg.inv(frame["transform_matrix"]) @ np.c_[points, np.ones(20)].T)[:3]
-        assert (z < 0).all() and frame["timestamp_s"] == t
-        pixels = np.stack([read["cx"] + read["fl_x"] * x / -z, read["cy"] - read["fl_y"] * y / -z], 1)
-        np.testing.assert_allclose(pixels - 0.5, seen_by_us(points, T), atol=1e-6)
-
-
-def test_transforms_without_images_have_no_depth_entries(tmp_path: Path) -> None:
-    path = some_path()
-    views.write_transforms(tmp_path / "t.json", CAMERA, NAMES, path.T_world_camera, path.timestamps_s.tolist())
-    read = json.loads((tmp_path / "t.json").read_text())
-    assert "depth_file_path" not in read["frames"][0] and not {"ply_file_path", "depth_unit_scale_factor"} & set(read)
 
 
 def write_colmap(folder: Path) -> tuple[Trajectory, np.ndarray, np.ndarray]:

@@ -23,7 +23,6 @@ BLIND = (
     "plugins/evaluation/report",
     "plugins/outputs/drawing",
     "plugins/outputs/floorplan",
-    "plugins/outputs/splats",
     "plugins/outputs/mesh_files.py",
     "plugins/outputs/mesh_editing.py",
     "plugins/sources",

@@ -11,7 +11,6 @@ from sigmasplat.plugins.evaluation.metrics.uncertainty import (
     calibration_scores,
     coverage,
     gaussian_nll,
-    reliability,
     score,
     sparsification,
     spearman,
@@ -50,17 +49,6 @@ def test_nll_is_lowest_at_the_true_variance() -> None:
 
 def test_a_slightly_negative_variance_gives_a_finite_nll() -> None:
     assert np.isfinite(gaussian_nll(np.array([-1e-6, 0.0]), np.array([0.1, 0.0])))
-
-
-def test_reliability_is_calibrated_for_true_variances() -> None:
-    v, e = noise()
-    rows = reliability(v, e)
-    assert [row["pixels"] for row in rows] == [4000] * 10
-    predicted, empirical = (np.array([row[name] for row in rows]) for name in ("predicted", "empirical"))
-    assert (np.diff(predicted) > 0).all()
-    np.testing.assert_allclose(empirical / predicted, 1.0, atol=0.12)
-    np.testing.assert_allclose(predicted.mean(), v.mean())
-    assert sum(row["pixels"] for row in reliability(v[:7], e[:7])) == 7
 
 
 def test_sparsification_by_hand() -> None:
@@ -126,6 +114,6 @@ def test_the_mean_squared_z_score_is_the_scale_of_the_highest_likelihood() -> No
 
 def test_scores_without_pixels_are_nan() -> None:
     values = score(np.empty(0), np.empty(0))
-    assert values["pixels"] == 0 and np.isnan(values["spearman"]) and values["reliability"] == []
+    assert values["pixels"] == 0 and np.isnan(values["spearman"])
     assert all(np.isnan(value) for value in calibration_scores(np.empty(0), np.empty(0)).values())
     assert np.isnan(z_scores(np.empty(0), np.empty(0))["z_rms"])

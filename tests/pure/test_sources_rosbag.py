@@ -198,46 +198,13 @@ def test_without_header_times_the_recording_times_are_used(tmp_path: Path) -> No
     assert np.array_equal(source.frame(0).depth_m, metres(seen.depths_mm[1]))
 
 
-@pytest.mark.parametrize("kind", ["ros1", "mcap"])
-def test_the_only_pose_topic_is_the_ground_truth(tmp_path: Path, kind: str) -> None:
+def test_poses_in_a_bag_are_no_ground_truth(tmp_path: Path) -> None:
+    """They are those of another tracker: odometry, as a rule."""
+
     def fill(recorder: Recorder, seen: Scene) -> None:
         aligned(recorder, seen)
         for t, T in zip(seen.times_s, seen.poses, strict=True):
-            recorder.add("/mocap/pose", t + 0.5, recorder.pose(t, T))
-
-    path, seen = written(tmp_path, kind, fill)
-    truth = open_source(path).truth()
-    assert truth is not None
-    np.testing.assert_allclose(truth.T_world_camera, seen.poses, atol=1e-9)
-    np.testing.assert_allclose(truth.timestamps_s, seen.times_s, atol=1e-6)
-
-
-@pytest.mark.parametrize("linked", [True, False])
-def test_poses_of_a_body_are_converted_to_the_camera_or_ignored(tmp_path: Path, linked: bool) -> None:
-    def fill(recorder: Recorder, seen: Scene) -> None:
-        aligned(recorder, seen)
-        for t, T in zip(seen.times_s, seen.poses, strict=True):
-            body = recorder.transform("/unused", t, "world", "marker", T @ se3.inverse(LINK))
-            recorder.messages.pop()
-            recorder.add("/vicon/marker", t, body)
-        if linked:
-            recorder.transform("/tf_static", seen.times_s[0], "marker", COLOR_FRAME, LINK)
-
-    path, seen = written(tmp_path, "ros1", fill)
-    truth = open_source(path).truth()
-    if not linked:
-        assert truth is None
-        return
-    assert truth is not None
-    np.testing.assert_allclose(truth.T_world_camera, seen.poses, atol=1e-9)
-
-
-def test_two_pose_topics_give_no_ground_truth(tmp_path: Path) -> None:
-    def fill(recorder: Recorder, seen: Scene) -> None:
-        aligned(recorder, seen)
-        for topic in ("/odom/a", "/odom/b"):
-            for t, T in zip(seen.times_s, seen.poses, strict=True):
-                recorder.add(topic, t, recorder.pose(t, T))
+            recorder.add("/odom", t, recorder.pose(t, T))
 
     path, _ = written(tmp_path, "ros1", fill)
     assert open_source(path).truth() is None

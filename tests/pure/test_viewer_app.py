@@ -9,24 +9,19 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 
 from room_map import room_map
 from sigmasplat.data.map_uncertainty import SHIPPED, Background, MapUncertainty, SplatStd
-from sigmasplat.data.mesh import Mesh
 
 viser = pytest.importorskip("viser", reason="viser is not installed (pip install 'sigmasplat[viewer]')")
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
 from sigmasplat.plugins.viewer.app import ViewerApp  # noqa: E402
 from sigmasplat.plugins.viewer.panel import (  # noqa: E402
-    COLOURINGS,
-    FINAL_MAP,
     MODE_LABELS,
     PREDICTED_MODES,
-    SUBMAPS,
     VIEW_MODES,
 )
 from sigmasplat.plugins.viewer.server import HOST, close, open_server  # noqa: E402
@@ -95,21 +90,21 @@ def test_a_growing_run_is_shown_and_the_controls_follow(
     assert panel.row.value == FRAMES - 1, "the timeline stays at its end"
     assert not panel.legend.visible, "the splats' own colours need no legend"
 
-    panel.colouring.value = "σ"
+    panel.colouring.value = "uncertainty"
     wait_until(lambda: panel.legend.visible)
     texts = panel.hidden_text.content
     panel.hidden.value = 50
     wait_until(lambda: panel.hidden_text.content != texts)
     offered = [mode for mode in VIEW_MODES if MODE_LABELS[mode] in panel.mode.options]
-    assert set(VIEW_MODES) - set(offered) == {*PREDICTED_MODES, "mesh"}, "submaps have no predicted errors and no mesh"
-    assert not panel.keyframes.value and not panel.thumbnails.value, "the viewer opens without frusta and images"
+    assert set(VIEW_MODES) - set(offered) == {*PREDICTED_MODES}, "submaps have no predicted errors"
+    assert not panel.keyframes.value, "the viewer opens without frusta"
     for mode in (*offered[1:], offered[0]):
         before = len(client)
         panel.mode.value = MODE_LABELS[mode]
         wait_until(lambda before=before: len(client) > before)  # type: ignore[misc]
     panel.row.value = 3
     wait_until(lambda: "3" in panel.frame.content)
-    for control in (panel.keyframes, panel.thumbnails, panel.path):
+    for control in (panel.keyframes, panel.path):
         before = len(client)
         control.value = not control.value
         wait_until(lambda before=before: len(client) > before)  # type: ignore[misc]
@@ -119,41 +114,26 @@ def test_a_growing_run_is_shown_and_the_controls_follow(
 def test_predicted_errors_are_offered_for_the_final_map_only(
     app: ViewerApp, client: list[int], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The errors have a legend in metres, and the slider hides splats with a larger error."""
+    """The errors have a legend, and hiding the most uncertain ones hides the splats with the larger error."""
     field, panel = room_map(), app.panel
     half = torch.arange(len(field)) % 2 == 0
     variances = torch.where(half[:, None], torch.tensor([0.01, 1e-4, 1e-4]), torch.tensor([0.01, 0.04, 0.04]))
     std = SplatStd(torch.where(half, 0.01, 0.2), torch.full((len(field),), 0.1))
     known = MapUncertainty(variances, Background((0.5, 0.5, 0.5), 0.1, 1.0), SHIPPED, 4, std)
-    app.show(Snapshot("room", EMPTY_PATH, Piece(None, field, uncertainty=known), (Piece(0, field),)))
-    wait_until(lambda: panel.max_std.visible)
-    everything, legend = panel.facts.content, panel.legend.image
-    panel.colouring.value = COLOURINGS["depth error"]
-    wait_until(lambda: panel.legend.visible and panel.legend.image is not legend)
-    panel.max_std.value = 0.05
-    wait_until(lambda: "0.05 m" in panel.hidden_text.content)
+    app.show(Snapshot("room", EMPTY_PATH, Piece(None, field, uncertainty=known)))
+    offered = lambda: {MODE_LABELS[mode] for mode in PREDICTED_MODES} <= {*panel.mode.options}  # noqa: E731
+    wait_until(offered)
+    everything = panel.facts.content
+    panel.hidden.value = 60
+    wait_until(lambda: "error of depth above" in panel.hidden_text.content and " m" in panel.hidden_text.content)
     assert panel.facts.content != everything and f"{int(half.sum()):,} of {len(field):,}" in panel.facts.content
     for mode in PREDICTED_MODES:
         before = len(client)
         panel.mode.value = MODE_LABELS[mode]
         wait_until(lambda before=before: len(client) > before)  # type: ignore[misc]
-    panel.part.value = SUBMAPS
-    wait_until(lambda: not panel.max_std.visible)
-    assert panel.mode.value == MODE_LABELS["splats"]
-    assert panel.part.value != FINAL_MAP and "viewer:" not in capsys.readouterr().err, "no error while drawing"
-
-
-def test_the_mesh_of_a_run_is_shown_instead_of_its_splats(
-    app: ViewerApp, client: list[int], capsys: pytest.CaptureFixture[str]
-) -> None:
-    corners = np.array([[0, 0, 1], [1, 0, 1], [0, 1, 1]], np.float32)
-    mesh = Mesh(corners, np.array([[0, 1, 2]], np.int32), np.ones((3, 3), np.float32))
-    app.show(Snapshot("room", final=Piece(None, room_map()), mesh=mesh))
-    wait_until(lambda: MODE_LABELS["mesh"] in app.panel.mode.options)
-    for mode in ("mesh", "splats"):
-        before = len(client)
-        app.panel.mode.value = MODE_LABELS[mode]
-        wait_until(lambda before=before: len(client) > before)  # type: ignore[misc]
-    app.show(Snapshot("another room", final=Piece(None, room_map())))
-    wait_until(lambda: MODE_LABELS["mesh"] not in app.panel.mode.options)
-    assert "viewer:" not in capsys.readouterr().err, "no error while drawing"
+    wait_until(lambda: panel.legend.visible)
+    app.show(Snapshot("room", EMPTY_PATH, None, (Piece(0, field),)))
+    wait_until(lambda: not offered())
+    assert panel.mode.value == MODE_LABELS["splats"] and "viewer:" not in capsys.readouterr().err, (
+        "no error while drawing"
+    )

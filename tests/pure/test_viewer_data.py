@@ -12,7 +12,6 @@ from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.map_uncertainty import SHIPPED, Background, MapUncertainty, SplatStd
-from sigmasplat.plugins.outputs.chosen_splats import sigmas
 from sigmasplat.plugins.outputs.drawing import colormap
 from sigmasplat.plugins.viewer import snapshot as lines
 from sigmasplat.plugins.viewer.layers import (
@@ -26,9 +25,9 @@ from sigmasplat.plugins.viewer.layers import (
     palette_range,
     render_layer,
     render_predicted,
-    sorted_depth_stds,
-    sorted_sigmas,
+    sorted_uncertainties,
     splat_arrays,
+    uncertainties,
     visibility_filter,
 )
 from sigmasplat.plugins.viewer.panel import escaped
@@ -89,7 +88,7 @@ def test_covariances_equal_rotated_squared_scales() -> None:
 
 def test_the_filter_hides_the_requested_share_and_splats_of_low_opacity() -> None:
     pieces = [Piece(0, field_of(600)), Piece(1, field_of(400, seed=1))]
-    ordered = sorted_sigmas(pieces)
+    ordered = sorted_uncertainties(pieces)
     assert len(ordered) == 1000 and (np.diff(ordered) >= 0).all()
     visible = visibility_filter(ordered, 0.25, 0.0)
     kept = [visible.mask(piece) for piece in pieces]
@@ -101,29 +100,32 @@ def test_the_filter_hides_the_requested_share_and_splats_of_low_opacity() -> Non
     assert torch.equal(faint, pieces[0].field.opacities >= 0.5) and 0 < faint.sum() < 600
     assert visibility_filter(ordered, 0.0, 0.0).mask(pieces[0]).all()
     assert (
-        len(sorted_sigmas(())) == 0
-        and visibility_filter(sorted_sigmas(()), 0.5, 0.0) == VisibilityFilter()
-        and palette_range(sorted_sigmas(())) == (0.0, 1.0)
+        len(sorted_uncertainties(())) == 0
+        and visibility_filter(sorted_uncertainties(()), 0.5, 0.0) == VisibilityFilter()
+        and palette_range(sorted_uncertainties(())) == (0.0, 1.0)
     )
 
 
 def test_splats_are_coloured_by_their_own_colour_or_by_sigma() -> None:
     field = field_of(50)
+    sigma = uncertainties(Piece(None, field))
     plain = splat_arrays(Piece(None, field), "colour", (0.0, 1.0), VisibilityFilter())
     np.testing.assert_array_equal(plain.colors, (field.colors.numpy() * 255).round().astype(np.uint8))
-    tinted = splat_arrays(Piece(None, field), "σ", (0.0, 0.3), VisibilityFilter())
-    np.testing.assert_array_equal(tinted.colors, colormap.apply(sigmas(field).numpy(), 0.0, 0.3, colormap.INFERNO))
+    tinted = splat_arrays(Piece(None, field), "uncertainty", (0.0, 0.3), VisibilityFilter())
+    np.testing.assert_array_equal(tinted.colors, colormap.apply(sigma.numpy(), 0.0, 0.3, colormap.INFERNO))
     np.testing.assert_array_equal(tinted.centers, field.means.numpy())
-    most, least = int(sigmas(field).numpy().argmax()), int(sigmas(field).numpy().argmin())
+    most, least = int(sigma.numpy().argmax()), int(sigma.numpy().argmin())
     assert tinted.colors[most].sum() > tinted.colors[least].sum() + 200
-    half = splat_arrays(Piece(None, field), "σ", (0.0, 0.3), VisibilityFilter(float(np.median(sigmas(field).numpy()))))
+    half = splat_arrays(
+        Piece(None, field), "uncertainty", (0.0, 0.3), VisibilityFilter(float(np.median(sigma.numpy())))
+    )
     assert len(half) == len(half.covariances) == len(half.colors) == 25
 
 
 def test_merged_pieces_hold_the_visible_splats_in_the_world_frame() -> None:
     T = se3.exp(np.array([1.0, 2.0, 3.0, 0.1, -0.2, 0.3]))
     pieces = (Piece(0, field_of(30)), Piece(1, field_of(20, seed=1), T))
-    visible = visibility_filter(sorted_sigmas(pieces), 0.4, 0.0)
+    visible = visibility_filter(sorted_uncertainties(pieces), 0.4, 0.0)
     whole = merge_pieces(pieces, visible)
     moved = pieces[1].field.moved(torch.from_numpy(T)).means[visible.mask(pieces[1])]
     torch.testing.assert_close(whole.means[-len(moved) :], moved)
@@ -148,10 +150,10 @@ def test_the_timeline_shows_the_submaps_started_by_then_and_the_final_map_comple
     pieces = tuple(Piece(i, field_of(3, seed=i)) for i in range(3))
     final = Piece(None, field_of(9))
     snapshot = Snapshot("run", path_of(30), final, pieces)
-    assert snapshot.visible_pieces(True, 0) == (final,) and snapshot.visible_pieces(False, 29) == pieces
-    assert snapshot.visible_pieces(False, 9) == pieces[:1] and snapshot.visible_pieces(False, 10) == pieces[:2]
-    assert Snapshot("run", path_of(30), final).visible_pieces(False, 0) == (final,)
-    assert Snapshot("run", pieces=pieces).visible_pieces(True, 0) == pieces
+    assert snapshot.visible_pieces(0) == (final,)
+    growing = Snapshot("run", path_of(30), None, pieces)
+    assert [growing.visible_pieces(row) for row in (9, 10, 29)] == [pieces[:1], pieces[:2], pieces]
+    assert Snapshot("run", pieces=pieces).visible_pieces(0) == pieces
 
 
 def test_the_path_is_drawn_up_to_a_frame_in_submap_colours_with_lost_frames_in_red() -> None:
@@ -238,17 +240,14 @@ def uncertain(count: int, seed: int = 0) -> Piece:
     return Piece(None, field_of(count, seed), uncertainty=known)
 
 
-def test_splats_with_a_large_depth_error_are_hidden_and_coloured_in_metres() -> None:
+def test_splats_with_a_large_depth_error_are_hidden() -> None:
     piece = uncertain(200)
     std_m = piece.uncertainty.std.depth_std_m  # type: ignore[union-attr]
     limit_m = float(std_m.median())
-    visible = VisibilityFilter(max_std_m=limit_m)
+    visible = VisibilityFilter(limit_m)
     assert torch.equal(visible.mask(piece), std_m <= limit_m)
-    assert visible.mask(Piece(0, piece.field)).all(), "submaps have no predicted error"
-    high = palette_range(sorted_depth_stds([piece]))[1]
-    drawn = splat_arrays(piece, "depth error", (0.0, high), visible)
-    expected = colormap.apply(std_m[std_m <= limit_m].numpy(), 0.0, high, colormap.INFERNO)
-    np.testing.assert_array_equal(drawn.colors, expected)
+    drawn = splat_arrays(piece, "colour", (0.0, 1.0), visible)
+    np.testing.assert_array_equal(drawn.centers, piece.field.means[std_m <= limit_m].numpy())
     merged, known = merge_pieces([piece], visible), merged_uncertainty([piece], visible)
     assert known is not None and len(known.splats) == len(merged) == len(drawn)
     assert merged_uncertainty([piece, piece], visible) is None

@@ -204,7 +204,7 @@ def test_replicas_true_mesh_and_the_weights_of_lpips_fill_their_columns(
     few = {"points": 10_000}
     monkeypatch.setattr(reconstruct.reconstruction, "score", partial(ours, **few))
     monkeypatch.setattr(reconstruct, "score_published", lambda *a, **n: published(*a, **n | few | {"views": 40}))
-    write_weights(tmp_path / "data/lpips", "alex")
+    write_weights(tmp_path / "data/lpips")
     data = paper_data.write_replica(tmp_path / "Replica", {"room0": paper_data.room(0, 60)}, surfaces=True)
     better = ["--set", "tracking.method=align", "--set", "mapping.first_iterations=30"]
     assert exit_code(*arguments(tmp_path / "out", data, "--scenes", "room0", *better)) == 0

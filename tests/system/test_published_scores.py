@@ -63,7 +63,7 @@ def test_replicas_layout_has_all_scores_of_the_papers(
     camera = {"w": c.width, "h": c.height, "fx": c.fx, "fy": c.fy, "cx": c.cx, "cy": c.cy, "scale": 1000.0}
     save_text(tmp_path / "cam_params.json", json.dumps({"camera": camera}))
     write_mesh(tmp_path / "room0_mesh.ply", walls(room))
-    write_weights(tmp_path / "weights", "alex")
+    write_weights(tmp_path / "weights")
 
     extra = ("--mesh", "--full-resolution", "--random-views", "6", "--lpips", str(tmp_path / "weights"))
     metrics = scored(folder, tmp_path / "run", *extra)

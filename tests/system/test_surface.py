@@ -168,7 +168,6 @@ def test_evaluation_scores_the_mesh_in_the_truths_frame(run: RunFolder) -> None:
     metrics = evaluate(run, WallAhead(), renderer=KnownView(off_m=0.005), strips_per_kind=0, mesh=True, random_views=0)
     found = metrics["reconstruction"]
     assert found["accuracy_m"] == pytest.approx(0.005, rel=0.05) and found["precision"] > 0.999
-    assert found["depth_l1_m"] == pytest.approx(0.005, rel=0.2)
     assert 0.5 < found["recall"] < found["completion_ratio"] < 0.9, (
         "the map has low alpha on the left and is too far away at the top"
     )
@@ -262,7 +261,7 @@ def test_the_command_makes_a_mesh_of_a_real_run(tmp_path: Path, capsys: pytest.C
     np.testing.assert_allclose(y_up.triangles, z_up.corners[..., [0, 2, 1]] * [1, 1, -1], atol=1e-5)
     np.testing.assert_allclose(np.sqrt(z_up.areas().sum() / mesh.areas().sum()), 1.0, atol=0.1, err_msg="still metres")
     for refused, words in (
-        (["--out", str(tmp_path / "a.fbx")], "give a name that ends in .ply, .obj, .glb, .stl"),
+        (["--out", str(tmp_path / "a.fbx")], "give a name that ends in .ply, .glb, .stl"),
         (["--out", str(tmp_path / "a.glb"), "--axes", "z-up"], "a GLB has y up by definition"),
         (["--triangles", "-1"], "--triangles must be at least 0"),
         (["--out", str(tmp_path / "run" / "mesh.ply")], "exists; give another --out"),

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -42,7 +42,6 @@ class EvalOptions:
             f"(default: {LPIPS_FOLDER}, if it exists)",
         ),
     ] = None
-    lpips_net: Annotated[Literal["alex", "vgg"], arg(None, "network of LPIPS; papers use alex")] = "alex"
 
     def network(self) -> tuple["Lpips | None", str]:
         """Load the network of LPIPS, or return the line that says why it is not scored. Raises ConfigError if weights
@@ -50,8 +49,8 @@ class EvalOptions:
         from sigmasplat.plugins.evaluation.metrics.lpips import Lpips, find_lpips
 
         if self.lpips is not None:
-            return Lpips.load(self.lpips, self.lpips_net), ""
-        return find_lpips(LPIPS_FOLDER, self.lpips_net)
+            return Lpips.load(self.lpips), ""
+        return find_lpips(LPIPS_FOLDER)
 
 
 DEFAULT_EVAL_OPTIONS = EvalOptions()

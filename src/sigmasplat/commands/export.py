@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import tyro
 
 from sigmasplat.commands import options
-from sigmasplat.commands.input_options import From0, Number, Whole, arg, flag
+from sigmasplat.commands.input_options import From0, Number, arg, flag
 from sigmasplat.commands.options import prepare_torch, refuse_existing, source_of
 from sigmasplat.config.ranges import Range
 from sigmasplat.files.lock import output_locked
@@ -19,10 +19,6 @@ from sigmasplat.registry import Output, rows
 class ExportOptions:
     """Options that only some formats accept, under their names on the command line (`Output.options`)."""
 
-    sigma_below: Annotated[
-        From0,
-        arg("S", "keep only splats with σ below S, for colours 0 to 1; σ is learned, not calibrated", "(default: all)"),
-    ] = None
     std_below_m: Annotated[
         From0,
         arg(
@@ -36,18 +32,13 @@ class ExportOptions:
         From0,
         arg("A", "keep only splats with opacity above A", "(default: all)"),
     ] = None
-    max_splats: Annotated[
-        Whole,
-        Range(1),
-        arg("N", "keep at most N splats, those that fill the most pixels of the run's views", "(default: all)"),
-    ] = None
     axes: Annotated[
         Literal["y-up", "z-up", "y-down", "camera"] | None,
         arg(
             "{y-up,z-up,y-down,camera}",
-            "axes of a map: y-up, z-up and y-down are levelled; camera: those of the run's path; y-up "
-            "and camera only for SPZ and glTF",
-            "(default: y-up for SPZ and glTF, else y-down)",
+            "axes of a map: y-up, z-up and y-down are levelled; camera: those of the run's path; SPZ: only y-up "
+            "and camera",
+            "(default: y-up for SPZ, y-down for PLY)",
         ),
     ] = None
     plain: Annotated[
@@ -101,7 +92,7 @@ def export(
 
     {formats}
 
-    example: sigmasplat export runs/kitchen-sigma --out kitchen.spz --sigma-below 0.02
+    example: sigmasplat export runs/kitchen-sigma --out kitchen.spz --std-below-m 0.02
     """
     formats = rows(Output)
     chosen = choose(formats, format, out)

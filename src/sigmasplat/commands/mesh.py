@@ -33,12 +33,12 @@ def make_mesh(
         Range(0),
         arg(
             "M",
-            "close gaps that are at most M metres across by smooth patches, which have a high depth_std_m; 0 = none",
+            "close gaps that are at most M metres across by patches, which have a high depth_std_m; 0 = none",
         ),
     ] = 0.0,
     out: Annotated[
         Path | None,
-        arg("FILE", "file to write: .glb, .ply, .obj or .stl (no colours)", "(default: mesh.ply in RUN)"),
+        arg("FILE", "file to write: .glb, .ply or .stl (no colours)", "(default: mesh.ply in RUN)"),
     ] = None,
     overwrite: options.Overwrite = False,
     moved_to: options.MovedSource = None,

@@ -278,7 +278,7 @@ def _run_and_score(
     else:
         screen.next_commands([f"sigmasplat eval {folder.path}"], f"{outcome.summary()}: {folder.path}")
     if viewer:
-        keep_showing(screen, viewer, folder, source)
+        keep_showing(screen, viewer, folder)
     return OK
 
 

@@ -6,12 +6,10 @@ from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING
 
 from sigmasplat.commands import options
-from sigmasplat.commands.options import prepare_torch, source_of
-from sigmasplat.errors import SigmaSplatError
+from sigmasplat.commands.options import prepare_torch
 from sigmasplat.plugins.viewer.server import HOST, PORT, close, is_loopback, open_server, url_of
 
 if TYPE_CHECKING:
-    from sigmasplat.input.source import Source
     from sigmasplat.plugins.viewer.app import ViewerApp
     from sigmasplat.run.terminal import Screen
     from sigmasplat.run_folder.runs import RunFolder
@@ -29,11 +27,8 @@ def view(run: options.RunPath, host: options.Host = HOST, port: options.Port = P
     folder = RunFolder.open(run)
     check_has_map(folder)
     prepare_torch()
-    source = None  # without it, the run is shown without its images
-    with suppress(SigmaSplatError):
-        source = source_of(folder, None)
     with serve_viewer(Screen(), host, port) as viewer, suppress(KeyboardInterrupt):
-        viewer.show(finished_snapshot(folder, source))
+        viewer.show(finished_snapshot(folder))
         threading.Event().wait()
     return 0
 
@@ -60,12 +55,12 @@ def serve_viewer(screen: "Screen", host: str, port: int) -> Iterator["ViewerApp"
         close(server)
 
 
-def keep_showing(screen: "Screen", viewer: "ViewerApp", folder: "RunFolder", source: "Source") -> None:
+def keep_showing(screen: "Screen", viewer: "ViewerApp", folder: "RunFolder") -> None:
     """Keep showing a finished run until Ctrl-C."""
     from sigmasplat.plugins.viewer.snapshot_sources import finished_snapshot
 
     try:
-        viewer.show(finished_snapshot(folder, source))
+        viewer.show(finished_snapshot(folder))
         screen.say("the viewer keeps showing the run; press Ctrl-C to stop it")
         threading.Event().wait()
     except KeyboardInterrupt:

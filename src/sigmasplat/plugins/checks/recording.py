@@ -1,13 +1,13 @@
 """Inspect a recording before a run: format, size, depth and poses; problems that degrade the map, and their fixes."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image
 
 from sigmasplat.api import (
     CameraUnknown,
@@ -24,11 +24,12 @@ from sigmasplat.api import (
 from sigmasplat.plugins.checks.depth import EdgeAgreement, edge_agreement, overlay
 from sigmasplat.plugins.checks.motion import Motion, motion_warnings, rate, time_warnings, times_of
 from sigmasplat.plugins.outputs.drawing import colormap
-from sigmasplat.plugins.outputs.drawing.view_panels import BACKGROUND, FAINT, TEXT
+from sigmasplat.plugins.outputs.drawing.view_panels import ViewPanel, coloured, draw_view_strip
 from sigmasplat.plugins.sources import open_source
 
 SAMPLES = 16
-SHOWN = 6
+SHOWN, SHEET_PX = 4, 240
+"""Frames on the contact sheet, and the width of each of their pictures."""
 USUAL_FOCAL = 0.9
 """Typical focal length of depth cameras, in image widths: a field of view of 58°. Enough to inspect, not to map."""
 CONSECUTIVE = 300
@@ -207,41 +208,16 @@ def _suggested(format_name: str) -> str:
 
 
 def _sheet(frames: list[Frame]) -> Image.Image:
-    """Draw colour, depth, and the image with depth outlines, one column per frame."""
+    """Draw colour, depth, and the image with depth outlines, one row per frame."""
     chosen = [frames[int(k)] for k in np.linspace(0, len(frames) - 1, min(SHOWN, len(frames))).round()]
     depths = np.concatenate([frame.depth_m.reshape(-1) for frame in chosen])
-    low, high = colormap.value_range(depths, depths > 0)
-    columns = [
-        (
-            f"{frame.timestamp_s:.2f} s",
-            [
-                (frame.color * 255.0).round().astype(np.uint8),
-                colormap.apply_masked(frame.depth_m, frame.depth_m > 0, low, high, colormap.VIRIDIS),
-                overlay(frame),
-            ],
-        )
+    limits = colormap.value_range(depths, depths > 0)
+    strips = [
+        draw_view_strip([
+            ViewPanel("colour", (frame.color * 255.0).round().astype(np.uint8), f"{frame.timestamp_s:.2f} s"),
+            coloured("depth", frame.depth_m, frame.depth_m > 0, limits, colormap.VIRIDIS, " m"),
+            ViewPanel("depth outlines", overlay(frame)),
+        ], SHEET_PX)
         for frame in chosen
-    ]
-    return draw_contact_sheet(columns, ("colour", f"depth, {low:.2f} to {high:.2f} m", "depth outlines on the image"))
-
-
-WIDTH, GAP, HEAD, LINE = 260, 8, 28, 26
-
-
-def draw_contact_sheet(columns: Sequence[tuple[str, Sequence[colormap.Rgb]]], rows: Sequence[str]) -> Image.Image:
-    """Draw columns side by side, each a title and a picture uint8 [H, W, 3] for each row, with the name of each row
-    above it. All pictures get the aspect of the first."""
-    first = columns[0][1][0]
-    height = round(WIDTH * first.shape[0] / first.shape[1])
-    size = (len(columns) * (WIDTH + GAP) + GAP, HEAD + len(rows) * (height + LINE) + GAP)
-    made = Image.new("RGB", size, BACKGROUND)
-    draw, font = ImageDraw.Draw(made), ImageFont.load_default(15)
-    for k, (title, pictures) in enumerate(columns):
-        left = GAP + k * (WIDTH + GAP)
-        draw.text((left + 2, HEAD // 2), title, FAINT, font, anchor="lm")
-        for r, picture in enumerate(pictures):
-            small = Image.fromarray(np.ascontiguousarray(picture)).resize((WIDTH, height), Image.Resampling.LANCZOS)
-            made.paste(small, (left, HEAD + r * (height + LINE) + LINE))
-    for r, name in enumerate(rows):
-        draw.text((GAP + 2, HEAD + r * (height + LINE) + LINE // 2), name, TEXT, font, anchor="lm")
-    return made
+    ]  # fmt: skip
+    return Image.fromarray(np.concatenate([np.asarray(strip) for strip in strips]))

@@ -103,8 +103,8 @@ def describe_sets() -> Iterator[str]:
     """Yield a line per data set: name, title, number of recordings, licence."""
     for name, entry in sorted(SETS.items()):
         if entry.recordings:
-            many = len(entry.recordings)
-            count = f"{many} recordings" if many > 1 else f"one archive, {format_size(entry.recordings[''].size_bytes)}"
+            first, *others = entry.recordings.values()
+            count = f"{1 + len(others)} recordings" if others else f"one download, {format_size(first.size_bytes)}"
             yield f"{name:<10} {entry.title} · {count} · {entry.licence}"
         else:
             yield f"{name:<10} {entry.title} · on request: {entry.page}"

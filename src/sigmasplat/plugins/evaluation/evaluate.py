@@ -263,7 +263,7 @@ def _facts(run: RunFolder, source: Source, log: Log, field: GaussianField) -> di
 
 
 def _draw_plots(run: RunFolder, frames: RunFrames, truth: Trajectory | None) -> dict[str, charts.Plot]:
-    """Return the charts of path, states, submaps and times by name, and write truth.txt."""
+    """Return the charts of path and states by name, and write truth.txt."""
     times, estimate = frames.path.timestamps_s, frames.path.T_world_camera[:, :3, 3]
     known: NDArray[np.float64] | None = None
     aligned: Trajectory | None = None
@@ -275,4 +275,4 @@ def _draw_plots(run: RunFolder, frames: RunFrames, truth: Trajectory | None) -> 
         (run.path / TRUTH).unlink(missing_ok=True)  # of an earlier evaluation
     else:
         write_trajectory(run.path / TRUTH, aligned)  # for the viewer
-    return charts.run_charts(frames, known, run.read_loops())
+    return charts.run_charts(frames, known)

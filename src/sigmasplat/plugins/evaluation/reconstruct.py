@@ -175,7 +175,7 @@ def score(
     points = np.concatenate([found.corners.mean(1), centers])
     seen_true, seen_points = reconstruction.visible_parts(truth, points, *reference[1:], progress)
     seen_found, seen_splats = seen_points[: len(found.faces)], seen_points[len(found.faces) :]
-    of_mesh = reconstruction.score(found, *reference, seen=(seen_true, seen_found), progress=progress)
+    of_mesh = reconstruction.score(found, *reference, seen=(seen_true, seen_found))
     opacities = field.opacities.numpy().astype(np.float64)
     of_splats = score_splats(centers, opacities, *reference, seen=(seen_true, seen_splats))
     published = score_published(found, truth, seen_true, seen_found, views=random_views, progress=progress)

@@ -15,7 +15,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from sigmasplat.api import FieldRenderer, Matrix, SigmaSplatError, Trajectory, noted_up
-from sigmasplat.plugins.outputs.floorplan.ground import floor_frame, sample_surfaces
+from sigmasplat.plugins.outputs.floorplan.ground import floor_frame, horizontal, sample_surfaces, unit
 from sigmasplat.plugins.outputs.run_reader import RunReader
 
 Axes = Literal["y-up", "z-up", "y-down", "camera"]
@@ -62,11 +62,7 @@ def levelled(reader: RunReader) -> Matrix:
 def level_cameras(path: Trajectory, up_world: Matrix | None = None) -> Matrix:
     """Return R_floor_world [3, 3] without a map: z is the measured up direction `up_world` [3], or else the mean
     vertical direction of the cameras; y is level and ahead."""
-    up = -path.T_world_camera[:, :3, 1].sum(0) if up_world is None else up_world
-    first = path.T_world_camera[0, :3]
-    up = -first[:, 1] if np.linalg.norm(up) < 1e-9 else up / np.linalg.norm(up)
-    right = np.cross(first[:, 2], up)
-    if np.linalg.norm(right) < 0.3:  # the first camera looks straight down or up
-        right = first[:, 0] - (first[:, 0] @ up) * up
-    right /= np.linalg.norm(right)
-    return np.stack([right, np.cross(up, right), up])
+    poses = path.T_world_camera
+    up = unit(-poses[:, :3, 1].sum(0), -poses[0, :3, 1]) if up_world is None else up_world
+    ahead = horizontal(poses[0], up)
+    return np.stack([np.cross(ahead, up), ahead, up])

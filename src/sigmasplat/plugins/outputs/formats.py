@@ -5,10 +5,8 @@ Imports that load torch are inside the functions, so that `sigmasplat export --h
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import partial
-from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from sigmasplat.api import ConfigError, Output
 from sigmasplat.plugins.outputs.source import ExportSource as ExportSource
@@ -19,7 +17,6 @@ if TYPE_CHECKING:
 
 
 Bound = float | None
-SPZ, SOG, GLTF = (f"sigmasplat.plugins.outputs.splats.{name}" for name in ("spz", "sog", "gltf"))
 
 
 def owners(formats: tuple[Output, ...]) -> dict[str, Output]:
@@ -67,30 +64,23 @@ def refuse_unused(chosen: Output, formats: tuple[Output, ...], given: list[str])
             )
 
 
-def _splats(
-    module: str, own: "Axes", keeps_std: bool, source: ExportSource, target: Path, *, sigma_below: Bound,
-    std_below_m: Bound, opacity_above: Bound, max_splats: int | None, axes: "Axes | None", **more: Any,
-) -> str:  # fmt: skip
-    """Write the chosen splats with `write_field` of a module; own: the axes of its format, keeps_std: it has `std`."""
+def _spz(source: ExportSource, target: Path, *, std_below_m: Bound, opacity_above: Bound, axes: "Axes | None") -> str:
     from sigmasplat.plugins.outputs.chosen_splats import write_splats
+    from sigmasplat.plugins.outputs.spz import write_field
 
-    def write(field: "GaussianField", std: "SplatStd | None") -> None:
-        import_module(module).write_field(target, field, **more, **({"std": std} if keeps_std else {}))
-
-    return write_splats(
-        source, own, write, sigma_below=sigma_below, std_below_m=std_below_m, opacity_above=opacity_above,
-        max_splats=max_splats, axes=axes,
-    )  # fmt: skip
+    return write_splats(source, "y-up", lambda field, std: write_field(target, field), std_below_m, opacity_above, axes)
 
 
 def _ply(
-    source: ExportSource, target: Path, *, sigma_below: Bound, std_below_m: Bound, opacity_above: Bound,
-    max_splats: int | None, axes: "Axes | None", plain: bool,
-) -> str:  # fmt: skip
-    return _splats(
-        "sigmasplat.run_folder.splat_ply", "y-down", True, source, target, sigma_below=sigma_below,
-        std_below_m=std_below_m, opacity_above=opacity_above, max_splats=max_splats, axes=axes, plain=plain,
-    )  # fmt: skip
+    source: ExportSource, target: Path, *, std_below_m: Bound, opacity_above: Bound, axes: "Axes | None", plain: bool
+) -> str:
+    from sigmasplat.api import splat_ply
+    from sigmasplat.plugins.outputs.chosen_splats import write_splats
+
+    def write(field: "GaussianField", std: "SplatStd | None") -> None:
+        splat_ply.write_field(target, field, plain=plain, std=std)
+
+    return write_splats(source, "y-down", write, std_below_m, opacity_above, axes)
 
 
 @contextmanager
@@ -120,15 +110,15 @@ def _covariance(source: ExportSource, target: Path) -> str:
     return f"{len(path):,} poses with their covariance{reader.left_out()}"
 
 
-def _views(write: str, source: ExportSource, target: Path, *, pictures: bool) -> str:
-    from sigmasplat.plugins.outputs import views
+def _colmap(source: ExportSource, target: Path, *, pictures: bool) -> str:
+    from sigmasplat.plugins.outputs.views import export_colmap
 
     reader = source.reader()
     if not pictures:
-        count = getattr(views, write)(reader, target)
+        count = export_colmap(reader, target)
         return f"{count:,} views, no pictures (--pictures){reader.left_out()}"
     with _counting("pictures") as progress:
-        count = getattr(views, write)(reader, target, True, progress)
+        count = export_colmap(reader, target, True, progress)
         return f"{count:,} views with their pictures{reader.left_out(keyframes=True)}"
 
 
@@ -161,18 +151,14 @@ def _bag(source: ExportSource, target: Path, *, pictures: bool) -> str:
     return f"{sum(counts.values()):,} messages of {len(counts)} topics{reader.left_out()}"
 
 
-_nerfstudio, _colmap = (partial(_views, write) for write in ("export_nerfstudio", "export_colmap"))
 PLUGIN = (
     Output("ply", (".ply",), "3DGS PLY with σ², for every viewer", _ply),
-    Output("spz", (".spz",), "Niantic's SPZ, less than a fifth of the size", partial(_splats, SPZ, "y-up", False)),
-    Output("sog", (".sog",), "SuperSplat's SOG, the smallest", partial(_splats, SOG, "y-down", False)),
-    Output("gltf", (".glb",), "glTF with splats (KHR) and σ", partial(_splats, GLTF, "y-up", True)),
+    Output("spz", (".spz",), "Niantic's SPZ, less than a fifth of the size", _spz),
     Output("trajectory", (".txt",), "the path as TUM text", _trajectory),
     Output("covariance", (".cov.txt",), "the path as TUM text with the covariance of each pose", _covariance),
-    Output("nerfstudio", (".json",), "views as nerfstudio's transforms.json", _nerfstudio, True),
     Output("colmap", ("-colmap",), "a folder with COLMAP's text model in sparse/0", _colmap, True),
-    Output("video", (".webm", ".mp4", ".gif", ".webp"), "a video: colour, depth, uncertainty", _video, True),
-    Output("bag", (".mcap", "-bag"), "ROS 2 messages: path with covariance, map", _bag, True),
+    Output("video", (".webm", ".mp4"), "a video: colour, depth, uncertainty", _video, True),
+    Output("bag", (".mcap",), "ROS 2 messages: path with covariance, map", _bag, True),
     Output("plan", (".plan.png", ".png"), "a floor plan with regions to scan again", _plan, True),
 )
 """The formats of this package. The first one is the default."""

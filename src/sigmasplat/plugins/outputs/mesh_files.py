@@ -1,4 +1,4 @@
-"""Write surfaces as PLY, OBJ or GLB with a normal and a colour per vertex, or as STL; read PLY.
+"""Write surfaces as PLY or GLB with a normal and a colour per vertex, or as STL; read PLY.
 
 PLY and GLB also contain depth_std_m, if it is known; PLY also `filled`, the vertices that only close gaps. The unit is
 the metre.
@@ -9,7 +9,10 @@ metal, which is black without surroundings to reflect. COLOR_0 is linear by defi
 room is seen from inside and from outside, hence `doubleSided`.
 """
 
+import json
 import os
+import struct
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -27,10 +30,14 @@ from sigmasplat.api import (
     read_header,
     replacing,
 )
-from sigmasplat.plugins.outputs.splats.gltf import UNLIT, glb, linear
 
 GRAY = 0.7
 Values = NDArray[np.floating]
+NUMBERS = {np.dtype(code): number for code, number in (("<u1", 5121), ("<u2", 5123), ("<u4", 5125), ("<f4", 5126))}
+TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
+VERTICES, INDICES = 34962, 34963
+"""Kinds of buffer views."""
+UNLIT = "KHR_materials_unlit"
 MATERIAL = {
     "name": "recorded light",
     "pbrMetallicRoughness": {"baseColorFactor": [1.0, 1.0, 1.0, 1.0], "metallicFactor": 0.0, "roughnessFactor": 1.0},
@@ -50,13 +57,54 @@ def _glb(mesh: Mesh, note: str) -> bytes:
     }  # fmt: skip
     if mesh.depth_std_m is not None:
         attributes["_DEPTH_STD_M"] = mesh.depth_std_m.astype("<f4")
-    return glb(attributes, {}, MATERIAL, "surface", mesh.faces.astype("<u4").ravel())
+    arrays = [*attributes.values(), mesh.faces.astype("<u4").ravel()]
+    document: dict[str, Any] = {"asset": {"version": "2.0", "generator": "SigmaSplat"}, "scene": 0, "scenes": [{}]}
+    if not all(array.size for array in arrays):  # glTF has no empty accessors
+        return _packed(document, b"")
+    starts = np.cumsum([0, *(array.nbytes + -array.nbytes % 4 for array in arrays)]).tolist()
+    accessors: list[dict[str, Any]] = [
+        {"bufferView": i, "componentType": NUMBERS[array.dtype], "count": len(array)}
+        | {"type": TYPES[1 if array.ndim == 1 else array.shape[1]]}
+        | ({"normalized": True} if array.dtype == np.uint16 else {})
+        for i, array in enumerate(arrays)
+    ]
+    accessors[0] |= {end: [float(x) for x in getattr(mesh.vertices, end)(0)] for end in ("min", "max")}
+    of_mesh = {"attributes": {key: i for i, key in enumerate(attributes)}, "material": 0, "indices": len(attributes)}
+    document |= {
+        "extensionsUsed": [UNLIT],
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "name": "surface"}],
+        "meshes": [{"primitives": [of_mesh]}],
+        "materials": [MATERIAL],
+        "accessors": accessors,
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": start, "byteLength": array.nbytes}
+            | {"target": VERTICES if i < len(attributes) else INDICES}
+            for i, (start, array) in enumerate(zip(starts, arrays, strict=False))
+        ],
+        "buffers": [{"byteLength": starts[-1]}],
+    }
+    return _packed(document, b"".join(array.tobytes() + bytes(-array.nbytes % 4) for array in arrays))
+
+
+def _packed(document: Mapping[str, Any], data: bytes) -> bytes:
+    """Return a GLB: the document as JSON and, if there are any, the data; the length of a chunk is a multiple of 4."""
+    text = json.dumps(document, separators=(",", ":")).encode()
+    chunks = [(b"JSON", text + b" " * (-len(text) % 4)), *([(b"BIN\0", data)] if data else [])]
+    body = b"".join(struct.pack("<I4s", len(chunk), kind) + chunk for kind, chunk in chunks)
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body
+
+
+def linear(srgb: Values) -> NDArray[np.float64]:
+    """Convert sRGB in [0, 1] to linear light (IEC 61966-2-1)."""
+    values = np.asarray(srgb, np.float64)
+    return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
 
 
 def _linear_colors(mesh: Mesh) -> NDArray[np.uint16]:
     srgb = np.full(mesh.vertices.shape, GRAY) if mesh.colors is None else mesh.colors
     rgba = np.ones((len(srgb), 4))
-    rgba[:, :3] = linear(srgb)
+    rgba[:, :3] = linear(np.clip(srgb, 0.0, 1.0))
     return np.rint(rgba * 65535.0).astype("<u2")
 
 
@@ -73,7 +121,7 @@ NOTE = "sigmasplat, unit metre"
 def write_mesh(path: Path, mesh: Mesh, note: str = NOTE) -> None:
     """Write a mesh in the format of the path's ending, atomically; the axes of the vertices stay as they are.
 
-    Vertices for GLB have y up, as glTF requires. note: one line of ASCII for the header of PLY, OBJ and STL, for
+    Vertices for GLB have y up, as glTF requires. note: one line of ASCII for the header of PLY and STL, for
     instance its axes. Raises RunError on an unknown ending or if the file cannot be written.
     """
     check_ending(path)
@@ -159,19 +207,19 @@ def _ply(mesh: Mesh, note: str) -> bytes:
     if it is known, uchar filled (1 = closes a gap) if gaps were closed, faces as lists of int."""
     faces = np.zeros(len(mesh.faces), np.dtype([("count", "u1"), ("corners", "<i4", 3)]))
     faces["count"], faces["corners"] = 3, mesh.faces
-    vertices = vertex_rows(mesh.vertices, _bytes(mesh), mesh.normals(), mesh.depth_std_m, mesh.filled)
+    vertices = _vertex_rows(mesh)
+    columns = [
+        f"{'uchar' if vertices.dtype[name].itemsize == 1 else 'float'} {name}" for name in vertices.dtype.names or ()
+    ]
     corners = ("face", len(faces), ["list uchar int vertex_indices"])
-    return header_of(vertex_header(vertices), corners, comment=note) + vertices.tobytes() + faces.tobytes()
+    return header_of(("vertex", len(vertices), columns), corners, comment=note) + vertices.tobytes() + faces.tobytes()
 
 
-def vertex_rows(
-    positions: Values, colors: NDArray[np.uint8], normals: Values | None, depth_std_m: Values | None,
-    filled: NDArray[np.bool_] | None = None,
-) -> NDArray[np.void]:  # fmt: skip
-    """Return vertices as rows of a PLY, with the columns that are given."""
-    groups = {
-        "x y z": positions, "nx ny nz": normals, "red green blue": colors, "depth_std_m": depth_std_m,
-        "filled": filled,
+def _vertex_rows(mesh: Mesh) -> NDArray[np.void]:
+    """Return the vertices as rows of a PLY, with the columns that are known."""
+    groups: dict[str, NDArray[Any] | None] = {
+        "x y z": mesh.vertices, "nx ny nz": mesh.normals(), "red green blue": _bytes(mesh),
+        "depth_std_m": mesh.depth_std_m, "filled": mesh.filled,
     }  # fmt: skip
     columns = {
         name: values if values.ndim == 1 else values[:, k]
@@ -180,27 +228,10 @@ def vertex_rows(
         for k, name in enumerate(names.split())
     }
     kinds = {name: "<f4" if values.dtype.kind == "f" else "u1" for name, values in columns.items()}
-    rows = np.zeros(len(positions), list(kinds.items()))
+    rows = np.zeros(len(mesh.vertices), list(kinds.items()))
     for name, values in columns.items():
         rows[name] = values
     return rows
-
-
-def vertex_header(rows: NDArray[np.void]) -> tuple[str, int, list[str]]:
-    """Return the element of `vertex_rows` for the header."""
-    kinds = {name: "uchar" if rows.dtype[name].itemsize == 1 else "float" for name in rows.dtype.names or ()}
-    return "vertex", len(rows), [f"{kind} {name}" for name, kind in kinds.items()]
-
-
-def _obj(mesh: Mesh, note: str) -> bytes:
-    """Return the mesh as Wavefront OBJ; the colour follows each vertex, as MeshLab and Blender read it."""
-    rows = np.concatenate([mesh.vertices.astype(np.float64), _bytes(mesh) / 255.0], 1)
-    normals = mesh.normals()
-    vertices = ("v %.5f %.5f %.5f %.4f %.4f %.4f\n" * len(rows)) % tuple(rows.ravel().tolist())
-    directions = ("vn %.4f %.4f %.4f\n" * len(rows)) % tuple(normals.ravel().tolist())
-    corners = np.repeat(mesh.faces.ravel() + 1, 2)  # a vertex and its normal have the same number
-    faces = ("f %d//%d %d//%d %d//%d\n" * len(mesh.faces)) % tuple(corners.tolist())
-    return (f"# {note}\n" + vertices + directions + faces).encode("ascii")
 
 
 def _stl(mesh: Mesh, note: str) -> bytes:
@@ -225,4 +256,4 @@ def color_bytes(colors: NDArray[np.floating]) -> NDArray[np.uint8]:
     return np.asarray(np.rint(np.clip(colors, 0.0, 1.0) * 255.0), np.uint8)
 
 
-_FORMATS = {".ply": _ply, ".obj": _obj, ".glb": _glb, ".stl": _stl}
+_FORMATS = {".ply": _ply, ".glb": _glb, ".stl": _stl}

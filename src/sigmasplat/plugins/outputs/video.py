@@ -11,7 +11,6 @@ from typing import Literal
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from PIL import Image
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 
@@ -30,11 +29,11 @@ from sigmasplat.api import (
     replacing,
     se3,
 )
-from sigmasplat.plugins.evaluation.metrics.views import COVERED_ALPHA
+from sigmasplat.plugins.evaluation.metrics.views import COVERED_ALPHA, Renderer
 from sigmasplat.plugins.outputs.drawing import colormap
 from sigmasplat.plugins.outputs.drawing.colormap import Rgb
 from sigmasplat.plugins.outputs.drawing.view_panels import ViewPanel, coloured, draw_view_strip
-from sigmasplat.plugins.outputs.floorplan.ground import Floats, SurfaceRenderer, floor_frame, sample_surfaces
+from sigmasplat.plugins.outputs.floorplan.ground import Floats, floor_frame, sample_surfaces
 from sigmasplat.plugins.outputs.run_reader import RunReader
 
 SMOOTHING_S = 0.25
@@ -131,7 +130,7 @@ def export_video(
     target: Path,
     options: VideoOptions | None = None,
     *,
-    renderer: SurfaceRenderer | None = None,
+    renderer: Renderer | None = None,
     progress: Progress = no_progress,
 ) -> int:
     """Write a video and return its number of images. Calls `progress(done, total)` at the start and after each image.
@@ -160,7 +159,7 @@ class Film:
 
     field: GaussianField
     camera: Camera
-    renderer: SurfaceRenderer
+    renderer: Renderer
 
     def images(self, poses: Matrix, panels: bool, progress: Progress = no_progress) -> Iterator[Rgb]:
         """Yield an image for each pose [N, 4, 4]: colour, in `panels` with depth and √V beside it."""
@@ -209,7 +208,7 @@ def orbit_view(
     path: Trajectory,
     camera: Camera,
     images: int,
-    renderer: SurfaceRenderer,
+    renderer: Renderer,
     up_world: Matrix | None = None,
 ) -> tuple[GaussianField, Matrix]:
     """Return the map without its ceiling, and poses [images, 4, 4] on a circle above it from which it is visible;
@@ -230,9 +229,6 @@ def orbit_view(
 
 
 CODECS = {".webm": "VP90", ".mp4": "vp09"}
-ANIMATIONS = {".gif": "GIF", ".webp": "WEBP"}
-ENDINGS = (*CODECS, *ANIMATIONS)
-NO_IMAGES = "a video needs at least one image, found none"
 
 
 def write_video(path: Path, images: Iterable[Rgb], fps: float) -> None:
@@ -245,10 +241,7 @@ def write_video(path: Path, images: Iterable[Rgb], fps: float) -> None:
     with replacing(path) as temporary:
         scratch = temporary.with_suffix(kind)  # OpenCV selects the format by the ending
         try:
-            if kind in CODECS:
-                _write_vp9(scratch, images, fps, CODECS[kind])
-            else:
-                _write_animation(scratch, iter(images), fps, ANIMATIONS[kind])
+            _write_vp9(scratch, images, fps, CODECS[kind])
             os.replace(scratch, temporary)
         finally:
             scratch.unlink(missing_ok=True)
@@ -256,8 +249,8 @@ def write_video(path: Path, images: Iterable[Rgb], fps: float) -> None:
 
 def check_ending(path: Path) -> None:
     """Raise RunError unless the path's ending is that of a video."""
-    if path.suffix.lower() not in ENDINGS:
-        raise RunError(f"cannot write a video as {path.name}; give a name that ends in {', '.join(ENDINGS)}")
+    if path.suffix.lower() not in CODECS:
+        raise RunError(f"cannot write a video as {path.name}; give a name that ends in {', '.join(CODECS)}")
 
 
 def _write_vp9(path: Path, images: Iterable[Rgb], fps: float, codec: str) -> None:
@@ -273,15 +266,13 @@ def _write_vp9(path: Path, images: Iterable[Rgb], fps: float, codec: str) -> Non
                     fourcc = cv2.VideoWriter.fourcc(*codec)
                     writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, fourcc, fps, size)
                 if not writer.isOpened():
-                    raise RunError(
-                        f"cannot write {path.name} with this OpenCV; choose .gif or .webp, or a writable place"
-                    )
+                    raise RunError(f"cannot write {path.name} with this OpenCV, which lacks VP9; reinstall it")
             writer.write(np.ascontiguousarray(image[: size[1], : size[0], ::-1]))
     finally:
         if writer is not None:
             writer.release()
     if writer is None:
-        raise RunError(NO_IMAGES)
+        raise RunError("a video needs at least one image, found none")
 
 
 @contextmanager
@@ -296,16 +287,3 @@ def _quiet() -> Iterator[None]:
     finally:
         os.dup2(kept, 2)
         os.close(kept)
-
-
-def _write_animation(path: Path, images: Iterator[Rgb], fps: float, kind: str) -> None:
-    """Write an animation that repeats endlessly."""
-    first = next(images, None)
-    if first is None:
-        raise RunError(NO_IMAGES)
-    rest = (Image.fromarray(image) for image in images)
-    duration_ms = round(1000.0 / fps)
-    options = {"quality": 80} if kind == "WEBP" else {}
-    Image.fromarray(first).save(
-        path, kind, save_all=True, append_images=rest, duration=duration_ms, loop=0, **options
-    )  # fmt: skip

@@ -1,16 +1,12 @@
-"""Write a run for programs that train on images: views as nerfstudio's transforms.json or as COLMAP's text model, and
-points.
+"""Write a run for programs that train on images: views and points as COLMAP's text model.
 
-nerfstudio's format is read by instant-ngp and most trainers of radiance fields, too. Its cameras have OpenGL's axes: x
-right, y up, z backwards (nerfstudio's documentation, "Data conventions"). COLMAP's poses are world to camera,
-quaternions wxyz; points have no tracks, because no features were matched (COLMAP's documentation, "Output Format").
-In both, the image's corner is (0, 0) and the first pixel's centre (½, ½), so the principal point is half a pixel larger
-than in `Camera`.
+COLMAP's poses are world to camera, quaternions wxyz; points have no tracks, because no features were matched (COLMAP's
+documentation, "Output Format"). The image's corner is (0, 0) and the first pixel's centre (½, ½), so the principal
+point is half a pixel larger than in `Camera`.
 """
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,15 +18,13 @@ from sigmasplat.api import (
     Matrix,
     Progress,
     RunError,
-    header_of,
     make_folder,
     no_progress,
     replacing,
     se3,
-    write_json,
     write_text,
 )
-from sigmasplat.plugins.outputs.mesh_files import color_bytes, vertex_header, vertex_rows
+from sigmasplat.plugins.outputs.mesh_files import color_bytes
 from sigmasplat.plugins.outputs.run_reader import RunReader
 
 Points = NDArray[np.floating]
@@ -51,115 +45,31 @@ def opaque_rows(field: GaussianField, most: int) -> NDArray[np.intp]:
     return np.asarray(rows[np.linspace(0, len(rows) - 1, min(most, len(rows))).astype(int)])
 
 
-def write_points(
-    path: Path, positions: Points, colors: Points, normals: Points | None = None, depth_std_m: Points | None = None
-) -> None:
-    """Write a binary PLY of positions [N, 3], colors [N, 3] in [0, 1], unit normals [N, 3] and depth_std_m [N].
-
-    Raises RunError if the file cannot be written.
-    """
-    rows = vertex_rows(positions, color_bytes(colors), normals, depth_std_m)
-    with replacing(path) as temporary:
-        temporary.write_bytes(header_of(vertex_header(rows)) + rows.tobytes())
-
-
-IMAGES, DEPTHS = "images", "depths"
-MAX_MM = 65535
+IMAGES = "images"
 
 
 def image_name(frame: int) -> str:
-    """Return the file name of a frame's images."""
+    """Return the file name of a frame's image."""
     return f"frame-{frame:06d}.png"
 
 
-def export_images(reader: RunReader, folder: Path, depth: bool, progress: Progress) -> Sequence[int]:
-    """Write the colour of the keyframes as PNG to images/, and, if requested, their depth as 16-bit millimetres (0 = no
-    reading, also above 65.5 m) to depths/.
+def export_images(reader: RunReader, folder: Path, progress: Progress) -> Sequence[int]:
+    """Write the colour of the keyframes as PNG to images/.
 
     Keyframes without a valid pose are left out. Returns their frame numbers. Raises RunError if no keyframe is left.
     """
     valid, written = set(reader.valid_frames()), []
+    make_folder(folder / IMAGES)
     total = reader.count_keyframes()
     for done, (frame, picture) in enumerate(reader.keyframes(), 1):
         if frame in valid:
-            _write_png(folder / IMAGES / image_name(frame), picture.color)
-            if depth:
-                millimetres = np.rint(picture.depth_m.astype(np.float64) * 1000.0)
-                millimetres[millimetres > MAX_MM] = 0.0
-                _write_png(folder / DEPTHS / image_name(frame), millimetres.astype(np.uint16))
+            with replacing(folder / IMAGES / image_name(frame)) as temporary:
+                Image.fromarray(picture.color).save(temporary, "PNG")
             written.append(frame)
         progress(done, total)
     if not written:
         raise RunError(f"run {reader.run.path} has no keyframes, so it has no images to export; run it again")
     return written
-
-
-def _write_png(path: Path, pixels: NDArray[Any]) -> None:
-    make_folder(path.parent)
-    with replacing(path) as temporary:
-        Image.fromarray(pixels).save(temporary, "PNG")
-
-
-POINTS_NAME = "points.ply"
-T_GL_CAMERA = np.diag([1.0, -1.0, -1.0, 1.0])
-"""From `Camera`'s axes to OpenGL's; it is its own inverse."""
-MILLIMETRES = 0.001
-
-
-def export_nerfstudio(reader: RunReader, target: Path, images: bool = False, progress: Progress = no_progress) -> int:
-    """Write transforms.json; return the number of views.
-
-    Views are all frames whose pose is valid; with `images` only the keyframes, whose images are written to images/
-    and depths/ beside the file, with points.ply. The images' names are the same in both cases. Raises RunError.
-    """
-    frames = export_images(reader, target.parent, True, progress) if images else reader.valid_frames()
-    path = reader.poses_of(frames)
-    if images:
-        write_points(target.parent / POINTS_NAME, *splat_points(reader.run.read_map()))
-    write_transforms(
-        target,
-        reader.camera,
-        [f"{IMAGES}/{image_name(frame)}" for frame in frames],
-        path.T_world_camera,
-        path.timestamps_s.tolist(),
-        depth_names=[f"{DEPTHS}/{image_name(frame)}" for frame in frames] if images else None,
-        points_name=POINTS_NAME if images else None,
-    )
-    return len(frames)
-
-
-def write_transforms(
-    path: Path,
-    camera: Camera,
-    names: Sequence[str],
-    T_world_camera: Matrix,
-    timestamps_s: Sequence[float],
-    *,
-    depth_names: Sequence[str] | None = None,
-    points_name: str | None = None,
-) -> None:
-    """Write views: the images' file names relative to the file, T_world_camera [N, 4, 4], times.
-
-    depth_names: 16-bit images in millimetres; points_name: a PLY with the initial points. Raises RunError if the file
-    cannot be written.
-    """
-    frames = [
-        {"file_path": name, "timestamp_s": float(t), "transform_matrix": T @ T_GL_CAMERA}
-        for name, t, T in zip(names, timestamps_s, T_world_camera, strict=True)
-    ]
-    for frame, depth_name in zip(frames, depth_names or (), strict=bool(depth_names)):
-        frame["depth_file_path"] = depth_name
-    depth = {"depth_unit_scale_factor": MILLIMETRES} if depth_names else {}
-    points = {"ply_file_path": points_name} if points_name else {}
-    write_json(path, _intrinsics(camera) | depth | points | {"frames": frames})
-
-
-def _intrinsics(camera: Camera) -> dict[str, Any]:
-    """Return the camera in nerfstudio's terms: a pinhole is OPENCV without distortion."""
-    return {
-        "camera_model": "OPENCV", "w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy,
-        "cx": camera.cx + 0.5, "cy": camera.cy + 0.5, "k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0,
-    }  # fmt: skip
 
 
 SPARSE = Path("sparse") / "0"
@@ -173,7 +83,7 @@ def export_colmap(reader: RunReader, target: Path, images: bool = False, progres
     Raises RunError.
     """
     make_folder(target / SPARSE)
-    frames = export_images(reader, target, False, progress) if images else reader.valid_frames()
+    frames = export_images(reader, target, progress) if images else reader.valid_frames()
     names = [image_name(frame) for frame in frames]
     poses = reader.poses_of(frames).T_world_camera
     write_model(target / SPARSE, reader.camera, names, poses, *splat_points(reader.run.read_map()))

@@ -1,21 +1,19 @@
-"""Write ROS 2 messages as a bag, through the rosbags package (Apache-2.0): of a running or of a finished run.
+"""Write ROS 2 messages, through the rosbags package (Apache-2.0).
 
-A bag is a folder with metadata.yaml and one MCAP file, or the MCAP file alone."""
+A run that goes on writes a bag: a folder with metadata.yaml and one MCAP file. A finished run is exported as that file
+alone."""
 
 import os
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from torch import Tensor
 
 from sigmasplat.api import (
-    LOST,
-    RELOCALISED,
     Matrix,
     PathCovariance,
     Progress,
@@ -25,7 +23,7 @@ from sigmasplat.api import (
     import_optional,
     no_progress,
     noted_up,
-    se3,
+    replacing,
 )
 from sigmasplat.plugins.outputs.axes import level_cameras
 from sigmasplat.plugins.outputs.floorplan.floor_plan import FloorPlan, run_floor_plan
@@ -100,51 +98,34 @@ class BagSink:
         )  # fmt: skip
 
 
-FILE_ENDING = ".mcap"
-
-
 def export_bag(
     reader: RunReader, target: Path, *, pictures: bool = False, progress: Progress = no_progress
 ) -> dict[str, int]:
-    """Write a bag, or one MCAP file if `target` ends in .mcap; return the number of messages of each topic.
+    """Write an MCAP file; return the number of messages of each topic.
 
     pictures: also write the images of the keyframes. Calls `progress(poses done, total)` while the floor plan is made.
     Raises RunError if the run has no path or map, or if the target cannot be written; SourceError without the rosbags
     package.
     """
-    messages = RosMessages()
-    one_file = target.suffix == FILE_ENDING
-    folder = target.with_name(f".{target.name}.part")
-    shutil.rmtree(folder, ignore_errors=True)
-    counts = dict[str, int]()
-    try:
-        folder.mkdir()
-        bag = folder / target.name.removesuffix(FILE_ENDING)
-        sink = BagSink(bag)
-        sink.open(messages)
+    messages, counts = RosMessages(), Counter[str]()
+    with replacing(target) as temporary:
+        folder = temporary.with_name(f"{temporary.name}-bag")  # of its files only the MCAP file is kept
         try:
-            for message in _messages(reader, messages, pictures, progress):
-                sink.write(message)
-                counts[message.topic.name] = counts.get(message.topic.name, 0) + 1
-            sink.close()
-        except BaseException:
-            sink.abort()
-            raise
-        _remove_earlier(target)
-        (bag / f"{bag.name}{FILE_ENDING}" if one_file else bag).rename(target)
-    except OSError as problem:
-        raise RunError(f"cannot write {target}: {problem.strerror or problem}; choose a writable place") from problem
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
+            shutil.rmtree(folder, ignore_errors=True)  # of a process that was killed
+            sink = BagSink(folder)
+            sink.open(messages)
+            try:
+                for message in _messages(reader, messages, pictures, progress):
+                    sink.write(message)
+                    counts[message.topic.name] += 1
+                sink.close()
+            except BaseException:
+                sink.abort()
+                raise
+            (folder / f"{folder.name}.mcap").replace(temporary)
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
     return counts
-
-
-def _remove_earlier(target: Path) -> None:
-    if not target.is_dir():
-        return target.unlink(missing_ok=True)
-    for name in ("metadata.yaml", f"{target.name}{FILE_ENDING}"):
-        (target / name).unlink(missing_ok=True)
-    target.rmdir()
 
 
 def _messages(reader: RunReader, messages: RosMessages, pictures: bool, progress: Progress) -> Iterator[Encoded]:
@@ -162,13 +143,10 @@ def _messages(reader: RunReader, messages: RosMessages, pictures: bool, progress
 
 
 def _frames(reader: RunReader, messages: RosMessages, T_map_world: Matrix, pictures: bool) -> Iterator[Encoded]:
-    """Yield the messages of the frames: transforms, odometry, pose with covariance, images of keyframes."""
+    """Yield the messages of the frames: transform and pose with covariance of valid ones, images of keyframes."""
     images = reader.keyframes() if pictures else iter(())
     picture = next(images, None)
-    tensors = reader.run.read_checkpoint()[0]
-    T_odom_camera, tracked = _odometry(reader, tensors)
-    path = PathCovariance.of(tensors)
-    chain = None if path is None else path.without_loops()
+    path = PathCovariance.of(reader.run.read_checkpoint()[0])
     valid_links = ros.link_pose(T_map_world @ reader.valid_path().T_world_camera)
     valid = dict(zip(reader.valid_frames(), valid_links, strict=True))
     for row, record in enumerate(reader.frames.log):
@@ -176,66 +154,10 @@ def _frames(reader: RunReader, messages: RosMessages, T_map_world: Matrix, pictu
         if picture is not None and picture[0] == row:
             yield from messages.images(stamp_ns, reader.camera, picture[1].unit_color, picture[1].depth_m)
             picture = next(images, None)
-        if reader.frames.states[row] == LOST:
-            continue
-        T_odom_link, T_map_link = ros.link_pose(ros.T_LINK_OPTICAL @ T_odom_camera[row]), valid.get(row)
-        covariance = None
-        if chain is not None and tracked[row]:
-            covariance = ros.ros_covariance(chain.of_frame(row), ros.T_LINK_OPTICAL, T_odom_link)
-        yield messages.transforms(ros.TF, stamp_ns, ros.camera_links(T_odom_link, T_map_link))
-        yield messages.odometry(stamp_ns, ros.ODOM, ros.LINK, T_odom_link, covariance)
-        if T_map_link is not None:
-            covariance = None if path is None else ros.ros_covariance(path.of_frame(row), T_map_world, T_map_link)
-            yield messages.pose(stamp_ns, ros.MAP, T_map_link, covariance)
-
-
-FOUND_BY_FEATURES = "inliers"
-"""A step has this value if relocalisation decided its pose."""
-
-
-def has_motion(state: str, tracking: Mapping[str, float]) -> bool:
-    """Return whether tracking measured the motion to a frame from an earlier one, given the values of its step.
-
-    A lost frame has only a guess, and a relocalised one was found without an earlier frame. A frame that is tracked
-    again after lost ones has a motion: it is tracked from the same keyframe as the frames before them.
-    """
-    return state not in (LOST, RELOCALISED) and FOUND_BY_FEATURES not in tracking
-
-
-def odometry_poses(
-    T_chain_camera: Matrix, moved: Sequence[bool], lost: Sequence[bool], components: Sequence[int]
-) -> tuple[Matrix, NDArray[np.bool_]]:
-    """Return T_odom_camera [F, 4, 4] of a finished path, the identity at the first frame, and whether all motions up to
-    each frame were tracked [F].
-
-    T_chain_camera [F, 4, 4]: poses without corrections by loops; moved [F]: `has_motion` of each frame; lost [F];
-    components [F]. Motion that was not tracked is left out. A lost frame stays at the pose of the frame before.
-    """
-    poses, last = [np.eye(4)] if len(T_chain_camera) else [], 0
-    tracked = np.ones(len(T_chain_camera), np.bool_)
-    for i in range(1, len(T_chain_camera)):
-        tracked[i] = lost[i] or (moved[i] and components[i] == components[last])
-        pose = poses[-1]
-        if tracked[i] and not lost[i]:
-            pose = se3.orthonormalise(pose @ se3.inverse(T_chain_camera[last]) @ T_chain_camera[i])
-        poses.append(pose)
-        last = last if lost[i] else i
-    return np.array(poses).reshape(-1, 4, 4), np.logical_and.accumulate(tracked)
-
-
-def _odometry(reader: RunReader, tensors: Mapping[str, Tensor]) -> tuple[Matrix, NDArray[np.bool_]]:
-    """Return T_odom_camera [F, 4, 4] of all frames, and whether all motions up to each frame were tracked [F]."""
-    frames = reader.frames
-    chain = tensors.get("T_world_camera_odometry", tensors["T_world_camera"]).numpy()
-    if len(chain) < len(frames):
-        run = reader.run.path
-        raise RunError(f"{run}: {len(chain)} poses in the checkpoint for {len(frames)} frames; run it again")
-    components = [0] * len(frames)
-    if "submap_component" in tensors:
-        components = tensors["submap_component"][tensors["frame_submap"]].tolist()
-    lost = [state == LOST for state in frames.states]
-    moved = [has_motion(s, r.get("tracking", {})) for s, r in zip(frames.states, frames.log, strict=True)]
-    return odometry_poses(chain[: len(frames)], moved, lost, components)
+        if row in valid:
+            covariance = None if path is None else ros.ros_covariance(path.of_frame(row), T_map_world, valid[row])
+            yield messages.transforms(ros.TF, stamp_ns, [(ros.MAP, ros.LINK, valid[row])])
+            yield messages.pose(stamp_ns, ros.MAP, valid[row], covariance)
 
 
 def _floor(reader: RunReader, progress: Progress) -> tuple[FloorPlan | None, Matrix]:

@@ -1,18 +1,31 @@
 """Write a run that goes on to a bag: transforms, odometry, images. An error of the disk ends the bag, not the run."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from sigmasplat.api import Atlas, Callback, Frame, Matrix, Slam, Step, se3
+from sigmasplat.api import LOST, RELOCALISED, Atlas, Callback, Frame, Matrix, Slam, Step, se3
 from sigmasplat.plugins.robots import ros_messages as ros
-from sigmasplat.plugins.robots.bag import BagSink, has_motion
+from sigmasplat.plugins.robots.bag import BagSink
 from sigmasplat.plugins.robots.ros_messages import Encoded, RosMessages
 
 Images = Literal["none", "keyframes", "all"]
 STATIC = ((ros.MAP, ros.WORLD, ros.T_MAP_WORLD), (ros.LINK, ros.OPTICAL, ros.T_LINK_OPTICAL))
+
+
+FOUND_BY_FEATURES = "inliers"
+"""A step has this value if relocalisation decided its pose."""
+
+
+def has_motion(state: str, tracking: Mapping[str, float]) -> bool:
+    """Return whether tracking measured the motion to a frame from an earlier one, given the values of its step.
+
+    A lost frame has only a guess, and a relocalised one was found without an earlier frame. A frame that is tracked
+    again after lost ones has a motion: it is tracked from the same keyframe as the frames before them.
+    """
+    return state not in (LOST, RELOCALISED) and FOUND_BY_FEATURES not in tracking
 
 
 class LiveOdometry:

@@ -37,7 +37,6 @@ from sigmasplat.plugins.sources.bag_cameras import (
     depth_topic,
     lookup_transform,
     read_bag_calibration,
-    read_truth,
     sdk_transform,
 )
 from sigmasplat.plugins.sources.bag_messages import (
@@ -147,7 +146,6 @@ def open_bag(place: str, settings: InputConfig) -> RecordedSource:
     refuse_other_units(bag.path, {color.name: color_s, depth.name: depth_s})
     if not len(pairs):
         raise no_pairs(bag.path, {name: _times_s(found[name], True) for name in topics})
-    truth = read_truth(bag, color.frame, recorded_time)
     colors, depths = _message_paths(bag, color.name, color_s), _message_paths(bag, depth.name, depth_s)
     images = [
         BagImagePair(float(color_s[i]), colors[i], depths[j], bag, topics, (entries[0][i], entries[1][j]))
@@ -157,7 +155,7 @@ def open_bag(place: str, settings: InputConfig) -> RecordedSource:
     skipped = [f"{colors[i]}: no depth within {MAX_GAP_S:g} s" for i in alone]
     gyroscope, accelerometer = read_bag_imu(bag, color, color_s)
     return RecordedSource(
-        bag.path.resolve().stem, images, calibration, settings, truth, skipped, None, gyroscope, accelerometer
+        bag.path.resolve().stem, images, calibration, settings, None, skipped, None, gyroscope, accelerometer
     )
 
 

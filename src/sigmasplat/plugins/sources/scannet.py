@@ -1,9 +1,8 @@
-"""Read ScanNet scenes extracted from .sens files, in both layouts of SensReader, and ScanNet++ scenes.
+"""Read ScanNet scenes extracted from .sens files by SensReader/python, and ScanNet++ scenes.
 
-color/0.jpg  depth/0.png  pose/0.txt                         SensReader/python; also 000000.jpg
+color/0.jpg  depth/0.png  pose/0.txt                         also 000000.jpg
 intrinsic/intrinsic_color.txt  intrinsic_depth.txt  extrinsic_color.txt  extrinsic_depth.txt
 intrinsics_color.txt  intrinsics_depth.txt                   or in the scene's folder, as in scannet_frames_25k
-frame-000000.color.jpg  .depth.pgm  .pose.txt  _info.txt     SensReader/c++; also 3RScan's, BundleFusion's (info.txt)
 
 Depth (640×480, mm) has its own camera. It is registered to colour (1296×968), and the working width is depth's.
 Extrinsics transform a common frame to each camera: T_color_depth = E_color · E_depth⁻¹ (as in BundleFusion).
@@ -41,32 +40,24 @@ from sigmasplat.api import (
     SourceFormat,
     build_camera,
     build_trajectory,
-    check_positive,
     first_file,
     first_size,
     first_subfolder,
     folder_source,
-    frame_files,
-    has_frame_files,
     index_by_number,
     list_images,
     numbered_pairs,
-    parse_numbers,
     read_frames,
     read_json_object,
     read_matrix,
     read_pose,
     read_pose_files,
-    read_text,
     read_transforms_camera,
     se3,
-    to_matrix,
 )
 
 COLOR_SIZE, DEPTH_SIZE = (1296, 968), (640, 480)
 """Width and height of ScanNet's recordings. The published matrices are for these sizes, even if images are resized."""
-
-INFO_NAMES = ("_info.txt", "info.txt")
 
 
 def open_scannet(path: str, settings: InputConfig) -> RecordedSource:
@@ -84,8 +75,6 @@ def open_scannet(path: str, settings: InputConfig) -> RecordedSource:
 
 
 def _files(folder: Path) -> FrameFiles:
-    if has_frame_files(folder):
-        return frame_files(folder)
     return {
         "color": index_by_number(list_images(first_subfolder(folder, ("color", "rgb")), COLOR_ENDINGS)),
         "depth": index_by_number(list_images(folder / "depth", DEPTH_ENDINGS)),
@@ -95,7 +84,7 @@ def _files(folder: Path) -> FrameFiles:
 
 def _recorded(folder: Path, size: tuple[int, int], depth_size: tuple[int, int]) -> Calibration | None:
     """Build both cameras from the scene's matrices, None if they are missing. Raises SourceError if one is damaged."""
-    where, found, units = _matrices(folder)
+    where, found = _matrices(folder)
     if "color_intrinsic" not in found:
         return None
     camera = _camera(where["color_intrinsic"], found["color_intrinsic"], size, COLOR_SIZE)
@@ -106,29 +95,18 @@ def _recorded(folder: Path, size: tuple[int, int], depth_size: tuple[int, int]) 
     if not all(se3.is_rigid(T) for T in ends):
         raise SourceError(f"{folder}: the extrinsics of colour or depth are not rigid; correct or delete them")
     T_color_depth = ends[0] @ se3.inverse(ends[1])
-    return Calibration(camera, units, depth_camera=depth_camera, T_color_depth=T_color_depth)
+    return Calibration(camera, MM_PER_METRE, depth_camera=depth_camera, T_color_depth=T_color_depth)
 
 
-def _matrices(folder: Path) -> tuple[dict[str, Path], dict[str, Matrix], float]:
-    """Return file and value of each matrix by `{color|depth}_{intrinsic|extrinsic}`, and depth units per metre."""
-    where, found, units = {}, {}, MM_PER_METRE
-    for info in (folder / name for name in INFO_NAMES if (folder / name).is_file()):
-        lines = (line.split("=", 1) for line in read_text(info, errors="replace").splitlines() if "=" in line)
-        entries = {key.strip(): value.strip() for key, value in lines}
-        if shift := entries.get("m_depthShift"):
-            units = check_positive(info, "m_depthShift", parse_numbers(info, 1, [shift])[0])
-        for key, kind in (("Color", "color"), ("Depth", "depth")):
-            for part in ("Intrinsic", "Extrinsic"):
-                if text := entries.get(f"m_calibration{key}{part}"):
-                    name = f"{kind}_{part.lower()}"
-                    where[name], found[name] = info, to_matrix(f"{info} {key}{part}", text.split())
-        return where, found, units
+def _matrices(folder: Path) -> tuple[dict[str, Path], dict[str, Matrix]]:
+    """Return file and value of each matrix by `{color|depth}_{intrinsic|extrinsic}`."""
+    where, found = {}, {}
     for kind in ("color", "depth"):
         for part in ("intrinsic", "extrinsic"):
             names = (f"intrinsic/{part}_{kind}.txt", f"{part}s_{kind}.txt", f"{part}_{kind}.txt")
             if path := first_file(folder, names):
                 where[f"{kind}_{part}"], found[f"{kind}_{part}"] = path, read_matrix(path)
-    return where, found, units
+    return where, found
 
 
 def _camera(path: Path, K: Matrix, size: tuple[int, int], published: tuple[int, int]) -> Camera:
@@ -139,8 +117,7 @@ def _camera(path: Path, K: Matrix, size: tuple[int, int], published: tuple[int, 
 
 def _recognises(path: str) -> bool:
     folder = Path(path)
-    has_info = any((folder / name).is_file() for name in INFO_NAMES)
-    if any(folder.glob("*.sens")) or (has_info and has_frame_files(folder)):
+    if any(folder.glob("*.sens")):
         return True
     images = first_subfolder(folder, ("color", "rgb", "depth"))
     camera = (folder / "intrinsic").is_dir() or any(folder.glob("intrinsic*_*.txt"))

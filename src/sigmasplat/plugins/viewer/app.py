@@ -57,9 +57,7 @@ class ViewerApp:
         self.scene = ViserScene(server, self._clicked)
         self._snapshot: Snapshot | None = None
         self._drawn: dict[Any, Any] = {}
-        self._values: tuple[list[IdentityKey], dict[str, Floats]] = (
-            [], {"σ": layers.sorted_sigmas(()), "depth error": layers.sorted_depth_stds(())}
-        )  # fmt: skip
+        self._unsure: tuple[list[IdentityKey], Floats] = [], layers.sorted_uncertainties(())
         self._merged: tuple[Any, Any] = (None, None)
         self._wake, self._stop = threading.Event(), threading.Event()
         self._sharp, self._can_sharpen = False, False
@@ -104,27 +102,25 @@ class ViewerApp:
 
     def _draw(self, snapshot: Snapshot) -> None:
         path = snapshot.path
-        has_final, has_submaps = snapshot.final is not None, bool(snapshot.pieces)
-        self.panel.adapt(len(path), snapshot.live, snapshot.true_positions is not None, has_final and has_submaps)
+        self.panel.adapt(len(path), snapshot.live, snapshot.true_positions is not None)
         controls = self.panel.state()
-        pieces = snapshot.visible_pieces(controls.final_map, controls.row)
-        self.panel.offer(any(piece.uncertainty is not None for piece in pieces), snapshot.mesh is not None)
+        pieces = snapshot.visible_pieces(controls.row)
+        known = any(piece.uncertainty is not None for piece in pieces)
+        unit = " m" * any(piece.depth_std_m is not None for piece in pieces)
+        self.panel.offer(known)
         controls = self.panel.state()
-        ordered = self._values_of(pieces)
-        visible = layers.visibility_filter(
-            ordered["σ"], controls.hidden_share, controls.min_opacity, controls.max_std_m
-        )  # fmt: skip
-        span = layers.palette_range(ordered["depth error" if controls.colouring == "depth error" else "σ"])
+        ordered = self._uncertainties_of(pieces)
+        visible = layers.visibility_filter(ordered, controls.hidden_share, controls.min_opacity)
+        span = layers.palette_range(ordered)
         with self.server.atomic():
             self._draw_path(snapshot, controls)
             self._draw_splats(pieces, controls, span, visible)
-            self._draw_mesh(snapshot, controls)
         self._draw_keyframes(snapshot, controls)
-        self._show_texts(snapshot, controls, pieces, visible)
+        self._show_texts(snapshot, controls, pieces, visible, unit)
         self._follow(snapshot, controls)
         legend = None
-        if controls.mode == "splats" and controls.colouring != "colour":
-            legend = Legend(INFERNO, *span, " m" if controls.colouring == "depth error" else "")
+        if controls.mode == "splats" and controls.colouring == "uncertainty":
+            legend = Legend(INFERNO, *span, unit)
         for client in self.server.get_clients().values():
             legend = self._draw_layer(client, snapshot, controls, pieces, visible) or legend
         if self._is_new("legend", legend and legend[1:]):
@@ -137,15 +133,12 @@ class ViewerApp:
         self._drawn[what] = state
         return True
 
-    def _values_of(self, pieces: tuple[Piece, ...]) -> dict[str, Floats]:
-        """Return σ and depth errors of the splats in ascending order."""
+    def _uncertainties_of(self, pieces: tuple[Piece, ...]) -> Floats:
+        """Return the uncertainties of the splats in ascending order."""
         fields = [IdentityKey(piece.field) for piece in pieces]
-        if self._values[0] != fields:
-            self._values = (
-                fields,
-                {"σ": layers.sorted_sigmas(pieces), "depth error": layers.sorted_depth_stds(pieces)},
-            )
-        return self._values[1]
+        if self._unsure[0] != fields:
+            self._unsure = fields, layers.sorted_uncertainties(pieces)
+        return self._unsure[1]
 
     def _draw_path(self, snapshot: Snapshot, controls: ControlState) -> None:
         path, row = snapshot.path, controls.row
@@ -176,17 +169,12 @@ class ViewerApp:
         else:
             self.scene.place_splats({piece.name: piece.T_world_piece for piece in pieces})
 
-    def _draw_mesh(self, snapshot: Snapshot, controls: ControlState) -> None:
-        mesh = snapshot.mesh if controls.mode == "mesh" else None
-        if self._is_new("mesh", IdentityKey(mesh)):
-            self.scene.show_mesh(mesh)
-
     def _draw_keyframes(self, snapshot: Snapshot, controls: ControlState) -> None:
         path = snapshot.path
-        if self._is_new("keyframes", (IdentityKey(path), controls.row, controls.keyframes, controls.thumbnails)):
+        if self._is_new("keyframes", (IdentityKey(path), controls.row, controls.keyframes)):
             rows = lines.keyframes_to_show(path, controls.row) if controls.keyframes else ()
             poses = {row: path.T_world_camera[row] for row in rows}
-            self.scene.show_keyframes(snapshot.camera, poses, snapshot.image if controls.thumbnails else None)
+            self.scene.show_keyframes(snapshot.camera, poses)
 
     def _draw_layer(
         self, client: viser.ClientHandle, snapshot: Snapshot, controls: ControlState, pieces: tuple[Piece, ...],
@@ -225,7 +213,12 @@ class ViewerApp:
         return legend
 
     def _show_texts(
-        self, snapshot: Snapshot, controls: ControlState, pieces: tuple[Piece, ...], visible: VisibilityFilter
+        self,
+        snapshot: Snapshot,
+        controls: ControlState,
+        pieces: tuple[Piece, ...],
+        visible: VisibilityFilter,
+        unit: str,
     ) -> None:
         path = snapshot.path
         splats, kept = sum(len(p.field) for p in pieces), sum(int(visible.mask(p).sum()) for p in pieces)
@@ -238,9 +231,8 @@ class ViewerApp:
             f"{int(path.lost.sum())} lost{apart}, {submaps} submap{'s' * (submaps != 1)}  \n"
             f"{kept:,} of {splats:,} splats shown"
         )
-        limits = [f"σ above {visible.max_sigma:.3g}"] if visible.max_sigma < float("inf") else []
-        limits += [f"error of depth above {visible.max_std_m:g} m"] if visible.max_std_m < float("inf") else []
-        hidden = f"hidden: {', '.join(limits)}" if limits else ""
+        what = "error of depth" if unit else "σ"
+        hidden = f"hidden: {what} above {visible.most:.3g}{unit}" if visible.most < float("inf") else ""
         self.panel.show_texts(facts, hidden, _frame_text(snapshot, controls.row))
 
     def _follow(self, snapshot: Snapshot, controls: ControlState) -> None:
@@ -272,8 +264,7 @@ class ViewerApp:
             self._go(client, snapshot, min(self.panel.state().row, len(snapshot.path) - 1))
 
     def _go(self, client: viser.ClientHandle, snapshot: Snapshot, row: int) -> None:
-        """Move a browser's camera to the pose of a frame; hide the thumbnails, which would cover the view."""
-        self.panel.thumbnails.value = False
+        """Move a browser's camera to the pose of a frame."""
         move_camera(client, snapshot.path.T_world_camera[row])
         self.changed()
 

@@ -21,17 +21,23 @@ from sigmasplat.api import (
     se3,
     variance_parts,
 )
-from sigmasplat.plugins.evaluation.metrics.views import COVERED_ALPHA
-from sigmasplat.plugins.outputs.chosen_splats import sigmas
+from sigmasplat.plugins.evaluation.metrics.views import COVERED_ALPHA, as_array
 from sigmasplat.plugins.outputs.drawing import colormap
 from sigmasplat.plugins.outputs.drawing.view_panels import colour_bar
 from sigmasplat.plugins.viewer.snapshot import Piece, field_without_moments
 
-Colouring = Literal["colour", "σ", "depth error"]
+Colouring = Literal["colour", "uncertainty"]
 Floats = NDArray[np.float32]
 
+
+def uncertainties(piece: Piece) -> Tensor:
+    """Return how unsure each splat is [N]: its depth_std_m, m, if that is known, else σ, the root of the mean σ² of the
+    colour channels (colours in [0, 1])."""
+    return piece.field.variances.mean(1).sqrt() if piece.depth_std_m is None else piece.depth_std_m
+
+
 MIN_VISIBLE_OPACITY = 0.1
-"""Splats with a lower opacity are ignored when the range of σ or of the depth error is computed."""
+"""Splats with a lower opacity are ignored when the range of uncertainties is computed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,44 +56,31 @@ class SplatArrays:
 
 @dataclass(frozen=True)
 class VisibilityFilter:
-    """Hides splats whose σ is above `max_sigma`, whose opacity is below `min_opacity`, or whose depth_std_m is above
-    `max_std_m`, if it is known."""
+    """Hides splats whose uncertainty is above `most`, or whose opacity is below `min_opacity`."""
 
-    max_sigma: float = float("inf")
+    most: float = float("inf")
     min_opacity: float = 0.0
-    max_std_m: float = float("inf")
 
     def mask(self, piece: Piece) -> Tensor:
         """Return which splats are shown, bool [N]."""
-        shown = (sigmas(piece.field) <= self.max_sigma) & (piece.field.opacities >= self.min_opacity)
-        return shown if piece.depth_std_m is None else shown & (piece.depth_std_m <= self.max_std_m)
+        return (uncertainties(piece) <= self.most) & (piece.field.opacities >= self.min_opacity)
 
 
-def sorted_sigmas(pieces: Sequence[Piece]) -> Floats:
-    """Return σ of all visible splats in ascending order; of all splats if none is visible."""
-    return _sorted([(piece, sigmas(piece.field)) for piece in pieces])
-
-
-def sorted_depth_stds(pieces: Sequence[Piece]) -> Floats:
-    """Return depth_std_m of the splats of all pieces that have it, selected and sorted as `sorted_sigmas`."""
-    return _sorted([(piece, piece.depth_std_m) for piece in pieces if piece.depth_std_m is not None])
-
-
-def _sorted(values: Sequence[tuple[Piece, Tensor]]) -> Floats:
-    found = [of_piece[piece.field.opacities >= MIN_VISIBLE_OPACITY].numpy() for piece, of_piece in values]
+def sorted_uncertainties(pieces: Sequence[Piece]) -> Floats:
+    """Return the uncertainties of all visible splats in ascending order; of all splats if none is visible."""
+    known = [(uncertainties(piece), piece.field.opacities >= MIN_VISIBLE_OPACITY) for piece in pieces]
+    found = [values[shown].numpy() for values, shown in known]
     if not sum(map(len, found)):
-        found = [of_piece.numpy() for _, of_piece in values]
+        found = [values.numpy() for values, _ in known]
     return np.sort(np.concatenate([np.empty(0, np.float32), *found]))
 
 
-def visibility_filter(
-    ordered: Floats, hidden_share: float, min_opacity: float, max_std_m: float = float("inf")
-) -> VisibilityFilter:
-    """Return the filter that hides this share of the splats, those with the largest σ; `ordered` is sorted."""
-    max_sigma = float("inf")
+def visibility_filter(ordered: Floats, hidden_share: float, min_opacity: float) -> VisibilityFilter:
+    """Return the filter that hides this share of the splats, the most uncertain ones; `ordered` is sorted."""
+    most = float("inf")
     if hidden_share > 0.0 and len(ordered):
-        max_sigma = float(np.quantile(ordered, max(1.0 - hidden_share, 0.0)))
-    return VisibilityFilter(max_sigma, min_opacity, max_std_m)
+        most = float(np.quantile(ordered, max(1.0 - hidden_share, 0.0)))
+    return VisibilityFilter(most, min_opacity)
 
 
 def palette_range(ordered: Floats) -> tuple[float, float]:
@@ -98,18 +91,11 @@ def palette_range(ordered: Floats) -> tuple[float, float]:
 def splat_arrays(
     piece: Piece, colouring: Colouring, span: tuple[float, float], visible: VisibilityFilter
 ) -> SplatArrays:
-    """Return the visible splats in their own colours, or coloured by σ or depth error over the range `span`.
-
-    Splats without a known depth error are grey.
-    """
+    """Return the visible splats in their own colours, or coloured by uncertainty over the range `span`."""
     mask = visible.mask(piece)
     chosen = field_without_moments(piece.field.params[mask], {})
-    if colouring == "σ":
-        colors = colormap.apply(sigmas(chosen).numpy(), *span, colormap.INFERNO)
-    elif colouring == "depth error" and piece.depth_std_m is None:
-        colors = np.full((len(chosen), 3), colormap.NO_READING, np.uint8)
-    elif colouring == "depth error" and piece.depth_std_m is not None:
-        colors = colormap.apply(piece.depth_std_m[mask].numpy(), *span, colormap.INFERNO)
+    if colouring == "uncertainty":
+        colors = colormap.apply(uncertainties(piece)[mask].numpy(), *span, colormap.INFERNO)
     else:
         colors = np.asarray((chosen.colors.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8))
     return SplatArrays(
@@ -174,18 +160,18 @@ def render_layer(
     T_camera_world = se3.inverse(T_world_camera)
     with torch.no_grad():
         seen = render(field, camera, T_camera_world, None, options, backend)
-        alpha = _array(seen.alpha)
+        alpha = as_array(seen.alpha)
         covered = alpha > COVERED_ALPHA
-        depth_m = np.where(covered, _array(seen.depth) / np.maximum(alpha, COVERED_ALPHA), 0.0).astype(np.float32)
+        depth_m = np.where(covered, as_array(seen.depth) / np.maximum(alpha, COVERED_ALPHA), 0.0).astype(np.float32)
         if layer == "colour":
             return LayerImage((seen.color.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).cpu().numpy())
         if layer == "depth":
             return _mapped(depth_m, covered, colormap.value_range(depth_m, covered), colormap.VIRIDIS, " m")
         if layer == "V":
-            return _from_zero(_array(seen.variance.mean(2).clamp(min=0.0).sqrt()), covered, "")
+            return _from_zero(as_array(seen.variance.mean(2).clamp(min=0.0).sqrt()), covered, "")
         spread = render(field, camera, T_camera_world, torch.from_numpy(depth_m), options, backend).uncertainty
         assert spread is not None
-        about = np.sqrt(np.maximum(_array(spread), 0.0) / np.maximum(alpha, COVERED_ALPHA))
+        about = np.sqrt(np.maximum(as_array(spread), 0.0) / np.maximum(alpha, COVERED_ALPHA))
         return _from_zero(about, covered, " m")
 
 
@@ -201,10 +187,10 @@ def render_predicted(
     with torch.no_grad():
         parts = variance_parts(field, known.splats, known.background, camera, T_camera_world, options, backend)
         found = predicted(parts, known.calibration)
-    covered = _array(parts.alpha) > COVERED_ALPHA
+    covered = as_array(parts.alpha) > COVERED_ALPHA
     if layer == "color error":
-        return _from_zero(_array(found.color.sqrt()), np.ones_like(covered), "")
-    return _from_zero(_array(found.depth_std_m), covered, " m")
+        return _from_zero(as_array(found.color.sqrt()), np.ones_like(covered), "")
+    return _from_zero(as_array(found.depth_std_m), covered, " m")
 
 
 def draw_legend(legend: Legend) -> colormap.Rgb:
@@ -217,10 +203,6 @@ def draw_legend(legend: Legend) -> colormap.Rgb:
     draw.text((1, middle), f"{legend.low:.3g}{legend.unit}", INK, font, anchor="lm")
     draw.text((width - 1, middle), f"{legend.high:.3g}{legend.unit}", INK, font, anchor="rm")
     return np.asarray(image)
-
-
-def _array(values: Tensor) -> Floats:
-    return np.asarray(values.cpu(), np.float32)
 
 
 def _from_zero(values: Floats, valid: NDArray[np.bool_], unit: str) -> LayerImage:

@@ -10,13 +10,12 @@ import viser
 from sigmasplat.plugins.outputs.drawing.colormap import NO_READING, Rgb
 from sigmasplat.plugins.viewer.layers import LEGEND_SIZE, Colouring, Layer
 
-ViewMode = Literal["splats", "mesh", "colour", "depth", "V", "U", "color error", "depth error"]
+ViewMode = Literal["splats", "colour", "depth", "V", "U", "color error", "depth error"]
 VIEW_MODES: tuple[ViewMode, ...] = get_args(ViewMode)
 PREDICTED_MODES: tuple[ViewMode, ...] = ("color error", "depth error")
 """Only for maps with predicted errors."""
 MODE_LABELS: dict[ViewMode, str] = {
     "splats": "splats, drawn by the browser",
-    "mesh": "mesh",
     "colour": "colour, rendered by SigmaSplat",
     "depth": "depth",
     "V": "√V: standard deviation of colour",
@@ -24,10 +23,6 @@ MODE_LABELS: dict[ViewMode, str] = {
     "color error": "predicted error of colour",
     "depth error": "predicted error of depth",
 }
-COLOURINGS: dict[Colouring, str] = {"colour": "colour", "σ": "σ", "depth error": "predicted error of depth"}
-MOST_STD_M = 0.3
-"""End of the slider for predicted errors of depth; there, no splat is hidden."""
-FINAL_MAP, SUBMAPS = "final map", "submaps"
 
 
 @dataclass(frozen=True)
@@ -36,21 +31,18 @@ class ControlState:
 
     mode: ViewMode
     colouring: Colouring
-    final_map: bool
     hidden_share: float
     min_opacity: float
-    max_std_m: float
     row: int
     path: bool
     keyframes: bool
-    thumbnails: bool
     true_path: bool
     follow: bool
 
     @property
     def layer(self) -> Layer | None:
         """Return the layer that SigmaSplat renders, or None if the browser draws the scene."""
-        return None if self.mode == "splats" or self.mode == "mesh" else self.mode
+        return None if self.mode == "splats" else self.mode
 
 
 class ControlPanel:
@@ -72,23 +64,16 @@ class ControlPanel:
 
     def _add_map_controls(self, gui: viser.GuiApi) -> None:
         with gui.add_folder("Map"):
-            self.mode: Any = gui.add_dropdown("show", _mode_options(frozenset((*PREDICTED_MODES, "mesh"))))
+            self.mode: Any = gui.add_dropdown("show", _mode_options(predicted=False))
             self.colouring: Any = gui.add_dropdown(
                 "splat colour",
-                _colouring_options(predicted=False),
-                hint="the splats' own colours, σ of their colour, or predicted error of depth: bright = uncertain",
-            )
-            self.part = gui.add_dropdown(
-                "map", (FINAL_MAP, SUBMAPS), hint="the final map, or the submaps from which it was made"
+                get_args(Colouring),
+                hint="the splats' own colours, or how unsure they are: bright = uncertain",
             )
             self.legend = gui.add_image(np.zeros((*LEGEND_SIZE[::-1], 3), np.uint8), visible=False, format="png")
             self.hidden = gui.add_slider(
-                "hide uncertain", 0, 99, 1, 0, hint="hide this percentage of the splats: those with the largest σ"
+                "hide uncertain", 0, 99, 1, 0, hint="hide this percentage of the splats: the most uncertain ones"
             )
-            self.max_std = gui.add_slider(
-                "hide above, m", 0.005, MOST_STD_M, 0.005, MOST_STD_M, visible=False,
-                hint="hide splats with a larger predicted standard deviation of depth; at the right end none is hidden",
-            )  # fmt: skip
             self.min_opacity = gui.add_slider(
                 "minimum opacity", 0.0, 0.99, 0.01, 0.0, hint="hide splats with a lower opacity"
             )
@@ -104,33 +89,29 @@ class ControlPanel:
             self.keyframes = gui.add_checkbox(
                 "keyframes", False, hint="click a keyframe to move there and to see its image"
             )
-            self.thumbnails: Any = gui.add_checkbox("keyframe images", False)
             self.true_path = gui.add_checkbox("ground truth", True, visible=False)
 
     def _controls(self) -> tuple[Any, ...]:
         return (
-            self.mode, self.colouring, self.part, self.hidden, self.max_std, self.min_opacity,
-            self.row, self.follow, self.path, self.keyframes, self.thumbnails, self.true_path,
+            self.mode, self.colouring, self.hidden, self.min_opacity,
+            self.row, self.follow, self.path, self.keyframes, self.true_path,
         )  # fmt: skip
 
     def state(self) -> ControlState:
         """Return the current values of the controls."""
         return ControlState(
             next(mode for mode in VIEW_MODES if MODE_LABELS[mode] == self.mode.value),
-            next(name for name, label in COLOURINGS.items() if label == self.colouring.value),
-            self.part.value == FINAL_MAP,
+            self.colouring.value,
             self.hidden.value / 100.0,
             float(self.min_opacity.value),
-            float(self.max_std.value) if self.max_std.visible and self.max_std.value < MOST_STD_M else float("inf"),
             int(self.row.value),
             self.path.value,
             self.keyframes.value,
-            self.thumbnails.value,
             self.true_path.value,
             self.follow.value,
         )
 
-    def adapt(self, frames: int, live: bool, truth_known: bool, can_choose_map: bool) -> None:
+    def adapt(self, frames: int, live: bool, truth_known: bool) -> None:
         """Adapt the controls to the snapshot; a timeline at its end stays there while frames are added."""
         last = max(frames - 1, 1)
         at_end = self.row.value >= self.row.max
@@ -140,18 +121,13 @@ class ControlPanel:
             self.row.max = last
             if at_end:
                 self.row.value = last
-        self.follow.visible, self.true_path.visible, self.part.visible = live, truth_known, can_choose_map
+        self.follow.visible, self.true_path.visible = live, truth_known
 
-    def offer(self, known: bool, has_mesh: bool) -> None:
-        """Offer the controls of predicted errors if the shown map has them (`known`), and the mesh if there is one."""
-        absent = frozenset((() if known else PREDICTED_MODES) + (() if has_mesh else ("mesh",)))
-        for control, options in (
-            (self.mode, _mode_options(absent)),
-            (self.colouring, _colouring_options(known)),
-        ):
-            if control.options != options:
-                control.options = options
-        self.max_std.visible = known
+    def offer(self, known: bool) -> None:
+        """Offer to show predicted errors if the shown map has them (`known`)."""
+        options = _mode_options(known)
+        if self.mode.options != options:
+            self.mode.options = options
 
     def show_texts(self, facts: str, hidden: str, frame: str) -> None:
         """Show texts about the run, about the hidden splats, and about the selected frame."""
@@ -177,9 +153,5 @@ def escaped(text: str) -> str:
     return "".join(c if c.isalnum() or c in " .,-" or not c.isascii() else f"&#{ord(c)};" for c in text)
 
 
-def _mode_options(absent: frozenset[str]) -> tuple[str, ...]:
-    return tuple(MODE_LABELS[mode] for mode in VIEW_MODES if mode not in absent)
-
-
-def _colouring_options(predicted: bool) -> tuple[str, ...]:
-    return tuple(label for name, label in COLOURINGS.items() if predicted or name != "depth error")
+def _mode_options(predicted: bool) -> tuple[str, ...]:
+    return tuple(MODE_LABELS[mode] for mode in VIEW_MODES if predicted or mode not in PREDICTED_MODES)

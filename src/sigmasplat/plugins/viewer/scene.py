@@ -5,16 +5,13 @@ from functools import partial
 from typing import Any, Literal
 
 import numpy as np
-import trimesh
 import viser
-from PIL import Image
 
-from sigmasplat.api import Camera, Matrix, Mesh, se3
-from sigmasplat.plugins.outputs.drawing.colormap import Rgb
+from sigmasplat.api import Camera, Matrix, se3
 from sigmasplat.plugins.viewer.layers import SplatArrays
 from sigmasplat.plugins.viewer.snapshot import LOST_COLOUR, Bytes, Floats, Segments
 
-FRUSTUM_M, THUMBNAIL_PX = 0.08, 160
+FRUSTUM_M = 0.08
 LINE_PX, FRUSTUM_PX, DOT_M = {"path": 4.0, "truth": 2.0}, 1.0, 0.03
 KEYFRAME_COLOUR, CURRENT_COLOUR = (112, 120, 130), (255, 210, 60)
 AHEAD_M = 1.0
@@ -31,7 +28,6 @@ class ViserScene:
         self.server, self.clicked = server, clicked
         self._splats: dict[str, viser.GaussianSplatHandle] = {}
         self._keyframes: dict[int, viser.CameraFrustumHandle] = {}
-        self._with_images = True
         self._marks: dict[str, Any] = {}
         server.scene.set_up_direction("-y")
 
@@ -53,17 +49,6 @@ class ViserScene:
         for name, T in T_world_piece.items():
             if name in self._splats:
                 _place(self._splats[name], T)
-
-    def show_mesh(self, mesh: Mesh | None) -> None:
-        """Show a mesh in its own colours without light and shadow, or remove it if None."""
-        self._drop("mesh")
-        if mesh is not None and len(mesh.faces):
-            grey = np.full_like(mesh.vertices, 0.7)
-            colors = np.rint(255.0 * (grey if mesh.colors is None else mesh.colors)).astype(np.uint8)
-            drawn = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colors, process=False)
-            self._marks["mesh"] = self.server.scene.add_mesh_trimesh(
-                "/mesh", drawn, cast_shadow=False, receive_shadow=False
-            )
 
     def show_lines(self, name: Literal["path", "truth"], segments: Segments | None) -> None:
         """Show line segments under a name, or remove them if None."""
@@ -96,34 +81,27 @@ class ViserScene:
             return
         if shown not in self._marks:
             colour = LOST_COLOUR if lost else CURRENT_COLOUR
-            self._marks[shown] = self._frustum(f"/{shown.replace(' ', '-')}", camera, 1.5 * FRUSTUM_M, colour, None)
+            self._marks[shown] = self._frustum(f"/{shown.replace(' ', '-')}", camera, 1.5 * FRUSTUM_M, colour)
         _place(self._marks[shown], T_world_camera)
 
-    def show_keyframes(
-        self, camera: Camera, T_world_camera: Mapping[int, Matrix], image: Callable[[int], Rgb | None] | None
-    ) -> None:
-        """Show exactly the frusta of these keyframes, by row, with thumbnails unless `image` is None."""
-        with_images = image is not None
-        all_change = with_images != self._with_images
-        removed = self._keyframes.keys() if all_change else self._keyframes.keys() - T_world_camera.keys()
-        for row in tuple(removed):
+    def show_keyframes(self, camera: Camera, T_world_camera: Mapping[int, Matrix]) -> None:
+        """Show exactly the frusta of these keyframes, by row."""
+        for row in tuple(self._keyframes.keys() - T_world_camera.keys()):
             self._keyframes.pop(row).remove()
-        self._with_images = with_images
         for row, T in T_world_camera.items():
             if row not in self._keyframes:
-                small = thumbnail(image(row)) if image else None
-                frustum = self._frustum(f"/keyframes/{row}", camera, FRUSTUM_M, KEYFRAME_COLOUR, small)
+                frustum = self._frustum(f"/keyframes/{row}", camera, FRUSTUM_M, KEYFRAME_COLOUR)
                 frustum.on_click(partial(self._pass_on, row))
                 self._keyframes[row] = frustum
             _place(self._keyframes[row], T)
 
     def _frustum(
-        self, name: str, camera: Camera, scale: float, color: tuple[int, int, int], image: Rgb | None
+        self, name: str, camera: Camera, scale: float, color: tuple[int, int, int]
     ) -> viser.CameraFrustumHandle:
         fov = 2.0 * float(np.arctan(0.5 * camera.height / camera.fy))
         return self.server.scene.add_camera_frustum(
             name, fov, camera.width / camera.height, scale=scale, thickness=FRUSTUM_PX, thickness_units="screen",
-            color=color, image=image, format="jpeg", jpeg_quality=80, cast_shadow=False, receive_shadow=False,
+            color=color, cast_shadow=False, receive_shadow=False,
         )  # fmt: skip
 
     def _pass_on(self, row: int, event: viser.SceneNodePointerEvent[viser.CameraFrustumHandle]) -> None:
@@ -159,15 +137,6 @@ def camera_pose(camera: viser.CameraHandle) -> Matrix:
 def srgb_to_linear(colors: Bytes) -> Bytes:
     """Convert sRGB colours to linear ones, 0 to 255, which viser expects for lines."""
     return (255.0 * (colors / 255.0) ** 2.2).round().astype(np.uint8)
-
-
-def thumbnail(image: Rgb | None) -> Rgb | None:
-    """Return an image scaled down to at most `THUMBNAIL_PX` on each side."""
-    if image is None:
-        return None
-    small = Image.fromarray(image)
-    small.thumbnail((THUMBNAIL_PX, THUMBNAIL_PX))
-    return np.asarray(small)
 
 
 def _place(node: Any, T_world_node: Matrix) -> None:

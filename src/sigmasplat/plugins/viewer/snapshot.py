@@ -18,7 +18,6 @@ from sigmasplat.api import (
     GaussianField,
     MapUncertainty,
     Matrix,
-    Mesh,
     RenderConfig,
     Rows,
     evenly_spaced,
@@ -93,10 +92,9 @@ EMPTY_PATH = CameraPath(np.empty((0, 4, 4)), np.empty(0, np.bool_), np.empty(0, 
 class Snapshot:
     """The state of a run at one time.
 
-    final: the final map, None before it is made; pieces: the submaps, which may be missing if there is a final map.
+    final: the final map, None before it is made; pieces: the submaps until then.
     true_positions [M, 3] m in the run's world, None unless an evaluation has stored them. image(row) returns the image
-    of the keyframe at a row of the path, or None if it was not kept. mesh: the surface that `sigmasplat mesh` has
-    written, None without one.
+    of the keyframe at a row of the path, or None if it was not kept.
     """
 
     title: str
@@ -110,11 +108,10 @@ class Snapshot:
     backend: str = "auto"
     live: bool = False
     status: str = ""
-    mesh: Mesh | None = None
 
-    def visible_pieces(self, final_map: bool, row: int) -> tuple[Piece, ...]:
-        """Return the final map if it exists and is requested, else the submaps started up to frame `row`."""
-        if self.final is not None and (final_map or not self.pieces):
+    def visible_pieces(self, row: int) -> tuple[Piece, ...]:
+        """Return the final map if it exists, else the submaps started up to frame `row`."""
+        if self.final is not None:
             return (self.final,)
         if not len(self.path):
             return self.pieces

@@ -3,7 +3,6 @@
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,18 +11,13 @@ from torch import Tensor
 
 from sigmasplat.api import (
     LOST,
-    MESH,
     TRUTH,
     Callback,
     Camera,
-    GaussianField,
     Matrix,
-    Mesh,
     RunError,
     RunFolder,
     RunFrames,
-    SigmaSplatError,
-    Source,
     SubmapStore,
     outside_world,
     read_trajectory,
@@ -31,7 +25,6 @@ from sigmasplat.api import (
     submaps_outside,
 )
 from sigmasplat.plugins.outputs.drawing.colormap import Rgb
-from sigmasplat.plugins.outputs.mesh_files import read_mesh
 from sigmasplat.plugins.viewer.snapshot import (
     BUDGET,
     DEFAULT_CAMERA,
@@ -51,32 +44,26 @@ Log = list[dict[str, Any]]
 ShowSnapshot = Callable[[Snapshot], None]
 
 
-def finished_snapshot(run: RunFolder, source: Source | None = None, budget: int = BUDGET) -> Snapshot:
-    """Read the snapshot of a finished run; `source` provides keyframe images that the run did not keep.
+def finished_snapshot(run: RunFolder, budget: int = BUDGET) -> Snapshot:
+    """Read the snapshot of a finished run.
 
     Raises RunError if the run stopped before it had a map, or if its uncertainty belongs to another map.
     """
     frames, final, tensors = run.read_frames(), run.read_map(), run.read_checkpoint()[0]
     config, true_file = run.config(), run.path / TRUTH
-    outside = frames.submaps_outside()
-    cache, anchors = SubmapCache(run.submaps, budget), np.asarray(tensors["T_world_submap"], np.float64)
-    cache.load(anchors)
-    pieces = list(cache.pieces.values())
-    if pieces and len(pieces) < len(anchors):
-        pieces.append(Piece(len(pieces), thin(GaussianField(tensors["params"]), budget), anchors[-1]))
-    pieces = [piece for piece in pieces if piece.submap not in outside]
+    cache = SubmapCache(run.submaps, budget)
+    cache.load(np.asarray(tensors["T_world_submap"], np.float64))  # for the images of keyframes
     return Snapshot(
         run.path.resolve().name,
         _final_path(frames, tensors),
         Piece(None, without_moments(final), uncertainty=run.uncertainty_of(final)),
-        within_budget(pieces, budget),
+        (),
         read_trajectory(true_file).T_world_camera[:, :3, 3] if true_file.is_file() else None,
-        _camera(run, cache, source),
-        partial(_image, cache, frames.log, run, source),
+        cache.camera or DEFAULT_CAMERA,
+        cache.image,
         config.render,
         config.backend,
         status=str(run.facts().get("status")),
-        mesh=_mesh(run),
     )
 
 
@@ -107,14 +94,6 @@ class SubmapCache:
         return self.store.picture(*self._keyframes[row]).color
 
 
-def _mesh(run: RunFolder) -> Mesh | None:
-    """Read the mesh that `sigmasplat mesh` has written into the run folder; None without one, or if it is damaged."""
-    try:
-        return read_mesh(run.path / MESH) if (run.path / MESH).is_file() else None
-    except SigmaSplatError:
-        return None
-
-
 def _final_path(frames: RunFrames, tensors: Mapping[str, Tensor]) -> CameraPath:
     """Return the path of a finished run: valid poses from trajectory.txt, the others from the checkpoint."""
     poses = np.tile(np.eye(4), (len(frames), 1, 1))
@@ -129,27 +108,6 @@ def _lost_and_submaps(log: Log) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
     """Return whether each frame is lost [F], and its submap [F]."""
     lost = np.array([bool(record.get("lost")) for record in log], np.bool_)
     return lost, np.array([record.get("submap", 0) for record in log], np.int64)
-
-
-def _camera(run: RunFolder, cache: SubmapCache, source: Source | None) -> Camera:
-    """Return the camera at the run's working resolution, or a default if it is not known."""
-    if cache.camera:
-        return cache.camera
-    settings = run.config().input
-    return source.camera.prepared(settings.width, settings.crop_px) if source else DEFAULT_CAMERA
-
-
-def _image(cache: SubmapCache, log: Log, run: RunFolder, source: Source | None, row: int) -> Rgb | None:
-    """Return the image of a keyframe from its submap, else from the sequence if it is available."""
-    kept = cache.image(row)
-    if kept is not None or source is None or row >= len(log):
-        return kept
-    s = run.config().input
-    try:
-        frame = source.frame(log[row]["index"]).prepared(s.width, s.min_depth_m, s.max_depth_m, s.crop_px)
-    except SigmaSplatError:
-        return None
-    return (frame.color * 255.0).round().astype(np.uint8)
 
 
 def check_has_map(run: RunFolder) -> None:

@@ -28,10 +28,6 @@ BEHIND_M = 0.05
 CANDIDATES = 8
 """Faces tested for each point: those with the nearest centroids."""
 POINTS_AT_ONCE = 20_000
-NOVEL_VIEWS = 20
-NOVEL_SHIFT_M, NOVEL_TURN_RAD, NOVEL_LEAST_M = 0.3, 0.35, 0.2
-"""A novel view is a training view, shifted and rotated by up to the first two values along each axis. No pixel of it
-may be nearer to the true surface than NOVEL_LEAST_M."""
 
 
 @dataclass(frozen=True)
@@ -41,8 +37,6 @@ class MeshScores:
     accuracy_m: mean distance from the reconstruction to the true surface; completion_m: from the true surface to the
     reconstruction; completion_ratio: share of the true surface within 5 cm of the reconstruction; precision, recall:
     share of the reconstruction, and of the true surface, within 1 cm of the other; f1: their harmonic mean.
-    The last two use pixels of novel views whose true surface a training view saw: depth_l1_m is the mean |depth
-    difference| where the reconstruction has a surface too; depth_coverage is the share of pixels where it has one.
     """
 
     accuracy_m: float
@@ -51,8 +45,6 @@ class MeshScores:
     precision: float
     recall: float
     f1: float
-    depth_l1_m: float
-    depth_coverage: float
 
 
 def score(
@@ -62,34 +54,24 @@ def score(
     T_world_camera: Matrix,
     *,
     points: int = POINTS,
-    novel_views: int = NOVEL_VIEWS,
     seed: int = 0,
     seen: tuple[Mask, Mask] | None = None,
-    progress: Progress = no_progress,
 ) -> MeshScores:
     """Score mesh `found` against mesh `truth`, both in the frame of the truth, as seen from true poses [K, 4, 4].
 
     The true faces should be small (a few cm). A true face counts if a training view shows it at a pixel, or if its
     centre is at most `SLACK_M` behind the depth rendered there. A reconstructed face counts if its centre is in a
     training view and at most `BEHIND_M` behind the true surface. `seen` gives both if they are known (`visible_parts`).
-    Calls `progress(novel views done, total)`. Scores without data are nan.
+    Scores without data are nan.
     """
     seen_true, seen_found = seen or visible_parts(truth, found.corners.mean(1), camera, T_world_camera)
     ours, theirs = found.with_faces(seen_found), truth.with_faces(seen_true)
     to_truth = distances(ours.sampled(points, seed), theirs)
     to_found = distances(theirs.sampled(points, seed + 1), ours)
     precision, recall = share(to_truth, CORRECT_M), share(to_found, CORRECT_M)
-    views = sample_novel_views(truth, camera, T_world_camera, novel_views, seed)
-    compared = []
-    for done, (T, depth_m, face) in enumerate(views, 1):
-        compared.append(_depth_pairs(found, seen_true, camera, T, depth_m, face))
-        progress(done, novel_views)
-    both = np.concatenate([*compared, np.empty((2, 0))], axis=1)
-    has = both[0] > 0
     return MeshScores(
-        mean(to_truth), mean(to_found), share(to_found, COMPLETE_M), precision, recall, f1(precision, recall),
-        mean(np.abs(both[0] - both[1])[has]), mean(has.astype(np.float64)),
-    )  # fmt: skip
+        mean(to_truth), mean(to_found), share(to_found, COMPLETE_M), precision, recall, f1(precision, recall)
+    )
 
 
 def visible_parts(
@@ -171,31 +153,6 @@ def _squared_distance(p: Matrix, a: Matrix, b: Matrix, c: Matrix) -> Matrix:
 
 def _dot(a: Matrix, b: Matrix) -> Matrix:
     return np.asarray(np.einsum("...k,...k->...", a, b))
-
-
-def sample_novel_views(
-    truth: Mesh, camera: Camera, T_world_camera: Matrix, views: int, seed: int
-) -> list[tuple[Matrix, NDArray[np.float32], NDArray[np.int32]]]:
-    """Sample at most `views` novel views. Return their poses, true depth and true faces (see `NOVEL_SHIFT_M`)."""
-    rng, found = np.random.default_rng(seed), []
-    for _ in range(4 * views if len(T_world_camera) else 0):
-        shift, turn = rng.uniform(-1, 1, (2, 3)) * np.array([[NOVEL_SHIFT_M], [NOVEL_TURN_RAD]])
-        T = T_world_camera[rng.integers(len(T_world_camera))] @ se3.exp(np.concatenate([shift, turn]))
-        depth_m, face = mesh_depth(truth, camera, se3.inverse(T))
-        if depth_m[face >= 0].min(initial=np.inf) >= NOVEL_LEAST_M:
-            found.append((T, depth_m, face))
-        if len(found) == views:
-            break
-    return found
-
-
-def _depth_pairs(
-    found: Mesh, seen_true: Mask, camera: Camera, T: Matrix, depth_m: NDArray[np.float32], face: NDArray[np.int32]
-) -> Matrix:
-    """Return reconstructed and true depth [2, P] where a training view saw the true face; 0 = no reconstruction."""
-    ours, _ = mesh_depth(found, camera, se3.inverse(T))
-    counted = (face >= 0) & seen_true[face]
-    return np.stack([ours[counted], depth_m[counted]]).astype(np.float64)
 
 
 def mean(values: Matrix) -> float:

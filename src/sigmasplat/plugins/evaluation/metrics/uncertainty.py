@@ -59,16 +59,6 @@ def auce(variance: Values, squared_error: Values, epsilon: float = EPSILON) -> f
     return float(np.abs(coverage(variance, squared_error, LEVELS, epsilon) - LEVELS).mean())
 
 
-def reliability(variance: Values, squared_error: Values, bins: int = 10) -> list[dict[str, Any]]:
-    """Split the pixels into `bins` equal shares by rising V; return mean V (`predicted`), mean r² (`empirical`) and the
-    number of pixels of each."""
-    v, e = variance.ravel().astype(np.float64), squared_error.ravel().astype(np.float64)
-    parts = [rows for rows in np.array_split(np.argsort(v, kind="stable"), bins) if len(rows)]
-    return [
-        {"predicted": float(v[rows].mean()), "empirical": float(e[rows].mean()), "pixels": len(rows)} for rows in parts
-    ]
-
-
 def sparsification(order_by: Values, squared_error: Values, steps: int = 100) -> NDArray[np.float64]:
     """Return the RMSE [steps] after removing the share 0, 1/steps, … of pixels with the highest `order_by`."""
     e = squared_error.ravel().astype(np.float64)
@@ -122,7 +112,6 @@ def score(variance: Values, squared_error: Values) -> dict[str, Any]:
         "ause": ause(variance, squared_error),
         "mean_variance": float(variance.mean()) if variance.size else float("nan"),
         "mean_squared_error": float(squared_error.mean()) if variance.size else float("nan"),
-        "reliability": reliability(variance, squared_error),
     }
 
 

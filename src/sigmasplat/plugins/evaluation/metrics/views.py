@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import groupby
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,25 +18,17 @@ COVERED_ALPHA = 0.5
 """Above this alpha a pixel counts as covered by the map: its depth is Σwz / Σw."""
 
 
-@dataclass(frozen=True, eq=False)
-class PredictedErrors:
-    """What a map predicts of the errors of a view, variances [H, W]: of colour (mean over channels, colour²) in two
-    parts, and of the difference between rendered depth and a reading of the sensor (m²), with its epistemic part."""
+class PredictedErrors(NamedTuple):
+    """What a map predicts of the errors of a view, variances [H, W]: of colour (mean over channels, colour²), and of
+    the difference between rendered depth and a reading of the sensor (m²)."""
 
-    color_aleatoric: NDArray[np.float32]
-    color_epistemic: NDArray[np.float32]
+    color: NDArray[np.float32]
     reading_m2: NDArray[np.float32]
-    depth_epistemic_m2: NDArray[np.float32]
 
-    @property
-    def reading_aleatoric_m2(self) -> NDArray[np.float32]:
-        """Return the part of reading_m2 that more views do not reduce [H, W]."""
-        return np.asarray(np.maximum(self.reading_m2 - self.depth_epistemic_m2, 0.0), np.float32)
 
-    @property
-    def color(self) -> NDArray[np.float32]:
-        """Return the variance of colour [H, W]."""
-        return self.color_aleatoric + self.color_epistemic
+def as_array(values: Tensor) -> NDArray[np.float32]:
+    """Return values of any device as an array."""
+    return np.asarray(values.detach().cpu(), np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,7 +185,8 @@ def render_views(
             rendered = renderer(maps.final, frame.camera, T_camera_world)
             final = scored_view(frame, rendered, kind, exposure=maps.exposure(record))
             if maps.predict is not None and kind == HELD_OUT:
-                final = replace(final, predicted=predicted_errors(maps.predict(frame.camera, T_camera_world)))
+                found = maps.predict(frame.camera, T_camera_world)
+                final = replace(final, predicted=PredictedErrors(as_array(found.color), as_array(found.reading_m2)))
             before = None
             T_camera_submap = maps.T_camera_submap(record)
             if submap is not None and T_camera_submap is not None:
@@ -211,19 +204,13 @@ def scored_view(
 ) -> ScoredView:
     """Pair a frame with its rendering, in the frame's exposure [3, 2] if given. Depth is Σwz/Σw where the map covers
     the pixel, else 0."""
-    alpha, neutral = _array(rendered.alpha), np.clip(_array(rendered.color), 0.0, 1.0)
-    shown = neutral if exposure is None else exposed(_array(rendered.color), exposure)
-    depth = np.where(alpha > COVERED_ALPHA, _array(rendered.depth) / np.maximum(alpha, COVERED_ALPHA), 0.0)
+    alpha, neutral = as_array(rendered.alpha), np.clip(as_array(rendered.color), 0.0, 1.0)
+    shown = neutral if exposure is None else exposed(as_array(rendered.color), exposure)
+    depth = np.where(alpha > COVERED_ALPHA, as_array(rendered.depth) / np.maximum(alpha, COVERED_ALPHA), 0.0)
     return ScoredView(
         frame.index, kind, frame.color, frame.depth_m, shown, depth.astype(np.float32), alpha,
-        _array(rendered.variance), notes, neutral=neutral,
+        as_array(rendered.variance), notes, neutral=neutral,
     )  # fmt: skip
-
-
-def predicted_errors(found: Predicted) -> PredictedErrors:
-    """Return the predictive variances of a view as arrays."""
-    variances = found.color_aleatoric, found.color_epistemic, found.reading_m2, found.depth_epistemic_m2
-    return PredictedErrors(*map(_array, variances))
 
 
 def sample_pixels(view: ScoredView) -> NDArray[np.float32]:
@@ -311,7 +298,3 @@ def _mean(values: NDArray[np.float64]) -> float | None:
     """Return the mean of the values that are not nan; None if all are nan."""
     existing = values[~np.isnan(values)]
     return float(existing.mean()) if len(existing) else None
-
-
-def _array(values: Tensor) -> NDArray[np.float32]:
-    return np.asarray(values.detach().cpu(), np.float32)

@@ -10,8 +10,6 @@ Metrics = dict[str, Any]
 Advice = tuple[str, str]
 """What was found and what it means, and a command to try; the command may be empty."""
 PSNR_WORDS = ((30.0, "very close to the camera images"), (25.0, "good"), (20.0, "recognisable, fine detail is blurred"))
-OVERFIT_DB = 3.0
-"""If training views are better than held-out views by this much, there are too few keyframes."""
 SLOW_PER_S = 5.0
 """Below this number of images per second a run is slow."""
 
@@ -64,17 +62,6 @@ def _apart(metrics: Metrics, again: str, settings: dict[str, Any]) -> Advice | N
     )
 
 
-def _few_keyframes(metrics: Metrics, again: str, settings: dict[str, Any]) -> Advice | None:
-    training, held_out = (((metrics.get(kind) or {}).get("psnr_db")) for kind in ("training", "held_out"))
-    every = (settings.get("mapping") or {}).get("every", 1)
-    if training is None or held_out is None or training - held_out < OVERFIT_DB or every < 2:
-        return None
-    return (
-        f"Training views are {number(training - held_out, 1)} dB better than held-out views. Use more keyframes:",
-        f"{again} --set mapping.every={every // 2}",
-    )
-
-
 def _blurred(metrics: Metrics, again: str, settings: dict[str, Any]) -> Advice | None:
     psnr_db = (metrics.get("held_out") or {}).get("psnr_db")
     width = (settings.get("input") or {}).get("width", 0)
@@ -97,29 +84,12 @@ def _holes(metrics: Metrics, again: str, settings: dict[str, Any]) -> Advice | N
 
 def _slow(metrics: Metrics, again: str, settings: dict[str, Any]) -> Advice | None:
     speed, width = metrics.get("frames_per_s"), (settings.get("input") or {}).get("width", 0)
-    finish_s = metrics.get("finish_s") or 0.0
-    if speed and finish_s > (frames_s := metrics["frames"] / speed):
-        return _slow_to_finish(metrics["frames"], frames_s, finish_s, again, settings)
     if not speed or speed >= SLOW_PER_S:
         return None
     smaller = max((width or 640) * 3 // 4 // 16 * 16, 160)
     return (
         f"The run is slow: {rate(speed)}. Smaller images are faster:",
         f"{again} --set input.width={smaller}",
-    )
-
-
-def _slow_to_finish(
-    frames: int, frames_s: float, finish_s: float, again: str, settings: dict[str, Any]
-) -> Advice | None:
-    """Advise fewer iterations of the final map if it took longer than all frames, and the run was slow in total."""
-    steps = (settings.get("final") or {}).get("iterations", 0)
-    if steps < 2 or frames / (frames_s + finish_s) >= SLOW_PER_S:
-        return None
-    return (
-        f"The final map took {number(finish_s, 0)} s, all frames took {number(frames_s, 0)} s. "
-        "Fewer iterations are faster:",
-        f"{again} --set final.iterations={steps // 2}",
     )
 
 
@@ -141,5 +111,5 @@ def _no_prediction(metrics: Metrics, again: str, settings: dict[str, Any]) -> Ad
     )
 
 
-RULES = (_lost, _apart, _few_keyframes, _blurred, _holes, _slow, _no_loop, _no_prediction)
+RULES = (_lost, _apart, _blurred, _holes, _slow, _no_loop, _no_prediction)
 """What to check, the most important first."""

@@ -3,9 +3,9 @@
 import html
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
-from sigmasplat.api import number
 from sigmasplat.plugins.evaluation.report import tables
 from sigmasplat.plugins.evaluation.report.advice import Advice
 from sigmasplat.plugins.evaluation.report.charts import Plot
@@ -14,78 +14,10 @@ from sigmasplat.plugins.evaluation.report.view_strips import PanelFigure
 from sigmasplat.plugins.outputs.drawing.plot import svg
 from sigmasplat.plugins.outputs.floorplan.rescan import RescanRegion
 
-NARROW = "(max-width: 640px)"
-"""Pages this narrow have one column."""
 VIEW_PANELS = 5
 """Number of panels of a view; fewer are not of one view, or of its predicted errors."""
 
-STYLE = """
-:root { color-scheme: light dark; --page: #f6f7f9; --card: #ffffff; --ink: #1b1f24; --soft: #5c6670; --line: #e1e4e8;
-  --accent: #c2501b; --unsure: #d65a1e; --unseen: #286ebe; --thin: #825aaa; }
-@media (prefers-color-scheme: dark) {
-  :root { --page: #101317; --card: #181b20; --ink: #e8ebef; --soft: #99a3ad; --line: #2c3138;
-    --accent: #ff8c46; --unsure: #ff8c46; --unseen: #64aafa; --thin: #be96e6; } }
-* { box-sizing: border-box; }
-body { margin: 0; background: var(--page); color: var(--ink); overflow-wrap: break-word;
-  font: 16px/1.55 system-ui, -apple-system, "Segoe UI", "Helvetica Neue", sans-serif; }
-main { max-width: 1180px; margin: 0 auto; padding: 28px 24px 60px; }
-h1 { font-size: 30px; line-height: 1.2; letter-spacing: -0.02em; margin: 0 0 4px; }
-h2 { font-size: 17px; margin: 0; }
-h3 { font-size: 15px; margin: 0 0 12px; }
-p { max-width: 74ch; margin: 0 0 12px; }
-.soft, figcaption, th { color: var(--soft); }
-.alarm { color: var(--accent); font-weight: 600; }
-.card { background: var(--card); border: 1px solid var(--line); border-radius: 10px; padding: 14px 16px;
-  overflow-x: auto; }
-.map { display: grid; grid-template-columns: 1fr 1fr; gap: 12px; margin-top: 16px; }
-.map img { max-height: 430px; object-fit: contain; background: #15181d; }
-.judged { display: grid; grid-template-columns: repeat(3, 1fr); gap: 12px; margin-bottom: 12px; }
-.judged b { display: block; font-size: 19px; line-height: 1.3; margin-bottom: 6px; }
-.judged p { font-size: 14.5px; }
-.pair { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(420px, 100%), 1fr)); gap: 12px;
-  align-items: start; }
-table { border-collapse: collapse; width: 100%; font-size: 14.5px; font-variant-numeric: tabular-nums; }
-th, td { text-align: right; padding: 6px 10px; border-bottom: 1px solid var(--line); font-weight: 400; }
-th:first-child, td:first-child { text-align: left; padding-left: 0; }
-tr:last-child td { border-bottom: 0; }
-figure { margin: 0 0 14px; }
-figure img { display: block; width: 100%; height: auto; border-radius: 10px; border: 1px solid var(--line); }
-figcaption { font-size: 14px; margin-top: 6px; }
-.view { display: grid; grid-template-columns: repeat(auto-fit, minmax(150px, 1fr)); gap: 10px;
-  background: #15181d; color: #e9edf2; border-radius: 10px; padding: 10px; font-size: 13px; line-height: 1.4; }
-.view.large { grid-template-columns: repeat(6, 1fr); } .view.large div { grid-column: span 2; }
-.view.large div:nth-child(-n+2) { grid-column: span 3; }
-.view img { border: 0; border-radius: 4px; margin: 4px 0; }
-.view span { color: #9aa2ac; }
-.chart { width: 100%; max-width: 620px; height: auto; }
-.bar { display: grid; grid-template-columns: auto 1fr auto; gap: 6px; align-items: center; white-space: nowrap; }
-.bar i { height: 8px; border-radius: 2px; }
-.regions { list-style: none; padding: 0; font-size: 15px; }
-.regions li { display: grid; grid-template-columns: 26px 1fr; gap: 10px; align-items: start; }
-.regions b { width: 24px; height: 24px; border-radius: 50%; color: var(--card); font-size: 13px; line-height: 24px;
-  text-align: center; }
-.regions .unseen b { background: var(--unseen); } .regions .thin b { background: var(--thin); }
-.regions .unsure b { background: var(--unsure); }
-ul { max-width: 74ch; padding-left: 20px; } li { margin-bottom: 10px; }
-li pre { background: var(--card); border: 1px solid var(--line); border-radius: 8px; padding: 8px 12px;
-  margin-top: 4px; user-select: all; }
-details { margin-top: 12px; } summary { cursor: pointer; } summary h2 { display: inline; }
-.part { border-bottom: 1px solid var(--line); padding-bottom: 12px; } .part > summary + * { margin-top: 16px; }
-.part > pre { max-height: 60vh; overflow: auto; }
-pre { white-space: pre-wrap; overflow-wrap: anywhere; margin: 0;
-  font: 13px/1.5 ui-monospace, "SF Mono", Menlo, Consolas, monospace; }
-@media NARROW {
-  main { padding: 20px 12px 56px; } h1 { font-size: 24px; } .map, .judged { grid-template-columns: 1fr; }
-  .view.large div, .view.large div:nth-child(-n+2) { grid-column: span 6; }
-  th, td { padding: 6px; } .card { padding: 12px; } }
-""".replace("NARROW", NARROW)
-
-
-PREDICTED_EXPLANATION = (
-    "<p class=soft>Below each held-out view: its errors, and the predicted errors, one standard deviation each. Their "
-    "aleatoric part is noise and detail that the map cannot show; more or better views reduce the epistemic part.</p>"
-)
-
+STYLE = Path(__file__).with_name("page.css").read_text(encoding="utf-8")
 
 PLAN_CAPTION = (
     "The map from above: walls are light, objects grey, the free floor dark, floor that was not observed blue; the "
@@ -99,7 +31,7 @@ class Contents:
 
     verdicts: shown first; commands: what to do with the map; advice: what else to try; rescan: sentences about what to
     scan again; regions: the same numbered regions as in the floor plan; strips: panels of views by heading; plots:
-    charts by name; plan: panels of the floor plan; seconds: time per stage; loops: the records of loops.json.
+    charts by name; plan: panels of the floor plan.
     """
 
     title: str
@@ -109,14 +41,12 @@ class Contents:
     plots: dict[str, Plot] = field(default_factory=dict)
     config: str = ""
     warnings: list[str] = field(default_factory=list)
-    loops: list[dict[str, Any]] = field(default_factory=list)
     verdicts: list[Verdict] = field(default_factory=list)
     commands: list[Advice] = field(default_factory=list)
     advice: list[Advice] = field(default_factory=list)
     rescan: list[str] = field(default_factory=list)
     plan: list[PanelFigure] = field(default_factory=list)
     regions: Sequence[RescanRegion] = ()
-    seconds: dict[str, float] = field(default_factory=dict)
 
 
 def build_report(contents: Contents) -> str:
@@ -131,11 +61,8 @@ def build_report(contents: Contents) -> str:
         _part("Where to scan again", _rescan(contents)),
         _part("Trajectory", _figure(contents, "trajectory")),
         _part("States of the frames", _states(contents)),
-        _part("What moved", _figure(contents, "moving")),
         _part("Views", _strips(contents)),
-        _part("Submaps and loops", _submaps(contents)),
         _part("Scores", _scores(contents)),
-        _part("Time", _time(contents)),
         _part("Settings (config.json)", contents.config and f"<pre>{html.escape(contents.config)}</pre>"),
     ]
     head = "<meta charset=utf-8><meta name=viewport content='width=device-width, initial-scale=1'>"
@@ -196,19 +123,6 @@ def _rescan(contents: Contents) -> str:
     return f"{words}{_plan(contents)}{listed}"
 
 
-def _time(contents: Contents) -> str:
-    """Show where the time went: per frame, and in total per stage, including the final map."""
-    if "seconds" not in contents.plots and not contents.seconds:
-        return ""
-    finish_s = contents.metrics.get("finish_s")
-    seconds = contents.seconds | ({} if finish_s is None else {"final map": finish_s})
-    total_s = sum(seconds.values()) or 1.0
-    longest_first = sorted(seconds.items(), key=lambda item: -item[1])
-    rows = [[stage, number(spent, 1), number(spent / total_s, 0, 100.0)] for stage, spent in longest_first]
-    table = f"<div class=card>{_table([['stage', 'seconds', '%'], *rows])}</div>" if rows else ""
-    return f"{_figure(contents, 'seconds')}{table}"
-
-
 def _advice(advice: list[Advice]) -> str:
     if not advice:
         return ""
@@ -226,10 +140,9 @@ def _strips(contents: Contents) -> str:
     explanation = (
         "<p class=soft>Images are rendered at the estimated poses. The map predicts V, the variance of colour along "
         "each ray. The root of V and the RMS error have separate colour scales. Where both look alike, V predicts "
-        "the error well. Slate pixels: no depth reading, or no surface in the map.</p>"
+        "the error well. If the run has predicted errors, held-out views show them instead, one standard deviation "
+        "in the colours of the error. Slate pixels: no depth reading, or no surface in the map.</p>"
     )
-    if contents.metrics.get("calibration"):
-        explanation += PREDICTED_EXPLANATION
     parts = [explanation]
     for kind, strips in contents.strips.items():
         if strips:
@@ -271,23 +184,6 @@ def _figure(contents: Contents, name: str) -> str:
 
 def _plan(contents: Contents) -> str:
     return f"{_view(contents.plan)}<p class=soft>{PLAN_CAPTION}</p>" if contents.plan else ""
-
-
-def _submaps(contents: Contents) -> str:
-    if (contents.metrics.get("submaps") or 1) < 2:
-        return ""
-    accepted = [loop for loop in contents.loops if loop.get("accepted")]
-    refused = [loop for loop in contents.loops if not loop.get("accepted")]
-    parts = [
-        f"<p class=soft>{html.escape(tables.submap_sentence(contents.metrics))}</p>",
-        _figure(contents, "submaps"),
-    ]
-    if accepted:
-        parts.append(f"<div class=card><h3>Loops accepted</h3>{_table(tables.loop_rows(accepted))}</div>")
-    if refused:
-        rows = _table(tables.loop_rows(refused))
-        parts.append(f"<details class=card><summary>{len(refused)} loops tried and refused</summary>{rows}</details>")
-    return "".join(parts)
 
 
 def _table(rows: list[list[str]]) -> str:

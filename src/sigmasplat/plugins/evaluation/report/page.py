@@ -7,7 +7,6 @@ from typing import Any
 from sigmasplat.api import (
     Camera,
     Config,
-    RunError,
     RunFolder,
     RunFrames,
     SigmaSplatError,
@@ -51,14 +50,12 @@ def write_page(
         plots=plots,
         config=json.dumps(config.to_dict(), indent=2),
         warnings=warnings,
-        loops=run.read_loops(),
         verdicts=verdicts(metrics, unsure, found),
         commands=next_commands(str(run.path)),
         advice=found[1:],
         rescan=rescan_sentences(metrics, plan),
         plan=[panel_figure(panel) for panel in plan_panels(plan)] if plan else [],
         regions=plan.regions if plan else (),
-        seconds=_seconds(run),
     )
     run.write_report(build_report(contents))
 
@@ -92,11 +89,3 @@ def rerun_command(config: Config, facts: dict[str, Any]) -> str:
     return shlex.join(
         [*words, *(word for pair in differences(config, preset(config.name)) for word in ("--set", pair))]
     )
-
-
-def _seconds(run: RunFolder) -> dict[str, float]:
-    """Return the seconds of each stage; empty if the run stopped before it wrote them."""
-    try:
-        return run.read_profile()
-    except RunError:
-        return {}

@@ -67,36 +67,17 @@ def _run_rows(metrics: dict[str, Any]) -> list[list[str]]:
              ("Longest frame after the first", "worst_frame_s", 0, 1e3, "ms"),
              ("Final map", "finish_s", 1, 1.0, "s"), ("Frames and final map", "total_s", 1, 1.0, "s"),
              ("Splats", "splats", 0, 1.0, ""), ("Map file", "map_bytes", 1, 1e-6, "MB")]  # fmt: skip
-    return [["size and time", ""]] + [
-        [name, f"{number(metrics[key], digits, scale)} {unit}"]
-        for name, key, digits, scale, unit in lines
-        if metrics.get(key) is not None
+    loops, submaps = metrics.get("loops") or {}, metrics.get("submaps") or 1
+    closed = f"{submaps}; {loops.get('accepted', 0)} of {loops.get('tried', 0)}"
+    return [
+        ["size and time", ""],
+        *(
+            [name, f"{number(metrics[key], digits, scale)} {unit}"]
+            for name, key, digits, scale, unit in lines
+            if metrics.get(key) is not None
+        ),
+        *([["Submaps; loops accepted", closed]] if submaps > 1 else []),
     ]
-
-
-def submap_sentence(metrics: dict[str, Any]) -> str:
-    """Describe how many submaps and loops there are, and how long the final map took."""
-    loops, finish_s = metrics.get("loops") or {}, metrics.get("finish_s")
-    tried = f"Loops between them: {loops.get('tried', 0)} tried, {loops.get('accepted', 0)} accepted."
-    after = f" The final map took {number(finish_s, 1)} s after the last frame." if finish_s is not None else ""
-    return f"The map has {metrics['submaps']} submaps. {tried}{after}"
-
-
-LOOP_LINES = (
-    ("similarity", "similarity", 3, 1.0), ("residual", "residual", 4, 1.0), ("overlap, %", "overlap", 0, 100.0),
-    ("shift, cm", "translation_m", 1, 100.0), ("rotation, °", "rotation_deg", 2, 1.0),
-)  # fmt: skip
-
-
-def loop_rows(loops: list[dict[str, Any]]) -> list[list[str]]:
-    """Return one row per loop: submaps, frames, similarity, quality of fit, correction of the pose, verdict."""
-    rows = [["submaps", "frames", *(label for label, *_ in LOOP_LINES), "verdict", "reason"]]
-    for loop in loops:
-        ends = [f"{loop.get(f'query{of}')} → {loop.get(f'database{of}')}" for of in ("", "_frame")]
-        reason, verdict = loop.get("reason") or "", "accepted" if loop.get("accepted") else "refused"
-        figures = [cell for _, cell in figure_rows(LOOP_LINES, loop)]
-        rows.append([*ends, *figures, verdict, "" if reason == "accepted" else reason])
-    return rows
 
 
 def _image_rows(metrics: dict[str, Any]) -> list[list[str]]:
@@ -168,9 +149,7 @@ def _surface_rows(metrics: dict[str, Any]) -> list[list[str]]:
     found = metrics.get("reconstruction")
     if not found:
         return []
-    lines = [*SURFACE_LINES, ("Depth L1, novel views, cm", "depth_l1_m", 2, 100.0),
-             ("Depth covered, novel views, %", "depth_coverage", 1, 100.0),
-             ("Splats to surface, cm", "splats_accuracy_m", 2, 100.0),
+    lines = [*SURFACE_LINES, ("Splats to surface, cm", "splats_accuracy_m", 2, 100.0),
              ("Surface to splats, cm", "splats_completion_m", 2, 100.0),
              ("Chamfer distance of splats, cm", "splats_chamfer_m", 2, 100.0),
              ("Floaters (> 10 cm) among opaque splats, %", "floaters", 2, 100.0)]  # fmt: skip

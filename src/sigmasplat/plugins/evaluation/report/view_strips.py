@@ -12,7 +12,6 @@ from sigmasplat.plugins.outputs.drawing.view_panels import (
     PANEL_WIDTH,
     ViewPanel,
     draw_view_strip,
-    predicted_panels,
     view_panels,
 )
 
@@ -26,7 +25,7 @@ HEADINGS = {"test": "novel views"}
 
 @dataclass(frozen=True)
 class PanelFigure:
-    """One panel of a view on the page: title, address of its picture, and a caption, a colour bar, or both.
+    """One panel of a view on the page: title, address of its picture, and a caption or a colour bar.
 
     bar: CSS colours from low to high; ends: the labels of both ends of the bar.
     """
@@ -49,19 +48,11 @@ class ViewStrips:
             old.unlink()
 
     def add(self, view: ScoredView, place: str = "") -> None:
-        """Draw one view, and strips of its predicted errors of colour and depth if they are known; `place` is added to
-        the heading if the view was not rendered from the final map.
-        """
+        """Write the strip of a view, and keep its panels for the page; `place` is added to the heading if the view was
+        not rendered from the final map."""
         name, heading = f"view-{view.kind.replace(' ', '-')}", HEADINGS.get(view.kind, f"{view.kind} views") + place
-        self.draw(f"{name}{place and '-submap'}-{view.index:06d}.png", heading, view_panels(view))
-        if view.predicted is not None:
-            panels = predicted_panels(view, view.predicted)
-            for quantity, of_quantity in (("color", panels[:4]), ("depth", panels[4:])):
-                self.draw(f"{name}-predicted-{quantity}-{view.index:06d}.png", heading, of_quantity)
-
-    def draw(self, name: str, heading: str, panels: list[ViewPanel]) -> None:
-        """Write a strip, and keep its panels for the page."""
-        self.run.write_image(name, draw_view_strip(panels))
+        panels = view_panels(view)
+        self.run.write_image(f"{name}{place and '-submap'}-{view.index:06d}.png", draw_view_strip(panels))
         self.figures.setdefault(heading, []).append([panel_figure(panel) for panel in panels])
 
 

@@ -1,1 +1,1 @@
-"""Draw charts, view strips and contact sheets."""
+"""Draw charts and view strips."""

@@ -1,6 +1,6 @@
 """Draw line charts as SVG, in colours for a light and a dark page."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from html import escape
 
 import numpy as np
@@ -45,8 +45,7 @@ class Curve:
 class Chart:
     """Curves on one pair of axes.
 
-    `square`: both axes have the same scale; `from_zero`: the y axis starts at 0; labels: texts beside points;
-    y_limits: ends of the y axis (default: from the curves).
+    `square`: both axes have the same scale; y_limits: ends of the y axis (default: from the curves).
     """
 
     title: str
@@ -54,8 +53,6 @@ class Chart:
     y_label: str
     curves: list[Curve]
     square: bool = False
-    from_zero: bool = False
-    labels: dict[str, tuple[float, float]] = field(default_factory=dict)
     y_limits: tuple[float, float] | None = None
 
 
@@ -69,9 +66,6 @@ def svg(chart: Chart) -> str:
     parts = [f"<style>{STYLE}</style>", *_grid(chart, low, high), *_head(chart)]
     for curve in chart.curves:
         parts.append(_path(curve, place(_drawable(curve.points))))
-    for words, point in chart.labels.items():
-        x, y = place(np.array(point))
-        parts.append(_text(x + 5, y - 5, words))
     size = f"viewBox='0 0 {WIDTH} {HEIGHT}' width='{WIDTH}' height='{HEIGHT}'"
     head = f"<svg class='chart' xmlns='http://www.w3.org/2000/svg' {size} role='img'>"
     return f"{head}<title>{escape(chart.title)}</title>{''.join(parts)}</svg>"
@@ -96,10 +90,8 @@ def _limits(chart: Chart) -> tuple[Matrix, Matrix]:
     if not len(points):
         return np.zeros(2), np.ones(2)
     low, high = points.min(0), points.max(0)
-    if chart.from_zero:
-        low[1] = min(low[1], 0.0)
     margin = np.maximum(0.06 * (high - low), np.maximum(1e-3, 1e-9 * np.abs(high)))
-    low, high = low - margin * (0.0 if chart.from_zero else 1.0), high + margin
+    low, high = low - margin, high + margin
     if chart.y_limits is not None:
         low[1], high[1] = chart.y_limits
     if chart.square:

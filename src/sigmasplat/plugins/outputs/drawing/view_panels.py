@@ -1,38 +1,24 @@
 """Draw one view as a strip of panels: input, rendered colour, depth, uncertainty V and error, with their ranges."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from sigmasplat.plugins.evaluation.metrics.views import COVERED_ALPHA, PredictedErrors, ScoredView
+from sigmasplat.plugins.evaluation.metrics.views import COVERED_ALPHA, ScoredView
 from sigmasplat.plugins.outputs.drawing import colormap
 
 BACKGROUND, TEXT, FAINT = (21, 24, 29), (233, 237, 242), (150, 158, 168)
 PANEL_WIDTH, GAP, HEAD, FOOT = 320, 10, 34, 38
 LEAST_WIDTH = 200
 """Narrower panels have no texts."""
-PREDICTED_CAPTIONS = (
-    "Difference between the image and the rendered colour.",
-    "One standard deviation: 68 % of the errors should be smaller.",
-    "Noise, and detail that the map cannot show; more views do not reduce it.",
-    "The part that more or better views would reduce.",
-    "Difference between the depth reading and the rendered depth.",
-    "One standard deviation, including the noise of the sensor: 68 % of the errors should be smaller.",
-    "Noise of the sensor, and surfaces that the map does not show sharply; more views do not reduce it.",
-    "Edges and gaps in the map: the part that more or better views would reduce.",
-)
-"""What each panel of `predicted_panels` means."""
 
 
 @dataclass(frozen=True, eq=False)
 class ViewPanel:
-    """One panel of a strip: title, uint8 pixels, and a colour bar (palette, labels of its ends) or a line of text.
-
-    If a panel has both, the line of text is shown on the page only.
-    """
+    """One panel of a strip: title, uint8 pixels, and a colour bar (palette, labels of its ends) or a line of text."""
 
     title: str
     pixels: colormap.Rgb
@@ -62,47 +48,26 @@ def draw_view_strip(panels: Sequence[ViewPanel], width: int = PANEL_WIDTH) -> Im
 
 
 def view_panels(view: ScoredView) -> list[ViewPanel]:
-    """Return the five panels of a view. Uncertainty and error are shown as square roots, in units of colour."""
+    """Return the five panels of a view. Uncertainty and error are shown as square roots, in units of colour: the
+    predicted error in the range of the error if it is known, else V."""
     depth_range = colormap.value_range(view.recorded_depth_m, view.valid)
     deviation, error = np.sqrt(view.uncertainty), np.sqrt(view.squared_error)
     mapped = view.alpha > COVERED_ALPHA
-    score = view.scores()
+    score, limits = view.scores(), _from_zero(error, view.valid)
+    unsure = coloured("uncertainty, root of V", deviation, mapped, _from_zero(deviation, mapped), colormap.INFERNO)
+    if view.predicted is not None:  # where the map is empty too
+        everywhere, total = np.ones_like(mapped), np.sqrt(view.predicted.color)
+        limits = 0.0, max(limits[1], _from_zero(total, everywhere)[1])
+        unsure = coloured("predicted colour error", total, everywhere, limits, colormap.INFERNO)
     return [
         ViewPanel("input", _bytes(view.recorded), " · ".join((f"frame {view.index}", view.kind, *view.notes))),
         ViewPanel(
             "rendered colour", _bytes(view.rendered), f"PSNR {score['psnr_db']:.1f} dB · SSIM {score['ssim']:.3f}"
         ),
         coloured("rendered depth", view.rendered_depth_m, mapped, depth_range, colormap.VIRIDIS, " m"),
-        coloured("uncertainty, root of V", deviation, mapped, _from_zero(deviation, mapped), colormap.INFERNO),
-        coloured("error, RMS", error, view.valid, _from_zero(error, view.valid), colormap.INFERNO),
+        unsure,
+        coloured("error, RMS", error, view.valid, limits, colormap.INFERNO),
     ]
-
-
-def predicted_panels(view: ScoredView, predicted: PredictedErrors) -> list[ViewPanel]:
-    """Return eight panels: the errors of colour and depth, the standard deviations that the map predicts for them, and
-    their parts.
-
-    All panels of colour have one range, and all panels of depth. Colour is predicted where the map is empty too.
-    """
-    everywhere, mapped = np.ones_like(view.valid), view.alpha > COVERED_ALPHA
-    error, total = np.sqrt(view.squared_error), np.sqrt(predicted.color)
-    error_m, total_m = np.sqrt(view.depth_squared_error), np.sqrt(predicted.reading_m2)
-    aleatoric, epistemic = np.sqrt(predicted.color_aleatoric), np.sqrt(predicted.color_epistemic)
-    aleatoric_m, epistemic_m = np.sqrt(predicted.reading_aleatoric_m2), np.sqrt(predicted.depth_epistemic_m2)
-    color = 0.0, max(_from_zero(error, view.valid)[1], _from_zero(total, everywhere)[1])
-    depth_m = 0.0, max(_from_zero(error_m, view.depth_compared)[1], _from_zero(total_m, mapped)[1])
-    inferno = colormap.INFERNO
-    panels = [
-        coloured("colour error, RMS", error, view.valid, color, inferno),
-        coloured("predicted colour error", total, everywhere, color, inferno),
-        coloured("colour: aleatoric part", aleatoric, everywhere, color, inferno),
-        coloured("colour: epistemic part", epistemic, everywhere, color, inferno),
-        coloured("depth error", error_m, view.depth_compared, depth_m, inferno, " m"),
-        coloured("predicted depth error", total_m, mapped, depth_m, inferno, " m"),
-        coloured("depth: aleatoric part", aleatoric_m, mapped, depth_m, inferno, " m"),
-        coloured("depth: epistemic part", epistemic_m, mapped, depth_m, inferno, " m"),
-    ]
-    return [replace(panel, caption=caption) for panel, caption in zip(panels, PREDICTED_CAPTIONS, strict=True)]
 
 
 def _from_zero(values: NDArray[np.float32], valid: NDArray[np.bool_]) -> tuple[float, float]:

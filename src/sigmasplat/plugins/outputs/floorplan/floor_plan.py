@@ -10,11 +10,9 @@ from numpy.typing import NDArray
 
 from sigmasplat.api import (
     Camera,
-    Config,
     ConfigError,
     FieldRenderer,
     GaussianField,
-    MapUncertainty,
     Matrix,
     Progress,
     RunFolder,
@@ -26,9 +24,9 @@ from sigmasplat.api import (
     render,
     se3,
 )
+from sigmasplat.plugins.evaluation.metrics.views import Renderer
 from sigmasplat.plugins.outputs.floorplan.ground import (
     SurfacePredictor,
-    SurfaceRenderer,
     SurfaceSample,
     floor_frame,
     sample_surfaces,
@@ -120,7 +118,7 @@ def floor_plan(
     camera: Camera,
     *,
     cell_m: float = CELL_M,
-    renderer: SurfaceRenderer = render,
+    renderer: Renderer = render,
     predictor: SurfacePredictor | None = None,
     up_world: Matrix | None = None,
     progress: Progress = no_progress,
@@ -159,20 +157,13 @@ def run_floor_plan(
     SigmaSplatError if no surface is visible.
     """
     config, field = run.config(), run.read_map()
-    known, up_world = run.uncertainty_of(field), noted_up(run.facts())
-    return map_floor_plan(field, known, config, path, camera, cell_m=cell_m, up_world=up_world, progress=progress)
-
-
-def map_floor_plan(
-    field: GaussianField, known: MapUncertainty | None, config: Config, path: Trajectory, camera: Camera, **options: Any
-) -> FloorPlan:
-    """Make the floor plan of a map with the settings that made it, and with its predicted errors if they are known;
-    arguments and errors as for `floor_plan`."""
-    predictor = None
+    known, predictor = run.uncertainty_of(field), None
     if known is not None:
         predictor = partial(predict, field, known, options=config.render, backend=config.backend)
-    renderer = FieldRenderer(config.render, config.backend)
-    return floor_plan(field, path, camera, renderer=renderer, predictor=predictor, **options)
+    return floor_plan(
+        field, path, camera, cell_m=cell_m, renderer=FieldRenderer(config.render, config.backend),
+        predictor=predictor, up_world=noted_up(run.facts()), progress=progress,
+    )  # fmt: skip
 
 
 def _transformed(T: Matrix, points: NDArray[np.floating]) -> Matrix:

@@ -7,7 +7,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.special import erfc
-from torch import Tensor
 
 from sigmasplat.api import (
     Camera,
@@ -15,14 +14,13 @@ from sigmasplat.api import (
     Matrix,
     Predicted,
     Progress,
-    Render,
     SigmaSplatError,
     Trajectory,
     evenly_spaced,
     no_progress,
     se3,
 )
-from sigmasplat.plugins.evaluation.metrics.views import COVERED_ALPHA
+from sigmasplat.plugins.evaluation.metrics.views import COVERED_ALPHA, Renderer, as_array
 
 WIDTH_PX = 160
 """Width of the rendered images: at 5 m a pixel is about 4 cm wide."""
@@ -35,8 +33,6 @@ MAX_DEPTH_STEP = 0.05
 Floats = NDArray[np.float32]
 
 
-SurfaceRenderer = Callable[[GaussianField, Camera, Matrix], Render]
-"""Renders a field from T_camera_world."""
 SurfacePredictor = Callable[[Camera, Matrix], Predicted]
 """Predicts the errors of a field from T_camera_world."""
 
@@ -63,7 +59,7 @@ def sample_surfaces(
     field: GaussianField,
     trajectory: Trajectory,
     camera: Camera,
-    renderer: SurfaceRenderer,
+    renderer: Renderer,
     max_poses: int = MAX_POSES,
     progress: Progress = no_progress,
     predictor: SurfacePredictor | None = None,
@@ -80,19 +76,19 @@ def sample_surface(
     field: GaussianField,
     camera: Camera,
     T_world_camera: Matrix,
-    renderer: SurfaceRenderer,
+    renderer: Renderer,
     predictor: SurfacePredictor | None = None,
 ) -> SurfaceSample:
     """Sample from one pose: render depth, and predict its error if a predictor is given."""
     T_camera_world = se3.inverse(T_world_camera)
     with torch.inference_mode():
         seen = renderer(field, camera, T_camera_world)
-        alpha, depth_m = _array(seen.alpha), _array((seen.depth / seen.alpha.clamp(min=COVERED_ALPHA)).float())
+        alpha, depth_m = as_array(seen.alpha), as_array((seen.depth / seen.alpha.clamp(min=COVERED_ALPHA)).float())
         sigma_m = wrong = np.full_like(depth_m, np.nan)
         if predictor is not None:
             predicted = predictor(camera, T_camera_world)
-            sigma_m = _array(predicted.depth_std_m)
-            wrong = probability_wrong(_array(predicted.color))
+            sigma_m = as_array(predicted.depth_std_m)
+            wrong = probability_wrong(as_array(predicted.color))
     inner = np.s_[1:-1, 1:-1]
     on = _smooth(depth_m, alpha > COVERED_ALPHA)
     points = camera.rays() * depth_m[..., None]
@@ -121,10 +117,6 @@ def _smooth(depth_m: Floats, covered: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return on
 
 
-def _array(values: Tensor) -> Floats:
-    return np.asarray(values.detach().cpu(), np.float32)
-
-
 MAX_TILT_COS = np.cos(np.deg2rad(40.0))
 """Cameras are assumed upright within 40°."""
 MEASURED_COS = np.cos(np.deg2rad(6.0))
@@ -150,11 +142,11 @@ def floor_frame(samples: Sequence[SurfaceSample], up_world: Matrix | None = None
     points, normals, area = _subsampled(samples)
     poses = np.stack([sample.T_world_camera for sample in samples])
     if up_world is None:
-        up = up_direction(normals, area, _unit(-poses[:, :3, 1].sum(0), -poses[0, :3, 1]))
+        up = up_direction(normals, area, unit(-poses[:, :3, 1].sum(0), -poses[0, :3, 1]))
     else:
         up = up_direction(normals, area, up_world, MEASURED_COS)
     height_m = floor_height(points @ up, normals @ up, area, float((poses[:, :3, 3] @ up).min()))
-    ahead = _horizontal(poses[0], up)
+    ahead = horizontal(poses[0], up)
     ahead = along_walls(normals, area, up, ahead)
     R = np.stack([np.cross(ahead, up), ahead, up])
     foot = poses[0, :3, 3] - (poses[0, :3, 3] @ up - height_m) * up
@@ -192,7 +184,7 @@ def up_direction(normals: Matrix, area: Matrix, about_up: Matrix, within_cos: fl
     for _ in range(3):
         cosine = normals @ up
         agree = np.abs(cosine) > PARALLEL_COS
-        up = _unit((np.sign(cosine) * area)[agree] @ normals[agree], up)
+        up = unit((np.sign(cosine) * area)[agree] @ normals[agree], up)
     return np.asarray(up * np.sign(up @ about_up))
 
 
@@ -242,16 +234,16 @@ def along_walls(normals: Matrix, area: Matrix, up: Matrix, ahead: Matrix) -> Mat
     return np.asarray(np.cos(turn) * ahead + np.sin(turn) * aside)
 
 
-def _horizontal(T_world_camera: Matrix, up: Matrix) -> Matrix:
+def horizontal(T_world_camera: Matrix, up: Matrix) -> Matrix:
     """Return the horizontal viewing direction of a camera; looking straight down, that of the image's upper edge."""
     for direction in (T_world_camera[:3, 2], -T_world_camera[:3, 1]):
         level = direction - (direction @ up) * up
         if np.linalg.norm(level) > 0.3:
             break
-    return _unit(level, level)
+    return unit(level, level)
 
 
-def _unit(vector: Matrix, otherwise: Matrix) -> Matrix:
+def unit(vector: Matrix, otherwise: Matrix) -> Matrix:
     """Return a vector scaled to length 1, or `otherwise` if its length is 0."""
     length = float(np.linalg.norm(vector))
     return np.asarray(vector / length) if length > 1e-9 else otherwise

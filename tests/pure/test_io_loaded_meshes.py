@@ -1,4 +1,4 @@
-"""Files of points and meshes, loaded by trimesh."""
+"""Files of meshes, loaded by trimesh."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -7,9 +7,7 @@ import numpy as np
 import pytest
 
 from sigmasplat.data.mesh import Mesh
-from sigmasplat.plugins.outputs.mesh_files import read_mesh, write_mesh
-from sigmasplat.plugins.outputs.splats.gltf import linear
-from sigmasplat.plugins.outputs.views import write_points
+from sigmasplat.plugins.outputs.mesh_files import linear, read_mesh, write_mesh
 
 trimesh = pytest.importorskip("trimesh", reason="the [dev] extra is not installed")
 
@@ -21,26 +19,6 @@ def ball() -> Mesh:
     return Mesh(
         np.add(made.vertices, [1, 2, 3]).astype(np.float32), made.faces.astype(np.int32), colors.astype(np.float32)
     )
-
-
-@pytest.mark.parametrize("normals", [True, False])
-def test_points_are_loaded_with_normals_and_colours(tmp_path: Path, normals: bool) -> None:
-    mesh = ball()
-    write_points(tmp_path / "a.ply", mesh.vertices, mesh.colors, mesh.normals() if normals else None)
-    cloud = trimesh.load(tmp_path / "a.ply")
-    assert isinstance(cloud, trimesh.PointCloud)
-    np.testing.assert_array_equal(cloud.vertices.astype(np.float32), mesh.vertices)
-    np.testing.assert_array_equal(cloud.colors[:, :3], np.rint(mesh.colors * 255))
-    rows = cloud.metadata["_ply_raw"]["vertex"]["data"]
-    assert ("nx" in rows.dtype.names) is normals
-    if normals:
-        found = np.stack([rows[name].ravel() for name in ("nx", "ny", "nz")], 1)
-        np.testing.assert_allclose(found, mesh.normals(), atol=1e-6)
-
-
-def test_a_file_without_points_can_be_written(tmp_path: Path) -> None:
-    write_points(tmp_path / "a.ply", np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3)))
-    assert b"element vertex 0\n" in (tmp_path / "a.ply").read_bytes()
 
 
 def test_normals_of_a_ball_point_outwards_and_unused_vertices_have_none() -> None:
@@ -56,23 +34,21 @@ def test_normals_of_a_ball_point_outwards_and_unused_vertices_have_none() -> Non
 def test_vertices_are_loaded_with_their_standard_deviation(tmp_path: Path) -> None:
     mesh = ball()
     known = replace(mesh, depth_std_m=np.linspace(0.001, 0.1, len(mesh.vertices)).astype(np.float32))
-    for name in ("a.ply", "a.glb", "a.obj"):
+    for name in ("a.ply", "a.glb"):
         write_mesh(tmp_path / name, known)
-    write_mesh(tmp_path / "without.obj", mesh)
-    write_points(tmp_path / "points.ply", known.vertices, known.colors, known.normals(), known.depth_std_m)
-    for name in ("a.ply", "points.ply"):
-        loaded = trimesh.load(tmp_path / name, process=False)
-        rows = loaded.metadata["_ply_raw"]["vertex"]["data"]
-        np.testing.assert_array_equal(rows["depth_std_m"].ravel(), known.depth_std_m)
-        np.testing.assert_array_equal(loaded.vertices.astype(np.float32), mesh.vertices)
+    loaded = trimesh.load(tmp_path / "a.ply", process=False)
+    rows = loaded.metadata["_ply_raw"]["vertex"]["data"]
+    np.testing.assert_array_equal(rows["depth_std_m"].ravel(), known.depth_std_m)
+    normals = np.stack([rows[name].ravel() for name in ("nx", "ny", "nz")], 1)
+    np.testing.assert_allclose(normals, mesh.normals(), atol=1e-6)
+    np.testing.assert_array_equal(loaded.vertices.astype(np.float32), mesh.vertices)
     loaded = trimesh.load(tmp_path / "a.glb", process=False, force="mesh")
     np.testing.assert_array_equal(loaded.vertex_attributes["_DEPTH_STD_M"].ravel(), known.depth_std_m)
     np.testing.assert_array_equal(loaded.faces, mesh.faces)
-    assert (tmp_path / "a.obj").read_bytes() == (tmp_path / "without.obj").read_bytes()
     np.testing.assert_array_equal(read_mesh(tmp_path / "a.ply").vertices, mesh.vertices)
 
 
-@pytest.mark.parametrize("ending", ["ply", "obj", "glb", "stl"])
+@pytest.mark.parametrize("ending", ["ply", "glb", "stl"])
 def test_meshes_are_loaded_by_a_standard_loader(tmp_path: Path, ending: str) -> None:
     mesh = ball()
     write_mesh(tmp_path / f"a.{ending}", mesh)

@@ -34,7 +34,8 @@ MAGIC = b"NGSP"
 HEADER = struct.Struct("<4sIIBBBB")
 WRITTEN_VERSION = 3
 FRACTIONAL_BITS = 12
-"""Positions have steps of a quarter of a millimetre up to 2 km from the origin; larger maps have coarser steps."""
+STEPS_PER_M = 1 << FRACTIONAL_BITS
+"""Positions have steps of a quarter of a millimetre up to 2 km from the origin."""
 LARGEST_FIXED = (1 << 23) - 1
 COLOR_SCALE = 0.15
 LOG_SCALE_START, LOG_SCALE_STEPS = -10.0, 16.0
@@ -45,33 +46,24 @@ def write_field(path: Path, field: GaussianField) -> None:
     """Write the splats atomically. Raises RunError if the file cannot be written or a position is too large."""
     values = SplatValues.of(field).turned_about_x()
     values = values.ordered(morton_order(values.means))
-    bits = _fractional_bits(path, values.means)
+    farthest_m = float(np.abs(values.means).max(initial=0.0))
+    if not farthest_m * STEPS_PER_M <= LARGEST_FIXED:  # also if it is nan
+        raise RunError(
+            f"{path} cannot be written: a splat is {farthest_m:.3g} m from the origin, SPZ holds at most "
+            f"{LARGEST_FIXED / STEPS_PER_M:.0f} m; the map is damaged, make it again"
+        )
     colors = (values.colors - 0.5) / SH_C0 * COLOR_SCALE + 0.5
     streams = [
-        np.round(values.means * 2.0**bits).astype("<i4")[..., None].view("u1")[..., :3].tobytes(),
+        np.round(values.means * STEPS_PER_M).astype("<i4")[..., None].view("u1")[..., :3].tobytes(),
         opacity_bytes(values.opacities).tobytes(),
         to_bytes(colors * 255.0).tobytes(),
         to_bytes((values.log_scales - LOG_SCALE_START) * LOG_SCALE_STEPS).tobytes(),
         _packed_rotations(values.quats).tobytes(),
         to_bytes(np.round(values.harmonics * 128.0) + 128.0).tobytes(),
     ]
-    header = HEADER.pack(MAGIC, WRITTEN_VERSION, len(values), values.degree, bits, 0, 0)
+    header = HEADER.pack(MAGIC, WRITTEN_VERSION, len(values), values.degree, FRACTIONAL_BITS, 0, 0)
     with replacing(path) as temporary:
         temporary.write_bytes(gzip.compress(b"".join([header, *streams]), compresslevel=9, mtime=0))
-
-
-def _fractional_bits(path: Path, means: Doubles) -> int:
-    """Return the number of fractional bits of the 24-bit positions: fewer than the default if positions are large.
-    Raises RunError if even none are too many."""
-    farthest = float(np.abs(means).max(initial=0.0))
-    if not farthest <= LARGEST_FIXED:
-        raise RunError(
-            f"{path} cannot be written: a splat is {farthest:.3g} m from the origin, SPZ holds at most "
-            f"{LARGEST_FIXED / 1000:.0f} km; the map is damaged, make it again"
-        )
-    if farthest * 2.0**FRACTIONAL_BITS <= LARGEST_FIXED:
-        return FRACTIONAL_BITS
-    return max(0, int(np.floor(np.log2(LARGEST_FIXED / farthest))))
 
 
 def _packed_rotations(quats: Doubles) -> NDArray[np.uint32]:

@@ -1,1 +1,0 @@
-"""Read and write splats in the formats of other programs."""
