@@ -33,7 +33,7 @@ def make_mesh(
         Range(0),
         arg(
             "M",
-            "close gaps that are at most M metres across by patches, which have a high depth_std_m; 0 = none",
+            "close gaps that are at most M metres across by smooth patches, which have a high depth_std_m; 0 = none",
         ),
     ] = 0.0,
     out: Annotated[

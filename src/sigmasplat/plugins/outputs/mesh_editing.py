@@ -1,7 +1,7 @@
 """Close small gaps of a mesh, and reduce its number of triangles.
 
-A patch of a gap has the connectivity of a disc, is stretched over its edge as a membrane (each new vertex is the mean
-of its neighbours), and is marked: nobody has seen it. Triangles are reduced by quadric edge
+A patch of a gap has the connectivity of a disc, minimises the bending over itself and its edge (the square of the
+Laplacian, as in Botsch and Kobbelt 2004), and is marked: nobody has seen it. Triangles are reduced by quadric edge
 collapse (Garland and Heckbert 1997), by fast-simplification.
 """
 
@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array, csc_array, diags_array
+from scipy.sparse import coo_array, csc_array, csr_array
 from scipy.sparse.linalg import splu
 from scipy.spatial import Delaunay, cKDTree
 from scipy.spatial.distance import pdist
@@ -23,6 +23,9 @@ STD_PER_M = 0.5
 """Standard deviation of a patch, added per distance from the seen edge: the surface may bend by about 27°."""
 MOST_POINTS = 4000
 """Largest number of points inside one patch."""
+ROUNDS, LEAST_LENGTH = 4, 0.3
+"""Times a patch is placed, each time with the lengths of its edges found before; shorter ones count as this share of
+the median."""
 OUTWARD = 0.3
 """Mean cosine between the surface beside an edge and the direction away from the middle of the loop. It is 1 around a
 hole in a plane, 0 at the rim of a cup, and −1 at the outer border of a part."""
@@ -49,7 +52,8 @@ def filled(mesh: Mesh, largest_m: float) -> Mesh:
     """
     if not largest_m > 0 or not len(mesh.faces):
         return mesh
-    patches = [_patch(mesh, loop) for loop in gaps(mesh, largest_m)]
+    neighbours = _neighbours(mesh.faces.astype(np.int64), len(mesh.vertices))
+    patches = [_patch(mesh, loop, neighbours) for loop in gaps(mesh, largest_m)]
     return _joined(mesh, [patch for patch in patches if patch is not None])
 
 
@@ -112,7 +116,7 @@ def _edges(loop: Indices) -> list[tuple[int, int]]:
     return list(zip(loop.tolist(), np.roll(loop, -1).tolist(), strict=True))
 
 
-def _patch(mesh: Mesh, loop: Indices) -> Patch | None:
+def _patch(mesh: Mesh, loop: Indices, neighbours: csr_array) -> Patch | None:
     """Make the patch of a loop; None if the loop cannot be triangulated."""
     n = len(loop)
     disc, faces = _disc(n)
@@ -123,20 +127,30 @@ def _patch(mesh: Mesh, loop: Indices) -> Patch | None:
     if len(disc) == n:
         none = np.empty((0, 3))
         return Patch(loop, none, faces, none, none[:, 0])
-    row, column = np.concatenate([pairs, pairs[:, ::-1]]).T
-    beside = csc_array(coo_array((np.ones(len(row)), (row, column)), shape=(len(disc), len(disc))))
-    membrane = splu(csc_array(diags_array(np.bincount(row)[n:].astype(np.float64)) - beside[n:, n:]))
+    known = np.concatenate([loop, np.setdiff1d(neighbours[loop].indices, loop)])
+    points = mesh.vertices[known].astype(np.float64)
+    pairs = _pairs(_neighbours(faces, len(disc)), csr_array(neighbours[loop][:, known]))
+    new = np.arange(n, len(disc))
+    placed = np.concatenate([points[:n], np.zeros((len(new), 3)), points[n:]])
+    lengths = np.ones(pairs.shape[1])
+    for _ in range(ROUNDS):
+        rows = _laplacian(pairs, lengths, len(disc), len(placed))
+        free = rows[:, new]
+        placed[new] = 0.0
+        placed[new] = splu(csc_array(free.T @ free)).solve(-(free.T @ (rows @ placed)))
+        lengths = np.linalg.norm(placed[pairs[0]] - placed[pairs[1]], axis=1)
+        lengths = np.maximum(lengths, LEAST_LENGTH * np.median(lengths))
+    membrane = splu(csc_array(rows[new][:, new]))
 
     def from_edge(values: NDArray[np.float32]) -> Matrix:
-        return np.asarray(membrane.solve(beside[n:, :n] @ values.astype(np.float64)))
+        return np.asarray(membrane.solve(-(rows[new][:, :n] @ values.astype(np.float64))))
 
-    points = from_edge(mesh.vertices[loop])
     colors = None if mesh.colors is None else np.clip(from_edge(mesh.colors[loop]), 0.0, 1.0)
     std = None
     if mesh.depth_std_m is not None:
-        distance, _ = cKDTree(mesh.vertices[loop]).query(points)
+        distance, _ = cKDTree(points[:n]).query(placed[new])
         std = np.hypot(from_edge(mesh.depth_std_m[loop]), STD_PER_M * distance)
-    return Patch(loop, points, faces, colors, std)
+    return Patch(loop, placed[new], faces, colors, std)
 
 
 def _disc(n: int) -> tuple[Matrix, Indices]:
@@ -153,6 +167,33 @@ def _disc(n: int) -> tuple[Matrix, Indices]:
     area = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
     faces = np.where((area > 0)[:, None], faces, faces[:, ::-1])
     return points, faces[np.abs(area) > 1e-9]
+
+
+def _pairs(inside: csr_array, around: csr_array) -> Indices:
+    """Return pairs of neighbours [2, P]: those inside a patch [n + m, n + m], and those of its loop in the mesh [n, n +
+    others]. Numbers: first the loop, then new vertices, then other vertices beside the loop."""
+    n, m = around.shape[0], inside.shape[0] - around.shape[0]
+    (row, column), (of_loop, other) = inside.nonzero(), around.nonzero()
+    other = np.where(other < n, other, other + m)
+    both = np.concatenate([np.stack([row, column]), np.stack([of_loop, other])], axis=1)
+    return np.unique(both, axis=1).astype(np.int64)  # an edge of the loop is in both
+
+
+def _laplacian(pairs: Indices, lengths: Matrix, rows: int, columns: int) -> csc_array:
+    """Return the mean of the vectors to the neighbours, each divided by its length [rows, columns]: on a smooth surface
+    it is the curvature times the distance of the vertices, also if they are not equally dense."""
+    row, column = pairs
+    weight = 1.0 / (lengths * np.bincount(row, minlength=rows)[row])
+    out = coo_array((weight, (row, column)), shape=(rows, columns))
+    own = coo_array((np.bincount(row, weight, rows), (np.arange(rows), np.arange(rows))), shape=(rows, columns))
+    return csc_array(out - own)
+
+
+def _neighbours(faces: Indices, vertices: int) -> csr_array:
+    """Return which vertices have an edge in common [V, V]."""
+    start, end = faces[:, [0, 1, 2]].ravel(), faces[:, [1, 2, 0]].ravel()
+    row, column = np.concatenate([start, end]), np.concatenate([end, start])
+    return csr_array(coo_array((np.ones(len(row)), (row, column)), shape=(vertices, vertices)))
 
 
 def _joined(mesh: Mesh, patches: list[Patch]) -> Mesh:
