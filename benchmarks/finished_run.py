@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from sigmasplat.config import Config
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
-from sigmasplat.data.map_uncertainty import MapUncertainty
 from sigmasplat.data.submap import MemoryStore, RefinedStore, StorePart, SubmapStore
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.graph.path_covariance import PathCovariance
@@ -18,9 +17,10 @@ from sigmasplat.input.source import Source
 from sigmasplat.plugins.evaluation.metrics.trajectory import associate, score_failures, truth_in_estimate
 from sigmasplat.plugins.evaluation.path_scores import score_path_covariance
 from sigmasplat.run.callbacks import Callback
-from sigmasplat.slam.slam import Slam
+from sigmasplat.system.slam import Slam
 from sigmasplat.tracking.keyframe_rule import is_held_back
 from sigmasplat.types import Matrix, no_progress
+from sigmasplat.uncertainty.map_uncertainty import MapUncertainty
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,7 +23,7 @@ from sigmasplat.plugins.evaluation.metrics.trajectory import associate, score_pa
 from sigmasplat.plugins.evaluation.metrics.views import ScoredView, scored_view
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.render import FieldRenderer
-from sigmasplat.slam.slam import Slam
+from sigmasplat.system.slam import Slam
 from sigmasplat.tracking.descriptors import similarity
 from sigmasplat.types import completed
 

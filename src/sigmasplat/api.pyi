@@ -35,14 +35,6 @@ from sigmasplat.data.frame_arrays import (
 )
 from sigmasplat.data.harmonics import count as count
 from sigmasplat.data.images import resized_color as resized_color
-from sigmasplat.data.imu import (
-    GRAVITY_M_S2 as GRAVITY_M_S2,
-    Accelerometer as Accelerometer,
-    Gyroscope as Gyroscope,
-    accelerometer_from_samples as accelerometer_from_samples,
-    gyroscope_from_samples as gyroscope_from_samples,
-)
-from sigmasplat.data.map_uncertainty import MapUncertainty as MapUncertainty, SplatStd as SplatStd
 from sigmasplat.data.mesh import Mesh as Mesh, mesh_depth as mesh_depth
 from sigmasplat.data.submap import Picture as Picture, SubmapStore as SubmapStore
 from sigmasplat.data.trajectory import (
@@ -177,6 +169,13 @@ from sigmasplat.input.images import (
     times_of_names as times_of_names,
     without_nan as without_nan,
 )
+from sigmasplat.input.imu import (
+    GRAVITY_M_S2 as GRAVITY_M_S2,
+    Accelerometer as Accelerometer,
+    Gyroscope as Gyroscope,
+    accelerometer_from_samples as accelerometer_from_samples,
+    gyroscope_from_samples as gyroscope_from_samples,
+)
 from sigmasplat.input.lists import (
     FLIP_YZ as FLIP_YZ,
     MAX_GAP_S as MAX_GAP_S,
@@ -268,8 +267,9 @@ from sigmasplat.run_folder.trajectory import (
     write_trajectory as write_trajectory,
 )
 from sigmasplat.slam.results import Step as Step
-from sigmasplat.slam.slam import Slam as Slam
+from sigmasplat.system.slam import Slam as Slam
 from sigmasplat.types import Matrix as Matrix, Progress as Progress, no_progress as no_progress
+from sigmasplat.uncertainty.map_uncertainty import MapUncertainty as MapUncertainty, SplatStd as SplatStd
 from sigmasplat.uncertainty.predictive import (
     Predicted as Predicted,
     blend_values as blend_values,

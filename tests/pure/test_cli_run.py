@@ -175,7 +175,7 @@ def corridor(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Corridor:
     source = Corridor()
     # This line must be the first: it imports `resume` with the real SLAM. The fake has no state to save.
     monkeypatch.setattr("sigmasplat.run.resume.StateFile.save", lambda *ignored: None)
-    module = ModuleType("sigmasplat.slam.slam")
+    module = ModuleType("sigmasplat.system.slam")
     module.Slam = MadeUpSlam  # type: ignore[attr-defined]
     scores = ModuleType("sigmasplat.plugins.evaluation.evaluate")
     scores.evaluate = evaluate  # type: ignore[attr-defined]

@@ -11,7 +11,6 @@ from splat_readers import read_any
 from command_line import exit_code
 from sigmasplat.commands.export import ExportOptions
 from sigmasplat.data.field import GaussianField
-from sigmasplat.data.map_uncertainty import SHIPPED, Background, MapUncertainty, SplatStd
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.files.ply_elements import read_header
 from sigmasplat.plugins.outputs.formats import PLUGIN, ExportSource, choose, listed, owners
@@ -20,6 +19,7 @@ from sigmasplat.registry import Output
 from sigmasplat.run_folder import splat_ply as ply
 from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.run_folder.trajectory import read_trajectory
+from sigmasplat.uncertainty.map_uncertainty import SHIPPED, Background, MapUncertainty, SplatStd
 
 
 @pytest.fixture

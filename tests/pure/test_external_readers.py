@@ -10,10 +10,10 @@ from command_line import exit_code
 from external_readers import convert, package, read_by_splat_transform, script
 from sigmasplat.data.field import GaussianField, Rows
 from sigmasplat.data.harmonics import count
-from sigmasplat.data.map_uncertainty import SplatStd
 from sigmasplat.plugins.outputs.splats import gltf, sog
 from sigmasplat.run_folder import splat_ply as ply
 from sigmasplat.run_folder.splat_values import SplatValues
+from sigmasplat.uncertainty.map_uncertainty import SplatStd
 
 VALIDATE = """
 import {readFileSync} from 'fs'; import validator from 'gltf-validator';

@@ -14,7 +14,7 @@ from sigmasplat.plugins.evaluation.metrics.trajectory import align_similarity
 from sigmasplat.plugins.evaluation.path_scores import arbitrary_scale, in_metres, in_units_of_run
 from sigmasplat.run.scene import config_for, config_of_facts, scene_facts
 from sigmasplat.run_folder.runs import RunFolder
-from sigmasplat.slam.slam import Slam
+from sigmasplat.system.slam import Slam
 from sigmasplat.tracking.predicted_depth_fit import DepthFit, pixel_noise, smoothed
 
 HEIGHT, WIDTH = 96, 128

@@ -36,7 +36,7 @@ from sigmasplat.run.session import Session
 from sigmasplat.run_folder.runs import TRUTH, RunFolder
 from sigmasplat.run_folder.submaps import DiskStore
 from sigmasplat.run_folder.trajectory import read_trajectory
-from sigmasplat.slam.slam import Slam
+from sigmasplat.system.slam import Slam
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 

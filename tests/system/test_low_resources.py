@@ -20,7 +20,7 @@ from run_process import PATIENCE_S, QUICK, ROOM, files_of_at_most, lines, runnin
 from sigmasplat.errors import RunError
 from sigmasplat.files.tensors import write_tensors
 from sigmasplat.run_folder.runs import RunFolder
-from sigmasplat.slam.slam import Slam
+from sigmasplat.system.slam import Slam
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 

@@ -17,7 +17,7 @@ from sigmasplat.plugins.sources import SyntheticRoom
 from sigmasplat.run.session import Outcome, Session
 from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.run_folder.trajectory import read_trajectory
-from sigmasplat.slam.slam import Slam
+from sigmasplat.system.slam import Slam
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 

@@ -95,7 +95,7 @@ def run(
     from sigmasplat.run.session import new_run
     from sigmasplat.run.terminal import Screen
     from sigmasplat.run_folder.runs import RunFolder
-    from sigmasplat.slam.slam import Slam
+    from sigmasplat.system.slam import Slam
 
     check_robot_output(robot_options)
     settings += () if final_seconds is None else (f"final.seconds={final_seconds:g}",)

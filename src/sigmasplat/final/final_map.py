@@ -11,16 +11,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.config import Config, FinalConfig
-from sigmasplat.data.atlas import Atlas
 from sigmasplat.data.field import COLUMNS, GaussianField
 from sigmasplat.data.mesh import Mesh
 from sigmasplat.data.submap import SubmapStore
-from sigmasplat.data.trajectory import Component, Trajectory, evenly_spread
-from sigmasplat.data.tsdf import packed
+from sigmasplat.data.trajectory import evenly_spread
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.final.full_resolution import refine_on_photos, working_seconds
 from sigmasplat.final.fusion import count_keyframes, fuse, fusion_views
 from sigmasplat.final.refinement import Clock, KeyframeReader, refine
+from sigmasplat.final.tsdf import packed
 from sigmasplat.graph.path_covariance import PathCovariance
 from sigmasplat.mapping.moving import carved, without_moving
 from sigmasplat.render.view import View
@@ -250,26 +249,3 @@ def position_std_m(path: PathCovariance) -> float:
     rows = evenly_spread(range(len(submaps)), KEYFRAMES_MOST)
     covariances = (path.of_keyframe(int(submaps[row]), int(numbers[row])) for row in rows)
     return float(np.median([np.sqrt(np.trace(covariance[:3, :3])) for covariance in covariances]))
-
-
-def merged_field(store: SubmapStore, atlas: Atlas, component: int, active: GaussianField) -> GaussianField:
-    """Return the splats of all submaps of a component side by side, in its frame, in host memory; `active` are those of
-    the submap that is not finished."""
-    fields = (
-        (store.load(s).field if s < len(store) else active.to(torch.device("cpu"))).moved(
-            torch.from_numpy(atlas.anchors[s])
-        )
-        for s in atlas.members(component)
-    )
-    return GaussianField.side_by_side(fields)
-
-
-def components_apart(
-    store: SubmapStore, atlas: Atlas, active: GaussianField, trajectory: Trajectory, found: NDArray[np.bool_]
-) -> list[Component]:
-    """Return the components that are not connected to the world; trajectory: of all frames, found [F]: not lost."""
-    component_of = np.array(atlas.components, np.int64)[atlas.places.submap]
-    return [
-        Component(n, merged_field(store, atlas, n, active), trajectory.at(found & (component_of == n)))
-        for n in sorted(set(atlas.components) - {0})
-    ]

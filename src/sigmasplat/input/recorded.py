@@ -14,11 +14,11 @@ from sigmasplat.config import InputConfig
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.frame_arrays import color_from_bytes
 from sigmasplat.data.images import resized_color
-from sigmasplat.data.imu import Accelerometer, Gyroscope
 from sigmasplat.data.trajectory import Trajectory, evenly_spaced
 from sigmasplat.errors import SourceError
 from sigmasplat.input.calibration import Calibration, refuse_impossible_camera, resolve_calibration
 from sigmasplat.input.images import FRAMES_PER_SECOND, image_size, pair_images, read_color, read_depth
+from sigmasplat.input.imu import Accelerometer, Gyroscope
 from sigmasplat.input.rectification import Rectification, check_image_sizes
 from sigmasplat.input.source import Source
 

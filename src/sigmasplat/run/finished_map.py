@@ -17,7 +17,7 @@ from sigmasplat.errors import ConfigError, RunError
 from sigmasplat.input.source import Source
 from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.run_folder.submaps import DiskStore
-from sigmasplat.slam.slam import Slam
+from sigmasplat.system.slam import Slam
 from sigmasplat.types import Matrix
 
 LEAST_SHARE = 0.5

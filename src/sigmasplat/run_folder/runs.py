@@ -12,7 +12,6 @@ from torch import Tensor
 
 from sigmasplat.config import Config
 from sigmasplat.data.field import GaussianField
-from sigmasplat.data.map_uncertainty import MapUncertainty, SplatStd
 from sigmasplat.data.trajectory import Component, Trajectory
 from sigmasplat.errors import RunError
 from sigmasplat.files import machine
@@ -24,6 +23,7 @@ from sigmasplat.run_folder import map_files, splat_ply as ply, trajectory as tum
 from sigmasplat.run_folder.frames import RunFrames
 from sigmasplat.run_folder.run_values import FACTS, check_checkpoint, check_fields, check_log, check_profile
 from sigmasplat.run_folder.submaps import DiskStore
+from sigmasplat.uncertainty.map_uncertainty import MapUncertainty, SplatStd
 
 PROGRAM = "sigmasplat"
 TRUTH = "truth.txt"

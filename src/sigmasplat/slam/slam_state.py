@@ -14,13 +14,11 @@ from sigmasplat.data.atlas import Atlas
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField, Rows
 from sigmasplat.data.frame import Frame
-from sigmasplat.data.map_uncertainty import MapUncertainty
 from sigmasplat.data.poses import Column
 from sigmasplat.data.relative_pose import RelativePose
 from sigmasplat.data.submap import MemoryStore, OnDisk, SubmapStore
 from sigmasplat.data.trajectory import LOST, Component, Trajectory
 from sigmasplat.errors import SourceError
-from sigmasplat.final.final_map import components_apart, merged_field
 from sigmasplat.graph.closer import LoopCloser, make_descriptor
 from sigmasplat.graph.confidence import Confidence
 from sigmasplat.graph.growing_graph import GrowingGraph, KeyframeImages
@@ -30,7 +28,6 @@ from sigmasplat.graph.path_covariance import recorded
 from sigmasplat.mapping.mapper import Mapper
 from sigmasplat.mapping.validation_views import ValidationViews
 from sigmasplat.render.view import View
-from sigmasplat.slam.listeners import Listeners
 from sigmasplat.slam.results import Step, Steps, StepTimer, SubmapState
 from sigmasplat.tracking.depth_filters import frame_filter
 from sigmasplat.tracking.drift import Drift
@@ -81,23 +78,14 @@ class SlamState:
         self.keyframe_indices: list[int] = []
         self._view: View | None = None
         self._resample = False
-        self._final: GaussianField | None = None
-        self.refinement_steps: int | None = None
-        """Number of refinement steps of the final map; None before `finish`."""
-        self.uncertainty: MapUncertainty | None = None
-        """How sure the final map is; None before `finish`, or without probe views (`uncertainty.probes`)."""
         self._timer = StepTimer()
         self._search: Task[list[Loop]] | None = None
-        self.listeners = Listeners()
         self._newest_covariance = NewestCovariance()
         self.keep_on_disk()
 
     @property
     def field(self) -> GaussianField:
-        """Return the map in the world, in host memory: the final map after `finish`, before that all submaps side by
-        side."""
-        if self._final is not None:
-            return self._final
+        """Return the map in the world, in host memory: all submaps side by side."""
         if not len(self.store):
             return self.mapper.field.to(HOST)
         return merged_field(self.store, self.atlas, 0, self.mapper.field)
@@ -269,3 +257,26 @@ def _rows_of(rows: Rows, prefix: str) -> dict[str, Tensor]:
     """Return the parameters and the optimiser state of rows, in host memory, with a prefix to each name."""
     parts = {f"{prefix}{name}": getattr(rows, name).cpu() for name in ("params", "moment1", "moment2", "last_step")}
     return parts | {f"{prefix}adam_steps": torch.tensor(rows.steps)}
+
+
+def merged_field(store: SubmapStore, atlas: Atlas, component: int, active: GaussianField) -> GaussianField:
+    """Return the splats of all submaps of a component side by side, in its frame, in host memory; `active` are those of
+    the submap that is not finished."""
+    fields = (
+        (store.load(s).field if s < len(store) else active.to(torch.device("cpu"))).moved(
+            torch.from_numpy(atlas.anchors[s])
+        )
+        for s in atlas.members(component)
+    )
+    return GaussianField.side_by_side(fields)
+
+
+def components_apart(
+    store: SubmapStore, atlas: Atlas, active: GaussianField, trajectory: Trajectory, found: NDArray[np.bool_]
+) -> list[Component]:
+    """Return the components that are not connected to the world; trajectory: of all frames, found [F]: not lost."""
+    component_of = np.array(atlas.components, np.int64)[atlas.places.submap]
+    return [
+        Component(n, merged_field(store, atlas, n, active), trajectory.at(found & (component_of == n)))
+        for n in sorted(set(atlas.components) - {0})
+    ]
