@@ -70,7 +70,7 @@ class FinishedRun:
             slam.config, slam.view.camera, slam.field, store, list(slam.atlas.anchors), slam.atlas.members(0),
             slam.atlas.refined, slam.atlas.exposures, slam.atlas.frame_exposures(), slam.trajectory(),
             slam.atlas.places.submap.tolist(), slam.atlas.T_submap_camera, slam.valid(),
-            slam.steps.rows.used[:, 0].astype(int).tolist(), slam.steps.p_off, counts,
+            slam.steps.frame.tolist(), slam.steps.p_off, counts,
             slam.uncertainty, PathCovariance.of(slam.checkpoint()), slam.keyframe_indices,
         )  # fmt: skip
 
