@@ -16,7 +16,7 @@ from sigmasplat.data.trajectory import Component, Trajectory
 from sigmasplat.errors import RunError
 from sigmasplat.files import machine
 from sigmasplat.files.atomic import part_of, remove_leftovers, replacing, sync_file, write_text
-from sigmasplat.files.json_files import append_line, read_json, read_lines, write_json, write_json_on_full_disk
+from sigmasplat.files.json_files import append_line, read_json, read_lines, write_json
 from sigmasplat.files.lock import LOCK, locked, no_warning
 from sigmasplat.files.tensors import open_tensors, write_tensors
 from sigmasplat.run_folder import map_files, splat_ply as ply, trajectory as tum
@@ -175,7 +175,7 @@ class RunFolder:
 
     def note(self, **facts: Any) -> None:
         """Add or change facts in run.json, for instance status="complete" or "interrupted", wall_s=…"""
-        write_json_on_full_disk(self.path / "run.json", self.facts() | facts)
+        write_json(self.path / "run.json", self.facts() | facts)
 
     def locked(self, warn: Callable[[str], None] = no_warning) -> AbstractContextManager[None]:
         """Hold the run while a block writes to it. Raises RunError if another process holds it (`files.lock`)."""
