@@ -262,7 +262,6 @@ from sigmasplat.run_folder.splat_values import (
     to_bytes as to_bytes,
 )
 from sigmasplat.run_folder.trajectory import (
-    read_trajectory as read_trajectory,
     write_square as write_square,
     write_trajectory as write_trajectory,
 )

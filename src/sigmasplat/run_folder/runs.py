@@ -19,6 +19,7 @@ from sigmasplat.files.atomic import part_of, remove_leftovers, replacing, sync_f
 from sigmasplat.files.json_files import append_line, read_json, read_lines, write_json
 from sigmasplat.files.lock import LOCK, locked, no_warning
 from sigmasplat.files.tensors import open_tensors, write_tensors
+from sigmasplat.input.lists import read_poses
 from sigmasplat.run_folder import map_files, splat_ply as ply, trajectory as tum
 from sigmasplat.run_folder.frames import RunFrames
 from sigmasplat.run_folder.run_values import FACTS, check_checkpoint, check_fields, check_log, check_profile
@@ -211,7 +212,7 @@ class RunFolder:
 
     write_trajectory = _writes("trajectory.txt", tum.write_trajectory)
     """Write trajectory.txt: the valid poses (TUM text, T_world_camera)."""
-    read_trajectory = _reads("trajectory.txt", partial(tum.read_trajectory, may_be_empty=True))
+    read_trajectory = _reads("trajectory.txt", partial(read_poses, may_be_empty=True))
     """Read trajectory.txt; it is empty if no pose is valid. Raises SourceError if it is damaged."""
 
     def read_frames(self) -> RunFrames:
@@ -230,7 +231,7 @@ class RunFolder:
     def read_component(self, number: int) -> Component:
         """Read a component from components/. Raises RunError if a file is missing, SourceError if it is damaged."""
         trajectory, field = (self._existing(f"{COMPONENTS}/{number}/{name}") for name in map_files.COMPONENT_FILES)
-        return Component(number, ply.read_field(field), tum.read_trajectory(trajectory))
+        return Component(number, ply.read_field(field), read_poses(trajectory))
 
     write_map = _writes("map.ply", ply.write_field)
     """Write map.ply (3DGS PLY, world frame)."""

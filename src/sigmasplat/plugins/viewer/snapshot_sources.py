@@ -26,7 +26,7 @@ from sigmasplat.api import (
     Source,
     SubmapStore,
     outside_world,
-    read_trajectory,
+    read_poses,
     states_at_end,
     submaps_outside,
 )
@@ -70,7 +70,7 @@ def finished_snapshot(run: RunFolder, source: Source | None = None, budget: int 
         _final_path(frames, tensors),
         Piece(None, without_moments(final), uncertainty=run.uncertainty_of(final)),
         within_budget(pieces, budget),
-        read_trajectory(true_file).T_world_camera[:, :3, 3] if true_file.is_file() else None,
+        read_poses(true_file).T_world_camera[:, :3, 3] if true_file.is_file() else None,
         _camera(run, cache, source),
         partial(_image, cache, frames.log, run, source),
         config.render,
