@@ -15,7 +15,7 @@ from sigmasplat.config.find_preset import (
     preset as preset,
     presets_by_scene as presets_by_scene,
 )
-from sigmasplat.config.sensors import SensorModel as SensorModel
+from sigmasplat.config.input import SensorModel as SensorModel
 from sigmasplat.config.text import differences as differences, override as override
 from sigmasplat.data import harmonics as harmonics, se3 as se3
 from sigmasplat.data.atlas import Atlas as Atlas

@@ -11,15 +11,15 @@ from typing import Any
 from sigmasplat.config.frames import DensifyConfig, MappingConfig, RenderConfig, SeedConfig
 from sigmasplat.config.input import RECORDED_POSES, InputConfig
 from sigmasplat.config.ranges import Count, Section, kinds_of, problems_of, refuse, shown
-from sigmasplat.config.run import (
-    MovingConfig,
-    RealTimeConfig,
-    RecoveryConfig,
+from sigmasplat.config.submaps import (
+    FinalConfig,
+    LoopConfig,
+    RegistrationConfig,
+    SubmapConfig,
     SurfaceConfig,
     UncertaintyConfig,
 )
-from sigmasplat.config.submaps import FinalConfig, LoopConfig, RegistrationConfig, SubmapConfig
-from sigmasplat.config.tracking import TrackingConfig
+from sigmasplat.config.tracking import MovingConfig, RealTimeConfig, RecoveryConfig, TrackingConfig
 from sigmasplat.errors import ConfigError
 from sigmasplat.files.reading import read_json
 from sigmasplat.registry import Backend, named

@@ -1,4 +1,5 @@
-"""Settings of the work per submap: when to start a new one, loops, registration, the final map."""
+"""Settings of the work per submap: when to start a new one, loops, registration; of the final map, its surface and its
+uncertainty."""
 
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal, NamedTuple
@@ -283,3 +284,22 @@ class FinalConfig(Section, name="final"):
     weight_moment = FromRow[bool]("schedule", SCHEDULES)
     max_axis_ratio = FromRow[float]("schedule", SCHEDULES)
     max_needle_ratio = FromRow[float]("schedule", SCHEDULES)
+
+
+@dataclass(frozen=True)
+class SurfaceConfig(Section, name="surface"):
+    """The mesh of a finished run. Raises ConfigError on invalid values."""
+
+    depth: Literal["map", "map+sensor"] = "map+sensor"
+    """Depth that is fused at each keyframe: map = rendered from its submap (VarSplat §7); map+sensor = rendered from
+    the final map, and the readings of the keyframe, weighted by their variances (ours)."""
+
+
+@dataclass(frozen=True)
+class UncertaintyConfig(Section, name="uncertainty"):
+    """Calibration of the variance that a map predicts for its colour and depth (ours). Raises ConfigError on invalid
+    values."""
+
+    probes: Count = 4
+    """Number of probe views that each submap keeps: well-tracked frames that are not keyframes. The map is not fitted
+    to them; the predicted variance is calibrated on them after the last frame. 0 = no predicted variance."""

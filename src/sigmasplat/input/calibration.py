@@ -26,7 +26,7 @@ class Calibration:
     camera, distortion: of the colour image, None for no distortion; depth_units_per_metre: of whole-number depth;
     depth_camera, depth_distortion: of depth images that are not registered to colour, None if they are registered;
     T_color_depth [4, 4]: transforms points of the depth camera to the colour camera, metres;
-    sensor: the depth sensor (`config.sensors`), None if it is unknown.
+    sensor: the depth sensor (`config.input`), None if it is unknown.
     """
 
     camera: Camera
@@ -76,7 +76,7 @@ def freiburg_calibration(folder: Path) -> Calibration | None:
 
 def read_calibration(path: Path, size: tuple[int, int], default_units_per_metre: float) -> Calibration:
     """Read `calibration.json`: fx, fy, cx, cy; optional width, height, depth_scale (PNG units per metre), distortion,
-    sensor (`config.sensors`).
+    sensor (`config.input`).
 
     For depth that is not registered to colour: depth_camera, an object of the same fields, and T_color_depth, 4 rows.
     `size` (width, height) in pixels is the default for a missing size. Raises SourceError naming file and field.

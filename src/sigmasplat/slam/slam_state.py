@@ -1,6 +1,6 @@
 """The state of SLAM, and how to read it: map, path, components, checkpoint."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.config import Config
-from sigmasplat.config.find_preset import configured
 from sigmasplat.data.atlas import Atlas
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField, Rows
@@ -46,19 +45,10 @@ class SlamState:
 
     Frame 0 fixes the gauge: the world is the first camera, or that of the map that is continued. Finished submaps go to
     `store`, by default in memory.
-
-    config: settings, or the name of a preset, by default the default preset; settings: values that replace some, as in
-    {"input.width": 320}. Raises ConfigError on an unknown preset or setting.
     """
 
-    def __init__(
-        self,
-        config: Config | str | None = None,
-        store: SubmapStore | None = None,
-        *,
-        settings: Mapping[str, object] | None = None,
-    ) -> None:
-        self.config = configured(config, settings)
+    def __init__(self, config: Config, store: SubmapStore | None = None) -> None:
+        self.config = config
         self.filtered = frame_filter(self.config.input.filters)
         self.random = np.random.default_rng(self.config.seed)
         self.store = MemoryStore() if store is None else store

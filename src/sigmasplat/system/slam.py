@@ -4,7 +4,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 from sigmasplat.config import Config
-from sigmasplat.config.sensors import RENDERED
+from sigmasplat.config.find_preset import configured
+from sigmasplat.config.input import RENDERED
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.submap import RefinedStore, StorePart, SubmapStore
@@ -26,6 +27,9 @@ class Slam(MainLoop, ArrayInterface):
 
     Frame 0 fixes the gauge: the world is the first camera. No part of this class reads ground truth. Finished submaps
     go to `store`, by default in memory.
+
+    config: settings, or the name of a preset, by default the default preset; settings: values that replace some, as in
+    {"input.width": 320}. Raises ConfigError on an unknown preset or setting.
     """
 
     def __init__(
@@ -35,7 +39,7 @@ class Slam(MainLoop, ArrayInterface):
         *,
         settings: Mapping[str, object] | None = None,
     ) -> None:
-        super().__init__(config, store, settings=settings)
+        super().__init__(configured(config, settings), store)
         self.listeners = Listeners()
         self._final: GaussianField | None = None
         self.refinement_steps: int | None = None
