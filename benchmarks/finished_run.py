@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from sigmasplat.config import Config
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
-from sigmasplat.data.submap import MemoryStore, RefinedStore, StorePart, SubmapStore
+from sigmasplat.data.submap import MemoryStore, SubmapStore
 from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.final.stores import RefinedStore, StorePart
 from sigmasplat.graph.path_covariance import PathCovariance
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.evaluation.metrics.trajectory import associate, score_failures, truth_in_estimate

@@ -9,8 +9,9 @@ from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.poses import Column, Place, Places
 from sigmasplat.data.relative_pose import UNKNOWN_HOP, RelativePose
-from sigmasplat.data.submap import MemoryStore, Picture, RefinedStore, StorePart, Submap
+from sigmasplat.data.submap import MemoryStore, Picture, Submap
 from sigmasplat.errors import SigmaSplatError
+from sigmasplat.final.stores import RefinedStore, StorePart
 
 CAMERA = Camera(4, 3, 4.0, 4.0, 1.5, 1.0)
 

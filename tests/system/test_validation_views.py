@@ -9,8 +9,8 @@ import torch
 from sigmasplat.config import Config
 from sigmasplat.config.find_preset import preset
 from sigmasplat.config.text import override
-from sigmasplat.data.submap import RefinedStore
 from sigmasplat.errors import ConfigError
+from sigmasplat.final.stores import RefinedStore
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.run_folder.submaps import DiskStore
 from sigmasplat.system.slam import Slam

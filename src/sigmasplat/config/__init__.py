@@ -2,7 +2,6 @@
 `presets`."""
 
 import dataclasses
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -79,10 +78,6 @@ class Config:
     def to_dict(self) -> dict[str, Any]:
         """Return the settings as nested dicts, as in a run's config.json."""
         return dataclasses.asdict(self)
-
-    def save(self, path: Path) -> None:
-        """Write the settings as JSON."""
-        path.write_text(json.dumps(self.to_dict(), indent=2) + "\n")
 
     @staticmethod
     def from_dict(values: dict[str, Any]) -> "Config":

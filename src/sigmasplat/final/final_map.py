@@ -18,10 +18,10 @@ from sigmasplat.data.trajectory import evenly_spread
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.final.full_resolution import refine_on_photos, working_seconds
 from sigmasplat.final.fusion import count_keyframes, fuse, fusion_views
+from sigmasplat.final.moving import carved, without_moving
 from sigmasplat.final.refinement import Clock, KeyframeReader, refine
 from sigmasplat.final.tsdf import packed
 from sigmasplat.graph.path_covariance import PathCovariance
-from sigmasplat.mapping.moving import carved, without_moving
 from sigmasplat.render.view import View
 from sigmasplat.types import Matrix, Progress, no_progress
 
@@ -57,7 +57,9 @@ def final_map(
     Calls `progress(steps done, total)`. Memory contains this map, one submap and some pictures.
     Raises SigmaSplatError if there is no submap, a submap has no anchor, or its camera is not the view's.
     """
-    _refuse_misfits(store, anchors)
+    if not 0 < len(store) <= len(anchors):
+        found = f"found {len(store)} and {len(anchors)}"
+        raise SigmaSplatError(f"the final map needs submaps and one anchor for each, {found}")
     seed = seeded_on_surface if config.final.seed_from == "mesh" else merged
     if config.moving.find:
         store = without_moving(store, anchors, config.moving)
@@ -76,14 +78,6 @@ def final_map(
     poses = keyframes.poses_in(anchors) if moves else None
     exposures = keyframes.exposures_in_submaps() if config.final.exposure else None
     return FinalMap(on_device.to(torch.device("cpu")), poses, exposures, done, refined_fx)
-
-
-def _refuse_misfits(store: SubmapStore, anchors: Sequence[Matrix]) -> None:
-    """Raise SigmaSplatError if no final map can be made."""
-    if not 0 < len(store) <= len(anchors):
-        raise SigmaSplatError(
-            f"the final map needs submaps and one anchor for each, found {len(store)} and {len(anchors)}"
-        )
 
 
 # ---- merging ----

@@ -8,9 +8,9 @@ from sigmasplat.config.find_preset import configured
 from sigmasplat.config.input import RENDERED
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.frame import Frame
-from sigmasplat.data.submap import RefinedStore, StorePart, SubmapStore
+from sigmasplat.data.submap import SubmapStore
 from sigmasplat.final.final_map import final_map, reaching
-from sigmasplat.final.followed_store import solved_keyframes
+from sigmasplat.final.stores import RefinedStore, StorePart, solved_keyframes
 from sigmasplat.final.uncertainty import final_uncertainty
 from sigmasplat.graph.path_covariance import PathCovariance
 from sigmasplat.render.render import as_refined
