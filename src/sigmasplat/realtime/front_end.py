@@ -23,7 +23,7 @@ from sigmasplat.fit.target import Target
 from sigmasplat.graph.confidence import Confidence
 from sigmasplat.graph.loops import Loop, Loops
 from sigmasplat.graph.newest_covariance import NO_ERRORS, PoseErrors
-from sigmasplat.mapping.validation_views import ValidationViews
+from sigmasplat.mapping.window import ValidationViews
 from sigmasplat.render.view import View
 from sigmasplat.slam.results import Step, StepTimer, SubmapState, make_step
 from sigmasplat.system.array_interface import Correction

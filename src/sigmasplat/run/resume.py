@@ -28,7 +28,7 @@ from sigmasplat.graph.growing_graph import GrowingGraph
 from sigmasplat.graph.loops import Loop, Loops
 from sigmasplat.input.source import Source
 from sigmasplat.mapping.mapper import Mapper, SecondHalf
-from sigmasplat.mapping.validation_views import ValidationView, ValidationViews
+from sigmasplat.mapping.window import ValidationView, ValidationViews
 from sigmasplat.run.callbacks import run_now
 from sigmasplat.run.same_conditions import refuse_other_sequence
 from sigmasplat.run_folder.runs import RunFolder

@@ -25,7 +25,7 @@ from sigmasplat.graph.loops import Loop, Loops
 from sigmasplat.graph.newest_covariance import NewestCovariance, PoseErrors
 from sigmasplat.graph.path_covariance import recorded
 from sigmasplat.mapping.mapper import Mapper
-from sigmasplat.mapping.validation_views import ValidationViews
+from sigmasplat.mapping.window import ValidationViews
 from sigmasplat.render.view import View
 from sigmasplat.slam.results import Step, Steps, StepTimer, SubmapState
 from sigmasplat.tracking.depth_filters import frame_filter
