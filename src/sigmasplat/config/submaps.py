@@ -28,7 +28,7 @@ class SubmapConfig(Section, name="submaps"):
     """A new submap starts this many frames after the first one of the active submap; 0 = off."""
     uncertainty_m: NotNegative = 0.02
     """A new submap starts if the standard deviation of the camera's position in the submap, accumulated from keyframe
-    to keyframe, exceeds this (`slam.drift`); 0 = off."""
+    to keyframe, exceeds this (`tracking.drift`); 0 = off."""
     inherit: bool = True  # starting a submap empty costs two seconds of first iterations
     """Whether a new submap starts with copies of the splats in view, which are then mapped like any others; off = it
     starts empty (paper)."""
@@ -46,7 +46,7 @@ class LoopConfig(Section, name="loops"):
     close: bool = True
     """Whether loops are searched and closed."""
     descriptor: Literal["grid", "netvlad", "netvlad-or-grid"] = "grid"
-    """Image descriptor: grid = built in (`slam.loop_closure.descriptors.OrientationGrid`); netvlad = with the weights
+    """Image descriptor: grid = built in (`tracking.descriptors.OrientationGrid`); netvlad = with the weights
     of the file `weights`; netvlad-or-grid = NetVLAD (papers) if `weights` is set, otherwise the built-in one, with a
     warning."""
     weights: str = ""
