@@ -99,7 +99,7 @@ def merged(store: SubmapStore, anchors: Sequence[Matrix], config: Config) -> Gau
     """
     kept, waiting = list[OwnedSplats](), list[OwnedSplats]()
     for index in range(len(store)):
-        part = _in_world(store, anchors, index)
+        part = store.load(index).field.moved(torch.from_numpy(anchors[index]))
         log_variance = part.params[:, COLUMNS["log_variances"]].mean(1)
         waiting.append(OwnedSplats(part, np.full(len(part), index), log_variance))
         if _count(waiting) >= max(AT_ONCE, _count(kept)):
@@ -119,11 +119,6 @@ def _without_duplicates(parts: Sequence[OwnedSplats], config: Config) -> OwnedSp
     keep = survivors(field.means.numpy(), owner, weigh, config.final.merge_m * config.render.scene_scale)
     field.keep(torch.from_numpy(keep))
     return OwnedSplats(field, owner[keep], log_variance[torch.from_numpy(keep)])
-
-
-def _in_world(store: SubmapStore, anchors: Sequence[Matrix], index: int) -> GaussianField:
-    """Return a submap's splats in the world."""
-    return store.load(index).field.moved(torch.from_numpy(anchors[index]))
 
 
 def survivors(

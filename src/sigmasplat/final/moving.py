@@ -47,7 +47,7 @@ class StillStore(ReadOnlyStore):
 
 def without_moving(store: SubmapStore, anchors: Sequence[Matrix], config: MovingConfig) -> StillStore:
     """Return the store with what moves masked in its keyframes; anchors: T_world_submap [4, 4] of each submap."""
-    still, places = StillStore(store), _places(store)
+    still, places = StillStore(store), [(s, k) for s in range(len(store)) for k in range(len(store.load(s).frames))]
     poses = [anchors[s] @ T for s in range(len(store)) for T in store.load(s).T_submap_camera]
     frames = [frame for s in range(len(store)) for frame in store.load(s).frames]
     camera = store.load(0).camera
@@ -60,10 +60,6 @@ def without_moving(store: SubmapStore, anchors: Sequence[Matrix], config: Moving
                 if pixels is not None:
                     still.hide(places[own], pixels)
     return still
-
-
-def _places(store: SubmapStore) -> list[KeyframeId]:
-    return [(s, k) for s in range(len(store)) for k in range(len(store.load(s).frames))]
 
 
 def _compared(poses: Sequence[Matrix]) -> Iterator[list[int]]:

@@ -14,10 +14,11 @@ from sigmasplat.data.camera import Camera, between
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.submap import Picture, Submap, SubmapStore
 from sigmasplat.errors import SigmaSplatError
+from sigmasplat.final.keyframe_nodes import KeyframeNodes, alignments
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.graph.graph_errors import shared_errors
 from sigmasplat.graph.growing_graph import GrowingGraph
-from sigmasplat.graph.keyframe_graph import KeyframeNodes, alignments, solve
+from sigmasplat.graph.keyframe_graph import solve
 from sigmasplat.graph.path_covariance import PathCovariance
 from sigmasplat.types import Matrix
 

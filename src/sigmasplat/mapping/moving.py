@@ -113,13 +113,10 @@ def _sees_through(means_m: NDArray[np.float32], keyframe: Keyframe) -> Mask:
 def _seen(means_m: NDArray[np.float32], keyframe: Keyframe) -> tuple[Mask, Mask]:
     """Return which splats with means [n, 3] m a keyframe sees through, and at which it shows a surface."""
     depth, z, inside, at = _on_keyframe(means_m, keyframe)
-    limit, (near, far) = _limit_m(z), (np.take(plane, at) for plane in Earlier(depth, np.eye(4)).range_m)
+    limit = np.asarray(np.float32(CLEAR_M) + np.float32(CLEAR_RELATIVE) * z)
+    near, far = (np.take(plane, at) for plane in Earlier(depth, np.eye(4)).range_m)
     free = inside & (np.take(depth, at) > 0) & (z + limit < near)
     return free, inside & (z > near - limit) & (z < far + limit)
-
-
-def _limit_m(z: NDArray[np.float32]) -> NDArray[np.float32]:
-    return np.asarray(np.float32(CLEAR_M) + np.float32(CLEAR_RELATIVE) * z)
 
 
 def _on_keyframe(

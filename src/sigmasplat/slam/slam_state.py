@@ -1,29 +1,24 @@
 """The state of SLAM, and how to read it: map, path, components, checkpoint."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from sigmasplat.config import Config
 from sigmasplat.data.atlas import Atlas
 from sigmasplat.data.camera import Camera
-from sigmasplat.data.field import GaussianField, Rows
+from sigmasplat.data.field import GaussianField
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.poses import Column
-from sigmasplat.data.relative_pose import RelativePose
 from sigmasplat.data.submap import MemoryStore, OnDisk, SubmapStore
-from sigmasplat.data.trajectory import LOST, Component, Trajectory
+from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SourceError
 from sigmasplat.graph.closer import LoopCloser, make_descriptor
 from sigmasplat.graph.confidence import Confidence
 from sigmasplat.graph.growing_graph import GrowingGraph, KeyframeImages
 from sigmasplat.graph.loops import Loop, Loops
-from sigmasplat.graph.newest_covariance import NewestCovariance, PoseErrors
-from sigmasplat.graph.path_covariance import recorded
 from sigmasplat.mapping.mapper import Mapper
 from sigmasplat.mapping.window import ValidationViews
 from sigmasplat.render.view import View
@@ -35,7 +30,7 @@ from sigmasplat.tracking.prepared_frame import PreparedFrame, observe, view_of, 
 from sigmasplat.tracking.recovery import Recovery
 from sigmasplat.tracking.relocaliser import Relocaliser
 from sigmasplat.tracking.tracker import Tracker
-from sigmasplat.types import Matrix, Task
+from sigmasplat.types import Task
 
 HOST = torch.device("cpu")
 
@@ -70,7 +65,6 @@ class SlamState:
         self._resample = False
         self._timer = StepTimer()
         self._search: Task[list[Loop]] | None = None
-        self._newest_covariance = NewestCovariance()
         self.keep_on_disk()
 
     @property
@@ -85,10 +79,6 @@ class SlamState:
         atlas, splats = self.atlas, len(self.mapper.field)
         drift = replace(self.drift)
         return SubmapState(len(atlas.anchors) - 1, atlas.components[-1], atlas.anchors[-1], drift, splats)
-
-    def components(self) -> list[Component]:
-        """Return the components of the atlas that are not connected to the world."""
-        return components_apart(self.store, self.atlas, self.mapper.field, self.trajectory(), ~self.steps.lost)
 
     @property
     def loops(self) -> Loops:
@@ -126,35 +116,6 @@ class SlamState:
     def newest_step(self) -> Step | None:
         """Return the result of the newest frame; None before the first one."""
         return self.steps[-1] if self.steps else None
-
-    def covariance(self) -> Matrix | None:
-        """Return the covariance [6, 6] of the newest frame's pose; None if that frame is lost.
-
-        Order: position x, y, z (m), then rotation about x, y, z (rad), all in the axes of the world, as in
-        geometry_msgs/PoseWithCovariance. It covers the noise and the systematic error of tracking since the first
-        camera of the component, its disagreement with mapping, and what closed loops corrected (`path_covariance`). It
-        does not cover a wrong pose that tracking did not notice: `Step.p_off` is its probability. For the first frame
-        it is 0. Raises SourceError before the first frame.
-        """
-        newest = self.newest_step()
-        if newest is None:
-            raise SourceError("no pose yet: give a frame to `track` or `step` first")
-        if newest.state == LOST:
-            return None
-        T_world_camera = (
-            self.atlas.anchors[-1] @ self.atlas.keyframe_poses.last[-1] @ self.atlas.places[-1].T_keyframe_camera
-        )
-        return self.pose_errors().of(T_world_camera, int(not newest.is_keyframe))
-
-    def pose_errors(self) -> PoseErrors:
-        """Return the errors of poses relative to the newest keyframe."""
-        return self._newest_covariance.errors(self.atlas, self.closer)
-
-    def checkpoint(self) -> dict[str, Tensor]:
-        """Return what is needed to read a run back, in host memory: the active submap's field with its optimiser state,
-        poses, times, keyframes, anchors, the submap of each frame, and the errors of the path (`path_covariance`)."""
-        path, edges = self.trajectory(), self.closer.valid
-        return checkpoint_of(self.mapper.field, path, self.atlas, self.keyframe_indices, edges)
 
     @property
     def view(self) -> View:
@@ -213,42 +174,6 @@ class SlamState:
         return (self.cuts and self.config.loops.close) or (m.window > 2 and m.covisibility == "descriptor")
 
 
-def checkpoint_of(
-    active: GaussianField, path: Trajectory, atlas: Atlas, keyframes: Sequence[int], edges: Sequence[RelativePose]
-) -> dict[str, Tensor]:
-    """Return the active submap's field with its attributes and its optimiser state, poses, times, keyframes, anchors,
-    the submap of each frame, the exposures of frames if they are known, and the errors of the path, in host
-    memory."""
-    return {
-        **_rows_of(active, ""),
-        **{key: part for name, rows in active.attributes.items() for key, part in _rows_of(rows, f"{name}_").items()},
-        "timestamps_s": torch.from_numpy(path.timestamps_s),
-        "T_world_camera": torch.from_numpy(path.T_world_camera),
-        "T_world_camera_odometry": torch.from_numpy(atlas.T_world_camera(loops=False)),
-        "T_world_keyframe": torch.from_numpy(atlas.T_world_keyframes),
-        "T_submap_camera": torch.from_numpy(atlas.T_submap_camera),
-        **path_errors(atlas, keyframes, edges),
-    }
-
-
-def path_errors(atlas: Atlas, keyframes: Sequence[int], edges: Sequence[RelativePose]) -> dict[str, Tensor]:
-    """Return the part of a checkpoint that `PathCovariance.of` reads; arguments as for `checkpoint_of`."""
-    return {
-        "keyframes": torch.tensor(keyframes, dtype=torch.int64),
-        "T_world_submap": torch.from_numpy(np.array(atlas.anchors)),
-        "submap_component": torch.tensor(atlas.components, dtype=torch.int64),
-        "frame_submap": torch.tensor(atlas.places.submap),
-        **({"exposure": torch.from_numpy(atlas.frame_exposures())} if atlas.exposures else {}),
-        **recorded(atlas, edges),
-    }
-
-
-def _rows_of(rows: Rows, prefix: str) -> dict[str, Tensor]:
-    """Return the parameters and the optimiser state of rows, in host memory, with a prefix to each name."""
-    parts = {f"{prefix}{name}": getattr(rows, name).cpu() for name in ("params", "moment1", "moment2", "last_step")}
-    return parts | {f"{prefix}adam_steps": torch.tensor(rows.steps)}
-
-
 def merged_field(store: SubmapStore, atlas: Atlas, component: int, active: GaussianField) -> GaussianField:
     """Return the splats of all submaps of a component side by side, in its frame, in host memory; `active` are those of
     the submap that is not finished."""
@@ -259,14 +184,3 @@ def merged_field(store: SubmapStore, atlas: Atlas, component: int, active: Gauss
         for s in atlas.members(component)
     )
     return GaussianField.side_by_side(fields)
-
-
-def components_apart(
-    store: SubmapStore, atlas: Atlas, active: GaussianField, trajectory: Trajectory, found: NDArray[np.bool_]
-) -> list[Component]:
-    """Return the components that are not connected to the world; trajectory: of all frames, found [F]: not lost."""
-    component_of = np.array(atlas.components, np.int64)[atlas.places.submap]
-    return [
-        Component(n, merged_field(store, atlas, n, active), trajectory.at(found & (component_of == n)))
-        for n in sorted(set(atlas.components) - {0})
-    ]

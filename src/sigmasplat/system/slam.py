@@ -1,23 +1,35 @@
-"""The whole system: the main loop, the interface for your own camera, and the final map after the last frame."""
+"""The whole system: the main loop, the interface for your own camera, covariances, the final map after the last frame,
+and the checkpoint."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
 
 from sigmasplat.config import Config
 from sigmasplat.config.find_preset import configured
 from sigmasplat.config.input import RENDERED
-from sigmasplat.data.field import GaussianField
+from sigmasplat.data.atlas import Atlas
+from sigmasplat.data.field import GaussianField, Rows
 from sigmasplat.data.frame import Frame
+from sigmasplat.data.relative_pose import RelativePose
 from sigmasplat.data.submap import SubmapStore
+from sigmasplat.data.trajectory import LOST, Component, Trajectory
+from sigmasplat.errors import SourceError
 from sigmasplat.final.final_map import final_map, reaching
 from sigmasplat.final.stores import RefinedStore, StorePart, solved_keyframes
 from sigmasplat.final.uncertainty import final_uncertainty
-from sigmasplat.graph.path_covariance import PathCovariance
+from sigmasplat.graph.newest_covariance import NewestCovariance, PoseErrors
+from sigmasplat.graph.path_covariance import PathCovariance, recorded
 from sigmasplat.render.render import as_refined
 from sigmasplat.slam.main_loop import MainLoop
 from sigmasplat.slam.results import Step
+from sigmasplat.slam.slam_state import merged_field
 from sigmasplat.system.array_interface import ArrayInterface, Listeners, notifying
-from sigmasplat.types import completed, no_progress, part_of
+from sigmasplat.types import Matrix, completed, no_progress, part_of
 from sigmasplat.uncertainty.map_uncertainty import MapUncertainty
 
 
@@ -41,6 +53,7 @@ class Slam(MainLoop, ArrayInterface):
     ) -> None:
         super().__init__(configured(config, settings), store)
         self.listeners = Listeners()
+        self._newest_covariance = NewestCovariance()
         self._final: GaussianField | None = None
         self.refinement_steps: int | None = None
         """Number of refinement steps of the final map; None before `finish`."""
@@ -52,6 +65,39 @@ class Slam(MainLoop, ArrayInterface):
         """Return the map in the world, in host memory: the final map after `finish`, before that all submaps side by
         side."""
         return super().field if self._final is None else self._final
+
+    def components(self) -> list[Component]:
+        """Return the components of the atlas that are not connected to the world."""
+        return components_apart(self.store, self.atlas, self.mapper.field, self.trajectory(), ~self.steps.lost)
+
+    def covariance(self) -> Matrix | None:
+        """Return the covariance [6, 6] of the newest frame's pose; None if that frame is lost.
+
+        Order: position x, y, z (m), then rotation about x, y, z (rad), all in the axes of the world, as in
+        geometry_msgs/PoseWithCovariance. It covers the noise and the systematic error of tracking since the first
+        camera of the component, its disagreement with mapping, and what closed loops corrected (`path_covariance`). It
+        does not cover a wrong pose that tracking did not notice: `Step.p_off` is its probability. For the first frame
+        it is 0. Raises SourceError before the first frame.
+        """
+        newest = self.newest_step()
+        if newest is None:
+            raise SourceError("no pose yet: give a frame to `track` or `step` first")
+        if newest.state == LOST:
+            return None
+        T_world_camera = (
+            self.atlas.anchors[-1] @ self.atlas.keyframe_poses.last[-1] @ self.atlas.places[-1].T_keyframe_camera
+        )
+        return self.pose_errors().of(T_world_camera, int(not newest.is_keyframe))
+
+    def pose_errors(self) -> PoseErrors:
+        """Return the errors of poses relative to the newest keyframe."""
+        return self._newest_covariance.errors(self.atlas, self.closer)
+
+    def checkpoint(self) -> dict[str, Tensor]:
+        """Return what is needed to read a run back, in host memory: the active submap's field with its optimiser state,
+        poses, times, keyframes, anchors, the submap of each frame, and the errors of the path (`path_covariance`)."""
+        path, edges = self.trajectory(), self.closer.valid
+        return checkpoint_of(self.mapper.field, path, self.atlas, self.keyframe_indices, edges)
 
     @notifying
     def step(self, frame: Frame) -> Step:
@@ -108,3 +154,50 @@ class Slam(MainLoop, ArrayInterface):
         """Return the number of steps of the final map's refinement, at working size and on photos."""
         final, photos = self.config.final, any(keyframe.photo for keyframe in self.mapper.keyframes)
         return final.iterations + final.width_iterations * (photos and final.iterations > 0)
+
+
+def checkpoint_of(
+    active: GaussianField, path: Trajectory, atlas: Atlas, keyframes: Sequence[int], edges: Sequence[RelativePose]
+) -> dict[str, Tensor]:
+    """Return the active submap's field with its attributes and its optimiser state, poses, times, keyframes, anchors,
+    the submap of each frame, the exposures of frames if they are known, and the errors of the path, in host
+    memory."""
+    return {
+        **_rows_of(active, ""),
+        **{key: part for name, rows in active.attributes.items() for key, part in _rows_of(rows, f"{name}_").items()},
+        "timestamps_s": torch.from_numpy(path.timestamps_s),
+        "T_world_camera": torch.from_numpy(path.T_world_camera),
+        "T_world_camera_odometry": torch.from_numpy(atlas.T_world_camera(loops=False)),
+        "T_world_keyframe": torch.from_numpy(atlas.T_world_keyframes),
+        "T_submap_camera": torch.from_numpy(atlas.T_submap_camera),
+        **path_errors(atlas, keyframes, edges),
+    }
+
+
+def path_errors(atlas: Atlas, keyframes: Sequence[int], edges: Sequence[RelativePose]) -> dict[str, Tensor]:
+    """Return the part of a checkpoint that `PathCovariance.of` reads; arguments as for `checkpoint_of`."""
+    return {
+        "keyframes": torch.tensor(keyframes, dtype=torch.int64),
+        "T_world_submap": torch.from_numpy(np.array(atlas.anchors)),
+        "submap_component": torch.tensor(atlas.components, dtype=torch.int64),
+        "frame_submap": torch.tensor(atlas.places.submap),
+        **({"exposure": torch.from_numpy(atlas.frame_exposures())} if atlas.exposures else {}),
+        **recorded(atlas, edges),
+    }
+
+
+def _rows_of(rows: Rows, prefix: str) -> dict[str, Tensor]:
+    """Return the parameters and the optimiser state of rows, in host memory, with a prefix to each name."""
+    parts = {f"{prefix}{name}": getattr(rows, name).cpu() for name in ("params", "moment1", "moment2", "last_step")}
+    return parts | {f"{prefix}adam_steps": torch.tensor(rows.steps)}
+
+
+def components_apart(
+    store: SubmapStore, atlas: Atlas, active: GaussianField, trajectory: Trajectory, found: NDArray[np.bool_]
+) -> list[Component]:
+    """Return the components that are not connected to the world; trajectory: of all frames, found [F]: not lost."""
+    component_of = np.array(atlas.components, np.int64)[atlas.places.submap]
+    return [
+        Component(n, merged_field(store, atlas, n, active), trajectory.at(found & (component_of == n)))
+        for n in sorted(set(atlas.components) - {0})
+    ]
