@@ -31,7 +31,7 @@ from sigmasplat.run.scene import open_scene
 from sigmasplat.run.session import Session, new_folder
 from sigmasplat.run.terminal import Screen
 from sigmasplat.run_folder.run_values import check_fields
-from sigmasplat.slam.slam import Slam
+from sigmasplat.system.slam import Slam
 
 WEIGHTS = ("tracking.uncertainty", "loops.uncertainty", "registration.uncertainty", "final.uncertainty")
 TAUS = ("tracking.tau", "loops.tau", "registration.tau")

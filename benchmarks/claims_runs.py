@@ -24,7 +24,7 @@ from sigmasplat.plugins.evaluation.metrics.trajectory import align_rigid, associ
 from sigmasplat.plugins.evaluation.metrics.uncertainty import spearman
 from sigmasplat.plugins.evaluation.metrics.views import ScoredView, sample_pixels, score_uncertainty
 from sigmasplat.plugins.sources import open_source
-from sigmasplat.slam.slam import Slam
+from sigmasplat.system.slam import Slam
 
 Rows = list[dict[str, Any]]
 Plateaus = dict[str, tuple[float, int]]

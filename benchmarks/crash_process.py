@@ -17,7 +17,7 @@ from typing import Any
 
 os.environ.setdefault("SIGMASPLAT_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is imported: threads do not survive a fork
-LOADED = ("cli", "slam.slam", "run.session", "run.terminal", "run.resume", "plugins.sources.synthetic")
+LOADED = ("cli", "system.slam", "run.session", "run.terminal", "run.resume", "plugins.sources.synthetic")
 """Modules that are imported once, before the processes are forked."""
 AUDITED = {"open": "create", "os.rename": "rename", "os.remove": "remove", "os.mkdir": "mkdir", "os.rmdir": "rmdir"}
 WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT

@@ -32,9 +32,9 @@ from tables import Section
 
 from sigmasplat.errors import SigmaSplatError, SourceError
 from sigmasplat.files.tensors import open_tensors
+from sigmasplat.input.lists import read_poses
 from sigmasplat.plugins.outputs.mesh_files import read_mesh
 from sigmasplat.run_folder.runs import RunFolder
-from sigmasplat.run_folder.trajectory import read_trajectory
 
 arg = tyro.conf.arg
 KILLED = -9
@@ -209,7 +209,7 @@ def read_image(path: Path) -> None:
 READERS: dict[str, Callable[[Path], Any]] = {
     ".json": lambda path: json.loads(path.read_text(encoding="utf-8")), ".safetensors": read_tensors,
     ".ply": lambda path: read_mesh(path) if path.name == "mesh.ply" else read_any(path), ".spz": read_any,
-    ".txt": lambda path: read_trajectory(path, may_be_empty=True), ".html": read_page, ".png": read_image,
+    ".txt": lambda path: read_poses(path, may_be_empty=True), ".html": read_page, ".png": read_image,
 }  # fmt: skip
 
 

@@ -29,7 +29,7 @@ from sigmasplat.data import se3
 from sigmasplat.plugins.evaluation.metrics.trajectory import associate
 from sigmasplat.plugins.evaluation.metrics.uncertainty import spearman
 from sigmasplat.plugins.sources import open_source
-from sigmasplat.slam.slam import Slam
+from sigmasplat.system.slam import Slam
 
 arg = tyro.conf.arg
 Matrix = NDArray[np.float64]

@@ -105,7 +105,7 @@ def follow(path: str, scratch: Path, config: Config, seconds: float, save_every_
     from sigmasplat.commands.options import prepare_torch
     from sigmasplat.run.resume import StateFile
     from sigmasplat.run.session import Session
-    from sigmasplat.slam.slam import Slam
+    from sigmasplat.system.slam import Slam
 
     prepare_torch()
     source = Repeated(open_source(path), scratch / "frames", MOST_FRAMES)

@@ -10,17 +10,18 @@ from numpy.typing import NDArray
 from sigmasplat.config import Config
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
-from sigmasplat.data.map_uncertainty import MapUncertainty
-from sigmasplat.data.submap import MemoryStore, RefinedStore, StorePart, SubmapStore
+from sigmasplat.data.submap import MemoryStore, SubmapStore
 from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.final.stores import RefinedStore, StorePart
 from sigmasplat.graph.path_covariance import PathCovariance
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.evaluation.metrics.trajectory import associate, score_failures, truth_in_estimate
 from sigmasplat.plugins.evaluation.path_scores import score_path_covariance
 from sigmasplat.run.callbacks import Callback
-from sigmasplat.slam.slam import Slam
+from sigmasplat.system.slam import Slam
 from sigmasplat.tracking.keyframe_rule import is_held_back
 from sigmasplat.types import Matrix, no_progress
+from sigmasplat.uncertainty.map_uncertainty import MapUncertainty
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +71,7 @@ class FinishedRun:
             slam.config, slam.view.camera, slam.field, store, list(slam.atlas.anchors), slam.atlas.members(0),
             slam.atlas.refined, slam.atlas.exposures, slam.atlas.frame_exposures(), slam.trajectory(),
             slam.atlas.places.submap.tolist(), slam.atlas.T_submap_camera, slam.valid(),
-            slam.steps.rows.used[:, 0].astype(int).tolist(), slam.steps.p_off, counts,
+            slam.steps.frame.tolist(), slam.steps.p_off, counts,
             slam.uncertainty, PathCovariance.of(slam.checkpoint()), slam.keyframe_indices,
         )  # fmt: skip
 

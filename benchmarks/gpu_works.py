@@ -23,7 +23,7 @@ from sigmasplat.plugins.cuda import launch as cuda_launch
 from sigmasplat.plugins.cuda.view import CudaView
 from sigmasplat.plugins.evaluation.metrics.trajectory import ate
 from sigmasplat.plugins.sources import SyntheticRoom
-from sigmasplat.slam.slam import Slam
+from sigmasplat.system.slam import Slam
 
 FRAME = 100
 WARMUPS, ITERATIONS, TRACKING_ITERATIONS = 3, 10, 60

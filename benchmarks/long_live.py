@@ -125,7 +125,7 @@ def follow(path: str, scratch: Path, config: Config, frames: int, save_every_s: 
     from sigmasplat.realtime.system import RealTime
     from sigmasplat.run.resume import StateFile
     from sigmasplat.run.session import Session
-    from sigmasplat.slam.slam import Slam
+    from sigmasplat.system.slam import Slam
 
     prepare_torch()
     source = Repeated(open_source(path), scratch / "frames", frames)

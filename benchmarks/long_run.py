@@ -125,7 +125,7 @@ def follow(path: str, scratch: Path, config: Config, finish: bool) -> dict[str, 
 
     seconds: `Step.seconds["total"]`, without reading the frame; resident_mib: after the frame.
     """
-    from sigmasplat.slam.slam import Slam
+    from sigmasplat.system.slam import Slam
 
     source, seconds, resident, submaps, lost = Drawn(open_source(path), scratch / "frames"), [], [], [], 0
     slam = Slam(config, DiskStore(scratch / "submaps"))

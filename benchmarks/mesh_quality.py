@@ -29,8 +29,8 @@ from tables import Section
 from sigmasplat.data import se3
 from sigmasplat.data.mesh import Mesh, mesh_depth
 from sigmasplat.data.trajectory import Trajectory, evenly_spread
-from sigmasplat.data.tsdf import Tsdf, extract_surface
 from sigmasplat.errors import SigmaSplatError
+from sigmasplat.final.tsdf import Tsdf, extract_surface
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.evaluation.metrics.reconstruction import (
     BEHIND_M,

@@ -36,7 +36,7 @@ from sigmasplat.plugins.evaluation.metrics.trajectory import ate
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.plugins.sources.synthetic import SyntheticRoom
 from sigmasplat.render import render
-from sigmasplat.slam.slam import Slam
+from sigmasplat.system.slam import Slam
 from sigmasplat.tracking.prepared_frame import working_frame
 
 arg = tyro.conf.arg

@@ -33,9 +33,9 @@ from peers import OtherSystems, Peer, Result, pythons_of
 from tables import Section, significant
 
 from sigmasplat.errors import ConfigError, SigmaSplatError
+from sigmasplat.input.lists import read_poses
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.run_folder.runs import RunFolder
-from sigmasplat.run_folder.trajectory import read_trajectory
 
 arg = tyro.conf.arg
 QUICK_FRAMES, WATCHED_EVERY_S = 60, 0.02
@@ -116,7 +116,7 @@ def run_ours(path: str, options: Options, scratch: Path, *more: str) -> list[Res
         words += [] if options.limit is None else ["--limit", str(options.limit)]
         wall_s, used_s = watched(words, folder, Path(new) / "output.txt")
         run = RunFolder.open(folder)
-        found = peers.score(read_trajectory(folder / "trajectory.txt"), open_source(path), options.limit)
+        found = peers.score(read_poses(folder / "trajectory.txt"), open_source(path), options.limit)
         return ours_of(run.read_log(), run.facts(), wall_s, used_s, found)
 
 

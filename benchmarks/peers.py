@@ -30,10 +30,10 @@ from sigmasplat.config.find_preset import default_preset, preset as preset_of
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import ConfigError, SigmaSplatError, SourceError
 from sigmasplat.files.atomic import write_text
+from sigmasplat.input.lists import read_poses
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.evaluation.metrics.trajectory import ate, pair_poses
 from sigmasplat.plugins.sources import open_source
-from sigmasplat.run_folder.trajectory import read_trajectory
 
 arg = tyro.conf.arg
 Result = dict[str, Any]
@@ -224,7 +224,7 @@ def read_paths(options: Options) -> list[Result]:
         name, _, file = rest.rpartition("=")
         if not name:
             raise ConfigError(f"--paths {text}: expected SYSTEM=SEQUENCE=FILE")
-        found = score(read_trajectory(Path(file)), open_source(accuracy.located(name)), options.limit)
+        found = score(read_poses(Path(file)), open_source(accuracy.located(name)), options.limit)
         made.append({"system": system, "source": Path(name).name, "problem": None, **found})
     return made
 

@@ -25,7 +25,7 @@ from sigmasplat.errors import SourceError
 from sigmasplat.graph.path_covariance import PathCovariance
 from sigmasplat.plugins.evaluation.path_scores import MOTIONS, score_path_covariance
 from sigmasplat.plugins.sources import open_source
-from sigmasplat.slam.slam import Slam
+from sigmasplat.system.slam import Slam
 
 arg = tyro.conf.arg
 NOISY = f"{accuracy.SYNTHETIC},noise=1"

@@ -35,7 +35,7 @@ from sigmasplat.data.harmonics import DEGREES
 from sigmasplat.errors import ConfigError, SourceError
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.run_folder.runs import RunFolder
-from sigmasplat.slam.slam import Slam
+from sigmasplat.system.slam import Slam
 
 arg = tyro.conf.arg
 Matrix = NDArray[np.float64]

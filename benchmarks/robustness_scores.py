@@ -12,9 +12,9 @@ from disturbed_recordings import FRAMES_PER_SECOND
 from numpy.typing import NDArray
 
 from sigmasplat.data import se3
+from sigmasplat.input.lists import read_poses
 from sigmasplat.plugins.evaluation.metrics import trajectory as failures
 from sigmasplat.plugins.evaluation.metrics.trajectory import OFF_M, SILENT_M, align_rigid
-from sigmasplat.run_folder.trajectory import read_trajectory
 
 ANCHOR_FRAMES, ANCHOR_M = 20, 0.05
 """Without an event, this number of first frames fixes the world; frames further off than this do not count."""
@@ -54,7 +54,7 @@ def read_run(folder: Path, frames: int) -> RunPath:
             p_off[index] = np.nan if values.get("p_off") is None else values["p_off"]
             if values["T_world_camera"] is not None:
                 tracked[index] = values["T_world_camera"]
-    path = read_trajectory(folder / "trajectory.txt")
+    path = read_poses(folder / "trajectory.txt")
     rows = np.rint(path.timestamps_s * FRAMES_PER_SECOND).astype(int)
     final[rows] = path.T_world_camera
     valid = np.isfinite(final[:, 0, 0]) & ~lost  # a component that joined the world later is valid at the end

@@ -28,7 +28,7 @@ from sigmasplat.config import Config
 from sigmasplat.config.find_preset import default_preset
 from sigmasplat.data.frame import Frame
 from sigmasplat.plugins.sources import open_source
-from sigmasplat.slam.slam import Slam
+from sigmasplat.system.slam import Slam
 
 arg = tyro.conf.arg
 CLOCKS = {"wall_s": "wall clock", "processor_s": "processor"}

@@ -22,7 +22,7 @@ from tables import Section, significant
 import sigmasplat
 from sigmasplat.commands.options import Settings
 from sigmasplat.config.find_preset import default_preset, preset
-from sigmasplat.config.sensors import sensor_model
+from sigmasplat.config.input import sensor_model
 from sigmasplat.data import se3
 from sigmasplat.files.machine import INSTALLED, code_digest
 from sigmasplat.fit.align import align

@@ -13,12 +13,12 @@ from torch import Tensor
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
-from sigmasplat.data.map_uncertainty import MapUncertainty
 from sigmasplat.fit.target import Keyframe
 from sigmasplat.render import FieldRenderer, Render
 from sigmasplat.render.backend import on_device
 from sigmasplat.types import Matrix
 from sigmasplat.uncertainty.calibration import squared_errors
+from sigmasplat.uncertainty.map_uncertainty import MapUncertainty
 from sigmasplat.uncertainty.predictive import BlendedValues, blend_values
 
 GRADIENT_STEPS = 6

@@ -11,8 +11,8 @@ from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.mesh import Mesh, mesh_depth
 from sigmasplat.data.trajectory import Trajectory, evenly_spread
-from sigmasplat.data.tsdf import Tsdf, extract_surface
 from sigmasplat.final.fusion import TRUNCATION_VOXELS, VOXEL_M, count_keyframes, fuse, surface_views
+from sigmasplat.final.tsdf import Tsdf, extract_surface
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.evaluation.metrics.reconstruction import BEHIND_M, Mask, distances, visible_points
 from sigmasplat.plugins.evaluation.metrics.trajectory import associate

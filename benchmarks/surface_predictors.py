@@ -14,8 +14,8 @@ from splat_statistics import MapFacts
 from surface_errors import SurfaceErrors
 from torch import Tensor
 
-from sigmasplat.data.map_uncertainty import SplatStd
 from sigmasplat.plugins.evaluation.reconstruct import nearest_opaque
+from sigmasplat.uncertainty.map_uncertainty import SplatStd
 
 Floats = NDArray[np.float32]
 

@@ -37,7 +37,7 @@ from sigmasplat.input.source import Source
 from sigmasplat.plugins.evaluation.metrics.trajectory import associate
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.render.backend import make_view
-from sigmasplat.slam.slam import Slam
+from sigmasplat.system.slam import Slam
 
 arg = tyro.conf.arg
 Matrix = NDArray[np.float64]

@@ -25,7 +25,6 @@ from sigmasplat.config.text import full_path, override, split_settings
 from sigmasplat.data import se3
 from sigmasplat.data.camera import NEUTRAL, exposed
 from sigmasplat.data.field import GaussianField
-from sigmasplat.data.map_uncertainty import MapUncertainty
 from sigmasplat.data.submap import SubmapStore
 from sigmasplat.data.trajectory import evenly_spread
 from sigmasplat.errors import ConfigError
@@ -36,6 +35,7 @@ from sigmasplat.plugins.evaluation.metrics.views import COVERED_ALPHA
 from sigmasplat.render import FieldRenderer
 from sigmasplat.render.backend import make_view
 from sigmasplat.types import Matrix, Progress, no_progress
+from sigmasplat.uncertainty.map_uncertainty import MapUncertainty
 
 Floats = NDArray[np.float32]
 

@@ -31,7 +31,6 @@ from sigmasplat.commands.input_options import Limit
 from sigmasplat.commands.options import prepare_torch
 from sigmasplat.config.text import full_path
 from sigmasplat.data import se3
-from sigmasplat.data.map_uncertainty import COLOR_PARTS, DEPTH_PARTS, SHIPPED
 from sigmasplat.final.refinement import KeyframeReader
 from sigmasplat.final.uncertainty import FIRM, LIMIT, Samples, probe_samples, probe_views
 from sigmasplat.fit.target import Keyframe, Target
@@ -39,6 +38,7 @@ from sigmasplat.plugins.evaluation.metrics.uncertainty import calibration_scores
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.render.backend import make_view
 from sigmasplat.uncertainty.calibration import background_of, fit_weights, splat_residuals
+from sigmasplat.uncertainty.map_uncertainty import COLOR_PARTS, DEPTH_PARTS, SHIPPED
 
 arg = tyro.conf.arg
 RUNS = record.ROOT / "runs" / "bench" / "uncertainty-weights"

@@ -38,7 +38,7 @@ from sigmasplat.plugins.viewer.snapshot import field_without_moments
 from sigmasplat.plugins.viewer.snapshot_sources import LiveView
 from sigmasplat.run_folder.submaps import DiskStore
 from sigmasplat.slam.results import Step
-from sigmasplat.slam.slam import Slam
+from sigmasplat.system.slam import Slam
 
 if TYPE_CHECKING:
     from sigmasplat.plugins.viewer.app import ViewerApp

@@ -12,8 +12,8 @@ from weights import Job
 from sigmasplat.config import Config
 from sigmasplat.data import se3
 from sigmasplat.data.field import GaussianField
-from sigmasplat.data.submap import StorePart
 from sigmasplat.final.final_map import final_map
+from sigmasplat.final.stores import StorePart
 from sigmasplat.graph.candidates import Candidate, SubmapPair, gate
 from sigmasplat.graph.closer import LoopCloser
 from sigmasplat.graph.localisations import differs
@@ -23,7 +23,7 @@ from sigmasplat.plugins.evaluation.metrics.trajectory import associate, score_pa
 from sigmasplat.plugins.evaluation.metrics.views import ScoredView, scored_view
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.render import FieldRenderer
-from sigmasplat.slam.slam import Slam
+from sigmasplat.system.slam import Slam
 from sigmasplat.tracking.descriptors import similarity
 from sigmasplat.types import completed
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from sigmasplat.plugins.sources import open_source as open_source
     from sigmasplat.realtime.system import RealTime as RealTime
     from sigmasplat.run.scene import open_scene as open_scene
-    from sigmasplat.slam.slam import Slam as Slam
+    from sigmasplat.system.slam import Slam as Slam
 
 # Imported at first use, so that `import sigmasplat` and `sigmasplat --help` do not load torch. The function `render` is
 # not here, because `sigmasplat.render` is its package: use `from sigmasplat.render import render`.
@@ -34,7 +34,7 @@ _HOMES = {
     "GaussianField": "sigmasplat.data.field",
     "RealTime": "sigmasplat.realtime.system",
     "SigmaSplatError": "sigmasplat.errors",
-    "Slam": "sigmasplat.slam.slam",
+    "Slam": "sigmasplat.system.slam",
     "open_scene": "sigmasplat.run.scene",
     "open_source": "sigmasplat.plugins.sources",
     "preset": "sigmasplat.config.find_preset",

@@ -15,7 +15,7 @@ from sigmasplat.config.find_preset import (
     preset as preset,
     presets_by_scene as presets_by_scene,
 )
-from sigmasplat.config.sensors import SensorModel as SensorModel
+from sigmasplat.config.input import SensorModel as SensorModel
 from sigmasplat.config.text import differences as differences, override as override
 from sigmasplat.data import harmonics as harmonics, se3 as se3
 from sigmasplat.data.atlas import Atlas as Atlas
@@ -33,14 +33,6 @@ from sigmasplat.data.frame_arrays import (
     frame_from_arrays as frame_from_arrays,
 )
 from sigmasplat.data.images import resized_color as resized_color
-from sigmasplat.data.imu import (
-    GRAVITY_M_S2 as GRAVITY_M_S2,
-    Accelerometer as Accelerometer,
-    Gyroscope as Gyroscope,
-    accelerometer_from_samples as accelerometer_from_samples,
-    gyroscope_from_samples as gyroscope_from_samples,
-)
-from sigmasplat.data.map_uncertainty import MapUncertainty as MapUncertainty, SplatStd as SplatStd
 from sigmasplat.data.mesh import Mesh as Mesh, mesh_depth as mesh_depth
 from sigmasplat.data.submap import Picture as Picture, SubmapStore as SubmapStore
 from sigmasplat.data.trajectory import (
@@ -175,6 +167,13 @@ from sigmasplat.input.images import (
     times_of_names as times_of_names,
     without_nan as without_nan,
 )
+from sigmasplat.input.imu import (
+    GRAVITY_M_S2 as GRAVITY_M_S2,
+    Accelerometer as Accelerometer,
+    Gyroscope as Gyroscope,
+    accelerometer_from_samples as accelerometer_from_samples,
+    gyroscope_from_samples as gyroscope_from_samples,
+)
 from sigmasplat.input.lists import (
     FLIP_YZ as FLIP_YZ,
     MAX_GAP_S as MAX_GAP_S,
@@ -261,13 +260,13 @@ from sigmasplat.run_folder.splat_values import (
     to_bytes as to_bytes,
 )
 from sigmasplat.run_folder.trajectory import (
-    read_trajectory as read_trajectory,
     write_square as write_square,
     write_trajectory as write_trajectory,
 )
 from sigmasplat.slam.results import Step as Step
-from sigmasplat.slam.slam import Slam as Slam
+from sigmasplat.system.slam import Slam as Slam
 from sigmasplat.types import Matrix as Matrix, Progress as Progress, no_progress as no_progress
+from sigmasplat.uncertainty.map_uncertainty import MapUncertainty as MapUncertainty, SplatStd as SplatStd
 from sigmasplat.uncertainty.predictive import (
     Predicted as Predicted,
     predict as predict,

@@ -6,14 +6,13 @@ import resource
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, redirect_stderr, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import fields, is_dataclass
 from functools import partial, wraps
 from importlib import import_module
 from importlib.abc import InspectLoader
 from importlib.util import find_spec
 from inspect import cleandoc, signature
-from io import StringIO
 from types import CodeType
 from typing import Annotated, Any, TextIO, get_args, get_origin
 
@@ -23,7 +22,6 @@ from sigmasplat.errors import ConfigError, SigmaSplatError, is_out_of_memory, ou
 from sigmasplat.files.reading import cause
 
 REFUSED, INTERRUPTED, CLOSED = 2, 130, 141
-HELP = {"-h", "--help"}
 LEAST_MEMORY = 1_200_000_000
 """Address space, bytes: a run of tiny images needs that much (1.0 GB was too little with torch 2.13)."""
 COLLECTED_AFTER = 10_000
@@ -80,41 +78,30 @@ def _refuse_memory_limit() -> None:
 
 
 def _call_of(arguments: Sequence[str]) -> Callable[[], int]:
-    """Return the call of the command in the arguments. Raises SystemExit after help, or if the arguments are wrong."""
-    first, wants_help = arguments[0], not HELP.isdisjoint(arguments)
-    if first not in COMMANDS:
-        return _parsed(arguments, with_options=not wants_help)
-    if wants_help:
-        return _parsed_alone(first, arguments[1:])
-    try:
-        with redirect_stderr(StringIO()):
-            return _parsed_alone(first, arguments[1:])
-    except SystemExit:  # the arguments are wrong: a complete message suggests options of other commands
-        return _parsed(arguments, with_options=True)
-
-
-def _parsed_alone(name: str, arguments: Sequence[str]) -> Callable[[], int]:
-    """Return the call of a command; the others are not parsed, which takes time. Raises SystemExit as `_parsed`."""
-    import tyro  # not at the top: `--version` and a wrong command do not need it
-
-    return tyro.cli(_postponed(name), prog=f"sigmasplat {name}", args=arguments, config=(tyro.conf.FlagCreatePairsOff,))
-
-
-def _parsed(arguments: Sequence[str], with_options: bool) -> Callable[[], int]:
-    """Return the call that the arguments ask for; with_options: parse the options of all commands, or none.
+    """Return the call of the command in the arguments; the options of others are not parsed, which takes time.
 
     Raises SystemExit after it has printed help, or what is wrong with the arguments.
     """
+    import tyro  # not at the top: `--version` and a wrong command do not need it
+
+    name, plain = arguments[0], (tyro.conf.FlagCreatePairsOff,)
+    if name not in COMMANDS:
+        return partial(_list_commands, arguments)
+    return tyro.cli(_postponed(name), prog=f"sigmasplat {name}", args=arguments[1:], config=plain)
+
+
+def _list_commands(arguments: Sequence[str]) -> int:
+    """Print the commands, or that there is no such option. Raises SystemExit afterwards."""
     import tyro
 
-    call: Callable[[], int] = tyro.extras.subcommand_cli_from_dict(
-        {name: _postponed(name) if with_options else _without_options(name) for name in COMMANDS},
+    tyro.extras.subcommand_cli_from_dict(
+        {name: _without_options(name) for name in COMMANDS},
         prog="sigmasplat",
         description=DESCRIPTION,
         args=arguments,
         config=(tyro.conf.FlagCreatePairsOff,),
     )
-    return call
+    return REFUSED
 
 
 def _postponed(name: str) -> Callable[..., Callable[[], int]]:

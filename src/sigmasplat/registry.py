@@ -46,7 +46,7 @@ class SourceFormat:
     recognises(path): whether the path has this layout, from its content only; looked_for: names the files that identify
     it, for messages; open(path, settings): builds the source of all its frames; priority: layouts of higher priority
     are asked first, so that a special one comes before a general one (above 0: other layouts recognise the same files;
-    below 0: a guess); sensor: the depth sensor of all its recordings (`config.sensors`), None if it varies.
+    below 0: a guess); sensor: the depth sensor of all its recordings (`config.input`), None if it varies.
     """
 
     name: str

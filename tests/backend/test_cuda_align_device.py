@@ -25,7 +25,7 @@ from sigmasplat.plugins.cuda.view import CudaView
 from sigmasplat.render.cpu import CpuView
 from sigmasplat.render.view import View
 from sigmasplat.run_folder.state import read_state, write_state
-from sigmasplat.slam.slam import Slam
+from sigmasplat.system.slam import Slam
 from splat_fields import OPTIONS
 from splat_wall import CAMERA, TRUTH, seen_from, wall
 from test_cuda_align import assert_same, level_of, room, seen, there

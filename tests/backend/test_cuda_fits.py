@@ -24,7 +24,7 @@ from sigmasplat.plugins.cuda import view as cuda_view
 from sigmasplat.plugins.cuda.view import CudaView
 from sigmasplat.plugins.sources import SyntheticRoom
 from sigmasplat.render.cpu import CpuView
-from sigmasplat.slam.slam import Slam
+from sigmasplat.system.slam import Slam
 from splat_fields import OPTIONS, params_of
 from splat_fits import target_of
 from splat_scenes import assert_same_vector, scene

@@ -32,9 +32,9 @@ from sigmasplat.plugins.viewer.snapshot import Snapshot
 from sigmasplat.plugins.viewer.snapshot_sources import LiveView
 from sigmasplat.render import FieldRenderer, render
 from sigmasplat.render.cpu import CpuView
+from sigmasplat.run.resume import CLASSES, fixed, restore, state_of
 from sigmasplat.run_folder.state import read_state, write_state
-from sigmasplat.slam.saved_state import CLASSES, fixed, restore, state_of
-from sigmasplat.slam.slam import Slam
+from sigmasplat.system.slam import Slam
 from splat_fields import OPTIONS, Gradients, exact_view, params_of, there_and_back
 from splat_fits import target_of
 from splat_scenes import assert_same_vector, scene

@@ -7,10 +7,17 @@ import torch
 from paper_settings import RenderConfig
 from sigmasplat.data import se3
 from sigmasplat.data.field import GaussianField
-from sigmasplat.data.map_uncertainty import COLOR_PARTS, DEPTH_PARTS, SHIPPED, Background, Calibration, MapUncertainty
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.render import render
 from sigmasplat.uncertainty.calibration import splat_residuals
+from sigmasplat.uncertainty.map_uncertainty import (
+    COLOR_PARTS,
+    DEPTH_PARTS,
+    SHIPPED,
+    Background,
+    Calibration,
+    MapUncertainty,
+)
 from sigmasplat.uncertainty.predictive import blend_values, novelty, predict, variance_parts
 from splat_scenes import WIDE, Scene, assert_same_vector, scene
 

@@ -6,9 +6,9 @@ import torch
 
 from paper_settings import RenderConfig
 from sigmasplat.data.field import GaussianField
-from sigmasplat.data.map_uncertainty import COLOR_PARTS, DEPTH_PARTS, Background, Calibration, MapUncertainty
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.uncertainty.calibration import splat_std
+from sigmasplat.uncertainty.map_uncertainty import COLOR_PARTS, DEPTH_PARTS, Background, Calibration, MapUncertainty
 from sigmasplat.uncertainty.predictive import predict
 from splat_scenes import WIDE
 

@@ -19,7 +19,7 @@ from sigmasplat.errors import RunError, SigmaSplatError
 from sigmasplat.plugins.outputs.floorplan.floor_plan import floor_plan
 from sigmasplat.plugins.presets.shared_by_papers import BASE
 from sigmasplat.run_folder.runs import RunFolder
-from sigmasplat.slam.slam_state import checkpoint_of
+from sigmasplat.system.slam import checkpoint_of
 
 Tensors = dict[str, torch.Tensor]
 

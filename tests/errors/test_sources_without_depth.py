@@ -85,14 +85,14 @@ def left_and_right(folder: Path) -> None:
 CASES = {
     video: "a video",
     phone_recording: "video: movie.mp4",
-    photos: "(images)",
+    photos: "(images in .)",
     photos_in_a_subfolder: "images in DCIM/100ANDRO",
-    raw_photos: "(images)",
+    raw_photos: "(images in .)",
     colmap: "(images in images)",
     one_photo: "a single image",
-    euroc: "stereo or multi-camera images in cam0, cam1",
-    kitti: "stereo or multi-camera images in image_2, image_3",
-    left_and_right: "stereo or multi-camera images in left, right",
+    euroc: "(images in mav0/cam0/data, mav0/cam1/data)",
+    kitti: "(images in image_2, image_3)",
+    left_and_right: "(images in left, right)",
 }
 
 

@@ -13,9 +13,9 @@ from sigmasplat.config.find_preset import preset
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.frame import Frame
-from sigmasplat.data.imu import Accelerometer, accelerometer_from_samples, up_of_path
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import RunError, SourceError
+from sigmasplat.input.imu import Accelerometer, accelerometer_from_samples, up_of_path
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.outputs.axes import level_cameras
 from sigmasplat.plugins.outputs.floorplan.ground import floor_frame, sample_surfaces

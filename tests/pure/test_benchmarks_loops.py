@@ -232,7 +232,7 @@ def test_every_step_is_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> 
             finished.append(True)
 
     finished: list[bool] = []
-    monkeypatch.setattr("sigmasplat.slam.slam.Slam", Stand)
+    monkeypatch.setattr("sigmasplat.system.slam.Slam", Stand)
     found = long_run.follow(ROOM, tmp_path, preset("varsplat-fast"), True)
     assert finished == [True] and found["each"]["seconds"] == [round(0.01 * i, 6) for i in range(40)]
     assert (found["frames"], found["lost"], found["submaps"]) == (40, 1, 5)

@@ -29,6 +29,7 @@ from sigmasplat.data.mesh import Mesh
 from sigmasplat.data.submap import SubmapStore
 from sigmasplat.data.trajectory import Component, Trajectory
 from sigmasplat.errors import SigmaSplatError, SourceError
+from sigmasplat.input.lists import read_poses
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.outputs.mesh_files import write_mesh
 from sigmasplat.plugins.presets.shared_by_papers import BASE
@@ -39,7 +40,6 @@ from sigmasplat.run_folder.frames import noted_up
 from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.run_folder.splat_ply import read_field
 from sigmasplat.run_folder.submaps import DiskStore
-from sigmasplat.run_folder.trajectory import read_trajectory
 
 CAMERA = Camera(8, 6, 8.0, 8.0, 3.5, 2.5)
 METRICS = {"ate": {"rmse_m": 0.0123}, "held_out": {"psnr_db": 27.31}, "training": {"psnr_db": 31.25}, "splats": 2}
@@ -175,7 +175,7 @@ def corridor(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Corridor:
     source = Corridor()
     # This line must be the first: it imports `resume` with the real SLAM. The fake has no state to save.
     monkeypatch.setattr("sigmasplat.run.resume.StateFile.save", lambda *ignored: None)
-    module = ModuleType("sigmasplat.slam.slam")
+    module = ModuleType("sigmasplat.system.slam")
     module.Slam = MadeUpSlam  # type: ignore[attr-defined]
     scores = ModuleType("sigmasplat.plugins.evaluation.evaluate")
     scores.evaluate = evaluate  # type: ignore[attr-defined]
@@ -574,7 +574,7 @@ def test_eval_and_export_read_what_run_wrote(corridor: Corridor, capsys: pytest.
     assert exit_code("export", "mine", "--axes", "camera") == 0
     assert torch.allclose(read_field(Path("mine.ply")).params, RunFolder.open(Path("mine")).read_map().params)
     assert exit_code("export", "mine", "--out", "path.txt") == 0
-    assert len(read_trajectory(Path("path.txt"))) == 6
+    assert len(read_poses(Path("path.txt"))) == 6
     assert exit_code("export", "mine") == 2
     assert "mine.ply exists" in capsys.readouterr().err
     assert exit_code("export", "mine", "--overwrite", "--format", "ply") == 0

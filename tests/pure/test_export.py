@@ -11,15 +11,15 @@ from splat_readers import read_any
 from command_line import exit_code
 from sigmasplat.commands.export import ExportOptions
 from sigmasplat.data.field import GaussianField
-from sigmasplat.data.map_uncertainty import SHIPPED, Background, MapUncertainty, SplatStd
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.files.ply_elements import read_header
+from sigmasplat.input.lists import read_poses
 from sigmasplat.plugins.outputs.formats import PLUGIN, ExportSource, choose, listed, owners
 from sigmasplat.plugins.presets.shared_by_papers import BASE
 from sigmasplat.registry import Output
 from sigmasplat.run_folder import splat_ply as ply
 from sigmasplat.run_folder.runs import RunFolder
-from sigmasplat.run_folder.trajectory import read_trajectory
+from sigmasplat.uncertainty.map_uncertainty import SHIPPED, Background, MapUncertainty, SplatStd
 
 
 @pytest.fixture
@@ -66,7 +66,7 @@ def test_the_format_can_be_given_by_name(export: Callable[..., str]) -> None:
     export("walk", "--out", "map.backup", "--format", "spz")
     assert len(read_any(Path("map.backup"))) == 10
     assert export("walk", "--format", "trajectory").startswith("walk.txt: 2 poses")
-    assert len(read_trajectory(Path("walk.txt"))) == 2
+    assert len(read_poses(Path("walk.txt"))) == 2
     assert export("walk").startswith("walk.ply: 10 splats")
 
 

@@ -15,7 +15,6 @@ from room_run import FRAMES, LOST, PATH, T_ROOM, WORLD, Walls, made_run, picture
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
-from sigmasplat.data.map_uncertainty import SHIPPED, Background, MapUncertainty, SplatStd
 from sigmasplat.data.mesh import Mesh
 from sigmasplat.data.trajectory import Component
 from sigmasplat.errors import RunError
@@ -26,6 +25,7 @@ from sigmasplat.plugins.outputs.mesh_files import write_mesh
 from sigmasplat.plugins.outputs.run_reader import RunReader
 from sigmasplat.plugins.outputs.video import VideoOptions, export_video, film_camera, orbit_view
 from sigmasplat.plugins.outputs.views import export_colmap, splat_points
+from sigmasplat.uncertainty.map_uncertainty import SHIPPED, Background, MapUncertainty, SplatStd
 
 
 @pytest.fixture(params=["submaps", "in one piece"])

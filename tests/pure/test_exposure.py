@@ -10,8 +10,9 @@ from sigmasplat.data.atlas import Atlas
 from sigmasplat.data.camera import NEUTRAL, between, centred, exposed, unexposed
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.poses import Place
-from sigmasplat.data.submap import MemoryStore, Picture, RefinedStore, Submap
+from sigmasplat.data.submap import MemoryStore, Picture, Submap
 from sigmasplat.final.final_map import FinalMap, final_map
+from sigmasplat.final.stores import RefinedStore
 from sigmasplat.fit.pose import fit_exposure
 from sigmasplat.fit.target import Target
 from sigmasplat.plugins.evaluation.metrics.image import psnr

@@ -246,5 +246,7 @@ def test_few_matches_give_no_pose() -> None:
 
 
 def test_opencv_is_imported_when_it_is_needed() -> None:
-    code = "import sys, sigmasplat.slam.slam, sigmasplat.tracking.features, sigmasplat.cli; print('cv2' in sys.modules)"
+    code = (
+        "import sys, sigmasplat.system.slam, sigmasplat.tracking.features, sigmasplat.cli; print('cv2' in sys.modules)"
+    )
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "False"

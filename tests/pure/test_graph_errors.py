@@ -14,13 +14,14 @@ from sigmasplat.data import se3
 from sigmasplat.data.atlas import Atlas
 from sigmasplat.data.relative_pose import Kind, RelativePose, SolvedGraph
 from sigmasplat.errors import RunError
+from sigmasplat.final.keyframe_nodes import KeyframeNodes
 from sigmasplat.graph import graph_errors
 from sigmasplat.graph.graph_errors import CALIBRATION, STAMP, GraphErrors, shared_errors
-from sigmasplat.graph.keyframe_graph import KeyframeNodes, solve
+from sigmasplat.graph.keyframe_graph import solve
 from sigmasplat.graph.path_covariance import PathCovariance
 from sigmasplat.graph.pose_graph import PoseGraph, minimise
 from sigmasplat.run_folder.run_values import check_checkpoint
-from sigmasplat.slam.slam_state import path_errors
+from sigmasplat.system.slam import path_errors
 
 Array = NDArray[np.float64]
 NOISE, SAME = np.array([0.002] * 3 + [0.001] * 3), np.array([0.001] * 3 + [0.0005] * 3)  # m, rad

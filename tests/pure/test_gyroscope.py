@@ -11,8 +11,8 @@ from paper_settings import InputConfig
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.frame import Frame
-from sigmasplat.data.imu import Gyroscope
 from sigmasplat.errors import SourceError
+from sigmasplat.input.imu import Gyroscope
 from sigmasplat.plugins.checks.recording import inspect_source
 from sigmasplat.plugins.sources import open_source
 

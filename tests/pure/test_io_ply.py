@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from sigmasplat.data.field import ATTRIBUTES, GaussianField, Rows
-from sigmasplat.data.map_uncertainty import SplatStd
 from sigmasplat.errors import RunError, SourceError
 from sigmasplat.run_folder import splat_ply as ply
 from sigmasplat.run_folder.splat_ply import SH_C0, read_field, write_field
+from sigmasplat.uncertainty.map_uncertainty import SplatStd
 
 
 def random_field(n: int = 50, seed: int = 0) -> GaussianField:

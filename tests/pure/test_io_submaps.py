@@ -23,9 +23,9 @@ from sigmasplat.data.submap import MemoryStore, Picture, Submap, SubmapStore
 from sigmasplat.errors import RunError, SigmaSplatError
 from sigmasplat.files import tensors
 from sigmasplat.files.tensors import open_tensors, write_tensors
+from sigmasplat.run.resume import state_of
 from sigmasplat.run_folder.submaps import DiskStore
-from sigmasplat.slam.saved_state import state_of
-from sigmasplat.slam.slam import Slam
+from sigmasplat.system.slam import Slam
 from sigmasplat.types import completed
 
 CAMERA = Camera(8, 6, 7.25, 7.5, 3.5 + 1 / 3, 2.5)

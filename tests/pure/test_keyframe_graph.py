@@ -11,7 +11,7 @@ from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.relative_pose import Kind, RelativePose
-from sigmasplat.final.followed_store import followed, nearest_view
+from sigmasplat.final.stores import followed, nearest_view
 from sigmasplat.graph.keyframe_graph import NEAR, partners, solve
 
 Array = NDArray[np.float64]

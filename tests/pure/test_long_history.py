@@ -23,7 +23,7 @@ from sigmasplat.graph.pose_graph import LoopVerdict
 from sigmasplat.run_folder.state import read_state, write_state
 from sigmasplat.run_folder.submaps import DiskStore
 from sigmasplat.slam.results import Step
-from sigmasplat.slam.slam import Slam
+from sigmasplat.system.slam import Slam
 
 MOST_BYTES = 100
 """Most bytes of RAM per frame of a long run; with lists of objects it was 1200."""

@@ -101,7 +101,7 @@ class Loopy:
                 RelativePose.hop(T, C, self.bias) for T, C in zip(self.steps[s], self.covariances[s], strict=True)
             ] if hops else [UNKNOWN_HOP] * KEYFRAMES  # fmt: skip
             for hop in (UNKNOWN_HOP, *known):
-                tracked.append(s, hop)
+                tracked.append(hop)
         atlas.hops = tracked
         found = PathCovariance.of(checkpoint(atlas, edges))
         assert found is not None

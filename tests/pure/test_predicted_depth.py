@@ -12,9 +12,9 @@ from sigmasplat.input.opening import open_source
 from sigmasplat.input.source import Subset
 from sigmasplat.plugins.evaluation.metrics.trajectory import align_similarity
 from sigmasplat.plugins.evaluation.path_scores import arbitrary_scale, in_metres, in_units_of_run
-from sigmasplat.run.scene import config_for, config_of_facts, scene_facts
+from sigmasplat.run.scene import config_of_facts, scene_facts
 from sigmasplat.run_folder.runs import RunFolder
-from sigmasplat.slam.slam import Slam
+from sigmasplat.system.slam import Slam
 from sigmasplat.tracking.predicted_depth_fit import DepthFit, pixel_noise, smoothed
 
 HEIGHT, WIDTH = 96, 128
@@ -52,11 +52,11 @@ def test_noise_of_pixels_is_measured_and_smoothed_but_not_edges() -> None:
 
 def test_the_settings_follow_from_the_source_and_from_the_facts_of_the_run() -> None:
     source = Subset(open_source("synthetic:frames=4,width=40,height=30,predicted=1"), InputConfig())
-    config = config_for(source, Config())
+    config = config_of_facts(scene_facts(source), Config())
     assert config.tracking.fit_depth and config.render.depth_noise_per_m == 0.1
     assert config_of_facts(scene_facts(source), Config()) == config
-    assert not config_for(source, Config(), ["tracking.fit_depth"]).tracking.fit_depth
-    assert not config_for(open_source("synthetic:frames=4"), Config()).tracking.fit_depth
+    assert not config_of_facts(scene_facts(source), Config(), ["tracking.fit_depth"]).tracking.fit_depth
+    assert not config_of_facts(scene_facts(open_source("synthetic:frames=4")), Config()).tracking.fit_depth
 
 
 def test_the_scale_of_a_path_is_found_for_predicted_depth_only(tmp_path: Path) -> None:
@@ -78,7 +78,7 @@ def test_a_path_from_predicted_depth_has_the_shape_of_the_true_one() -> None:
     source = open_source("synthetic:frames=200,width=160,height=120,predicted=1", limit=16)
     quick = {"input.width": 160, "final.iterations": 0, "uncertainty.probes": 0, "mapping.iterations": 5}
     slam = Slam("sigma", settings=quick)
-    slam = Slam(config_for(source, slam.config))
+    slam = Slam(config_of_facts(scene_facts(source), slam.config))
     for frame in source:
         slam.step(frame)
     assert not any(step.lost for step in slam.steps) and slam.tracker.depth.shape.views

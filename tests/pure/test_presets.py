@@ -13,6 +13,7 @@ from sigmasplat.config import Config
 from sigmasplat.config.find_preset import FAMILIES, default_preset, list_presets, preset, presets_by_scene
 from sigmasplat.config.text import override
 from sigmasplat.errors import ConfigError
+from sigmasplat.files.json_files import write_json
 from sigmasplat.plugins.presets.shared_by_papers import BASE
 
 DATASETS = ("replica", "tum", "scannet")
@@ -390,7 +391,7 @@ def test_saved_presets_come_back(tmp_path: Path) -> None:
     for name in EVERY:
         config = preset(name)
         assert config.name == name
-        config.save(tmp_path / "config.json")
+        write_json(tmp_path / "config.json", config.to_dict())
         assert Config.load(tmp_path / "config.json") == config
 
 

@@ -24,7 +24,7 @@ from sigmasplat.graph.path_covariance import PathCovariance
 from sigmasplat.plugins.outputs.floorplan.floor_plan import FloorPlan
 from sigmasplat.plugins.outputs.floorplan.rescan import FREE, OBJECT, UNOBSERVED, WALL
 from sigmasplat.plugins.robots.ros_messages import T_LINK_OPTICAL, levelled_map, link_pose, ros_covariance
-from sigmasplat.slam.slam_state import path_errors
+from sigmasplat.system.slam import path_errors
 
 pytest.importorskip("rosbags", reason="rosbags is not installed (extra `ros`)")
 from sigmasplat.plugins.robots.bag import BagSink

@@ -12,9 +12,9 @@ from constants import changed
 from paper_settings import InputConfig
 from sigmasplat.config import SECTIONS
 from sigmasplat.config.find_preset import preset
+from sigmasplat.config.input import RENDERED, SENSORS, SensorModel, sensor_model
 from sigmasplat.config.ranges import kinds_of
 from sigmasplat.config.scale import for_scene
-from sigmasplat.config.sensors import RENDERED, SENSORS, SensorModel, sensor_model
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.frame import Frame

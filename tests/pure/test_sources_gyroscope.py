@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from bag_recordings import Recorder, aligned
 from recordings import Scene, scene, write_stray
 from sigmasplat.data import se3
-from sigmasplat.data.imu import gyroscope_from_samples, still_bias
+from sigmasplat.input.imu import gyroscope_from_samples, still_bias
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.sources import open_source
 

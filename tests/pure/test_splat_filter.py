@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from sigmasplat.data.field import GaussianField
-from sigmasplat.data.map_uncertainty import SplatStd
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.plugins.outputs import chosen_splats
+from sigmasplat.uncertainty.map_uncertainty import SplatStd
 
 
 def three() -> GaussianField:

@@ -10,8 +10,8 @@ from scipy.spatial import cKDTree
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.mesh import Mesh
-from sigmasplat.data.tsdf import Tsdf, extract_surface, packed, unpacked
 from sigmasplat.errors import ConfigError, SigmaSplatError
+from sigmasplat.final.tsdf import Tsdf, extract_surface, packed, unpacked
 
 CAMERA = Camera(160, 120, 150.0, 150.0, 79.5, 59.5)
 VOXEL_M = 0.01

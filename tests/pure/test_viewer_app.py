@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from room_map import room_map
-from sigmasplat.data.map_uncertainty import SHIPPED, Background, MapUncertainty, SplatStd
+from sigmasplat.uncertainty.map_uncertainty import SHIPPED, Background, MapUncertainty, SplatStd
 
 viser = pytest.importorskip("viser", reason="viser is not installed (pip install 'sigmasplat[viewer]')")
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")

@@ -11,7 +11,6 @@ from paper_settings import RenderConfig
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
-from sigmasplat.data.map_uncertainty import SHIPPED, Background, MapUncertainty, SplatStd
 from sigmasplat.plugins.outputs.drawing import colormap
 from sigmasplat.plugins.viewer import snapshot as lines
 from sigmasplat.plugins.viewer.layers import (
@@ -33,6 +32,7 @@ from sigmasplat.plugins.viewer.layers import (
 from sigmasplat.plugins.viewer.panel import escaped
 from sigmasplat.plugins.viewer.snapshot import CameraPath, Piece, Snapshot, thin, within_budget
 from sigmasplat.render import render
+from sigmasplat.uncertainty.map_uncertainty import SHIPPED, Background, MapUncertainty, SplatStd
 from sigmasplat.uncertainty.predictive import predict
 
 OPTIONS = RenderConfig()

@@ -19,6 +19,7 @@ from sigmasplat.config.text import override
 from sigmasplat.data import se3
 from sigmasplat.data.trajectory import Component
 from sigmasplat.errors import ConfigError, RunError, SigmaSplatError
+from sigmasplat.input.lists import read_poses
 from sigmasplat.plugins.evaluation.evaluate import evaluate
 from sigmasplat.plugins.evaluation.reconstruct import FusionInput
 from sigmasplat.plugins.sources import SyntheticRoom, open_source
@@ -35,8 +36,7 @@ from sigmasplat.plugins.viewer.snapshot_sources import (
 from sigmasplat.run.session import Session
 from sigmasplat.run_folder.runs import TRUTH, RunFolder
 from sigmasplat.run_folder.submaps import DiskStore
-from sigmasplat.run_folder.trajectory import read_trajectory
-from sigmasplat.slam.slam import Slam
+from sigmasplat.system.slam import Slam
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
@@ -106,7 +106,7 @@ def test_a_run_without_a_map_is_refused(tmp_path: Path) -> None:
 
 
 def test_the_stored_true_path_is_aligned_and_gives_the_same_ate(finished: RunFolder) -> None:
-    aligned, path = read_trajectory(finished.path / TRUTH), finished.read_trajectory()
+    aligned, path = read_poses(finished.path / TRUTH), finished.read_trajectory()
     assert len(aligned) == FRAMES
     np.testing.assert_allclose(aligned.timestamps_s, path.timestamps_s, atol=1e-8)
     away_m = np.linalg.norm(aligned.T_world_camera[:, :3, 3] - path.T_world_camera[:, :3, 3], axis=1)

@@ -17,7 +17,7 @@ from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.mapping.mapper import Mapper
 from sigmasplat.plugins.sources import SyntheticRoom
 from sigmasplat.render.backend import make_view
-from sigmasplat.slam.slam import Slam
+from sigmasplat.system.slam import Slam
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 

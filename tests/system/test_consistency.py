@@ -12,7 +12,7 @@ from sigmasplat.config.text import override
 from sigmasplat.plugins.evaluation.metrics.image import psnr
 from sigmasplat.plugins.evaluation.metrics.trajectory import ate
 from sigmasplat.render import render
-from sigmasplat.slam.slam import Slam
+from sigmasplat.system.slam import Slam
 from small_room import SMALL, frames, walk
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")

@@ -29,7 +29,7 @@ from sigmasplat.plugins.evaluation.metrics.image import psnr
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.render import FieldRenderer
 from sigmasplat.run_folder.runs import RunFolder
-from sigmasplat.slam.slam import Slam
+from sigmasplat.system.slam import Slam
 from sigmasplat.types import Matrix
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")

@@ -12,11 +12,11 @@ from recorded_room import OPTIONS, mirrored, write_images
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.frame import Frame
+from sigmasplat.input.lists import read_poses
 from sigmasplat.plugins.sources import SyntheticRoom, open_source
 from sigmasplat.run.finished_map import FinishedMap
 from sigmasplat.run.localise import FOUND, NOT_FOUND, Localiser
 from sigmasplat.run_folder.runs import RunFolder
-from sigmasplat.run_folder.trajectory import read_trajectory
 
 pytest.importorskip("sigmasplat.native._core", reason="sigmasplat.native._core is not built")
 
@@ -62,7 +62,7 @@ def test_images_of_the_same_walk_are_found(run: Path, tmp_path: Path, capsys: py
         assert error_m(np.array(record["T_world_camera"]), 7 * i) < 0.05
         assert (np.linalg.eigvalsh(np.array(record["covariance"])) > 0).all()
     assert exit_code(*asked, "--out", str(tmp_path / "found.txt")) == 0
-    path = read_trajectory(tmp_path / "found.txt")
+    path = read_poses(tmp_path / "found.txt")
     assert np.allclose(path.T_world_camera, [record["T_world_camera"] for record in records], atol=1e-6)
 
 

@@ -17,10 +17,9 @@ import torch
 
 from command_line import exit_code
 from run_process import PATIENCE_S, QUICK, ROOM, files_of_at_most, lines, running, wait_for
-from sigmasplat.errors import RunError
 from sigmasplat.files.tensors import write_tensors
 from sigmasplat.run_folder.runs import RunFolder
-from sigmasplat.slam.slam import Slam
+from sigmasplat.system.slam import Slam
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
@@ -54,23 +53,6 @@ def test_results_that_cannot_be_written_make_the_run_failed(tmp_path: Path, caps
     assert "cannot write" in refusal(capsys.readouterr().err)
     assert RunFolder(out).facts()["status"] == "failed"
     assert not [path for path in out.rglob("*") if path.name.startswith(".")]
-
-
-def full(*arguments: Any, **more: Any) -> Any:
-    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-
-def test_the_status_can_be_written_on_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    out = tmp_path / "run"
-    ended = exit_code(*run_of(out, 2))
-    run, before = RunFolder(out), RunFolder(out).facts()
-    monkeypatch.setattr(os, "replace", full)
-    run.note(status="failed")
-    assert ended == 0 and run.facts() == before | {"status": "failed"}
-    run.note(status="complete")
-    assert run.facts() == before
-    with pytest.raises(RunError, match="cannot write"):
-        run.write_loops([])
 
 
 OUT_OF_MEMORY = [

@@ -7,7 +7,7 @@ from sigmasplat.config.find_preset import preset
 from sigmasplat.config.text import override
 from sigmasplat.data import se3
 from sigmasplat.plugins.sources import SyntheticRoom
-from sigmasplat.slam.slam import Slam
+from sigmasplat.system.slam import Slam
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 SMALL = {

@@ -12,9 +12,9 @@ from sigmasplat.config.text import override
 from sigmasplat.data import se3
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.submap import MemoryStore
+from sigmasplat.run.resume import CLASSES, fixed, restore, state_of
 from sigmasplat.run_folder.state import read_state, write_state
-from sigmasplat.slam.saved_state import CLASSES, fixed, restore, state_of
-from sigmasplat.slam.slam import Slam
+from sigmasplat.system.slam import Slam
 from small_room import SMALL, frame_at, walk
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")

@@ -24,9 +24,9 @@ from sigmasplat.data.trajectory import LOST, RELOCALISED
 from sigmasplat.errors import RunError
 from sigmasplat.plugins.evaluation.metrics.trajectory import ate
 from sigmasplat.realtime.system import MappingThread, RealTime
+from sigmasplat.run.resume import restore, state_of
 from sigmasplat.run_folder.runs import RunFolder
-from sigmasplat.slam.saved_state import restore, state_of
-from sigmasplat.slam.slam import Slam
+from sigmasplat.system.slam import Slam
 from small_room import SMALL, frames, walk
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")

@@ -20,10 +20,10 @@ from sigmasplat.data.frame import Frame
 from sigmasplat.data.submap import MemoryStore
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.input.source import Source
+from sigmasplat.run.resume import CLASSES, fixed, restore, state_of
 from sigmasplat.run.session import Session, new_folder
 from sigmasplat.run_folder.state import read_state, write_state
-from sigmasplat.slam.saved_state import CLASSES, fixed, restore, state_of
-from sigmasplat.slam.slam import Slam
+from sigmasplat.system.slam import Slam
 from small_room import frame_at, walk
 
 _core = pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")

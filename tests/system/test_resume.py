@@ -20,11 +20,11 @@ from sigmasplat.config.text import override
 from sigmasplat.data.poses import Column, KeyframePoses
 from sigmasplat.errors import RunError
 from sigmasplat.plugins.sources import open_source
+from sigmasplat.run.resume import CLASSES, fixed, restore, state_of
 from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.run_folder.state import read_state, write_state
 from sigmasplat.run_folder.submaps import DiskStore
-from sigmasplat.slam.saved_state import CLASSES, fixed, restore, state_of
-from sigmasplat.slam.slam import Slam
+from sigmasplat.system.slam import Slam
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
@@ -192,7 +192,7 @@ def test_a_search_for_loops_that_is_divided_over_frames_resumes_and_finds_what_a
     """Each frame that is not a keyframe makes some slices; the state is saved when some are made. With one slice, the
     next submap ends before the search does, and its own search waits."""
     monkeypatch.setattr(LoopConfig, "near_deg", 180.0)
-    monkeypatch.setattr("sigmasplat.slam.slam.SLICES_PER_FRAME", slices)
+    monkeypatch.setattr("sigmasplat.slam.main_loop.SLICES_PER_FRAME", slices)
     loops, final = {"near_m": 10.0}, {"iterations": 0}
     config = tiny().changed(input={"limit": 36}, submaps={"frames": 6}, loops=loops, final=final)
     frames = list(open_source(ROOM, config.input))
@@ -200,7 +200,7 @@ def test_a_search_for_loops_that_is_divided_over_frames_resumes_and_finds_what_a
     saved, reported = tmp_path / "saved.st", list[int]()
     for frame in frames:
         with monkeypatch.context() as patch:
-            patch.setattr("sigmasplat.slam.slam.SLICES_PER_FRAME", 10**6)
+            patch.setattr("sigmasplat.slam.main_loop.SLICES_PER_FRAME", 10**6)
             at_once = whole.step(frame)
         step = slam.step(frame)
         assert at_once.is_keyframe or not whole.closer.pending

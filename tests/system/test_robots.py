@@ -18,7 +18,7 @@ from sigmasplat.config.text import override
 from sigmasplat.data.frame import Frame
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.run_folder.runs import RunFolder
-from sigmasplat.slam.slam import Slam
+from sigmasplat.system.slam import Slam
 from small_room import frame_at, walk
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")

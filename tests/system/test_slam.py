@@ -20,7 +20,7 @@ from sigmasplat.plugins.evaluation.metrics.trajectory import ate
 from sigmasplat.plugins.sources import SyntheticRoom
 from sigmasplat.render import render
 from sigmasplat.slam.results import Step
-from sigmasplat.slam.slam import Slam
+from sigmasplat.system.slam import Slam
 from small_room import SMALL, frames, walk
 
 _core = pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")

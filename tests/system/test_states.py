@@ -12,12 +12,12 @@ from sigmasplat.config.find_preset import default_preset, preset
 from sigmasplat.config.text import override
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.input.lists import read_poses
 from sigmasplat.plugins.evaluation.evaluate import evaluate
 from sigmasplat.plugins.sources import SyntheticRoom
 from sigmasplat.run.session import Outcome, Session
 from sigmasplat.run_folder.runs import RunFolder
-from sigmasplat.run_folder.trajectory import read_trajectory
-from sigmasplat.slam.slam import Slam
+from sigmasplat.system.slam import Slam
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
@@ -79,4 +79,4 @@ def test_lost_frames_are_not_scored_and_not_exported(
     assert "States of the frames" in (run.path / "report.html").read_text()
     out: Path = run.path.parent / "path.txt"
     assert exit_code("export", str(run.path), "--out", str(out)) == 0
-    assert len(read_trajectory(out)) == FRAMES - 2 and "left out: 2 lost" in capsys.readouterr().out
+    assert len(read_poses(out)) == FRAMES - 2 and "left out: 2 lost" in capsys.readouterr().out

@@ -20,7 +20,7 @@ from sigmasplat.plugins.evaluation.metrics.image import psnr
 from sigmasplat.plugins.evaluation.metrics.trajectory import ate
 from sigmasplat.render import render
 from sigmasplat.run_folder.submaps import DiskStore
-from sigmasplat.slam.slam import Slam
+from sigmasplat.system.slam import Slam
 from small_room import frame_at, walk
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")

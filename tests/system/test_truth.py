@@ -19,7 +19,7 @@ from sigmasplat.plugins.evaluation.metrics.trajectory import ate
 from sigmasplat.plugins.sources import SyntheticRoom, open_source
 from sigmasplat.run.session import Session
 from sigmasplat.run_folder.runs import RunFolder
-from sigmasplat.slam.slam import Slam
+from sigmasplat.system.slam import Slam
 from tum_recording import write_tum
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")

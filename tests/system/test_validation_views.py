@@ -9,12 +9,12 @@ import torch
 from sigmasplat.config import Config
 from sigmasplat.config.find_preset import preset
 from sigmasplat.config.text import override
-from sigmasplat.data.map_uncertainty import SHIPPED
-from sigmasplat.data.submap import RefinedStore
 from sigmasplat.errors import ConfigError
+from sigmasplat.final.stores import RefinedStore
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.run_folder.submaps import DiskStore
-from sigmasplat.slam.slam import Slam
+from sigmasplat.system.slam import Slam
+from sigmasplat.uncertainty.map_uncertainty import SHIPPED
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 

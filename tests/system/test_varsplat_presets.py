@@ -9,7 +9,7 @@ import pytest
 from sigmasplat.config import Config
 from sigmasplat.config.find_preset import list_presets, preset, presets_by_scene
 from sigmasplat.config.text import override
-from sigmasplat.slam.slam import Slam
+from sigmasplat.system.slam import Slam
 from small_room import frames
 
 NAMES = [name for name in presets_by_scene() if name.startswith("varsplat-")]

@@ -26,7 +26,7 @@ from sigmasplat.plugins.outputs.drawing import colormap
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.run.session import Session
 from sigmasplat.run_folder.runs import RunFolder
-from sigmasplat.slam.slam import Slam
+from sigmasplat.system.slam import Slam
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 pytest.importorskip("viser", reason="viser is not installed (pip install 'sigmasplat[viewer]')")

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from sigmasplat.plugins.robots.live import LiveRobot
     from sigmasplat.run.terminal import Screen
     from sigmasplat.run_folder.runs import RunFolder
-    from sigmasplat.slam.slam import Slam
+    from sigmasplat.system.slam import Slam
 
 Bag = Annotated[
     Path | None,

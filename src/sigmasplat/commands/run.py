@@ -7,12 +7,12 @@ from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 from sigmasplat.commands import options
 from sigmasplat.commands.end_of_run import warn_at_the_end
 from sigmasplat.commands.evaluate import score
-from sigmasplat.commands.input_options import DEFAULT_INPUT_OPTIONS, InputOptions, InputOptionsFlat, Whole, arg
+from sigmasplat.commands.input_options import DEFAULT_INPUT_OPTIONS, InputOptions, InputOptionsFlat
 from sigmasplat.commands.options import configured, prepare_torch, source_of
 from sigmasplat.commands.robot_output import (
     DEFAULT_ROBOT_OPTIONS,
@@ -23,7 +23,6 @@ from sigmasplat.commands.robot_output import (
 )
 from sigmasplat.commands.view import keep_showing, serve_viewer
 from sigmasplat.config.find_preset import default_preset
-from sigmasplat.config.ranges import WIDTHS_PX
 from sigmasplat.config.text import full_path, split_settings
 from sigmasplat.errors import ConfigError
 
@@ -41,16 +40,6 @@ if TYPE_CHECKING:
 OK, INTERRUPTED = 0, 130
 DEFAULT_PRESET = default_preset()
 DEMO_FOLDER, DEMO_FRAMES = Path("runs/demo"), 120
-FinalWidth = Annotated[
-    Whole,
-    WIDTHS_PX,
-    arg(
-        "PX",
-        "width in pixels of the images that the final map is refined on at the end, at most the recorded width "
-        "(8192: as recorded); short form of --set final.width=PX",
-        "(default: 0, no larger than in tracking)",
-    ),
-]
 
 
 def demo(
@@ -81,7 +70,6 @@ def run(
     run_options: options.RunOptionsFlat = options.DEFAULT_RUN_OPTIONS,
     onto: options.OntoRun = None,
     final_seconds: options.FinalSeconds = None,
-    final_width: FinalWidth = None,
     robot_options: RobotOptionsFlat = DEFAULT_ROBOT_OPTIONS,
     realtime: options.RealTime = False,
 ) -> int:
@@ -95,11 +83,10 @@ def run(
     from sigmasplat.run.session import new_run
     from sigmasplat.run.terminal import Screen
     from sigmasplat.run_folder.runs import RunFolder
-    from sigmasplat.slam.slam import Slam
+    from sigmasplat.system.slam import Slam
 
     check_robot_output(robot_options)
     settings += () if final_seconds is None else (f"final.seconds={final_seconds:g}",)
-    settings += () if final_width is None else (f"final.width={final_width}",)
     screen, earlier = Screen(), FinishedMap.of(RunFolder.open(onto)) if onto else None
     config = configured(preset, settings, seed, input_options, earlier.config if earlier else None)
     if earlier:

@@ -2,7 +2,6 @@
 `presets`."""
 
 import dataclasses
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,15 +10,15 @@ from typing import Any
 from sigmasplat.config.frames import DensifyConfig, MappingConfig, RenderConfig, SeedConfig
 from sigmasplat.config.input import RECORDED_POSES, InputConfig
 from sigmasplat.config.ranges import Count, Section, kinds_of, problems_of, refuse, shown
-from sigmasplat.config.run import (
-    MovingConfig,
-    RealTimeConfig,
-    RecoveryConfig,
+from sigmasplat.config.submaps import (
+    FinalConfig,
+    LoopConfig,
+    RegistrationConfig,
+    SubmapConfig,
     SurfaceConfig,
     UncertaintyConfig,
 )
-from sigmasplat.config.submaps import FinalConfig, LoopConfig, RegistrationConfig, SubmapConfig
-from sigmasplat.config.tracking import TrackingConfig
+from sigmasplat.config.tracking import MovingConfig, RealTimeConfig, RecoveryConfig, TrackingConfig
 from sigmasplat.errors import ConfigError
 from sigmasplat.files.reading import read_json
 from sigmasplat.registry import Backend, named
@@ -79,10 +78,6 @@ class Config:
     def to_dict(self) -> dict[str, Any]:
         """Return the settings as nested dicts, as in a run's config.json."""
         return dataclasses.asdict(self)
-
-    def save(self, path: Path) -> None:
-        """Write the settings as JSON."""
-        path.write_text(json.dumps(self.to_dict(), indent=2) + "\n")
 
     @staticmethod
     def from_dict(values: dict[str, Any]) -> "Config":

@@ -1,4 +1,5 @@
-"""Settings of the work per submap: when to start a new one, loops, registration, the final map."""
+"""Settings of the work per submap: when to start a new one, loops, registration; of the final map, its surface and its
+uncertainty."""
 
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal, NamedTuple
@@ -27,7 +28,7 @@ class SubmapConfig(Section, name="submaps"):
     """A new submap starts this many frames after the first one of the active submap; 0 = off."""
     uncertainty_m: NotNegative = 0.02
     """A new submap starts if the standard deviation of the camera's position in the submap, accumulated from keyframe
-    to keyframe, exceeds this (`slam.drift`); 0 = off."""
+    to keyframe, exceeds this (`tracking.drift`); 0 = off."""
     inherit: bool = True  # starting a submap empty costs two seconds of first iterations
     """Whether a new submap starts with copies of the splats in view, which are then mapped like any others; off = it
     starts empty (paper)."""
@@ -45,7 +46,7 @@ class LoopConfig(Section, name="loops"):
     close: bool = True
     """Whether loops are searched and closed."""
     descriptor: Literal["grid", "netvlad", "netvlad-or-grid"] = "grid"
-    """Image descriptor: grid = built in (`slam.loop_closure.descriptors.OrientationGrid`); netvlad = with the weights
+    """Image descriptor: grid = built in (`tracking.descriptors.OrientationGrid`); netvlad = with the weights
     of the file `weights`; netvlad-or-grid = NetVLAD (papers) if `weights` is set, otherwise the built-in one, with a
     warning."""
     weights: str = ""
@@ -283,3 +284,22 @@ class FinalConfig(Section, name="final"):
     weight_moment = FromRow[bool]("schedule", SCHEDULES)
     max_axis_ratio = FromRow[float]("schedule", SCHEDULES)
     max_needle_ratio = FromRow[float]("schedule", SCHEDULES)
+
+
+@dataclass(frozen=True)
+class SurfaceConfig(Section, name="surface"):
+    """The mesh of a finished run. Raises ConfigError on invalid values."""
+
+    depth: Literal["map", "map+sensor"] = "map+sensor"
+    """Depth that is fused at each keyframe: map = rendered from its submap (VarSplat §7); map+sensor = rendered from
+    the final map, and the readings of the keyframe, weighted by their variances (ours)."""
+
+
+@dataclass(frozen=True)
+class UncertaintyConfig(Section, name="uncertainty"):
+    """Calibration of the variance that a map predicts for its colour and depth (ours). Raises ConfigError on invalid
+    values."""
+
+    probes: Count = 4
+    """Number of probe views that each submap keeps: well-tracked frames that are not keyframes. The map is not fitted
+    to them; the predicted variance is calibrated on them after the last frame. 0 = no predicted variance."""

@@ -57,11 +57,11 @@ class Atlas:
         self.components.append(0)
         self.keyframe_poses.begin(keyframe_poses)
         for _ in keyframe_poses:
-            self.hops.append(len(self.anchors) - 1, UNKNOWN_HOP)
+            self.hops.append(UNKNOWN_HOP)
 
     def set_keyframes(self, keyframe_poses: list[Matrix], hop: RelativePose) -> None:
         """Set T_submap_camera [4, 4] of the last submap's keyframes, with a new one at the end, and the hop to it."""
-        self.hops.append(len(self.anchors) - 1, hop)
+        self.hops.append(hop)
         self.keyframe_poses.newest = keyframe_poses
 
     def join(self, a: int, b: int, T_a_b: Matrix) -> None:

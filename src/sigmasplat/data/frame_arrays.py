@@ -80,15 +80,11 @@ def color_from_array(rgb: Array, color_order: ColorOrder = "rgb") -> NDArray[np.
     """Convert colour to new float32 [H, W, 3], RGB. Raises SourceError on another shape or type."""
     values = _array("colour", rgb)
     shape, name = values.shape, f"colour is {described(values)}"
-    if values.ndim == 2 or (values.ndim == 3 and 1 in (shape[0], shape[2])):
-        raise SourceError(f"{name}, a gray image; give three channels: numpy.stack([gray] * 3, axis=-1)")
-    if values.ndim == 3 and shape[2] == 4:
-        raise SourceError(f"{name}, with an alpha channel; give three channels: rgb[..., :3]")
-    if values.ndim == 3 and shape[0] in (3, 4) and shape[2] != 3:
-        remedy = "rgb[:3].permute(1, 2, 0)" if isinstance(rgb, torch.Tensor) else "rgb[:3].transpose(1, 2, 0)"
-        raise SourceError(f"{name}, with the channels first; give [H, W, 3]: {remedy}")
     if values.ndim != 3 or shape[2] != 3 or 0 in shape:
-        raise SourceError(f"{name}; give one image [H, W, 3]")
+        raise SourceError(
+            f"{name}; give one image [H, W, 3], three channels last: numpy.stack([gray] * 3, axis=-1) for a gray one, "
+            "rgb[..., :3] with an alpha channel, rgb.transpose(1, 2, 0), or rgb.permute(1, 2, 0), with channels first"
+        )
     if color_order == "bgr":
         values = values[..., ::-1]
     if values.dtype == np.uint8:
@@ -107,10 +103,8 @@ def depth_from_array(depth: Array, depth_scale: float | None = None) -> NDArray[
     type, and on whole numbers without `depth_scale`."""
     values = _array("depth", depth)
     name = f"depth is {described(values)}"
-    if values.ndim == 3 and 1 in (values.shape[0], values.shape[2]):
-        raise SourceError(f"{name}; give [H, W]: depth.squeeze()")
     if values.ndim != 2 or 0 in values.shape:
-        raise SourceError(f"{name}; give one image [H, W] (a picture of depth in colours holds no distances)")
+        raise SourceError(f"{name}; give one image [H, W]: depth.squeeze() (a picture of depth in colours holds none)")
     if values.dtype.kind == "b" or values.dtype == np.uint8:
         raise SourceError(f"{name}; 8 bits hold no metric depth: give uint16 with depth_scale, or float metres")
     if depth_scale is not None:
@@ -132,12 +126,7 @@ def camera_from(K: Camera | Array, width: int, height: int) -> Camera:
         if (K.width, K.height) != (width, height):
             raise SourceError(f"colour is {width}×{height}, but the camera is for {K.width}×{K.height}; see resized")
         return K
-    if K is None:
-        raise SourceError("K is None; give a 3×3 matrix or (fx, fy, cx, cy) in pixels")
-    try:
-        values = _array("K", K).astype(np.float64)
-    except (TypeError, ValueError):
-        raise SourceError("K does not hold numbers; give a 3×3 matrix or (fx, fy, cx, cy) in pixels") from None
+    values = _array("K", K).astype(np.float64)
     if values.shape == (4,):
         fx, fy, cx, cy = values.tolist()
     elif values.shape in ((3, 3), (9,)):
@@ -147,12 +136,10 @@ def camera_from(K: Camera | Array, width: int, height: int) -> Camera:
     else:
         raise SourceError(f"K has the shape {list(values.shape)}; give a 3×3 matrix or (fx, fy, cx, cy) in pixels")
     camera = Camera(width, height, fx, fy, cx, cy)
-    if fx < NARROWEST * width:
-        raise SourceError(f"K has fx = {fx:g} for images {width} pixels wide; give pixels, not normalised coordinates")
-    if not (-0.5 <= cx <= width - 0.5 and -0.5 <= cy <= height - 0.5):
+    if fx < NARROWEST * width or not (-0.5 <= cx <= width - 0.5 and -0.5 <= cy <= height - 0.5):
         raise SourceError(
-            f"K has its principal point at ({cx:g}, {cy:g}), outside images of {width}×{height}; give K for this image "
-            "size, or a Camera if that is correct"
+            f"K has fx = {fx:g} and its principal point at ({cx:g}, {cy:g}), but the images are {width}×{height}; give "
+            "pixels of this image size, not normalised coordinates, or a Camera if that is correct"
         )
     return camera
 
@@ -162,18 +149,17 @@ def seconds_from(timestamp: float) -> float:
     try:
         time_s = float(timestamp)
     except (TypeError, ValueError):
-        raise SourceError(f"timestamp is {described(timestamp)}; give seconds as one number") from None
-    if not np.isfinite(time_s):
-        raise SourceError(f"timestamp is {time_s}; give seconds as a finite number")
-    if abs(time_s) > LATEST_S:
-        raise SourceError(f"timestamp is {timestamp}; give seconds (divide nanoseconds by 1e9)")
+        time_s = float("nan")
+    if not abs(time_s) <= LATEST_S:
+        found = timestamp if isinstance(timestamp, int | float) else described(timestamp)
+        raise SourceError(f"timestamp is {found}; give seconds as one finite number (divide nanoseconds by 1e9)")
     return time_s
 
 
 def _array(name: str, values: Any) -> NDArray[Any]:
     """Return values as a numpy array, without a copy if possible. Raises SourceError if they are not numbers."""
     if values is None:
-        raise SourceError(f"{name} is None; the camera or the file gave no image")
+        raise SourceError(f"{name} is None; give an array (did the camera or the file give no image?)")
     try:
         if isinstance(values, torch.Tensor):
             whole = values.detach().cpu()
@@ -193,14 +179,9 @@ def _float32(values: NDArray[Any]) -> NDArray[np.float32]:
 
 def _check_scale(depth_scale: float) -> None:
     """Raise SourceError if `depth_scale` is not a number of units per metre."""
-    try:
-        scale = float(depth_scale)
-    except (TypeError, ValueError):
-        raise SourceError(f"depth_scale is {described(depth_scale)}; give a number, the units per metre") from None
-    if not (np.isfinite(scale) and scale > 0):
-        raise SourceError(f"depth_scale is {scale:g}; give the units per metre (1000 for millimetres)")
-    if scale < 1:
-        raise SourceError(f"depth_scale is {scale:g}, metres per unit; give the units per metre, {1 / scale:g}")
+    if not isinstance(depth_scale, int | float | np.number) or not 1 <= depth_scale < np.inf:
+        found = f"{depth_scale:g}" if isinstance(depth_scale, int | float | np.number) else described(depth_scale)
+        raise SourceError(f"depth_scale is {found}; give the units per metre, at least 1 (1000 for millimetres)")
 
 
 def _check_unit(frame: Frame, depth_scale: float | None) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from sigmasplat.config.sensors import SensorModel
+from sigmasplat.config.input import SensorModel
 from sigmasplat.native import _core
 
 Depth = NDArray[np.float32]

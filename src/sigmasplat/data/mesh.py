@@ -35,12 +35,9 @@ class Mesh:
         if v.ndim != 2 or v.shape[1] != 3 or f.ndim != 2 or f.shape[1] != 3 or (c is not None and c.shape != v.shape):
             shapes = (v.shape, f.shape, None if c is None else c.shape)
             raise SigmaSplatError(f"a mesh needs vertices [V, 3], faces [F, 3], colors [V, 3], found {shapes}")
-        if self.depth_std_m is not None and self.depth_std_m.shape != (len(v),):
-            raise SigmaSplatError(
-                f"a mesh with {len(v)} vertices needs depth_std_m [V], found {self.depth_std_m.shape}"
-            )
-        if self.filled is not None and self.filled.shape != (len(v),):
-            raise SigmaSplatError(f"a mesh with {len(v)} vertices needs filled [V], found {self.filled.shape}")
+        for name, values in (("depth_std_m", self.depth_std_m), ("filled", self.filled)):
+            if values is not None and values.shape != (len(v),):
+                raise SigmaSplatError(f"a mesh with {len(v)} vertices needs {name} [V], found {values.shape}")
         if not np.isfinite(v).all() or not (c is None or np.isfinite(c).all()):
             raise SigmaSplatError("a mesh needs finite vertices and colors, found NaN or inf")
         if f.size and (f.min() < 0 or f.max() >= len(v)):

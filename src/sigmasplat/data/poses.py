@@ -10,7 +10,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import Any, Generic, NamedTuple, TypeVar, overload
+from typing import Any, ClassVar, Generic, NamedTuple, TypeVar, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from sigmasplat.types import Matrix
 
 Record = TypeVar("Record")
+Number = TypeVar("Number", bound=np.generic)
 GROWTH = 1.25
 """Factor by which the space grows when it is full."""
 FEWEST = 64
@@ -113,11 +114,42 @@ class Column:
         return Column(self.values[: min(count, self.count)], min(count, self.count))
 
 
+class Part(Generic[Number]):
+    """One value of each record, a number or an array of a shape: some columns of `Records.rows`. As an attribute of the
+    records it is a copy of all values [N, …]."""
+
+    def __init__(self, kind: type[Number], *shape: int) -> None:
+        self.kind, self.shape, self.columns = kind, shape, slice(0)
+
+    def __set_name__(self, records: "type[Records[Any]]", name: str) -> None:
+        width = records.width + int(np.prod(self.shape))
+        self.columns, records.width, records.parts = slice(records.width, width), width, (*records.parts, self)
+
+    def __get__(self, records: "Records[Any]", kind: type) -> NDArray[Number]:
+        return self._shaped(records.rows.used[:, self.columns], -1)
+
+    def of(self, row: NDArray[Any]) -> Any:
+        """Return the value in a row, a number or an array."""
+        value = self._shaped(row[self.columns])
+        return value if self.shape else value.item()
+
+    def _shaped(self, values: NDArray[Any], *before: int) -> NDArray[Number]:
+        return values.reshape((*before, *self.shape)).astype(self.kind)
+
+
 @dataclass(eq=False)
 class Records(Sequence[Record], Generic[Record]):
-    """A sequence of records that are made from the rows of a column on reading."""
+    """A sequence of records that are made from the rows of a column on reading. rows [N, width]: the parts of a record
+    side by side, if the class names its parts."""
 
-    rows: Column
+    width: ClassVar[int] = 0
+    parts: ClassVar[tuple[Part[Any], ...]] = ()
+
+    rows: Column = field(default_factory=Column)
+
+    def __post_init__(self) -> None:
+        if self.parts and self.rows.values.ndim == 1:
+            self.rows = Column.of(np.float64, self.width)
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -132,6 +164,15 @@ class Records(Sequence[Record], Generic[Record]):
     def __getitem__(self, i: int | slice) -> Record | list[Record]:
         known = range(len(self))
         return [self._record(k) for k in known[i]] if isinstance(i, slice) else self._record(known[i])
+
+    def add(self, *values: Any) -> None:
+        """Append a record: the values of its parts."""
+        self.rows.append(np.concatenate([np.ravel(value) for value in values]))
+
+    def values(self, i: int) -> list[Any]:
+        """Return the values of the parts of a record."""
+        row = self.rows.used[i]
+        return [part.of(row) for part in self.parts]
 
     @abstractmethod
     def _record(self, i: int) -> Record:
@@ -221,10 +262,6 @@ class KeyframePoses(Records[Sequence[Matrix]]):
         return KeyframePoses(rows, ends, None if self.newest is None else list(self.newest))
 
 
-NUMBERS = 2
-"""Columns before the pose: submap and keyframe, which are exact as floating-point numbers."""
-
-
 class Place(NamedTuple):
     """The pose of a frame relative to a keyframe of a submap; both numbers count from 0."""
 
@@ -235,33 +272,19 @@ class Place(NamedTuple):
 
 @dataclass(eq=False)
 class Places(Records[Place]):
-    """The places of all frames. rows [F, 18]: submap, keyframe, and T_keyframe_camera [4, 4] by rows."""
+    """The places of all frames."""
 
-    rows: Column = field(default_factory=lambda: Column.of(np.float64, NUMBERS + 16))
-
-    @property
-    def submap(self) -> NDArray[np.int64]:
-        """Return the submap of each frame [F]."""
-        return self.rows.used[:, 0].astype(np.int64)
-
-    @property
-    def keyframe(self) -> NDArray[np.int64]:
-        """Return the keyframe of each frame in its submap [F]."""
-        return self.rows.used[:, 1].astype(np.int64)
-
-    @property
-    def T_keyframe_camera(self) -> Matrix:
-        """Return the pose of each frame relative to its keyframe [F, 4, 4]."""
-        return self.rows.used[:, NUMBERS:].reshape(-1, 4, 4).copy()
+    submap = Part(np.int64)
+    keyframe = Part(np.int64)
+    T_keyframe_camera = Part(np.float64, 4, 4)
 
     def append(self, place: Place) -> None:
         """Append the place of the next frame."""
-        self.rows.append([place.submap, place.keyframe, *place.T_keyframe_camera.ravel()])
+        self.add(*place)
 
     def first(self, count: int) -> "Places":
         """Return the places of the first frames, in the same memory."""
         return Places(self.rows.first(count))
 
     def _record(self, i: int) -> Place:
-        row = self.rows.used[i]
-        return Place(int(row[0]), int(row[1]), row[NUMBERS:].reshape(4, 4).copy())
+        return Place(*self.values(i))

@@ -2,12 +2,12 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.data.poses import Column, Records
+from sigmasplat.data.poses import Column, Part, Records
 from sigmasplat.types import Matrix
 
 Kind = Literal["hop", "odometry", "loop", "relocalisation", "join", "alignment"]
@@ -64,55 +64,41 @@ UNKNOWN_HOP = RelativePose.hop(np.eye(4))
 
 @dataclass(eq=False)
 class TrackedHops(Records[RelativePose]):
-    """The hops to all keyframes, submap by submap. rows [K, 59]: submap, then T_camera_before, covariance and bias by
-    rows."""
+    """The hops to all keyframes, submap by submap."""
 
-    rows: Column = field(default_factory=lambda: Column.of(np.float64, 1 + 16 + 36 + 6))
+    T_camera_before = Part(np.float64, 4, 4)
+    covariance = Part(np.float64, 6, 6)
+    bias = Part(np.float64, 6)
 
-    def append(self, submap: int, hop: RelativePose) -> None:
-        """Append the hop to the next keyframe, which is in a submap that is not before the last one."""
-        self.rows.append([submap, *hop.T_a_b.ravel(), *hop.covariance.ravel(), *hop.bias])
-
-    @property
-    def T_camera_before(self) -> Matrix:
-        """Return the motion of each hop [K, 4, 4]."""
-        return self.rows.used[:, 1:17].reshape(-1, 4, 4).copy()
-
-    @property
-    def covariance(self) -> Matrix:
-        """Return the covariance of each hop [K, 6, 6]."""
-        return self.rows.used[:, 17:53].reshape(-1, 6, 6).copy()
-
-    @property
-    def bias(self) -> Matrix:
-        """Return the bias of each hop [K, 6]."""
-        return self.rows.used[:, 53:].copy()
+    def append(self, hop: RelativePose) -> None:
+        """Append the hop to the next keyframe."""
+        self.add(hop.T_a_b, hop.covariance, hop.bias)
 
     def _record(self, i: int) -> RelativePose:
-        row = self.rows.used[i]
-        T_camera_before, covariance = row[1:17].reshape(4, 4).copy(), row[17:53].reshape(6, 6).copy()
-        return RelativePose.hop(T_camera_before, covariance, row[53:].copy())
+        return RelativePose.hop(*self.values(i))
 
 
 @dataclass(eq=False)
 class Alignments(Records[RelativePose]):
-    """Alignments between keyframes, in the order in which they were made. rows [E, 60]: b, which is later, and a, then
-    T_b_a, information and bias by rows."""
+    """Alignments between keyframes, in the order in which they were made; a is later than b."""
 
-    rows: Column = field(default_factory=lambda: Column.of(np.float64, 2 + 16 + 36 + 6))
+    a = Part(np.int64)
+    b = Part(np.int64)
+    T_a_b = Part(np.float64, 4, 4)
+    information = Part(np.float64, 6, 6)
+    bias = Part(np.float64, 6)
 
     def append(self, edge: RelativePose) -> None:
         """Append an alignment from its later keyframe, `edge.a`, to an earlier one."""
-        self.rows.append([edge.a, edge.b, *edge.T_a_b.ravel(), *edge.information.ravel(), *edge.bias])
+        self.add(edge.a, edge.b, edge.T_a_b, edge.information, edge.bias)
 
     def touching(self, first: int) -> list[RelativePose]:
         """Return the alignments of keyframes from row `first` on."""
         return self[int(np.searchsorted(self.rows.used[:, 0], first)) :]
 
     def _record(self, i: int) -> RelativePose:
-        row = self.rows.used[i].copy()
-        T_a_b, information = row[2:18].reshape(4, 4), row[18:54].reshape(6, 6)
-        return RelativePose(int(row[0]), int(row[1]), T_a_b, information, "alignment", bias=row[54:])
+        a, b, T_a_b, information, bias = self.values(i)
+        return RelativePose(a, b, T_a_b, information, "alignment", bias=bias)
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,27 +137,23 @@ class SolvedGraph:
     shared: Matrix
 
 
-NUMBERS = 5
-"""Columns before the motion, see `Edges.rows`."""
 TRUSTED: tuple[Kind, ...] = ("odometry", "relocalisation", "join")
 """The kinds of edges that the pose graph does not judge."""
-INFORMATION = slice(NUMBERS + 16, NUMBERS + 16 + 36)
-DRIFT = slice(NUMBERS + 16 + 36, None)
 
 
 @dataclass(eq=False)
 class Edges(Records[RelativePose]):
     """Edges in their order. An edge is made when it is read.
 
-    rows [E, 93]: a, b, row of the loop that the edge is, or −1 minus its place in
-    `TRUSTED`, both keyframes, T_a_b, information and
-    drift by rows.
+    loop_row: row of the loop that the edge is, or −1 minus the place of its kind in `TRUSTED`.
     """
 
-    POSE_COLUMNS: ClassVar[slice] = slice(NUMBERS, NUMBERS + 16)
-    """The columns of `rows` that hold a pose."""
-
-    rows: Column = field(default_factory=lambda: Column.of(np.float64, NUMBERS + 16 + 2 * 36))
+    ends = Part(np.int64, 2)
+    loop_row = Part(np.int64)
+    keyframes = Part(np.int64, 2)
+    T_a_b = Part(np.float64, 4, 4)
+    information = Part(np.float64, 6, 6)
+    drift = Part(np.float64, 6, 6)
 
     @staticmethod
     def of(known: Iterable[RelativePose]) -> "Edges":
@@ -186,38 +168,12 @@ class Edges(Records[RelativePose]):
     def append(self, edge: RelativePose, loop_row: int = 0) -> None:
         """Append an edge; loop_row: of a loop, its row among all pairs that were tried."""
         loop_row = -1 - TRUSTED.index(edge.kind) if edge.kind in TRUSTED else loop_row
-        numbers, matrices = (edge.a, edge.b, loop_row, *edge.keyframes), (edge.T_a_b, edge.information, edge.drift)
-        self.rows.append(np.concatenate([numbers, *(matrix.ravel() for matrix in matrices)]))
-
-    @property
-    def ends(self) -> NDArray[np.int64]:
-        """Return a and b of each edge [E, 2]."""
-        return np.asarray(self.rows.used[:, :2].astype(np.int64))
-
-    @property
-    def T_a_b(self) -> Matrix:
-        """Return the motion of each edge [E, 4, 4]."""
-        return self.rows.used[:, NUMBERS : NUMBERS + 16].reshape(-1, 4, 4).copy()
-
-    @property
-    def information(self) -> Matrix:
-        """Return the information of each edge [E, 6, 6]."""
-        return self.rows.used[:, INFORMATION].reshape(-1, 6, 6).copy()
-
-    @property
-    def keyframes(self) -> NDArray[np.int64]:
-        """Return both keyframes of each edge [E, 2]."""
-        return np.asarray(self.rows.used[:, 3:NUMBERS].astype(np.int64))
-
-    @property
-    def drift(self) -> Matrix:
-        """Return the drift in each edge [E, 6, 6]."""
-        return self.rows.used[:, DRIFT].reshape(-1, 6, 6).copy()
+        self.add(edge.a, edge.b, loop_row, edge.keyframes, edge.T_a_b, edge.information, edge.drift)
 
     @property
     def is_loop(self) -> NDArray[np.bool_]:
         """Return which edges are loops [E]."""
-        return np.asarray(self.rows.used[:, 2] >= 0)
+        return np.asarray(self.loop_row >= 0)
 
     def taken(self, chosen: NDArray[np.bool_]) -> "Edges":
         """Return a copy of some edges."""
@@ -226,11 +182,9 @@ class Edges(Records[RelativePose]):
 
     def loop_rows(self, edges: Sequence[int]) -> NDArray[np.int64]:
         """Return the row of the loop that each of some edges is [n], below 0 for a trusted edge."""
-        return np.asarray(self.rows.used[np.array(edges, np.intp), 2].astype(np.int64))
+        return self.loop_row[np.array(edges, np.intp)]
 
     def _record(self, i: int) -> RelativePose:
-        row = self.rows.used[i].copy()
-        a, b, loop_row, in_a, in_b = (int(number) for number in row[:NUMBERS].tolist())
-        information, drift = (row[columns].reshape(6, 6) for columns in (INFORMATION, DRIFT))
-        kind = "loop" if loop_row >= 0 else TRUSTED[-1 - loop_row]
-        return RelativePose(a, b, row[self.POSE_COLUMNS].reshape(4, 4), information, kind, (in_a, in_b), drift)
+        (a, b), loop_row, keyframes, T_a_b, information, drift = self.values(i)
+        kind: Kind = "loop" if loop_row >= 0 else TRUSTED[-1 - loop_row]
+        return RelativePose(int(a), int(b), T_a_b, information, kind, tuple(keyframes.tolist()), drift)

@@ -1,7 +1,6 @@
 """Write files completely or not at all: Ctrl-C, a full disk or a power failure leave no partial file under its final
 name. What a killed process left is found and removed."""
 
-import errno
 import os
 import re
 from collections.abc import Iterator
@@ -9,8 +8,6 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from sigmasplat.errors import RunError
-
-FULL = {errno.ENOSPC, errno.EDQUOT}
 
 
 @contextmanager
@@ -65,33 +62,6 @@ def write_text(path: Path, text: str) -> None:
     """Write a UTF-8 text file atomically. Raises RunError if it cannot be written."""
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
-
-
-def write_text_on_full_disk(path: Path, text: str) -> None:
-    """Write a short UTF-8 text file atomically; if the disk is full, write over the existing file.
-
-    That needs no space. Text shorter than the existing file is then padded with spaces. Raises RunError if it cannot
-    be written.
-    """
-    try:
-        write_text(path, text)
-    except RunError as problem:
-        if getattr(problem.__cause__, "errno", None) not in FULL or not path.is_file():
-            raise
-        earlier = path.read_bytes()
-        try:
-            _write_over(path, text.encode().ljust(len(earlier)))  # one call: a kill does not divide it
-        except OSError:
-            _write_over(path, earlier)
-            raise problem from None
-
-
-def _write_over(path: Path, content: bytes) -> None:
-    with path.open("r+b", buffering=0) as file:
-        written = file.write(content) or 0
-        if written < len(content):
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        file.truncate()
 
 
 def cannot_write(path: Path, problem: OSError) -> RunError:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from sigmasplat.errors import RunError
 from sigmasplat.files import reading
-from sigmasplat.files.atomic import replacing, write_text, write_text_on_full_disk
+from sigmasplat.files.atomic import replacing, write_text
 from sigmasplat.files.reading import MOST_OWN_JSON_BYTES, parse_json
 
 
@@ -36,7 +36,7 @@ def write_json(path: Path, values: Any) -> None:
     if isinstance(values, list | Iterator):
         _write_items(path, values)  # may be many, and indenting is slow
     else:
-        write_text(path, _json_text(values))
+        write_text(path, json.dumps(to_json(values), indent=2, allow_nan=False) + "\n")
 
 
 def _write_items(path: Path, items: Iterable[Any]) -> None:
@@ -46,15 +46,6 @@ def _write_items(path: Path, items: Iterable[Any]) -> None:
             file.write(before + json_line(item).rstrip())
             before = ",\n"
         file.write("[]\n" if before == "[\n" else "\n]\n")
-
-
-def write_json_on_full_disk(path: Path, values: Any) -> None:
-    """Write a short file atomically, also if the disk is full (`write_text_on_full_disk`). Raises as `write_json`."""
-    write_text_on_full_disk(path, _json_text(values))
-
-
-def _json_text(values: Any) -> str:
-    return json.dumps(to_json(values), indent=2, allow_nan=False) + "\n"
 
 
 def read_json(path: Path) -> Any:

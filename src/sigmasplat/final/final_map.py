@@ -11,18 +11,17 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.config import Config, FinalConfig
-from sigmasplat.data.atlas import Atlas
 from sigmasplat.data.field import COLUMNS, GaussianField
 from sigmasplat.data.mesh import Mesh
 from sigmasplat.data.submap import SubmapStore
-from sigmasplat.data.trajectory import Component, Trajectory, evenly_spread
-from sigmasplat.data.tsdf import packed
+from sigmasplat.data.trajectory import evenly_spread
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.final.full_resolution import refine_on_photos, working_seconds
 from sigmasplat.final.fusion import count_keyframes, fuse, fusion_views
+from sigmasplat.final.moving import carved, without_moving
 from sigmasplat.final.refinement import Clock, KeyframeReader, refine
+from sigmasplat.final.tsdf import packed
 from sigmasplat.graph.path_covariance import PathCovariance
-from sigmasplat.mapping.moving import carved, without_moving
 from sigmasplat.render.view import View
 from sigmasplat.types import Matrix, Progress, no_progress
 
@@ -58,7 +57,9 @@ def final_map(
     Calls `progress(steps done, total)`. Memory contains this map, one submap and some pictures.
     Raises SigmaSplatError if there is no submap, a submap has no anchor, or its camera is not the view's.
     """
-    _refuse_misfits(store, anchors)
+    if not 0 < len(store) <= len(anchors):
+        found = f"found {len(store)} and {len(anchors)}"
+        raise SigmaSplatError(f"the final map needs submaps and one anchor for each, {found}")
     seed = seeded_on_surface if config.final.seed_from == "mesh" else merged
     if config.moving.find:
         store = without_moving(store, anchors, config.moving)
@@ -77,14 +78,6 @@ def final_map(
     poses = keyframes.poses_in(anchors) if moves else None
     exposures = keyframes.exposures_in_submaps() if config.final.exposure else None
     return FinalMap(on_device.to(torch.device("cpu")), poses, exposures, done, refined_fx)
-
-
-def _refuse_misfits(store: SubmapStore, anchors: Sequence[Matrix]) -> None:
-    """Raise SigmaSplatError if no final map can be made."""
-    if not 0 < len(store) <= len(anchors):
-        raise SigmaSplatError(
-            f"the final map needs submaps and one anchor for each, found {len(store)} and {len(anchors)}"
-        )
 
 
 # ---- merging ----
@@ -106,7 +99,7 @@ def merged(store: SubmapStore, anchors: Sequence[Matrix], config: Config) -> Gau
     """
     kept, waiting = list[OwnedSplats](), list[OwnedSplats]()
     for index in range(len(store)):
-        part = _in_world(store, anchors, index)
+        part = store.load(index).field.moved(torch.from_numpy(anchors[index]))
         log_variance = part.params[:, COLUMNS["log_variances"]].mean(1)
         waiting.append(OwnedSplats(part, np.full(len(part), index), log_variance))
         if _count(waiting) >= max(AT_ONCE, _count(kept)):
@@ -126,11 +119,6 @@ def _without_duplicates(parts: Sequence[OwnedSplats], config: Config) -> OwnedSp
     keep = survivors(field.means.numpy(), owner, weigh, config.final.merge_m * config.render.scene_scale)
     field.keep(torch.from_numpy(keep))
     return OwnedSplats(field, owner[keep], log_variance[torch.from_numpy(keep)])
-
-
-def _in_world(store: SubmapStore, anchors: Sequence[Matrix], index: int) -> GaussianField:
-    """Return a submap's splats in the world."""
-    return store.load(index).field.moved(torch.from_numpy(anchors[index]))
 
 
 def survivors(
@@ -250,26 +238,3 @@ def position_std_m(path: PathCovariance) -> float:
     rows = evenly_spread(range(len(submaps)), KEYFRAMES_MOST)
     covariances = (path.of_keyframe(int(submaps[row]), int(numbers[row])) for row in rows)
     return float(np.median([np.sqrt(np.trace(covariance[:3, :3])) for covariance in covariances]))
-
-
-def merged_field(store: SubmapStore, atlas: Atlas, component: int, active: GaussianField) -> GaussianField:
-    """Return the splats of all submaps of a component side by side, in its frame, in host memory; `active` are those of
-    the submap that is not finished."""
-    fields = (
-        (store.load(s).field if s < len(store) else active.to(torch.device("cpu"))).moved(
-            torch.from_numpy(atlas.anchors[s])
-        )
-        for s in atlas.members(component)
-    )
-    return GaussianField.side_by_side(fields)
-
-
-def components_apart(
-    store: SubmapStore, atlas: Atlas, active: GaussianField, trajectory: Trajectory, found: NDArray[np.bool_]
-) -> list[Component]:
-    """Return the components that are not connected to the world; trajectory: of all frames, found [F]: not lost."""
-    component_of = np.array(atlas.components, np.int64)[atlas.places.submap]
-    return [
-        Component(n, merged_field(store, atlas, n, active), trajectory.at(found & (component_of == n)))
-        for n in sorted(set(atlas.components) - {0})
-    ]

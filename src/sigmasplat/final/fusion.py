@@ -18,7 +18,7 @@ from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.mesh import Mesh
 from sigmasplat.data.submap import Picture, SubmapStore
-from sigmasplat.data.tsdf import Tsdf, extract_surface
+from sigmasplat.final.tsdf import Tsdf, extract_surface
 from sigmasplat.render import FieldRenderer, Render
 from sigmasplat.types import Matrix, Progress, no_progress
 

@@ -11,7 +11,6 @@ from torch import Tensor
 from sigmasplat.config import Config
 from sigmasplat.data import se3
 from sigmasplat.data.field import GaussianField
-from sigmasplat.data.map_uncertainty import COLOR_PARTS, DEPTH_PARTS, SHIPPED, Background, Calibration, MapUncertainty
 from sigmasplat.data.submap import SubmapStore
 from sigmasplat.data.trajectory import evenly_spread
 from sigmasplat.final.refinement import KeyframeReader
@@ -19,6 +18,14 @@ from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.render.view import View
 from sigmasplat.types import Matrix, Progress, no_progress
 from sigmasplat.uncertainty.calibration import background_of, fit_weights, splat_residuals, splat_std, squared_errors
+from sigmasplat.uncertainty.map_uncertainty import (
+    COLOR_PARTS,
+    DEPTH_PARTS,
+    SHIPPED,
+    Background,
+    Calibration,
+    MapUncertainty,
+)
 from sigmasplat.uncertainty.predictive import COVERED, variance_parts
 
 PIXELS = 4000

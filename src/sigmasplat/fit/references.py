@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.config import TrackingConfig
-from sigmasplat.config.sensors import SensorModel
+from sigmasplat.config.input import SensorModel
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.images import alignment_std, generic_std

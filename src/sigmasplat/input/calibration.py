@@ -26,7 +26,7 @@ class Calibration:
     camera, distortion: of the colour image, None for no distortion; depth_units_per_metre: of whole-number depth;
     depth_camera, depth_distortion: of depth images that are not registered to colour, None if they are registered;
     T_color_depth [4, 4]: transforms points of the depth camera to the colour camera, metres;
-    sensor: the depth sensor (`config.sensors`), None if it is unknown.
+    sensor: the depth sensor (`config.input`), None if it is unknown.
     """
 
     camera: Camera
@@ -76,7 +76,7 @@ def freiburg_calibration(folder: Path) -> Calibration | None:
 
 def read_calibration(path: Path, size: tuple[int, int], default_units_per_metre: float) -> Calibration:
     """Read `calibration.json`: fx, fy, cx, cy; optional width, height, depth_scale (PNG units per metre), distortion,
-    sensor (`config.sensors`).
+    sensor (`config.input`).
 
     For depth that is not registered to colour: depth_camera, an object of the same fields, and T_color_depth, 4 rows.
     `size` (width, height) in pixels is the default for a missing size. Raises SourceError naming file and field.
@@ -172,10 +172,10 @@ CENTRED = 0.2
 def refuse_impossible_camera(name: str, camera: Camera) -> None:
     """Raise SourceError if the intrinsics cannot be those of a camera with such images."""
     low, high = POSSIBLE_VIEW_DEG
-    for axis, degrees in zip("xy", fields_of_view_deg(camera), strict=True):
-        if not low <= degrees <= high:
+    for axis, focal, size in (("x", camera.fx, camera.width), ("y", camera.fy, camera.height)):
+        if not low <= (degrees := float(np.degrees(2 * np.arctan(0.5 * size / focal)))) <= high:
             raise SourceError(
-                f"{name}: f{axis} = {getattr(camera, 'f' + axis):g} pixels gives a field of view of {degrees:.3g}°; "
+                f"{name}: f{axis} = {focal:g} pixels gives a field of view of {degrees:.3g}°; "
                 f"correct the calibration, or give --f{axis} PIXELS"
             )
     if not (-0.5 <= camera.cx <= camera.width - 0.5 and -0.5 <= camera.cy <= camera.height - 0.5):
@@ -187,7 +187,7 @@ def refuse_impossible_camera(name: str, camera: Camera) -> None:
 
 def unlikely_camera(camera: Camera) -> str | None:
     """Return a warning if the intrinsics are unusual, None if they are plausible."""
-    degrees, (low, high) = fields_of_view_deg(camera)[0], USUAL_VIEW_DEG
+    degrees, (low, high) = float(np.degrees(camera.width_rad)), USUAL_VIEW_DEG
     if not low <= degrees <= high:
         return f"the field of view is {degrees:.0f}°, which is unusual for a depth camera; check fx"
     if not 0.8 <= camera.fx / camera.fy <= 1.25:
@@ -196,14 +196,6 @@ def unlikely_camera(camera: Camera) -> str | None:
     if abs(x) > CENTRED * camera.width or abs(y) > CENTRED * camera.height:
         return f"the principal point is ({x:+.0f}, {y:+.0f}) pixels from the image centre; check cx and cy"
     return None
-
-
-def fields_of_view_deg(camera: Camera) -> tuple[float, float]:
-    """Return the horizontal and the vertical field of view of the image, degrees."""
-    return (
-        float(np.degrees(2 * np.arctan(0.5 * camera.width / camera.fx))),
-        float(np.degrees(2 * np.arctan(0.5 * camera.height / camera.fy))),
-    )
 
 
 def read_camera(path: Path, fields: dict[str, Any], size: tuple[int, int]) -> Camera:

@@ -64,11 +64,14 @@ def rigid_transform(where: str, position: ArrayLike, quaternion_wxyz: ArrayLike)
     """Build a transform [4, 4]. Raises SourceError naming `where` unless it is finite with a unit quaternion."""
     q, T = np.array(quaternion_wxyz, np.float64), np.eye(4)
     T[:3, 3] = position
-    norm = float(np.linalg.norm(q))
-    if not np.isfinite(T).all() or not abs(norm - 1.0) < QUATERNION_TOLERANCE:
-        raise SourceError(f"{where}: the pose is not rigid: its quaternion has length {norm:.4g}, not 1")
+    _refuse_unless_unit(where, float(np.linalg.norm(q)) if np.isfinite(T).all() else np.nan)
     T[:3, :3] = se3.rotation_from_quaternion(q)
     return T
+
+
+def _refuse_unless_unit(where: str, length: float) -> None:
+    if not abs(length - 1.0) < QUATERNION_TOLERANCE:
+        raise SourceError(f"{where}: the pose is not rigid: its quaternion has length {length:.4g}, not 1")
 
 
 def build_trajectory(timed: Iterable[tuple[float, Matrix | None]]) -> Trajectory | None:
@@ -82,19 +85,21 @@ def read_pose_files(timed: Iterable[tuple[float, Path]]) -> Trajectory | None:
     return build_trajectory((t, checked_pose(str(path), read_matrix(path))) for t, path in timed if path.is_file())
 
 
-def read_poses(path: Path) -> Trajectory:
-    """Read "t tx ty tz qx qy qz qw" lines. Raises SourceError naming the line whose pose is not finite or not rigid."""
-    times, poses = [], []
-    for line, words in read_lines(path):
+def read_poses(path: Path, may_be_empty: bool = False) -> Trajectory:
+    """Read TUM text, a pose "t tx ty tz qx qy qz qw" per line. Raises SourceError naming the line whose pose is not
+    finite or not rigid, or if there is no pose, unless it `may_be_empty`."""
+    lines, rows = list(read_lines(path)), list[list[float]]()
+    for line, words in lines:
         if len(words) != 8:
             raise SourceError(f"{path}:{line}: expected 't tx ty tz qx qy qz qw', found {len(words)} values")
-        t, *values = parse_numbers(path, line, words)
-        times.append(t)
-        x, y, z, qx, qy, qz, qw = values
-        poses.append(rigid_transform(f"{path}:{line}", [x, y, z], [qw, qx, qy, qz]))
-    if not poses:
+        rows.append(parse_numbers(path, line, words))
+    if not rows and not may_be_empty:
         raise SourceError(f"{path}: holds no poses; delete it or add poses")
-    return Trajectory(np.array(times), np.stack(poses))
+    table, T = np.array(rows, np.float64).reshape(-1, 8), np.tile(np.eye(4), (len(rows), 1, 1))
+    for (line, _), length in zip(lines, np.linalg.norm(table[:, 4:], axis=1), strict=True):
+        _refuse_unless_unit(f"{path}:{line}", length)
+    T[:, :3, :3], T[:, :3, 3] = se3.rotation_from_quaternion(table[:, [7, 4, 5, 6]]), table[:, 1:4]
+    return Trajectory(table[:, 0], T)
 
 
 def read_groundtruth(folder: Path) -> Trajectory | None:

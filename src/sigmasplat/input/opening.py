@@ -3,7 +3,6 @@ no depth (video, photos, stereo pairs) are recognised too."""
 
 import importlib
 import os
-import re
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import fields, replace
@@ -24,8 +23,6 @@ VIDEO_ENDINGS = (".mp4", ".mov", ".m4v", ".avi", ".webm", ".3gp", ".mts")
 PHOTO_ENDINGS = (*COLOR_ENDINGS, ".heic", ".dng")
 RGBD_ENDINGS = (".exr", ".npy", ".pgm", ".bag", ".mcap", ".db3", ".r3d", ".sens", ".oni", ".klg", ".svo", ".mkv")
 """Files that may hold depth; .mkv is what Azure Kinect records."""
-STEREO_FOLDER = re.compile(r"cam[0-9]|image_[0-9]+|(?:left|right).*")
-"""Camera folders of EuRoC and TUM-VI, of KITTI, and of many stereo rigs."""
 MAX_LEVELS, MAX_ENTRIES = 4, 20_000
 """How far a folder is searched: EuRoC's images are three levels down, in mav0/cam0/data."""
 
@@ -49,21 +46,15 @@ def _described(path: Path) -> str | None:
     files = list(islice(_files(path), MAX_ENTRIES))
     if any("depth" in str(file.relative_to(path)).lower() or file.suffix.lower() in RGBD_ENDINGS for file in files):
         return None
-    folders: dict[Path, list[Path]] = {}
+    folders: dict[Path, Path] = {}  # with one of their images
     for file in files:
         if file.suffix.lower() in PHOTO_ENDINGS:
-            folders.setdefault(file.parent, []).append(file)
-    if not all(_is_color_image(images[0]) for images in folders.values()):
+            folders.setdefault(file.parent, file)
+    if not all(map(_is_color_image, folders.values())):
         return None
-    videos = [file for file in files if file.suffix.lower() in VIDEO_ENDINGS]
-    cameras = {(folder.parent if folder.name == "data" else folder).name for folder in folders}
-    stereo = sorted(name for name in cameras if STEREO_FOLDER.fullmatch(name.lower()))
-    if len(stereo) > 1:
-        return f"stereo or multi-camera images in {', '.join(stereo[:4])}"
     if folders:
-        folder = max(folders, key=lambda folder: len(folders[folder]))
-        return "images" if folder == path else f"images in {folder.relative_to(path)}"
-    return f"video: {videos[0].name}" if videos else None
+        return "images in " + ", ".join(sorted(str(folder.relative_to(path)) for folder in folders)[:4])
+    return next((f"video: {file.name}" for file in files if file.suffix.lower() in VIDEO_ENDINGS), None)
 
 
 def _files(folder: Path) -> Iterator[Path]:

@@ -14,11 +14,11 @@ from sigmasplat.config import InputConfig
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.frame_arrays import color_from_bytes
 from sigmasplat.data.images import resized_color
-from sigmasplat.data.imu import Accelerometer, Gyroscope
 from sigmasplat.data.trajectory import Trajectory, evenly_spaced
 from sigmasplat.errors import SourceError
 from sigmasplat.input.calibration import Calibration, refuse_impossible_camera, resolve_calibration
 from sigmasplat.input.images import FRAMES_PER_SECOND, image_size, pair_images, read_color, read_depth
+from sigmasplat.input.imu import Accelerometer, Gyroscope
 from sigmasplat.input.rectification import Rectification, check_image_sizes
 from sigmasplat.input.source import Source
 
@@ -109,10 +109,9 @@ class ImagePair:
         """Read depth in metres [H, W], 0 = no reading; whole numbers are divided. Raises SourceError naming `depth`."""
         return read_depth(self.depth, units_per_metre)
 
-    def read(self, units_per_metre: float) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32] | None]:
-        """Read both images, as `read_color` and `read_depth` do, and the standard deviation of depth, m [H, W], if it
-        is known."""
-        return self.read_color(), self.read_depth(units_per_metre), None
+    def read(self, units_per_metre: float) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+        """Read both images, as `read_color` and `read_depth` do."""
+        return self.read_color(), self.read_depth(units_per_metre)
 
     def sizes(self) -> tuple[Size, Size]:
         """Return (width, height) of colour and of depth in pixels. Raises SourceError naming the unreadable file."""
@@ -159,7 +158,7 @@ class RecordedSource(Source):
     def frame(self, i: int) -> Frame:
         """Read frame i: colour and depth of one camera, lens distortion removed."""
         files = self._images[self._checked_index(i)]
-        recorded, depth_m, _ = files.read(self.depth_units_per_metre)
+        recorded, depth_m = files.read(self.depth_units_per_metre)
         color = color_from_bytes(recorded)
         check_image_sizes(self._rectified, files.color, color.shape[1::-1], files.depth, depth_m.shape[::-1])
         color, depth_m = self._rectified(color, depth_m)

@@ -60,7 +60,7 @@ class Source(ABC):
     predicted depth, so that its scale is arbitrary;
     scene_scale: size of the scene relative to a room, above 1 outdoors; depth_noise_per_m: standard deviation
     of depth, times z²; None if it is unknown (`config.scale.for_scene` uses both);
-    sensor: the depth sensor (`config.sensors`), None if it is unknown;
+    sensor: the depth sensor (`config.input`), None if it is unknown;
     live: whether frames come from a live camera: each only once, and their number is unknown (LiveSource);
     arrived_s: when the last frame arrived, by `time.perf_counter`, if frames do not wait for the consumer (Arrivals);
     dropped: number of frames that were dropped because the consumer was late.

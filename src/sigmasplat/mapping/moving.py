@@ -1,13 +1,11 @@
-"""Keep what moves out of the map: compare keyframes with each other, and remove splats from space that is free. Before
-the final map is made, the same across submaps.
+"""Keep what moves out of the map: compare keyframes with each other, and remove splats from space that is free.
 
 Two keyframes contradict each other where one shows a surface in space that the other one sees through. If the other one
 is later, the surface has gone: it is masked in the earlier one. If it is earlier, the surface has come; it is masked in
 the later one if both are so close in time that it may still be moving. Masked pixels have no depth.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field as dataclass_field, replace
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import torch
@@ -17,8 +15,7 @@ from sigmasplat.config import MovingConfig
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
-from sigmasplat.data.submap import KeyframeId, Picture, ReadOnlyStore, SubmapStore
-from sigmasplat.fit.target import Keyframe, Target
+from sigmasplat.fit.target import Keyframe
 from sigmasplat.tracking.moving.dynamic_mask import Earlier, dynamic_mask
 from sigmasplat.tracking.moving.free_space import CLEAR_M, CLEAR_RELATIVE, Depth, Mask, free_places, on_image
 from sigmasplat.types import Matrix
@@ -79,26 +76,21 @@ def carve(field: GaussianField, keyframes: Sequence[Keyframe], votes: int) -> No
     rows = np.flatnonzero(_sees_through(means, newest))
     if not _are_stray(len(rows), field):
         gone = np.zeros(len(field), np.bool_)
-        gone[rows] = _is_free(means[rows], keyframes, votes)
-        _remove(field, gone)
-
-
-def carve_everywhere(field: GaussianField, keyframes: Iterable[Keyframe], votes: int) -> None:
-    """Remove the splats whose place at least `votes` of the keyframes see to be free, as `carve`."""
-    _remove(field, _is_free(field.means.numpy(), keyframes, votes))
+        gone[rows] = is_free(means[rows], keyframes, votes)
+        remove(field, gone)
 
 
 def _are_stray(count: int, field: GaussianField) -> bool:
     return count < STRAY * len(field)
 
 
-def _remove(field: GaussianField, gone: Mask) -> None:
+def remove(field: GaussianField, gone: Mask) -> None:
     """Remove splats [N] from a map, unless they are stray."""
     if gone.any() and not _are_stray(int(gone.sum()), field):
         field.keep(torch.from_numpy(~gone).to(field.params.device))
 
 
-def _is_free(means_m: NDArray[np.float32], keyframes: Iterable[Keyframe], votes: int) -> Mask:
+def is_free(means_m: NDArray[np.float32], keyframes: Iterable[Keyframe], votes: int) -> Mask:
     """Return which splats with means [n, 3] m are in free space."""
     through, there = np.zeros(len(means_m), np.int64), np.zeros(len(means_m), np.int64)
     for keyframe in keyframes:
@@ -121,13 +113,10 @@ def _sees_through(means_m: NDArray[np.float32], keyframe: Keyframe) -> Mask:
 def _seen(means_m: NDArray[np.float32], keyframe: Keyframe) -> tuple[Mask, Mask]:
     """Return which splats with means [n, 3] m a keyframe sees through, and at which it shows a surface."""
     depth, z, inside, at = _on_keyframe(means_m, keyframe)
-    limit, (near, far) = _limit_m(z), (np.take(plane, at) for plane in Earlier(depth, np.eye(4)).range_m)
+    limit = np.asarray(np.float32(CLEAR_M) + np.float32(CLEAR_RELATIVE) * z)
+    near, far = (np.take(plane, at) for plane in Earlier(depth, np.eye(4)).range_m)
     free = inside & (np.take(depth, at) > 0) & (z + limit < near)
     return free, inside & (z > near - limit) & (z < far + limit)
-
-
-def _limit_m(z: NDArray[np.float32]) -> NDArray[np.float32]:
-    return np.asarray(np.float32(CLEAR_M) + np.float32(CLEAR_RELATIVE) * z)
 
 
 def _on_keyframe(
@@ -141,80 +130,3 @@ def _on_keyframe(
     x, y, z = (r[0] * means[0] + r[1] * means[1] + r[2] * means[2] + r[3] for r in rows)
     inside, row, column = on_image(x, y, z, camera)
     return depth, z, inside, row * camera.width + column
-
-
-STEPS_BACK = (1, 3, 6, 10)
-"""A keyframe is compared with those so many before it, and with the `REVISITS` nearest of all earlier ones."""
-REVISITS = 2
-TURN_M = 1.0
-"""Keyframes are near each other by the distance of their cameras, and by so many metres per radian of turn."""
-
-
-@dataclass(frozen=True, eq=False)
-class StillStore(ReadOnlyStore):
-    """A store whose keyframes have no depth where something moved.
-
-    hidden: the pixels [H, W] of each keyframe that are masked, packed into bits, by submap and keyframe.
-    """
-
-    hidden: dict[KeyframeId, NDArray[np.uint8]] = dataclass_field(default_factory=dict)
-
-    def picture(self, index: int, keyframe: int) -> Picture:
-        picture, bits = self.store.picture(index, keyframe), self.hidden.get((index, keyframe))
-        if bits is None:
-            return picture
-        hidden = np.unpackbits(bits, count=picture.depth_m.size).reshape(picture.depth_m.shape).astype(bool)
-        return replace(picture, depth_m=np.where(hidden, np.float32(0.0), picture.depth_m))
-
-    def hide(self, place: KeyframeId, pixels: NDArray[np.bool_]) -> None:
-        """Mask more pixels [H, W] of a keyframe."""
-        bits = np.packbits(pixels)
-        self.hidden[place] = bits | self.hidden.get(place, bits)
-
-
-def without_moving(store: SubmapStore, anchors: Sequence[Matrix], config: MovingConfig) -> StillStore:
-    """Return the store with what moves masked in its keyframes; anchors: T_world_submap [4, 4] of each submap."""
-    still, places = StillStore(store), _places(store)
-    poses = [anchors[s] @ T for s in range(len(store)) for T in store.load(s).T_submap_camera]
-    frames = [frame for s in range(len(store)) for frame in store.load(s).frames]
-    camera = store.load(0).camera
-    for late, others in enumerate(_compared(poses)):
-        for early in others:
-            close = frames[late] - frames[early] <= config.still_frames or not config.still_frames
-            for own, other in ((early, late), (late, early))[: 1 + close]:
-                own_m, other_m = (still.picture(*places[n]).depth_m for n in (own, other))
-                pixels = contradicted(own_m, other_m, se3.inverse(poses[other]) @ poses[own], camera)
-                if pixels is not None:
-                    still.hide(places[own], pixels)
-    return still
-
-
-def _places(store: SubmapStore) -> list[KeyframeId]:
-    return [(s, k) for s in range(len(store)) for k in range(len(store.load(s).frames))]
-
-
-def _compared(poses: Sequence[Matrix]) -> Iterator[list[int]]:
-    """Yield the earlier keyframes that each one is compared with."""
-    positions = np.array([T[:3, 3] for T in poses])
-    ahead = np.array([T[:3, 2] for T in poses])
-    for late in range(len(poses)):
-        others = [late - n for n in STEPS_BACK if n <= late]
-        rest = max(late - STEPS_BACK[-1], 0)
-        if rest:
-            turn = np.arccos(np.clip(ahead[:rest] @ ahead[late], -1.0, 1.0))
-            apart = np.linalg.norm(positions[:rest] - positions[late], axis=1) + TURN_M * turn
-            others += np.argsort(apart, kind="stable")[:REVISITS].tolist()
-        yield others
-
-
-def carved(field: GaussianField, store: SubmapStore, anchors: Sequence[Matrix], config: MovingConfig) -> None:
-    """Remove the splats of a map in the world from space that the keyframes of all submaps see to be free."""
-
-    def keyframes() -> Iterator[Keyframe]:
-        for s in range(len(store)):
-            submap = store.load(s)
-            for k, T in enumerate(submap.T_submap_camera):
-                size = submap.camera.height, submap.camera.width
-                yield Keyframe(k, Target.of_picture(store.picture(s, k), submap.camera, size), anchors[s] @ T)
-
-    carve_everywhere(field, keyframes(), config.carve_votes)

@@ -15,9 +15,10 @@ from sigmasplat.fit.pose import fit_pose_align
 from sigmasplat.graph.loops import Loops
 from sigmasplat.graph.newest_covariance import NO_ERRORS
 from sigmasplat.realtime.front_end import Offer, Search, Snapshot, TrackedFrame
-from sigmasplat.slam.listeners import Before, Correction, correction_since
-from sigmasplat.slam.mapping_backend import SLICES_PER_FRAME, MappingBackend
+from sigmasplat.slam.mapping_backend import SLICES_PER_FRAME
 from sigmasplat.slam.results import StepTimer
+from sigmasplat.system.array_interface import Before, Correction, correction_since
+from sigmasplat.system.slam import Slam
 from sigmasplat.tracking.pose_validation import is_better
 from sigmasplat.tracking.prepared_frame import PreparedFrame, TrackedKeyframe, mapped_keyframe
 from sigmasplat.tracking.relocaliser import Relocation
@@ -37,7 +38,7 @@ class BackEnd:
     with_errors: whether snapshots contain the errors of poses.
     """
 
-    def __init__(self, system: MappingBackend, publish: Callable[[Snapshot], None]) -> None:
+    def __init__(self, system: Slam, publish: Callable[[Snapshot], None]) -> None:
         self.system, self.publish = system, publish
         self.given: queue.SimpleQueue[TrackedFrame | Callable[[], None]] = queue.SimpleQueue()
         self.last: Snapshot | None = None

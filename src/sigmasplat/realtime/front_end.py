@@ -23,10 +23,10 @@ from sigmasplat.fit.target import Target
 from sigmasplat.graph.confidence import Confidence
 from sigmasplat.graph.loops import Loop, Loops
 from sigmasplat.graph.newest_covariance import NO_ERRORS, PoseErrors
-from sigmasplat.mapping.validation_views import ValidationViews
+from sigmasplat.mapping.window import ValidationViews
 from sigmasplat.render.view import View
-from sigmasplat.slam.listeners import Correction
 from sigmasplat.slam.results import Step, StepTimer, SubmapState, make_step
+from sigmasplat.system.array_interface import Correction
 from sigmasplat.tracking.frame_estimate import FrameEstimate
 from sigmasplat.tracking.keyframe_rule import becomes_keyframe, is_held_back, is_mappable, may_validate
 from sigmasplat.tracking.moving.dynamic_mask import DynamicMask

@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator
 from sigmasplat import env
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.frame import Frame
-from sigmasplat.data.map_uncertainty import MapUncertainty
 from sigmasplat.data.trajectory import LOST
 from sigmasplat.errors import SourceError
 from sigmasplat.graph.loops import Loops
@@ -17,15 +16,15 @@ from sigmasplat.native.threads import idle_kernel_workers, set_kernel_threads, y
 from sigmasplat.realtime.back_end import BackEnd
 from sigmasplat.realtime.front_end import FrontEnd, Snapshot
 from sigmasplat.render.view import View
-from sigmasplat.slam.array_interface import ArrayInterface
-from sigmasplat.slam.listeners import Events
 from sigmasplat.slam.results import Step, StepTimer
-from sigmasplat.slam.slam import Slam
+from sigmasplat.system.array_interface import ArrayInterface, Events
+from sigmasplat.system.slam import Slam
 from sigmasplat.tracking.features import extractor_of
 from sigmasplat.tracking.prepared_frame import view_of, working_frame
 from sigmasplat.tracking.recovery import Recovery
 from sigmasplat.tracking.tracker import Tracker
 from sigmasplat.types import Matrix, Progress, ShouldStop, never, no_progress
+from sigmasplat.uncertainty.map_uncertainty import MapUncertainty
 
 SWITCH_S = 0.0005
 """How long a thread may hold the interpreter lock while another one waits for it; Python's default is 5 ms."""

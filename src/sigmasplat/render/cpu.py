@@ -6,7 +6,7 @@ from torch import Tensor
 
 from sigmasplat import env
 from sigmasplat.config import RenderConfig
-from sigmasplat.config.sensors import SensorModel
+from sigmasplat.config.input import SensorModel
 from sigmasplat.data.camera import Camera
 from sigmasplat.errors import BackendError
 from sigmasplat.native import _core

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from sigmasplat.config import RenderConfig
-from sigmasplat.config.sensors import SensorModel
+from sigmasplat.config.input import SensorModel
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
 from sigmasplat.render.kernels import (

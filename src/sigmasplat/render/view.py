@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.config import RenderConfig
-from sigmasplat.config.sensors import SensorModel
+from sigmasplat.config.input import SensorModel
 from sigmasplat.data.camera import Camera
 from sigmasplat.types import Matrix
 

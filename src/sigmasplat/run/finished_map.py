@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 
 from sigmasplat.config import Config
-from sigmasplat.config.scale import for_scene
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.submap import SubmapStore
 from sigmasplat.errors import ConfigError, RunError
 from sigmasplat.input.source import Source
+from sigmasplat.run.scene import config_of_facts, scene_facts
 from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.run_folder.submaps import DiskStore
-from sigmasplat.slam.slam import Slam
+from sigmasplat.system.slam import Slam
 from sigmasplat.types import Matrix
 
 LEAST_SHARE = 0.5
@@ -82,14 +82,8 @@ class FinishedMap:
         Settings named in `given` keep their values.
         """
         of_map = ("input.min_depth_m", "input.max_depth_m")  # `config` has the map's already
-        return for_scene(
-            config,
-            self.facts.get("scene_scale") or 1.0,
-            source.depth_noise_per_m,
-            {*given, *of_map},
-            None,
-            source.predicted_depth,
-        )
+        facts = scene_facts(source) | {"scene_scale": self.facts.get("scene_scale"), "sensor": None}
+        return config_of_facts(facts, config, {*given, *of_map})
 
     @contextmanager
     def unchanged(self) -> Iterator[None]:

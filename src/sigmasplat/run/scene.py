@@ -140,12 +140,7 @@ def open_scene(path: str | Path, config: Config | None = None, given: Collection
         config = with_measured_scale(source, config)
     if config.input != asked:
         source = open_source(path, config.input)
-    return source, config_for(source, config, given)
-
-
-def config_for(source: Source, config: Config, given: Collection[str] = ()) -> Config:
-    """Return the settings for the scene of a source; those named in `given` keep their values."""
-    return for_scene(config, source.scene_scale, source.depth_noise_per_m, given, source.sensor, source.predicted_depth)
+    return source, config_of_facts(scene_facts(source), config, given)
 
 
 def scene_facts(source: Source) -> dict[str, Any]:

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from sigmasplat.realtime.system import RealTime
     from sigmasplat.run.resume import StateFile
     from sigmasplat.slam.results import Step
-    from sigmasplat.slam.slam import Slam
+    from sigmasplat.system.slam import Slam
 
 RUNS = Path("runs")
 LOOPS_GROWTH = 1.05

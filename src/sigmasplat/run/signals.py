@@ -24,7 +24,7 @@ def interrupt_event() -> Iterator[threading.Event]:
     if threading.current_thread() is not threading.main_thread():
         yield interrupt
         return
-    terminals = [output for output in STANDARD_OUTPUTS if _is_terminal(output)]
+    terminals = [output for output in STANDARD_OUTPUTS if os.isatty(output)]
 
     def on_first(number: int, frame: FrameType | None) -> None:
         interrupt.set()
@@ -43,13 +43,6 @@ def interrupt_event() -> Iterator[threading.Event]:
     finally:
         for ending, handler in earlier.items():
             signal.signal(ending, handler)
-
-
-def _is_terminal(output: int) -> bool:
-    try:
-        return os.isatty(output)
-    except OSError:
-        return False
 
 
 def _discard(outputs: list[int]) -> None:

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.data.imu import up_of_path
 from sigmasplat.data.trajectory import LOST, TRACKED, Trajectory, outside_world, states_at_end, submaps_outside
+from sigmasplat.input.imu import up_of_path
 
 Log = list[dict[str, Any]]
 

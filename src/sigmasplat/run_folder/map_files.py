@@ -7,7 +7,14 @@ from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 
-from sigmasplat.data.map_uncertainty import (
+from sigmasplat.data.trajectory import Component
+from sigmasplat.errors import RunError
+from sigmasplat.files.atomic import make_folder
+from sigmasplat.files.json_files import read_json, write_json
+from sigmasplat.files.tensors import open_tensors, write_tensors
+from sigmasplat.run_folder import splat_ply as ply
+from sigmasplat.run_folder.trajectory import write_trajectory
+from sigmasplat.uncertainty.map_uncertainty import (
     COLOR_PARTS,
     DEPTH_PARTS,
     SPLAT_COLUMNS,
@@ -17,13 +24,6 @@ from sigmasplat.data.map_uncertainty import (
     MapUncertainty,
     SplatStd,
 )
-from sigmasplat.data.trajectory import Component
-from sigmasplat.errors import RunError
-from sigmasplat.files.atomic import make_folder
-from sigmasplat.files.json_files import read_json, write_json
-from sigmasplat.files.tensors import open_tensors, write_tensors
-from sigmasplat.run_folder import splat_ply as ply
-from sigmasplat.run_folder.trajectory import write_trajectory
 
 UNCERTAINTY_JSON, UNCERTAINTY_TENSORS = "uncertainty.json", "uncertainty.safetensors"
 STD_TENSORS = ("depth_std_m", "color_std")

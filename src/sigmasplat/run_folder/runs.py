@@ -12,18 +12,19 @@ from torch import Tensor
 
 from sigmasplat.config import Config
 from sigmasplat.data.field import GaussianField
-from sigmasplat.data.map_uncertainty import MapUncertainty, SplatStd
 from sigmasplat.data.trajectory import Component, Trajectory
 from sigmasplat.errors import RunError
 from sigmasplat.files import machine
 from sigmasplat.files.atomic import part_of, remove_leftovers, replacing, sync_file, write_text
-from sigmasplat.files.json_files import append_line, read_json, read_lines, write_json, write_json_on_full_disk
+from sigmasplat.files.json_files import append_line, read_json, read_lines, write_json
 from sigmasplat.files.lock import LOCK, locked, no_warning
 from sigmasplat.files.tensors import open_tensors, write_tensors
+from sigmasplat.input.lists import read_poses
 from sigmasplat.run_folder import map_files, splat_ply as ply, trajectory as tum
 from sigmasplat.run_folder.frames import RunFrames
 from sigmasplat.run_folder.run_values import FACTS, check_checkpoint, check_fields, check_log, check_profile
 from sigmasplat.run_folder.submaps import DiskStore
+from sigmasplat.uncertainty.map_uncertainty import MapUncertainty, SplatStd
 
 PROGRAM = "sigmasplat"
 TRUTH = "truth.txt"
@@ -175,7 +176,7 @@ class RunFolder:
 
     def note(self, **facts: Any) -> None:
         """Add or change facts in run.json, for instance status="complete" or "interrupted", wall_s=…"""
-        write_json_on_full_disk(self.path / "run.json", self.facts() | facts)
+        write_json(self.path / "run.json", self.facts() | facts)
 
     def locked(self, warn: Callable[[str], None] = no_warning) -> AbstractContextManager[None]:
         """Hold the run while a block writes to it. Raises RunError if another process holds it (`files.lock`)."""
@@ -211,7 +212,7 @@ class RunFolder:
 
     write_trajectory = _writes("trajectory.txt", tum.write_trajectory)
     """Write trajectory.txt: the valid poses (TUM text, T_world_camera)."""
-    read_trajectory = _reads("trajectory.txt", partial(tum.read_trajectory, may_be_empty=True))
+    read_trajectory = _reads("trajectory.txt", partial(read_poses, may_be_empty=True))
     """Read trajectory.txt; it is empty if no pose is valid. Raises SourceError if it is damaged."""
 
     def read_frames(self) -> RunFrames:
@@ -230,7 +231,7 @@ class RunFolder:
     def read_component(self, number: int) -> Component:
         """Read a component from components/. Raises RunError if a file is missing, SourceError if it is damaged."""
         trajectory, field = (self._existing(f"{COMPONENTS}/{number}/{name}") for name in map_files.COMPONENT_FILES)
-        return Component(number, ply.read_field(field), tum.read_trajectory(trajectory))
+        return Component(number, ply.read_field(field), read_poses(trajectory))
 
     write_map = _writes("map.ply", ply.write_field)
     """Write map.ply (3DGS PLY, world frame)."""

@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 
 from sigmasplat.data.field import ATTRIBUTES, COLUMNS, INITIAL_LOG_VARIANCE, GaussianField, Rows
 from sigmasplat.data.harmonics import DEGREES, count
-from sigmasplat.data.map_uncertainty import SplatStd
 from sigmasplat.errors import SourceError
 from sigmasplat.files.atomic import replacing
 from sigmasplat.files.ply_elements import header_of, read_header
 from sigmasplat.files.reading import open_binary
 from sigmasplat.run_folder.splat_values import SH_C0, by_channel, check_finite, check_values
+from sigmasplat.uncertainty.map_uncertainty import SplatStd
 
 PLY_COLUMNS: dict[str, list[str]] = {
     "means": ["x", "y", "z"],

@@ -64,20 +64,16 @@ class DiskStore:
         written."""
         self.settle()
         refuse_misfit(submap, pictures, len(self), probes)
-        tensors = {
-            "params": submap.field.params,
-            "T_submap_camera": torch.tensor(submap.T_submap_camera, dtype=torch.float64),
-            "frames": torch.tensor(submap.frames, dtype=torch.int64),
-            **{f"extra.{name}": attribute.params for name, attribute in submap.field.attributes.items()},
-            "colors": torch.from_numpy(np.stack([picture.color for picture in pictures])),
-            "depths_m": torch.from_numpy(np.stack([picture.depth_m for picture in pictures])),
-        }
-        if probes:
+        attributes = submap.field.attributes.items()
+        tensors = {"params": submap.field.params, **{f"extra.{name}": values.params for name, values in attributes}}
+        keyframes = "", "T_submap_camera", submap.frames, submap.T_submap_camera, pictures
+        views = "probe_", "T_submap_probe", submap.probe_frames, submap.T_submap_probe, probes
+        for prefix, poses, frames, T, images in (keyframes, views) if probes else (keyframes,):
             tensors |= {
-                "T_submap_probe": torch.tensor(submap.T_submap_probe, dtype=torch.float64),
-                "probe_frames": torch.tensor(submap.probe_frames, dtype=torch.int64),
-                "probe_colors": torch.from_numpy(np.stack([picture.color for picture in probes])),
-                "probe_depths_m": torch.from_numpy(np.stack([picture.depth_m for picture in probes])),
+                poses: torch.tensor(T, dtype=torch.float64),
+                f"{prefix}frames": torch.tensor(frames, dtype=torch.int64),
+                f"{prefix}colors": torch.from_numpy(np.stack([picture.color for picture in images])),
+                f"{prefix}depths_m": torch.from_numpy(np.stack([picture.depth_m for picture in images])),
             }
         make_folder(self.folder)
         text = {"index": str(submap.index), "camera": json.dumps(asdict(submap.camera))}

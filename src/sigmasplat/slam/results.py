@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.data.poses import Column, Records
-from sigmasplat.data.trajectory import APART, LOST, RELOCALISED, TRACKED
+from sigmasplat.data.poses import Part, Records
+from sigmasplat.data.trajectory import APART, LOST, STATES, TRACKED
 from sigmasplat.graph.confidence import Confidence
 from sigmasplat.graph.loops import Loop
 from sigmasplat.render.view import View
@@ -109,9 +109,6 @@ class StepTimer(Stopwatch):
 
 WHOLE_STEPS = 1000
 """Number of newest steps that are kept whole."""
-STATES = (TRACKED, RELOCALISED, LOST, APART)
-NUMBERS = 9
-"""Columns before the pose, see `Steps.rows`."""
 
 
 @dataclass(eq=False)
@@ -119,11 +116,20 @@ class Steps(Records[Step]):
     """The steps of all frames. Only the newest `WHOLE_STEPS` are kept whole; of earlier ones the values of tracking,
     loops, seconds and the covariance are dropped: they take most of the memory, and nothing reads them later.
 
-    rows [F, 25]: of every frame index, timestamp_s, is_keyframe, lost, splats, submap, number of the state in `STATES`,
-    component, p_off, and T_world_camera [4, 4] by rows; whole: the newest steps by number.
+    frame: its number in the source; state: its number in `STATES`; whole: the newest steps by number.
     """
 
-    rows: Column = field(default_factory=lambda: Column.of(np.float64, NUMBERS + 16))
+    frame = Part(np.int64)
+    timestamps_s = Part(np.float64)
+    is_keyframe = Part(np.bool_)
+    lost = Part(np.bool_)
+    splats = Part(np.int64)
+    submap = Part(np.int64)
+    state = Part(np.int64)
+    component = Part(np.int64)
+    p_off = Part(np.float64)
+    T_world_camera = Part(np.float64, 4, 4)
+
     whole: dict[int, Step] = field(default_factory=dict)
 
     def append(self, step: Step) -> None:
@@ -131,43 +137,21 @@ class Steps(Records[Step]):
         number = len(self)
         self.whole[number] = step
         self.whole.pop(number - WHOLE_STEPS, None)
-        numbers = (
+        self.add(
             step.index, step.timestamp_s, step.is_keyframe, step.lost, step.splats, step.submap,
-            STATES.index(step.state), step.component, step.p_off,
+            STATES.index(step.state), step.component, step.p_off, step.T_world_camera,
         )  # fmt: skip
-        self.rows.append([*numbers, *step.T_world_camera.ravel()])
-
-    @property
-    def timestamps_s(self) -> NDArray[np.float64]:
-        """Return the time of each frame [F]."""
-        return self.rows.used[:, 1].copy()
-
-    @property
-    def lost(self) -> NDArray[np.bool_]:
-        """Return whether each frame was lost [F]."""
-        return np.asarray(self.rows.used[:, 3] != 0)
-
-    @property
-    def submap(self) -> NDArray[np.int64]:
-        """Return the submap of each frame [F]."""
-        return self.rows.used[:, 5].astype(np.int64)
 
     @property
     def states(self) -> list[str]:
         """Return the state of each frame."""
-        return [STATES[number] for number in self.rows.used[:, 6].astype(np.int64).tolist()]
-
-    @property
-    def p_off(self) -> NDArray[np.float64]:
-        """Return the probability that each pose is off [F]."""
-        return self.rows.used[:, 8].copy()
+        return [STATES[number] for number in self.state]
 
     def _record(self, i: int) -> Step:
         if (step := self.whole.get(i)) is not None:
             return step
-        index, timestamp_s, is_keyframe, lost, splats, submap, state, component, p_off = self.rows.used[i, :NUMBERS]
+        index, timestamp_s, is_keyframe, lost, splats, submap, state, component, p_off, T = self.values(i)
         return Step(
-            int(index), float(timestamp_s), self.rows.used[i, NUMBERS:].reshape(4, 4).copy(), bool(is_keyframe),
-            bool(lost), {}, int(splats), int(submap), state=STATES[int(state)], component=int(component),
-            p_off=float(p_off),
+            index, timestamp_s, T, is_keyframe, lost, {}, splats, submap, state=STATES[state], component=component,
+            p_off=p_off,
         )  # fmt: skip

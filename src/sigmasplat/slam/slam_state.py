@@ -1,36 +1,27 @@
 """The state of SLAM, and how to read it: map, path, components, checkpoint."""
 
-from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from sigmasplat.config import Config
-from sigmasplat.config.find_preset import configured
 from sigmasplat.data.atlas import Atlas
 from sigmasplat.data.camera import Camera
-from sigmasplat.data.field import GaussianField, Rows
+from sigmasplat.data.field import GaussianField
 from sigmasplat.data.frame import Frame
-from sigmasplat.data.map_uncertainty import MapUncertainty
 from sigmasplat.data.poses import Column
-from sigmasplat.data.relative_pose import RelativePose
 from sigmasplat.data.submap import MemoryStore, OnDisk, SubmapStore
-from sigmasplat.data.trajectory import LOST, Component, Trajectory
+from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SourceError
-from sigmasplat.final.final_map import components_apart, merged_field
 from sigmasplat.graph.closer import LoopCloser, make_descriptor
 from sigmasplat.graph.confidence import Confidence
 from sigmasplat.graph.growing_graph import GrowingGraph, KeyframeImages
 from sigmasplat.graph.loops import Loop, Loops
-from sigmasplat.graph.newest_covariance import NewestCovariance, PoseErrors
-from sigmasplat.graph.path_covariance import recorded
 from sigmasplat.mapping.mapper import Mapper
-from sigmasplat.mapping.validation_views import ValidationViews
+from sigmasplat.mapping.window import ValidationViews
 from sigmasplat.render.view import View
-from sigmasplat.slam.listeners import Listeners
 from sigmasplat.slam.results import Step, Steps, StepTimer, SubmapState
 from sigmasplat.tracking.depth_filters import frame_filter
 from sigmasplat.tracking.drift import Drift
@@ -39,7 +30,7 @@ from sigmasplat.tracking.prepared_frame import PreparedFrame, observe, view_of, 
 from sigmasplat.tracking.recovery import Recovery
 from sigmasplat.tracking.relocaliser import Relocaliser
 from sigmasplat.tracking.tracker import Tracker
-from sigmasplat.types import Matrix, Task
+from sigmasplat.types import Task
 
 HOST = torch.device("cpu")
 
@@ -49,19 +40,10 @@ class SlamState:
 
     Frame 0 fixes the gauge: the world is the first camera, or that of the map that is continued. Finished submaps go to
     `store`, by default in memory.
-
-    config: settings, or the name of a preset, by default the default preset; settings: values that replace some, as in
-    {"input.width": 320}. Raises ConfigError on an unknown preset or setting.
     """
 
-    def __init__(
-        self,
-        config: Config | str | None = None,
-        store: SubmapStore | None = None,
-        *,
-        settings: Mapping[str, object] | None = None,
-    ) -> None:
-        self.config = configured(config, settings)
+    def __init__(self, config: Config, store: SubmapStore | None = None) -> None:
+        self.config = config
         self.filtered = frame_filter(self.config.input.filters)
         self.random = np.random.default_rng(self.config.seed)
         self.store = MemoryStore() if store is None else store
@@ -81,23 +63,13 @@ class SlamState:
         self.keyframe_indices: list[int] = []
         self._view: View | None = None
         self._resample = False
-        self._final: GaussianField | None = None
-        self.refinement_steps: int | None = None
-        """Number of refinement steps of the final map; None before `finish`."""
-        self.uncertainty: MapUncertainty | None = None
-        """How sure the final map is; None before `finish`, or without probe views (`uncertainty.probes`)."""
         self._timer = StepTimer()
         self._search: Task[list[Loop]] | None = None
-        self.listeners = Listeners()
-        self._newest_covariance = NewestCovariance()
         self.keep_on_disk()
 
     @property
     def field(self) -> GaussianField:
-        """Return the map in the world, in host memory: the final map after `finish`, before that all submaps side by
-        side."""
-        if self._final is not None:
-            return self._final
+        """Return the map in the world, in host memory: all submaps side by side."""
         if not len(self.store):
             return self.mapper.field.to(HOST)
         return merged_field(self.store, self.atlas, 0, self.mapper.field)
@@ -107,10 +79,6 @@ class SlamState:
         atlas, splats = self.atlas, len(self.mapper.field)
         drift = replace(self.drift)
         return SubmapState(len(atlas.anchors) - 1, atlas.components[-1], atlas.anchors[-1], drift, splats)
-
-    def components(self) -> list[Component]:
-        """Return the components of the atlas that are not connected to the world."""
-        return components_apart(self.store, self.atlas, self.mapper.field, self.trajectory(), ~self.steps.lost)
 
     @property
     def loops(self) -> Loops:
@@ -148,35 +116,6 @@ class SlamState:
     def newest_step(self) -> Step | None:
         """Return the result of the newest frame; None before the first one."""
         return self.steps[-1] if self.steps else None
-
-    def covariance(self) -> Matrix | None:
-        """Return the covariance [6, 6] of the newest frame's pose; None if that frame is lost.
-
-        Order: position x, y, z (m), then rotation about x, y, z (rad), all in the axes of the world, as in
-        geometry_msgs/PoseWithCovariance. It covers the noise and the systematic error of tracking since the first
-        camera of the component, its disagreement with mapping, and what closed loops corrected (`path_covariance`). It
-        does not cover a wrong pose that tracking did not notice: `Step.p_off` is its probability. For the first frame
-        it is 0. Raises SourceError before the first frame.
-        """
-        newest = self.newest_step()
-        if newest is None:
-            raise SourceError("no pose yet: give a frame to `track` or `step` first")
-        if newest.state == LOST:
-            return None
-        T_world_camera = (
-            self.atlas.anchors[-1] @ self.atlas.keyframe_poses.last[-1] @ self.atlas.places[-1].T_keyframe_camera
-        )
-        return self.pose_errors().of(T_world_camera, int(not newest.is_keyframe))
-
-    def pose_errors(self) -> PoseErrors:
-        """Return the errors of poses relative to the newest keyframe."""
-        return self._newest_covariance.errors(self.atlas, self.closer)
-
-    def checkpoint(self) -> dict[str, Tensor]:
-        """Return what is needed to read a run back, in host memory: the active submap's field with its optimiser state,
-        poses, times, keyframes, anchors, the submap of each frame, and the errors of the path (`path_covariance`)."""
-        path, edges = self.trajectory(), self.closer.valid
-        return checkpoint_of(self.mapper.field, path, self.atlas, self.keyframe_indices, edges)
 
     @property
     def view(self) -> View:
@@ -235,37 +174,13 @@ class SlamState:
         return (self.cuts and self.config.loops.close) or (m.window > 2 and m.covisibility == "descriptor")
 
 
-def checkpoint_of(
-    active: GaussianField, path: Trajectory, atlas: Atlas, keyframes: Sequence[int], edges: Sequence[RelativePose]
-) -> dict[str, Tensor]:
-    """Return the active submap's field with its attributes and its optimiser state, poses, times, keyframes, anchors,
-    the submap of each frame, the exposures of frames if they are known, and the errors of the path, in host
-    memory."""
-    return {
-        **_rows_of(active, ""),
-        **{key: part for name, rows in active.attributes.items() for key, part in _rows_of(rows, f"{name}_").items()},
-        "timestamps_s": torch.from_numpy(path.timestamps_s),
-        "T_world_camera": torch.from_numpy(path.T_world_camera),
-        "T_world_camera_odometry": torch.from_numpy(atlas.T_world_camera(loops=False)),
-        "T_world_keyframe": torch.from_numpy(atlas.T_world_keyframes),
-        "T_submap_camera": torch.from_numpy(atlas.T_submap_camera),
-        **path_errors(atlas, keyframes, edges),
-    }
-
-
-def path_errors(atlas: Atlas, keyframes: Sequence[int], edges: Sequence[RelativePose]) -> dict[str, Tensor]:
-    """Return the part of a checkpoint that `PathCovariance.of` reads; arguments as for `checkpoint_of`."""
-    return {
-        "keyframes": torch.tensor(keyframes, dtype=torch.int64),
-        "T_world_submap": torch.from_numpy(np.array(atlas.anchors)),
-        "submap_component": torch.tensor(atlas.components, dtype=torch.int64),
-        "frame_submap": torch.tensor(atlas.places.submap),
-        **({"exposure": torch.from_numpy(atlas.frame_exposures())} if atlas.exposures else {}),
-        **recorded(atlas, edges),
-    }
-
-
-def _rows_of(rows: Rows, prefix: str) -> dict[str, Tensor]:
-    """Return the parameters and the optimiser state of rows, in host memory, with a prefix to each name."""
-    parts = {f"{prefix}{name}": getattr(rows, name).cpu() for name in ("params", "moment1", "moment2", "last_step")}
-    return parts | {f"{prefix}adam_steps": torch.tensor(rows.steps)}
+def merged_field(store: SubmapStore, atlas: Atlas, component: int, active: GaussianField) -> GaussianField:
+    """Return the splats of all submaps of a component side by side, in its frame, in host memory; `active` are those of
+    the submap that is not finished."""
+    fields = (
+        (store.load(s).field if s < len(store) else active.to(torch.device("cpu"))).moved(
+            torch.from_numpy(atlas.anchors[s])
+        )
+        for s in atlas.members(component)
+    )
+    return GaussianField.side_by_side(fields)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.config import Config, TrackingConfig
-from sigmasplat.config.sensors import sensor_model
+from sigmasplat.config.input import sensor_model
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera, gray_exposure, unexposed
 from sigmasplat.data.frame import Frame, Photo, photo_size

@@ -17,9 +17,9 @@ from torch import Tensor
 from sigmasplat.config import RenderConfig
 from sigmasplat.data import se3
 from sigmasplat.data.field import COLUMNS, GaussianField
-from sigmasplat.data.map_uncertainty import Background, MapUncertainty, SplatStd
 from sigmasplat.fit.target import Keyframe
 from sigmasplat.render.backend import on_device
+from sigmasplat.uncertainty.map_uncertainty import Background, MapUncertainty, SplatStd
 from sigmasplat.uncertainty.predictive import COVERED, blend_values, directions_toward, predicted, variance_parts
 
 SQUARE_OF_MEAN = (3.0 * math.pi / 8.0, math.pi / 2.0)

@@ -21,7 +21,10 @@ from sigmasplat.config import RenderConfig
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import COLUMNS, GaussianField
-from sigmasplat.data.map_uncertainty import (
+from sigmasplat.render.backend import backend_module, backend_name, on_device, options_on
+from sigmasplat.render.kernels import Projection, depth_of, plane_features
+from sigmasplat.render.render import CENTER, colors_from
+from sigmasplat.uncertainty.map_uncertainty import (
     COLOR_PARTS,
     DEPTH_PARTS,
     EPISTEMIC,
@@ -30,9 +33,6 @@ from sigmasplat.data.map_uncertainty import (
     Calibration,
     MapUncertainty,
 )
-from sigmasplat.render.backend import backend_module, backend_name, on_device, options_on
-from sigmasplat.render.kernels import Projection, depth_of, plane_features
-from sigmasplat.render.render import CENTER, colors_from
 
 MEANS, QUATS = COLUMNS["means"], COLUMNS["quats"]
 OWN = 6

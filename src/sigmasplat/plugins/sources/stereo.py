@@ -47,10 +47,10 @@ class StereoPair(ImagePair):
         """Match both images: depth of the left one in metres [H, W]. Raises SourceError naming the file."""
         return self.read(units_per_metre)[1]
 
-    def read(self, units_per_metre: float) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32]]:
-        """Read both images once: the left one, its depth and the standard deviation of depth, m."""
+    def read(self, units_per_metre: float) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+        """Read both images once: the left one and its depth."""
         left, right = self._read(self.color), self._read(self.depth)
-        return left, *self.matcher.depth_and_std_m(left, right)
+        return left, self.matcher.depth_and_std_m(left, right)[0]
 
     def _read(self, path: Path) -> NDArray[np.uint8]:
         image, c = read_color(path), self.matcher.camera

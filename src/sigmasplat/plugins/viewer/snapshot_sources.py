@@ -20,7 +20,7 @@ from sigmasplat.api import (
     RunFrames,
     SubmapStore,
     outside_world,
-    read_trajectory,
+    read_poses,
     states_at_end,
     submaps_outside,
 )
@@ -58,7 +58,7 @@ def finished_snapshot(run: RunFolder, budget: int = BUDGET) -> Snapshot:
         _final_path(frames, tensors),
         Piece(None, without_moments(final), uncertainty=run.uncertainty_of(final)),
         (),
-        read_trajectory(true_file).T_world_camera[:, :3, 3] if true_file.is_file() else None,
+        read_poses(true_file).T_world_camera[:, :3, 3] if true_file.is_file() else None,
         cache.camera or DEFAULT_CAMERA,
         cache.image,
         config.render,

@@ -1,6 +1,7 @@
-"""Finished submaps after the graph of keyframes has moved their keyframes: the splats move with them."""
+"""The finished submaps as the final map sees them: some of them, with other poses, exposures or masks, and with splats
+that have moved with the keyframes that the graph has moved."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,15 +10,100 @@ from numpy.typing import NDArray
 
 from sigmasplat.data import se3
 from sigmasplat.data.atlas import Atlas
-from sigmasplat.data.camera import Camera
+from sigmasplat.data.camera import Camera, between
 from sigmasplat.data.field import GaussianField
-from sigmasplat.data.submap import RefinedStore, StorePart, Submap
+from sigmasplat.data.submap import Picture, Submap, SubmapStore
+from sigmasplat.errors import SigmaSplatError
+from sigmasplat.final.keyframe_nodes import KeyframeNodes, alignments
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.graph.graph_errors import shared_errors
 from sigmasplat.graph.growing_graph import GrowingGraph
-from sigmasplat.graph.keyframe_graph import KeyframeNodes, alignments, solve
+from sigmasplat.graph.keyframe_graph import solve
 from sigmasplat.graph.path_covariance import PathCovariance
 from sigmasplat.types import Matrix
+
+
+@dataclass(frozen=True, eq=False)
+class ReadOnlyStore:
+    """The submaps of a store, which can only be read. Subclasses change what is read."""
+
+    store: SubmapStore
+
+    def __len__(self) -> int:
+        return len(self.store)
+
+    def save(self, submap: Submap, pictures: list[Picture], probes: Sequence[Picture] = ()) -> None:
+        """Raise SigmaSplatError."""
+        raise SigmaSplatError(f"submap {submap.index} cannot be saved in a store that is only read")
+
+    def load(self, index: int) -> Submap:
+        return self.store.load(index)
+
+    def picture(self, index: int, keyframe: int) -> Picture:
+        return self.store.picture(index, keyframe)
+
+    def probe(self, index: int, probe: int) -> Picture:
+        return self.store.probe(index, probe)
+
+
+@dataclass(frozen=True, eq=False)
+class StorePart(ReadOnlyStore):
+    """Some submaps of a store, numbered from 0 in the order of `members`."""
+
+    members: Sequence[int]
+
+    def __len__(self) -> int:
+        return len(self.members)
+
+    def load(self, index: int) -> Submap:
+        return self.store.load(self.members[index])
+
+    def picture(self, index: int, keyframe: int) -> Picture:
+        return self.store.picture(self.members[index], keyframe)
+
+    def probe(self, index: int, probe: int) -> Picture:
+        return self.store.probe(self.members[index], probe)
+
+
+@dataclass(frozen=True, eq=False)
+class RefinedStore(ReadOnlyStore):
+    """The submaps of a store as the final map sees them: with the poses of their keyframes that its refinement has
+    moved, and with images in the exposure of the map. Probe views follow as frames do; their
+    exposure is interpolated between those of keyframes.
+
+    keyframe_poses: T_submap_camera [4, 4] of each submap's keyframes, None: not moved. The splats of the submaps fit
+    the old poses. exposures: [K, 3, 2] of each submap's keyframes (`data.camera`), None: not fitted.
+    """
+
+    keyframe_poses: Sequence[Sequence[Matrix]] | None = None
+    exposures: Sequence[Matrix] | None = None
+
+    def load(self, index: int) -> Submap:
+        return self.moved(self.store.load(index), index)
+
+    def moved(self, submap: Submap, index: int) -> Submap:
+        """Return a submap of the store with the moved poses."""
+        if self.keyframe_poses is None:
+            return submap
+        poses, frames = np.array(self.keyframe_poses[index]).reshape(-1, 4, 4), np.array(submap.frames, np.int64)
+        motions, at = poses @ se3.inverse(submap.T_submap_camera), np.array(submap.probe_frames, np.int64)
+        keyframe = np.searchsorted(frames, at, side="right") - 1
+        after = np.minimum(keyframe + 1, len(frames) - 1)
+        share = (at - frames[keyframe]) / np.maximum(frames[after] - frames[keyframe], 1) * (after > keyframe)
+        probes = se3.interpolated(motions[keyframe], motions[after], share) @ submap.T_submap_probe
+        return replace(submap, T_submap_camera=poses, T_submap_probe=probes)
+
+    def picture(self, index: int, keyframe: int) -> Picture:
+        picture = self.store.picture(index, keyframe)
+        return picture if self.exposures is None else picture.without_exposure(self.exposures[index][keyframe])
+
+    def probe(self, index: int, probe: int) -> Picture:
+        picture = self.store.probe(index, probe)
+        if self.exposures is None:
+            return picture
+        submap = self.store.load(index)
+        at = np.array(submap.probe_frames[probe : probe + 1])
+        return picture.without_exposure(between(np.array(submap.frames), self.exposures[index], at)[0])
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,25 +1,15 @@
-"""SLAM: track every frame, map keyframes, cut submaps, close loops. `Slam.step` follows the papers' overviews."""
+"""SLAM: track every frame, map keyframes, cut submaps, close loops. `MainLoop.step` follows the papers' overviews."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 
 import numpy as np
 
-from sigmasplat.config.sensors import RENDERED
 from sigmasplat.data import se3
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.relative_pose import UNKNOWN_HOP, RelativePose
-from sigmasplat.data.submap import RefinedStore, StorePart, SubmapStore
 from sigmasplat.data.trajectory import APART, RELOCALISED, TRACKED
-from sigmasplat.final.final_map import final_map, reaching
-from sigmasplat.final.followed_store import solved_keyframes
-from sigmasplat.final.uncertainty import final_uncertainty
 from sigmasplat.fit.pose import PoseFit
 from sigmasplat.graph.loops import Loop
-from sigmasplat.graph.path_covariance import PathCovariance
-from sigmasplat.render.render import as_refined
-from sigmasplat.slam.array_interface import ArrayInterface
-from sigmasplat.slam.listeners import notifying
 from sigmasplat.slam.mapping_backend import SLICES_PER_FRAME, MappingBackend
 from sigmasplat.slam.results import Step, StepTimer, make_step
 from sigmasplat.tracking.frame_estimate import FrameEstimate
@@ -29,18 +19,12 @@ from sigmasplat.tracking.predicted_depth_frames import fitted_keyframe, fitted_t
 from sigmasplat.tracking.prepared_frame import PreparedFrame, refuse_first_without_depth, working_frame
 from sigmasplat.tracking.recovery import usable
 from sigmasplat.tracking.relocaliser import Relocation
-from sigmasplat.types import Matrix, completed, no_progress, part_of
+from sigmasplat.types import Matrix, completed
 
 
-class Slam(MappingBackend, ArrayInterface):
-    """Simultaneous localisation and mapping: give frames to `step`, or arrays to `track`, then call `finish`; read
-    `field` and `trajectory()` at any time.
+class MainLoop(MappingBackend):
+    """Simultaneous localisation and mapping, frame by frame. No part of this class reads ground truth."""
 
-    Frame 0 fixes the gauge: the world is the first camera. No part of this class reads ground truth. Finished submaps
-    go to `store`, by default in memory.
-    """
-
-    @notifying
     def step(self, frame: Frame) -> Step:
         """Process one frame: track it, find it in the whole map if it is lost, map it if it is a keyframe, and cut the
         submap if a rule ends it here.
@@ -58,53 +42,6 @@ class Slam(MappingBackend, ArrayInterface):
         self.atlas.place_frame(estimate.T_submap_camera)
         self.steps.append(self._result(seen, estimate, self.closer.loops[tried:]))
         return self.steps[-1]
-
-    @notifying
-    def finish(self, progress: Callable[[int, int], None] = no_progress) -> None:
-        """Finish the last submap, look for its loops, and make the final map (VarSplat §7); call it once, at the end.
-
-        Calls `progress(done, total)` with the steps of refinement, from 0 to the last one, and then the keyframes that
-        the uncertainty is measured at; without both the total is 1. Does nothing when no rule cuts submaps and
-        `final.iterations` is 0. Components that are not connected to the world are left out of the final map.
-        """
-        completed(self.refining(self.mapper.pending))
-        if not self.steps or not (len(self.store) or self.cuts or self.config.final.iterations):
-            return
-        steps, measures = self._refinement_steps(), self.config.uncertainty.probes > 0
-        total = max(1, steps + measures * self.atlas.keyframe_poses.total)
-        progress(0, total)
-        completed(self.finish_submap())
-        self.settle()
-        completed(self.closing())
-        self._connect_components()
-        self.closer.solve_all(self.atlas)
-        members = self.atlas.members(0)
-        part = StorePart(self.store, members)
-        store: SubmapStore = part
-        refining, measuring = (part_of(progress, first, total) for first in (0, steps))
-        known = PathCovariance.of_keyframes(self.atlas, self.closer.valid)
-        if self.follows:
-            store, poses = solved_keyframes(
-                self.atlas, known, part, self.keyframe_image, self.graph, self.config.input.sensor == RENDERED
-            )
-            self.atlas.refined = dict(zip(members, poses, strict=True))
-        anchors = [self.atlas.anchors[s] for s in members]
-        config = replace(self.config, final=reaching(self.config, known))
-        final = final_map(store, anchors, config, self.view, self.random, refining)
-        self._final, self.refinement_steps = final.field, final.steps
-        refined = RefinedStore(store, final.keyframe_poses, final.keyframe_exposures)
-        if final.keyframe_poses is not None:
-            self.atlas.refined = dict(zip(members, final.keyframe_poses, strict=True))
-        if final.keyframe_exposures is not None:
-            self.atlas.exposures = dict(zip(members, final.keyframe_exposures, strict=True))
-        shown = replace(self.config, render=as_refined(self.config.render, self.view.camera, final.refined_fx))
-        self.uncertainty = final_uncertainty(self._final, refined, anchors, shown, self.view, measuring)
-        progress(total, total)
-
-    def _refinement_steps(self) -> int:
-        """Return the number of steps of the final map's refinement, at working size and on photos."""
-        final, photos = self.config.final, any(keyframe.photo for keyframe in self.mapper.keyframes)
-        return final.iterations + final.width_iterations * (photos and final.iterations > 0)
 
     def _prepared(self, frame: Frame) -> PreparedFrame:
         """Resize a frame to working size and prepare it for the fits."""
