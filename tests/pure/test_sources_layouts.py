@@ -199,7 +199,7 @@ def test_icl_nuims_negative_focal_length_equals_ours_in_the_mirrored_world(tmp_p
     c = source.camera
     ours = source.truth().T_world_camera[2] @ [(u - c.cx) / c.fx * z, (v - c.cy) / c.fy * z, z, 1.0]
     assert ours == pytest.approx(mirror @ theirs, abs=1e-6)
-    assert source.truth().std == (0.0, 0.0)
+    assert source.truth().error_rms == (0.0, 0.0)
 
 
 def test_an_association_file_of_real_times_is_read_without_the_mirror(tmp_path, tiny_tum):

@@ -41,7 +41,7 @@ def test_reading(replica):
     )
     truth = source.truth().T_world_camera
     assert truth[2, :3, 3].tolist() == [2, 2, 3] and truth[2, 1, 0] == 1.0
-    assert source.truth().std == (0.0, 0.0)
+    assert source.truth().error_rms == (0.0, 0.0)
 
 
 def test_the_camera_file_in_the_folder_overrides_the_parents(replica):

@@ -85,9 +85,9 @@ def test_calibration_json_overrides_the_folders_name(tiny_tum):
 
 
 def test_only_the_truth_of_tums_own_recordings_is_known_to_be_motion_capture(tiny_tum):
-    assert open_source(tiny_tum).truth().std is None
+    assert open_source(tiny_tum).truth().error_rms is None
     renamed = tiny_tum.rename(tiny_tum.with_name("freiburg1_desk"))
-    assert open_source(renamed, limit=2).truth().std == (0.004, pytest.approx(np.deg2rad(0.3)))
+    assert open_source(renamed, limit=2).truth().error_rms == (0.004, pytest.approx(np.deg2rad(0.3)))
 
 
 def undistort(points, coefficients):
