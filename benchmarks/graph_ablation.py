@@ -38,10 +38,10 @@ from sigmasplat.config.submaps import LoopConfig
 from sigmasplat.config.text import override, split_settings
 from sigmasplat.data.relative_pose import RelativePose
 from sigmasplat.errors import ConfigError, SigmaSplatError
-from sigmasplat.final import followed_store
+from sigmasplat.final import stores
 from sigmasplat.graph import growing_graph, keyframe_graph
 from sigmasplat.plugins.sources import open_source
-from sigmasplat.slam.slam import Slam
+from sigmasplat.system.slam import Slam
 from sigmasplat.types import Matrix
 
 arg = tyro.conf.arg
@@ -72,7 +72,7 @@ class Variant:
             if not self.window:
                 stack.enter_context(mock.patch.object(growing_graph.GrowingGraph, "solved", unsolved))
             if not self.weights:
-                for module in (growing_graph, followed_store):
+                for module in (growing_graph, stores):
                     stack.enter_context(mock.patch.object(module, "solve", solve_unweighted))
             yield
 

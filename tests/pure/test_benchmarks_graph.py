@@ -11,7 +11,7 @@ from sigmasplat.config.submaps import LoopConfig
 from sigmasplat.data import se3
 from sigmasplat.data.relative_pose import RelativePose
 from sigmasplat.errors import ConfigError
-from sigmasplat.final import followed_store
+from sigmasplat.final import stores
 from sigmasplat.graph import growing_graph
 from sigmasplat.graph.keyframe_graph import solve
 
@@ -32,14 +32,14 @@ def triangle() -> tuple[Any, list[RelativePose]]:
 def test_a_variant_replaces_its_part_while_it_runs() -> None:
     T, edges = triangle()
     graph, most = growing_graph.GrowingGraph(8), LoopConfig.alignments
-    before = growing_graph.GrowingGraph.solved, growing_graph.solve, followed_store.solve
+    before = growing_graph.GrowingGraph.solved, growing_graph.solve, stores.solve
     variant = ablation.Variant(edges=3, window=False, weights=False)
     with variant.in_place():
         assert LoopConfig().alignments == 3
         assert np.array_equal(graph.solved(T, [RelativePose.hop(np.eye(4))] * 2, 1), T[1:])
-        assert growing_graph.solve is followed_store.solve is ablation.solve_unweighted
-        equal = followed_store.solve(T, edges).T_world_keyframe
-    assert (growing_graph.GrowingGraph.solved, growing_graph.solve, followed_store.solve) == before
+        assert growing_graph.solve is stores.solve is ablation.solve_unweighted
+        equal = stores.solve(T, edges).T_world_keyframe
+    assert (growing_graph.GrowingGraph.solved, growing_graph.solve, stores.solve) == before
     assert LoopConfig.alignments == most == ablation.VARIANTS["as it is"].edges
     assert solve(T, edges).T_world_keyframe[2, 0, 3] == pytest.approx(0.2, abs=1e-3)
     assert equal[2, 0, 3] == pytest.approx(0.22, abs=2e-3)  # the error of 3 cm is shared by three equal edges
