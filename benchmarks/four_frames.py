@@ -48,7 +48,7 @@ from sigmasplat.types import completed, never
 try:
     from sigmasplat.render.backend import make_view
 except ImportError:  # an older checkout
-    from sigmasplat.render.backend import make_view  # type: ignore[attr-defined, no-redef]
+    from sigmasplat.render.view import make_view  # type: ignore[attr-defined, no-redef]
 
 arg = tyro.conf.arg
 Matrix = NDArray[np.float64]
