@@ -29,8 +29,7 @@ from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import ConfigError
 from sigmasplat.fit.compare import best_alignment
 from sigmasplat.fit.pyramid import Pyramid
-from sigmasplat.graph.normal_equations import factorised
-from sigmasplat.graph.pose_graph import PoseGraph
+from sigmasplat.graph.pose_graph import PoseGraph, factorised
 from sigmasplat.plugins.evaluation.metrics.trajectory import ate
 from sigmasplat.plugins.evaluation.view_scoring import working_frame
 from sigmasplat.plugins.sources import open_source

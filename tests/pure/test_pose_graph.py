@@ -16,7 +16,7 @@ from scipy.stats import chi2
 from sigmasplat.data import se3
 from sigmasplat.data.relative_pose import Kind, RelativePose
 from sigmasplat.errors import SigmaSplatError
-from sigmasplat.graph import normal_equations, pose_graph
+from sigmasplat.graph import pose_graph
 from sigmasplat.graph.neighbourhood import Incidence, Neighbourhood
 from sigmasplat.graph.pose_graph import LoopVerdict, PoseGraph, optimise
 
@@ -153,8 +153,8 @@ def test_a_large_graph_has_the_solution_that_factorisations_find(
 ) -> None:
     """A long chain needs a factorisation; in a graph with many loops none is made."""
     _, drifted, edges = scene(3, 150, true_loops, false_loops)
-    made, counted = list[int](), normal_equations.factorised
-    monkeypatch.setattr(normal_equations, "factorised", lambda H: (made.append(1), counted(H))[1])
+    made, counted = list[int](), pose_graph.factorised
+    monkeypatch.setattr(pose_graph, "factorised", lambda H: (made.append(1), counted(H))[1])
     found, factorisations = optimise(drifted, edges), len(made)
     monkeypatch.setattr(pose_graph, "LARGE", len(drifted))
     known = optimise(drifted, edges)
@@ -380,15 +380,6 @@ def test_a_part_of_a_graph_that_grows_is_that_of_the_grown_graph() -> None:
 # What is refused.
 
 
-def test_a_node_that_hangs_on_a_loop_only_is_named() -> None:
-    _, drifted, edges = scene(0, nodes=12, true_loops=1, false_loops=0)
-    without = [edge for edge in edges if 7 not in (edge.a, edge.b)] + [replace(edges[6], kind="loop")]
-    with pytest.raises(SigmaSplatError, match=r"no chain of odometry edges connects node 7 to node 0"):
-        optimise(drifted, without)
-    with pytest.raises(SigmaSplatError, match=r"node 1 "):
-        optimise(drifted, [])
-
-
 def test_information_must_be_symmetric_positive_definite() -> None:
     for information in [
         np.zeros((6, 6)),
@@ -397,7 +388,6 @@ def test_information_must_be_symmetric_positive_definite() -> None:
         np.eye(6) + np.triu(np.full((6, 6), 1e-3), 1),
         np.diag([1.0, 1, 1, 1, 1, np.nan]),
         np.diag([1.0, 1, 1, 1, 1, np.inf]),
-        np.eye(3),
     ]:
         _, drifted, edges = scene(0, nodes=12, true_loops=1, false_loops=0)
         edges[4] = replace(edges[4], information=information)
@@ -405,24 +395,7 @@ def test_information_must_be_symmetric_positive_definite() -> None:
             optimise(drifted, edges)
 
 
-def test_edges_must_join_two_nodes() -> None:
-    for a, b in [(3, 3), (0, 12), (-1, 4)]:
-        _, drifted, edges = scene(0, nodes=12, true_loops=1, false_loops=0)
-        with pytest.raises(SigmaSplatError, match=f"edge {a} → {b} does not connect two of the 12 nodes"):
-            optimise(drifted, [*edges, replace(edges[-1], a=a, b=b)])
-
-
-def test_poses_measurements_and_confidence_must_make_sense() -> None:
+def test_measurements_must_be_rigid() -> None:
     _, drifted, edges = scene(0, nodes=12, true_loops=1, false_loops=0)
-    bent = drifted.copy()
-    bent[3, 0, 0] = np.nan
-    with pytest.raises(SigmaSplatError, match="pose of node 3 "):
-        optimise(bent, edges)
-    with pytest.raises(SigmaSplatError, match="edge 0 → 1 does not have a rigid motion"):
+    with pytest.raises(SigmaSplatError, match="edge 0 → 1 is not a rigid motion"):
         optimise(drifted, [replace(edges[0], T_a_b=2.0 * np.eye(4)), *edges[1:]])
-    for poses in (drifted[0], drifted[:0]):
-        with pytest.raises(SigmaSplatError, match="poses have shape"):
-            optimise(poses, edges)
-    for confidence in (0.0, 1.1, float("nan")):
-        with pytest.raises(SigmaSplatError, match="confidence"):
-            optimise(drifted, edges, confidence)

@@ -15,8 +15,7 @@ from sigmasplat.data import se3
 from sigmasplat.data.relative_pose import Kind, RelativePose
 from sigmasplat.fit.compare import best_alignment
 from sigmasplat.fit.pyramid import Pyramid
-from sigmasplat.graph.normal_equations import factorised
-from sigmasplat.graph.pose_graph import PoseGraph, minimise, most_chi2
+from sigmasplat.graph.pose_graph import PoseGraph, factorised, minimise, most_chi2
 from sigmasplat.tracking.drift import UNKNOWN
 from sigmasplat.tracking.pose_validation import confirmed
 from sigmasplat.types import Matrix

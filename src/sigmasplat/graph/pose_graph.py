@@ -11,13 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csc_array
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse.linalg import LinearOperator, SuperLU, cg, splu
 from scipy.special import gammaincinv
 
 from sigmasplat.data import se3
 from sigmasplat.data.relative_pose import RelativePose
 from sigmasplat.errors import SigmaSplatError
-from sigmasplat.graph.normal_equations import Solver, factorised
 from sigmasplat.types import Matrix
 
 PRUNE_WEIGHT = 0.25
@@ -77,14 +76,11 @@ def optimise(
     rejected [E]: loops that an earlier solution has rejected; by default none. They are judged again, but do not
     prolong the solution: it starts as if they were not there.
 
-    Raises SigmaSplatError on poses or edges that are not rigid, edges to nodes that do not exist, information that is
-    not symmetric positive definite, and nodes without a chain of odometry edges to a fixed node: if their loops are
-    rejected, their poses are undetermined.
+    Each node must be connected to a fixed one by trusted edges: if its loops are rejected, nothing else determines its
+    pose. Raises SigmaSplatError on edges that are not rigid, or whose information is not symmetric positive definite.
     """
-    if not 0.0 < confidence <= 1.0:
-        raise SigmaSplatError(f"pose graph: confidence is {confidence}; give a probability above 0 and at most 1")
     poses = np.array(T_world_node, np.float64)
-    _refuse_bad_input(poses, edges, fixed)
+    _refuse_bad_input(edges)
     if not edges:
         return PoseGraphSolution(poses, (), 0, 0.0, 0.0)
     graph = PoseGraph(len(poses), edges, fixed)
@@ -114,6 +110,55 @@ def optimise(
 def most_chi2(confidence: float = 0.99) -> float:
     """Return the χ² of a loop, with 6 degrees of freedom, above which it is rejected."""
     return 2.0 * float(gammaincinv(3.0, confidence))
+
+
+ENOUGH = 1e-8
+"""Residual of an iterative solution relative to the right-hand side."""
+MOST_BY_BLOCKS, MOST_BY_FACTORS = 200, 30
+"""Maximum number of iterations with each preconditioner."""
+
+
+def factorised(H: csc_array) -> SuperLU:
+    """Factorise a symmetric positive definite matrix."""
+    return splu(H, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+
+
+@dataclass(eq=False)
+class Solver:
+    """Solves H δ = g for matrices H of one graph, which change little from one step to the next.
+
+    A large H is solved by conjugate gradients. The first preconditioner is the inverse of its diagonal blocks. It is
+    enough if many loops connect all parts of the graph: then a factorisation is nearly dense and takes minutes. It is
+    not enough for long chains. Their factorisation is cheap: it is the preconditioner from then on, and is made again
+    when H has changed too much.
+    """
+
+    large: bool
+    factors: SuperLU | None = None
+
+    def solve(self, H: csc_array, g: Matrix) -> Matrix:
+        """Return δ."""
+        if self.large:
+            inverse, most = (self.factors or _Blocks(H)).solve, MOST_BY_FACTORS if self.factors else MOST_BY_BLOCKS
+            nearly = LinearOperator(H.shape, matvec=inverse, dtype=g.dtype)
+            delta, failed = cg(H, g, rtol=ENOUGH, atol=0.0, maxiter=most, M=nearly)
+            if not failed:
+                return np.asarray(delta)
+        self.factors = factorised(H)
+        return np.asarray(self.factors.solve(g))
+
+
+class _Blocks:
+    """The inverse of the diagonal 6×6 blocks of a matrix."""
+
+    def __init__(self, H: csc_array) -> None:
+        blocks = H.tobsr((6, 6))
+        on_diagonal = blocks.indices == np.repeat(np.arange(len(blocks.indptr) - 1), np.diff(blocks.indptr))
+        self.inverse = np.linalg.inv(blocks.data[on_diagonal])
+
+    def solve(self, g: Matrix) -> Matrix:
+        """Return the product with g [6 N]."""
+        return np.asarray(np.einsum("nij,nj->ni", self.inverse, g.reshape(-1, 6))).ravel()
 
 
 class PoseGraph:
@@ -244,54 +289,19 @@ class Sensitivity:
         return np.asarray((G @ np.linalg.inv(self.graph.information) @ np.swapaxes(G, 1, 2)).sum(0))
 
 
-def _refuse_bad_input(poses: Matrix, edges: Sequence[RelativePose], fixed: int) -> None:
-    """Raise SigmaSplatError if the input is invalid; its message names the node or the edge."""
-    if poses.ndim != 3 or poses.shape[1:] != (4, 4) or not len(poses):
-        raise SigmaSplatError(
-            f"pose graph: poses have shape {list(poses.shape)}; give [N, 4, 4] with at least one node"
-        )
-    for node in np.flatnonzero(~se3.are_rigid(poses)):
-        raise SigmaSplatError(f"pose graph: the pose of node {node} is not a rigid motion; orthonormalise it first")
-    for edge in edges:
-        if edge.a == edge.b or not (0 <= edge.a < len(poses) and 0 <= edge.b < len(poses)):
-            raise SigmaSplatError(
-                f"{_name(edge)} does not connect two of the {len(poses)} nodes; they are numbered from 0"
-            )
-    if edges:
-        _refuse_bad_measurements(edges)
-    trusted = [(edge.a, edge.b) for edge in edges if not edge.loop] + [(0, node) for node in range(1, fixed)]
-    a, b = np.array(trusted, np.intp).reshape(-1, 2).T
-    _, part = connected_components(coo_array((np.ones(len(a)), (a, b)), shape=(len(poses),) * 2), directed=False)
-    loose = np.flatnonzero(part != part[0])
-    if len(loose):
-        raise SigmaSplatError(
-            f"pose graph: no chain of odometry edges connects node {loose[0]} to node 0; add its edge"
-        )
-
-
-def _refuse_bad_measurements(edges: Sequence[RelativePose]) -> None:
-    for i in np.flatnonzero(~se3.are_rigid(_stacked([edge.T_a_b for edge in edges], 4))).tolist():
-        raise SigmaSplatError(f"{_name(edges[i])} does not have a rigid motion; orthonormalise it first")
-    for i in np.flatnonzero(~_are_positive_definite(_stacked([edge.information for edge in edges], 6))).tolist():
-        raise SigmaSplatError(
-            f"{_name(edges[i])} has an information matrix that is not 6×6 symmetric positive definite"
-        )
-
-
-def _name(edge: RelativePose) -> str:
-    return f"pose graph: edge {edge.a} → {edge.b}"
-
-
-def _stacked(matrices: Sequence[Matrix], size: int) -> Matrix:
-    """Return matrices [N, size, size]; NaN in place of those of another shape."""
-    missing = np.full((size, size), np.nan)
-    return np.stack([matrix if matrix.shape == (size, size) else missing for matrix in matrices])
-
-
-def _are_positive_definite(information: Matrix) -> NDArray[np.bool_]:
-    """Return which matrices [N, 6, 6] are finite, symmetric and positive definite, up to rounding."""
-    good = np.asarray(np.isfinite(information).all((1, 2)))
+def _refuse_bad_input(edges: Sequence[RelativePose]) -> None:
+    """Raise SigmaSplatError if a motion is not rigid or its information not symmetric positive definite, up to
+    rounding: both would spread to all poses."""
+    if not edges:
+        return
+    information = np.stack([edge.information for edge in edges])
+    good = np.isfinite(information).all((1, 2)) & se3.are_rigid(np.stack([edge.T_a_b for edge in edges]))
     known = np.where(good[:, None, None], information, np.eye(6))
     good &= np.abs(known - np.swapaxes(known, 1, 2)).max((1, 2)) <= 1e-9 * np.abs(known).max((1, 2))
     eigenvalues = np.linalg.eigvalsh(known)
-    return np.asarray(good & (eigenvalues[:, 0] > np.finfo(np.float64).eps * eigenvalues[:, -1]))
+    good &= eigenvalues[:, 0] > np.finfo(np.float64).eps * eigenvalues[:, -1]
+    for i in np.flatnonzero(~good).tolist():
+        raise SigmaSplatError(
+            f"pose graph: edge {edges[i].a} → {edges[i].b} is not a rigid motion with symmetric positive definite "
+            "information"
+        )
