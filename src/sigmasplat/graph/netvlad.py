@@ -10,7 +10,6 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
-from safetensors.torch import load_file, save_file
 from scipy.io import loadmat
 from torch import Tensor
 
@@ -27,10 +26,7 @@ VLAD_LAYER, WHITEN_LAYER = 30, 33
 IMAGENET_MEAN, IMAGENET_STD = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
 CAFFE_MEAN, CAFFE_STD = torch.tensor([123.68, 116.779, 103.939]) / 255.0, torch.full((3,), 1.0 / 255.0)
 """The input of OpenIBL: RGB in 0…255 minus the mean, as in the original network."""
-FORMATS = (
-    "a pytorch-NetVlad checkpoint, OpenIBL's vgg16_netvlad.pth, hloc's VGG16-NetVLAD-Pitts30K.mat or a file "
-    "NetVladWeights.save wrote"
-)
+FORMATS = "a pytorch-NetVlad checkpoint, OpenIBL's vgg16_netvlad.pth or hloc's VGG16-NetVLAD-Pitts30K.mat"
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +49,7 @@ class NetVladWeights:
 
     @staticmethod
     def load(path: Path | str) -> "NetVladWeights":
-        """Read a weights file of any of the four formats, which are recognised by content.
+        """Read a weights file of any of the three formats, which are recognised by content.
 
         Raises ConfigError naming the file, and the tensor with its actual and expected shape, if a tensor does not fit.
         """
@@ -70,17 +66,6 @@ class NetVladWeights:
             reason = " ".join(f"{type(problem).__name__}: {problem}".split())[:200]
             raise ConfigError(f"{path}: unreadable as NetVLAD weights ({reason}); give {FORMATS}") from problem
         return file.weights()
-
-    def save(self, path: Path | str) -> None:
-        """Write as safetensors, which loads faster than the other formats and runs no code."""
-        tensors = {"vlad.assign.weight": self.assign, "vlad.assign.bias": self.assign_bias}
-        tensors |= {"vlad.centroids": self.centroids, "input.mean": self.mean, "input.std": self.std}
-        tensors["input.scale"] = torch.tensor([self.scale])
-        for name, (weight, bias) in zip(CONVOLUTIONS, self.convolutions, strict=True):
-            tensors |= {f"vgg.{name}.weight": weight, f"vgg.{name}.bias": bias}
-        if self.whitening:
-            tensors |= {"whiten.weight": self.whitening[0], "whiten.bias": self.whitening[1]}
-        save_file({name: tensor.contiguous() for name, tensor in tensors.items()}, path)
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,10 +167,6 @@ class _TensorFile:
         return NetVladWeights(chain, assign, bias, centroids, whitening, scale, mean, std)
 
 
-def _read_safetensors(path: Path) -> _TensorFile:
-    return _TensorFile(path, load_file(path), {})
-
-
 def _read_checkpoint(path: Path) -> _TensorFile:
     """Read a state_dict of pytorch-NetVlad or OpenIBL, either wrapped or not.
 
@@ -266,8 +247,6 @@ def _reader(path: Path) -> Callable[[Path], _TensorFile]:
         raise ConfigError(f"cannot read NetVLAD weights {path}: {problem.strerror}; give {FORMATS}") from problem
     if head.startswith(b"MATLAB"):
         return _read_matlab
-    if head[5:9] == b"\0\0\0{":  # JSON follows its length, which may start with any byte, even that of a pickle
-        return _read_safetensors
     if head.startswith((b"PK", b"\x80")):
         return _read_checkpoint
-    raise ConfigError(f"{path}: neither PyTorch, Matlab nor safetensors (found {head[:8]!r}); give {FORMATS}")
+    raise ConfigError(f"{path}: neither PyTorch nor Matlab (found {head[:8]!r}); give {FORMATS}")
