@@ -1,7 +1,6 @@
 """Tell two motions apart: where a frame agrees better with a keyframe at one pose of the camera, where at another."""
 
-from dataclasses import dataclass
-from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,60 +33,25 @@ pose follows the moving thing instead. That thing's squared differences can outw
 covers a smaller part of the image."""
 
 
-@dataclass(frozen=True, eq=False)
-class TwoMotions:
+class TwoMotions(NamedTuple):
     """How the gray values of a frame agree with a keyframe at two poses.
 
-    first, second: squared differences [h, w] of the points of the keyframe at each pose; seen: the points that are seen
-    at both; inside: those of them that the thing shows at the first pose.
+    rest_gains: the squared differences outside of the thing at the first pose, relative to the second; thing_loses:
+    those of the parts of the thing that agree better at the first pose, at the second pose relative to the first;
+    moves: the share of these parts in the compared points; follows: the share of the points outside of the thing that
+    agree better at the second pose.
     """
 
-    first: Image
-    second: Image
-    seen: Mask
-    inside: Mask
-
-    @cached_property
-    def rest_gains(self) -> float:
-        """Return the squared differences outside of the thing at the first pose, relative to the second."""
-        return _ratio(self.first[self._rest], self.second[self._rest])
-
-    @cached_property
-    def thing_loses(self) -> float:
-        """Return the squared differences of the parts of the thing that agree better at the first pose, at the second
-        pose relative to the first."""
-        return _ratio(self.second[self._moving], self.first[self._moving])
-
-    @property
-    def moves(self) -> float:
-        """Return the share of these parts in the compared points."""
-        return np.count_nonzero(self._moving) / self.seen.size
-
-    @property
-    def follows(self) -> float:
-        """Return the share of the points outside of the thing that agree better at the second pose."""
-        at_first, at_second = self._voted
-        return float((at_second < at_first)[self._rest].mean()) if self._rest.any() else 0.0
+    rest_gains: float
+    thing_loses: float
+    moves: float
+    follows: float
 
     @property
     def apart(self) -> bool:
         """Return whether thing and rest move differently: each agrees clearly better at a pose of its own."""
-        if self.rest_gains < REST_GAINS or self.thing_loses < THING_LOSES:
-            return False
-        return self.moves >= LEAST_MOVES and self.follows >= MOST_OF_REST
-
-    @cached_property
-    def _rest(self) -> Mask:
-        return self.seen & ~self.inside
-
-    @cached_property
-    def _moving(self) -> Mask:
-        at_first, at_second = self._voted
-        return self.inside & (at_first < at_second)
-
-    @cached_property
-    def _voted(self) -> tuple[Image, Image]:
-        return _voted(self.first, self.seen), _voted(self.second, self.seen)
+        gains = self.rest_gains >= REST_GAINS and self.thing_loses >= THING_LOSES
+        return gains and self.moves >= LEAST_MOVES and self.follows >= MOST_OF_REST
 
 
 def two_motions(
@@ -95,41 +59,34 @@ def two_motions(
 ) -> TwoMotions | None:
     """Compare a frame with a keyframe at two poses T_camera_world [4, 4], in and outside of a thing [H, W]; None if too
     little is in view at both."""
-    points_m = _points(keyframe.pyramid)
-    first, second = (
-        _differences(keyframe.pyramid, points_m, live, T @ se3.inverse(keyframe.T_camera_world))
-        for T in (T_first, T_second)
+    p = keyframe.pyramid
+    level = min(LEVEL, len(p.cameras) - 1)
+    points_m = (
+        np.moveaxis(coarse_rays(p.cameras[level], STEP), -1, 0) * p.kernels.to_host(p.depth[level])[::STEP, ::STEP]
     )
-    seen = np.isfinite(first.square) & np.isfinite(second.square)
+    (first, row, column), (second, _, _) = (
+        _differences(p, level, points_m, live, T @ se3.inverse(keyframe.T_camera_world)) for T in (T_first, T_second)
+    )
+    seen = np.isfinite(first) & np.isfinite(second)
     if np.count_nonzero(seen) < FEWEST:
         return None
-    return TwoMotions(first.square, second.square, seen, seen & thing[first.row, first.column])
+    inside = seen & thing[row, column]
+    rest, at_first, at_second = seen & ~inside, _voted(first, seen), _voted(second, seen)
+    moving = inside & (at_first < at_second)
+    return TwoMotions(
+        rest_gains=_ratio(first[rest], second[rest]),
+        thing_loses=_ratio(second[moving], first[moving]),
+        moves=np.count_nonzero(moving) / seen.size,
+        follows=float((at_second < at_first)[rest].mean()) if rest.any() else 0.0,
+    )
 
 
-@dataclass(frozen=True, eq=False)
-class _Differences:
-    """square: squared gray differences of the points of a keyframe [h, w], NaN where they are not seen; row, column:
-    where they are in the frame, in pixels of its finest level."""
-
-    square: Image
-    row: NDArray[np.intp]
-    column: NDArray[np.intp]
-
-
-def _points(reference: Pyramid) -> Matrix:
-    """Return the compared points of a reference [3, h, w], m in its camera."""
-    level = _level(reference)
-    depth_m = reference.kernels.to_host(reference.depth[level])[::STEP, ::STEP]
-    return np.moveaxis(coarse_rays(reference.cameras[level], STEP), -1, 0) * depth_m
-
-
-def _level(reference: Pyramid) -> int:
-    return min(LEVEL, len(reference.cameras) - 1)
-
-
-def _differences(p: Pyramid, points_m: Matrix, live: Pyramid, T: Matrix) -> _Differences:
-    """Compare the points of a reference with a live image at T_live_reference [4, 4]."""
-    level, host = _level(p), p.kernels.to_host
+def _differences(
+    p: Pyramid, level: int, points_m: Matrix, live: Pyramid, T: Matrix
+) -> tuple[Image, NDArray[np.intp], NDArray[np.intp]]:
+    """Compare points [3, h, w] (m) of a level of a reference with a live image at T_live_reference [4, 4]. Return the
+    squared gray differences [h, w], NaN where they are not seen; row and column in pixels of the finest level."""
+    host = p.kernels.to_host
     camera, gray = p.cameras[level], host(p.gray[level])[::STEP, ::STEP]
     x, y, ahead = np.tensordot(T[:3, :3], points_m, 1) + T[:3, 3][:, None, None]
     depth = np.maximum(ahead, 1e-3)
@@ -147,7 +104,7 @@ def _differences(p: Pyramid, points_m: Matrix, live: Pyramid, T: Matrix) -> _Dif
     finest = live.cameras[0]
     ends = (finest.width - 1, finest.height - 1)
     column, row = (np.clip(2**level * (a + 0.25), 0, end).astype(np.intp) for a, end in zip(at, ends, strict=True))
-    return _Differences(square, row, column)
+    return square, row, column
 
 
 def _voted(square: Image, seen: Mask) -> Image:
