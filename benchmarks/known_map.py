@@ -57,7 +57,7 @@ class TrueMap:
         assert seen.image is not None
         seen.image.features(self.extractor)
         clock = time.process_time()
-        found = self.relocaliser.find(known, self.view, seen, index_at_most=None)
+        found = self.relocaliser.search(known, self.view, seen, index_at_most=None).found
         searched: dict[str, Any] = {"frame": i, "cpu_ms": round(1e3 * (time.process_time() - clock), 1)}
         if found is None:
             return searched | {"found": False}

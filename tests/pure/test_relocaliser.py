@@ -121,7 +121,8 @@ def off(found: Relocation | None, i: int) -> tuple[float, float]:
 
 def test_a_place_seen_a_round_ago_is_found_in_a_finished_submap(tmp_path: Path) -> None:
     on_disk, in_memory = (
-        relocaliser().find(known(store), view(), seen(AGAIN)) for store in (DiskStore(tmp_path / "s"), MemoryStore())
+        relocaliser().search(known(store), view(), seen(AGAIN)).found
+        for store in (DiskStore(tmp_path / "s"), MemoryStore())
     )
     assert on_disk is not None and in_memory is not None
     assert on_disk.where[0] == 0 and on_disk.inliers >= 15
@@ -137,12 +138,12 @@ def _frame(found: Relocation) -> tuple[int, int]:
 
 @pytest.mark.parametrize(("i", "part"), [(66, 1), (127, 2)], ids=["finished", "active"])
 def test_other_parts_of_the_map_are_found_too(i: int, part: int) -> None:
-    found = relocaliser().find(known(), view(), seen(i))
+    found = relocaliser().search(known(), view(), seen(i)).found
     assert found is not None and found.where[0] == part and off(found, i)[0] < 0.03
 
 
 def test_the_reported_covariance_covers_the_error() -> None:
-    found = relocaliser().find(known(), view(), seen(AGAIN))
+    found = relocaliser().search(known(), view(), seen(AGAIN)).found
     assert found is not None
     twist = se3.log(found.T_submap_camera @ se3.inverse(pose(found.where[0], AGAIN)))
     assert np.linalg.eigvalsh(found.information).min() > 0
@@ -152,18 +153,18 @@ def test_the_reported_covariance_covers_the_error() -> None:
 def test_images_of_another_room_are_not_found() -> None:
     search, map_of_room = relocaliser(), known()
     for i in (0, 10, 40, 60, 90, 150):
-        assert search.find(map_of_room, view(), seen(i, mirrored=True)) is None, i
-    assert search.find(map_of_room, view(), seen(150)) is not None, "the room itself is found"
+        assert search.search(map_of_room, view(), seen(i, mirrored=True)).found is None, i
+    assert search.search(map_of_room, view(), seen(150)).found is not None, "the room itself is found"
 
 
 def test_only_wanted_submaps_are_searched() -> None:
     search = relocaliser()
-    found = search.find(known(wanted=lambda submap: submap != 0), view(), seen(AGAIN))
+    found = search.search(known(wanted=lambda submap: submap != 0), view(), seen(AGAIN)).found
     assert found is None or found.where[0] != 0
     assert {submap for submap, _ in search.indexed} == {1, 2}
-    found = search.find(known(), view(), seen(AGAIN))
+    found = search.search(known(), view(), seen(AGAIN)).found
     assert found is not None and found.where[0] == 0
-    found = search.find(known(wanted=lambda submap: submap != 0), view(), seen(AGAIN))
+    found = search.search(known(wanted=lambda submap: submap != 0), view(), seen(AGAIN)).found
     assert found is None or found.where[0] != 0, "also keyframes that were searched before"
 
 
@@ -171,11 +172,11 @@ def test_few_keyframes_are_added_per_call_the_newest_first() -> None:
     search, map_of_room = relocaliser(), known()
     added = []
     for _ in range(4):
-        found = search.find(map_of_room, view(), seen(AGAIN), index_at_most=2)
+        found = search.search(map_of_room, view(), seen(AGAIN), index_at_most=2).found
         added.append(len(search.indexed))
         assert found is None or found.where in search.indexed
     assert search.indexed == NEWEST_FIRST and added == [2, 4, 6, 7]
-    at_once = relocaliser().find(map_of_room, view(), seen(AGAIN), index_at_most=None)
+    at_once = relocaliser().search(map_of_room, view(), seen(AGAIN), index_at_most=None).found
     assert found is not None and at_once is not None and found.where == at_once.where
     assert np.array_equal(found.T_submap_camera, at_once.T_submap_camera)
 
@@ -183,9 +184,9 @@ def test_few_keyframes_are_added_per_call_the_newest_first() -> None:
 def test_a_resumed_search_knows_the_same_keyframes_and_finds_the_same_pose() -> None:
     search, map_of_room = relocaliser(), known()
     for _ in range(3):
-        search.find(map_of_room, view(), seen(AGAIN), index_at_most=2)
+        search.search(map_of_room, view(), seen(AGAIN), index_at_most=2)
     resumed = Relocaliser(CONFIG, extractor(), list(search.indexed))
-    one, other = (s.find(map_of_room, view(), seen(AGAIN), index_at_most=0) for s in (search, resumed))
+    one, other = (s.search(map_of_room, view(), seen(AGAIN), index_at_most=0).found for s in (search, resumed))
     assert search.indexed == resumed.indexed == NEWEST_FIRST[:6]
     assert one is not None and other is not None and one.where == other.where
     assert np.array_equal(one.T_submap_camera, other.T_submap_camera)
@@ -193,7 +194,7 @@ def test_a_resumed_search_knows_the_same_keyframes_and_finds_the_same_pose() -> 
 
 def test_an_empty_map_is_searched_in_vain() -> None:
     nothing = KnownMap(MemoryStore(), [[]], [], GaussianField.empty())
-    assert relocaliser().find(nothing, view(), seen(AGAIN)) is None
+    assert relocaliser().search(nothing, view(), seen(AGAIN)).found is None
 
 
 # ---- the image in which features are found

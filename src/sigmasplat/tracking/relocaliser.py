@@ -145,19 +145,13 @@ class Relocaliser:
     _strongest: dict[KeyframeId, Features] = field(default_factory=dict, init=False)
     _landmarks: "OrderedDict[KeyframeId, Landmarks]" = field(default_factory=OrderedDict, init=False)
 
-    def find(
-        self, known: KnownMap, view: View, seen: PreparedFrame, index_at_most: int | None = INDEX_AT_MOST
-    ) -> Relocation | None:
-        """Return where the camera is, or None if no keyframe leads to a pose that the map confirms.
-
-        index_at_most: number of keyframes that may be added to the search; None = all.
-        """
-        return self.search(known, view, seen, index_at_most).found
-
     def search(
         self, known: KnownMap, view: View, seen: PreparedFrame, index_at_most: int | None = INDEX_AT_MOST
     ) -> SearchResult:
-        """Search as `find` does, and also return what was refused."""
+        """Return where the camera is, if a keyframe leads to a pose that the map confirms, and what was refused.
+
+        index_at_most: number of keyframes that may be added to the search; None = all.
+        """
         return completed(self.searching(known, view, seen, index_at_most))
 
     def searching(
