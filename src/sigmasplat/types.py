@@ -5,7 +5,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import islice
-from typing import TypeVar
+from typing import ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ ShouldStop = Callable[[], bool]
 """Asked again and again during long work."""
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+Arguments = ParamSpec("Arguments")
 Task = Generator[None, None, Result]
 """A long task in slices: it yields after each slice, and returns its result after the last one."""
 
@@ -36,6 +37,11 @@ def completed(slices: Task[Result]) -> Result:
         except StopIteration as end:
             result: Result = end.value
             return result
+
+
+def at_once(task: Callable[Arguments, Task[Result]]) -> Callable[Arguments, Result]:
+    """Return the function that runs a task from its first slice to its last."""
+    return lambda *args, **options: completed(task(*args, **options))
 
 
 def no_progress(done: int, total: int) -> None:

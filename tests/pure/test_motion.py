@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from paper_settings import TrackingConfig
 from sigmasplat.data import se3
-from sigmasplat.fit.descent import AxisAngle, Parametrisation, QuaternionMotion, parametrisation
+from sigmasplat.fit.descent import AxisAngle, QuaternionMotion, parametrisation
 
 Array = NDArray[np.float64]
 AXES = np.array([[0.6, -0.48, 0.64], [1.0, 0.0, 0.0], [0.0, 0.6, -0.8]])
@@ -39,7 +39,7 @@ def differences(f: Callable[[Array], float], at: Array, step: float = 1e-3) -> A
     return np.array(slopes)
 
 
-def assert_gradient(way: Parametrisation, numbers: Array) -> None:
+def assert_gradient(way: AxisAngle | QuaternionMotion, numbers: Array) -> None:
     T = way.pose(numbers)
     twist = differences(lambda xi: value(se3.exp(xi) @ T), np.zeros(6))
     expected = differences(lambda x: value(way.pose(x)), numbers)

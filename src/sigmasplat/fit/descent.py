@@ -5,7 +5,7 @@ A pose has parameters that can be changed by addition; the gradient of a twist i
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,44 +24,29 @@ from sigmasplat.types import Matrix
 Vector = NDArray[np.float64]
 
 
-class Parametrisation(Protocol):
-    """A parametrisation of T_camera_world [4, 4] by a vector: first `rotations` numbers for the rotation, last three
-    for the translation."""
-
-    rotations: int
-
-    @property
-    def start(self) -> Vector:
-        """Return the parameters of the initial guess."""
-
-    def pose(self, numbers: Vector) -> Matrix:
-        """Return T_camera_world of some parameters."""
-
-    def gradient(self, numbers: Vector, twist: Vector) -> Vector:
-        """Convert the gradient [6] with respect to the left twist (ρ, φ) of T_camera_world to the gradient with respect
-        to the parameters."""
-
-
 @dataclass(frozen=True, eq=False)
 class QuaternionMotion:
     """(w, x, y, z, tx, ty, tz) of the motion relative to an initial guess; the quaternion may have any norm (VarSplat's
-    code)."""
+    code). Like `AxisAngle`: `rotations` numbers for the rotation come first, those of the translation last."""
 
     guess: Matrix
     rotations = 4
 
     @property
     def start(self) -> Vector:
+        """Return the parameters of the initial guess T_camera_world [4, 4]."""
         return np.array([1.0, 0, 0, 0, 0, 0, 0])
 
     def pose(self, numbers: Vector) -> Matrix:
+        """Return T_camera_world of some parameters."""
         motion = np.eye(4)
         motion[:3, :3] = se3.rotation_from_quaternion(numbers[:4])
         motion[:3, 3] = numbers[4:]
         return motion @ self.guess
 
     def gradient(self, numbers: Vector, twist: Vector) -> Vector:
-        """Return the gradient with respect to the parameters.
+        """Convert the gradient [6] with respect to the left twist (ρ, φ) of T_camera_world to that with respect to the
+        parameters.
 
         The motion's rotation turns the pose about the motion's translation t, so its gradient is g = g_φ − t × g_ρ.
         With respect to a quaternion q the gradient is 2 (0, g) ⊗ q / |q|².
@@ -104,7 +89,7 @@ class AxisAngle:
         return -np.concatenate([turned[:3, 3], turned[:3, :3] @ twist[:3]])
 
 
-def parametrisation(config: TrackingConfig, guess: Matrix) -> Parametrisation:
+def parametrisation(config: TrackingConfig, guess: Matrix) -> QuaternionMotion | AxisAngle:
     """Return the parametrisation that the settings choose, for an initial guess of T_camera_world."""
     return AxisAngle(guess) if config.parametrisation == "axis-angle" else QuaternionMotion(guess)
 

@@ -18,7 +18,7 @@ from sigmasplat.fit.backends import fits_of, step_for
 from sigmasplat.fit.interface import Twist
 from sigmasplat.fit.target import Keyframe
 from sigmasplat.render.view import View
-from sigmasplat.types import Matrix, Stopwatch, Task, completed
+from sigmasplat.types import Matrix, Stopwatch, Task, at_once
 
 
 @dataclass(eq=False)
@@ -82,7 +82,7 @@ def loss_weights(config: MappingConfig) -> dict[str, float]:
     return weights | own
 
 
-def fit_field(
+def fitting(
     field: GaussianField,
     view: View,
     batches: Iterable[Sequence[Keyframe]],
@@ -91,8 +91,9 @@ def fit_field(
     frozen_colors: int = 0,
     degree: int = 0,
     stats: DensifyStats | None = None,
-) -> FieldFit:
+) -> Task[FieldFit]:
     """Take one Adam step on the field for each batch of keyframes, in the given order, with the mean loss of the batch.
+    A slice is one step.
 
     schedule: the learning rates of each step, by default those of the settings. frozen_colors: the first splats that
     keep their colours. degree: degree of view-dependent colour; 0 = none. stats: receives the gradient with respect to
@@ -106,20 +107,6 @@ def fit_field(
     Raises BackendError if the field is not on the view's device; ConfigError if colour covariances or view-dependent
     colours are to be fitted to several keyframes at once.
     """
-    return completed(fitting(field, view, batches, config, schedule, frozen_colors, degree, stats))
-
-
-def fitting(
-    field: GaussianField,
-    view: View,
-    batches: Iterable[Sequence[Keyframe]],
-    config: MappingConfig,
-    schedule: Iterable[Rates] | None = None,
-    frozen_colors: int = 0,
-    degree: int = 0,
-    stats: DensifyStats | None = None,
-) -> Task[FieldFit]:
-    """Fit as `fit_field` does, in slices of one step."""
     if field.params.device != view.sums.device:
         where = f"the field is on {field.params.device}, the view on {view.sums.device}"
         raise BackendError(f"{where}; bring the field to the view's device with GaussianField.to")
@@ -137,6 +124,10 @@ def fitting(
     for name, attribute in field.attributes.items():
         settle(attribute, rates.of_attribute(name))
     return fit
+
+
+fit_field = at_once(fitting)
+"""Fit as `fitting` does, in one go."""
 
 
 class _Steps:
