@@ -135,9 +135,9 @@ def dynamic_mask(
     if np.count_nonzero(free | again) < LEAST_REGION * depth.size:
         return None
     inside = smooth(depth)
-    moved = _regions(inside & ~same, free, again)
+    moved = _regions(inside & ~same, free, again, whole_objects=False)
     if whole_objects:
-        moved |= _objects(inside, free, again)
+        moved |= _regions(inside, free, again, whole_objects=True)
     if not moved.any():
         return None
     whole, hidden = enlarged(moved, step, live_m, whole_objects)
@@ -191,22 +191,15 @@ def _holes_in(mask: Mask, thing: Mask | None, depth_m: Depth) -> Mask:
     return np.take(own, holes) if own.any() else np.zeros_like(mask)
 
 
-def _objects(inside: Mask, free: Mask, again: Mask) -> Mask:
-    """Return the whole regions of which a small part is in places that were free, or the larger part is where something
-    was before."""
+def _regions(inside: Mask, free: Mask, again: Mask, whole_objects: bool) -> Mask:
+    """Return the connected regions of pixels that are in places which were free, or where something was before; with
+    whole_objects, of which a small part is, or of which the larger part is where something was before."""
     regions, count = labelled(inside)
     sizes, in_free, old = (np.bincount(regions[chosen], minlength=count + 1) for chosen in (regions > 0, free, again))
-    moved = (in_free >= LEAST_REGION * free.size) & (in_free + old >= WHOLE_SHARE * sizes)
-    chosen = moved | ((sizes >= LEAST_REGION * free.size) & (in_free + old >= SAME_THING * sizes))
-    chosen[0] = False
-    return np.asarray(chosen[regions])
-
-
-def _regions(inside: Mask, free: Mask, again: Mask) -> Mask:
-    """Return the connected regions of pixels that are in places which were free, or where something was before."""
-    regions, count = labelled(inside)
-    sizes, in_free, old = (np.bincount(regions[chosen], minlength=count + 1) for chosen in (regions > 0, free, again))
-    chosen = (in_free >= LEAST_REGION * free.size) & (in_free + old >= LEAST_SHARE * sizes)
+    least, share = LEAST_REGION * free.size, WHOLE_SHARE if whole_objects else LEAST_SHARE
+    chosen = (in_free >= least) & (in_free + old >= share * sizes)
+    if whole_objects:
+        chosen |= (sizes >= least) & (in_free + old >= SAME_THING * sizes)
     chosen[0] = False
     return np.asarray(chosen[regions])
 
