@@ -15,11 +15,11 @@ from sigmasplat.data.camera import Camera
 from sigmasplat.data.frame import Frame
 from sigmasplat.fit.target import gray_of
 from sigmasplat.plugins.sources.synthetic import SyntheticRoom
+from sigmasplat.tracking import features as features_module
 from sigmasplat.tracking.features import (
     Extractor,
     Features,
     Landmarks,
-    base,
     depth_readings,
     landmarks_of,
     pose_from_landmarks,
@@ -146,9 +146,9 @@ def test_pixel_centres_are_at_integers(texture: NDArray[np.uint8]) -> None:
 
 def test_features_are_sorted_and_limited(texture: NDArray[np.uint8], monkeypatch: pytest.MonkeyPatch) -> None:
     image = np.ascontiguousarray(texture[:240, :320])
-    monkeypatch.setattr(base, "COUNT", 200)
+    monkeypatch.setattr(features_module, "COUNT", 200)
     many = Extractor().find(image, CAMERA)
-    monkeypatch.setattr(base, "COUNT", 50)
+    monkeypatch.setattr(features_module, "COUNT", 50)
     few = Extractor().find(image, CAMERA)
     assert len(few) <= 50 < len(many) <= 200
     assert many.points.shape == (len(many), 2) and many.sigma_px.shape == (len(many),)
@@ -167,7 +167,7 @@ def test_an_empty_image_has_no_features() -> None:
 
 def test_wide_images_are_reduced(views: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     reference = views[0]
-    monkeypatch.setattr(base, "FEATURE_WIDTH", 320)
+    monkeypatch.setattr(features_module, "FEATURE_WIDTH", 320)
     found = Extractor().find(gray_bytes(reference), reference.camera)
     assert found.camera == reference.camera.resized(320, 240)
     assert found.points[:, 0].max() < 320

@@ -16,8 +16,7 @@ from sigmasplat.data.submap import MemoryStore, Picture, Submap
 from sigmasplat.errors import ConfigError
 from sigmasplat.graph import closer
 from sigmasplat.graph.candidates import SubmapPair
-from sigmasplat.graph.closer import LoopCloser, make_descriptor
-from sigmasplat.graph.neighbourhood import Incidence, Neighbourhood
+from sigmasplat.graph.closer import Incidence, LoopCloser, Neighbourhood, make_descriptor
 from sigmasplat.graph.registration import Registration
 from sigmasplat.tracking.descriptors import OrientationGrid
 from sigmasplat.types import Task, completed

@@ -17,7 +17,7 @@ from sigmasplat.data import se3
 from sigmasplat.data.relative_pose import Kind, RelativePose
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.graph import pose_graph
-from sigmasplat.graph.neighbourhood import Incidence, Neighbourhood
+from sigmasplat.graph.closer import Incidence, Neighbourhood
 from sigmasplat.graph.pose_graph import LoopVerdict, PoseGraph, optimise
 
 Array = NDArray[np.float64]

@@ -14,7 +14,7 @@ function: it is the pose graph's solution.
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cache, cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -29,9 +29,10 @@ from sigmasplat.data.atlas import Atlas, between_keyframes
 from sigmasplat.data.poses import Places
 from sigmasplat.data.relative_pose import Edges, Hops, RelativePose, SolvedGraph
 from sigmasplat.graph import graph_errors
+from sigmasplat.graph.closer import LoopCloser
 from sigmasplat.graph.graph_errors import GraphErrors, Part, root
 from sigmasplat.graph.pose_graph import Sensitivity
-from sigmasplat.tracking.drift import UNKNOWN
+from sigmasplat.tracking.drift import UNKNOWN, hop_errors
 from sigmasplat.types import Matrix
 
 Numbers = NDArray[np.int64]
@@ -233,7 +234,7 @@ class PathCovariance:
         `_shared`."""
         count = len(self.keyframe_submap)
         error = np.zeros((6, count + len(self.edges) + len(self._shared), 6))
-        graph = self._graphs[int(self.components[submap])]
+        graph = self._graph(int(self.components[submap]))
         if graph.sensitivity is None:
             return error
         A = se3.adjoint(self.anchors[graph.submaps[0]])
@@ -285,10 +286,7 @@ class PathCovariance:
         mean[:, 0] = self._disagreement[0]
         return A * self.hops.bias[:, None], A @ mean
 
-    @cached_property
-    def _graphs(self) -> dict[int, Part]:
-        return {int(component): self._graph(int(component)) for component in np.unique(self.components)}
-
+    @cache  # noqa: B019
     def _graph(self, component: int) -> Part:
         submaps = np.flatnonzero(self.components == component).tolist()
         node = {submap: i for i, submap in enumerate(submaps)}
@@ -301,3 +299,50 @@ class PathCovariance:
         """Return whether an edge leads to the last keyframe of its submap: then its error is that of the hops."""
         last = self._rows_of_hops(edge.a).stop - 1
         return not edge.loop and np.array_equal(edge.T_a_b, self.T_submap_keyframe[last])
+
+
+# ---- the newest pose, while frames arrive ----
+
+FIRST_HOP = hop_errors()
+"""Covariance of a frame's motion from its keyframe before any motion between keyframes was measured, m² and rad²."""
+
+
+@dataclass(frozen=True, eq=False)
+class PoseErrors:
+    """What the covariance of a new pose needs: of_keyframe [6, 6] of the newest keyframe's pose in the world, and hop
+    [6, 6] of a frame's motion from a keyframe, both of left twists."""
+
+    of_keyframe: Matrix
+    hop: Matrix
+
+    def of(self, T_world_camera: Matrix, hops: int) -> Matrix:
+        """Return the covariance [6, 6] of position and rotation in the axes of the world, m² and rad², of a pose that
+        is so many independent motions away from the keyframe."""
+        A, J = se3.adjoint(T_world_camera), se3.displacement(T_world_camera)
+        return np.asarray(J @ (self.of_keyframe + hops * (A @ self.hop @ A.T)) @ J.T)
+
+
+NO_ERRORS = PoseErrors(np.zeros((6, 6)), FIRST_HOP)
+"""At the first frame."""
+
+
+@dataclass(eq=False)
+class NewestCovariance:
+    """Computes the errors of new poses. Those of the keyframes are computed again only after a keyframe."""
+
+    _state: bytes = b""
+    _errors: PoseErrors = NO_ERRORS
+
+    def errors(self, atlas: Atlas, closer: LoopCloser) -> PoseErrors:
+        """Return the errors for poses relative to the newest keyframe."""
+        submap, keyframe = len(atlas.keyframe_poses) - 1, len(atlas.keyframe_poses.last) - 1
+        counts = np.array([submap, keyframe, atlas.keyframe_poses.total, *atlas.components])
+        state = counts.tobytes() + (atlas.anchors[-1] @ atlas.keyframe_poses.last[-1]).tobytes()
+        if state != self._state:
+            path = PathCovariance.of_keyframes(atlas, closer.valid)
+            known = (hop.total_covariance for hop in reversed(atlas.hops))
+            # a frame is tracked from its keyframe in the same way as the newest keyframe that has a covariance
+            hop = next((covariance for covariance in known if covariance is not None), FIRST_HOP)
+            self._errors = PoseErrors(path.of_keyframe(submap, keyframe), hop)
+            self._state = state
+        return self._errors

@@ -13,7 +13,7 @@ from sigmasplat.data.trajectory import APART, RELOCALISED
 from sigmasplat.fit.align import Alignment
 from sigmasplat.fit.pose import fit_pose_align
 from sigmasplat.graph.loops import Loops
-from sigmasplat.graph.newest_covariance import NO_ERRORS
+from sigmasplat.graph.path_covariance import NO_ERRORS
 from sigmasplat.realtime.front_end import Offer, Search, Snapshot, TrackedFrame
 from sigmasplat.slam.mapping_backend import SLICES_PER_FRAME
 from sigmasplat.slam.results import StepTimer

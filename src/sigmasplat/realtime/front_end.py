@@ -22,7 +22,7 @@ from sigmasplat.fit.references import Reference
 from sigmasplat.fit.target import Target
 from sigmasplat.graph.confidence import Confidence
 from sigmasplat.graph.loops import Loop, Loops
-from sigmasplat.graph.newest_covariance import NO_ERRORS, PoseErrors
+from sigmasplat.graph.path_covariance import NO_ERRORS, PoseErrors
 from sigmasplat.mapping.window import ValidationViews
 from sigmasplat.render.view import View
 from sigmasplat.slam.results import Step, StepTimer, SubmapState, make_step

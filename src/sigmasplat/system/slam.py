@@ -22,8 +22,7 @@ from sigmasplat.errors import SourceError
 from sigmasplat.final.final_map import final_map, reaching
 from sigmasplat.final.stores import RefinedStore, StorePart, solved_keyframes
 from sigmasplat.final.uncertainty import final_uncertainty
-from sigmasplat.graph.newest_covariance import NewestCovariance, PoseErrors
-from sigmasplat.graph.path_covariance import PathCovariance, recorded
+from sigmasplat.graph.path_covariance import NewestCovariance, PathCovariance, PoseErrors, recorded
 from sigmasplat.render.render import as_refined
 from sigmasplat.slam.main_loop import MainLoop
 from sigmasplat.slam.results import Step

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sigmasplat.data import se3
 from sigmasplat.env import opencv
 from sigmasplat.tracking.feature_image import FeatureImage
-from sigmasplat.tracking.features import Extractor, Features
+from sigmasplat.tracking.features import Extractor, Features, nearest_pixels
 from sigmasplat.types import Matrix
 
 TERMS = 5
@@ -149,14 +149,8 @@ def _polynomials(u: Matrix, v: Matrix) -> Matrix:
 
 def depth_at(image: FeatureImage, extractor: Extractor) -> Matrix:
     """Return the predicted depth at each feature [N], of the nearest pixel; 0 = none."""
-    features, camera = image.features(extractor), image.camera
-    c = features.camera
-    u, v = features.points.T.astype(np.float64)
-    column = np.rint((u - c.cx) / c.fx * camera.fx + camera.cx).astype(np.intp)
-    row = np.rint((v - c.cy) / c.fy * camera.fy + camera.cy).astype(np.intp)
-    inside = (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
-    z = image.depth_m[row.clip(0, camera.height - 1), column.clip(0, camera.width - 1)].astype(np.float64)
-    return np.where(inside, z, 0.0)
+    column, row, inside = nearest_pixels(image.features(extractor), image.camera)
+    return np.where(inside, image.depth_m[row, column].astype(np.float64), 0.0)
 
 
 Floats = NDArray[np.float32]
