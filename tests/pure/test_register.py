@@ -20,10 +20,11 @@ from sigmasplat.data.submap import MemoryStore, Picture, Submap
 from sigmasplat.fit.target import Target
 from sigmasplat.graph import localisations, registration
 from sigmasplat.graph.candidates import Candidate, SubmapPair
-from sigmasplat.graph.localisations import FeatureGuesses, Localisation
+from sigmasplat.graph.localisations import Localisation
 from sigmasplat.graph.registration import Registrar, Registration, drift_between
 from sigmasplat.mapping.seeding import make_splats
 from sigmasplat.render.backend import make_view
+from sigmasplat.render.view import View
 from sigmasplat.tracking import drift
 from sigmasplat.tracking.drift import floor, hop_errors
 from sigmasplat.tracking.features import Extractor, Features
@@ -183,18 +184,18 @@ def test_features_guess_the_pose_and_are_found_once_per_image_in_slices_of_their
     store, counting = MemoryStore(), Counting()
     ours, theirs = piece(store, range(0, 12, 6)), piece(store, range(3, 15, 6))
     truth = walk().truth().T_world_camera
-    guesses = FeatureGuesses(store, cast(Extractor, counting), seed=0)
+    guesses = Registrar(Config(), store, cast(View, None), cast(Extractor, counting)).guesses_by_features
     for k, frame in enumerate(ours.frames):
-        for _ in (slices := guesses.of(ours, k, theirs, (0, 1))):
+        for _ in (slices := guesses(ours, k, theirs, (0, 1))):
             before = counting.images
             next(slices, None)
             assert counting.images <= before + 1, "one image in a slice"
-        for found in completed(guesses.of(ours, k, theirs, (0, 1))):
+        for found in completed(guesses(ours, k, theirs, (0, 1))):
             apart_m, turned_deg = off(found, se3.inverse(truth[frame]) @ truth[theirs.frames[0]])
             assert apart_m < 0.02 and turned_deg < 1.0
-    assert len(completed(guesses.of(ours, 0, theirs, (0, 1)))) == 2
+    assert len(completed(guesses(ours, 0, theirs, (0, 1)))) == 2
     assert counting.images == 4
-    assert completed(FeatureGuesses(store, None, seed=0).of(ours, 0, theirs, (0, 1))) == []
+    assert completed(Registrar(Config(), store, cast(View, None)).guesses_by_features(ours, 0, theirs, (0, 1))) == []
 
 
 def test_submaps_of_different_places_are_refused_and_left_where_they_are() -> None:

@@ -22,9 +22,10 @@ from sigmasplat.fit.references import Reference, keyframe_reference, map_referen
 from sigmasplat.fit.target import Target
 from sigmasplat.fit.tracking_loss import PoseMaps
 from sigmasplat.graph.candidates import SubmapPair
-from sigmasplat.graph.localisations import FeatureGuesses, Localisation, combined, consensus, inverted, mean_covariance
+from sigmasplat.graph.localisations import Localisation, combined, consensus, inverted, mean_covariance
 from sigmasplat.render.view import View
 from sigmasplat.tracking.drift import drift_to, symmetric, systematic_errors
+from sigmasplat.tracking.feature_image import FeatureImage, pose_by_features
 from sigmasplat.tracking.features import Extractor
 from sigmasplat.tracking.pose_validation import confirmed
 from sigmasplat.types import Matrix, Task, long_slice
@@ -65,8 +66,8 @@ class Registrar:
 
     def __init__(self, config: Config, store: SubmapStore, view: View, extractor: Extractor | None = None) -> None:
         self.config, self.store, self.view, self.verify = config.registration, store, view, config.tracking.verify
-        self.by_features = FeatureGuesses(store, extractor, config.seed)
-        self.tracking = tracking_of(config)
+        self.extractor, self.seed, self.tracking = extractor, config.seed, tracking_of(config)
+        self._with_features: dict[tuple[int, int], FeatureImage] = {}
         self._images: dict[tuple[int, int], tuple[Target, Pyramid]] = {}
         self._references: dict[tuple[int, int], Reference] = {}
 
@@ -93,7 +94,7 @@ class Registrar:
         if score(fits[0]) < DOUBTFUL:
             fits += yield from self._all_aligned(other_rows, live, map(se3.inverse, other.T_submap_camera[[*alike]]))
         if max(map(score, fits)) < DOUBTFUL:
-            by_features = yield from self.by_features.of(own, keyframe, other, alike)
+            by_features = yield from self.guesses_by_features(own, keyframe, other, alike)
             fits += yield from self._all_aligned(other_rows, live, by_features)
         fit, at_keyframe = yield from self._refined(other, other_rows, target, live, max(fits, key=score))
         A = se3.adjoint(T_own_camera)
@@ -104,6 +105,31 @@ class Registrar:
         return Localisation(
             T_own_other, fit.loss, covariance, fit.agreement, fit.overlap, comparison, at_keyframe, (keyframe, nearest)
         )
+
+    def guesses_by_features(
+        self, own: Submap, keyframe: int, other: Submap, alike: Sequence[int]
+    ) -> Task[list[Matrix]]:
+        """Return T_camera_other [4, 4] of a keyframe of `own` by each keyframe of `other` in `alike` whose features
+        give a pose; none without an extractor. A long slice ends after each image whose features are found."""
+        guesses = list[Matrix]()
+        if self.extractor is None or not alike:
+            return guesses
+        image = yield from self._featured(own, keyframe, self.extractor)
+        for k in alike:
+            reference = yield from self._featured(other, k, self.extractor)
+            found = pose_by_features(reference.landmarks(self.extractor), image, self.extractor, self.seed)
+            if found is not None:
+                guesses.append(found.T_live_reference @ se3.inverse(other.T_submap_camera[k]))
+        return guesses
+
+    def _featured(self, submap: Submap, keyframe: int, extractor: Extractor) -> Task[FeatureImage]:
+        """Return the image of a keyframe when its features are found, once for each image."""
+        where = submap.index, keyframe
+        if where not in self._with_features:
+            image = self._with_features[where] = FeatureImage.of_picture(self.store.picture(*where), submap.camera)
+            image.features(extractor)
+            yield from long_slice()
+        return self._with_features[where]
 
     def _refined(
         self, other: Submap, other_rows: Tensor, target: Target, live: Pyramid, found: PoseFit
