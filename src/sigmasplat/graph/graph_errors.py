@@ -82,15 +82,6 @@ def read(arrays: Mapping[str, Any]) -> SolvedGraph | None:
     return SolvedGraph(**values | {"fixed": int(values["fixed"][0])})
 
 
-@dataclass(frozen=True, eq=False)
-class Part:
-    """The submaps of a component, the numbers of its edges, and how their errors move the submaps, if it has edges."""
-
-    submaps: list[int]
-    edges: list[int]
-    sensitivity: Sensitivity | None
-
-
 def root(covariance: Matrix) -> Matrix:
     """Return W [..., 6, 6] with W Wᵀ = a covariance, which may be singular."""
     values, vectors = np.linalg.eigh(covariance)

@@ -80,7 +80,10 @@ class Loops(Records[Loop]):
 
     def judge(self, i: int, verdict: LoopVerdict) -> None:
         """Set the pose graph's verdict on a registered pair."""
-        self.verdicts.used[i] = self._verdict(judged(self[i], verdict))
+        reason = "accepted" if verdict.accepted else f"the pose graph disagrees (χ² {verdict.chi2:.0f})"
+        accepted, chi2, weight = verdict.accepted, verdict.chi2, verdict.weight
+        loop = replace(self[i], accepted=accepted, reason=reason, chi2=chi2, weight=weight)
+        self.verdicts.used[i] = self._verdict(loop)
 
     def _verdict(self, loop: Loop) -> tuple[bool, int, float, float]:
         number = self._numbers.setdefault(loop.reason, len(self._numbers))
@@ -130,9 +133,3 @@ def described(best: Candidate, a: Submap, b: Submap, found: Registration, known:
         best.gated, found.accepted, found.reason, found.residual, found.overlap, found.localised,
         float(np.linalg.norm(moved[:3, 3])), float(np.rad2deg(se3.rotation_angle(moved[:3, :3]))), found.T_a_b,
     )  # fmt: skip
-
-
-def judged(loop: Loop, verdict: LoopVerdict) -> Loop:
-    """Return a registered loop with the pose graph's verdict on it."""
-    reason = "accepted" if verdict.accepted else f"the pose graph disagrees (χ² {verdict.chi2:.0f})"
-    return replace(loop, accepted=verdict.accepted, reason=reason, chi2=verdict.chi2, weight=verdict.weight)

@@ -30,7 +30,7 @@ from sigmasplat.data.poses import Places
 from sigmasplat.data.relative_pose import Edges, Hops, RelativePose, SolvedGraph
 from sigmasplat.graph import graph_errors
 from sigmasplat.graph.closer import LoopCloser
-from sigmasplat.graph.graph_errors import GraphErrors, Part, root
+from sigmasplat.graph.graph_errors import GraphErrors, root
 from sigmasplat.graph.pose_graph import Sensitivity
 from sigmasplat.tracking.drift import UNKNOWN, hop_errors
 from sigmasplat.types import Matrix
@@ -234,11 +234,11 @@ class PathCovariance:
         `_shared`."""
         count = len(self.keyframe_submap)
         error = np.zeros((6, count + len(self.edges) + len(self._shared), 6))
-        graph = self._graph(int(self.components[submap]))
-        if graph.sensitivity is None:
+        submaps, numbers, sensitivity = self._graph(int(self.components[submap]))
+        if sensitivity is None:
             return error
-        A = se3.adjoint(self.anchors[graph.submaps[0]])
-        for number, G in zip(graph.edges, graph.sensitivity.of(graph.submaps.index(submap)), strict=True):
+        A = se3.adjoint(self.anchors[submaps[0]])
+        for number, G in zip(numbers, sensitivity.of(submaps.index(submap)), strict=True):
             edge = self.edges[number]
             if self._is_chain(edge):
                 self._add_hops(error, A @ G, self._rows_of_hops(edge.a))
@@ -287,13 +287,15 @@ class PathCovariance:
         return A * self.hops.bias[:, None], A @ mean
 
     @cache  # noqa: B019
-    def _graph(self, component: int) -> Part:
+    def _graph(self, component: int) -> tuple[list[int], list[int], Sensitivity | None]:
+        """Return the submaps of a component, the numbers of its edges, and how their errors move the submaps, if it has
+        edges."""
         submaps = np.flatnonzero(self.components == component).tolist()
         node = {submap: i for i, submap in enumerate(submaps)}
         numbers = [i for i, edge in enumerate(self.edges) if edge.a in node]
         edges = [replace(e, a=node[e.a], b=node[e.b]) for e in (self.edges[i] for i in numbers)]
         poses = se3.inverse(self.anchors[submaps[:1]]) @ self.anchors[submaps]
-        return Part(submaps, numbers, Sensitivity(poses, edges) if edges else None)
+        return submaps, numbers, Sensitivity(poses, edges) if edges else None
 
     def _is_chain(self, edge: RelativePose) -> bool:
         """Return whether an edge leads to the last keyframe of its submap: then its error is that of the hops."""

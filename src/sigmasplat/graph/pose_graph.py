@@ -37,11 +37,9 @@ ROUGHLY = 1e-3
 
 @dataclass(frozen=True)
 class LoopVerdict:
-    """Whether loop a → b was accepted; its Geman–McClure weight in [0, 1] at the decision; the χ² (6 degrees of
+    """Whether a loop was accepted; its Geman–McClure weight in [0, 1] at the decision; the χ² (6 degrees of
     freedom) of its difference to the solution."""
 
-    a: int
-    b: int
     weight: float
     chi2: float
     accepted: bool
@@ -97,9 +95,7 @@ def optimise(
     T, finishing = minimise(graph, T, valid.astype(np.float64), max_iterations)
     chi2 = graph.chi2(T)
     verdicts = tuple(
-        LoopVerdict(edge.a, edge.b, float(weights[i]), float(chi2[i]), bool(valid[i]))
-        for i, edge in enumerate(edges)
-        if edge.loop
+        LoopVerdict(float(weights[i]), float(chi2[i]), bool(valid[i])) for i, edge in enumerate(edges) if edge.loop
     )
     solved = se3.orthonormalise(poses[0] @ T)
     solved[:fixed] = poses[:fixed]
@@ -282,11 +278,6 @@ class Sensitivity:
             unit[6 * free : 6 * free + 6] = np.eye(6)
             columns[self.graph.fixed :] = self._solver.solve(unit).reshape(-1, 6, 6)
         return np.asarray(np.swapaxes(columns[self.graph.b] - columns[self.graph.a], 1, 2) @ self._pull)
-
-    def covariance(self, node: int) -> Matrix:
-        """Return the marginal covariance [6, 6] of a node, if the information of the edges is that of their errors."""
-        G = self.of(node)
-        return np.asarray((G @ np.linalg.inv(self.graph.information) @ np.swapaxes(G, 1, 2)).sum(0))
 
 
 def _refuse_bad_input(edges: Sequence[RelativePose]) -> None:
