@@ -28,7 +28,7 @@ class PoseFit:
 
     agreement: share of the pixels visible to both map and sensor whose depths agree; overlap: share of sensor readings
     where the map has a surface; first and last loss; iterations; alignment: the alignment that found the pose, or None;
-    degenerate: number of undetermined directions of motion, which keep the guess; exposure (a, b) of exp(a)·Ĉ + b;
+    exposure (a, b) of exp(a)·Ĉ + b;
     comparison: of the two images at the pose, if it was made.
     """
 
@@ -39,7 +39,6 @@ class PoseFit:
     loss: float
     iterations: int
     alignment: Alignment | None = None
-    degenerate: int = 0
     exposure: tuple[float, float] = (0.0, 0.0)
     comparison: Comparison | None = None
 
@@ -92,7 +91,6 @@ def fit_pose_align(
         found.cost,
         found.steps,
         alignment=found,
-        degenerate=found.degenerate,
     )
 
 

@@ -1,8 +1,6 @@
 """Where the camera is expected before its image is used, and its motion since the last image."""
 
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 
@@ -14,9 +12,7 @@ from sigmasplat.fit.backends import fits_of
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.render.view import View
 from sigmasplat.tracking.prepared_frame import Splats
-from sigmasplat.types import Matrix, ShouldStop, unless
-
-Item = TypeVar("Item")
+from sigmasplat.types import Matrix, ShouldStop
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,10 +59,6 @@ class Given:
     view: View
     prediction: PosePrediction
     should_stop: ShouldStop
-
-    def unless(self, guesses: Iterable[Item], least: int = 0) -> Iterator[Item]:
-        """Yield guesses, after the first `least` ones only while nothing asks to stop."""
-        return unless(self.should_stop, guesses, least)
 
 
 def odometry(last: Pyramid | None, live: Pyramid, given: Given, config: TrackingConfig) -> Matrix | None:

@@ -25,7 +25,7 @@ from sigmasplat.tracking.pose_prediction import Given, PosePrediction, odometry,
 from sigmasplat.tracking.pose_validation import TrackingStatistics
 from sigmasplat.tracking.predicted_depth_fit import NOTHING_FITTED, DepthFit
 from sigmasplat.tracking.prepared_frame import PreparedFrame, Splats, TrackedKeyframe, mapped_keyframe
-from sigmasplat.types import Matrix, ShouldStop, never
+from sigmasplat.types import Matrix, ShouldStop, never, unless
 
 
 @dataclass(eq=False)
@@ -104,7 +104,7 @@ class Tracker:
         best = self._fit(given, shown, given.prediction.predicted)
         best, shown = self._uncovered(given, seen, shown, best)
         if judge.is_wide(self.previous, best, given.view.camera, self.extractor is not None) or self._doubts(best):
-            guesses = given.unless(self._other_guesses(shown, given.prediction))
+            guesses = unless(given.should_stop, self._other_guesses(shown, given.prediction))
             best = max([best, *(self._fit(given, shown, guess) for guess in guesses)], key=self._score)
         return self._retry(given, shown, best) if self._doubts(best) else best
 
@@ -132,8 +132,8 @@ class Tracker:
         ):
             return None
         keyframe, predicted, expected_front = self.keyframe, given.prediction.predicted, None
-        for guess in given.unless((predicted, se3.inverse(fit.T_camera_world)), least=1):
-            for _ in given.unless(range(2), least=1):  # a better pose shows better what is in front
+        for guess in unless(given.should_stop, (predicted, se3.inverse(fit.T_camera_world)), least=1):
+            for _ in unless(given.should_stop, range(2), least=1):  # a better pose shows better what is in front
                 front = together(
                     self.detector.in_front(keyframe, self.keyframe_front, before, self.previous, seen, guess), slow
                 )
@@ -168,7 +168,7 @@ class Tracker:
         predicted = given.prediction.predicted
         contradicted, urgent = self._contradicted(drawn), known or self.statistics.agrees_less(drawn.comparison)
         self.detector, things = self.detector.suspected(self.keyframe, seen, drawn, self.config, contradicted, urgent)
-        for front in given.unless(things):
+        for front in unless(given.should_stop, things):
             found = self._fit(given, shown := seen.aside(front), predicted)
             if self._stands(found, predicted) and has_drawn(front, self.keyframe, seen, drawn, found, contradicted):
                 self.front = front
@@ -253,8 +253,8 @@ class Tracker:
         starts = [given.prediction.last]
         if moved is not None:
             starts.insert(0, np.asarray(self.previous @ se3.inverse(moved)))
-        fits = [fit, *(self._fit(given, seen, start, 2) for start in given.unless(starts))]
-        for start in given.unless(starts if self.config.method == "align" else ()):
+        fits = [fit, *(self._fit(given, seen, start, 2) for start in unless(given.should_stop, starts))]
+        for start in unless(given.should_stop, starts if self.config.method == "align" else ()):
             reference = map_reference(given.field.params, given.view, se3.inverse(start), self.config)
             fits.append(self._aligned(reference, seen.live, se3.inverse(start)))
         best = max(fits, key=self._score)
