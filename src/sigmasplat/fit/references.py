@@ -39,14 +39,8 @@ class Reference:
 
     def without(self, hidden: NDArray[np.bool_]) -> "Reference":
         """Return the reference without depth at some pixels [H, W], so that nothing is aligned to them."""
-        p = self.pyramid
-        shown = p.depth[0] * p.kernels.beside((~hidden).astype(np.float32), p.depth[0])
-        made = Pyramid.of(
-            p.gray[0], shown, p.cameras[0], backend=p.backend, scene_scale=p.scene_scale, noise_per_m=p.noise_per_m,
-            noise=p.noise[0], confidence=p.confidence,
-        )  # fmt: skip
-        pyramid = replace(made, weight=p.weight, weight_depth=p.weight_depth)
-        return Reference(pyramid, self.T_camera_world)
+        host_m = self.pyramid.kernels.to_host(self.pyramid.depth[0])
+        return replace(self, pyramid=self.pyramid.with_depth(np.where(hidden, np.float32(0.0), host_m)))
 
     def moved_by(self, T_new_old: Matrix) -> "Reference":
         """Return the reference with its pose in other coordinates [4, 4]."""

@@ -6,7 +6,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import binary_erosion, gaussian_filter
 
 from sigmasplat.fit.target import gray_of
 from sigmasplat.types import Matrix
@@ -17,6 +17,8 @@ WORKING_SIZE = (80, 60)
 """Width and height in pixels of the image that gradients are computed on, for every camera."""
 BLUR_PX = 1.0
 """Standard deviation of the blur at that size."""
+NEIGHBOURS = np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]])
+"""The pixels whose values give the gradient of the one between them."""
 LEAST_READINGS = 0.25
 """A small pixel has depth if at least this share of the large pixels under it have depth."""
 SOFTENING = 0.5
@@ -114,12 +116,8 @@ def _small_log_depth(depth_m: Plane) -> tuple[Plane, NDArray[np.bool_]]:
 
 def _gradients(image: Plane, valid: NDArray[np.bool_]) -> tuple[Matrix, Matrix, NDArray[np.bool_]]:
     """Return the gradient's magnitude, its direction in half turns [0, 1), and which pixels have both."""
-    image = image.astype(np.float64)
-    dx, dy = np.zeros_like(image), np.zeros_like(image)
-    dx[:, 1:-1] = image[:, 2:] - image[:, :-2]
-    dy[1:-1] = image[2:] - image[:-2]
-    known = np.zeros(image.shape, bool)
-    known[1:-1, 1:-1] = valid[1:-1, 2:] & valid[1:-1, :-2] & valid[2:, 1:-1] & valid[:-2, 1:-1]
+    dy, dx = np.gradient(2.0 * image.astype(np.float64))
+    known = binary_erosion(valid, NEIGHBOURS)
     return np.hypot(dx, dy) * known, np.arctan2(dy, dx) / np.pi % 1.0, known
 
 
