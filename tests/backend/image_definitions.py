@@ -22,8 +22,7 @@ from sigmasplat.fit.compare import (
 from sigmasplat.fit.interface import DEPTH_STEP_M
 from sigmasplat.fit.pyramid import HIDDEN_M, NOISE_PER_M, Pyramid
 from sigmasplat.fit.target import Target
-from sigmasplat.tracking.moving.free_space import AROUND_PX, CLEAR_M, CLEAR_RELATIVE, on_image
-from sigmasplat.tracking.moving.windows import least_around
+from sigmasplat.tracking.moving.free_space import AROUND_PX, CLEAR_M, CLEAR_RELATIVE, least_around, on_image
 from sigmasplat.types import Matrix
 
 Image = NDArray[np.float32]

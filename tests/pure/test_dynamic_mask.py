@@ -9,7 +9,7 @@ from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.plugins.sources import SyntheticRoom
 from sigmasplat.tracking.moving.dynamic_mask import DynamicMask, Earlier, dynamic_mask
-from sigmasplat.tracking.moving.windows import labelled
+from sigmasplat.tracking.moving.free_space import labelled
 
 cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed (pip install opencv-python-headless)")
 

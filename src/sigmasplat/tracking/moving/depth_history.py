@@ -15,8 +15,7 @@ from sigmasplat.tracking.moving.dynamic_mask import (
     seen_again,
     smooth,
 )
-from sigmasplat.tracking.moving.free_space import Depth
-from sigmasplat.tracking.moving.windows import labelled, widened
+from sigmasplat.tracking.moving.free_space import Depth, labelled, widened
 from sigmasplat.types import Matrix
 
 EVERY = 5

@@ -13,12 +13,18 @@ from numpy.typing import NDArray
 
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
-from sigmasplat.tracking.moving.free_space import AROUND_PX, CLEAR_M, CLEAR_RELATIVE, Depth, Mask, free_places, on_image
-from sigmasplat.tracking.moving.windows import (
+from sigmasplat.tracking.moving.free_space import (
+    AROUND_PX,
+    CLEAR_M,
+    CLEAR_RELATIVE,
+    Depth,
+    Mask,
+    free_places,
     labelled,
     largest_around,
     largest_label,
     least_around,
+    on_image,
     upper_median,
     widened,
 )

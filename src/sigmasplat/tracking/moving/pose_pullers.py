@@ -23,9 +23,8 @@ from sigmasplat.tracking.moving.dynamic_mask import (
     thinned,
     with_margin,
 )
-from sigmasplat.tracking.moving.free_space import Depth, Mask
+from sigmasplat.tracking.moving.free_space import Depth, Mask, boxed, upper_median, widened
 from sigmasplat.tracking.moving.two_motions import two_motions
-from sigmasplat.tracking.moving.windows import boxed, upper_median, widened
 from sigmasplat.tracking.pose_validation import agrees_more, differs, disagrees, gray_gain, may_draw
 from sigmasplat.tracking.prepared_frame import PreparedFrame
 from sigmasplat.types import Matrix
