@@ -3,7 +3,6 @@ with the same weights.
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -74,32 +73,6 @@ def agreement(maps: PoseMaps, target: Target) -> tuple[float, float]:
     return float((close & common).sum()) / max(n, 1), n / max(target.valid_pixels, 1)
 
 
-class PixelWeights(NamedTuple):
-    """Which pixels are used for colour and for depth, bool [H, W], and their weights: A^p [H, W], and w̃ of colour [H,
-    W, 3]."""
-
-    in_color: Tensor
-    in_depth: Tensor
-    opacity: Tensor
-    confidence: Tensor
-
-
-@torch.no_grad()
-def pixel_weights(maps: PoseMaps, target: Target, color_error: Tensor, config: TrackingConfig) -> PixelWeights:
-    """Choose and weight pixels (VarSplat §3; CG-SLAM §6), without gradient; color_error [H, W, 3] may have any sign."""
-    valid = target.depth_image > 0
-    if config.alpha_above > 0:
-        valid = valid & (maps.alpha > config.alpha_above)
-    in_depth = outlier_mask(maps.depth - target.depth_image, valid, config.outlier_factor)
-    in_color = in_depth
-    if config.outlier_factor_color > 0:
-        in_color = outlier_mask(color_error.abs().sum(-1), valid, config.outlier_factor_color)
-    opacity, confidence = maps.alpha.clamp(min=0.0) ** config.alpha_power, torch.ones_like(maps.color)
-    if config.uncertainty and maps.variance is not None:
-        confidence = uncertainty_weights(maps.variance, in_color, config.tau, config.weight_max)
-    return PixelWeights(in_color, in_depth, opacity, confidence)
-
-
 def per_value(weight: float, mask: Tensor, channels: int, average: str) -> float:
     """Return the weight of one error in the mean: over the pixels of the image, or over the used pixels and channels.
 
@@ -109,21 +82,30 @@ def per_value(weight: float, mask: Tensor, channels: int, average: str) -> float
     return weight / n if n else 0.0
 
 
+@torch.no_grad()
 def tracking_gradient(view: View, target: Target, config: TrackingConfig, exposure: Tensor) -> tuple[float, Tensor]:
     """Write ∂L_track/∂(color, depth) to the view's planes; return the loss and its gradient with respect to exposure
     (a, b).
 
     L_track = Σ A³ M (λ_c w̃ |exp(a) Ĉ + b − C| + (1 − λ_c) |D̂ − D|). Here it is a mean over all pixels (VarSplat §3),
-    or over the pixels used for colour and for depth (CG-SLAM §6).
+    or over the pixels used for colour and for depth (CG-SLAM §6). The choice of pixels M and their weights A³ and w̃
+    have no gradient.
     """
     maps, c = PoseMaps.of(view), config
     gain, offset = exposure[0].exp(), exposure[1]
     color_error = gain * maps.color + offset - target.image
     depth_error = maps.depth - target.depth_image
-    w = pixel_weights(maps, target, color_error, config)
-    each_color = per_value(c.weight_color, w.in_color, 3, c.average)
-    on_color = each_color * (w.opacity * w.in_color)[..., None] * w.confidence
-    on_depth = per_value(1.0 - c.weight_color, w.in_depth, 1, c.average) * (w.opacity * w.in_depth)
+    valid = target.depth_image > 0
+    if c.alpha_above > 0:
+        valid = valid & (maps.alpha > c.alpha_above)
+    in_color = in_depth = outlier_mask(depth_error, valid, c.outlier_factor)
+    if c.outlier_factor_color > 0:
+        in_color = outlier_mask(color_error.abs().sum(-1), valid, c.outlier_factor_color)
+    opacity, confidence = maps.alpha.clamp(min=0.0) ** c.alpha_power, torch.ones_like(maps.color)
+    if c.uncertainty and maps.variance is not None:
+        confidence = uncertainty_weights(maps.variance, in_color, c.tau, c.weight_max)
+    on_color = per_value(c.weight_color, in_color, 3, c.average) * (opacity * in_color)[..., None] * confidence
+    on_depth = per_value(1.0 - c.weight_color, in_depth, 1, c.average) * (opacity * in_depth)
     g_color = on_color * color_error.sign()
     rows, columns = depth_error.shape
     view.g_sums.zero_()
