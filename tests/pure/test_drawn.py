@@ -17,8 +17,7 @@ from sigmasplat.fit.references import Reference
 from sigmasplat.fit.target import Target
 from sigmasplat.tracking.moving.dynamic_detector import DynamicDetector
 from sigmasplat.tracking.moving.dynamic_mask import DynamicMask, thinned
-from sigmasplat.tracking.moving.pose_pullers import free_standing, has_drawn, is_still, shift_px, suspected
-from sigmasplat.tracking.moving.two_motions import two_motions
+from sigmasplat.tracking.moving.pose_pullers import free_standing, has_drawn, is_still, shift_px, suspected, two_motions
 from sigmasplat.tracking.pose_validation import is_missed
 from sigmasplat.tracking.prepared_frame import PreparedFrame
 
