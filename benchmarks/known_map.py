@@ -17,7 +17,7 @@ from sigmasplat.fit.target import Target
 from sigmasplat.input.source import Source
 from sigmasplat.render.backend import make_view
 from sigmasplat.tracking.feature_image import FeatureImage, detail_of
-from sigmasplat.tracking.features import FEATURE_WIDTH, Extractor
+from sigmasplat.tracking.features import Extractor
 from sigmasplat.tracking.prepared_frame import PreparedFrame
 from sigmasplat.tracking.relocaliser import KnownMap, Relocaliser
 
@@ -41,7 +41,7 @@ class TrueMap:
             frame = source.frame(i)
             small = self._working(frame)
             color = np.rint(small.color * 255.0).astype(np.uint8)
-            picture = Picture(color, small.depth_m, detail_of(frame, FEATURE_WIDTH))
+            picture = Picture(color, small.depth_m, detail_of(frame))
             self.store.save(Submap(number, GaussianField.empty(), (i,), np.eye(4)[None], small.camera), [picture])
 
     def search(self, i: int) -> dict[str, Any]:
@@ -74,6 +74,6 @@ class TrueMap:
         """Return a frame in the forms that the search needs."""
         small = self._working(frame)
         target = Target.of(small, (self.view.sums.shape[1], self.view.sums.shape[2]))
-        image = FeatureImage(detail_of(frame, FEATURE_WIDTH), small.depth_m, small.camera)
+        image = FeatureImage(detail_of(frame), small.depth_m, small.camera)
         live = live_image(self.view, small.color, small.depth_m, target)
         return PreparedFrame(target, live, image, frame=small, whole=frame)

@@ -62,7 +62,7 @@ def seen(i: int, mirrored: bool = False) -> PreparedFrame:
         whole = replace(whole, color=color, depth_m=depth_m)
     frame = whole.prepared(160, 0.1, 8.0)
     target = Target.of(frame, (view().sums.shape[1], view().sums.shape[2]))
-    image = FeatureImage(detail_of(whole, 640), frame.depth_m, frame.camera)
+    image = FeatureImage(detail_of(whole), frame.depth_m, frame.camera)
     live = live_image(view(), frame.color, frame.depth_m, target)
     return PreparedFrame(target, live, image, frame=frame, whole=whole)
 
@@ -200,12 +200,13 @@ def test_an_empty_map_is_searched_in_vain() -> None:
 # ---- the image in which features are found
 
 
-def test_the_gray_image_keeps_the_frames_own_size_up_to_a_width() -> None:
+def test_the_gray_image_keeps_the_frames_own_size_up_to_a_width(monkeypatch: pytest.MonkeyPatch) -> None:
     frame = room().frame(0)
-    own, small = detail_of(frame, 640), detail_of(frame, 160)
+    own = detail_of(frame)
+    monkeypatch.setattr("sigmasplat.tracking.features.FEATURE_WIDTH", 160)
+    small = detail_of(frame)
     assert own.gray.shape == (240, 320) and own.camera == frame.camera
     assert small.gray.shape == (120, 160) and small.camera == frame.camera.prepared(160)
-    assert detail_of(frame, 0).gray.shape == (240, 320)
     assert own.gray.reshape(120, 2, 160, 2).mean((1, 3)) == pytest.approx(small.gray, abs=1.0)
 
 

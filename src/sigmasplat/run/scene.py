@@ -13,7 +13,7 @@ from sigmasplat.errors import SourceError
 from sigmasplat.input.opening import open_source
 from sigmasplat.input.source import Source
 from sigmasplat.tracking.feature_image import FeatureImage, LateDetail
-from sigmasplat.tracking.features import FEATURE_WIDTH, Extractor, Features
+from sigmasplat.tracking.features import Extractor, Features
 from sigmasplat.tracking.predicted_depth_fit import depth_at
 from sigmasplat.types import Matrix
 
@@ -124,7 +124,7 @@ def _seen(source: Source, i: int, config: Config) -> tuple[FeatureImage, Matrix]
         return None
     c = config.input
     working = frame.prepared(c.width or frame.camera.width, c.min_depth_m, c.max_depth_m, c.crop_px)
-    image = FeatureImage(LateDetail(frame, FEATURE_WIDTH), working.depth_m, working.camera)
+    image = FeatureImage(LateDetail(frame), working.depth_m, working.camera)
     return image, np.asarray(frame.T_given_camera)
 
 

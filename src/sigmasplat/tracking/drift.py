@@ -15,7 +15,7 @@ FLOOR_M, FLOOR_RAD = 0.005, 0.003
 """Least standard deviation of a pose between two maps, or in another map: two maps of the same wall differ by about
 this much."""
 UNKNOWN = np.diag([1.0] * 6)
-"""Covariance of a hop between images without overlap, m² and rad²."""
+"""Covariance of a hop between images without overlap, or of another pose without an estimate, m² and rad²."""
 BIAS = 0.02
 """Relative systematic error of the distance travelled and the angle turned: calibration errors do not average out over
 hops. On redkitchen the estimated rotations are 3 to 11 % smaller than the true ones."""

@@ -18,18 +18,14 @@ from sigmasplat.tracking.features import (
     depth_readings,
     landmarks_of,
     pose_from_landmarks,
+    reduced,
 )
 from sigmasplat.types import Matrix
 
 
-def detail_of(frame: Frame, width: int) -> Detail:
-    """Return the gray image of a frame at its own size, or `width` pixels wide if it is wider; 0 = no limit."""
-    gray, camera = gray_levels(frame.color), frame.camera
-    if width and camera.width > width:
-        camera = camera.prepared(width)
-        cv2 = opencv()
-        gray = cv2.resize(gray, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-    return Detail(gray, camera)
+def detail_of(frame: Frame) -> Detail:
+    """Return the gray image of a frame at its own size, or `FEATURE_WIDTH` pixels wide if it is wider."""
+    return Detail(*reduced(gray_levels(frame.color), frame.camera))
 
 
 def gray_levels(color: NDArray[np.float32]) -> NDArray[np.uint8]:
@@ -42,17 +38,15 @@ def gray_levels(color: NDArray[np.float32]) -> NDArray[np.uint8]:
 class LateDetail:
     """The gray image of a frame, computed when it is first needed: most frames do not need it."""
 
-    def __init__(self, frame: Frame, width: int) -> None:
-        """frame, width: as in `detail_of`."""
+    def __init__(self, frame: Frame) -> None:
         self._frame: Frame | None = frame
         self._detail: Detail | None = None
-        self._width = width
 
     def get(self) -> Detail:
         """Return the gray image. Threads may share this object."""
         frame = self._frame
         if frame is not None:
-            self._detail = detail_of(frame, self._width)
+            self._detail = detail_of(frame)
             self._frame = None
         assert self._detail is not None  # it is set before the frame is dropped
         return self._detail

@@ -11,6 +11,7 @@ from sigmasplat.config import Config
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.env import opencv
+from sigmasplat.fit.pyramid import NOISE_PER_M
 from sigmasplat.types import Matrix
 
 Gray = NDArray[np.uint8]
@@ -112,8 +113,6 @@ def matched_by_distance(a: NDArray[np.float32], b: NDArray[np.float32], ratio: f
     return np.asarray(np.stack([rows, best], 1)[good])
 
 
-NOISE_RELATIVE_PER_M = 0.003
-"""Standard deviation of a depth reading, times z² (m), as in `fit.align` (Khoshelham & Elberink 2012)."""
 STEP_SHARE = 0.03
 """A reading is at a depth step if the 3×3 readings around it differ by more than this share of the depth."""
 
@@ -168,7 +167,7 @@ def depth_readings(features: Features, depth_m: NDArray[np.float32], depth_camer
 
 def depth_sigma_m(z: Matrix) -> Matrix:
     """Return the standard deviation of depth readings, metres."""
-    return NOISE_RELATIVE_PER_M * z * z + 1e-3
+    return NOISE_PER_M * z * z + 1e-3
 
 
 def nearest_pixels(features: Features, camera: Camera) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.bool_]]:

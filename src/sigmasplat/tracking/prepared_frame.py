@@ -22,7 +22,7 @@ from sigmasplat.render.backend import make_view
 from sigmasplat.render.view import View
 from sigmasplat.tracking.depth_filters import denoised
 from sigmasplat.tracking.feature_image import FeatureImage, LateDetail
-from sigmasplat.tracking.features import FEATURE_WIDTH, Extractor
+from sigmasplat.tracking.features import Extractor
 from sigmasplat.tracking.moving.dynamic_mask import DynamicMask
 from sigmasplat.tracking.predicted_depth_fit import smoothed
 from sigmasplat.types import Matrix
@@ -136,7 +136,7 @@ def observe(whole: Frame, working: Frame, view: View, config: Config, extractor:
     target = Target.of(working, (view.sums.shape[1], view.sums.shape[2]))
     live, image = live_image(view, working.color, working.depth_m, target), None
     if extractor is not None:
-        image = FeatureImage(LateDetail(whole, FEATURE_WIDTH), working.depth_m, working.camera)
+        image = FeatureImage(LateDetail(whole), working.depth_m, working.camera)
     return PreparedFrame(target, live, image, ignored, frame=working, whole=whole)
 
 

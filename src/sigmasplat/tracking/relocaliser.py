@@ -20,7 +20,7 @@ from sigmasplat.fit.pose import PoseFit, fit_pose_align
 from sigmasplat.fit.references import Reference, map_reference, picture_images
 from sigmasplat.fit.target import Keyframe
 from sigmasplat.render.view import View
-from sigmasplat.tracking.drift import floor, symmetric
+from sigmasplat.tracking.drift import UNKNOWN, floor, symmetric
 from sigmasplat.tracking.feature_image import FeatureImage, pose_by_features
 from sigmasplat.tracking.features import VOTE_RATIO, Extractor, Features, Landmarks, matched_by_distance
 from sigmasplat.tracking.pose_validation import MOST_SPREAD_M, recognised, score
@@ -68,8 +68,6 @@ INDEX_AT_MOST = 25
 """Maximum number of keyframes whose features are found per call: 25 take about a second."""
 KEPT_LANDMARKS = 64
 """Number of keyframes whose complete landmarks stay in memory, half a megabyte each."""
-UNKNOWN = np.eye(6)
-"""Covariance of a pose without an estimate, m² and rad²."""
 ENOUGH = 0.5
 """A pose with a higher score ends the search."""
 
