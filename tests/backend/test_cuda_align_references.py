@@ -23,7 +23,7 @@ from sigmasplat.render.cpu import CpuView
 from sigmasplat.render.reference import ReferenceView
 from sigmasplat.render.view import View
 from sigmasplat.run_folder.state import read_state, write_state
-from sigmasplat.tracking.moving import depth_history, dynamic_detector
+from sigmasplat.tracking.moving import dynamic_detector
 from sigmasplat.tracking.pose_validation import TrackingStatistics
 from sigmasplat.tracking.predicted_depth_fit import DepthFit, DepthShape
 from sigmasplat.tracking.prepared_frame import PreparedFrame
@@ -155,7 +155,7 @@ def test_what_a_tracker_remembers_is_kept_and_read_back(tmp_path: Path) -> None:
             Camera,
             TrackingStatistics,
             dynamic_detector.DynamicDetector,
-            depth_history.DepthHistory,
+            dynamic_detector.DepthHistory,
             DepthFit,
             DepthShape,
         ),

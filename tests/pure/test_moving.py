@@ -16,7 +16,7 @@ from sigmasplat.errors import SourceError
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.mapping.moving import carve, mask_keyframes
 from sigmasplat.plugins.sources import SyntheticRoom, open_source
-from sigmasplat.tracking.moving.depth_history import DepthHistory
+from sigmasplat.tracking.moving.dynamic_detector import DepthHistory
 from sigmasplat.tracking.moving.dynamic_mask import DynamicMask
 
 CAMERA = Camera(160, 120, 140.0, 140.0, 79.5, 59.5)

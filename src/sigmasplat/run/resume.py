@@ -37,8 +37,7 @@ from sigmasplat.slam.results import Step, Steps
 from sigmasplat.system.slam import Slam
 from sigmasplat.tracking.drift import Drift
 from sigmasplat.tracking.feature_image import FeatureImage
-from sigmasplat.tracking.moving.depth_history import DepthHistory, RememberedDepth
-from sigmasplat.tracking.moving.dynamic_detector import DynamicDetector
+from sigmasplat.tracking.moving.dynamic_detector import DepthHistory, DynamicDetector, RememberedDepth
 from sigmasplat.tracking.moving.dynamic_mask import DynamicMask
 from sigmasplat.tracking.pose_validation import TrackingStatistics
 from sigmasplat.tracking.predicted_depth_fit import DepthFit, DepthShape

@@ -17,8 +17,7 @@ from sigmasplat.render.view import View
 from sigmasplat.tracking import pose_validation as judge
 from sigmasplat.tracking.feature_image import FeatureImage, motion_by_features
 from sigmasplat.tracking.features import Extractor
-from sigmasplat.tracking.moving.depth_history import together
-from sigmasplat.tracking.moving.dynamic_detector import DynamicDetector
+from sigmasplat.tracking.moving.dynamic_detector import DynamicDetector, together
 from sigmasplat.tracking.moving.dynamic_mask import DynamicMask
 from sigmasplat.tracking.moving.pose_pullers import has_drawn
 from sigmasplat.tracking.pose_prediction import Given, PosePrediction, odometry, predict
