@@ -46,9 +46,7 @@ WIDEST = WIDER**2
 
 def make_descriptor(config: LoopConfig) -> Descriptor:
     """Make the descriptor of keyframes. Raises ConfigError if NetVLAD has no weights file or cannot load it."""
-    if config.descriptor == "grid":
-        return OrientationGrid()
-    if lacks_weights(config):
+    if config.descriptor == "grid" or lacks_weights(config):
         return OrientationGrid()
     if not config.weights:
         raise ConfigError("loops.descriptor=netvlad needs a file of weights: --set loops.weights=FILE")

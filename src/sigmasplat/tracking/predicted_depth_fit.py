@@ -63,10 +63,6 @@ class DepthShape:
         factor = 1.0 + np.tensordot(self.theta, _polynomials(u, v), 1)
         return np.asarray(predicted_m / np.clip(factor, *FACTOR_RANGE), np.float32)
 
-    def without_views(self) -> "DepthShape":
-        """Return the shape to go on with where the motion since the last keyframe is not known."""
-        return replace(self, views=())
-
     def after(self, image: FeatureImage, T_last_new: Matrix, extractor: Extractor) -> "DepthShape":
         """Return the shape that a new keyframe with its predicted depth shows; T_last_new [4, 4]: its tracked pose
         relative to the last keyframe."""

@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sigmasplat.data import se3
 from sigmasplat.render.view import View
@@ -23,7 +22,7 @@ def fitted_to_map(tracker: Tracker, field: Splats, view: View, seen: PreparedFra
         return seen
     T_world_camera = tracker.prediction(seen.frame.prior).predicted
     tracker.depth = _fitted(tracker.depth, field, view, seen, T_world_camera)
-    return _with_fit(tracker.depth, seen)
+    return seen.with_depth(tracker.depth.applied(seen.frame.depth_m))
 
 
 def fitted_keyframe(
@@ -37,30 +36,23 @@ def fitted_keyframe(
     if not tracker.config.fit_depth:
         return seen
     depth, extractor, keyframe = tracker.depth, tracker.extractor, tracker.keyframe
-    if not connected:
-        depth = replace(depth, shape=depth.shape.without_views())
+    if not connected:  # the motion since the last keyframe is not known
+        depth = replace(depth, shape=replace(depth.shape, views=()))
     if extractor is not None and seen.image is not None:
         hop = keyframe.T_camera_world @ T_world_camera if connected and keyframe is not None else np.eye(4)
         depth = replace(depth, shape=depth.shape.after(seen.image.with_depth(seen.frame.depth_m), hop, extractor))
     if connected:
         depth = _fitted(depth, field, view, seen, T_world_camera)
     tracker.depth = depth
-    return _with_fit(depth, seen)
+    return seen.with_depth(depth.applied(seen.frame.depth_m))
 
 
 def _fitted(depth: DepthFit, field: Splats, view: View, seen: PreparedFrame, T_world_camera: Matrix) -> DepthFit:
+    """Return the fit of a frame to the depth of the map from a camera, where the map is opaque."""
     if not len(field.params):
         return depth
-    return depth.fitted(seen.frame.depth_m, _depth_of_map(field, view, T_world_camera))
-
-
-def _depth_of_map(field: Splats, view: View, T_world_camera: Matrix) -> NDArray[np.float32]:
-    """Return the depth of the map from a camera [H, W], m; 0 where it is not opaque."""
     camera = view.camera
     view.forward(field.params, se3.inverse(T_world_camera))
-    alpha, depth = (plane[: camera.height, : camera.width].cpu().numpy() for plane in (view.alpha, view.sums[3]))
-    return np.where(alpha > OPAQUE, depth / np.maximum(alpha, np.float32(OPAQUE)), np.float32(0.0))
-
-
-def _with_fit(depth: DepthFit, seen: PreparedFrame) -> PreparedFrame:
-    return seen.with_depth(depth.applied(seen.frame.depth_m))
+    alpha, surface = (plane[: camera.height, : camera.width].cpu().numpy() for plane in (view.alpha, view.sums[3]))
+    known_m = np.where(alpha > OPAQUE, surface / np.maximum(alpha, np.float32(OPAQUE)), np.float32(0.0))
+    return depth.fitted(seen.frame.depth_m, known_m)
