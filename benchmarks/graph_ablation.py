@@ -39,7 +39,7 @@ from sigmasplat.config.text import override, split_settings
 from sigmasplat.data.relative_pose import RelativePose
 from sigmasplat.errors import ConfigError, SigmaSplatError
 from sigmasplat.final import stores
-from sigmasplat.graph import growing_graph, keyframe_graph
+from sigmasplat.graph import keyframe_graph
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.system.slam import Slam
 from sigmasplat.types import Matrix
@@ -70,9 +70,9 @@ class Variant:
         with ExitStack() as stack:
             stack.enter_context(mock.patch.object(LoopConfig, "alignments", self.edges))
             if not self.window:
-                stack.enter_context(mock.patch.object(growing_graph.GrowingGraph, "solved", unsolved))
+                stack.enter_context(mock.patch.object(keyframe_graph.GrowingGraph, "solved", unsolved))
             if not self.weights:
-                for module in (growing_graph, stores):
+                for module in (keyframe_graph, stores):
                     stack.enter_context(mock.patch.object(module, "solve", solve_unweighted))
             yield
 

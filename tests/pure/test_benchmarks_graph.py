@@ -12,7 +12,7 @@ from sigmasplat.data import se3
 from sigmasplat.data.relative_pose import RelativePose
 from sigmasplat.errors import ConfigError
 from sigmasplat.final import stores
-from sigmasplat.graph import growing_graph
+from sigmasplat.graph import keyframe_graph
 from sigmasplat.graph.keyframe_graph import solve
 
 ablation: Any = importlib.import_module("graph_ablation")
@@ -31,15 +31,15 @@ def triangle() -> tuple[Any, list[RelativePose]]:
 
 def test_a_variant_replaces_its_part_while_it_runs() -> None:
     T, edges = triangle()
-    graph, most = growing_graph.GrowingGraph(8), LoopConfig.alignments
-    before = growing_graph.GrowingGraph.solved, growing_graph.solve, stores.solve
+    graph, most = keyframe_graph.GrowingGraph(8), LoopConfig.alignments
+    before = keyframe_graph.GrowingGraph.solved, keyframe_graph.solve, stores.solve
     variant = ablation.Variant(edges=3, window=False, weights=False)
     with variant.in_place():
         assert LoopConfig().alignments == 3
         assert np.array_equal(graph.solved(T, [RelativePose.hop(np.eye(4))] * 2, 1), T[1:])
-        assert growing_graph.solve is stores.solve is ablation.solve_unweighted
+        assert keyframe_graph.solve is stores.solve is ablation.solve_unweighted
         equal = stores.solve(T, edges).T_world_keyframe
-    assert (growing_graph.GrowingGraph.solved, growing_graph.solve, stores.solve) == before
+    assert (keyframe_graph.GrowingGraph.solved, keyframe_graph.solve, stores.solve) == before
     assert LoopConfig.alignments == most == ablation.VARIANTS["as it is"].edges
     assert solve(T, edges).T_world_keyframe[2, 0, 3] == pytest.approx(0.2, abs=1e-3)
     assert equal[2, 0, 3] == pytest.approx(0.22, abs=2e-3)  # the error of 3 cm is shared by three equal edges

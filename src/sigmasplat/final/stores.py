@@ -17,8 +17,7 @@ from sigmasplat.errors import SigmaSplatError
 from sigmasplat.final.keyframe_nodes import KeyframeNodes, alignments
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.graph.graph_errors import shared_errors
-from sigmasplat.graph.growing_graph import GrowingGraph
-from sigmasplat.graph.keyframe_graph import solve
+from sigmasplat.graph.keyframe_graph import GrowingGraph, solve
 from sigmasplat.graph.path_covariance import PathCovariance
 from sigmasplat.types import Matrix
 

@@ -24,7 +24,7 @@ from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.graph.candidates import DescribedSubmaps
 from sigmasplat.graph.closer import LoopCloser, PendingSearch
 from sigmasplat.graph.confidence import Confidence
-from sigmasplat.graph.growing_graph import GrowingGraph
+from sigmasplat.graph.keyframe_graph import GrowingGraph
 from sigmasplat.graph.loops import Loop, Loops
 from sigmasplat.input.source import Source
 from sigmasplat.mapping.mapper import Mapper, SecondHalf

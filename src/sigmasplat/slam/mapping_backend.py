@@ -17,7 +17,7 @@ from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.target import Keyframe
 from sigmasplat.graph.closer import PendingSearch
 from sigmasplat.graph.confidence import std_of
-from sigmasplat.graph.growing_graph import WINDOW
+from sigmasplat.graph.keyframe_graph import WINDOW
 from sigmasplat.mapping.mapper import Mapper
 from sigmasplat.slam.slam_state import SlamState
 from sigmasplat.tracking.drift import Drift

@@ -17,7 +17,7 @@ from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SourceError
 from sigmasplat.graph.closer import LoopCloser, make_descriptor
 from sigmasplat.graph.confidence import Confidence
-from sigmasplat.graph.growing_graph import GrowingGraph, KeyframeImages
+from sigmasplat.graph.keyframe_graph import GrowingGraph, KeyframeImages
 from sigmasplat.graph.loops import Loop, Loops
 from sigmasplat.mapping.mapper import Mapper
 from sigmasplat.mapping.window import ValidationViews
