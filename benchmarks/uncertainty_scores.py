@@ -208,7 +208,7 @@ def sparsification_charts(kind: Kind, arrays: Arrays, predictors: Sequence[AnyPr
     return [
         Chart(
             title, x_label, y_label, [*(of(p, colour) for p, colour in zip(some, CURVES, strict=False)), *best],
-            from_zero=True, y_limits=(0.0, top),
+            y_limits=(0.0, top),
         )
         for some in groups
     ]  # fmt: skip

@@ -44,11 +44,11 @@ SYNTHETIC = "synthetic:frames=120,overrun=20,noise=1,drift=6,seed={seed}"
 """A different room for each seed, a sensor that drifts, and a path that ends where it began."""
 COMMON = (
     "input.width=240", "input.hold_every=8", "uncertainty.probes=0", "final.iterations=250",
-    "tracking.tau=10", "loops.tau=10", "registration.tau=10",
+    "tracking.tau=10", "loops.tau=10", "registration.tau=10", "tracking.uncertainty=true", "mapping.weight_moment=0.1",
 )  # fmt: skip
-"""Settings of all runs; --set adds to them."""
+"""Settings of all runs; --set adds to them. `sigma` has no V in tracking and no U in the loss."""
 DEFAULT = "default"
-"""The run of the preset itself, of which the maps are measured too."""
+"""The run with all uncertainties, of which the maps are measured too."""
 NO_WEIGHTS = tuple(f"{part}.uncertainty=false" for part in ("tracking", "loops", "registration", "final"))
 PATH: dict[str, tuple[str, ...]] = {
     "no weights at all": NO_WEIGHTS,
@@ -58,7 +58,7 @@ PATH: dict[str, tuple[str, ...]] = {
     "mapping: with alignment": ("mapping.weight_alignment=0.25",),
     "pruning: no fading": ("primitives.uncertain_m2=0",),
 }
-"""Settings of the complete runs that are compared with `default`, the preset: V as published in every weight, U in the
+"""Settings of the complete runs that are compared with `default`: V as published in every weight, U in the
 loss, and fading."""
 TAU_2 = ("registration.tau=2", "loops.tau=2")
 WEIGHTS: dict[str, tuple[str, ...]] = {

@@ -428,7 +428,7 @@ def small_config(options: Any, seed: int) -> Config:
 def test_a_followed_pose_has_the_error_of_its_own_motion(monkeypatch: pytest.MonkeyPatch) -> None:
     """Poses that are off by a known twist in the live camera come back as that twist, whatever mapping moves."""
     known, claimed = np.array([1e-3, -2e-3, 3e-3, 1e-3, 2e-3, -1e-3]), np.diag([1e-6] * 6)
-    covering, source = SimpleNamespace(covariance=claimed, bias=np.zeros(6)), open_source(ROOM, limit=8)
+    covering, source = SimpleNamespace(covariance=claimed, bias=np.zeros(6), depth_m=1.0), open_source(ROOM, limit=8)
     T_world_room = se3.inverse(source.truth().T_world_camera[0])
 
     def off(self: Tracker, field: Any, view: Any, seen_now: Any, R_inertial_camera: Any) -> PoseFit:
@@ -439,7 +439,10 @@ def test_a_followed_pose_has_the_error_of_its_own_motion(monkeypatch: pytest.Mon
 
     seen: list[int] = []
     monkeypatch.setattr(Tracker, "track", off)
-    config = override(small_config(None, 0), {"mapping.lr_pose_translation": "0", "mapping.lr_pose_rotation": "0"})
+    config = override(
+        small_config(None, 0),
+        {"mapping.lr_pose_translation": "0", "mapping.lr_pose_rotation": "0", "mapping.overlap_below": "0"},
+    )
     twists, covariances, ages, lost = tracking.follow(source, config)
     assert (lost, ages.tolist()) == (0, [1, 2, 3, 4, 5, 1, 2])
     np.testing.assert_allclose(twists[:5], np.tile(known, (5, 1)), atol=1e-9)  # their keyframe is the first, exact

@@ -366,12 +366,12 @@ def test_fast_is_one_map_without_variance() -> None:
     assert (fast.primitives.uncertain_m2, fast.primitives.split_gradient) == (0.025, 0.0)
 
 
-def test_sigma_adds_to_fast_and_removes_nothing() -> None:
+def test_sigma_adds_to_fast_and_leaves_out_the_weights_of_tracking() -> None:
     sigma, fast = preset("sigma"), preset("varsplat-fast")
     added = changed_settings(sigma, fast)
-    uncertainty = {"mapping.iterations", "mapping.weight_moment", "primitives.uncertain_m2", "uncertainty.probes"}
+    uncertainty = {"mapping.iterations", "tracking.uncertainty", "primitives.uncertain_m2", "uncertainty.probes"}
     assert added == uncertainty | {
-        "input.denoise_depth", "tracking.features", "tracking.verify",
+        "mapping.overlap_below", "input.denoise_depth", "tracking.features", "tracking.verify",
         "final.iterations", "final.schedule", "mapping.lr_log_scales", "seeding.shape",
         "mapping.divided", "mapping.first_iterations", "mapping.lr_pose_translation",
         "mapping.lr_pose_rotation",
@@ -381,7 +381,7 @@ def test_sigma_adds_to_fast_and_removes_nothing() -> None:
         "final.sh_degree",
     }  # fmt: skip
     assert sigma.mapping.weight_nll_color == fast.mapping.weight_nll_color > 0
-    assert sigma.tracking.uncertainty and sigma.loops.uncertainty and sigma.registration.uncertainty
+    assert not sigma.tracking.uncertainty and sigma.loops.uncertainty and sigma.registration.uncertainty
 
 
 # ---- all of them

@@ -168,7 +168,7 @@ def test_a_camera_is_accepted_and_times_follow_those_of_frames() -> None:
 
 def test_the_covariance_is_that_of_the_path_in_the_order_of_ros() -> None:
     slam = Slam(settings=CUTS)
-    for i in range(14):
+    for i in range(18):
         rgb, depth = images(i)
         step = slam.track(rgb, depth, K, i / 30, depth_scale=1000)
         assert step.covariance is not None and step.covariance.shape == (6, 6)

@@ -194,13 +194,13 @@ def test_a_new_map_begins_apart_and_joins_where_the_world_is_recognised(joined: 
 
 @pytest.mark.parametrize(
     "after",
-    [pytest.param(11, marks=pytest.mark.slow), pytest.param(18, marks=pytest.mark.slow), 31],
+    [pytest.param(11, marks=pytest.mark.slow), pytest.param(18, marks=pytest.mark.slow), 30],
     ids=lambda n: f"frame {n}",
 )
 def test_a_run_resumes_with_the_same_bytes_while_the_camera_is_lost_or_apart(joined: Recorded, after: int) -> None:
     """Lost with a known place ahead; lost before a new map begins; apart, with one observation before the join."""
     now, parts = states(joined[0]), [step.component for step in joined[0].steps]
-    assert (now[after], parts[after]) == {11: ("lost", 0), 18: ("lost", 0), 31: ("apart", 1)}[after]
+    assert (now[after], parts[after]) == {11: ("lost", 0), 18: ("lost", 0), 30: ("apart", 1)}[after]
     assert contents(resumed(joined, after, JOINING)) == contents(joined[0])
 
 

@@ -68,7 +68,7 @@ def sparse() -> Slam:
     for frame in frames(FRAMES):
         drawn = random.random(frame.depth_m.shape)
         given.append(replace(frame, depth_m=np.where(drawn < 0.5, np.float32(0.0), frame.depth_m)))
-    return follow(given, settings(final__move_poses="no"))
+    return follow(given, settings())
 
 
 @pytest.fixture

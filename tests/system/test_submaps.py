@@ -194,7 +194,12 @@ def test_a_successor_inherits_the_splats_in_view_unless_inherit_is_off() -> None
 @pytest.mark.parametrize("inherit", [True, False])
 def test_a_successor_that_inherits_splats_makes_the_second_half_of_the_steps(inherit: bool) -> None:
     """No step is made twice or left out at a cut; without inheritance the first submap makes all of them."""
-    every = {"submaps__inherit": str(inherit).lower(), "mapping__first_iterations": "10", "loops__close": "false"}
+    every = {
+        "submaps__inherit": str(inherit).lower(),
+        "mapping__first_iterations": "10",
+        "loops__close": "false",
+        "mapping__overlap_below": "0",
+    }
     slam, steps = Slam(settings(**every)), list[int]()
     for frame in there_and_back()[:14]:
         step = slam.step(frame)

@@ -22,6 +22,7 @@ from sigmasplat.data.mesh import Mesh
 from sigmasplat.data.submap import Picture, Submap
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import ConfigError, RunError
+from sigmasplat.files.json_files import write_json
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.evaluation import reconstruct
 from sigmasplat.plugins.evaluation.evaluate import evaluate
@@ -231,7 +232,7 @@ def test_the_working_camera_is_that_of_prepared_frames(run: RunFolder) -> None:
 
 
 def test_a_cropped_run_has_the_cropped_camera(run: RunFolder) -> None:
-    replace(CONFIG, input=replace(CONFIG.input, crop_px=3)).save(run.path / "config.json")
+    write_json(run.path / "config.json", replace(CONFIG, input=replace(CONFIG.input, crop_px=3)).to_dict())
     frame = WallAhead().frame(0).prepared(48, 0.1, 4.0, 3)
     assert FusionInput.of(run, CAMERA).camera == frame.camera and frame.camera.width == 42
 
