@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from align_oracle import CAMERA, HUGE, MISSING, Pair, missing, oracle, pair
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
-from sigmasplat.fit.align import align, align_to_all
+from sigmasplat.fit.align import align, align_to_all, surest_weight
+from sigmasplat.fit.compare import best_alignment
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.target import gray_of
 from sigmasplat.plugins.sources import SyntheticRoom
@@ -102,6 +103,28 @@ def test_either_kind_of_residual_finds_the_motion() -> None:
     for weight_color in (0.0, 1.0):
         found = align(seen(10), seen(12), np.eye(4), iterations=30, weight_color=weight_color)
         assert_same_pose(found.T_live_reference, motion(10, 12), 5e-3, 0.2)
+
+
+def stained(i: int, gray: float, depth: float) -> Pyramid:
+    """Return a frame with a pattern that stays where it is in the image, as reflections in gray and distortions of
+    depth do; gray: 0 to 1; depth: a share."""
+    clean = seen(i)
+    v, u = np.indices((120, 160)) / 40.0
+    pattern = np.sin(2.0 * np.pi * u) * np.sin(2.0 * np.pi * v)
+    g, d = (clean.kernels.to_host(plane[0]) for plane in (clean.gray, clean.depth))
+    return Pyramid.of(np.float32(g + gray * pattern), np.float32(d * (1.0 + depth * pattern)), clean.cameras[0])
+
+
+@pytest.mark.parametrize(("gray", "depth", "weight"), [(0.2, 0.0, 0.1), (0.0, 0.03, 0.5)])
+def test_gray_counts_less_where_it_is_wrong_and_depth_where_that_is(gray: float, depth: float, weight: float) -> None:
+    off_m = {0.1: 0.0, 0.5: 0.0}
+    for i, j in [(10, 14), (60, 56), (101, 105)]:
+        images = stained(i, gray, depth), stained(j, gray, depth)
+        assert surest_weight(*images, motion(i, j)) == weight
+        for w in off_m:
+            found = best_alignment(*images, motion(i, j), w)[0].T_live_reference
+            off_m[w] += float(np.linalg.norm((se3.inverse(motion(i, j)) @ found)[:3, 3]))
+    assert off_m[weight] == min(off_m.values()), "the surer one is the better one"
 
 
 def test_covariance_is_positive_definite_and_grows_with_the_residual() -> None:
