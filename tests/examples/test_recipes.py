@@ -88,8 +88,8 @@ def test_a_rule_is_a_function_and_a_descriptor_a_class(package: Path, run: Calla
     replace(loops / "closer.py", "import Descriptor, OrientationGrid", "import Descriptor, MeanColor, OrientationGrid")
     replace(
         loops / "closer.py",
-        '    if config.descriptor == "grid":',
-        '    if config.descriptor == "mean":\n        return MeanColor()\n    if config.descriptor == "grid":',
+        '    if config.descriptor == "grid"',
+        '    if config.descriptor == "mean":\n        return MeanColor()\n    if config.descriptor == "grid"',
     )
     run(
         "from sigmasplat import Slam, open_source, preset\n"
