@@ -37,8 +37,6 @@ FINE_LEVELS = 2
 """An alignment to several references uses this number of levels."""
 UNKNOWN_M = 1.0
 """Standard deviation assumed for an undetermined direction, metres (for rotations: shift at the mean depth)."""
-WEIGHTS = (0.5, 0.1)
-"""Weights of gray between keyframes: as much as depth, and as in tracking."""
 UPPER = np.triu_indices(6)
 """Rows and columns of the upper triangle of H, in the order of the kernels' sums."""
 
@@ -63,8 +61,28 @@ class Alignment:
 
     @cached_property
     def covariance(self) -> Matrix:
-        """Estimate the covariance [6, 6] of the left twist (ρ, φ), m and rad, on first access (`covariance_of`)."""
-        return covariance_of(self.pair, self.T_live_reference, self.depth_m)
+        """Estimate the covariance [6, 6] of the left twist (ρ, φ), m and rad, on first access. It costs as much as 13
+        steps.
+
+        The result is D⁻¹ S D⁻ᵀ. S sums outer products of the gradient per cell of the image, because residuals of
+        neighbouring pixels are correlated (cluster-robust sandwich estimator, Liang & Zeger 1986). D is the measured
+        change of the gradient within half a pixel. H is not used for D: it is computed from noisy image gradients, so
+        it is several times too steep. An undetermined direction has the standard deviation `UNKNOWN_M`. Without common
+        pixels the covariance is infinite.
+        """
+        half_rad = 0.5 / self.pair.reference.cameras[0].fx
+        steps = np.repeat([half_rad * self.depth_m, half_rad], 3)
+        aside = [se3.exp(sign * twist) @ self.T_live_reference for twist in np.diag(steps) for sign in (1.0, -1.0)]
+        n, *around = normal_equations(self.pair.kernels, self.pair.level(0), [self.T_live_reference, *aside])
+        if n.sums[1] < MIN_PIXELS:
+            return np.diag(np.full(6, np.inf))
+        directions, decided = _axes(n, self.depth_m)
+        basis, unknown = directions[:, decided], directions[:, ~decided]
+        slope = basis.T @ _slope(around, steps) @ basis
+        bread = basis @ np.linalg.inv(slope) @ basis.T
+        return np.asarray(
+            bread @ n.S @ bread.T + (UNKNOWN_M * self.pair.reference.scene_scale) ** 2 * unknown @ unknown.T
+        )
 
     @property
     def bias(self) -> Matrix:
@@ -183,39 +201,19 @@ def align(
     )
 
 
-def covariance_of(pair: Pair, T_live_reference: Matrix, depth_m: float, k: int = 0) -> Matrix:
-    """Estimate the covariance [6, 6] of the left twist (ρ, φ), m and rad, of an alignment at level k. It costs as much
-    as 13 steps.
+def gray_share(reference: Pyramid, live: Pyramid, T_live_reference: Matrix) -> float:
+    """Return the weight of gray, 0 to 1, that is due to it by how well gray and depth agree at a guess [4, 4].
 
-    The result is D⁻¹ S D⁻ᵀ. S sums outer products of the gradient per cell of the image, because residuals of
-    neighbouring pixels are correlated (cluster-robust sandwich estimator, Liang & Zeger 1986). D is the measured change
-    of the gradient within half a pixel. H is not used for D: it is computed from noisy image gradients, so it is
-    several times too steep. An undetermined direction has the standard deviation `UNKNOWN_M`. Without common pixels the
-    covariance is infinite.
+    Each is weighted by the inverse of its size: the root of its mean cost at the finest size, where its Huber width is
+    the unit. The inverse of the variance would be right if residuals were nothing but noise. Errors of other kinds do
+    not become smaller with it, as in `balanced`.
     """
-    half_rad = 0.5 / pair.reference.cameras[k].fx
-    steps = np.repeat([half_rad * depth_m, half_rad], 3)
-    aside = [se3.exp(sign * twist) @ T_live_reference for twist in np.diag(steps) for sign in (1.0, -1.0)]
-    n, *around = normal_equations(pair.kernels, pair.level(k), [T_live_reference, *aside])
-    if n.sums[1] < MIN_PIXELS:
-        return np.diag(np.full(6, np.inf))
-    directions, decided = _axes(n, depth_m)
-    basis, unknown = directions[:, decided], directions[:, ~decided]
-    slope = basis.T @ _slope(around, steps) @ basis
-    bread = basis @ np.linalg.inv(slope) @ basis.T
-    return np.asarray(bread @ n.S @ bread.T + (UNKNOWN_M * pair.reference.scene_scale) ** 2 * unknown @ unknown.T)
-
-
-def surest_weight(reference: Pyramid, live: Pyramid, T_live_reference: Matrix) -> float:
-    """Return the weight of gray, of `WEIGHTS`, that gives the alignment the smaller covariance at a guess [4, 4].
-
-    Which of gray and depth is the better differs from camera to camera and from scene to scene: glossy surfaces pull
-    gray, a sensor's distortion pulls depth. Their residuals are correlated over the image then, which the covariance
-    sees. Half of the full size is enough.
-    """
-    k, depth_m = min(1, len(reference.cameras) - 1), float(reference.readings[0])
-    size = [np.linalg.slogdet(covariance_of(Pair(reference, live, w), T_live_reference, depth_m, k)) for w in WEIGHTS]
-    return WEIGHTS[int(np.argmin([found.logabsdet if found.sign > 0 else np.inf for found in size]))]
+    cost = []
+    for weight in (1.0, 0.0):
+        pair = Pair(reference, live, weight)
+        sums = normal_equations(pair.kernels, pair.level(0), [T_live_reference])[0].sums
+        cost.append(math.sqrt(sums[0] / max(sums[1], 1.0)))
+    return cost[1] / max(cost[0] + cost[1], 1e-9)
 
 
 def align_to_all(

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.fit.align import Alignment, align, surest_weight
+from sigmasplat.fit.align import Alignment, align, gray_share
 from sigmasplat.fit.pyramid import HIDDEN_M, NOISE_PER_M, Pyramid
 from sigmasplat.native import _core
 from sigmasplat.types import Matrix
@@ -77,9 +77,9 @@ def best_alignment(
     """Align two images coarse to fine, and at the finest size alone; return what agrees better at full resolution.
 
     Coarse sizes reach far, but where the scene repeats they pull the pose away, and fine sizes cannot come back.
-    weight_color: as of `align`; None: the surer one (`surest_weight`).
+    weight_color: as of `align`; None: measured (`gray_share`).
     """
-    weight = surest_weight(reference, live, T_live_reference) if weight_color is None else weight_color
+    weight = gray_share(reference, live, T_live_reference) if weight_color is None else weight_color
     pairs = (reference, live), (reference.finest(), live.finest())
     found = [align(*pair, T_live_reference, weight_color=weight) for pair in pairs]
     seen = [compare(reference, live, motion.T_live_reference) for motion in found]
