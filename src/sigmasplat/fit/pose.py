@@ -73,13 +73,14 @@ def fit_pose_align(
     """Align the live image, a gray and depth (m) pyramid, to a reference by Gauss–Newton (`fit.align`), from a guess.
 
     T_camera_world [4, 4]: the guess for the live camera; moves: if False, it is only judged. With `config.verify` the
-    finest size alone is a second candidate. In the result, `loss` is the final cost and `first_loss` is NaN.
+    finest size alone is a second candidate, and `comparison` is that with the reference. In the result, `loss` is the
+    final cost and `first_loss` is NaN.
     """
     guess = T_camera_world @ se3.inverse(reference.T_camera_world)
     if config.verify and moves:
-        found, _ = best_alignment(reference.pyramid, live, guess, config.align_weight_color)
+        found, seen = best_alignment(reference.pyramid, live, guess, config.align_weight_color)
     else:
-        found = align(
+        seen, found = None, align(
             reference.pyramid, live, guess, config.align_iterations * moves, config.align_weight_color,
             config.align_stop, config.plateau_stop,
         )  # fmt: skip
@@ -91,6 +92,7 @@ def fit_pose_align(
         found.cost,
         found.steps,
         alignment=found,
+        comparison=seen,
     )
 
 

@@ -217,7 +217,8 @@ class Tracker:
 
     def _aligned(self, reference: Reference, live: Pyramid, T_camera_world: Matrix, moves: bool = True) -> PoseFit:
         fit = fit_pose_align(reference, live, T_camera_world, self.config, moves)
-        if self.config.verify:
+        known = fit.comparison is not None and (self.keyframe is None or self.keyframe is reference)
+        if self.config.verify and not known:
             fit.comparison = self._compared(reference, live, fit.T_camera_world)
         return fit
 
