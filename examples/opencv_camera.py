@@ -36,7 +36,6 @@ def main(out: str = "camera-out") -> RealTime:
     """Track images until they end or Ctrl-C is pressed, then write trajectory.txt and map.ply into `out`."""
     capture, slam = cv2.VideoCapture(0, cv2.CAP_OBSENSOR), RealTime(Slam("sigma"))
     K = [capture.get(number) for number in FOCAL]
-    slam.on_loop(lambda loop: print(f"loop closed: submaps {loop.query} and {loop.database}"))
     slam.on_correction(lambda moved: print(f"{len(moved.frames)} poses moved by up to {moved.moved_m.max():.3f} m"))
     with interrupt_event() as stopped:  # Ctrl-C ends the loop after an image, never in the middle of one
         for time_s, bgr, depth in images(capture):

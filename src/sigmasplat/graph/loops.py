@@ -106,12 +106,6 @@ class Loops(Records[Loop]):
         verdicts = Column(self.verdicts.used.copy(), len(self))
         return Loops(self.rows.first(len(self)), verdicts, list(self.reasons))
 
-    def newly_closed(self, before: NDArray[np.bool_]) -> list[Loop]:
-        """Return the loops that are accepted now, but were not when `accepted` was `before`."""
-        now = self.accepted
-        now[: len(before)] &= ~before
-        return [self[i] for i in np.flatnonzero(now).tolist()]
-
     def _record(self, i: int) -> Loop:
         row, (accepted, number, chi2, weight) = self.rows.used[i].copy(), self.verdicts.used[i].tolist()
         query, database, query_frame, database_frame, similarity, gated, *rest = row[:NUMBERS].tolist()

@@ -12,7 +12,6 @@ from sigmasplat.data.relative_pose import UNKNOWN_HOP
 from sigmasplat.data.trajectory import APART, RELOCALISED
 from sigmasplat.fit.align import Alignment
 from sigmasplat.fit.pose import fit_pose_align
-from sigmasplat.graph.loops import Loops
 from sigmasplat.graph.path_covariance import NO_ERRORS
 from sigmasplat.realtime.front_end import Offer, Search, Snapshot, TrackedFrame
 from sigmasplat.slam.mapping_backend import SLICES_PER_FRAME
@@ -231,20 +230,17 @@ class BackEnd:
 
     # ---- snapshots ----
 
-    def unreported(self) -> tuple[Loops, Correction | None]:
-        """Return all loops tried, and the correction since the last snapshot; call it when no work is left."""
-        return self.system.loops, self._correction()
-
-    def _correction(self) -> Correction | None:
+    def correction(self) -> Correction | None:
+        """Return how earlier poses have changed since the last call, if a function of the caller wants it."""
         before, self._before = self._before, Before.of(self.system)
-        return correction_since(self.system, before) if self.system.listeners.correction else None
+        return correction_since(self.system, before) if self.system.listeners else None
 
     def _publish(self, number: int, keyframe: TrackedKeyframe, poses: dict[int, Matrix], state: str) -> None:
         """Hand a snapshot of the active map to tracking."""
         system, seconds = self.system, self._timer.stop(self.system.view)["total"]
         if state:
             self._found = number
-        correction = self._correction()
+        correction = self.correction()
         errors = system.pose_errors() if self.with_errors else NO_ERRORS
         self._hand_over(
             Snapshot(

@@ -17,7 +17,7 @@ from sigmasplat.realtime.back_end import BackEnd
 from sigmasplat.realtime.front_end import FrontEnd, Snapshot
 from sigmasplat.render.view import View
 from sigmasplat.slam.results import Step, StepTimer
-from sigmasplat.system.array_interface import ArrayInterface, Events
+from sigmasplat.system.array_interface import ArrayInterface, Correction, tell
 from sigmasplat.system.slam import Slam
 from sigmasplat.tracking.features import extractor_of
 from sigmasplat.tracking.prepared_frame import view_of, working_frame
@@ -115,8 +115,8 @@ class RealTime(ArrayInterface):
     after `settle`. The results depend on how fast the machine is, so they are not reproducible. schedule: runs
     the work on the map; covariances: whether `track` and `covariance` return covariances, which
     cost some milliseconds of work per keyframe; should_stop: whether the next frame waits or is due soon, then no
-    further guess of a doubtful pose is tried. Functions of `on_keyframe`, `on_loop` and `on_correction` are called by
-    the thread that calls `step`, when it learns of the event.
+    further guess of a doubtful pose is tried. Functions of `on_correction` are called by the thread that calls `step`,
+    when it learns of the correction.
     """
 
     def __init__(
@@ -134,7 +134,7 @@ class RealTime(ArrayInterface):
         self._back_end = BackEnd(slam, self._snapshots.put)
         self._back_end.with_errors = covariances
         self.listeners = slam.listeners
-        self._newest, self._events = slam.newest_step(), Events(slam.loops)
+        self._newest, self._corrections = slam.newest_step(), list[Correction | None]()
         self._schedule = MappingThread() if schedule is None else schedule
         self._view: View | None = None
         self._runs, self._threads = False, 0
@@ -160,7 +160,7 @@ class RealTime(ArrayInterface):
         self._back_end.given.put(tracked)
         self._schedule.wake()
         self._newest = tracked.step
-        self._events.tell(self.listeners, [tracked.step] if tracked.step.is_keyframe else [])
+        self._tell()
         return tracked.step
 
     def newest_step(self) -> Step | None:
@@ -201,7 +201,13 @@ class RealTime(ArrayInterface):
                 return mapping_s
             mapping_s += snapshot.seconds
             self._front_end.adopt(snapshot)
-            self._events.add(snapshot.loops, snapshot.correction)
+            self._corrections.append(snapshot.correction)
+
+    def _tell(self) -> None:
+        """Call the caller's functions for what has arrived."""
+        arrived, self._corrections = self._corrections, []
+        for correction in arrived:
+            tell(self.listeners, correction)
 
     @property
     def snapshot(self) -> Snapshot | None:
@@ -248,8 +254,8 @@ class RealTime(ArrayInterface):
             self._adopt()
             self._give_back(self._front_end.copied())
         self.slam.settle()
-        self._events.add(*self._back_end.unreported())  # the last frames may have closed loops
-        self._events.tell(self.listeners)
+        self._corrections.append(self._back_end.correction())  # the last frames may have closed loops
+        self._tell()
 
     def _give_back(self, camera: FrontEnd) -> None:
         """Put the state of tracking into `slam`."""

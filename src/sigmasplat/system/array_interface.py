@@ -1,9 +1,9 @@
-"""The interface of SLAM for your own camera: images as arrays, covariances, and functions to call at keyframes, closed
-loops and corrections of earlier poses."""
+"""The interface of SLAM for your own camera: images as arrays, covariances, and functions to call at corrections of
+earlier poses."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import wraps
 from typing import Any, Literal, Protocol, TypeVar, cast
 
@@ -15,11 +15,9 @@ from sigmasplat.data.camera import Camera
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.frame_arrays import Array, ColorOrder, frame_from_arrays
 from sigmasplat.errors import SourceError
-from sigmasplat.graph.loops import Loop, Loops
 from sigmasplat.slam.results import Step, Steps
 from sigmasplat.types import Matrix
 
-Event = TypeVar("Event")
 Method = TypeVar("Method", bound=Callable[..., Any])
 
 
@@ -39,23 +37,19 @@ class Correction:
 
 
 class Observed(Protocol):
-    """What listeners read of a SLAM system."""
+    """What corrections are found from."""
 
     atlas: Atlas
     steps: Steps
     listeners: "Listeners"
 
-    @property
-    def loops(self) -> Loops: ...
-
 
 @dataclass(frozen=True, eq=False)
 class Before:
-    """The state before a step, as far as listeners need it. closed [L]: which pairs of submaps were closed loops."""
+    """The state before a step, as far as corrections need it."""
 
     atlas: Atlas
     steps: int
-    closed: NDArray[np.bool_]
 
     @staticmethod
     def of(slam: Observed) -> "Before":
@@ -65,60 +59,14 @@ class Before:
             a, anchors=a.anchors.copied(), components=list(a.components), refined=dict(a.refined),
             keyframe_poses=a.keyframe_poses.copied(),
         )  # fmt: skip
-        return Before(kept, len(slam.steps), slam.loops.accepted)
+        return Before(kept, len(slam.steps))
 
 
-@dataclass(eq=False)
-class Listeners:
-    """The functions to call, in the order in which they were added."""
-
-    keyframe: list[Callable[[Step], object]] = field(default_factory=list)
-    loop: list[Callable[[Loop], object]] = field(default_factory=list)
-    correction: list[Callable[[Correction], object]] = field(default_factory=list)
-
-    def __bool__(self) -> bool:
-        return bool(self.keyframe or self.loop or self.correction)
-
-    def notify(self, slam: Observed, before: Before) -> None:
-        """Call the functions for what happened since `before`."""
-        closed = slam.loops.newly_closed(before.closed)
-        correction = correction_since(slam, before) if self.correction else None
-        corrections = [] if correction is None else [correction]
-        self.call([step for step in slam.steps[before.steps :] if step.is_keyframe], closed, corrections)
-
-    def call(self, keyframes: Sequence[Step], closed: Sequence[Loop], corrections: Sequence[Correction]) -> None:
-        """Call the functions for keyframes, closed loops and corrections. If functions raise, the others are still
-        called, then the first exception is raised."""
-        problems = _called(self.keyframe, keyframes) + _called(self.loop, closed)
-        problems += _called(self.correction, corrections)
-        if problems:
-            raise problems[0]
-
-
-class Events:
-    """Collects what the work on the map reports, until the caller's functions can be called."""
-
-    def __init__(self, loops: Loops) -> None:
-        self._closed = loops.accepted
-        self._new: list[Loop] = []
-        self._corrections: list[Correction] = []
-
-    def add(self, loops: Loops, correction: Correction | None) -> None:
-        """Add what a snapshot contains; loops: all pairs tried so far."""
-        self._new += loops.newly_closed(self._closed)
-        before, self._closed = self._closed, loops.accepted
-        self._closed[: len(before)] |= before
-        if correction is not None:
-            self._corrections.append(correction)
-
-    def tell(self, listeners: Listeners, keyframes: Sequence[Step] = ()) -> None:
-        """Call the functions for everything collected, and forget it."""
-        closed, corrections, self._new, self._corrections = self._new, self._corrections, [], []
-        listeners.call(keyframes, closed, corrections)
+Listeners = list[Callable[[Correction], object]]
 
 
 def notifying(method: Method) -> Method:
-    """Make a method of SLAM call the listeners after it has ended without an error."""
+    """Make a method of SLAM tell the listeners of a correction after it has ended without an error."""
 
     @wraps(method)
     def notified(slam: Observed, /, *args: Any, **named: Any) -> Any:
@@ -126,10 +74,17 @@ def notifying(method: Method) -> Method:
             return method(slam, *args, **named)
         before = Before.of(slam)
         result = method(slam, *args, **named)
-        slam.listeners.notify(slam, before)
+        tell(slam.listeners, correction_since(slam, before))
         return result
 
     return cast(Method, notified)
+
+
+def tell(listeners: Listeners, correction: Correction | None) -> None:
+    """Call every function with a correction, if there is one."""
+    if correction is not None:
+        for function in listeners:
+            function(correction)
 
 
 def correction_since(slam: Observed, before: Before) -> Correction | None:
@@ -152,24 +107,11 @@ def correction_since(slam: Observed, before: Before) -> Correction | None:
     return Correction("final map" if refined else "join" if joined else "loop", frames, T_now[frames], moved_m)
 
 
-def _called(functions: Sequence[Callable[[Event], object]], events: Sequence[Event]) -> list[Exception]:
-    """Call every function with every event; return the exceptions they raise."""
-    problems = []
-    for function, event in ((function, event) for event in events for function in functions):
-        try:
-            function(event)
-        except Exception as problem:
-            problems.append(problem)
-    return problems
-
-
-OnKeyframe = TypeVar("OnKeyframe", bound=Callable[[Step], object])
-OnLoop = TypeVar("OnLoop", bound=Callable[[Loop], object])
 OnCorrection = TypeVar("OnCorrection", bound=Callable[[Correction], object])
 
 
 class ArrayInterface(ABC):
-    """Takes arrays instead of frames, and calls functions at events."""
+    """Takes arrays instead of frames, and calls functions when earlier poses have changed."""
 
     listeners: Listeners
 
@@ -222,23 +164,13 @@ class ArrayInterface(ABC):
             )
         return replace(self.step(frame), covariance=self.covariance())
 
-    def on_keyframe(self, function: OnKeyframe) -> OnKeyframe:
-        """Call `function(step)` after each frame that became a keyframe. Returns the function, so this can decorate it.
-
-        The functions of this and the next two methods are called by the thread that called `track`, `step` or
-        `finish`, after the frame is complete. If one raises, the others are still called; then the exception leaves
-        `track`. The state stays valid, `steps[-1]` has the result, and the next frame can be given.
-        """
-        self.listeners.keyframe.append(function)
-        return function
-
-    def on_loop(self, function: OnLoop) -> OnLoop:
-        """Call `function(loop)` for each loop that is closed, also during `finish`."""
-        self.listeners.loop.append(function)
-        return function
-
     def on_correction(self, function: OnCorrection) -> OnCorrection:
         """Call `function(correction)` when poses of earlier frames have changed: a loop was closed, components joined,
-        or `finish` refined the final map."""
-        self.listeners.correction.append(function)
+        or `finish` refined the final map. Returns the function, so this can decorate it.
+
+        Functions are called by the thread that called `track`, `step` or `finish`, after the frame is complete. If one
+        raises, the exception leaves `track`. The state stays valid, `steps[-1]` has the result, and the next frame can
+        be given.
+        """
+        self.listeners.append(function)
         return function

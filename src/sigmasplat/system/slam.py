@@ -51,7 +51,7 @@ class Slam(MainLoop, ArrayInterface):
         settings: Mapping[str, object] | None = None,
     ) -> None:
         super().__init__(configured(config, settings), store)
-        self.listeners = Listeners()
+        self.listeners: Listeners = []
         self._newest_covariance = NewestCovariance()
         self._final: GaussianField | None = None
         self.refinement_steps: int | None = None
