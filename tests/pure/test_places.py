@@ -191,29 +191,23 @@ def test_candidates_are_those_of_a_search_by_hand_whatever_the_order_of_the_data
         assert expected, "a search without result shows nothing"
 
 
-def test_a_limit_keeps_the_candidates_of_the_best_submaps() -> None:
+def test_a_limit_keeps_the_pairs_of_the_best_submaps() -> None:
     limited = 0
     for seed in range(5):
         everyone = random_signatures(seed, count=12)
         found = find_candidates(everyone[5], everyone, min_similarity=1.0)
         ranking = list(dict.fromkeys(candidate.database_submap for candidate in found))
-        for most in (1, 2, 4, 20):
-            few = find_candidates(everyone[5], everyone, 1.0, most=most)
-            assert few == [c for c in found if c.database_submap in ranking[:most]]
+        for most in (1, 2, 4, 20, None):
+            pairs = pairs_to_register(found, everyone[5], everyone, most=most)
+            assert [pair.best.database_submap for pair in pairs] == ranking[:most]
         limited += len(ranking) > 4
     assert limited, "a limit that cuts nothing shows nothing"
 
 
-def test_a_submap_at_the_threshold_takes_no_place_of_a_candidate() -> None:
+def test_a_submap_at_the_threshold_is_no_candidate() -> None:
     query = SubmapDescriptor(9, at(0, 0, 60, 100))  # its twins must exceed 1, the others cos 40°
     same, near = SubmapDescriptor(1, at(0)), SubmapDescriptor(2, at(55))
-    for most in (1, 2, None):
-        assert {c.database_submap for c in find_candidates(query, [same, near], most=most)} == {2}
-
-
-def test_a_limit_keeps_equally_good_submaps() -> None:
-    query, alike = SubmapDescriptor(9, at(0, 0, 90, 90)), [SubmapDescriptor(i, at(1)) for i in range(4)]
-    assert {c.database_submap for c in find_candidates(query, alike, 0.75, most=1)} == {0, 1, 2, 3}
+    assert {c.database_submap for c in find_candidates(query, [same, near])} == {2}
 
 
 def test_ties_go_by_submap_then_query_keyframe_then_database_keyframe() -> None:

@@ -88,8 +88,6 @@ class DescribedSubmaps(Records[SubmapDescriptor]):
         return SubmapDescriptor(int(index), self.rows.used[first : int(end)], ratio, reach_m)
 
 
-ROUNDING = float(np.finfo(np.float32).eps)
-"""Times the length of a descriptor, this is larger than any rounding error of a similarity in single precision."""
 GATE_LEAST, GATE_MOST = 0.85, 1.20
 """Limits of the factor by which the variance of two submaps changes the similarity of their keyframes."""
 
@@ -166,7 +164,6 @@ def find_candidates(
     min_interval: int = 2,
     similarity_floor: float = 0.0,
     uncertainty: bool = True,
-    most: int | None = None,
     among: NDArray[np.bool_] | None = None,
 ) -> list[Candidate]:
     """List the keyframe pairs of the query and other submaps that may show the same place (VarSplat §4), best first.
@@ -176,14 +173,13 @@ def find_candidates(
     low `self_similarity`). Without `uncertainty` the gate is 1. The order is by gated similarity, then by database
     submap, query keyframe, database keyframe; the order of `database` does not matter.
 
-    most: list the pairs of this many submaps, those with the best pairs, and of submaps that are equally good; None:
-    of all. among [S]: which submaps of the database are compared; None: all.
+    among [S]: which submaps of the database are compared; None: all.
     """
     threshold, known = self_similarity(query.descriptors, min_similarity), DescribedSubmaps.of(database)
     wanted = _apart(query, known, min_interval) & (True if among is None else among)
     gates = gate(query.opacity_ratio, known.opacity_ratio) if uncertainty else np.ones(len(known))
     found: list[Candidate] = []
-    for row in _worth_comparing(query, known, wanted, gates, threshold, similarity_floor, most):
+    for row in np.flatnonzero(wanted).tolist() if len(threshold) else ():
         other, factor = known[row], gates[row]
         alike = similarity(query.descriptors, other.descriptors)
         rows, columns = np.nonzero((alike * factor > threshold[:, None]) & (alike > similarity_floor))
@@ -238,37 +234,6 @@ def _apart(query: SubmapDescriptor, known: DescribedSubmaps, min_interval: int) 
     """Return which submaps [S] have keyframes and are at least `min_interval` apart from the query, without the query
     itself."""
     return np.asarray((np.abs(known.numbers - query.index) >= max(min_interval, 1)) & (known.counts > 0))
-
-
-def _worth_comparing(
-    query: SubmapDescriptor,
-    known: DescribedSubmaps,
-    wanted: NDArray[np.bool_],
-    gates: Matrix,
-    threshold: Matrix,
-    floor: float,
-    most: int | None,
-) -> list[int]:
-    """Return the rows of the wanted submaps that may have pairs to list; arguments as in `find_candidates`.
-
-    One product of matrices in single precision replaces one per submap. It is rounded differently: a pair whose
-    similarity is so near a limit is compared again, and takes no place among the `most` best.
-    """
-    if not wanted.any() or not len(threshold):
-        return []
-    counts = known.counts
-    some = np.flatnonzero(counts)
-    alike = query.descriptors @ known.rows.used.T
-    rounding = ROUNDING * query.descriptors.shape[1]
-    gated = alike * np.repeat(gates, counts)
-    above = np.minimum(gated - threshold[:, None], alike - floor)
-    possible, certain = (
-        np.maximum.reduceat(np.where(above > limit, gated, -np.inf).max(0), (np.cumsum(counts) - counts)[some])
-        for limit in (-rounding, rounding)
-    )
-    possible, certain, rows = possible[wanted[some]], certain[wanted[some]], some[wanted[some]]
-    least = -np.inf if most is None or most > len(rows) else np.partition(certain, -most)[-most] - 2.0 * rounding
-    return [int(row) for row in rows[(possible > -np.inf) & (possible >= least)]]
 
 
 def _differences(a: Matrix, b: Matrix) -> tuple[Matrix, Matrix]:

@@ -250,7 +250,7 @@ class LoopCloser:
         connected = components[database.numbers] == components[query.index]
         keyframes, most = self.config.registration.keyframes, c.most or None
         candidates = find_candidates(
-            query, database, c.min_similarity, c.min_interval, c.similarity_floor, c.uncertainty, most, connected
+            query, database, c.min_similarity, c.min_interval, c.similarity_floor, c.uncertainty, connected
         )
         pairs = pairs_to_register(candidates, query, database, keyframes, most)
         if c.near_m:
