@@ -66,7 +66,7 @@ def points_and_pairs(count: int, outliers: int, seed: int = 0) -> tuple[Landmark
     seen[:outliers] = random.uniform([0, 0], [CAMERA.width, CAMERA.height], (outliers, 2))
     sigma, nothing = np.full(count, 0.5, np.float32), np.zeros((count, 1), np.float32)
     reference = Features(pixels, sigma, nothing, CAMERA)
-    landmarks = Landmarks(reference, points, np.full(count, 0.003), np.ones(count))
+    landmarks = Landmarks(reference, points, np.full(count, 0.003))
     return (
         landmarks,
         Features(seen.astype(np.float32), sigma, nothing, CAMERA),
@@ -181,10 +181,9 @@ def test_depth_is_taken_at_the_same_place_for_any_size() -> None:
     pixels = np.array([[10, 20], [200, 100], [317, 237]])
     points = (2 * (pixels + 1) + 0.5).astype(np.float32)
     features = Features(points, np.ones(3, np.float32), np.zeros((3, 1), np.float32), wide)
-    landmarks = landmarks_of(features, depth, small, weights=depth)
+    landmarks = landmarks_of(features, depth, small)
     expected = depth[pixels[:, 1], pixels[:, 0]]
     assert np.array_equal(landmarks.points_m[:, 2], expected.astype(np.float64))
-    assert np.array_equal(landmarks.weight, expected.astype(np.float64))
     rays = small.rays()[pixels[:, 1], pixels[:, 0]]
     assert np.allclose(landmarks.points_m, rays * expected[:, None], atol=1e-5)
     assert np.allclose(landmarks.sigma_m, 0.003 * expected**2, atol=2e-3)
@@ -209,19 +208,18 @@ def test_false_matches_do_not_move_the_pose() -> None:
     assert found.supporting[40:].all() and found.supporting[:40].sum() < 3
 
 
-def test_weights_and_noise_decide_how_much_a_match_counts() -> None:
-    """Half of the matches are shifted by one pixel: the pose follows the other half if these weigh or know more."""
+def test_noise_decides_how_much_a_match_counts() -> None:
+    """Half of the matches are shifted by one pixel: the pose follows the other half if these know more."""
     landmarks, features, pairs, motion = points_and_pairs(100, 0)
     shifted = features.points.copy()
     shifted[::2] += [0.8, 0.0]
     features = dataclasses.replace(features, points=shifted)
-    weight, sigma = np.ones(100), features.sigma_px.copy()
-    weight[::2], sigma[::2] = 0.01, 5.0
+    sigma = features.sigma_px.copy()
+    sigma[::2] = 5.0
     plain = pose_from_landmarks(landmarks, features, pairs, 0)
-    by_weight = pose_from_landmarks(dataclasses.replace(landmarks, weight=weight), features, pairs, 0)
     by_noise = pose_from_landmarks(landmarks, dataclasses.replace(features, sigma_px=sigma), pairs, 0)
-    errors = [distance(found.T_live_reference, motion)[1] for found in (plain, by_weight, by_noise)]
-    assert errors[1] < 0.3 * errors[0] and errors[2] < 0.3 * errors[0]
+    errors = [distance(found.T_live_reference, motion)[1] for found in (plain, by_noise)]
+    assert errors[1] < 0.3 * errors[0]
 
 
 def test_covariance_covers_the_error() -> None:

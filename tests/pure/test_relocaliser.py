@@ -215,21 +215,15 @@ def test_gray_levels_are_the_luma_of_the_colour() -> None:
     assert gray_levels(color).tolist() == [[0, 255, 76, 150, 29]]
 
 
-def test_landmarks_are_the_features_with_depth_and_have_its_weights() -> None:
+def test_landmarks_are_the_features_with_depth() -> None:
     image = seen(0).image
     assert image is not None
     half = image.depth_m.copy()
     half[:, 80:] = 0.0
-    weights = np.where(np.arange(120)[:, None] < 60, 0.25, 1.0) * np.ones((120, 160))
-    some = FeatureImage(image.detail, half, image.camera, weights.astype(np.float32))
+    some = FeatureImage(image.detail, half, image.camera)
     landmarks = some.landmarks(extractor())
     assert 0 < len(landmarks) < len(some.features(extractor()))
-    u, v = landmarks.features.points.T
-    assert u.max() < 162.0, "in pixels of the larger image"
-    above, below = landmarks.weight[v < 116], landmarks.weight[v > 124]
-    assert len(above) and len(below) and set(above) == {0.25} and set(below) == {1.0}
-    other = some.weighed(None)
-    assert set(other.landmarks(extractor()).weight) == {1.0} and len(other.landmarks(extractor())) == len(landmarks)
+    assert landmarks.features.points[:, 0].max() < 162.0, "in pixels of the larger image"
 
 
 def test_features_give_the_motion_between_two_frames() -> None:

@@ -31,12 +31,6 @@ class Reference:
     pyramid: Pyramid
     T_camera_world: Matrix
 
-    @property
-    def weights(self) -> Image | None:
-        """Return the weight of each pixel [H, W] in host memory; None if all are equal."""
-        weight = self.pyramid.weight[0]
-        return None if weight is None else self.pyramid.kernels.to_host(weight)
-
     def without(self, hidden: NDArray[np.bool_]) -> "Reference":
         """Return the reference without depth at some pixels [H, W], so that nothing is aligned to them."""
         host_m = self.pyramid.kernels.to_host(self.pyramid.depth[0])

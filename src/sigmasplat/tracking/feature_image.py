@@ -68,15 +68,11 @@ class DetailField:
 @dataclass(eq=False)
 class FeatureImage:
     """The gray image of a frame at its own size, and its depth [h, w] (m, 0 = no reading) in the working camera.
-
-    weights [h, w]: factor on the information of a landmark, such as w̃ of the map's V; None = 1. Features are found when
-    they are first needed, and kept.
-    """
+    Features are found when they are first needed, and kept."""
 
     detail: DetailField = DetailField()
     depth_m: NDArray[np.float32]  # type: ignore[misc]  # mypy takes the descriptor above for a default
     camera: Camera  # type: ignore[misc]
-    weights: NDArray[np.float32] | None = None
     given_detail: Detail | LateDetail = field(init=False, repr=False)
     _features: Features | None = field(default=None, init=False, repr=False)
     _landmarks: Landmarks | None = field(default=None, init=False, repr=False)
@@ -95,20 +91,14 @@ class FeatureImage:
 
     def with_depth(self, depth_m: NDArray[np.float32]) -> "FeatureImage":
         """Return the same image with other depth [h, w], m; features that were found already are kept."""
-        other = FeatureImage(self.given_detail, depth_m, self.camera, self.weights)
-        other._features = self._features
-        return other
-
-    def weighed(self, weights: NDArray[np.float32] | None) -> "FeatureImage":
-        """Return the same image with other weights; features that were found already are kept."""
-        other = FeatureImage(self.given_detail, self.depth_m, self.camera, weights)
+        other = FeatureImage(self.given_detail, depth_m, self.camera)
         other._features = self._features
         return other
 
     def landmarks(self, extractor: Extractor) -> Landmarks:
         """Return the features that have depth."""
         if self._landmarks is None:
-            self._landmarks = landmarks_of(self.features(extractor), self.depth_m, self.camera, self.weights)
+            self._landmarks = landmarks_of(self.features(extractor), self.depth_m, self.camera)
         return self._landmarks
 
 

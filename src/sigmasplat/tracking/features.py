@@ -121,26 +121,22 @@ STEP_SHARE = 0.03
 class Landmarks:
     """Features with a position in space, in the frame of the camera that saw them.
 
-    points_m [N, 3]; sigma_m [N]: standard deviation of the depth; weight [N]: factor on the information of a landmark,
-    0 to 1.
+    points_m [N, 3]; sigma_m [N]: standard deviation of the depth.
     """
 
     features: Features
     points_m: Matrix
     sigma_m: Matrix
-    weight: Matrix
 
     def __len__(self) -> int:
         return len(self.features)
 
 
-def landmarks_of(
-    features: Features, depth_m: NDArray[np.float32], depth_camera: Camera, weights: NDArray[np.floating] | None = None
-) -> Landmarks:
+def landmarks_of(features: Features, depth_m: NDArray[np.float32], depth_camera: Camera) -> Landmarks:
     """Return the features that have a depth reading away from depth steps, with their positions.
 
-    depth_m [h, w] and weights [h, w] (all 1 if None) are images of `depth_camera`, which may have another size and
-    crop than the camera of the features, but the same pose.
+    depth_m [h, w] is an image of `depth_camera`, which may have another size and crop than the camera of the features,
+    but the same pose.
     """
     z = depth_readings(features, depth_m, depth_camera)
     kept = z > 0
@@ -148,9 +144,7 @@ def landmarks_of(
     c = some.camera
     u, v = some.points.T.astype(np.float64)
     points = np.stack([(u - c.cx) / c.fx * z, (v - c.cy) / c.fy * z, z], 1)
-    column, row, _ = nearest_pixels(some, depth_camera)
-    weight = np.ones(len(z)) if weights is None else np.asarray(weights[row, column], np.float64)
-    return Landmarks(some, points, depth_sigma_m(z), weight)
+    return Landmarks(some, points, depth_sigma_m(z))
 
 
 def depth_readings(features: Features, depth_m: NDArray[np.float32], depth_camera: Camera) -> Matrix:
@@ -256,7 +250,6 @@ class _Problem:
         first, second = pairs.T
         self.camera = features.camera
         self.points = landmarks.points_m[first]
-        self.weight = landmarks.weight[first]
         self.seen = features.points[second].astype(np.float64)
         z = self.points[:, 2]
         sideways = landmarks.features.sigma_px[first] * z / landmarks.features.camera.fx
@@ -309,7 +302,7 @@ class _Problem:
         freedom = 2.0 + (depth > 0)
         # The noise model gives ratios between matches; its scale differs by camera, so it is measured here.
         scale2 = max(float(np.median(squared / freedom)) / MEDIAN_OF_SQUARE, LEAST_SCALE**2)
-        weight = self.weight[chosen] / (1.0 + squared / (scale2 * CAUCHY**2))
+        weight = 1.0 / (1.0 + squared / (scale2 * CAUCHY**2))
         G = np.concatenate([J, -J @ se3.hat(moved)], 2)
         pull = np.swapaxes(G, 1, 2) @ information * weight[:, None, None]
         return (pull @ G).sum(0), (pull @ residual[:, :, None]).sum(0)[:, 0], scale2

@@ -170,10 +170,9 @@ class TrackedKeyframe:
 
     def weighed(self, params: Tensor, view: View, config: TrackingConfig) -> "TrackedKeyframe":
         """Return a keyframe of the map at which the camera was found, weighed by the map with rows `params` [N, 17]."""
-        assert self.reference is not None and self.image is not None
+        assert self.reference is not None
         own = self.reference
-        reference = keyframe_reference(params, view, own.pyramid, own.T_camera_world, config)
-        return TrackedKeyframe(reference, self.image.weighed(reference.weights))
+        return replace(self, reference=keyframe_reference(params, view, own.pyramid, own.T_camera_world, config))
 
 
 def mapped_keyframe(
@@ -188,5 +187,4 @@ def mapped_keyframe(
     if config.method != "align" and not fits_of(view).aligns:
         return TrackedKeyframe(None, seen.image, front)  # nothing aligns to it
     T_camera_world = se3.inverse(T_world_camera)
-    reference = keyframe_reference(params, view, seen.live, T_camera_world, config)
-    return TrackedKeyframe(reference, seen.image and seen.image.weighed(reference.weights), front)
+    return TrackedKeyframe(keyframe_reference(params, view, seen.live, T_camera_world, config), seen.image, front)
