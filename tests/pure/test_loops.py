@@ -16,7 +16,7 @@ from sigmasplat.data.submap import MemoryStore, Picture, Submap
 from sigmasplat.errors import ConfigError
 from sigmasplat.graph import closer
 from sigmasplat.graph.candidates import SubmapPair
-from sigmasplat.graph.closer import Incidence, LoopCloser, Neighbourhood, make_descriptor
+from sigmasplat.graph.closer import LoopCloser, Neighbourhood, make_descriptor
 from sigmasplat.graph.registration import Registration
 from sigmasplat.tracking.descriptors import OrientationGrid
 from sigmasplat.types import Task, completed
@@ -183,9 +183,9 @@ def solved_parts(monkeypatch: pytest.MonkeyPatch, most_free: int) -> dict[int, l
     the whole graph."""
     parts, around, whole = dict[int, list[int | None]](), Neighbourhood.around, Neighbourhood.whole
 
-    def part_of(centre: int, graph: Incidence, always_fixed: int, size: int) -> Neighbourhood:
+    def part_of(centre: int, ends: np.ndarray, always_fixed: int, size: int) -> Neighbourhood:
         parts.setdefault(centre, []).append(size)
-        return around(centre, graph, always_fixed, size)
+        return around(centre, ends, always_fixed, size)
 
     def all_of(nodes: list[int], edges: list[RelativePose]) -> Neighbourhood:
         parts.setdefault(nodes[-1], []).append(None)

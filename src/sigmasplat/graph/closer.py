@@ -1,6 +1,5 @@
 """Close loops: find candidate submaps, register them, solve the pose graph, and move the anchors."""
 
-from array import array
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -64,35 +63,6 @@ MOST_FREE = 100
 """A larger graph is solved in parts of this many nodes; a smaller one is always solved as a whole."""
 
 
-@dataclass(eq=False)
-class Incidence:
-    """Which edges are at each node; kept up to date while edges are appended to a list, so that a part of a large graph
-    is found without reading the whole one."""
-
-    edges: Sequence[RelativePose]
-    at: dict[int, "array[int]"] = field(default_factory=dict)
-    ends: "array[int]" = field(default_factory=lambda: array("i"))
-    """Both ends of each edge that was read."""
-
-    def rows_at(self, node: int) -> list[int]:
-        """Return the rows of the edges at a node, in the order of the edges."""
-        for row in range(len(self.ends) // 2, len(self.edges)):
-            edge = self.edges[row]
-            for end in (edge.a, edge.b):
-                self.at.setdefault(end, array("i")).append(row)
-                self.ends.append(end)
-        return list(self.at.get(node, ()))
-
-    def ends_of(self, row: int) -> tuple[int, int]:
-        """Return both ends of an edge that `rows_at` has returned."""
-        return self.ends[2 * row], self.ends[2 * row + 1]
-
-    def other_end(self, row: int, node: int) -> int:
-        """Return the end of an edge that is not the node."""
-        a, b = self.ends_of(row)
-        return b if a == node else a
-
-
 @dataclass(frozen=True, eq=False)
 class Neighbourhood:
     """A part of a graph. nodes: their numbers in the graph, the fixed ones first; fixed: how many these are; edges:
@@ -109,25 +79,21 @@ class Neighbourhood:
         return Neighbourhood(tuple(nodes), 1, tuple(row for row, edge in enumerate(edges) if edge.a in inside))
 
     @staticmethod
-    def around(centre: int, graph: Incidence, always_fixed: int, most_free: int = MOST_FREE) -> "Neighbourhood":
+    def around(centre: int, ends: NDArray[np.int64], always_fixed: int, most_free: int = MOST_FREE) -> "Neighbourhood":
         """Return the `most_free` nodes that are the fewest edges away from a centre, with their neighbours fixed.
 
-        The node `always_fixed` is never free. The time taken depends on the part, not on the whole graph.
+        ends [E, 2]: of the edges of the graph. The node `always_fixed` is never free.
         """
-        order, seen = [centre], {centre}
+        order = [centre]
         for node in order:
             if len(order) > most_free:  # always_fixed may be one of them
                 break
-            for row in graph.rows_at(node):
-                other = graph.other_end(row, node)
-                if other not in seen:
-                    seen.add(other)
-                    order.append(other)
+            beside = ends[(ends == node).any(1)].ravel().tolist()
+            order += [other for other in dict.fromkeys(beside) if other not in order]
         free = sorted([node for node in order if node != always_fixed][:most_free])
-        rows = sorted({row for node in free for row in graph.rows_at(node)})
-        ends = {end for row in rows for end in graph.ends_of(row)}
-        fixed = sorted(ends.difference(free))
-        return Neighbourhood((*fixed, *free), len(fixed), tuple(rows))
+        rows = np.flatnonzero(np.isin(ends, free).any(1))
+        fixed = np.setdiff1d(ends[rows], free).tolist()
+        return Neighbourhood((*fixed, *free), len(fixed), tuple(rows.tolist()))
 
     def solve(
         self, T_world_node: Sequence[Matrix], edges: Sequence[RelativePose], rejected: Sequence[bool] = ()
@@ -173,9 +139,6 @@ class LoopCloser:
     loops: Loops = field(default_factory=Loops)
     solved: int = 0
     pending: list[PendingSearch] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        self.graph = Incidence(self.edges)
 
     def add_finished(self, submap: Submap, descriptors: Sequence[NDArray[np.float32]], T_first_submap: Matrix) -> None:
         """Add a submap of an earlier session: loops to it are tried, but it stays where it is relative to the first
@@ -324,7 +287,7 @@ class LoopCloser:
         if centre is None or whole:
             part = Neighbourhood.whole(members, self.edges)
         else:
-            part = Neighbourhood.around(centre, self.graph, members[0], most_free)
+            part = Neighbourhood.around(centre, self.edges.ends, members[0], most_free)
         small = len(members) <= MOST_FREE
         loop_rows = self.edges.loop_rows(part.edges).tolist()
         rejected = [] if small else [row >= 0 and self.loops.is_rejected(row) for row in loop_rows]
