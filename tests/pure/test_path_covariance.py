@@ -218,9 +218,10 @@ def test_poses_that_mapping_moves_are_less_certain() -> None:
     room = Loopy()
     sure = room.covariance(None)
     shift = se3.exp(np.array([5e-3, 0.0, 0.0, 0.0, 0.0, 0.0]))
-    tracked = sure.hops.T_camera_before.copy()
+    hops = sure.hops
+    tracked = hops.T_camera_before
     tracked[1::2] = shift @ tracked[1::2]
-    moved = replace(sure, hops=replace(sure.hops, T_camera_before=tracked))
+    moved = replace(sure, hops=TrackedHops.joined(tracked, hops.covariance, hops.bias))
     assert moved.between(0, 1)[0, 0] > sure.between(0, 1)[0, 0] + 0.2 * 5e-3**2
 
 

@@ -10,7 +10,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import Any, ClassVar, Generic, NamedTuple, TypeVar, overload
+from typing import Any, ClassVar, Generic, NamedTuple, Self, TypeVar, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -150,6 +150,12 @@ class Records(Sequence[Record], Generic[Record]):
     def __post_init__(self) -> None:
         if self.parts and self.rows.values.ndim == 1:
             self.rows = Column.of(np.float64, self.width)
+
+    @classmethod
+    def joined(cls, *values: NDArray[Any]) -> Self:
+        """Return records of the values of their parts, [N, …] each."""
+        rows = np.concatenate([part.reshape(len(part), -1) for part in values], 1)
+        return cls(Column(rows, len(rows)))
 
     def __len__(self) -> int:
         return len(self.rows)

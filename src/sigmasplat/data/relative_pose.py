@@ -102,24 +102,6 @@ class Alignments(Records[RelativePose]):
 
 
 @dataclass(frozen=True, eq=False)
-class Hops:
-    """The motion to each of K keyframes from the one before it in its submap, as tracking found it:
-    T_camera_before [K, 4, 4], covariance [K, 6, 6], bias [K, 6]."""
-
-    T_camera_before: Matrix
-    covariance: Matrix
-    bias: Matrix
-
-    def hop(self, row: int) -> RelativePose:
-        """Return one hop."""
-        return RelativePose.hop(self.T_camera_before[row], self.covariance[row], self.bias[row])
-
-    def known(self, row: int) -> Matrix | None:
-        """Return the covariance [6, 6] that tracking estimated for one hop, with its bias; None if it is not known."""
-        return self.hop(row).total_covariance
-
-
-@dataclass(frozen=True, eq=False)
 class SolvedGraph:
     """The edges that determined the final poses of keyframes, as numbers: a keyframe that submaps share is one node.
 

@@ -72,7 +72,7 @@ class KeyframeNodes:
         for row in np.flatnonzero(self.node >= 0)[1:].tolist():
             if submap[row] == submap[row - 1]:
                 a, b = self.node[[row, row - 1]].tolist()
-                found.append(hop_between(a, b, path.hops.hop(row), se3.inverse(T[row]) @ T[row - 1]))
+                found.append(hop_between(a, b, path.hops[row], se3.inverse(T[row]) @ T[row - 1]))
         for edge in path.edges:
             a, b = (int(first[s]) + k for s, k in zip((edge.a, edge.b), edge.keyframes, strict=True))
             if self.node[a] < 0 or self.node[a] == self.node[b] or self._share(edge):

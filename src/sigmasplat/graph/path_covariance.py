@@ -12,22 +12,18 @@ A pose is a linear function of all errors, and so is the motion between two pose
 function: it is the pose graph's solution.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, lru_cache
-from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import breadth_first_order
 from torch import Tensor
 
 from sigmasplat.data import se3
 from sigmasplat.data.atlas import Atlas, between_keyframes
-from sigmasplat.data.poses import Places
-from sigmasplat.data.relative_pose import Edges, Hops, RelativePose, SolvedGraph
+from sigmasplat.data.relative_pose import Edges, RelativePose, SolvedGraph, TrackedHops
 from sigmasplat.graph import graph_errors
 from sigmasplat.graph.closer import LoopCloser
 from sigmasplat.graph.graph_errors import GraphErrors, root
@@ -80,7 +76,7 @@ class PathCovariance:
     is_keyframe: NDArray[np.bool_]
     keyframe_submap: Numbers
     T_submap_keyframe: Matrix
-    hops: Hops
+    hops: TrackedHops
     edges: tuple[RelativePose, ...]
     graph: SolvedGraph | None = None
     T_final: Matrix | None = None
@@ -88,12 +84,11 @@ class PathCovariance:
     @staticmethod
     def of_keyframes(atlas: Atlas, edges: Sequence[RelativePose]) -> "PathCovariance":
         """Return the errors of the keyframes alone, without other frames."""
-        read = {name: tensor.numpy() for name, tensor in recorded(replace(atlas, places=Places()), edges).items()}
-        none, anchors, components = np.empty(0, np.int64), np.array(atlas.anchors), np.array(atlas.components, np.int64)
+        none, counts = np.empty(0, np.int64), atlas.keyframe_poses.counts
         return PathCovariance(
-            anchors, components, none, none, read["T_keyframe_camera"], none.astype(bool),
-            read["keyframe_submap"], read["T_submap_keyframe"],
-            Hops(read["hop_T_camera_before"], read["hop_covariance"], read["hop_bias"]), tuple(edges),
+            np.array(atlas.anchors), np.array(atlas.components, np.int64), none, none, np.empty((0, 4, 4)),
+            none.astype(bool), np.repeat(np.arange(len(counts)), counts), atlas.keyframe_poses.stacked(), atlas.hops,
+            tuple(edges),
         )  # fmt: skip
 
     @staticmethod
@@ -102,18 +97,18 @@ class PathCovariance:
         if "hop_covariance" not in checkpoint:
             return None
         read = {name: tensor.numpy() for name, tensor in checkpoint.items()}
-        columns: list[Iterable[Any]] = [read[name] for name in ("edge_T_a_b", "edge_information", "edge_is_loop")]
-        if "edge_drift" in read:  # older versions did not write it
-            columns += [map(tuple, read["edge_keyframes"].tolist()), read["edge_drift"]]
-        edges = zip(read["edge_submaps"].tolist(), *columns, strict=True)
+        edges = zip(
+            read["edge_submaps"].tolist(), read["edge_T_a_b"], read["edge_information"], read["edge_is_loop"],
+            read["edge_keyframes"].tolist(), read["edge_drift"], strict=True,
+        )  # fmt: skip
         return PathCovariance(
             read["T_world_submap"], read["submap_component"], read["frame_submap"], read["frame_keyframe"],
             read["T_keyframe_camera"], np.isin(np.arange(len(read["frame_keyframe"])), read["keyframes"]),
             read["keyframe_submap"], read["T_submap_keyframe"],
-            Hops(read["hop_T_camera_before"], read["hop_covariance"], read["hop_bias"]),
+            TrackedHops.joined(read["hop_T_camera_before"], read["hop_covariance"], read["hop_bias"]),
             tuple(
-                RelativePose(a, b, T, information, "loop" if loop else "odometry", *drift)
-                for (a, b), T, information, loop, *drift in edges
+                RelativePose(a, b, T, information, "loop" if loop else "odometry", (in_a, in_b), drift)
+                for (a, b), T, information, loop, (in_a, in_b), drift in edges
             ),
             graph_errors.read(read), read.get("T_world_camera"),
         )  # fmt: skip
@@ -151,19 +146,6 @@ class PathCovariance:
         if self.T_final is not None:
             return self.T_final
         return np.asarray(self.anchors[self.frame_submap] @ self.T_submap_keyframe[self._row] @ self.T_keyframe_camera)
-
-    def without_loops(self) -> "PathCovariance":
-        """Return the path as the trusted edges alone give it: odometry, and places where the camera was found."""
-        edges = tuple(edge for edge in self.edges if not edge.loop)
-        motions = {(edge.a, edge.b): edge.T_a_b for edge in edges}
-        motions |= {(edge.b, edge.a): se3.inverse(edge.T_a_b) for edge in edges}
-        a, b = np.array(list(motions), np.intp).reshape(-1, 2).T
-        connected, anchors = coo_array((np.ones(len(a)), (a, b)), shape=(len(self.anchors),) * 2), self.anchors.copy()
-        for first in np.unique(self.components, return_index=True)[1]:
-            order, before = breadth_first_order(connected, first)
-            for submap in order[1:]:
-                anchors[submap] = anchors[before[submap]] @ motions[before[submap], submap]
-        return replace(self, anchors=anchors, edges=edges, graph=None, T_final=None)
 
     # ---- rows of keyframes ----
 
@@ -217,7 +199,7 @@ class PathCovariance:
         """
         rows, row = self._rows_of_hops(int(self.frame_submap[frame])), int(self._row[frame])
         near = [r for r in (row + 1, row) if rows.start <= r < rows.stop]
-        known = (self.hops.known(r) for r in near or range(row, -1, -1))
+        known = (self.hops[r].total_covariance for r in near or range(row, -1, -1))
         return next((covariance for covariance in known if covariance is not None), UNKNOWN)
 
     @lru_cache(maxsize=64)  # noqa: B019 - the object lives as long as one evaluation or export
