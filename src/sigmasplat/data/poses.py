@@ -173,7 +173,12 @@ class Records(Sequence[Record], Generic[Record]):
 
     def add(self, *values: Any) -> None:
         """Append a record: the values of its parts."""
-        self.rows.append(np.concatenate([np.ravel(value) for value in values]))
+        self.rows.append(self.row_of(*values))
+
+    @staticmethod
+    def row_of(*values: Any) -> NDArray[Any]:
+        """Return the row of a record, given the values of its parts."""
+        return np.concatenate([np.ravel(value) for value in values])
 
     def values(self, i: int) -> list[Any]:
         """Return the values of the parts of a record."""

@@ -4,18 +4,14 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sigmasplat.data import se3
-from sigmasplat.data.poses import Column, Records
+from sigmasplat.data.poses import Column, Part, Records
 from sigmasplat.data.submap import Submap
 from sigmasplat.graph.candidates import Candidate
 from sigmasplat.graph.pose_graph import LoopVerdict
 from sigmasplat.graph.registration import Registration
 from sigmasplat.types import Matrix
-
-NUMBERS = 11
-"""Columns before the pose, see `Loops.rows`."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -55,66 +51,54 @@ class Loop:
 
 @dataclass(eq=False)
 class Loops(Records[Loop]):
-    """All pairs that were tried, in their order. A record is made when it is read.
+    """All pairs that were tried, in their order. A record is made when it is read. reasons: their texts by number."""
 
-    rows [L, 27]: what never changes: query, database, query_frame, database_frame, similarity, gated, residual,
-    overlap, localised, translation_m, rotation_deg, and T_query_database by rows; verdicts [L, 4]: accepted, number of
-    the reason in `reasons`, chi2, weight.
-    """
+    query = Part(np.int64)
+    database = Part(np.int64)
+    query_frame = Part(np.int64)
+    database_frame = Part(np.int64)
+    similarity = Part(np.float64)
+    gated = Part(np.float64)
+    accepted = Part(np.bool_)
+    reason = Part(np.int64)
+    residual = Part(np.float64)
+    overlap = Part(np.float64)
+    localised = Part(np.int64)
+    translation_m = Part(np.float64)
+    rotation_deg = Part(np.float64)
+    T_query_database = Part(np.float64, 4, 4)
+    chi2 = Part(np.float64)
+    weight = Part(np.float64)
 
-    rows: Column = field(default_factory=lambda: Column.of(np.float64, NUMBERS + 16))
-    verdicts: Column = field(default_factory=lambda: Column.of(np.float64, 4))
     reasons: list[str] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        self._numbers = {reason: number for number, reason in enumerate(self.reasons)}
 
     def append(self, loop: Loop) -> None:
         """Append a pair."""
-        numbers = (
-            loop.query, loop.database, loop.query_frame, loop.database_frame, loop.similarity, loop.gated,
-            loop.residual, loop.overlap, loop.localised, loop.translation_m, loop.rotation_deg,
-        )  # fmt: skip
-        self.verdicts.append(self._verdict(loop))
-        self.rows.append([*numbers, *loop.T_query_database.ravel()])
+        self.rows.append(self._row(loop))
 
     def judge(self, i: int, verdict: LoopVerdict) -> None:
         """Set the pose graph's verdict on a registered pair."""
         reason = "accepted" if verdict.accepted else f"the pose graph disagrees (χ² {verdict.chi2:.0f})"
         accepted, chi2, weight = verdict.accepted, verdict.chi2, verdict.weight
-        loop = replace(self[i], accepted=accepted, reason=reason, chi2=chi2, weight=weight)
-        self.verdicts.used[i] = self._verdict(loop)
+        self.rows.used[i] = self._row(replace(self[i], accepted=accepted, reason=reason, chi2=chi2, weight=weight))
 
-    def _verdict(self, loop: Loop) -> tuple[bool, int, float, float]:
-        number = self._numbers.setdefault(loop.reason, len(self._numbers))
-        if number == len(self.reasons):
+    def _row(self, loop: Loop) -> Matrix:
+        if loop.reason not in self.reasons:
             self.reasons.append(loop.reason)
-        return loop.accepted, number, loop.chi2, loop.weight
-
-    @property
-    def accepted(self) -> NDArray[np.bool_]:
-        """Return whether each pair is used as a loop [L]."""
-        return np.asarray(self.verdicts.used[:, 0] != 0)
+        values = {name: getattr(loop, name) for name in Loop.__dataclass_fields__}
+        return self.row_of(*(values | {"reason": self.reasons.index(loop.reason)}).values())
 
     def is_rejected(self, i: int) -> bool:
         """Return whether a pose graph that was solved before has rejected a pair."""
-        accepted, _, chi2, _ = self.verdicts.used[i]
-        return bool(np.isfinite(chi2) and not accepted)
+        return bool(np.isfinite(self[i].chi2) and not self[i].accepted)
 
     def copied(self) -> "Loops":
         """Return the pairs so far with the verdicts of now."""
-        verdicts = Column(self.verdicts.used.copy(), len(self))
-        return Loops(self.rows.first(len(self)), verdicts, list(self.reasons))
+        return Loops(Column(self.rows.used.copy(), len(self)), list(self.reasons))
 
     def _record(self, i: int) -> Loop:
-        row, (accepted, number, chi2, weight) = self.rows.used[i].copy(), self.verdicts.used[i].tolist()
-        query, database, query_frame, database_frame, similarity, gated, *rest = row[:NUMBERS].tolist()
-        residual, overlap, localised, translation_m, rotation_deg = rest
-        return Loop(
-            int(query), int(database), int(query_frame), int(database_frame), similarity, gated, bool(accepted),
-            self.reasons[int(number)], residual, overlap, int(localised), translation_m, rotation_deg,
-            row[NUMBERS:].reshape(4, 4), chi2, weight,
-        )  # fmt: skip
+        values = dict(zip(Loop.__dataclass_fields__, self.values(i), strict=True))
+        return Loop(**values | {"reason": self.reasons[values["reason"]]})
 
 
 def described(best: Candidate, a: Submap, b: Submap, found: Registration, known: Matrix) -> Loop:
