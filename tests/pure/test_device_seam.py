@@ -102,7 +102,7 @@ def test_the_checks_notice_what_they_are_for() -> None:
 def test_every_backend_has_a_row() -> None:
     assert backend_names() == ["cpu", "reference", "cuda"]
     offered = [fits_of(SimpleNamespace(backend=name)) for name in backend_names()]
-    assert len({id(fits) for fits in offered}) == 3 and [fits.aligns for fits in offered] == [True, False, True]
+    assert len({id(fits) for fits in offered}) == 3
 
 
 def test_fused_terms_are_in_the_order_of_the_kernels_struct() -> None:

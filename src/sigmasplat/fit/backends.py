@@ -34,7 +34,6 @@ TORCH = DeviceFits(
     reference_maps=reference_arrays,
     live_planes=cpu.live_planes,
     images=cpu.CPU_IMAGES,
-    aligns=False,
 )
 CPU = replace(
     TORCH,
@@ -44,7 +43,6 @@ CPU = replace(
     tracking_loss=cpu.tracking_gradient,
     descend=partial(descend, tracking_loss=cpu.tracking_gradient),
     reference_maps=cpu.reference_maps,
-    aligns=True,
 )
 OWN = {"reference": TORCH, "cpu": CPU}
 

@@ -198,5 +198,3 @@ class DeviceFits:
     """Return gray and depth of a frame (colour [H, W, 3], depth [H, W] m, its target) on the device that aligns
     them."""
     images: ImageKernels
-    aligns: bool
-    """Whether images are aligned even if the settings do not ask for it: plain torch fits by its definitions alone."""

@@ -14,7 +14,6 @@ from sigmasplat.config import Config, TrackingConfig
 from sigmasplat.data import se3
 from sigmasplat.data.submap import Picture, Submap, SubmapStore
 from sigmasplat.fit.align import align
-from sigmasplat.fit.backends import fits_of
 from sigmasplat.fit.compare import Comparison, compare
 from sigmasplat.fit.pose import PoseFit, fit_pose_adam, fit_pose_align
 from sigmasplat.fit.pyramid import Pyramid
@@ -176,18 +175,11 @@ class Registrar:
 
     def _aligned(self, other: Tensor, live: Pyramid, guess: Matrix) -> PoseFit:
         """Align a keyframe to the map rendered at a guess, then again to the map rendered at the result."""
-        if not fits_of(self.view).aligns:
-            return PoseFit(guess, 0.0, 0.0, np.nan, np.nan, 0)  # alignment needs the compiled kernels
         for _ in range(2):
             reference = map_reference(other, self.view, guess, self.tracking)
             fit = fit_pose_align(reference, live, guess, self.tracking)
             guess = fit.T_camera_world
         return fit
-
-    @property
-    def _aligns_to_keyframes(self) -> bool:
-        """Return whether localised keyframes are aligned to recorded images, which needs the compiled kernels."""
-        return self.config.to_keyframe and fits_of(self.view).aligns
 
     def _at_keyframe(self, other: Submap, target: Target, live: Pyramid, found: PoseFit) -> PoseFit | None:
         """Align a keyframe that was found in a submap to the recorded image of its nearest keyframe there; return None
@@ -197,7 +189,7 @@ class Registrar:
         wrong pose. Readings are not.
         """
         c = self.config
-        if not self._aligns_to_keyframes or not bool((target.depth_image > 0).any()):
+        if not c.to_keyframe or not bool((target.depth_image > 0).any()):
             return None
         k = _nearest_keyframe(other, found.T_camera_world, target)
         fit = fit_pose_align(self._reference_at(other, k), live, found.T_camera_world, self.tracking)
@@ -216,8 +208,6 @@ class Registrar:
     def _checked(self, other: Tensor, live: Pyramid, T_camera_map: Matrix) -> tuple[Matrix, Comparison | None]:
         """Return the covariance [6, 6] of T_camera_map's left twist, estimated by alignment to the map at that pose,
         and, if poses are verified, the comparison with the map there."""
-        if not fits_of(self.view).aligns:
-            return np.zeros((6, 6)), None
         reference = map_reference(other, self.view, T_camera_map, self.tracking)
         covariance = align(reference.pyramid, live, np.eye(4), 0, self.tracking.align_weight_color).covariance
         comparison = compare(reference.pyramid, live, np.eye(4)) if self.verify else None
@@ -236,7 +226,7 @@ class Registrar:
         agreed = consensus(good, centre_b, c.spread_m * scale, np.deg2rad(c.spread_deg))
         if len(agreed) < 2:
             return refused(T_a_b, good, len(agreed), f"the poses of {len(good)} keyframes disagree")
-        if self._aligns_to_keyframes and not any(f.at_keyframe for f in agreed):
+        if c.to_keyframe and not any(f.at_keyframe for f in agreed):
             return refused(T_a_b, agreed, len(agreed), f"only maps agree with {len(agreed)} keyframes, no image does")
         mean = combined(agreed)
         overlap = shared(a, b, mean, c.overlap_m * scale)

@@ -121,7 +121,7 @@ class BackEnd:
         if first is None or last is None or offer.seen.frame.T_given_camera is not None:
             return T, first
         reference, with_weights = last.keyframe.reference, each.based_on >= self._newest
-        if with_weights or last.newest != self._newest or reference is None:
+        if with_weights or last.newest != self._newest:
             return T, first
         fit = fit_pose_align(reference, offer.seen.live, se3.inverse(T), self.system.config.tracking)
         if fit.alignment is None or fit.agreement * fit.overlap < AS_GOOD * first.agreement * first.overlap:

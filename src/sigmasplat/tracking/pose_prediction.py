@@ -8,7 +8,6 @@ from sigmasplat.config import TrackingConfig
 from sigmasplat.data import se3
 from sigmasplat.data.frame import PosePrior
 from sigmasplat.fit.align import align
-from sigmasplat.fit.backends import fits_of
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.render.view import View
 from sigmasplat.tracking.prepared_frame import Splats
@@ -63,8 +62,8 @@ class Given:
 
 def odometry(last: Pyramid | None, live: Pyramid, given: Given, config: TrackingConfig) -> Matrix | None:
     """Align the last image to this one and return T_live_last [4, 4]; None without a last image, or if it fails."""
-    if last is None or (config.method == "adam" and not fits_of(given.view).aligns):
-        return None  # alignment needs the compiled kernels
+    if last is None:
+        return None
     prediction = given.prediction
     guesses = (se3.inverse(prediction.motion), prediction.turn.T.copy())  # the inverse, because it has no translation
     found = [align(last, live, g, 2 * config.align_iterations, config.align_weight_color) for g in guesses]

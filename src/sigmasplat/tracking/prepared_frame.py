@@ -14,7 +14,6 @@ from sigmasplat.data.camera import Camera, gray_exposure, unexposed
 from sigmasplat.data.frame import Frame, Photo, photo_size
 from sigmasplat.data.submap import Picture
 from sigmasplat.errors import SourceError
-from sigmasplat.fit.backends import fits_of
 from sigmasplat.fit.pyramid import HIDDEN_M, Pyramid
 from sigmasplat.fit.references import Reference, keyframe_reference, live_image, picture_images
 from sigmasplat.fit.target import Target
@@ -161,16 +160,14 @@ class TrackedKeyframe:
     """What tracking keeps of a keyframe. The map's `Keyframe` has planes for the fits instead, and the state of Adam:
     neither needs the other's memory.
 
-    reference: its image with the weights of the map, None if nothing aligns to it; image: for features; front: what
-    was in front of the scene."""
+    reference: its image with the weights of the map; image: for features; front: what was in front of the scene."""
 
-    reference: Reference | None
+    reference: Reference
     image: FeatureImage | None
     front: DynamicMask | None = None
 
     def weighed(self, params: Tensor, view: View, config: TrackingConfig) -> "TrackedKeyframe":
         """Return a keyframe of the map at which the camera was found, weighed by the map with rows `params` [N, 17]."""
-        assert self.reference is not None
         own = self.reference
         return replace(self, reference=keyframe_reference(params, view, own.pyramid, own.T_camera_world, config))
 
@@ -184,7 +181,5 @@ def mapped_keyframe(
     front: DynamicMask | None,
 ) -> TrackedKeyframe:
     """Return a keyframe that was just mapped, weighed by the map with rows `params` [N, 17]."""
-    if config.method != "align" and not fits_of(view).aligns:
-        return TrackedKeyframe(None, seen.image, front)  # nothing aligns to it
     T_camera_world = se3.inverse(T_world_camera)
     return TrackedKeyframe(keyframe_reference(params, view, seen.live, T_camera_world, config), seen.image, front)

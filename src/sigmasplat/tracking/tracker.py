@@ -308,9 +308,8 @@ class Tracker:
 
     def follow(self, keyframe: TrackedKeyframe) -> None:
         """Use a keyframe as the reference of the next frames."""
-        if keyframe.reference is not None:
-            self.detector = self.detector.followed(self.keyframe, keyframe.reference)
-            self.keyframe = keyframe.reference
+        self.detector = self.detector.followed(self.keyframe, keyframe.reference)
+        self.keyframe = keyframe.reference
         self.keyframe_features, self.keyframe_front = keyframe.image, keyframe.front
 
     def move_to(self, field: Splats, view: View, keyframe: TrackedKeyframe, T_world_camera: Matrix) -> None:
@@ -341,7 +340,7 @@ class Tracker:
         self.front, self.keyframe_front, self.detector = None, None, self.detector.cleared()
 
     def hop(self, fit: PoseFit, live: Pyramid) -> Alignment | None:
-        """Return the alignment to the newest keyframe that gives the covariance of a fit; None without the kernels. For
+        """Return the alignment to the newest keyframe that gives the covariance of a fit; None without one. For
         a pose found by gradient descent, it takes no step."""
         if fit.alignment is not None or self.keyframe is None:
             return fit.alignment

@@ -40,7 +40,6 @@ def _fits() -> DeviceFits:
         reference_maps=reference_maps,
         live_planes=images.live_planes,
         images=images.CUDA_IMAGES,
-        aligns=True,
     )
 
 
