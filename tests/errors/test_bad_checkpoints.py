@@ -13,7 +13,7 @@ from sigmasplat.data.atlas import Atlas
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.poses import Place
-from sigmasplat.data.relative_pose import UNKNOWN_HOP, RelativePose
+from sigmasplat.data.relative_pose import UNKNOWN_HOP, Edges, RelativePose
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import RunError, SigmaSplatError
 from sigmasplat.plugins.outputs.floorplan.floor_plan import floor_plan
@@ -54,7 +54,8 @@ def run(tmp_path: Path) -> RunFolder:
         atlas.begin_submap(T if submap else None)
         for k in range(keyframes):
             atlas.set_keyframes([T] * (k + 1), UNKNOWN_HOP)
-    edges = [RelativePose(0, 1, T, np.eye(6), kind="loop")]
+    edges = Edges()
+    edges.append(RelativePose(0, 1, T, np.eye(6), kind="loop"))
     run = RunFolder.create(tmp_path / "run", BASE, "room")
     trajectory = Trajectory(np.arange(3.0), np.tile(np.eye(4), (3, 1, 1)))
     run.write_checkpoint(checkpoint_of(GaussianField.empty(), trajectory, atlas, [0, 1, 2], edges), {})

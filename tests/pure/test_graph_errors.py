@@ -12,7 +12,7 @@ from scipy.stats import chi2
 
 from sigmasplat.data import se3
 from sigmasplat.data.atlas import Atlas
-from sigmasplat.data.relative_pose import Kind, RelativePose, SolvedGraph
+from sigmasplat.data.relative_pose import Edges, Kind, RelativePose, SolvedGraph
 from sigmasplat.errors import RunError
 from sigmasplat.final.keyframe_nodes import KeyframeNodes
 from sigmasplat.graph import graph_errors
@@ -114,7 +114,7 @@ def with_keyframes(graph: SolvedGraph) -> tuple[Atlas, list[int]]:
 def test_a_frame_between_keyframes_shares_the_errors_of_both() -> None:
     graph = solved(measured(np.random.default_rng(2)))
     atlas, keyframes = with_keyframes(graph)
-    tensors = path_errors(atlas, keyframes, []) | {"T_world_camera": torch.from_numpy(atlas.T_world_camera())}
+    tensors = path_errors(atlas, keyframes, Edges()) | {"T_world_camera": torch.from_numpy(atlas.T_world_camera())}
     path = PathCovariance.of(tensors)
     assert path is not None
     errors = GraphErrors(graph)
@@ -131,7 +131,7 @@ def test_a_frame_between_keyframes_shares_the_errors_of_both() -> None:
 def test_a_checkpoint_keeps_the_graph_and_a_broken_one_is_refused(tmp_path: Path) -> None:
     graph = solved(measured(np.random.default_rng(3)))
     atlas, keyframes = with_keyframes(graph)
-    tensors = path_errors(atlas, keyframes, [])
+    tensors = path_errors(atlas, keyframes, Edges())
     arrays = {name: tensor.numpy() for name, tensor in check_checkpoint(tensors, tmp_path).items()}
     found = graph_errors.read(arrays)
     assert found is not None and found.fixed == 1
@@ -145,7 +145,7 @@ def test_a_checkpoint_keeps_the_graph_and_a_broken_one_is_refused(tmp_path: Path
 def test_a_chain_alone_has_the_errors_of_its_hops() -> None:
     atlas, keyframes = with_keyframes(solved(measured(np.random.default_rng(4))))
     atlas.graph, atlas.refined = None, {}
-    path = PathCovariance.of_keyframes(atlas, [])
+    path = PathCovariance.of_keyframes(atlas, Edges())
     nodes = KeyframeNodes.of(path, {0: keyframes})
     edges = nodes.edges()
     assert nodes.solved(solve(nodes.T_world_keyframe, edges), edges, np.zeros((len(edges), 6, 9))) is None

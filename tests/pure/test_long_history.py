@@ -158,24 +158,25 @@ def test_edges_are_read_as_they_were_added() -> None:
         assert np.array_equal(found.T_a_b, edge.T_a_b) and np.array_equal(found.information, edge.information)
     assert edges.loop_rows(range(4)).tolist() == [0, -1, 2, -3] and edges.loop_rows([]).tolist() == []
     some = edges.taken(np.array([False, True, True, False]))
-    for few in (some, Edges.of(known[1:3])):
-        assert few.ends.tolist() == [[2, 3], [3, 4]] and few.is_loop.tolist() == [False, True]
-        assert np.array_equal(few.T_a_b, [edge.T_a_b for edge in known[1:3]])
-        assert np.array_equal(few.information, [edge.information for edge in known[1:3]])
-    assert Edges.of(some) is some and Edges().T_a_b.shape == (0, 4, 4)
+    assert some.ends.tolist() == [[2, 3], [3, 4]] and some.is_loop.tolist() == [False, True]
+    assert np.array_equal(some.T_a_b, [edge.T_a_b for edge in known[1:3]])
+    assert np.array_equal(some.information, [edge.information for edge in known[1:3]])
+    assert Edges().T_a_b.shape == (0, 4, 4)
 
 
 def test_described_submaps_are_read_as_they_were_added() -> None:
     rng = np.random.default_rng(0)
     counts = (0, 3, 0, 2)
     known = [SubmapDescriptor(5 * i, rng.random((n, 4), np.float32), 1.0 + i, 0.5 * i) for i, n in enumerate(counts)]
-    found = DescribedSubmaps.of(known)
+    found = DescribedSubmaps()
+    for each in known:
+        found.append(each)
     assert found.counts.tolist() == [0, 3, 0, 2] and found.numbers.tolist() == [0, 5, 10, 15]
     assert found.opacity_ratio.tolist() == [1, 2, 3, 4] and found.reach_m.tolist() == [0, 0.5, 1, 1.5]
     for each, before in zip(found, known, strict=True):
         assert (each.index, each.opacity_ratio, each.reach_m) == (before.index, before.opacity_ratio, before.reach_m)
         assert np.array_equal(each.descriptors.ravel(), before.descriptors.ravel())
-    assert DescribedSubmaps.of(found) is found and not DescribedSubmaps().counts.size
+    assert not DescribedSubmaps().counts.size
 
 
 def test_an_iterator_is_written_as_the_list_is(tmp_path: Path) -> None:

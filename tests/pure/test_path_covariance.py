@@ -13,7 +13,7 @@ from paper_settings import FinalConfig, RenderConfig, paper_settings
 from sigmasplat.config import Config
 from sigmasplat.data import se3
 from sigmasplat.data.atlas import Atlas
-from sigmasplat.data.relative_pose import UNKNOWN_HOP, Kind, RelativePose, TrackedHops
+from sigmasplat.data.relative_pose import UNKNOWN_HOP, Edges, Kind, RelativePose, TrackedHops
 from sigmasplat.final.final_map import reaching
 from sigmasplat.fit.align import BIAS_PX
 from sigmasplat.graph.path_covariance import PathCovariance, recorded
@@ -109,7 +109,10 @@ class Loopy:
 
 
 def checkpoint(atlas: Atlas, edges: list[RelativePose]) -> dict[str, torch.Tensor]:
-    return recorded(atlas, edges) | {
+    kept = Edges()
+    for edge in edges:
+        kept.append(edge)
+    return recorded(atlas, kept) | {
         "keyframes": torch.arange(len(atlas.places)),
         "T_world_submap": torch.from_numpy(np.stack(atlas.anchors)),
         "submap_component": torch.tensor(atlas.components),

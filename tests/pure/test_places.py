@@ -1,19 +1,21 @@
 """Loop candidates against VarSplat §4 written out, on descriptors whose angles are known."""
 
+from collections.abc import Iterable
 from itertools import permutations
+from typing import Any
 
 import numpy as np
 import pytest
 
 from sigmasplat.data import se3
+from sigmasplat.graph import candidates
 from sigmasplat.graph.candidates import (
     Candidate,
+    DescribedSubmaps,
     SubmapDescriptor,
-    find_candidates,
-    find_nearby,
+    SubmapPair,
     gate,
     opacity_ratio,
-    pairs_to_register,
     self_similarity,
     variance_weights,
 )
@@ -25,6 +27,31 @@ def at(*degrees: float) -> np.ndarray:
     """Descriptors in a plane: their similarity is the cosine of the angle between them."""
     angles = np.array(degrees) * DEGREE
     return np.stack([np.cos(angles), np.sin(angles)], -1).astype(np.float32)
+
+
+def known(submaps: Iterable[SubmapDescriptor]) -> DescribedSubmaps:
+    made = DescribedSubmaps()
+    for submap in submaps:
+        made.append(submap)
+    return made
+
+
+def find_candidates(
+    query: SubmapDescriptor, others: Iterable[SubmapDescriptor], *args: Any, **named: Any
+) -> list[Candidate]:
+    return candidates.find_candidates(query, known(others), *args, **named)
+
+
+def find_nearby(
+    query: SubmapDescriptor, others: Iterable[SubmapDescriptor], *args: Any, **named: Any
+) -> list[SubmapPair]:
+    return candidates.find_nearby(query, known(others), *args, **named)
+
+
+def pairs_to_register(
+    found: list[Candidate], query: SubmapDescriptor, others: Iterable[SubmapDescriptor], *args: Any, **named: Any
+) -> list[SubmapPair]:
+    return candidates.pairs_to_register(found, query, known(others), *args, **named)
 
 
 def splats(seed: int = 0, count: int = 501) -> tuple[np.ndarray, np.ndarray]:

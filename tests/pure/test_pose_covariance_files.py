@@ -14,7 +14,7 @@ from command_line import exit_code
 from room_run import LOST, PATH, made_run
 from sigmasplat.data import se3
 from sigmasplat.data.atlas import Atlas
-from sigmasplat.data.relative_pose import RelativePose
+from sigmasplat.data.relative_pose import Edges, RelativePose
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.graph.path_covariance import PathCovariance, recorded
 from sigmasplat.plugins.evaluation.metrics.trajectory import score_covariances
@@ -148,7 +148,7 @@ def with_errors(folder: Path) -> tuple[RunFolder, PathCovariance]:
             atlas.set_keyframes(keyframes, hop)
         atlas.place_frame(T)
     tensors, _ = run.read_checkpoint()
-    tensors |= recorded(atlas, []) | {
+    tensors |= recorded(atlas, Edges()) | {
         "T_world_submap": torch.eye(4, dtype=torch.float64)[None],
         "submap_component": torch.zeros(1, dtype=torch.int64),
         "frame_submap": torch.zeros(len(poses), dtype=torch.int64),

@@ -18,7 +18,7 @@ from sigmasplat.data import se3
 from sigmasplat.data.atlas import Atlas
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
-from sigmasplat.data.relative_pose import UNKNOWN_HOP, RelativePose
+from sigmasplat.data.relative_pose import UNKNOWN_HOP, Edges, RelativePose
 from sigmasplat.data.trajectory import LOST as LOST_STATE, RELOCALISED, TRACKED
 from sigmasplat.graph.path_covariance import PathCovariance
 from sigmasplat.plugins.outputs.floorplan.floor_plan import FloorPlan
@@ -283,7 +283,7 @@ def test_the_exported_covariance_is_that_of_the_path(tmp_path: Path) -> None:
             hop = UNKNOWN_HOP if i == 0 else RelativePose.hop(np.eye(4), some_covariance(i), np.zeros(6))
             atlas.set_keyframes([*atlas.keyframe_poses[-1], PATH.T_world_camera[i]], hop)
         atlas.place_frame(PATH.T_world_camera[i])
-    tensors = run.read_checkpoint()[0] | path_errors(atlas, [0, 2, 4], [])
+    tensors = run.read_checkpoint()[0] | path_errors(atlas, [0, 2, 4], Edges())
     run.write_checkpoint({name: torch.as_tensor(value).contiguous() for name, value in tensors.items()}, {})
     errors = PathCovariance.of(tensors)
     assert errors is not None

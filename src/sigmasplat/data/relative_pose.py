@@ -1,6 +1,6 @@
 """Measured poses relative to each other, one by one and in columns: hops between keyframes, edges of the pose graph."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -136,16 +136,6 @@ class Edges(Records[RelativePose]):
     T_a_b = Part(np.float64, 4, 4)
     information = Part(np.float64, 6, 6)
     drift = Part(np.float64, 6, 6)
-
-    @staticmethod
-    def of(known: Iterable[RelativePose]) -> "Edges":
-        """Return edges in their order; each loop has row 0."""
-        if isinstance(known, Edges):
-            return known
-        edges = Edges()
-        for edge in known:
-            edges.append(edge)
-        return edges
 
     def append(self, edge: RelativePose, loop_row: int = 0) -> None:
         """Append an edge; loop_row: of a loop, its row among all pairs that were tried."""

@@ -1,6 +1,6 @@
 """Loop candidates: submaps that may show the same place, and the keyframes to register them by (VarSplat §4)."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -38,16 +38,6 @@ class DescribedSubmaps(Records[SubmapDescriptor]):
 
     rows: Column = field(default_factory=lambda: Column.of(np.float32, 0))
     facts: Column = field(default_factory=lambda: Column.of(np.float64, 4))
-
-    @staticmethod
-    def of(known: Iterable[SubmapDescriptor]) -> "DescribedSubmaps":
-        """Return the descriptors of submaps in their order."""
-        if isinstance(known, DescribedSubmaps):
-            return known
-        made = DescribedSubmaps()
-        for submap in known:
-            made.append(submap)
-        return made
 
     def append(self, submap: SubmapDescriptor) -> None:
         """Append a submap. All have descriptors of the same length."""
@@ -159,7 +149,7 @@ def self_similarity(descriptors: Descriptors, min_similarity: float = 0.5) -> Ma
 
 def find_candidates(
     query: SubmapDescriptor,
-    database: Sequence[SubmapDescriptor],
+    known: DescribedSubmaps,
     min_similarity: float = 0.5,
     min_interval: int = 2,
     similarity_floor: float = 0.0,
@@ -171,11 +161,11 @@ def find_candidates(
     A pair counts if its submaps are at least `min_interval` apart, if similarity × gate exceeds the query keyframe's
     `self_similarity`, and if the similarity without gate exceeds `similarity_floor` (a submap of dissimilar views has a
     low `self_similarity`). Without `uncertainty` the gate is 1. The order is by gated similarity, then by database
-    submap, query keyframe, database keyframe; the order of `database` does not matter.
+    submap, query keyframe, database keyframe; the order of `known` does not matter.
 
-    among [S]: which submaps of the database are compared; None: all.
+    among [S]: which of the known submaps are compared; None: all.
     """
-    threshold, known = self_similarity(query.descriptors, min_similarity), DescribedSubmaps.of(database)
+    threshold = self_similarity(query.descriptors, min_similarity)
     wanted = _apart(query, known, min_interval) & (True if among is None else among)
     gates = gate(query.opacity_ratio, known.opacity_ratio) if uncertainty else np.ones(len(known))
     found: list[Candidate] = []
@@ -192,7 +182,7 @@ def find_candidates(
 
 def find_nearby(
     query: SubmapDescriptor,
-    database: Sequence[SubmapDescriptor],
+    known: DescribedSubmaps,
     T_world_keyframe: Mapping[int, Matrix],
     near_m: float,
     near_rad: float,
@@ -208,7 +198,6 @@ def find_nearby(
     keyframes are nearer than near_m and their rotations differ by less than near_rad. The nearest `keyframes` of each
     side, in units of both limits, are to be localised.
     """
-    known = DescribedSubmaps.of(database)
     wanted = _apart(query, known, min_interval) & (True if among is None else among)
     if not wanted.any():
         return []
@@ -246,17 +235,16 @@ def _differences(a: Matrix, b: Matrix) -> tuple[Matrix, Matrix]:
 def pairs_to_register(
     candidates: Sequence[Candidate],
     query: SubmapDescriptor,
-    database: Sequence[SubmapDescriptor],
+    known: DescribedSubmaps,
     keyframes: int = 2,
     most: int | None = None,
 ) -> list[SubmapPair]:
     """Group a query's candidates by submap, the `most` best pairs first, and choose the keyframes to localise
     (VarSplat §5).
 
-    candidates: the result of `find_candidates` for the same query and database. Of each side, the `keyframes` most
+    candidates: the result of `find_candidates` for the same submaps. Of each side, the `keyframes` most
     similar to any keyframe of the other side are chosen, most similar first.
     """
-    known = DescribedSubmaps.of(database)
     best: dict[int, Candidate] = {}
     for candidate in candidates:
         best.setdefault(candidate.database_submap, candidate)

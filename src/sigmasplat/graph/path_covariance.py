@@ -36,9 +36,9 @@ BIAS, MEAN = -2, -1
 """Columns of the errors that are the same in all hops."""
 
 
-def recorded(atlas: Atlas, edges: Sequence[RelativePose]) -> dict[str, Tensor]:
+def recorded(atlas: Atlas, edges: Edges) -> dict[str, Tensor]:
     """Return what a checkpoint keeps of the errors of a path; edges: the trusted ones and the accepted loops."""
-    counts, known = atlas.keyframe_poses.counts, Edges.of(edges)
+    counts = atlas.keyframe_poses.counts
     arrays = {
         "frame_keyframe": atlas.places.keyframe,
         "T_keyframe_camera": atlas.places.T_keyframe_camera,
@@ -47,12 +47,12 @@ def recorded(atlas: Atlas, edges: Sequence[RelativePose]) -> dict[str, Tensor]:
         "hop_T_camera_before": atlas.hops.T_camera_before,
         "hop_covariance": atlas.hops.covariance,
         "hop_bias": atlas.hops.bias,
-        "edge_submaps": known.ends,
-        "edge_T_a_b": known.T_a_b,
-        "edge_information": known.information,
-        "edge_is_loop": known.is_loop,
-        "edge_keyframes": known.keyframes,
-        "edge_drift": known.drift,
+        "edge_submaps": edges.ends,
+        "edge_T_a_b": edges.T_a_b,
+        "edge_information": edges.information,
+        "edge_is_loop": edges.is_loop,
+        "edge_keyframes": edges.keyframes,
+        "edge_drift": edges.drift,
         **graph_errors.written(atlas.graph),
     }
     return {name: torch.from_numpy(array) for name, array in arrays.items()}

@@ -15,7 +15,7 @@ from sigmasplat.config.input import RENDERED
 from sigmasplat.data.atlas import Atlas
 from sigmasplat.data.field import GaussianField, Rows
 from sigmasplat.data.frame import Frame
-from sigmasplat.data.relative_pose import RelativePose
+from sigmasplat.data.relative_pose import Edges
 from sigmasplat.data.submap import SubmapStore
 from sigmasplat.data.trajectory import LOST, Component, Trajectory
 from sigmasplat.errors import SourceError
@@ -156,7 +156,7 @@ class Slam(MainLoop, ArrayInterface):
 
 
 def checkpoint_of(
-    active: GaussianField, path: Trajectory, atlas: Atlas, keyframes: Sequence[int], edges: Sequence[RelativePose]
+    active: GaussianField, path: Trajectory, atlas: Atlas, keyframes: Sequence[int], edges: Edges
 ) -> dict[str, Tensor]:
     """Return the active submap's field with its attributes and its optimiser state, poses, times, keyframes, anchors,
     the submap of each frame, the exposures of frames if they are known, and the errors of the path, in host
@@ -173,7 +173,7 @@ def checkpoint_of(
     }
 
 
-def path_errors(atlas: Atlas, keyframes: Sequence[int], edges: Sequence[RelativePose]) -> dict[str, Tensor]:
+def path_errors(atlas: Atlas, keyframes: Sequence[int], edges: Edges) -> dict[str, Tensor]:
     """Return the part of a checkpoint that `PathCovariance.of` reads; arguments as for `checkpoint_of`."""
     return {
         "keyframes": torch.tensor(keyframes, dtype=torch.int64),
