@@ -184,7 +184,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     warnings.filterwarnings("ignore", "Image size .* exceeds limit")  # our limit is lower (`files/pictures.py`)
     try:
         env.switches()
-        _refuse_nul(given)
         given = _with_plugins(given)
         _refuse_unknown(given[0])
         _refuse_memory_limit()
@@ -239,13 +238,6 @@ def _with_plugins(given: Sequence[str]) -> list[str]:
 
         use_files(files)
     return rest or ["--help"]
-
-
-def _refuse_nul(given: Sequence[str]) -> None:
-    """Raise ConfigError if an argument has a NUL character, which no path can have."""
-    for word in given:
-        if "\0" in word:
-            raise ConfigError(f"the argument {word!r} has a NUL character; remove it")
 
 
 def _refused(message: str) -> int:

@@ -2,10 +2,10 @@
 earlier poses."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import wraps
-from typing import Any, Literal, Protocol, TypeVar, cast
+from typing import Literal, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +17,6 @@ from sigmasplat.data.frame_arrays import Array, ColorOrder, frame_from_arrays
 from sigmasplat.errors import SourceError
 from sigmasplat.slam.results import Step, Steps
 from sigmasplat.types import Matrix
-
-Method = TypeVar("Method", bound=Callable[..., Any])
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,19 +63,13 @@ class Before:
 Listeners = list[Callable[[Correction], object]]
 
 
-def notifying(method: Method) -> Method:
-    """Make a method of SLAM tell the listeners of a correction after it has ended without an error."""
-
-    @wraps(method)
-    def notified(slam: Observed, /, *args: Any, **named: Any) -> Any:
-        if not slam.listeners:
-            return method(slam, *args, **named)
-        before = Before.of(slam)
-        result = method(slam, *args, **named)
+@contextmanager
+def notifying(slam: Observed) -> Iterator[None]:
+    """Tell the listeners of a correction that a block of code has made, after it has ended without an error."""
+    before = Before.of(slam) if slam.listeners else None
+    yield
+    if before is not None:
         tell(slam.listeners, correction_since(slam, before))
-        return result
-
-    return cast(Method, notified)
 
 
 def tell(listeners: Listeners, correction: Correction | None) -> None:

@@ -1,7 +1,7 @@
 """The whole system: the main loop, the interface for your own camera, covariances, the final map after the last frame,
 and the checkpoint."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -28,7 +28,7 @@ from sigmasplat.slam.main_loop import MainLoop
 from sigmasplat.slam.results import Step
 from sigmasplat.slam.slam_state import merged_field
 from sigmasplat.system.array_interface import ArrayInterface, Listeners, notifying
-from sigmasplat.types import Matrix, completed, no_progress, part_of
+from sigmasplat.types import Matrix, Progress, completed, no_progress, part_of
 from sigmasplat.uncertainty.map_uncertainty import MapUncertainty
 
 
@@ -98,23 +98,26 @@ class Slam(MainLoop, ArrayInterface):
         path, edges = self.trajectory(), self.closer.valid
         return checkpoint_of(self.mapper.field, path, self.atlas, self.keyframe_indices, edges)
 
-    @notifying
     def step(self, frame: Frame) -> Step:
         """Process one frame: track it, find it in the whole map if it is lost, map it if it is a keyframe, and cut the
         submap if a rule ends it here.
 
         Raises SourceError if the first frame has no depth or a later one comes from another camera.
         """
-        return super().step(frame)
+        with notifying(self):
+            return super().step(frame)
 
-    @notifying
-    def finish(self, progress: Callable[[int, int], None] = no_progress) -> None:
+    def finish(self, progress: Progress = no_progress) -> None:
         """Finish the last submap, look for its loops, and make the final map (VarSplat §7); call it once, at the end.
 
         Calls `progress(done, total)` with the steps of refinement, from 0 to the last one, and then the keyframes that
         the uncertainty is measured at; without both the total is 1. Does nothing when no rule cuts submaps and
         `final.iterations` is 0. Components that are not connected to the world are left out of the final map.
         """
+        with notifying(self):
+            self._finish(progress)
+
+    def _finish(self, progress: Progress) -> None:
         completed(self.refining(self.mapper.pending))
         if not self.steps or not (len(self.store) or self.cuts or self.config.final.iterations):
             return

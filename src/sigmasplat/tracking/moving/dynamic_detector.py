@@ -96,7 +96,8 @@ class DepthHistory:
             return front
         step = _step(camera)
         depth = np.where(front.depth_m > 0, depth_m, np.float32(0.0))[::step, ::step]
-        regions, count = labelled(smooth(depth))
+        regions, boxes = labelled(smooth(depth))
+        count = len(boxes)
         rests = np.ones(count + 1, np.bool_)
         for earlier in self.seen[before[-1] :]:  # what comes back to an earlier place has not rested there
             scene = Earlier(earlier.depth_m, se3.inverse(earlier.T_world_camera) @ T_world_camera)

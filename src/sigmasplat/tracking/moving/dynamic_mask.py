@@ -179,7 +179,8 @@ def _holes_in(mask: Mask, thing: Mask | None, depth_m: Depth) -> Mask:
     between two holes is too thin to be a region. Then lines without readings, as at outlines, join no holes.
     """
     unread = depth_m <= 0
-    holes, count = labelled(unread if thing is None else ~widened(~unread, 3))
+    holes, boxes = labelled(unread if thing is None else ~widened(~unread, 3))
+    count = len(boxes)
     holes = holes if thing is None else largest_label(holes, count) * unread
     beside = largest_label(holes, count)
     edge = np.flatnonzero((beside > 0) & ~unread)
@@ -200,7 +201,8 @@ def _holes_in(mask: Mask, thing: Mask | None, depth_m: Depth) -> Mask:
 def _regions(inside: Mask, free: Mask, again: Mask, whole_objects: bool) -> Mask:
     """Return the connected regions of pixels that are in places which were free, or where something was before; with
     whole_objects, of which a small part is, or of which the larger part is where something was before."""
-    regions, count = labelled(inside)
+    regions, boxes = labelled(inside)
+    count = len(boxes)
     sizes, in_free, old = (np.bincount(regions[chosen], minlength=count + 1) for chosen in (regions > 0, free, again))
     least, share = LEAST_REGION * free.size, WHOLE_SHARE if whole_objects else LEAST_SHARE
     chosen = (in_free >= least) & (in_free + old >= share * sizes)

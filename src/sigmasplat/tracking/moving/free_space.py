@@ -62,16 +62,10 @@ def widened(mask: NDArray[np.bool_], size: int) -> NDArray[np.bool_]:
     return np.asarray(opencv().dilate(np.ascontiguousarray(mask).view(np.uint8), _window(size)).view(np.bool_))
 
 
-def labelled(mask: NDArray[np.bool_]) -> tuple[NDArray[np.int32], int]:
+def labelled(mask: NDArray[np.bool_]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """Return the number of the connected region of each pixel [H, W], from 1 on in the order of rows, 0 outside of the
-    mask; and how many there are. Regions also connect at their corners."""
-    cv2, image = opencv(), np.ascontiguousarray(mask).view(np.uint8)
-    count, labels = cv2.connectedComponentsWithAlgorithm(image, 8, cv2.CV_32S, cv2.CCL_SAUF)
-    return np.asarray(labels, np.int32), count - 1
-
-
-def boxed(mask: NDArray[np.bool_]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Return the same numbers, and left, top, width, height and size of each region [count, 5], in pixels."""
+    mask; and left, top, width, height and size of each region [count, 5], in pixels. Regions also connect at their
+    corners."""
     cv2, image = opencv(), np.ascontiguousarray(mask).view(np.uint8)
     _, labels, stats, _ = cv2.connectedComponentsWithStatsWithAlgorithm(image, 8, cv2.CV_32S, cv2.CCL_SAUF)
     return np.asarray(labels, np.int32), np.asarray(stats[1:], np.int32)

@@ -26,7 +26,7 @@ from sigmasplat.tracking.moving.dynamic_mask import (
     thinned,
     with_margin,
 )
-from sigmasplat.tracking.moving.free_space import Depth, Mask, boxed, upper_median, widened
+from sigmasplat.tracking.moving.free_space import Depth, Mask, labelled, upper_median, widened
 from sigmasplat.tracking.pose_validation import agrees_more, differs, disagrees, gray_gain, may_draw
 from sigmasplat.tracking.prepared_frame import PreparedFrame
 from sigmasplat.types import Matrix
@@ -97,7 +97,7 @@ def _front(whole: Mask, hidden: Mask, live_m: Depth) -> DynamicMask:
 def free_standing(depth: Depth) -> Iterator[Mask]:
     """Yield the things that stand free in `thinned` depth [h, w], m, in front of farther surfaces all around, as masks
     [h, w]: the largest first, at most `MOST_OBJECTS`."""
-    regions, boxes = boxed(smooth(depth))
+    regions, boxes = labelled(smooth(depth))
     sizes, found = boxes[:, -1] / max(int(np.count_nonzero(depth)), 1), 0
     for region in np.argsort(-sizes, kind="stable"):
         if sizes[region] < OBJECT_SHARE[0] or found == MOST_OBJECTS:
@@ -108,7 +108,7 @@ def free_standing(depth: Depth) -> Iterator[Mask]:
 
 
 def _stands_free(depth: Depth, regions: NDArray[np.int32], region: int, box: NDArray[np.int32]) -> bool:
-    """Return whether most of what is around a region of depth [h, w], m, is farther; box: of `boxed`."""
+    """Return whether most of what is around a region of depth [h, w], m, is farther; box: of `labelled`."""
     left, top, width, height, _ = box.tolist()
     around = slice(max(top - RING, 0), top + height + RING), slice(max(left - RING, 0), left + width + RING)
     near_m, inside = depth[around], regions[around] == region
