@@ -125,7 +125,7 @@ def test_a_field_is_fitted(device: torch.device, images: int, degree: int) -> No
         keyframes = [Keyframe(k, target, pose @ se3.exp(0.01 * k * np.ones(6))) for k in range(images)]
         stats = Gradients()
         fit = fit_field(field, view, [keyframes] * 3, MAPPING, degree=degree, stats=stats)
-        assert {x.device.type for x in (*(given for _, given in stats.given), *field.state())} == {
+        assert {x.device.type for x in (*(given for _, given in stats.given), *field._tensors)} == {
             view.sums.device.type
         }
         found.append((field.params.cpu() - start, fit.losses, keyframes[-1].T_world_camera))
@@ -225,7 +225,7 @@ def test_slam_runs(device: torch.device, run: str) -> None:
     assert [loop.accepted for loop in ours.loops] == [loop.accepted for loop in theirs.loops]
     assert ours.mapper.field.params.device.type == "cuda"
     at_rest = [ours.field, *(ours.store.load(index).field for index in range(len(ours.store)))]
-    assert {x.device.type for field in at_rest for x in (*field.state(), field.ids)} == {"cpu"}
+    assert {x.device.type for field in at_rest for x in (*field._tensors, field.ids)} == {"cpu"}
 
 
 def test_a_field_does_not_travel(stand_in: StandIn) -> None:

@@ -121,8 +121,6 @@ def test_probe_views_follow_as_frames_do_in_the_final_map() -> None:
     first, last = (new @ se3.inverse(old) for new, old in zip(moved, T, strict=True))
     at_frame_5 = se3.exp(5 / 8 * se3.log(last @ se3.inverse(first))) @ first  # of 8 frames between the keyframes
     assert np.allclose(submap.T_submap_probe[0], at_frame_5 @ probe)
-    with pytest.raises(SigmaSplatError, match="submap 1 cannot be saved in a store that is only read"):
-        RefinedStore(store, [moved]).save(Submap(1, GaussianField.empty(), (0,), T[:1], CAMERA), [picture])
 
 
 def test_an_atlas_without_frames_has_no_poses() -> None:
@@ -225,7 +223,7 @@ def test_a_loop_before_a_join_is_kept_apart_from_the_path_without_loops() -> Non
     assert not np.allclose(atlas.anchors[2], atlas.odometry[2])
 
 
-def test_a_part_of_a_store_numbers_its_submaps_anew_and_cannot_grow() -> None:
+def test_a_part_of_a_store_numbers_its_submaps_anew() -> None:
     store = MemoryStore()
     for k in range(4):
         some = Picture(np.full((3, 4, 3), k, np.uint8), np.ones((3, 4), np.float32))
@@ -234,9 +232,6 @@ def test_a_part_of_a_store_numbers_its_submaps_anew_and_cannot_grow() -> None:
     assert len(part) == 2
     assert [part.load(k).index for k in range(2)] == [3, 1]
     assert [int(part.picture(k, 0).color[0, 0, 0]) for k in range(2)] == [3, 1]
-    with pytest.raises(SigmaSplatError, match="store that is only read"):
-        part.save(piece(2), [picture()])
-    assert len(store) == 4
 
 
 def test_places_of_thousands_of_frames_are_kept_as_they_were_appended() -> None:

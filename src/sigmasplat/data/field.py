@@ -51,10 +51,6 @@ class Rows:
     def __len__(self) -> int:
         return len(self.params)
 
-    def state(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return copies of params, both moments and last_step."""
-        return self.params.clone(), self.moment1.clone(), self.moment2.clone(), self.last_step.clone()
-
     def copy_to(self, device: torch.device) -> "Rows":
         """Return copies of these rows on a device."""
         params, moment1, moment2, last_step = (x.to(device, copy=True) for x in self._tensors)
@@ -224,10 +220,8 @@ class GaussianField(Rows):
     def copy_to(self, device: torch.device) -> "GaussianField":
         """Return a copy of the field on a device, including attributes and ids."""
         attributes = {name: attribute.copy_to(device) for name, attribute in self.attributes.items()}
-        params, moment1, moment2, last_step = (x.to(device, copy=True) for x in self._tensors)
-        return GaussianField(
-            params, moment1, moment2, last_step, self.steps, attributes, self.ids.to(device), self.next_id
-        )  # fmt: skip
+        rows = super().copy_to(device)
+        return GaussianField(*rows._tensors, rows.steps, attributes, self.ids.to(device), self.next_id)
 
     def to(self, device: torch.device) -> "GaussianField":
         """Return the field itself if it is already on a device, else a copy on it."""
@@ -261,19 +255,15 @@ class GaussianField(Rows):
         View-dependent colours rotate with the field, and so do Adam's moments. The second moments rotate as if the
         components of a gradient were independent.
         """
-        T = T_new_old.to(self.params)
-        params, moment1, moment2, last_step = self.state()
+        T, new = T_new_old.to(self.params), self.copy_to(self.params.device)
         for name, matrix in (("means", T[:3, :3]), ("quats", left_factor(quaternion_of(T[:3, :3])))):
             columns = COLUMNS[name]
-            for rows, by in ((params, matrix), (moment1, matrix), (moment2, matrix**2)):
+            for rows, by in ((new.params, matrix), (new.moment1, matrix), (new.moment2, matrix**2)):
                 rows[:, columns] = transformed(rows[:, columns], by)
-        params[:, COLUMNS["means"]] += T[:3, 3]
-        attributes = {name: Rows(*attribute.state(), attribute.steps) for name, attribute in self.attributes.items()}
-        if "harmonics" in attributes:
-            attributes["harmonics"].params = harmonics.turned(attributes["harmonics"].params, T[:3, :3])
-        return GaussianField(
-            params, moment1, moment2, last_step, self.steps, attributes, self.ids.clone(), self.next_id
-        )
+        new.means.add_(T[:3, 3])
+        if "harmonics" in new.attributes:
+            new.attributes["harmonics"].params = harmonics.turned(new.attributes["harmonics"].params, T[:3, :3])
+        return new
 
 
 def quaternion_of(R: Tensor) -> Tensor:

@@ -61,12 +61,9 @@ class Submap:
 
 
 class SubmapStore(Protocol):
-    """Keeps finished submaps. They are numbered from 0 in the order of saving."""
+    """Finished submaps, numbered from 0 in the order of saving, as they are read."""
 
     def __len__(self) -> int: ...
-
-    def save(self, submap: Submap, pictures: list[Picture], probes: Sequence[Picture] = ()) -> None:
-        """Save a submap and the images of its keyframes and probe views. A finished submap never changes."""
 
     def load(self, index: int) -> Submap:
         """Return a submap; the caller may change it."""
@@ -79,6 +76,13 @@ class SubmapStore(Protocol):
     def probe(self, index: int, probe: int) -> Picture:
         """Return the images of one probe view of a submap."""
         ...
+
+
+class GrowingStore(SubmapStore, Protocol):
+    """Keeps finished submaps."""
+
+    def save(self, submap: Submap, pictures: list[Picture], probes: Sequence[Picture] = ()) -> None:
+        """Save a submap and the images of its keyframes and probe views. A finished submap never changes."""
 
 
 @runtime_checkable

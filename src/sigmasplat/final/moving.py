@@ -11,7 +11,7 @@ from sigmasplat.config import MovingConfig
 from sigmasplat.data import se3
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.submap import KeyframeId, Picture, SubmapStore
-from sigmasplat.final.stores import ReadOnlyStore
+from sigmasplat.final.stores import RefinedStore
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.mapping.moving import contradicted, is_free, remove
 from sigmasplat.types import Matrix
@@ -24,7 +24,7 @@ TURN_M = 1.0
 
 
 @dataclass(frozen=True, eq=False)
-class StillStore(ReadOnlyStore):
+class StillStore(RefinedStore):
     """A store whose keyframes have no depth where something moved.
 
     hidden: the pixels [H, W] of each keyframe that are masked, packed into bits, by submap and keyframe.

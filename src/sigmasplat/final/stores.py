@@ -13,7 +13,6 @@ from sigmasplat.data.atlas import Atlas
 from sigmasplat.data.camera import Camera, between
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.submap import Picture, Submap, SubmapStore
-from sigmasplat.errors import SigmaSplatError
 from sigmasplat.final.keyframe_nodes import KeyframeNodes, alignments
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.graph.graph_errors import shared_errors
@@ -23,32 +22,10 @@ from sigmasplat.types import Matrix
 
 
 @dataclass(frozen=True, eq=False)
-class ReadOnlyStore:
-    """The submaps of a store, which can only be read. Subclasses change what is read."""
-
-    store: SubmapStore
-
-    def __len__(self) -> int:
-        return len(self.store)
-
-    def save(self, submap: Submap, pictures: list[Picture], probes: Sequence[Picture] = ()) -> None:
-        """Raise SigmaSplatError."""
-        raise SigmaSplatError(f"submap {submap.index} cannot be saved in a store that is only read")
-
-    def load(self, index: int) -> Submap:
-        return self.store.load(index)
-
-    def picture(self, index: int, keyframe: int) -> Picture:
-        return self.store.picture(index, keyframe)
-
-    def probe(self, index: int, probe: int) -> Picture:
-        return self.store.probe(index, probe)
-
-
-@dataclass(frozen=True, eq=False)
-class StorePart(ReadOnlyStore):
+class StorePart:
     """Some submaps of a store, numbered from 0 in the order of `members`."""
 
+    store: SubmapStore
     members: Sequence[int]
 
     def __len__(self) -> int:
@@ -65,7 +42,7 @@ class StorePart(ReadOnlyStore):
 
 
 @dataclass(frozen=True, eq=False)
-class RefinedStore(ReadOnlyStore):
+class RefinedStore:
     """The submaps of a store as the final map sees them: with the poses of their keyframes that its refinement has
     moved, and with images in the exposure of the map. Probe views follow as frames do; their
     exposure is interpolated between those of keyframes.
@@ -74,8 +51,12 @@ class RefinedStore(ReadOnlyStore):
     the old poses. exposures: [K, 3, 2] of each submap's keyframes (`data.camera`), None: not fitted.
     """
 
+    store: SubmapStore
     keyframe_poses: Sequence[Sequence[Matrix]] | None = None
     exposures: Sequence[Matrix] | None = None
+
+    def __len__(self) -> int:
+        return len(self.store)
 
     def load(self, index: int) -> Submap:
         return self.moved(self.store.load(index), index)

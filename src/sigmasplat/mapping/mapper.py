@@ -12,7 +12,7 @@ from torch import Tensor
 
 from sigmasplat.config import Config
 from sigmasplat.data import se3
-from sigmasplat.data.field import GaussianField, Rows
+from sigmasplat.data.field import GaussianField
 from sigmasplat.data.submap import Picture, Submap
 from sigmasplat.fit.adam import Rates
 from sigmasplat.fit.field import DensifyStats, FieldFit, fitting
@@ -233,11 +233,7 @@ class Mapper:
         poses = np.stack([keyframe.T_world_camera for keyframe in self.keyframes])
         frames = tuple(keyframe.index for keyframe in self.keyframes)
         pictures = [keyframe.picture() for keyframe in self.keyframes]
-        here = torch.device("cpu")
-        params, *attributes = (
-            rows.params.to(here, copy=True) for rows in (self.field, *self.field.attributes.values())
-        )
-        field = GaussianField(params, attributes=dict(zip(self.field.attributes, map(Rows, attributes), strict=True)))
+        field = GaussianField.side_by_side([self.field])
         return Submap(index, field, frames, poses, self.keyframes[0].target.camera), pictures
 
     def successor(self, view: View, T_submap_camera: NDArray[np.float64]) -> "Mapper":

@@ -11,7 +11,7 @@ import numpy as np
 from sigmasplat.config import Config
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
-from sigmasplat.data.submap import SubmapStore
+from sigmasplat.data.submap import GrowingStore, SubmapStore
 from sigmasplat.errors import ConfigError, RunError
 from sigmasplat.input.source import Source
 from sigmasplat.run.scene import config_of_facts, scene_facts
@@ -132,7 +132,7 @@ def continue_map(earlier: FinishedMap, config: Config, source: Source, run: RunF
     return continued(config, run.submaps.in_background(), anchors)
 
 
-def take_over(earlier: SubmapStore, members: Sequence[int], frames: int, store: SubmapStore) -> None:
+def take_over(earlier: SubmapStore, members: Sequence[int], frames: int, store: GrowingStore) -> None:
     """Copy submaps of an earlier session, `members`, to the store of a new one.
 
     frames: number of frames of the earlier session. Its frame numbers become negative: −1 is its last frame. So they
@@ -147,7 +147,7 @@ def take_over(earlier: SubmapStore, members: Sequence[int], frames: int, store: 
         store.save(replace(submap, index=index, frames=numbers, probe_frames=probe_numbers), pictures, probes)
 
 
-def continued(config: Config, store: SubmapStore, anchors: Sequence[Matrix]) -> Slam:
+def continued(config: Config, store: GrowingStore, anchors: Sequence[Matrix]) -> Slam:
     """Return a system that continues the map in `store`; anchors: T_world_submap [4, 4] of its submaps.
 
     The world is that of the map. The first frame is searched for in it. If it is not found, a new component begins,

@@ -12,7 +12,7 @@ from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.poses import Column
-from sigmasplat.data.submap import MemoryStore, OnDisk, SubmapStore
+from sigmasplat.data.submap import GrowingStore, MemoryStore, OnDisk, SubmapStore
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SourceError
 from sigmasplat.graph.closer import LoopCloser, make_descriptor
@@ -42,11 +42,11 @@ class SlamState:
     `store`, by default in memory.
     """
 
-    def __init__(self, config: Config, store: SubmapStore | None = None) -> None:
+    def __init__(self, config: Config, store: GrowingStore | None = None) -> None:
         self.config = config
         self.filtered = frame_filter(self.config.input.filters)
         self.random = np.random.default_rng(self.config.seed)
-        self.store = MemoryStore() if store is None else store
+        self.store: GrowingStore = MemoryStore() if store is None else store
         self.atlas = Atlas(follows=self.follows)
         self.extractor = extractor_of(self.config)
         self.tracker = Tracker.of(self.config, self.extractor)

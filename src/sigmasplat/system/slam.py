@@ -16,7 +16,7 @@ from sigmasplat.data.atlas import Atlas
 from sigmasplat.data.field import GaussianField, Rows
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.relative_pose import Edges
-from sigmasplat.data.submap import SubmapStore
+from sigmasplat.data.submap import GrowingStore, SubmapStore
 from sigmasplat.data.trajectory import LOST, Component, Trajectory
 from sigmasplat.errors import SourceError
 from sigmasplat.final.final_map import final_map, reaching
@@ -46,7 +46,7 @@ class Slam(MainLoop, ArrayInterface):
     def __init__(
         self,
         config: Config | str | None = None,
-        store: SubmapStore | None = None,
+        store: GrowingStore | None = None,
         *,
         settings: Mapping[str, object] | None = None,
     ) -> None:
