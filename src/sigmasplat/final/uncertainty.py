@@ -91,7 +91,8 @@ def map_uncertainty(
     splats = splat_residuals(field, _counted(keyframes, progress), config.render, config.backend)
     probes = probe_views(store, anchors, (view.alpha.shape[0], view.alpha.shape[1]))
     chosen = evenly_spread(probes, PROBES_MOST)
-    calibration = calibrate(field, splats, background, chosen, config, pulled_to)
+    color, depth = probe_samples(field, splats, background, chosen, config)
+    calibration = Calibration(color.fitted(pulled_to.color), depth.fitted(pulled_to.depth), pulled_to.temperature)
     return MapUncertainty(splats, background, calibration, len(chosen))
 
 
@@ -100,19 +101,6 @@ def _counted(keyframes: KeyframeReader, progress: Progress) -> Iterator[Keyframe
     for done, keyframe in enumerate(keyframes):
         progress(done, len(keyframes))
         yield keyframe
-
-
-def calibrate(
-    field: GaussianField,
-    splats: Tensor,
-    background: Background,
-    probes: Sequence[Keyframe],
-    config: Config,
-    pulled_to: Calibration = SHIPPED,
-) -> Calibration:
-    """Fit the weights of the parts of a map's variance to its errors at probe views."""
-    color, depth = probe_samples(field, splats, background, probes, config)
-    return Calibration(color.fitted(pulled_to.color), depth.fitted(pulled_to.depth), pulled_to.temperature)
 
 
 def probe_samples(

@@ -20,7 +20,7 @@ from sigmasplat.slam.results import Step, StepTimer
 from sigmasplat.system.array_interface import ArrayInterface, Correction, tell
 from sigmasplat.system.slam import Slam
 from sigmasplat.tracking.features import extractor_of
-from sigmasplat.tracking.prepared_frame import view_of, working_frame
+from sigmasplat.tracking.prepared_frame import view_of
 from sigmasplat.tracking.recovery import Recovery
 from sigmasplat.tracking.tracker import Tracker
 from sigmasplat.types import Matrix, Progress, ShouldStop, never, no_progress
@@ -181,11 +181,7 @@ class RealTime(ArrayInterface):
 
     def _start(self, frame: Frame) -> View:
         """Make the two views of the camera, and start the mapping thread."""
-        if self.slam.is_prepared:
-            camera = self.slam.view.camera
-        else:
-            camera = working_frame(frame, self.slam.config).camera
-            self.slam.prepare(camera)
+        camera = self.slam.view_for(frame).camera
         self._threads = set_kernel_threads(1)
         self._schedule.start(self._back_end.slices())
         self._runs = True

@@ -16,7 +16,7 @@ from sigmasplat.tracking.frame_estimate import FrameEstimate
 from sigmasplat.tracking.keyframe_rule import becomes_keyframe, is_held_back, is_mappable, may_validate
 from sigmasplat.tracking.pose_validation import is_better, is_questionable
 from sigmasplat.tracking.predicted_depth_frames import fitted_keyframe, fitted_to_map
-from sigmasplat.tracking.prepared_frame import PreparedFrame, refuse_first_without_depth, working_frame
+from sigmasplat.tracking.prepared_frame import PreparedFrame, refuse_first_without_depth
 from sigmasplat.tracking.recovery import usable
 from sigmasplat.tracking.relocaliser import Relocation
 from sigmasplat.types import Matrix, completed
@@ -46,7 +46,7 @@ class MainLoop(MappingBackend):
     def _prepared(self, frame: Frame) -> PreparedFrame:
         """Resize a frame to working size and prepare it for the fits."""
         with self._timer.stage("prepare"):
-            view = self._view or self.prepare(working_frame(frame, self.config).camera)
+            view = self.view_for(frame)
             self._timer.start_kernels(view)
             seen = self.observed(frame, view, self.extractor)
         return fitted_to_map(self.tracker, self.mapper.field, view, seen) if self.steps else seen

@@ -130,10 +130,9 @@ class SlamState:
         self._resample, self._view = resample, view_of(camera, self.config)
         return self._view
 
-    @property
-    def is_prepared(self) -> bool:
-        """Return whether there is a view yet."""
-        return self._view is not None
+    def view_for(self, frame: Frame) -> View:
+        """Return the view; the first frame makes it, if `prepare` has not."""
+        return self._view or self.prepare(working_frame(frame, self.config).camera)
 
     def observed(self, frame: Frame, view: View, extractor: Extractor | None) -> PreparedFrame:
         """Resize a frame to working size and prepare it for the fits. Raises SourceError if it comes from another
