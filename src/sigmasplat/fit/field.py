@@ -42,44 +42,26 @@ class DensifyStats:
             self.times += grad2d > 0
 
 
-@dataclass
-class FieldFit:
-    """The result of a fit: the loss of each iteration, and the seconds of each stage."""
+@dataclass(eq=False)
+class FieldFit(Stopwatch):
+    """The result of a fit: the loss of each iteration, and the seconds of each stage: forward, loss, backward."""
 
     losses: list[float] = dataclass_field(default_factory=list)
-    stopwatch: Stopwatch = dataclass_field(default_factory=Stopwatch)
-
-    @property
-    def seconds(self) -> dict[str, float]:
-        """Return the seconds by stage: forward, loss, backward."""
-        return self.stopwatch.seconds
 
     def join(self, later: "FieldFit") -> None:
         """Append a later fit's losses and add its seconds."""
         self.losses += later.losses
-        self.stopwatch.add(later.seconds)
+        self.add(later.seconds)
 
 
 def loss_weights(config: MappingConfig) -> dict[str, float]:
     """Return the terms of the mapping loss with their weights.
 
-    VarSplat §2: 0.8 L1 + 0.2 (1 − SSIM) + depth + L_reg + NLL. CG-SLAM eq. 18: with median depth, isotropy as a ratio,
-    and U. Any other term of `fit.losses` has the weight `weight_<term>` if the settings have such a field.
+    VarSplat §2: 0.8 L1 + 0.2 (1 − SSIM) + depth + L_reg + NLL. CG-SLAM eq. 18: with median depth (`weight_alignment`),
+    isotropy as a ratio, and U. The weight of any other term is `weight_<term>`; 0 if the settings have no such field.
     """
-    weights = {
-        "l1": config.weight_l1,
-        "ssim": config.weight_ssim,
-        "depth": config.weight_depth,
-        "nll_color": config.weight_nll_color,
-        "nll_depth": config.weight_nll_depth,
-        "isotropy": config.weight_isotropy,
-        "isotropy_ratio": config.weight_isotropy_ratio,
-        "median_depth": config.weight_alignment,
-        "moment": config.weight_moment,
-        "mean_depth": config.weight_mean_depth,
-    }
-    own = {name: getattr(config, f"weight_{name}", 0.0) for name in losses.TERMS if name not in weights}
-    return weights | own
+    names = {term: term for term in losses.TERMS} | {"median_depth": "alignment"}
+    return {term: getattr(config, f"weight_{name}", 0.0) for term, name in names.items()}
 
 
 def fitting(
@@ -114,7 +96,7 @@ def fitting(
     pose_rates = np.repeat([config.lr_pose_translation, config.lr_pose_rotation], 3)
     steps = _Steps(field, view, loss_weights(config), frozen_colors, degree, stats)
     for batch, rates in zip(batches, schedule or repeat(rates), strict=False):  # noqa: B020 # the last ones settle the fit
-        loss, twists = steps.take(batch, rates, fit.stopwatch)
+        loss, twists = steps.take(batch, rates, fit)
         fit.losses.append(loss)
         for keyframe, twist in zip(batch, twists, strict=True):
             if pose_rates.any() and keyframe.movable and not keyframe.fixed:
