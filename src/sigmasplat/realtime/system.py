@@ -9,8 +9,6 @@ from collections.abc import Callable, Iterator
 from sigmasplat import env
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.frame import Frame
-from sigmasplat.data.trajectory import LOST
-from sigmasplat.errors import SourceError
 from sigmasplat.graph.loops import Loops
 from sigmasplat.native.threads import idle_kernel_workers, set_kernel_threads, yield_to_others
 from sigmasplat.realtime.back_end import BackEnd
@@ -167,17 +165,8 @@ class RealTime(ArrayInterface):
         """Return the result of the newest frame; None before the first one."""
         return self._newest
 
-    def covariance(self) -> Matrix | None:
-        """Return the covariance [6, 6] of the newest frame's pose, as `Slam.covariance`; None if that frame is
-        lost, or without `covariances`.
-
-        Raises SourceError before the first frame.
-        """
-        if self._newest is None:
-            raise SourceError("no pose yet: give a frame to `track` or `step` first")
-        if self._newest.state == LOST or not self._back_end.with_errors:
-            return None
-        return self._front_end.covariance(self._newest)
+    def covariance_of(self, newest: Step) -> Matrix | None:
+        return self._front_end.covariance(newest) if self._back_end.with_errors else None
 
     def _start(self, frame: Frame) -> View:
         """Make the two views of the camera, and start the mapping thread."""

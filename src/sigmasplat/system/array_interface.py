@@ -14,6 +14,7 @@ from sigmasplat.data.atlas import Atlas
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.frame_arrays import Array, ColorOrder, frame_from_arrays
+from sigmasplat.data.trajectory import LOST
 from sigmasplat.errors import SourceError
 from sigmasplat.slam.results import Step, Steps
 from sigmasplat.types import Matrix
@@ -116,8 +117,23 @@ class ArrayInterface(ABC):
         """Return the result of the newest frame; None before the first one."""
 
     @abstractmethod
+    def covariance_of(self, newest: Step) -> Matrix | None:
+        """Return the covariance of the newest frame's pose, which is not lost, as `covariance`."""
+
     def covariance(self) -> Matrix | None:
-        """Return the covariance [6, 6] of the newest frame's pose; None if that frame is lost."""
+        """Return the covariance [6, 6] of the newest frame's pose; None if that frame is lost, or in real time without
+        `covariances`.
+
+        Order: position x, y, z (m), then rotation about x, y, z (rad), all in the axes of the world, as in
+        geometry_msgs/PoseWithCovariance. It covers the noise and the systematic error of tracking since the first
+        camera of the component, its disagreement with mapping, and what closed loops corrected (`path_covariance`). It
+        does not cover a wrong pose that tracking did not notice: `Step.p_off` is its probability. For the first frame
+        it is 0. Raises SourceError before the first frame.
+        """
+        newest = self.newest_step()
+        if newest is None:
+            raise SourceError("no pose yet: give a frame to `track` or `step` first")
+        return None if newest.state == LOST else self.covariance_of(newest)
 
     def track(
         self,

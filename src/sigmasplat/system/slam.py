@@ -17,8 +17,7 @@ from sigmasplat.data.field import GaussianField, Rows
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.relative_pose import Edges
 from sigmasplat.data.submap import GrowingStore, SubmapStore
-from sigmasplat.data.trajectory import LOST, Component, Trajectory
-from sigmasplat.errors import SourceError
+from sigmasplat.data.trajectory import Component, Trajectory
 from sigmasplat.final.final_map import final_map, reaching
 from sigmasplat.final.stores import RefinedStore, StorePart, solved_keyframes
 from sigmasplat.final.uncertainty import final_uncertainty
@@ -69,23 +68,9 @@ class Slam(MainLoop, ArrayInterface):
         """Return the components of the atlas that are not connected to the world."""
         return components_apart(self.store, self.atlas, self.mapper.field, self.trajectory(), ~self.steps.lost)
 
-    def covariance(self) -> Matrix | None:
-        """Return the covariance [6, 6] of the newest frame's pose; None if that frame is lost.
-
-        Order: position x, y, z (m), then rotation about x, y, z (rad), all in the axes of the world, as in
-        geometry_msgs/PoseWithCovariance. It covers the noise and the systematic error of tracking since the first
-        camera of the component, its disagreement with mapping, and what closed loops corrected (`path_covariance`). It
-        does not cover a wrong pose that tracking did not notice: `Step.p_off` is its probability. For the first frame
-        it is 0. Raises SourceError before the first frame.
-        """
-        newest = self.newest_step()
-        if newest is None:
-            raise SourceError("no pose yet: give a frame to `track` or `step` first")
-        if newest.state == LOST:
-            return None
-        T_world_camera = (
-            self.atlas.anchors[-1] @ self.atlas.keyframe_poses.last[-1] @ self.atlas.places[-1].T_keyframe_camera
-        )
+    def covariance_of(self, newest: Step) -> Matrix:
+        atlas = self.atlas
+        T_world_camera = atlas.anchors[-1] @ atlas.keyframe_poses.last[-1] @ atlas.places[-1].T_keyframe_camera
         return self.pose_errors().of(T_world_camera, int(not newest.is_keyframe))
 
     def pose_errors(self) -> PoseErrors:
