@@ -38,14 +38,9 @@ class TrackingConfig(Section, name="tracking"):
     image."""
     iterations: Count = 200
     """Maximum number of Adam steps per frame. Use more for fast or shaky motion, fewer for speed."""
-    align_iterations: ClassVar[int] = 15
-    """Maximum number of Gauss–Newton steps per pyramid level."""
     align_depth_by: Literal["V", "U"] = "V"
     """Whether alignment weights depth residuals by V, like gray residuals, or in the same way by the depth variance U
     of the map (CG-SLAM eq. 10)."""
-    align_stop: ClassVar[float] = 2e-4
-    """Alignment ends the finest pyramid level when a step is smaller than this (metres and radians). The limit doubles
-    from each level to the next coarser one."""
     align_weight_color: Share = 0.1  # gray has the smaller basin of convergence; with 0.5, steps of 5° fail
     """Weight of gray residuals in alignment; depth residuals have 1 minus this."""
     descent: Literal["quaternion", "amsgrad", "axis-angle", "axis-angle-start"] = "quaternion"

@@ -27,6 +27,8 @@ finest value is the noise of a structured-light sensor (Khoshelham & Elberink 20
 DEPTH_GATES_M = (0.1, 0.3, 0.8, 2.0)
 """Depth residuals above this limit are assumed to belong to other surfaces; finest level first."""
 MIN_PIXELS = 60
+ITERATIONS, UPDATE_STOP = 15, 2e-4
+"""Usual limits of an alignment: see `align`."""
 DEGENERATE = 1e-5
 """A direction is undetermined if its information is below this share of the largest one."""
 BIAS_PX = 0.01
@@ -167,9 +169,9 @@ def align(
     reference: Pyramid,
     live: Pyramid,
     T_live_reference: Matrix,
-    iterations: int = 15,
+    iterations: int = ITERATIONS,
     weight_color: float = 0.5,
-    update_stop: float = 2e-4,
+    update_stop: float = UPDATE_STOP,
     plateau_stop: float = 0.0,
 ) -> Alignment:
     """Find the motion from the reference to the live image, starting at an initial guess.
@@ -220,9 +222,9 @@ def align_to_all(
     references: Sequence[Pyramid],
     live: Pyramid,
     T_live_reference: Sequence[Matrix],
-    iterations: int = 15,
+    iterations: int = ITERATIONS,
     weight_color: float = 0.5,
-    update_stop: float = 2e-4,
+    update_stop: float = UPDATE_STOP,
 ) -> Matrix:
     """Find the motion of the live camera that fits several references at once, whose poses are fixed to each other.
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from sigmasplat.config import TrackingConfig
 from sigmasplat.data import se3
 from sigmasplat.data.camera import NEUTRAL
-from sigmasplat.fit.align import Alignment, align
+from sigmasplat.fit.align import ITERATIONS, Alignment, align
 from sigmasplat.fit.backends import fits_of
 from sigmasplat.fit.compare import Comparison, best_alignment
 from sigmasplat.fit.pyramid import Pyramid
@@ -81,8 +81,8 @@ def fit_pose_align(
         found, seen = best_alignment(reference.pyramid, live, guess, config.align_weight_color)
     else:
         seen, found = None, align(
-            reference.pyramid, live, guess, config.align_iterations * moves, config.align_weight_color,
-            config.align_stop, config.plateau_stop,
+            reference.pyramid, live, guess, ITERATIONS * moves, config.align_weight_color,
+            plateau_stop=config.plateau_stop,
         )  # fmt: skip
     return PoseFit(
         found.T_live_reference @ reference.T_camera_world,

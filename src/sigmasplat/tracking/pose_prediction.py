@@ -7,7 +7,7 @@ import numpy as np
 from sigmasplat.config import TrackingConfig
 from sigmasplat.data import se3
 from sigmasplat.data.frame import PosePrior
-from sigmasplat.fit.align import align
+from sigmasplat.fit.align import ITERATIONS, align
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.render.view import View
 from sigmasplat.tracking.prepared_frame import Splats
@@ -66,6 +66,6 @@ def odometry(last: Pyramid | None, live: Pyramid, given: Given, config: Tracking
         return None
     prediction = given.prediction
     guesses = (se3.inverse(prediction.motion), prediction.turn.T.copy())  # the inverse, because it has no translation
-    found = [align(last, live, g, 2 * config.align_iterations, config.align_weight_color) for g in guesses]
+    found = [align(last, live, g, 2 * ITERATIONS, config.align_weight_color) for g in guesses]
     best = max(found, key=lambda a: a.agreement * a.overlap)
     return None if best.agreement * best.overlap < config.lost_share else best.T_live_reference

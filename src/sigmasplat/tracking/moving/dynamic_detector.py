@@ -234,10 +234,8 @@ class DynamicDetector:
             return fit
         references = [keyframe, *self.earlier]
         guesses = [fit.T_camera_world @ se3.inverse(reference.T_camera_world) for reference in references]
-        moved = align_to_all(
-            [reference.pyramid for reference in references], live, guesses, config.align_iterations,
-            config.align_weight_color, config.align_stop,
-        )  # fmt: skip
+        pyramids = [reference.pyramid for reference in references]
+        moved = align_to_all(pyramids, live, guesses, weight_color=config.align_weight_color)
         T_camera_world = moved @ fit.T_camera_world
         return replace(fit, T_camera_world=T_camera_world, comparison=keyframe.compared(live, T_camera_world))
 

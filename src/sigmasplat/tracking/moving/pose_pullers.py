@@ -75,11 +75,8 @@ def _may_have_drawn(
     here = keyframe.compared(rest, fit.T_camera_world)
     if may_draw(here, fit.comparison):
         return True
-    found = align(
-        keyframe.pyramid.coarse(QUICK_LEVELS), rest.coarse(QUICK_LEVELS),
-        fit.T_camera_world @ se3.inverse(keyframe.T_camera_world),
-        config.align_iterations, config.align_weight_color, config.align_stop,
-    )  # fmt: skip
+    small, guess = keyframe.pyramid.coarse(QUICK_LEVELS), fit.T_camera_world @ se3.inverse(keyframe.T_camera_world)
+    found = align(small, rest.coarse(QUICK_LEVELS), guess, weight_color=config.align_weight_color)
     T_camera_world = found.T_live_reference @ keyframe.T_camera_world
     there = keyframe.compared(rest, T_camera_world)
     gain = gray_gain(here, there)
