@@ -24,7 +24,7 @@ from sigmasplat.tracking.drift import Drift
 from sigmasplat.tracking.prepared_frame import PreparedFrame
 from sigmasplat.tracking.recovery import usable
 from sigmasplat.tracking.relocaliser import INDEX_AT_MOST, KnownMap, Relocation
-from sigmasplat.types import Matrix, ShouldStop, Task, completed, never
+from sigmasplat.types import Matrix, ShouldStop, Task, at_once, completed, never
 
 SLICES_PER_FRAME = 3
 """Each frame that is not a keyframe continues the search for the loops of finished submaps by this many slices for each
@@ -235,16 +235,10 @@ class MappingBackend(SlamState):
 
     # ---- search and join ----
 
-    def relocalise(
-        self, seen: PreparedFrame, apart_from: int | None = None, index_at_most: int | None = INDEX_AT_MOST
-    ) -> Relocation | None:
-        """Search the map for the camera; apart_from: only in components that are not that of this submap."""
-        return completed(self.relocalising(seen, apart_from, index_at_most))
-
     def relocalising(
         self, seen: PreparedFrame, apart_from: int | None = None, index_at_most: int | None = INDEX_AT_MOST
     ) -> Task[Relocation | None]:
-        """Search the map as `relocalise` does, in slices."""
+        """Search the map for the camera, in slices; apart_from: only in components that are not that of this submap."""
         if not self.config.recovery.relocalise or not usable(seen):
             return None
         components = self.atlas.components
@@ -252,6 +246,9 @@ class MappingBackend(SlamState):
         with self._timer.stage("relocalise"):
             result = yield from self.relocaliser.searching(self._known(wanted), self.view, seen, index_at_most)
             return result.found
+
+    relocalise = at_once(relocalising)
+    """Search the map as `relocalising` does, in one go."""
 
     def _known(self, wanted: Sequence[bool]) -> KnownMap:
         """Return the map as relocalisation reads it; wanted [S]: which submaps are searched."""

@@ -25,7 +25,7 @@ from sigmasplat.tracking.feature_image import FeatureImage, pose_by_features
 from sigmasplat.tracking.features import VOTE_RATIO, Extractor, Features, Landmarks, matched_by_distance
 from sigmasplat.tracking.pose_validation import MOST_SPREAD_M, recognised, score
 from sigmasplat.tracking.prepared_frame import PreparedFrame, TrackedKeyframe
-from sigmasplat.types import Matrix, Task, completed
+from sigmasplat.types import Matrix, Task, at_once
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,19 +143,14 @@ class Relocaliser:
     _strongest: dict[KeyframeId, Features] = field(default_factory=dict, init=False)
     _landmarks: "OrderedDict[KeyframeId, Landmarks]" = field(default_factory=OrderedDict, init=False)
 
-    def search(
-        self, known: KnownMap, view: View, seen: PreparedFrame, index_at_most: int | None = INDEX_AT_MOST
-    ) -> SearchResult:
-        """Return where the camera is, if a keyframe leads to a pose that the map confirms, and what was refused.
-
-        index_at_most: number of keyframes that may be added to the search; None = all.
-        """
-        return completed(self.searching(known, view, seen, index_at_most))
-
     def searching(
         self, known: KnownMap, view: View, seen: PreparedFrame, index_at_most: int | None = INDEX_AT_MOST
     ) -> Task[SearchResult]:
-        """Search as `search` does, in slices: the features of one keyframe, one pose. `known` must not change."""
+        """Return where the camera is, if a keyframe leads to a pose that the map confirms, and what was refused, in
+        slices: the features of one keyframe, one pose. `known` must not change.
+
+        index_at_most: number of keyframes that may be added to the search; None = all.
+        """
         wanted = known.keyframes()
         yield from self._index(known, view, wanted, index_at_most)
         candidates = self._candidates(wanted, seen)
@@ -169,6 +164,9 @@ class Relocaliser:
                 break
             yield
         return SearchResult(best.get(True), len(candidates), best.get(False))
+
+    search = at_once(searching)
+    """Search as `searching` does, in one go."""
 
     def _index(self, known: KnownMap, view: View, wanted: Sequence[KeyframeId], at_most: int | None) -> Task[None]:
         """Add keyframes to the search, and find the features that are missing, also those of a resumed run."""
