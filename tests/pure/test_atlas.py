@@ -10,7 +10,6 @@ from sigmasplat.data.field import GaussianField
 from sigmasplat.data.poses import Column, Place, Places
 from sigmasplat.data.relative_pose import UNKNOWN_HOP, RelativePose
 from sigmasplat.data.submap import MemoryStore, Picture, Submap
-from sigmasplat.errors import SigmaSplatError
 from sigmasplat.final.stores import RefinedStore, StorePart
 
 CAMERA = Camera(4, 3, 4.0, 4.0, 1.5, 1.0)
@@ -143,11 +142,11 @@ def test_the_memory_store_gives_back_what_it_took() -> None:
     assert np.allclose(store.picture(0, 1).unit_color, 0.2)
 
 
-def test_submaps_are_kept_in_order_and_with_all_their_pictures() -> None:
+def test_submaps_are_kept_in_order() -> None:
     store = MemoryStore()
-    with pytest.raises(SigmaSplatError, match="submap 1 cannot be saved: the next index is 0"):
+    with pytest.raises(AssertionError, match="in their order"):
         store.save(piece(1), [picture()])
-    with pytest.raises(SigmaSplatError, match="2 frames, 2 poses, 1 pictures"):
+    with pytest.raises(AssertionError, match="with all images"):
         store.save(piece(0, 2), [picture()])
     assert len(store) == 0
 

@@ -361,16 +361,7 @@ def test_pictures_are_read_when_drawn_and_kept_while_there_is_room(monkeypatch: 
 # ---- bad input ----
 
 
-def test_what_no_map_can_be_made_of_is_refused() -> None:
-    for store, anchors in ((MemoryStore(), []), (make_store(), ANCHORS[:1])):
-        view = ReferenceView(CAMERA, CONFIG.render)
-        with pytest.raises(
-            SigmaSplatError, match=f"needs submaps and one anchor for each, found {len(store)} and {len(anchors)}"
-        ):
-            final_map(store, anchors, config(), view, np.random.default_rng(0))
-    other = ReferenceView(replace(CAMERA, fx=21.0), CONFIG.render)
-    with pytest.raises(SigmaSplatError, match="the camera of submap 0 is"):
-        final_map(make_store(), ANCHORS, config(iterations=1), other, np.random.default_rng(0))
+def test_submaps_without_a_surface_are_refused_as_seeds() -> None:
     blind = deepcopy(make_store())
     for submap in blind.submaps:
         submap.field.params[:, 10] = -9.0

@@ -20,7 +20,7 @@ from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import ATTRIBUTES, GaussianField, Rows
 from sigmasplat.data.frame import Detail, Frame
 from sigmasplat.data.submap import MemoryStore, Picture, Submap, SubmapStore
-from sigmasplat.errors import RunError, SigmaSplatError
+from sigmasplat.errors import RunError
 from sigmasplat.files import tensors
 from sigmasplat.files.tensors import open_tensors, write_tensors
 from sigmasplat.run.resume import state_of
@@ -136,7 +136,7 @@ def test_probe_views_are_read_back_from_both_stores(store: DiskStore) -> None:
         for k, probe in enumerate(probes):
             assert np.array_equal(where.probe(0, k).color, probe.color)
             assert np.array_equal(where.probe(0, k).depth_m, probe.depth_m)
-        with pytest.raises(SigmaSplatError, match="probe views"):
+        with pytest.raises(AssertionError, match="with all images"):
             where.save(replace(submap, index=1), pictures, probes[:1])
 
 
@@ -243,14 +243,14 @@ def test_images_are_read_one_by_one(store: DiskStore, monkeypatch: pytest.Monkey
     assert {name for name, _ in asked} == {"params", "frames", "T_submap_camera"}
 
 
-def test_submaps_are_saved_in_order_and_complete(store: DiskStore) -> None:
-    with pytest.raises(SigmaSplatError, match="submap 1 cannot be saved: the next index is 0"):
+def test_submaps_are_saved_in_order(store: DiskStore) -> None:
+    with pytest.raises(AssertionError, match="in their order"):
         store.save(*some_submap(1))
     store.save(*some_submap(0))
-    with pytest.raises(SigmaSplatError, match="submap 0 cannot be saved: the next index is 1"):
+    with pytest.raises(AssertionError, match="in their order"):
         store.save(*some_submap(0))
     submap, pictures = some_submap(1)
-    with pytest.raises(SigmaSplatError, match="3 frames, 3 poses, 2 pictures"):
+    with pytest.raises(AssertionError, match="with all images"):
         store.save(submap, pictures[:2])
     assert len(store) == 1 and not list(store.folder.glob(".*"))
 

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from sigmasplat.data.camera import Camera, unexposed
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.frame import Detail, Photo
-from sigmasplat.errors import SigmaSplatError
 from sigmasplat.types import Matrix
 
 KeyframeId = tuple[int, int]
@@ -107,8 +106,9 @@ class MemoryStore:
         return len(self.submaps)
 
     def save(self, submap: Submap, pictures: list[Picture], probes: Sequence[Picture] = ()) -> None:
-        """Save a submap. Raises SigmaSplatError unless it is the next one and has images for all its views."""
-        refuse_misfit(submap, pictures, len(self), probes)
+        """Save a submap, which must be the next one."""
+        complete = len(submap.frames) == len(pictures) and len(submap.probe_frames) == len(probes)
+        assert submap.index == len(self) and complete, "submaps are saved in their order, with all images"
         self.submaps.append(submap)
         self.pictures.append(pictures)
         self.probes.append(list(probes))
@@ -121,17 +121,3 @@ class MemoryStore:
 
     def probe(self, index: int, probe: int) -> Picture:
         return self.probes[index][probe]
-
-
-def refuse_misfit(submap: Submap, pictures: Sequence[Picture], next_index: int, probes: Sequence[Picture] = ()) -> None:
-    """Raise SigmaSplatError if a submap is not the next one to save, or its keyframes or probe views do not match their
-    images."""
-    if submap.index != next_index:
-        raise SigmaSplatError(f"submap {submap.index} cannot be saved: the next index is {next_index}")
-    keyframes = submap.frames, submap.T_submap_camera, pictures
-    views = submap.probe_frames, submap.T_submap_probe, probes
-    for of, given in (("keyframes", keyframes), ("probe views", views)):
-        frames, poses, images = map(len, given)
-        if not frames == poses == images:
-            counts = f"{frames} frames, {poses} poses, {images} pictures of {of}"
-            raise SigmaSplatError(f"submap {submap.index} cannot be saved: {counts}")

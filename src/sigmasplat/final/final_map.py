@@ -54,12 +54,9 @@ def final_map(
     """Return the map in the world: made from submaps at `anchors` (T_world_submap [4, 4] each), then refined with
     `view`.
 
-    Calls `progress(steps done, total)`. Memory contains this map, one submap and some pictures.
-    Raises SigmaSplatError if there is no submap, a submap has no anchor, or its camera is not the view's.
+    Calls `progress(steps done, total)`. Memory contains this map, one submap and some pictures. All submaps have the
+    view's camera.
     """
-    if not 0 < len(store) <= len(anchors):
-        found = f"found {len(store)} and {len(anchors)}"
-        raise SigmaSplatError(f"the final map needs submaps and one anchor for each, {found}")
     seed = seeded_on_surface if config.final.seed_from == "mesh" else merged
     if config.moving.find:
         store = without_moving(store, anchors, config.moving)

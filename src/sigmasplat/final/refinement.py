@@ -14,7 +14,6 @@ from sigmasplat.data import se3
 from sigmasplat.data.camera import NEUTRAL, centred
 from sigmasplat.data.field import COLUMNS, GaussianField
 from sigmasplat.data.submap import SubmapStore
-from sigmasplat.errors import SigmaSplatError
 from sigmasplat.fit.adam import BETA2, Rates, VectorAdam
 from sigmasplat.fit.field import fit_field
 from sigmasplat.fit.pose import fit_exposure
@@ -56,8 +55,7 @@ class KeyframeReader:
 
     anchors: T_world_submap [4, 4] of each submap; `places`: submap and number of each keyframe; `poses`: their
     T_world_camera [4, 4], which `refine` may move; `motions`: Adam's state of each pose; `exposures` [K, 3, 2]: those
-    of the images relative to the map, as fitted last; `left`: the keyframes left in the current epoch. Raises
-    SigmaSplatError if there is no keyframe, or a submap's camera is not the view's.
+    of the images relative to the map, as fitted last; `left`: the keyframes left in the current epoch.
     """
 
     def __init__(self, store: SubmapStore, anchors: Sequence[Matrix], view: View) -> None:
@@ -66,20 +64,13 @@ class KeyframeReader:
         self.places: list[tuple[int, int]] = []
         self.poses: list[Matrix] = []
         for index in range(len(store)):
-            self._add(index, anchors[index])
-        if not self.places:
-            raise SigmaSplatError("the submaps have no keyframes, so the final map cannot be refined")
+            submap = store.load(index)
+            self.places += [(index, k) for k in range(len(submap.frames))]
+            self.poses += [anchors[index] @ T for T in submap.T_submap_camera]
         self.tracked = tuple(self.poses)
         self.motions, self.left = [VectorAdam.of(6) for _ in self.poses], list[int]()
         self.exposures = np.tile(NEUTRAL, (len(self.poses), 1, 1))
         self._target = lru_cache(max(1, CACHE_BYTES // (16 * view.alpha.numel())))(self._read)
-
-    def _add(self, index: int, T_world_submap: Matrix) -> None:
-        submap = self.store.load(index)
-        if submap.camera != self.camera:
-            raise SigmaSplatError(f"the camera of submap {index} is {submap.camera}, but the view has {self.camera}")
-        self.places += [(index, k) for k in range(len(submap.frames))]
-        self.poses += [T_world_submap @ T for T in submap.T_submap_camera]
 
     def __len__(self) -> int:
         return len(self.places)

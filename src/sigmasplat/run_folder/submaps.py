@@ -15,7 +15,7 @@ import torch
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import ATTRIBUTES, GaussianField, Rows
 from sigmasplat.data.frame import Detail, Photo
-from sigmasplat.data.submap import Picture, Submap, refuse_misfit
+from sigmasplat.data.submap import Picture, Submap
 from sigmasplat.errors import RunError
 from sigmasplat.files.atomic import make_folder
 from sigmasplat.files.tensors import open_tensors, write_tensors
@@ -60,10 +60,10 @@ class DiskStore:
         return self.folder / f"submap-{index:05d}.safetensors"
 
     def save(self, submap: Submap, pictures: list[Picture], probes: Sequence[Picture] = ()) -> None:
-        """Write a submap. Raises SigmaSplatError if it is inconsistent, RunError if it or the one before cannot be
-        written."""
+        """Write a submap, which must be the next one. Raises RunError if it or the one before cannot be written."""
         self.settle()
-        refuse_misfit(submap, pictures, len(self), probes)
+        complete = len(submap.frames) == len(pictures) and len(submap.probe_frames) == len(probes)
+        assert submap.index == len(self) and complete, "submaps are saved in their order, with all images"
         attributes = submap.field.attributes.items()
         tensors = {"params": submap.field.params, **{f"extra.{name}": values.params for name, values in attributes}}
         keyframes = "", "T_submap_camera", submap.frames, submap.T_submap_camera, pictures
