@@ -167,14 +167,14 @@ def test_edges_are_read_as_they_were_added() -> None:
 def test_described_submaps_are_read_as_they_were_added() -> None:
     rng = np.random.default_rng(0)
     counts = (0, 3, 0, 2)
-    known = [SubmapDescriptor(5 * i, rng.random((n, 4), np.float32), 1.0 + i, 0.5 * i) for i, n in enumerate(counts)]
+    known = [SubmapDescriptor(5 * i, rng.random((n, 4), np.float32), 1.0 + i) for i, n in enumerate(counts)]
     found = DescribedSubmaps()
     for each in known:
         found.append(each)
     assert found.counts.tolist() == [0, 3, 0, 2] and found.numbers.tolist() == [0, 5, 10, 15]
-    assert found.opacity_ratio.tolist() == [1, 2, 3, 4] and found.reach_m.tolist() == [0, 0.5, 1, 1.5]
+    assert found.opacity_ratio.tolist() == [1, 2, 3, 4]
     for each, before in zip(found, known, strict=True):
-        assert (each.index, each.opacity_ratio, each.reach_m) == (before.index, before.opacity_ratio, before.reach_m)
+        assert (each.index, each.opacity_ratio) == (before.index, before.opacity_ratio)
         assert np.array_equal(each.descriptors.ravel(), before.descriptors.ravel())
     assert not DescribedSubmaps().counts.size
 

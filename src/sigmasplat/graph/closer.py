@@ -160,8 +160,7 @@ class LoopCloser:
         return self.edges.taken(valid)
 
     def _described(self, submap: Submap, descriptors: Sequence[NDArray[np.float32]]) -> SubmapDescriptor:
-        reach_m = float(np.linalg.norm(submap.T_submap_camera[:, :3, 3], axis=1).max())
-        return SubmapDescriptor(submap.index, np.stack(descriptors), self.opacity_ratio(submap), reach_m)
+        return SubmapDescriptor(submap.index, np.stack(descriptors), self.opacity_ratio(submap))
 
     def opacity_ratio(self, submap: Submap) -> float:
         """Return the variance-weighted opacity ratio of a submap (VarSplat §4)."""
@@ -217,20 +216,13 @@ class LoopCloser:
         )
         pairs = pairs_to_register(candidates, query, database, keyframes, most)
         if c.near_m:
-            around = connected & self._around(query, atlas)
-            poses = atlas.T_world_keyframes_of([query.index, *database.numbers[around].tolist()])
+            poses = atlas.T_world_keyframes_of([query.index, *database.numbers[connected].tolist()])
             near_rad, known = np.deg2rad(c.near_deg), {pair.best.database_submap for pair in pairs}
             # Of the nearest 2n, at most n are known already.
             twice = None if most is None else 2 * most
-            near = find_nearby(query, database, poses, c.near_m, near_rad, c.min_interval, keyframes, twice, around)
+            near = find_nearby(query, database, poses, c.near_m, near_rad, c.min_interval, keyframes, twice, connected)
             pairs += [pair for pair in near if pair.best.database_submap not in known]
         return pairs[:most]
-
-    def _around(self, query: SubmapDescriptor, atlas: Atlas) -> NDArray[np.bool_]:
-        """Return which described submaps [n] may have a keyframe nearer than `near_m` to one of the query's."""
-        known, anchors = self.descriptors, np.array(atlas.anchors)
-        apart_m = np.linalg.norm(anchors[known.numbers][:, :3, 3] - anchors[query.index][:3, 3], axis=1)
-        return np.asarray(apart_m <= self.config.loops.near_m + query.reach_m + known.reach_m)
 
     def _try(
         self, pair: SubmapPair, a: Submap, atlas: Atlas, registrar: Registrar
