@@ -181,10 +181,9 @@ def find_nearby(
     near_rad: float,
     min_interval: int = 2,
     keyframes: int = 2,
-    most: int | None = None,
     among: NDArray[np.bool_] | None = None,
 ) -> list[SubmapPair]:
-    """List pairs of submaps that show the same place according to the current poses; the `most` nearest, nearest first.
+    """List pairs of submaps that show the same place according to the current poses, nearest first.
 
     An addition to the paper: while drift is small, poses find more revisits than descriptors do. T_world_keyframe:
     poses [K, 4, 4] of each of these submaps, by its index; among: as in `find_candidates`. A pair counts if two
@@ -202,7 +201,7 @@ def find_nearby(
     within = np.where((apart_m < near_m) & (apart_rad < near_rad), far, np.inf)
     nearest = np.minimum.reduceat(within.min(0), first[:-1])
     found, rows = [], np.flatnonzero(wanted)
-    for row in sorted(np.flatnonzero(np.isfinite(nearest)), key=lambda row: (nearest[row], others[row]))[:most]:
+    for row in sorted(np.flatnonzero(np.isfinite(nearest)), key=lambda row: (nearest[row], others[row])):
         other, ours_theirs = known[int(rows[row])], far[:, first[row] : first[row + 1]]
         q, d = np.argwhere(within[:, first[row] : first[row + 1]] == nearest[row])[0].tolist()
         alike = float(similarity(query.descriptors[q : q + 1], other.descriptors[d : d + 1])[0, 0])
@@ -230,9 +229,8 @@ def pairs_to_register(
     query: SubmapDescriptor,
     known: DescribedSubmaps,
     keyframes: int = 2,
-    most: int | None = None,
 ) -> list[SubmapPair]:
-    """Group a query's candidates by submap, the `most` best pairs first, and choose the keyframes to localise
+    """Group a query's candidates by submap, the best pairs first, and choose the keyframes to localise
     (VarSplat §5).
 
     candidates: the result of `find_candidates` for the same submaps. Of each side, the `keyframes` most
@@ -242,7 +240,7 @@ def pairs_to_register(
     for candidate in candidates:
         best.setdefault(candidate.database_submap, candidate)
     pairs = []
-    for index, candidate in list(best.items())[:most]:
+    for index, candidate in best.items():
         alike = similarity(query.descriptors, known[int(np.flatnonzero(known.numbers == index)[0])].descriptors)
         pairs.append(SubmapPair(candidate, _highest(alike.max(1), keyframes), _highest(alike.max(0), keyframes)))
     return pairs

@@ -210,19 +210,17 @@ class LoopCloser:
         c = self.config.loops
         database, components = self.descriptors, np.array(atlas.components, np.int64)
         connected = components[database.numbers] == components[query.index]
-        keyframes, most = self.config.registration.keyframes, c.most or None
+        keyframes = self.config.registration.keyframes
         candidates = find_candidates(
             query, database, c.min_similarity, c.min_interval, c.similarity_floor, c.uncertainty, connected
         )
-        pairs = pairs_to_register(candidates, query, database, keyframes, most)
+        pairs = pairs_to_register(candidates, query, database, keyframes)
         if c.near_m:
             poses = atlas.T_world_keyframes_of([query.index, *database.numbers[connected].tolist()])
             near_rad, known = np.deg2rad(c.near_deg), {pair.best.database_submap for pair in pairs}
-            # Of the nearest 2n, at most n are known already.
-            twice = None if most is None else 2 * most
-            near = find_nearby(query, database, poses, c.near_m, near_rad, c.min_interval, keyframes, twice, connected)
+            near = find_nearby(query, database, poses, c.near_m, near_rad, c.min_interval, keyframes, connected)
             pairs += [pair for pair in near if pair.best.database_submap not in known]
-        return pairs[:most]
+        return pairs[: c.most or None]
 
     def _try(
         self, pair: SubmapPair, a: Submap, atlas: Atlas, registrar: Registrar
