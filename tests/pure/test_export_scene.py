@@ -47,7 +47,7 @@ def test_film_plan_and_map_are_written_with_their_progress(here: Path, capsys: p
     assert turn[1, 1] < -0.8
     said = capsys.readouterr().out
     assert "film …\n" in said and "floor plan …\n" in said
-    assert "a.webm: 2 images, 0.5 s" in said and "to scan again, also in kitchen.plan.json" in said
+    assert "a.webm: 2 images, 0.5 s" in said and "m² of free floor, also in kitchen.plan.json" in said
 
 
 def test_options_of_other_formats_and_wrong_values_are_refused(here: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -24,14 +24,6 @@ from sigmasplat.plugins.outputs.drawing.view_panels import (
     draw_view_strip,
     view_panels,
 )
-from sigmasplat.plugins.outputs.floorplan.rescan import (
-    FLOOR_UNOBSERVED,
-    FREE,
-    UNOBSERVED,
-    RescanRegion,
-    find_rescan_regions,
-    unsure_rule,
-)
 from sigmasplat.run.figures import number, rate
 from sigmasplat.run_folder.frames import RunFrames
 
@@ -92,22 +84,8 @@ def test_the_font_has_every_character_of_the_panels() -> None:
     font = ImageFont.load_default(20)
     panels = [*view_panels(some_view()), *view_panels(predicted_view())]
     texts = [word for panel in panels for word in (panel.title, panel.caption, *panel.ends)]
-    texts += [region.sentence("sq m") for region in regions_of_every_kind()]
-    assert {text.split(":")[0] for text in texts} >= {"unseen", "thin", "unsure"}
-    texts += [unsure_rule(predicted_errors) for predicted_errors in (True, False)]
     missing = bytes(font.getmask("\uffff"))
     assert not [c for c in sorted({*"".join(texts)} - {" "}) if bytes(font.getmask(c)) == missing]
-
-
-def regions_of_every_kind() -> list[RescanRegion]:
-    """Return regions of maps with an uncertain patch, a thin one, and cells that were not observed."""
-    kind = np.full((40, 40), UNOBSERVED, np.uint8)
-    kind[2:-2, 2:-2] = FREE
-    kind[20:24, 20:24] = UNOBSERVED
-    kind[30:34, 4:8] = FLOOR_UNOBSERVED
-    wrong, depth, alpha = np.full((3, 40, 40), [[[0.01]], [[0.01]], [[1.0]]])
-    wrong[5:10, 5:10], depth[5:10, 5:10], alpha[5:10, 20:25] = 0.9, 0.2, 0.5
-    return find_rescan_regions(kind, alpha, depth, wrong, 0.05, np.zeros(2))
 
 
 def test_a_strip_shows_the_five_panels_of_a_view() -> None:

@@ -1,7 +1,6 @@
 """Build report.html: a picture of the map, three verdicts and the next commands; the rest is folded. No scripts."""
 
 import html
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,6 @@ from sigmasplat.plugins.evaluation.report.charts import Plot
 from sigmasplat.plugins.evaluation.report.summary import Verdict
 from sigmasplat.plugins.evaluation.report.view_strips import PanelFigure
 from sigmasplat.plugins.outputs.drawing.plot import svg
-from sigmasplat.plugins.outputs.floorplan.rescan import RescanRegion
 
 VIEW_PANELS = 5
 """Number of panels of a view; fewer are not of one view, or of its predicted errors."""
@@ -21,7 +19,7 @@ STYLE = Path(__file__).with_name("page.css").read_text(encoding="utf-8")
 
 PLAN_CAPTION = (
     "The map from above: walls are light, objects grey, the free floor dark, floor that was not observed blue; the "
-    "camera path is green. Numbered circles are regions to scan again, the largest first."
+    "camera path is green."
 )
 
 
@@ -29,9 +27,8 @@ PLAN_CAPTION = (
 class Contents:
     """What a report shows.
 
-    verdicts: shown first; commands: what to do with the map; advice: what else to try; rescan: sentences about what to
-    scan again; regions: the same numbered regions as in the floor plan; strips: panels of views by heading; plots:
-    charts by name; plan: panels of the floor plan.
+    verdicts: shown first; commands: what to do with the map; advice: what else to try; strips: panels of views by
+    heading; plots: charts by name; plan: panels of the floor plan.
     """
 
     title: str
@@ -44,9 +41,7 @@ class Contents:
     verdicts: list[Verdict] = field(default_factory=list)
     commands: list[Advice] = field(default_factory=list)
     advice: list[Advice] = field(default_factory=list)
-    rescan: list[str] = field(default_factory=list)
     plan: list[PanelFigure] = field(default_factory=list)
-    regions: Sequence[RescanRegion] = ()
 
 
 def build_report(contents: Contents) -> str:
@@ -58,7 +53,7 @@ def build_report(contents: Contents) -> str:
         f"<div class=judged>{''.join(map(_verdict, contents.verdicts))}</div>",
         _advice(contents.commands),
         _part("What else to try", _advice(contents.advice)),
-        _part("Where to scan again", _rescan(contents)),
+        _part("Floor plan", _plan(contents)),
         _part("Trajectory", _figure(contents, "trajectory")),
         _part("States of the frames", _states(contents)),
         _part("Views", _strips(contents)),
@@ -108,19 +103,6 @@ def _scores(contents: Contents) -> str:
         if rows[1:]
     )
     return f"<div class=pair>{body}</div>"
-
-
-def _rescan(contents: Contents) -> str:
-    """Show where to scan again: sentences, the floor plan, and the list of its numbered regions."""
-    if not contents.rescan and not contents.plan:
-        return ""
-    words = "".join(f"<p>{html.escape(sentence)}</p>" for sentence in contents.rescan)
-    items = "".join(
-        f"<li class={html.escape(region.why)}><b>{number}</b><span>{html.escape(region.sentence())}</span></li>"
-        for number, region in enumerate(contents.regions, 1)
-    )
-    listed = f"<ol class=regions>{items}</ol>" if items else ""
-    return f"{words}{_plan(contents)}{listed}"
 
 
 def _advice(advice: list[Advice]) -> str:

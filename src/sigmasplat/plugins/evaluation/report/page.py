@@ -19,7 +19,7 @@ from sigmasplat.api import (
 from sigmasplat.plugins.evaluation.report.advice import advice, next_commands
 from sigmasplat.plugins.evaluation.report.charts import Plot
 from sigmasplat.plugins.evaluation.report.html import Contents, build_report
-from sigmasplat.plugins.evaluation.report.summary import rescan_sentences, verdicts
+from sigmasplat.plugins.evaluation.report.summary import verdicts
 from sigmasplat.plugins.evaluation.report.view_strips import PanelFigure, panel_figure
 from sigmasplat.plugins.outputs.floorplan.floor_plan import FloorPlan, run_floor_plan
 from sigmasplat.plugins.outputs.floorplan.picture import plan_panels
@@ -53,9 +53,7 @@ def write_page(
         verdicts=verdicts(metrics, unsure, found),
         commands=next_commands(str(run.path)),
         advice=found[1:],
-        rescan=rescan_sentences(metrics, plan),
         plan=[panel_figure(panel) for panel in plan_panels(plan)] if plan else [],
-        regions=plan.regions if plan else (),
     )
     run.write_report(build_report(contents))
 
