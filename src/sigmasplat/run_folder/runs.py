@@ -1,5 +1,6 @@
 """Write and read the folder of a run, which is valid at any time."""
 
+import zlib
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -18,11 +19,12 @@ from sigmasplat.files import machine
 from sigmasplat.files.atomic import part_of, remove_leftovers, replacing, sync_file, write_text
 from sigmasplat.files.json_files import append_line, read_json, read_lines, write_json
 from sigmasplat.files.lock import LOCK, locked, no_warning
+from sigmasplat.files.reading import refuse_special
 from sigmasplat.files.tensors import open_tensors, write_tensors
 from sigmasplat.input.lists import read_poses
 from sigmasplat.run_folder import map_files, splat_ply as ply, trajectory as tum
 from sigmasplat.run_folder.frames import RunFrames
-from sigmasplat.run_folder.run_values import FACTS, check_checkpoint, check_fields, check_log, check_profile
+from sigmasplat.run_folder.run_values import FACTS, REMEDY, Tensors, check_fields, check_log, check_profile
 from sigmasplat.run_folder.submaps import DiskStore
 from sigmasplat.uncertainty.map_uncertainty import MapUncertainty, SplatStd
 
@@ -268,14 +270,20 @@ class RunFolder:
         return uncertainty
 
     def write_checkpoint(self, tensors: dict[str, Tensor], text: dict[str, str]) -> None:
-        """Write checkpoint.safetensors: named tensors and text."""
-        write_tensors(self.path / "checkpoint.safetensors", tensors, text)
+        """Write checkpoint.safetensors: named tensors and text. Its checksum is noted in run.json."""
+        write_tensors(path := self.path / "checkpoint.safetensors", tensors, text)
+        self.note(checkpoint=_checksum(path))
 
     def read_checkpoint(self) -> tuple[dict[str, Tensor], dict[str, str]]:
-        """Read checkpoint.safetensors: tensors and text. Raises RunError if it is missing or damaged."""
-        with open_tensors(path := self._existing("checkpoint.safetensors"), "checkpoint") as file:
+        """Read checkpoint.safetensors: tensors and text. Raises RunError if it is missing, damaged, or not that of
+        run.json; so its tensors need no other checks."""
+        path = self._existing("checkpoint.safetensors")
+        refuse_special(path, RunError)
+        if self.facts().get("checkpoint") != _checksum(path):
+            raise RunError(f"checkpoint {path} is damaged: its checksum is not that in run.json; {REMEDY}")
+        with open_tensors(path, "checkpoint") as file:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-            return check_checkpoint(tensors, path), file.metadata() or {}
+            return Tensors(tensors, path), file.metadata() or {}
 
     def read_odometry(self) -> Trajectory | None:
         """Return the path of tracking alone, without loop closure; None if the run has no such path or no loop.
@@ -308,6 +316,10 @@ class RunFolder:
         if not (self.path / name).is_file():
             raise RunError(f"run {self.path} has no {name}; did it stop before writing it? run it again")
         return self.path / name
+
+
+def _checksum(path: Path) -> str:
+    return f"{zlib.crc32(path.read_bytes()):08x}"
 
 
 def _object(path: Path) -> dict[str, Any]:
