@@ -21,7 +21,6 @@ from sigmasplat.errors import RunError
 from sigmasplat.files.lock import LOCK, locked, no_warning
 from sigmasplat.input.source import Source
 from sigmasplat.run.callbacks import Callback, run_now
-from sigmasplat.run.figures import profile
 from sigmasplat.run.same_conditions import start_facts
 from sigmasplat.run.signals import interrupt_event
 from sigmasplat.run_folder.frames import RunFrames
@@ -288,9 +287,7 @@ class Session:
         self.run.write_trajectory(valid)
         self._write_loops()
         self.run.write_checkpoint(self.slam.checkpoint(), {"frames": str(self.outcome.frames)})
-        log = self.run.read_log()
-        self.run.write_profile(profile(log, self.outcome.wall_s))
-        if (up := RunFrames.of(log, valid).measured_up()) is not None:
+        if (up := RunFrames.of(self.run.read_log(), valid).measured_up()) is not None:
             self.run.note(up_world=up.tolist())
         self.run.write_components(components)
         self.run.write_map(self.slam.field)

@@ -72,11 +72,6 @@ def check_fields(values: Any, kinds: Mapping[str, Kind], required: tuple[str, ..
     return checked
 
 
-def check_profile(values: Any, path: Path) -> dict[str, float]:
-    """Return the seconds of each stage of a run. Raises RunError naming the file if one is not a number."""
-    return check_fields(values, dict.fromkeys(values, float) if isinstance(values, dict) else {}, (), path)
-
-
 class Record(dict[str, Any]):
     """A line of log.jsonl; a missing field raises RunError. Logs of older versions lack some fields."""
 

@@ -24,7 +24,7 @@ from sigmasplat.files.tensors import open_tensors, write_tensors
 from sigmasplat.input.lists import read_poses
 from sigmasplat.run_folder import map_files, splat_ply as ply, trajectory as tum
 from sigmasplat.run_folder.frames import RunFrames
-from sigmasplat.run_folder.run_values import FACTS, REMEDY, Tensors, check_fields, check_log, check_profile
+from sigmasplat.run_folder.run_values import FACTS, REMEDY, Tensors, check_fields, check_log
 from sigmasplat.run_folder.submaps import DiskStore
 from sigmasplat.uncertainty.map_uncertainty import MapUncertainty, SplatStd
 
@@ -37,7 +37,7 @@ STATE = "state.safetensors"
 """The state from which an unfinished run resumes."""
 FILES = (
     "config.json", "trajectory.txt", "map.ply", "checkpoint.safetensors", "log.jsonl", "loops.json",
-    "metrics.json", "profile.json", "report.html", TRUTH, map_files.UNCERTAINTY_JSON, map_files.UNCERTAINTY_TENSORS,
+    "metrics.json", "report.html", TRUTH, map_files.UNCERTAINTY_JSON, map_files.UNCERTAINTY_TENSORS,
 )  # fmt: skip
 """Files that a run may have in addition to run.json, which always exists and identifies the folder as ours."""
 COMPONENTS = "components"
@@ -69,7 +69,7 @@ def _writes(name: str, write: Callable[[Path, Value], None]) -> Callable[["RunFo
 @dataclass(frozen=True)
 class RunFolder:
     """One run on disk: config.json, run.json (source, version, machine, status), log.jsonl (one line per frame),
-    trajectory.txt, map.ply, checkpoint.safetensors, loops.json, profile.json, metrics.json, report.html, images/,
+    trajectory.txt, map.ply, checkpoint.safetensors, loops.json, metrics.json, report.html, images/,
     submaps/, components/.
 
     Files are replaced atomically, and the log grows by complete lines, so an interrupted run can still be read.
@@ -300,10 +300,6 @@ class RunFolder:
     """Write metrics.json; nan and inf become null."""
     read_metrics = _reads("metrics.json", lambda path: _object(path))
     """Read metrics.json. Raises RunError if it is damaged."""
-    write_profile = _writes("profile.json", write_json)
-    """Write profile.json: seconds by stage."""
-    read_profile = _reads("profile.json", lambda path: check_profile(_object(path), path))
-    """Read profile.json. Raises RunError if it is damaged."""
     write_report = _writes("report.html", write_text)
     """Write report.html."""
 
