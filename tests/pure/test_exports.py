@@ -129,9 +129,9 @@ def test_films_follow_the_path_or_an_orbit(reader: RunReader, tmp_path: Path, pa
     calls: list[tuple[int, int]] = []
     options = VideoOptions(width_px=64, fps=5.0, seconds=1.0, path=path)
     count = export_video(
-        reader, tmp_path / "film.webm", options, renderer=seer(WORLD), progress=lambda *at: calls.append(at)
+        reader, tmp_path / "film.mp4", options, renderer=seer(WORLD), progress=lambda *at: calls.append(at)
     )
-    frames, _ = read_film(tmp_path / "film.webm")
+    frames, _ = read_film(tmp_path / "film.mp4")
     first = frames[0]
     assert (first.shape, len(frames), count) == ((48, 3 * 64, 3), 5, 5)
     assert calls == [(i, 5) for i in range(6)]
@@ -141,8 +141,8 @@ def test_films_follow_the_path_or_an_orbit(reader: RunReader, tmp_path: Path, pa
 
 def test_a_film_of_colour_alone_has_one_panel_and_no_legend(reader: RunReader, tmp_path: Path) -> None:
     options = VideoOptions(width_px=64, fps=5.0, seconds=1.0, panels="color")
-    assert export_video(reader, tmp_path / "film.webm", options, renderer=seer(WORLD)) == 5
-    first = read_film(tmp_path / "film.webm")[0][0]
+    assert export_video(reader, tmp_path / "film.mp4", options, renderer=seer(WORLD)) == 5
+    first = read_film(tmp_path / "film.mp4")[0][0]
     assert first.shape == (48, 64, 3) and np.abs(first.astype(int) - 128).max() < 12
 
 
@@ -165,8 +165,8 @@ def test_the_length_and_the_size_of_a_film(reader: RunReader, tmp_path: Path) ->
     assert VideoOptions(path="orbit", fps=10.0).images(500.0) == 120
     camera = film_camera(Camera(321, 241, 200.0, 200.0, 160.0, 120.0), 0)
     assert (camera.width, camera.height) == (320, 240)
-    export_video(reader, tmp_path / "film.webm", VideoOptions(200, 5.0, 0.2), renderer=seer(WORLD))
-    shown = read_film(tmp_path / "film.webm")[0][0].astype(int)
+    export_video(reader, tmp_path / "film.mp4", VideoOptions(200, 5.0, 0.2), renderer=seer(WORLD))
+    shown = read_film(tmp_path / "film.mp4")[0][0].astype(int)
     assert shown.shape == (150 + HEAD + FOOT, 3 * 200 + 4 * GAP, 3), "panels with titles and colour bars"
     bar = shown[HEAD + 150 + FOOT // 2, 2 * GAP + 200 + 80 : 2 * GAP + 400 - 80]
     assert (np.ptp(bar, axis=0) > 60).all() and shown[:HEAD, 2 * GAP + 200 :].max() > 150

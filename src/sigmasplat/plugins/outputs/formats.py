@@ -157,7 +157,7 @@ PLUGIN = (
     Output("trajectory", (".txt",), "the path as TUM text", _trajectory),
     Output("covariance", (".cov.txt",), "the path as TUM text with the covariance of each pose", _covariance),
     Output("colmap", ("-colmap",), "a folder with COLMAP's text model in sparse/0", _colmap, True),
-    Output("video", (".webm", ".mp4"), "a video: colour, depth, uncertainty", _video, True),
+    Output("video", (".mp4",), "a video: colour, depth, uncertainty", _video, True),
     Output("bag", (".mcap",), "ROS 2 messages: path with covariance, map", _bag, True),
     Output("plan", (".plan.png", ".png"), "a floor plan", _plan, True),
 )
