@@ -116,7 +116,6 @@ def resume(
     The result has the same bytes as an uninterrupted run. example: sigmasplat resume runs/kitchen-sigma
     """
     from sigmasplat.run.resume import resume as resumed
-    from sigmasplat.run.same_conditions import other_instruction_set
     from sigmasplat.run.terminal import Screen
     from sigmasplat.run_folder.runs import RunFolder
 
@@ -126,8 +125,6 @@ def resume(
     prepare_torch()
     with _viewer(screen, run_options) as viewer, folder.locked(screen.warn):
         start = resumed(folder, source)
-        if warning := other_instruction_set(folder):
-            screen.warn(warning)
         folder.note(status="running")
         screen.say(f"{source.name}: {resume_line(start.next_index, len(source))} → {folder.path}")
         return _run_and_score(screen, start, source, folder, run_options, viewer, robot_options)

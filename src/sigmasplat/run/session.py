@@ -33,8 +33,6 @@ if TYPE_CHECKING:
     from sigmasplat.system.slam import Slam
 
 RUNS = Path("runs")
-LOOPS_GROWTH = 1.05
-"""loops.json is written when the number of loops has grown by this factor: a long run writes a loop about 20 times."""
 
 
 def new_folder(
@@ -162,7 +160,6 @@ class Session:
     watch: Callable[[Frame], object] | None = None
     later: Callable[[Callable[[], None]], None] = run_now
     outcome: Outcome = field(init=False)
-    loops_written: int = field(default=0, init=False)
 
     def __post_init__(self, wall_s: float) -> None:
         self.outcome = Outcome(wall_s=wall_s)
@@ -250,15 +247,13 @@ class Session:
 
     def _log(self, step: "Step", frame: Frame, arrived_s: float | None) -> None:
         """Append the step to log.jsonl, with the force on the camera and the time since the image arrived if they are
-        known; update loops.json if enough loops were tried since it was written, and count the frame."""
+        known, and count the frame."""
         line = log_line(step)
         if frame.specific_force_m_s2 is not None:
             line["specific_force_m_s2"] = frame.specific_force_m_s2
         if arrived_s is not None:
             line["seconds"]["latency"] = time.perf_counter() - arrived_s
         self.run.log(line)
-        if step.loops and len(self.slam.loops) >= LOOPS_GROWTH * self.loops_written:
-            self.later(self._write_loops)
         self.outcome.count(step.lost, step.state, step.submap)
 
     def _finish(self, interrupt: threading.Event) -> None:
@@ -285,7 +280,7 @@ class Session:
         self.outcome.apart = tuple(len(component.trajectory) for component in components)
         valid = path.at(self.slam.valid())
         self.run.write_trajectory(valid)
-        self._write_loops()
+        self.run.write_loops(loop.record() for loop in self.slam.loops)
         self.run.write_checkpoint(self.slam.checkpoint(), {"frames": str(self.outcome.frames)})
         if (up := RunFrames.of(self.run.read_log(), valid).measured_up()) is not None:
             self.run.note(up_world=up.tolist())
@@ -293,11 +288,6 @@ class Session:
         self.run.write_map(self.slam.field)
         if self.slam.uncertainty is not None:
             self.run.write_uncertainty(self.slam.uncertainty)
-
-    def _write_loops(self) -> None:
-        loops = self.slam.loops
-        self.loops_written = len(loops)
-        self.run.write_loops(loop.record() for loop in loops)
 
 
 LOGGED = (
