@@ -12,7 +12,7 @@ from PIL import Image, ImageFont
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.plugins.evaluation.metrics.views import PredictedErrors, ScoredView
 from sigmasplat.plugins.evaluation.report import charts
-from sigmasplat.plugins.evaluation.report.html import Contents, build_report
+from sigmasplat.plugins.evaluation.report.page import Contents, build_report
 from sigmasplat.plugins.evaluation.report.summary import Verdict
 from sigmasplat.plugins.evaluation.report.tables import key_figures
 from sigmasplat.plugins.evaluation.report.view_strips import PanelFigure
