@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from box_room import CAMERA, HIGH, LOW, seer, splats
 from films import read_film
-from room_run import FRAMES, LOST, PATH, T_ROOM, WORLD, Walls, made_run, picture
+from room_run import FRAMES, LOST, PATH, T_ROOM, WORLD, made_run, picture
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
@@ -30,7 +30,7 @@ from sigmasplat.uncertainty.map_uncertainty import SHIPPED, Background, MapUncer
 
 @pytest.fixture(params=["submaps", "in one piece"])
 def reader(tmp_path: Path, request: pytest.FixtureRequest) -> RunReader:
-    return RunReader(made_run(tmp_path / "run", request.param == "submaps"), Walls)
+    return RunReader(made_run(tmp_path / "run", request.param == "submaps"))
 
 
 def images(model: Path) -> list[list[str]]:
@@ -44,6 +44,14 @@ def positions(model: Path) -> np.ndarray:
     return -R.apply(rows[:, 4:])
 
 
+def test_a_damaged_camera_is_refused_in_one_line(tmp_path: Path) -> None:
+    run = made_run(tmp_path / "run", submaps=False)
+    for camera in ({}, {"width": 4}, {"fx": "x"}):
+        run.note(camera=camera)
+        with pytest.raises(RunError, match=r"run\.json: its camera cannot be used"):
+            _ = RunReader(run).camera
+
+
 def test_views_without_images_are_all_frames_that_were_not_lost(reader: RunReader, tmp_path: Path) -> None:
     kept = [i for i in range(FRAMES) if i != LOST]
     export_colmap(reader, tmp_path / "model")
@@ -54,6 +62,10 @@ def test_views_without_images_are_all_frames_that_were_not_lost(reader: RunReade
 
 def test_images_are_those_of_the_keyframes_each_once(reader: RunReader, tmp_path: Path) -> None:
     out = tmp_path / "scene"
+    if not len(reader.run.submaps):
+        with pytest.raises(RunError, match="kept no submaps, so it has no images; leave out --pictures"):
+            export_colmap(reader, out, images=True)
+        return
     export_colmap(reader, out, images=True)
     names = [f"frame-{i:06d}.png" for i in (0, 2, 4)]
     assert [line[-1] for line in images(out)] == sorted(p.name for p in (out / "images").iterdir()) == names
@@ -192,7 +204,7 @@ def reader_apart(tmp_path: Path) -> RunReader:
     (run.path / "log.jsonl").write_text("".join(json.dumps(record) + "\n" for record in log))
     run.write_trajectory(PATH.at(np.array([0, 1, 2])))
     run.write_components([Component(1, splats(WORLD), PATH.at(np.array([4, 5])))])
-    return RunReader(run, Walls)
+    return RunReader(run)
 
 
 def test_frames_apart_are_not_exported(reader_apart: RunReader, tmp_path: Path) -> None:
@@ -214,4 +226,4 @@ def test_runs_without_a_pose_are_refused(reader: RunReader, tmp_path: Path) -> N
         export_colmap(reader, tmp_path / "model")
     (reader.run.path / "trajectory.txt").unlink()
     with pytest.raises(RunError, match=r"no trajectory\.txt"):
-        export_colmap(RunReader(reader.run, Walls), tmp_path / "model")
+        export_colmap(RunReader(reader.run), tmp_path / "model")

@@ -156,9 +156,9 @@ PLUGIN = (
     Output("spz", (".spz",), "Niantic's SPZ, less than a fifth of the size", _spz),
     Output("trajectory", (".txt",), "the path as TUM text", _trajectory),
     Output("covariance", (".cov.txt",), "the path as TUM text with the covariance of each pose", _covariance),
-    Output("colmap", ("-colmap",), "a folder with COLMAP's text model in sparse/0", _colmap, True),
-    Output("video", (".mp4",), "a video: colour, depth, uncertainty", _video, True),
-    Output("bag", (".mcap",), "ROS 2 messages: path with covariance, map", _bag, True),
-    Output("plan", (".plan.png", ".png"), "a floor plan", _plan, True),
+    Output("colmap", ("-colmap",), "a folder with COLMAP's text model in sparse/0", _colmap),
+    Output("video", (".mp4",), "a video: colour, depth, uncertainty", _video),
+    Output("bag", (".mcap",), "ROS 2 messages: path with covariance, map", _bag),
+    Output("plan", (".plan.png", ".png"), "a floor plan", _plan),
 )
 """The formats of this package. The first one is the default."""
