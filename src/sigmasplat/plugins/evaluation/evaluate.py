@@ -173,14 +173,10 @@ def _predicting(
 ) -> tuple[views.MapSources, views.PredictionScores]:
     """Add the prediction of errors to the maps if the run measured how sure its map is; fx: `refined_fx`. Raises
     RunError if that belongs to another map."""
-    known, field = run.read_uncertainty(), maps.final
+    field = maps.final
+    known = run.uncertainty_of(field)
     if known is None:
         return maps, views.PredictionScores()
-    if len(known.splats) != len(field):
-        raise RunError(
-            f"uncertainty.safetensors of run {run.path} has {len(known.splats)} splats, map.ply has {len(field)}; "
-            "delete uncertainty.json to evaluate without it"
-        )
 
     def predict_view(camera: Camera, T_camera_world: NDArray[np.float64]) -> Predicted:
         options = as_refined(config.render, camera, fx)
