@@ -92,11 +92,11 @@ def _remove_without_results(run: RunFolder) -> None:
     # run.json goes last: it marks the folder as ours, so that after a kill in between --overwrite still accepts it.
     written_first, lock = [run.path / "config.json", run.path / "run.json"], run.path / LOCK
     copied = {run.submaps.folder, *run.submaps.folder.glob("*")}
-    if {*run.path.rglob("*")} <= {run.images, lock, *written_first, *copied}:
+    if {*run.path.rglob("*")} <= {lock, *written_first, *copied}:
         run.submaps.clear()
         for file in (*written_first, lock):
             file.unlink(missing_ok=True)
-        for folder in (run.images, run.path, RUNS):
+        for folder in (run.path, RUNS):
             with suppress(OSError):
                 folder.rmdir()
 

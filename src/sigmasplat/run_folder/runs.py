@@ -8,7 +8,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from PIL import Image
 from torch import Tensor
 
 from sigmasplat.config import Config
@@ -16,7 +15,7 @@ from sigmasplat.data.field import GaussianField
 from sigmasplat.data.trajectory import Component, Trajectory
 from sigmasplat.errors import RunError
 from sigmasplat.files import machine
-from sigmasplat.files.atomic import part_of, remove_leftovers, replacing, sync_file, write_text
+from sigmasplat.files.atomic import part_of, remove_leftovers, sync_file, write_text
 from sigmasplat.files.json_files import append_line, read_json, read_lines, write_json
 from sigmasplat.files.lock import LOCK, locked, no_warning
 from sigmasplat.files.reading import refuse_special
@@ -69,8 +68,8 @@ def _writes(name: str, write: Callable[[Path, Value], None]) -> Callable[["RunFo
 @dataclass(frozen=True)
 class RunFolder:
     """One run on disk: config.json, run.json (source, version, machine, status), log.jsonl (one line per frame),
-    trajectory.txt, map.ply, checkpoint.safetensors, loops.json, metrics.json, report.html, images/,
-    submaps/, components/.
+    trajectory.txt, map.ply, checkpoint.safetensors, loops.json, metrics.json, report.html, submaps/,
+    components/.
 
     Files are replaced atomically, and the log grows by complete lines, so an interrupted run can still be read.
     """
@@ -117,7 +116,6 @@ class RunFolder:
         self.path.mkdir(parents=True, exist_ok=True)
         write_json(self.path / "run.json", facts)
         self._clear()
-        self.images.mkdir(exist_ok=True)
 
     @staticmethod
     def refuse_taken(path: Path, overwrite: bool) -> None:
@@ -148,16 +146,9 @@ class RunFolder:
         """Remove the files of an earlier run, and keep files that the user added."""
         for name in (*FILES, MESH, STATE):
             (self.path / name).unlink(missing_ok=True)
-        for picture in self.images.glob("*.png"):
-            picture.unlink()
         self.remove_leftovers()
         self.submaps.clear()
         self.write_components(())
-
-    @property
-    def images(self) -> Path:
-        """Return the folder of images, images/."""
-        return self.path / "images"
 
     @property
     def submaps(self) -> DiskStore:
@@ -186,7 +177,7 @@ class RunFolder:
 
     def remove_leftovers(self) -> None:
         """Remove temporary files of killed processes, and the state of a complete run."""
-        remove_leftovers(self.path, self.images, self.submaps.folder, *(self.path / COMPONENTS).glob("*"))
+        remove_leftovers(self.path, self.submaps.folder, *(self.path / COMPONENTS).glob("*"))
         if self.facts().get("status") == "complete":
             self.state.unlink(missing_ok=True)
 
@@ -302,11 +293,6 @@ class RunFolder:
     """Read metrics.json. Raises RunError if it is damaged."""
     write_report = _writes("report.html", write_text)
     """Write report.html."""
-
-    def write_image(self, name: str, picture: Image.Image) -> None:
-        """Write images/<name>, a PNG."""
-        with replacing(self.images / name) as temporary:
-            picture.save(temporary, "PNG")
 
     def _existing(self, name: str) -> Path:
         if not (self.path / name).is_file():

@@ -1,4 +1,4 @@
-"""Score a finished run; only this folder reads ground truth. Writes metrics.json, images/ and report.html."""
+"""Score a finished run; only this folder reads ground truth. Writes metrics.json and report.html."""
 
 from dataclasses import replace
 from typing import Any
@@ -89,7 +89,7 @@ def evaluate(
     known, scale, path_scores, problem = _score_path(run, frames, source)
     kinds = {kind: [r for r in log if bool(r["is_keyframe"]) == of_map] for kind, of_map in KINDS.items()}
     chosen = {kind: evenly_spread(records, views_per_kind) for kind, records in kinds.items()}
-    strips, config = ViewStrips(run, strips_per_kind), run.config()
+    strips, config = ViewStrips(strips_per_kind), run.config()
     fx, path = refined_fx(config, source.camera), frames.path
     aligned = None if known is None else truth_in_estimate(path.timestamps_s, path.T_world_camera[:, :3, 3], known)
     standard, renderer = renderer is None, renderer or FieldRenderer(config.render, config.backend, (field, fx))

@@ -1,4 +1,4 @@
-"""Draw view strips for the report: files in images/, and one figure per panel for the page."""
+"""Draw the views of the report, one figure per panel."""
 
 import base64
 import io
@@ -6,12 +6,10 @@ from dataclasses import dataclass
 
 from PIL import Image
 
-from sigmasplat.api import RunFolder
 from sigmasplat.plugins.evaluation.metrics.views import ScoredView
 from sigmasplat.plugins.outputs.drawing.view_panels import (
     PANEL_WIDTH,
     ViewPanel,
-    draw_view_strip,
     view_panels,
 )
 
@@ -38,22 +36,16 @@ class PanelFigure:
 
 
 class ViewStrips:
-    """Draw the strips of a few views of each kind into images/, and collect their panels for the page."""
+    """Collect the panels of a few views of each kind for the page."""
 
-    def __init__(self, run: RunFolder, per_kind: int) -> None:
-        """Start empty. Strips of an earlier evaluation are deleted, because the views may differ."""
-        self.run, self.per_kind = run, per_kind
+    def __init__(self, per_kind: int) -> None:
+        self.per_kind = per_kind
         self.figures: dict[str, list[list[PanelFigure]]] = {}
-        for old in run.images.glob("view-*.png"):
-            old.unlink()
 
     def add(self, view: ScoredView, place: str = "") -> None:
-        """Write the strip of a view, and keep its panels for the page; `place` is added to the heading if the view was
-        not rendered from the final map."""
-        name, heading = f"view-{view.kind.replace(' ', '-')}", HEADINGS.get(view.kind, f"{view.kind} views") + place
-        panels = view_panels(view)
-        self.run.write_image(f"{name}{place and '-submap'}-{view.index:06d}.png", draw_view_strip(panels))
-        self.figures.setdefault(heading, []).append([panel_figure(panel) for panel in panels])
+        """Keep the panels of a view; `place` is added to the heading if it was not rendered from the final map."""
+        heading = HEADINGS.get(view.kind, f"{view.kind} views") + place
+        self.figures.setdefault(heading, []).append([panel_figure(panel) for panel in view_panels(view)])
 
 
 def panel_figure(panel: ViewPanel) -> PanelFigure:
