@@ -6,7 +6,6 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from sigmasplat.config.find_preset import preset
 from sigmasplat.config.text import override, split_settings
@@ -18,7 +17,7 @@ from sigmasplat.plugins.evaluation.report.summary import (
     verdicts,
 )
 from sigmasplat.plugins.evaluation.report.tables import score_tables, state_rows
-from sigmasplat.plugins.evaluation.report.view_strips import PanelFigure, data_uri
+from sigmasplat.plugins.outputs.drawing.view_panels import ViewPanel
 from sigmasplat.plugins.presets.shared_by_papers import BASE
 from sigmasplat.run_folder.runs import RunFolder
 
@@ -207,7 +206,7 @@ def test_the_page_is_one_file(tmp_path) -> None:
     write_page(
         run,
         GOOD | {"uncertainty": None},
-        {"held-out": [[PanelFigure("input", data_uri(Image.new("RGB", (40, 30))))]]},
+        {"held-out": [[ViewPanel("input", np.zeros((30, 40, 3), np.uint8))]]},
         {"trajectory": (trajectory_charts(np.eye(3), None), "a path")},
         ["careful"],
     )

@@ -44,9 +44,9 @@ from sigmasplat.plugins.evaluation.path_scores import (
 )
 from sigmasplat.plugins.evaluation.report import charts
 from sigmasplat.plugins.evaluation.report.page import report_plan, write_page
-from sigmasplat.plugins.evaluation.report.view_strips import ViewStrips
 from sigmasplat.plugins.evaluation.view_scoring import (
     ViewScoring,
+    ViewStrips,
     refined_fx,
     score_full_resolution,
     score_test_views,
@@ -110,8 +110,8 @@ def evaluate(
     metrics["test_views"] = None if scale else score_test_views(scoring, config.input, strips)
     run.write_metrics(metrics)
     plan = report_plan(run, path, source.camera) if standard else None
-    figures, warnings = strips.figures, [str(problem)] if problem else []
-    write_page(run, metrics, figures, _draw_plots(run, frames, known), warnings, plan, frames)
+    warnings = [str(problem)] if problem else []
+    write_page(run, metrics, strips.panels, _draw_plots(run, frames, known), warnings, plan, frames)
     if problem:
         raise problem
     return metrics

@@ -3,7 +3,9 @@
 It begins with a picture of the map, three verdicts and the next commands; the rest is folded.
 """
 
+import base64
 import html
+import io
 import json
 import shlex
 from dataclasses import dataclass, field
@@ -26,8 +28,8 @@ from sigmasplat.plugins.evaluation.report import tables
 from sigmasplat.plugins.evaluation.report.advice import Advice, advice, next_commands
 from sigmasplat.plugins.evaluation.report.charts import Plot
 from sigmasplat.plugins.evaluation.report.summary import Verdict, verdicts
-from sigmasplat.plugins.evaluation.report.view_strips import PanelFigure, panel_figure
 from sigmasplat.plugins.outputs.drawing.plot import svg
+from sigmasplat.plugins.outputs.drawing.view_panels import PANEL_WIDTH, ViewPanel
 from sigmasplat.plugins.outputs.floorplan.floor_plan import FloorPlan, run_floor_plan
 from sigmasplat.plugins.outputs.floorplan.picture import plan_panels
 
@@ -38,7 +40,7 @@ LIKELY = 0.5
 def write_page(
     run: RunFolder,
     metrics: dict[str, Any],
-    strips: dict[str, list[list[PanelFigure]]],
+    strips: dict[str, list[list[ViewPanel]]],
     plots: dict[str, Plot],
     warnings: list[str],
     plan: FloorPlan | None = None,
@@ -60,7 +62,7 @@ def write_page(
         verdicts=verdicts(metrics, unsure, found),
         commands=next_commands(str(run.path)),
         advice=found[1:],
-        plan=[panel_figure(panel) for panel in plan_panels(plan)] if plan else [],
+        plan=plan_panels(plan) if plan else [],
     )
     run.write_report(build_report(contents))
 
@@ -96,6 +98,10 @@ def rerun_command(config: Config, facts: dict[str, Any]) -> str:
     )
 
 
+QUALITY, EFFORT = 86, 2
+"""Quality of WebP, and the effort to compress (0 to 6; a larger one takes longer and hardly saves space)."""
+PAGE_WIDTH = 1152
+"""Width of the page's text column at twice the resolution of a panel, in pixels."""
 VIEW_PANELS = 5
 """Number of panels of a view; fewer are not of one view, or of its predicted errors."""
 
@@ -118,14 +124,14 @@ class Contents:
     title: str
     subtitle: str
     metrics: dict[str, Any]
-    strips: dict[str, list[list[PanelFigure]]] = field(default_factory=dict)
+    strips: dict[str, list[list[ViewPanel]]] = field(default_factory=dict)
     plots: dict[str, Plot] = field(default_factory=dict)
     config: str = ""
     warnings: list[str] = field(default_factory=list)
     verdicts: list[Verdict] = field(default_factory=list)
     commands: list[Advice] = field(default_factory=list)
     advice: list[Advice] = field(default_factory=list)
-    plan: list[PanelFigure] = field(default_factory=list)
+    plan: list[ViewPanel] = field(default_factory=list)
 
 
 def build_report(contents: Contents) -> str:
@@ -166,7 +172,7 @@ def _map(contents: Contents) -> str:
     recorded, *rendered = views[len(views) // 2][:2]
     shown = [(panel, "The map") for panel in rendered] + [(recorded, "The recorded image")]
     figures = (
-        f"<figure><img src='{html.escape(panel.address)}' alt='{words}'>"
+        f"<figure><img src='{address(panel)}' alt='{words}'>"
         f"<figcaption>{words}: {html.escape(panel.caption)}</figcaption></figure>"
         for panel, words in shown
     )
@@ -217,19 +223,32 @@ def _strips(contents: Contents) -> str:
     return "".join(parts)
 
 
-def _view(panels: list[PanelFigure]) -> str:
+def _view(panels: list[ViewPanel]) -> str:
     """Show the panels of a view. With five of them, the image and its render are half as wide as the page."""
     large = " large" if len(panels) == VIEW_PANELS else ""
     return f"<figure class='view{large}'>{''.join(map(_panel, panels))}</figure>"
 
 
-def _panel(panel: PanelFigure) -> str:
-    low, high = (html.escape(end) for end in panel.ends)
-    ramp = f"<i style='background: linear-gradient(90deg, {', '.join(panel.bar)})'></i>"
-    below = f"<span class=bar>{low}{ramp}{high}</span>" if panel.bar else ""
-    below += f"<span>{html.escape(panel.caption)}</span>" if panel.caption else ""
+def address(panel: ViewPanel) -> str:
+    """Return the picture of a panel as a data: URI, WebP.
+
+    Pictures larger than a panel of a strip keep their size, up to `PAGE_WIDTH`.
+    """
+    width = min(max(PANEL_WIDTH, panel.pixels.shape[1]), PAGE_WIDTH)
+    picture, buffer = panel.picture(width, round(width * panel.pixels.shape[0] / panel.pixels.shape[1])), io.BytesIO()
+    picture.convert("RGB").save(buffer, "WEBP", quality=QUALITY, method=EFFORT)
+    return f"data:image/webp;base64,{base64.b64encode(buffer.getvalue()).decode('ascii')}"
+
+
+def _panel(panel: ViewPanel) -> str:
+    below = f"<span>{html.escape(panel.caption)}</span>" if panel.caption else ""
+    if panel.bar is not None:
+        low, high = (html.escape(end) for end in panel.ends)
+        colours = ", ".join(f"rgb({r:.0f} {g:.0f} {b:.0f})" for r, g, b in panel.bar)
+        ramp = f"<i style='background: linear-gradient(90deg, {colours})'></i>"
+        below = f"<span class=bar>{low}{ramp}{high}</span>{below}"
     title = html.escape(panel.title)
-    return f"<div>{title}<img src='{html.escape(panel.address)}' alt='{title}'>{below}</div>"
+    return f"<div>{title}<img src='{address(panel)}' alt='{title}'>{below}</div>"
 
 
 def _states(contents: Contents) -> str:
