@@ -38,7 +38,7 @@ from sigmasplat.run_folder.runs import RunFolder
 
 arg = tyro.conf.arg
 KILLED = -9
-RESULTS = ("map.ply", "uncertainty", "checkpoint", "profile", "trajectory")
+RESULTS = ("map.ply", "uncertainty", "checkpoint", "trajectory")
 FRAMES, MOST_AGAIN, MOST_CRASHES, LONGEST_DELAY_S = 12, 1, 3, 0.003
 ROOM = "synthetic:frames=60,width=64,height=48"
 SETTINGS = {
@@ -240,7 +240,7 @@ def name_only(path: Path) -> str:
 
 
 TIMELESS: dict[str, Callable[[Path], Any]] = {
-    "log.jsonl": timeless_log, "run.json": timeless_json, "metrics.json": timeless_json, "profile.json": name_only,
+    "log.jsonl": timeless_log, "run.json": timeless_json, "metrics.json": timeless_json,
     "report.html": name_only,
 }  # fmt: skip
 

@@ -39,10 +39,10 @@ Out = Annotated[Path, arg(help="picture to write")]
 
 def panels(run: RunFolder, index: int, direction: int) -> list[ViewPanel]:
     """Render the four panels. Raises RunError or SourceError where run or sequence cannot be read."""
-    reader = RunReader(run, lambda: open_source(run.facts()["source_path"]))
+    reader, source = RunReader(run), open_source(run.facts()["source_path"])
     config, field = reader.config, run.read_map()
     renderer = FieldRenderer(config.render, config.backend)
-    frame = reader.source.frame(index).prepared(0, config.input.min_depth_m, config.input.max_depth_m)
+    frame = source.frame(index).prepared(0, config.input.min_depth_m, config.input.max_depth_m)
     T_camera_world = se3.inverse(reader.poses_of([index]).T_world_camera[0])
     with torch.inference_mode():
         view = scored_view(frame, renderer(field, frame.camera, T_camera_world), "")

@@ -14,7 +14,7 @@ Value = Any
 """A number, a text, a truth value, None, or an array."""
 DONE = "same-bytes.json"
 """In the folder of a kept run: its words and processor time."""
-NOT_COMPARED = {DONE, "config.json", "profile.json", "report.html", "images", ".lock"}
+NOT_COMPARED = {DONE, "config.json", "report.html", "images", ".lock"}
 """Settings, times and pictures."""
 LEFT_OUT = {
     "seconds", "wall_s", "finish_s", "total_s", "frames_per_s", "worst_frame_s",

@@ -1,5 +1,6 @@
 """A run made by hand in the room of `box_room`: six frames, the fourth lost, keyframes 0, 2, 4."""
 
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -7,10 +8,7 @@ import torch
 
 from box_room import CAMERA, splats, walk
 from sigmasplat.data import se3
-from sigmasplat.data.frame import Frame
 from sigmasplat.data.submap import Picture, Submap
-from sigmasplat.data.trajectory import Trajectory
-from sigmasplat.input.source import Source
 from sigmasplat.plugins.presets.shared_by_papers import BASE
 from sigmasplat.run_folder.runs import RunFolder
 
@@ -28,26 +26,10 @@ def picture(i: int) -> Picture:
     return Picture(np.full((30, 40, 3), 10 * i, np.uint8), depth)
 
 
-class Walls(Source):
-    """The frames that the run was made of."""
-
-    def __init__(self) -> None:
-        super().__init__("walls", SMALL)
-
-    def __len__(self) -> int:
-        return FRAMES
-
-    def frame(self, i: int) -> Frame:
-        p = picture(i)
-        return Frame(i, PATH.timestamps_s[i], p.unit_color, p.depth_m, SMALL)
-
-    def truth(self) -> Trajectory | None:
-        return None
-
-
 def made_run(folder: Path, submaps: bool) -> RunFolder:
     """Write the run, in two submaps that share frame 2, or in one piece."""
     run = RunFolder.create(folder, BASE, "walls")
+    run.note(camera=asdict(SMALL))
     for i in range(FRAMES):
         run.log({"index": i, "timestamp_s": i / 10, "is_keyframe": i in (0, 2, 4), "lost": i == LOST, "seconds": {}})
     run.write_trajectory(PATH.at(np.arange(FRAMES) != LOST))

@@ -80,14 +80,12 @@ class Output:
     An ending selects the first row that has it. Without --out, an export gets the row's first ending. `write(source,
     target, …)` writes the target, a file or folder that does not exist or may be replaced, and returns a short
     description of its content. Its keyword-only parameters are the options of the command line that the format accepts.
-    reads_sequence: the format also accepts --source.
     """
 
     name: str
     endings: tuple[str, ...]
     help: str
     write: Callable[..., str]
-    reads_sequence: bool = False
 
     @property
     def options(self) -> tuple[str, ...]:
@@ -96,7 +94,7 @@ class Output:
 
     def accepts(self, option: str) -> bool:
         """Return whether an option of the command line can be used with this format."""
-        return option in self.options or (option == "source" and self.reads_sequence)
+        return option in self.options
 
 
 @dataclass(frozen=True)

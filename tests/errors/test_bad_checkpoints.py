@@ -1,6 +1,5 @@
-"""A damaged checkpoint is refused in one line that names the tensor, whatever is wrong with it."""
+"""A damaged checkpoint is refused in one line, whatever is wrong with it."""
 
-import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -29,18 +28,18 @@ def changed(name: str, change: Callable[[torch.Tensor], torch.Tensor]) -> Callab
 
 
 DAMAGES = {
-    "0-d": (changed("keyframe_submap", lambda t: t[0].clone()), r"'keyframe_submap' is torch.int64 \[\]"),
-    "keyframe that does not exist": (changed("keyframes", lambda t: t + (1 << 40)), "'keyframes' has the number"),
-    "negative submap": (changed("frame_submap", lambda t: t - 1), "'frame_submap' has the number -1"),
-    "floats as numbers": (changed("frame_keyframe", torch.Tensor.double), "'frame_keyframe' is torch.float64"),
-    "fewer poses": (changed("T_world_camera", lambda t: t[1:].clone()), "'T_world_camera' has"),
-    "no number": (changed("edge_T_a_b", lambda t: t.new_full((1, 4, 4), torch.nan)), "'edge_T_a_b' has"),
-    "numbers as flags": (changed("edge_is_loop", torch.Tensor.long), "'edge_is_loop' is torch.int64"),
-    "compared keyframe of another submap": (
-        changed("edge_keyframes", lambda t: torch.tensor([[0, 2]])), "'edge_keyframes' counts keyframes that its submap"
-    ),
-    "keyframe of another submap": (changed("frame_keyframe", lambda t: t.clamp(min=1)), "counts keyframes|but there"),
-}  # fmt: skip
+    "0-d": changed("keyframe_submap", lambda t: t[0].clone()),
+    "keyframe that does not exist": changed("keyframes", lambda t: t + (1 << 40)),
+    "negative submap": changed("frame_submap", lambda t: t - 1),
+    "floats as numbers": changed("frame_keyframe", torch.Tensor.double),
+    "fewer poses": changed("T_world_camera", lambda t: t[1:].clone()),
+    "no number": changed("edge_T_a_b", lambda t: t.new_full((1, 4, 4), torch.nan)),
+    "numbers as flags": changed("edge_is_loop", torch.Tensor.long),
+    "compared keyframe of another submap": changed("edge_keyframes", lambda t: torch.tensor([[0, 2]])),
+    "keyframe of another submap": changed("frame_keyframe", lambda t: t.clamp(min=1)),
+    "last bit of a pose": changed("T_world_camera", lambda t: t.nextafter(t + 1)),
+    "a tensor is missing": lambda tensors: {name: t for name, t in tensors.items() if name != "keyframes"},
+}
 
 
 @pytest.fixture
@@ -63,21 +62,14 @@ def run(tmp_path: Path) -> RunFolder:
 
 
 @pytest.mark.parametrize("damage", DAMAGES)
-def test_a_damaged_tensor_is_named(run: RunFolder, damage: str) -> None:
-    change, words = DAMAGES[damage]
+def test_a_damaged_tensor_is_refused(run: RunFolder, damage: str) -> None:
+    assert run.read_checkpoint()[0]
     path = run.path / "checkpoint.safetensors"
-    save_file(change(load_file(path)), path)
-    with pytest.raises(RunError, match=words) as refusal:
+    save_file(DAMAGES[damage](load_file(path)), path)
+    with pytest.raises(RunError, match="is damaged: its checksum") as refusal:
         run.read_checkpoint()
     assert str(path) in str(refusal.value) and "run it again" in str(refusal.value)
     assert "\n" not in str(refusal.value)
-
-
-def test_an_older_checkpoint_with_fewer_tensors_is_read(run: RunFolder) -> None:
-    path = run.path / "checkpoint.safetensors"
-    older = {name: tensor for name, tensor in load_file(path).items() if not re.match("edge|hop|frame_key", name)}
-    save_file(older, path)
-    assert set(run.read_checkpoint()[0]) == set(older)
 
 
 def test_a_floor_plan_of_kilometres_is_refused_before_memory_is_taken() -> None:

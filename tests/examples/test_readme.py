@@ -83,7 +83,7 @@ def test_python_in_the_documents(name: str, demo: Path, monkeypatch: pytest.Monk
 
 def test_the_run_folder_holds_what_the_documents_say(demo: Path) -> None:
     run = demo / "runs" / "demo"
-    assert {path.name for path in run.iterdir()} == {*FILES, "run.json", "images", "submaps"}
+    assert {path.name for path in run.iterdir()} == {*FILES, "run.json", "submaps"}
     text = (ROOT / "docs" / "runs.md").read_text(encoding="utf-8")
     assert all(f"`{name}`" in text for name in FILES if name != "report.html") and "report.html" in text
     folder = RunFolder.open(run)

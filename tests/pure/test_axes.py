@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from box_room import seer
-from room_run import PATH, WORLD, Walls, made_run
+from room_run import PATH, WORLD, made_run
 from sigmasplat.data import se3
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.plugins.outputs import axes as module
@@ -36,7 +36,7 @@ def test_a_run_of_a_tilted_camera_stands_upright(tmp_path: Path, monkeypatch: py
     """The camera looks 29° down; the room's floor and walls give the vertical direction."""
     monkeypatch.setattr(module, "FieldRenderer", lambda *_: seer(WORLD))
     run = made_run(tmp_path / "run", submaps=True)
-    R = levelled(RunReader(run, Walls))
+    R = levelled(RunReader(run))
     up = WORLD[:3, 2]
     for axes, row in UP_ROW.items():
         np.testing.assert_allclose((transform_to(axes, R)[:3, :3] @ up)[row], 1.0, atol=1e-4)

@@ -395,7 +395,7 @@ def test_submaps_and_loops_are_stored_and_printed(corridor: Corridor, capsys: py
     MadeUpSlam.every = 2
     MadeUpSlam.tried = {4: [CLOSED, REFUSED], "end": [LAST]}
     stored_while_running: list[list[dict[str, Any]]] = []
-    MadeUpSlam.at = {5: lambda: stored_while_running.append(RunFolder.open(Path("mine")).read_loops())}
+    MadeUpSlam.at = {5: lambda: stored_while_running.append(RunFolder.open(Path("mine")).read_log()[4]["loops"])}
     assert exit_code("run", "corridor", "--no-eval", "--out", "mine") == 0
     run, log = RunFolder.open(Path("mine")), RunFolder.open(Path("mine")).read_log()
     assert [record["submap"] for record in log] == [0, 0, 1, 1, 2, 2]
@@ -403,7 +403,7 @@ def test_submaps_and_loops_are_stored_and_printed(corridor: Corridor, capsys: py
     assert log[4]["loops"][1] == {"query": 7, "database": 2, "accepted": False, "residual": 0.02149,
                                   "translation_m": 0.043, "chi2": None}  # fmt: skip
     assert [[loop["database"] for loop in loops] for loops in stored_while_running] == [[0, 2]], (
-        "a killed run has stored them"
+        "the log of a killed run has them"
     )
     assert [loop["database"] for loop in run.read_loops()] == [0, 2, 1]
     said = capsys.readouterr().out
@@ -438,7 +438,6 @@ def test_the_time_of_the_final_map_is_separate_from_that_of_the_frames(
     assert exit_code("run", "corridor", "--no-eval", "--out", "mine") == 0
     facts = RunFolder.open(Path("mine")).facts()
     assert (facts["wall_s"], facts["finish_s"]) == (5.0, 100.0)
-    assert sum(RunFolder.open(Path("mine")).read_profile().values()) == pytest.approx(5.0)
 
 
 @pytest.mark.parametrize("moment", ["loops", "finish 1"])

@@ -33,9 +33,9 @@ def test_the_name_selects_the_format_of_a_path(here: Path, capsys: pytest.Captur
 
 def test_film_plan_and_map_are_written_with_their_progress(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
-    film = ("--out", "a.webm", "--size", "64", "--fps", "4", "--seconds", "0.5", "--path", "orbit")
+    film = ("--out", "a.mp4", "--size", "64", "--fps", "4", "--seconds", "0.5", "--path", "orbit")
     assert exit_code("export", "kitchen", *film) == 0
-    frames, _ = read_film(here / "a.webm")
+    frames, _ = read_film(here / "a.mp4")
     assert [frame.shape for frame in frames] == [(48, 192, 3)] * 2
     assert exit_code("export", "kitchen", "--format", "plan", "--cell-m", "0.1") == 0
     assert json.loads((here / "kitchen.plan.json").read_text())["resolution_m"] == 0.1
@@ -47,19 +47,19 @@ def test_film_plan_and_map_are_written_with_their_progress(here: Path, capsys: p
     assert turn[1, 1] < -0.8
     said = capsys.readouterr().out
     assert "film …\n" in said and "floor plan …\n" in said
-    assert "a.webm: 2 images, 0.5 s" in said and "to scan again, also in kitchen.plan.json" in said
+    assert "a.mp4: 2 images, 0.5 s" in said and "m² of free floor, also in kitchen.plan.json" in said
 
 
 def test_options_of_other_formats_and_wrong_values_are_refused(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (here / "map.ply").write_bytes((here / "kitchen/map.ply").read_bytes())
     for arguments, words in (
         (
-            ["kitchen", "--out", "a.webm", "--cell-m", "0.1"],
+            ["kitchen", "--out", "a.mp4", "--cell-m", "0.1"],
             "--cell-m cannot be used with format video, only with plan",
         ),
         (["kitchen", "--out", "a.txt", "--pictures"], "only with colmap"),
-        (["kitchen", "--out", "a.webm", "--fps", "0"], "--fps must be between 1 and 120"),
-        (["kitchen", "--format", "video", "--out", "a.avi"], "give a name that ends in .webm, .mp4"),
+        (["kitchen", "--out", "a.mp4", "--fps", "0"], "--fps must be between 1 and 120"),
+        (["kitchen", "--format", "video", "--out", "a.avi"], "give a name that ends in .mp4"),
         (["kitchen", "--out", "missing/a.txt"], "choose a writable place"),
         (["map.ply", "--out", "a.png"], "can be exported only as another map"),
     ):

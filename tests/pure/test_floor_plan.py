@@ -1,8 +1,7 @@
-"""Floor plans of a synthetic room: walls, objects and rescan regions are at their true places in any world frame."""
+"""Floor plans of a synthetic room: walls, objects and predicted errors are at their true places in any world frame."""
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -17,18 +16,19 @@ from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import ConfigError, SigmaSplatError
 from sigmasplat.files.json_files import write_json
 from sigmasplat.plugins.outputs.drawing.view_panels import BACKGROUND, GAP, HEAD, PANEL_WIDTH
-from sigmasplat.plugins.outputs.floorplan.floor_plan import CELL_M, SIGNS, FloorPlan, floor_plan
-from sigmasplat.plugins.outputs.floorplan.ground import floor_frame, sample_surface, sample_surfaces
-from sigmasplat.plugins.outputs.floorplan.picture import KIND_COLOURS, draw_floor_plan, plan_panels
-from sigmasplat.plugins.outputs.floorplan.rescan import (
+from sigmasplat.plugins.outputs.floorplan.floor_plan import (
+    CELL_M,
     FLOOR_UNOBSERVED,
     FREE,
     OBJECT,
+    SIGNS,
     UNOBSERVED,
     WALL,
-    RescanRegion,
-    unsure_rule,
+    FloorPlan,
+    floor_plan,
 )
+from sigmasplat.plugins.outputs.floorplan.ground import floor_frame, sample_surface, sample_surfaces
+from sigmasplat.plugins.outputs.floorplan.picture import KIND_COLOURS, draw_floor_plan, plan_panels
 from sigmasplat.uncertainty.predictive import Predicted
 
 WORLD = se3.exp(np.array([3.0, -2.0, 1.0, 1.9, 0.4, -0.3]))
@@ -133,7 +133,7 @@ def test_walls_and_objects_are_at_their_true_places() -> None:
 
 
 @pytest.mark.parametrize("T_world_room", [UPRIGHT, WORLD])
-def test_uncertain_and_thin_regions_are_found_within_a_cell(T_world_room: np.ndarray) -> None:
+def test_uncertain_and_thin_places_are_found_within_a_cell(T_world_room: np.ndarray) -> None:
     deep, thin, wrong = (
         patch((-1.2, -1.2), (-0.8, -0.8)),
         patch((0.6, -1.3), (1.1, -0.8)),
@@ -143,50 +143,34 @@ def test_uncertain_and_thin_regions_are_found_within_a_cell(T_world_room: np.nda
         T_world_room, lambda at: np.where(deep(at), 0.08, 0.02), lambda at: np.where(wrong(at), 0.2, 0.02)
     )
     plan = plan_of(T_world_room, predictor=errors, alpha=lambda at: np.where(thin(at), 0.7, 1.0))
-    for why, x, y, area_m2, words in (
-        ("unsure", -1.0, -1.0, 0.16, "depth uncertain by 8 cm"),
-        ("thin", 0.85, -1.05, 0.25, "surface 30 % transparent"),
-        ("unsure", -1.2, 1.2, 0.16, "62 % of the pixels expected wrong by more than 0.1"),
-    ):
-        here = [
-            r for r in plan.regions if r.why == why and np.abs(np.subtract(r.center_m, (x, y - 0.3))).max() < CELL_M
-        ]
-        assert len(here) == 1, (why, plan.regions)
-        assert here[0].area_m2 == pytest.approx(area_m2, rel=0.3) and here[0].found.startswith(words)
-    assert sum(region.why == "unsure" for region in plan.regions) == 2
-    assert [r.area_m2 for r in plan.regions] == sorted([r.area_m2 for r in plan.regions], reverse=True)
+    y, x = plan.origin_m[::-1, None, None] + (np.indices(plan.kind.shape) + 0.5) * CELL_M
+    place = np.stack([x, y + 0.3, np.zeros_like(x)], -1)
+    for patch_of, values, inside_value, outside_value in (
+        (deep, plan.depth_sigma_m, 0.08, 0.02), (thin, plan.alpha, 0.7, 1.0), (wrong, plan.wrong_share, 0.617, 0.0),
+    ):  # fmt: skip
+        floor = plan.kind == FREE
+        shifted = [patch_of(place + np.array([dx, dy, 0.0])) for dx in (-CELL_M, CELL_M) for dy in (-CELL_M, CELL_M)]
+        inside, outside = np.all(shifted, 0) & floor, ~np.any(shifted, 0) & floor
+        assert inside.sum() > 20 and outside.sum() > 500
+        np.testing.assert_allclose(values[inside], inside_value, atol=0.02)
+        np.testing.assert_allclose(values[outside], outside_value, atol=0.02)
     assert plan.predicted_errors and plan.record()["predicted_errors"]
     assert np.nanmax(plan.wrong_share) == pytest.approx(0.617, abs=0.01)
     assert [panel.ends[1][-2:] for panel in plan_panels(plan)] == ["", " %", "cm"]
 
 
-def test_a_plan_without_predicted_errors_has_no_unsure_regions() -> None:
+def test_a_plan_without_predicted_errors_shows_none() -> None:
     plan = plain_plan()
     assert not plan.predicted_errors and not plan.record()["predicted_errors"]
     assert np.isnan(plan.wrong_share).all() and np.isnan(plan.depth_sigma_m).all() and len(plan_panels(plan)) == 1
-    assert "no predicted errors" in unsure_rule(False) and "5 cm" in unsure_rule(True)
 
 
-def test_the_list_of_regions_fits_the_picture() -> None:
-    """The longest line ends before the margin on the right."""
-    words = "depth uncertain by 8 cm, 62 % of the pixels expected wrong by more than 0.1"
-    plan = replace(plain_plan(), regions=(RescanRegion((-10.0, -10.0), 0.1, 10.0, "unsure", words),))
-    picture = np.asarray(draw_floor_plan(plan))
-    without = np.asarray(draw_floor_plan(replace(plan, regions=())))
-    assert picture.shape[0] > without.shape[0] and picture.shape[1] >= without.shape[1]
-    assert (picture[-200:, -15:] == BACKGROUND).all()
-
-
-def test_a_certain_map_has_only_unobserved_regions_such_as_behind_the_pillar() -> None:
+def test_what_is_not_observed_is_behind_the_pillar_and_below_the_camera() -> None:
     plan = plain_plan()
-    assert {region.why for region in plan.regions} == {"unseen"}
-    hidden = np.array([(x, y + 0.3) for x, y in (r.center_m for r in plan.regions if r.found == "not observed")])
-    behind = (hidden > PILLAR[0][:2]).all(1)
-    assert behind.any(), hidden
-    assert (np.linalg.norm(hidden[~behind], axis=1) < 0.3).all(), "the others are around the camera"
-    floor = next(r for r in plan.regions if r.found == "floor not observed")
-    assert np.linalg.norm(np.add(floor.center_m, (0.0, 0.3))) < 0.8, "around the camera"
-    assert kind_at(plan, floor.center_m[0], floor.center_m[1] + 0.3) == FLOOR_UNOBSERVED
+    assert kind_at(plan, *(np.add(PILLAR[0][:2], PILLAR[1][:2]) / 2)) == UNOBSERVED
+    rows, columns = np.nonzero(plan.kind == FLOOR_UNOBSERVED)
+    floor = plan.origin_m + (np.stack([columns, rows], 1) + 0.5) * CELL_M
+    assert np.linalg.norm(floor.mean(0)) < 0.8, "around the camera"
 
 
 def test_another_world_frame_changes_the_plan_by_rounding_only() -> None:
@@ -199,7 +183,7 @@ def test_another_world_frame_changes_the_plan_by_rounding_only() -> None:
     np.testing.assert_allclose(there.alpha[both], here.alpha[both], atol=1e-4)
 
 
-def test_the_record_holds_frame_cells_and_regions(tmp_path: Path) -> None:
+def test_the_record_holds_frame_and_cells(tmp_path: Path) -> None:
     deep = patch((-1.2, -1.2), (-0.8, -0.8))
     errors = seer_of_errors(WORLD, lambda at: np.where(deep(at), 0.12, 0.01), lambda at: np.full(at.shape[:-1], 0.02))
     plan = plan_of(WORLD, predictor=errors)
@@ -207,9 +191,6 @@ def test_the_record_holds_frame_cells_and_regions(tmp_path: Path) -> None:
     record = json.loads((tmp_path / "plan.json").read_text())
     assert record["resolution_m"] == CELL_M and np.shape(record["T_floor_world"]) == (4, 4)
     assert [[SIGNS.index(sign) for sign in row] for row in record["cells"]] == plan.kind.tolist()
-    (place,) = [r["center_world_m"] for r in record["scan_again"] if r["why"] == "unsure"]
-    in_room = se3.inverse(WORLD) @ np.append(place, 1.0)
-    np.testing.assert_allclose(in_room[:3], [-1.0, -1.0, 0.0], atol=CELL_M)
 
 
 def test_the_picture_shows_the_cells_with_y_up() -> None:

@@ -2,7 +2,6 @@
 
 import itertools
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,14 +12,12 @@ from scipy.stats import chi2
 from sigmasplat.data import se3
 from sigmasplat.data.atlas import Atlas
 from sigmasplat.data.relative_pose import Edges, Kind, RelativePose, SolvedGraph
-from sigmasplat.errors import RunError
 from sigmasplat.final.keyframe_nodes import KeyframeNodes
 from sigmasplat.graph import graph_errors
 from sigmasplat.graph.graph_errors import CALIBRATION, STAMP, GraphErrors, shared_errors
 from sigmasplat.graph.keyframe_graph import solve
 from sigmasplat.graph.path_covariance import PathCovariance
 from sigmasplat.graph.pose_graph import PoseGraph, minimise
-from sigmasplat.run_folder.run_values import check_checkpoint
 from sigmasplat.system.slam import path_errors
 
 Array = NDArray[np.float64]
@@ -128,17 +125,14 @@ def test_a_frame_between_keyframes_shares_the_errors_of_both() -> None:
     assert np.allclose(between, se3.adjoint(se3.inverse(graph.T_world_node[0])) @ before @ before.T, atol=1e-15)
 
 
-def test_a_checkpoint_keeps_the_graph_and_a_broken_one_is_refused(tmp_path: Path) -> None:
+def test_a_checkpoint_keeps_the_graph() -> None:
     graph = solved(measured(np.random.default_rng(3)))
     atlas, keyframes = with_keyframes(graph)
     tensors = path_errors(atlas, keyframes, Edges())
-    arrays = {name: tensor.numpy() for name, tensor in check_checkpoint(tensors, tmp_path).items()}
+    arrays = {name: tensor.numpy() for name, tensor in tensors.items()}
     found = graph_errors.read(arrays)
     assert found is not None and found.fixed == 1
     assert np.array_equal(GraphErrors(found).of(12), GraphErrors(graph).of(12))
-    for name in ("graph_node", "graph_ends"):
-        with pytest.raises(RunError, match=name):
-            check_checkpoint(tensors | {name: tensors[name] + NODES}, tmp_path)
     assert graph_errors.read({}) is None
 
 

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 from paper_settings import InputConfig
 from sigmasplat.data.field import GaussianField
@@ -32,7 +31,7 @@ def test_a_new_run_records_how_it_was_made(run: RunFolder) -> None:
     facts = RunFolder.open(run.path).facts()
     assert facts["program"] == "sigmasplat" and facts["source"] == "/data/room" and facts["status"] == "running"
     assert facts["machine"]["cpu"] and facts["machine"]["cores"] >= 1 and facts["version"]
-    assert run.config() == CONFIG and run.images.is_dir()
+    assert run.config() == CONFIG
 
 
 def test_facts_are_added_to_run_json(run: RunFolder) -> None:
@@ -97,11 +96,10 @@ def test_ctrl_c_while_writing_keeps_the_old_file(run: RunFolder, monkeypatch: py
 
 def test_overwriting_removes_only_the_files_of_a_run(run: RunFolder) -> None:
     run.log({"index": 0})
-    run.write_image("view.png", Image.new("RGB", (4, 4)))
     (run.path / "notes.txt").write_text("mine")
     again = RunFolder.create(run.path, BASE, "elsewhere", overwrite=True)
     assert again.facts()["source"] == "elsewhere" and (run.path / "notes.txt").read_text() == "mine"
-    assert not (run.path / "log.jsonl").exists() and not list(run.images.iterdir())
+    assert not (run.path / "log.jsonl").exists()
 
 
 def leave_submaps(run: RunFolder) -> None:
@@ -147,7 +145,7 @@ def test_a_run_killed_at_its_start_leaves_a_folder_that_can_be_overwritten(
         RunFolder.create(out, CONFIG, "killed", overwrite=True)
     monkeypatch.undo()
     again = RunFolder.create(out, CONFIG, "again", overwrite=True)
-    assert again.facts()["source"] == "again" and again.config() == CONFIG and again.images.is_dir()
+    assert again.facts()["source"] == "again" and again.config() == CONFIG
     assert not (out / "log.jsonl").exists() and len(again.submaps) == 0
 
 

@@ -12,32 +12,31 @@ from PIL import Image, ImageFont
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.plugins.evaluation.metrics.views import PredictedErrors, ScoredView
 from sigmasplat.plugins.evaluation.report import charts
-from sigmasplat.plugins.evaluation.report.html import Contents, build_report
+from sigmasplat.plugins.evaluation.report.page import Contents, address, build_report
 from sigmasplat.plugins.evaluation.report.summary import Verdict
 from sigmasplat.plugins.evaluation.report.tables import key_figures
-from sigmasplat.plugins.evaluation.report.view_strips import PanelFigure
 from sigmasplat.plugins.outputs.drawing import colormap, plot
 from sigmasplat.plugins.outputs.drawing.view_panels import (
     GAP,
     HEAD,
     PANEL_WIDTH,
+    ViewPanel,
     draw_view_strip,
     view_panels,
-)
-from sigmasplat.plugins.outputs.floorplan.rescan import (
-    FLOOR_UNOBSERVED,
-    FREE,
-    UNOBSERVED,
-    RescanRegion,
-    find_rescan_regions,
-    unsure_rule,
 )
 from sigmasplat.run.figures import number, rate
 from sigmasplat.run_folder.frames import RunFrames
 
 PLOTS = {"trajectory": (charts.trajectory_charts(np.eye(3), None), "caption")}
 NAMESPACE = "http://www.w3.org/2000/svg"
-STRIPS = {"held-out views": [[PanelFigure("input", "images/a.png")]]}
+
+
+def plain(title: str, gray: int, caption: str = "") -> ViewPanel:
+    """Return a panel of one gray value."""
+    return ViewPanel(title, np.full((30, 40, 3), gray, np.uint8), caption)
+
+
+STRIPS = {"held-out views": [[plain("input", 5)]]}
 VOID = {"meta", "img", "source", "br", "!doctype"}
 
 
@@ -92,22 +91,8 @@ def test_the_font_has_every_character_of_the_panels() -> None:
     font = ImageFont.load_default(20)
     panels = [*view_panels(some_view()), *view_panels(predicted_view())]
     texts = [word for panel in panels for word in (panel.title, panel.caption, *panel.ends)]
-    texts += [region.sentence("sq m") for region in regions_of_every_kind()]
-    assert {text.split(":")[0] for text in texts} >= {"unseen", "thin", "unsure"}
-    texts += [unsure_rule(predicted_errors) for predicted_errors in (True, False)]
     missing = bytes(font.getmask("\uffff"))
     assert not [c for c in sorted({*"".join(texts)} - {" "}) if bytes(font.getmask(c)) == missing]
-
-
-def regions_of_every_kind() -> list[RescanRegion]:
-    """Return regions of maps with an uncertain patch, a thin one, and cells that were not observed."""
-    kind = np.full((40, 40), UNOBSERVED, np.uint8)
-    kind[2:-2, 2:-2] = FREE
-    kind[20:24, 20:24] = UNOBSERVED
-    kind[30:34, 4:8] = FLOOR_UNOBSERVED
-    wrong, depth, alpha = np.full((3, 40, 40), [[[0.01]], [[0.01]], [[1.0]]])
-    wrong[5:10, 5:10], depth[5:10, 5:10], alpha[5:10, 20:25] = 0.9, 0.2, 0.5
-    return find_rescan_regions(kind, alpha, depth, wrong, 0.05, np.zeros(2))
 
 
 def test_a_strip_shows_the_five_panels_of_a_view() -> None:
@@ -277,7 +262,7 @@ def test_the_page_is_complete_and_needs_no_other_file(metrics: dict[str, object]
     reader = Balance()
     reader.feed(page)
     assert not reader.wrong and not reader.open
-    assert set(reader.addresses) == {"images/a.png"} and page.count("<svg") == page.count("</svg>") == 2
+    assert set(reader.addresses) == {address(plain("input", 5))} and page.count("<svg") == page.count("</svg>") == 2
     assert "http" not in page.replace(NAMESPACE, "") and "<script" not in page and "prefers-color-scheme: dark" in page
     text = "".join(reader.text)
     assert "<room> & more" in text and "</pre><script>" in text and "share no timestamps" in text
@@ -368,19 +353,21 @@ def test_the_time_of_the_final_map_is_shown() -> None:
 
 
 def test_the_map_and_the_verdicts_come_first_and_the_rest_is_folded() -> None:
-    views = [[PanelFigure(f"panel {k}", f"images/{view}{k}.png", "<frame>") for k in range(5)] for view in "abc"]
+    views = [[plain(f"panel {k}", 50 * view + 9 * k, "<frame>") for k in range(5)] for view in (1, 2, 3)]
+    (photo, render), shown = map(address, views[1][:2]), r"src='(data:[^']*)'"
     verdicts = [Verdict("Path", "All 3 images", "No image is <lost>."), Verdict("Next", "Try", "Smaller:", "run --x")]
     page = build_report(
         Contents("t", "s", METRICS, {"held-out views": [STRIPS["held-out views"][0], *views]}, PLOTS,
                  '{"a": 1}', ["careful"], verdicts=verdicts, commands=[("View it:", "sigmasplat view r")])
     )  # fmt: skip
     opened = page[page.index("<main>") : page.index("<details")]
-    assert re.findall(r"images/\w+\.png", opened) == ["images/b1.png", "images/b0.png"], "the map, then the photo"
-    places = [opened.index(words) for words in ("careful", "images/b1", "All 3 images", "run --x", "sigmasplat view")]
+    assert re.findall(shown, opened) == [render, photo] and render != photo, "the map, then the photo"
+    places = [opened.index(words) for words in ("careful", render, "All 3 images", "run --x", "sigmasplat view")]
     assert places == sorted(places) and "No image is &lt;lost&gt;." in opened and "&lt;frame&gt;" in opened
     folded = page[page.index("<details") :]
     titles = re.findall(r"<details class=part><summary><h2>(.*?)</h2>", folded)
     assert titles == ["Trajectory", "Views", "Scores", "Settings (config.json)"]
     assert page.count("<h2>") == len(titles)
-    plain = build_report(Contents("t", "s", METRICS, plan=[PanelFigure("What is there", "images/plan.png")]))
-    assert "images/plan.png" in plain[: plain.index("<details")], "without a view the floor plan is shown"
+    page = build_report(Contents("t", "s", METRICS, plan=[plain("What is there", 7)]))
+    drawn = address(plain("What is there", 7))
+    assert drawn in page[: page.index("<details")], "without a view the floor plan is shown"

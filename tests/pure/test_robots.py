@@ -21,8 +21,7 @@ from sigmasplat.data.field import GaussianField
 from sigmasplat.data.relative_pose import UNKNOWN_HOP, Edges, RelativePose
 from sigmasplat.data.trajectory import LOST as LOST_STATE, RELOCALISED, TRACKED
 from sigmasplat.graph.path_covariance import PathCovariance
-from sigmasplat.plugins.outputs.floorplan.floor_plan import FloorPlan
-from sigmasplat.plugins.outputs.floorplan.rescan import FREE, OBJECT, UNOBSERVED, WALL
+from sigmasplat.plugins.outputs.floorplan.floor_plan import FREE, OBJECT, UNOBSERVED, WALL, FloorPlan
 from sigmasplat.plugins.robots.ros_messages import T_LINK_OPTICAL, levelled_map, link_pose, ros_covariance
 from sigmasplat.system.slam import path_errors
 
@@ -180,7 +179,7 @@ def test_the_grid_has_the_cells_of_the_plan() -> None:
     kind = np.array([[UNOBSERVED, FREE, OBJECT], [FREE, WALL, UNOBSERVED]], np.uint8)
     std = np.array([[np.nan, 0.013, 0.02], [0.004, 7.0, np.nan]], np.float32)
     nothing = np.zeros_like(std)
-    plan = FloorPlan(0.05, np.array([-1.0, 2.0]), np.eye(4), kind, nothing, std, nothing, np.zeros((0, 2)), ())
+    plan = FloorPlan(0.05, np.array([-1.0, 2.0]), np.eye(4), kind, nothing, std, nothing, np.zeros((0, 2)))
     sent = MESSAGES.grid(0, "map", plan)
     occupied = decoded(sent.data, sent.topic.msgtype)
     assert occupied.info.resolution == pytest.approx(0.05)

@@ -1,10 +1,11 @@
-"""Filtering splats by the standard deviation of their depth and by opacity."""
+"""Splats are written by the standard deviation of their depth and by opacity."""
 
-import pytest
+from pathlib import Path
+from types import SimpleNamespace
+
 import torch
 
 from sigmasplat.data.field import GaussianField
-from sigmasplat.errors import SigmaSplatError
 from sigmasplat.plugins.outputs import chosen_splats
 from sigmasplat.uncertainty.map_uncertainty import SplatStd
 
@@ -19,18 +20,24 @@ def three() -> GaussianField:
     )
 
 
+STD = SplatStd(torch.tensor([0.03, 0.01, 0.02]), torch.zeros(3))
+
+
+def written(std_below_m: float | None, opacity_above: float | None) -> list[float]:
+    """Return the opacities of the splats that are written."""
+    found: list[float] = []
+    source = SimpleNamespace(path=Path("run"), splats=lambda: (three(), STD))
+
+    def write(field: GaussianField, std: SplatStd | None) -> None:
+        found.extend(field.opacities.tolist())
+
+    chosen_splats.write_splats(source, "y-down", write, std_below_m, opacity_above, "camera")
+    return [round(opacity, 3) for opacity in found]
+
+
 def test_bounds_select_splats() -> None:
-    for bounds, kept in [
-        ({}, [True, True, True]),
-        ({"opacity_above": 0.3}, [True, True, False]),
-        ({"opacity_above": 1.0}, [False, False, False]),
-    ]:
-        assert chosen_splats.filter_splats(three(), **bounds).tolist() == kept
+    assert written(None, None) == [0.9, 0.5, 0.1] and written(None, 0.3) == [0.9, 0.5]
 
 
 def test_a_bound_of_the_depth_drops_exactly_the_splats_above_it() -> None:
-    std = SplatStd(torch.tensor([0.03, 0.01, 0.02]), torch.zeros(3))
-    found = chosen_splats.filter_splats(three(), opacity_above=0.3, std_below_m=0.03, std=std)
-    assert found.tolist() == [False, True, False]
-    with pytest.raises(SigmaSplatError, match="standard deviations"):
-        chosen_splats.filter_splats(three(), std_below_m=0.03)
+    assert written(0.03, 0.3) == [0.5] and written(0.03, None) == [0.5, 0.1]

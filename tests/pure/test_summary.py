@@ -3,11 +3,9 @@
 import shlex
 from dataclasses import replace
 from itertools import pairwise
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from sigmasplat.config.find_preset import preset
 from sigmasplat.config.text import override, split_settings
@@ -15,13 +13,11 @@ from sigmasplat.plugins.evaluation.report.advice import advice, next_commands
 from sigmasplat.plugins.evaluation.report.charts import trajectory_charts
 from sigmasplat.plugins.evaluation.report.page import rerun_command, write_page
 from sigmasplat.plugins.evaluation.report.summary import (
-    rescan_sentences,
     result_sentence,
     verdicts,
 )
 from sigmasplat.plugins.evaluation.report.tables import score_tables, state_rows
-from sigmasplat.plugins.evaluation.report.view_strips import PanelFigure, data_uri
-from sigmasplat.plugins.outputs.floorplan.rescan import RescanRegion
+from sigmasplat.plugins.outputs.drawing.view_panels import ViewPanel
 from sigmasplat.plugins.presets.shared_by_papers import BASE
 from sigmasplat.run_folder.runs import RunFolder
 
@@ -182,21 +178,6 @@ def test_the_command_to_run_again_keeps_the_settings_of_the_run() -> None:
     assert rerun_command(replace(config, name="mine"), {}) == "sigmasplat run PATH"
 
 
-def test_regions_to_scan_again_are_summed_up() -> None:
-    areas = ((2.0, "unseen"), (1.5, "unseen"), (0.4, "unsure"))
-    regions = [RescanRegion((0, 0), 0.3, area, why, "") for area, why in areas]
-    plan = SimpleNamespace(regions=regions, predicted_errors=True)
-    assert rescan_sentences(GOOD, None) == []
-    sentence, rule = rescan_sentences(GOOD, plan)
-    assert "above 5 cm" in rule
-    assert "2 not observed (3.5 m²), 1 mapped with high uncertainty (0.4 m²)" in sentence
-    empty = SimpleNamespace(regions=[], predicted_errors=False)
-    lost, rule = rescan_sentences(GOOD | {"lost_frames": [3, 4, 5, 9]}, empty)
-    assert "3–5, 9" in lost and "no predicted errors" in rule
-    both = rescan_sentences(GOOD | {"lost_frames": [3], "apart_frames": [4, 5]}, None)
-    assert len(both) == 2 and "4–5" in both[1]
-
-
 def test_tables_count_the_states() -> None:
     found = GOOD | {"lost": 2, "lost_frames": [3, 4], "relocalised_frames": [5], "apart": 1, "apart_frames": [9]}
     rows = {row[0]: row[1:] for row in state_rows(found)}
@@ -225,7 +206,7 @@ def test_the_page_is_one_file(tmp_path) -> None:
     write_page(
         run,
         GOOD | {"uncertainty": None},
-        {"held-out": [[PanelFigure("input", data_uri(Image.new("RGB", (40, 30))))]]},
+        {"held-out": [[ViewPanel("input", np.zeros((30, 40, 3), np.uint8))]]},
         {"trajectory": (trajectory_charts(np.eye(3), None), "a path")},
         ["careful"],
     )

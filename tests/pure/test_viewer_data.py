@@ -15,19 +15,19 @@ from sigmasplat.plugins.outputs.drawing import colormap
 from sigmasplat.plugins.viewer import snapshot as lines
 from sigmasplat.plugins.viewer.layers import (
     Legend,
-    VisibilityFilter,
     browser_camera,
     covariances,
     draw_legend,
+    largest_shown,
     merge_pieces,
     merged_uncertainty,
     palette_range,
     render_layer,
     render_predicted,
+    shown,
     sorted_uncertainties,
     splat_arrays,
     uncertainties,
-    visibility_filter,
 )
 from sigmasplat.plugins.viewer.panel import escaped
 from sigmasplat.plugins.viewer.snapshot import CameraPath, Piece, Snapshot, thin, within_budget
@@ -86,22 +86,20 @@ def test_covariances_equal_rotated_squared_scales() -> None:
         np.testing.assert_allclose(covariance, R @ np.diag(scale.astype(float) ** 2) @ R.T, rtol=1e-4, atol=1e-8)
 
 
-def test_the_filter_hides_the_requested_share_and_splats_of_low_opacity() -> None:
+def test_the_filter_hides_the_requested_share() -> None:
     pieces = [Piece(0, field_of(600)), Piece(1, field_of(400, seed=1))]
     ordered = sorted_uncertainties(pieces)
     assert len(ordered) == 1000 and (np.diff(ordered) >= 0).all()
-    visible = visibility_filter(ordered, 0.25, 0.0)
-    kept = [visible.mask(piece) for piece in pieces]
+    most = largest_shown(ordered, 0.25)
+    kept = [shown(piece, most) for piece in pieces]
     assert sum(int(k.sum()) for k in kept) == pytest.approx(750, abs=1)
     hidden = torch.cat([~k for k in kept])
     σ = torch.cat([p.field.variances.mean(1).sqrt() for p in pieces])
     assert σ[hidden].min() >= σ[~hidden].max()
-    faint = VisibilityFilter(min_opacity=0.5).mask(pieces[0])
-    assert torch.equal(faint, pieces[0].field.opacities >= 0.5) and 0 < faint.sum() < 600
-    assert visibility_filter(ordered, 0.0, 0.0).mask(pieces[0]).all()
+    assert shown(pieces[0], largest_shown(ordered, 0.0)).all()
     assert (
         len(sorted_uncertainties(())) == 0
-        and visibility_filter(sorted_uncertainties(()), 0.5, 0.0) == VisibilityFilter()
+        and largest_shown(sorted_uncertainties(()), 0.5) == np.inf
         and palette_range(sorted_uncertainties(())) == (0.0, 1.0)
     )
 
@@ -109,25 +107,23 @@ def test_the_filter_hides_the_requested_share_and_splats_of_low_opacity() -> Non
 def test_splats_are_coloured_by_their_own_colour_or_by_sigma() -> None:
     field = field_of(50)
     sigma = uncertainties(Piece(None, field))
-    plain = splat_arrays(Piece(None, field), "colour", (0.0, 1.0), VisibilityFilter())
+    plain = splat_arrays(Piece(None, field), "colour", (0.0, 1.0), np.inf)
     np.testing.assert_array_equal(plain.colors, (field.colors.numpy() * 255).round().astype(np.uint8))
-    tinted = splat_arrays(Piece(None, field), "uncertainty", (0.0, 0.3), VisibilityFilter())
+    tinted = splat_arrays(Piece(None, field), "uncertainty", (0.0, 0.3), np.inf)
     np.testing.assert_array_equal(tinted.colors, colormap.apply(sigma.numpy(), 0.0, 0.3, colormap.INFERNO))
     np.testing.assert_array_equal(tinted.centers, field.means.numpy())
     most, least = int(sigma.numpy().argmax()), int(sigma.numpy().argmin())
     assert tinted.colors[most].sum() > tinted.colors[least].sum() + 200
-    half = splat_arrays(
-        Piece(None, field), "uncertainty", (0.0, 0.3), VisibilityFilter(float(np.median(sigma.numpy())))
-    )
+    half = splat_arrays(Piece(None, field), "uncertainty", (0.0, 0.3), float(np.median(sigma.numpy())))
     assert len(half) == len(half.covariances) == len(half.colors) == 25
 
 
 def test_merged_pieces_hold_the_visible_splats_in_the_world_frame() -> None:
     T = se3.exp(np.array([1.0, 2.0, 3.0, 0.1, -0.2, 0.3]))
     pieces = (Piece(0, field_of(30)), Piece(1, field_of(20, seed=1), T))
-    visible = visibility_filter(sorted_uncertainties(pieces), 0.4, 0.0)
-    whole = merge_pieces(pieces, visible)
-    moved = pieces[1].field.moved(torch.from_numpy(T)).means[visible.mask(pieces[1])]
+    most = largest_shown(sorted_uncertainties(pieces), 0.4)
+    whole = merge_pieces(pieces, most)
+    moved = pieces[1].field.moved(torch.from_numpy(T)).means[shown(pieces[1], most)]
     torch.testing.assert_close(whole.means[-len(moved) :], moved)
     assert len(whole) == 30 and len(pieces[0].field) == 30
 
@@ -137,7 +133,7 @@ def test_merging_pieces_equals_moving_and_appending_fields() -> None:
     T = se3.exp(np.array([1.0, 2.0, 3.0, 0.4, -0.5, 0.6]))
     first, second = field_of(30), field_of(20, seed=1)
     second.get_or_create("harmonics").params += torch.randn(20, 45, generator=torch.Generator().manual_seed(0))
-    found = merge_pieces((Piece(0, first), Piece(1, second, T)), VisibilityFilter())
+    found = merge_pieces((Piece(0, first), Piece(1, second, T)), np.inf)
     expected = first.moved(torch.eye(4))
     expected.append(second.moved(torch.from_numpy(T)))
     torch.testing.assert_close(found.params, expected.params)
@@ -244,13 +240,13 @@ def test_splats_with_a_large_depth_error_are_hidden() -> None:
     piece = uncertain(200)
     std_m = piece.uncertainty.std.depth_std_m  # type: ignore[union-attr]
     limit_m = float(std_m.median())
-    visible = VisibilityFilter(limit_m)
-    assert torch.equal(visible.mask(piece), std_m <= limit_m)
-    drawn = splat_arrays(piece, "colour", (0.0, 1.0), visible)
+    most = limit_m
+    assert torch.equal(shown(piece, most), std_m <= limit_m)
+    drawn = splat_arrays(piece, "colour", (0.0, 1.0), most)
     np.testing.assert_array_equal(drawn.centers, piece.field.means[std_m <= limit_m].numpy())
-    merged, known = merge_pieces([piece], visible), merged_uncertainty([piece], visible)
+    merged, known = merge_pieces([piece], most), merged_uncertainty([piece], most)
     assert known is not None and len(known.splats) == len(merged) == len(drawn)
-    assert merged_uncertainty([piece, piece], visible) is None
+    assert merged_uncertainty([piece, piece], most) is None
 
 
 def test_thinned_splats_keep_their_own_errors() -> None:

@@ -23,14 +23,13 @@ from sigmasplat.input.lists import read_poses
 from sigmasplat.plugins.evaluation.evaluate import evaluate
 from sigmasplat.plugins.evaluation.reconstruct import FusionInput
 from sigmasplat.plugins.sources import SyntheticRoom, open_source
-from sigmasplat.plugins.viewer.layers import VisibilityFilter, merge_pieces
+from sigmasplat.plugins.viewer.layers import merge_pieces
 from sigmasplat.plugins.viewer.server import free_port, is_loopback, open_server, url_of
 from sigmasplat.plugins.viewer.snapshot import Snapshot
 from sigmasplat.plugins.viewer.snapshot_sources import (
     ACTIVE_SHARE,
     LiveView,
     SubmapCache,
-    check_has_map,
     finished_snapshot,
 )
 from sigmasplat.run.session import Session
@@ -101,8 +100,8 @@ def test_a_run_without_a_map_is_refused(tmp_path: Path) -> None:
     run = RunFolder.create(tmp_path / "run", settings(), "room")
     for status in ("running", "failed"):
         run.note(status=status)
-        with pytest.raises(RunError, match=rf"has no map to show \(status: {status}\)"):
-            check_has_map(run)
+        with pytest.raises(RunError, match=r"has no map\.ply; did it stop before writing it\? run it again"):
+            finished_snapshot(run)
 
 
 def test_the_stored_true_path_is_aligned_and_gives_the_same_ate(finished: RunFolder) -> None:
@@ -204,7 +203,7 @@ def test_the_live_map_and_its_images_equal_those_of_the_system(tmp_path: Path) -
     source = open_source(ROOM)
     before_final = shown[-2]
     kept = [slam.store.load(i).field.moved(torch.from_numpy(slam.atlas.anchors[i])).params for i in range(3)]
-    torch.testing.assert_close(merge_pieces(before_final.pieces, VisibilityFilter()).params, torch.cat(kept))
+    torch.testing.assert_close(merge_pieces(before_final.pieces, np.inf).params, torch.cat(kept))
     for row in slam.keyframe_indices:
         picture = shown[-1].image(row)
         assert picture is not None
@@ -255,7 +254,10 @@ def test_without_viser_the_error_names_the_package_to_install(
 def test_a_run_without_a_map_cannot_be_viewed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = RunFolder.create(tmp_path / "run", settings(), "room")
     run.note(status="failed")
-    for folder, says in ((run.path, "has no map to show"), (tmp_path / "none", "no run folder")):
+    for folder, says in (
+        (run.path, "has no map.ply; did it stop before writing it?"),
+        (tmp_path / "none", "no run folder"),
+    ):
         assert exit_code("view", str(folder)) == 2
         said = capsys.readouterr().err
         assert said.count("\n") == 1 and says in said

@@ -87,7 +87,7 @@ def test_the_new_run_contains_the_old_submaps(place: Path) -> None:
 
 def test_readers_use_the_frames_of_the_new_session_only(place: Path) -> None:
     second = RunFolder(place / "second")
-    reader = RunReader(second, lambda: open_source(WALK))
+    reader = RunReader(second)
     found = [frame for frame, _ in reader.keyframes()]
     assert len(found) == reader.count_keyframes() and min(found) == 0 and max(found) < FRAMES
     snapshot = finished_snapshot(second)

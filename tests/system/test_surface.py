@@ -267,7 +267,6 @@ def test_the_command_makes_a_mesh_of_a_real_run(tmp_path: Path, capsys: pytest.C
         (["--triangles", "-1"], "--triangles must be at least 0"),
         (["--out", str(tmp_path / "run" / "mesh.ply")], "exists; give another --out"),
         (["--voxel-m", "-1"], "--voxel-m must be above 0"),
-        (["--source", str(tmp_path / "nowhere")], "no such folder"),
     ):
         capsys.readouterr()
         assert exit_code("mesh", out, *refused) == 2

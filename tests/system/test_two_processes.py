@@ -191,21 +191,6 @@ def test_a_copy_of_the_sequence_is_resumed_without_leftovers(stopped: Path, tmp_
     assert [file for file in leftovers if file.exists()] == [] and all(file.exists() for file in own)
 
 
-def test_other_kernels_are_announced_when_a_run_is_resumed(
-    stopped: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    shutil.copytree(stopped, tmp_path / "copy")
-    run, room = RunFolder(tmp_path / "copy/run"), str(tmp_path / "copy/room")
-    assert exit_code("resume", str(run.path), "--source", room, "--no-eval") == 0
-    assert "kernels" not in capsys.readouterr().err
-    shutil.rmtree(tmp_path / "copy")
-    shutil.copytree(stopped, tmp_path / "copy")
-    run.note(isa="altivec")
-    assert exit_code("resume", str(run.path), "--source", room, "--no-eval") == 0
-    warning = capsys.readouterr().err
-    assert warning.startswith("warning: ") and warning.count("\n") == 1 and "SIGMASPLAT_ISA=altivec" in warning
-
-
 @pytest.mark.slow
 def test_two_runs_at_once_have_their_own_folders(tmp_path: Path) -> None:
     first, second = tmp_path / "first", tmp_path / "second"

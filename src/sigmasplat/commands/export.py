@@ -8,7 +8,7 @@ import tyro
 
 from sigmasplat.commands import options
 from sigmasplat.commands.input_options import From0, Number, arg, flag
-from sigmasplat.commands.options import prepare_torch, refuse_existing, source_of
+from sigmasplat.commands.options import prepare_torch, refuse_existing
 from sigmasplat.config.ranges import Range
 from sigmasplat.files.lock import output_locked
 from sigmasplat.plugins.outputs.formats import ExportSource, choose, listed, refuse_unused
@@ -68,7 +68,6 @@ class ExportOptions:
         arg(None, "panels of a video: colour, depth and uncertainty side by side, or colour alone"),
     ] = "all"
     cell_m: Annotated[float, Range(0.001, 1), arg("M", "cell size of the floor plan in metres")] = 0.05
-    source: options.MovedSource = None
 
     def given(self) -> list[str]:
         """Return the names of the options that differ from their defaults."""
@@ -97,7 +96,7 @@ def export(
     formats = rows(Output)
     chosen = choose(formats, format, out)
     refuse_unused(chosen, formats, asked.given())
-    source = ExportSource(run, lambda folder: source_of(folder, asked.source))
+    source = ExportSource(run)
     target = out or Path(source.name + chosen.endings[0])
     refuse_existing(target, overwrite)
     prepare_torch()

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from sigmasplat.commands import options
 from sigmasplat.commands.input_options import arg
-from sigmasplat.commands.options import prepare_torch, refuse_existing, source_of
+from sigmasplat.commands.options import prepare_torch, refuse_existing
 from sigmasplat.config.ranges import Range
 from sigmasplat.errors import ConfigError
 
@@ -41,7 +41,6 @@ def make_mesh(
         arg("FILE", "file to write: .glb, .ply or .stl (no colours)", "(default: mesh.ply in RUN)"),
     ] = None,
     overwrite: options.Overwrite = False,
-    moved_to: options.MovedSource = None,
 ) -> int:
     """Extract a coloured triangle mesh from a run's map, upright and in metres.
 
@@ -62,10 +61,10 @@ def make_mesh(
         raise ConfigError(f"a GLB has y up by definition, so --axes {axes} cannot be used; leave --axes out")
     chosen: Axes = axes or ("y-up" if out else "camera")  # the run's own mesh.ply has the axes of its other files
     refuse_existing(out, overwrite)
-    source = source_of(folder, moved_to)
+    reader = RunReader(folder)
     prepare_torch()
     with output_locked(out, screen.warn) if out else folder.locked(screen.warn):
-        fusion_input = FusionInput.of(folder, source.camera)
+        fusion_input = FusionInput.at(folder, reader.camera)
         with screen.counting("surface") as progress:
             surface = fusion_input.surface(voxel_m, progress=progress)
         seen, surface = len(surface.vertices), filled(surface, fill_gaps)
@@ -77,7 +76,7 @@ def make_mesh(
             screen.say(f"{len(surface.faces):,} triangles are reduced to {triangles:,} (--triangles)")
             surface = decimated(surface, triangles)
         if chosen != "camera":
-            surface = surface.moved(transform_to(chosen, levelled(RunReader(folder, lambda: source))))
+            surface = surface.moved(transform_to(chosen, levelled(reader)))
         write_mesh(target, surface, f"sigmasplat, unit metre, axes {chosen}")
         screen.say(f"axes {chosen}, {len(surface.vertices):,} vertices, {len(surface.faces):,} triangles: {target}")
     return 0

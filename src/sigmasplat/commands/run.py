@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sigmasplat.commands import options
-from sigmasplat.commands.end_of_run import warn_at_the_end
 from sigmasplat.commands.evaluate import score
 from sigmasplat.commands.input_options import DEFAULT_INPUT_OPTIONS, InputOptions, InputOptionsFlat
 from sigmasplat.commands.options import configured, prepare_torch, source_of
@@ -29,6 +28,7 @@ from sigmasplat.errors import ConfigError
 if TYPE_CHECKING:
     from sigmasplat.config import Config
     from sigmasplat.input.source import Source
+    from sigmasplat.plugins.checks.motion import MotionWatch
     from sigmasplat.plugins.robots.live import LiveRobot
     from sigmasplat.plugins.viewer.app import ViewerApp
     from sigmasplat.run.callbacks import Callback
@@ -40,6 +40,8 @@ if TYPE_CHECKING:
 OK, INTERRUPTED = 0, 130
 DEFAULT_PRESET = default_preset()
 DEMO_FOLDER, DEMO_FRAMES = Path("runs/demo"), 120
+CONTRADICTED_MOST = 0.05
+"""Given poses are reported if the images contradict a larger share of them."""
 
 
 def demo(
@@ -116,7 +118,6 @@ def resume(
     The result has the same bytes as an uninterrupted run. example: sigmasplat resume runs/kitchen-sigma
     """
     from sigmasplat.run.resume import resume as resumed
-    from sigmasplat.run.same_conditions import other_instruction_set
     from sigmasplat.run.terminal import Screen
     from sigmasplat.run_folder.runs import RunFolder
 
@@ -126,8 +127,6 @@ def resume(
     prepare_torch()
     with _viewer(screen, run_options) as viewer, folder.locked(screen.warn):
         start = resumed(folder, source)
-        if warning := other_instruction_set(folder):
-            screen.warn(warning)
         folder.note(status="running")
         screen.say(f"{source.name}: {resume_line(start.next_index, len(source))} → {folder.path}")
         return _run_and_score(screen, start, source, folder, run_options, viewer, robot_options)
@@ -279,3 +278,39 @@ def _readers(
 
         readers.append(LiveView(start.slam, viewer.show, source.name))
     return readers
+
+
+def warn_at_the_end(
+    screen: "Screen", source: "Source", read: "Source", folder: "RunFolder", motion: "MotionWatch"
+) -> None:
+    """Print what was wrong with the frames, and whether the scale of the result is arbitrary.
+
+    source: the sequence; read: the one that was read from, in real time the arrivals of the other one.
+    """
+    from sigmasplat.plugins.sources.live import LiveSource
+
+    if source.skipped:
+        images = "image" if len(source.skipped) == 1 else "images"
+        screen.warn(f"{len(source.skipped)} {images} skipped (first: {source.skipped[0]})")
+    if isinstance(source, LiveSource):
+        if source.ending:
+            screen.warn(source.ending)
+        if source.dropped:
+            screen.say(f"{source.dropped} frames of the camera were dropped because SLAM was slower")
+    if read.arrived_s is not None and read.dropped:
+        screen.warn(f"{read.dropped} frames were dropped because tracking was late")
+    onto, chosen = folder.facts().get("onto"), folder.config().input
+    if onto and not len(folder.read_trajectory()):
+        apart = folder.path / "components"
+        screen.warn(f"the recording was never recognised in the map of {onto['run']}; its path and map are in {apart}")
+    for warning in motion.warnings():
+        screen.warn(warning)
+    frames = folder.read_log() if chosen.poses else []
+    wrong = sum((frame.get("p_off") or 0.0) > 0.5 for frame in frames)
+    if wrong > CONTRADICTED_MOST * len(frames):
+        screen.warn(
+            f"the images contradict the given pose in {wrong} of {len(frames)} frames (p_off above 0.5); are they "
+            "poses of the colour camera, camera to world, x right, y down, z forward?"
+        )
+    if source.predicted_depth and not chosen.poses_scale_depth:
+        screen.say("the scale is arbitrary, because a network predicted depth: lengths are not in metres")

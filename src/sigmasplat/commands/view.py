@@ -20,15 +20,14 @@ def view(run: options.RunPath, host: options.Host = HOST, port: options.Port = P
 
     example: sigmasplat view runs/kitchen-sigma
     """
-    from sigmasplat.plugins.viewer.snapshot_sources import check_has_map, finished_snapshot
+    from sigmasplat.plugins.viewer.snapshot_sources import finished_snapshot
     from sigmasplat.run.terminal import Screen
     from sigmasplat.run_folder.runs import RunFolder
 
-    folder = RunFolder.open(run)
-    check_has_map(folder)
     prepare_torch()
+    snapshot = finished_snapshot(RunFolder.open(run))
     with serve_viewer(Screen(), host, port) as viewer, suppress(KeyboardInterrupt):
-        viewer.show(finished_snapshot(folder))
+        viewer.show(snapshot)
         threading.Event().wait()
     return 0
 

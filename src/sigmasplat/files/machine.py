@@ -62,7 +62,9 @@ def _commit_of(checkout: Path) -> str | None:
     """Return the commit of a folder that is itself a checkout; a repository in a parent folder is not ours."""
     if not (checkout / ".git").exists():
         return None
-    command = ["git", "-C", str(checkout), "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+    # git must not refresh the index of a checkout in which another command of git may run.
+    asked = ["describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+    command = ["git", "--no-optional-locks", "-C", str(checkout), *asked]
     try:
         answer = subprocess.run(command, capture_output=True, text=True, timeout=5, check=True)
     except (OSError, subprocess.SubprocessError):

@@ -128,7 +128,7 @@ def continue_map(earlier: FinishedMap, config: Config, source: Source, run: RunF
     with earlier.unchanged():
         take_over(earlier.store, earlier.members, earlier.frames, run.submaps)
     anchors = [earlier.anchors[index] for index in earlier.members]
-    run.note(onto={"run": str(earlier.run.path.resolve()), "submaps": len(anchors), "T_world_submap": anchors})
+    run.note(onto={"run": str(earlier.run.path.resolve()), "submaps": len(anchors)})
     return continued(config, run.submaps.in_background(), anchors)
 
 

@@ -1,4 +1,4 @@
-"""Compare the sequence and the machine of a resumed run with those it was started with."""
+"""Compare the sequence of a resumed run with the one it was started with."""
 
 import math
 from collections.abc import Iterator
@@ -70,14 +70,3 @@ def instruction_set() -> str:
 
     asked = env.switches().isa
     return _core.isa_name() if asked == "auto" else asked
-
-
-def other_instruction_set(run: RunFolder) -> str:
-    """Return the warning for a run that was started with other kernels than those of this process, else ""."""
-    noted, found = run.facts().get("isa"), instruction_set()
-    if noted in (None, found):
-        return ""
-    return (
-        f"the run was started with the {noted} kernels and goes on with {found}, so its result will differ a little "
-        f"from that of an uninterrupted run; for equal results set SIGMASPLAT_ISA={noted}"
-    )

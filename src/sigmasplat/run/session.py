@@ -21,7 +21,6 @@ from sigmasplat.errors import RunError
 from sigmasplat.files.lock import LOCK, locked, no_warning
 from sigmasplat.input.source import Source
 from sigmasplat.run.callbacks import Callback, run_now
-from sigmasplat.run.figures import profile
 from sigmasplat.run.same_conditions import start_facts
 from sigmasplat.run.signals import interrupt_event
 from sigmasplat.run_folder.frames import RunFrames
@@ -34,8 +33,6 @@ if TYPE_CHECKING:
     from sigmasplat.system.slam import Slam
 
 RUNS = Path("runs")
-LOOPS_GROWTH = 1.05
-"""loops.json is written when the number of loops has grown by this factor: a long run writes a loop about 20 times."""
 
 
 def new_folder(
@@ -95,11 +92,11 @@ def _remove_without_results(run: RunFolder) -> None:
     # run.json goes last: it marks the folder as ours, so that after a kill in between --overwrite still accepts it.
     written_first, lock = [run.path / "config.json", run.path / "run.json"], run.path / LOCK
     copied = {run.submaps.folder, *run.submaps.folder.glob("*")}
-    if {*run.path.rglob("*")} <= {run.images, lock, *written_first, *copied}:
+    if {*run.path.rglob("*")} <= {lock, *written_first, *copied}:
         run.submaps.clear()
         for file in (*written_first, lock):
             file.unlink(missing_ok=True)
-        for folder in (run.images, run.path, RUNS):
+        for folder in (run.path, RUNS):
             with suppress(OSError):
                 folder.rmdir()
 
@@ -163,7 +160,6 @@ class Session:
     watch: Callable[[Frame], object] | None = None
     later: Callable[[Callable[[], None]], None] = run_now
     outcome: Outcome = field(init=False)
-    loops_written: int = field(default=0, init=False)
 
     def __post_init__(self, wall_s: float) -> None:
         self.outcome = Outcome(wall_s=wall_s)
@@ -251,15 +247,13 @@ class Session:
 
     def _log(self, step: "Step", frame: Frame, arrived_s: float | None) -> None:
         """Append the step to log.jsonl, with the force on the camera and the time since the image arrived if they are
-        known; update loops.json if enough loops were tried since it was written, and count the frame."""
+        known, and count the frame."""
         line = log_line(step)
         if frame.specific_force_m_s2 is not None:
             line["specific_force_m_s2"] = frame.specific_force_m_s2
         if arrived_s is not None:
             line["seconds"]["latency"] = time.perf_counter() - arrived_s
         self.run.log(line)
-        if step.loops and len(self.slam.loops) >= LOOPS_GROWTH * self.loops_written:
-            self.later(self._write_loops)
         self.outcome.count(step.lost, step.state, step.submap)
 
     def _finish(self, interrupt: threading.Event) -> None:
@@ -286,21 +280,14 @@ class Session:
         self.outcome.apart = tuple(len(component.trajectory) for component in components)
         valid = path.at(self.slam.valid())
         self.run.write_trajectory(valid)
-        self._write_loops()
+        self.run.write_loops(loop.record() for loop in self.slam.loops)
         self.run.write_checkpoint(self.slam.checkpoint(), {"frames": str(self.outcome.frames)})
-        log = self.run.read_log()
-        self.run.write_profile(profile(log, self.outcome.wall_s))
-        if (up := RunFrames.of(log, valid).measured_up()) is not None:
+        if (up := RunFrames.of(self.run.read_log(), valid).measured_up()) is not None:
             self.run.note(up_world=up.tolist())
         self.run.write_components(components)
         self.run.write_map(self.slam.field)
         if self.slam.uncertainty is not None:
             self.run.write_uncertainty(self.slam.uncertainty)
-
-    def _write_loops(self) -> None:
-        loops = self.slam.loops
-        self.loops_written = len(loops)
-        self.run.write_loops(loop.record() for loop in loops)
 
 
 LOGGED = (

@@ -70,7 +70,8 @@ def refuse_misfit(folder: Path, uncertainty: MapUncertainty, splats: int) -> Non
     std, (rows, columns) = uncertainty.std, uncertainty.splats.shape
     fits = std is None or std.depth_std_m.shape == std.color_std.shape == (splats,)
     if rows != splats or columns not in (VARIANCES, len(SPLAT_COLUMNS)) or not fits:
-        raise RunError(f"{folder} has uncertainties of {rows} rows for {splats} splats; run it again")
+        path = folder / UNCERTAINTY_TENSORS
+        raise RunError(f"{path} has {rows} rows for {splats} splats; delete {UNCERTAINTY_JSON}, or run it again")
 
 
 COMPONENT_FILES = ("trajectory.txt", "map.ply")

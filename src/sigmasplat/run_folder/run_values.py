@@ -1,11 +1,10 @@
-"""Check the JSON files and the checkpoint of a run when they are read: a damaged file is named, with what is wrong."""
+"""Check the JSON files of a run when they are read: a damaged file is named, with what is wrong."""
 
 import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from sigmasplat.data.trajectory import APART, LOST, RELOCALISED, TRACKED
@@ -53,7 +52,7 @@ FACTS: Mapping[str, Kind] = {
     "source": str, "source_path": str, "status": str, "skipped": [str], "wall_s": (float, None),
     "finish_s": (float, None), "final_steps": (float, None), "machine": dict, "onto": dict, "camera": dict,
     "source_frames": int, "depth_units_per_metre": (float, None), "isa": (str, None), "scene_scale": (float, None),
-    "depth_noise_per_m": (float, None), "sensor": (str, None), "predicted_depth": bool,
+    "depth_noise_per_m": (float, None), "sensor": (str, None), "predicted_depth": bool, "checkpoint": str,
     "up_world": lambda value: _vector(value) and math.hypot(*value) > 0.0,
 }  # fmt: skip
 """Values of run.json that commands use."""
@@ -71,11 +70,6 @@ def check_fields(values: Any, kinds: Mapping[str, Kind], required: tuple[str, ..
             raise RunError(f"{where}: field {name!r} has the value {_short(value)}; {REMEDY}")
     checked: dict[str, Any] = values
     return checked
-
-
-def check_profile(values: Any, path: Path) -> dict[str, float]:
-    """Return the seconds of each stage of a run. Raises RunError naming the file if one is not a number."""
-    return check_fields(values, dict.fromkeys(values, float) if isinstance(values, dict) else {}, (), path)
 
 
 class Record(dict[str, Any]):
@@ -108,36 +102,6 @@ def _short(value: Any) -> str:
     return text if len(text) <= 60 else f"{text[:60]} …"
 
 
-POSE, FLOAT, INT, BOOL = (4, 4), "float", "int", "bool"
-TENSORS: Mapping[str, tuple[str, tuple[int, ...], str]] = {
-    "timestamps_s": ("frames", (), FLOAT), "T_world_camera": ("frames", POSE, FLOAT),
-    "T_world_camera_odometry": ("frames", POSE, FLOAT), "T_submap_camera": ("frames", POSE, FLOAT),
-    "T_keyframe_camera": ("frames", POSE, FLOAT), "exposure": ("frames", (3, 2), FLOAT),
-    "T_world_submap": ("submaps", POSE, FLOAT), "T_world_keyframe": ("places", POSE, FLOAT),
-    "T_submap_keyframe": ("places", POSE, FLOAT), "hop_T_camera_before": ("places", POSE, FLOAT),
-    "hop_bias": ("places", (6,), FLOAT), "hop_covariance": ("places", (6, 6), FLOAT),
-    "edge_T_a_b": ("edges", POSE, FLOAT), "edge_information": ("edges", (6, 6), FLOAT),
-    "edge_drift": ("edges", (6, 6), FLOAT), "edge_is_loop": ("edges", (), BOOL), "keyframes": ("keyframes", (), INT),
-    "frame_submap": ("frames", (), INT), "frame_keyframe": ("frames", (), INT), "keyframe_submap": ("places", (), INT),
-    "submap_component": ("submaps", (), INT), "edge_submaps": ("edges", (2,), INT),
-    "edge_keyframes": ("edges", (2,), INT), "graph_node": ("places", (), INT),
-    "graph_T_world_node": ("nodes", POSE, FLOAT), "graph_ends": ("alignments", (2,), INT),
-    "graph_T_a_b": ("alignments", POSE, FLOAT), "graph_information": ("alignments", (6, 6), FLOAT),
-    "graph_shared": ("alignments", (6, 9), FLOAT), "graph_fixed": ("graphs", (), INT),
-}  # fmt: skip
-"""What the rows of each tensor are, the shape of a row, and the type. A place is a keyframe of a submap."""
-MAY_BE_UNKNOWN = {"hop_covariance"}
-"""Tensors in which inf means that a number is not known; the others are finite."""
-MAY_BE_NONE = {"graph_node"}
-"""Tensors of row numbers in which −1 means none."""
-COUNTED = {
-    "keyframes": "frames", "frame_submap": "submaps", "frame_keyframe": "places", "keyframe_submap": "submaps",
-    "submap_component": "submaps", "edge_submaps": "submaps", "edge_keyframes": "places",
-    "graph_node": "nodes", "graph_ends": "nodes", "graph_fixed": "nodes",
-}  # fmt: skip
-"""What the row numbers in a tensor count."""
-
-
 class Tensors(dict[str, Tensor]):
     """The tensors of a file by name; a missing one raises RunError."""
 
@@ -147,62 +111,3 @@ class Tensors(dict[str, Tensor]):
 
     def __missing__(self, name: str) -> Tensor:
         raise RunError(f"{self.path}: tensor {name!r} is missing; {REMEDY}")
-
-
-def check_checkpoint(found: Mapping[str, Tensor], path: Path) -> Tensors:
-    """Return the tensors of a checkpoint. Raises RunError if one has a wrong type or shape, is not finite, counts rows
-    that do not exist, or does not fit to the others. Versions before this one wrote fewer tensors."""
-    lengths = _checked_shapes(found, path)
-    for name, counted in COUNTED.items():
-        values, most = found.get(name), lengths.get(counted)
-        if values is None or most is None or not values.numel():
-            continue
-        low, high = int(values.min()), int(values.max())
-        least = -1 if name in MAY_BE_NONE else 0
-        if low < least or high >= most:
-            found_number = low if low < least else high
-            raise RunError(
-                f"{path}: tensor {name!r} has the number {found_number}, but there are {most} {counted}; {REMEDY}"
-            )
-    _check_places(found, path)
-    return Tensors(found, path)
-
-
-def _checked_shapes(found: Mapping[str, Tensor], path: Path) -> dict[str, int]:
-    """Return how many frames, keyframes, places, submaps and edges there are; all tensors agree on it."""
-    lengths, first = dict[str, int](), dict[str, str]()
-    for name, (rows, row, kind) in TENSORS.items():
-        if (tensor := found.get(name)) is None:
-            continue
-        if (
-            not str(tensor.dtype).startswith(f"torch.{kind}")
-            or tensor.ndim != 1 + len(row)
-            or tuple(tensor.shape[1:]) != row
-        ):
-            raise RunError(f"{path}: tensor {name!r} is {tensor.dtype} {list(tensor.shape)}; {REMEDY}")
-        if kind == FLOAT and name not in MAY_BE_UNKNOWN and not _is_finite(tensor):
-            raise RunError(f"{path}: tensor {name!r} has nan, inf or very large numbers; {REMEDY}")
-        if lengths.setdefault(rows, len(tensor)) != len(tensor):
-            wrong = f"{len(tensor)} rows, and {first[rows]!r} has {lengths[rows]}"
-            raise RunError(f"{path}: tensor {name!r} has {wrong}; {REMEDY}")
-        first.setdefault(rows, name)
-    return lengths
-
-
-def _is_finite(tensor: Tensor) -> bool:
-    return bool(torch.isfinite(tensor).all()) and (not tensor.numel() or float(tensor.abs().max()) <= MOST_NUMBER)
-
-
-def _check_places(found: Mapping[str, Tensor], path: Path) -> None:
-    """Raise RunError unless the keyframes are in the order of their submaps, and each frame's keyframe is among those
-    of its submap."""
-    if not {"keyframe_submap", "frame_submap", "frame_keyframe", "T_world_submap"} <= set(found):
-        return
-    submaps = found["keyframe_submap"]
-    if bool((submaps[1:] < submaps[:-1]).any()):
-        raise RunError(f"{path}: tensor 'keyframe_submap' is not in order; {REMEDY}")
-    counts = torch.bincount(submaps, minlength=len(found["T_world_submap"]))
-    if bool((found["frame_keyframe"] >= counts[found["frame_submap"]]).any()):
-        raise RunError(f"{path}: tensor 'frame_keyframe' counts keyframes that its submap does not have; {REMEDY}")
-    if "edge_keyframes" in found and bool((found["edge_keyframes"] >= counts[found["edge_submaps"]]).any()):
-        raise RunError(f"{path}: tensor 'edge_keyframes' counts keyframes that its submap does not have; {REMEDY}")

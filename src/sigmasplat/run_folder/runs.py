@@ -1,5 +1,6 @@
 """Write and read the folder of a run, which is valid at any time."""
 
+import zlib
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -7,7 +8,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from PIL import Image
 from torch import Tensor
 
 from sigmasplat.config import Config
@@ -15,14 +15,15 @@ from sigmasplat.data.field import GaussianField
 from sigmasplat.data.trajectory import Component, Trajectory
 from sigmasplat.errors import RunError
 from sigmasplat.files import machine
-from sigmasplat.files.atomic import part_of, remove_leftovers, replacing, sync_file, write_text
+from sigmasplat.files.atomic import part_of, remove_leftovers, sync_file, write_text
 from sigmasplat.files.json_files import append_line, read_json, read_lines, write_json
 from sigmasplat.files.lock import LOCK, locked, no_warning
+from sigmasplat.files.reading import refuse_special
 from sigmasplat.files.tensors import open_tensors, write_tensors
 from sigmasplat.input.lists import read_poses
 from sigmasplat.run_folder import map_files, splat_ply as ply, trajectory as tum
 from sigmasplat.run_folder.frames import RunFrames
-from sigmasplat.run_folder.run_values import FACTS, check_checkpoint, check_fields, check_log, check_profile
+from sigmasplat.run_folder.run_values import FACTS, REMEDY, Tensors, check_fields, check_log
 from sigmasplat.run_folder.submaps import DiskStore
 from sigmasplat.uncertainty.map_uncertainty import MapUncertainty, SplatStd
 
@@ -35,7 +36,7 @@ STATE = "state.safetensors"
 """The state from which an unfinished run resumes."""
 FILES = (
     "config.json", "trajectory.txt", "map.ply", "checkpoint.safetensors", "log.jsonl", "loops.json",
-    "metrics.json", "profile.json", "report.html", TRUTH, map_files.UNCERTAINTY_JSON, map_files.UNCERTAINTY_TENSORS,
+    "metrics.json", "report.html", TRUTH, map_files.UNCERTAINTY_JSON, map_files.UNCERTAINTY_TENSORS,
 )  # fmt: skip
 """Files that a run may have in addition to run.json, which always exists and identifies the folder as ours."""
 COMPONENTS = "components"
@@ -67,8 +68,8 @@ def _writes(name: str, write: Callable[[Path, Value], None]) -> Callable[["RunFo
 @dataclass(frozen=True)
 class RunFolder:
     """One run on disk: config.json, run.json (source, version, machine, status), log.jsonl (one line per frame),
-    trajectory.txt, map.ply, checkpoint.safetensors, loops.json, profile.json, metrics.json, report.html, images/,
-    submaps/, components/.
+    trajectory.txt, map.ply, checkpoint.safetensors, loops.json, metrics.json, report.html, submaps/,
+    components/.
 
     Files are replaced atomically, and the log grows by complete lines, so an interrupted run can still be read.
     """
@@ -115,7 +116,6 @@ class RunFolder:
         self.path.mkdir(parents=True, exist_ok=True)
         write_json(self.path / "run.json", facts)
         self._clear()
-        self.images.mkdir(exist_ok=True)
 
     @staticmethod
     def refuse_taken(path: Path, overwrite: bool) -> None:
@@ -146,16 +146,9 @@ class RunFolder:
         """Remove the files of an earlier run, and keep files that the user added."""
         for name in (*FILES, MESH, STATE):
             (self.path / name).unlink(missing_ok=True)
-        for picture in self.images.glob("*.png"):
-            picture.unlink()
         self.remove_leftovers()
         self.submaps.clear()
         self.write_components(())
-
-    @property
-    def images(self) -> Path:
-        """Return the folder of images, images/."""
-        return self.path / "images"
 
     @property
     def submaps(self) -> DiskStore:
@@ -184,7 +177,7 @@ class RunFolder:
 
     def remove_leftovers(self) -> None:
         """Remove temporary files of killed processes, and the state of a complete run."""
-        remove_leftovers(self.path, self.images, self.submaps.folder, *(self.path / COMPONENTS).glob("*"))
+        remove_leftovers(self.path, self.submaps.folder, *(self.path / COMPONENTS).glob("*"))
         if self.facts().get("status") == "complete":
             self.state.unlink(missing_ok=True)
 
@@ -268,14 +261,21 @@ class RunFolder:
         return uncertainty
 
     def write_checkpoint(self, tensors: dict[str, Tensor], text: dict[str, str]) -> None:
-        """Write checkpoint.safetensors: named tensors and text."""
-        write_tensors(self.path / "checkpoint.safetensors", tensors, text)
+        """Write checkpoint.safetensors: named tensors and text. Its checksum is noted in run.json."""
+        write_tensors(path := self.path / "checkpoint.safetensors", tensors, text)
+        self.note(checkpoint=_checksum(path))
 
     def read_checkpoint(self) -> tuple[dict[str, Tensor], dict[str, str]]:
-        """Read checkpoint.safetensors: tensors and text. Raises RunError if it is missing or damaged."""
-        with open_tensors(path := self._existing("checkpoint.safetensors"), "checkpoint") as file:
+        """Read checkpoint.safetensors: tensors and text. Raises RunError if it is missing, damaged, or not that of
+        run.json; so its tensors need no other checks."""
+        path = self._existing("checkpoint.safetensors")
+        refuse_special(path, RunError)
+        if (noted := self.facts().get("checkpoint")) != _checksum(path):
+            why = "is damaged: its checksum is not that in run.json" if noted else "has no checksum in run.json"
+            raise RunError(f"checkpoint {path} {why}; {REMEDY}")
+        with open_tensors(path, "checkpoint") as file:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-            return check_checkpoint(tensors, path), file.metadata() or {}
+            return Tensors(tensors, path), file.metadata() or {}
 
     def read_odometry(self) -> Trajectory | None:
         """Return the path of tracking alone, without loop closure; None if the run has no such path or no loop.
@@ -292,22 +292,17 @@ class RunFolder:
     """Write metrics.json; nan and inf become null."""
     read_metrics = _reads("metrics.json", lambda path: _object(path))
     """Read metrics.json. Raises RunError if it is damaged."""
-    write_profile = _writes("profile.json", write_json)
-    """Write profile.json: seconds by stage."""
-    read_profile = _reads("profile.json", lambda path: check_profile(_object(path), path))
-    """Read profile.json. Raises RunError if it is damaged."""
     write_report = _writes("report.html", write_text)
     """Write report.html."""
-
-    def write_image(self, name: str, picture: Image.Image) -> None:
-        """Write images/<name>, a PNG."""
-        with replacing(self.images / name) as temporary:
-            picture.save(temporary, "PNG")
 
     def _existing(self, name: str) -> Path:
         if not (self.path / name).is_file():
             raise RunError(f"run {self.path} has no {name}; did it stop before writing it? run it again")
         return self.path / name
+
+
+def _checksum(path: Path) -> str:
+    return f"{zlib.crc32(path.read_bytes()):08x}"
 
 
 def _object(path: Path) -> dict[str, Any]:

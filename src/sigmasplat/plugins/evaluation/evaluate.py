@@ -1,4 +1,4 @@
-"""Score a finished run; only this folder reads ground truth. Writes metrics.json, images/ and report.html."""
+"""Score a finished run; only this folder reads ground truth. Writes metrics.json and report.html."""
 
 from dataclasses import replace
 from typing import Any
@@ -44,9 +44,9 @@ from sigmasplat.plugins.evaluation.path_scores import (
 )
 from sigmasplat.plugins.evaluation.report import charts
 from sigmasplat.plugins.evaluation.report.page import report_plan, write_page
-from sigmasplat.plugins.evaluation.report.view_strips import ViewStrips
 from sigmasplat.plugins.evaluation.view_scoring import (
     ViewScoring,
+    ViewStrips,
     refined_fx,
     score_full_resolution,
     score_test_views,
@@ -89,7 +89,7 @@ def evaluate(
     known, scale, path_scores, problem = _score_path(run, frames, source)
     kinds = {kind: [r for r in log if bool(r["is_keyframe"]) == of_map] for kind, of_map in KINDS.items()}
     chosen = {kind: evenly_spread(records, views_per_kind) for kind, records in kinds.items()}
-    strips, config = ViewStrips(run, strips_per_kind), run.config()
+    strips, config = ViewStrips(strips_per_kind), run.config()
     fx, path = refined_fx(config, source.camera), frames.path
     aligned = None if known is None else truth_in_estimate(path.timestamps_s, path.T_world_camera[:, :3, 3], known)
     standard, renderer = renderer is None, renderer or FieldRenderer(config.render, config.backend, (field, fx))
@@ -110,8 +110,8 @@ def evaluate(
     metrics["test_views"] = None if scale else score_test_views(scoring, config.input, strips)
     run.write_metrics(metrics)
     plan = report_plan(run, path, source.camera) if standard else None
-    figures, warnings = strips.figures, [str(problem)] if problem else []
-    write_page(run, metrics, figures, _draw_plots(run, frames, known), warnings, plan, frames)
+    warnings = [str(problem)] if problem else []
+    write_page(run, metrics, strips.panels, _draw_plots(run, frames, known), warnings, plan, frames)
     if problem:
         raise problem
     return metrics
@@ -173,14 +173,10 @@ def _predicting(
 ) -> tuple[views.MapSources, views.PredictionScores]:
     """Add the prediction of errors to the maps if the run measured how sure its map is; fx: `refined_fx`. Raises
     RunError if that belongs to another map."""
-    known, field = run.read_uncertainty(), maps.final
+    field = maps.final
+    known = run.uncertainty_of(field)
     if known is None:
         return maps, views.PredictionScores()
-    if len(known.splats) != len(field):
-        raise RunError(
-            f"uncertainty.safetensors of run {run.path} has {len(known.splats)} splats, map.ply has {len(field)}; "
-            "delete uncertainty.json to evaluate without it"
-        )
 
     def predict_view(camera: Camera, T_camera_world: NDArray[np.float64]) -> Predicted:
         options = as_refined(config.render, camera, fx)

@@ -28,7 +28,23 @@ from sigmasplat.plugins.evaluation.metrics import views
 from sigmasplat.plugins.evaluation.metrics.lpips import Lpips
 from sigmasplat.plugins.evaluation.metrics.trajectory import associate
 from sigmasplat.plugins.evaluation.metrics.views import ScoredView
-from sigmasplat.plugins.evaluation.report.view_strips import ViewStrips
+from sigmasplat.plugins.outputs.drawing.view_panels import ViewPanel, view_panels
+
+HEADINGS = {"test": "novel views"}
+"""Headings of kinds of views; without an entry "<kind> views"."""
+
+
+class ViewStrips:
+    """Collect the panels of a few views of each kind for the page, by heading."""
+
+    def __init__(self, per_kind: int) -> None:
+        self.per_kind = per_kind
+        self.panels: dict[str, list[list[ViewPanel]]] = {}
+
+    def add(self, view: ScoredView, place: str = "") -> None:
+        """Keep the panels of a view; `place` is added to the heading if it was not rendered from the final map."""
+        heading = HEADINGS.get(view.kind, f"{view.kind} views") + place
+        self.panels.setdefault(heading, []).append(view_panels(view))
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from sigmasplat.api import (
     ConfigError,
@@ -19,22 +18,6 @@ from sigmasplat.plugins.outputs.axes import AXES, Axes, levelled, transform_to
 
 if TYPE_CHECKING:
     from sigmasplat.plugins.outputs.source import ExportSource
-
-
-def filter_splats(
-    field: GaussianField, *, opacity_above: float | None = None, std_below_m: float | None = None,
-    std: SplatStd | None = None,
-) -> Tensor:  # fmt: skip
-    """Return the mask [N] of splats with opacity > `opacity_above` and depth_std_m < `std_below_m`.
-
-    None sets no bound. Raises SigmaSplatError on `std_below_m` without `std`.
-    """
-    if std_below_m is not None and std is None:
-        raise SigmaSplatError("std_below_m needs the standard deviations of the splats (RunFolder.read_splat_std)")
-    kept = torch.ones(len(field), dtype=torch.bool, device=field.params.device)
-    if std_below_m is not None and std is not None:
-        kept &= std.depth_std_m.to(kept.device) < std_below_m
-    return kept if opacity_above is None else kept & (field.opacities > opacity_above)
 
 
 Y_UP_FORMATS: tuple[Axes, ...] = ("y-up", "camera")
@@ -63,8 +46,11 @@ def write_splats(
             f"{source.path} has no calibrated uncertainty, so --std-below-m cannot be used; give a run with "
             "uncertainty.json (run older runs again)"
         )
-    total = len(field)
-    kept = filter_splats(field, opacity_above=opacity_above, std_below_m=std_below_m, std=std)
+    total, kept = len(field), torch.ones(len(field), dtype=torch.bool, device=field.params.device)
+    if opacity_above is not None:
+        kept &= field.opacities > opacity_above
+    if std_below_m is not None and std is not None:
+        kept &= std.depth_std_m.to(kept.device) < std_below_m
     if total and not kept.any():
         medians = f"median opacity is {field.opacities.median():.3g}"
         medians += "" if std is None else f", of depth_std_m {std.depth_std_m.median():.3g} m"

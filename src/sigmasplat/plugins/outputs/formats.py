@@ -134,12 +134,12 @@ def _video(
 
 
 def _plan(source: ExportSource, target: Path, *, cell_m: float) -> str:
+    from sigmasplat.plugins.outputs.floorplan.floor_plan import FREE
     from sigmasplat.plugins.outputs.floorplan.picture import export_plan
 
     with _counting("floor plan") as progress:
         plan = export_plan(source.reader(), target, cell_m=cell_m, progress=progress)
-    regions = "no places to scan again" if not plan.regions else f"{len(plan.regions)} places to scan again"
-    return f"{regions}, also in {target.with_suffix('.json').name}"
+    return f"{plan.area_m2(FREE):.1f} m² of free floor, also in {target.with_suffix('.json').name}"
 
 
 def _bag(source: ExportSource, target: Path, *, pictures: bool) -> str:
@@ -156,9 +156,9 @@ PLUGIN = (
     Output("spz", (".spz",), "Niantic's SPZ, less than a fifth of the size", _spz),
     Output("trajectory", (".txt",), "the path as TUM text", _trajectory),
     Output("covariance", (".cov.txt",), "the path as TUM text with the covariance of each pose", _covariance),
-    Output("colmap", ("-colmap",), "a folder with COLMAP's text model in sparse/0", _colmap, True),
-    Output("video", (".webm", ".mp4"), "a video: colour, depth, uncertainty", _video, True),
-    Output("bag", (".mcap",), "ROS 2 messages: path with covariance, map", _bag, True),
-    Output("plan", (".plan.png", ".png"), "a floor plan with regions to scan again", _plan, True),
+    Output("colmap", ("-colmap",), "a folder with COLMAP's text model in sparse/0", _colmap),
+    Output("video", (".mp4",), "a video: colour, depth, uncertainty", _video),
+    Output("bag", (".mcap",), "ROS 2 messages: path with covariance, map", _bag),
+    Output("plan", (".plan.png", ".png"), "a floor plan", _plan),
 )
 """The formats of this package. The first one is the default."""

@@ -1,6 +1,6 @@
 """Read the parts of a run that exports need: its camera, its path, and the images of its keyframes."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -17,22 +17,16 @@ from sigmasplat.api import (
     RunError,
     RunFolder,
     RunFrames,
-    Source,
     Trajectory,
+    guarded,
 )
 
 
 @dataclass(frozen=True, eq=False)
 class RunReader:
-    """A run, and its sequence, which is opened only if the run kept no submaps."""
+    """A run whose files are read once."""
 
     run: RunFolder
-    open_source: Callable[[], Source]
-
-    @cached_property
-    def source(self) -> Source:
-        """Return the sequence."""
-        return self.open_source()
 
     @cached_property
     def config(self) -> Config:
@@ -44,7 +38,9 @@ class RunReader:
         """Return the camera at the run's working resolution."""
         if len(self.run.submaps):
             return self.run.submaps.load(0).camera
-        return self.source.camera.prepared(self.config.input.width, self.config.input.crop_px)
+        path, settings = self.run.path / "run.json", self.config.input
+        with guarded(path, "run it again", RunError, "its camera cannot be used"):
+            return Camera(**self.run.facts()["camera"]).prepared(settings.width, settings.crop_px)
 
     @cached_property
     def frames(self) -> RunFrames:
@@ -101,10 +97,12 @@ class RunReader:
         return sum(bool(record["is_keyframe"]) for record in self.frames.log)
 
     def keyframes(self) -> Iterator[tuple[int, Picture]]:
-        """Yield each keyframe once, in order of time: its frame number, and its images, one at a time in memory."""
+        """Yield each keyframe once, in order of time: its frame number, and its images, one at a time in memory.
+
+        Raises RunError if the run kept no submaps, which contain the images.
+        """
         if not len(self.run.submaps):
-            yield from self._keyframes_of_sequence()
-            return
+            raise RunError(f"run {self.run.path} kept no submaps, so it has no images; leave out --pictures")
         seen = set[int]()
         for index in range(len(self.run.submaps)):
             for k, frame in enumerate(self.run.submaps.load(index).frames):
@@ -112,12 +110,3 @@ class RunReader:
                 if 0 <= frame < len(self.frames) and frame not in seen:
                     seen.add(frame)
                     yield frame, self.run.submaps.picture(index, k)
-
-    def _keyframes_of_sequence(self) -> Iterator[tuple[int, Picture]]:
-        s = self.config.input
-        for i, record in enumerate(self.frames.log):
-            if record["is_keyframe"]:
-                read = self.source.frame(record["index"])
-                frame = read.prepared(s.width, s.min_depth_m, s.max_depth_m, s.crop_px)
-                color = np.rint(frame.color * np.float32(255.0)).astype(np.uint8)
-                yield i, Picture(color, frame.depth_m)

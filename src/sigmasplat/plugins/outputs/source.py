@@ -1,6 +1,5 @@
 """What is exported: a run folder, or a map's PLY. Imports that load torch are inside the functions."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -8,23 +7,15 @@ from typing import TYPE_CHECKING
 from sigmasplat.api import RunError
 
 if TYPE_CHECKING:
-    from sigmasplat.api import GaussianField, RunFolder, Source, SplatStd
+    from sigmasplat.api import GaussianField, RunFolder, SplatStd
     from sigmasplat.plugins.outputs.run_reader import RunReader
-
-
-def _no_sequence(run: "RunFolder") -> "Source":
-    raise RunError(f"run {run.path} kept no submaps, and its sequence was not given")
 
 
 @dataclass(frozen=True)
 class ExportSource:
-    """What is exported: a run folder, or a PLY that holds a map.
-
-    open_sequence: opens the sequence of a run, for keyframe images that the run did not keep.
-    """
+    """What is exported: a run folder, or a PLY that holds a map."""
 
     path: Path
-    open_sequence: "Callable[[RunFolder], Source]" = _no_sequence
 
     @property
     def name(self) -> str:
@@ -44,8 +35,7 @@ class ExportSource:
         """Open the run to read its path, camera and keyframe images. Raises RunError as `run` does."""
         from sigmasplat.plugins.outputs.run_reader import RunReader
 
-        run = self.run()
-        return RunReader(run, lambda: self.open_sequence(run))
+        return RunReader(self.run())
 
     def splats(self) -> "tuple[GaussianField, SplatStd | None]":
         """Read the map, and the standard deviations of its splats if a run has measured them.

@@ -1,9 +1,7 @@
 """Render a run as a video along its path or on an orbit: colour alone, or with depth and uncertainty beside it."""
 
 import os
-import sys
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -138,7 +136,6 @@ def export_video(
     Raises RunError on an unknown ending, or without a map or path.
     """
     options = options or VideoOptions()
-    check_ending(target)
     config, path = reader.config, reader.valid_path()
     renderer = renderer or FieldRenderer(config.render, config.backend)
     field, camera = reader.run.read_map(), film_camera(reader.camera, options.width_px)
@@ -228,33 +225,27 @@ def orbit_view(
     return kept, orbit(center, T[2, :3], T[1, :3], radius_m, images)
 
 
-CODECS = {".webm": "VP90", ".mp4": "vp09"}
+CODEC, ENDING = "vp09", ".mp4"
 
 
 def write_video(path: Path, images: Iterable[Rgb], fps: float) -> None:
-    """Write images uint8 RGB [H, W, 3] of equal size as a video in the format of the path's ending, atomically.
+    """Write images uint8 RGB [H, W, 3] of equal size as an MP4 file with VP9, atomically.
 
-    Raises RunError on an unknown ending, an unwritable file or a missing codec.
+    VP9 needs even sizes: an odd last row or column is dropped. Raises RunError on another ending, an unwritable file or
+    a missing codec.
     """
-    check_ending(path)
-    kind = path.suffix.lower()
+    if path.suffix.lower() != ENDING:
+        raise RunError(f"cannot write a video as {path.name}; give a name that ends in {ENDING}")
     with replacing(path) as temporary:
-        scratch = temporary.with_suffix(kind)  # OpenCV selects the format by the ending
+        scratch = temporary.with_suffix(ENDING)  # OpenCV selects the format by the ending
         try:
-            _write_vp9(scratch, images, fps, CODECS[kind])
+            _encode(scratch, images, fps)
             os.replace(scratch, temporary)
         finally:
             scratch.unlink(missing_ok=True)
 
 
-def check_ending(path: Path) -> None:
-    """Raise RunError unless the path's ending is that of a video."""
-    if path.suffix.lower() not in CODECS:
-        raise RunError(f"cannot write a video as {path.name}; give a name that ends in {', '.join(CODECS)}")
-
-
-def _write_vp9(path: Path, images: Iterable[Rgb], fps: float, codec: str) -> None:
-    """Encode with VP9, which needs even sizes: an odd last row or column is dropped."""
+def _encode(path: Path, images: Iterable[Rgb], fps: float) -> None:
     import cv2
 
     writer, size = None, (0, 0)
@@ -262,9 +253,8 @@ def _write_vp9(path: Path, images: Iterable[Rgb], fps: float, codec: str) -> Non
         for image in images:
             if writer is None:
                 size = (image.shape[1] // 2 * 2, image.shape[0] // 2 * 2)
-                with _quiet():
-                    fourcc = cv2.VideoWriter.fourcc(*codec)
-                    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, fourcc, fps, size)
+                fourcc = cv2.VideoWriter.fourcc(*CODEC)
+                writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, fourcc, fps, size)
                 if not writer.isOpened():
                     raise RunError(f"cannot write {path.name} with this OpenCV, which lacks VP9; reinstall it")
             writer.write(np.ascontiguousarray(image[: size[1], : size[0], ::-1]))
@@ -273,17 +263,3 @@ def _write_vp9(path: Path, images: Iterable[Rgb], fps: float, codec: str) -> Non
             writer.release()
     if writer is None:
         raise RunError("a video needs at least one image, found none")
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Silence the process's standard error, where OpenCV prints a harmless warning about a tag in .webm."""
-    sys.stderr.flush()
-    kept = os.dup(2)
-    try:
-        with open(os.devnull, "wb") as nowhere:
-            os.dup2(nowhere.fileno(), 2)
-        yield
-    finally:
-        os.dup2(kept, 2)
-        os.close(kept)

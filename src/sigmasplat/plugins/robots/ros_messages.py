@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.api import Camera, GaussianField, Matrix, import_optional, se3
-from sigmasplat.plugins.outputs.floorplan.floor_plan import FloorPlan
-from sigmasplat.plugins.outputs.floorplan.rescan import FREE, OBJECT, WALL
+from sigmasplat.plugins.outputs.floorplan.floor_plan import FREE, OBJECT, WALL, FloorPlan
 from sigmasplat.plugins.outputs.views import opaque_rows
 
 MAP, ODOM, LINK, OPTICAL = "map", "odom", "camera_link", "camera_optical_frame"

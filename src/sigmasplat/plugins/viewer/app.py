@@ -11,7 +11,7 @@ import viser
 from sigmasplat.api import SigmaSplatError
 from sigmasplat.plugins.outputs.drawing.colormap import INFERNO
 from sigmasplat.plugins.viewer import layers, snapshot as lines
-from sigmasplat.plugins.viewer.layers import Floats, LayerImage, Legend, VisibilityFilter
+from sigmasplat.plugins.viewer.layers import Floats, LayerImage, Legend
 from sigmasplat.plugins.viewer.panel import PREDICTED_MODES, ControlPanel, ControlState, escaped
 from sigmasplat.plugins.viewer.scene import ViserScene, camera_pose, move_camera, set_initial_camera
 from sigmasplat.plugins.viewer.snapshot import BUDGET, Piece, Snapshot, within_budget
@@ -110,19 +110,19 @@ class ViewerApp:
         self.panel.offer(known)
         controls = self.panel.state()
         ordered = self._uncertainties_of(pieces)
-        visible = layers.visibility_filter(ordered, controls.hidden_share, controls.min_opacity)
+        most = layers.largest_shown(ordered, controls.hidden_share)
         span = layers.palette_range(ordered)
         with self.server.atomic():
             self._draw_path(snapshot, controls)
-            self._draw_splats(pieces, controls, span, visible)
+            self._draw_splats(pieces, controls, span, most)
         self._draw_keyframes(snapshot, controls)
-        self._show_texts(snapshot, controls, pieces, visible, unit)
+        self._show_texts(snapshot, controls, pieces, most, unit)
         self._follow(snapshot, controls)
         legend = None
         if controls.mode == "splats" and controls.colouring == "uncertainty":
             legend = Legend(INFERNO, *span, unit)
         for client in self.server.get_clients().values():
-            legend = self._draw_layer(client, snapshot, controls, pieces, visible) or legend
+            legend = self._draw_layer(client, snapshot, controls, pieces, most) or legend
         if self._is_new("legend", legend and legend[1:]):
             self.panel.show_legend(None if legend is None else layers.draw_legend(legend))
 
@@ -156,15 +156,15 @@ class ViewerApp:
             self.scene.show_lines("truth", lines.truth_segments(truth) if shown and truth is not None else None)
 
     def _draw_splats(
-        self, pieces: tuple[Piece, ...], controls: ControlState, span: tuple[float, float], visible: VisibilityFilter
+        self, pieces: tuple[Piece, ...], controls: ControlState, span: tuple[float, float], most: float
     ) -> None:
         if controls.mode != "splats":
             pieces = ()
         ends = None if controls.colouring == "colour" else span  # own colours do not depend on the range
-        state = ([(p.name, IdentityKey(p.field)) for p in pieces], controls.colouring, ends, visible)
+        state = ([(p.name, IdentityKey(p.field)) for p in pieces], controls.colouring, ends, most)
         if self._is_new("splats", state):
             sent = within_budget(pieces, BUDGET)  # a large final map is rendered completely, but sent thinned
-            drawn = {p.name: (layers.splat_arrays(p, controls.colouring, span, visible), p.T_world_piece) for p in sent}
+            drawn = {p.name: (layers.splat_arrays(p, controls.colouring, span, most), p.T_world_piece) for p in sent}
             self.scene.show_splats(drawn)
         else:
             self.scene.place_splats({piece.name: piece.T_world_piece for piece in pieces})
@@ -178,7 +178,7 @@ class ViewerApp:
 
     def _draw_layer(
         self, client: viser.ClientHandle, snapshot: Snapshot, controls: ControlState, pieces: tuple[Piece, ...],
-        visible: VisibilityFilter,
+        most: float,
     ) -> Legend | None:  # fmt: skip
         """Render the selected layer from a browser's viewpoint as the background of its scene; return its legend."""
         key, c = ("layer", client.client_id), client.camera
@@ -186,7 +186,7 @@ class ViewerApp:
             if self._drawn.pop(key, None) is not None:
                 client.scene.set_background_image(None)
             return None
-        pose, splats = camera_pose(c), ([(IdentityKey(p.field), p.T_world_piece.tobytes()) for p in pieces], visible)
+        pose, splats = camera_pose(c), ([(IdentityKey(p.field), p.T_world_piece.tobytes()) for p in pieces], most)
         state = (controls.layer, pose.tobytes(), c.fov, c.aspect, splats)
         drawn, rows = self._drawn.get(key), LIVE_ROWS if snapshot.live else ROWS
         sharp_rows = rows if snapshot.live else max(rows, min(SHARP_ROWS, c.image_height))
@@ -195,7 +195,7 @@ class ViewerApp:
             if self._merged[0] != splats:
                 self._merged = (
                     splats,
-                    (layers.merge_pieces(pieces, visible), layers.merged_uncertainty(pieces, visible)),
+                    (layers.merge_pieces(pieces, most), layers.merged_uncertainty(pieces, most)),
                 )
             camera = layers.browser_camera(c.fov, c.aspect, rows)
             (field, known), how = self._merged[1], (snapshot.options, snapshot.backend)
@@ -217,11 +217,11 @@ class ViewerApp:
         snapshot: Snapshot,
         controls: ControlState,
         pieces: tuple[Piece, ...],
-        visible: VisibilityFilter,
+        most: float,
         unit: str,
     ) -> None:
         path = snapshot.path
-        splats, kept = sum(len(p.field) for p in pieces), sum(int(visible.mask(p).sum()) for p in pieces)
+        splats, kept = sum(len(p.field) for p in pieces), sum(int(layers.shown(p, most).sum()) for p in pieces)
         submaps = int(path.submaps[-1]) + 1 if len(path) else 0
         outside = int((~path.inside & ~path.lost).sum())
         apart = f", {outside} apart (not shown)" if outside else ""
@@ -232,7 +232,7 @@ class ViewerApp:
             f"{kept:,} of {splats:,} splats shown"
         )
         what = "error of depth" if unit else "σ"
-        hidden = f"hidden: {what} above {visible.most:.3g}{unit}" if visible.most < float("inf") else ""
+        hidden = f"hidden: {what} above {most:.3g}{unit}" if most < float("inf") else ""
         self.panel.show_texts(facts, hidden, _frame_text(snapshot, controls.row))
 
     def _follow(self, snapshot: Snapshot, controls: ControlState) -> None:

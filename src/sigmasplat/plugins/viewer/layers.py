@@ -54,16 +54,9 @@ class SplatArrays:
         return len(self.centers)
 
 
-@dataclass(frozen=True)
-class VisibilityFilter:
-    """Hides splats whose uncertainty is above `most`, or whose opacity is below `min_opacity`."""
-
-    most: float = float("inf")
-    min_opacity: float = 0.0
-
-    def mask(self, piece: Piece) -> Tensor:
-        """Return which splats are shown, bool [N]."""
-        return (uncertainties(piece) <= self.most) & (piece.field.opacities >= self.min_opacity)
+def shown(piece: Piece, most: float) -> Tensor:
+    """Return which splats have an uncertainty of at most `most`, bool [N]; others are hidden."""
+    return uncertainties(piece) <= most
 
 
 def sorted_uncertainties(pieces: Sequence[Piece]) -> Floats:
@@ -75,12 +68,12 @@ def sorted_uncertainties(pieces: Sequence[Piece]) -> Floats:
     return np.sort(np.concatenate([np.empty(0, np.float32), *found]))
 
 
-def visibility_filter(ordered: Floats, hidden_share: float, min_opacity: float) -> VisibilityFilter:
-    """Return the filter that hides this share of the splats, the most uncertain ones; `ordered` is sorted."""
-    most = float("inf")
-    if hidden_share > 0.0 and len(ordered):
-        most = float(np.quantile(ordered, max(1.0 - hidden_share, 0.0)))
-    return VisibilityFilter(most, min_opacity)
+def largest_shown(ordered: Floats, hidden_share: float) -> float:
+    """Return the largest uncertainty that is shown if this share of the splats is hidden, the most uncertain ones, inf
+    if none is; `ordered` is sorted."""
+    if not hidden_share or not len(ordered):
+        return float("inf")
+    return float(np.quantile(ordered, max(1.0 - hidden_share, 0.0)))
 
 
 def palette_range(ordered: Floats) -> tuple[float, float]:
@@ -88,11 +81,9 @@ def palette_range(ordered: Floats) -> tuple[float, float]:
     return 0.0, colormap.value_range(ordered, np.ones(len(ordered), bool))[1]
 
 
-def splat_arrays(
-    piece: Piece, colouring: Colouring, span: tuple[float, float], visible: VisibilityFilter
-) -> SplatArrays:
-    """Return the visible splats in their own colours, or coloured by uncertainty over the range `span`."""
-    mask = visible.mask(piece)
+def splat_arrays(piece: Piece, colouring: Colouring, span: tuple[float, float], most: float) -> SplatArrays:
+    """Return the shown splats in their own colours, or coloured by uncertainty over the range `span`."""
+    mask = shown(piece, most)
     chosen = field_without_moments(piece.field.params[mask], {})
     if colouring == "uncertainty":
         colors = colormap.apply(uncertainties(piece)[mask].numpy(), *span, colormap.INFERNO)
@@ -109,18 +100,18 @@ def covariances(quats_wxyz: Floats, scales: Floats) -> Floats:
     return np.asarray(spread @ spread.transpose(0, 2, 1), np.float32)
 
 
-def merge_pieces(pieces: Sequence[Piece], visible: VisibilityFilter) -> GaussianField:
-    """Return the visible splats of all pieces as one field in the world frame."""
-    parts = (piece.field.part(visible.mask(piece)).moved(torch.from_numpy(piece.T_world_piece)) for piece in pieces)
+def merge_pieces(pieces: Sequence[Piece], most: float) -> GaussianField:
+    """Return the shown splats of all pieces as one field in the world frame."""
+    parts = (piece.field.part(shown(piece, most)).moved(torch.from_numpy(piece.T_world_piece)) for piece in pieces)
     return GaussianField.side_by_side(parts)
 
 
-def merged_uncertainty(pieces: Sequence[Piece], visible: VisibilityFilter) -> MapUncertainty | None:
+def merged_uncertainty(pieces: Sequence[Piece], most: float) -> MapUncertainty | None:
     """Return how sure the splats of `merge_pieces` are; None unless it was measured for the only piece."""
     if len(pieces) != 1 or pieces[0].uncertainty is None:
         return None
     known = pieces[0].uncertainty
-    return known.at(visible.mask(pieces[0]))
+    return known.at(shown(pieces[0], most))
 
 
 Layer = Literal["colour", "depth", "V", "U", "color error", "depth error"]

@@ -32,7 +32,6 @@ class ControlState:
     mode: ViewMode
     colouring: Colouring
     hidden_share: float
-    min_opacity: float
     row: int
     path: bool
     keyframes: bool
@@ -74,9 +73,6 @@ class ControlPanel:
             self.hidden = gui.add_slider(
                 "hide uncertain", 0, 99, 1, 0, hint="hide this percentage of the splats: the most uncertain ones"
             )
-            self.min_opacity = gui.add_slider(
-                "minimum opacity", 0.0, 0.99, 0.01, 0.0, hint="hide splats with a lower opacity"
-            )
             self.hidden_text = gui.add_markdown("")
 
     def _add_path_controls(self, gui: viser.GuiApi) -> None:
@@ -93,7 +89,7 @@ class ControlPanel:
 
     def _controls(self) -> tuple[Any, ...]:
         return (
-            self.mode, self.colouring, self.hidden, self.min_opacity,
+            self.mode, self.colouring, self.hidden,
             self.row, self.follow, self.path, self.keyframes, self.true_path,
         )  # fmt: skip
 
@@ -103,7 +99,6 @@ class ControlPanel:
             next(mode for mode in VIEW_MODES if MODE_LABELS[mode] == self.mode.value),
             self.colouring.value,
             self.hidden.value / 100.0,
-            float(self.min_opacity.value),
             int(self.row.value),
             self.path.value,
             self.keyframes.value,

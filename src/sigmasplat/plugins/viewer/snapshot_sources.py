@@ -15,7 +15,6 @@ from sigmasplat.api import (
     Callback,
     Camera,
     Matrix,
-    RunError,
     RunFolder,
     RunFrames,
     SubmapStore,
@@ -49,7 +48,7 @@ def finished_snapshot(run: RunFolder, budget: int = BUDGET) -> Snapshot:
 
     Raises RunError if the run stopped before it had a map, or if its uncertainty belongs to another map.
     """
-    frames, final, tensors = run.read_frames(), run.read_map(), run.read_checkpoint()[0]
+    final, frames, tensors = run.read_map(), run.read_frames(), run.read_checkpoint()[0]
     config, true_file = run.config(), run.path / TRUTH
     cache = SubmapCache(run.submaps, budget)
     cache.load(np.asarray(tensors["T_world_submap"], np.float64))  # for the images of keyframes
@@ -108,15 +107,6 @@ def _lost_and_submaps(log: Log) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
     """Return whether each frame is lost [F], and its submap [F]."""
     lost = np.array([bool(record.get("lost")) for record in log], np.bool_)
     return lost, np.array([record.get("submap", 0) for record in log], np.int64)
-
-
-def check_has_map(run: RunFolder) -> None:
-    """Raise RunError if a run has no map: it is not finished, or it ended without one."""
-    if not (run.path / "map.ply").is_file():
-        raise RunError(
-            f"run {run.path} has no map to show (status: {run.facts().get('status')}); a run writes it at its end, "
-            "`sigmasplat run --view` shows it from the start"
-        )
 
 
 MAX_TIME_SHARE = 0.02

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from scipy.special import gammaincinv
 from scipy.stats import rankdata
 
@@ -83,24 +84,13 @@ def associate(times_a_s: Matrix, times_b_s: Matrix, max_difference_s: float = 0.
     """
     if not len(times_a_s) or not len(times_b_s):
         return np.empty(0, np.intp), np.empty(0, np.intp)
-    nearest_b = _nearest(times_a_s, times_b_s)
-    nearest_a = _nearest(times_b_s, times_a_s)
+    nearest_b = np.asarray(cKDTree(times_b_s[:, None]).query(times_a_s[:, None])[1], np.intp)
+    nearest_a = np.asarray(cKDTree(times_a_s[:, None]).query(times_b_s[:, None])[1], np.intp)
     rows_a = np.arange(len(times_a_s))
     mutual = nearest_a[nearest_b] == rows_a
     close = np.abs(times_a_s - times_b_s[nearest_b]) <= max_difference_s
     chosen = rows_a[mutual & close]
     return chosen, nearest_b[chosen]
-
-
-def _nearest(wanted: Matrix, among: Matrix) -> Rows:
-    """Return for each value of `wanted` the row of the nearest value of `among` (unsorted; a tie takes the earlier)."""
-    order = np.argsort(among, kind="stable")
-    ordered = among[order]
-    right = np.clip(np.searchsorted(ordered, wanted), 1, max(len(among) - 1, 1))
-    left = right - 1
-    right = np.minimum(right, len(among) - 1)
-    nearer_right = np.abs(ordered[right] - wanted) < np.abs(ordered[left] - wanted)
-    return order[np.where(nearer_right, right, left)]
 
 
 def pair_poses(estimate: Trajectory, truth: Trajectory, max_difference_s: float = 0.02) -> tuple[Matrix, Matrix]:

@@ -1,7 +1,15 @@
-"""Write the report of an evaluated run, report.html: one file that you can share, without scripts."""
+"""Write the report of an evaluated run, report.html: one file that you can share, without scripts.
 
+It begins with a picture of the map, three verdicts and the next commands; the rest is folded.
+"""
+
+import base64
+import html
+import io
 import json
 import shlex
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from sigmasplat.api import (
@@ -16,11 +24,12 @@ from sigmasplat.api import (
     is_preset,
     preset,
 )
-from sigmasplat.plugins.evaluation.report.advice import advice, next_commands
+from sigmasplat.plugins.evaluation.report import tables
+from sigmasplat.plugins.evaluation.report.advice import Advice, advice, next_commands
 from sigmasplat.plugins.evaluation.report.charts import Plot
-from sigmasplat.plugins.evaluation.report.html import Contents, build_report
-from sigmasplat.plugins.evaluation.report.summary import rescan_sentences, verdicts
-from sigmasplat.plugins.evaluation.report.view_strips import PanelFigure, panel_figure
+from sigmasplat.plugins.evaluation.report.summary import Verdict, verdicts
+from sigmasplat.plugins.outputs.drawing.plot import svg
+from sigmasplat.plugins.outputs.drawing.view_panels import PANEL_WIDTH, ViewPanel
 from sigmasplat.plugins.outputs.floorplan.floor_plan import FloorPlan, run_floor_plan
 from sigmasplat.plugins.outputs.floorplan.picture import plan_panels
 
@@ -31,7 +40,7 @@ LIKELY = 0.5
 def write_page(
     run: RunFolder,
     metrics: dict[str, Any],
-    strips: dict[str, list[list[PanelFigure]]],
+    strips: dict[str, list[list[ViewPanel]]],
     plots: dict[str, Plot],
     warnings: list[str],
     plan: FloorPlan | None = None,
@@ -53,9 +62,7 @@ def write_page(
         verdicts=verdicts(metrics, unsure, found),
         commands=next_commands(str(run.path)),
         advice=found[1:],
-        rescan=rescan_sentences(metrics, plan),
-        plan=[panel_figure(panel) for panel in plan_panels(plan)] if plan else [],
-        regions=plan.regions if plan else (),
+        plan=plan_panels(plan) if plan else [],
     )
     run.write_report(build_report(contents))
 
@@ -89,3 +96,183 @@ def rerun_command(config: Config, facts: dict[str, Any]) -> str:
     return shlex.join(
         [*words, *(word for pair in differences(config, preset(config.name)) for word in ("--set", pair))]
     )
+
+
+QUALITY, EFFORT = 86, 2
+"""Quality of WebP, and the effort to compress (0 to 6; a larger one takes longer and hardly saves space)."""
+PAGE_WIDTH = 1152
+"""Width of the page's text column at twice the resolution of a panel, in pixels."""
+VIEW_PANELS = 5
+"""Number of panels of a view; fewer are not of one view, or of its predicted errors."""
+
+STYLE = Path(__file__).with_name("page.css").read_text(encoding="utf-8")
+
+PLAN_CAPTION = (
+    "The map from above: walls are light, objects grey, the free floor dark, floor that was not observed blue; the "
+    "camera path is green."
+)
+
+
+@dataclass(frozen=True)
+class Contents:
+    """What a report shows.
+
+    verdicts: shown first; commands: what to do with the map; advice: what else to try; strips: panels of views by
+    heading; plots: charts by name; plan: panels of the floor plan.
+    """
+
+    title: str
+    subtitle: str
+    metrics: dict[str, Any]
+    strips: dict[str, list[list[ViewPanel]]] = field(default_factory=dict)
+    plots: dict[str, Plot] = field(default_factory=dict)
+    config: str = ""
+    warnings: list[str] = field(default_factory=list)
+    verdicts: list[Verdict] = field(default_factory=list)
+    commands: list[Advice] = field(default_factory=list)
+    advice: list[Advice] = field(default_factory=list)
+    plan: list[ViewPanel] = field(default_factory=list)
+
+
+def build_report(contents: Contents) -> str:
+    """Return the whole page as HTML. `metrics` is what `evaluate` returns; absent values show as a dash."""
+    parts = [
+        f"<h1>{html.escape(contents.title)}</h1><p class=soft>{html.escape(contents.subtitle)}</p>",
+        "".join(f"<p class=alarm>{html.escape(warning)}</p>" for warning in contents.warnings),
+        _map(contents),
+        f"<div class=judged>{''.join(map(_verdict, contents.verdicts))}</div>",
+        _advice(contents.commands),
+        _part("What else to try", _advice(contents.advice)),
+        _part("Floor plan", _plan(contents)),
+        _part("Trajectory", _figure(contents, "trajectory")),
+        _part("States of the frames", _states(contents)),
+        _part("Views", _strips(contents)),
+        _part("Scores", _scores(contents)),
+        _part("Settings (config.json)", contents.config and f"<pre>{html.escape(contents.config)}</pre>"),
+    ]
+    head = "<meta charset=utf-8><meta name=viewport content='width=device-width, initial-scale=1'>"
+    title, body = html.escape(contents.title), "\n".join(parts)
+    return (
+        f"<!doctype html>\n<html lang=en>{head}<title>{title}</title><style>{STYLE}</style>\n"
+        f"<main>\n{body}\n</main></html>\n"
+    )
+
+
+def _part(title: str, body: str) -> str:
+    """Return a folded part of the page; nothing if it is empty."""
+    return f"<details class=part><summary><h2>{title}</h2></summary>{body}</details>" if body else ""
+
+
+def _map(contents: Contents) -> str:
+    """Show the map from the place of a recorded image, and that image; without one, the floor plan."""
+    views = next((found for found in contents.strips.values() if found), [])
+    views = [panels for panels in views if len(panels) == VIEW_PANELS] or views
+    if not views:
+        return _plan(contents)
+    recorded, *rendered = views[len(views) // 2][:2]
+    shown = [(panel, "The map") for panel in rendered] + [(recorded, "The recorded image")]
+    figures = (
+        f"<figure><img src='{address(panel)}' alt='{words}'>"
+        f"<figcaption>{words}: {html.escape(panel.caption)}</figcaption></figure>"
+        for panel, words in shown
+    )
+    return f"<div class=map>{''.join(figures)}</div>"
+
+
+def _verdict(verdict: Verdict) -> str:
+    about, words, meaning, command = map(html.escape, verdict)
+    shown = f"<pre>{command}</pre>" if command else ""
+    return f"<div class=card><span class=soft>{about}</span><b>{words}</b><p>{meaning}</p>{shown}</div>"
+
+
+def _scores(contents: Contents) -> str:
+    """Show all scores of images, path, surface and uncertainty."""
+    body = "".join(
+        f"<div class=card><h3>{title}</h3>{_table(rows)}</div>"
+        for title, rows in tables.score_tables(contents.metrics)
+        if rows[1:]
+    )
+    return f"<div class=pair>{body}</div>"
+
+
+def _advice(advice: list[Advice]) -> str:
+    if not advice:
+        return ""
+    items = [
+        f"<li>{html.escape(words)}{f'<pre>{html.escape(command)}</pre>' if command else ''}</li>"
+        for words, command in advice
+    ]
+    return f"<ul>{''.join(items)}</ul>"
+
+
+def _strips(contents: Contents) -> str:
+    """Show the views of each kind, each as a row of panels that wraps on narrow pages."""
+    if not any(contents.strips.values()):
+        return ""
+    explanation = (
+        "<p class=soft>Images are rendered at the estimated poses. The map predicts V, the variance of colour along "
+        "each ray. The root of V and the RMS error have separate colour scales. Where both look alike, V predicts "
+        "the error well. If the run has predicted errors, held-out views show them instead, one standard deviation "
+        "in the colours of the error. Slate pixels: no depth reading, or no surface in the map.</p>"
+    )
+    parts = [explanation]
+    for kind, strips in contents.strips.items():
+        if strips:
+            parts.append(f"<h3>{html.escape(kind)}</h3>")
+            parts += map(_view, strips)
+    return "".join(parts)
+
+
+def _view(panels: list[ViewPanel]) -> str:
+    """Show the panels of a view. With five of them, the image and its render are half as wide as the page."""
+    large = " large" if len(panels) == VIEW_PANELS else ""
+    return f"<figure class='view{large}'>{''.join(map(_panel, panels))}</figure>"
+
+
+def address(panel: ViewPanel) -> str:
+    """Return the picture of a panel as a data: URI, WebP.
+
+    Pictures larger than a panel of a strip keep their size, up to `PAGE_WIDTH`.
+    """
+    width = min(max(PANEL_WIDTH, panel.pixels.shape[1]), PAGE_WIDTH)
+    picture, buffer = panel.picture(width, round(width * panel.pixels.shape[0] / panel.pixels.shape[1])), io.BytesIO()
+    picture.convert("RGB").save(buffer, "WEBP", quality=QUALITY, method=EFFORT)
+    return f"data:image/webp;base64,{base64.b64encode(buffer.getvalue()).decode('ascii')}"
+
+
+def _panel(panel: ViewPanel) -> str:
+    below = f"<span>{html.escape(panel.caption)}</span>" if panel.caption else ""
+    if panel.bar is not None:
+        low, high = (html.escape(end) for end in panel.ends)
+        colours = ", ".join(f"rgb({r:.0f} {g:.0f} {b:.0f})" for r, g, b in panel.bar)
+        ramp = f"<i style='background: linear-gradient(90deg, {colours})'></i>"
+        below = f"<span class=bar>{low}{ramp}{high}</span>{below}"
+    title = html.escape(panel.title)
+    return f"<div>{title}<img src='{address(panel)}' alt='{title}'>{below}</div>"
+
+
+def _states(contents: Contents) -> str:
+    if "states" not in contents.plots:
+        return ""
+    table = f"<div class=card>{_table(tables.state_rows(contents.metrics))}</div>"
+    return f"{_figure(contents, 'states')}{table}"
+
+
+def _figure(contents: Contents, name: str) -> str:
+    """Show the charts of a plot and its caption; nothing if there is no such plot."""
+    if name not in contents.plots:
+        return ""
+    charts, caption = contents.plots[name]
+    drawn = "".join(map(svg, charts))
+    return f"<figure><div class=pair>{drawn}</div><figcaption>{html.escape(caption)}</figcaption></figure>"
+
+
+def _plan(contents: Contents) -> str:
+    return f"{_view(contents.plan)}<p class=soft>{PLAN_CAPTION}</p>" if contents.plan else ""
+
+
+def _table(rows: list[list[str]]) -> str:
+    """Return a table of text; the first row is the head."""
+    head = "".join(f"<th>{html.escape(cell)}</th>" for cell in rows[0])
+    body = "".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows[1:])
+    return f"<table><tr>{head}</tr>{body}</table>"

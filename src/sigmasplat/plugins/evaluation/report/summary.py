@@ -1,14 +1,10 @@
-"""Describe the scores of a run in sentences: three verdicts, the result, where to scan again."""
+"""Describe the scores of a run in sentences: three verdicts, the result."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from sigmasplat.api import format_ranges, number
 from sigmasplat.plugins.evaluation.report.advice import PSNR_WORDS, Advice, Metrics
-from sigmasplat.plugins.outputs.floorplan.rescan import unsure_rule
-
-if TYPE_CHECKING:
-    from sigmasplat.plugins.outputs.floorplan.floor_plan import FloorPlan
 
 DEPTH_WORDS = ((0.01, "very accurate"), (0.03, "good"))
 CALIBRATED = 0.05
@@ -157,21 +153,3 @@ def _with_truth(covariance: Metrics, found: Metrics) -> list[str]:
         return []
     own = f"{number(covariance['truth_error_m'], 0, 1e3)} mm and {number(covariance['truth_error_deg'], 1)}° a pose"
     return [f"With the own error of the true path, {own}, {number(share, 0, 100.0)} % are within."]
-
-
-def rescan_sentences(metrics: Metrics, plan: "FloorPlan | None") -> list[str]:
-    """Return sentences about what the map lacks: lost frames, frames apart, and regions of the plan."""
-    sentences = []
-    lost = metrics.get("lost_frames") or []
-    if lost:
-        sentences.append(f"Tracking was lost at images {format_ranges(lost)}: they are not in the map.")
-    if apart := metrics.get("apart_frames"):
-        sentences.append(f"Images {format_ranges(apart)} are not connected to the map, so they are not in the plan.")
-    if plan is None:
-        return sentences
-    reasons = {"unseen": "not observed", "thin": "mapped too thinly", "unsure": "mapped with high uncertainty"}
-    areas = {why: [region.area_m2 for region in plan.regions if region.why == why] for why in reasons}
-    parts = [f"{len(found)} {reasons[why]} ({number(sum(found), 1)} m²)" for why, found in areas.items() if found]
-    if parts:
-        sentences.append(f"Regions near the path to scan again: {', '.join(parts)}.")
-    return [*sentences, unsure_rule(plan.predicted_errors)]

@@ -1,1 +1,1 @@
-"""Make a floor plan of a map, with the regions to scan again."""
+"""Make a floor plan of a map."""

@@ -1,7 +1,7 @@
 """Make a floor plan of a map: cells seen from above with what is there, its uncertainty, and what is not observed."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -22,7 +22,6 @@ from sigmasplat.api import (
     noted_up,
     predict,
     render,
-    se3,
 )
 from sigmasplat.plugins.evaluation.metrics.views import Renderer
 from sigmasplat.plugins.outputs.floorplan.ground import (
@@ -31,17 +30,10 @@ from sigmasplat.plugins.outputs.floorplan.ground import (
     floor_frame,
     sample_surfaces,
 )
-from sigmasplat.plugins.outputs.floorplan.rescan import (
-    FLOOR_UNOBSERVED,
-    FREE,
-    OBJECT,
-    UNOBSERVED,
-    WALL,
-    RescanRegion,
-    find_rescan_regions,
-)
 
 CELL_M = 0.05
+UNOBSERVED, FLOOR_UNOBSERVED, FREE, OBJECT, WALL = range(5)
+"""Kinds of cells. FLOOR_UNOBSERVED: a ray passed above the cell, but its floor was not observed."""
 SIGNS = "?,.o#"
 """One sign per kind, for the rows of `FloorPlan.record`."""
 MEANINGS = ("not observed", "floor not observed", "free floor", "object", "wall or tall object")
@@ -69,7 +61,7 @@ class FloorPlan:
     kind: UNOBSERVED, FLOOR_UNOBSERVED, FREE, OBJECT or WALL. alpha: mean opacity of the surfaces in the cell;
     depth_sigma_m: their mean predicted standard deviation of depth; wrong_share: the share of their pixels whose colour
     is expected to be wrong (`WRONG_BY`). They are nan in cells without a surface, and the last two also without
-    predicted errors. path_m [N, 2]: the camera path. regions: where to scan again, the largest first.
+    predicted errors. path_m [N, 2]: the camera path.
     """
 
     cell_m: float
@@ -80,7 +72,6 @@ class FloorPlan:
     depth_sigma_m: Grid
     wrong_share: Grid
     path_m: Matrix
-    regions: tuple[RescanRegion, ...]
 
     @property
     def predicted_errors(self) -> bool:
@@ -92,11 +83,7 @@ class FloorPlan:
         return float(np.isin(self.kind, kinds).sum()) * self.cell_m**2
 
     def record(self) -> dict[str, Any]:
-        """Return the plan as values for JSON: the frame, one sign per cell (row 0 at the lowest y), the regions."""
-        T_world_floor = se3.inverse(self.T_floor_world)
-        places = [
-            np.append(region.center_m, 0.0) @ T_world_floor[:3, :3].T + T_world_floor[:3, 3] for region in self.regions
-        ]
+        """Return the plan as values for JSON: the frame, and one sign per cell (row 0 at the lowest y)."""
         return {
             "resolution_m": self.cell_m,
             "origin_m": self.origin_m,
@@ -106,9 +93,6 @@ class FloorPlan:
             "predicted_errors": self.predicted_errors,
             "legend": dict(zip(SIGNS, MEANINGS, strict=True)),
             "cells": ["".join(SIGNS[kind] for kind in row) for row in self.kind],
-            "scan_again": [
-                asdict(region) | {"center_world_m": place} for region, place in zip(self.regions, places, strict=True)
-            ],
         }
 
 
@@ -140,10 +124,9 @@ def floor_plan(
         grid.add_rays(to_floor(sample.points), to_floor(sample.T_world_camera[None, :3, 3])[0])
     for sample in samples:
         grid.add_points(to_floor(sample.points), sample)
-    kind, (alpha, depth_sigma_m, wrong_share) = grid.kinds(), grid.means()
-    regions = find_rescan_regions(kind, alpha, depth_sigma_m, wrong_share, cell_m, grid.origin_m)
-    maps = kind, alpha, depth_sigma_m, wrong_share
-    return FloorPlan(cell_m, grid.origin_m, T_floor_world, *maps, path[:, :2], tuple(regions))
+    alpha, depth_sigma_m, wrong_share = grid.means()
+    maps = grid.kinds(), alpha, depth_sigma_m, wrong_share
+    return FloorPlan(cell_m, grid.origin_m, T_floor_world, *maps, path[:, :2])
 
 
 def run_floor_plan(

@@ -1,6 +1,5 @@
-"""Draw a floor plan: what is there, the predicted errors of colour and depth, and where to scan again."""
+"""Draw a floor plan: what is there, and the predicted errors of colour and depth."""
 
-import textwrap
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +8,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from sigmasplat.api import Progress, RunError, no_progress, replacing, write_json
 from sigmasplat.plugins.outputs.drawing import colormap
-from sigmasplat.plugins.outputs.drawing.plot import ACCENT, BLUE, DARK, GREEN, PURPLE, nice_ticks
+from sigmasplat.plugins.outputs.drawing.plot import DARK, GREEN, nice_ticks
 from sigmasplat.plugins.outputs.drawing.view_panels import (
     BACKGROUND,
     GAP,
@@ -18,43 +17,44 @@ from sigmasplat.plugins.outputs.drawing.view_panels import (
     ViewPanel,
     draw_view_strip,
 )
-from sigmasplat.plugins.outputs.floorplan.floor_plan import CELL_M, MEANINGS, FloorPlan, run_floor_plan
+from sigmasplat.plugins.outputs.floorplan.floor_plan import (
+    CELL_M,
+    FLOOR_UNOBSERVED,
+    FREE,
+    MEANINGS,
+    UNOBSERVED,
+    FloorPlan,
+    run_floor_plan,
+)
 from sigmasplat.plugins.outputs.floorplan.ground import WRONG_BY
-from sigmasplat.plugins.outputs.floorplan.rescan import FLOOR_UNOBSERVED, FREE, UNOBSERVED, unsure_rule
 from sigmasplat.plugins.outputs.run_reader import RunReader
 
 SCALE = 2
 """Panels are drawn this many times larger and then reduced, because PIL does not smooth lines."""
 WIDEST, TALLEST = PANEL_WIDTH * SCALE, 3 * PANEL_WIDTH
-LINE, COLUMNS = 22, 120
+LINE = 22
 KIND_COLOURS = np.array([(45, 49, 55), (39, 56, 76), (24, 27, 32), (92, 98, 105), (176, 184, 194)], np.uint8)
 """Of the cells in the order of their kinds, as in `FloorPlan`."""
-REASON_COLOURS = {"unseen": DARK[BLUE], "thin": DARK[PURPLE], "unsure": DARK[ACCENT]}
 PATH_COLOUR = DARK[GREEN]
 
 
 def draw_floor_plan(plan: FloorPlan) -> Image.Image:
-    """Draw a plan: its panels side by side, and below them the legend and the list of regions to scan again."""
+    """Draw a plan: its panels side by side, and below them the legend."""
     strip, measured = draw_view_strip(plan_panels(plan)), (FLOOR_UNOBSERVED, FREE)
     rows = [
         (f"{meaning}, {plan.area_m2(kind):.1f} sq m" if kind in measured else meaning, tuple(colour))
         for kind, (meaning, colour) in enumerate(zip(MEANINGS, KIND_COLOURS.tolist(), strict=True))
     ]
     rows.append(("camera path", PATH_COLOUR))
-    rows += [(f"{n}  {r.sentence('sq m')}", REASON_COLOURS[r.why]) for n, r in enumerate(plan.regions, 1)]
-    rule = textwrap.wrap(unsure_rule(plan.predicted_errors), COLUMNS)
     font = ImageFont.load_default(14)
-    widest = max(font.getlength(words) for words in [*rule, *(words for words, _ in rows)])
-    size = max(strip.width, round(widest) + 6 * GAP), strip.height + LINE * (len(rows) + len(rule) + 1)
+    widest = max(font.getlength(words) for words, _ in rows)
+    size = max(strip.width, round(widest) + 6 * GAP), strip.height + LINE * (len(rows) + 1)
     image = Image.new("RGB", size, BACKGROUND)
     image.paste(strip)
     draw, y = ImageDraw.Draw(image), strip.height + LINE // 2
     for words, colour in rows:
         draw.rectangle((GAP, y - 6, GAP + 12, y + 6), colour, outline=TEXT)
         draw.text((GAP + 22, y), words, TEXT, font, anchor="lm")
-        y += LINE
-    for words in rule:
-        draw.text((GAP, y), words, TEXT, font, anchor="lm")
         y += LINE
     return image
 
@@ -95,8 +95,7 @@ def plan_panels(plan: FloorPlan) -> list[ViewPanel]:
 
 
 def _drawn(plan: FloorPlan, cells: NDArray[np.uint8], with_path: bool = False) -> colormap.Rgb:
-    """Return the pixels of a panel: cells with y upwards, circles at the regions, and in the first panel the path, a
-    scale bar and the numbers of the regions."""
+    """Return the pixels of a panel: cells with y upwards, and in the first panel the path and a scale bar."""
     rows, columns = plan.kind.shape
     cell_px = min(WIDEST / columns, TALLEST / rows)
     size = max(1, round(columns * cell_px)), max(1, round(rows * cell_px))
@@ -115,11 +114,4 @@ def _drawn(plan: FloorPlan, cells: NDArray[np.uint8], with_path: bool = False) -
         y, right = size[1] - 8 * SCALE, 8 * SCALE + metres / plan.cell_m * cell_px
         draw.line((8 * SCALE, y, right, y), TEXT, 2 * SCALE)
         draw.text((right + 4 * SCALE, y), f"{metres:g} m", TEXT, font, anchor="lm")
-    for number, region in enumerate(plan.regions, 1):
-        middle, colour = place(*region.center_m), REASON_COLOURS[region.why]
-        radius = max(9.0 * SCALE, region.radius_m / plan.cell_m * cell_px)
-        draw.circle(middle, radius, outline=colour, width=2 * SCALE)
-        if with_path:
-            draw.circle(middle, 9 * SCALE, colour)
-            draw.text(middle, str(number), BACKGROUND, font, anchor="mm")
     return np.asarray(image)
