@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.data import se3
+from sigmasplat.data.readout import readouts
 from sigmasplat.errors import BackendError
 from sigmasplat.fit.interface import AlignRules, ImageKernels, LevelPlanes, Plane
 from sigmasplat.fit.pyramid import LEVELS, NOISE_PER_M, Pyramid
@@ -117,6 +118,7 @@ class Pair:
         return LevelPlanes(
             r.gray[k], r.depth[k], r.weight[k], r.weight_depth[k], live.gray[k], live.depth[k],
             [c.fx, c.fy, c.cx, c.cy], options, _noise_at(r.noise[k], width),
+            readouts(r.readout, live.readout),
         )  # fmt: skip
 
 

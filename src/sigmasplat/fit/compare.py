@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sigmasplat.data.readout import readouts
 from sigmasplat.fit.align import Alignment, align, gray_share
 from sigmasplat.fit.pyramid import HIDDEN_M, NOISE_PER_M, Pyramid
 from sigmasplat.native import _core
@@ -64,7 +65,7 @@ def compare(reference: Pyramid, live: Pyramid, T_live_reference: Matrix) -> Comp
     T = np.ascontiguousarray(T_live_reference, np.float64)
     if not _core.compare(
         depth, gray, host(live.depth[level]), host(live.gray[level]), [c.fx, c.fy, c.cx, c.cy], T,
-        _rules(HIDDEN_M, live.noise_per_m, live.scene_scale), found,
+        _rules(HIDDEN_M, live.noise_per_m, live.scene_scale), found, readouts(reference.readout, live.readout),
     ):  # fmt: skip
         return NOTHING
     common, close, front, behind, residual, correlation, points, covered = found.tolist()

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from sigmasplat.data.camera import Camera
+from sigmasplat.data.readout import Readout
 from sigmasplat.fit.backends import fits_of
 from sigmasplat.fit.interface import DEPTH_STEP_M, ImageKernels, Plane
 
@@ -25,7 +26,8 @@ class Pyramid:
     backend: its image kernels halve and align the planes. Only the planes of CUDA are not in host memory.
     scene_scale: size of the scene relative to a room (`render.scene_scale`); noise_per_m: standard deviation of depth
     readings, times z² (`render.depth_noise_per_m`); noise: σ of each reading relative to that law, None: all follow it;
-    confidence: how many times as sure readings are as that law, at the distance of a wall.
+    confidence: how many times as sure readings are as that law, at the distance of a wall; readout: None: all rows were
+    read at once.
     """
 
     gray: list[Plane]
@@ -38,6 +40,7 @@ class Pyramid:
     scene_scale: float = 1.0
     noise_per_m: float = NOISE_PER_M
     confidence: float = 1.0
+    readout: Readout | None = None
 
     @property
     def kernels(self) -> ImageKernels:
@@ -66,9 +69,17 @@ class Pyramid:
         """Return the coarsest `levels` sizes, for a quick alignment."""
         return self._sizes(slice(max(0, len(self.cameras) - levels), None))
 
+    def half(self) -> "Pyramid":
+        """Return half of the size alone."""
+        return self._sizes(slice(1, 2))
+
     def finest(self) -> "Pyramid":
         """Return the finest size alone, for an alignment that coarse sizes cannot pull away."""
         return self._sizes(slice(1))
+
+    def read(self, readout: Readout | None) -> "Pyramid":
+        """Return the same images, with when their rows were read."""
+        return self if readout is self.readout else replace(self, readout=readout)
 
     def _sizes(self, which: slice) -> "Pyramid":
         return replace(

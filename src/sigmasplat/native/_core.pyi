@@ -156,6 +156,7 @@ def compare(
     T_live_reference: Array,
     rules: list[float],
     found: Array,
+    readouts: list[float] = ...,
 ) -> bool: ...
 def free_places(
     points: Array,
@@ -180,6 +181,7 @@ class Level:
         intrinsics: list[float],
         options: list[float],
         noise: Array | None = None,
+        readouts: list[float] = ...,
     ) -> None: ...
 
 class Harmonics:

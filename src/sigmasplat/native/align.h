@@ -32,7 +32,7 @@ static LivePairs side_by_side(const AlignLevel& L, Buffer<float>& memory) {
 // The vectors of the rows of a cell that are computed together. Each stage runs over all of them before the next one
 // begins: its values fit into the registers, and the processor works on several vectors at once.
 constexpr int PART_ROWS = 8, PART = PART_ROWS * CELL / W;
-struct Part { Warped warped[PART]; Residuals residuals[PART]; Derivatives derivatives[PART]; size_t at[PART]; int lanes[PART]; };
+struct Part { Warped warped[PART], gray[PART]; Residuals residuals[PART]; Derivatives derivatives[PART]; size_t at[PART]; int lanes[PART]; };
 
 // The next cells are fetched ahead: a row of a cell is one cache line, too short for the processor to do so by itself.
 // Without this, most of the time is spent on waiting for memory. Beyond the end of an image a prefetch does nothing.
@@ -50,26 +50,34 @@ SIGMA_INLINE vf load_lanes(const float* p, int lanes) {
 }
 SIGMA_INLINE vf load_lanes(const float* plane, size_t at, int lanes, float otherwise) { return plane ? load_lanes(plane + at, lanes) : splat(otherwise); }
 
-// Warp the pixels of a part; return the number of vectors with a pixel that is used.
+// Warp the pixels of a part; return the number of vectors with a pixel that is used. With times, gray is warped by itself: it
+// was read at another time than depth.
 struct Bounds { int left, right, top, bottom; };
-static int warp_part(const AlignLevel& L, const Motion& T, Bounds in, Part& part) {
+template <bool TIMED> static int warp_part(const AlignLevel& L, const Motion& T, const AlignReadouts* times, Bounds in, Part& part) {
     int n = 0;
     for (int y = in.top; y < in.bottom; y++) {
+        const Motion of_depth = TIMED ? motion_of_depth_row(L, T, times->reference, y) : T, of_gray = TIMED ? motion_of_gray_row(L, T, times->reference, y) : T;
         fetch_ahead(L, size_t(y) * L.width + in.left);
         for (int x = in.left; x < in.right; x += W) {
             const size_t at = part.at[n] = size_t(y) * L.width + x;
             const int lanes = part.lanes[n] = L.width - x < W ? L.width - x : W;
             const Mask inside = gt(splat(float(lanes)), lane_index());
-            n += warp(L, T, load_lanes(L.reference_depth + at, lanes), lane_index() + (float(x) - L.cx), float(y) - L.cy, inside, part.warped[n]);
+            const vf depth = load_lanes(L.reference_depth + at, lanes), off_x = lane_index() + (float(x) - L.cx);
+            const float off_y = float(y) - L.cy;
+            if constexpr (TIMED) {
+                if (!warp(L, of_gray, depth, off_x, off_y, inside, gray_rows(L, times->live), part.gray[n])) continue;
+                n += warp(L, of_depth, depth, off_x, off_y, inside, depth_rows(L, times->live), part.warped[n]);
+            } else n += warp(L, T, depth, off_x, off_y, inside, AtOnce{}, part.warped[n]);
         }
     }
     return n;
 }
 
 // Add residuals and derivatives of reference pixels to H and sums (acc) and to b (pull).
-static void add_part(const AlignLevel& L, const LivePairs& live, const AlignOptions& o, const Motion& T, Bounds in, vf* acc, vf* pull) {
+template <bool TIMED>
+static void add_part(const AlignLevel& L, const LivePairs& live, const AlignOptions& o, const Motion& T, const AlignReadouts* times, Bounds in, vf* acc, vf* pull) {
     Part part;
-    const int n = warp_part(L, T, in, part);
+    const int n = warp_part<TIMED>(L, T, times, in, part);
     for (int i = 0; i < n; i++) {
         const Warped& w = part.warped[i];
         const size_t at = part.at[i];
@@ -77,7 +85,9 @@ static void add_part(const AlignLevel& L, const LivePairs& live, const AlignOpti
         __builtin_prefetch(live.pairs + 2 * (w.at[0] + CELLS_AHEAD * CELL));
         const ReferencePixels pixels = {load_lanes(L.reference_gray + at, lanes), load_lanes(L.weight_gray, at, lanes, 1.f),
                                         load_lanes(L.weight_depth, at, lanes, 1.f), load_lanes(L.noise, at, lanes, 1.f)};
-        part.residuals[i] = compared(o, w, neighbours(live, w.at), pixels, acc + MATRIX_TERMS);
+        const Neighbours near = neighbours(live, w.at);
+        if constexpr (TIMED) part.residuals[i] = compared(o, w, near, part.gray[i], neighbours(live, part.gray[i].at).gray, pixels, acc + MATRIX_TERMS);
+        else part.residuals[i] = compared(o, w, near, w, near.gray, pixels, acc + MATRIX_TERMS);
     }
     for (int i = 0; i < n; i++) part.derivatives[i] = derivatives(L, part.warped[i], part.residuals[i]);
     add_rows<0, 1>(part.residuals, part.derivatives, n, acc, pull);
@@ -88,7 +98,7 @@ static void add_part(const AlignLevel& L, const LivePairs& live, const AlignOpti
 // So few bands take less time than waking the other threads.
 constexpr int FEW_BANDS = 4;
 
-static void linearise(const AlignLevel& L, const LivePairs& live, const AlignOptions* o, const double* T, double* H, double* b, double* S, double* sums) {
+static void linearise(const AlignLevel& L, const LivePairs& live, const AlignOptions* o, const AlignReadouts* times, const double* T, double* H, double* b, double* S, double* sums) {
     const Motion motion = motion_of(T);
     const int bands = (L.height + CELL - 1) / CELL, cells = (L.width + CELL - 1) / CELL;
     Buffer<double> band_sums;
@@ -104,7 +114,7 @@ static void linearise(const AlignLevel& L, const LivePairs& live, const AlignOpt
             const vf used = acc[22], read = acc[23], agreeing = acc[24];
             const int bottom = (band + 1) * CELL < L.height ? (band + 1) * CELL : L.height, right = (cell + 1) * CELL < L.width ? (cell + 1) * CELL : L.width;
             for (int y = band * CELL; y < bottom; y += PART_ROWS)
-                add_part(L, live, *o, motion, {cell * CELL, right, y, y + PART_ROWS < bottom ? y + PART_ROWS : bottom}, acc, pull);
+                (times ? add_part<true> : add_part<false>)(L, live, *o, motion, times, {cell * CELL, right, y, y + PART_ROWS < bottom ? y + PART_ROWS : bottom}, acc, pull);
             double g[6];
             for (int k = 0; k < 6; k++) { g[k] = lane_sum(pull[k]); total[21 + k] += g[k]; }
             // Two counts in one sum, exact below 2²⁴: pixels in view without a reading or agreeing, and readings.
@@ -126,14 +136,15 @@ static void linearise(const AlignLevel& L, const LivePairs& live, const AlignOpt
     memcpy(S, total + COMMON + 1, 21 * sizeof(double));
 }
 
-static void align_step(const AlignLevel* level, const AlignOptions* o, const double* T, double* H, double* b, double* S, double* sums) {
+static void align_step(const AlignLevel* level, const AlignOptions* o, const AlignReadouts* times, const double* T, double* H, double* b, double* S, double* sums) {
     static thread_local Buffer<float> memory;         // each thread that calls has its own
-    linearise(*level, side_by_side(*level, memory), o, T, H, b, S, sums);
+    linearise(*level, side_by_side(*level, memory), o, times, T, H, b, S, sums);
 }
 
+// times: null if all rows of both images were read at once.
 // Align from the coarsest level, `levels[count - 1]`, to the finest. T is the guess on input and the motion on output.
 // found: sums of the last or best iterate of the finest level. Returns the number of steps.
-static int align_images(const AlignLevel* levels, const AlignOptions* options, int count, AlignLoop o, double* T, double* found, int* degenerate) {
+static int align_images(const AlignLevel* levels, const AlignOptions* options, const AlignReadouts* times, int count, AlignLoop o, double* T, double* found, int* degenerate) {
     double normal[NORMAL_TERMS];
     static thread_local Buffer<float> memory;
     LivePairs live{};
@@ -141,7 +152,7 @@ static int align_images(const AlignLevel* levels, const AlignOptions* options, i
     for (int before = count; d.level >= 0 && o.iterations > 0;) {
         const int k = d.level;
         if (k != before) live = side_by_side(levels[before = k], memory);
-        linearise(levels[k], live, &options[k], d.T, normal, normal + 21, normal + COMMON + 1, normal + 27);
+        linearise(levels[k], live, &options[k], times, d.T, normal, normal + 21, normal + COMMON + 1, normal + 27);
         take_step(d, o, normal);
     }
     copy(d.T, 12, T);

@@ -13,4 +13,9 @@ struct AlignOptions {
     float depth_gate;                      // metres
 };
 
+// When the rows of an image were read, s after the time of its colour: depth late by `late_s`; rows take `…_rows_s` from the
+// first to the last, half of it before the middle. rate: twist (v, ω) of the camera per second, in its own axes.
+struct Readout { float rate[6], late_s, depth_rows_s, gray_rows_s; };
+struct AlignReadouts { Readout reference, live; };
+
 struct AlignLoop { int iterations; double update_stop, plateau_stop, depth_m, degenerate_share, min_pixels; };

@@ -40,6 +40,46 @@ SIGMA_INLINE Motion motion_of(const double* T) {
     return m;
 }
 
+// The motion from a reference row that was read `late_s` after its image's time, to first order: T exp(late_s · rate).
+SIGMA_INLINE Motion motion_of_row(const Motion& T, const float* rate, float late_s) {
+    const float *R = T.R, *v = rate, *w = rate + 3;
+    Motion m;
+    for (int i = 0; i < 3; i++) {
+        const float a = R[3 * i], b = R[3 * i + 1], c = R[3 * i + 2];
+        m.R[3 * i] = a + late_s * (b * w[2] - c * w[1]);
+        m.R[3 * i + 1] = b + late_s * (c * w[0] - a * w[2]);
+        m.R[3 * i + 2] = c + late_s * (a * w[1] - b * w[0]);
+        m.t[i] = T.t[i] + late_s * (a * v[0] + b * v[1] + c * v[2]);
+    }
+    return m;
+}
+SIGMA_INLINE Motion motion_of_depth_row(const AlignPinhole& L, const Motion& T, const Readout& r, int y) {
+    return motion_of_row(T, r.rate, r.late_s + r.depth_rows_s * ((y + 0.5f) / L.height - 0.5f));
+}
+SIGMA_INLINE Motion motion_of_gray_row(const AlignPinhole& L, const Motion& T, const Readout& r, int y) {
+    return motion_of_row(T, r.rate, r.gray_rows_s * ((y + 0.5f) / L.height - 0.5f));
+}
+// Live rows that are read one after another while the camera moves: moves a position in the live camera from the time of the
+// image to the time of the row that shows it.
+struct RowByRow {
+    const float* rate;
+    float first_s, rows_s, fy, cy;         // when the first row is read; from it to the last, over the height
+    void operator()(vf& x, vf& y, vf& z) const {
+        const float *v = rate, *w = rate + 3;
+        const vf row = fy * (y / max(z, splat(0.05f))) + cy, late_s = fma(row, splat(rows_s), splat(first_s));
+        const vf dx = v[0] + (w[1] * z - w[2] * y), dy = v[1] + (w[2] * x - w[0] * z), dz = v[2] + (w[0] * y - w[1] * x);
+        x = x - late_s * dx;
+        y = y - late_s * dy;
+        z = z - late_s * dz;
+    }
+};
+SIGMA_INLINE RowByRow depth_rows(const AlignPinhole& L, const Readout& r) {
+    return {r.rate, r.late_s - 0.5f * r.depth_rows_s, r.depth_rows_s / L.height, L.fy, L.cy + 0.5f};
+}
+SIGMA_INLINE RowByRow gray_rows(const AlignPinhole& L, const Readout& r) {
+    return {r.rate, -0.5f * r.gray_rows_s, r.gray_rows_s / L.height, L.fy, L.cy + 0.5f};
+}
+
 // The number of a cell's pixels that both cameras see: those in view, unless live depth has a large hole there. Holes
 // that are scattered do not matter as long as a quarter of the pixels fall on a reading.
 inline double common_pixels(double in_view, double read) { return in_view < 4.0 * read ? in_view : 4.0 * read; }
@@ -50,9 +90,12 @@ struct Neighbours { vf gray[4], depth[4]; };
 // Reference pixels in the live camera: position (px, py, pz), 1 / pz, and the live pixel `at` up and left of them, with the
 // shares (a, c) of the one to its right and the one below. ok: lanes that are used.
 struct Warped { vf px, py, pz, iz, a, c; vi at; Mask ok; };
-// off_x, off_y: position relative to the principal point. inside: lanes that are pixels of the image. Returns whether any
-// lane is used.
-SIGMA_INLINE bool warp(const AlignPinhole& L, const Motion& T, vf d, vf off_x, float off_y, Mask inside, Warped& w) {
+// A live image whose rows were all read at its time.
+struct AtOnce { void operator()(vf&, vf&, vf&) const {} };
+// off_x, off_y: position relative to the principal point. inside: lanes that are pixels of the image. read: moves positions
+// from the live camera at the time of its image to that at the time of their row. Returns whether any lane is used.
+template <class Read>
+SIGMA_INLINE bool warp(const AlignPinhole& L, const Motion& T, vf d, vf off_x, float off_y, Mask inside, const Read& read, Warped& w) {
     const float *R = T.R, *t = T.t;
     w.ok = both(inside, gt(d, splat(0.f)));
     if (!any(w.ok)) return false;
@@ -60,6 +103,7 @@ SIGMA_INLINE bool warp(const AlignPinhole& L, const Motion& T, vf d, vf off_x, f
     w.px = R[0] * X + (R[1] * Y + (R[2] * d + t[0]));
     w.py = R[3] * X + (R[4] * Y + (R[5] * d + t[1]));
     w.pz = R[6] * X + (R[7] * Y + (R[8] * d + t[2]));
+    read(w.px, w.py, w.pz);
     w.ok = both(w.ok, gt(w.pz, splat(0.05f)));
     w.iz = 1.f / max(w.pz, splat(0.05f));
     vf u = L.fx * (w.px * w.iz) + L.cx, v = L.fy * (w.py * w.iz) + L.cy;
@@ -78,11 +122,12 @@ struct ReferencePixels { vf gray, weight_gray, weight_depth, noise; };   // 1 wi
 // Residuals of gray and depth, their weights, and the derivatives of the live images.
 struct Residuals { vf gray, depth, weight_gray, weight_depth, gray_dx, gray_dy, depth_dx, depth_dy; };
 
-// Compare warped pixels with the live images, of which `near` are the neighbours. Adds to sums [4].
-SIGMA_INLINE Residuals compared(const AlignOptions& o, const Warped& w, const Neighbours& near, const ReferencePixels& pixels, vf* sums) {
-    const vf *g = near.gray, d00 = near.depth[0], d10 = near.depth[1], d01 = near.depth[2], d11 = near.depth[3];
+// Compare warped pixels with the live images, of which `near` are the neighbours; gray can be warped by itself (`wg`, with
+// neighbours g). Adds to sums [4].
+SIGMA_INLINE Residuals compared(const AlignOptions& o, const Warped& w, const Neighbours& near, const Warped& wg, const vf* g, const ReferencePixels& pixels, vf* sums) {
+    const vf d00 = near.depth[0], d10 = near.depth[1], d01 = near.depth[2], d11 = near.depth[3];
     const Mask ok = w.ok;
-    const Bilinear I = interpolate(g[0], g[1], g[2], g[3], w.a, w.c);
+    const Bilinear I = interpolate(g[0], g[1], g[2], g[3], wg.a, wg.c);
     Bilinear D = interpolate(d00, d10, d01, d11, w.a, w.c);
     vf nearest = min(min(d00, d10), min(d01, d11));
     const vf farthest = max(max(d00, d10), max(d01, d11));
@@ -99,7 +144,7 @@ SIGMA_INLINE Residuals compared(const AlignOptions& o, const Warped& w, const Ne
     // No derivative is used where the neighbours do not determine it or contain a depth step. Without live depth only
     // colour is used.
     const Mask smooth = both(both(agrees, planar), gt(0.03f * w.pz, farthest - nearest));
-    const Mask color_ok = both(ok, mask_or(agrees, mask_not(read)));
+    const Mask color_ok = both(both(ok, wg.ok), mask_or(agrees, mask_not(read)));
     // Sensor noise grows with z², unless readings have their own.
     const vf hd = splat(o.huber_depth_relative) * w.pz * w.pz * max(pixels.noise, splat(1e-3f));
     const vf wi = only(color_ok, pixels.weight_gray * (o.weight_color / (o.huber_gray * o.huber_gray)) * huber_weight(r_gray, splat(o.huber_gray)));

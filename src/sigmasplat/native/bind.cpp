@@ -68,15 +68,17 @@ struct Level {
     std::vector<float> intrinsics;
     AlignOptions options;
     Maybe<ConstFloats> noise;
+    std::optional<AlignReadouts> readouts;
 
     Level(ConstFloats rg, ConstFloats rd, Maybe<ConstFloats> wg, Maybe<ConstFloats> wd, ConstFloats lg, ConstFloats ld, std::vector<float> camera, std::vector<float> o,
-          Maybe<ConstFloats> noise_factor)
-        : reference_gray(rg), reference_depth(rd), weight_gray(wg), weight_depth(wd), live_gray(lg), live_depth(ld), intrinsics(camera), noise(noise_factor) {
+          Maybe<ConstFloats> noise_factor, const std::vector<float>& read)
+        : reference_gray(rg), reference_depth(rd), weight_gray(wg), weight_depth(wd), live_gray(lg), live_depth(ld), intrinsics(camera), noise(noise_factor), readouts(readouts_of(read)) {
         need(camera.size() == 4 && o.size() == 5, "a level has 4 intrinsics and 5 options");
         need(rg.ndim() == 2 && rd.size() == rg.size() && lg.size() == rg.size() && ld.size() == rg.size()
              && (!wg || wg->size() == rg.size()) && (!wd || wd->size() == rg.size()) && (!noise || noise->size() == rg.size()), "the planes of a level are of one size");
         options = {o[0], o[1], o[2], o[3], o[4]};
     }
+    const AlignReadouts* read() const { return readouts ? &*readouts : nullptr; }
     AlignLevel planes() const {
         return {{reference_gray.data(), reference_depth.data(), weight_gray ? weight_gray->data() : nullptr, weight_depth ? weight_depth->data() : nullptr,
                  live_gray.data(), live_depth.data(), noise ? noise->data() : nullptr},
@@ -304,14 +306,14 @@ NB_MODULE(_core, m) {
         mesh_depth({u.data(), v.data(), z.data(), faces.data(), faces.shape(0)}, width, height, near_m, depth.data(), face.data());
     });
     nb::class_<Level>(m, "Level")
-        .def(nb::init<ConstFloats, ConstFloats, Maybe<ConstFloats>, Maybe<ConstFloats>, ConstFloats, ConstFloats, std::vector<float>, std::vector<float>, Maybe<ConstFloats>>(),
+        .def(nb::init<ConstFloats, ConstFloats, Maybe<ConstFloats>, Maybe<ConstFloats>, ConstFloats, ConstFloats, std::vector<float>, std::vector<float>, Maybe<ConstFloats>, std::vector<float>>(),
              nb::arg("reference_gray"), nb::arg("reference_depth"), nb::arg("weight_gray").none(), nb::arg("weight_depth").none(), nb::arg("live_gray"),
-             nb::arg("live_depth"), nb::arg("intrinsics"), nb::arg("options"), nb::arg("noise").none() = nb::none());
+             nb::arg("live_depth"), nb::arg("intrinsics"), nb::arg("options"), nb::arg("noise").none() = nb::none(), nb::arg("readouts") = std::vector<float>());
     m.def("align_step", [](const Level& level, Doubles T, Doubles H, Doubles b, Doubles S, Doubles sums) {
         need(T.size() >= 12 && H.size() == 21 && b.size() == 6 && S.size() == 21 && sums.size() == 5, "align_step: wrong sizes");
         const AlignLevel planes = level.planes();
         nb::gil_scoped_release unlocked;
-        active->align_step(&planes, &level.options, T.data(), H.data(), b.data(), S.data(), sums.data());
+        active->align_step(&planes, &level.options, level.read(), T.data(), H.data(), b.data(), S.data(), sums.data());
     });
     m.def("align_images", [](const std::vector<Level*>& levels, int iterations, double update_stop, double plateau_stop, double depth_m, double degenerate_share,
                              double min_pixels, Doubles T, Doubles sums) {
@@ -322,7 +324,7 @@ NB_MODULE(_core, m) {
         int degenerate = 6, steps;
         {
             nb::gil_scoped_release unlocked;
-            steps = active->align_images(planes.data(), options.data(), int(planes.size()), {iterations, update_stop, plateau_stop, depth_m, degenerate_share, min_pixels},
+            steps = active->align_images(planes.data(), options.data(), levels[0]->read(), int(planes.size()), {iterations, update_stop, plateau_stop, depth_m, degenerate_share, min_pixels},
                                          T.data(), sums.data(), &degenerate);
         }
         return std::make_pair(steps, degenerate);

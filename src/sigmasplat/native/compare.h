@@ -97,7 +97,37 @@ static void judge(Point* points, int64_t count, int64_t comparable, int64_t live
     memcpy(found, values, sizeof values);
 }
 
-static bool compare(ComparedImages c, const double* T, CompareRules o, double* found) {
+// Move a position in a camera by its motion in `late_s`, to first order.
+struct Position { double x, y, z; };
+SIGMA_INLINE Position moved(const Position& p, const float* rate, double late_s) {
+    const float *v = rate, *w = rate + 3;
+    return {p.x + late_s * (v[0] + w[1] * p.z - w[2] * p.y), p.y + late_s * (v[1] + w[2] * p.x - w[0] * p.z), p.z + late_s * (v[2] + w[0] * p.y - w[1] * p.x)};
+}
+SIGMA_INLINE Position transformed(const double* T, const Position& p) {
+    return {T[0] * p.x + T[1] * p.y + T[2] * p.z + T[3], T[4] * p.x + T[5] * p.y + T[6] * p.z + T[7], T[8] * p.x + T[9] * p.y + T[10] * p.z + T[11]};
+}
+struct Pixel { double column, row; };
+SIGMA_INLINE Pixel projected(const ComparedImages& c, const Position& p) {
+    const double ahead = p.z > 1e-3 ? p.z : 1e-3;
+    return {c.fx * p.x / ahead + c.cx, c.fy * p.y / ahead + c.cy};
+}
+SIGMA_INLINE bool in_view(const ComparedImages& c, const Position& p, const Pixel& at) {
+    return p.z > 0.05 && at.column >= 0 && at.row >= 0 && at.column < c.width - 1 && at.row < c.height - 1;
+}
+SIGMA_INLINE size_t nearest_to(const ComparedImages& c, const Pixel& at) {
+    const int left = int(at.column), top = int(at.row);
+    return size_t(top + (at.row - top > 0.5)) * c.width + left + (at.column - left > 0.5);
+}
+// The live position of a reference pixel whose row was read late: as the live row that shows it was.
+SIGMA_INLINE Position read_late(const ComparedImages& c, const double* T, const Position& p, int v, const AlignReadouts& r, bool depth) {
+    const auto late_s = [&](const Readout& image, double row) {
+        return (depth ? image.late_s : 0.f) + (depth ? image.depth_rows_s : image.gray_rows_s) * ((row + 0.5) / c.height - 0.5);
+    };
+    const Position live = transformed(T, moved(p, r.reference.rate, late_s(r.reference, v)));
+    return moved(live, r.live.rate, -late_s(r.live, projected(c, live).row));
+}
+
+static bool compare(ComparedImages c, const double* T, const AlignReadouts* readouts, CompareRules o, double* found) {
     const double scale = noise_scale(c.live_depth, c.width, c.height, o);
     static thread_local Buffer<Point> found_points;
     Point* points = found_points.reserve(size_t((c.height + o.step - 1) / o.step) * ((c.width + o.step - 1) / o.step));
@@ -109,19 +139,24 @@ static bool compare(ComparedImages c, const double* T, CompareRules o, double* f
             const double z = c.reference_depth[at];
             if (!(z > 0.0)) continue;
             readings++;
-            const double X = (u - c.cx) / c.fx * z, Y = (v - c.cy) / c.fy * z;
-            const double x = T[0] * X + T[1] * Y + T[2] * z + T[3], y = T[4] * X + T[5] * Y + T[6] * z + T[7], seen = T[8] * X + T[9] * Y + T[10] * z + T[11];
-            const double ahead = seen > 1e-3 ? seen : 1e-3, column = c.fx * x / ahead + c.cx, row = c.fy * y / ahead + c.cy;
-            if (!(seen > 0.05 && column >= 0 && row >= 0 && column < c.width - 1 && row < c.height - 1)) continue;
+            const Position point = {(u - c.cx) / c.fx * z, (v - c.cy) / c.fy * z, z};
+            const Position live = readouts ? read_late(c, T, point, v, *readouts, true) : transformed(T, point);
+            const Pixel pixel = projected(c, live);
+            if (!in_view(c, live, pixel)) continue;
             inside++;
-            const int left = int(column), top = int(row);
-            const double difference = nearest_difference(c, o, left, top, seen);
+            const int left = int(pixel.column), top = int(pixel.row);
+            const double difference = nearest_difference(c, o, left, top, live.z);
             if (!(__builtin_fabs(difference) < __builtin_inf())) {
                 hidden += c.live_depth[size_t(top) * c.width + left] >= float(o.hidden_m);
                 continue;
             }
-            const size_t nearest = size_t(top + (row - top > 0.5)) * c.width + left + (column - left > 0.5);
-            points[count++] = {difference, noise_m(seen, o) * scale, c.reference_gray[at], c.live_gray[nearest]};
+            Pixel gray = pixel;
+            if (readouts) {
+                const Position seen = read_late(c, T, point, v, *readouts, false);
+                if (in_view(c, seen, projected(c, seen))) gray = projected(c, seen);
+            }
+            const size_t nearest = nearest_to(c, gray);
+            points[count++] = {difference, noise_m(live.z, o) * scale, c.reference_gray[at], c.live_gray[nearest]};
         }
     if (readings < o.least_pixels || inside < o.least_pixels || count < o.least_pixels) return false;
     judge(points, count, readings - hidden, live_readings, o, found);

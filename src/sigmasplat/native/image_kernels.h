@@ -7,6 +7,8 @@
 
 namespace sigmasplat {
 
+#include "align_level.h"
+
 // Which pixels of a depth image each row (or column) of the resized image reads. nearest: the one whose centre is
 // nearest; first, second, share: the two around the centre, and the weight of the second one.
 struct ResizedAxis { int size, source; const int *nearest, *first, *second; const float* share; };
@@ -43,8 +45,8 @@ struct ImageKernels {
     // differ by step_m or more.
     void (*halve_depth)(const float* depth, int width, int height, float step_m, float* half);
     double (*noise_scale)(const float* depth, int width, int height, CompareRules);
-    // Returns false if too few pixels can be compared.
-    bool (*compare)(ComparedImages, const double* T_live_reference, CompareRules, double* found);
+    // Returns false if too few pixels can be compared. readouts: null if all rows of both images were read at once.
+    bool (*compare)(ComparedImages, const double* T_live_reference, const AlignReadouts* readouts, CompareRules, double* found);
     // Writes 1 for each point that the image sees through, else 0.
     void (*free_places)(PointColumns, const double* T_camera_points, DepthImage, FreeRules, uint8_t* free);
 };

@@ -86,7 +86,7 @@ inline int cells_of(const AlignLevel& L) { return (L.width + CELL - 1) / CELL * 
 
 // Store the sums of one cell's pixels in the order of NORMAL_TERMS: float within a warp, double across warps. All
 // threads must call this.
-inline void store_cell(const AlignLevel& L, const AlignOptions& o, const double* T, int cell, double* stored) {
+inline void store_cell(const AlignLevel& L, const AlignOptions& o, const AlignReadouts* times, const double* T, int cell, double* stored) {
     __shared__ float of_warps[WARPS][FLOATS];
     __shared__ double of_cell[FLOATS];
     const int thread = int(threadIdx.x), cells_x = (L.width + CELL - 1) / CELL;
@@ -96,10 +96,16 @@ inline void store_cell(const AlignLevel& L, const AlignOptions& o, const double*
         const size_t at = size_t(y) * L.width + x;
         const ReferencePixels pixel = {L.reference_gray[at], L.weight_gray ? L.weight_gray[at] : 1.f, L.weight_depth ? L.weight_depth[at] : 1.f,
                                        L.noise ? L.noise[at] : 1.f};
-        Warped w;
-        if (warp(L, motion_of(T), L.reference_depth[at], float(x) - L.cx, float(y) - L.cy, true, w)) {
+        Warped w, gray;
+        const Motion motion = motion_of(T);
+        const float depth = L.reference_depth[at], off_x = float(x) - L.cx, off_y = float(y) - L.cy;
+        const bool used = !times ? warp(L, motion, depth, off_x, off_y, true, AtOnce{}, w)
+            : warp(L, motion_of_gray_row(L, motion, times->reference, y), depth, off_x, off_y, true, gray_rows(L, times->live), gray)
+                && warp(L, motion_of_depth_row(L, motion, times->reference, y), depth, off_x, off_y, true, depth_rows(L, times->live), w);
+        if (used) {
             const LivePlanes live = {L.live_gray, L.live_depth, L.width};
-            const Residuals r = compared(o, w, neighbours(live, w.at), pixel, terms + MATRIX_TERMS);
+            const Neighbours near = neighbours(live, w.at), of_gray = times ? neighbours(live, gray.at) : near;
+            const Residuals r = compared(o, w, near, times ? gray : w, of_gray.gray, pixel, terms + MATRIX_TERMS);
             const Derivatives J = derivatives(L, w, r);
             add_rows<0, 6>(&r, &J, 1, terms, terms + PULL);
         }
@@ -131,13 +137,13 @@ inline void store_cell(const AlignLevel& L, const AlignOptions& o, const double*
 
 // Store a cell's sums. The last block to arrive adds all cells in order to `total` and returns true. arrived: 0 before
 // and after. All threads must call this.
-inline bool add_cells(const AlignLevel& L, const AlignOptions& o, const double* T, int cell, double* of_cells, unsigned* arrived,
-                      double* total) {
+inline bool add_cells(const AlignLevel& L, const AlignOptions& o, const AlignReadouts* times, const double* T, int cell,
+                      double* of_cells, unsigned* arrived, double* total) {
     constexpr int GROUPS = THREADS / NORMAL_TERMS;
     __shared__ bool last;
     __shared__ double of_groups[GROUPS * NORMAL_TERMS];
     const int thread = int(threadIdx.x), cells = cells_of(L);
-    store_cell(L, o, T, cell, of_cells + size_t(cell) * NORMAL_TERMS);
+    store_cell(L, o, times, T, cell, of_cells + size_t(cell) * NORMAL_TERMS);
     __threadfence();                       // make this thread's data visible before the block is counted
     __syncthreads();
     if (thread == 0) last = atomicAdd(arrived, 1u) == unsigned(cells) - 1u;
@@ -163,15 +169,15 @@ inline bool add_cells(const AlignLevel& L, const AlignOptions& o, const double* 
 constexpr int MOTIONS = 13;                // maximum of one launch: one motion, and six steps in both directions
 struct Motions { double T[MOTIONS][12]; };
 
-// Linearise a level at several motions, with one block per cell and motion: found [motions, NORMAL_TERMS], of_cells
+// Linearise a level at several motions, with one block per cell and motion; timed: whether `readouts` are known: found [motions, NORMAL_TERMS], of_cells
 // [motions, cells, NORMAL_TERMS], arrived [motions].
-KERNEL normal_equations(AlignPlanes planes, AlignPinhole pinhole, AlignOptions options, Motions motions, double* of_cells,
-                        unsigned* arrived, double* found) {
+KERNEL normal_equations(AlignPlanes planes, AlignPinhole pinhole, AlignOptions options, AlignReadouts readouts, int timed,
+                        Motions motions, double* of_cells, unsigned* arrived, double* found) {
     __shared__ double total[NORMAL_TERMS];
     const AlignLevel level = {planes, pinhole};
     const int cells = cells_of(level), motion = int(blockIdx.x) / cells;
     double* stored = of_cells + size_t(motion) * cells * NORMAL_TERMS;
-    if (add_cells(level, options, motions.T[motion], int(blockIdx.x) % cells, stored, arrived + motion, total) && threadIdx.x < NORMAL_TERMS)
+    if (add_cells(level, options, timed ? &readouts : nullptr, motions.T[motion], int(blockIdx.x) % cells, stored, arrived + motion, total) && threadIdx.x < NORMAL_TERMS)
         found[motion * NORMAL_TERMS + int(threadIdx.x)] = total[threadIdx.x];
 }
 
@@ -192,11 +198,11 @@ KERNEL begin_alignment(AlignState* state, AlignLoop loop, Guess guess, int level
 }
 
 // Take a step on a level, unless the level is finished. of_cells [cells, NORMAL_TERMS], arrived [1].
-KERNEL take_align_step(AlignPlanes planes, AlignPinhole pinhole, AlignOptions options, int number, AlignState* state,
-                       double* of_cells, unsigned* arrived) {
+KERNEL take_align_step(AlignPlanes planes, AlignPinhole pinhole, AlignOptions options, AlignReadouts readouts, int timed,
+                       int number, AlignState* state, double* of_cells, unsigned* arrived) {
     __shared__ double total[NORMAL_TERMS];
     if (state->descent.level != number) return;
-    if (add_cells({planes, pinhole}, options, state->descent.T, int(blockIdx.x), of_cells, arrived, total) && threadIdx.x == 0)
+    if (add_cells({planes, pinhole}, options, timed ? &readouts : nullptr, state->descent.T, int(blockIdx.x), of_cells, arrived, total) && threadIdx.x == 0)
         take_step(state->descent, state->loop, total);
 }
 

@@ -30,6 +30,8 @@ CELL = 16
 """Width and height of a cell in pixels; one block of threads processes one cell (native/align_pixel.h)."""
 MOTIONS = 13
 """Maximum number of motions that one launch linearises."""
+READOUTS = 18
+"""Numbers of the readouts of both images (native/align_level.h)."""
 PINHOLE = np.dtype([("size", "i4", 2), ("intrinsics", "f4", 4)])
 LOOP = np.dtype(
     [
@@ -60,7 +62,7 @@ class CudaLevel:
     def __init__(
         self, reference_gray: Tensor, reference_depth: Tensor, weight_gray: Tensor | None, weight_depth: Tensor | None,
         live_gray: Tensor, live_depth: Tensor, intrinsics: Sequence[float], options: Sequence[float],
-        noise: Tensor | None = None,
+        noise: Tensor | None = None, readouts: Sequence[float] = (),
     ) -> None:  # fmt: skip
         self.planes = (reference_gray, reference_depth, weight_gray, weight_depth, live_gray, live_depth, noise)
         given = [plane for plane in self.planes if plane is not None]
@@ -69,6 +71,7 @@ class CudaLevel:
         height, width = reference_gray.shape
         self.pinhole = np.array(((width, height), intrinsics), PINHOLE)
         self.options = np.array(options, np.float32)
+        self.readouts = np.array(readouts if len(readouts) else np.zeros(READOUTS), np.float32), len(readouts) > 0
         self.cells = -(-width // CELL) * -(-height // CELL)
         self.device = reference_gray.device
 
@@ -80,8 +83,8 @@ class CudaLevel:
         of_cells, arrived = _workspace(n, self.cells, self.device)
         found = torch.empty(n, NORMAL_TERMS, dtype=torch.float64, device=self.device)
         cuda_launch.launcher_for(self.device)(
-            ALIGNING, "normal_equations", n * self.cells, self.planes, self.pinhole, self.options, given, of_cells,
-            arrived, found,
+            ALIGNING, "normal_equations", n * self.cells, self.planes, self.pinhole, self.options,
+            *self.readouts, given, of_cells, arrived, found,
         )  # fmt: skip
         return np.asarray(found.cpu().numpy())
 
@@ -109,7 +112,7 @@ def align(planes: Sequence[LevelPlanes], readings: Tensor, T_live_reference: Mat
     of_cells, arrived = _workspace(1, max(level.cells for level in levels), device)
     launch(ALIGNING, "begin_alignment", 1, state, np.array(loop, LOOP), guess, len(levels), readings)
     for number, level in reversed(list(enumerate(levels))):
-        given = (level.planes, level.pinhole, level.options, number, state, of_cells, arrived)
+        given = (level.planes, level.pinhole, level.options, *level.readouts, number, state, of_cells, arrived)
         for _ in range(r.iterations):
             launch(ALIGNING, "take_align_step", level.cells, *given)
     return _pose_of(state.cpu().numpy().view(STATE)[0])
