@@ -94,12 +94,12 @@ def score_views(run: RunFolder, frames: RunFrames, source: Source) -> dict[str, 
     renderer = FieldRenderer(config.render, config.backend)
     T_submap_camera = np.asarray(run.read_checkpoint()[0]["T_submap_camera"], np.float64)
     chosen = evenly_spread([record for record in frames.posed_log() if not record["is_keyframe"]], VIEWS)
-    found = []
+    found, readouts = [], frames.readouts(run.facts())
     for submap, records in groupby(sorted(chosen, key=lambda r: r["submap"]), key=lambda r: r["submap"]):
         field = run.submaps.load(submap).field
         for record in records:
             try:
-                frame = working_frame(source, config.input, record["index"])
+                frame = working_frame(source, config.input, record["index"], readouts)
             except SourceError:
                 continue
             rendered = renderer(field, frame.camera, se3.inverse(T_submap_camera[record["row"]]))

@@ -14,6 +14,7 @@ from sigmasplat.config.find_preset import default_preset, preset
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.frame import Frame, PosePrior
+from sigmasplat.data.readout import SensorTimes
 from sigmasplat.fit.pose import fit_pose_align
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference, keyframe_reference, live_image, map_reference
@@ -24,6 +25,7 @@ from sigmasplat.render.reference import ReferenceView
 from sigmasplat.render.view import View
 from sigmasplat.run_folder.state import read_state, write_state
 from sigmasplat.tracking.moving import dynamic_detector
+from sigmasplat.tracking.pose_prediction import CameraMotion
 from sigmasplat.tracking.pose_validation import TrackingStatistics
 from sigmasplat.tracking.predicted_depth_fit import DepthFit, DepthShape
 from sigmasplat.tracking.prepared_frame import PreparedFrame
@@ -149,6 +151,8 @@ def test_what_a_tracker_remembers_is_kept_and_read_back(tmp_path: Path) -> None:
         Tracker(CONFIGS["V"], keyframe=kept),
         (
             Tracker,
+            CameraMotion,
+            SensorTimes,
             PosePrior,
             Reference,
             Pyramid,

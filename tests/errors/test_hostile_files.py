@@ -251,8 +251,8 @@ def test_a_folder_that_may_not_be_read(tmp_path: Path) -> None:
     assert str(path) in refused(path)
 
 
-def test_a_path_that_is_too_long_or_has_nul_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
-    for arguments in (["inspect", "a" * 5000], ["run", "synthetic:frames=1", "--out", "a\0b"], ["run", "x" * 300]):
+def test_a_path_that_is_too_long_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    for arguments in (["inspect", "a" * 5000], ["run", "x" * 300]):
         with pytest.raises(SystemExit) as left:
             cli.main(arguments)
         said = capsys.readouterr().err

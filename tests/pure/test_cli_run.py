@@ -26,6 +26,7 @@ from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.mesh import Mesh
+from sigmasplat.data.readout import UNKNOWN_TIMES
 from sigmasplat.data.submap import SubmapStore
 from sigmasplat.data.trajectory import Component, Trajectory
 from sigmasplat.errors import SigmaSplatError, SourceError
@@ -119,7 +120,7 @@ class MadeUpSlam:
         self.config, self.store = config, store
         self.loops: list[MadeUpLoop] = []
         self.finished = 0
-        self.uncertainty, self.refinement_steps = None, None
+        self.uncertainty, self.refinement_steps, self.sensor_times = None, None, UNKNOWN_TIMES
         self.field = GaussianField.from_values(torch.rand(2, 3), torch.full((2,), 0.1), torch.rand(2, 3))
         self.steps: list[MadeUpStep] = []
         MadeUpSlam.latest = self

@@ -129,6 +129,9 @@ class InputConfig(Section, name="input"):
     """Model of the standard deviation of depth readings: that of a sensor (`config.input`); generic = the law of
     `render.depth_noise_per_m`; rendered = the same law, with an exact calibration and exact times; auto = that of the
     sensor if the source knows it, otherwise generic."""
+    calibrate: Literal["auto", "off"] = "auto"
+    """Whether it is measured from the keyframes when the sensor reads depth and rows (rolling shutter), and corrected;
+    not for rendered images, and only where keyframes are aligned to each other."""
     denoise_depth: bool = True
     """Whether depth images that are noisier than those of a structured-light sensor are smoothed."""
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from sigmasplat.data import se3
 from sigmasplat.data.camera import between
 from sigmasplat.data.poses import Column, KeyframePoses, Place, Places, Poses
+from sigmasplat.data.readout import STILL, Reading, Readings
 from sigmasplat.data.relative_pose import UNKNOWN_HOP, RelativePose, SolvedGraph, TrackedHops
 from sigmasplat.types import Matrix
 
@@ -20,7 +21,8 @@ class Atlas:
     anchors: T_world_submap of each submap, the first one the identity; closing a loop changes only these.
     odometry: the same poses from tracking alone; no loop changes them.
     keyframe_poses: T_submap_camera of each submap's keyframes; those of the last submap change while it is mapped.
-    hops: one per keyframe: how tracking found it from the keyframe before it in the submap. places: one per frame.
+    hops: one per keyframe: how tracking found it from the keyframe before it in the submap; readings: how its camera
+    moved. places: one per frame.
     refined: T_submap_camera of the keyframes of each submap in the final map, as the graph of keyframes and refinement
     have moved them; the world poses of keyframes and of their frames then come from these.
     graph: of the keyframes of the world, once it is solved. follows: whether keyframes move while the graph grows.
@@ -33,6 +35,7 @@ class Atlas:
     odometry: Poses = field(default_factory=Poses)
     keyframe_poses: KeyframePoses = field(default_factory=KeyframePoses)
     hops: TrackedHops = field(default_factory=TrackedHops)
+    readings: Readings = field(default_factory=Readings)
     places: Places = field(default_factory=Places)
     components: list[int] = field(default_factory=list)
     refined: dict[int, list[Matrix]] = field(default_factory=dict)
@@ -58,10 +61,12 @@ class Atlas:
         self.keyframe_poses.begin(keyframe_poses)
         for _ in keyframe_poses:
             self.hops.append(UNKNOWN_HOP)
+            self.readings.append(STILL)
 
-    def set_keyframes(self, keyframe_poses: list[Matrix], hop: RelativePose) -> None:
+    def set_keyframes(self, keyframe_poses: list[Matrix], hop: RelativePose, reading: Reading = STILL) -> None:
         """Set T_submap_camera [4, 4] of the last submap's keyframes, with a new one at the end, and the hop to it."""
         self.hops.append(hop)
+        self.readings.append(reading)
         self.keyframe_poses.newest = keyframe_poses
 
     def join(self, a: int, b: int, T_a_b: Matrix) -> None:
@@ -83,7 +88,7 @@ class Atlas:
     @property
     def columns(self) -> tuple[Column, ...]:
         """Return what grows with every frame or keyframe."""
-        return self.keyframe_poses.rows, self.hops.rows, self.places.rows
+        return self.keyframe_poses.rows, self.hops.rows, self.readings.rows, self.places.rows
 
     @property
     def in_world(self) -> NDArray[np.bool_]:

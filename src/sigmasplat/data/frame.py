@@ -52,7 +52,8 @@ class Frame:
     (`ignored_by` resamples them) whose colour is not used either, None = none; they have no depth; T_given_camera
     [4, 4]: pose of the camera in fixed axes, metres, which is used as it is; None = the pose is estimated. Only the
     motion between two frames is used; specific_force_m_s2 [3]: measured by an accelerometer along the camera's axes,
-    9.81 upwards at rest, from which a run finds the vertical direction; None = not measured. The frame keeps read-only
+    9.81 upwards at rest, from which a run finds the vertical direction; None = not measured; depth_late_s: time of the
+    depth image after the colour image, as the files say. The frame keeps read-only
     views of the arrays and does not copy them: do not write to them later (`frame_from_arrays` copies). Raises
     SourceError if an array is not float32, on inconsistent shapes, values that are not finite, colour in 0…255,
     negative depth, a matrix that is not a rotation, a pose that is not rigid, or a force that is not three finite
@@ -68,6 +69,7 @@ class Frame:
     ignored: NDArray[np.bool_] | None = None
     T_given_camera: Matrix | None = None
     specific_force_m_s2: NDArray[np.float64] | None = None
+    depth_late_s: float = 0.0
 
     def __post_init__(self) -> None:
         for problem in self._problems():

@@ -13,12 +13,14 @@ from numpy.typing import NDArray
 from scipy.stats import chi2 as chi2_distribution
 
 from sigmasplat.data import se3
+from sigmasplat.data.readout import UNKNOWN_TIMES, Reading, SensorTimes
 from sigmasplat.data.relative_pose import Alignments, Kind, RelativePose
 from sigmasplat.data.submap import Picture
 from sigmasplat.fit.compare import best_alignment
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import picture_images
 from sigmasplat.graph.pose_graph import PoseGraph, factorised, minimise, most_chi2
+from sigmasplat.graph.sensor_times import FIRST_MEASURED, MOST_MEASURED, Pair, measured
 from sigmasplat.render.view import View
 from sigmasplat.tracking.drift import UNKNOWN
 from sigmasplat.tracking.pose_validation import confirmed
@@ -149,10 +151,15 @@ CACHE_BYTES = 1 << 28
 
 @dataclass(eq=False)
 class GrowingGraph:
-    """Keeps the alignments of all keyframes; their nodes are rows of `Atlas.T_world_keyframes`. most: per keyframe."""
+    """Keeps the alignments of all keyframes; their nodes are rows of `Atlas.T_world_keyframes`. most: per keyframe;
+    calibrates: whether the times of the sensor are measured; times: as the alignments show them; measured: number of
+    alignments when they were last measured."""
 
     most: int
+    calibrates: bool = False
     edges: Alignments = field(default_factory=Alignments)
+    times: SensorTimes = UNKNOWN_TIMES
+    measured: int = 0
 
     def aligning(
         self,
@@ -176,6 +183,30 @@ class GrowingGraph:
             if should_stop():
                 return
             yield
+
+    def measuring(self, image: Callable[[int], Pyramid], reading: Callable[[int], Reading]) -> Task[None]:
+        """Measure when the sensor reads, in slices of one pair, and then align all again. Until the images show it,
+        this is tried each time that there are twice as many alignments.
+
+        image, reading: of a row.
+        """
+        count = len(self.edges)
+        if not self.calibrates or self.times.std_s is not None or count < max(FIRST_MEASURED, 2 * self.measured):
+            return
+        self.measured = count
+        chosen = self.edges[:: -(-count // MOST_MEASURED)]
+        halves = ((image(e.b).half(), image(e.a).half(), reading(e.b), reading(e.a), e.T_a_b, e.a) for e in chosen)
+        self.times = yield from measured([Pair(*half) for half in halves])
+        if self.times.std_s is None:
+            return
+        again = Alignments()
+        again.rows.folder = self.edges.rows.folder
+        for edge in self.edges:
+            found = edge_between(edge.b, edge.a, image(edge.b), image(edge.a), edge.T_a_b)
+            if found is not None:
+                again.append(found)
+            yield
+        self.edges = again
 
     def solved(self, T_world_keyframe: Matrix, hops: Sequence[RelativePose], first: int) -> Matrix:
         """Return the poses [n, 4, 4] of the keyframes from row `first` on that agree best with their edges to each

@@ -3,7 +3,7 @@ checked before a run for a wrong unit or missing readings."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -91,7 +91,7 @@ Value = TypeVar("Value")
 
 @dataclass(frozen=True)
 class ImagePair:
-    """The colour and the depth file of one frame, and its time in seconds.
+    """The colour and the depth file of one frame, its time, and how much later the depth is, in seconds.
 
     Formats whose images are not separate files (members of an archive, frames of a video, messages of a bag) derive
     from this class and override the readers; the paths then only name the images in error messages.
@@ -100,6 +100,7 @@ class ImagePair:
     timestamp_s: float
     color: Path
     depth: Path
+    depth_late_s: float = field(default=0.0, kw_only=True)
 
     def read_color(self) -> NDArray[np.uint8]:
         """Read 8-bit RGB [H, W, 3]. Raises SourceError naming `color`."""
@@ -165,7 +166,10 @@ class RecordedSource(Source):
         color = resized_color(color, self.camera.width, self.camera.height)
         R_inertial_camera = None if self._gyroscope is None else self._gyroscope.R_inertial_camera(files.timestamp_s)
         force = None if self._accelerometer is None else self._accelerometer.at(files.timestamp_s)
-        return Frame(i, files.timestamp_s, color, depth_m, self.camera, R_inertial_camera, specific_force_m_s2=force)
+        return Frame(
+            i, files.timestamp_s, color, depth_m, self.camera, R_inertial_camera, specific_force_m_s2=force,
+            depth_late_s=files.depth_late_s,
+        )  # fmt: skip
 
     def depth_of(self, i: int) -> NDArray[np.float32]:
         files = self._images[self._checked_index(i)]

@@ -246,7 +246,7 @@ class BackEnd:
             Snapshot(
                 number, self._newest, poses, state, system.mapper.field.params.clone(), keyframe,
                 system.active_submap(), system.confidence.spread_m[-1], system.loops.copied(), number, seconds, errors,
-                correction,
+                correction, system.graph.times,
             )
         )  # fmt: skip
 

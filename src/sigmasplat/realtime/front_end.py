@@ -14,6 +14,7 @@ from torch import Tensor
 from sigmasplat.config import Config
 from sigmasplat.data import se3
 from sigmasplat.data.field import GaussianField
+from sigmasplat.data.readout import UNKNOWN_TIMES, SensorTimes
 from sigmasplat.data.trajectory import APART, RELOCALISED, TRACKED
 from sigmasplat.fit.align import Alignment
 from sigmasplat.fit.compare import Comparison
@@ -28,7 +29,7 @@ from sigmasplat.render.view import View
 from sigmasplat.slam.results import Step, StepTimer, SubmapState, make_step
 from sigmasplat.system.array_interface import Correction
 from sigmasplat.tracking.frame_estimate import FrameEstimate
-from sigmasplat.tracking.keyframe_rule import becomes_keyframe, is_held_back, is_mappable, may_validate
+from sigmasplat.tracking.keyframe_rule import becomes_keyframe, hop_alignment, is_held_back, is_mappable, may_validate
 from sigmasplat.tracking.moving.dynamic_mask import DynamicMask
 from sigmasplat.tracking.pose_validation import is_questionable
 from sigmasplat.tracking.predicted_depth_frames import fitted_keyframe, fitted_to_map
@@ -50,7 +51,7 @@ class Snapshot:
     reference of the next frames; spread_m: standard deviation of the submap's position; loops:
     all pairs tried so far; searched: number of the last frame that was searched for in the whole map; seconds: of the
     work since the snapshot before; errors: of poses relative to the newest keyframe, if the system computes them;
-    correction: of earlier poses since the snapshot before, if a function of the caller wants it.
+    correction: of earlier poses since the snapshot before, if a function of the caller wants it; times: of the sensor.
     """
 
     frame: int
@@ -66,6 +67,7 @@ class Snapshot:
     seconds: float = 0.0
     errors: PoseErrors = NO_ERRORS
     correction: Correction | None = None
+    times: SensorTimes = UNKNOWN_TIMES
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,6 +164,7 @@ class FrontEnd:
         if snapshot.searched >= self.searching:
             self.searching = -1
         self.confidence.spread_m, self.snapshot = [snapshot.spread_m], snapshot
+        self.tracker.times = snapshot.times
 
     def _found(self, snapshot: Snapshot) -> None:
         """Continue where the camera was found, or in a new map."""
@@ -218,7 +221,7 @@ class FrontEnd:
             fit, self.tracker, since, self.config.mapping, least_deg
         ):
             return None
-        alignment = self.tracker.hop(fit, seen.live)
+        alignment, seen = hop_alignment(fit, seen.live, self.tracker), seen.at_once(view, self.config)
         splats = NOTHING if self.snapshot is None else self.snapshot
         refitted = fitted_keyframe(self.tracker, splats, view, seen, estimate.T_submap_camera, connected=not self.found)
         shown = refitted.without(self.tracker.front)

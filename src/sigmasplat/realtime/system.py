@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from sigmasplat import env
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.frame import Frame
+from sigmasplat.data.readout import SensorTimes
 from sigmasplat.graph.loops import Loops
 from sigmasplat.native.threads import idle_kernel_workers, set_kernel_threads, yield_to_others
 from sigmasplat.realtime.back_end import BackEnd
@@ -268,6 +269,11 @@ class RealTime(ArrayInterface):
     def field(self) -> GaussianField:
         """Return the map, as `Slam.field`, after `settle`."""
         return self.slam.field
+
+    @property
+    def sensor_times(self) -> SensorTimes:
+        """Return when the sensor reads, as `Slam.sensor_times`, after `settle`."""
+        return self.slam.sensor_times
 
     @property
     def uncertainty(self) -> MapUncertainty | None:

@@ -11,6 +11,7 @@ from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField, Rows
 from sigmasplat.data.frame import Detail, Photo, PosePrior
 from sigmasplat.data.poses import Column, KeyframePoses, Places, Poses
+from sigmasplat.data.readout import Reading, Readings, Readout, SensorTimes
 from sigmasplat.data.relative_pose import Alignments, Edges, RelativePose, TrackedHops
 from sigmasplat.data.submap import Picture
 from sigmasplat.errors import RunError
@@ -39,6 +40,7 @@ from sigmasplat.tracking.drift import Drift
 from sigmasplat.tracking.feature_image import FeatureImage
 from sigmasplat.tracking.moving.dynamic_detector import DepthHistory, DynamicDetector, RememberedDepth
 from sigmasplat.tracking.moving.dynamic_mask import DynamicMask
+from sigmasplat.tracking.pose_prediction import CameraMotion
 from sigmasplat.tracking.pose_validation import TrackingStatistics
 from sigmasplat.tracking.predicted_depth_fit import DepthFit, DepthShape
 from sigmasplat.tracking.recovery import Recovery
@@ -46,12 +48,12 @@ from sigmasplat.tracking.relocaliser import Relocaliser
 from sigmasplat.tracking.tracker import Tracker
 
 CLASSES: tuple[type, ...] = (
-    Alignments, Atlas, Camera, Column, Confidence, DepthFit, DepthHistory, DepthShape, DescribedSubmaps, Detail, Drift,
-    DynamicDetector, DynamicMask, Edges, FeatureImage, GaussianField, GrowingGraph, Keyframe, KeyframePoses, Loop,
-    LoopCloser, Loops, Mapper, PendingSearch, Photo, Picture, Places, PosePrior, Poses, Pyramid, Recovery, Reference,
-    RelativePose,
-    Relocaliser, RememberedDepth, Rows, SecondHalf, Step, Steps, Target, TrackedHops, Tracker, TrackingStatistics,
-    ValidationView, ValidationViews, VectorAdam,
+    Alignments, Atlas, Camera, CameraMotion, Column, Confidence, DepthFit, DepthHistory, DepthShape, DescribedSubmaps,
+    Detail, Drift, DynamicDetector, DynamicMask, Edges, FeatureImage, GaussianField, GrowingGraph, Keyframe,
+    KeyframePoses, Loop, LoopCloser, Loops, Mapper, PendingSearch, Photo, Picture, Places, PosePrior, Poses, Pyramid,
+    Reading, Readings, Readout, Recovery, Reference, RelativePose, Relocaliser, RememberedDepth, Rows, SecondHalf,
+    SensorTimes, Step, Steps, Target, TrackedHops, Tracker, TrackingStatistics, ValidationView, ValidationViews,
+    VectorAdam,
 )  # fmt: skip
 """The classes that a state may contain."""
 

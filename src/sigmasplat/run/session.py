@@ -118,6 +118,7 @@ class Outcome:
     loops_refused: int = 0
     relocalised: int = 0
     apart: tuple[int, ...] = ()
+    sensor: str = ""
 
     def count(self, lost: bool, state: str, submap: int) -> None:
         """Count a frame."""
@@ -136,7 +137,7 @@ class Outcome:
         line += f", {self.frames / self.wall_s:.1f} frames/s"
         if self.submaps > 1:
             line += f", {self.submaps} submaps, loops: {self.loops_closed} closed, {self.loops_refused} refused"
-        return line
+        return line + f"; {self.sensor}" * bool(self.sensor)
 
 
 @dataclass(eq=False)
@@ -268,6 +269,8 @@ class Session:
         before, started_s = len(self.slam.loops), time.perf_counter()
         self.slam.finish(progress)
         self.run.note(finish_s=time.perf_counter() - started_s, final_steps=self.slam.refinement_steps)
+        self.run.note(**self.slam.sensor_times.noted())
+        self.outcome.sensor = self.slam.sensor_times.said()
         for callback in (*self.callbacks, *self.readers):
             callback.last_loops(self.slam.loops[before:])
 

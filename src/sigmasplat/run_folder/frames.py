@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sigmasplat.data import se3
+from sigmasplat.data.readout import Readout, SensorTimes
 from sigmasplat.data.trajectory import LOST, TRACKED, Trajectory, outside_world, states_at_end, submaps_outside
 from sigmasplat.input.imu import up_of_path
 
@@ -72,6 +74,18 @@ class RunFrames:
             self.log[row] | {"T_world_camera": T, "row": int(row), "state": self.states[row]}
             for row, T in zip(self.rows, self.path.T_world_camera, strict=True)
         ]
+
+    def readouts(self, facts: Mapping[str, Any]) -> dict[int, Readout]:
+        """Return when the rows of the valid frames were read, by their numbers in the source, as far as the run has
+        measured it (facts: run.json); the camera moves between the frames before and after."""
+        if "sensor_times" not in facts or len(self.path) < 2:
+            return {}
+        times, T, times_s = SensorTimes.of(facts["sensor_times"]), self.path.T_world_camera, self.path.timestamps_s
+        last = np.arange(len(T))
+        before, after = np.maximum(last - 1, 0), np.minimum(last + 1, len(T) - 1)
+        elapsed_s = np.maximum(times_s[after] - times_s[before], 1e-3)
+        rates = se3.log_stack(se3.inverse(T[before]) @ T[after]) / elapsed_s[:, None]
+        return {self.log[row]["index"]: Readout(rate, 0.0, times) for row, rate in zip(self.rows, rates, strict=True)}
 
     def outside(self) -> NDArray[np.bool_]:
         """Return whether each frame [F] is outside the world: apart, or lost after a frame that is apart."""

@@ -271,8 +271,8 @@ class RunFolder:
         path = self._existing("checkpoint.safetensors")
         refuse_special(path, RunError)
         if (noted := self.facts().get("checkpoint")) != _checksum(path):
-            why = "is damaged: its checksum is not that in run.json" if noted else "has no checksum in run.json"
-            raise RunError(f"checkpoint {path} {why}; {REMEDY}")
+            why = "its checksum is not that in run.json" if noted else "run.json does not have its checksum"
+            raise RunError(f"checkpoint {path} is damaged: {why}; {REMEDY}")
         with open_tensors(path, "checkpoint") as file:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
             return Tensors(tensors, path), file.metadata() or {}

@@ -13,7 +13,7 @@ from sigmasplat.graph.loops import Loop
 from sigmasplat.slam.mapping_backend import SLICES_PER_FRAME, MappingBackend
 from sigmasplat.slam.results import Step, StepTimer, make_step
 from sigmasplat.tracking.frame_estimate import FrameEstimate
-from sigmasplat.tracking.keyframe_rule import becomes_keyframe, is_held_back, is_mappable, may_validate
+from sigmasplat.tracking.keyframe_rule import becomes_keyframe, hop_alignment, is_held_back, is_mappable, may_validate
 from sigmasplat.tracking.pose_validation import is_better, is_questionable
 from sigmasplat.tracking.predicted_depth_frames import fitted_keyframe, fitted_to_map
 from sigmasplat.tracking.prepared_frame import PreparedFrame, refuse_first_without_depth
@@ -52,7 +52,8 @@ class MainLoop(MappingBackend):
         return fitted_to_map(self.tracker, self.mapper.field, view, seen) if self.steps else seen
 
     def _masked(self, seen: PreparedFrame, estimate: FrameEstimate) -> PreparedFrame:
-        """Return a keyframe as it is mapped: without what moves in front, in the exposure of the map."""
+        """Return a keyframe as it is mapped: read at once, without what moves in front, in the exposure of the map."""
+        seen = seen.at_once(self.view, self.config)
         connected, pose = len(self.steps) > 0 and estimate.state == TRACKED, estimate.T_submap_camera
         seen = fitted_keyframe(self.tracker, self.mapper.field, self.view, seen, pose, connected)
         seen = seen.without(self.tracker.front)
@@ -78,7 +79,8 @@ class MainLoop(MappingBackend):
         if not lost:
             estimate.mapped = not held_back and self._is_keyframe(fit)
             if estimate.mapped:
-                estimate.hop = self.hop_to(se3.inverse(estimate.T_submap_camera), self.tracker.hop(fit, seen.live))
+                alignment = hop_alignment(fit, seen.live, self.tracker)
+                estimate.hop = self.hop_to(se3.inverse(estimate.T_submap_camera), alignment)
                 if self.cuts:
                     estimate.drift_m = self.add_drift(estimate.T_submap_camera, estimate.hop)
             if not held_back:
@@ -122,6 +124,7 @@ class MainLoop(MappingBackend):
     def _mapped(self, seen: PreparedFrame, T_submap_camera: Matrix, hop: RelativePose = UNKNOWN_HOP) -> Matrix:
         """Map a keyframe, and track the next frames relative to it; return its pose."""
         T_submap_camera = completed(self.map_keyframe(seen, len(self.steps), T_submap_camera, hop))
+        self.tracker.times = self.graph.times
         self.tracker.keep_keyframe(self.mapper.field, self.view, seen, T_submap_camera)
         return T_submap_camera
 

@@ -11,6 +11,7 @@ import numpy as np
 from sigmasplat.config import SubmapConfig
 from sigmasplat.data import se3
 from sigmasplat.data.field import GaussianField
+from sigmasplat.data.readout import Reading
 from sigmasplat.data.relative_pose import UNKNOWN_HOP, RelativePose
 from sigmasplat.fit.align import Alignment
 from sigmasplat.fit.pyramid import Pyramid
@@ -55,20 +56,21 @@ class MappingBackend(SlamState):
         keyframe = self._keyframe(seen, index, T_submap_camera)
         if self.follows and self.mapper.keyframes:
             with self._timer.stage("graph"):
-                yield from self._align(keyframe, hop, should_stop)
+                yield from self._align(keyframe, seen.reading, hop, should_stop)
         with self._timer.stage("map"):
             fit = yield from self.mapper.mapping(self.view, keyframe, should_stop)
         self._timer.add(fit.seconds, prefix="map_")
-        return self._placed(index, hop)
+        return self._placed(index, hop, seen.reading)
 
     def keyframe_image(self, row: int) -> Pyramid:
         """Return the images of a keyframe of a finished submap; row: in `Atlas.T_world_keyframes`."""
         ends = np.cumsum(self.atlas.keyframe_poses.counts)
         submap = int(np.searchsorted(ends, row, side="right"))
         k = int(row - ends[submap] + self.atlas.keyframe_poses.counts[submap])
-        return self.images.of(row, self.view, lambda: self.store.picture(submap, k))
+        image = self.images.of(row, self.view, lambda: self.store.picture(submap, k))
+        return image.read(self.graph.times.readout(self.atlas.readings[row]))
 
-    def _align(self, keyframe: Keyframe, hop: RelativePose, should_stop: ShouldStop) -> Task[None]:
+    def _align(self, keyframe: Keyframe, reading: Reading, hop: RelativePose, should_stop: ShouldStop) -> Task[None]:
         """Align a keyframe to earlier ones that see the same, in slices, and move the newest keyframes of the active
         submap to where all agree best."""
         atlas, anchor, active = self.atlas, self.atlas.anchors[-1], [*self.mapper.keyframes, keyframe]
@@ -82,10 +84,13 @@ class MappingBackend(SlamState):
             k = row - newest - 1
             if -k > len(active):
                 return self.keyframe_image(row)
-            target = active[k].target
-            return self.images.of(row, self.view, target.picture, target.valid_pixels)
+            target, known = active[k].target, reading if k == -1 else self.atlas.readings[row]
+            image = self.images.of(row, self.view, target.picture, target.valid_pixels)
+            return image.read(self.graph.times.readout(known))
 
         yield from self.graph.aligning(T_world_keyframe, rows, image, should_stop)
+        known = [*self.atlas.readings, reading]
+        yield from self.graph.measuring(image, known.__getitem__)
         first = max(newest + 1 - WINDOW, newest + 2 - len(active))
         poses = self.graph.solved(T_world_keyframe, [*atlas.hops[first:], hop], first)
         moved = se3.orthonormalise(se3.inverse(anchor) @ poses)
@@ -95,7 +100,7 @@ class MappingBackend(SlamState):
     def add_keyframe(self, seen: PreparedFrame, index: int, T_submap_camera: Matrix, hop: RelativePose) -> Matrix:
         """Add frame number `index` to the keyframes of the active submap without fitting the map; return its pose."""
         self.mapper.add(self.view, self._keyframe(seen, index, T_submap_camera))
-        return self._placed(index, hop)
+        return self._placed(index, hop, seen.reading)
 
     def refining(self, steps: int, should_stop: ShouldStop = never) -> Task[None]:
         """Make this many of the pending steps of the active submap's keyframes, in slices, until `should_stop`
@@ -113,11 +118,11 @@ class MappingBackend(SlamState):
             photo = seen.photo(self.config)
         return Keyframe(index, seen.target, T_submap_camera, descriptor=descriptor, detail=detail, photo=photo)
 
-    def _placed(self, index: int, hop: RelativePose) -> Matrix:
+    def _placed(self, index: int, hop: RelativePose, reading: Reading) -> Matrix:
         """Write the poses of the active submap's keyframes to the atlas; return that of the newest."""
         if self.keyframe_indices[-1:] != [index]:  # a keyframe that two submaps share is counted once
             self.keyframe_indices.append(index)
-        self.atlas.set_keyframes([keyframe.T_world_camera for keyframe in self.mapper.keyframes], hop)
+        self.atlas.set_keyframes([keyframe.T_world_camera for keyframe in self.mapper.keyframes], hop, reading)
         return self.atlas.keyframe_poses.last[-1]
 
     def hop_to(self, T_camera_submap: Matrix, alignment: Alignment | None) -> RelativePose:

@@ -7,11 +7,13 @@ import torch
 from numpy.typing import NDArray
 
 from sigmasplat.config import Config
+from sigmasplat.config.input import RENDERED
 from sigmasplat.data.atlas import Atlas
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.poses import Column
+from sigmasplat.data.readout import SensorTimes
 from sigmasplat.data.submap import GrowingStore, MemoryStore, OnDisk, SubmapStore
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SourceError
@@ -56,7 +58,7 @@ class SlamState:
         self.descriptor = make_descriptor(self.config.loops)
         self.closer = LoopCloser(self.config, self.store, self.tracker.extractor)
         self.recovery = Recovery(self.config.recovery)
-        self.graph, self.images = GrowingGraph(self.config.loops.alignments), KeyframeImages()
+        self.graph, self.images = self._new_graph(), KeyframeImages()
         self.confidence = Confidence()
         self.relocaliser = Relocaliser(self.config, self.extractor)
         self.steps = Steps()
@@ -73,6 +75,11 @@ class SlamState:
         if not len(self.store):
             return self.mapper.field.to(HOST)
         return merged_field(self.store, self.atlas, 0, self.mapper.field)
+
+    @property
+    def sensor_times(self) -> SensorTimes:
+        """Return when the sensor reads depth and rows, as far as the keyframes have shown it."""
+        return self.graph.times
 
     def active_submap(self) -> SubmapState:
         """Return a copy of the active submap's state, as steps report it."""
@@ -166,6 +173,10 @@ class SlamState:
         """Return whether keyframes are aligned to each other, and the map follows their graph."""
         c = self.config
         return c.loops.close and c.final.move_poses and not c.input.poses
+
+    def _new_graph(self) -> GrowingGraph:
+        i = self.config.input
+        return GrowingGraph(self.config.loops.alignments, i.calibrate == "auto" and i.sensor != RENDERED)
 
     @property
     def _describes(self) -> bool:

@@ -5,8 +5,11 @@ import numpy as np
 from sigmasplat.config import MappingConfig
 from sigmasplat.data import se3
 from sigmasplat.data.trajectory import TRACKED
+from sigmasplat.fit.align import Alignment, align
 from sigmasplat.fit.pose import PoseFit
+from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.tracking.frame_estimate import FrameEstimate
+from sigmasplat.tracking.pose_validation import stands
 from sigmasplat.tracking.recovery import Recovery
 from sigmasplat.tracking.tracker import Tracker
 
@@ -17,7 +20,18 @@ depth."""
 
 def is_mappable(fit: PoseFit, tracker: Tracker, recovery: Recovery) -> bool:
     """Return whether the pose of the frame tracked last is certain enough to map the frame."""
-    return not tracker.lost and recovery.is_steady and tracker.is_certain(fit)
+    doubtful = tracker.doubtful if tracker.config.verify else 0
+    certain = not doubtful or (fit.comparison is not None and stands(fit.comparison, doubtful))
+    return not tracker.lost and recovery.is_steady and certain
+
+
+def hop_alignment(fit: PoseFit, live: Pyramid, tracker: Tracker) -> Alignment | None:
+    """Return the alignment to the newest keyframe that gives the covariance of a fit; None without one. For a pose
+    found by gradient descent, it takes no step."""
+    if fit.alignment is not None or tracker.keyframe is None:
+        return fit.alignment
+    T_live_keyframe = fit.T_camera_world @ se3.inverse(tracker.keyframe.T_camera_world)
+    return align(tracker.keyframe.pyramid, live, T_live_keyframe, 0, tracker.config.align_weight_color)
 
 
 def becomes_keyframe(fit: PoseFit, tracker: Tracker, since: int, config: MappingConfig, least_deg: float = 0.0) -> bool:

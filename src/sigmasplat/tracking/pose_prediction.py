@@ -1,6 +1,6 @@
 """Where the camera is expected before its image is used, and its motion since the last image."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -30,6 +30,28 @@ class PosePrediction:
     last: Matrix
     measured: bool
     given: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class CameraMotion:
+    """The motion of the camera at the time of a frame, s: T_last_camera [4, 4], and a twist per second [6] in its axes;
+    at rest if they are not known."""
+
+    time_s: float = 0.0
+    velocity: Matrix = field(default_factory=lambda: np.eye(4))
+    rate: Matrix = field(default_factory=lambda: np.zeros(6))
+
+    def after(self, T_last_camera: Matrix, time_s: float) -> "CameraMotion":
+        """Return the motion at the next frame. Its rate is the mean of the one before and of the motion since, which
+        alone is as noisy as two poses: late readings are corrected by it."""
+        elapsed_s, rate = time_s - self.time_s, self.rate
+        if elapsed_s > 0.0:
+            rate = 0.5 * (rate + se3.log(T_last_camera) / elapsed_s)
+        return CameraMotion(time_s, T_last_camera, rate)
+
+    def stopped(self) -> "CameraMotion":
+        """Return no motion: poses of earlier frames do not agree with later ones."""
+        return CameraMotion(self.time_s)
 
 
 def predict(previous: Matrix, velocity: Matrix, before: PosePrior, now: PosePrior) -> PosePrediction:

@@ -12,6 +12,8 @@ from sigmasplat.config.input import sensor_model
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera, gray_exposure, unexposed
 from sigmasplat.data.frame import Frame, Photo, photo_size
+from sigmasplat.data.read_at_once import read_at_once
+from sigmasplat.data.readout import STILL, Reading, SensorTimes
 from sigmasplat.data.submap import Picture
 from sigmasplat.errors import SourceError
 from sigmasplat.fit.pyramid import HIDDEN_M, Pyramid
@@ -30,13 +32,14 @@ from sigmasplat.types import Matrix
 @dataclass(eq=False)
 class PreparedFrame:
     """A frame in the forms that tracking and mapping need: the target of the fits, its pyramid, the image for features,
-    the pixels [H, W] that the user wants to be ignored, which have no depth, the working frame, and the whole one as it
-    was read."""
+    the pixels [H, W] that the user wants to be ignored, which have no depth, how its camera moves (as far as tracking
+    knows), the working frame, and the whole one as it was read."""
 
     target: Target
     live: Pyramid
     image: FeatureImage | None = None
     ignored: NDArray[np.bool_] | None = None
+    reading: Reading = STILL
     frame: Frame = field(kw_only=True)
     whole: Frame = field(kw_only=True)
 
@@ -46,6 +49,19 @@ class PreparedFrame:
         target, live = picture_images(view, picture, view.camera)
         frame = Frame(0, 0.0, picture.unit_color, picture.depth_m, view.camera)
         return PreparedFrame(target, live, FeatureImage.of_picture(picture, view.camera), frame=frame, whole=frame)
+
+    def move(self, rate: Matrix, times: SensorTimes) -> None:
+        """Take note of the motion of the camera, a twist per second [6] in its axes, and of when the sensor reads."""
+        self.reading = Reading(rate, self.frame.depth_late_s)
+        self.live = self.live.read(times.readout(self.reading))
+
+    def at_once(self, view: View, config: Config) -> "PreparedFrame":
+        """Return the frame as if all rows had been read at once, as far as it is known when they were."""
+        readout = self.live.readout
+        if readout is None:
+            return self
+        frame, whole = (read_at_once(each, readout) for each in (self.frame, self.whole))
+        return replace(observe(whole, frame, view, config, None), image=self.image)
 
     @property
     def shown(self) -> "PreparedFrame":

@@ -8,7 +8,7 @@ import numpy as np
 from sigmasplat.config import Config, TrackingConfig
 from sigmasplat.data import se3
 from sigmasplat.data.frame import NO_PRIOR, PosePrior
-from sigmasplat.fit.align import Alignment, align
+from sigmasplat.data.readout import UNKNOWN_TIMES, SensorTimes
 from sigmasplat.fit.compare import Comparison
 from sigmasplat.fit.pose import PoseFit, fit_pose_adam, fit_pose_align
 from sigmasplat.fit.pyramid import Pyramid
@@ -20,7 +20,7 @@ from sigmasplat.tracking.features import Extractor
 from sigmasplat.tracking.moving.dynamic_detector import DynamicDetector, together
 from sigmasplat.tracking.moving.dynamic_mask import DynamicMask
 from sigmasplat.tracking.moving.pose_pullers import has_drawn
-from sigmasplat.tracking.pose_prediction import Given, PosePrediction, odometry, predict
+from sigmasplat.tracking.pose_prediction import CameraMotion, Given, PosePrediction, odometry, predict
 from sigmasplat.tracking.pose_validation import TrackingStatistics
 from sigmasplat.tracking.predicted_depth_fit import NOTHING_FITTED, DepthFit
 from sigmasplat.tracking.prepared_frame import PreparedFrame, Splats, TrackedKeyframe, mapped_keyframe
@@ -29,19 +29,19 @@ from sigmasplat.types import Matrix, ShouldStop, never, unless
 
 @dataclass(eq=False)
 class Tracker:
-    """Keeps the last pose, the velocity, the last image, the reference keyframe, and statistics of recent fits.
+    """Keeps the last pose, the motion, the last image, the reference keyframe, and statistics of recent fits.
 
     prior: that of the last frame; lost: tracking of the last frame failed; doubtful: number of frames in a row whose
     best pose the images contradict (`_contradicted`); front: what was in front of the scene in the last frame, None if
     there was nothing or the frame was lost; keyframe_front: the same for the newest keyframe; detector: of moving
-    things; depth: the fit of predicted depth; started: a frame was tracked. Raises ConfigError on settings that do not
-    fit together.
+    things; depth: the fit of predicted depth; started: a frame was tracked; times: of the sensor. Raises
+    ConfigError on settings that do not fit together.
     """
 
     config: TrackingConfig
     extractor: Extractor | None = None
     previous: Matrix = dataclass_field(default_factory=lambda: np.eye(4))
-    velocity: Matrix = dataclass_field(default_factory=lambda: np.eye(4))
+    motion: CameraMotion = dataclass_field(default_factory=CameraMotion)
     last_image: Pyramid | None = None
     last_features: FeatureImage | None = None
     keyframe: Reference | None = None
@@ -57,6 +57,7 @@ class Tracker:
     lost: bool = False
     doubtful: int = 0
     started: bool = False
+    times: SensorTimes = UNKNOWN_TIMES
 
     @staticmethod
     def of(config: Config, extractor: Extractor | None) -> "Tracker":
@@ -67,6 +68,7 @@ class Tracker:
     def start(self, seen: PreparedFrame, prior: PosePrior = NO_PRIOR) -> None:
         """Fix the gauge: the first camera is the world."""
         self.last_image, self.last_features, self.prior = seen.live, seen.image, prior
+        self.motion = CameraMotion(seen.frame.timestamp_s)
 
     def track(
         self, field: Splats, view: View, seen: PreparedFrame, prior: PosePrior = NO_PRIOR,
@@ -77,8 +79,9 @@ class Tracker:
 
         prior: what is known of the pose apart from the images. should_stop: asked before each further guess; if it
         returns True, that guess and the later ones are left out. A lost frame gets the best available guess (odometry,
-        else the last pose), and the velocity is reset.
+        else the last pose), and the motion is reset.
         """
+        seen.move(self.motion.rate, self.times)
         given, shown = Given(field, view, self.prediction(prior), should_stop), seen.shown
         predicted = given.prediction.predicted
         if given.prediction.given:
@@ -88,6 +91,7 @@ class Tracker:
         else:
             best = self._estimated(given, seen, shown)
             self.lost = self._is_lost(best) or self._leaps(best, predicted)
+            best = best if self.lost else self._reread(given, seen, best)
             self.doubtful = self.doubtful + 1 if self._contradicted(best) else 0
         self.prior = prior
         if self.lost:  # poses of earlier frames do not agree with later ones
@@ -95,8 +99,18 @@ class Tracker:
         best.T_camera_world = se3.orthonormalise(best.T_camera_world)
         if not self.lost:
             self._notice_rest(seen, se3.inverse(best.T_camera_world))
-        self._remember(best, seen.without(self.front))
+        self._remember(best, seen)
         return best
+
+    def _reread(self, given: Given, seen: PreparedFrame, fit: PoseFit) -> PoseFit:
+        """Fit once more with the motion that the camera has made, which matters where the sensor reads late."""
+        if seen.live.readout is None:
+            return fit
+        T_world_camera = se3.inverse(fit.T_camera_world)
+        motion = self.motion.after(se3.inverse(self.previous) @ T_world_camera, seen.frame.timestamp_s)
+        seen.move(motion.rate, self.times)
+        found = self._fit(given, seen.shown if self.front is None else seen.aside(self.front), T_world_camera)
+        return fit if self._doubts(found) and not self._doubts(fit) else found
 
     def _estimated(self, given: Given, seen: PreparedFrame, shown: PreparedFrame) -> PoseFit:
         """Return the best of the fits from all guesses; shown: the frame as it is fitted first."""
@@ -187,22 +201,25 @@ class Tracker:
     def _remember(self, fit: PoseFit, seen: PreparedFrame) -> None:
         """Keep what the next frame needs."""
         T_world_camera = se3.inverse(fit.T_camera_world)
+        self.motion = self.motion.after(se3.inverse(self.previous) @ T_world_camera, seen.frame.timestamp_s)
         if self.lost:
-            self.velocity = np.eye(4)
+            self.motion = self.motion.stopped()
         else:
-            self.velocity = se3.inverse(self.previous) @ T_world_camera
             self.agreements = [*self.agreements, fit.agreement * fit.overlap][-judge.RECENT :]
             self.first_losses = [*self.first_losses, fit.first_loss][-judge.RECENT :]
             if fit.comparison is not None:
-                self.statistics.add(fit.comparison, float(np.linalg.norm(self.velocity[:3, 3])))
+                self.statistics.add(fit.comparison, float(np.linalg.norm(self.motion.velocity[:3, 3])))
         self.previous = T_world_camera
+        if seen.live.readout is None:
+            seen.move(self.motion.rate, self.times)
+        seen = seen.without(self.front)
         self.last_image, self.last_features, self.started = seen.live, seen.image, True
 
     # ---- guesses ----
 
     def prediction(self, prior: PosePrior) -> PosePrediction:
         """Return where the camera of the next frame is expected."""
-        return predict(self.previous, self.velocity, self.prior, prior)
+        return predict(self.previous, self.motion.velocity, self.prior, prior)
 
     def _fit(self, given: Given, seen: PreparedFrame, guess: Matrix, patience: int = 1) -> PoseFit:
         """Fit from an initial T_world_camera; patience: factor on the number of iterations of gradient descent; with 0,
@@ -234,15 +251,15 @@ class Tracker:
     def _other_guesses(self, seen: PreparedFrame, prediction: PosePrediction) -> Iterator[Matrix]:
         """Yield T_world_camera by features, and by constant velocity alone if a gyroscope changed the first guess."""
         if self.extractor is not None and seen.image is not None:
-            known = None if self.keyframe is None else self.keyframe_features
-            motion = motion_by_features(known, seen.image, self.extractor)
-            if self.keyframe is not None and motion is not None:
-                yield se3.inverse(motion @ self.keyframe.T_camera_world)
-            motion = motion_by_features(self.last_features, seen.image, self.extractor)
-            if motion is not None:
-                yield self.previous @ se3.inverse(motion)
+            known = [(self.last_features, self.previous)]
+            if self.keyframe is not None:
+                known.insert(0, (self.keyframe_features, se3.inverse(self.keyframe.T_camera_world)))
+            for features, T_world_then in known:
+                motion = motion_by_features(features, seen.image, self.extractor)
+                if motion is not None:
+                    yield T_world_then @ se3.inverse(motion)
         if prediction.measured:
-            yield self.previous @ self.velocity
+            yield self.previous @ self.motion.velocity
 
     def _retry(self, given: Given, seen: PreparedFrame, fit: PoseFit) -> PoseFit:
         """Retry from odometry with twice the iterations (VarSplat §3), and from the last pose; return the best fit.
@@ -284,19 +301,12 @@ class Tracker:
     def _doubts(self, fit: PoseFit) -> bool:
         if fit.comparison is not None:
             return self.statistics.doubts(fit.comparison)
-        worse = fit.agreement * fit.overlap < judge.DOUBT * (
-            float(np.median(self.agreements)) if self.agreements else 1.0
-        )
+        worse = fit.agreement * fit.overlap < judge.DOUBT * float(np.median(self.agreements or [1.0]))
         return worse or judge.jumped(fit.first_loss, self.first_losses, self.config.reinit_factor)
 
     def _contradicted(self, fit: PoseFit) -> bool:
         """Return whether a pose is doubtful for another reason than a small overlap, which a new keyframe mends."""
         return self._doubts(fit) if fit.comparison is None else self.statistics.contradicts(fit.comparison)
-
-    def is_certain(self, fit: PoseFit) -> bool:
-        """Return whether the pose of the last frame may be used for mapping."""
-        doubtful = self.doubtful if self.config.verify else 0
-        return not doubtful or (fit.comparison is not None and judge.stands(fit.comparison, doubtful))
 
     # ---- keyframes ----
 
@@ -314,7 +324,7 @@ class Tracker:
 
     def move_to(self, field: Splats, view: View, keyframe: TrackedKeyframe, T_world_camera: Matrix) -> None:
         """Continue at another pose, with a keyframe as the reference of the next frames."""
-        self.previous, self.velocity, self.lost = T_world_camera, np.eye(4), False
+        self.previous, self.motion, self.lost = T_world_camera, self.motion.stopped(), False
         self.detector = self.detector.cleared()
         self.follow(keyframe.weighed(field.params, view, self.config))
 
@@ -324,7 +334,7 @@ class Tracker:
 
     def continue_elsewhere(self, apart: bool) -> None:
         """Go on where the search has found the camera, or in a new map (`apart`)."""
-        self.velocity, self.lost = np.eye(4), self.lost and not apart
+        self.motion, self.lost = self.motion.stopped(), self.lost and not apart
         self.forget_moving()
 
     def move_by(self, T_new_old: Matrix, previous: Matrix | None = None) -> None:
@@ -336,13 +346,5 @@ class Tracker:
 
     def forget(self) -> None:
         """Restart at the identity, as for the first frame."""
-        self.previous, self.velocity, self.keyframe, self.keyframe_features = np.eye(4), np.eye(4), None, None
-        self.front, self.keyframe_front, self.detector = None, None, self.detector.cleared()
-
-    def hop(self, fit: PoseFit, live: Pyramid) -> Alignment | None:
-        """Return the alignment to the newest keyframe that gives the covariance of a fit; None without one. For
-        a pose found by gradient descent, it takes no step."""
-        if fit.alignment is not None or self.keyframe is None:
-            return fit.alignment
-        T_live_keyframe = fit.T_camera_world @ se3.inverse(self.keyframe.T_camera_world)
-        return align(self.keyframe.pyramid, live, T_live_keyframe, 0, self.config.align_weight_color)
+        self.previous, self.motion, self.detector = np.eye(4), self.motion.stopped(), self.detector.cleared()
+        self.keyframe = self.keyframe_features = self.front = self.keyframe_front = None

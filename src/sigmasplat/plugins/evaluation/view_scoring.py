@@ -4,7 +4,7 @@ Scores at different resolutions are never mixed: each resolution has its own obj
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -17,11 +17,13 @@ from sigmasplat.api import (
     Frame,
     InputConfig,
     Progress,
+    Readout,
     Source,
     SourceError,
     evenly_spread,
     no_progress,
     photo_size,
+    read_at_once,
     se3,
 )
 from sigmasplat.plugins.evaluation.metrics import views
@@ -53,7 +55,7 @@ class ViewScoring:
 
     input: the run's settings of working images; chosen: the log records of the scored views by kind; most: the largest
     number of test views; T_estimate_truth [4, 4]: the alignment of the ATE, None without a truth; lpips: the network of
-    LPIPS, if it is scored.
+    LPIPS, if it is scored; readouts: when the rows of each frame were read, where it is known.
     """
 
     source: Source
@@ -64,6 +66,7 @@ class ViewScoring:
     most: int
     T_estimate_truth: NDArray[np.float64] | None
     lpips: Lpips | None = None
+    readouts: Mapping[int, Readout] = field(default_factory=dict)
 
     @property
     def count(self) -> int:
@@ -72,7 +75,8 @@ class ViewScoring:
 
     def rendered(self, settings: InputConfig) -> Iterator[tuple[ScoredView, ScoredView | None]]:
         """Render the chosen views at the size of `settings` (`views.render_views`)."""
-        return views.render_views(partial(working_frame, self.source, settings), self.maps, self.chosen, self.renderer)
+        read = partial(working_frame, self.source, settings, readouts=self.readouts)
+        return views.render_views(read, self.maps, self.chosen, self.renderer)
 
 
 def full_width(config: Config, camera: Camera) -> int | None:
@@ -156,7 +160,12 @@ def score_test_views(
     return views.mean_scores([view.scores(scoring.lpips) for view in rendered])
 
 
-def working_frame(source: Source, settings: InputConfig, index: int) -> Frame:
-    """Read a frame at the resolution, depth range and crop that SLAM works with. Raises SourceError if unreadable."""
+def working_frame(
+    source: Source, settings: InputConfig, index: int, readouts: Mapping[int, Readout] | None = None
+) -> Frame:
+    """Read a frame at the resolution, depth range and crop that SLAM works with, and as if all rows had been read at
+    once where it is known when they were (readouts, by frame). Raises SourceError if unreadable."""
     s = settings
-    return source.frame(index).prepared(s.width, s.min_depth_m, s.max_depth_m, s.crop_px)
+    frame = source.frame(index).prepared(s.width, s.min_depth_m, s.max_depth_m, s.crop_px)
+    known = (readouts or {}).get(index)
+    return frame if known is None else read_at_once(frame, replace(known, late_s=frame.depth_late_s))

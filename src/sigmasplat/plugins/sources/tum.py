@@ -82,7 +82,12 @@ def open_tum(
     color_times_s, colors = read_list(folder / "rgb.txt")
     depth_times_s, depths = _depth_list(folder)
     pairs, alone = pair_times(folder, {"rgb.txt": color_times_s, "depth.txt": depth_times_s})
-    images = [ImagePair(float(color_times_s[i]), colors[i], depths[j]) for i, j in pairs]
+    images = [
+        ImagePair(
+            float(color_times_s[i]), colors[i], depths[j], depth_late_s=float(depth_times_s[j] - color_times_s[i])
+        )
+        for i, j in pairs
+    ]
     gaps_s = nearest_gaps_s(color_times_s, depth_times_s)
     skipped = [
         f"{colors[i]}: no depth within {MAX_GAP_S:g} s, nearest {gaps_s[i]:.3f} s away"

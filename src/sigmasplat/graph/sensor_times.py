@@ -1,0 +1,143 @@
+"""Measure when the sensor reads depth and rows, from pairs of keyframes that see the same.
+
+A pair of images agrees best at the true times: late depth contradicts colour where the camera changes its speed, and
+rows that are read one after another bend an image where it moves. The cost of aligning a pair, as a function of the
+three times, is its lowest cost over all motions (a profile). The sum over the pairs is minimised by Newton steps; the
+covariance is that of an M-estimator whose terms share images (sandwich, as in `fit.align`). No truth is used.
+"""
+
+from collections.abc import Sequence
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import chi2
+
+from sigmasplat.data.readout import UNKNOWN_TIMES, Reading, SensorTimes
+from sigmasplat.fit.align import align
+from sigmasplat.fit.pyramid import Pyramid
+from sigmasplat.types import Matrix, Task
+
+FIRST_MEASURED, MOST_MEASURED = 60, 60
+"""Alignments before the first measurement, and pairs of one."""
+STEP_S, LONGEST_S = 0.01, 0.03
+"""Step of the differences, where images move by some pixels; and the longest Newton step, the time of one frame."""
+ROUNDS, NO_STEP_S = 10, 1e-4
+"""Most rounds; smaller steps move no point by a tenth of a millimetre."""
+NEIGHBOURS = 3
+"""So many keyframes in a row see the same: the errors of their pairs are not independent."""
+LEAST_PAIRS = 10
+LEAST_OVERLAP = 0.25
+SURE = float(chi2.ppf(0.999, 3))
+"""Times are used if the hypothesis that all rows are read at once is rejected at this level."""
+
+
+class Pair(NamedTuple):
+    """Two images that see the same, how their cameras moved, the motion between them, and the number of the later one:
+    pairs of later images in a row share errors."""
+
+    reference: Pyramid
+    live: Pyramid
+    of_reference: Reading
+    of_live: Reading
+    T_live_reference: Matrix
+    number: int
+    cost: float = 0.0
+
+    def at(self, times_s: Matrix) -> "Pair | None":
+        """Return the pair with its motion if the sensor has these times [3], and the cost per pixel there; None if its
+        images overlap too little."""
+        times = _times(times_s, np.zeros(3))
+        images = self.reference.read(times.readout(self.of_reference)), self.live.read(times.readout(self.of_live))
+        found = align(*images, self.T_live_reference, 12, update_stop=5e-5)
+        if found.degenerate or found.overlap < LEAST_OVERLAP or not found.cost > 0.0:
+            return None
+        return self._replace(T_live_reference=found.T_live_reference, cost=found.cost)
+
+
+def measured(pairs: Sequence[Pair]) -> Task[SensorTimes]:
+    """Measure the times, in slices of one pair and round.
+
+    Returns all zero, without standard deviations, if the images do not show that anything is read late. The images of a
+    pair may be small: half of the working size takes a quarter of the time and gives the same times.
+    """
+    moved, times_s, longest_s = list(pairs), np.zeros(3), LONGEST_S
+    lowest, best = np.inf, None
+    for _ in range(ROUNDS):
+        there = list[Pair]()
+        for pair in moved:
+            found = pair.at(times_s)
+            yield
+            there += [] if found is None else [found]
+        if len(there) < LEAST_PAIRS:
+            return UNKNOWN_TIMES
+        cost = float(np.mean([np.log(pair.cost) for pair in there]))
+        if best is None or cost < lowest:
+            moved, terms = there, list[Term]()
+            for pair in moved:
+                terms += [_expanded(pair, times_s)]
+                yield
+            step_s, covariance = newton_step(terms)
+            lowest, best = cost, (times_s, step_s, covariance)
+            std_s = np.sqrt(np.diag(covariance))
+            still = bool((np.abs(step_s) <= np.maximum(0.5 * std_s, NO_STEP_S)).all())
+            if std_s.max() < STEP_S and (still or not _sure(times_s + step_s, covariance)):
+                break
+        else:
+            longest_s /= 3.0
+        times_s = best[0] + best[1] * min(1.0, longest_s / float(np.abs(best[1]).max()))
+    assert best is not None
+    times_s, step_s, covariance = best
+    std_s = np.sqrt(np.diag(covariance))
+    settled = std_s.max() < STEP_S and bool((np.abs(step_s) <= np.maximum(std_s, NO_STEP_S)).all())
+    found_s = times_s + step_s
+    return _times(found_s, std_s) if settled and _sure(found_s, covariance) else UNKNOWN_TIMES
+
+
+def _sure(times_s: Matrix, covariance: Matrix) -> bool:
+    return bool(times_s @ np.linalg.solve(covariance, times_s) > SURE)
+
+
+def _times(values_s: Matrix, std_s: Matrix) -> SensorTimes:
+    late, depth_rows, color_rows = values_s.tolist()
+    a, b, c = std_s.tolist()
+    return SensorTimes(late, depth_rows, color_rows, (a, b, c))
+
+
+class Term(NamedTuple):
+    """Slope [3] and bend [3, 3] of the cost of a pair at some times, as shares of the cost, and its number."""
+
+    slope: Matrix
+    bend: Matrix
+    number: int
+
+
+def _expanded(pair: Pair, times_s: Matrix) -> Term:
+    """Return the term of a pair at some times."""
+
+    def cost(of_s: Matrix) -> float:
+        return (pair.at(of_s) or pair).cost
+
+    pair = pair.at(times_s) or pair  # once more: the others begin there
+    units = STEP_S * np.eye(3)
+    above, below = (np.array([cost(times_s + sign * unit) for unit in units]) for sign in (1.0, -1.0))
+    bend = np.diag(above + below - 2.0 * pair.cost)
+    for i, j in combinations(range(3), 2):
+        bend[i, j] = bend[j, i] = cost(times_s + units[i] + units[j]) - above[i] - above[j] + pair.cost
+    return Term((above - below) / (2.0 * STEP_S * pair.cost), bend / (STEP_S**2 * pair.cost), pair.number)
+
+
+def newton_step(terms: Sequence[Term]) -> tuple[Matrix, Matrix]:
+    """Return the step [3] to the lowest point of the sum of terms, and the covariance [3, 3] there.
+
+    Terms of keyframes in a row share errors. Directions in which the sum is not convex, far from its lowest point, take
+    the step of one that is as much bent the other way.
+    """
+    slope, bend = np.array([term.slope for term in terms]), np.array([term.bend for term in terms])
+    values, vectors = np.linalg.eigh(bend.sum(0))
+    sizes = np.maximum(np.abs(values), 1e-2 * np.abs(values).max())
+    inverse = vectors @ np.diag(1.0 / sizes) @ vectors.T
+    step = -inverse @ slope.sum(0)
+    left, groups = slope + bend @ step, np.array([term.number // NEIGHBOURS for term in terms])
+    of_groups = np.array([left[groups == group].sum(0) for group in np.unique(groups)])
+    return np.asarray(step), np.asarray(inverse @ (of_groups.T @ of_groups) @ inverse)
