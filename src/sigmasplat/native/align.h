@@ -51,7 +51,7 @@ SIGMA_INLINE vf load_lanes(const float* p, int lanes) {
 SIGMA_INLINE vf load_lanes(const float* plane, size_t at, int lanes, float otherwise) { return plane ? load_lanes(plane + at, lanes) : splat(otherwise); }
 
 // Warp the pixels of a part; return the number of vectors with a pixel that is used. With times, gray is warped by itself: it
-// was read at another time than depth.
+// was read at another time than depth. A pixel is used if both are in view: `linearise` counts on it.
 struct Bounds { int left, right, top, bottom; };
 template <bool TIMED> static int warp_part(const AlignLevel& L, const Motion& T, const AlignReadouts* times, Bounds in, Part& part) {
     int n = 0;
@@ -66,7 +66,9 @@ template <bool TIMED> static int warp_part(const AlignLevel& L, const Motion& T,
             const float off_y = float(y) - L.cy;
             if constexpr (TIMED) {
                 if (!warp(L, of_gray, depth, off_x, off_y, inside, gray_rows(L, times->live), part.gray[n])) continue;
-                n += warp(L, of_depth, depth, off_x, off_y, inside, depth_rows(L, times->live), part.warped[n]);
+                if (!warp(L, of_depth, depth, off_x, off_y, inside, depth_rows(L, times->live), part.warped[n])) continue;
+                const Mask both_seen = part.warped[n].ok = both(part.warped[n].ok, part.gray[n].ok);
+                n += any(both_seen);
             } else n += warp(L, T, depth, off_x, off_y, inside, AtOnce{}, part.warped[n]);
         }
     }

@@ -123,7 +123,7 @@ struct ReferencePixels { vf gray, weight_gray, weight_depth, noise; };   // 1 wi
 struct Residuals { vf gray, depth, weight_gray, weight_depth, gray_dx, gray_dy, depth_dx, depth_dy; };
 
 // Compare warped pixels with the live images, of which `near` are the neighbours; gray can be warped by itself (`wg`, with
-// neighbours g). Adds to sums [4].
+// neighbours g), and is in view where depth is. Adds to sums [4].
 SIGMA_INLINE Residuals compared(const AlignOptions& o, const Warped& w, const Neighbours& near, const Warped& wg, const vf* g, const ReferencePixels& pixels, vf* sums) {
     const vf d00 = near.depth[0], d10 = near.depth[1], d01 = near.depth[2], d11 = near.depth[3];
     const Mask ok = w.ok;
@@ -144,13 +144,13 @@ SIGMA_INLINE Residuals compared(const AlignOptions& o, const Warped& w, const Ne
     // No derivative is used where the neighbours do not determine it or contain a depth step. Without live depth only
     // colour is used.
     const Mask smooth = both(both(agrees, planar), gt(0.03f * w.pz, farthest - nearest));
-    const Mask used = both(ok, mask_or(agrees, mask_not(read)));
+    const Mask color_ok = both(ok, mask_or(agrees, mask_not(read)));
     // Sensor noise grows with z², unless readings have their own.
     const vf hd = splat(o.huber_depth_relative) * w.pz * w.pz * max(pixels.noise, splat(1e-3f));
-    const vf wi = only(both(used, wg.ok), pixels.weight_gray * (o.weight_color / (o.huber_gray * o.huber_gray)) * huber_weight(r_gray, splat(o.huber_gray)));
+    const vf wi = only(color_ok, pixels.weight_gray * (o.weight_color / (o.huber_gray * o.huber_gray)) * huber_weight(r_gray, splat(o.huber_gray)));
     const vf wd = only(smooth, pixels.weight_depth * (o.weight_depth / (hd * hd)) * huber_weight(r_depth, hd));
     sums[0] += fma(wi * r_gray, r_gray, wd * r_depth * r_depth);
-    sums[1] += only(used, splat(1.f));
+    sums[1] += only(color_ok, splat(1.f));
     sums[2] += only(read, splat(1.f));
     sums[3] += only(agrees, splat(1.f));
     return {r_gray, r_depth, wi, wd, I.dx, I.dy, D.dx, D.dy};
