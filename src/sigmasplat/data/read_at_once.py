@@ -15,6 +15,7 @@ ROUNDS = 2
 """What is read at a pixel depends on where its point was then; so often is it looked up."""
 SAME_SURFACE = 0.03
 """Readings of one surface differ by less than this share, as in alignment (native/align_pixel.h)."""
+PIXEL_AND_NEXT = np.ones((2, 2), np.uint8)
 Image = NDArray[Any]
 
 
@@ -41,11 +42,15 @@ def read_at_once(frame: Frame, readout: Readout) -> Frame:
 
 def _between_readings(depth_m: Image, column: Image, row: Image) -> Image:
     """Return the depth [H, W] at some columns and rows: interpolated on a surface, that of the nearest pixel at its
-    edge, 0 beyond the image."""
+    edge and beside a hole, 0 beyond the image."""
     import cv2
 
-    nearest_m, between_m = (cv2.remap(depth_m, column, row, how) for how in (cv2.INTER_NEAREST, cv2.INTER_LINEAR))
-    return np.where(np.abs(between_m - nearest_m) < SAME_SURFACE * nearest_m, between_m, nearest_m)
+    nearest_m = cv2.remap(depth_m, column, row, cv2.INTER_NEAREST)
+    between_m = cv2.remap(depth_m, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    least_m, most_m = (extreme(depth_m, PIXEL_AND_NEXT, anchor=(0, 0)) for extreme in (cv2.erode, cv2.dilate))
+    whole = (most_m - least_m < SAME_SURFACE * least_m).astype(np.float32)
+    whole = cv2.remap(whole, np.floor(column), np.floor(row), cv2.INTER_NEAREST)
+    return np.where((whole > 0) & (nearest_m > 0), between_m, nearest_m)
 
 
 def _points(camera: Camera, column: Image, row: Image, z: Image) -> tuple[Image, Image, Image]:
