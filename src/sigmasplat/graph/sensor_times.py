@@ -26,6 +26,8 @@ ROUNDS, NO_STEP_S = 10, 1e-4
 """Most rounds; smaller steps move no point by a tenth of a millimetre."""
 NEIGHBOURS = 3
 """So many keyframes in a row see the same: the errors of their pairs are not independent."""
+BIAS_S = 1e-4
+"""Systematic error of a time: in so long, an image moves by `fit.align.BIAS_PX` at 100 pixels per second."""
 LEAST_PAIRS = 10
 LEAST_OVERLAP = 0.25
 SURE = float(chi2.ppf(0.999, 3))
@@ -62,7 +64,7 @@ def measured(pairs: Sequence[Pair]) -> Task[SensorTimes]:
     pair may be small: half of the working size takes a quarter of the time and gives the same times.
     """
     moved, times_s, longest_s = list(pairs), np.zeros(3), LONGEST_S
-    lowest, best = np.inf, None
+    lowest, best, near = np.inf, None, False
     for _ in range(ROUNDS):
         there = list[Pair]()
         for pair in moved:
@@ -72,19 +74,23 @@ def measured(pairs: Sequence[Pair]) -> Task[SensorTimes]:
         if len(there) < LEAST_PAIRS:
             return UNKNOWN_TIMES
         cost = float(np.mean([np.log(pair.cost) for pair in there]))
-        if best is None or cost < lowest:
+        if best is None or near or cost < lowest:
             moved, terms = there, list[Term]()
             for pair in moved:
                 terms += [_expanded(pair, times_s)]
                 yield
+            if not any(term.bend.any() for term in terms):  # no camera moved
+                return UNKNOWN_TIMES
             step_s, covariance = newton_step(terms)
+            covariance += BIAS_S**2 * np.eye(3)
             lowest, best = cost, (times_s, step_s, covariance)
             std_s = np.sqrt(np.diag(covariance))
+            near = bool((np.abs(step_s) <= 2.0 * std_s).all() and std_s.max() < STEP_S)  # costs hardly differ
             still = bool((np.abs(step_s) <= np.maximum(0.5 * std_s, NO_STEP_S)).all())
             if std_s.max() < STEP_S and (still or not _sure(times_s + step_s, covariance)):
                 break
         else:
-            longest_s /= 3.0
+            longest_s = float(np.abs(times_s - best[0]).max()) / 3.0
         times_s = best[0] + best[1] * min(1.0, longest_s / float(np.abs(best[1]).max()))
     assert best is not None
     times_s, step_s, covariance = best
