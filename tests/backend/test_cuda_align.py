@@ -13,6 +13,7 @@ from align_oracle import CAMERA, HUGE, MISSING, Pair, missing, oracle, pair
 from emulated_cuda import Emulator
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
+from sigmasplat.data.readout import Readout, SensorTimes, readouts
 from sigmasplat.errors import BackendError
 from sigmasplat.fit import align as aligning
 from sigmasplat.fit.align import Alignment, align
@@ -132,6 +133,30 @@ def test_missing_readings_leave_the_normal_equations_those_of_the_cpu_and_of_the
     assert np.linalg.norm(got.S - want.S) < 1e-5 * np.linalg.norm(want.S)
 
 
+RATE = np.array([0.4, -0.3, 0.2, 0.3, -0.5, 0.4])
+TIMES = SensorTimes(0.02, 0.03, -0.025, (0.001, 0.001, 0.001))
+LATE = Readout(RATE, 0.005, TIMES), Readout(-0.7 * RATE[::-1], -0.01, TIMES)
+
+
+@pytest.mark.parametrize("which", [(1, 1), (1, 0), (0, 1)], ids=["both", "reference", "live"])
+@pytest.mark.parametrize("holes", [False, True], ids=["whole", "holes"])
+def test_rows_that_are_read_late_give_the_normal_equations_of_the_cpu(holes: bool, which: tuple[int, int]) -> None:
+    p = pair(0.05, 0.004, holes)
+    late = readouts(*(readout if known else None for readout, known in zip(LATE, which, strict=True)))
+    motions = [se3.exp(sign * 0.004 * np.ones(6)) @ p.T for sign in (0.0, 1.0, -1.0)]
+    at_once = aligning.normal_equations(CPU_IMAGES, level_of(p), motions)
+    found = aligning.normal_equations(CUDA_IMAGES, level_of(p, device="cpu")._replace(readouts=late), motions)
+    expected = aligning.normal_equations(CPU_IMAGES, level_of(p)._replace(readouts=late), motions)
+    for got, want, without in zip(found, expected, at_once, strict=True):
+        np.testing.assert_array_equal(got.sums[1:], want.sums[1:])
+        assert (want.sums[1:] > 0).all() and want.sums[4] <= (p.depth > 0).sum()
+        for name in ("H", "b", "S"):
+            ours, theirs = getattr(got, name), getattr(want, name)
+            assert np.linalg.norm(ours - theirs) < 1e-5 * np.linalg.norm(theirs)
+        assert got.sums[0] == pytest.approx(want.sums[0], rel=1e-5)
+        assert np.linalg.norm(got.b - without.b) > 0.1 * np.linalg.norm(without.b), "the times matter"
+
+
 def test_several_motions_at_once_are_each_alone() -> None:
     p = pair(0.05, 0.004, True)
     motions = [se3.exp(0.002 * k * np.ones(6)) @ p.T for k in range(MOTIONS)]
@@ -179,6 +204,19 @@ def test_two_images_are_aligned_as_on_the_cpu(size: tuple[int, int], weighed: bo
         ours.covariance, theirs.covariance, rtol=1e-2, atol=1e-3 * np.abs(theirs.covariance).max()
     )
     assert np.linalg.eigvalsh(ours.covariance).min() > 0
+
+
+def test_images_whose_rows_are_read_late_are_aligned_as_on_the_cpu() -> None:
+    reference, live = seen(10), seen(12)
+    guess = se3.exp(np.array([0.003, -0.002, 0.001, 0.002, 0.001, -0.003]))
+    theirs = align(reference.read(LATE[0]), live.read(LATE[1]), guess, 8)
+    ours = align(there(reference).read(LATE[0]), there(live).read(LATE[1]), guess, 8)
+    assert_same(ours, theirs, 1e-5)
+    np.testing.assert_allclose(
+        ours.covariance, theirs.covariance, rtol=1e-2, atol=1e-3 * np.abs(theirs.covariance).max()
+    )
+    at_once = align(reference, live, guess, 8)
+    assert np.abs(theirs.T_live_reference - at_once.T_live_reference).max() > 1e-3, "the times matter"
 
 
 @pytest.mark.parametrize("stops", [(0.0, 0.0), (1e-4, 0.0), (0.0, 3e-2)], ids=["never", "update", "plateau"])
