@@ -53,11 +53,11 @@ def views_of_the_room() -> Iterator[None]:
     from sigmasplat.plugins.sources import synthetic
 
     @lru_cache(maxsize=600)
-    def rendered(scene: Any, camera: Any, pose: bytes) -> tuple[np.ndarray, np.ndarray]:
-        return render_scene(scene, camera, np.frombuffer(pose).reshape(4, 4))
+    def rendered(scene: Any, camera: Any, pose: bytes, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+        return render_scene(scene, camera, np.frombuffer(pose).reshape(shape))
 
     def remembered(scene: Any, camera: Any, T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        color, depth_m = rendered(scene, camera, np.asarray(T_world_camera, np.float64).tobytes())
+        color, depth_m = rendered(scene, camera, np.asarray(T_world_camera, np.float64).tobytes(), T_world_camera.shape)
         return color.copy(), depth_m.copy()
 
     render_scene = synthetic.render_scene

@@ -1,5 +1,6 @@
 """Render the synthetic room: exact depth and poses, any length and size, the same bytes for the same seed."""
 
+import re
 from inspect import signature
 from typing import Any
 
@@ -56,7 +57,9 @@ class SyntheticRoom(Source):
     average, that a ball covers which moves through the room by itself (`Mover`); scored views and the true surface show
     the room without it; predicted: whether depth is that of an imagined network, with a smooth scale error
     (`room.capture.predicted_depth`); corridor: whether there is a long corridor with plain walls instead of rooms, seen
-    by a wide lens that moves 80 mm a frame (`room.corridor`); it has one way and no ball.
+    by a wide lens that moves 80 mm a frame (`room.corridor`); it has one way and no ball; late: time of depth after
+    colour, s; rows, depth_rows: time from the first to the last row of colour and of depth, s (rolling shutter). Each
+    row is then seen from where the path is at its time; the true pose is that in the middle of colour.
 
     A path with loops to close: frames=720,rooms=2,overrun=20,noise=1,drift=6. A round of 600 frames is a slow pace. The
     way back looks in other directions than the way out, so drift accumulates over a whole round; the last 120 frames
@@ -69,6 +72,7 @@ class SyntheticRoom(Source):
         self, frames: int = 200, width: int = 320, height: int = 240, seed: int = 0, noise: bool = False,
         loops: int = 1, exposure_change: bool | None = None, rooms: int = 1, overrun: int = 0, drift: int = 0,
         test_views: int = 0, stereo: int = 0, mover: int = 0, predicted: bool = False, corridor: bool = False,
+        late: float = 0.0, rows: float = 0.0, depth_rows: float = 0.0,
     ) -> None:  # fmt: skip
         """Compute the camera path, no image yet. Raises SourceError unless counts and sizes are ≥ 1, the rest ≥ 0."""
         counts = {"frames": frames, "width": width, "height": height, "loops": loops, "rooms": rooms}
@@ -86,6 +90,9 @@ class SyntheticRoom(Source):
         super().__init__("synthetic", camera)
         if predicted and stereo:
             raise SourceError("synthetic room: depth is either predicted or from stereo; leave out predicted or stereo")
+        if (late, rows, depth_rows) != (0.0, 0.0, 0.0) and (stereo or mover):
+            raise SourceError("synthetic room: stereo pairs and the ball are read at once; leave out stereo or mover")
+        self._late_s, self._rows_s, self._depth_rows_s = late, rows, depth_rows
         self.predicted_depth, self.sensor = predicted, None if drift or predicted else "rendered"
         self._seed, self._noise, self._corridor = seed, noise, corridor
         self._rooms = sections(frames) if corridor else rooms
@@ -173,9 +180,25 @@ class SyntheticRoom(Source):
     def _exposed(self, i: int, T_world_camera: Matrix) -> tuple[Floats, Floats]:
         """Return colour and depth of frame i from a pose; the exposure gain makes one sine period over the sequence."""
         color, depth_m = render_scene(self._scene(i), self.camera, T_world_camera)
+        if self._rows_s:
+            color = render_scene(self._scene(i), self.camera, self._poses_of_rows(i, 0.0, self._rows_s))[0]
+        if self._late_s or self._depth_rows_s:
+            poses = self._poses_of_rows(i, self._late_s, self._depth_rows_s)
+            depth_m = render_scene(self._scene(i), self.camera, poses)[1]
         swing = EXPOSURE_SWING if self._exposure_change else 0.0
         gain = 1.0 + swing * float(np.sin(2 * np.pi * i / max(len(self) - 1, 1)))
         return np.clip(color * np.float32(gain), 0.0, 1.0), depth_m
+
+    def _poses_of_rows(self, i: int, late_s: float, rows_s: float) -> Matrix:
+        """Return the poses [H, 4, 4] at which the rows of frame i are read: `late_s` after its time, and one after
+        another in `rows_s`. Between frames, and beyond the path's ends, the camera moves along screws."""
+        height, path = self.camera.height, self._T_world_camera
+        if len(path) == 1:
+            return np.repeat(path, height, 0)
+        late = late_s + rows_s * ((np.arange(height) + 0.5) / height - 0.5)
+        when = i + FRAMES_PER_SECOND * late
+        k = np.clip(np.floor(when).astype(int), 0, len(path) - 2)
+        return se3.interpolated(path[k], path[k + 1], when - k)
 
 
 class _ViewsAway(Source):
@@ -224,15 +247,27 @@ def open_synthetic(text: str) -> SyntheticRoom:
     options: dict[str, Any] = {}
     for part in filter(None, text.partition(":")[2].split(",")):
         key, equals, value = (word.strip() for word in part.partition("="))
-        number = key in _OPTIONS and type(_OPTIONS[key].default) is int
-        value = value if equals or number else "1"  # a word alone says yes
-        if key not in _OPTIONS or not value.removeprefix("-").isdecimal():
-            raise SourceError(f"synthetic room: unknown option {part!r}; give whole numbers for {', '.join(_OPTIONS)}")
-        options[key] = int(value) if number else bool(int(value))
+        kind = type(_OPTIONS[key].default) if key in _OPTIONS else None
+        value = value if equals or kind in (int, float) else "1"  # a word alone says yes
+        if kind is float and _SECONDS.fullmatch(value):
+            options[key] = float(value)
+        elif kind in (None, float) or not value.removeprefix("-").isdecimal():
+            raise SourceError(
+                f"synthetic room: unknown option {part!r}; give whole numbers for {', '.join(_of_type(False))}; "
+                f"seconds for {', '.join(_of_type(True))}"
+            )
+        else:
+            options[key] = int(value) if kind is int else bool(int(value))
     return SyntheticRoom(**options)
 
 
 _OPTIONS = signature(SyntheticRoom).parameters
+_SECONDS = re.compile(r"-?[0-9]{1,2}(\.[0-9]{1,6})?")
+
+
+def _of_type(seconds: bool) -> list[str]:
+    return [key for key, option in _OPTIONS.items() if isinstance(option.default, float) == seconds]
+
 
 PLUGIN = SourceFormat(
     "synthetic", "the word 'synthetic'", lambda path: path.partition(":")[0] == "synthetic",

@@ -162,9 +162,10 @@ def render_scene(
     """Return colour [H, W, 3] in [0, 1] and exact depth [H, W] in metres along the optical axis.
 
     Depth and colour are those of the ray through the pixel centre. Where a neighbour shows another shape or face, the
-    colour is the mean of four rays (antialiasing).
+    colour is the mean of four rays (antialiasing). T_world_camera [4, 4], or [H, 4, 4]: a pose for each row.
     """
-    windows = image_windows(scene.shapes, se3.inverse(T_world_camera), camera)
+    row_by_row = T_world_camera.ndim == 3  # no windows then: they are those of one pose
+    windows = None if row_by_row else image_windows(scene.shapes, se3.inverse(T_world_camera), camera)
     v, u = np.indices((camera.height, camera.width), np.float32).reshape(2, -1)
     color, depth_m, faces = _colors(scene, _rays(camera, T_world_camera, np.stack([u, v])), windows, camera.fx)
     edges = np.flatnonzero(_edges(faces.reshape(camera.height, camera.width)))
@@ -176,11 +177,14 @@ def render_scene(
 
 
 def _rays(camera: Camera, T_world_camera: NDArray[np.float64], pixels: Floats) -> Rays:
-    """Return rays through pixels [2, N]; a step of 1 along them is 1 m of depth."""
-    R = T_world_camera[:3, :3].astype(np.float32)
+    """Return rays through pixels [2, N]; a step of 1 along them is 1 m of depth. The pose is one, or one per row."""
+    R, origins = T_world_camera[:3, :3].astype(np.float32), T_world_camera[:3, 3:]
+    if T_world_camera.ndim == 3:
+        T = np.moveaxis(T_world_camera[np.rint(pixels[1]).astype(int)], 0, -1)
+        R, origins = T[:3, :3].astype(np.float32), T[:3, 3]
     x, y = (pixels[0] - camera.cx) / camera.fx, (pixels[1] - camera.cy) / camera.fy
     directions = np.stack([R[k, 0] * x + R[k, 1] * y + R[k, 2] for k in range(3)]).astype(np.float32)
-    return Rays(T_world_camera[:3, 3:].astype(np.float32), directions, pixels.astype(np.float32))
+    return Rays(origins.astype(np.float32), directions, pixels.astype(np.float32))
 
 
 def _edges(faces: Indices) -> NDArray[np.bool_]:
