@@ -56,7 +56,7 @@ READ = (RUN,) * 9 + (INSPECT,)
 """Commands that read a recording: `inspect` takes eight times as long as a run of four tiny frames."""
 EXPORTS = tuple(("export", INPUT, "--out", f"{OUT}{ending}") for ending in (".ply", ".spz", ".glb"))
 OF_RUN = tuple(
-    ("export", INPUT, "--format", name, "--out", OUT) for name in ("trajectory", "colmap", "spz", "bag", "covariance")
+    ("export", INPUT, "--format", name, "--out", OUT) for name in ("trajectory", "colmap", "spz", "covariance")
 )
 OF_FINISHED = (
     ("eval", INPUT),

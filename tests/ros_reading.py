@@ -60,16 +60,6 @@ def covariance(message: Any) -> Array:
     return np.asarray(message.pose.covariance, np.float64).reshape(6, 6)
 
 
-def points(message: Any) -> np.ndarray:
-    """Return the rows of a point cloud, with its own field names."""
-    assert all(f.datatype == 7 and f.count == 1 for f in message.fields)
-    kind = np.dtype({
-        "names": [f.name for f in message.fields], "formats": ["<f4"] * len(message.fields),
-        "offsets": [f.offset for f in message.fields], "itemsize": message.point_step,
-    })  # fmt: skip
-    return np.frombuffer(message.data.tobytes(), kind)
-
-
 def image(message: Any) -> np.ndarray:
     kind, channels = {"rgb8": (np.uint8, 3), "32FC1": (np.float32, 1)}[message.encoding]
     array = np.frombuffer(message.data.tobytes(), kind).reshape(message.height, message.width, channels)

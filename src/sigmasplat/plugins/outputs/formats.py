@@ -142,15 +142,6 @@ def _plan(source: ExportSource, target: Path, *, cell_m: float) -> str:
     return f"{plan.area_m2(FREE):.1f} m² of free floor, also in {target.with_suffix('.json').name}"
 
 
-def _bag(source: ExportSource, target: Path, *, pictures: bool) -> str:
-    from sigmasplat.plugins.robots.bag import export_bag
-
-    reader = source.reader()
-    with _counting("floor plan") as progress:
-        counts = export_bag(reader, target, pictures=pictures, progress=progress)
-    return f"{sum(counts.values()):,} messages of {len(counts)} topics{reader.left_out()}"
-
-
 PLUGIN = (
     Output("ply", (".ply",), "3DGS PLY with σ², for every viewer", _ply),
     Output("spz", (".spz",), "Niantic's SPZ, less than a fifth of the size", _spz),
@@ -158,7 +149,6 @@ PLUGIN = (
     Output("covariance", (".cov.txt",), "the path as TUM text with the covariance of each pose", _covariance),
     Output("colmap", ("-colmap",), "a folder with COLMAP's text model in sparse/0", _colmap),
     Output("video", (".mp4",), "a video: colour, depth, uncertainty", _video),
-    Output("bag", (".mcap",), "ROS 2 messages: path with covariance, map", _bag),
     Output("plan", (".plan.png", ".png"), "a floor plan", _plan),
 )
 """The formats of this package. The first one is the default."""

@@ -35,14 +35,9 @@ MIN_OPACITY = 0.5
 
 def splat_points(field: GaussianField, most: int = MAX_POINTS) -> tuple[Matrix, Matrix]:
     """Return the centres [P, 3] m and colours [P, 3] of the opaque splats, evenly thinned to `most`."""
-    rows = opaque_rows(field, most)
+    opaque = np.flatnonzero(field.opacities.numpy() >= MIN_OPACITY)
+    rows = opaque[np.linspace(0, len(opaque) - 1, min(most, len(opaque))).astype(int)]
     return field.means.numpy()[rows].astype(np.float64), field.colors.numpy()[rows].astype(np.float64)
-
-
-def opaque_rows(field: GaussianField, most: int) -> NDArray[np.intp]:
-    """Return the rows of the opaque splats, evenly thinned to `most`."""
-    rows = np.flatnonzero(field.opacities.detach().cpu().numpy() >= MIN_OPACITY)
-    return np.asarray(rows[np.linspace(0, len(rows) - 1, min(most, len(rows))).astype(int)])
 
 
 IMAGES = "images"

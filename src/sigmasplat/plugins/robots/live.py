@@ -136,7 +136,7 @@ class LiveRobot(Callback):
         links = ros.camera_links(
             T_odom_link, None if step.component else ros.link_pose(ros.T_MAP_WORLD @ step.T_world_camera)
         )
-        odometry = self.messages.odometry(stamp_ns, ros.ODOM, ros.LINK, T_odom_link, None)
+        odometry = self.messages.odometry(stamp_ns, ros.ODOM, ros.LINK, T_odom_link)
         return [self.messages.transforms(ros.TF, stamp_ns, links), odometry]
 
 

@@ -1,4 +1,4 @@
-"""Make ROS 2 messages from poses, maps and images, as bytes (CDR), through the rosbags package (Apache-2.0).
+"""Make ROS 2 messages from poses and images, as bytes (CDR), through the rosbags package (Apache-2.0).
 
 Stamps are the times of the frames, nanoseconds. Coordinate frames are those of REP 105 (map, odom) and REP 103 (x
 forward, y left, z up; optical frames z forward):
@@ -14,11 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor
 
-from sigmasplat.api import Camera, GaussianField, Matrix, import_optional, se3
-from sigmasplat.plugins.outputs.floorplan.floor_plan import FREE, OBJECT, WALL, FloorPlan
-from sigmasplat.plugins.outputs.views import opaque_rows
+from sigmasplat.api import Camera, Matrix, import_optional, se3
 
 MAP, ODOM, LINK, OPTICAL = "map", "odom", "camera_link", "camera_optical_frame"
 WORLD = "sigmasplat_world"
@@ -27,16 +24,6 @@ T_LINK_OPTICAL = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 
 """From optical axes (x right, y down, z forward) to those of a body (x forward, y left, z up); the origin is shared."""
 T_MAP_WORLD = T_LINK_OPTICAL
 """From the world to the map while a run goes on: the first camera is assumed to be level."""
-T_BODY_FLOOR = np.array([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-"""From the axes of the floor plan (x right, y ahead, z up) to x ahead, y left, z up."""
-
-
-def levelled_map(T_floor_world: Matrix) -> Matrix:
-    """Return T_map_world [4, 4] for a known floor: x ahead, y left, z up, origin on the floor below the first camera.
-
-    T_floor_world: that of `FloorPlan`.
-    """
-    return np.asarray(T_BODY_FLOOR @ T_floor_world)
 
 
 def link_pose(T_outer_optical: Matrix) -> Matrix:
@@ -53,20 +40,7 @@ def camera_links(T_odom_link: Matrix, T_map_link: Matrix | None) -> list[tuple[s
     return links
 
 
-def ros_covariance(covariance: Matrix, T_outer_world: Matrix, T_outer_link: Matrix) -> Matrix:
-    """Return the covariance [6, 6] as in geometry_msgs/PoseWithCovariance: x, y, z, rotation about x, y, z, all in the
-    axes of the outer frame.
-
-    covariance [6, 6]: of the left twist (ρ, φ), m and rad, of the pose in the world; T_outer_world [4, 4]: from the
-    world to the outer frame; T_outer_link [4, 4]: the pose in the outer frame.
-    """
-    J = se3.displacement(T_outer_link) @ se3.adjoint(T_outer_world)
-    return np.asarray(J @ covariance @ J.T)
-
-
 EXTRA = "ros"
-KNOWN_VARIANCE = 1e-10
-"""Variance written for a pose that is known exactly (10 µm, 10 µrad), because readers invert covariances."""
 UNKNOWN = (-1.0, *(0.0,) * 35)
 """Covariance that is not known: ROS marks it by −1 in the first element."""
 
@@ -82,21 +56,11 @@ class Topic(NamedTuple):
 TF = Topic("/tf", "tf2_msgs/msg/TFMessage")
 TF_STATIC = Topic("/tf_static", "tf2_msgs/msg/TFMessage", True)
 ODOMETRY = Topic("/sigmasplat/odometry", "nav_msgs/msg/Odometry")
-POSE = Topic("/sigmasplat/pose", "geometry_msgs/msg/PoseWithCovarianceStamped")
-CLOUD = Topic("/sigmasplat/cloud", "sensor_msgs/msg/PointCloud2", True)
-GRID = Topic("/map", "nav_msgs/msg/OccupancyGrid", True)
 COLOR = Topic("/camera/color/image_raw", "sensor_msgs/msg/Image")
 COLOR_INFO = Topic("/camera/color/camera_info", "sensor_msgs/msg/CameraInfo")
 DEPTH = Topic("/camera/aligned_depth_to_color/image_raw", "sensor_msgs/msg/Image")
 DEPTH_INFO = Topic("/camera/aligned_depth_to_color/camera_info", "sensor_msgs/msg/CameraInfo")
-TOPICS = (
-    TF, TF_STATIC, ODOMETRY, POSE, CLOUD, GRID, COLOR, COLOR_INFO, DEPTH, DEPTH_INFO,
-)  # fmt: skip
-
-
-MAX_POINTS = 200_000
-UNOBSERVED, EMPTY, OCCUPIED = -1, 0, 100
-"""Values of nav_msgs/OccupancyGrid."""
+TOPICS = (TF, TF_STATIC, ODOMETRY, COLOR, COLOR_INFO, DEPTH, DEPTH_INFO)
 
 
 class Encoded(NamedTuple):
@@ -124,13 +88,6 @@ def _pose(T: Matrix) -> dict[str, Any]:
     return {"position": _xyz(T[:3, 3]), "orientation": _rotation(T)}
 
 
-def _pose_with_covariance(T: Matrix, covariance: Matrix | None) -> dict[str, Any]:
-    values = np.array(UNKNOWN)
-    if covariance is not None:
-        values = (covariance if covariance.any() else KNOWN_VARIANCE * np.eye(6)).reshape(-1).astype(np.float64)
-    return {"pose": _pose(T), "covariance": values}
-
-
 def _header(stamp_ns: int, frame: str) -> dict[str, Any]:
     return {"stamp": {"sec": stamp_ns // 10**9, "nanosec": stamp_ns % 10**9}, "frame_id": frame}
 
@@ -154,61 +111,13 @@ class RosMessages:
         ]  # fmt: skip
         return self._encoded(topic, stamp_ns, "", transforms=stamped)
 
-    def odometry(self, stamp_ns: int, parent: str, child: str, T: Matrix, covariance: Matrix | None) -> Encoded:
-        """Make nav_msgs/Odometry: the pose T_parent_child with covariance [6, 6] (`ros_covariance`), None if it
-        is not known. Velocities are not estimated: their covariance is marked as not known."""
-        pose, twist = _pose_with_covariance(T, covariance), {"covariance": np.array(UNKNOWN)}
-        return self._encoded(ODOMETRY, stamp_ns, parent, child_frame_id=child, pose=pose, twist=twist)
-
-    def pose(self, stamp_ns: int, parent: str, T: Matrix, covariance: Matrix | None) -> Encoded:
-        """Make geometry_msgs/PoseWithCovarianceStamped, arguments as for `odometry`."""
-        return self._encoded(POSE, stamp_ns, parent, pose=_pose_with_covariance(T, covariance))
-
-    def cloud(
-        self, stamp_ns: int, frame: str, field: GaussianField, depth_std_m: Tensor | None, T_frame_field: Matrix
-    ) -> Encoded:
-        """Make sensor_msgs/PointCloud2 of the centres of the opaque splats, evenly thinned to `MAX_POINTS`: x, y, z,
-        rgb, opacity, depth_std (m, nan if not known).
-
-        depth_std_m [N]: standard deviation of the depth that each splat shows; None if it was not measured.
-        """
-        names, chosen = ("x", "y", "z", "rgb", "opacity", "depth_std"), opaque_rows(field, MAX_POINTS)
-        means, colors, opacities = (
-            values.detach().cpu().numpy()[chosen] for values in (field.means, field.colors, field.opacities)
-        )
-        rows = np.zeros(len(chosen), [(name, "<f4") for name in names])
-        positions = means.astype(np.float64) @ T_frame_field[:3, :3].T + T_frame_field[:3, 3]
-        rows["x"], rows["y"], rows["z"] = positions.T
-        red, green, blue = (np.rint(255.0 * np.clip(colors, 0.0, 1.0))).astype(np.uint32).T
-        rows["rgb"] = (red << 16 | green << 8 | blue).view("<f4")
-        rows["opacity"] = opacities
-        rows["depth_std"] = np.nan if depth_std_m is None else depth_std_m.cpu().numpy()[chosen]
-        size = rows.dtype.itemsize
-        fields = [{"name": name, "offset": 4 * i, "datatype": 7, "count": 1} for i, name in enumerate(names)]
+    def odometry(self, stamp_ns: int, parent: str, child: str, T: Matrix) -> Encoded:
+        """Make nav_msgs/Odometry: the pose T_parent_child. Its covariance and that of velocities, which are not
+        estimated, are marked as not known."""
+        unknown = {"covariance": np.array(UNKNOWN)}
         return self._encoded(
-            CLOUD, stamp_ns, frame, height=1, width=len(rows), fields=fields, point_step=size,
-            row_step=size * len(rows), data=np.frombuffer(rows.tobytes(), np.uint8),
-            is_dense=bool(np.isfinite(positions).all()),
-        )  # fmt: skip
-
-    def grid(self, stamp_ns: int, frame: str, plan: FloorPlan) -> Encoded:
-        """Make nav_msgs/OccupancyGrid of a floor plan: 0 free floor, 100 object or wall, −1 not observed, also where
-        only the floor was not observed.
-
-        frame: the frame with the axes of `levelled_map`. The grid is not rotated in it, because navigation software
-        ignores the rotation of a grid. Columns grow along x, rows along y.
-        """
-        occupied = np.full(plan.kind.shape, UNOBSERVED, np.int8)
-        occupied[plan.kind == FREE] = EMPTY
-        occupied[(plan.kind == OBJECT) | (plan.kind == WALL)] = OCCUPIED
-        cells, T_frame_grid = np.ascontiguousarray(occupied.T[::-1]), np.eye(4)
-        # x ahead is y of the plan, y left is −x of the plan
-        T_frame_grid[:2, 3] = plan.origin_m[1], -(plan.origin_m[0] + plan.cell_m * plan.kind.shape[1])
-        info = {
-            "map_load_time": _header(stamp_ns, "")["stamp"], "resolution": plan.cell_m, "width": cells.shape[1],
-            "height": cells.shape[0], "origin": _pose(T_frame_grid),
-        }  # fmt: skip
-        return self._encoded(GRID, stamp_ns, frame, info=info, data=cells.reshape(-1))
+            ODOMETRY, stamp_ns, parent, child_frame_id=child, pose={"pose": _pose(T), **unknown}, twist=unknown
+        )
 
     def images(
         self, stamp_ns: int, camera: Camera, color: NDArray[np.float32], depth_m: NDArray[np.float32]
