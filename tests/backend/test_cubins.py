@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from cuda_kernels import ARCHITECTURES, kernel_names
 from sigmasplat.errors import BackendError
 from sigmasplat.plugins.cuda import cubins
 
@@ -23,7 +24,7 @@ where alignment solves for a step, to the one thread that does, and to where the
 
 @pytest.mark.parametrize(
     "architecture",
-    [pytest.param(each, marks=() if each == "sm_90" else pytest.mark.slow) for each in cubins.ARCHITECTURES],
+    [pytest.param(each, marks=() if each == "sm_90" else pytest.mark.slow) for each in ARCHITECTURES],
 )
 def test_every_kernel_compiles_without_a_warning_and_keeps_to_its_registers(architecture: str) -> None:
     with ThreadPoolExecutor(2) as pool:
@@ -34,8 +35,8 @@ def test_every_kernel_compiles_without_a_warning_and_keeps_to_its_registers(arch
         for usage in used.values():
             assert usage.spilled <= MOST_SPILLED.get(features, 0), usage
             assert usage.shared <= 48 << 10 and kernels.blocks_held(usage, architecture) >= 1, usage
-        assert len(cubins.kernel_names(features)) >= 4
-        for name in cubins.kernel_names(features):
+        assert len(kernel_names(features)) >= 4
+        for name in kernel_names(features):
             of_views = name in ("pack_view", "blend_backward_pose", "chain_params", "chain_pose")
             there = f".text.{name}\0".encode() in program.code
             assert there == (name in used) == (features <= 7 or not of_views), name

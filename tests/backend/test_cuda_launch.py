@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from cuda_kernels import kernel_names
 from emulated_cuda import Emulator
 from sigmasplat.errors import BackendError
 from sigmasplat.plugins.cuda import cubins, launch as cuda_launch, operators as cuda
@@ -65,7 +66,7 @@ class Driver:
         return Result.CUDA_SUCCESS, int(code)
 
     def cuModuleGetFunction(self, module: int, name: bytes) -> tuple[Result, int]:
-        assert name.decode() in cubins.kernel_names(module)
+        assert name.decode() in kernel_names(module)
         self.kernels.append((module, name.decode()))
         return Result.CUDA_SUCCESS, len(self.kernels) - 1
 

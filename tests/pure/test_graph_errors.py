@@ -12,7 +12,7 @@ from scipy.stats import chi2
 from sigmasplat.data import se3
 from sigmasplat.data.atlas import Atlas
 from sigmasplat.data.relative_pose import Edges, Kind, RelativePose, SolvedGraph
-from sigmasplat.final.keyframe_nodes import KeyframeNodes
+from sigmasplat.final.stores import KeyframeNodes
 from sigmasplat.graph import graph_errors
 from sigmasplat.graph.graph_errors import CALIBRATION, STAMP, GraphErrors, shared_errors
 from sigmasplat.graph.keyframe_graph import solve

@@ -18,8 +18,7 @@ from sigmasplat.data.trajectory import LOST as LOST_STATE, RELOCALISED, TRACKED
 from sigmasplat.plugins.robots.ros_messages import T_LINK_OPTICAL
 
 pytest.importorskip("rosbags", reason="rosbags is not installed (extra `ros`)")
-from sigmasplat.plugins.robots.bag import BagSink
-from sigmasplat.plugins.robots.live import LiveOdometry, has_motion
+from sigmasplat.plugins.robots.bag import BagSink, LiveOdometry, has_motion
 from sigmasplat.plugins.robots.ros_messages import TF, RosMessages, stamp_of
 
 Array = NDArray[np.float64]

@@ -23,8 +23,7 @@ from small_room import frame_at, walk
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 pytest.importorskip("rosbags", reason="rosbags is not installed (extra `ros`)")
-from sigmasplat.plugins.robots.bag import BagSink
-from sigmasplat.plugins.robots.live import LiveRobot
+from sigmasplat.plugins.robots.bag import BagSink, LiveRobot
 from sigmasplat.plugins.robots.ros_messages import Encoded
 
 SETTINGS = {

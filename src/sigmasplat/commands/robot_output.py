@@ -11,7 +11,7 @@ import tyro
 from sigmasplat.commands.input_options import arg
 
 if TYPE_CHECKING:
-    from sigmasplat.plugins.robots.live import LiveRobot
+    from sigmasplat.plugins.robots.bag import LiveRobot
     from sigmasplat.run.terminal import Screen
     from sigmasplat.run_folder.runs import RunFolder
     from sigmasplat.system.slam import Slam
@@ -54,7 +54,7 @@ def robot_output(
     if asked.bag is None:
         yield None
         return
-    from sigmasplat.plugins.robots.live import LiveRobot
+    from sigmasplat.plugins.robots.bag import LiveRobot
 
     robot = LiveRobot(slam, asked.bag, screen.warn, asked.bag_images)
     try:

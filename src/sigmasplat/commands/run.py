@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from sigmasplat.config import Config
     from sigmasplat.input.source import Source
     from sigmasplat.plugins.checks.motion import MotionWatch
-    from sigmasplat.plugins.robots.live import LiveRobot
+    from sigmasplat.plugins.robots.bag import LiveRobot
     from sigmasplat.plugins.viewer.app import ViewerApp
     from sigmasplat.run.callbacks import Callback
     from sigmasplat.run.finished_map import FinishedMap

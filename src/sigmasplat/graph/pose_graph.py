@@ -48,13 +48,11 @@ class LoopVerdict:
 @dataclass(frozen=True, eq=False)
 class PoseGraphSolution:
     """T_world_node [N, 4, 4]; one verdict per loop edge in the order of the edges; number of steps of
-    Levenberg–Marquardt; cost Σ χ² of odometry and accepted loops, at the given poses and at the solution."""
+    Levenberg–Marquardt."""
 
     T_world_node: Matrix
     verdicts: tuple[LoopVerdict, ...]
     iterations: int
-    cost_before: float
-    cost_after: float
 
 
 def optimise(
@@ -79,15 +77,11 @@ def optimise(
     """
     poses = np.array(T_world_node, np.float64)
     _refuse_bad_input(edges)
-    if not edges:
-        return PoseGraphSolution(poses, (), 0, 0.0, 0.0)
+    if not any(edge.loop for edge in edges):
+        return PoseGraphSolution(poses, (), 0)
     graph = PoseGraph(len(poses), edges, fixed)
     # Relative to node 0, so that rounding and the steps do not depend on the origin of the world.
     start = se3.inverse(poses[:1]) @ poses
-    if not graph.loop.any():
-        cost = float(graph.chi2(start).sum())
-        return PoseGraphSolution(poses, (), 0, cost, cost)
-
     chi2_limit = most_chi2(confidence)
     judged_first = graph.loop & ~np.array(rejected, bool) if len(rejected) else graph.loop
     T, weights, graduating = _graduate(graph, start, chi2_limit, judged_first)
@@ -99,8 +93,7 @@ def optimise(
     )
     solved = se3.orthonormalise(poses[0] @ T)
     solved[:fixed] = poses[:fixed]
-    cost_before, cost_after = float(graph.chi2(start)[valid].sum()), float(chi2[valid].sum())
-    return PoseGraphSolution(solved, verdicts, graduating + finishing, cost_before, cost_after)
+    return PoseGraphSolution(solved, verdicts, graduating + finishing)
 
 
 def most_chi2(confidence: float = 0.99) -> float:

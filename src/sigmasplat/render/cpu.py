@@ -140,10 +140,6 @@ project = project_with(_Project, reference.project)
 blend = blend_with(_Blend, FEATURES_AT_ONCE, reference.blend)
 
 
-NO_GATE_M = 0.0
-"""The kernels can also damp depth behind the median depth (GauS-SLAM); nothing uses this."""
-
-
 class CpuView:
     """A view on the compiled kernels."""
 
@@ -182,7 +178,7 @@ class CpuView:
         self._made, self._splats = (depth_reference is not None, layers), len(params)
         view, planes = view_params(self.camera, T_camera_world, o), self.layers if layers else NO_LAYERS
         self.raster.view_forward(
-            view, params, harmonics, self._k, o.alpha_min, o.transmittance_stop, o.depth == "ray", NO_GATE_M,
+            view, params, harmonics, self._k, o.alpha_min, o.transmittance_stop, o.depth == "ray", 0.0,
             reference_depth, self.sums, moment, self.alpha, *planes, self.seconds[:3],
         )  # fmt: skip
 

@@ -3,7 +3,6 @@ result."""
 
 import hashlib
 import os
-import re
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -26,8 +25,6 @@ FITTING = 0
 ALIGNING = -1
 """The same for the program that aligns images."""
 PROGRAMS = (ALIGNING, FITTING, *FEATURE_COUNTS)
-ARCHITECTURES = ("sm_75", "sm_80", "sm_86", "sm_89", "sm_90", "sm_100", "sm_120")
-"""Architectures compiled in the tests; any other that NVRTC supports is compiled when a device needs it."""
 INSTALL = install_extra("gpu")
 INSTALL_OLDER = "pip install 'cuda-bindings<13' nvidia-cuda-nvrtc-cu12"
 """For drivers that support only CUDA 12."""
@@ -154,12 +151,6 @@ def target_of(capability: tuple[int, int]) -> str:
 def include_folders() -> tuple[Path, ...]:
     """Return the folder of the sources' headers."""
     return FOLDER / "cuda", FOLDER
-
-
-def kernel_names(features: int) -> list[str]:
-    """List the kernels that a program defines, whatever its feature count."""
-    texts = ((FOLDER / name).read_text(encoding="utf-8") for name in TEXTS[text_of(features)])
-    return [name for text in texts for name in re.findall(r"^KERNEL (\w+)\(", text, re.MULTILINE)]
 
 
 def _keep(path: Path, code: bytes) -> None:

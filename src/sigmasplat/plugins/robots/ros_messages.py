@@ -31,15 +31,6 @@ def link_pose(T_outer_optical: Matrix) -> Matrix:
     return np.asarray(T_outer_optical @ se3.inverse(T_LINK_OPTICAL))
 
 
-def camera_links(T_odom_link: Matrix, T_map_link: Matrix | None) -> list[tuple[str, str, Matrix]]:
-    """Return the transforms of a frame as (parent, child, pose): map → odom, left out if T_map_link is None, and odom →
-    camera_link."""
-    links = [(ODOM, LINK, T_odom_link)]
-    if T_map_link is not None:
-        links.insert(0, (MAP, ODOM, se3.orthonormalise(T_map_link @ se3.inverse(T_odom_link))))
-    return links
-
-
 EXTRA = "ros"
 UNKNOWN = (-1.0, *(0.0,) * 35)
 """Covariance that is not known: ROS marks it by −1 in the first element."""
