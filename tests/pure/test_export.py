@@ -70,14 +70,6 @@ def test_the_format_can_be_given_by_name(export: Callable[..., str]) -> None:
     assert export("walk").startswith("walk.ply: 10 splats")
 
 
-def test_splats_outside_the_bounds_are_dropped_and_counted(export: Callable[..., str]) -> None:
-    said = export("walk", "--out", "a.ply", "--opacity-above", "0.5")
-    assert said.startswith("a.ply: 5 splats, axes y-down") and "; dropped 5 of 10" in said
-    kept = ply.read_field(Path("a.ply"))
-    assert kept.opacities.min() > 0.5
-    assert "dropped 0 of 10" in export("walk", "--out", "b.ply", "--opacity-above", "0")
-
-
 @pytest.fixture
 def std(export: Callable[..., str]) -> SplatStd:
     """Write the uncertainty of the run's map; return the standard deviations of its splats."""
@@ -102,7 +94,7 @@ def test_a_run_that_has_not_measured_them_is_exported_without_them(export: Calla
     """Runs of older versions have an uncertainty.json without standard deviations of splats."""
     background = Background((0.5, 0.5, 0.5), 0.1, 1.0)
     RunFolder.open(Path("walk")).write_uncertainty(MapUncertainty(torch.zeros(10, 3), background, SHIPPED))
-    export("walk", "--out", "a.ply", "--opacity-above", "0")
+    export("walk", "--out", "a.ply")
     assert vertices(Path("a.ply")).dtype == vertices(Path("walk/map.ply")).dtype
 
 

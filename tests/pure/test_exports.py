@@ -23,7 +23,7 @@ from sigmasplat.plugins.outputs.drawing.view_panels import FOOT, GAP, HEAD, PANE
 from sigmasplat.plugins.outputs.floorplan.picture import export_plan
 from sigmasplat.plugins.outputs.mesh_files import write_mesh
 from sigmasplat.plugins.outputs.run_reader import RunReader
-from sigmasplat.plugins.outputs.video import VideoOptions, export_video, film_camera, orbit_view
+from sigmasplat.plugins.outputs.video import export_video, film_camera, image_count, orbit_view
 from sigmasplat.plugins.outputs.views import export_colmap, splat_points
 from sigmasplat.uncertainty.map_uncertainty import SHIPPED, Background, MapUncertainty, SplatStd
 
@@ -139,10 +139,10 @@ def _from_any_submap(reader: RunReader):
 @pytest.mark.parametrize("path", ["run", "orbit"])
 def test_films_follow_the_path_or_an_orbit(reader: RunReader, tmp_path: Path, path: str) -> None:
     calls: list[tuple[int, int]] = []
-    options = VideoOptions(width_px=64, fps=5.0, seconds=1.0, path=path)
     count = export_video(
-        reader, tmp_path / "film.mp4", options, renderer=seer(WORLD), progress=lambda *at: calls.append(at)
-    )
+        reader, tmp_path / "film.mp4", width_px=64, fps=5.0, seconds=1.0, orbit=path == "orbit", renderer=seer(WORLD),
+        progress=lambda *at: calls.append(at),
+    )  # fmt: skip
     frames, _ = read_film(tmp_path / "film.mp4")
     first = frames[0]
     assert (first.shape, len(frames), count) == ((48, 3 * 64, 3), 5, 5)
@@ -152,8 +152,8 @@ def test_films_follow_the_path_or_an_orbit(reader: RunReader, tmp_path: Path, pa
 
 
 def test_a_film_of_colour_alone_has_one_panel_and_no_legend(reader: RunReader, tmp_path: Path) -> None:
-    options = VideoOptions(width_px=64, fps=5.0, seconds=1.0, panels="color")
-    assert export_video(reader, tmp_path / "film.mp4", options, renderer=seer(WORLD)) == 5
+    options = {"width_px": 64, "fps": 5.0, "seconds": 1.0, "panels": False}
+    assert export_video(reader, tmp_path / "film.mp4", **options, renderer=seer(WORLD)) == 5
     first = read_film(tmp_path / "film.mp4")[0][0]
     assert first.shape == (48, 64, 3) and np.abs(first.astype(int) - 128).max() < 12
 
@@ -173,11 +173,11 @@ def test_the_orbit_view_removes_the_ceiling_and_shows_the_whole_room() -> None:
 
 
 def test_the_length_and_the_size_of_a_film(reader: RunReader, tmp_path: Path) -> None:
-    assert VideoOptions().images(0.5) == 100 and VideoOptions(fps=10.0).images(500.0) == 200
-    assert VideoOptions(path="orbit", fps=10.0).images(500.0) == 120
+    assert image_count(0.5) == 100 and image_count(500.0, fps=10.0) == 200
+    assert image_count(500.0, fps=10.0, orbit=True) == 120
     camera = film_camera(Camera(321, 241, 200.0, 200.0, 160.0, 120.0), 0)
     assert (camera.width, camera.height) == (320, 240)
-    export_video(reader, tmp_path / "film.mp4", VideoOptions(200, 5.0, 0.2), renderer=seer(WORLD))
+    export_video(reader, tmp_path / "film.mp4", width_px=200, fps=5.0, seconds=0.2, renderer=seer(WORLD))
     shown = read_film(tmp_path / "film.mp4")[0][0].astype(int)
     assert shown.shape == (150 + HEAD + FOOT, 3 * 200 + 4 * GAP, 3), "panels with titles and colour bars"
     bar = shown[HEAD + 150 + FOOT // 2, 2 * GAP + 200 + 80 : 2 * GAP + 400 - 80]

@@ -1,4 +1,4 @@
-"""Splats are written by the standard deviation of their depth and by opacity."""
+"""Splats are written by the standard deviation of their depth."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,7 +23,7 @@ def three() -> GaussianField:
 STD = SplatStd(torch.tensor([0.03, 0.01, 0.02]), torch.zeros(3))
 
 
-def written(std_below_m: float | None, opacity_above: float | None) -> list[float]:
+def written(std_below_m: float | None) -> list[float]:
     """Return the opacities of the splats that are written."""
     found: list[float] = []
     source = SimpleNamespace(path=Path("run"), splats=lambda: (three(), STD))
@@ -31,13 +31,9 @@ def written(std_below_m: float | None, opacity_above: float | None) -> list[floa
     def write(field: GaussianField, std: SplatStd | None) -> None:
         found.extend(field.opacities.tolist())
 
-    chosen_splats.write_splats(source, "y-down", write, std_below_m, opacity_above, "camera")
+    chosen_splats.write_splats(source, "y-down", write, std_below_m, "camera")
     return [round(opacity, 3) for opacity in found]
 
 
-def test_bounds_select_splats() -> None:
-    assert written(None, None) == [0.9, 0.5, 0.1] and written(None, 0.3) == [0.9, 0.5]
-
-
 def test_a_bound_of_the_depth_drops_exactly_the_splats_above_it() -> None:
-    assert written(0.03, 0.3) == [0.5] and written(0.03, None) == [0.5, 0.1]
+    assert written(None) == [0.9, 0.5, 0.1] and written(0.03) == [0.5, 0.1] and written(0.015) == [0.5]

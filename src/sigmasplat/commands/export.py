@@ -28,10 +28,6 @@ class ExportOptions:
             "(default: all)",
         ),
     ] = None
-    opacity_above: Annotated[
-        From0,
-        arg("A", "keep only splats with opacity above A", "(default: all)"),
-    ] = None
     axes: Annotated[
         Literal["y-up", "z-up", "y-down", "camera"] | None,
         arg(

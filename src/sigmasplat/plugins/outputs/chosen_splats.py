@@ -24,14 +24,13 @@ Y_UP_FORMATS: tuple[Axes, ...] = ("y-up", "camera")
 """The axes of formats that define y as up. `camera` is not levelled, only rotated by 180° about x."""
 HALF_TURN = np.diag([1.0, -1.0, -1.0, 1.0])
 WriteSplats = Callable[[GaussianField, SplatStd | None], None]
-Bound = float | None
 
 
 def write_splats(
-    source: "ExportSource", own: Axes, write: WriteSplats, std_below_m: Bound, opacity_above: Bound, axes: Axes | None
+    source: "ExportSource", own: Axes, write: WriteSplats, std_below_m: float | None, axes: Axes | None
 ) -> str:
-    """Write the splats within the bounds of the standard deviation of depth (m) and of opacity; return how many were
-    written and dropped, and the axes. None sets no bound.
+    """Write the splats whose standard deviation of depth (m) is below a bound, if there is one; return how many were
+    written and dropped, and the axes.
 
     own: the axes of the format, used without `axes`. If it defines y as up, the field that `write` gets is rotated by
     180° about x, because the writer rotates it back. Raises ConfigError on axes that the format cannot have, or if the
@@ -47,22 +46,18 @@ def write_splats(
             "uncertainty.json (run older runs again)"
         )
     total, kept = len(field), torch.ones(len(field), dtype=torch.bool, device=field.params.device)
-    if opacity_above is not None:
-        kept &= field.opacities > opacity_above
     if std_below_m is not None and std is not None:
         kept &= std.depth_std_m.to(kept.device) < std_below_m
     if total and not kept.any():
-        medians = f"median opacity is {field.opacities.median():.3g}"
-        medians += "" if std is None else f", of depth_std_m {std.depth_std_m.median():.3g} m"
-        raise RunError(f"no splat of {source.path} is left ({medians}); use weaker bounds")
+        median = "" if std is None else f" (median of depth_std_m is {std.depth_std_m.median():.3g} m)"
+        raise RunError(f"no splat of {source.path} is left{median}; use a weaker bound")
     field.keep(kept)
     std = None if std is None else std.at(kept.cpu())
     T, note = _transform(source, axes, own)
     field = field if np.array_equal(T, np.eye(4)) else field.moved(torch.from_numpy(T))
     print(f"writing {len(field):,} splats …", flush=True)
     write(field, std)
-    bounded = std_below_m is not None or opacity_above is not None
-    dropped = f"; dropped {total - len(field):,} of {total:,}" if bounded else ""
+    dropped = "" if std_below_m is None else f"; dropped {total - len(field):,} of {total:,}"
     return f"{len(field):,} splats, axes {axes}{note}{dropped}"
 
 

@@ -16,9 +16,6 @@ if TYPE_CHECKING:
     from sigmasplat.plugins.outputs.axes import Axes
 
 
-Bound = float | None
-
-
 def owners(formats: tuple[Output, ...]) -> dict[str, Output]:
     """Return the format that each ending selects: the first one with that ending."""
     endings: dict[str, Output] = {}
@@ -64,23 +61,21 @@ def refuse_unused(chosen: Output, formats: tuple[Output, ...], given: list[str])
             )
 
 
-def _spz(source: ExportSource, target: Path, *, std_below_m: Bound, opacity_above: Bound, axes: "Axes | None") -> str:
+def _spz(source: ExportSource, target: Path, *, std_below_m: float | None, axes: "Axes | None") -> str:
     from sigmasplat.plugins.outputs.chosen_splats import write_splats
     from sigmasplat.plugins.outputs.spz import write_field
 
-    return write_splats(source, "y-up", lambda field, std: write_field(target, field), std_below_m, opacity_above, axes)
+    return write_splats(source, "y-up", lambda field, std: write_field(target, field), std_below_m, axes)
 
 
-def _ply(
-    source: ExportSource, target: Path, *, std_below_m: Bound, opacity_above: Bound, axes: "Axes | None", plain: bool
-) -> str:
+def _ply(source: ExportSource, target: Path, *, std_below_m: float | None, axes: "Axes | None", plain: bool) -> str:
     from sigmasplat.api import splat_ply
     from sigmasplat.plugins.outputs.chosen_splats import write_splats
 
     def write(field: "GaussianField", std: "SplatStd | None") -> None:
         splat_ply.write_field(target, field, plain=plain, std=std)
 
-    return write_splats(source, "y-down", write, std_below_m, opacity_above, axes)
+    return write_splats(source, "y-down", write, std_below_m, axes)
 
 
 @contextmanager
@@ -125,11 +120,13 @@ def _colmap(source: ExportSource, target: Path, *, pictures: bool) -> str:
 def _video(
     source: ExportSource, target: Path, *, size: int, fps: float, seconds: float | None, path: str, panels: str
 ) -> str:
-    from sigmasplat.plugins.outputs.video import VideoOptions, export_video
+    from sigmasplat.plugins.outputs.video import export_video
 
-    options = VideoOptions(size, fps, seconds, path, panels)  # type: ignore[arg-type]
     with _counting("film") as progress:
-        count = export_video(source.reader(), target, options, progress=progress)
+        count = export_video(
+            source.reader(), target, width_px=size, fps=fps, seconds=seconds, orbit=path == "orbit",
+            panels=panels == "all", progress=progress,
+        )  # fmt: skip
     return f"{count:,} images, {count / fps:.1f} s"
 
 

@@ -4,7 +4,6 @@ import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
@@ -102,51 +101,41 @@ CEILING_M = 0.1
 """On an orbit, splats higher than this above the camera's median height are removed: mostly the ceiling."""
 
 
-@dataclass(frozen=True)
-class VideoOptions:
-    """The options of a video.
-
-    width_px: width of a panel (0: that of the run's images); fps: images per second; seconds: length (None: that of the
-    path, within 4 to 20 s; 12 s for an orbit); path: along the run's path or on an orbit; panels: colour, depth and
-    uncertainty side by side ("all"), or colour alone ("color").
-    """
-
-    width_px: int = 0
-    fps: float = 25.0
-    seconds: float | None = None
-    path: Literal["run", "orbit"] = "run"
-    panels: Literal["all", "color"] = "all"
-
-    def images(self, path_s: float) -> int:
-        """Return the number of images of the film, for a path that lasts `path_s` seconds."""
-        usual = ORBIT_S if self.path == "orbit" else float(np.clip(path_s, SHORTEST_S, LONGEST_S))
-        return max(1, round((self.seconds or usual) * self.fps))
+def image_count(path_s: float, fps: float = 25.0, seconds: float | None = None, orbit: bool = False) -> int:
+    """Return the number of images of a film of some seconds (None: those of the path, `path_s`, within 4 to 20 s; 12 s
+    for an orbit)."""
+    usual = ORBIT_S if orbit else float(np.clip(path_s, SHORTEST_S, LONGEST_S))
+    return max(1, round((seconds or usual) * fps))
 
 
 def export_video(
     reader: RunReader,
     target: Path,
-    options: VideoOptions | None = None,
     *,
+    width_px: int = 0,
+    fps: float = 25.0,
+    seconds: float | None = None,
+    orbit: bool = False,
+    panels: bool = True,
     renderer: Renderer | None = None,
     progress: Progress = no_progress,
 ) -> int:
     """Write a video and return its number of images. Calls `progress(done, total)` at the start and after each image.
 
-    Raises RunError on an unknown ending, or without a map or path.
+    width_px: width of a panel (0: that of the run's images); orbit: not along the run's path; panels: depth and
+    uncertainty beside colour. Raises RunError on an unknown ending, or without a map or path.
     """
-    options = options or VideoOptions()
     config, path = reader.config, reader.valid_path()
     renderer = renderer or FieldRenderer(config.render, config.backend)
-    field, camera = reader.run.read_map(), film_camera(reader.camera, options.width_px)
-    count = options.images(float(path.timestamps_s[-1] - path.timestamps_s[0]))
-    if options.path == "orbit":
+    field, camera = reader.run.read_map(), film_camera(reader.camera, width_px)
+    count = image_count(float(path.timestamps_s[-1] - path.timestamps_s[0]), fps, seconds, orbit)
+    if orbit:
         field, poses = orbit_view(field, path, camera, count, renderer, noted_up(reader.run.facts()))
     else:
         poses = smooth_path(path, count)
     film = Film(field, camera, renderer)
     progress(0, count)
-    write_video(target, film.images(poses, options.panels == "all", progress), options.fps)
+    write_video(target, film.images(poses, panels, progress), fps)
     return count
 
 
