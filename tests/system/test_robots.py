@@ -106,7 +106,7 @@ def test_a_disk_that_fails_ends_the_bag_and_not_the_run(tmp_path: Path, monkeypa
     monkeypatch.setattr(BagSink, "write", failing)
     slam, robot = followed(tmp_path / "bag", warnings)
     assert robot is not None and contents(slam) == plain()
-    assert robot.record() == {"written": 61, "failure": "No space left on device"}
+    assert (robot.written, robot.failure) == (61, "No space left on device")
     assert warnings == ["the bag ended (No space left on device) after 61 messages; the run goes on"]
 
 

@@ -61,4 +61,4 @@ def robot_output(
         yield robot
     finally:
         robot.close()
-        folder.note(bag=robot.record())
+        folder.note(bag={"written": robot.written, "failure": robot.failure})

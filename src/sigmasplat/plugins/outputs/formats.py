@@ -3,8 +3,6 @@
 Imports that load torch are inside the functions, so that `sigmasplat export --help` is fast.
 """
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,7 +10,7 @@ from sigmasplat.api import ConfigError, Output
 from sigmasplat.plugins.outputs.source import ExportSource as ExportSource
 
 if TYPE_CHECKING:
-    from sigmasplat.api import GaussianField, Progress, SplatStd
+    from sigmasplat.api import GaussianField, SplatStd
     from sigmasplat.plugins.outputs.axes import Axes
 
 
@@ -78,14 +76,6 @@ def _ply(source: ExportSource, target: Path, *, std_below_m: float | None, axes:
     return write_splats(source, "y-down", write, std_below_m, axes)
 
 
-@contextmanager
-def _counting(title: str) -> "Iterator[Progress]":
-    from sigmasplat.api import Screen
-
-    with Screen().counting(title) as progress:
-        yield progress
-
-
 def _trajectory(source: ExportSource, target: Path) -> str:
     from sigmasplat.api import write_trajectory
 
@@ -106,13 +96,14 @@ def _covariance(source: ExportSource, target: Path) -> str:
 
 
 def _colmap(source: ExportSource, target: Path, *, pictures: bool) -> str:
+    from sigmasplat.api import Screen
     from sigmasplat.plugins.outputs.views import export_colmap
 
     reader = source.reader()
     if not pictures:
         count = export_colmap(reader, target)
         return f"{count:,} views, no pictures (--pictures){reader.left_out()}"
-    with _counting("pictures") as progress:
+    with Screen().counting("pictures") as progress:
         count = export_colmap(reader, target, True, progress)
         return f"{count:,} views with their pictures{reader.left_out(keyframes=True)}"
 
@@ -120,9 +111,10 @@ def _colmap(source: ExportSource, target: Path, *, pictures: bool) -> str:
 def _video(
     source: ExportSource, target: Path, *, size: int, fps: float, seconds: float | None, path: str, panels: str
 ) -> str:
+    from sigmasplat.api import Screen
     from sigmasplat.plugins.outputs.video import export_video
 
-    with _counting("film") as progress:
+    with Screen().counting("film") as progress:
         count = export_video(
             source.reader(), target, width_px=size, fps=fps, seconds=seconds, orbit=path == "orbit",
             panels=panels == "all", progress=progress,
@@ -131,10 +123,11 @@ def _video(
 
 
 def _plan(source: ExportSource, target: Path, *, cell_m: float) -> str:
+    from sigmasplat.api import Screen
     from sigmasplat.plugins.outputs.floorplan.floor_plan import FREE
     from sigmasplat.plugins.outputs.floorplan.picture import export_plan
 
-    with _counting("floor plan") as progress:
+    with Screen().counting("floor plan") as progress:
         plan = export_plan(source.reader(), target, cell_m=cell_m, progress=progress)
     return f"{plan.area_m2(FREE):.1f} m² of free floor, also in {target.with_suffix('.json').name}"
 

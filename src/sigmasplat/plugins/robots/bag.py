@@ -174,10 +174,6 @@ class LiveRobot(Callback):
         if self.written:
             self._try(self.sink.close)
 
-    def record(self) -> dict[str, Any]:
-        """Return count and failure as values for run.json."""
-        return {"written": self.written, "failure": self.failure}
-
     def _try(self, action: Callable[[], None]) -> None:
         """Call a function that writes; if it fails, end the bag and say so."""
         if self.failure:
