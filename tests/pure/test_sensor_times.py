@@ -14,7 +14,7 @@ from sigmasplat.data.readout import AT_ONCE, UNKNOWN_TIMES, Reading, Readout, Se
 from sigmasplat.fit.align import Alignment, Pair as Aligned, align, normal_equations
 from sigmasplat.fit.compare import compare
 from sigmasplat.fit.pyramid import Pyramid
-from sigmasplat.graph.sensor_times import LEAST_PAIRS, Pair, Term, measured, newton_step
+from sigmasplat.graph.sensor_times import LEAST_PAIRS, NEIGHBOURS, Pair, Term, measured, newton_step
 from sigmasplat.types import completed
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
@@ -220,7 +220,7 @@ def test_a_newton_step_ends_at_the_lowest_point_of_a_quadratic() -> None:
 
     def terms(at: Array, own: Array, numbers: Sequence[int]) -> list[Term]:
         slopes = [bend @ (at - low) for bend, low in zip(bends, own, strict=True)]
-        return [Term(*parts) for parts in zip(slopes, bends, numbers, strict=True)]
+        return [Term(s, b, NEIGHBOURS * n) for s, b, n in zip(slopes, bends, numbers, strict=True)]
 
     start, common = np.array([0.01, -0.02, 0.03]), np.array([0.004, 0.005, -0.006])
     step, covariance = newton_step(terms(start, np.repeat(common[None], 12, 0), range(12)))

@@ -48,7 +48,7 @@ def _between_readings(depth_m: Image, column: Image, row: Image) -> Image:
     nearest_m = cv2.remap(depth_m, column, row, cv2.INTER_NEAREST)
     between_m = cv2.remap(depth_m, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     least_m, most_m = (extreme(depth_m, PIXEL_AND_NEXT, anchor=(0, 0)) for extreme in (cv2.erode, cv2.dilate))
-    whole = (most_m - least_m < SAME_SURFACE * least_m).astype(np.float32)
+    whole: Image = (most_m - least_m < SAME_SURFACE * least_m).astype(np.float32)
     whole = cv2.remap(whole, np.floor(column), np.floor(row), cv2.INTER_NEAREST)
     return np.where((whole > 0) & (nearest_m > 0), between_m, nearest_m)
 
