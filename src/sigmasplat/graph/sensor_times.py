@@ -11,7 +11,7 @@ from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.stats import f as f_distribution
 
 from sigmasplat.data.readout import UNKNOWN_TIMES, Reading, SensorTimes
 from sigmasplat.fit.align import align
@@ -30,8 +30,9 @@ BIAS_S = 1e-4
 """Systematic error of a time: in so long, an image moves by `fit.align.BIAS_PX` at 100 pixels per second."""
 LEAST_PAIRS = 10
 LEAST_OVERLAP = 0.25
-SURE = float(chi2.ppf(0.999, 3))
-"""Times are used if the hypothesis that all rows are read at once is rejected at this level."""
+LEVEL, HOPELESS = 0.999, 0.9
+"""Times are used if the hypothesis that all rows are read at once is rejected at the first level; if the first step is
+not even sure at the second one, it was the last."""
 
 
 class Pair(NamedTuple):
@@ -87,7 +88,8 @@ def measured(pairs: Sequence[Pair]) -> Task[SensorTimes]:
             std_s = np.sqrt(np.diag(covariance))
             near = bool((np.abs(step_s) <= 2.0 * std_s).all() and std_s.max() < STEP_S)  # costs hardly differ
             still = bool((np.abs(step_s) <= np.maximum(0.5 * std_s, NO_STEP_S)).all())
-            if std_s.max() < STEP_S and (still or not _sure(times_s + step_s, covariance)):
+            groups = len({term.number // NEIGHBOURS for term in terms})
+            if std_s.max() < STEP_S and (still or not _sure(times_s + step_s, covariance, groups, HOPELESS)):
                 break
         else:
             longest_s = float(np.abs(times_s - best[0]).max()) / 3.0
@@ -97,11 +99,15 @@ def measured(pairs: Sequence[Pair]) -> Task[SensorTimes]:
     std_s = np.sqrt(np.diag(covariance))
     settled = std_s.max() < STEP_S and bool((np.abs(step_s) <= np.maximum(std_s, NO_STEP_S)).all())
     found_s = times_s + step_s
-    return _times(found_s, std_s) if settled and _sure(found_s, covariance) else UNKNOWN_TIMES
+    return _times(found_s, std_s) if settled and _sure(found_s, covariance, groups) else UNKNOWN_TIMES
 
 
-def _sure(times_s: Matrix, covariance: Matrix) -> bool:
-    return bool(times_s @ np.linalg.solve(covariance, times_s) > SURE)
+def _sure(times_s: Matrix, covariance: Matrix, groups: int, level: float = LEVEL) -> bool:
+    """Return whether times are not 0, by Hotelling's test: the covariance is that of so many groups."""
+    if groups < 5:
+        return False
+    limit = 3.0 * (groups - 1) / (groups - 3) * float(f_distribution.ppf(level, 3, groups - 3))
+    return bool(times_s @ np.linalg.solve(covariance, times_s) > limit)
 
 
 def _times(values_s: Matrix, std_s: Matrix) -> SensorTimes:
