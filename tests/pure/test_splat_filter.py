@@ -3,9 +3,11 @@
 from pathlib import Path
 from types import SimpleNamespace
 
+import pytest
 import torch
 
 from sigmasplat.data.field import GaussianField
+from sigmasplat.errors import RunError
 from sigmasplat.plugins.outputs import chosen_splats
 from sigmasplat.uncertainty.map_uncertainty import SplatStd
 
@@ -37,3 +39,5 @@ def written(std_below_m: float | None) -> list[float]:
 
 def test_a_bound_of_the_depth_drops_exactly_the_splats_above_it() -> None:
     assert written(None) == [0.9, 0.5, 0.1] and written(0.03) == [0.5, 0.1] and written(0.015) == [0.5]
+    with pytest.raises(RunError, match=r"no splat of run is left \(median depth_std_m is 0\.02 m\)"):
+        written(0.01)

@@ -40,19 +40,19 @@ def write_splats(
     if axes not in allowed:
         raise ConfigError(f"--axes {axes} cannot be used with this format, only {', '.join(allowed)}")
     field, std = source.splats()
-    if std_below_m is not None and std is None:
-        raise ConfigError(
-            f"{source.path} has no calibrated uncertainty, so --std-below-m cannot be used; give a run with "
-            "uncertainty.json (run older runs again)"
-        )
-    total, kept = len(field), torch.ones(len(field), dtype=torch.bool, device=field.params.device)
-    if std_below_m is not None and std is not None:
-        kept &= std.depth_std_m.to(kept.device) < std_below_m
-    if total and not kept.any():
-        median = "" if std is None else f" (median of depth_std_m is {std.depth_std_m.median():.3g} m)"
-        raise RunError(f"no splat of {source.path} is left{median}; use a weaker bound")
-    field.keep(kept)
-    std = None if std is None else std.at(kept.cpu())
+    total = len(field)
+    if std_below_m is not None:
+        if std is None:
+            raise ConfigError(
+                f"{source.path} has no calibrated uncertainty, so --std-below-m cannot be used; give a run with "
+                "uncertainty.json (run older runs again)"
+            )
+        kept = std.depth_std_m < std_below_m
+        if total and not kept.any():
+            median = f"{std.depth_std_m.median():.3g} m"
+            raise RunError(f"no splat of {source.path} is left (median depth_std_m is {median}); use a weaker bound")
+        field.keep(kept.to(field.params.device))
+        std = std.at(kept.cpu())
     T, note = _transform(source, axes, own)
     field = field if np.array_equal(T, np.eye(4)) else field.moved(torch.from_numpy(T))
     print(f"writing {len(field):,} splats …", flush=True)
