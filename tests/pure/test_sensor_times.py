@@ -10,7 +10,7 @@ from late_images import CAMERA, cast, frame, image
 from sigmasplat.data import se3
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.read_at_once import read_at_once
-from sigmasplat.data.readout import AT_ONCE, UNKNOWN_TIMES, Reading, Readout, SensorTimes, readouts
+from sigmasplat.data.readout import AT_ONCE, UNKNOWN_TIMES, Readout, SensorTimes, readouts
 from sigmasplat.fit.align import Alignment, Pair as Aligned, align, normal_equations
 from sigmasplat.fit.compare import compare
 from sigmasplat.fit.pyramid import Pyramid
@@ -114,8 +114,8 @@ def test_at_the_true_motion_late_images_look_alike_if_their_times_are_known() ->
 
 def test_only_known_times_of_a_moving_camera_matter() -> None:
     times = SensorTimes(0.01, 0.02, 0.03, STD_S)
-    assert UNKNOWN_TIMES.readout(Reading(SHIFTING)) is None and times.readout(Reading(np.zeros(6))) is None
-    late = times.readout(Reading(SHIFTING, 0.005))
+    assert UNKNOWN_TIMES.read(Readout(SHIFTING)) is None and times.read(Readout(np.zeros(6))) is None
+    late = times.read(Readout(SHIFTING, 0.005))
     assert late is not None
     np.testing.assert_allclose(late.numbers, [*SHIFTING, 0.015, 0.02, 0.03])
     rows, middles = np.array([0, 59.5, 119]), 119 / 240 * np.array([-1, 0, 1])
@@ -184,7 +184,7 @@ def pairs(times_s: Sequence[float], count: int = 20, seed: int = 0) -> list[Pair
             for i, (T, rate) in enumerate(zip(poses, rates, strict=True))
         )
         guess = se3.exp(random.normal(0.0, 0.003, 6)) @ se3.inverse(poses[1]) @ poses[0]
-        found.append(Pair(*halves, Reading(rates[0]), Reading(rates[1]), guess, k))
+        found.append(Pair(*halves, Readout(rates[0]), Readout(rates[1]), guess, k))
     return found
 
 
@@ -207,7 +207,7 @@ def test_few_pairs_and_cameras_at_rest_tell_nothing() -> None:
     late = pairs((0.02, 0.03, 0.03))
     assert completed(measured([])) is UNKNOWN_TIMES
     assert completed(measured(late[: LEAST_PAIRS - 1])) is UNKNOWN_TIMES
-    resting = Reading(np.zeros(6))
+    resting = Readout(np.zeros(6))
     still = [pair._replace(of_reference=resting, of_live=resting) for pair in late]
     assert completed(measured(still)) is UNKNOWN_TIMES
 

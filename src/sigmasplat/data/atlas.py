@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from sigmasplat.data import se3
 from sigmasplat.data.camera import between
 from sigmasplat.data.poses import Column, KeyframePoses, Place, Places, Poses
-from sigmasplat.data.readout import STILL, Reading, Readings
+from sigmasplat.data.readout import AT_ONCE, Readout, Readouts
 from sigmasplat.data.relative_pose import UNKNOWN_HOP, RelativePose, SolvedGraph, TrackedHops
 from sigmasplat.types import Matrix
 
@@ -35,7 +35,7 @@ class Atlas:
     odometry: Poses = field(default_factory=Poses)
     keyframe_poses: KeyframePoses = field(default_factory=KeyframePoses)
     hops: TrackedHops = field(default_factory=TrackedHops)
-    readings: Readings = field(default_factory=Readings)
+    readings: Readouts = field(default_factory=Readouts)
     places: Places = field(default_factory=Places)
     components: list[int] = field(default_factory=list)
     refined: dict[int, list[Matrix]] = field(default_factory=dict)
@@ -61,9 +61,9 @@ class Atlas:
         self.keyframe_poses.begin(keyframe_poses)
         for _ in keyframe_poses:
             self.hops.append(UNKNOWN_HOP)
-            self.readings.append(STILL)
+            self.readings.append(AT_ONCE)
 
-    def set_keyframes(self, keyframe_poses: list[Matrix], hop: RelativePose, reading: Reading = STILL) -> None:
+    def set_keyframes(self, keyframe_poses: list[Matrix], hop: RelativePose, reading: Readout = AT_ONCE) -> None:
         """Set T_submap_camera [4, 4] of the last submap's keyframes, with a new one at the end, and the hop to it."""
         self.hops.append(hop)
         self.readings.append(reading)

@@ -1,7 +1,7 @@
 """When a sensor reads its images, and how its camera moves meanwhile."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -24,9 +24,7 @@ class SensorTimes:
     @staticmethod
     def of(noted: Mapping[str, Any]) -> "SensorTimes":
         """Return times that `noted` has written."""
-        late_s, depth_s, color_s = (float(noted[name]) for name in ("depth_late_s", "depth_rows_s", "color_rows_s"))
-        std_s = tuple(float(value) for value in noted["std_s"])
-        return SensorTimes(late_s, depth_s, color_s, (std_s[0], std_s[1], std_s[2]))
+        return SensorTimes(**{**noted, "std_s": tuple(noted["std_s"])})
 
     def noted(self) -> dict[str, Any]:
         """Return the times as facts of a run; nothing if they are not known."""
@@ -43,33 +41,23 @@ class SensorTimes:
             f"{'late' if self.depth_late_s > 0 else 'early'} (corrected)"
         )
 
-    def readout(self, reading: "Reading") -> "Readout | None":
+    def read(self, image: "Readout") -> "Readout | None":
         """Return when the rows of an image were read; None if that is not known, or does not matter at rest."""
-        known = self.std_s is not None and reading.rate.any()
-        return Readout(reading.rate, reading.late_s, self) if known else None
+        return replace(image, times=self) if self.std_s is not None and image.rate.any() else None
 
 
-@dataclass(frozen=True, eq=False)
-class Reading:
-    """What is particular to one image: the motion of its camera, a twist (v, ω) per second [6] in its axes, and the
-    time of depth after colour that the files say, s."""
-
-    rate: Matrix
-    late_s: float = 0.0
-
-
-STILL = Reading(np.zeros(6))
 UNKNOWN_TIMES = SensorTimes()
 
 
 @dataclass(frozen=True, eq=False)
 class Readout:
-    """When the rows of an image were read, and how its camera moved meanwhile; as `Reading` and `SensorTimes`. The pose
-    of the image is that of the camera in the middle of its colour."""
+    """When the rows of an image were read, and how its camera moved meanwhile: a twist (v, ω) per second [6] in its
+    axes. late_s: time of depth after colour that the files say. The pose of the image is that of the camera in the
+    middle of its colour."""
 
     rate: Matrix
-    late_s: float
-    times: SensorTimes
+    late_s: float = 0.0
+    times: SensorTimes = UNKNOWN_TIMES
 
     @property
     def numbers(self) -> list[float]:
@@ -87,7 +75,7 @@ class Readout:
         return self.times.color_rows_s * ((row + 0.5) / height - 0.5)
 
 
-AT_ONCE = Readout(np.zeros(6), 0.0, UNKNOWN_TIMES)
+AT_ONCE = Readout(np.zeros(6))
 
 
 def readouts(reference: Readout | None, live: Readout | None) -> list[float]:
@@ -96,15 +84,15 @@ def readouts(reference: Readout | None, live: Readout | None) -> list[float]:
 
 
 @dataclass(eq=False)
-class Readings(Records[Reading]):
-    """The readings of all keyframes, submap by submap."""
+class Readouts(Records[Readout]):
+    """Those of all keyframes, submap by submap, without the times of the sensor."""
 
     rate = Part(np.float64, 6)
     late_s = Part(np.float64)
 
-    def append(self, reading: Reading) -> None:
-        """Append the reading of the next keyframe."""
-        self.add(reading.rate, reading.late_s)
+    def append(self, readout: Readout) -> None:
+        """Append that of the next keyframe."""
+        self.add(readout.rate, readout.late_s)
 
-    def _record(self, i: int) -> Reading:
-        return Reading(*self.values(i))
+    def _record(self, i: int) -> Readout:
+        return Readout(*self.values(i))

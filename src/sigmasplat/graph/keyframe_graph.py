@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2 as chi2_distribution
 
 from sigmasplat.data import se3
-from sigmasplat.data.readout import UNKNOWN_TIMES, Reading, SensorTimes
+from sigmasplat.data.readout import UNKNOWN_TIMES, Readout, SensorTimes
 from sigmasplat.data.relative_pose import Alignments, Kind, RelativePose
 from sigmasplat.data.submap import Picture
 from sigmasplat.fit.compare import best_alignment
@@ -184,7 +184,7 @@ class GrowingGraph:
                 return
             yield
 
-    def measuring(self, image: Callable[[int], Pyramid], reading: Callable[[int], Reading]) -> Task[None]:
+    def measuring(self, image: Callable[[int], Pyramid], reading: Callable[[int], Readout]) -> Task[None]:
         """Measure when the sensor reads, in slices of one pair, and then align all again. Until the images show it,
         this is tried each time that there are twice as many alignments.
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import f as f_distribution
 
-from sigmasplat.data.readout import UNKNOWN_TIMES, Reading, SensorTimes
+from sigmasplat.data.readout import UNKNOWN_TIMES, Readout, SensorTimes
 from sigmasplat.fit.align import align
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.types import Matrix, Task
@@ -41,8 +41,8 @@ class Pair(NamedTuple):
 
     reference: Pyramid
     live: Pyramid
-    of_reference: Reading
-    of_live: Reading
+    of_reference: Readout
+    of_live: Readout
     T_live_reference: Matrix
     number: int
     cost: float = 0.0
@@ -51,7 +51,7 @@ class Pair(NamedTuple):
         """Return the pair with its motion if the sensor has these times [3], and the cost per pixel there; None if its
         images overlap too little."""
         times = _times(times_s, np.zeros(3))
-        images = self.reference.read(times.readout(self.of_reference)), self.live.read(times.readout(self.of_live))
+        images = self.reference.read(times.read(self.of_reference)), self.live.read(times.read(self.of_live))
         found = align(*images, self.T_live_reference, 12, update_stop=5e-5)
         if found.degenerate or found.overlap < LEAST_OVERLAP or not found.cost > 0.0:
             return None

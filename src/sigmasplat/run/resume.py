@@ -11,7 +11,7 @@ from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField, Rows
 from sigmasplat.data.frame import Detail, Photo, PosePrior
 from sigmasplat.data.poses import Column, KeyframePoses, Places, Poses
-from sigmasplat.data.readout import Reading, Readings, Readout, SensorTimes
+from sigmasplat.data.readout import Readout, Readouts, SensorTimes
 from sigmasplat.data.relative_pose import Alignments, Edges, RelativePose, TrackedHops
 from sigmasplat.data.submap import Picture
 from sigmasplat.errors import RunError
@@ -51,7 +51,7 @@ CLASSES: tuple[type, ...] = (
     Alignments, Atlas, Camera, CameraMotion, Column, Confidence, DepthFit, DepthHistory, DepthShape, DescribedSubmaps,
     Detail, Drift, DynamicDetector, DynamicMask, Edges, FeatureImage, GaussianField, GrowingGraph, Keyframe,
     KeyframePoses, Loop, LoopCloser, Loops, Mapper, PendingSearch, Photo, Picture, Places, PosePrior, Poses, Pyramid,
-    Reading, Readings, Readout, Recovery, Reference, RelativePose, Relocaliser, RememberedDepth, Rows, SecondHalf,
+    Readout, Readouts, Recovery, Reference, RelativePose, Relocaliser, RememberedDepth, Rows, SecondHalf,
     SensorTimes, Step, Steps, Target, TrackedHops, Tracker, TrackingStatistics, ValidationView, ValidationViews,
     VectorAdam,
 )  # fmt: skip

@@ -11,7 +11,7 @@ import numpy as np
 from sigmasplat.config import SubmapConfig
 from sigmasplat.data import se3
 from sigmasplat.data.field import GaussianField
-from sigmasplat.data.readout import Reading
+from sigmasplat.data.readout import Readout
 from sigmasplat.data.relative_pose import UNKNOWN_HOP, RelativePose
 from sigmasplat.fit.align import Alignment
 from sigmasplat.fit.pyramid import Pyramid
@@ -68,9 +68,9 @@ class MappingBackend(SlamState):
         submap = int(np.searchsorted(ends, row, side="right"))
         k = int(row - ends[submap] + self.atlas.keyframe_poses.counts[submap])
         image = self.images.of(row, self.view, lambda: self.store.picture(submap, k))
-        return image.read(self.graph.times.readout(self.atlas.readings[row]))
+        return image.read(self.graph.times.read(self.atlas.readings[row]))
 
-    def _align(self, keyframe: Keyframe, reading: Reading, hop: RelativePose, should_stop: ShouldStop) -> Task[None]:
+    def _align(self, keyframe: Keyframe, reading: Readout, hop: RelativePose, should_stop: ShouldStop) -> Task[None]:
         """Align a keyframe to earlier ones that see the same, in slices, and move the newest keyframes of the active
         submap to where all agree best."""
         atlas, anchor, active = self.atlas, self.atlas.anchors[-1], [*self.mapper.keyframes, keyframe]
@@ -86,7 +86,7 @@ class MappingBackend(SlamState):
                 return self.keyframe_image(row)
             target, known = active[k].target, reading if k == -1 else self.atlas.readings[row]
             image = self.images.of(row, self.view, target.picture, target.valid_pixels)
-            return image.read(self.graph.times.readout(known))
+            return image.read(self.graph.times.read(known))
 
         yield from self.graph.aligning(T_world_keyframe, rows, image, should_stop)
         known = [*self.atlas.readings, reading]
@@ -118,7 +118,7 @@ class MappingBackend(SlamState):
             photo = seen.photo(self.config)
         return Keyframe(index, seen.target, T_submap_camera, descriptor=descriptor, detail=detail, photo=photo)
 
-    def _placed(self, index: int, hop: RelativePose, reading: Reading) -> Matrix:
+    def _placed(self, index: int, hop: RelativePose, reading: Readout) -> Matrix:
         """Write the poses of the active submap's keyframes to the atlas; return that of the newest."""
         if self.keyframe_indices[-1:] != [index]:  # a keyframe that two submaps share is counted once
             self.keyframe_indices.append(index)

@@ -13,7 +13,7 @@ from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera, gray_exposure, unexposed
 from sigmasplat.data.frame import Frame, Photo, photo_size
 from sigmasplat.data.read_at_once import read_at_once
-from sigmasplat.data.readout import STILL, Reading, SensorTimes
+from sigmasplat.data.readout import AT_ONCE, Readout, SensorTimes
 from sigmasplat.data.submap import Picture
 from sigmasplat.errors import SourceError
 from sigmasplat.fit.pyramid import HIDDEN_M, Pyramid
@@ -39,7 +39,7 @@ class PreparedFrame:
     live: Pyramid
     image: FeatureImage | None = None
     ignored: NDArray[np.bool_] | None = None
-    reading: Reading = STILL
+    reading: Readout = AT_ONCE
     frame: Frame = field(kw_only=True)
     whole: Frame = field(kw_only=True)
 
@@ -52,8 +52,8 @@ class PreparedFrame:
 
     def move(self, rate: Matrix, times: SensorTimes) -> None:
         """Take note of the motion of the camera, a twist per second [6] in its axes, and of when the sensor reads."""
-        self.reading = Reading(rate, self.frame.depth_late_s)
-        self.live = self.live.read(times.readout(self.reading))
+        self.reading = Readout(rate, self.frame.depth_late_s)
+        self.live = self.live.read(times.read(self.reading))
 
     def at_once(self, view: View, config: Config) -> "PreparedFrame":
         """Return the frame as if all rows had been read at once, as far as it is known when they were."""
