@@ -202,7 +202,7 @@ class FrontEnd:
         step = self._step(seen, estimate, timer, view)
         self.frames += 1
         based_on = -1 if self.snapshot is None else self.snapshot.frame
-        shown = self._validation_view(number, seen, estimate)
+        shown = self._validation_view(number, seen, view, estimate)
         return TrackedFrame(number, step, estimate.T_submap_camera, self.poses, based_on, offer, search, shown)
 
     def _begin(self, seen: PreparedFrame, view: View) -> tuple[FrameEstimate, Offer]:
@@ -249,14 +249,15 @@ class FrontEnd:
         self.searching = self.frames
         return Search(seen.separate(), apart=apart) if lost else Search(seen.separate(), fit.comparison)
 
-    def _validation_view(self, number: int, seen: PreparedFrame, estimate: FrameEstimate) -> Target | None:
+    def _validation_view(self, number: int, seen: PreparedFrame, view: View, estimate: FrameEstimate) -> Target | None:
         """Return the images of a frame that may become a validation view."""
         full = len(self.waits) >= self.config.realtime.waiting_most
         if full or not may_validate(estimate, self.tracker, self.recovery):
             return None
         views = ValidationViews(self.config.uncertainty.probes, self.config.mapping.every)
         wanted = not is_held_back(number, self.config.input.hold_every)
-        return seen.target if wanted and views.wants(self.offered - 1, number - self.newest) else None
+        kept = wanted and views.wants(self.offered - 1, number - self.newest)
+        return seen.at_once(view, self.config, photo=False).target if kept else None
 
     def _step(self, seen: PreparedFrame, estimate: FrameEstimate, timer: StepTimer, view: View) -> Step:
         if estimate.state == TRACKED and self.found:

@@ -132,8 +132,10 @@ class MainLoop(MappingBackend):
         """Offer a frame as a validation view if it was tracked without doubt and is not held back."""
         if may_validate(estimate, self.tracker, self.recovery) and not self._is_held_back:
             index, newest, last = len(self.steps), self.mapper.keyframes[-1], len(self.mapper.keyframes) - 1
-            T_keyframe_camera = se3.inverse(newest.T_world_camera) @ estimate.T_submap_camera
-            self.validation_views.offer(index, last, index - newest.index, T_keyframe_camera, seen.target)
+            if self.validation_views.wants(last, index - newest.index):
+                T_keyframe_camera = se3.inverse(newest.T_world_camera) @ estimate.T_submap_camera
+                shown = seen.at_once(self.view, self.config, photo=False).target
+                self.validation_views.offer(index, last, index - newest.index, T_keyframe_camera, shown)
 
     # ---- lost and found ----
 

@@ -55,13 +55,14 @@ class PreparedFrame:
         self.reading = Readout(rate, self.frame.depth_late_s)
         self.live = self.live.read(times.read(self.reading))
 
-    def at_once(self, view: View, config: Config) -> "PreparedFrame":
-        """Return the frame as if all rows had been read at once, as far as it is known when they were."""
+    def at_once(self, view: View, config: Config, photo: bool = True) -> "PreparedFrame":
+        """Return the frame as if all rows had been read at once, as far as it is known when they were; photo: also the
+        whole image."""
         readout = self.live.readout
         if readout is None:
             return self
-        frame, whole = (read_at_once(each, readout) for each in (self.frame, self.whole))
-        return replace(observe(whole, frame, view, config, None), image=self.image)
+        whole = read_at_once(self.whole, readout) if photo else self.whole
+        return replace(observe(whole, read_at_once(self.frame, readout), view, config, None), image=self.image)
 
     @property
     def shown(self) -> "PreparedFrame":
