@@ -62,7 +62,8 @@ class PreparedFrame:
         if readout is None:
             return self
         whole = read_at_once(self.whole, readout) if photo else self.whole
-        return replace(observe(whole, read_at_once(self.frame, readout), view, config, None), image=self.image)
+        frame = self.frame.with_depth(self.target.depth_image.numpy())  # predicted depth is fitted in the target alone
+        return replace(observe(whole, read_at_once(frame, readout), view, config, None), image=self.image)
 
     @property
     def shown(self) -> "PreparedFrame":
