@@ -53,11 +53,10 @@ class Frame:
     [4, 4]: pose of the camera in fixed axes, metres, which is used as it is; None = the pose is estimated. Only the
     motion between two frames is used; specific_force_m_s2 [3]: measured by an accelerometer along the camera's axes,
     9.81 upwards at rest, from which a run finds the vertical direction; None = not measured; depth_late_s: time of the
-    depth image after the colour image, as the files say. The frame keeps read-only
-    views of the arrays and does not copy them: do not write to them later (`frame_from_arrays` copies). Raises
-    SourceError if an array is not float32, on inconsistent shapes, values that are not finite, colour in 0…255,
-    negative depth, a matrix that is not a rotation, a pose that is not rigid, or a force that is not three finite
-    numbers.
+    depth image after the colour image, as the files say. The frame keeps read-only views of the arrays and does not
+    copy them: do not write to them later (`frame_from_arrays` copies). Raises SourceError if an array is not float32,
+    on inconsistent shapes, values that are not finite, colour in 0…255, negative depth, a matrix that is not a
+    rotation, a pose that is not rigid, or a force that is not three finite numbers.
     """
 
     index: int

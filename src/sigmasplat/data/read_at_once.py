@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.readout import Readout
+from sigmasplat.env import opencv
 from sigmasplat.types import Matrix
 
 ROUNDS = 2
@@ -25,8 +26,7 @@ def read_at_once(frame: Frame, readout: Readout) -> Frame:
     Each pixel is looked up where its point was when its row was read; its motion is that of `readout.rate`, to first
     order. Pixels without depth move as those at the median depth.
     """
-    import cv2
-
+    cv2 = opencv()
     c, depth_m, z = frame.camera, frame.depth_m, frame.depth_m
     usual_m = np.float32(np.median(depth_m[depth_m > 0]) if (depth_m > 0).any() else 1.0)
     row = np.arange(c.height, dtype=np.float64)[:, None]
@@ -43,14 +43,13 @@ def read_at_once(frame: Frame, readout: Readout) -> Frame:
 def _between_readings(depth_m: Image, column: Image, row: Image) -> Image:
     """Return the depth [H, W] at some columns and rows: interpolated on a surface, that of the nearest pixel at its
     edge and beside a hole, 0 beyond the image."""
-    import cv2
-
+    cv2 = opencv()
     nearest_m = cv2.remap(depth_m, column, row, cv2.INTER_NEAREST)
     between_m = cv2.remap(depth_m, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     least_m, most_m = (extreme(depth_m, PIXEL_AND_NEXT, anchor=(0, 0)) for extreme in (cv2.erode, cv2.dilate))
     whole: Image = (most_m - least_m < SAME_SURFACE * least_m).astype(np.float32)
     whole = cv2.remap(whole, np.floor(column), np.floor(row), cv2.INTER_NEAREST)
-    return np.where((whole > 0) & (nearest_m > 0), between_m, nearest_m)
+    return np.asarray(np.where((whole > 0) & (nearest_m > 0), between_m, nearest_m))
 
 
 def _points(camera: Camera, column: Image, row: Image, z: Image) -> tuple[Image, Image, Image]:

@@ -90,7 +90,8 @@ class Loops(Records[Loop]):
 
     def is_rejected(self, i: int) -> bool:
         """Return whether a pose graph that was solved before has rejected a pair."""
-        return bool(np.isfinite(self[i].chi2) and not self[i].accepted)
+        loop = self[i]
+        return bool(np.isfinite(loop.chi2) and not loop.accepted)
 
     def copied(self) -> "Loops":
         """Return the pairs so far with the verdicts of now."""

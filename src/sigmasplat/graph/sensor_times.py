@@ -65,7 +65,7 @@ def measured(pairs: Sequence[Pair]) -> Task[SensorTimes]:
     pair may be small: half of the working size takes a quarter of the time and gives the same times.
     """
     moved, times_s, longest_s = list(pairs), np.zeros(3), LONGEST_S
-    lowest, best, near = np.inf, None, False
+    lowest, near = np.inf, False
     for _ in range(ROUNDS):
         there = list[Pair]()
         for pair in moved:
@@ -75,31 +75,26 @@ def measured(pairs: Sequence[Pair]) -> Task[SensorTimes]:
         if len(there) < LEAST_PAIRS:
             return UNKNOWN_TIMES
         cost = float(np.mean([np.log(pair.cost) for pair in there]))
-        if best is None or near or cost < lowest:
+        if near or cost < lowest:
             moved, terms = there, list[Term]()
             for pair in moved:
                 terms += [_expanded(pair, times_s)]
                 yield
             if not any(term.bend.any() for term in terms):  # no camera moved
                 return UNKNOWN_TIMES
-            step_s, covariance = newton_step(terms)
+            lowest, best_s, (step_s, covariance) = cost, times_s, newton_step(terms)
             covariance += BIAS_S**2 * np.eye(3)
-            lowest, best = cost, (times_s, step_s, covariance)
-            std_s = np.sqrt(np.diag(covariance))
+            std_s, groups = np.sqrt(np.diag(covariance)), len({term.number // NEIGHBOURS for term in terms})
             near = bool((np.abs(step_s) <= 2.0 * std_s).all() and std_s.max() < STEP_S)  # costs hardly differ
             still = bool((np.abs(step_s) <= np.maximum(0.5 * std_s, NO_STEP_S)).all())
-            groups = len({term.number // NEIGHBOURS for term in terms})
-            if std_s.max() < STEP_S and (still or not _sure(times_s + step_s, covariance, groups, HOPELESS)):
+            if std_s.max() < STEP_S and (still or not _sure(best_s + step_s, covariance, groups, HOPELESS)):
                 break
         else:
-            longest_s = float(np.abs(times_s - best[0]).max()) / 3.0
-        times_s = best[0] + best[1] * min(1.0, longest_s / float(np.abs(best[1]).max()))
-    assert best is not None
-    times_s, step_s, covariance = best
-    std_s = np.sqrt(np.diag(covariance))
+            longest_s = float(np.abs(times_s - best_s).max()) / 3.0
+        times_s = best_s + step_s * min(1.0, longest_s / float(np.abs(step_s).max()))
     settled = std_s.max() < STEP_S and bool((np.abs(step_s) <= np.maximum(std_s, NO_STEP_S)).all())
-    found_s = times_s + step_s
-    return _times(found_s, std_s) if settled and _sure(found_s, covariance, groups) else UNKNOWN_TIMES
+    sure = settled and _sure(best_s + step_s, covariance, groups)
+    return _times(best_s + step_s, std_s) if sure else UNKNOWN_TIMES
 
 
 def _sure(times_s: Matrix, covariance: Matrix, groups: int, level: float = LEVEL) -> bool:

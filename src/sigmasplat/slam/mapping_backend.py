@@ -80,17 +80,19 @@ class MappingBackend(SlamState):
         usable &= (np.abs(T_world_keyframe[1:] - T_world_keyframe[:-1]) > SAME).any((1, 2))  # of two copies the second
         rows = np.append(np.flatnonzero(usable), newest)
 
+        def reading_of(row: int) -> Readout:
+            return reading if row == newest else atlas.readings[row]
+
         def image(row: int) -> Pyramid:
             k = row - newest - 1
             if -k > len(active):
                 return self.keyframe_image(row)
-            target, known = active[k].target, reading if k == -1 else self.atlas.readings[row]
+            target = active[k].target
             image = self.images.of(row, self.view, target.picture, target.valid_pixels)
-            return image.read(self.graph.times.read(known))
+            return image.read(self.graph.times.read(reading_of(row)))
 
         yield from self.graph.aligning(T_world_keyframe, rows, image, should_stop)
-        known = [*self.atlas.readings, reading]
-        yield from self.graph.measuring(image, known.__getitem__)
+        yield from self.graph.measuring(image, reading_of)
         first = max(newest + 1 - WINDOW, newest + 2 - len(active))
         poses = self.graph.solved(T_world_keyframe, [*atlas.hops[first:], hop], first)
         moved = se3.orthonormalise(se3.inverse(anchor) @ poses)

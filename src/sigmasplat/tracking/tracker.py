@@ -201,10 +201,9 @@ class Tracker:
     def _remember(self, fit: PoseFit, seen: PreparedFrame) -> None:
         """Keep what the next frame needs."""
         T_world_camera = se3.inverse(fit.T_camera_world)
-        self.motion = self.motion.after(se3.inverse(self.previous) @ T_world_camera, seen.frame.timestamp_s)
-        if self.lost:
-            self.motion = self.motion.stopped()
-        else:
+        motion = self.motion.after(se3.inverse(self.previous) @ T_world_camera, seen.frame.timestamp_s)
+        self.motion = motion.stopped() if self.lost else motion
+        if not self.lost:
             self.agreements = [*self.agreements, fit.agreement * fit.overlap][-judge.RECENT :]
             self.first_losses = [*self.first_losses, fit.first_loss][-judge.RECENT :]
             if fit.comparison is not None:

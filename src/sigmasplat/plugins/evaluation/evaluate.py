@@ -93,9 +93,9 @@ def evaluate(
     fx, path = refined_fx(config, source.camera), frames.path
     aligned = None if known is None else truth_in_estimate(path.timestamps_s, path.T_world_camera[:, :3, 3], known)
     standard, renderer = renderer is None, renderer or FieldRenderer(config.render, config.backend, (field, fx))
-    maps, read = _map_sources(run, field, records, config.final), frames.readouts(run.facts())
+    maps, readouts = _map_sources(run, field, records, config.final), frames.readouts(run.facts())
     maps, predictions = _predicting(maps, run, frames, config, fx) if standard else (maps, views.PredictionScores())
-    scoring = ViewScoring(source, config.input, maps, chosen, renderer, views_per_kind, aligned, lpips, read)
+    scoring = ViewScoring(source, config.input, maps, chosen, renderer, views_per_kind, aligned, lpips, readouts)
     metrics = _facts(run, source, records, field) | score_states(run, frames, known)
     metrics |= in_metres(path_scores | score_frame_sets(run, frames, known), scale) | {"path_scale": scale}
     metrics |= _score_views(scoring, config.final, predictions, strips, progress)
