@@ -32,7 +32,7 @@ from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.frame import Frame
 from sigmasplat.plugins.evaluation.metrics.trajectory import associate
-from sigmasplat.plugins.evaluation.view_scoring import working_frame
+from sigmasplat.plugins.evaluation.run_views import working_frame
 from sigmasplat.plugins.sources.synthetic import open_synthetic
 from sigmasplat.render import render
 from sigmasplat.render.reference import project

@@ -32,9 +32,9 @@ from sigmasplat.data.mesh import Mesh
 from sigmasplat.data.trajectory import evenly_spread
 from sigmasplat.errors import SigmaSplatError, SourceError
 from sigmasplat.input.source import Source
-from sigmasplat.plugins.evaluation.metrics import views
+from sigmasplat.plugins.evaluation.metrics import view_scores
 from sigmasplat.plugins.evaluation.reconstruct import FusionInput
-from sigmasplat.plugins.evaluation.view_scoring import working_frame
+from sigmasplat.plugins.evaluation.run_views import working_frame
 from sigmasplat.plugins.outputs.formats import PLUGIN, ExportSource, choose
 from sigmasplat.render import FieldRenderer
 from sigmasplat.run_folder.runs import RunFolder
@@ -81,11 +81,11 @@ class HeldOutViews:
 
     def psnr_db(self, field: GaussianField) -> float:
         """Return the mean PSNR of a map over the views, as `sigmasplat eval` scores it."""
-        scores = views.ViewScores(False)
+        scores = view_scores.ViewScores(False)
         for frame, T_camera_world in self.views:
             rendered = self.renderer(field, frame.camera, T_camera_world)
-            scores.add(views.scored_view(frame, rendered, views.HELD_OUT))
-        return float(views.mean_scores(scores.rows)["psnr_db"])
+            scores.add(view_scores.scored_view(frame, rendered, view_scores.HELD_OUT))
+        return float(view_scores.mean_scores(scores.rows)["psnr_db"])
 
 
 def measure(options: Options) -> dict[str, Any]:

@@ -31,7 +31,7 @@ from sigmasplat.fit.compare import best_alignment
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.graph.pose_graph import PoseGraph, factorised
 from sigmasplat.plugins.evaluation.metrics.trajectory import ate
-from sigmasplat.plugins.evaluation.view_scoring import working_frame
+from sigmasplat.plugins.evaluation.run_views import working_frame
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.types import Matrix
 

@@ -16,7 +16,7 @@ from sigmasplat.final.tsdf import Tsdf, extract_surface
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.evaluation.metrics.reconstruction import BEHIND_M, Mask, distances, visible_points
 from sigmasplat.plugins.evaluation.metrics.trajectory import associate
-from sigmasplat.plugins.evaluation.view_scoring import working_frame
+from sigmasplat.plugins.evaluation.run_views import working_frame
 from sigmasplat.render import FieldRenderer
 from sigmasplat.types import Matrix, Progress, no_progress
 

@@ -12,7 +12,7 @@ from sigmasplat.data.images import resized_depth
 from sigmasplat.data.trajectory import evenly_spread
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.evaluation.metrics.trajectory import associate
-from sigmasplat.plugins.evaluation.view_scoring import working_frame
+from sigmasplat.plugins.evaluation.run_views import working_frame
 from sigmasplat.types import Matrix
 
 

@@ -19,12 +19,12 @@ from sigmasplat.data.mesh import Mesh
 from sigmasplat.data.trajectory import Component
 from sigmasplat.errors import RunError
 from sigmasplat.plugins.evaluation.reconstruct import FusionInput
+from sigmasplat.plugins.outputs.colmap import export_colmap, splat_points
 from sigmasplat.plugins.outputs.drawing.view_panels import FOOT, GAP, HEAD, PANEL_WIDTH
 from sigmasplat.plugins.outputs.floorplan.picture import export_plan
 from sigmasplat.plugins.outputs.mesh_files import write_mesh
 from sigmasplat.plugins.outputs.run_reader import RunReader
 from sigmasplat.plugins.outputs.video import export_video, film_camera, image_count, orbit_view
-from sigmasplat.plugins.outputs.views import export_colmap, splat_points
 from sigmasplat.uncertainty.map_uncertainty import SHIPPED, Background, MapUncertainty, SplatStd
 
 

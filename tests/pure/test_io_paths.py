@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.trajectory import Trajectory
-from sigmasplat.plugins.outputs import views
+from sigmasplat.plugins.outputs import colmap
 
 CAMERA = Camera(64, 48, 50.0, 51.0, 30.25, 24.75)
 NAMES = [f"frame-{i:06d}.png" for i in range(7)]
@@ -43,7 +43,7 @@ def ahead(T_world_camera: np.ndarray) -> np.ndarray:
 def write_colmap(folder: Path) -> tuple[Trajectory, np.ndarray, np.ndarray]:
     path, rng = some_path(), np.random.default_rng(4)
     points, colors = rng.normal(size=(30, 3)), rng.uniform(-0.1, 1.1, (30, 3))
-    views.write_model(folder, CAMERA, NAMES, path.T_world_camera, points, colors)
+    colmap.write_model(folder, CAMERA, NAMES, path.T_world_camera, points, colors)
     return path, points, colors
 
 

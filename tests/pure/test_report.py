@@ -10,7 +10,7 @@ import pytest
 from PIL import Image, ImageFont
 
 from sigmasplat.data.trajectory import Trajectory
-from sigmasplat.plugins.evaluation.metrics.views import PredictedErrors, ScoredView
+from sigmasplat.plugins.evaluation.metrics.view_scores import PredictedErrors, ScoredView
 from sigmasplat.plugins.evaluation.report import charts
 from sigmasplat.plugins.evaluation.report.page import Contents, address, build_report
 from sigmasplat.plugins.evaluation.report.summary import Verdict

@@ -7,17 +7,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from sigmasplat.config.frames import DensifyConfig, MappingConfig, RenderConfig, SeedConfig
+from sigmasplat.config.final import FinalConfig, SurfaceConfig, UncertaintyConfig
 from sigmasplat.config.input import RECORDED_POSES, InputConfig
+from sigmasplat.config.mapping import DensifyConfig, MappingConfig, RenderConfig, SeedConfig
 from sigmasplat.config.ranges import Count, Section, kinds_of, problems_of, refuse, shown
-from sigmasplat.config.submaps import (
-    FinalConfig,
-    LoopConfig,
-    RegistrationConfig,
-    SubmapConfig,
-    SurfaceConfig,
-    UncertaintyConfig,
-)
+from sigmasplat.config.submaps import LoopConfig, RegistrationConfig, SubmapConfig
 from sigmasplat.config.tracking import MovingConfig, RealTimeConfig, RecoveryConfig, TrackingConfig
 from sigmasplat.errors import ConfigError
 from sigmasplat.files.reading import read_json

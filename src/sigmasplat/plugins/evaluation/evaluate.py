@@ -30,7 +30,7 @@ from sigmasplat.api import (
     write_trajectory,
 )
 from sigmasplat.plugins.evaluation import reconstruct
-from sigmasplat.plugins.evaluation.metrics import views
+from sigmasplat.plugins.evaluation.metrics import view_scores
 from sigmasplat.plugins.evaluation.metrics.lpips import Lpips
 from sigmasplat.plugins.evaluation.metrics.published_reconstruction import VIEWS
 from sigmasplat.plugins.evaluation.metrics.trajectory import aligned_truth, score_path, truth_in_estimate
@@ -44,7 +44,7 @@ from sigmasplat.plugins.evaluation.path_scores import (
 )
 from sigmasplat.plugins.evaluation.report import charts
 from sigmasplat.plugins.evaluation.report.page import report_plan, write_page
-from sigmasplat.plugins.evaluation.view_scoring import (
+from sigmasplat.plugins.evaluation.run_views import (
     ViewScoring,
     ViewStrips,
     refined_fx,
@@ -61,7 +61,7 @@ def evaluate(
     run: RunFolder,
     source: Source,
     *,
-    renderer: views.Renderer | None = None,
+    renderer: view_scores.Renderer | None = None,
     views_per_kind: int = 40,
     strips_per_kind: int = 3,
     mesh: bool = False,
@@ -94,7 +94,9 @@ def evaluate(
     aligned = None if known is None else truth_in_estimate(path.timestamps_s, path.T_world_camera[:, :3, 3], known)
     standard, renderer = renderer is None, renderer or FieldRenderer(config.render, config.backend, (field, fx))
     maps, readouts = _map_sources(run, field, records, config.final), frames.readouts(run.facts())
-    maps, predictions = _predicting(maps, run, frames, config, fx) if standard else (maps, views.PredictionScores())
+    maps, predictions = (
+        _predicting(maps, run, frames, config, fx) if standard else (maps, view_scores.PredictionScores())
+    )
     scoring = ViewScoring(source, config.input, maps, chosen, renderer, views_per_kind, aligned, lpips, readouts)
     metrics = _facts(run, source, records, field) | score_states(run, frames, known)
     metrics |= in_metres(path_scores | score_frame_sets(run, frames, known), scale) | {"path_scale": scale}
@@ -155,7 +157,7 @@ def _anchors(run: RunFolder, records: Log, final: FinalConfig) -> NDArray[np.flo
     return None if anchors is None or len(anchors) != count else np.asarray(anchors, np.float64)
 
 
-def _map_sources(run: RunFolder, field: GaussianField, records: Log, final: FinalConfig) -> views.MapSources:
+def _map_sources(run: RunFolder, field: GaussianField, records: Log, final: FinalConfig) -> view_scores.MapSources:
     """Return the final map and the submaps, with the poses of the frames in them and the exposures of the frames, if
     the checkpoint has these."""
     anchors = _anchors(run, records, final)
@@ -165,18 +167,18 @@ def _map_sources(run: RunFolder, field: GaussianField, records: Log, final: Fina
         for name in ("T_submap_camera", "exposure")
     )
     poses = None if anchors is None else poses
-    return views.MapSources(field, run.submaps, anchors, T_submap_camera=poses, exposures=exposures)
+    return view_scores.MapSources(field, run.submaps, anchors, T_submap_camera=poses, exposures=exposures)
 
 
 def _predicting(
-    maps: views.MapSources, run: RunFolder, frames: RunFrames, config: Config, fx: float | None
-) -> tuple[views.MapSources, views.PredictionScores]:
+    maps: view_scores.MapSources, run: RunFolder, frames: RunFrames, config: Config, fx: float | None
+) -> tuple[view_scores.MapSources, view_scores.PredictionScores]:
     """Add the prediction of errors to the maps if the run measured how sure its map is; fx: `refined_fx`. Raises
     RunError if that belongs to another map."""
     field = maps.final
     known = run.uncertainty_of(field)
     if known is None:
-        return maps, views.PredictionScores()
+        return maps, view_scores.PredictionScores()
 
     def predict_view(camera: Camera, T_camera_world: NDArray[np.float64]) -> Predicted:
         options = as_refined(config.render, camera, fx)
@@ -184,7 +186,7 @@ def _predicting(
 
     probes = [row for index in range(len(run.submaps)) for row in run.submaps.load(index).probe_frames]
     calibrated_on = frozenset(frames.log[row]["index"] for row in probes if 0 <= row < len(frames))
-    return replace(maps, predict=predict_view), views.PredictionScores(calibrated_on)
+    return replace(maps, predict=predict_view), view_scores.PredictionScores(calibrated_on)
 
 
 def _calibration(run: RunFolder) -> dict[str, Any] | None:
@@ -202,7 +204,7 @@ def _submaps(log: Log) -> int:
 
 
 def _score_views(
-    scoring: ViewScoring, final: FinalConfig, predictions: views.PredictionScores, strips: ViewStrips,
+    scoring: ViewScoring, final: FinalConfig, predictions: view_scores.PredictionScores, strips: ViewStrips,
     progress: Progress,
 ) -> dict[str, Any]:  # fmt: skip
     """Render the chosen views from the final map and from their submaps; average scores per kind and map; judge V and
@@ -210,8 +212,8 @@ def _score_views(
     """
     chosen, maps = scoring.chosen, scoring.maps
     judged_on = "held-out" if chosen["held-out"] else "training"
-    scores = {kind: views.ViewScores(kind == judged_on, scoring.lpips) for kind in chosen}
-    before = {kind: views.ViewScores(kind == judged_on, scoring.lpips) for kind in chosen}
+    scores = {kind: view_scores.ViewScores(kind == judged_on, scoring.lpips) for kind in chosen}
+    before = {kind: view_scores.ViewScores(kind == judged_on, scoring.lpips) for kind in chosen}
     shown = {(kind, r["index"]) for kind, records in chosen.items() for r in evenly_spread(records, strips.per_kind)}
     for done, (view, in_submap) in enumerate(scoring.rendered(scoring.input), 1):
         scores[view.kind].add(view)
@@ -226,8 +228,10 @@ def _score_views(
     kept = maps.T_world_submap is not None
     # σ² of the final map is valid if it was learned during refinement too, or taken over from the submaps.
     keeps_variance = final.uncertainty if final.iterations else final.seed_from == "submaps"
-    judged, judged_before = (views.score_uncertainty(found[judged_on].samples, judged_on) for found in (scores, before))
-    return views.kind_scores(scores, before, maps) | {
+    judged, judged_before = (
+        view_scores.score_uncertainty(found[judged_on].samples, judged_on) for found in (scores, before)
+    )
+    return view_scores.kind_scores(scores, before, maps) | {
         "uncertainty": judged_before if kept else judged,
         "uncertainty_final": judged if kept and keeps_variance else None,
         "predictive": predictions.scores(),

@@ -97,7 +97,7 @@ def _covariance(source: ExportSource, target: Path) -> str:
 
 def _colmap(source: ExportSource, target: Path, *, pictures: bool) -> str:
     from sigmasplat.api import Screen
-    from sigmasplat.plugins.outputs.views import export_colmap
+    from sigmasplat.plugins.outputs.colmap import export_colmap
 
     reader = source.reader()
     if not pictures:

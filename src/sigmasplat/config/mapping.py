@@ -1,4 +1,4 @@
-"""Settings of the work per keyframe: rendering, seeding, mapping."""
+"""Settings of the map of a submap: rendering, seeding, mapping, and when splats are pruned or split."""
 
 from dataclasses import dataclass
 from math import ceil

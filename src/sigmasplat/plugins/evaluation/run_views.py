@@ -26,10 +26,10 @@ from sigmasplat.api import (
     read_at_once,
     se3,
 )
-from sigmasplat.plugins.evaluation.metrics import views
+from sigmasplat.plugins.evaluation.metrics import view_scores
 from sigmasplat.plugins.evaluation.metrics.lpips import Lpips
 from sigmasplat.plugins.evaluation.metrics.trajectory import associate
-from sigmasplat.plugins.evaluation.metrics.views import ScoredView
+from sigmasplat.plugins.evaluation.metrics.view_scores import ScoredView
 from sigmasplat.plugins.outputs.drawing.view_panels import ViewPanel, view_panels
 
 HEADINGS = {"test": "novel views"}
@@ -60,9 +60,9 @@ class ViewScoring:
 
     source: Source
     input: InputConfig
-    maps: views.MapSources
+    maps: view_scores.MapSources
     chosen: Mapping[str, list[dict[str, Any]]]
-    renderer: views.Renderer
+    renderer: view_scores.Renderer
     most: int
     T_estimate_truth: NDArray[np.float64] | None
     lpips: Lpips | None = None
@@ -74,9 +74,9 @@ class ViewScoring:
         return sum(len(records) for records in self.chosen.values())
 
     def rendered(self, settings: InputConfig) -> Iterator[tuple[ScoredView, ScoredView | None]]:
-        """Render the chosen views at the size of `settings` (`views.render_views`)."""
+        """Render the chosen views at the size of `settings` (`view_scores.render_views`)."""
         read = partial(working_frame, self.source, settings, readouts=self.readouts)
-        return views.render_views(read, self.maps, self.chosen, self.renderer)
+        return view_scores.render_views(read, self.maps, self.chosen, self.renderer)
 
 
 def full_width(config: Config, camera: Camera) -> int | None:
@@ -119,14 +119,14 @@ def score_full_resolution(
         return None
     settings, chosen = input_of_width(scoring.input, scoring.source, width), scoring.chosen
     camera = scoring.source.camera.prepared(settings.width, settings.crop_px)
-    final, before = ({kind: views.ViewScores(False, scoring.lpips) for kind in chosen} for _ in range(2))
+    final, before = ({kind: view_scores.ViewScores(False, scoring.lpips) for kind in chosen} for _ in range(2))
     unpredicted = replace(scoring, maps=replace(scoring.maps, predict=None))
     for done, (view, in_submap) in enumerate(unpredicted.rendered(settings), 1):
         final[view.kind].add(view)
         if in_submap:
             before[view.kind].add(in_submap)
         progress(done, scoring.count)
-    scores = views.kind_scores(final, before, scoring.maps) | {"test_views": score_test_views(scoring, settings)}
+    scores = view_scores.kind_scores(final, before, scoring.maps) | {"test_views": score_test_views(scoring, settings)}
     return {"width": camera.width, "height": camera.height} | scores
 
 
@@ -134,7 +134,7 @@ def score_test_views(
     scoring: ViewScoring, settings: InputConfig, strips: ViewStrips | None = None
 ) -> dict[str, Any] | None:
     """Render the final map at the true poses of the source's test views at the size of `settings`; return their mean
-    scores as `views.mean_scores` does, None without test views, their poses or a truth.
+    scores as `view_scores.mean_scores` does, None without test views, their poses or a truth.
 
     The alignment of the ATE transforms the poses to the estimate's world. So errors of the path lower these scores, as
     in the papers. Adds a few views to `strips`, if given. Unreadable views and those without a pose are skipped.
@@ -153,11 +153,11 @@ def score_test_views(
         if len(rows):
             T_camera_world = se3.inverse(T_estimate_truth @ poses.T_world_camera[found[0]])
             seen = scoring.renderer(scoring.maps.final, frame.camera, T_camera_world)
-            rendered.append(views.scored_view(frame, seen, "test"))
+            rendered.append(view_scores.scored_view(frame, seen, "test"))
     if strips is not None:
         for view in rendered[:: max(1, len(rendered) // max(strips.per_kind, 1))][: strips.per_kind]:
             strips.add(view)
-    return views.mean_scores([view.scores(scoring.lpips) for view in rendered])
+    return view_scores.mean_scores([view.scores(scoring.lpips) for view in rendered])
 
 
 def working_frame(
