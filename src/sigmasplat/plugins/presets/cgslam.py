@@ -13,7 +13,7 @@ import dataclasses
 
 from sigmasplat.api import Config
 from sigmasplat.plugins.presets import varsplat
-from sigmasplat.plugins.presets.shared_by_papers import BASE
+from sigmasplat.plugins.presets.shared_by_papers import BASE, fixed
 
 PAPER = BASE.changed(
     input={"min_depth_m": 0.0},  # as in the code, no reading is removed
@@ -127,12 +127,13 @@ FAST = dataclasses.replace(
     submaps=PAPER.submaps, loops=PAPER.loops, registration=PAPER.registration, final=PAPER.final,
 )  # fmt: skip
 
-PRESETS = {
-    **{f"cgslam-{name}": config for name, config in DATASETS.items()},
-    **{
-        f"cgslam-light-{name}": config.changed(input={"width": LIGHT_WIDTHS[name]}) for name, config in DATASETS.items()
-    },
-    **{f"cgslam-loops-{name}": _with_loops(config, varsplat.DATASETS[name]) for name, config in DATASETS.items()},
-    "cgslam-fast": FAST,
-    "cgslam-loops-fast": _with_loops(FAST, varsplat.FAST),
-}
+PLUGIN = (
+    *(fixed(f"cgslam-{name}", config) for name, config in DATASETS.items()),
+    *(
+        fixed(f"cgslam-light-{name}", config.changed(input={"width": LIGHT_WIDTHS[name]}))
+        for name, config in DATASETS.items()
+    ),
+    *(fixed(f"cgslam-loops-{name}", _with_loops(config, varsplat.DATASETS[name])) for name, config in DATASETS.items()),
+    fixed("cgslam-fast", FAST),
+    fixed("cgslam-loops-fast", _with_loops(FAST, varsplat.FAST)),
+)

@@ -14,11 +14,11 @@ iterations.
 
 import tomllib
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-from sigmasplat.api import Config, ConfigError, nearest
+from sigmasplat.api import Config, ConfigError, Preset, nearest
 from sigmasplat.plugins.presets import cgslam, varsplat
 
 # min_interval: the code's limit + 1, because it asks for more than the limit. max_depth_m: no reading is removed, the
@@ -74,21 +74,22 @@ def _cgslam(row: dict[str, Any]) -> Config:
     return cgslam.sized(config, row["extent"], **rates)
 
 
-FAMILIES: dict[str, Callable[[dict[str, Any]], Config]] = {"cgslam-released": _cgslam, "varsplat-released": _varsplat}
-"""What makes the settings of a scene, by preset without the scene."""
-
-
 @cache
-def scenes(family: str) -> dict[str, dict[str, Any]]:
-    """Return the rows of a family's table by scene."""
-    table = Path(__file__).parent / "scenes" / f"{family.removesuffix('-released')}.toml"
-    return tomllib.loads(table.read_text(encoding="utf-8"))
+def _scenes(paper: str) -> dict[str, dict[str, Any]]:
+    """Return the rows of a paper's table by scene."""
+    return tomllib.loads((Path(__file__).parent / "scenes" / f"{paper}.toml").read_text(encoding="utf-8"))
 
 
-def released(family: str, scene: str) -> Config:
+def _released(paper: str, make: Callable[[dict[str, Any]], Config], scene: str) -> Config:
     """Return the settings of a scene. Raises ConfigError if the table has no such scene."""
-    known = scenes(family)
+    known = _scenes(paper)
     if scene not in known:
         what = f"no scene {scene!r}{nearest(scene, known)}" if scene else "no scene"
-        raise ConfigError(f"{what} in preset {family}-SCENE; known: {', '.join(known)}")
-    return FAMILIES[family](known[scene])
+        raise ConfigError(f"{what} in preset {paper}-released-SCENE; known: {', '.join(known)}")
+    return make(known[scene])
+
+
+PLUGIN = tuple(
+    Preset(f"{paper}-released", partial(_released, paper, make), partial(_scenes, paper))
+    for paper, make in (("cgslam", _cgslam), ("varsplat", _varsplat))
+)

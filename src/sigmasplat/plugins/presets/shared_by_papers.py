@@ -1,6 +1,6 @@
 """The settings that the papers' presets build on: those in which the papers differ from our defaults, as values."""
 
-from sigmasplat.api import Config
+from sigmasplat.api import Config, Preset
 
 BASE_VALUES: dict[str, dict[str, object]] = {
     "input": {
@@ -82,3 +82,8 @@ BASE_VALUES: dict[str, dict[str, object]] = {
 """What is ours alone is off, and a value that both papers share is theirs; the presets name the rest."""
 
 BASE = Config().changed(**BASE_VALUES)
+
+
+def fixed(name: str, config: Config) -> Preset:
+    """Return the row of a preset whose settings are known."""
+    return Preset(name, lambda: config)

@@ -7,7 +7,7 @@ from: docs/varsplat.md.
 """
 
 from sigmasplat.api import Config
-from sigmasplat.plugins.presets.shared_by_papers import BASE
+from sigmasplat.plugins.presets.shared_by_papers import BASE, fixed
 
 UNCERTAIN_M = 0.02
 """The rule of accumulated uncertainty is the paper's, the limit is ours."""
@@ -134,6 +134,7 @@ def without_variance(config: Config) -> Config:
     )  # fmt: skip
 
 
-PRESETS = {f"varsplat-{dataset}": config for dataset, config in DATASETS.items()} | {
-    f"loopsplat-{dataset}": without_variance(config) for dataset, config in DATASETS.items()
-}
+PLUGIN = (
+    *(fixed(f"varsplat-{name}", config) for name, config in DATASETS.items()),
+    *(fixed(f"loopsplat-{name}", without_variance(config)) for name, config in DATASETS.items()),
+)
