@@ -19,11 +19,7 @@ viser = pytest.importorskip("viser", reason="viser is not installed (pip install
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
 from sigmasplat.plugins.viewer.app import ViewerApp  # noqa: E402
-from sigmasplat.plugins.viewer.panel import (  # noqa: E402
-    MODE_LABELS,
-    PREDICTED_MODES,
-    VIEW_MODES,
-)
+from sigmasplat.plugins.viewer.layers import MODES, PREDICTED_MODES  # noqa: E402
 from sigmasplat.plugins.viewer.server import HOST, close, open_server  # noqa: E402
 from sigmasplat.plugins.viewer.snapshot import EMPTY_PATH, Piece, Snapshot  # noqa: E402
 from sigmasplat.plugins.viewer.snapshot_sources import LiveView  # noqa: E402
@@ -95,12 +91,12 @@ def test_a_growing_run_is_shown_and_the_controls_follow(
     texts = panel.hidden_text.content
     panel.hidden.value = 50
     wait_until(lambda: panel.hidden_text.content != texts)
-    offered = [mode for mode in VIEW_MODES if MODE_LABELS[mode] in panel.mode.options]
-    assert set(VIEW_MODES) - set(offered) == {*PREDICTED_MODES}, "submaps have no predicted errors"
+    offered = [mode for mode in MODES if MODES[mode] in panel.mode.options]
+    assert set(MODES) - set(offered) == {*PREDICTED_MODES}, "submaps have no predicted errors"
     assert not panel.keyframes.value, "the viewer opens without frusta"
     for mode in (*offered[1:], offered[0]):
         before = len(client)
-        panel.mode.value = MODE_LABELS[mode]
+        panel.mode.value = MODES[mode]
         wait_until(lambda before=before: len(client) > before)  # type: ignore[misc]
     panel.row.value = 3
     wait_until(lambda: "3" in panel.frame.content)
@@ -121,7 +117,7 @@ def test_predicted_errors_are_offered_for_the_final_map_only(
     std = SplatStd(torch.where(half, 0.01, 0.2), torch.full((len(field),), 0.1))
     known = MapUncertainty(variances, Background((0.5, 0.5, 0.5), 0.1, 1.0), SHIPPED, 4, std)
     app.show(Snapshot("room", EMPTY_PATH, Piece(None, field, uncertainty=known)))
-    offered = lambda: {MODE_LABELS[mode] for mode in PREDICTED_MODES} <= {*panel.mode.options}  # noqa: E731
+    offered = lambda: {MODES[mode] for mode in PREDICTED_MODES} <= {*panel.mode.options}  # noqa: E731
     wait_until(offered)
     everything = panel.facts.content
     panel.hidden.value = 60
@@ -129,11 +125,9 @@ def test_predicted_errors_are_offered_for_the_final_map_only(
     assert panel.facts.content != everything and f"{int(half.sum()):,} of {len(field):,}" in panel.facts.content
     for mode in PREDICTED_MODES:
         before = len(client)
-        panel.mode.value = MODE_LABELS[mode]
+        panel.mode.value = MODES[mode]
         wait_until(lambda before=before: len(client) > before)  # type: ignore[misc]
     wait_until(lambda: panel.legend.visible)
     app.show(Snapshot("room", EMPTY_PATH, None, (Piece(0, field),)))
     wait_until(lambda: not offered())
-    assert panel.mode.value == MODE_LABELS["splats"] and "viewer:" not in capsys.readouterr().err, (
-        "no error while drawing"
-    )
+    assert panel.mode.value == MODES["splats"] and "viewer:" not in capsys.readouterr().err, "no error while drawing"

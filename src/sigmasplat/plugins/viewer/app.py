@@ -11,8 +11,8 @@ import viser
 from sigmasplat.api import SigmaSplatError
 from sigmasplat.plugins.outputs.drawing.colormap import INFERNO
 from sigmasplat.plugins.viewer import layers, snapshot as lines
-from sigmasplat.plugins.viewer.layers import Floats, LayerImage, Legend
-from sigmasplat.plugins.viewer.panel import PREDICTED_MODES, ControlPanel, ControlState, escaped
+from sigmasplat.plugins.viewer.layers import PREDICTED_MODES, Floats, LayerImage, Legend
+from sigmasplat.plugins.viewer.panel import ControlPanel, ControlState, escaped
 from sigmasplat.plugins.viewer.scene import ViserScene, camera_pose, move_camera, set_initial_camera
 from sigmasplat.plugins.viewer.snapshot import BUDGET, Piece, Snapshot, within_budget
 

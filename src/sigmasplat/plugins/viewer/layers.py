@@ -114,7 +114,19 @@ def merged_uncertainty(pieces: Sequence[Piece], most: float) -> MapUncertainty |
     return known.at(shown(pieces[0], most))
 
 
-Layer = Literal["colour", "depth", "V", "U", "color error", "depth error"]
+MODES = {
+    "splats": "splats, drawn by the browser",
+    "colour": "colour, rendered by SigmaSplat",
+    "depth": "depth",
+    "V": "√V: standard deviation of colour",
+    "U": "√U: standard deviation of depth",
+    "color error": "predicted error of colour",
+    "depth error": "predicted error of depth",
+}
+"""What the viewer can show, with its label: the splats, or a layer that SigmaSplat renders from the browser's
+viewpoint."""
+PREDICTED_MODES = ("color error", "depth error")
+"""Only for maps with predicted errors."""
 LEGEND_SIZE, LEGEND_BAR, INK, PAPER = (280, 34), 14, (233, 237, 242), (36, 40, 46)
 
 
@@ -141,7 +153,7 @@ def browser_camera(fov: float, aspect: float, height: int) -> Camera:
 
 
 def render_layer(
-    field: GaussianField, camera: Camera, T_world_camera: Matrix, layer: Layer, options: RenderConfig, backend: str
+    field: GaussianField, camera: Camera, T_world_camera: Matrix, layer: str, options: RenderConfig, backend: str
 ) -> LayerImage:
     """Render a field and draw one layer of the result.
 
@@ -167,7 +179,7 @@ def render_layer(
 
 
 def render_predicted(
-    field: GaussianField, known: MapUncertainty, camera: Camera, T_world_camera: Matrix, layer: Layer,
+    field: GaussianField, known: MapUncertainty, camera: Camera, T_world_camera: Matrix, layer: str,
     options: RenderConfig, backend: str,
 ) -> LayerImage:  # fmt: skip
     """Draw the predicted standard deviation of colour ("color error") or of depth in m ("depth error").

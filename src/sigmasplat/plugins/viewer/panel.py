@@ -2,34 +2,20 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import numpy as np
 import viser
 
 from sigmasplat.plugins.outputs.drawing.colormap import NO_READING, Rgb
-from sigmasplat.plugins.viewer.layers import LEGEND_SIZE, Colouring, Layer
-
-ViewMode = Literal["splats", "colour", "depth", "V", "U", "color error", "depth error"]
-VIEW_MODES: tuple[ViewMode, ...] = get_args(ViewMode)
-PREDICTED_MODES: tuple[ViewMode, ...] = ("color error", "depth error")
-"""Only for maps with predicted errors."""
-MODE_LABELS: dict[ViewMode, str] = {
-    "splats": "splats, drawn by the browser",
-    "colour": "colour, rendered by SigmaSplat",
-    "depth": "depth",
-    "V": "√V: standard deviation of colour",
-    "U": "√U: standard deviation of depth",
-    "color error": "predicted error of colour",
-    "depth error": "predicted error of depth",
-}
+from sigmasplat.plugins.viewer.layers import LEGEND_SIZE, MODES, PREDICTED_MODES, Colouring
 
 
 @dataclass(frozen=True)
 class ControlState:
     """The values of the controls at one time."""
 
-    mode: ViewMode
+    mode: str
     colouring: Colouring
     hidden_share: float
     row: int
@@ -39,7 +25,7 @@ class ControlState:
     follow: bool
 
     @property
-    def layer(self) -> Layer | None:
+    def layer(self) -> str | None:
         """Return the layer that SigmaSplat renders, or None if the browser draws the scene."""
         return None if self.mode == "splats" else self.mode
 
@@ -96,7 +82,7 @@ class ControlPanel:
     def state(self) -> ControlState:
         """Return the current values of the controls."""
         return ControlState(
-            next(mode for mode in VIEW_MODES if MODE_LABELS[mode] == self.mode.value),
+            next(mode for mode, label in MODES.items() if label == self.mode.value),
             self.colouring.value,
             self.hidden.value / 100.0,
             int(self.row.value),
@@ -149,4 +135,4 @@ def escaped(text: str) -> str:
 
 
 def _mode_options(predicted: bool) -> tuple[str, ...]:
-    return tuple(MODE_LABELS[mode] for mode in VIEW_MODES if predicted or mode not in PREDICTED_MODES)
+    return tuple(label for mode, label in MODES.items() if predicted or mode not in PREDICTED_MODES)
