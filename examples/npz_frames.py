@@ -3,8 +3,8 @@
 camera.npz      width, height, fx, fy, cx, cy
 000000.npz …    t (seconds), color (uint8 [H, W, 3]), depth_m (float [H, W], 0 = no reading); T_world_camera if known
 
-Copy this file into src/sigmasplat/plugins/sources/, then run `make install`, because .venv holds an installed copy.
-Then `sigmasplat run FOLDER` reads the format; nothing else is needed.
+`sigmasplat run FOLDER --plugin examples/npz_frames.py` reads the format. In src/sigmasplat/plugins/sources/ this file
+needs no --plugin.
 """
 
 import zipfile
@@ -13,14 +13,16 @@ from typing import Any
 
 import numpy as np
 
-from sigmasplat.config import InputConfig
-from sigmasplat.data.camera import Camera
-from sigmasplat.data.frame import Frame
-from sigmasplat.data.frame_arrays import color_from_bytes
-from sigmasplat.data.trajectory import Trajectory
-from sigmasplat.errors import SourceError
-from sigmasplat.input.source import Source
-from sigmasplat.registry import SourceFormat
+from sigmasplat.api import (
+    Camera,
+    Frame,
+    InputConfig,
+    Source,
+    SourceError,
+    SourceFormat,
+    Trajectory,
+    color_from_bytes,
+)
 
 
 def read(path: Path) -> dict[str, Any]:

@@ -143,6 +143,11 @@ def test_example_own_channel() -> None:
     assert torch.allclose(sums[..., 2], seen.depth, atol=1e-4)
 
 
+def test_the_example_of_a_format_imports_the_api_only() -> None:
+    text = (ROOT / "examples" / "npz_frames.py").read_text(encoding="utf-8")
+    assert set(re.findall(r"^(?:from|import) (sigmasplat\S*)", text, re.MULTILINE)) == {"sigmasplat.api"}
+
+
 def test_a_format_is_one_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     extra, data = tmp_path / "extra", tmp_path / "data"
     extra.mkdir()

@@ -170,6 +170,31 @@ def test_a_mask_of_another_shape_is_refused_and_a_depth_filter_changes_what_slam
     registry.rows.cache_clear()
 
 
+@pytest.mark.parametrize(
+    ("returned", "says"),
+    [
+        ("None", "returned None; return float32 (48, 64)"),
+        ("frame.depth_m * float('nan')", "returned NaN, infinite or negative depth; 0 = no reading"),
+        ("-frame.depth_m", "returned NaN, infinite or negative depth; 0 = no reading"),
+        ("frame.depth_m[1:]", "returned float32 (47, 64); return float32 (48, 64)"),
+        ("frame.depth_m > 1", "returned bool (48, 64); return float32 (48, 64)"),
+    ],
+)
+def test_depth_that_cannot_be_used_is_one_line_that_names_the_filter(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], returned: str, says: str
+) -> None:
+    file = tmp_path / "mine.py"
+    file.write_text(f"from sigmasplat.api import DepthFilter\nPLUGIN = DepthFilter('mine', lambda frame: {returned})")
+    asked = ["run", "synthetic:frames=2,width=64,height=48", "--no-eval", "--out", str(tmp_path / "run")]
+    assert exit_code(*asked, "--plugin", str(file), "--set", "input.filters=mine") == 2
+    error = capsys.readouterr().err
+    assert f"depth filter 'mine' {says}" in error and error.count("sigmasplat: ") == 1 and "Traceback" not in error
+
+
+def test_help_of_run_names_plugin(capsys: pytest.CaptureFixture[str]) -> None:
+    assert exit_code("run", "--help") == 0 and "--plugin my.py" in capsys.readouterr().out
+
+
 def test_every_name_of_the_api_is_there_and_no_other() -> None:
     assert [name for name in api.__all__ if getattr(api, name) is None] == [] and len(api.__all__) > 20
     with pytest.raises(AttributeError, match="no attribute 'Nothing'"):

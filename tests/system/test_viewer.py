@@ -186,7 +186,7 @@ def test_a_finished_run_shows_its_map_and_its_uncertainty(finished: RunFolder, t
         wait_for(lambda: "14 frames" in page.text() and colours(page.scene()) > 8)
         plain = page.screenshot()
         keep(plain, "finished")
-        page.choose("splat colour", "σ")
+        page.choose("splat colour", "uncertainty")
         wait_for(lambda: likeness(page.scene(), colormap.INFERNO) > 2 * likeness(scene_of(plain), colormap.INFERNO))
         keep(page.screenshot(), "sigma")
         by_sigma = page.scene()

@@ -79,6 +79,7 @@ def run(
 
     example: sigmasplat run data/kitchen --limit 200 --set input.width=480
     for robots: sigmasplat run data/kitchen --bag kitchen-bag
+    with plug-ins of yours: sigmasplat run data/kitchen --plugin my.py --set input.filters=my-mask
     """
     from sigmasplat.run.finished_map import FinishedMap, continue_map
     from sigmasplat.run.resume import StartPoint

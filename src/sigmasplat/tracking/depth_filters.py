@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,7 @@ from sigmasplat.env import opencv
 from sigmasplat.errors import ConfigError
 from sigmasplat.fit.compare import noise_scale
 from sigmasplat.fit.pyramid import NOISE_PER_M
-from sigmasplat.registry import DepthFilter, Mask, named
+from sigmasplat.registry import WORDS, DepthFilter, Mask, named
 
 DIAMETER_PX = 5
 """Each reading becomes the weighted mean of the readings in a window of this width."""
@@ -45,7 +46,7 @@ FrameFilter = Callable[[Frame], Frame]
 def frame_filter(names: str) -> FrameFilter:
     """Return the function that applies masks and depth filters in the order of their names, separated by commas.
 
-    Raises ConfigError if a name is unknown; the function raises it if a plug-in returns another shape or type.
+    Raises ConfigError if a name is unknown; the function raises it if a plug-in returns no such image.
     """
     chosen = [named((Mask, DepthFilter), name.strip()) for name in names.split(",") if name.strip()]
 
@@ -58,16 +59,24 @@ def frame_filter(names: str) -> FrameFilter:
 
 
 def _masked(frame: Frame, mask: Mask) -> Frame:
-    ignored, size = np.asarray(mask.ignored(frame)), frame.depth_m.shape
-    if ignored.dtype != np.bool_ or ignored.shape != size:
-        raise ConfigError(f"mask {mask.name!r} returned {ignored.dtype} {ignored.shape}; return bool {size}")
+    ignored = _image_of(mask, mask.ignored(frame), "b", "bool", frame)
     known = ignored if frame.ignored is None else frame.ignored | ignored
     return replace(frame, depth_m=np.where(ignored, np.float32(0.0), frame.depth_m), ignored=known)
 
 
 def _filtered(frame: Frame, row: DepthFilter) -> Frame:
-    """Return the frame with the filter's depth."""
-    depth_m, size = np.asarray(row.filtered(frame), np.float32), frame.depth_m.shape
-    if depth_m.shape != size:
-        raise ConfigError(f"depth filter {row.name!r} returned {depth_m.shape}; return {size}")
+    depth_m = _image_of(row, row.filtered(frame), "fiu", "float32", frame).astype(np.float32)
+    if not (np.isfinite(depth_m) & (depth_m >= 0)).all():
+        raise ConfigError(
+            f"depth filter {row.name!r} returned NaN, infinite or negative depth; 0 = no reading"
+        )
     return replace(frame, depth_m=depth_m)
+
+
+def _image_of(row: Mask | DepthFilter, returned: object, kinds: str, wanted: str, frame: Frame) -> NDArray[Any]:
+    """Return what a plug-in returned. Raises ConfigError unless it has the frame's size and one of the numpy kinds."""
+    image, size = np.asarray(returned), frame.depth_m.shape
+    if image.dtype.kind not in kinds or image.shape != size:
+        found = "None" if returned is None else f"{image.dtype} {image.shape}"
+        raise ConfigError(f"{WORDS[type(row)]} {row.name!r} returned {found}; return {wanted} {size}")
+    return image

@@ -38,14 +38,16 @@ def choose(formats: tuple[Output, ...], name: str | None, out: Path | None) -> O
     if name is not None:
         named = [row for row in formats if row.name == name]
         if not named:
-            raise ConfigError(f"no format '{name}'; there are {', '.join(row.name for row in formats)}")
+            known = ", ".join(row.name for row in formats)
+            raise ConfigError(f"no format '{name}'; there are {known}; --plugin FILE.py adds others")
         return named[0]
     if out is None:
         return formats[0]
     endings = owners(formats)
     fitting = [ending for ending in endings if out.name.lower().endswith(ending)]
     if not fitting:
-        raise ConfigError(f"unknown ending of {out}; end it in {', '.join(endings)}, or give --format")
+        known = ", ".join(endings)
+        raise ConfigError(f"unknown ending of {out}; end it in {known}, or give --format; --plugin FILE.py adds others")
     return endings[max(fitting, key=len)]
 
 
