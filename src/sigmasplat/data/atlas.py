@@ -111,12 +111,8 @@ class Atlas:
     def rates(self, frames: NDArray[np.int64]) -> Matrix:
         """Return how the camera moves in the time of a frame, at some frames of the world [N]: twists [N, 6] in its
         axes; 0 for frames below 0, which are of an earlier session."""
-        T, known, last = self.T_world_camera(), self.in_world, len(self.places) - 1
-        at = np.maximum(frames, 0)
-        before, after = np.maximum(at - 1, 0), np.minimum(at + 1, last)
-        before, after = np.where(known[before], before, at), np.where(known[after], after, at)
-        moved = se3.log_stack(se3.inverse(T[before]) @ T[after]) / np.maximum(after - before, 1)[:, None]
-        return np.asarray(moved * (frames >= 0)[:, None])
+        found = se3.rates(self.T_world_camera(), np.arange(len(self.places)), np.maximum(frames, 0), self.in_world)
+        return found * (frames >= 0)[:, None]
 
     @property
     def T_submap_camera(self) -> Matrix:

@@ -4,6 +4,7 @@ A twist is ξ = (ρ, φ): translation first, then rotation vector (radians).
 """
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -179,6 +180,16 @@ def rotation_angle(R: Matrix) -> float:
 def interpolated(T: Matrix, T_next: Matrix, share: Matrix) -> Matrix:
     """Return the poses [N, 4, 4] that are a share [N] of the way from T to T_next, along a screw motion."""
     return np.asarray(exp_stack(share[:, None] * log_stack(T_next @ inverse(T))) @ T)
+
+
+def rates(T: Matrix, times: NDArray[Any], at: NDArray[np.integer], known: NDArray[np.bool_]) -> Matrix:
+    """Return how a camera moves at some rows of its path [F, 4, 4], between the rows before and after which are known:
+    twists [N, 6] in its axes for each unit of the times [F]."""
+    before, after = np.maximum(at - 1, 0), np.minimum(at + 1, len(T) - 1)
+    before, after = np.where(known[before], before, at), np.where(known[after], after, at)
+    return np.asarray(
+        log_stack(inverse(T[before]) @ T[after]) / np.maximum(times[after] - times[before], 1e-3)[:, None]
+    )
 
 
 def orthonormalise(T: Matrix) -> Matrix:

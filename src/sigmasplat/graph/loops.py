@@ -49,9 +49,12 @@ class Loop:
         }
 
 
+NUMBERS = tuple(name for name in Loop.__dataclass_fields__ if name != "reason")
+
+
 @dataclass(eq=False)
 class Loops(Records[Loop]):
-    """All pairs that were tried, in their order. A record is made when it is read. reasons: their texts by number."""
+    """All pairs that were tried, in their order. A record is made when it is read. reasons: one of each pair."""
 
     query = Part(np.int64)
     database = Part(np.int64)
@@ -60,7 +63,6 @@ class Loops(Records[Loop]):
     similarity = Part(np.float64)
     gated = Part(np.float64)
     accepted = Part(np.bool_)
-    reason = Part(np.int64)
     residual = Part(np.float64)
     overlap = Part(np.float64)
     localised = Part(np.int64)
@@ -75,18 +77,16 @@ class Loops(Records[Loop]):
     def append(self, loop: Loop) -> None:
         """Append a pair."""
         self.rows.append(self._row(loop))
+        self.reasons.append(loop.reason)
 
     def judge(self, i: int, verdict: LoopVerdict) -> None:
         """Set the pose graph's verdict on a registered pair."""
-        reason = "accepted" if verdict.accepted else f"the pose graph disagrees (χ² {verdict.chi2:.0f})"
         accepted, chi2, weight = verdict.accepted, verdict.chi2, verdict.weight
-        self.rows.used[i] = self._row(replace(self[i], accepted=accepted, reason=reason, chi2=chi2, weight=weight))
+        self.rows.used[i] = self._row(replace(self[i], accepted=accepted, chi2=chi2, weight=weight))
+        self.reasons[i] = "accepted" if accepted else f"the pose graph disagrees (χ² {chi2:.0f})"
 
     def _row(self, loop: Loop) -> Matrix:
-        if loop.reason not in self.reasons:
-            self.reasons.append(loop.reason)
-        values = {name: getattr(loop, name) for name in Loop.__dataclass_fields__}
-        return self.row_of(*(values | {"reason": self.reasons.index(loop.reason)}).values())
+        return self.row_of(*(getattr(loop, name) for name in NUMBERS))
 
     def is_rejected(self, i: int) -> bool:
         """Return whether a pose graph that was solved before has rejected a pair."""
@@ -98,8 +98,7 @@ class Loops(Records[Loop]):
         return Loops(Column(self.rows.used.copy(), len(self)), list(self.reasons))
 
     def _record(self, i: int) -> Loop:
-        values = dict(zip(Loop.__dataclass_fields__, self.values(i), strict=True))
-        return Loop(**values | {"reason": self.reasons[values["reason"]]})
+        return Loop(**dict(zip(NUMBERS, self.values(i), strict=True)), reason=self.reasons[i])
 
 
 def described(best: Candidate, a: Submap, b: Submap, found: Registration, known: Matrix) -> Loop:

@@ -80,11 +80,8 @@ class RunFrames:
         measured it (facts: run.json); the camera moves between the frames before and after."""
         if "sensor_times" not in facts or len(self.path) < 2:
             return {}
-        times, T, times_s = SensorTimes.of(facts["sensor_times"]), self.path.T_world_camera, self.path.timestamps_s
-        last = np.arange(len(T))
-        before, after = np.maximum(last - 1, 0), np.minimum(last + 1, len(T) - 1)
-        elapsed_s = np.maximum(times_s[after] - times_s[before], 1e-3)
-        rates = se3.log_stack(se3.inverse(T[before]) @ T[after]) / elapsed_s[:, None]
+        times, every = SensorTimes.of(facts["sensor_times"]), np.arange(len(self.path))
+        rates = se3.rates(self.path.T_world_camera, self.path.timestamps_s, every, every >= 0)
         return {self.log[row]["index"]: Readout(rate, 0.0, times) for row, rate in zip(self.rows, rates, strict=True)}
 
     def outside(self) -> NDArray[np.bool_]:

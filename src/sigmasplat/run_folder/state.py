@@ -22,7 +22,7 @@ from sigmasplat.files.tensors import open_tensors, write_tensors
 INLINE = 64
 """Arrays with at most this many numbers are stored in the text, since there are many poses and each tensor needs a
 header."""
-FORMAT = "8"
+FORMAT = "9"
 TEXT = "state"
 """Name of the tensor with the tree as JSON, bytes."""
 _json = json.JSONEncoder().encode

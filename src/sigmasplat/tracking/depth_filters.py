@@ -67,9 +67,7 @@ def _masked(frame: Frame, mask: Mask) -> Frame:
 def _filtered(frame: Frame, row: DepthFilter) -> Frame:
     depth_m = _image_of(row, row.filtered(frame), "fiu", "float32", frame).astype(np.float32)
     if not (np.isfinite(depth_m) & (depth_m >= 0)).all():
-        raise ConfigError(
-            f"depth filter {row.name!r} returned NaN, infinite or negative depth; 0 = no reading"
-        )
+        raise ConfigError(f"depth filter {row.name!r} returned NaN, infinite or negative depth; 0 = no reading")
     return replace(frame, depth_m=depth_m)
 
 
