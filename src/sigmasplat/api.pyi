@@ -257,7 +257,6 @@ from sigmasplat.run_folder.splat_values import (
     Doubles as Doubles,
     SplatValues as SplatValues,
     morton_order as morton_order,
-    opacity_bytes as opacity_bytes,
     smallest_three as smallest_three,
     to_bytes as to_bytes,
 )

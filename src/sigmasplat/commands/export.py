@@ -99,12 +99,8 @@ def export(
     with output_locked(target):
         refuse_existing(target, overwrite)  # another process may have written it meanwhile
         content = chosen.write(source, target, **{name: getattr(asked, name) for name in chosen.options})
-    print(f"{target}: {content}{_size(target)}")
+    print(f"{target}: {content}" + (f", {target.stat().st_size / 1e6:.1f} MB" if target.is_file() else ""))
     return 0
-
-
-def _size(target: Path) -> str:
-    return f", {target.stat().st_size / 1e6:.1f} MB" if target.is_file() else ""
 
 
 export.__doc__ = (export.__doc__ or "").format(formats="\n    ".join(listed(rows(Output))))

@@ -85,11 +85,6 @@ def interpolated_depth(
     return np.where(smooth, above + down[:, None] * (below - above), otherwise)
 
 
-def _centers(size: int, resized: int) -> NDArray[np.float64]:
-    """Return the centres of `resized` pixels in pixels of an axis of `size`."""
-    return (np.arange(resized, dtype=np.float64) + 0.5) * (size / resized) - 0.5
-
-
 def _around(positions: NDArray[np.float64], size: int) -> tuple[NDArray[np.intp], NDArray[np.intp], Depth]:
     """Return the two pixels around each position on an axis of `size` pixels, and the weight of the second one."""
     first = np.floor(positions)
@@ -104,7 +99,8 @@ def _axis(size: int, resized: int) -> tuple[Indices, Depth]:
     and the weight [n] of the last."""
     numbers = Image.fromarray(np.arange(size, dtype=np.int32)[None])
     nearest = np.asarray(numbers.resize((resized, 1), Image.Resampling.NEAREST))[0]
-    first, second, share = _around(_centers(size, resized), size)
+    centers = (np.arange(resized, dtype=np.float64) + 0.5) * (size / resized) - 0.5
+    first, second, share = _around(centers, size)
     return np.stack([nearest, first, second]).astype(np.int32), share
 
 

@@ -70,7 +70,9 @@ class KeyframeReader:
         self.tracked = tuple(self.poses)
         self.motions, self.left = [VectorAdam.of(6) for _ in self.poses], list[int]()
         self.exposures = np.tile(NEUTRAL, (len(self.poses), 1, 1))
-        self._target = lru_cache(max(1, CACHE_BYTES // (16 * view.alpha.numel())))(self._read)
+        self._target = lru_cache(max(1, CACHE_BYTES // (16 * view.alpha.numel())))(
+            lambda i: Target.of_picture(self.store.picture(*self.places[i]), self.camera, self.size)
+        )
 
     def __len__(self) -> int:
         return len(self.places)
@@ -117,9 +119,6 @@ class KeyframeReader:
         """Return the exposures [K, 3, 2] of the keyframes of each submap, relative to the mean of all."""
         found, submap_of = centred(self.exposures), np.array([submap for submap, _ in self.places])
         return [found[submap_of == index] for index in range(len(self.store))]
-
-    def _read(self, i: int) -> Target:
-        return Target.of_picture(self.store.picture(*self.places[i]), self.camera, self.size)
 
 
 def refine(

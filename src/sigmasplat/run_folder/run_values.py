@@ -3,15 +3,14 @@
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
-
-from torch import Tensor
+from typing import Any, TypeVar
 
 from sigmasplat.data.trajectory import APART, LOST, RELOCALISED, TRACKED
 from sigmasplat.errors import RunError
 
 MOST_NUMBER = 1e15
 REMEDY = "restore the file, or run it again"
+Value = TypeVar("Value")
 Kind = Any
 """What a value may be, see `fits`."""
 
@@ -37,15 +36,12 @@ def _vector(value: Any) -> bool:
     return fits(value, [float]) and len(value) == 3
 
 
-def _pose(value: Any) -> bool:
-    return fits(value, [[float]]) and list(map(len, value)) == [4] * 4
-
-
 LOG: Mapping[str, Kind] = {
     "index": lambda value: fits(value, int) and value >= 0, "timestamp_s": float, "is_keyframe": bool, "lost": bool,
     "state": lambda value: value in (TRACKED, RELOCALISED, LOST, APART), "component": int, "p_off": (float, None),
     "splats": int, "submap": int, "tracking": {"": (float, None, bool)}, "seconds": {"": float},
-    "T_world_camera": _pose, "loops": [dict], "specific_force_m_s2": _vector,
+    "T_world_camera": lambda value: fits(value, [[float]]) and list(map(len, value)) == [4] * 4,
+    "loops": [dict], "specific_force_m_s2": _vector,
 }  # fmt: skip
 """Values of a line of log.jsonl."""
 FACTS: Mapping[str, Kind] = {
@@ -73,21 +69,21 @@ def check_fields(values: Any, kinds: Mapping[str, Kind], required: tuple[str, ..
     return checked
 
 
-class Record(dict[str, Any]):
-    """A line of log.jsonl; a missing field raises RunError. Logs of older versions lack some fields."""
+class Named(dict[str, Value]):
+    """Values by name: fields of a line of log.jsonl, or tensors of a file. A missing one raises RunError."""
 
-    def __init__(self, values: Mapping[str, Any], where: str) -> None:
+    def __init__(self, values: Mapping[str, Value], where: object, what: str) -> None:
         super().__init__(values)
-        self.where = where
+        self.where, self.what = where, what
 
-    def __missing__(self, name: str) -> Any:
-        raise RunError(f"{self.where}: field {name!r} is missing; {REMEDY}")
+    def __missing__(self, name: str) -> Value:
+        raise RunError(f"{self.where}: {self.what} {name!r} is missing; {REMEDY}")
 
 
 def check_log(records: list[Any], path: Path) -> list[dict[str, Any]]:
     """Return the records of a log. Raises RunError naming the line of a wrong value."""
-    places = (f"{path}:{number}" for number in range(1, len(records) + 1))
-    return [Record(check_fields(record, LOG, (), where), where) for record, where in zip(records, places, strict=True)]
+    places = zip(records, (f"{path}:{number}" for number in range(1, len(records) + 1)), strict=True)
+    return [Named(check_fields(record, LOG, (), where), where, "field") for record, where in places]
 
 
 def frame_seconds(record: Mapping[str, Any]) -> float:
@@ -101,14 +97,3 @@ def _short(value: Any) -> str:
         return "a very large number"
     text = repr(value)
     return text if len(text) <= 60 else f"{text[:60]} …"
-
-
-class Tensors(dict[str, Tensor]):
-    """The tensors of a file by name; a missing one raises RunError."""
-
-    def __init__(self, found: Mapping[str, Tensor], path: Path) -> None:
-        super().__init__(found)
-        self.path = path
-
-    def __missing__(self, name: str) -> Tensor:
-        raise RunError(f"{self.path}: tensor {name!r} is missing; {REMEDY}")

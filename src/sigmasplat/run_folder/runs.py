@@ -23,7 +23,7 @@ from sigmasplat.files.tensors import open_tensors, write_tensors
 from sigmasplat.input.lists import read_poses
 from sigmasplat.run_folder import map_files, splat_ply as ply, trajectory as tum
 from sigmasplat.run_folder.frames import RunFrames
-from sigmasplat.run_folder.run_values import FACTS, REMEDY, Tensors, check_fields, check_log
+from sigmasplat.run_folder.run_values import FACTS, REMEDY, Named, check_fields, check_log
 from sigmasplat.run_folder.submaps import DiskStore
 from sigmasplat.uncertainty.map_uncertainty import MapUncertainty, SplatStd
 
@@ -275,7 +275,7 @@ class RunFolder:
             raise RunError(f"checkpoint {path} is damaged: {why}; {REMEDY}")
         with open_tensors(path, "checkpoint") as file:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-            return Tensors(tensors, path), file.metadata() or {}
+            return Named(tensors, path, "tensor"), file.metadata() or {}
 
     def read_odometry(self) -> Trajectory | None:
         """Return the path of tracking alone, without loop closure; None if the run has no such path or no loop.

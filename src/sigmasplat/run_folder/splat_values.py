@@ -105,14 +105,9 @@ def by_channel(harmonics: NDArray[Number]) -> NDArray[Number]:
     return harmonics.reshape(rows, columns // 3, 3).swapaxes(1, 2).reshape(rows, columns)
 
 
-def to_bytes(values: Doubles) -> NDArray[np.uint8]:
+def to_bytes(values: NDArray[np.floating]) -> NDArray[np.uint8]:
     """Round values to bytes; those outside 0 to 255 are clipped."""
     return np.clip(np.round(values), 0.0, 255.0).astype(np.uint8)
-
-
-def opacity_bytes(opacities: Doubles) -> NDArray[np.uint8]:
-    """Convert opacities in [0, 1] to bytes."""
-    return to_bytes(opacities * 255.0)
 
 
 def morton_order(points: Doubles) -> NDArray[np.intp]:

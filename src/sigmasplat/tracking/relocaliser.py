@@ -184,7 +184,9 @@ class Relocaliser:
             landmarks = FeatureImage.of_picture(known.picture(where), view.camera).landmarks(self.extractor)
             self._landmarks[where] = landmarks
             some = landmarks.features.take(np.arange(min(STRONGEST, len(landmarks))))
-            self._strongest[where] = replace(some, descriptors=_compact(some.descriptors))
+            if some.descriptors.dtype == np.float32:  # half precision holds them exactly
+                some = replace(some, descriptors=some.descriptors.astype(np.float16))
+            self._strongest[where] = some
             if len(self._landmarks) > KEPT_LANDMARKS:
                 self._landmarks.popitem(last=False)
         self._landmarks.move_to_end(where)
@@ -233,8 +235,3 @@ def aligned(
         fit.comparison = reference.compared(seen.live, fit.T_camera_world)
         found.append((fit, fit.comparison))
     return max(found, key=lambda each: score(each[1]))
-
-
-def _compact(descriptors: Matrix) -> Matrix:
-    """Return float descriptors in half precision, which holds them exactly."""
-    return descriptors.astype(np.float16) if descriptors.dtype == np.float32 else descriptors

@@ -4,9 +4,7 @@ import warnings
 from dataclasses import replace
 from types import ModuleType
 
-import torch
-
-from sigmasplat.api import TORCH, Backend, Camera, DeviceFits, RenderConfig, reference_maps
+from sigmasplat.api import TORCH, Backend, DeviceFits, RenderConfig, reference_maps
 from sigmasplat.plugins.cuda import descent, images, launch
 from sigmasplat.plugins.cuda.mapping_step import CudaStep, CudaViewDependentStep, to_host
 from sigmasplat.plugins.cuda.view import CudaView
@@ -26,10 +24,6 @@ def _options(options: RenderConfig) -> RenderConfig:
     return replace(options, depth="center")
 
 
-def _view(camera: Camera, options: RenderConfig, variance: bool) -> CudaView:
-    return CudaView(camera, _options(options), variance)
-
-
 def _fits() -> DeviceFits:
     return replace(
         TORCH,
@@ -43,8 +37,7 @@ def _fits() -> DeviceFits:
     )
 
 
-def _device() -> torch.device:
-    return launch.this_device()
-
-
-PLUGIN = Backend("cuda", _operators, _view, _fits, _options, _device)
+PLUGIN = Backend(
+    "cuda", _operators, lambda camera, options, variance: CudaView(camera, _options(options), variance), _fits,
+    _options, lambda: launch.this_device(),
+)  # fmt: skip

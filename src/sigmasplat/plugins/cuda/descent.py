@@ -177,7 +177,7 @@ class CudaDescent:
                 left, look = self._make_room(iterations)
                 work = self.iterate
             if work == self.iterate and self.config.cuda_graphs and left >= GRAPH_FROM:
-                work = self._graph()
+                work = repeatable(self.iterate, self.view.alpha.device)
         return _found(look.read())
 
     def iterate(self) -> None:
@@ -189,9 +189,6 @@ class CudaDescent:
             "descend", 1, self._state, self._shown, self._numbers, self._axis, losses, len(losses), twists, len(twists),
             self.view.raster.pairs,
         )  # fmt: skip
-
-    def _graph(self) -> Work:
-        return repeatable(self.iterate, self.view.alpha.device)
 
     def _make_room(self, iterations: int) -> "tuple[int, _Look]":
         """Allocate memory for the missing pairs; return the number of remaining steps."""

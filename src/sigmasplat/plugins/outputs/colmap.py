@@ -22,9 +22,9 @@ from sigmasplat.api import (
     no_progress,
     replacing,
     se3,
+    to_bytes,
     write_text,
 )
-from sigmasplat.plugins.outputs.mesh_files import color_bytes
 from sigmasplat.plugins.outputs.run_reader import RunReader
 
 Points = NDArray[np.floating]
@@ -114,6 +114,6 @@ def _image_lines(names: Sequence[str], T_world_camera: Matrix) -> str:
 
 def _point_lines(points: Points, colors: Points) -> str:
     """Return one line per point; its error is 0 and its track is empty."""
-    rows = zip(points.tolist(), color_bytes(colors).tolist(), strict=True)
+    rows = zip(points.tolist(), to_bytes(colors * 255.0).tolist(), strict=True)
     lines = (f"{i} {x:.6f} {y:.6f} {z:.6f} {r} {g} {b} 0\n" for i, ((x, y, z), (r, g, b)) in enumerate(rows, 1))
     return "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n" + "".join(lines)

@@ -65,7 +65,8 @@ def gaps(mesh: Mesh, largest_m: float) -> list[Indices]:
         points = mesh.vertices[loop].astype(np.float64)
         if len(loop) < 3 or (np.ptp(points, axis=0) > largest_m).any() or pdist(points).max() > largest_m:
             continue
-        across, opposite = points - points.mean(0), mesh.vertices[[beside[edge] for edge in _edges(loop)]]
+        edges = zip(loop.tolist(), np.roll(loop, -1).tolist(), strict=True)
+        across, opposite = points - points.mean(0), mesh.vertices[[beside[edge] for edge in edges]]
         along = np.roll(points, -1, axis=0) - points
         away = opposite - points
         away -= along * (_dot(away, along) / np.maximum(_dot(along, along), 1e-18))[:, None]
@@ -110,10 +111,6 @@ def _loops(edges: dict[tuple[int, int], int]) -> list[Indices]:
                     place[at] = len(path)
                     path.append(at)
     return loops
-
-
-def _edges(loop: Indices) -> list[tuple[int, int]]:
-    return list(zip(loop.tolist(), np.roll(loop, -1).tolist(), strict=True))
 
 
 def _patch(mesh: Mesh, loop: Indices, neighbours: csr_array) -> Patch | None:

@@ -29,6 +29,7 @@ from sigmasplat.api import (
     open_binary,
     read_header,
     replacing,
+    to_bytes,
 )
 
 GRAY = 0.7
@@ -248,12 +249,7 @@ def _stl(mesh: Mesh, note: str) -> bytes:
 
 def _bytes(mesh: Mesh) -> NDArray[np.uint8]:
     """Return the vertices' colours as bytes [V, 3]; gray if the mesh has no colours."""
-    return color_bytes(np.full(mesh.vertices.shape, GRAY, np.float32) if mesh.colors is None else mesh.colors)
-
-
-def color_bytes(colors: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """Convert colours in [0, 1] to bytes; values outside are clipped."""
-    return np.asarray(np.rint(np.clip(colors, 0.0, 1.0) * 255.0), np.uint8)
+    return to_bytes((np.full(mesh.vertices.shape, GRAY, np.float32) if mesh.colors is None else mesh.colors) * 255.0)
 
 
 _FORMATS = {".ply": _ply, ".glb": _glb, ".stl": _stl}

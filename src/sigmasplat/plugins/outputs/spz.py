@@ -24,7 +24,6 @@ from sigmasplat.api import (
     RunError,
     SplatValues,
     morton_order,
-    opacity_bytes,
     replacing,
     smallest_three,
     to_bytes,
@@ -55,7 +54,7 @@ def write_field(path: Path, field: GaussianField) -> None:
     colors = (values.colors - 0.5) / SH_C0 * COLOR_SCALE + 0.5
     streams = [
         np.round(values.means * STEPS_PER_M).astype("<i4")[..., None].view("u1")[..., :3].tobytes(),
-        opacity_bytes(values.opacities).tobytes(),
+        to_bytes(values.opacities * 255.0).tobytes(),
         to_bytes(colors * 255.0).tobytes(),
         to_bytes((values.log_scales - LOG_SCALE_START) * LOG_SCALE_STEPS).tobytes(),
         _packed_rotations(values.quats).tobytes(),

@@ -44,7 +44,9 @@ class ControlPanel:
         self._add_map_controls(gui)
         self._add_path_controls(gui)
         self.look.on_click(lambda event: look_from(event.client) if event.client else None)
-        for control in self._controls():
+        for control in (
+            self.mode, self.colouring, self.hidden, self.row, self.follow, self.path, self.keyframes, self.true_path,
+        ):  # fmt: skip
             control.on_update(lambda _: changed())
 
     def _add_map_controls(self, gui: viser.GuiApi) -> None:
@@ -72,12 +74,6 @@ class ControlPanel:
                 "keyframes", False, hint="click a keyframe to move there and to see its image"
             )
             self.true_path = gui.add_checkbox("ground truth", True, visible=False)
-
-    def _controls(self) -> tuple[Any, ...]:
-        return (
-            self.mode, self.colouring, self.hidden,
-            self.row, self.follow, self.path, self.keyframes, self.true_path,
-        )  # fmt: skip
 
     def state(self) -> ControlState:
         """Return the current values of the controls."""
