@@ -45,21 +45,11 @@ Floats = NDArray[np.float32]
 
 
 class SyntheticRoom(Source):
-    """A furnished room (or several), ray-cast frame by frame.
+    """A furnished room (or several), or a corridor, ray-cast frame by frame. docs/data.md describes the options.
 
-    frames, width, height: length and image size, pixels; seed: appearance of the room, start of the path and all noise;
-    noise: whether depth and colour have sensor noise; loops: rounds of the path; exposure_change: whether the image
-    gain varies by ±8 % over the sequence (None: in rooms, not in a corridor); rooms: number of rooms, joined by
-    doorways; overrun: how far the path continues past its start, percent of a round; drift: standard deviation of the
-    depth calibration's slow drift (`room.capture.drifted_depth`), tenths of a percent of the depth; test_views: number
-    of exact views away from the path (`SyntheticRoom.test_views`); stereo: if above 0, depth is computed from a stereo
-    pair with this baseline in cm instead of being exact (`right_image`); mover: the share of the image, in percent on
-    average, that a ball covers which moves through the room by itself (`Mover`); scored views and the true surface show
-    the room without it; predicted: whether depth is that of an imagined network, with a smooth scale error
-    (`room.capture.predicted_depth`); corridor: whether there is a long corridor with plain walls instead of rooms, seen
-    by a wide lens that moves 80 mm a frame (`room.corridor`); it has one way and no ball; late: time of depth after
-    colour, s; rows, depth_rows: time from the first to the last row of colour and of depth, s (rolling shutter). Each
-    row is then seen from where the path is at its time; the true pose is that in the middle of colour.
+    seed: appearance of the room, start of the path and all noise. exposure_change None: in rooms, not in a corridor.
+    Scored views and the true surface show the room without the ball (`mover`). Each row is seen from where the path is
+    at its time (`late`, `rows`, `depth_rows`). What is wrong with depth is in `room.capture`.
 
     A path with loops to close: frames=720,rooms=2,overrun=20,noise=1,drift=6. A round of 600 frames is a slow pace. The
     way back looks in other directions than the way out, so drift accumulates over a whole round; the last 120 frames
