@@ -86,11 +86,12 @@ def _call_of(arguments: Sequence[str]) -> Callable[[], int]:
 
     name, plain = arguments[0], (tyro.conf.FlagCreatePairsOff,)
     if name not in COMMANDS:
-        return partial(_list_commands, arguments)
+        _list_commands(arguments)
+        return lambda: REFUSED
     return tyro.cli(_postponed(name), prog=f"sigmasplat {name}", args=arguments[1:], config=plain)
 
 
-def _list_commands(arguments: Sequence[str]) -> int:
+def _list_commands(arguments: Sequence[str]) -> None:
     """Print the commands, or that there is no such option. Raises SystemExit afterwards."""
     import tyro
 
@@ -101,7 +102,6 @@ def _list_commands(arguments: Sequence[str]) -> int:
         args=arguments,
         config=(tyro.conf.FlagCreatePairsOff,),
     )
-    return REFUSED
 
 
 def _postponed(name: str) -> Callable[..., Callable[[], int]]:
