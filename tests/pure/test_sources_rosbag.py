@@ -45,7 +45,7 @@ def test_every_kind_of_bag_gives_equal_frames(tmp_path: Path, kind: str) -> None
     assert source.camera == Camera(*SIZE, *FOCAL)
     assert not source.depth_registered and source.depth_units_per_metre == 1000.0
     for frame, color, depth, t in zip(source, seen.colors, seen.depths_mm, seen.times_s, strict=True):
-        assert frame.timestamp_s == pytest.approx(t, abs=1e-6)
+        assert frame.timestamp_s == pytest.approx(t, abs=1e-6) and frame.depth_late_s == pytest.approx(0.004, abs=1e-6)
         assert np.array_equal(np.rint(frame.color * 255), color)
         assert np.array_equal(frame.depth_m, metres(depth))
     assert np.array_equal(source.frame(1).depth_m, metres(seen.depths_mm[1]))  # read backwards after the end

@@ -147,9 +147,11 @@ def open_bag(place: str, settings: InputConfig) -> RecordedSource:
     if not len(pairs):
         raise no_pairs(bag.path, {name: _times_s(found[name], True) for name in topics})
     colors, depths = _message_paths(bag, color.name, color_s), _message_paths(bag, depth.name, depth_s)
+    known = 0.0 if recorded_time else 1.0  # how long messages travel says nothing about the images
+    times = [(i, j, float(color_s[i]), known * float(depth_s[j] - color_s[i])) for i, j in pairs]
     images = [
-        BagImagePair(float(color_s[i]), colors[i], depths[j], bag, topics, (entries[0][i], entries[1][j]))
-        for i, j in pairs
+        BagImagePair(t, colors[i], depths[j], bag, topics, (entries[0][i], entries[1][j]), depth_late_s=late)
+        for i, j, t, late in times
     ]
     alone = sorted(set(range(len(colors))) - set(pairs[:, 0].tolist()))
     skipped = [f"{colors[i]}: no depth within {MAX_GAP_S:g} s" for i in alone]
