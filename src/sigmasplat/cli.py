@@ -37,6 +37,7 @@ sigmasplat --plugin FILE.py run PATH    use a file with plug-ins of yours; befor
 COMMANDS = {
     "demo": ("run", "demo"),
     "inspect": ("inspect", "inspect"),
+    "calibrate": ("inspect", "calibrate"),
     "run": ("run", "run"),
     "resume": ("run", "resume"),
     "batch": ("batch", "batch"),

@@ -28,7 +28,10 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
     [
         (["rnu", "data/kitchen"], "no command 'rnu' (did you mean run?); the commands are demo, "),
         (["evaluate", "--help"], "no command 'evaluate' (did you mean eval?)"),
-        (["xyzzy"], "no command 'xyzzy'; the commands are demo, inspect, run, resume, batch, localise, view, eval, me"),
+        (
+            ["xyzzy"],
+            "no command 'xyzzy'; the commands are demo, inspect, calibrate, run, resume, batch, localise",
+        ),
         (["run", "/no/such/place"], "/no/such/place"),
         (["run", "."], "unknown format"),
         (["run", "/no/such/place", "--preset", "quick"], "no preset 'quick'"),

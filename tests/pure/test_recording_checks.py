@@ -47,7 +47,7 @@ def test_delay_of_depth_is_estimated(shaken: Motion, delay: int) -> None:
     late = Motion(shaken.times_s[:n], gray, depth)
     assert late.delay_frames() == pytest.approx(delay, abs=0.3)
     (warning,) = motion_warnings(late)
-    assert warning.startswith("depth is" if delay > 0 else "colour is")
+    assert warning.startswith("depth is" if delay > 0 else "colour is") and "`sigmasplat calibrate PATH`" in warning
 
 
 def test_a_still_camera_has_no_delay(shaken: Motion) -> None:

@@ -1,15 +1,20 @@
-"""Command `sigmasplat inspect`: check a recording before a run."""
+"""Examine a recording before a run: sigmasplat inspect | calibrate."""
 
+import shlex
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 from sigmasplat.commands import options
 from sigmasplat.commands.input_options import DEFAULT_INPUT_OPTIONS, InputOptionsFlat, arg
-from sigmasplat.commands.options import configured
+from sigmasplat.commands.options import configured, prepare_torch
 from sigmasplat.config.find_preset import default_preset
+from sigmasplat.config.input import sensor_times
+from sigmasplat.config.text import split_settings
+from sigmasplat.errors import ConfigError, RunError
 
 OK, WARNED = 0, 1
-SHEETS = Path("runs/inspect")
+SHEETS, TIMES = Path("runs/inspect"), Path("sensor_times.json")
 
 
 def inspect(
@@ -52,3 +57,49 @@ def inspect(
     if json is not None:
         write_json(json, found.record())
     return WARNED if found.warnings else OK
+
+
+def calibrate(
+    path: options.SourcePath,
+    input_options: InputOptionsFlat = DEFAULT_INPUT_OPTIONS,
+    settings: options.Settings = (),
+    out: Annotated[Path, arg("FILE", "file to write, .json, with a picture beside it, .png")] = TIMES,
+) -> int:
+    """Measure when a camera reads depth and rows (rolling shutter), from a recording in which it moves.
+
+    A run with this file corrects its images from the first one on. example: sigmasplat calibrate data/kitchen
+    """
+    from sigmasplat.files.atomic import replacing
+    from sigmasplat.files.json_files import write_json
+    from sigmasplat.files.lock import output_locked
+    from sigmasplat.plugins.outputs.drawing.sensor_times import draw_sensor_times
+    from sigmasplat.run.calibrate import measure_times
+    from sigmasplat.run.scene import open_scene
+    from sigmasplat.run.terminal import Screen
+
+    screen, out, picture = Screen(), out.with_suffix(".json"), out.with_suffix(".png")
+    _refuse_others(out, picture)
+    config = configured(default_preset(), settings, None, replace(input_options, poses=None))
+    source, config = open_scene(path, config, split_settings(settings))
+    if source.live:
+        raise ConfigError("a live camera cannot be measured; record it first: sigmasplat run realsense")
+    prepare_torch()
+    with output_locked(out, screen.warn):
+        with screen.counting("frames") as progress:
+            times, measured, costs = measure_times(source, config, progress)
+        write_json(out, {"source": source.name, "frames": len(source)} | times.noted())
+        with replacing(picture) as temporary:
+            draw_sensor_times(measured, costs).save(temporary, "PNG")
+    screen.say(f"{times.said()}: {out}, {picture}")
+    screen.next_commands([shlex.join(["sigmasplat", "run", path, "--set", f"input.calibrate={out}"])])
+    return OK
+
+
+def _refuse_others(out: Path, picture: Path) -> None:
+    """Raise RunError if a file of another kind would be replaced."""
+    kept = next((file for file in (out, picture) if file.exists()), None)
+    try:
+        if kept:
+            sensor_times(str(out))
+    except ConfigError as problem:
+        raise RunError(f"{kept} exists and was not written by this command; give another --out") from problem

@@ -1,10 +1,14 @@
 """Settings of the input, for every format: which frames, which calibration, which pixels; how sure the depth readings
 of a sensor are: models as numbers, by name."""
 
+from contextlib import suppress
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
-from sigmasplat.config.ranges import WIDTHS_PX, Above0, AtLeastOne, Count, NotNegative, Range, Section
+from sigmasplat.config.ranges import WIDTHS_PX, Above0, AtLeastOne, Count, NotNegative, Range, Section, problem_of
+from sigmasplat.errors import ConfigError
+from sigmasplat.files.reading import exists, read_json
 
 
 @dataclass(frozen=True)
@@ -50,6 +54,29 @@ def sensor_model(name: str) -> SensorModel | None:
 
 RECORDED_POSES = "recorded"
 """Value of `input.poses` for the poses that the recording device estimated itself."""
+TIMES = ("depth_late_s", "depth_rows_s", "color_rows_s", "std_s", "std_s", "std_s")
+"""Numbers of a file for `input.calibrate`, which is JSON."""
+TIMES_NEEDED = "input.calibrate needs auto, off, or a file that `sigmasplat calibrate PATH` has written"
+
+
+def sensor_times(given: str) -> str:
+    """Return `TIMES` as numbers with commas, from such text, a file, or the run.json of a run. Raises ConfigError."""
+    values: Any = given.split(",")
+    if len(values) == len(TIMES):
+        with suppress(ValueError):
+            values = [float(value) for value in values]
+    elif exists(Path(given)):
+        found = read_json(Path(given), ConfigError)
+        found = found.get("sensor_times", found) if isinstance(found, dict) else None
+        found = found if isinstance(found, dict) else {}
+        values = found.get("std_s") if isinstance(found.get("std_s"), list) else []
+        values = [*map(found.get, TIMES[:3]), *[*values, None, None, None][:3]]
+    else:
+        raise ConfigError(f"no file {given!r}; {TIMES_NEEDED}")
+    for name, value in zip(TIMES, values, strict=True):
+        if problem := problem_of(Annotated[float, Range(0 if name == "std_s" else -1, 1)], value):
+            raise ConfigError(f"{given}: {name} {problem}; {TIMES_NEEDED}")
+    return ",".join(f"{value:g}" for value in values)
 
 
 @dataclass(frozen=True)
@@ -129,11 +156,18 @@ class InputConfig(Section, name="input"):
     """Model of the standard deviation of depth readings: that of a sensor (`config.input`); generic = the law of
     `render.depth_noise_per_m`; rendered = the same law, with an exact calibration and exact times; auto = that of the
     sensor if the source knows it, otherwise generic."""
-    calibrate: Literal["auto", "off"] = "auto"
-    """Whether it is measured from the keyframes when the sensor reads depth and rows (rolling shutter), and corrected;
-    not for rendered images, and only where keyframes are aligned to each other."""
+    calibrate: str = "auto"
+    """When the sensor reads depth and rows (rolling shutter), which is corrected: auto = measured from the keyframes,
+    except of rendered images, and only where keyframes are aligned to each other; off = not known; or the path of a
+    file with these times, which `sigmasplat calibrate` has written. Its six numbers replace the path in a run's
+    settings."""
     denoise_depth: bool = True
     """Whether depth images that are noisier than those of a structured-light sensor are smoothed."""
+
+    def __post_init__(self) -> None:
+        if isinstance(self.calibrate, str) and self.calibrate not in ("auto", "off"):
+            object.__setattr__(self, "calibrate", sensor_times(self.calibrate))
+        super().__post_init__()
 
     @property
     def poses_scale_depth(self) -> bool:

@@ -22,9 +22,18 @@ class SensorTimes:
     std_s: tuple[float, float, float] | None = None
 
     @staticmethod
-    def of(noted: Mapping[str, Any]) -> "SensorTimes":
-        """Return times that `noted` has written."""
-        return SensorTimes(**{**noted, "std_s": tuple(noted["std_s"])})
+    def noted_in(facts: Mapping[str, Any]) -> "SensorTimes":
+        """Return the times in the facts of a run (run.json), where `noted` has written them."""
+        noted = facts.get("sensor_times")
+        return SensorTimes(**{**noted, "std_s": tuple(noted["std_s"])}) if noted else UNKNOWN_TIMES
+
+    @staticmethod
+    def given(text: str) -> "SensorTimes":
+        """Return the times that `input.calibrate` gives as numbers; they are not known if it is a word."""
+        if "," not in text:
+            return UNKNOWN_TIMES
+        late, depth, color, *std_s = map(float, text.split(","))
+        return SensorTimes(late, depth, color, (std_s[0], std_s[1], std_s[2]))
 
     def noted(self) -> dict[str, Any]:
         """Return the times as facts of a run; nothing if they are not known."""
@@ -34,7 +43,9 @@ class SensorTimes:
         """Return the times in words, empty if they are not known."""
         if self.std_s is None:
             return ""
-        late, depth, color = (f"{1e3 * std_s:.0f} ms" for std_s in self.std_s)
+        late, depth, color = (f"{1e3 * std_s:.{int(std_s < 0.001)}f} ms" for std_s in self.std_s)
+        if self.at_once:
+            return f"the sensor reads nothing late (± {color} for colour, {depth} for depth, {late} between both)"
         return (
             f"the sensor reads colour in {1e3 * self.color_rows_s:.0f} ± {color}, depth in "
             f"{1e3 * self.depth_rows_s:.0f} ± {depth} and {1e3 * abs(self.depth_late_s):.0f} ± {late} "
@@ -43,7 +54,13 @@ class SensorTimes:
 
     def read(self, image: "Readout") -> "Readout | None":
         """Return when the rows of an image were read; None if that is not known, or does not matter at rest."""
-        return replace(image, times=self) if self.std_s is not None and image.rate.any() else None
+        matters = image.rate.any() and (image.late_s or not self.at_once)
+        return replace(image, times=self) if self.std_s is not None and matters else None
+
+    @property
+    def at_once(self) -> bool:
+        """Return whether all is read at once."""
+        return not (self.depth_late_s or self.depth_rows_s or self.color_rows_s)
 
 
 UNKNOWN_TIMES = SensorTimes()

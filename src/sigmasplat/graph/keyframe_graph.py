@@ -184,6 +184,12 @@ class GrowingGraph:
                 return
             yield
 
+    def pairs(self, image: Callable[[int], Pyramid], reading: Callable[[int], Readout], most: int) -> list[Pair]:
+        """Return the images of at most so many alignments, at half the size; image, reading: of a row."""
+        chosen = self.edges[:: -(-len(self.edges) // most) or 1]
+        halves = ((image(e.b).half(), image(e.a).half(), reading(e.b), reading(e.a), e.T_a_b, e.a) for e in chosen)
+        return [Pair(*half) for half in halves]
+
     def measuring(self, image: Callable[[int], Pyramid], reading: Callable[[int], Readout]) -> Task[None]:
         """Measure when the sensor reads, in slices of one pair, and then align all again. Until the images show it,
         this is tried each time that there are twice as many alignments.
@@ -194,9 +200,7 @@ class GrowingGraph:
         if not self.calibrates or self.times.std_s is not None or count < max(FIRST_MEASURED, 2 * self.measured):
             return
         self.measured = count
-        chosen = self.edges[:: -(-count // MOST_MEASURED)]
-        halves = ((image(e.b).half(), image(e.a).half(), reading(e.b), reading(e.a), e.T_a_b, e.a) for e in chosen)
-        self.times = yield from measured([Pair(*half) for half in halves])
+        self.times = yield from measured(self.pairs(image, reading, MOST_MEASURED))
         if self.times.std_s is None:
             return
         again = Alignments()

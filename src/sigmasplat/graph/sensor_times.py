@@ -28,7 +28,7 @@ NEIGHBOURS = 3
 """So many keyframes in a row see the same: the errors of their pairs are not independent."""
 BIAS_S = 1e-4
 """Systematic error of a time: in so long, an image moves by `fit.align.BIAS_PX` at 100 pixels per second."""
-LEAST_PAIRS = 10
+LEAST_PAIRS, LEAST_GROUPS = 10, 5
 LEAST_OVERLAP = 0.25
 LEVEL, HOPELESS = 0.999, 0.9
 """Times are used if the hypothesis that all rows are read at once is rejected at the first level; if the first step is
@@ -64,6 +64,13 @@ def measured(pairs: Sequence[Pair]) -> Task[SensorTimes]:
     Returns all zero, without standard deviations, if the images do not show that anything is read late. The images of a
     pair may be small: half of the working size takes a quarter of the time and gives the same times.
     """
+    times, sure = yield from estimated(pairs)
+    return times if sure else UNKNOWN_TIMES
+
+
+def estimated(pairs: Sequence[Pair]) -> Task[tuple[SensorTimes, bool]]:
+    """Return where the pairs agree best, and whether it is sure that anything is read late; times are unknown if it is
+    neither sure nor refuted. In slices as `measured`."""
     moved, times_s, longest_s = list(pairs), np.zeros(3), LONGEST_S
     lowest, near = np.inf, False
     for _ in range(ROUNDS):
@@ -73,7 +80,7 @@ def measured(pairs: Sequence[Pair]) -> Task[SensorTimes]:
             yield
             there += [] if found is None else [found]
         if len(there) < LEAST_PAIRS:
-            return UNKNOWN_TIMES
+            return UNKNOWN_TIMES, False
         cost = float(np.mean([np.log(pair.cost) for pair in there]))
         if near or cost < lowest:
             moved, terms = there, list[Term]()
@@ -81,7 +88,7 @@ def measured(pairs: Sequence[Pair]) -> Task[SensorTimes]:
                 terms += [_expanded(pair, times_s)]
                 yield
             if not any(term.bend.any() for term in terms):  # no camera moved
-                return UNKNOWN_TIMES
+                return UNKNOWN_TIMES, False
             lowest, best_s, (step_s, covariance) = cost, times_s, newton_step(terms)
             covariance += BIAS_S**2 * np.eye(3)
             std_s, groups = np.sqrt(np.diag(covariance)), len({term.number // NEIGHBOURS for term in terms})
@@ -93,13 +100,15 @@ def measured(pairs: Sequence[Pair]) -> Task[SensorTimes]:
             longest_s = float(np.abs(times_s - best_s).max()) / 3.0
         times_s = best_s + step_s * min(1.0, longest_s / float(np.abs(step_s).max()))
     settled = std_s.max() < STEP_S and bool((np.abs(step_s) <= np.maximum(std_s, NO_STEP_S)).all())
-    sure = settled and _sure(best_s + step_s, covariance, groups)
-    return _times(best_s + step_s, std_s) if sure else UNKNOWN_TIMES
+    best_s, exact = best_s + step_s, std_s.max() < STEP_S / 2 and groups >= LEAST_GROUPS
+    sure = settled and _sure(best_s, covariance, groups)
+    at_once = exact and not _sure(best_s, covariance, groups, HOPELESS)
+    return _times(best_s, std_s) if sure or at_once else UNKNOWN_TIMES, sure
 
 
 def _sure(times_s: Matrix, covariance: Matrix, groups: int, level: float = LEVEL) -> bool:
     """Return whether times are not 0, by Hotelling's test: the covariance is that of so many groups."""
-    if groups < 5:
+    if groups < LEAST_GROUPS:
         return False
     limit = 3.0 * (groups - 1) / (groups - 3) * float(f_distribution.ppf(level, 3, groups - 3))
     return bool(times_s @ np.linalg.solve(covariance, times_s) > limit)

@@ -78,9 +78,9 @@ class RunFrames:
     def readouts(self, facts: Mapping[str, Any]) -> dict[int, Readout]:
         """Return when the rows of the valid frames were read, by their numbers in the source, as far as the run has
         measured it (facts: run.json); the camera moves between the frames before and after."""
-        if "sensor_times" not in facts or len(self.path) < 2:
+        times, every = SensorTimes.noted_in(facts), np.arange(len(self.path))
+        if times.std_s is None or len(every) < 2:
             return {}
-        times, every = SensorTimes.of(facts["sensor_times"]), np.arange(len(self.path))
         rates = se3.rates(self.path.T_world_camera, self.path.timestamps_s, every, every >= 0)
         return {self.log[row]["index"]: Readout(rate, 0.0, times) for row, rate in zip(self.rows, rates, strict=True)}
 

@@ -49,7 +49,7 @@ FACTS: Mapping[str, Kind] = {
     "finish_s": (float, None), "final_steps": (float, None), "machine": dict, "onto": dict, "camera": dict,
     "source_frames": int, "depth_units_per_metre": (float, None), "isa": (str, None), "scene_scale": (float, None),
     "depth_noise_per_m": (float, None), "sensor": (str, None), "predicted_depth": bool, "checkpoint": str,
-    "sensor_times": dict,
+    "sensor_times": {"": (float, [float])},
     "up_world": lambda value: _vector(value) and math.hypot(*value) > 0.0,
 }  # fmt: skip
 """Values of run.json that commands use."""

@@ -16,7 +16,7 @@ from sigmasplat.data.poses import Column
 from sigmasplat.data.readout import SensorTimes
 from sigmasplat.data.submap import GrowingStore, MemoryStore, OnDisk, SubmapStore
 from sigmasplat.data.trajectory import Trajectory
-from sigmasplat.errors import SourceError
+from sigmasplat.errors import ConfigError, SourceError
 from sigmasplat.graph.closer import LoopCloser, make_descriptor
 from sigmasplat.graph.confidence import Confidence
 from sigmasplat.graph.keyframe_graph import GrowingGraph, KeyframeImages
@@ -59,6 +59,7 @@ class SlamState:
         self.closer = LoopCloser(self.config, self.store, self.tracker.extractor)
         self.recovery = Recovery(self.config.recovery)
         self.graph, self.images = self._new_graph(), KeyframeImages()
+        self.tracker.times = self.graph.times
         self.confidence = Confidence()
         self.relocaliser = Relocaliser(self.config, self.extractor)
         self.steps = Steps()
@@ -175,8 +176,10 @@ class SlamState:
         return c.loops.close and c.final.move_poses and not c.input.poses
 
     def _new_graph(self) -> GrowingGraph:
-        i = self.config.input
-        return GrowingGraph(self.config.loops.alignments, i.calibrate == "auto" and i.sensor != RENDERED)
+        i, times = self.config.input, SensorTimes.given(self.config.input.calibrate)
+        if times.std_s and self.config.tracking.method != "align":
+            raise ConfigError("input.calibrate with a file needs tracking.method=align, which knows the times of rows")
+        return GrowingGraph(self.config.loops.alignments, i.calibrate == "auto" and i.sensor != RENDERED, times=times)
 
     @property
     def _describes(self) -> bool:

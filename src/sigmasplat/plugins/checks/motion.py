@@ -212,7 +212,8 @@ def motion_warnings(motion: Motion, first: int = 0) -> list[str]:
         late, early = ("depth", "colour") if delay > 0 else ("colour", "depth")
         warnings.append(
             f"{late} is {seconds:.3f} s ({abs(delay):.1f} frames) behind {early}, judged by the motion of both; "
-            f"a run measures and corrects it; if its last line does not say so, subtract it from the times of {late}"
+            "`sigmasplat calibrate PATH` measures it, and a run corrects it; if neither finds it, subtract it from the "
+            f"times of {late}"
         )
     watch = MotionWatch()
     for i, gray in enumerate(motion.gray):

@@ -17,6 +17,7 @@ from sigmasplat.api import (
     Config,
     RunFolder,
     RunFrames,
+    SensorTimes,
     SigmaSplatError,
     Trajectory,
     default_preset,
@@ -51,9 +52,11 @@ def write_page(
     config, facts = run.config(), run.facts()
     unsure = [] if frames is None else [frames.log[i]["index"] for i in frames.rows if frames.p_off[i] > LIKELY]
     found = advice(metrics, rerun_command(config, facts), config.to_dict())
+    about = [config.name, f"version {facts.get('version')}", _machine(run), str(facts.get("status"))]
+    about.append(SensorTimes.noted_in(facts).said())
     contents = Contents(
         title=f"SigmaSplat · {metrics.get('source')}",
-        subtitle=" · ".join([config.name, f"version {facts.get('version')}", _machine(run), str(facts.get("status"))]),
+        subtitle=" · ".join(filter(None, about)),
         metrics=metrics,
         strips=strips,
         plots=plots,

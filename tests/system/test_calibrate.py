@@ -1,0 +1,145 @@
+"""`sigmasplat calibrate`: the times of a sensor from a recording, and runs that begin with them."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+
+from command_line import exit_code
+from late_images import CAMERA, cast, texture
+from sigmasplat.config import InputConfig
+from sigmasplat.config.find_preset import configured
+from sigmasplat.data import se3
+from sigmasplat.data.frame import Frame
+from sigmasplat.data.readout import UNKNOWN_TIMES, Readout, SensorTimes
+from sigmasplat.errors import ConfigError
+from sigmasplat.plugins.sources.tum import TumWriter
+from sigmasplat.run_folder.runs import RunFolder
+from sigmasplat.system.slam import Slam
+
+pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
+
+Array = NDArray[np.float64]
+LATE_S, DEPTH_ROWS_S, COLOR_ROWS_S = TIMES_S = (-0.015, 0.025, 0.03)
+SHAKEN, HERTZ = np.array([0.06, 0.05, 0.06, 0.07, 0.09, 0.1]), np.array([0.45, 0.7, 0.35, 0.6, 0.5, 0.8])
+QUICK = ("--set", "final.iterations=0", "--set", "uncertainty.probes=0", "--set", "input.width=80")
+
+
+def path(times_s: Array) -> Array:
+    """Return T_world_camera [N, 4, 4] of a hand that shakes."""
+    return se3.exp_stack(SHAKEN * np.sin(2.0 * np.pi * np.outer(times_s, HERTZ) + np.arange(6)))
+
+
+def record(folder: Path, frames: int, times_s: tuple[float, float, float]) -> Path:
+    """Write what a camera sees whose rows are read when it has come to where they are read."""
+    writer, rows = TumWriter(folder, CAMERA), (np.arange(CAMERA.height) + 0.5) / CAMERA.height - 0.5
+    for i in range(frames):
+        gray = texture(cast(path(i / 30 + times_s[2] * rows))[0])
+        depth_m = cast(path(i / 30 + times_s[0] + times_s[1] * rows))[1]
+        writer.add(Frame(i, i / 30, np.repeat(gray[..., None], 3, 2).astype("f4"), depth_m.astype("f4"), CAMERA))
+    return folder
+
+
+def test_times_are_found_and_a_run_uses_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    seen, file, run = record(tmp_path / "shaken", 64, TIMES_S), tmp_path / "times.json", tmp_path / "run"
+    assert exit_code("calibrate", str(seen), "--out", str(file)) == 0
+    times = SensorTimes.noted_in(json.loads(file.read_text()))
+    found = np.array([times.depth_late_s, times.depth_rows_s, times.color_rows_s])
+    assert times.std_s is not None and max(times.std_s) < 0.002 and np.abs(found - TIMES_S).max() < 0.002
+    said = capsys.readouterr().out
+    assert times.said() in said and f"sigmasplat run {seen} --set input.calibrate={file}" in said
+    assert Image.open(tmp_path / "times.png").width > 900
+
+    limited = ("run", str(seen), "--limit", "8", "--out", str(run))
+    assert exit_code(*limited, "--set", f"input.calibrate={file}", *QUICK) == 0
+    assert times.said() in capsys.readouterr().out
+    folder = RunFolder.open(run)
+    assert SensorTimes.noted_in(folder.facts()).said() == times.said() in (run / "report.html").read_text()
+    file.unlink()
+    assert Slam(folder.config()).sensor_times == Slam(settings={"input.calibrate": str(run / "run.json")}).sensor_times
+    assert Slam(folder.config()).tracker.times.depth_late_s == pytest.approx(times.depth_late_s, abs=1e-6)
+
+
+def test_a_camera_at_rest_shows_no_times(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    still, file = record(tmp_path / "still", 1, (0.0, 0.0, 0.0)), tmp_path / "times.json"
+    assert exit_code("calibrate", str(still), "--out", str(file)) == 2
+    assert "still: 0 pairs of keyframes do not show clearly when the sensor reads; record" in capsys.readouterr().err
+    assert not file.exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "out", "message"),
+    [("a.json", "a.json", "a.json exists and was not written by this command; give another --out"),
+     ("a.png", "a", "a.png exists and was not written by this command; give another --out")],
+)  # fmt: skip
+def test_other_files_are_not_replaced(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, out: str, message: str
+) -> None:
+    (tmp_path / name).write_text('{"fx": 500}')
+    assert exit_code("calibrate", "synthetic:frames=2", "--out", str(tmp_path / out)) == 2
+    assert message in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == [name] and (tmp_path / name).read_text() == '{"fx": 500}'
+
+
+GOOD = {"depth_late_s": -0.01, "depth_rows_s": 0, "color_rows_s": 0.03, "std_s": [0.001, 0.002, 0.003]}
+
+
+@pytest.mark.parametrize("wrap", [lambda times: times, lambda times: {"source": "x", "sensor_times": times}])
+def test_a_file_becomes_six_numbers(tmp_path: Path, wrap: Callable[[object], object]) -> None:
+    (tmp_path / "a.json").write_text(json.dumps(wrap(GOOD)))
+    settings = InputConfig(calibrate=str(tmp_path / "a.json"))
+    assert settings.calibrate == "-0.01,0,0.03,0.001,0.002,0.003"
+    again = replace(settings, limit=3), InputConfig(calibrate=settings.calibrate)
+    assert [one.calibrate for one in again] == [settings.calibrate] * 2
+    assert SensorTimes.given(settings.calibrate) == SensorTimes(-0.01, 0.0, 0.03, (0.001, 0.002, 0.003))
+    assert SensorTimes.given("auto") is SensorTimes.given("off") is UNKNOWN_TIMES
+
+
+NEEDED = "input.calibrate needs auto, off, or a file that `sigmasplat calibrate PATH` has written"
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (json.dumps(GOOD | {"depth_rows_s": "soon"}), "a.json: depth_rows_s must be a number, found 'soon'; " + NEEDED),
+        (
+            json.dumps(GOOD | {"depth_late_s": -18}),
+            "a.json: depth_late_s must be between -1 and 1, found -18",
+        ),
+        (json.dumps(GOOD | {"std_s": [0.1, 0.1]}), "a.json: std_s must be a number, found None; " + NEEDED),
+        (json.dumps(GOOD | {"std_s": [0.1, -0.1, 0]}), "a.json: std_s must be between 0 and 1, found -0.1; " + NEEDED),
+        ('{"sensor_times": [], "status": "complete"}', "a.json: depth_late_s must be a number, found None; " + NEEDED),
+        ("[1, 2, 3, 4, 5, 6]", "a.json: depth_late_s must be a number, found None; " + NEEDED),
+        ("colour", "a.json: not readable as JSON"),
+        (None, "a.json'; " + NEEDED),
+    ],
+)
+def test_bad_files_are_refused(tmp_path: Path, content: str | None, message: str) -> None:
+    if content is not None:
+        (tmp_path / "a.json").write_text(content)
+    with pytest.raises(ConfigError) as refused:
+        configured(None, {"input.calibrate": tmp_path / "a.json"})
+    assert message in str(refused.value) and "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("given", ["on", "", "1,2,3,4,5,x", "0,0,0,nan,0,0", "0.01"])
+def test_bad_words_are_refused(given: str) -> None:
+    with pytest.raises(ConfigError, match=r"calibrate needs auto, off, or a file|cannot read"):
+        InputConfig(calibrate=given)
+
+
+def test_times_need_alignment() -> None:
+    with pytest.raises(ConfigError, match=r"needs tracking\.method=align"):
+        Slam(settings={"input.calibrate": "0,0,0.03,0.001,0.001,0.001", "tracking.method": "adam"})
+
+
+def test_nothing_late_is_said_with_its_error() -> None:
+    times = SensorTimes(std_s=(0.0012, 0.003, 0.0004))
+    assert times.said() == "the sensor reads nothing late (± 0.4 ms for colour, 3 ms for depth, 1 ms between both)"
+    moving = np.ones(6)
+    assert times.read(Readout(moving)) is None and times.read(Readout(moving, 0.01)) is not None
