@@ -107,7 +107,7 @@ class SolvedGraph:
 
     node [K]: the node of each keyframe, −1: not in the graph. T_world_node [N, 4, 4], of which the first `fixed` are
     given. ends [E, 2]: nodes a and b of each edge; T_a_b [E, 4, 4]; information [E, 6, 6]: with the factor and weight
-    of the solution; shared [E, 6, 9]: one standard deviation of each error that all edges share (`graph_errors`).
+    of the solution; shared [E, 6, 11]: one standard deviation of each error that all edges share (`graph_errors`).
     """
 
     node: NDArray[np.int64]

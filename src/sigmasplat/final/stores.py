@@ -248,7 +248,8 @@ def solved_keyframes(
     more = alignments(T, lambda node: image(int(nodes.rows[node])), graph.most, aligned)
     edges = [*nodes.edges(), *aligned, *more]
     solved = solve(T, edges, nodes.fixed)
-    atlas.graph = nodes.solved(solved, edges, shared_errors(edges, atlas.rates(nodes.frames), rendered))
+    points = None if rendered else [image(int(row)).points for row in nodes.rows]
+    atlas.graph = nodes.solved(solved, edges, shared_errors(edges, atlas.rates(nodes.frames), points))
     poses, tracked = nodes.spread(solved.T_world_keyframe), nodes.spread(T)
     in_submaps = list[list[Matrix]]()
     for s in store.members:

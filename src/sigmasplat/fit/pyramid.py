@@ -10,6 +10,7 @@ from sigmasplat.data.camera import Camera
 from sigmasplat.data.readout import Readout
 from sigmasplat.fit.backends import fits_of
 from sigmasplat.fit.interface import DEPTH_STEP_M, ImageKernels, Plane
+from sigmasplat.types import Matrix
 
 LEVELS = 4
 NOISE_PER_M = 0.003
@@ -52,6 +53,12 @@ class Pyramid:
         """Return the mean depth of the coarsest level in metres (1 without readings), and how many pixels of the finest
         level have a reading, float64 [2], on the planes' device."""
         return self.kernels.readings_of(self.depth[0], self.depth[-1])
+
+    @property
+    def points(self) -> Matrix:
+        """Return the points [P, 3] that the coarsest size shows, m, in the axes of the camera."""
+        depth_m: Matrix = np.asarray(self.kernels.to_host(self.depth[-1]), np.float64)[..., None]
+        return np.asarray((self.cameras[-1].rays() * depth_m)[depth_m[..., 0] > 0])
 
     def weighed(self, weight: Plane | None, weight_depth: Plane | None = None) -> "Pyramid":
         """Return the same images with other weights [H, W] of gray and depth; without a depth weight, gray's weight is

@@ -13,10 +13,12 @@ from sigmasplat.graph.pose_graph import Sensitivity
 from sigmasplat.types import Matrix
 
 CALIBRATION = 0.01
-"""Standard deviation of the scale of depth and of the focal length, as a share. It is assumed (ours): files do not say
-how well a camera was calibrated."""
+"""Standard deviation of the scale of depth and of the focal length, as a share, and of the image centre, in focal
+lengths. It is assumed (ours): files do not say how well a camera was calibrated."""
 STAMP = 12.0**-0.5
 """Standard deviation of the time of a frame, in frames: it lies anywhere between two of them."""
+NEAREST_M = 1e-3
+"""Points behind a camera are not seen."""
 PREFIX = "graph_"
 """Begins the names of the arrays of a `SolvedGraph` in a checkpoint."""
 
@@ -30,7 +32,7 @@ class GraphErrors:
 
     @lru_cache(maxsize=64)  # noqa: B019 - the object lives as long as one evaluation or export
     def of(self, node: int) -> Matrix:
-        """Return the error of T_world_node: a matrix [6, 6 E + 9] to multiply with standard normal twists that all
+        """Return the error of T_world_node: a matrix [6, 6 E + 11] to multiply with standard normal twists that all
         nodes share."""
         G = self._sensitivity.of(node)
         independent, same = G @ self._roots, (G @ self.graph.shared).sum(0)
@@ -49,24 +51,43 @@ class GraphErrors:
         return np.swapaxes(np.linalg.inv(np.linalg.cholesky(self.graph.information)), 1, 2)
 
 
-def shared_errors(edges: Sequence[RelativePose], rates: Matrix, rendered: bool) -> Matrix:
-    """Return one standard deviation of each error that all edges share [E, 6, 9], as twists of T_a_b: the systematic
-    error of alignment in six directions; of the scale of depth, the focal length, and the time of a frame.
+def shared_errors(edges: Sequence[RelativePose], rates: Matrix, points: Sequence[Matrix] | None) -> Matrix:
+    """Return one standard deviation of each error that all edges share [E, 6, 11], as twists of T_a_b: the systematic
+    error of alignment in six directions; of the scale of depth, the focal length, the image centre to the right and
+    down, and the time of a frame.
 
-    rates [N, 6]: the motion of each node's camera in the time of a frame, a twist in its axes. The last three are those
-    of a camera whose calibration nobody has checked: parameters that are considered, not estimated (Schmidt 1966).
-    Rendered images do not have them.
+    rates [N, 6]: the motion of each node's camera in the time of a frame, a twist in its axes; points [P, 3]: what each
+    node sees, m, in its camera. The last five are those of a camera whose calibration nobody has checked: parameters
+    that are considered, not estimated (Schmidt 1966). Rendered images do not have them (no points).
     """
     if not edges:
-        return np.empty((0, 6, 9))
+        return np.empty((0, 6, 11))
     T_a_b, bias = (np.array([getattr(edge, name) for edge in edges]) for name in ("T_a_b", "bias"))
-    a, b = np.array([(edge.a, edge.b) for edge in edges]).T
-    t, turned = T_a_b[:, :3, 3], se3.log_stack(T_a_b)[:, 3:]
-    longer = np.concatenate([t, np.zeros_like(t)], 1) * (0.0 if rendered else CALIBRATION)
-    wider = np.concatenate([np.cross(t, turned), turned], 1) * (0.0 if rendered else CALIBRATION)
-    late = (se3.adjoint(T_a_b) @ rates[b][..., None])[..., 0] - rates[a]
-    late *= 0.0 if rendered else STAMP
-    return np.concatenate([bias[:, None] * np.eye(6), np.stack([longer, wider, late], 2)], 2)
+    shared = np.concatenate([bias[:, None] * np.eye(6), np.zeros((len(edges), 6, 5))], 2)
+    if points is not None:
+        a, b = np.array([(edge.a, edge.b) for edge in edges]).T
+        shared[:, :, 6:10] = [CALIBRATION * moved_by_camera(edge.T_a_b, points[edge.b]) for edge in edges]
+        shared[:, :, 10] = STAMP * ((se3.adjoint(T_a_b) @ rates[b][..., None])[..., 0] - rates[a])
+    return shared
+
+
+def moved_by_camera(T_a_b: Matrix, points: Matrix) -> Matrix:
+    """Return how T_a_b moves with the scale of depth, the focal length, and the image centre [6, 4]: left twists per
+    share, and per focal length.
+
+    points [P, 3]: what camera b sees. The points of both images move with the parameters; the twist is that of the best
+    rigid motion between them. Its residuals are those of alignment: in pixels across, in the noise of depth along.
+    """
+    in_a = points @ T_a_b[:3, :3].T + T_a_b[:3, 3]
+    in_a, points = in_a[in_a[:, 2] > NEAREST_M], points[in_a[:, 2] > NEAREST_M]
+    right, down, ahead = np.eye(3)
+    stretched = np.eye(3), np.diag(right + down), np.outer(right, ahead), np.outer(down, ahead)
+    moved = np.array([in_a @ S.T - points @ S.T @ T_a_b[:3, :3].T for S in stretched])  # [4, P, 3]
+    turns = np.cross(np.eye(3)[:, None], in_a)  # [3, P, 3]: about each axis
+    J = np.concatenate([np.broadcast_to(np.eye(3)[:, None], (3, *in_a.shape)), turns])
+    weights = in_a[:, 2:] ** -np.array([1.0, 1.0, 2.0])
+    J, moved = ((each * weights).reshape(len(each), -1) for each in (J, moved))
+    return np.asarray(np.linalg.solve(J @ J.T + 1e-9 * np.eye(6), J @ moved.T))
 
 
 def written(graph: SolvedGraph | None) -> dict[str, Any]:
