@@ -99,6 +99,11 @@ class Atlas:
         """Append a frame, relative to the newest keyframe of the last submap."""
         self.place_by_keyframe(se3.inverse(self.keyframe_poses.last[-1]) @ T_submap_camera)
 
+    def place_again(self, T_submap_camera: Matrix) -> None:
+        """Place the newest frame again, as the keyframe that it has become."""
+        self.places.rows.count -= 1
+        self.place_frame(T_submap_camera)
+
     def place_by_keyframe(self, T_keyframe_camera: Matrix) -> None:
         """Append a frame at its pose [4, 4] relative to the newest keyframe of the last submap."""
         place = Place(len(self.anchors) - 1, len(self.keyframe_poses.last) - 1, se3.orthonormalise(T_keyframe_camera))

@@ -5,6 +5,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sigmasplat.data.poses import Part, Records
 from sigmasplat.types import Matrix
@@ -110,6 +111,10 @@ class Readouts(Records[Readout]):
     def append(self, readout: Readout) -> None:
         """Append that of the next keyframe."""
         self.add(readout.rate, readout.late_s)
+
+    def correct(self, rows: NDArray[np.int64] | int, rates: Matrix) -> None:
+        """Replace the motion [6] of some, because it is known better, or because their images were rewritten."""
+        self.rows.used[rows, :6] = rates
 
     def _record(self, i: int) -> Readout:
         return Readout(*self.values(i))

@@ -11,6 +11,8 @@ from torch import Tensor
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.frame import Detail, Frame, Photo
+from sigmasplat.data.read_at_once import read_at_once
+from sigmasplat.data.readout import Readout
 from sigmasplat.data.submap import Picture
 from sigmasplat.fit.adam import VectorAdam
 from sigmasplat.native import _core
@@ -84,6 +86,12 @@ class Target:
         depth[: self.camera.height, : self.camera.width] = torch.from_numpy(depth_m)
         readings = int((depth_m > 0).sum())
         return Target(self.camera, self.color, depth, readings)
+
+    def read_at_once(self, readout: Readout) -> "Target":
+        """Return the images as the camera sees them at one time (`data.read_at_once`)."""
+        frame = Frame(0, 0.0, self.image.numpy(), self.depth_image.numpy(), self.camera)
+        rows, columns = self.depth.shape
+        return Target.of(read_at_once(frame, readout), (rows, columns))
 
     def without_exposure(self, exposure: NDArray[np.float64]) -> "Target":
         """Return the same depth with the colours in the exposure of the map (`data.camera`), in [0, 1]."""

@@ -190,16 +190,16 @@ class GrowingGraph:
         halves = ((image(e.b).half(), image(e.a).half(), reading(e.b), reading(e.a), e.T_a_b, e.a) for e in chosen)
         return [Pair(*half) for half in halves]
 
-    def measuring(self, image: Callable[[int], Pyramid], reading: Callable[[int], Readout]) -> Task[None]:
-        """Measure when the sensor reads, in slices of one pair, and then align all again. Until the images show it,
-        this is tried each time that there are twice as many alignments.
+    @property
+    def is_due(self) -> bool:
+        """Return whether the times of the sensor are to be measured: again each time that there are twice as many
+        alignments, until the images show them."""
+        enough = len(self.edges) >= max(FIRST_MEASURED, 2 * self.measured)
+        return self.calibrates and self.times.std_s is None and enough
 
-        image, reading: of a row.
-        """
-        count = len(self.edges)
-        if not self.calibrates or self.times.std_s is not None or count < max(FIRST_MEASURED, 2 * self.measured):
-            return
-        self.measured = count
+    def measuring(self, image: Callable[[int], Pyramid], reading: Callable[[int], Readout]) -> Task[None]:
+        """Measure when the sensor reads, in slices of one pair, and then align all again; image, reading: of a row."""
+        self.measured = len(self.edges)
         self.times = yield from measured(self.pairs(image, reading, MOST_MEASURED))
         if self.times.std_s is None:
             return

@@ -18,13 +18,11 @@ from sigmasplat.slam.mapping_backend import SLICES_PER_FRAME
 from sigmasplat.slam.results import StepTimer
 from sigmasplat.system.array_interface import Before, Correction, correction_since
 from sigmasplat.system.slam import Slam
+from sigmasplat.tracking.newest_frame import AS_GOOD
 from sigmasplat.tracking.pose_validation import is_better
 from sigmasplat.tracking.prepared_frame import PreparedFrame, TrackedKeyframe, mapped_keyframe
 from sigmasplat.tracking.relocaliser import Relocation
 from sigmasplat.types import Matrix
-
-AS_GOOD = 0.99
-"""A repeated alignment replaces the first one if its agreement × overlap is at least this share of the first one's."""
 
 MOST_ADDED = 4
 """Largest number of keyframes in a row that are added without a fit. Without this limit, a map that falls behind never

@@ -19,7 +19,6 @@ from sigmasplat.data.trajectory import APART, RELOCALISED, TRACKED
 from sigmasplat.fit.align import Alignment
 from sigmasplat.fit.compare import Comparison
 from sigmasplat.fit.pose import PoseFit
-from sigmasplat.fit.references import Reference
 from sigmasplat.fit.target import Target
 from sigmasplat.graph.confidence import Confidence
 from sigmasplat.graph.loops import Loop, Loops
@@ -31,6 +30,8 @@ from sigmasplat.system.array_interface import Correction
 from sigmasplat.tracking.frame_estimate import FrameEstimate
 from sigmasplat.tracking.keyframe_rule import becomes_keyframe, hop_alignment, is_held_back, is_mappable, may_validate
 from sigmasplat.tracking.moving.dynamic_mask import DynamicMask
+from sigmasplat.tracking.newest_frame import NewestFrame
+from sigmasplat.tracking.pose_prediction import CameraMotion
 from sigmasplat.tracking.pose_validation import is_questionable
 from sigmasplat.tracking.predicted_depth_frames import fitted_keyframe, fitted_to_map
 from sigmasplat.tracking.prepared_frame import PreparedFrame, TrackedKeyframe, refuse_first_without_depth
@@ -120,7 +121,8 @@ class FrontEnd:
     coordinates of the tracker; frames: number of frames so far; newest: number of the frame that is the
     reference of tracking; offered, refused: numbers of keyframes that were handed to the map, and that were not because
     too many waited;
-    searching: number of the frame that is searched for, −1 = none; waits: numbers of the keyframes not yet mapped.
+    searching: number of the frame that is searched for, −1 = none; waits: numbers of the keyframes not yet mapped;
+    late: the last frame, if its sensor reads late: it is handed over when the next one has shown how its camera moved.
     """
 
     config: Config
@@ -137,6 +139,7 @@ class FrontEnd:
     waits: tuple[int, ...] = ()
     found: str = ""
     loops: int = 0
+    late: tuple[NewestFrame, TrackedFrame] | None = None
 
     def copied(self) -> "FrontEnd":
         """Return a copy that later frames do not change."""
@@ -153,6 +156,7 @@ class FrontEnd:
         if moved:
             T_new_old = now @ se3.inverse(before)
             self.tracker.move_by(T_new_old, now if snapshot.frame == self.frames - 1 else None)
+            self.late = None if self.late is None else (self.late[0].moved_by(T_new_old), self.late[1])
         kept = {n: T_new_old @ T if moved else T for n, T in self.poses.items() if n > snapshot.newest}
         self.poses = kept | dict(snapshot.poses)
         if snapshot.state:
@@ -182,9 +186,13 @@ class FrontEnd:
 
     # ---- a frame ----
 
-    def track(self, seen: PreparedFrame, view: View, timer: StepTimer, should_stop: ShouldStop = never) -> TrackedFrame:
-        """Track a frame, and decide whether it becomes a keyframe; should_stop: as in `Tracker.track`."""
-        number, offer, search = self.frames, None, None
+    def track(
+        self, seen: PreparedFrame, view: View, timer: StepTimer, should_stop: ShouldStop = never
+    ) -> tuple[Step, list[TrackedFrame]]:
+        """Track a frame, and decide whether it becomes a keyframe; return its step, and the frames to hand over;
+        should_stop: as in `Tracker.track`."""
+        number, offer, search, found = self.frames, None, None, None
+        given = list[TrackedFrame]()
         if number == 0:
             estimate, offer = self._begin(seen, view)
         else:
@@ -192,55 +200,76 @@ class FrontEnd:
                 splats = NOTHING if self.snapshot is None else self.snapshot
                 seen = fitted_to_map(self.tracker, splats, view, seen)
                 fit = self.tracker.track(splats, view, seen, seen.frame.prior, should_stop)
+                given += self.settled(self.tracker.motion, view)
             estimate = FrameEstimate.of(fit, self.tracker.lost)
             self.recovery.count(self.tracker.lost, self.tracker.doubtful > 0, seen)
             held_back = is_held_back(number, self.config.input.hold_every)
-            offer = None if held_back else self._offer(fit, seen, view, estimate)
-            search = None if held_back else self._search(fit, seen, offer)
-        if offer is not None or search is not None:
+            mapped = not held_back and self._becomes_keyframe(fit, seen, estimate)
+            found = NewestFrame.of(seen, estimate, self.tracker, number)
+            if mapped:
+                offer = self._follow(found, view)
+            search = None if held_back or estimate.mapped else self._search(fit, seen)
+        if search is not None or estimate.mapped:
             self.poses = {**self.poses, number: estimate.T_submap_camera}
         step = self._step(seen, estimate, timer, view)
         self.frames += 1
         based_on = -1 if self.snapshot is None else self.snapshot.frame
         shown = self._validation_view(number, seen, view, estimate)
-        return TrackedFrame(number, step, estimate.T_submap_camera, self.poses, based_on, offer, search, shown)
+        newest = TrackedFrame(number, step, estimate.T_submap_camera, self.poses, based_on, offer, search, shown)
+        if found is None or not found.reads_late:
+            return step, [*given, newest]
+        self.late = found, newest
+        return step, given
 
-    def _begin(self, seen: PreparedFrame, view: View) -> tuple[FrameEstimate, Offer]:
+    def settled(self, after: CameraMotion, view: View) -> list[TrackedFrame]:
+        """Return the frame that waits, if there is one, fitted again with its known motion; after: that since."""
+        if self.late is None:
+            return []
+        (late, frame), self.late = self.late, None
+        found = late.settled(after, self.tracker.times, self.config.tracking)
+        if not found.mapped:
+            self.tracker.came_from(found.T_world_camera)
+        T = frame.T_submap_camera @ se3.inverse(late.T_world_camera) @ found.T_world_camera
+        offer = _offered(replace(found, seen=found.seen.at_once(view, self.config))) if found.mapped else None
+        return [replace(frame, T_submap_camera=T, offer=offer)]
+
+    def _begin(self, seen: PreparedFrame, view: View) -> tuple[FrameEstimate, Offer | None]:
         """Start at the first frame, whose camera is the world until the map says otherwise."""
         refuse_first_without_depth(seen.frame, self.config)
         self.tracker.start(seen, seen.frame.prior)
-        seen = fitted_keyframe(self.tracker, NOTHING, view, seen, np.eye(4), connected=False)
-        self._follow(0, seen, np.eye(4))
         self.offered, self.waits = 1, (0,)
-        return FrameEstimate(np.eye(4), TRACKED, mapped=True), Offer(seen.separate())
+        estimate = FrameEstimate(np.eye(4), TRACKED, mapped=True)
+        return estimate, self._follow(NewestFrame.of(seen, estimate, self.tracker, 0), view)
 
-    def _offer(self, fit: PoseFit, seen: PreparedFrame, view: View, estimate: FrameEstimate) -> Offer | None:
-        """Return the frame as a keyframe, if it becomes one; track the next frames relative to it."""
+    def _follow(self, found: NewestFrame, view: View) -> Offer | None:
+        """Track the next frames relative to a keyframe, before the map has weights for its pixels; return what the map
+        gets, unless the keyframe waits."""
+        if not found.reads_late:
+            splats, connected = NOTHING if self.snapshot is None else self.snapshot, found.connected and not self.found
+            T = found.T_world_camera
+            found = replace(found, seen=fitted_keyframe(self.tracker, splats, view, found.seen, T, connected))
+        self.tracker.follow(found.followed)
+        self.newest = found.number
+        return _offered(found) if found.mapped and not found.reads_late else None
+
+    def _becomes_keyframe(self, fit: PoseFit, seen: PreparedFrame, estimate: FrameEstimate) -> bool:
+        """Return whether the frame becomes the reference of the next frames; `estimate.mapped` then says whether it is
+        handed to the map."""
         since, least_deg = self.frames - self.newest, self.config.realtime.keyframe_deg
         if not is_mappable(fit, self.tracker, self.recovery) or not becomes_keyframe(
             fit, self.tracker, since, self.config.mapping, least_deg
         ):
-            return None
-        alignment, seen = hop_alignment(fit, seen.live, self.tracker), seen.at_once(view, self.config)
-        splats = NOTHING if self.snapshot is None else self.snapshot
-        refitted = fitted_keyframe(self.tracker, splats, view, seen, estimate.T_submap_camera, connected=not self.found)
-        shown = refitted.without(self.tracker.front)
-        self._follow(self.frames, shown, estimate.T_submap_camera)
-        if len(self.waits) >= self.config.realtime.waiting_most:
+            return False
+        estimate.alignment = hop_alignment(fit, seen.live, self.tracker)
+        if len(self.waits) < self.config.realtime.waiting_most:
+            estimate.mapped, self.offered, self.waits = True, self.offered + 1, (*self.waits, self.frames)
+        else:
             self.refused += 1
-            return None
-        estimate.mapped, self.offered, self.waits = True, self.offered + 1, (*self.waits, self.frames)
-        return Offer(shown.separate(), alignment, self.tracker.front, estimate.exposure)
+        return True
 
-    def _follow(self, number: int, seen: PreparedFrame, T_submap_camera: Matrix) -> None:
-        """Track the next frames relative to a frame, before the map has weights for its pixels."""
-        reference = Reference(seen.live, se3.inverse(T_submap_camera))
-        self.tracker.follow(TrackedKeyframe(reference, seen.image, self.tracker.front))
-        self.newest = number
-
-    def _search(self, fit: PoseFit, seen: PreparedFrame, offer: Offer | None) -> Search | None:
+    def _search(self, fit: PoseFit, seen: PreparedFrame) -> Search | None:
         """Return the frame to be searched for in the whole map, if it is lost or doubtful and no other is searched."""
-        if self.searching >= 0 or offer is not None:
+        if self.searching >= 0:
             return None
         searched, apart = self.config.recovery.relocalise, self.recovery.gives_up
         lost, questionable = self.tracker.lost, fit.comparison is not None and is_questionable(self.tracker.doubtful)
@@ -268,3 +297,8 @@ class FrontEnd:
         self.loops += len(loops)
         seconds, waiting = timer.stop(view), len(self.waits)
         return make_step(seen, estimate, active, self.tracker, self.confidence, loops, seconds, waiting)
+
+
+def _offered(found: NewestFrame) -> Offer:
+    """Return what the map gets of a keyframe: images that tracking does not change."""
+    return Offer(found.seen.without(found.front).separate(), found.alignment, found.front, found.exposure)

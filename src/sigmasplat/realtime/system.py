@@ -4,7 +4,7 @@ import gc
 import queue
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 
 from sigmasplat import env
 from sigmasplat.data.field import GaussianField
@@ -13,7 +13,7 @@ from sigmasplat.data.readout import SensorTimes
 from sigmasplat.graph.loops import Loops
 from sigmasplat.native.threads import idle_kernel_workers, set_kernel_threads, yield_to_others
 from sigmasplat.realtime.back_end import BackEnd
-from sigmasplat.realtime.front_end import FrontEnd, Snapshot
+from sigmasplat.realtime.front_end import FrontEnd, Snapshot, TrackedFrame
 from sigmasplat.render.view import View
 from sigmasplat.slam.results import Step, StepTimer
 from sigmasplat.system.array_interface import ArrayInterface, Correction, tell
@@ -155,12 +155,21 @@ class RealTime(ArrayInterface):
             seen = self.slam.observed(frame, self._view, self._extractor)
         if mapping_s:
             timer.add({"mapping": mapping_s})
-        tracked = self._front_end.track(seen, self._view, timer, self._hurried)
-        self._back_end.given.put(tracked)
+        self._newest, tracked = self._front_end.track(seen, self._view, timer, self._hurried)
+        self._give(tracked)
         self._schedule.wake()
-        self._newest = tracked.step
         self._tell()
-        return tracked.step
+        return self._newest
+
+    def _give(self, tracked: Iterable[TrackedFrame]) -> None:
+        """Hand frames to the map."""
+        for each in tracked:
+            self._back_end.given.put(each)
+
+    def _give_last(self) -> None:
+        """Hand over the last frame, if it waits for the next one."""
+        if self._view is not None:
+            self._give(self._front_end.settled(self._front_end.tracker.motion.stopped(), self._view))
 
     def newest_step(self) -> Step | None:
         """Return the result of the newest frame; None before the first one."""
@@ -209,11 +218,13 @@ class RealTime(ArrayInterface):
 
     def between_frames(self, task: Callable[[], None]) -> None:
         """Run a task on the mapping thread as soon as all frames so far are in the map. It may read `slam`."""
+        self._give_last()
         self._back_end.given.put(task)
         self._schedule.wake()
 
     def save(self, write: Callable[[], None]) -> None:
         """Run a task as `between_frames` does, with the whole state in `slam`, as after `Slam.step`."""
+        self._give_last()
         camera = self._front_end.copied()
 
         def save() -> None:
@@ -231,6 +242,7 @@ class RealTime(ArrayInterface):
         if not self._runs:
             return
         self._runs = False
+        self._give_last()
         try:
             self._schedule.wake()
             self._schedule.settle()

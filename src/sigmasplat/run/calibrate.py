@@ -1,14 +1,12 @@
 """Measure when a sensor reads depth and rows, from a whole recording: the run's own tracking, but no map is fitted."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from sigmasplat.config import Config
-from sigmasplat.data import se3
-from sigmasplat.data.readout import Readout, SensorTimes
+from sigmasplat.data.readout import SensorTimes
 from sigmasplat.errors import SourceError
 from sigmasplat.graph.sensor_times import Pair, estimated
 from sigmasplat.input.source import Source
@@ -39,7 +37,8 @@ def measure_times(
         progress(done, len(source))
     if slam.steps:
         completed(slam.finish_submap())
-    pairs = slam.graph.pairs(slam.keyframe_image, _readings(slam).__getitem__, MOST_PAIRS)
+    slam.correct_motions()
+    pairs = slam.graph.pairs(slam.keyframe_image, slam.atlas.readings.__getitem__, MOST_PAIRS)
     estimate, sure = completed(estimated(pairs))
     if estimate.std_s is None:
         raise SourceError(
@@ -47,15 +46,6 @@ def measure_times(
             "minute in which the camera turns and shifts to and fro, before surfaces with edges"
         )
     return estimate if sure else SensorTimes(std_s=estimate.std_s), estimate, _costs(pairs, estimate)
-
-
-def _readings(slam: Slam) -> list[Readout]:
-    """Return when each keyframe was read, with the motion between the frames before and after. That of tracking, from
-    the frame before alone, is noisier and comes earlier, and makes the times too short."""
-    path, store = slam.trajectory(), slam.store
-    numbers = np.array([number for submap in range(len(store)) for number in store.load(submap).frames], np.int64)
-    rates = se3.rates(path.T_world_camera, path.timestamps_s, numbers, slam.valid())
-    return [replace(reading, rate=rate) for reading, rate in zip(slam.atlas.readings, rates, strict=True)]
 
 
 def _costs(pairs: Sequence[Pair], best: SensorTimes) -> Matrix:

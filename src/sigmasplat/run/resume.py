@@ -9,7 +9,7 @@ from typing import Any
 from sigmasplat.data.atlas import Atlas
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField, Rows
-from sigmasplat.data.frame import Detail, Photo, PosePrior
+from sigmasplat.data.frame import Detail, Frame, Photo, PosePrior
 from sigmasplat.data.poses import Column, KeyframePoses, Places, Poses
 from sigmasplat.data.readout import Readout, Readouts, SensorTimes
 from sigmasplat.data.relative_pose import Alignments, Edges, RelativePose, TrackedHops
@@ -40,27 +40,29 @@ from sigmasplat.tracking.drift import Drift
 from sigmasplat.tracking.feature_image import FeatureImage
 from sigmasplat.tracking.moving.dynamic_detector import DepthHistory, DynamicDetector, RememberedDepth
 from sigmasplat.tracking.moving.dynamic_mask import DynamicMask
+from sigmasplat.tracking.newest_frame import NewestFrame
 from sigmasplat.tracking.pose_prediction import CameraMotion
 from sigmasplat.tracking.pose_validation import TrackingStatistics
 from sigmasplat.tracking.predicted_depth_fit import DepthFit, DepthShape
+from sigmasplat.tracking.prepared_frame import PreparedFrame
 from sigmasplat.tracking.recovery import Recovery
 from sigmasplat.tracking.relocaliser import Relocaliser
 from sigmasplat.tracking.tracker import Tracker
 
 CLASSES: tuple[type, ...] = (
-    Alignments, Atlas, Camera, CameraMotion, Column, Confidence, DepthFit, DepthHistory, DepthShape, DescribedSubmaps,
-    Detail, Drift, DynamicDetector, DynamicMask, Edges, FeatureImage, GaussianField, GrowingGraph, Keyframe,
-    KeyframePoses, Loop, LoopCloser, Loops, Mapper, PendingSearch, Photo, Picture, Places, PosePrior, Poses, Pyramid,
-    Readout, Readouts, Recovery, Reference, RelativePose, Relocaliser, RememberedDepth, Rows, SecondHalf,
-    SensorTimes, Step, Steps, Target, TrackedHops, Tracker, TrackingStatistics, ValidationView, ValidationViews,
-    VectorAdam,
+    Alignments, Atlas, Camera, CameraMotion, Column, Confidence, DepthFit, DepthHistory, DepthShape,
+    DescribedSubmaps, Detail, Drift, DynamicDetector, DynamicMask, Edges, FeatureImage, Frame, GaussianField,
+    GrowingGraph, Keyframe, KeyframePoses, Loop, LoopCloser, Loops, Mapper, NewestFrame, PendingSearch, Photo, Picture,
+    Places, PosePrior, Poses, PreparedFrame, Pyramid, Readout, Readouts, Recovery, Reference, RelativePose, Relocaliser,
+    RememberedDepth, Rows, SecondHalf, SensorTimes, Step, Steps, Target, TrackedHops, Tracker, TrackingStatistics,
+    ValidationView, ValidationViews, VectorAdam,
 )  # fmt: skip
 """The classes that a state may contain."""
 
 
 REMEMBERED = (
     "atlas", "mapper", "tracker", "drift", "steps", "keyframe_indices", "closer", "recovery", "relocaliser",
-    "confidence", "validation_views", "graph",
+    "confidence", "validation_views", "graph", "late",
 )  # fmt: skip
 """The attributes of `Slam` that change from frame to frame, except its random numbers."""
 

@@ -1,6 +1,7 @@
 """SLAM: track every frame, map keyframes, cut submaps, close loops. `MainLoop.step` follows the papers' overviews."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -14,6 +15,8 @@ from sigmasplat.slam.mapping_backend import SLICES_PER_FRAME, MappingBackend
 from sigmasplat.slam.results import Step, StepTimer, make_step
 from sigmasplat.tracking.frame_estimate import FrameEstimate
 from sigmasplat.tracking.keyframe_rule import becomes_keyframe, hop_alignment, is_held_back, is_mappable, may_validate
+from sigmasplat.tracking.newest_frame import NewestFrame
+from sigmasplat.tracking.pose_prediction import CameraMotion
 from sigmasplat.tracking.pose_validation import is_better, is_questionable
 from sigmasplat.tracking.predicted_depth_frames import fitted_keyframe, fitted_to_map
 from sigmasplat.tracking.prepared_frame import PreparedFrame, refuse_first_without_depth
@@ -25,6 +28,8 @@ from sigmasplat.types import Matrix, completed
 class MainLoop(MappingBackend):
     """Simultaneous localisation and mapping, frame by frame. No part of this class reads ground truth."""
 
+    late: NewestFrame | None = None
+
     def step(self, frame: Frame) -> Step:
         """Process one frame: track it, find it in the whole map if it is lost, map it if it is a keyframe, and cut the
         submap if a rule ends it here.
@@ -34,11 +39,16 @@ class MainLoop(MappingBackend):
         self._timer, tried = StepTimer(), len(self.closer.loops)
         seen = self._prepared(frame)
         estimate = self._locate(seen) if self.steps else self._begin(seen)
-        if estimate.mapped:
-            self._map(self._masked(seen, estimate), estimate)
-        else:
+        found = NewestFrame.of(seen, estimate, self.tracker, len(self.steps))
+        self.late = found if found.reads_late and self.steps else None
+        if not estimate.mapped:
             self._offer_validation_view(seen, estimate)
             self._run_pending()
+        elif self.late is None:
+            estimate.T_submap_camera = self._map(found)
+            self.tracker.previous, self.tracker.lost = estimate.T_submap_camera, False
+        else:
+            self.tracker.follow(found.followed)
         self.atlas.place_frame(estimate.T_submap_camera)
         self.steps.append(self._result(seen, estimate, self.closer.loops[tried:]))
         return self.steps[-1]
@@ -51,14 +61,53 @@ class MainLoop(MappingBackend):
             seen = self.observed(frame, view, self.extractor)
         return fitted_to_map(self.tracker, self.mapper.field, view, seen) if self.steps else seen
 
-    def _masked(self, seen: PreparedFrame, estimate: FrameEstimate) -> PreparedFrame:
-        """Return a keyframe as it is mapped: read at once, without what moves in front, in the exposure of the map."""
-        seen = seen.at_once(self.view, self.config)
-        connected, pose = len(self.steps) > 0 and estimate.state == TRACKED, estimate.T_submap_camera
-        seen = fitted_keyframe(self.tracker, self.mapper.field, self.view, seen, pose, connected)
-        seen = seen.without(self.tracker.front)
-        found = self.config.tracking.exposure and self.config.mapping.colors == "code"
-        return seen.without_exposure(estimate.exposure) if found else seen
+    def settle_late(self, after: CameraMotion) -> Matrix:
+        """Fit the last frame again, if its sensor reads late, now that its motion is known; map it if it is a keyframe.
+        Returns how the coordinates of tracking change, T_new_old [4, 4].
+
+        after: the motion since.
+        """
+        if self.late is None:
+            return np.eye(4)
+        late, T_tracked, self.late = self.late, self.late.T_world_camera, None
+        with self._timer.stage("track"):
+            late = late.settled(after, self.tracker.times, self.config.tracking)
+        if late.mapped:
+            self.tracker.move_by(late.T_world_camera @ se3.inverse(T_tracked))
+            late = replace(late, T_world_camera=self._map(late))
+        else:
+            self.tracker.came_from(late.T_world_camera)
+        self.atlas.place_again(late.T_world_camera)
+        return late.T_world_camera @ se3.inverse(T_tracked) if late.mapped else np.eye(4)
+
+    def _map(self, found: NewestFrame) -> Matrix:
+        """Map a keyframe, as if it was read at once and without what moves in front, in the exposure of the map; cut
+        the submap if a rule ends it here; look for the place in other components. Return its pose."""
+        view, tracker, number = self.view, self.tracker, found.number
+        seen, T = found.seen.at_once(view, self.config), found.T_world_camera
+        seen = fitted_keyframe(tracker, self.mapper.field, view, seen, T, found.connected).without(found.front)
+        if self.config.tracking.exposure and self.config.mapping.colors == "code":
+            seen = seen.without_exposure(found.exposure)
+        hop = self.hop_to(se3.inverse(T), found.alignment) if found.connected else UNKNOWN_HOP
+        T = self._mapped(seen, found, T, hop)
+        if self.submap_ends(number, T):
+            completed(self.cut(T))
+            tracker.move_by(se3.inverse(T))
+            T = self._mapped(seen, found, np.eye(4))  # the next submap begins with the same keyframe
+        completed(self.seek_component(seen, T))
+        return T
+
+    def _mapped(
+        self, seen: PreparedFrame, found: NewestFrame, T_tracked: Matrix, hop: RelativePose = UNKNOWN_HOP
+    ) -> Matrix:
+        """Map a keyframe at the pose where it was tracked, and track the next frames relative to it; return its pose,
+        which mapping may have moved."""
+        T_submap_camera = completed(self.map_keyframe(seen, found.number, T_tracked, hop))
+        self.tracker.times = self.graph.times
+        self.tracker.move_by(T_submap_camera @ se3.inverse(T_tracked))
+        seen.live = seen.live.read(self.graph.times.read(seen.reading))
+        self.tracker.keep_keyframe(self.mapper.field, self.view, seen, T_submap_camera, found.front)
+        return T_submap_camera
 
     def _begin(self, seen: PreparedFrame) -> FrameEstimate:
         """Start the first submap at the first frame. Its camera is the world, unless there are earlier submaps: then
@@ -73,16 +122,18 @@ class MainLoop(MappingBackend):
     def _locate(self, seen: PreparedFrame) -> FrameEstimate:
         """Track a frame; if it is lost, search the whole map for it; if that fails too often, begin a new map."""
         fit = self._track(seen)
+        if self.late is not None:
+            fit.T_camera_world = fit.T_camera_world @ se3.inverse(self.settle_late(self.tracker.motion))
         lost, held_back = self.tracker.lost, self._is_held_back
         self.recovery.count(lost, self.tracker.doubtful > 0, seen)
         estimate = FrameEstimate.of(fit, lost)
         if not lost:
             estimate.mapped = not held_back and self._is_keyframe(fit)
             if estimate.mapped:
-                alignment = hop_alignment(fit, seen.live, self.tracker)
-                estimate.hop = self.hop_to(se3.inverse(estimate.T_submap_camera), alignment)
+                estimate.alignment = hop_alignment(fit, seen.live, self.tracker)
                 if self.cuts:
-                    estimate.drift_m = self.add_drift(estimate.T_submap_camera, estimate.hop)
+                    hop = self.hop_to(se3.inverse(estimate.T_submap_camera), estimate.alignment)
+                    estimate.drift_m = self.add_drift(estimate.T_submap_camera, hop)
             if not held_back:
                 self._question(fit, seen, estimate)
         elif held_back:
@@ -107,26 +158,11 @@ class MainLoop(MappingBackend):
         mappable = is_mappable(fit, self.tracker, self.recovery)
         return mappable and becomes_keyframe(fit, self.tracker, since, self.config.mapping)
 
-    def _map(self, seen: PreparedFrame, estimate: FrameEstimate) -> None:
-        """Map a keyframe, cut the submap if a rule ends it here, and look for the place in other components."""
-        estimate.T_submap_camera = self._mapped(seen, estimate.T_submap_camera, estimate.hop)
-        if self.submap_ends(len(self.steps), estimate.T_submap_camera):
-            completed(self.cut(estimate.T_submap_camera))
-            estimate.T_submap_camera = self._mapped(seen, np.eye(4))  # the next submap begins with the same keyframe
-        completed(self.seek_component(seen, estimate.T_submap_camera))
-
     def _run_pending(self) -> None:
         """Make the steps that this frame does of the pending work: of the map, and of the search for loops."""
         completed(self.refining(self.mapper.pending_now))
         with self._timer.stage("loops"):
             completed(self.closing(SLICES_PER_FRAME))
-
-    def _mapped(self, seen: PreparedFrame, T_submap_camera: Matrix, hop: RelativePose = UNKNOWN_HOP) -> Matrix:
-        """Map a keyframe, and track the next frames relative to it; return its pose."""
-        T_submap_camera = completed(self.map_keyframe(seen, len(self.steps), T_submap_camera, hop))
-        self.tracker.times = self.graph.times
-        self.tracker.keep_keyframe(self.mapper.field, self.view, seen, T_submap_camera)
-        return T_submap_camera
 
     def _offer_validation_view(self, seen: PreparedFrame, estimate: FrameEstimate) -> None:
         """Offer a frame as a validation view if it was tracked without doubt and is not held back."""

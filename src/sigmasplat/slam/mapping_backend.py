@@ -11,7 +11,7 @@ import numpy as np
 from sigmasplat.config import SubmapConfig
 from sigmasplat.data import se3
 from sigmasplat.data.field import GaussianField
-from sigmasplat.data.readout import Readout
+from sigmasplat.data.readout import AT_ONCE, Readout
 from sigmasplat.data.relative_pose import UNKNOWN_HOP, RelativePose
 from sigmasplat.fit.align import Alignment
 from sigmasplat.fit.pyramid import Pyramid
@@ -92,12 +92,38 @@ class MappingBackend(SlamState):
             return image.read(self.graph.times.read(reading_of(row)))
 
         yield from self.graph.aligning(T_world_keyframe, rows, image, should_stop)
-        yield from self.graph.measuring(image, reading_of)
+        if self.graph.is_due:
+            self.correct_motions()
+            yield from self.graph.measuring(image, reading_of)
+            yield from self._read_at_once()
         first = max(newest + 1 - WINDOW, newest + 2 - len(active))
         poses = self.graph.solved(T_world_keyframe, [*atlas.hops[first:], hop], first)
         moved = se3.orthonormalise(se3.inverse(anchor) @ poses)
         for each, T_submap_camera in zip(active[first - newest - 1 :], moved, strict=True):
             each.T_world_camera = T_submap_camera
+
+    def correct_motions(self) -> None:
+        """Let the keyframes so far have moved as the frames before and after them say. The motion of tracking, from the
+        frame before alone, is noisier and comes earlier, which makes the times of a sensor too short."""
+        atlas = self.atlas
+        submap, keyframe = atlas.places.submap, atlas.places.keyframe
+        first = np.cumsum([0, *atlas.keyframe_poses.counts])
+        rows, frames = np.unique(first[submap] + keyframe, return_index=True)
+        known = (np.array(atlas.components)[submap] == atlas.components[-1]) & ~self.steps.lost
+        rows, frames = rows[known[frames]], frames[known[frames]]
+        atlas.readings.correct(rows, se3.rates(atlas.T_world_camera(), self.steps.timestamps_s, frames, known))
+
+    def _read_at_once(self) -> Task[None]:
+        """Rewrite the keyframes of the active submap that were mapped before it was known when the sensor reads, in
+        slices of one."""
+        readings, first = self.atlas.readings, len(self.atlas.readings) - len(self.mapper.keyframes)
+        for row, keyframe in enumerate(self.mapper.keyframes, first):
+            readout = self.graph.times.read(readings[row])
+            if readout is not None:
+                keyframe.target = keyframe.target.read_at_once(readout)
+                self.images.kept.pop(row, None)
+                readings.correct(row, AT_ONCE.rate)
+                yield
 
     def add_keyframe(self, seen: PreparedFrame, index: int, T_submap_camera: Matrix, hop: RelativePose) -> Matrix:
         """Add frame number `index` to the keyframes of the active submap without fitting the map; return its pose."""

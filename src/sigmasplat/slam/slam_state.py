@@ -176,10 +176,11 @@ class SlamState:
         return c.loops.close and c.final.move_poses and not c.input.poses
 
     def _new_graph(self) -> GrowingGraph:
-        i, times = self.config.input, SensorTimes.given(self.config.input.calibrate)
-        if times.std_s and self.config.tracking.method != "align":
+        c, times = self.config, SensorTimes.given(self.config.input.calibrate)
+        if times.std_s and c.tracking.method != "align":
             raise ConfigError("input.calibrate with a file needs tracking.method=align, which knows the times of rows")
-        return GrowingGraph(self.config.loops.alignments, i.calibrate == "auto" and i.sensor != RENDERED, times=times)
+        measures = c.input.calibrate == "auto" and c.input.sensor != RENDERED and not c.tracking.fit_depth
+        return GrowingGraph(c.loops.alignments, measures, times=times)
 
     @property
     def _describes(self) -> bool:

@@ -103,6 +103,7 @@ class Slam(MainLoop, ArrayInterface):
             self._finish(progress)
 
     def _finish(self, progress: Progress) -> None:
+        self.settle_late(self.tracker.motion.stopped())
         completed(self.refining(self.mapper.pending))
         if not self.steps or not (len(self.store) or self.cuts or self.config.final.iterations):
             return

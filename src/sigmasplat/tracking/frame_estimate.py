@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 from sigmasplat.data import se3
-from sigmasplat.data.relative_pose import UNKNOWN_HOP, RelativePose
 from sigmasplat.data.trajectory import LOST, TRACKED
+from sigmasplat.fit.align import Alignment
 from sigmasplat.fit.compare import Comparison
 from sigmasplat.fit.pose import PoseFit
 from sigmasplat.types import Matrix
@@ -14,8 +14,9 @@ from sigmasplat.types import Matrix
 class FrameEstimate:
     """Where a frame is: T_submap_camera [4, 4] in the active submap, its state, and whether it is to be mapped.
 
-    fit: of tracking, None for the first frame; comparison: with the map at the pose, if it was made; hop: from the last
-    keyframe; inliers: matches of the relocalisation; drift_m: of the submap, if a rule reads it.
+    fit: of tracking, None for the first frame; comparison: with the map at the pose, if it was made;
+    alignment: to the newest keyframe, if it is to be mapped; inliers: matches of the relocalisation; drift_m: of the
+    submap, if a rule reads it.
     """
 
     T_submap_camera: Matrix
@@ -23,7 +24,7 @@ class FrameEstimate:
     mapped: bool = False
     fit: PoseFit | None = None
     comparison: Comparison | None = None
-    hop: RelativePose = UNKNOWN_HOP
+    alignment: Alignment | None = None
     inliers: int | None = None
     drift_m: float | None = None
 

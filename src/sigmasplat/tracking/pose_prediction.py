@@ -34,24 +34,29 @@ class PosePrediction:
 
 @dataclass(frozen=True, eq=False)
 class CameraMotion:
-    """The motion of the camera at the time of a frame, s: T_last_camera [4, 4], and a twist per second [6] in its axes;
+    """The motion of the camera at the time of a frame, s: T_last_camera [4, 4], and the time since the last frame, s;
     at rest if they are not known."""
 
     time_s: float = 0.0
     velocity: Matrix = field(default_factory=lambda: np.eye(4))
-    rate: Matrix = field(default_factory=lambda: np.zeros(6))
+    elapsed_s: float = 0.0
 
     def after(self, T_last_camera: Matrix, time_s: float) -> "CameraMotion":
-        """Return the motion at the next frame. Its rate is the mean of the one before and of the motion since, which
-        alone is as noisy as two poses: late readings are corrected by it."""
-        elapsed_s, rate = time_s - self.time_s, self.rate
-        if elapsed_s > 0.0:
-            rate = 0.5 * (rate + se3.log(T_last_camera) / elapsed_s)
-        return CameraMotion(time_s, T_last_camera, rate)
+        """Return the motion at the next frame."""
+        return CameraMotion(time_s, T_last_camera, max(time_s - self.time_s, 0.0))
 
     def stopped(self) -> "CameraMotion":
         """Return no motion: poses of earlier frames do not agree with later ones."""
         return CameraMotion(self.time_s)
+
+    def rate(self, next_: "CameraMotion | None" = None) -> Matrix:
+        """Return the motion at this frame, a twist per second [6] in its axes: the mean since the frame before, or, if
+        the motion at the next frame is known, from the frame before to the next one. This central difference neither
+        lags behind the motion nor doubles the noise of poses."""
+        motions = [self] if next_ is None else [self, next_]
+        elapsed_s = sum(motion.elapsed_s for motion in motions)
+        moved = np.sum([se3.log(motion.velocity) for motion in motions], 0)
+        return np.asarray(moved / elapsed_s if elapsed_s > 0.0 else np.zeros(6))
 
 
 def predict(previous: Matrix, velocity: Matrix, before: PosePrior, now: PosePrior) -> PosePrediction:

@@ -1,7 +1,7 @@
 """Tracking: predict the pose, fit it to the fixed map, judge the fit, and try other guesses if it is doubtful."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field as dataclass_field
+from dataclasses import dataclass, field as dataclass_field, replace
 
 import numpy as np
 
@@ -81,7 +81,7 @@ class Tracker:
         returns True, that guess and the later ones are left out. A lost frame gets the best available guess (odometry,
         else the last pose), and the motion is reset.
         """
-        seen.move(self.motion.rate, self.times)
+        seen.move(self.motion.rate(), self.times)
         given, shown = Given(field, view, self.prediction(prior), should_stop), seen.shown
         predicted = given.prediction.predicted
         if given.prediction.given:
@@ -91,7 +91,6 @@ class Tracker:
         else:
             best = self._estimated(given, seen, shown)
             self.lost = self._is_lost(best) or self._leaps(best, predicted)
-            best = best if self.lost else self._reread(given, seen, best)
             self.doubtful = self.doubtful + 1 if self._contradicted(best) else 0
         self.prior = prior
         if self.lost:  # poses of earlier frames do not agree with later ones
@@ -101,16 +100,6 @@ class Tracker:
             self._notice_rest(seen, se3.inverse(best.T_camera_world))
         self._remember(best, seen)
         return best
-
-    def _reread(self, given: Given, seen: PreparedFrame, fit: PoseFit) -> PoseFit:
-        """Fit once more with the motion that the camera has made, which matters where the sensor reads late."""
-        if seen.live.readout is None:
-            return fit
-        T_world_camera = se3.inverse(fit.T_camera_world)
-        motion = self.motion.after(se3.inverse(self.previous) @ T_world_camera, seen.frame.timestamp_s)
-        seen.move(motion.rate, self.times)
-        found = self._fit(given, seen.shown if self.front is None else seen.aside(self.front), T_world_camera)
-        return fit if self._doubts(found) and not self._doubts(fit) else found
 
     def _estimated(self, given: Given, seen: PreparedFrame, shown: PreparedFrame) -> PoseFit:
         """Return the best of the fits from all guesses; shown: the frame as it is fitted first."""
@@ -209,8 +198,7 @@ class Tracker:
             if fit.comparison is not None:
                 self.statistics.add(fit.comparison, float(np.linalg.norm(self.motion.velocity[:3, 3])))
         self.previous = T_world_camera
-        if seen.live.readout is None:
-            seen.move(self.motion.rate, self.times)
+        seen.move(self.motion.rate(), self.times)
         seen = seen.without(self.front)
         self.last_image, self.last_features, self.started = seen.live, seen.image, True
 
@@ -309,11 +297,17 @@ class Tracker:
 
     # ---- keyframes ----
 
-    def keep_keyframe(self, field: Splats, view: View, seen: PreparedFrame, T_world_camera: Matrix) -> None:
-        """Use a keyframe that was just mapped: its refined pose, and its image as the reference of the next frames."""
-        self.move_by(T_world_camera @ se3.inverse(self.previous))  # at a cut, the coordinates change
-        self.previous, self.lost = T_world_camera, False
-        self.follow(mapped_keyframe(field.params, view, seen, T_world_camera, self.config, self.front))
+    def keep_keyframe(
+        self, field: Splats, view: View, seen: PreparedFrame, T_world_camera: Matrix, front: DynamicMask | None
+    ) -> None:
+        """Use a keyframe that was just mapped: its pose, and its image as the reference of the next frames; front: what
+        was in front of the scene in it."""
+        self.follow(mapped_keyframe(field.params, view, seen, T_world_camera, self.config, front))
+
+    def came_from(self, previous: Matrix) -> None:
+        """Take note that the frame before the last one was at another pose [4, 4] than thought."""
+        if not self.lost:
+            self.motion = replace(self.motion, velocity=se3.inverse(previous) @ self.previous)
 
     def follow(self, keyframe: TrackedKeyframe) -> None:
         """Use a keyframe as the reference of the next frames."""

@@ -1,0 +1,85 @@
+"""A frame of a sensor that reads late is fitted again when the next one has shown how its camera moved."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sigmasplat.config import TrackingConfig
+from sigmasplat.data import se3
+from sigmasplat.data.readout import SensorTimes
+from sigmasplat.data.trajectory import TRACKED
+from sigmasplat.fit.align import Alignment
+from sigmasplat.fit.pose import fit_pose_align
+from sigmasplat.fit.references import Reference
+from sigmasplat.tracking.frame_estimate import FrameEstimate
+from sigmasplat.tracking.moving.dynamic_mask import DynamicMask
+from sigmasplat.tracking.pose_prediction import CameraMotion
+from sigmasplat.tracking.prepared_frame import PreparedFrame, TrackedKeyframe
+from sigmasplat.tracking.tracker import Tracker
+from sigmasplat.types import Matrix
+
+AS_GOOD = 0.99
+"""A second alignment replaces the first one if its agreement × overlap is at least this share of the first one's."""
+
+
+@dataclass(frozen=True, eq=False)
+class NewestFrame:
+    """The newest frame, as tracking found it. If its sensor reads late, it waits for the next one: the motion from the
+    frame before to the frame after is known five times better than the motion before alone.
+
+    number: of the frame; T_world_camera [4, 4] in the coordinates of tracking; motion: that led to it; mapped: whether
+    it is a keyframe; connected: whether tracking found it from the keyframes before; reference: the keyframe that it
+    was aligned to, None if there is none; explained: agreement × overlap of this alignment; alignment: only of a frame
+    that does not wait; front: what was in front of the scene; exposure: relative to the map.
+    """
+
+    number: int
+    seen: PreparedFrame
+    T_world_camera: Matrix
+    motion: CameraMotion
+    mapped: bool
+    connected: bool
+    reference: Reference | None
+    explained: float
+    alignment: Alignment | None
+    front: DynamicMask | None
+    exposure: tuple[float, float]
+
+    @staticmethod
+    def of(seen: PreparedFrame, estimate: FrameEstimate, tracker: Tracker, number: int) -> "NewestFrame":
+        """Return the frame that was tracked last."""
+        connected, fit = number > 0 and estimate.state == TRACKED, estimate.fit
+        explained = 0.0 if fit is None else fit.agreement * fit.overlap
+        found = NewestFrame(
+            number, seen, estimate.T_submap_camera, tracker.motion, estimate.mapped, connected, tracker.keyframe,
+            explained, estimate.alignment, tracker.front, estimate.exposure,
+        )  # fmt: skip
+        return replace(found, alignment=None) if found.reads_late else found
+
+    @property
+    def reads_late(self) -> bool:
+        """Return whether the motion of the camera matters for the image."""
+        return self.connected and self.seen.live.readout is not None
+
+    @property
+    def followed(self) -> TrackedKeyframe:
+        """Return the frame as a keyframe before the map has weights for its pixels."""
+        seen = self.seen.without(self.front)
+        return TrackedKeyframe(Reference(seen.live, se3.inverse(self.T_world_camera)), seen.image, self.front)
+
+    def moved_by(self, T_new_old: Matrix) -> "NewestFrame":
+        """Return the frame in other coordinates of tracking [4, 4]."""
+        reference = None if self.reference is None else self.reference.moved_by(T_new_old)
+        return replace(self, T_world_camera=T_new_old @ self.T_world_camera, reference=reference)
+
+    def settled(self, after: CameraMotion, times: SensorTimes, config: TrackingConfig) -> "NewestFrame":
+        """Return the frame with the pose that agrees with its motion before and after it."""
+        self.seen.move(self.motion.rate(after), times)
+        if self.reference is None:
+            return self
+        live, T_camera_world = self.seen.shown_without(self.front).live, se3.inverse(self.T_world_camera)
+        fit = fit_pose_align(self.reference, live, T_camera_world, config)
+        if fit.agreement * fit.overlap < AS_GOOD * self.explained:
+            return replace(self, alignment=fit.alignment)
+        T_world_camera = np.asarray(se3.inverse(se3.orthonormalise(fit.T_camera_world)))
+        return replace(self, T_world_camera=T_world_camera, alignment=fit.alignment)
