@@ -19,7 +19,6 @@ from sigmasplat.slam.results import StepTimer
 from sigmasplat.system.array_interface import Before, Correction, correction_since
 from sigmasplat.system.slam import Slam
 from sigmasplat.tracking.newest_frame import AS_GOOD
-from sigmasplat.tracking.pose_validation import is_better
 from sigmasplat.tracking.prepared_frame import PreparedFrame, TrackedKeyframe, mapped_keyframe
 from sigmasplat.tracking.relocaliser import Relocation
 from sigmasplat.types import Matrix
@@ -192,11 +191,10 @@ class BackEnd:
     def _search(self, each: TrackedFrame, search: Search) -> Iterator[None]:
         """Search the whole map for a frame, and tell tracking the result."""
         system, number = self.system, each.number
-        self._timer, recovered = system.start_timer(), self._has_recovered(search)
+        self._timer, recovered = system.start_timer(), self._has_recovered()
         place = None if recovered else (yield from system.relocalising(search.seen))
         yield
-        better = place is not None and (search.comparison is None or is_better(place.comparison, search.comparison))
-        if place is not None and better:
+        if place is not None:
             yield from self._go_to(place, number, search.seen)
         elif search.apart and not recovered:
             yield from system.begin_apart()
@@ -205,10 +203,10 @@ class BackEnd:
             last = replace(self.last, state="", searched=number, loops=system.loops.copied(), seconds=0.0)
             self._hand_over(replace(last, correction=None))
 
-    def _has_recovered(self, search: Search) -> bool:
+    def _has_recovered(self) -> bool:
         """Return whether a lost camera was tracked again meanwhile."""
         frames = (each for each in self._pending if isinstance(each, TrackedFrame))
-        return search.comparison is None and self._take() and any(not each.step.lost for each in frames)
+        return self._take() and any(not each.step.lost for each in frames)
 
     def _go_to(self, place: Relocation, number: int, seen: PreparedFrame) -> Iterator[None]:
         system = self.system

@@ -17,7 +17,6 @@ from sigmasplat.data.field import GaussianField
 from sigmasplat.data.readout import UNKNOWN_TIMES, SensorTimes
 from sigmasplat.data.trajectory import APART, RELOCALISED, TRACKED
 from sigmasplat.fit.align import Alignment
-from sigmasplat.fit.compare import Comparison
 from sigmasplat.fit.pose import PoseFit
 from sigmasplat.fit.target import Target
 from sigmasplat.graph.confidence import Confidence
@@ -32,7 +31,6 @@ from sigmasplat.tracking.keyframe_rule import becomes_keyframe, hop_alignment, i
 from sigmasplat.tracking.moving.dynamic_mask import DynamicMask
 from sigmasplat.tracking.newest_frame import NewestFrame
 from sigmasplat.tracking.pose_prediction import CameraMotion
-from sigmasplat.tracking.pose_validation import is_questionable
 from sigmasplat.tracking.predicted_depth_frames import fitted_keyframe, fitted_to_map
 from sigmasplat.tracking.prepared_frame import PreparedFrame, TrackedKeyframe, refuse_first_without_depth
 from sigmasplat.tracking.recovery import Recovery, usable
@@ -73,12 +71,10 @@ class Snapshot:
 
 @dataclass(frozen=True, eq=False)
 class Search:
-    """A frame to be found in the whole map; comparison: of its doubtful pose, None if it is lost; apart: whether a new
-    map begins if it is not found."""
+    """A lost frame to be found in the whole map; apart: whether a new map begins if it is not found."""
 
     seen: PreparedFrame
-    comparison: Comparison | None = None
-    apart: bool = False
+    apart: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,7 +204,7 @@ class FrontEnd:
             found = NewestFrame.of(seen, estimate, self.tracker, number)
             if mapped:
                 offer = self._follow(found, view)
-            search = None if held_back or estimate.mapped else self._search(fit, seen)
+            search = None if held_back else self._search(seen)
         if search is not None or estimate.mapped:
             self.poses = {**self.poses, number: estimate.T_submap_camera}
         step = self._step(seen, estimate, timer, view)
@@ -267,16 +263,14 @@ class FrontEnd:
             self.refused += 1
         return True
 
-    def _search(self, fit: PoseFit, seen: PreparedFrame) -> Search | None:
-        """Return the frame to be searched for in the whole map, if it is lost or doubtful and no other is searched."""
-        if self.searching >= 0:
-            return None
-        searched, apart = self.config.recovery.relocalise, self.recovery.gives_up
-        lost, questionable = self.tracker.lost, fit.comparison is not None and is_questionable(self.tracker.doubtful)
-        if not ((lost and (searched or apart)) or (not lost and searched and questionable)) or not usable(seen):
+    def _search(self, seen: PreparedFrame) -> Search | None:
+        """Return the frame to be searched for in the whole map, if it is lost and no other is searched."""
+        apart = self.recovery.gives_up
+        wanted = self.tracker.lost and (self.config.recovery.relocalise or apart) and usable(seen)
+        if self.searching >= 0 or not wanted:
             return None
         self.searching = self.frames
-        return Search(seen.separate(), apart=apart) if lost else Search(seen.separate(), fit.comparison)
+        return Search(seen.separate(), apart)
 
     def _validation_view(self, number: int, seen: PreparedFrame, view: View, estimate: FrameEstimate) -> Target | None:
         """Return the images of a frame that may become a validation view."""

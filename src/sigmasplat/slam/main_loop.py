@@ -17,7 +17,6 @@ from sigmasplat.tracking.frame_estimate import FrameEstimate
 from sigmasplat.tracking.keyframe_rule import becomes_keyframe, hop_alignment, is_held_back, is_mappable, may_validate
 from sigmasplat.tracking.newest_frame import NewestFrame
 from sigmasplat.tracking.pose_prediction import CameraMotion
-from sigmasplat.tracking.pose_validation import is_better, is_questionable
 from sigmasplat.tracking.predicted_depth_frames import fitted_keyframe, fitted_to_map
 from sigmasplat.tracking.prepared_frame import PreparedFrame, refuse_first_without_depth
 from sigmasplat.tracking.recovery import usable
@@ -134,8 +133,6 @@ class MainLoop(MappingBackend):
                 if self.cuts:
                     hop = self.hop_to(se3.inverse(estimate.T_submap_camera), estimate.alignment)
                     estimate.drift_m = self.add_drift(estimate.T_submap_camera, hop)
-            if not held_back:
-                self._question(fit, seen, estimate)
         elif held_back:
             return estimate  # a search for the camera could make a keyframe of this frame
         elif (place := self.relocalise(seen)) is not None:
@@ -174,14 +171,6 @@ class MainLoop(MappingBackend):
                 self.validation_views.offer(index, last, index - newest.index, T_keyframe_camera, shown)
 
     # ---- lost and found ----
-
-    def _question(self, fit: PoseFit, seen: PreparedFrame, estimate: FrameEstimate) -> None:
-        """After some doubtful frames, search the whole map for a pose that explains the frame much better."""
-        if fit.comparison is None or not is_questionable(self.tracker.doubtful):
-            return
-        place = self.relocalise(seen)
-        if place is not None and is_better(place.comparison, fit.comparison):
-            self._go_to(place, seen, estimate)
 
     def _go_to(self, place: Relocation, seen: PreparedFrame, estimate: FrameEstimate) -> None:
         """Continue where the camera was found: in the active submap, or in a new one that is connected to the place."""

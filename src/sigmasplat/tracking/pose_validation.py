@@ -52,13 +52,9 @@ walls fit each other across a room."""
 DOUBT_SCORE, FIRST_SCORE = 0.7, 0.8
 """Doubtful: the score falls below this share of the usual one, which is the second value while it is not known. A frame
 and its keyframe share four fifths of their surface, or less: with 1, the fifth frame of a turn was doubtful."""
-PATIENCE = 3
-"""Number of doubtful frames in a row after which the whole map is searched."""
-STANDS_CORRELATION = 0.7
-"""A doubtful pose stands if the map has been searched without success, and if the map confirms the pose with this
-correlation: blur and exposure lower the correlation at right poses too."""
-BETTER = 0.1
-"""A pose from the whole map replaces a doubtful one if its score is higher by this."""
+PATIENCE, STANDS_CORRELATION = 3, 0.7
+"""A doubtful pose is used for mapping after this number of doubtful frames in a row, if the surfaces confirm it with
+this correlation: blur and exposure lower the correlation at right poses too."""
 DIFFERS, DRAWS = 0.02, 2.5
 """A moving thing may have pulled the pose if 1 − correlation of the gray values is above the first value. It has pulled
 the pose if 1 − correlation falls by more than the second, a factor, when the thing is left out. For still things in
@@ -142,20 +138,9 @@ def is_missed(without: Comparison | None, whole: Comparison | None) -> bool:
     return not 1.0 - without.correlation <= DISAGREES * (1.0 - whole.correlation)
 
 
-def is_questionable(doubtful: int) -> bool:
-    """Return whether the whole map is searched after this number of doubtful frames in a row."""
-    return doubtful > 0 and doubtful % PATIENCE == 0
-
-
 def stands(c: Comparison, doubtful: int) -> bool:
-    """Return whether a pose is used for mapping after this number of doubtful frames in a row: the whole map has been
-    searched and has no better one."""
+    """Return whether a pose is used for mapping although it is the last of this number of doubtful ones in a row."""
     return doubtful > PATIENCE and confirmed(c, STANDS_CORRELATION)
-
-
-def is_better(c: Comparison, doubtful: Comparison) -> bool:
-    """Return whether a pose from the whole map replaces a doubtful one."""
-    return score(c) > score(doubtful) + BETTER
 
 
 def is_wide(T_previous: Matrix, fit: PoseFit, camera: Camera, has_features: bool) -> bool:
