@@ -77,8 +77,8 @@ class TrackingConfig(Section, name="tracking"):
     lr_exposure: ClassVar[float] = 0.01
     """Learning rate of the exposure: change per step of the factor's logarithm and of the offset (colours 0 to 1)."""
     features: bool = True
-    """Whether sparse features give a second guess of the pose where motion is wide or the first fit is doubtful (ours).
-    The same fit starts from each guess, and the result that explains more is used."""
+    """Whether sparse features give a second guess of the pose where the first fit is doubtful (ours). The same fit
+    starts from each guess, and the result that explains more is used."""
     verify: bool = True
     """Whether a pose is judged by comparing surfaces at it (ours); off = by agreement and overlap only. It needs
     `method` align. Alignment then uses the part of σ that depends on the distance, by the model of `input.sensor`,

@@ -6,15 +6,9 @@ from statistics import median
 
 import numpy as np
 
-from sigmasplat.data import se3
-from sigmasplat.data.camera import Camera
 from sigmasplat.fit.compare import Comparison
 from sigmasplat.fit.pose import PoseFit
-from sigmasplat.types import Matrix
 
-WIDE = 0.065
-"""A motion between two frames is wide if it moves the image by more than this share of its width: the basin of
-convergence of alignment ends near there."""
 RECENT = 50
 """What is usual is the median over this many recent frames that were not lost."""
 FEW = 5
@@ -141,14 +135,6 @@ def is_missed(without: Comparison | None, whole: Comparison | None) -> bool:
 def stands(c: Comparison, doubtful: int) -> bool:
     """Return whether a pose is used for mapping although it is the last of this number of doubtful ones in a row."""
     return doubtful > PATIENCE and confirmed(c, STANDS_CORRELATION)
-
-
-def is_wide(T_previous: Matrix, fit: PoseFit, camera: Camera, has_features: bool) -> bool:
-    """Return whether a frame is so far from the last one, at T_previous [4, 4], that a second guess by features is
-    worth its time."""
-    depth_m = fit.alignment.depth_m if fit.alignment is not None else 1.0
-    moved = se3.angle_between(T_previous, se3.inverse(fit.T_camera_world), depth_m) if has_features else 0.0
-    return moved * camera.fx > WIDE * camera.width
 
 
 def is_lost(fit: PoseFit, least_agreement: float, least_share: float) -> bool:

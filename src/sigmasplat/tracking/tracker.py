@@ -105,7 +105,7 @@ class Tracker:
         """Return the best of the fits from all guesses; shown: the frame as it is fitted first."""
         best = self._fit(given, shown, given.prediction.predicted)
         best, shown = self._uncovered(given, seen, shown, best)
-        if judge.is_wide(self.previous, best, given.view.camera, self.extractor is not None) or self._doubts(best):
+        if self._doubts(best):
             guesses = unless(given.should_stop, self._other_guesses(shown, given.prediction))
             best = max([best, *(self._fit(given, shown, guess) for guess in guesses)], key=self._score)
         return self._retry(given, shown, best) if self._doubts(best) else best
