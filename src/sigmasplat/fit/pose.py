@@ -13,7 +13,7 @@ from sigmasplat.data import se3
 from sigmasplat.data.camera import NEUTRAL
 from sigmasplat.fit.align import ITERATIONS, Alignment, align
 from sigmasplat.fit.backends import fits_of
-from sigmasplat.fit.compare import Comparison, best_alignment
+from sigmasplat.fit.compare import Comparison, best_alignment, compare
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference
 from sigmasplat.fit.target import Target
@@ -73,17 +73,18 @@ def fit_pose_align(
     """Align the live image, a gray and depth (m) pyramid, to a reference by Gauss–Newton (`fit.align`), from a guess.
 
     T_camera_world [4, 4]: the guess for the live camera; moves: if False, it is only judged. With `config.verify` the
-    finest size alone is a second candidate, and `comparison` is that with the reference. In the result, `loss` is the
+    finest size alone is a second candidate, and the result has the comparison with the reference. Its `loss` is the
     final cost and `first_loss` is NaN.
     """
     guess = T_camera_world @ se3.inverse(reference.T_camera_world)
     if config.verify and moves:
         found, seen = best_alignment(reference.pyramid, live, guess, config.align_weight_color)
     else:
-        seen, found = None, align(
+        found = align(
             reference.pyramid, live, guess, ITERATIONS * moves, config.align_weight_color,
             plateau_stop=config.plateau_stop,
         )  # fmt: skip
+        seen = compare(reference.pyramid, live, found.T_live_reference) if config.verify else None
     return PoseFit(
         found.T_live_reference @ reference.T_camera_world,
         found.agreement,

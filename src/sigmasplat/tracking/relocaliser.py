@@ -232,6 +232,5 @@ def aligned(
     found = list[tuple[PoseFit, Comparison]]()
     for moves in (True, False):
         fit = fit_pose_align(reference, seen.live, T_camera_world, config, moves)
-        fit.comparison = reference.compared(seen.live, fit.T_camera_world)
-        found.append((fit, fit.comparison))
+        found.append((fit, fit.comparison or reference.compared(seen.live, fit.T_camera_world)))
     return max(found, key=lambda each: score(each[1]))

@@ -12,7 +12,7 @@ from sigmasplat.data.readout import UNKNOWN_TIMES, SensorTimes
 from sigmasplat.fit.compare import Comparison
 from sigmasplat.fit.pose import PoseFit, fit_pose_adam, fit_pose_align
 from sigmasplat.fit.pyramid import Pyramid
-from sigmasplat.fit.references import Reference, map_reference
+from sigmasplat.fit.references import Reference
 from sigmasplat.render.view import View
 from sigmasplat.tracking import pose_validation as judge
 from sigmasplat.tracking.feature_image import FeatureImage, motion_by_features
@@ -127,7 +127,7 @@ class Tracker:
         self, given: Given, seen: PreparedFrame, first: PreparedFrame, fit: PoseFit, before: DynamicMask | None
     ) -> tuple[PoseFit, PreparedFrame] | None:
         """Return the fit and the frame without what is in space that was free, or None; before: in front in the last
-        frame. The newest keyframe loses what has left it. If it is hidden, the last image and the map give the pose."""
+        frame. The newest keyframe loses what has left it. If it is hidden, the last image gives the pose."""
         slow, known = self.detector.slow(seen, se3.inverse(fit.T_camera_world)), before or self.keyframe_front
         if fit.comparison is None or (
             slow is None and not self.detector.suspects(fit.comparison, known, given.should_stop)
@@ -216,24 +216,8 @@ class Tracker:
             config = c if self.started else c.without_motion()
             steps = patience * config.iterations
             return fit_pose_adam(given.field.params, given.view, seen.target, T_camera_world, config, steps)
-        reference = self.keyframe or map_reference(given.field.params, given.view, T_camera_world, c)
-        return self._aligned(reference, seen.live, T_camera_world, patience > 0)
-
-    def _aligned(self, reference: Reference, live: Pyramid, T_camera_world: Matrix, moves: bool = True) -> PoseFit:
-        fit = fit_pose_align(reference, live, T_camera_world, self.config, moves)
-        known = fit.comparison is not None and (self.keyframe is None or self.keyframe is reference)
-        if self.config.verify and not known:
-            fit.comparison = self._compared(reference, live, fit.T_camera_world)
-        return fit
-
-    def _compared(self, reference: Reference, live: Pyramid, T_camera_world: Matrix) -> Comparison:
-        """Compare a frame at a pose with the newest keyframe, so that all guesses and frames are judged alike; where it
-        shows too little of the frame, with the reference of the alignment."""
-        if self.keyframe is not None and self.keyframe is not reference:
-            found = self.keyframe.compared(live, T_camera_world)
-            if found.common >= judge.LEAST_COMMON:
-                return found
-        return reference.compared(live, T_camera_world)
+        assert self.keyframe is not None  # the first frame of each map is one
+        return fit_pose_align(self.keyframe, seen.live, T_camera_world, c, patience > 0)
 
     def _other_guesses(self, seen: PreparedFrame, prediction: PosePrediction) -> Iterator[Matrix]:
         """Yield T_world_camera by features, and by constant velocity alone if a gyroscope changed the first guess."""
@@ -249,18 +233,12 @@ class Tracker:
             yield self.previous @ self.motion.velocity
 
     def _retry(self, given: Given, seen: PreparedFrame, fit: PoseFit) -> PoseFit:
-        """Retry from odometry with twice the iterations (VarSplat §3), and from the last pose; return the best fit.
-
-        With alignment, also try the map rendered at these poses: it contains more than the newest keyframe.
-        """
+        """Retry from odometry with twice the iterations (VarSplat §3), and from the last pose; return the best fit."""
         moved = None if given.should_stop() else odometry(self.last_image, seen.live, given, self.config)
         starts = [given.prediction.last]
         if moved is not None:
             starts.insert(0, np.asarray(self.previous @ se3.inverse(moved)))
         fits = [fit, *(self._fit(given, seen, start, 2) for start in unless(given.should_stop, starts))]
-        for start in unless(given.should_stop, starts if self.config.method == "align" else ()):
-            reference = map_reference(given.field.params, given.view, se3.inverse(start), self.config)
-            fits.append(self._aligned(reference, seen.live, se3.inverse(start)))
         best = max(fits, key=self._score)
         if self._is_lost(best):
             best.T_camera_world = se3.inverse(starts[0])
