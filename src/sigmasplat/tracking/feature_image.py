@@ -20,7 +20,6 @@ from sigmasplat.tracking.features import (
     pose_from_landmarks,
     reduced,
 )
-from sigmasplat.types import Matrix
 
 
 def detail_of(frame: Frame) -> Detail:
@@ -108,11 +107,3 @@ def pose_by_features(reference: Landmarks, live: FeatureImage, extractor: Extrac
     pairs = extractor.match(reference.features, seen)
     depth_m = depth_readings(seen, live.depth_m, live.camera)
     return pose_from_landmarks(reference, seen, pairs, seed, depth_m)
-
-
-def motion_by_features(reference: FeatureImage | None, live: FeatureImage, extractor: Extractor) -> Matrix | None:
-    """Return T_live_reference by the features of two images; None if they do not give it, or without a reference."""
-    if reference is None:
-        return None
-    found = pose_by_features(reference.landmarks(extractor), live, extractor, seed=0)
-    return None if found is None else found.T_live_reference

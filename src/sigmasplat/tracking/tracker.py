@@ -15,7 +15,7 @@ from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference
 from sigmasplat.render.view import View
 from sigmasplat.tracking import pose_validation as judge
-from sigmasplat.tracking.feature_image import FeatureImage, motion_by_features
+from sigmasplat.tracking.feature_image import FeatureImage, pose_by_features
 from sigmasplat.tracking.features import Extractor
 from sigmasplat.tracking.moving.dynamic_detector import DynamicDetector, together
 from sigmasplat.tracking.moving.dynamic_mask import DynamicMask
@@ -43,7 +43,6 @@ class Tracker:
     previous: Matrix = dataclass_field(default_factory=lambda: np.eye(4))
     motion: CameraMotion = dataclass_field(default_factory=CameraMotion)
     last_image: Pyramid | None = None
-    last_features: FeatureImage | None = None
     keyframe: Reference | None = None
     keyframe_features: FeatureImage | None = None
     keyframe_front: DynamicMask | None = None
@@ -67,7 +66,7 @@ class Tracker:
 
     def start(self, seen: PreparedFrame, prior: PosePrior = NO_PRIOR) -> None:
         """Fix the gauge: the first camera is the world."""
-        self.last_image, self.last_features, self.prior = seen.live, seen.image, prior
+        self.last_image, self.prior = seen.live, prior
         self.motion = CameraMotion(seen.frame.timestamp_s)
 
     def track(
@@ -199,8 +198,7 @@ class Tracker:
                 self.statistics.add(fit.comparison, float(np.linalg.norm(self.motion.velocity[:3, 3])))
         self.previous = T_world_camera
         seen.move(self.motion.rate(), self.times)
-        seen = seen.without(self.front)
-        self.last_image, self.last_features, self.started = seen.live, seen.image, True
+        self.last_image, self.started = seen.without(self.front).live, True
 
     # ---- guesses ----
 
@@ -220,15 +218,13 @@ class Tracker:
         return fit_pose_align(self.keyframe, seen.live, T_camera_world, c, patience > 0)
 
     def _other_guesses(self, seen: PreparedFrame, prediction: PosePrediction) -> Iterator[Matrix]:
-        """Yield T_world_camera by features, and by constant velocity alone if a gyroscope changed the first guess."""
-        if self.extractor is not None and seen.image is not None:
-            known = [(self.last_features, self.previous)]
-            if self.keyframe is not None:
-                known.insert(0, (self.keyframe_features, se3.inverse(self.keyframe.T_camera_world)))
-            for features, T_world_then in known:
-                motion = motion_by_features(features, seen.image, self.extractor)
-                if motion is not None:
-                    yield T_world_then @ se3.inverse(motion)
+        """Yield T_world_camera by features of the newest keyframe, and by constant velocity alone if a gyroscope
+        changed the first guess."""
+        known = self.keyframe_features
+        if self.extractor is not None and seen.image is not None and self.keyframe is not None and known is not None:
+            found = pose_by_features(known.landmarks(self.extractor), seen.image, self.extractor, seed=0)
+            if found is not None:
+                yield se3.inverse(found.T_live_reference @ self.keyframe.T_camera_world)
         if prediction.measured:
             yield self.previous @ self.motion.velocity
 
