@@ -36,8 +36,6 @@ BIAS_PX = 0.01
 """Systematic error of an alignment, pixels. Interpolation moves an edge by up to 1/40 pixel, depending on where it lies
 between two pixels (Schreier et al. 2000). The mean over an image is smaller but not zero. 1/100 pixel is the accuracy
 that digital image correlation reaches in practice."""
-FINE_LEVELS = 2
-"""An alignment to several references uses this number of levels."""
 UNKNOWN_M = 1.0
 """Standard deviation assumed for an undetermined direction, metres (for rotations: shift at the mean depth)."""
 UPPER = np.triu_indices(6)
@@ -218,41 +216,6 @@ def gray_share(reference: Pyramid, live: Pyramid, T_live_reference: Matrix) -> f
         sums = normal_equations(pair.kernels, pair.level(0), [T_live_reference])[0].sums
         cost.append(math.sqrt(sums[0] / max(sums[1], 1.0)))
     return cost[1] / max(cost[0] + cost[1], 1e-9)
-
-
-def align_to_all(
-    references: Sequence[Pyramid],
-    live: Pyramid,
-    T_live_reference: Sequence[Matrix],
-    iterations: int = ITERATIONS,
-    weight_color: float = 0.5,
-    update_stop: float = UPDATE_STOP,
-) -> Matrix:
-    """Find the motion of the live camera that fits several references at once, whose poses are fixed to each other.
-
-    T_live_reference: the guess for each reference [4, 4], near the solution: only the finest two levels are used.
-    Returns a left twist as motion [4, 4]: it moves each guess. Undetermined directions keep the guess; without
-    `MIN_PIXELS` common pixels the guess is returned. Steps stop as in `align`.
-    """
-    pairs, T = [Pair(reference, live, weight_color) for reference in references], np.eye(4)
-    for k in reversed(range(min(FINE_LEVELS, len(live.cameras)))):
-        levels = [pair.level(k) for pair in pairs]
-        for _ in range(iterations):
-            found = [
-                normal_equations(pair.kernels, level, [T @ guess])[0]
-                for pair, level, guess in zip(pairs, levels, T_live_reference, strict=True)
-            ]
-            n = Normal(*(sum(parts) for parts in zip(*((f.H, f.b, f.S, f.sums) for f in found), strict=True)))
-            if n.sums[1] < MIN_PIXELS:
-                break
-            depth_m = float(pairs[0].reference.readings[0])
-            directions, decided = _axes(n, depth_m)
-            basis = directions[:, decided]
-            twist = -basis @ np.linalg.solve(basis.T @ n.H @ basis, basis.T @ n.b)
-            T = se3.exp(twist) @ T
-            if np.abs(twist).max() < update_stop * 2**k:
-                break
-    return se3.orthonormalise(T)
 
 
 def _axes(n: Normal, depth_m: float) -> tuple[Matrix, NDArray[np.bool_]]:

@@ -144,7 +144,6 @@ class Tracker:
                     break
                 shown = first if front is None else seen.aside(front)
                 found = self._fit(given, shown, guess)
-                found = self.detector.fitted_to_all(self.keyframe, shown.live, found, self.config, given.should_stop)
                 guess = se3.inverse(found.T_camera_world)
             else:
                 moves = self.detector.takes_for_moving(front, self.keyframe, seen, found)
@@ -285,7 +284,6 @@ class Tracker:
 
     def follow(self, keyframe: TrackedKeyframe) -> None:
         """Use a keyframe as the reference of the next frames."""
-        self.detector = self.detector.followed(self.keyframe, keyframe.reference)
         self.keyframe = keyframe.reference
         self.keyframe_features, self.keyframe_front = keyframe.image, keyframe.front
 

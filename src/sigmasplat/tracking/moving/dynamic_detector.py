@@ -9,10 +9,8 @@ import numpy as np
 from sigmasplat.config import MovingConfig, TrackingConfig
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
-from sigmasplat.fit.align import align_to_all
-from sigmasplat.fit.compare import STEP, Comparison
+from sigmasplat.fit.compare import Comparison
 from sigmasplat.fit.pose import PoseFit
-from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference
 from sigmasplat.tracking.moving.dynamic_mask import (
     LEAST_REGION,
@@ -135,14 +133,8 @@ def together(a: DynamicMask | None, b: DynamicMask | None) -> DynamicMask | None
 FRONT = 0.03
 """What is in front is looked for if at least this share of the compared points is nearer than the reference."""
 
-EARLIER, ENOUGH = 3, 0.4
-"""If the newest keyframe and a frame with something in front share less than this share of the image, the pose is also
-fitted to so many earlier keyframes."""
 RENEWED = 0.7
 """A frame with something in front becomes a keyframe if it shares less than this with the newest one."""
-SAME_POSE = 1e-6
-"""Two keyframes whose poses differ by less than this are the same frame."""
-
 DRAWN_EVERY, IN_VAIN = 2, 3
 """What draws the pose is looked for in every second frame, in every one if it is urgent: between keyframes, a wrong
 pose does not last. After so many looks in vain, half as often."""
@@ -150,13 +142,11 @@ pose does not last. After so many looks in vain, half as often."""
 
 @dataclass(frozen=True, eq=False)
 class DynamicDetector:
-    """What is known of moving things between two frames: what recent frames saw, the keyframes before the newest one,
-    the newest last, and how often something that draws the pose was looked for since something was in front. Without
-    `config.find` nothing is remembered."""
+    """What is known of moving things between two frames: what recent frames saw, and how often something that draws the
+    pose was looked for since something was in front. Without `config.find` nothing is remembered."""
 
     config: MovingConfig = field(default_factory=MovingConfig)
     history: DepthHistory = field(default_factory=DepthHistory)
-    earlier: tuple[Reference, ...] = ()
     looks: int = 0
 
     def suspects(self, found: Comparison, known: DynamicMask | None, should_stop: ShouldStop) -> bool:
@@ -224,33 +214,11 @@ class DynamicDetector:
         poses or depth are wrong."""
         return front is None or not (self.config.find and is_still(front, keyframe, seen.live, fit))
 
-    def fitted_to_all(
-        self, keyframe: Reference | None, live: Pyramid, fit: PoseFit, config: TrackingConfig, should_stop: ShouldStop
-    ) -> PoseFit:
-        """Return the fit of a frame without what is in front; if the newest keyframe shows little of the rest, fitted
-        to earlier keyframes too, unless the next frame waits (`should_stop`)."""
-        c = None if should_stop() else fit.comparison
-        if keyframe is None or c is None or not self.earlier or c.points >= ENOUGH * _compared_points(live):
-            return fit
-        references = [keyframe, *self.earlier]
-        guesses = [fit.T_camera_world @ se3.inverse(reference.T_camera_world) for reference in references]
-        pyramids = [reference.pyramid for reference in references]
-        moved = align_to_all(pyramids, live, guesses, weight_color=config.align_weight_color)
-        T_camera_world = moved @ fit.T_camera_world
-        return replace(fit, T_camera_world=T_camera_world, comparison=keyframe.compared(live, T_camera_world))
-
     def renews(self, found: Comparison | None, front: DynamicMask | None) -> bool:
         """Return whether a frame with something in front becomes a keyframe: it shares too little with the newest."""
         if not self.config.find or front is None or found is None:
             return False
         return min(found.common, found.covered) < RENEWED
-
-    def followed(self, keyframe: Reference | None, newest: Reference) -> "DynamicDetector":
-        """Return the watch when a keyframe is no longer the newest one; at a cut, the newest one is the same again."""
-        same = keyframe is None or np.allclose(keyframe.T_camera_world, newest.T_camera_world, atol=SAME_POSE)
-        if keyframe is None or same or not self.config.find:
-            return self
-        return replace(self, earlier=(*self.earlier, keyframe)[-EARLIER:])
 
     def slow(self, seen: PreparedFrame, T_world_camera: Matrix) -> DynamicMask | None:
         """Find what moves too slowly to show against the newest keyframe."""
@@ -278,15 +246,8 @@ class DynamicDetector:
 
     def moved_by(self, T_new_old: Matrix) -> "DynamicDetector":
         """Return the same in other coordinates [4, 4]."""
-        earlier = tuple(reference.moved_by(T_new_old) for reference in self.earlier)
-        return replace(self, history=self.history.moved_by(T_new_old), earlier=earlier)
+        return replace(self, history=self.history.moved_by(T_new_old))
 
     def cleared(self) -> "DynamicDetector":
         """Return the watch with nothing remembered."""
         return DynamicDetector(self.config)
-
-
-def _compared_points(live: Pyramid) -> int:
-    """Return how many pixels of an image a comparison looks at."""
-    camera = live.cameras[0]
-    return -(-camera.width // STEP) * -(-camera.height // STEP)
