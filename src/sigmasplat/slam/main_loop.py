@@ -180,7 +180,6 @@ class MainLoop(MappingBackend):
             estimate.T_submap_camera = place.T_submap_camera
             self.tracker.move_to(self.mapper.field, self.view, place.keyframe, place.T_submap_camera)
         else:
-            self.tracker.forget_moving()
             completed(self.branch_at(place))
             estimate.T_submap_camera, estimate.mapped = np.eye(4), True
         self.recovery.found()

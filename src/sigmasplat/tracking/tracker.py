@@ -288,19 +288,14 @@ class Tracker:
         self.keyframe_features, self.keyframe_front = keyframe.image, keyframe.front
 
     def move_to(self, field: Splats, view: View, keyframe: TrackedKeyframe, T_world_camera: Matrix) -> None:
-        """Continue at another pose, with a keyframe as the reference of the next frames."""
-        self.previous, self.motion, self.lost = T_world_camera, self.motion.stopped(), False
-        self.detector = self.detector.cleared()
+        """Continue at another pose after a lost frame, with a keyframe as the reference of the next frames."""
+        self.previous, self.lost = T_world_camera, False
         self.follow(keyframe.weighed(field.params, view, self.config))
-
-    def forget_moving(self) -> None:
-        """Forget what moves: the camera continues in another map."""
-        self.detector = self.detector.cleared()
 
     def continue_elsewhere(self, apart: bool) -> None:
         """Go on where the search has found the camera, or in a new map (`apart`)."""
         self.motion, self.lost = self.motion.stopped(), self.lost and not apart
-        self.forget_moving()
+        self.detector = self.detector.cleared()
 
     def move_by(self, T_new_old: Matrix, previous: Matrix | None = None) -> None:
         """Express the last pose and the reference in other coordinates [4, 4]; previous: the last pose there, if it is
@@ -310,6 +305,6 @@ class Tracker:
         self.detector = self.detector.moved_by(T_new_old)
 
     def forget(self) -> None:
-        """Restart at the identity, as for the first frame."""
-        self.previous, self.motion, self.detector = np.eye(4), self.motion.stopped(), self.detector.cleared()
-        self.keyframe = self.keyframe_features = self.front = self.keyframe_front = None
+        """Restart at the identity after a lost frame, as for the first one."""
+        self.previous = np.eye(4)
+        self.keyframe = self.keyframe_features = self.keyframe_front = None
