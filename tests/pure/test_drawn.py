@@ -17,7 +17,7 @@ from sigmasplat.fit.references import Reference
 from sigmasplat.fit.target import Target
 from sigmasplat.tracking.moving.dynamic_detector import DynamicDetector
 from sigmasplat.tracking.moving.dynamic_mask import DynamicMask, thinned
-from sigmasplat.tracking.moving.pose_pullers import free_standing, has_drawn, is_still, shift_px, suspected, two_motions
+from sigmasplat.tracking.moving.pose_pullers import free_standing, has_drawn, is_still, shift_px, suspected
 from sigmasplat.tracking.pose_validation import is_missed
 from sigmasplat.tracking.prepared_frame import PreparedFrame
 
@@ -99,22 +99,6 @@ def test_a_box_that_moves_on_a_still_block_has_drawn_the_pose(moves: bool) -> No
     assert thing.hidden[80, 75] and thing.hidden[60, 80]
     assert has_drawn(thing, whole, seen, drawn, fitted(seen, MOVED_M, thing, block=True), False) == moves
     assert not moves or list(suspected(whole, seen, drawn, CONFIG, every=False))
-
-
-def test_two_poses_are_told_apart_by_where_each_agrees() -> None:
-    seen, right, wrong = sight(MOVED_M, MOVED_M), pose(MOVED_M), pose(BETWEEN_M)
-    box = box_of(seen).hidden
-    found = two_motions(keyframe(), seen.live, box, pose(0.0), right)
-    assert found is not None and found.apart and found.rest_gains > 3 and found.thing_loses > 3
-    assert found.moves == pytest.approx(np.mean(seen.target.depth_image.numpy() == BOX_M), abs=0.04)
-    still = sight(MOVED_M, 0.0)
-    poor = two_motions(keyframe(), still.live, box_of(still).hidden, wrong, right)
-    assert poor is not None and poor.rest_gains > 3 and not poor.apart
-    brighter = replace(seen.live, gray=[plane + np.float32(0.05) for plane in seen.live.gray])
-    again = two_motions(keyframe(), brighter, box, pose(0.0), right)
-    assert again is not None and again.rest_gains == pytest.approx(found.rest_gains, rel=0.05)
-    aside = se3.exp(np.array([0, 0, 0, 0, np.pi, 0]))
-    assert two_motions(keyframe(), seen.live, box, aside, right) is None
 
 
 def test_a_pose_between_two_motions_raises_suspicion_although_the_rest_does_not_agree_there() -> None:
