@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from sigmasplat.config import Config, TrackingConfig
+from sigmasplat.config import Config
 from sigmasplat.data import se3
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.relative_pose import RelativePose
@@ -212,25 +212,13 @@ class Relocaliser:
         found = pose_by_features(landmarks, seen.image, self.extractor, seed=self.config.seed)
         if found is None:
             return
-        T_keyframe_submap, scale = se3.inverse(known.T_submap_camera(where)), view.options.scene_scale
+        T_keyframe_submap, c = se3.inverse(known.T_submap_camera(where)), self.config.tracking
         guess = found.T_live_reference @ T_keyframe_submap
         own = Reference(picture_images(view, picture, view.camera)[1], T_keyframe_submap)
         keyframe = TrackedKeyframe(own, FeatureImage.of_picture(picture, view.camera))
-        yield Relocation(where, keyframe, found.inliers, *aligned(own, seen, guess, self.config.tracking), scale)
         params = known.splats(where[0]).params.to(view.sums.device)
-        rendered = map_reference(params, view, guess, self.config.tracking)
-        yield Relocation(where, keyframe, found.inliers, *aligned(rendered, seen, guess, self.config.tracking), scale)
-
-
-def aligned(
-    reference: Reference, seen: PreparedFrame, T_camera_world: Matrix, config: TrackingConfig
-) -> tuple[PoseFit, Comparison]:
-    """Align a frame to a reference from a guess; return the fit, and the comparison of both images at it.
-
-    Where only a wall is in view, alignment can slide along it: then the guess explains the image better, and is kept.
-    """
-    found = list[tuple[PoseFit, Comparison]]()
-    for moves in (True, False):
-        fit = fit_pose_align(reference, seen.live, T_camera_world, config, moves)
-        found.append((fit, fit.comparison or reference.compared(seen.live, fit.T_camera_world)))
-    return max(found, key=lambda each: score(each[1]))
+        for reference in (own, None):
+            reference = reference or map_reference(params, view, guess, c)
+            fit = fit_pose_align(reference, seen.live, guess, c)
+            compared = fit.comparison or reference.compared(seen.live, fit.T_camera_world)
+            yield Relocation(where, keyframe, found.inliers, fit, compared, view.options.scene_scale)
