@@ -38,7 +38,7 @@ from sigmasplat.errors import SourceError
 from sigmasplat.fit.target import gray_of
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.sources import open_source
-from sigmasplat.tracking.features import Extractor, Features, depth_readings, landmarks_of, pose_from_landmarks
+from sigmasplat.tracking.features import Extractor, Features, landmarks_of, pose_from_landmarks
 
 arg = tyro.conf.arg
 Matrix = NDArray[np.float64]
@@ -143,11 +143,10 @@ class Finder:
 
     def pose(self, pair: Pair, seed: int) -> dict[str, Any]:
         """Return inliers and error of the pose of a pair; no error if none was found."""
-        (reference, far), (live, near) = self.features(pair.reference), self.features(pair.live)
+        (reference, far), (live, _) = self.features(pair.reference), self.features(pair.live)
         landmarks = landmarks_of(reference, far.depth_m, far.camera)
-        readings = depth_readings(live, near.depth_m, near.camera)
         pairs = self._timed("match", self.extractor.match, landmarks.features, live)
-        found = self._timed("pose", pose_from_landmarks, landmarks, live, pairs, seed, readings)
+        found = self._timed("pose", pose_from_landmarks, landmarks, live, pairs, seed)
         measured: dict[str, Any] = {"frames": [pair.reference, pair.live], "matches": len(pairs)}
         if found is None:
             return measured | {"inliers": 0, "right": False}

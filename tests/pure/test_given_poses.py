@@ -217,7 +217,7 @@ def test_given_motions_show_the_depth_of_features_and_which_matches_are_wrong() 
 
     def seen(x: np.ndarray) -> Features:
         pixels = x[:, :2] / x[:, 2:] * 300.0 + [160.0, 120.0]
-        return Features(pixels, np.ones(len(x)), np.zeros((len(x), 1)), camera)
+        return Features(pixels, np.zeros((len(x), 1)), camera)
 
     first, second = seen(points), seen(points @ T[:3, :3].T + T[:3, 3])
     np.testing.assert_allclose(triangulated(first, second, T), points[:, 2], rtol=1e-9)

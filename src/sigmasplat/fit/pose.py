@@ -77,6 +77,7 @@ def fit_pose_align(
     final cost and `first_loss` is NaN.
     """
     guess = T_camera_world @ se3.inverse(reference.T_camera_world)
+    seen: Comparison | None = None
     if config.verify and moves:
         found, seen = best_alignment(reference.pyramid, live, guess, config.align_weight_color)
     else:
@@ -84,7 +85,8 @@ def fit_pose_align(
             reference.pyramid, live, guess, ITERATIONS * moves, config.align_weight_color,
             plateau_stop=config.plateau_stop,
         )  # fmt: skip
-        seen = compare(reference.pyramid, live, found.T_live_reference) if config.verify else None
+        if config.verify:
+            seen = compare(reference.pyramid, live, found.T_live_reference)
     return PoseFit(
         found.T_live_reference @ reference.T_camera_world,
         found.agreement,

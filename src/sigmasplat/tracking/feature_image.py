@@ -15,7 +15,6 @@ from sigmasplat.tracking.features import (
     Features,
     Landmarks,
     PnP,
-    depth_readings,
     landmarks_of,
     pose_from_landmarks,
     reduced,
@@ -104,6 +103,4 @@ class FeatureImage:
 def pose_by_features(reference: Landmarks, live: FeatureImage, extractor: Extractor, seed: int) -> PnP | None:
     """Match landmarks with the features of a live image; return the pose, or None if the matches do not give one."""
     seen = live.features(extractor)
-    pairs = extractor.match(reference.features, seen)
-    depth_m = depth_readings(seen, live.depth_m, live.camera)
-    return pose_from_landmarks(reference, seen, pairs, seed, depth_m)
+    return pose_from_landmarks(reference, seen, extractor.match(reference.features, seen), seed)

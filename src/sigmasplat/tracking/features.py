@@ -1,5 +1,5 @@
 """Sparse features (RootSIFT of OpenCV), their matches, and landmarks, which are features with depth; the pose from
-matches by RANSAC with P3P, then by weighted Gauss–Newton."""
+matches by RANSAC with P3P."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -8,10 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.config import Config
-from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.env import opencv
-from sigmasplat.fit.pyramid import NOISE_PER_M
 from sigmasplat.types import Matrix
 
 Gray = NDArray[np.uint8]
@@ -35,13 +33,12 @@ depend on the order of summation, hence not on the number of threads."""
 class Features:
     """The features of one image, strongest first.
 
-    points [N, 2]: pixels (u, v), centres at integers; sigma_px [N]: standard deviation of a point per axis;
-    descriptors: [N, D] float32 of about unit norm, multiples of `DESCRIPTOR_STEP`; camera: the pinhole of the image in
-    which they were found. It is smaller than the frame's if the image was reduced.
+    points [N, 2]: pixels (u, v), centres at integers; descriptors: [N, D] float32 of about unit norm, multiples of
+    `DESCRIPTOR_STEP`; camera: the pinhole of the image in which they were found. It is smaller than the frame's if the
+    image was reduced.
     """
 
     points: NDArray[np.float32]
-    sigma_px: NDArray[np.float32]
     descriptors: NDArray[Any]
     camera: Camera
 
@@ -50,7 +47,7 @@ class Features:
 
     def take(self, rows: NDArray[Any]) -> "Features":
         """Return the features of some rows (indices or a mask)."""
-        return Features(self.points[rows], self.sigma_px[rows], self.descriptors[rows], self.camera)
+        return Features(self.points[rows], self.descriptors[rows], self.camera)
 
 
 class Extractor:
@@ -61,20 +58,18 @@ class Extractor:
         self._sift = opencv().SIFT_create(nfeatures=COUNT, contrastThreshold=CONTRAST, enable_precise_upscale=True)
 
     def find(self, gray: Gray, camera: Camera) -> Features:
-        """Find features in an image [H, W]; camera is its pinhole. sigma_px grows with the scale of the feature."""
+        """Find features in an image [H, W]; camera is its pinhole."""
         gray, camera = reduced(gray, camera)
         keypoints, raw = self._sift.detectAndCompute(gray, None)
         if not keypoints:
-            points, sigma_px, descriptors = (np.zeros(size, np.float32) for size in ((0, 2), 0, (0, 128)))
-            return Features(points, sigma_px, descriptors, camera)
+            return Features(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.float32), camera)
         values = np.array([(*p.pt, p.response, p.size, p.angle) for p in keypoints], np.float64)
         # strongest first, ties by position
         order = np.lexsort((values[:, 4], values[:, 3], values[:, 0], values[:, 1], -values[:, 2]))[:COUNT]
-        raw, points, diameter = raw[order], values[order, :2].astype(np.float32), values[order, 3].astype(np.float32)
+        raw, points = raw[order], values[order, :2].astype(np.float32)
         root = np.sqrt(raw / np.maximum(raw.sum(1, keepdims=True), 1e-9))
         descriptors = np.asarray(np.rint(root / DESCRIPTOR_STEP) * DESCRIPTOR_STEP, np.float32)
-        # A keypoint's diameter is twice the standard deviation of its Gaussian.
-        return Features(points, 0.5 + 0.1 * diameter, descriptors, camera)
+        return Features(points, descriptors, camera)
 
     def match(self, a: Features, b: Features) -> Pairs:
         """Return matches [M, 2]: rows of a and rows of b, each used at most once, ordered by row of a."""
@@ -119,14 +114,10 @@ STEP_SHARE = 0.03
 
 @dataclass(frozen=True, eq=False)
 class Landmarks:
-    """Features with a position in space, in the frame of the camera that saw them.
-
-    points_m [N, 3]; sigma_m [N]: standard deviation of the depth.
-    """
+    """Features with a position in space, points_m [N, 3], in the frame of the camera that saw them."""
 
     features: Features
     points_m: Matrix
-    sigma_m: Matrix
 
     def __len__(self) -> int:
         return len(self.features)
@@ -144,7 +135,7 @@ def landmarks_of(features: Features, depth_m: NDArray[np.float32], depth_camera:
     c = some.camera
     u, v = some.points.T.astype(np.float64)
     points = np.stack([(u - c.cx) / c.fx * z, (v - c.cy) / c.fy * z, z], 1)
-    return Landmarks(some, points, depth_sigma_m(z))
+    return Landmarks(some, points)
 
 
 def depth_readings(features: Features, depth_m: NDArray[np.float32], depth_camera: Camera) -> Matrix:
@@ -157,11 +148,6 @@ def depth_readings(features: Features, depth_m: NDArray[np.float32], depth_camer
     low = np.where(around > 0, around, np.inf).min(0)
     smooth = around.max(0) - low <= STEP_SHARE * z
     return np.where(inside & (z > 0) & smooth, z, 0.0)
-
-
-def depth_sigma_m(z: Matrix) -> Matrix:
-    """Return the standard deviation of depth readings, metres."""
-    return NOISE_PER_M * z * z + 1e-3
 
 
 def nearest_pixels(features: Features, camera: Camera) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.bool_]]:
@@ -182,25 +168,15 @@ with the width."""
 RANSAC_TRIES = 1000
 """Maximum number of minimal samples per pose. Fewer are drawn if a pose is found with `CONFIDENCE` sooner."""
 CONFIDENCE = 0.999
-STEPS = 10
-CAUCHY = 2.4
-"""Width of the robust loss, in standard deviations of a residual."""
-MEDIAN_OF_SQUARE = 0.7
-"""Median of χ²/n for n = 2 or 3 degrees of freedom."""
-LEAST_SCALE = 0.1
-NO_READING_M2 = 1e6
-"""Variance of the depth residual where the live frame has no reading."""
 NEAREST_M = 0.05
 
 
 @dataclass(frozen=True, eq=False)
 class PnP:
-    """A pose from matches: T_live_reference [4, 4]; which matches support it [M]; covariance [6, 6] of the left
-    twist."""
+    """A pose from matches: T_live_reference [4, 4]; which matches support it [M]."""
 
     T_live_reference: Matrix
     supporting: NDArray[np.bool_]
-    covariance: Matrix
 
     @property
     def inliers(self) -> int:
@@ -208,124 +184,40 @@ class PnP:
         return int(self.supporting.sum())
 
 
-def pose_from_landmarks(
-    landmarks: Landmarks,
-    features: Features,
-    pairs: NDArray[np.intp],
-    seed: int,
-    live_depth_m: NDArray[np.floating] | None = None,
-) -> PnP | None:
+def pose_from_landmarks(landmarks: Landmarks, features: Features, pairs: Pairs, seed: int) -> PnP | None:
     """Find the motion from the landmarks' camera to the features' camera; None with fewer than 8 inliers.
 
-    pairs [M, 2]: rows of landmarks and features; live_depth_m [N]: depth of each feature, 0 = no reading
-    (`depth_readings`): it makes distances to surfaces more exact. The same input and seed give the same bits.
+    pairs [M, 2]: rows of landmarks and features. The same input and seed give the same bits.
     """
-    gate_px = RANSAC_PX * features.camera.width / 640.0
     if len(pairs) < LEAST_INLIERS:
         return None
-    problem = _Problem(landmarks, features, pairs, live_depth_m)
-    T = _ransac(problem, seed, gate_px, RANSAC_TRIES)
+    points_m, seen = landmarks.points_m[pairs[:, 0]], features.points[pairs[:, 1]].astype(np.float64)
+    gate_px = RANSAC_PX * features.camera.width / 640.0
+    T = _ransac(points_m, seen, features.camera, seed, gate_px)
     if T is None:
         return None
-    # A second round includes matches that only the improved pose supports.
-    for _ in range(2):
-        supporting = problem.errors_px(T) < gate_px
-        if supporting.sum() < LEAST_INLIERS:
-            return None
-        T, covariance = problem.fitted(T, supporting)
-    supporting = problem.errors_px(T) < gate_px
-    return PnP(T, supporting, covariance) if supporting.sum() >= LEAST_INLIERS else None
+    supporting = _errors_px(points_m, seen, features.camera, T) < gate_px
+    return PnP(T, supporting) if supporting.sum() >= LEAST_INLIERS else None
 
 
-class _Problem:
-    """The matched points, their images and noise, as arrays [M, …]."""
-
-    def __init__(
-        self,
-        landmarks: Landmarks,
-        features: Features,
-        pairs: NDArray[np.intp],
-        live_depth_m: NDArray[np.floating] | None,
-    ) -> None:
-        first, second = pairs.T
-        self.camera = features.camera
-        self.points = landmarks.points_m[first]
-        self.seen = features.points[second].astype(np.float64)
-        z = self.points[:, 2]
-        sideways = landmarks.features.sigma_px[first] * z / landmarks.features.camera.fx
-        along = self.points / z[:, None]
-        # Covariance of a landmark: depth noise along its ray, noise of its image across it.
-        self.spread = landmarks.sigma_m[first, None, None] ** 2 * along[:, :, None] * along[:, None, :]
-        self.spread += (sideways**2)[:, None, None] * np.diag([1.0, 1.0, 0.0])
-        self.noise_px2 = features.sigma_px[second].astype(np.float64) ** 2
-        self.depth = np.zeros(len(pairs)) if live_depth_m is None else np.asarray(live_depth_m, np.float64)[second]
-
-    def errors_px(self, T: Matrix) -> Matrix:
-        """Return the reprojection error of each match; infinite behind the camera."""
-        moved = self.points @ T[:3, :3].T + T[:3, 3]
-        front = moved[:, 2] > NEAREST_M
-        error = np.linalg.norm(self._projected(np.where(front[:, None], moved, 1.0)) - self.seen, axis=1)
-        return np.where(front, error, np.inf)
-
-    def fitted(self, T: Matrix, chosen: NDArray[np.bool_]) -> tuple[Matrix, Matrix]:
-        """Return the pose after Gauss–Newton with Cauchy weights on the chosen matches, and its covariance."""
-        for _ in range(STEPS):
-            H, b, _ = self._normal(T, chosen)
-            step = np.linalg.solve(H + 1e-9 * np.diag(np.diag(H)), -b)
-            T = se3.exp(step) @ T
-            if np.abs(step).max() < 1e-7:
-                break
-        H, _, scale2 = self._normal(T, chosen)
-        covariance = np.linalg.inv(H + 1e-12 * np.trace(H) * np.eye(6)) * scale2
-        return se3.orthonormalise(T), covariance
-
-    def _normal(self, T: Matrix, chosen: NDArray[np.bool_]) -> tuple[Matrix, Matrix, float]:
-        """Return information H, gradient b with respect to the left twist, and the squared scale of the
-        residuals in units of the noise model."""
-        moved = self.points[chosen] @ T[:3, :3].T + T[:3, 3]
-        z = np.maximum(moved[:, 2], NEAREST_M)
-        depth = self.depth[chosen]
-        c = self.camera
-        J = np.zeros((len(z), 3, 3))
-        J[:, 0, 0], J[:, 0, 2] = c.fx / z, -c.fx * moved[:, 0] / z**2
-        J[:, 1, 1], J[:, 1, 2] = c.fy / z, -c.fy * moved[:, 1] / z**2
-        J[:, 2, 2] = 1.0
-        residual = np.concatenate(
-            [self._projected(moved) - self.seen[chosen], np.where(depth > 0, z - depth, 0.0)[:, None]], 1
-        )
-        R = T[:3, :3]
-        variance = J @ (R @ self.spread[chosen] @ R.T) @ J.transpose(0, 2, 1)
-        own = np.where(depth > 0, depth_sigma_m(depth) ** 2, NO_READING_M2)
-        variance += np.stack([self.noise_px2[chosen], self.noise_px2[chosen], own], 1)[:, :, None] * np.eye(3)
-        information = np.linalg.inv(variance)
-        squared = np.einsum("ni,nij,nj->n", residual, information, residual)
-        freedom = 2.0 + (depth > 0)
-        # The noise model gives ratios between matches; its scale differs by camera, so it is measured here.
-        scale2 = max(float(np.median(squared / freedom)) / MEDIAN_OF_SQUARE, LEAST_SCALE**2)
-        weight = 1.0 / (1.0 + squared / (scale2 * CAUCHY**2))
-        G = np.concatenate([J, -J @ se3.hat(moved)], 2)
-        pull = np.swapaxes(G, 1, 2) @ information * weight[:, None, None]
-        return (pull @ G).sum(0), (pull @ residual[:, :, None]).sum(0)[:, 0], scale2
-
-    def _projected(self, moved: Matrix) -> Matrix:
-        c = self.camera
-        z = np.maximum(moved[:, 2], NEAREST_M)
-        return np.stack([c.fx * moved[:, 0] / z + c.cx, c.fy * moved[:, 1] / z + c.cy], 1)
+def _errors_px(points_m: Matrix, seen: Matrix, c: Camera, T: Matrix) -> Matrix:
+    """Return the reprojection error of each match; infinite behind the camera."""
+    x, y, z = T[:3, :3] @ points_m.T + T[:3, 3:]
+    ahead = np.maximum(z, NEAREST_M)
+    error = np.hypot(c.fx * x / ahead + c.cx - seen[:, 0], c.fy * y / ahead + c.cy - seen[:, 1])
+    return np.where(z > NEAREST_M, error, np.inf)
 
 
-def _ransac(problem: _Problem, seed: int, gate_px: float, tries: int) -> Matrix | None:
+def _ransac(points_m: Matrix, seen: Matrix, c: Camera, seed: int, gate_px: float) -> Matrix | None:
     """Return the pose that most matches support, from minimal samples (P3P) with local optimisation, or None."""
-    cv2, c = opencv(), problem.camera
-    order = np.random.default_rng(seed).permutation(len(problem.points))
+    cv2, order = opencv(), np.random.default_rng(seed).permutation(len(points_m))
     K = np.array([[c.fx, 0.0, c.cx], [0.0, c.fy, c.cy], [0.0, 0.0, 1.0]])
     params = cv2.UsacParams()
     params.randomGeneratorState = seed % 2**31
     params.isParallel = False
-    params.maxIterations, params.threshold, params.confidence = tries, gate_px, CONFIDENCE
+    params.maxIterations, params.threshold, params.confidence = RANSAC_TRIES, gate_px, CONFIDENCE
     try:
-        found, _, rotation, shift, _ = cv2.solvePnPRansac(
-            problem.points[order], problem.seen[order], K, None, params=params
-        )
+        found, _, rotation, shift, _ = cv2.solvePnPRansac(points_m[order], seen[order], K, None, params=params)
     except cv2.error:  # all samples are degenerate, such as points on one line
         return None
     if not found or rotation is None or not (np.isfinite(rotation).all() and np.isfinite(shift).all()):
