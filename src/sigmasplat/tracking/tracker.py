@@ -126,39 +126,27 @@ class Tracker:
         self, given: Given, seen: PreparedFrame, first: PreparedFrame, fit: PoseFit, before: DynamicMask | None
     ) -> tuple[PoseFit, PreparedFrame] | None:
         """Return the fit and the frame without what is in space that was free, or None; before: in front in the last
-        frame. The newest keyframe loses what has left it. If it is hidden, the last image gives the pose."""
+        frame. The newest keyframe loses what has left it."""
         slow, known = self.detector.slow(seen, se3.inverse(fit.T_camera_world)), before or self.keyframe_front
         if fit.comparison is None or (
             slow is None and not self.detector.suspects(fit.comparison, known, given.should_stop)
         ):
             return None
-        keyframe, predicted, expected_front = self.keyframe, given.prediction.predicted, None
-        for guess in unless(given.should_stop, (predicted, se3.inverse(fit.T_camera_world)), least=1):
-            for _ in unless(given.should_stop, range(2), least=1):  # a better pose shows better what is in front
-                front = together(
-                    self.detector.in_front(keyframe, self.keyframe_front, before, self.previous, seen, guess), slow
-                )
-                expected_front = front if expected_front is None else expected_front
-                self.keyframe = self.detector.without_gone(keyframe, seen, guess)
-                if front is None and self.keyframe is keyframe:
-                    break
-                shown = first if front is None else seen.aside(front)
-                found = self._fit(given, shown, guess)
-                guess = se3.inverse(found.T_camera_world)
-            else:
-                moves = self.detector.takes_for_moving(front, self.keyframe, seen, found)
-                if moves and self._stands(found, predicted, fit.comparison):
-                    self.front = front
-                    return found, shown
-        self.keyframe = keyframe
-        if expected_front is None or given.should_stop():
+        keyframe, predicted = self.keyframe, given.prediction.predicted
+        front = together(
+            self.detector.in_front(keyframe, self.keyframe_front, before, self.previous, seen, predicted), slow
+        )
+        self.keyframe = self.detector.without_gone(keyframe, seen, predicted)
+        if front is None and self.keyframe is keyframe:
             return None
-        shown = seen.aside(expected_front)
-        judged = self._fit(given, shown, se3.inverse(fit.T_camera_world), patience=0)
-        found = self._retry(given, shown, judged)
-        moves = self.detector.takes_for_moving(expected_front, keyframe, seen, found)
-        self.front = expected_front if moves and self._stands(found, predicted, fit.comparison) else None
-        return None if self.front is None else (found, shown)
+        shown = first if front is None else seen.aside(front)
+        found = self._fit(given, shown, predicted)
+        moves = self.detector.takes_for_moving(front, self.keyframe, seen, found)
+        if moves and self._stands(found, predicted, fit.comparison):
+            self.front = front
+            return found, shown
+        self.keyframe = keyframe
+        return None
 
     def _without_object(
         self, given: Given, seen: PreparedFrame, drawn: PoseFit, known: bool
