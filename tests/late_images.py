@@ -1,5 +1,7 @@
 """RGB-D images of a textured corner of a room, each row seen from where the camera is when the row is read."""
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -52,3 +54,21 @@ def image(T_world_camera: Array, readout: Readout | None = None, seed: int | Non
     """Return the same for alignment, without knowledge of when its rows were read."""
     seen = frame(T_world_camera, readout, seed)
     return Pyramid.of(gray_of(seen.color), seen.depth_m, CAMERA)
+
+
+SHAKEN, HERTZ = np.array([0.06, 0.05, 0.06, 0.07, 0.09, 0.1]), np.array([0.45, 0.7, 0.35, 0.6, 0.5, 0.8])
+
+
+def path(times_s: Array) -> Array:
+    """Return T_world_camera [N, 4, 4] of a hand that shakes; at 0 it is not at the origin."""
+    return se3.exp_stack(SHAKEN * np.sin(2.0 * np.pi * np.outer(times_s, HERTZ) + np.arange(6)))
+
+
+def film(frames: int, times_s: tuple[float, float, float]) -> Iterator[Frame]:
+    """Yield what the camera in this hand sees at 30 Hz. times_s: of depth after colour, and of the rows of depth and
+    colour, s. Each row is seen from where the camera has come to when it is read."""
+    rows = (np.arange(CAMERA.height) + 0.5) / CAMERA.height - 0.5
+    for i in range(frames):
+        gray = texture(cast(path(i / 30 + times_s[2] * rows))[0])
+        depth_m = cast(path(i / 30 + times_s[0] + times_s[1] * rows))[1]
+        yield Frame(i, i / 30, np.repeat(gray[..., None], 3, 2).astype("f4"), depth_m.astype("f4"), CAMERA)

@@ -11,11 +11,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from command_line import exit_code
-from late_images import CAMERA, cast, texture
+from late_images import CAMERA, film
 from sigmasplat.config import InputConfig
 from sigmasplat.config.find_preset import configured
-from sigmasplat.data import se3
-from sigmasplat.data.frame import Frame
 from sigmasplat.data.readout import UNKNOWN_TIMES, Readout, SensorTimes
 from sigmasplat.errors import ConfigError
 from sigmasplat.plugins.sources.tum import TumWriter
@@ -26,22 +24,14 @@ pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built
 
 Array = NDArray[np.float64]
 LATE_S, DEPTH_ROWS_S, COLOR_ROWS_S = TIMES_S = (-0.015, 0.025, 0.03)
-SHAKEN, HERTZ = np.array([0.06, 0.05, 0.06, 0.07, 0.09, 0.1]), np.array([0.45, 0.7, 0.35, 0.6, 0.5, 0.8])
 QUICK = ("--set", "final.iterations=0", "--set", "uncertainty.probes=0", "--set", "input.width=80")
 
 
-def path(times_s: Array) -> Array:
-    """Return T_world_camera [N, 4, 4] of a hand that shakes."""
-    return se3.exp_stack(SHAKEN * np.sin(2.0 * np.pi * np.outer(times_s, HERTZ) + np.arange(6)))
-
-
 def record(folder: Path, frames: int, times_s: tuple[float, float, float]) -> Path:
-    """Write what a camera sees whose rows are read when it has come to where they are read."""
-    writer, rows = TumWriter(folder, CAMERA), (np.arange(CAMERA.height) + 0.5) / CAMERA.height - 0.5
-    for i in range(frames):
-        gray = texture(cast(path(i / 30 + times_s[2] * rows))[0])
-        depth_m = cast(path(i / 30 + times_s[0] + times_s[1] * rows))[1]
-        writer.add(Frame(i, i / 30, np.repeat(gray[..., None], 3, 2).astype("f4"), depth_m.astype("f4"), CAMERA))
+    """Write the film of a hand that shakes."""
+    writer = TumWriter(folder, CAMERA)
+    for seen in film(frames, times_s):
+        writer.add(seen)
     return folder
 
 

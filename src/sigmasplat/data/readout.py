@@ -55,8 +55,11 @@ class SensorTimes:
 
     def read(self, image: "Readout") -> "Readout | None":
         """Return when the rows of an image were read; None if that is not known, or does not matter at rest."""
-        matters = image.rate.any() and (image.late_s or not self.at_once)
-        return replace(image, times=self) if self.std_s is not None and matters else None
+        return replace(image, times=self) if self.matter(image.late_s) and image.rate.any() else None
+
+    def matter(self, late_s: float) -> bool:
+        """Return whether an image of a moving camera is read late; late_s: as of `Readout`."""
+        return self.std_s is not None and bool(late_s or not self.at_once)
 
     @property
     def at_once(self) -> bool:

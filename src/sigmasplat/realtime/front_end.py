@@ -187,10 +187,9 @@ class FrontEnd:
     ) -> tuple[Step, list[TrackedFrame]]:
         """Track a frame, and decide whether it becomes a keyframe; return its step, and the frames to hand over;
         should_stop: as in `Tracker.track`."""
-        number, offer, search, found = self.frames, None, None, None
-        given = list[TrackedFrame]()
+        number, search, given = self.frames, None, list[TrackedFrame]()
         if number == 0:
-            estimate, offer = self._begin(seen, view)
+            estimate, followed = self._begin(seen), True
         else:
             with timer.stage("track"), timer.kernels_of(view, "track_kernels"):
                 splats = NOTHING if self.snapshot is None else self.snapshot
@@ -200,11 +199,10 @@ class FrontEnd:
             estimate = FrameEstimate.of(fit, self.tracker.lost)
             self.recovery.count(self.tracker.lost, self.tracker.doubtful > 0, seen)
             held_back = is_held_back(number, self.config.input.hold_every)
-            mapped = not held_back and self._becomes_keyframe(fit, seen, estimate)
-            found = NewestFrame.of(seen, estimate, self.tracker, number)
-            if mapped:
-                offer = self._follow(found, view)
+            followed = not held_back and self._becomes_keyframe(fit, seen, estimate)
             search = None if held_back else self._search(seen)
+        found = NewestFrame.of(seen, estimate, self.tracker, number)
+        offer = self._follow(found, view) if followed else None
         if search is not None or estimate.mapped:
             self.poses = {**self.poses, number: estimate.T_submap_camera}
         step = self._step(seen, estimate, timer, view)
@@ -212,7 +210,7 @@ class FrontEnd:
         based_on = -1 if self.snapshot is None else self.snapshot.frame
         shown = self._validation_view(number, seen, view, estimate)
         newest = TrackedFrame(number, step, estimate.T_submap_camera, self.poses, based_on, offer, search, shown)
-        if found is None or not found.reads_late:
+        if not found.reads_late:
             return step, [*given, newest]
         self.late = found, newest
         return step, given
@@ -223,19 +221,20 @@ class FrontEnd:
             return []
         (late, frame), self.late = self.late, None
         found = late.settled(after, self.tracker.times, self.config.tracking)
-        if not found.mapped:
+        if late.number == self.newest:  # until it is mapped, its motion is known at least
+            self.tracker.follow(replace(found, T_world_camera=late.T_world_camera).followed)
+        else:
             self.tracker.came_from(found.T_world_camera)
         T = frame.T_submap_camera @ se3.inverse(late.T_world_camera) @ found.T_world_camera
         offer = _offered(replace(found, seen=found.seen.at_once(view, self.config))) if found.mapped else None
         return [replace(frame, T_submap_camera=T, offer=offer)]
 
-    def _begin(self, seen: PreparedFrame, view: View) -> tuple[FrameEstimate, Offer | None]:
+    def _begin(self, seen: PreparedFrame) -> FrameEstimate:
         """Start at the first frame, whose camera is the world until the map says otherwise."""
         refuse_first_without_depth(seen.frame, self.config)
         self.tracker.start(seen, seen.frame.prior)
         self.offered, self.waits = 1, (0,)
-        estimate = FrameEstimate(np.eye(4), TRACKED, mapped=True)
-        return estimate, self._follow(NewestFrame.of(seen, estimate, self.tracker, 0), view)
+        return FrameEstimate(np.eye(4), TRACKED, mapped=True)
 
     def _follow(self, found: NewestFrame, view: View) -> Offer | None:
         """Track the next frames relative to a keyframe, before the map has weights for its pixels; return what the map

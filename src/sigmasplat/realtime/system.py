@@ -5,6 +5,7 @@ import queue
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 
 from sigmasplat import env
 from sigmasplat.data.field import GaussianField
@@ -127,7 +128,7 @@ class RealTime(ArrayInterface):
     ) -> None:
         self.slam, self._hurried, c = slam, should_stop, slam.config
         self._extractor = extractor_of(c)  # not shared with the mapping thread
-        tracker = Tracker.of(c, self._extractor)
+        tracker = replace(Tracker.of(c, self._extractor), times=slam.sensor_times)
         self._front_end = FrontEnd(c, tracker, Recovery(c.recovery))
         self._snapshots: queue.SimpleQueue[Snapshot] = queue.SimpleQueue()
         self._back_end = BackEnd(slam, self._snapshots.put)

@@ -39,11 +39,11 @@ class MainLoop(MappingBackend):
         seen = self._prepared(frame)
         estimate = self._locate(seen) if self.steps else self._begin(seen)
         found = NewestFrame.of(seen, estimate, self.tracker, len(self.steps))
-        self.late = found if found.reads_late and self.steps else None
+        self.late = found if found.reads_late else None
         if not estimate.mapped:
             self._offer_validation_view(seen, estimate)
             self._run_pending()
-        elif self.late is None:
+        elif self.late is None or not self.steps:
             estimate.T_submap_camera = self._map(found)
             self.tracker.previous, self.tracker.lost = estimate.T_submap_camera, False
         else:
@@ -71,6 +71,9 @@ class MainLoop(MappingBackend):
         late, T_tracked, self.late = self.late, self.late.T_world_camera, None
         with self._timer.stage("track"):
             late = late.settled(after, self.tracker.times, self.config.tracking)
+        if not late.number:
+            self._read_first_at_once(late)
+            return np.eye(4)
         if late.mapped:
             self.tracker.move_by(late.T_world_camera @ se3.inverse(T_tracked))
             late = replace(late, T_world_camera=self._map(late))
@@ -78,6 +81,13 @@ class MainLoop(MappingBackend):
             self.tracker.came_from(late.T_world_camera)
         self.atlas.place_again(late.T_world_camera)
         return late.T_world_camera @ se3.inverse(T_tracked) if late.mapped else np.eye(4)
+
+    def _read_first_at_once(self, first: NewestFrame) -> None:
+        """Rewrite the first frame, which was mapped before it was known how its camera moved."""
+        seen, keyframe = first.seen.at_once(self.view, self.config), self.mapper.keyframes[-1]
+        keyframe.target, keyframe.photo = seen.target, seen.photo(self.config)
+        self.images.kept.clear()
+        self.tracker.keep_keyframe(self.mapper.field, self.view, seen, first.T_world_camera, first.front)
 
     def _map(self, found: NewestFrame) -> Matrix:
         """Map a keyframe, as if it was read at once and without what moves in front, in the exposure of the map; cut

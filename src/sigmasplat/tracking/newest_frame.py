@@ -28,9 +28,10 @@ class NewestFrame:
     frame before to the frame after is known five times better than the motion before alone.
 
     number: of the frame; T_world_camera [4, 4] in the coordinates of tracking; motion: that led to it; mapped: whether
-    it is a keyframe; connected: whether tracking found it from the keyframes before; reference: the keyframe that it
-    was aligned to, None if there is none; explained: agreement × overlap of this alignment; alignment: only of a frame
-    that does not wait; front: what was in front of the scene; exposure: relative to the map.
+    it is a keyframe; connected: whether tracking found it from the keyframes before; reads_late: whether it waits;
+    reference: the keyframe that it was aligned to, None if there is none; explained: agreement × overlap of this
+    alignment; alignment: only of a frame that does not wait; front: what was in front of the scene; exposure: relative
+    to the map.
     """
 
     number: int
@@ -39,6 +40,7 @@ class NewestFrame:
     motion: CameraMotion
     mapped: bool
     connected: bool
+    reads_late: bool
     reference: Reference | None
     explained: float
     alignment: Alignment | None
@@ -48,18 +50,13 @@ class NewestFrame:
     @staticmethod
     def of(seen: PreparedFrame, estimate: FrameEstimate, tracker: Tracker, number: int) -> "NewestFrame":
         """Return the frame that was tracked last."""
-        connected, fit = number > 0 and estimate.state == TRACKED, estimate.fit
-        explained = 0.0 if fit is None else fit.agreement * fit.overlap
-        found = NewestFrame(
-            number, seen, estimate.T_submap_camera, tracker.motion, estimate.mapped, connected, tracker.keyframe,
-            explained, estimate.alignment, tracker.front, estimate.exposure,
+        tracked, fit = estimate.state == TRACKED, estimate.fit
+        late = tracked and tracker.times.matter(seen.frame.depth_late_s)
+        return NewestFrame(
+            number, seen, estimate.T_submap_camera, tracker.motion, estimate.mapped, tracked and number > 0, late,
+            tracker.keyframe if number else None, 0.0 if fit is None else fit.agreement * fit.overlap,
+            None if late else estimate.alignment, tracker.front, estimate.exposure,
         )  # fmt: skip
-        return replace(found, alignment=None) if found.reads_late else found
-
-    @property
-    def reads_late(self) -> bool:
-        """Return whether the motion of the camera matters for the image."""
-        return self.connected and self.seen.live.readout is not None
 
     @property
     def followed(self) -> TrackedKeyframe:
