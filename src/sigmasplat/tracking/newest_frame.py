@@ -8,8 +8,7 @@ from sigmasplat.config import TrackingConfig
 from sigmasplat.data import se3
 from sigmasplat.data.readout import SensorTimes
 from sigmasplat.data.trajectory import TRACKED
-from sigmasplat.fit.align import Alignment
-from sigmasplat.fit.pose import fit_pose_align
+from sigmasplat.fit.align import Alignment, align
 from sigmasplat.fit.references import Reference
 from sigmasplat.tracking.frame_estimate import FrameEstimate
 from sigmasplat.tracking.moving.dynamic_mask import DynamicMask
@@ -74,9 +73,11 @@ class NewestFrame:
         self.seen.move(self.motion.rate(after), times)
         if self.reference is None:
             return self
-        live, T_camera_world = self.seen.shown_without(self.front).live, se3.inverse(self.T_world_camera)
-        fit = fit_pose_align(self.reference, live, T_camera_world, config)
-        if fit.agreement * fit.overlap < AS_GOOD * self.explained:
-            return replace(self, alignment=fit.alignment)
-        T_world_camera = np.asarray(se3.inverse(se3.orthonormalise(fit.T_camera_world)))
-        return replace(self, T_world_camera=T_world_camera, alignment=fit.alignment)
+        live, T_reference = self.seen.shown_without(self.front).live, self.reference.T_camera_world
+        guess = se3.inverse(self.T_world_camera) @ se3.inverse(T_reference)
+        images = self.reference.pyramid.finest(), live.finest()  # it is nearer than the coarse sizes can tell
+        found = align(*images, guess, weight_color=config.align_weight_color)
+        if found.agreement * found.overlap < AS_GOOD * self.explained:
+            return replace(self, alignment=found)
+        T_world_camera = np.asarray(se3.inverse(se3.orthonormalise(found.T_live_reference @ T_reference)))
+        return replace(self, T_world_camera=T_world_camera, alignment=found)
