@@ -23,6 +23,18 @@ CURVE_POINTS, BESIDE_S = 13, 0.01
 """Points of a curve, which goes so far beyond 0 and the measured time."""
 
 
+def aligned_pairs(source: Source, config: Config, progress: Progress = no_progress) -> list[Pair]:
+    """Return pairs of keyframes of a recording that see the same."""
+    slam = Slam(config.changed(**WITHOUT_MAP))
+    for done, frame in enumerate(source.frames_from(0), 1):
+        slam.step(frame)
+        progress(done, len(source))
+    if slam.steps:
+        completed(slam.finish_submap())
+    slam.correct_motions()
+    return slam.graph.pairs(slam.keyframe_image, slam.atlas.readings.__getitem__, MOST_PAIRS)
+
+
 def measure_times(
     source: Source, config: Config, progress: Progress = no_progress
 ) -> tuple[SensorTimes, SensorTimes, Matrix]:
@@ -31,14 +43,7 @@ def measure_times(
     Returns those for runs, which are 0 if the measured ones may be; the measured ones; and costs [3, N, 2]: of some
     values of each time, s, with the others as measured, relative to the lowest cost.
     """
-    slam = Slam(config.changed(**WITHOUT_MAP))
-    for done, frame in enumerate(source.frames_from(0), 1):
-        slam.step(frame)
-        progress(done, len(source))
-    if slam.steps:
-        completed(slam.finish_submap())
-    slam.correct_motions()
-    pairs = slam.graph.pairs(slam.keyframe_image, slam.atlas.readings.__getitem__, MOST_PAIRS)
+    pairs = aligned_pairs(source, config, progress)
     estimate, sure = completed(estimated(pairs))
     if estimate.std_s is None:
         raise SourceError(
