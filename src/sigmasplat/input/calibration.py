@@ -120,12 +120,8 @@ def resolve_calibration(
         centred = Camera(*size, settings.fx, settings.fy or settings.fx, (size[0] - 1) / 2, (size[1] - 1) / 2)
         recorded = Calibration(centred, default_units)
     units = settings.depth_scale or recorded.depth_units_per_metre
-    return replace(recorded, camera=given_intrinsics(recorded.camera, settings), depth_units_per_metre=units)
-
-
-def given_intrinsics(camera: Camera, settings: InputConfig) -> Camera:
-    """Return the camera with the intrinsics that the settings give."""
-    return replace(camera, **{key: value for key in ("fx", "fy", "cx", "cy") if (value := getattr(settings, key))})
+    given = {key: value for key in ("fx", "fy", "cx", "cy") if (value := getattr(settings, key))}
+    return replace(recorded, camera=replace(recorded.camera, **given), depth_units_per_metre=units)
 
 
 def read_json_object(path: Path) -> dict[str, Any]:

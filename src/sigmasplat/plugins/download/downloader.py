@@ -107,7 +107,7 @@ def verify(path: Path, published: str, progress: Callable[[int, int], None]) -> 
 
 def _unpack_file(public_set: PublicSet, archive: RemoteFile, path: Path, into: Path, progress: FileProgress) -> None:
     """Unpack an archive and its nested archives, or copy a plain file. A damaged archive is removed."""
-    if not is_archive(path.name):
+    if not path.name.lower().endswith((".zip", ".tgz", ".tar.gz")):
         shutil.copyfile(path, into)
         return
     likely = int(public_set.disk_ratio * path.stat().st_size)
@@ -170,11 +170,6 @@ DESKTOP_FILES = {"__MACOSX", ".DS_Store", "Thumbs.db", "desktop.ini"}
 
 class ArchiveError(DownloadError):
     """The archive is damaged or unsafe."""
-
-
-def is_archive(name: str) -> bool:
-    """Return whether a file is an archive, by its name."""
-    return name.lower().endswith((".zip", ".tgz", ".tar.gz"))
 
 
 def unpack(archive: Path, folder: Path, most_bytes: int, progress: "Progress") -> None:

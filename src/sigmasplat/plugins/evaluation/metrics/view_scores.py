@@ -78,11 +78,6 @@ class ScoredView:
         """Return which pixels have a depth reading and a rendered depth [H, W]."""
         return self.valid & (self.rendered_depth_m > 0)
 
-    @property
-    def depth_squared_error(self) -> NDArray[np.float32]:
-        """Return the squared difference of rendered depth and reading [H, W], m²; it counts where `depth_compared`."""
-        return np.asarray((self.rendered_depth_m - self.recorded_depth_m) ** 2, np.float32)
-
     def scores(self, lpips: Lpips | None = None) -> dict[str, float]:
         """Return the scores of the view.
 
@@ -270,7 +265,8 @@ class PredictionScores:
             return
         read, compared = view.valid, view.depth_compared
         self.color.append(_every_kth(np.stack([found.color[read], *view.squared_errors[read].T])))
-        self.depth.append(_every_kth(np.stack([found.reading_m2[compared], view.depth_squared_error[compared]])))
+        squares = np.asarray((view.rendered_depth_m - view.recorded_depth_m) ** 2, np.float32)
+        self.depth.append(_every_kth(np.stack([found.reading_m2[compared], squares[compared]])))
 
     def scores(self) -> dict[str, Any] | None:
         """Return the number of views, and the scores of colour and depth over all their pixels; None without views."""
