@@ -130,7 +130,8 @@ class MainLoop(MappingBackend):
 
     def _locate(self, seen: PreparedFrame) -> FrameEstimate:
         """Track a frame; if it is lost, search the whole map for it; if that fails too often, begin a new map."""
-        fit = self._track(seen)
+        with self._timer.stage("track"), self._timer.kernels_of(self.view, "track_kernels"):
+            fit = self.tracker.track(self.mapper.field, self.view, seen, seen.frame.prior)
         if self.late is not None:
             fit.T_camera_world = fit.T_camera_world @ se3.inverse(self.settle_late(self.tracker.motion))
         lost, held_back = self.tracker.lost, self._is_held_back
@@ -150,11 +151,6 @@ class MainLoop(MappingBackend):
         elif self.recovery.gives_up and usable(seen):
             self._begin_apart(estimate)
         return estimate
-
-    def _track(self, seen: PreparedFrame) -> PoseFit:
-        """Fit the frame's pose to the active submap."""
-        with self._timer.stage("track"), self._timer.kernels_of(self.view, "track_kernels"):
-            return self.tracker.track(self.mapper.field, self.view, seen, seen.frame.prior)
 
     @property
     def _is_held_back(self) -> bool:

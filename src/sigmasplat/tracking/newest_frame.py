@@ -73,7 +73,8 @@ class NewestFrame:
         self.seen.move(self.motion.rate(after), times)
         if self.reference is None:
             return self
-        live, T_reference = self.seen.shown_without(self.front).live, self.reference.T_camera_world
+        shown = self.seen.shown if self.front is None else self.seen.aside(self.front)
+        live, T_reference = shown.live, self.reference.T_camera_world
         guess = se3.inverse(self.T_world_camera) @ se3.inverse(T_reference)
         images = self.reference.pyramid.finest(), live.finest()  # it is nearer than the coarse sizes can tell
         found = align(*images, guess, weight_color=config.align_weight_color)

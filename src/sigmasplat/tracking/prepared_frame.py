@@ -70,10 +70,6 @@ class PreparedFrame:
         """Return the frame for fits of its pose, which do not use the pixels that are to be ignored."""
         return self if self.ignored is None else self.aside(None)
 
-    def shown_without(self, front: DynamicMask | None) -> "PreparedFrame":
-        """Return the frame for fits of its pose, without what is in front or ignored."""
-        return self.shown if front is None else self.aside(front)
-
     def without(self, front: DynamicMask | None) -> "PreparedFrame":
         """Return the frame without depth where something is in front: it is neither mapped nor a reference there."""
         if front is None:

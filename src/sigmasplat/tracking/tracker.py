@@ -19,7 +19,7 @@ from sigmasplat.tracking.feature_image import FeatureImage, pose_by_features
 from sigmasplat.tracking.features import Extractor
 from sigmasplat.tracking.moving.dynamic_detector import DynamicDetector, together
 from sigmasplat.tracking.moving.dynamic_mask import DynamicMask
-from sigmasplat.tracking.moving.pose_pullers import has_drawn
+from sigmasplat.tracking.moving.pose_pullers import has_drawn, is_still
 from sigmasplat.tracking.pose_prediction import CameraMotion, Given, PosePrediction, odometry, predict
 from sigmasplat.tracking.pose_validation import TrackingStatistics
 from sigmasplat.tracking.predicted_depth_fit import NOTHING_FITTED, DepthFit
@@ -141,8 +141,9 @@ class Tracker:
             return None
         shown = first if front is None else seen.aside(front)
         found = self._fit(given, shown, predicted)
-        moves = self.detector.takes_for_moving(front, self.keyframe, seen, found)
-        if moves and self._stands(found, predicted, fit.comparison):
+        # a still thing can seem to be in free space where poses or depth are wrong
+        still = front is not None and self.detector.config.find and is_still(front, self.keyframe, seen.live, found)
+        if not still and self._stands(found, predicted, fit.comparison):
             self.front = front
             return found, shown
         self.keyframe = keyframe

@@ -22,7 +22,7 @@ from sigmasplat.tracking.moving.dynamic_mask import (
     smooth,
 )
 from sigmasplat.tracking.moving.free_space import Depth, labelled, widened
-from sigmasplat.tracking.moving.pose_pullers import is_still, suspected
+from sigmasplat.tracking.moving.pose_pullers import suspected
 from sigmasplat.tracking.pose_validation import differs
 from sigmasplat.tracking.prepared_frame import PreparedFrame
 from sigmasplat.types import Matrix, ShouldStop
@@ -206,13 +206,6 @@ class DynamicDetector:
         if not (contradicted or (self.history.frames % every == 0 and differs(fit.comparison))):
             return self, iter(())
         return replace(self, looks=self.looks + 1), suspected(keyframe, seen, fit, config, contradicted)
-
-    def takes_for_moving(
-        self, front: DynamicMask | None, keyframe: Reference | None, seen: PreparedFrame, fit: PoseFit
-    ) -> bool:
-        """Return whether what is in front moves, by a fit without it: a still thing can seem to be in free space where
-        poses or depth are wrong."""
-        return front is None or not (self.config.find and is_still(front, keyframe, seen.live, fit))
 
     def renews(self, found: Comparison | None, front: DynamicMask | None) -> bool:
         """Return whether a frame with something in front becomes a keyframe: it shares too little with the newest."""
