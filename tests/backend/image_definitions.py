@@ -82,10 +82,8 @@ def resized_depth_in_numpy(depth_m: Depth, width: int, height: int) -> Depth:
     if depth_m.shape == (height, width):
         return depth_m.copy()
     nearest = nearest_depth(depth_m, width, height)
-    rows, columns = (
-        (np.arange(n, dtype=np.float64) + 0.5) * (m / n) - 0.5
-        for n, m in zip((height, width), depth_m.shape, strict=True)
-    )
+    sizes = zip((height, width), depth_m.shape, strict=True)
+    rows, columns = ((np.arange(n, dtype=np.float64) + 0.5) * (m / n) - 0.5 for n, m in sizes)
     return images.interpolated_depth(depth_m, rows, columns, nearest)
 
 
