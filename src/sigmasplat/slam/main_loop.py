@@ -9,7 +9,6 @@ from sigmasplat.data import se3
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.relative_pose import UNKNOWN_HOP, RelativePose
 from sigmasplat.data.trajectory import APART, RELOCALISED, TRACKED
-from sigmasplat.fit.pose import PoseFit
 from sigmasplat.graph.loops import Loop
 from sigmasplat.slam.mapping_backend import SLICES_PER_FRAME, MappingBackend
 from sigmasplat.slam.results import Step, StepTimer, make_step
@@ -62,10 +61,7 @@ class MainLoop(MappingBackend):
 
     def settle_late(self, after: CameraMotion) -> Matrix:
         """Fit the last frame again, if its sensor reads late, now that its motion is known; map it if it is a keyframe.
-        Returns how the coordinates of tracking change, T_new_old [4, 4].
-
-        after: the motion since.
-        """
+        Returns how the coordinates of tracking change, T_new_old [4, 4]; after: the motion since."""
         if self.late is None:
             return np.eye(4)
         late, T_tracked, self.late = self.late, self.late.T_world_camera, None
@@ -138,7 +134,9 @@ class MainLoop(MappingBackend):
         self.recovery.count(lost, self.tracker.doubtful > 0, seen)
         estimate = FrameEstimate.of(fit, lost)
         if not lost:
-            estimate.mapped = not held_back and self._is_keyframe(fit)
+            since = len(self.steps) - self.mapper.keyframes[-1].index
+            mappable = not held_back and is_mappable(fit, self.tracker, self.recovery)
+            estimate.mapped = mappable and becomes_keyframe(fit, self.tracker, since, self.config.mapping)
             if estimate.mapped:
                 estimate.alignment = hop_alignment(fit, seen.live, self.tracker)
                 if self.cuts:
@@ -155,11 +153,6 @@ class MainLoop(MappingBackend):
     @property
     def _is_held_back(self) -> bool:
         return is_held_back(len(self.steps), self.config.input.hold_every)
-
-    def _is_keyframe(self, fit: PoseFit) -> bool:
-        since = len(self.steps) - self.mapper.keyframes[-1].index
-        mappable = is_mappable(fit, self.tracker, self.recovery)
-        return mappable and becomes_keyframe(fit, self.tracker, since, self.config.mapping)
 
     def _run_pending(self) -> None:
         """Make the steps that this frame does of the pending work: of the map, and of the search for loops."""
