@@ -123,9 +123,10 @@ def test_bad_words_are_refused(given: str) -> None:
         InputConfig(calibrate=given)
 
 
-def test_times_need_alignment() -> None:
-    with pytest.raises(ConfigError, match=r"needs tracking\.method=align"):
-        Slam(settings={"input.calibrate": "0,0,0.03,0.001,0.001,0.001", "tracking.method": "adam"})
+@pytest.mark.parametrize(("name", "value"), [("tracking.method", "adam"), ("tracking.fit_depth", True)])
+def test_times_need_alignment_and_measured_depth(name: str, value: object) -> None:
+    with pytest.raises(ConfigError, match=r"needs tracking\.method=align and depth that is not predicted"):
+        Slam(settings={"input.calibrate": "0,0,0.03,0.001,0.001,0.001", name: value})
 
 
 def test_nothing_late_is_said_with_its_error() -> None:

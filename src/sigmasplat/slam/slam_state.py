@@ -177,8 +177,8 @@ class SlamState:
 
     def _new_graph(self) -> GrowingGraph:
         c, times = self.config, SensorTimes.given(self.config.input.calibrate)
-        if times.std_s and c.tracking.method != "align":
-            raise ConfigError("input.calibrate with a file needs tracking.method=align, which knows the times of rows")
+        if times.std_s and (c.tracking.method != "align" or c.tracking.fit_depth):
+            raise ConfigError("input.calibrate with a file needs tracking.method=align and depth that is not predicted")
         measures = c.input.calibrate == "auto" and c.input.sensor != RENDERED and not c.tracking.fit_depth
         return GrowingGraph(c.loops.alignments, measures, times=times)
 
