@@ -100,7 +100,7 @@ class Atlas:
         self.place_by_keyframe(se3.inverse(self.keyframe_poses.last[-1]) @ T_submap_camera)
 
     def place_again(self, T_submap_camera: Matrix) -> None:
-        """Place the newest frame again, as the keyframe that it has become."""
+        """Place the newest frame again: its pose is known better, or it has become a keyframe."""
         self.places.rows.count -= 1
         self.place_frame(T_submap_camera)
 

@@ -79,7 +79,8 @@ def moved_by_camera(T_a_b: Matrix, points: Matrix) -> Matrix:
     rigid motion between them. Its residuals are those of alignment: in pixels across, in the noise of depth along.
     """
     in_a = points @ T_a_b[:3, :3].T + T_a_b[:3, 3]
-    in_a, points = in_a[in_a[:, 2] > NEAREST_M], points[in_a[:, 2] > NEAREST_M]
+    seen = in_a[:, 2] > NEAREST_M
+    in_a, points = in_a[seen], points[seen]
     right, down, ahead = np.eye(3)
     stretched = np.eye(3), np.diag(right + down), np.outer(right, ahead), np.outer(down, ahead)
     moved = np.array([in_a @ S.T - points @ S.T @ T_a_b[:3, :3].T for S in stretched])  # [4, P, 3]

@@ -110,7 +110,7 @@ class MainLoop(MappingBackend):
         T_submap_camera = completed(self.map_keyframe(seen, found.number, T_tracked, hop))
         self.tracker.times = self.graph.times
         self.tracker.move_by(T_submap_camera @ se3.inverse(T_tracked))
-        seen.live = seen.live.read(self.graph.times.read(seen.reading))
+        seen.live = seen.live.read(self.graph.times.read(seen.reading))  # if it has just shown the times
         self.tracker.keep_keyframe(self.mapper.field, self.view, seen, T_submap_camera, found.front)
         return T_submap_camera
 

@@ -23,8 +23,7 @@ AS_GOOD = 0.99
 
 @dataclass(frozen=True, eq=False)
 class NewestFrame:
-    """The newest frame, as tracking found it. If its sensor reads late, it waits for the next one: the motion from the
-    frame before to the frame after is known five times better than the motion before alone.
+    """The newest frame, as tracking found it. If its sensor reads late, it waits until the next one shows its motion.
 
     number: of the frame; T_world_camera [4, 4] in the coordinates of tracking; motion: that led to it; mapped: whether
     it is a keyframe; connected: whether tracking found it from the keyframes before; reads_late: whether it waits;
