@@ -136,7 +136,10 @@ def test_a_foreign_folder_is_not_changed(there: str, server: FileServer, tmp_pat
     assert server.ranges == [] and (target.exists() or target.is_symlink())
 
 
-@pytest.mark.parametrize("content", [tar_gz({"../evil": b"1"}), tar_gz(FILES)[:-900], zipped({"a": b""})])
+BAD = {"outside": tar_gz({"../evil": b"1"}), "cut": tar_gz(FILES)[:-900], "zip": zipped({"a": b""})}
+
+
+@pytest.mark.parametrize("content", BAD.values(), ids=BAD)
 def test_a_bad_archive_leaves_no_files(content: bytes, server: FileServer, tmp_path: Path) -> None:
     server.files["/desk.tgz"] = content
     with pytest.raises(DownloadError, match=r"desk.tgz has been removed, run it again"):
