@@ -115,7 +115,7 @@ class Pair:
         options += [HUBER_GRAY[width], HUBER_DEPTH_RELATIVE[width] * noise, DEPTH_GATES_M[width] * scale]
         return LevelPlanes(
             r.gray[k], r.depth[k], r.weight[k], r.weight_depth[k], live.gray[k], live.depth[k],
-            [c.fx, c.fy, c.cx, c.cy], options, _noise_at(r.noise[k], width),
+            [c.fx, c.fy, c.cx, c.cy], options, _noise_at(r.noise[k], width), r.color_depth(k),
             readouts(r.readout, live.readout),
         )  # fmt: skip
 

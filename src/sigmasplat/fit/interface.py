@@ -125,8 +125,8 @@ class AlignedPose(NamedTuple):
 
 class LevelPlanes(NamedTuple):
     """One level of two images to align, and the weights of its residuals, in the layout of the kernels' `Level`; noise:
-    σ of each reference reading relative to the z² law, None: all follow it; readouts: numbers of both images
-    (`data.readout`), none if both were read at once."""
+    σ of each reference reading relative to the z² law, None: all follow it; color_depth: as of `Pyramid`, of the
+    reference; readouts: numbers of both images (`data.readout`), none if both were read at once."""
 
     reference_gray: Plane
     reference_depth: Plane
@@ -137,6 +137,7 @@ class LevelPlanes(NamedTuple):
     intrinsics: Sequence[float]
     options: Sequence[float]
     noise: Plane | None = None
+    color_depth: Plane | None = None
     readouts: Sequence[float] = ()
 
 

@@ -1,12 +1,13 @@
 """Make image pyramids for coarse-to-fine alignment."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from sigmasplat.data.camera import Camera
+from sigmasplat.data.read_at_once import depth_of_color
 from sigmasplat.data.readout import Readout
 from sigmasplat.fit.backends import fits_of
 from sigmasplat.fit.interface import DEPTH_STEP_M, ImageKernels, Plane
@@ -28,7 +29,7 @@ class Pyramid:
     scene_scale: size of the scene relative to a room (`render.scene_scale`); noise_per_m: standard deviation of depth
     readings, times z² (`render.depth_noise_per_m`); noise: σ of each reading relative to that law, None: all follow it;
     confidence: how many times as sure readings are as that law, at the distance of a wall; readout: None: all rows were
-    read at once.
+    read at once; color_depths: of `color_depth`, by width.
     """
 
     gray: list[Plane]
@@ -42,6 +43,7 @@ class Pyramid:
     noise_per_m: float = NOISE_PER_M
     confidence: float = 1.0
     readout: Readout | None = None
+    color_depths: dict[int, Plane] = field(default_factory=dict)
 
     @property
     def kernels(self) -> ImageKernels:
@@ -86,7 +88,18 @@ class Pyramid:
 
     def read(self, readout: Readout | None) -> "Pyramid":
         """Return the same images, with when their rows were read."""
-        return self if readout is self.readout else replace(self, readout=readout)
+        return self if readout is self.readout else replace(self, readout=readout, color_depths={})
+
+    def color_depth(self, k: int) -> Plane | None:
+        """Return the depth [H, W] of what the pixels of a level show in colour; None: colour and depth were read at the
+        same time."""
+        if self.readout is None:
+            return None
+        c = self.cameras[k]
+        if c.width not in self.color_depths:
+            seen_m = depth_of_color(c, self.kernels.to_host(self.depth[k]), self.readout)
+            self.color_depths[c.width] = self.kernels.beside(seen_m, self.depth[k])
+        return self.color_depths[c.width]
 
     def _sizes(self, which: slice) -> "Pyramid":
         return replace(
@@ -97,7 +110,7 @@ class Pyramid:
     def hiding(self, hidden: Any) -> "Pyramid":
         """Return the same images for comparisons and quick fits that leave out these pixels [H, W] of the finest size:
         each level has `HIDDEN_M` there."""
-        return replace(self, depth=[self._hidden(depth, hidden) for depth in self.depth])
+        return replace(self, depth=[self._hidden(depth, hidden) for depth in self.depth], color_depths={})
 
     def _hidden(self, depth: Plane, hidden: Any) -> Plane:
         """Return the depth of a level with `HIDDEN_M` at these pixels of the finest size."""
@@ -111,7 +124,7 @@ class Pyramid:
         depth = [self.kernels.beside(np.ascontiguousarray(depth_m, np.float32), self.depth[0])]
         for _ in self.cameras[1:]:
             depth.append(self.kernels.halve((None, None), depth[-1], DEPTH_STEP_M * self.scene_scale)[2])
-        return replace(self, depth=depth)
+        return replace(self, depth=depth, color_depths={})
 
     @staticmethod
     def of(

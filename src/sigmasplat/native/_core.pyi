@@ -181,6 +181,7 @@ class Level:
         intrinsics: list[float],
         options: list[float],
         noise: Array | None = None,
+        color_depth: Array | None = None,
         readouts: list[float] = ...,
     ) -> None: ...
 

@@ -38,7 +38,7 @@ struct Part { Warped warped[PART], gray[PART]; Residuals residuals[PART]; Deriva
 // Without this, most of the time is spent on waiting for memory. Beyond the end of an image a prefetch does nothing.
 constexpr int CELLS_AHEAD = 2;
 SIGMA_INLINE void fetch_ahead(const AlignLevel& L, size_t at) {
-    for (const float* plane : {L.reference_depth, L.reference_gray, L.weight_gray, L.weight_depth, L.noise})
+    for (const float* plane : {L.reference_depth, L.reference_gray, L.weight_gray, L.weight_depth, L.noise, L.color_depth})
         if (plane) __builtin_prefetch(plane + at + CELLS_AHEAD * CELL);
 }
 
@@ -65,7 +65,8 @@ template <bool TIMED> static int warp_part(const AlignLevel& L, const Motion& T,
             const vf depth = load_lanes(L.reference_depth + at, lanes), off_x = lane_index() + (float(x) - L.cx);
             const float off_y = float(y) - L.cy;
             if constexpr (TIMED) {
-                if (!warp(L, of_gray, depth, off_x, off_y, inside, gray_rows(L, times->live), part.gray[n])) continue;
+                const vf gray_depth = L.color_depth ? load_lanes(L.color_depth + at, lanes) : depth;
+                if (!warp(L, of_gray, gray_depth, off_x, off_y, inside, gray_rows(L, times->live), part.gray[n])) continue;
                 if (!warp(L, of_depth, depth, off_x, off_y, inside, depth_rows(L, times->live), part.warped[n])) continue;
                 const Mask both_seen = part.warped[n].ok = both(part.warped[n].ok, part.gray[n].ok);
                 n += any(both_seen);

@@ -3,6 +3,7 @@
 struct AlignPlanes {                       // planes of width × height, contiguous; weights and noise may be null
     const float *reference_gray, *reference_depth, *weight_gray, *weight_depth, *live_gray, *live_depth;
     const float* noise;                    // factor on the Huber width of depth: σ of a reading over that of the z² law
+    const float* color_depth;              // reference depth where colour was read; null: it is read at the time of depth
 };
 struct AlignPinhole { int width, height; float fx, fy, cx, cy; };
 struct AlignLevel : AlignPlanes, AlignPinhole {};

@@ -40,16 +40,19 @@ SIGMA_INLINE Motion motion_of(const double* T) {
     return m;
 }
 
-// The motion from a reference row that was read `late_s` after its image's time, to first order: T exp(late_s · rate).
+// The motion from a reference row that was read `late_s` after its image's time, to second order: T exp(late_s · rate).
 SIGMA_INLINE Motion motion_of_row(const Motion& T, const float* rate, float late_s) {
-    const float *R = T.R, *v = rate, *w = rate + 3;
-    Motion m;
+    const float *v = rate, *w = rate + 3;
+    Motion m = T;
     for (int i = 0; i < 3; i++) {
-        const float a = R[3 * i], b = R[3 * i + 1], c = R[3 * i + 2];
-        m.R[3 * i] = a + late_s * (b * w[2] - c * w[1]);
-        m.R[3 * i + 1] = b + late_s * (c * w[0] - a * w[2]);
-        m.R[3 * i + 2] = c + late_s * (a * w[1] - b * w[0]);
-        m.t[i] = T.t[i] + late_s * (a * v[0] + b * v[1] + c * v[2]);
+        float a = T.R[3 * i], b = T.R[3 * i + 1], c = T.R[3 * i + 2];
+        for (float share : {late_s, 0.5f * late_s * late_s}) {
+            m.t[i] += share * (a * v[0] + b * v[1] + c * v[2]);
+            const float x = b * w[2] - c * w[1], y = c * w[0] - a * w[2], z = a * w[1] - b * w[0];
+            m.R[3 * i] += share * (a = x);
+            m.R[3 * i + 1] += share * (b = y);
+            m.R[3 * i + 2] += share * (c = z);
+        }
     }
     return m;
 }
@@ -66,11 +69,14 @@ struct RowByRow {
     float first_s, rows_s, fy, cy;         // when the first row is read; from it to the last, over the height
     void operator()(vf& x, vf& y, vf& z) const {
         const float *v = rate, *w = rate + 3;
-        const vf row = fy * (y / max(z, splat(0.05f))) + cy, late_s = fma(row, splat(rows_s), splat(first_s));
+        const vf x0 = x, y0 = y, z0 = z;
         const vf dx = v[0] + (w[1] * z - w[2] * y), dy = v[1] + (w[2] * x - w[0] * z), dz = v[2] + (w[0] * y - w[1] * x);
-        x = x - late_s * dx;
-        y = y - late_s * dy;
-        z = z - late_s * dz;
+        for (int round = 0; round < 2; round++) {                  // the row is another one when it is read
+            const vf row = fy * (y / max(z, splat(0.05f))) + cy, late_s = fma(row, splat(rows_s), splat(first_s)), half = 0.5f * late_s;
+            x = x0 - late_s * (dx - half * (w[1] * dz - w[2] * dy));    // to second order
+            y = y0 - late_s * (dy - half * (w[2] * dx - w[0] * dz));
+            z = z0 - late_s * (dz - half * (w[0] * dy - w[1] * dx));
+        }
     }
 };
 SIGMA_INLINE RowByRow depth_rows(const AlignPinhole& L, const Readout& r) {

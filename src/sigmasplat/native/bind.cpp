@@ -67,21 +67,21 @@ struct Level {
     ConstFloats live_gray, live_depth;
     std::vector<float> intrinsics;
     AlignOptions options;
-    Maybe<ConstFloats> noise;
+    Maybe<ConstFloats> noise, color_depth;
     std::optional<AlignReadouts> readouts;
 
     Level(ConstFloats rg, ConstFloats rd, Maybe<ConstFloats> wg, Maybe<ConstFloats> wd, ConstFloats lg, ConstFloats ld, std::vector<float> camera, std::vector<float> o,
-          Maybe<ConstFloats> noise_factor, const std::vector<float>& read)
-        : reference_gray(rg), reference_depth(rd), weight_gray(wg), weight_depth(wd), live_gray(lg), live_depth(ld), intrinsics(camera), noise(noise_factor), readouts(readouts_of(read)) {
+          Maybe<ConstFloats> noise_factor, Maybe<ConstFloats> cd, const std::vector<float>& read)
+        : reference_gray(rg), reference_depth(rd), weight_gray(wg), weight_depth(wd), live_gray(lg), live_depth(ld), intrinsics(camera), noise(noise_factor), color_depth(cd), readouts(readouts_of(read)) {
         need(camera.size() == 4 && o.size() == 5, "a level has 4 intrinsics and 5 options");
         need(rg.ndim() == 2 && rd.size() == rg.size() && lg.size() == rg.size() && ld.size() == rg.size()
-             && (!wg || wg->size() == rg.size()) && (!wd || wd->size() == rg.size()) && (!noise || noise->size() == rg.size()), "the planes of a level are of one size");
+             && (!wg || wg->size() == rg.size()) && (!wd || wd->size() == rg.size()) && (!noise || noise->size() == rg.size()) && (!cd || cd->size() == rg.size()), "the planes of a level are of one size");
         options = {o[0], o[1], o[2], o[3], o[4]};
     }
     const AlignReadouts* read() const { return readouts ? &*readouts : nullptr; }
     AlignLevel planes() const {
         return {{reference_gray.data(), reference_depth.data(), weight_gray ? weight_gray->data() : nullptr, weight_depth ? weight_depth->data() : nullptr,
-                 live_gray.data(), live_depth.data(), noise ? noise->data() : nullptr},
+                 live_gray.data(), live_depth.data(), noise ? noise->data() : nullptr, color_depth ? color_depth->data() : nullptr},
                 {int(reference_gray.shape(1)), int(reference_gray.shape(0)), intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]}};
     }
 };
@@ -306,9 +306,9 @@ NB_MODULE(_core, m) {
         mesh_depth({u.data(), v.data(), z.data(), faces.data(), faces.shape(0)}, width, height, near_m, depth.data(), face.data());
     });
     nb::class_<Level>(m, "Level")
-        .def(nb::init<ConstFloats, ConstFloats, Maybe<ConstFloats>, Maybe<ConstFloats>, ConstFloats, ConstFloats, std::vector<float>, std::vector<float>, Maybe<ConstFloats>, std::vector<float>>(),
+        .def(nb::init<ConstFloats, ConstFloats, Maybe<ConstFloats>, Maybe<ConstFloats>, ConstFloats, ConstFloats, std::vector<float>, std::vector<float>, Maybe<ConstFloats>, Maybe<ConstFloats>, std::vector<float>>(),
              nb::arg("reference_gray"), nb::arg("reference_depth"), nb::arg("weight_gray").none(), nb::arg("weight_depth").none(), nb::arg("live_gray"),
-             nb::arg("live_depth"), nb::arg("intrinsics"), nb::arg("options"), nb::arg("noise").none() = nb::none(), nb::arg("readouts") = std::vector<float>());
+             nb::arg("live_depth"), nb::arg("intrinsics"), nb::arg("options"), nb::arg("noise").none() = nb::none(), nb::arg("color_depth").none() = nb::none(), nb::arg("readouts") = std::vector<float>());
     m.def("align_step", [](const Level& level, Doubles T, Doubles H, Doubles b, Doubles S, Doubles sums) {
         need(T.size() >= 12 && H.size() == 21 && b.size() == 6 && S.size() == 21 && sums.size() == 5, "align_step: wrong sizes");
         const AlignLevel planes = level.planes();

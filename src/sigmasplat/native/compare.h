@@ -97,11 +97,12 @@ static void judge(Point* points, int64_t count, int64_t comparable, int64_t live
     memcpy(found, values, sizeof values);
 }
 
-// Move a position in a camera by its motion in `late_s`, to first order.
+// Move a position in a camera by its motion in `late_s`, to second order.
 struct Position { double x, y, z; };
 SIGMA_INLINE Position moved(const Position& p, const float* rate, double late_s) {
     const float *v = rate, *w = rate + 3;
-    return {p.x + late_s * (v[0] + w[1] * p.z - w[2] * p.y), p.y + late_s * (v[1] + w[2] * p.x - w[0] * p.z), p.z + late_s * (v[2] + w[0] * p.y - w[1] * p.x)};
+    const double x = v[0] + w[1] * p.z - w[2] * p.y, y = v[1] + w[2] * p.x - w[0] * p.z, z = v[2] + w[0] * p.y - w[1] * p.x, half = 0.5 * late_s;
+    return {p.x + late_s * (x + half * (w[1] * z - w[2] * y)), p.y + late_s * (y + half * (w[2] * x - w[0] * z)), p.z + late_s * (z + half * (w[0] * y - w[1] * x))};
 }
 SIGMA_INLINE Position transformed(const double* T, const Position& p) {
     return {T[0] * p.x + T[1] * p.y + T[2] * p.z + T[3], T[4] * p.x + T[5] * p.y + T[6] * p.z + T[7], T[8] * p.x + T[9] * p.y + T[10] * p.z + T[11]};
@@ -124,7 +125,8 @@ SIGMA_INLINE Position read_late(const ComparedImages& c, const double* T, const 
         return (depth ? image.late_s : 0.f) + (depth ? image.depth_rows_s : image.gray_rows_s) * ((row + 0.5) / c.height - 0.5);
     };
     const Position live = transformed(T, moved(p, r.reference.rate, late_s(r.reference, v)));
-    return moved(live, r.live.rate, -late_s(r.live, projected(c, live).row));
+    const Position shown = moved(live, r.live.rate, -late_s(r.live, projected(c, live).row));
+    return moved(live, r.live.rate, -late_s(r.live, projected(c, shown).row));    // the row is another one when it is read
 }
 
 static bool compare(ComparedImages c, const double* T, const AlignReadouts* readouts, CompareRules o, double* found) {

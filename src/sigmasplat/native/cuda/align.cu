@@ -100,7 +100,7 @@ inline void store_cell(const AlignLevel& L, const AlignOptions& o, const AlignRe
         const Motion motion = motion_of(T);
         const float depth = L.reference_depth[at], off_x = float(x) - L.cx, off_y = float(y) - L.cy;
         const bool used = !times ? warp(L, motion, depth, off_x, off_y, true, AtOnce{}, w)
-            : warp(L, motion_of_gray_row(L, motion, times->reference, y), depth, off_x, off_y, true, gray_rows(L, times->live), gray)
+            : warp(L, motion_of_gray_row(L, motion, times->reference, y), L.color_depth ? L.color_depth[at] : depth, off_x, off_y, true, gray_rows(L, times->live), gray)
                 && warp(L, motion_of_depth_row(L, motion, times->reference, y), depth, off_x, off_y, true, depth_rows(L, times->live), w);
         if (used) {
             const LivePlanes live = {L.live_gray, L.live_depth, L.width};

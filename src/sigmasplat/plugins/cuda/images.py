@@ -62,9 +62,10 @@ class CudaLevel:
     def __init__(
         self, reference_gray: Tensor, reference_depth: Tensor, weight_gray: Tensor | None, weight_depth: Tensor | None,
         live_gray: Tensor, live_depth: Tensor, intrinsics: Sequence[float], options: Sequence[float],
-        noise: Tensor | None = None, readouts: Sequence[float] = (),
+        noise: Tensor | None = None, color_depth: Tensor | None = None, readouts: Sequence[float] = (),
     ) -> None:  # fmt: skip
-        self.planes = (reference_gray, reference_depth, weight_gray, weight_depth, live_gray, live_depth, noise)
+        live = live_gray, live_depth
+        self.planes = (reference_gray, reference_depth, weight_gray, weight_depth, *live, noise, color_depth)
         given = [plane for plane in self.planes if plane is not None]
         if len({(p.shape, p.dtype, p.device) for p in given}) > 1 or reference_gray.dtype != torch.float32:
             raise ValueError("the planes of a level are float32, of one size, on one device")
