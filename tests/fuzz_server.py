@@ -80,14 +80,14 @@ def _lines(path: Path) -> list[str]:
 
 
 def _show_once() -> None:
-    """Make `view` end when it has read a run, as with Ctrl-C."""
+    """Make `view` end when it has read a run, before it waits for a browser."""
     from sigmasplat.plugins.viewer import snapshot_sources
 
     read = snapshot_sources.finished_snapshot
 
     def read_once(run: Any) -> None:
         read(run)
-        raise KeyboardInterrupt
+        sys.exit(0)  # Ctrl-C would be 130: nothing is shown yet
 
     snapshot_sources.finished_snapshot = read_once
 
