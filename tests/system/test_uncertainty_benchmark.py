@@ -52,6 +52,7 @@ from sigmasplat.plugins.evaluation.metrics.uncertainty import sparsification
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.render import FieldRenderer, reference
 from sigmasplat.render.backend import make_view
+from sigmasplat.run.scene import open_scene
 from small_room import frame_at, walk
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
@@ -185,7 +186,8 @@ def quick_job(seed: int = 0) -> Job:
 @pytest.fixture(scope="module")
 def run() -> FinishedRun:
     job = quick_job()
-    return run_slam(job.config, open_source(job.path, job.config.input))
+    source, config = open_scene(job.path, job.config, job.given)
+    return run_slam(config, source)
 
 
 def test_scored_views_are_not_in_the_map(run: FinishedRun) -> None:
@@ -227,7 +229,7 @@ def test_the_benchmark_writes_scores_tables_and_pictures(
     run: FinishedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def finished(config: Config, *_: object) -> FinishedRun:
-        assert config == quick_job().config
+        assert config == run.config
         return run
 
     monkeypatch.setattr(uncertainty, "run_slam", finished)
