@@ -1,5 +1,6 @@
 """A loss term that a device's kernels do not have is computed by autograd beside them; it is never dropped."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -11,6 +12,7 @@ from paper_settings import MappingConfig
 from sigmasplat import config as settings
 from sigmasplat.data import se3
 from sigmasplat.data.field import GaussianField
+from sigmasplat.errors import ConfigError
 from sigmasplat.fit import losses
 from sigmasplat.fit.backends import step_for
 from sigmasplat.fit.field import fit_field, loss_weights
@@ -19,7 +21,7 @@ from sigmasplat.render.reference import ReferenceView
 from sigmasplat.render.view import View
 from splat_fields import OPTIONS, params_of, view_on
 from splat_fits import target_of
-from splat_scenes import WIDE, scene
+from splat_scenes import WIDE, assert_same_vector, scene
 
 OWN = "darkness"
 
@@ -30,6 +32,7 @@ class OwnMapping(settings.MappingConfig):
 
     lr_colors: ClassVar[float] = 0.02
     weight_darkness: float = 0.0
+    weight_of_map: float = 0.0
 
 
 def darkness(color: Tensor, valid: Tensor) -> Tensor:
@@ -70,3 +73,54 @@ def test_a_fit_descends_a_term_of_ones_own(kernels: str, monkeypatch: pytest.Mon
         fit = fit_field(field, view, [[keyframe]] * 20, config, degree=degree)
         brightness[degree] = float(field.colors.mean())
         assert fit.losses[-1] < fit.losses[0] and brightness[degree] > float(params_of(s)[:, 11:14].mean()) + 0.02
+
+
+OF_MAPS: dict[str, Callable[..., Tensor]] = {
+    "color": lambda color, color_target, valid: losses.mean_over((color - color_target).square(), valid),
+    "depth": lambda depth, depth_target, valid: losses.mean_over((depth - depth_target).square(), valid),
+    "alpha": lambda alpha, valid: losses.mean_over(1.0 - alpha, valid),
+    "variance": lambda variance, valid: losses.mean_over(variance, valid),
+    "moment": lambda moment, valid: losses.mean_over((1.0 + moment).log(), valid),
+    "median_depth": lambda median_depth, valid: losses.mean_over((1.0 + median_depth).log(), valid),
+    "scales": lambda scales: scales.square().sum(1).mean(),
+}  # fmt: skip
+"""A term of one's own for each map, beside which no built-in term takes that map."""
+
+
+@pytest.mark.parametrize("degree", [0, 1])
+@pytest.mark.parametrize("name", OF_MAPS)
+def test_a_term_of_ones_own_can_take_every_map(
+    kernels: str, name: str, degree: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Three steps on the device's kernels and by the definition change the splats alike."""
+    monkeypatch.setitem(losses.TERMS, "of_map", OF_MAPS[name])
+    s, found = scene("random", 60), []
+    for weight, view in (
+        (1.0, view_on(kernels, WIDE)),
+        (1.0, ReferenceView(WIDE, OPTIONS)),
+        (0.0, ReferenceView(WIDE, OPTIONS)),
+    ):
+        config = OwnMapping(weight_l1=0.1, weight_mean_depth=0.0, weight_of_map=weight)
+        field, target = GaussianField(params_of(s)), target_of(WIDE, (view.alpha.shape[0], view.alpha.shape[1]))
+        keyframe = Keyframe(0, target, se3.inverse(s.T_camera_world.double().numpy()))
+        fit = fit_field(field, view, [[keyframe]] * 3, config, degree=degree)
+        found.append((fit.losses, field.moment1))
+    (got, moments), (want, want_moments), (without, _) = found
+    assert got == pytest.approx(want, rel=2e-3) and abs(want[0] - without[0]) > 1e-3
+    assert_same_vector(moments, want_moments, 2e-2, name)
+
+
+def test_a_term_of_unknown_maps_is_refused_by_name() -> None:
+    def bumpy(normal: Tensor, valid: Tensor) -> Tensor:
+        return losses.mean_over(normal, valid)
+
+    def mixed(scales: Tensor, depth: Tensor) -> Tensor:
+        return scales.mean() * depth.mean()
+
+    for function, message in (
+        (bumpy, "loss term 'bumpy' takes normal; known: alpha, "),
+        (mixed, "takes scales; .* or scales alone"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            losses.term(function)
+        assert function.__name__ not in losses.TERMS

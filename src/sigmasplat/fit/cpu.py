@@ -23,7 +23,7 @@ from sigmasplat.fit.interface import (
     ReferenceMaps,
     Weights,
 )
-from sigmasplat.fit.losses import PIXEL_TERMS, SHAPE_TERMS, kernel_weights, pixel_weights
+from sigmasplat.fit.losses import PIXEL_TERMS, SHAPE_TERMS, kernel_weights, pixel_weights, take
 from sigmasplat.fit.mapping_step import TorchStep, ViewDependentStep
 from sigmasplat.fit.target import Image, Target, gray_of
 from sigmasplat.fit.tracking_loss import ALIGN_ALPHA, tracking_params
@@ -122,7 +122,7 @@ def step_rows(
     """Propagate the view's gradient planes to the splats in view and step them, and their harmonics if given, in one
     pass that stores no gradient rows in memory. Returns what `MappingStep.splats` returns."""
     twist, (g_moment, median_id, g_median_depth) = np.zeros(6), view.depth_gradients()
-    g_alpha = view.g_alpha if weights.get("mean_depth") else None
+    g_alpha = view.g_alpha if take(weights, "alpha") else None
     cost = view.raster.step(
         field.params, field.moment1, field.moment2, field.last_step, view.g_sums, g_moment,
         g_alpha, median_id, g_median_depth, rates.per_column.numpy(), BETA1, rates.beta2, EPSILON, field.steps,
@@ -174,8 +174,8 @@ class CompiledViewDependentStep(ViewDependentStep):
     view: CpuView
 
     def forward(self, field: GaussianField, T_camera_world: Matrix, target: Target, weights: Weights) -> None:
-        reference = target.depth_image if weights.get("moment") else None
-        harmonics, layers = self._harmonics(field, 0.0), bool(weights.get("median_depth"))
+        reference = target.depth_image if take(weights, "moment") else None
+        harmonics, layers = self._harmonics(field, 0.0), take(weights, "median_depth")
         self.view.forward(field.params, T_camera_world, reference, layers=layers, harmonics=harmonics)
 
     def splats(

@@ -1,10 +1,10 @@
 """Define the loss terms: each is a function of the maps that its parameters name.
 
 `@term` registers a function as a term. The function's name is the term's name, to which a weight is given; its
-parameters are the maps it takes. `total` passes each term its maps by name, so a new term needs one function and one
-weight.
+parameters without a default are the maps it takes: `scales` alone, or maps of the image. `total` passes each term its
+maps by name, so a new term needs one function and one weight.
 
-Maps: color, color_target [H, W, 3] in [0, 1]; depth D̂ = Σwz, depth_target [H, W] m; alpha A = Σw [H, W];
+Maps of the image: color, color_target [H, W, 3] in [0, 1]; depth D̂ = Σwz, depth_target [H, W] m; alpha A = Σw [H, W];
 variance [H, W, 3] (V, VarSplat §1); moment [H, W] m² (U, CG-SLAM eq. 10); median_depth [H, W] m, 0 = none (CG-SLAM
 eq. 8); valid [H, W] bool, pixels with a depth reading; scales [N, 3] m.
 
@@ -12,8 +12,9 @@ Every image term is a mean over valid pixels (and channels), except SSIM, which 
 images. Without valid pixels a term is 0 with zero gradient, never NaN.
 """
 
-import inspect
 from collections.abc import Callable, Mapping, Sequence
+from functools import cache
+from inspect import signature
 
 import numpy as np
 import torch
@@ -24,6 +25,9 @@ from torch.nn.functional import conv2d
 from sigmasplat.errors import ConfigError
 
 TERMS: dict[str, Callable[..., Tensor]] = {}
+IMAGE_MAPS = frozenset(
+    ("color", "color_target", "depth", "depth_target", "alpha", "variance", "moment", "median_depth", "valid")
+)
 NLL_EPS = 1e-6
 COVERED = 0.5
 """Above this alpha a pixel has a depth: D̂/A."""
@@ -31,9 +35,32 @@ SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
 
 
 def term(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
-    """Register a loss term under its function's name."""
+    """Register a loss term under its function's name. Raises ConfigError if it takes a map that does not exist."""
+    maps = _maps_of(function)
+    if maps != {"scales"} and (unknown := sorted(maps - IMAGE_MAPS)):
+        known = ", ".join(sorted(IMAGE_MAPS))
+        raise ConfigError(
+            f"loss term {function.__name__!r} takes {', '.join(unknown)}; known: {known}, or scales alone"
+        )
     TERMS[function.__name__] = function
     return function
+
+
+@cache
+def _maps_of(function: Callable[..., Tensor]) -> frozenset[str]:
+    return frozenset(name for name, given in signature(function).parameters.items() if given.default is given.empty)
+
+
+def maps_of(name: str) -> frozenset[str]:
+    """Return the names of the maps that a term takes. Raises ConfigError if there is no such term."""
+    if name not in TERMS:
+        raise ConfigError(f"unknown loss term {name!r} (known: {', '.join(TERMS)})")
+    return _maps_of(TERMS[name])
+
+
+def take(weights: Mapping[str, float], map_name: str) -> bool:
+    """Return whether a term of nonzero weight takes this map."""
+    return any(weight and map_name in maps_of(name) for name, weight in weights.items())
 
 
 def total(weights: Mapping[str, float], maps: Mapping[str, Tensor]) -> Tensor:
@@ -43,12 +70,9 @@ def total(weights: Mapping[str, float], maps: Mapping[str, Tensor]) -> Tensor:
     """
     loss = torch.zeros(())
     for name, weight in weights.items():
-        if name not in TERMS:
-            raise ConfigError(f"unknown loss term {name!r} (known: {', '.join(TERMS)})")
+        taken = maps_of(name)
         if weight != 0.0:
-            takes = inspect.signature(TERMS[name]).parameters
-            given = {m: maps[m] for m, taken in takes.items() if m in maps or taken.default is taken.empty}
-            loss = loss + weight * TERMS[name](**given)
+            loss = loss + weight * TERMS[name](**{m: maps[m] for m in taken})
     return loss
 
 

@@ -12,7 +12,7 @@ from sigmasplat.errors import ConfigError
 from sigmasplat.fit import losses
 from sigmasplat.fit.adam import ROWS_AT_ONCE, Rates, adam_rows, adam_step
 from sigmasplat.fit.interface import Accumulator, MappingStep, Twist, Weights
-from sigmasplat.fit.losses import SHAPE_TERMS
+from sigmasplat.fit.losses import maps_of, take
 from sigmasplat.fit.target import Target
 from sigmasplat.render.kernels import variance_of
 from sigmasplat.render.view import View
@@ -21,24 +21,33 @@ from sigmasplat.types import Matrix
 
 def render_for(view: View, params: Tensor, T_camera_world: Matrix, target: Target, weights: Weights) -> None:
     """Render rows into the view's planes, with the outputs that terms with a nonzero weight need."""
-    reference = target.depth_image if weights.get("moment") else None
-    view.forward(params, T_camera_world, reference, layers=bool(weights.get("median_depth")))
+    reference = target.depth_image if take(weights, "moment") else None
+    view.forward(params, T_camera_world, reference, layers=take(weights, "median_depth"))
 
 
 def shape_gradient(log_scales: Tensor, weights: Weights, of_all: float, of_visible: float) -> tuple[Tensor, float]:
     """Return the gradient of the weighted shape terms with respect to the log scales [n, 3] of some splats, and the
     cost.
 
-    of_all, of_visible: the number of these splats relative to all splats and to those in view; each term is a mean over
-    one of the two.
+    of_all, of_visible: the number of these splats relative to all splats, over which `isotropy` is a mean, and to those
+    in view, over which the other terms are.
     """
-    leaf, shares = log_scales.clone().requires_grad_(), dict(zip(SHAPE_TERMS, (of_all, of_visible), strict=True))
-    cost = losses.total(
-        {name: weights.get(name, 0.0) * share for name, share in shares.items()}, {"scales": leaf.exp()}
-    )
+    leaf, of_scales = log_scales.clone().requires_grad_(), {n: x for n, x in weights.items() if "scales" in maps_of(n)}
+    shares = {name: weight * (of_all if name == "isotropy" else of_visible) for name, weight in of_scales.items()}
+    cost = losses.total(shares, {"scales": leaf.exp()})
     if not cost.requires_grad:
         return torch.zeros_like(log_scales), 0.0
     return torch.autograd.grad(cost, leaf)[0], float(cost.detach())
+
+
+def planes_beside_sums(view: View, weights: Weights) -> dict[str, tuple[Tensor, Tensor]]:
+    """Return the planes that terms take beside the sums, by the names of the maps, and those of their gradients."""
+    planes = {
+        "moment": (view.moment, view.g_moment),
+        "alpha": (view.alpha, view.g_alpha),
+        "median_depth": (view.layers.median_depth, view.g_median_depth),
+    }
+    return {name: pair for name, pair in planes.items() if take(weights, name)}
 
 
 def image_gradients(view: View, target: Target, weights: Weights) -> tuple[Tensor, list[tuple[Tensor, Tensor]]]:
@@ -47,14 +56,9 @@ def image_gradients(view: View, target: Target, weights: Weights) -> tuple[Tenso
     Terms of the splats are skipped, and so are terms of the variance if the view has none.
     """
     v, (h, w) = view, target.depth_image.shape
-    used = {n: x for n, x in weights.items() if n not in SHAPE_TERMS and (len(v.sums) >= 7 or "nll" not in n)}
-    planes = {"sums": (v.sums, v.g_sums)}
-    if used.get("moment"):
-        planes["moment"] = v.moment, v.g_moment
-    if used.get("mean_depth"):
-        planes["alpha"] = v.alpha, v.g_alpha
-    if used.get("median_depth"):
-        planes["median_depth"] = v.layers.median_depth, v.g_median_depth
+    absent = {"scales"} if len(v.sums) >= 7 else {"scales", "variance"}
+    used = {name: weight for name, weight in weights.items() if not absent & maps_of(name)}
+    planes = {"sums": (v.sums, v.g_sums)} | planes_beside_sums(v, used)
     leaves = {name: values.detach().clone().requires_grad_() for name, (values, _) in planes.items()}
     sums = leaves["sums"][:, :h, :w].movedim(0, -1)
     maps: dict[str, Tensor] = {name: leaf[:h, :w] for name, leaf in leaves.items() if name != "sums"} | {
@@ -102,7 +106,7 @@ class TorchStep:
 
     def __init__(self, view: View) -> None:
         self.view = view
-        view.g_alpha.zero_()  # only the term of mean depth writes it
+        view.g_alpha.zero_()  # only terms of alpha write it
 
     def forward(self, field: GaussianField, T_camera_world: Matrix, target: Target, weights: Weights) -> None:
         render_for(self.view, field.params, T_camera_world, target, weights)
@@ -134,8 +138,11 @@ class OwnTermsStep:
         )  # fmt: skip
 
     def images(self, target: Target, weights: Weights) -> float | Tensor:
+        of_own = {n: w for n, w in weights.items() if n in self._own}
+        for _, gradient in planes_beside_sums(self.view, of_own).values():
+            gradient.zero_()  # the kernels write it for their own terms only
         fused = self._fused.images(target, {n: w for n, w in weights.items() if n not in self._own})
-        own, gradients = image_gradients(self.view, target, {n: w for n, w in weights.items() if n in self._own})
+        own, gradients = image_gradients(self.view, target, of_own)
         for plane, gradient in gradients:
             plane.add_(gradient)
         return fused + own

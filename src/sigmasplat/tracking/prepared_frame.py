@@ -16,6 +16,8 @@ from sigmasplat.data.read_at_once import read_at_once
 from sigmasplat.data.readout import AT_ONCE, Readout, SensorTimes
 from sigmasplat.data.submap import Picture
 from sigmasplat.errors import SourceError
+from sigmasplat.fit.field import loss_weights
+from sigmasplat.fit.losses import take
 from sigmasplat.fit.pyramid import HIDDEN_M, Pyramid
 from sigmasplat.fit.references import Reference, keyframe_reference, live_image, picture_images
 from sigmasplat.fit.target import Target
@@ -121,8 +123,7 @@ class PreparedFrame:
 def view_of(camera: Camera, config: Config) -> View:
     """Make the view for working images of a camera, with planes for σ² if the run learns it or weighs by it, and with
     the noise of readings if alignment uses it."""
-    mapping, tracking = config.mapping, config.tracking
-    learned = bool(mapping.weight_nll_color or mapping.weight_nll_depth)
+    tracking, learned = config.tracking, take(loss_weights(config.mapping), "variance")
     read = tracking.uncertainty and tracking.align_depth_by == "V"
     view = make_view(config.backend, camera, config.render, variance=learned or read)
     view.sensor = sensor_model(config.input.sensor) if tracking.verify else None
