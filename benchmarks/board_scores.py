@@ -17,9 +17,9 @@ from sigmasplat.errors import SigmaSplatError, SourceError
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.evaluation.metrics.image import depth_l1, psnr
 from sigmasplat.plugins.evaluation.metrics.trajectory import associate, ate
-from sigmasplat.plugins.evaluation.metrics.view_scores import scored_view
 from sigmasplat.plugins.evaluation.path_scores import WINDOW_FRAMES, score_pose_covariance, score_states
 from sigmasplat.plugins.evaluation.run_views import working_frame
+from sigmasplat.plugins.evaluation.view_scores import scored_view
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.render import FieldRenderer
 from sigmasplat.run_folder.frames import RunFrames

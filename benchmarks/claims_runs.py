@@ -22,7 +22,7 @@ from sigmasplat.input.source import Source
 from sigmasplat.plugins.evaluation.metrics.reconstruction import score_splats
 from sigmasplat.plugins.evaluation.metrics.trajectory import align_rigid, associate, score_path
 from sigmasplat.plugins.evaluation.metrics.uncertainty import spearman
-from sigmasplat.plugins.evaluation.metrics.view_scores import ScoredView, sample_pixels, score_uncertainty
+from sigmasplat.plugins.evaluation.view_scores import ScoredView, sample_pixels, score_uncertainty
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.system.slam import Slam
 

@@ -32,7 +32,7 @@ from sigmasplat.data.mesh import Mesh
 from sigmasplat.data.trajectory import evenly_spread
 from sigmasplat.errors import SigmaSplatError, SourceError
 from sigmasplat.input.source import Source
-from sigmasplat.plugins.evaluation.metrics import view_scores
+from sigmasplat.plugins.evaluation import view_scores
 from sigmasplat.plugins.evaluation.reconstruct import FusionInput
 from sigmasplat.plugins.evaluation.run_views import working_frame
 from sigmasplat.plugins.outputs.formats import PLUGIN, ExportSource, choose

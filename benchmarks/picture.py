@@ -18,7 +18,7 @@ import tyro
 
 from sigmasplat.data import se3
 from sigmasplat.errors import SigmaSplatError
-from sigmasplat.plugins.evaluation.metrics.view_scores import scored_view
+from sigmasplat.plugins.evaluation.view_scores import scored_view
 from sigmasplat.plugins.outputs.drawing.view_panels import BACKGROUND, ViewPanel, draw_view_strip, view_panels
 from sigmasplat.plugins.outputs.run_reader import RunReader
 from sigmasplat.plugins.outputs.video import orbit_view

@@ -31,7 +31,7 @@ from sigmasplat.errors import ConfigError
 from sigmasplat.final.refinement import KeyframeReader
 from sigmasplat.final.uncertainty import map_uncertainty
 from sigmasplat.input.source import Source
-from sigmasplat.plugins.evaluation.metrics.view_scores import COVERED_ALPHA
+from sigmasplat.plugins.evaluation.view_scores import COVERED_ALPHA
 from sigmasplat.render import FieldRenderer
 from sigmasplat.render.backend import make_view
 from sigmasplat.types import Matrix, Progress, no_progress

@@ -20,7 +20,7 @@ from sigmasplat.plugins.evaluation.metrics.uncertainty import (
     spearman,
     z_scores,
 )
-from sigmasplat.plugins.evaluation.metrics.view_scores import COVERED_ALPHA
+from sigmasplat.plugins.evaluation.view_scores import COVERED_ALPHA
 from sigmasplat.plugins.outputs.drawing.plot import ACCENT, BLUE, FAINT, GREEN, PURPLE, Chart, Curve
 
 Arrays = Mapping[str, NDArray[np.float32]]

@@ -13,7 +13,7 @@ from splat_statistics import MapFacts, on_host
 from torch import Tensor
 
 from sigmasplat.data.camera import Camera
-from sigmasplat.plugins.evaluation.metrics.view_scores import COVERED_ALPHA
+from sigmasplat.plugins.evaluation.view_scores import COVERED_ALPHA
 from sigmasplat.render import FieldRenderer, Render
 from sigmasplat.types import Matrix
 from sigmasplat.uncertainty.predictive import Predicted, predict

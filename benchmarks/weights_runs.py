@@ -20,7 +20,7 @@ from sigmasplat.graph.localisations import differs
 from sigmasplat.graph.registration import Registrar
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.evaluation.metrics.trajectory import associate, score_path
-from sigmasplat.plugins.evaluation.metrics.view_scores import ScoredView, scored_view
+from sigmasplat.plugins.evaluation.view_scores import ScoredView, scored_view
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.render import FieldRenderer
 from sigmasplat.system.slam import Slam

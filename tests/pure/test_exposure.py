@@ -16,7 +16,7 @@ from sigmasplat.final.stores import RefinedStore
 from sigmasplat.fit.pose import fit_exposure
 from sigmasplat.fit.target import Target
 from sigmasplat.plugins.evaluation.metrics.image import psnr
-from sigmasplat.plugins.evaluation.metrics.view_scores import scored_view
+from sigmasplat.plugins.evaluation.view_scores import scored_view
 from sigmasplat.render import render
 from sigmasplat.render.reference import ReferenceView
 from sigmasplat.types import Matrix

@@ -21,6 +21,7 @@ FLOOR = {name: number for number, names in enumerate(FLOORS) for name in names}
 BLIND = (
     "plugins/evaluation/metrics",
     "plugins/evaluation/report",
+    "plugins/evaluation/view_scores.py",
     "plugins/outputs/drawing",
     "plugins/outputs/floorplan",
     "plugins/outputs/mesh_files.py",

@@ -10,11 +10,11 @@ import pytest
 from PIL import Image, ImageFont
 
 from sigmasplat.data.trajectory import Trajectory
-from sigmasplat.plugins.evaluation.metrics.view_scores import PredictedErrors, ScoredView
 from sigmasplat.plugins.evaluation.report import charts
 from sigmasplat.plugins.evaluation.report.page import Contents, address, build_report
 from sigmasplat.plugins.evaluation.report.summary import Verdict
 from sigmasplat.plugins.evaluation.report.tables import key_figures
+from sigmasplat.plugins.evaluation.view_scores import PredictedErrors, ScoredView
 from sigmasplat.plugins.outputs.drawing import colormap, plot
 from sigmasplat.plugins.outputs.drawing.view_panels import (
     GAP,

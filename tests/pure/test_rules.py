@@ -1,4 +1,4 @@
-"""The rules of slam/: each is a question with a known answer on either side of its bound."""
+"""The rules of tracking/ and mapping/: each is a question with a known answer on either side of its bound."""
 
 from collections import Counter
 from collections.abc import Iterator

@@ -10,16 +10,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sigmasplat.commands import options
-from sigmasplat.commands.evaluate import score
-from sigmasplat.commands.input_options import DEFAULT_INPUT_OPTIONS, InputOptions, InputOptionsFlat
-from sigmasplat.commands.options import configured, prepare_torch, source_of
-from sigmasplat.commands.robot_output import (
+from sigmasplat.commands.bag_options import (
     DEFAULT_ROBOT_OPTIONS,
     RobotOptions,
     RobotOptionsFlat,
     check_robot_output,
     robot_output,
 )
+from sigmasplat.commands.evaluate import score
+from sigmasplat.commands.input_options import DEFAULT_INPUT_OPTIONS, InputOptions, InputOptionsFlat
+from sigmasplat.commands.options import configured, prepare_torch, source_of
 from sigmasplat.commands.view import keep_showing, serve_viewer
 from sigmasplat.config.find_preset import default_preset
 from sigmasplat.config.text import full_path, split_settings

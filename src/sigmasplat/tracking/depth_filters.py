@@ -1,4 +1,8 @@
-"""Change the depth of a frame before SLAM sees it: our filter of noise, and masks and depth filters of plug-ins."""
+"""Change the depth of a frame before SLAM sees it: our filter of noise, and masks and depth filters of plug-ins.
+
+`prepared_frame.working_frame` calls `denoised`; `slam.slam_state` and `run.localise` call `frame_filter`. A filter of
+your own is a row in a file of its own (docs/recipes.md, "A plug-in of your own").
+"""
 
 from collections.abc import Callable
 from dataclasses import replace

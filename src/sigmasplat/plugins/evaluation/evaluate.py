@@ -29,8 +29,7 @@ from sigmasplat.api import (
     predict,
     write_trajectory,
 )
-from sigmasplat.plugins.evaluation import reconstruct
-from sigmasplat.plugins.evaluation.metrics import view_scores
+from sigmasplat.plugins.evaluation import reconstruct, view_scores
 from sigmasplat.plugins.evaluation.metrics.lpips import Lpips
 from sigmasplat.plugins.evaluation.metrics.published_reconstruction import VIEWS
 from sigmasplat.plugins.evaluation.metrics.trajectory import aligned_truth, score_path, truth_in_estimate

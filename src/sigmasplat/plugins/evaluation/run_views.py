@@ -26,10 +26,10 @@ from sigmasplat.api import (
     read_at_once,
     se3,
 )
-from sigmasplat.plugins.evaluation.metrics import view_scores
+from sigmasplat.plugins.evaluation import view_scores
 from sigmasplat.plugins.evaluation.metrics.lpips import Lpips
 from sigmasplat.plugins.evaluation.metrics.trajectory import associate
-from sigmasplat.plugins.evaluation.metrics.view_scores import ScoredView
+from sigmasplat.plugins.evaluation.view_scores import ScoredView
 from sigmasplat.plugins.outputs.drawing.view_panels import ViewPanel, view_panels
 
 HEADINGS = {"test": "novel views"}

@@ -26,7 +26,7 @@ from sigmasplat.api import (
     replacing,
     se3,
 )
-from sigmasplat.plugins.evaluation.metrics.view_scores import COVERED_ALPHA, Renderer
+from sigmasplat.plugins.evaluation.view_scores import COVERED_ALPHA, Renderer
 from sigmasplat.plugins.outputs.drawing import colormap
 from sigmasplat.plugins.outputs.drawing.colormap import Rgb
 from sigmasplat.plugins.outputs.drawing.view_panels import ViewPanel, coloured, draw_view_strip

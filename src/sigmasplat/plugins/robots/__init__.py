@@ -1,1 +1,1 @@
-"""Give poses, map and images to robots: ROS 2 messages in a bag, or over a WebSocket while a run goes on."""
+"""Give poses and images to robots: ROS 2 messages in a bag. examples/ros2_node.py publishes live."""

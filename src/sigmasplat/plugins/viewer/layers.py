@@ -21,7 +21,7 @@ from sigmasplat.api import (
     se3,
     variance_parts,
 )
-from sigmasplat.plugins.evaluation.metrics.view_scores import COVERED_ALPHA, as_array
+from sigmasplat.plugins.evaluation.view_scores import COVERED_ALPHA, as_array
 from sigmasplat.plugins.outputs.drawing import colormap
 from sigmasplat.plugins.outputs.drawing.view_panels import colour_bar
 from sigmasplat.plugins.viewer.snapshot import Piece, field_without_moments

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from sigmasplat.plugins.evaluation.metrics.view_scores import COVERED_ALPHA, ScoredView
+from sigmasplat.plugins.evaluation.view_scores import COVERED_ALPHA, ScoredView
 from sigmasplat.plugins.outputs.drawing import colormap
 
 BACKGROUND, TEXT, FAINT = (21, 24, 29), (233, 237, 242), (150, 158, 168)

@@ -23,7 +23,7 @@ from sigmasplat.api import (
     predict,
     render,
 )
-from sigmasplat.plugins.evaluation.metrics.view_scores import Renderer
+from sigmasplat.plugins.evaluation.view_scores import Renderer
 from sigmasplat.plugins.outputs.floorplan.ground import (
     SurfacePredictor,
     SurfaceSample,

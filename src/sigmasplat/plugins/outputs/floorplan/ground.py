@@ -20,7 +20,7 @@ from sigmasplat.api import (
     no_progress,
     se3,
 )
-from sigmasplat.plugins.evaluation.metrics.view_scores import COVERED_ALPHA, Renderer, as_array
+from sigmasplat.plugins.evaluation.view_scores import COVERED_ALPHA, Renderer, as_array
 
 WIDTH_PX = 160
 """Width of the rendered images: at 5 m a pixel is about 4 cm wide."""

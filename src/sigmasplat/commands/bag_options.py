@@ -1,4 +1,4 @@
-"""Write a bag while a run goes on: sigmasplat run --bag DIR."""
+"""Options of run and resume that write a bag: --bag DIR, --bag-images."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
