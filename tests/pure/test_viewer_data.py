@@ -212,6 +212,9 @@ def test_layers_show_the_maps_of_the_renderer() -> None:
     assert legend is not None and legend.high == pytest.approx(np.percentile(root[covered], 99), rel=1e-5)
     depth = shown["depth"].legend
     assert depth is not None and 2.0 < depth.low < depth.high < 4.5 and depth.unit == " m"
+    for unknown in ("splats", "color error", "normals"):
+        with pytest.raises(ValueError, match=f"no layer '{unknown}' is rendered"):
+            render_layer(field, camera, T, unknown, OPTIONS, "auto")
 
 
 def test_u_is_the_spread_of_depth_about_the_rendered_depth() -> None:
@@ -272,6 +275,8 @@ def test_layers_of_predicted_errors_show_the_prediction() -> None:
         assert whole.legend is not None and whole.legend.unit == unit
         assert whole.legend.high == pytest.approx(np.percentile(std.numpy()[where], 99), rel=1e-4)
         np.testing.assert_array_equal((whole.pixels == colormap.NO_READING).all(-1), ~where)
+    with pytest.raises(ValueError, match="no layer 'U' is predicted"):
+        render_predicted(piece.field, known, camera, T, "U", *how)
 
 
 def test_a_legend_shows_the_palette_from_end_to_end() -> None:

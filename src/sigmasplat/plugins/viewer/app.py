@@ -105,7 +105,7 @@ class ViewerApp:
         self.panel.adapt(len(path), snapshot.live, snapshot.true_positions is not None)
         controls = self.panel.state()
         pieces = snapshot.visible_pieces(controls.row)
-        known = any(piece.uncertainty is not None for piece in pieces)
+        known = len(pieces) == 1 and pieces[0].uncertainty is not None  # as `layers.merged_uncertainty`
         unit = " m" * any(piece.depth_std_m is not None for piece in pieces)
         self.panel.offer(known)
         controls = self.panel.state()

@@ -124,9 +124,9 @@ MODES = {
     "depth error": "predicted error of depth",
 }
 """What the viewer can show, with its label: the splats, or a layer that SigmaSplat renders from the browser's
-viewpoint."""
+viewpoint. A new one needs its branch in `render_layer`; lines and markers are in scene.py."""
 PREDICTED_MODES = ("color error", "depth error")
-"""Only for maps with predicted errors."""
+"""Only for maps with predicted errors: `render_predicted` draws them."""
 LEGEND_SIZE, LEGEND_BAR, INK, PAPER = (280, 34), 14, (233, 237, 242), (36, 40, 46)
 
 
@@ -172,6 +172,8 @@ def render_layer(
             return _mapped(depth_m, covered, colormap.value_range(depth_m, covered), colormap.VIRIDIS, " m")
         if layer == "V":
             return _from_zero(as_array(seen.variance.mean(2).clamp(min=0.0).sqrt()), covered, "")
+        if layer != "U":
+            raise ValueError(f"no layer {layer!r} is rendered")
         spread = render(field, camera, T_camera_world, torch.from_numpy(depth_m), options, backend).uncertainty
         assert spread is not None
         about = np.sqrt(np.maximum(as_array(spread), 0.0) / np.maximum(alpha, COVERED_ALPHA))
@@ -186,6 +188,8 @@ def render_predicted(
 
     Depth is drawn only where A > ½; colour is predicted where the map is empty too.
     """
+    if layer not in PREDICTED_MODES:
+        raise ValueError(f"no layer {layer!r} is predicted")
     T_camera_world = se3.inverse(T_world_camera)
     with torch.no_grad():
         parts = variance_parts(field, known.splats, known.background, camera, T_camera_world, options, backend)
