@@ -208,8 +208,6 @@ SHAPE_TERMS = ("isotropy", "isotropy_ratio")
 """Those of the splats instead of an image, in the order of `StepOptions` (native/kernels.h)."""
 FUSED_TERMS = frozenset((*PIXEL_TERMS, "ssim", *SHAPE_TERMS))
 """All terms of the compiled kernels. The others are computed in torch."""
-VARIANCE_TERMS = ("nll_color", "nll_depth")
-"""Terms that need the variance planes."""
 
 
 def kernel_weights(terms: Sequence[str], weights: Mapping[str, float]) -> NDArray[np.float64]:
@@ -219,5 +217,5 @@ def kernel_weights(terms: Sequence[str], weights: Mapping[str, float]) -> NDArra
 
 def pixel_weights(weights: Mapping[str, float], variance: bool) -> NDArray[np.float64]:
     """Return the weights of the pixel terms as an array; without variance planes, terms that need them get weight 0."""
-    known = weights if variance else {n: w for n, w in weights.items() if n not in VARIANCE_TERMS}
+    known = weights if variance else {n: w for n, w in weights.items() if "variance" not in maps_of(n)}
     return kernel_weights(PIXEL_TERMS, known)

@@ -36,11 +36,6 @@ def apply_switches(asked: env.Switches) -> None:
 apply_switches(env.switches())
 
 
-def feature_slots(k: int) -> int:
-    """Return how many feature planes a blend of k features writes: the next count the kernels are compiled for."""
-    return next(slots for slots in (4, 7, 11, 16) if slots >= k)
-
-
 def padded_size(camera: Camera) -> tuple[int, int]:
     """Return (rows, columns) of an image plane padded to whole tiles of the active instruction set."""
     tile_width, tile_height = _core.tile_size()
@@ -87,7 +82,8 @@ class _Blend(torch.autograd.Function):
         m, c, depth, r, o, f = inputs = [_float32(n, t) for n, t in zip(names, given, strict=True)]
         rows, columns = padded_size(camera)
         k = features.shape[1]
-        sums = torch.empty(feature_slots(k), rows, columns)
+        compiled = next(planes for planes in (4, 7, 11, 16) if planes >= k)  # counts of features of the kernels
+        sums = torch.empty(compiled, rows, columns)
         alpha, weights = torch.empty(rows, columns), torch.empty(2, rows, columns)
         ids = torch.empty(2, rows, columns, dtype=torch.int32)
         moment = ref = None

@@ -162,7 +162,9 @@ class MotionWatch:
 
     def warnings(self) -> list[str]:
         """Return warnings about the frames so far."""
-        jumps, warnings = [self.numbers[i] for i in _jumps_in(np.array(self.changes))], []
+        change, warnings = np.array(self.changes), list[str]()
+        usual = ndimage.median_filter(change, size=min(21, len(change)), mode="nearest") if len(change) else change
+        jumps = np.array(self.numbers)[1:][(change > JUMP * usual) & (change > JUMP_LEAST)].tolist()
         if self.black:
             warnings.append(
                 f"{len(self.black)} frames are black (first: frame {self.black[0]}); remove or correct them"
@@ -182,11 +184,6 @@ def reduced(color: NDArray[np.float32]) -> NDArray[np.float32]:
     height, width = (size // step * step for size in color.shape[:2])
     rows = color[:height, :width].reshape(height // step, step, width // step, step * 3)
     return np.asarray(rows.mean((1, 3)), np.float32)
-
-
-def _jumps_in(change: Numbers) -> list[int]:
-    usual = ndimage.median_filter(change, size=min(21, len(change)), mode="nearest") if len(change) else change
-    return [int(i) + 1 for i in np.flatnonzero((change > JUMP * usual) & (change > JUMP_LEAST))]
 
 
 def _varying(energy: Numbers) -> Numbers:

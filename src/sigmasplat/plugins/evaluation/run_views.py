@@ -99,12 +99,6 @@ def refined_fx(config: Config, camera: Camera) -> float | None:
     return None if width is None else camera.prepared(width).fx
 
 
-def input_of_width(settings: InputConfig, source: Source, width: int) -> InputConfig:
-    """Return input settings for images of another width; the cropped edge covers the same part of the image."""
-    scale = width / (settings.width or source.camera.width)
-    return replace(settings, width=width, crop_px=round(settings.crop_px * scale))
-
-
 def score_full_resolution(
     scoring: ViewScoring, config: Config, recorded: bool, progress: Progress = no_progress
 ) -> dict[str, Any] | None:
@@ -117,7 +111,8 @@ def score_full_resolution(
     width = scoring.source.camera.width if recorded else full_width(config, scoring.source.camera)
     if width is None:
         return None
-    settings, chosen = input_of_width(scoring.input, scoring.source, width), scoring.chosen
+    scale, chosen = width / (scoring.input.width or scoring.source.camera.width), scoring.chosen
+    settings = replace(scoring.input, width=width, crop_px=round(scoring.input.crop_px * scale))  # crops the same part
     camera = scoring.source.camera.prepared(settings.width, settings.crop_px)
     final, before = ({kind: view_scores.ViewScores(False, scoring.lpips) for kind in chosen} for _ in range(2))
     unpredicted = replace(scoring, maps=replace(scoring.maps, predict=None))

@@ -73,11 +73,6 @@ class ScoredView:
         """Return (Ĉ − C)² averaged over the channels [H, W], colour²."""
         return np.asarray(self.squared_errors.mean(-1), np.float32)
 
-    @property
-    def depth_compared(self) -> NDArray[np.bool_]:
-        """Return which pixels have a depth reading and a rendered depth [H, W]."""
-        return self.valid & (self.rendered_depth_m > 0)
-
     def scores(self, lpips: Lpips | None = None) -> dict[str, float]:
         """Return the scores of the view.
 
@@ -263,7 +258,7 @@ class PredictionScores:
         found = view.predicted
         if found is None or view.index in self.calibrated_on:
             return
-        read, compared = view.valid, view.depth_compared
+        read, compared = view.valid, view.valid & (view.rendered_depth_m > 0)
         self.color.append(_every_kth(np.stack([found.color[read], *view.squared_errors[read].T])))
         squares = np.asarray((view.rendered_depth_m - view.recorded_depth_m) ** 2, np.float32)
         self.depth.append(_every_kth(np.stack([found.reading_m2[compared], squares[compared]])))

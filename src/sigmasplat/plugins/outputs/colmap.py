@@ -93,14 +93,11 @@ def write_model(
     names: the images' file names [N], relative to their folder; T_world_camera [N, 4, 4]; points [P, 3] m in the world;
     colors [P, 3] in [0, 1]. Raises RunError if the files cannot be written.
     """
-    write_text(folder / "cameras.txt", _camera_lines(camera))
+    numbers = " ".join(f"{value:.12g}" for value in (camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5))
+    written = f"# CAMERA_ID, MODEL, WIDTH, HEIGHT, FX, FY, CX, CY\n1 PINHOLE {camera.width} {camera.height} {numbers}\n"
+    write_text(folder / "cameras.txt", written)
     write_text(folder / "images.txt", _image_lines(names, T_world_camera))
     write_text(folder / "points3D.txt", _point_lines(points, colors))
-
-
-def _camera_lines(c: Camera) -> str:
-    numbers = " ".join(f"{value:.12g}" for value in (c.fx, c.fy, c.cx + 0.5, c.cy + 0.5))
-    return f"# CAMERA_ID, MODEL, WIDTH, HEIGHT, FX, FY, CX, CY\n1 PINHOLE {c.width} {c.height} {numbers}\n"
 
 
 def _image_lines(names: Sequence[str], T_world_camera: Matrix) -> str:

@@ -232,8 +232,8 @@ class ViewerApp:
             f"{kept:,} of {splats:,} splats shown"
         )
         what = "error of depth" if unit else "σ"
-        hidden = f"hidden: {what} above {most:.3g}{unit}" if most < float("inf") else ""
-        self.panel.show_texts(facts, hidden, _frame_text(snapshot, controls.row))
+        self.panel.facts.content, self.panel.frame.content = facts, _frame_text(snapshot, controls.row)
+        self.panel.hidden_text.content = f"hidden: {what} above {most:.3g}{unit}" if most < float("inf") else ""
 
     def _follow(self, snapshot: Snapshot, controls: ControlState) -> None:
         path = snapshot.path

@@ -106,10 +106,6 @@ class ControlPanel:
         if self.mode.options != options:
             self.mode.options = options
 
-    def show_texts(self, facts: str, hidden: str, frame: str) -> None:
-        """Show texts about the run, about the hidden splats, and about the selected frame."""
-        self.facts.content, self.hidden_text.content, self.frame.content = facts, hidden, frame
-
     def show_legend(self, pixels: Rgb | None) -> None:
         """Show the colour legend, or hide it if None."""
         if pixels is not None:

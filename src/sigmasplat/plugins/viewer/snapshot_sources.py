@@ -3,10 +3,9 @@
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.api import (
@@ -39,7 +38,6 @@ if TYPE_CHECKING:
     from sigmasplat.api import Loop, Slam, Step
 
 EVERY_S = 2.0
-Log = list[dict[str, Any]]
 ShowSnapshot = Callable[[Snapshot], None]
 
 
@@ -100,13 +98,9 @@ def _final_path(frames: RunFrames, tensors: Mapping[str, Tensor]) -> CameraPath:
     poses[: len(kept)] = kept
     poses[frames.rows] = frames.path.T_world_camera
     keyframes = tuple(row for row in tensors["keyframes"].tolist() if row < len(frames))
-    return CameraPath(poses, *_lost_and_submaps(frames.log), keyframes, frames.outside())
-
-
-def _lost_and_submaps(log: Log) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
-    """Return whether each frame is lost [F], and its submap [F]."""
-    lost = np.array([bool(record.get("lost")) for record in log], np.bool_)
-    return lost, np.array([record.get("submap", 0) for record in log], np.int64)
+    lost = np.array([bool(record.get("lost")) for record in frames.log], np.bool_)
+    submaps = np.array([record.get("submap", 0) for record in frames.log], np.int64)
+    return CameraPath(poses, lost, submaps, keyframes, frames.outside())
 
 
 MAX_TIME_SHARE = 0.02

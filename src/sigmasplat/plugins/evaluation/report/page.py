@@ -50,10 +50,11 @@ def write_page(
     """Write report.html from metrics and pictures; `strips`: panels of views by heading, `plots`: charts by name,
     `frames`: to name those whose pose is doubtful. Raises RunError if the page cannot be written."""
     config, facts = run.config(), run.facts()
+    made_on = facts.get("machine") or {}
     unsure = [] if frames is None else [frames.log[i]["index"] for i in frames.rows if frames.p_off[i] > LIKELY]
     found = advice(metrics, rerun_command(config, facts), config.to_dict())
-    about = [config.name, f"version {facts.get('version')}", _machine(run), str(facts.get("status"))]
-    about.append(SensorTimes.noted_in(facts).said())
+    machine, times = f"{made_on.get('cpu')}, {made_on.get('cores')} cores", SensorTimes.noted_in(facts).said()
+    about = [config.name, f"version {facts.get('version')}", machine, str(facts.get("status")), times]
     contents = Contents(
         title=f"SigmaSplat · {metrics.get('source')}",
         subtitle=" · ".join(filter(None, about)),
@@ -80,11 +81,6 @@ def report_plan(run: RunFolder, path: Trajectory, camera: Camera) -> FloorPlan |
         return run_floor_plan(run, path, camera.prepared(settings.width, settings.crop_px))
     except SigmaSplatError:
         return None
-
-
-def _machine(run: RunFolder) -> str:
-    made_on = run.facts().get("machine") or {}
-    return f"{made_on.get('cpu')}, {made_on.get('cores')} cores"
 
 
 def rerun_command(config: Config, facts: dict[str, Any]) -> str:

@@ -84,11 +84,12 @@ def sample_surface(
     with torch.inference_mode():
         seen = renderer(field, camera, T_camera_world)
         alpha, depth_m = as_array(seen.alpha), as_array((seen.depth / seen.alpha.clamp(min=COVERED_ALPHA)).float())
-        sigma_m = wrong = np.full_like(depth_m, np.nan)
+        sigma_m, wrong = (np.full_like(depth_m, np.nan) for _ in range(2))
         if predictor is not None:
             predicted = predictor(camera, T_camera_world)
             sigma_m = as_array(predicted.depth_std_m)
-            wrong = probability_wrong(as_array(predicted.color))
+            # The probability that a Gaussian error of colour is larger than `WRONG_BY`.
+            wrong[:] = erfc(WRONG_BY / np.sqrt(2.0 * np.maximum(as_array(predicted.color), 1e-12)))
     inner = np.s_[1:-1, 1:-1]
     on = _smooth(depth_m, alpha > COVERED_ALPHA)
     points = camera.rays() * depth_m[..., None]
@@ -101,11 +102,6 @@ def sample_surface(
     planes = (values[inner][on] for values in (alpha, sigma_m, wrong))
     measured = (on_surface @ R.T + t, normals @ R.T, length / 4.0, *planes)
     return SurfaceSample(T_world_camera, *(np.asarray(values, np.float32) for values in measured))
-
-
-def probability_wrong(variance: Floats) -> Floats:
-    """Return the probability that a Gaussian error of this variance (colour²) is larger than `WRONG_BY`."""
-    return np.asarray(erfc(WRONG_BY / np.sqrt(2.0 * np.maximum(variance, 1e-12))), np.float32)
 
 
 def _smooth(depth_m: Floats, covered: NDArray[np.bool_]) -> NDArray[np.bool_]:
