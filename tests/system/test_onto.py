@@ -26,7 +26,7 @@ pytest.importorskip("sigmasplat.native._core", reason="sigmasplat.native._core i
 
 WALK = "synthetic:frames=200,width=160,height=120"
 SHORT = ("--set", "mapping.first_iterations=30", "--set", "mapping.iterations=8", "--set", "final.iterations=5",
-         "--set", "submaps.frames=12", "--set", "registration.iterations=3")  # fmt: skip
+         "--set", "submaps.frames=12", "--set", "registration.iterations=3", "--set", "input.width=112")  # fmt: skip
 FRAMES = 14
 FIRST, SECOND = ("--limit", "24"), ("--start", "0.5", "--limit", str(FRAMES))
 SECOND_BEGINS = 15
