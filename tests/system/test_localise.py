@@ -22,7 +22,7 @@ pytest.importorskip("sigmasplat.native._core", reason="sigmasplat.native._core i
 
 WALK = "synthetic:frames=200,width=160,height=120"
 SHORT = ("--set", "mapping.first_iterations=30", "--set", "mapping.iterations=10", "--set", "final.iterations=5",
-         "--set", "registration.iterations=3")  # fmt: skip
+         "--set", "registration.iterations=3", "--set", "input.width=112")  # fmt: skip
 
 
 @pytest.fixture(scope="module")
