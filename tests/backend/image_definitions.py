@@ -1,13 +1,17 @@
-"""Definitions in numpy of the kernels that prepare and compare images (native/resize.h, compare.h, free_space.h)."""
+"""Definitions in numpy of the kernels that prepare and compare images (native/resize.h, compare.h, free_space.h,
+read_at_once.h)."""
+
+from typing import Any
 
 import numpy as np
 import PIL.Image
 import torch
 from numpy.typing import NDArray
 
-from sigmasplat.data import images
+from sigmasplat.data import images, se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.frame import Frame
+from sigmasplat.data.readout import Readout
 from sigmasplat.fit.compare import (
     CLOSE_M,
     CLOSE_SIGMA,
@@ -187,3 +191,41 @@ def target_in_torch(frame: Frame, size: tuple[int, int]) -> Target:
     color[:, :h, :w] = torch.tensor(frame.color).movedim(-1, 0)
     depth[:h, :w] = torch.tensor(frame.depth_m)
     return Target(frame.camera, color, depth, int((frame.depth_m > 0).sum()))
+
+
+def read_before_in_numpy(depth_m: Image, camera: Camera, readout: Readout, of_color: bool) -> tuple[Image, Image]:
+    """Return the depth that `read_before` writes, and where colour shows it [2, H, W], with exact motions."""
+    c, (height, width) = camera, depth_m.shape
+    own, usual_m = np.indices(depth_m.shape, np.float64), float(np.median(depth_m[::4, ::4][depth_m[::4, ::4] > 0]))
+
+    def seen(z: NDArray[np.float64], late_s: NDArray[np.float64]) -> NDArray[np.float64]:
+        x, y, ahead = moved((own[1] - c.cx) / c.fx * z, (own[0] - c.cy) / c.fy * z, z, late_s)
+        return np.stack([c.fx * x / ahead + c.cx, c.fy * y / ahead + c.cy])
+
+    def moved(x: Any, y: Any, z: Any, late_s: Any) -> NDArray[np.float64]:
+        T = se3.inverse(se3.exp_stack(np.broadcast_to(late_s, z.shape).reshape(-1, 1) * readout.rate))
+        return np.einsum("nij,nj->ni", T[:, :3], np.stack([x, y, z, np.ones_like(z)], -1).reshape(-1, 4)).T.reshape(
+            3, *z.shape
+        )
+
+    z, row, of_row = depth_m.astype(np.float64), own[0], readout.color_s(own[0], height) if of_color else 0.0
+    for _ in range(2):
+        late_s = readout.depth_s(row, height) - of_row
+        column, row = seen(np.where(z > 0, z, usual_m), late_s)
+        if of_color:
+            column, row = column.clip(0, width - 1), row.clip(0, height - 1)
+        u, v = np.floor(column).astype(int).clip(0, width - 1), np.floor(row).astype(int).clip(0, height - 1)
+        four = np.stack(
+            [depth_m[y, x] for y in (v, (v + 1).clip(0, height - 1)) for x in (u, (u + 1).clip(0, width - 1))]
+        )
+        a, b = (column - u).clip(0, 1), (row - v).clip(0, 1)
+        nearest = np.take_along_axis(four, (2 * (b > 0.5) + (a > 0.5))[None], 0)[0]
+        between = (1 - b) * ((1 - a) * four[0] + a * four[1]) + b * ((1 - a) * four[2] + a * four[3])
+        read = np.where(np.ptp(four, axis=0) < 0.03 * four.min(0), between, nearest)
+        outside = (column < -0.5) | (row < -0.5) | (column >= width - 0.5) | (row >= height - 0.5)
+        read = np.where(outside | (nearest <= 0), 0.0, read)
+        z = np.where(read > 0, moved((column - c.cx) / c.fx * read, (row - c.cy) / c.fy * read, read, -late_s)[2], 0.0)
+    at = own[::-1]
+    for _ in range(2):
+        at = seen(np.where(z > 0, z, usual_m), readout.color_s(at[1], height))
+    return z.clip(0.0).astype(np.float32), at.astype(np.float32)

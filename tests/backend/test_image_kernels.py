@@ -14,12 +14,15 @@ from image_definitions import (
     halved_depth_in_numpy,
     halved_in_numpy,
     noise_scale_in_numpy,
+    read_before_in_numpy,
     resized_depth_in_numpy,
     target_in_torch,
 )
 from sigmasplat.data import images, se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.frame import Frame
+from sigmasplat.data.read_at_once import depth_of_color, read_at_once
+from sigmasplat.data.readout import Readout, SensorTimes
 from sigmasplat.fit.compare import NOTHING, compare, noise_scale
 from sigmasplat.fit.cpu import halved, halved_depth
 from sigmasplat.fit.pyramid import HIDDEN_M, Pyramid
@@ -116,6 +119,23 @@ def test_free_places_are_those_of_their_definition(isa: str, further_px: int, sh
         assert np.array_equal(found, free_places_in_numpy(points, T, depth(), CAMERA, 0.05, further_px)), isa
     if further_px < 200:  # in a window as large as the image, some reading is near
         assert 100 < free_places(rows[:, :3].T, T, depth(), CAMERA, 0.05, further_px).sum() < 3000
+
+
+@pytest.mark.parametrize("fast", [0.3, 2.0])
+def test_depth_at_another_time_is_that_of_its_definition(isa: str, fast: float) -> None:
+    """Depth to 10 µm, but for a few pixels that are next to another surface in one of both. Colour is a ramp: it says
+    from which column it was taken."""
+    readout = Readout(
+        fast * np.array([0.5, -0.4, 0.6, 0.7, -1.0, 0.4]), 0.004, SensorTimes(0.016, 0.03, 0.025, (1e-3,) * 3)
+    )
+    ramp = np.repeat(np.tile(np.linspace(0, 1, WIDTH, dtype=np.float32), (HEIGHT, 1))[..., None], 3, 2)
+    frame = read_at_once(Frame(0, 0.0, ramp, depth(), CAMERA), readout)
+    (before, at), (of_color, _) = (read_before_in_numpy(depth(), CAMERA, readout, which) for which in (False, True))
+    for found, expected in ((frame.depth_m, before), (depth_of_color(CAMERA, depth(), readout), of_color)):
+        other = np.abs(found - expected) > 1e-5 + 1e-4 * fast**3
+        assert found.dtype == np.float32 and other.mean() < 0.01 and np.abs(found - depth()).mean() > 0.01, isa
+    inner = (at[0] > 1) & (at[0] < WIDTH - 2)
+    np.testing.assert_allclose(frame.color[..., 0][inner], at[0][inner] / (WIDTH - 1), atol=5e-4)
 
 
 def test_free_places_need_points_and_an_image() -> None:

@@ -168,6 +168,17 @@ def free_places(
     clear_relative: float,
     free: Array,
 ) -> None: ...
+def read_before(
+    depth: Array,
+    intrinsics: list[float],
+    readout: list[float],
+    rounds: int,
+    same_surface: float,
+    usual_m: float,
+    of_color: bool,
+    before: Array,
+    color_at: Array | None = None,
+) -> None: ...
 
 class Level:
     def __init__(

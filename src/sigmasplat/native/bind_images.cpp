@@ -2,6 +2,7 @@
 // the time that another thread may hold the lock when it is requested again.
 #include <vector>
 
+#include <nanobind/stl/optional.h>
 #include <nanobind/stl/vector.h>
 
 #include "bind.h"
@@ -68,6 +69,16 @@ static void free_places(nb::ndarray<const float, nb::ndim<2>, nb::device::cpu> p
                                 {depth.data(), int(depth.shape(1)), int(depth.shape(0)), intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]},
                                 {radius_px, clear_m, clear_relative}, free.data());
 }
+static void read_before(ConstFloats depth, std::vector<double> intrinsics, const std::vector<float>& readout, int rounds, double same_surface, double usual_m,
+                        bool of_color, Floats before, std::optional<Floats> color_at) {
+    need_image(depth);
+    need(intrinsics.size() == 4 && readout.size() == sizeof(Readout) / sizeof(float) && rounds > 0, "read_before: four intrinsics, a readout, a round");
+    need(before.size() == depth.size() && (!color_at || color_at->size() == 2 * depth.size()), "read_before: images of one size");
+    Readout read;
+    std::memcpy(&read, readout.data(), sizeof read);
+    active->images->read_before({depth.data(), int(depth.shape(1)), int(depth.shape(0)), intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]}, read,
+                                {rounds, same_surface, usual_m, of_color}, before.data(), color_at ? color_at->data() : nullptr);
+}
 
 void sigmasplat::bind_images(nb::module_& m) {
     m.def("halve_color", halve_color);
@@ -89,4 +100,6 @@ void sigmasplat::bind_images(nb::module_& m) {
     m.def("compare", compare, nb::arg("reference_depth"), nb::arg("reference_gray"), nb::arg("live_depth"), nb::arg("live_gray"), nb::arg("intrinsics"),
           nb::arg("T_live_reference"), nb::arg("rules"), nb::arg("found"), nb::arg("readouts") = std::vector<float>());
     m.def("free_places", free_places);
+    m.def("read_before", read_before, nb::arg("depth"), nb::arg("intrinsics"), nb::arg("readout"), nb::arg("rounds"), nb::arg("same_surface"), nb::arg("usual_m"),
+          nb::arg("of_color"), nb::arg("before"), nb::arg("color_at").none() = nb::none());
 }

@@ -30,6 +30,10 @@ struct DepthImage { const float* depth; int width, height; double fx, fy, cx, cy
 // A place is free if all readings within radius_px are farther by clear_m plus a share of its depth.
 struct FreeRules { int radius_px; double clear_m, clear_relative; };
 
+// How depth is looked up at another time: so often; differences of one surface, a share of depth; depth where none is
+// read; at what time (read_at_once.h).
+struct ReadRules { int rounds; double same_surface, usual_m; bool of_color; };
+
 struct ImageKernels {
     // Colour [2h, 2w, 3] to [h, w, 3] (width = w): the mean of 2×2 pixels, limited to [0, 1].
     void (*halve_color)(const float* color, int width, int height, float* half);
@@ -49,6 +53,7 @@ struct ImageKernels {
     bool (*compare)(ComparedImages, const double* T_live_reference, const AlignReadouts* readouts, CompareRules, double* found);
     // Writes 1 for each point that the image sees through, else 0.
     void (*free_places)(PointColumns, const double* T_camera_points, DepthImage, FreeRules, uint8_t* free);
+    void (*read_before)(DepthImage, Readout, ReadRules, float* before, float* color_at);
 };
 
 }  // namespace sigmasplat

@@ -15,10 +15,11 @@ namespace {
 #include "resize.h"
 #include "compare.h"
 #include "free_space.h"
+#include "read_at_once.h"
 
 }  // namespace
 
 extern const ImageKernels image_table;
-const ImageKernels image_table = {halve_color, resize_depth, image_planes, gray, halve, halve_depth, noise_scale, compare, free_places};
+const ImageKernels image_table = {halve_color, resize_depth, image_planes, gray, halve, halve_depth, noise_scale, compare, free_places, read_before};
 
 }  // namespace sigmasplat::SIGMASPLAT_ISA
