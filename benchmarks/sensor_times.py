@@ -92,7 +92,7 @@ def measure(options: Options) -> dict[str, Any]:
     for number in range(options.rooms):
         true_ms = [float(t) for t in random.uniform((-LATE_MS, 0.0, 0.0), (LATE_MS, ROWS_MS, ROWS_MS)).round(1)]
         late, depth_rows, rows = (f"{t / 1e3:g}" for t in true_ms)
-        room = f"synthetic:frames={options.frames},width=160,height=120,noise=1,seed={number}"
+        room = f"synthetic:frames={options.frames},width=320,height=240,noise=1,seed={number}"
         pairs = aligned_pairs(open_source(f"{room},late={late},depth_rows={depth_rows},rows={rows}"), config)
         rooms.append({"seed": number, "true_ms": true_ms} | found_in(pairs))
         print(rooms[-1], file=sys.stderr, flush=True)
