@@ -146,7 +146,7 @@ def _expanded(pair: Pair, times_s: Matrix) -> Term:
 def newton_step(terms: Sequence[Term]) -> tuple[Matrix, Matrix]:
     """Return the step [3] to the lowest point of the sum of terms, and the covariance [3, 3] there.
 
-    Terms of keyframes in a row share errors. Directions in which the sum is not convex, far from its lowest point, take
+    Terms of keyframes in a row share errors; three numbers are fitted to so many groups of them. Directions in which the sum is not convex, far from its lowest point, take
     the step of one that is as much bent the other way.
     """
     slope, bend = np.array([term.slope for term in terms]), np.array([term.bend for term in terms])
@@ -156,4 +156,5 @@ def newton_step(terms: Sequence[Term]) -> tuple[Matrix, Matrix]:
     step = -inverse @ slope.sum(0)
     left, groups = slope + bend @ step, np.array([term.number // NEIGHBOURS for term in terms])
     of_groups = np.array([left[groups == group].sum(0) for group in np.unique(groups)])
-    return np.asarray(step), np.asarray(inverse @ (of_groups.T @ of_groups) @ inverse)
+    n = len(of_groups)
+    return np.asarray(step), np.asarray(inverse @ (of_groups.T @ of_groups) @ inverse) * n / max(n - 3, 1)
