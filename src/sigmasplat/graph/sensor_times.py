@@ -146,8 +146,8 @@ def _expanded(pair: Pair, times_s: Matrix) -> Term:
 def newton_step(terms: Sequence[Term]) -> tuple[Matrix, Matrix]:
     """Return the step [3] to the lowest point of the sum of terms, and the covariance [3, 3] there.
 
-    Terms of keyframes in a row share errors; three numbers are fitted to so many groups of them. Directions in which the sum is not convex, far from its lowest point, take
-    the step of one that is as much bent the other way.
+    Terms of keyframes in a row share errors; three numbers are fitted to so many groups of them. Directions in which
+    the sum is not convex, far from its lowest point, take the step of one that is as much bent the other way.
     """
     slope, bend = np.array([term.slope for term in terms]), np.array([term.bend for term in terms])
     values, vectors = np.linalg.eigh(bend.sum(0))
