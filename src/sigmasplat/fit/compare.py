@@ -62,10 +62,11 @@ def compare(reference: Pyramid, live: Pyramid, T_live_reference: Matrix) -> Comp
     level = min(LEVEL, len(reference.cameras) - 1)
     host, c, found = reference.kernels.to_host, reference.cameras[level], np.empty(8)
     depth, gray = host(reference.depth[level]), host(reference.gray[level])
-    T = np.ascontiguousarray(T_live_reference, np.float64)
+    T, color_depth = np.ascontiguousarray(T_live_reference, np.float64), reference.color_depth(level)
     if not _core.compare(
         depth, gray, host(live.depth[level]), host(live.gray[level]), [c.fx, c.fy, c.cx, c.cy], T,
-        _rules(HIDDEN_M, live.noise_per_m, live.scene_scale), found, readouts(reference.readout, live.readout),
+        _rules(HIDDEN_M, live.noise_per_m, live.scene_scale), found,
+        None if color_depth is None else host(color_depth), readouts(reference.readout, live.readout),
     ):  # fmt: skip
         return NOTHING
     common, close, front, behind, residual, correlation, points, covered = found.tolist()

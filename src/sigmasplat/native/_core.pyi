@@ -156,6 +156,7 @@ def compare(
     T_live_reference: Array,
     rules: list[float],
     found: Array,
+    color_depth: Array | None = None,
     readouts: list[float] = ...,
 ) -> bool: ...
 def free_places(

@@ -50,13 +50,15 @@ static void need_half(const ConstFloats& image, const Floats& half) {
     need(image.ndim() == 2 && half.ndim() == 2 && half.shape(0) == image.shape(0) / 2 && half.shape(1) == image.shape(1) / 2, "halve: [h, w] to [h/2, w/2]");
 }
 static bool compare(ConstFloats reference_depth, ConstFloats reference_gray, ConstFloats live_depth, ConstFloats live_gray,
-                    std::vector<double> intrinsics, ConstDoubles T, std::vector<double> rules, Doubles found, const std::vector<float>& readouts) {
+                    std::vector<double> intrinsics, ConstDoubles T, std::vector<double> rules, Doubles found, std::optional<ConstFloats> color_depth,
+                    const std::vector<float>& readouts) {
     need_image(reference_depth);
-    need(reference_gray.size() == reference_depth.size() && live_depth.size() == reference_depth.size() && live_gray.size() == reference_depth.size(), "compare: images of one size");
+    need(reference_gray.size() == reference_depth.size() && live_depth.size() == reference_depth.size() && live_gray.size() == reference_depth.size()
+         && (!color_depth || color_depth->size() == reference_depth.size()), "compare: images of one size");
     need(intrinsics.size() == 4 && T.size() >= 12 && found.size() == COMPARED, "compare: four intrinsics, a pose, eight values");
     const std::optional<AlignReadouts> read = readouts_of(readouts);
     return active->images->compare({reference_depth.data(), reference_gray.data(), live_depth.data(), live_gray.data(), int(reference_depth.shape(1)), int(reference_depth.shape(0)),
-                                    intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]}, T.data(), read ? &*read : nullptr, rules_of(rules), found.data());
+                                    intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3], color_depth ? color_depth->data() : nullptr}, T.data(), read ? &*read : nullptr, rules_of(rules), found.data());
 }
 static void free_places(nb::ndarray<const float, nb::ndim<2>, nb::device::cpu> points, ConstDoubles T, ConstFloats depth, std::vector<double> intrinsics,
                         int radius_px, double clear_m, double clear_relative, Bytes free) {
@@ -98,7 +100,7 @@ void sigmasplat::bind_images(nb::module_& m) {
         return active->images->noise_scale(depth.data(), int(depth.shape(1)), int(depth.shape(0)), rules_of(rules));
     });
     m.def("compare", compare, nb::arg("reference_depth"), nb::arg("reference_gray"), nb::arg("live_depth"), nb::arg("live_gray"), nb::arg("intrinsics"),
-          nb::arg("T_live_reference"), nb::arg("rules"), nb::arg("found"), nb::arg("readouts") = std::vector<float>());
+          nb::arg("T_live_reference"), nb::arg("rules"), nb::arg("found"), nb::arg("color_depth").none() = nb::none(), nb::arg("readouts") = std::vector<float>());
     m.def("free_places", free_places);
     m.def("read_before", read_before, nb::arg("depth"), nb::arg("intrinsics"), nb::arg("readout"), nb::arg("rounds"), nb::arg("same_surface"), nb::arg("usual_m"),
           nb::arg("of_color"), nb::arg("before"), nb::arg("color_at").none() = nb::none());

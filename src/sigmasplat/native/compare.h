@@ -154,7 +154,8 @@ static bool compare(ComparedImages c, const double* T, const AlignReadouts* read
             }
             Pixel gray = pixel;
             if (readouts) {
-                const Position seen = read_late(c, T, point, v, *readouts, false);
+                const double y = c.color_depth ? c.color_depth[at] : z;
+                const Position seen = read_late(c, T, {(u - c.cx) / c.fx * y, (v - c.cy) / c.fy * y, y}, v, *readouts, false);
                 if (in_view(c, seen, projected(c, seen))) gray = projected(c, seen);
             }
             const size_t nearest = nearest_to(c, gray);

@@ -23,6 +23,7 @@ struct ComparedImages {                                // of width × height; pi
     const float *reference_depth, *reference_gray, *live_depth, *live_gray;
     int width, height;
     double fx, fy, cx, cy;
+    const float* color_depth;                          // of the reference, as in AlignPlanes; may be null
 };
 
 struct PointColumns { const float *x, *y, *z; int64_t count, stride; };     // stride: floats from one point to the next
