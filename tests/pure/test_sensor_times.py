@@ -74,7 +74,7 @@ def test_known_times_undo_the_error_of_a_fast_camera_that_has_come_far(times_s: 
     of_both = [readout(3 * RATES["both"] * change, times_s) for change in (np.ones(6), [1, 1, 1, 0.9, 1.1, 1])]
     reference, live = image(HERE, of_both[0]).read(of_both[0]), image(se3.inverse(motion), of_both[1]).read(of_both[1])
     assert error_mm(align(reference, live, motion, update_stop=2e-5), motion) < 0.7
-    assert compare(reference, live, motion).correlation > 0.998
+    assert compare(reference, live, motion).correlation > 0.9989
 
 
 @pytest.mark.parametrize("turned", [0.15, -0.15])
