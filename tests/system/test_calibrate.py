@@ -55,6 +55,12 @@ def test_times_are_found_and_a_run_uses_them(tmp_path: Path, capsys: pytest.Capt
     assert Slam(folder.config()).tracker.times.depth_late_s == pytest.approx(times.depth_late_s, abs=1e-6)
 
 
+def test_predicted_depth_has_no_times_of_its_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source = "synthetic:frames=3,width=96,height=72,predicted=1"
+    assert exit_code("calibrate", source, "--out", str(tmp_path / "times.json")) == 2
+    assert "calibrate a recording of a sensor" in capsys.readouterr().err and not list(tmp_path.iterdir())
+
+
 def test_a_camera_at_rest_shows_no_times(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     still, file = record(tmp_path / "still", 1, (0.0, 0.0, 0.0)), tmp_path / "times.json"
     assert exit_code("calibrate", str(still), "--out", str(file)) == 2
