@@ -84,7 +84,7 @@ def calibrate(
     if source.live:
         raise ConfigError("a live camera cannot be measured; record it first: sigmasplat run realsense")
     if config.tracking.fit_depth:
-        raise ConfigError("depth that is predicted from the colours is not read late; calibrate a recording of a sensor")
+        raise ConfigError("predicted depth is read with its colours; calibrate a recording of a sensor")
     prepare_torch()
     with output_locked(out, screen.warn):
         with screen.counting("frames") as progress:
