@@ -11,14 +11,17 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from command_line import exit_code
-from late_images import CAMERA, film
+from late_images import CAMERA, film, path
 from sigmasplat.config import InputConfig
 from sigmasplat.config.find_preset import configured
+from sigmasplat.data import se3
 from sigmasplat.data.readout import UNKNOWN_TIMES, Readout, SensorTimes
 from sigmasplat.errors import ConfigError
 from sigmasplat.plugins.sources.tum import TumWriter
+from sigmasplat.run.calibrate import WITHOUT_MAP
 from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.system.slam import Slam
+from sigmasplat.types import completed
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
@@ -53,6 +56,22 @@ def test_times_are_found_and_a_run_uses_them(tmp_path: Path, capsys: pytest.Capt
     file.unlink()
     assert Slam(folder.config()).sensor_times == Slam(settings={"input.calibrate": str(run / "run.json")}).sensor_times
     assert Slam(folder.config()).tracker.times.depth_late_s == pytest.approx(times.depth_late_s, abs=1e-6)
+
+
+def test_keyframes_have_moved_as_the_frames_before_and_after_them_say() -> None:
+    """Those that two submaps share, too. The motion since the frame before is off by up to 0.04 rad/s."""
+    slam = Slam(configured(None, {"submaps.frames": 6, "input.width": 160}).changed(**WITHOUT_MAP))
+    for seen in film(24, (0.0, 0.0, 0.0)):
+        slam.step(seen)
+    completed(slam.finish_submap())
+    slam.correct_motions()
+    rows, every = slam.atlas.T_world_keyframes, slam.atlas.T_world_camera()
+    frames = np.array([np.abs(every - T).sum((1, 2)).argmin() for T in rows])
+    assert len(slam.atlas.anchors) > 2 and len(set(frames.tolist())) < len(rows)
+    inner = np.flatnonzero((frames > 0) & (frames < 23))
+    true = se3.rates(path(np.arange(24) / 30), np.arange(24) / 30, frames[inner], np.ones(24, bool))
+    found = np.array([slam.atlas.readings[row].rate for row in inner])
+    assert np.abs(found - true)[:, 3:].max() < 0.02 < np.abs(true[:, 3:]).max() / 5
 
 
 def test_predicted_depth_has_no_times_of_its_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -111,7 +111,10 @@ class MappingBackend(SlamState):
         rows, frames = np.unique(first[submap] + keyframe, return_index=True)
         known = (np.array(atlas.components)[submap] == atlas.components[-1]) & ~self.steps.lost
         rows, frames = rows[known[frames]], frames[known[frames]]
-        atlas.readings.correct(rows, se3.rates(atlas.T_world_camera(), self.steps.timestamps_s, frames, known))
+        rates = se3.rates(atlas.T_world_camera(), self.steps.timestamps_s, frames, known)
+        atlas.readings.correct(rows, rates)
+        copied = np.isin(rows, first[1:-1]) & ~np.isin(rows - 1, rows)  # the last of a submap is the first of the next
+        atlas.readings.correct(rows[copied] - 1, rates[copied])
 
     def _read_at_once(self) -> Task[None]:
         """Rewrite the keyframes of the active submap that were mapped before it was known when the sensor reads, in
