@@ -107,10 +107,10 @@ def estimated(pairs: Sequence[Pair]) -> Task[tuple[SensorTimes, bool]]:
 
 
 def _sure(times_s: Matrix, covariance: Matrix, groups: int, level: float = LEVEL) -> bool:
-    """Return whether times are not 0, by Hotelling's test: the covariance is that of so many groups."""
+    """Return whether times are not 0, by Hotelling's test: the covariance (of `newton_step`) is that of so many groups."""
     if groups < LEAST_GROUPS:
         return False
-    limit = 3.0 * (groups - 1) / (groups - 3) * float(f_distribution.ppf(level, 3, groups - 3))
+    limit = 3.0 * (groups - 1) / groups * float(f_distribution.ppf(level, 3, groups - 3))
     return bool(times_s @ np.linalg.solve(covariance, times_s) > limit)
 
 
