@@ -107,7 +107,7 @@ def estimated(pairs: Sequence[Pair]) -> Task[tuple[SensorTimes, bool]]:
 
 
 def _sure(times_s: Matrix, covariance: Matrix, groups: int, level: float = LEVEL) -> bool:
-    """Return whether times are not 0, by Hotelling's test: the covariance (of `newton_step`) is that of so many groups."""
+    """Return whether times are not 0, by Hotelling's test; covariance: of `newton_step`, from so many groups."""
     if groups < LEAST_GROUPS:
         return False
     limit = 3.0 * (groups - 1) / groups * float(f_distribution.ppf(level, 3, groups - 3))
