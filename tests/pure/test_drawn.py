@@ -164,6 +164,19 @@ def test_what_hides_most_of_the_readings_is_the_scene(far_depth: bool, things: i
     assert len(list(found)) == things
 
 
+@pytest.mark.parametrize(("width_px", "left"), [(50, True), (120, False)])
+def test_what_has_left_a_keyframe_is_never_most_of_it(width_px: int, left: bool) -> None:
+    """A board that has gone is taken out of the keyframe; where most seems to have gone, the pose is wrong."""
+    before_m = np.full((CAMERA.height, CAMERA.width), WALL_M, np.float32)
+    before_m[:, 10 : 10 + width_px] = BOX_M
+    shown = Reference(Pyramid.of(sight(0.0, 0.0).live.gray[0], before_m, CAMERA), np.eye(4))
+    seen = sight(0.0, 0.0).with_depth(np.full_like(before_m, WALL_M))
+    kept = DynamicDetector(MovingConfig(find=True)).without_gone(shown, seen, np.eye(4))
+    assert kept is not None and (kept is not shown) == left
+    board = kept.pyramid.depth[0][:, 20:width_px]
+    assert (board == 0).mean() > 0.9 if left else (board > 0).all()
+
+
 def look(watch: DynamicDetector, contradicted: bool = False, urgent: bool = False) -> tuple[DynamicDetector, bool]:
     """Return the watch after a look for the box that has drawn a pose, and whether it finds it."""
     seen = sight(MOVED_M, MOVED_M)
