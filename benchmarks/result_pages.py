@@ -151,7 +151,6 @@ PAGES = {
                 "Alignment of images beside Adam through the renderer, from the same start.",
                 ("Ratios",),
             ),
-            Shown("sensor-times", "Times of a sensor without truth: halves of recordings, moved depth, random rooms."),
             Shown(
                 "relocalisation",
                 "How often a lost camera is found from sparse features, and how often wrongly.",
