@@ -152,6 +152,10 @@ PAGES = {
                 ("Ratios",),
             ),
             Shown(
+                "sensor-times", "Times of a sensor without truth: depth moved in time, and random rooms.",
+                ("Depth moved in time", "Random rooms"),
+            ),
+            Shown(
                 "relocalisation",
                 "How often a lost camera is found from sparse features, and how often wrongly.",
                 ("Whole map",),
