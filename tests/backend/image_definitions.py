@@ -204,9 +204,8 @@ def read_before_in_numpy(depth_m: Image, camera: Camera, readout: Readout, of_co
 
     def moved(x: Any, y: Any, z: Any, late_s: Any) -> NDArray[np.float64]:
         T = se3.inverse(se3.exp_stack(np.broadcast_to(late_s, z.shape).reshape(-1, 1) * readout.rate))
-        return np.einsum("nij,nj->ni", T[:, :3], np.stack([x, y, z, np.ones_like(z)], -1).reshape(-1, 4)).T.reshape(
-            3, *z.shape
-        )
+        points = np.stack([x, y, z, np.ones_like(z)], -1).reshape(-1, 4)
+        return np.einsum("nij,nj->ni", T[:, :3], points).T.reshape(3, *z.shape)
 
     z, row, of_row = depth_m.astype(np.float64), own[0], readout.color_s(own[0], height) if of_color else 0.0
     for _ in range(2):
@@ -215,9 +214,8 @@ def read_before_in_numpy(depth_m: Image, camera: Camera, readout: Readout, of_co
         if of_color:
             column, row = column.clip(0, width - 1), row.clip(0, height - 1)
         u, v = np.floor(column).astype(int).clip(0, width - 1), np.floor(row).astype(int).clip(0, height - 1)
-        four = np.stack(
-            [depth_m[y, x] for y in (v, (v + 1).clip(0, height - 1)) for x in (u, (u + 1).clip(0, width - 1))]
-        )
+        below, right = (v + 1).clip(0, height - 1), (u + 1).clip(0, width - 1)
+        four = np.stack([depth_m[y, x] for y in (v, below) for x in (u, right)])
         a, b = (column - u).clip(0, 1), (row - v).clip(0, 1)
         nearest = np.take_along_axis(four, (2 * (b > 0.5) + (a > 0.5))[None], 0)[0]
         between = (1 - b) * ((1 - a) * four[0] + a * four[1]) + b * ((1 - a) * four[2] + a * four[3])

@@ -27,6 +27,8 @@ def read_at_once(frame: Frame, readout: Readout) -> Frame:
     """
     cv2, color_at = opencv(), np.empty((2, *frame.depth_m.shape), np.float32)
     depth_m = _depth_before(frame.camera, frame.depth_m, readout, color_at)
+    if not readout.times.color_rows_s:
+        return replace(frame, depth_m=depth_m)
     color = cv2.remap(frame.color, *color_at, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE).clip(0.0, 1.0)
     return replace(frame, color=color, depth_m=depth_m)
 
@@ -38,12 +40,12 @@ def depth_of_color(camera: Camera, depth_m: Image, readout: Readout) -> Image:
 
 
 def _depth_before(camera: Camera, depth_m: Image, readout: Readout, color_at: Image | None = None) -> Image:
-    """Return the depth [H, W] that the camera saw in the middle of colour, and write where colour shows it [2, H, W];
-    without this, that of `depth_of_color`."""
+    """Return the depth [H, W] that the camera saw in the middle of colour, and write to color_at [2, H, W] the column
+    and row at which colour shows it. Without color_at, return that of `depth_of_color`."""
     c, before_m, some_m = camera, np.empty(depth_m.shape, np.float32), depth_m[::4, ::4]
     usual_m = float(np.median(some_m[some_m > 0])) if (some_m > 0).any() else 1.0
     _core.read_before(
         np.ascontiguousarray(depth_m, np.float32), [c.fx, c.fy, c.cx, c.cy], readout.numbers, ROUNDS, SAME_SURFACE,
-        usual_m, color_at is None, before_m, color_at,
+        usual_m, before_m, color_at,
     )  # fmt: skip
     return before_m

@@ -176,7 +176,6 @@ def read_before(
     rounds: int,
     same_surface: float,
     usual_m: float,
-    of_color: bool,
     before: Array,
     color_at: Array | None = None,
 ) -> None: ...

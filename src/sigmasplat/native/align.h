@@ -2,6 +2,7 @@
 // only a tenth of a millisecond. H [21] upper triangle, b [6], sums [5], S [21], upper triangle of Σ b_c b_cᵀ over
 // cells c of CELL×CELL pixels.
 #include "align_loop.h"
+#include "late_points.h"
 #include "align_pixel.h"
 static_assert(CELL % W == 0, "a cell is whole vectors wide");
 

@@ -68,14 +68,13 @@ struct RowByRow {
     const float* rate;
     float first_s, rows_s, fy, cy;         // when the first row is read; from it to the last, over the height
     void operator()(vf& x, vf& y, vf& z) const {
-        const float *v = rate, *w = rate + 3;
-        const vf x0 = x, y0 = y, z0 = z;
-        const vf dx = v[0] + (w[1] * z - w[2] * y), dy = v[1] + (w[2] * x - w[0] * z), dz = v[2] + (w[0] * y - w[1] * x);
+        const Point3<vf> at_once = {x, y, z};
         for (int round = 0; round < 2; round++) {                  // the row is another one when it is read
-            const vf row = fy * (y / max(z, splat(0.05f))) + cy, late_s = fma(row, splat(rows_s), splat(first_s)), half = 0.5f * late_s;
-            x = x0 - late_s * (dx - half * (w[1] * dz - w[2] * dy));    // to second order
-            y = y0 - late_s * (dy - half * (w[2] * dx - w[0] * dz));
-            z = z0 - late_s * (dz - half * (w[0] * dy - w[1] * dx));
+            const vf row = fy * (y / max(z, splat(0.05f))) + cy, late_s = fma(row, splat(rows_s), splat(first_s));
+            const Point3<vf> read = moved(at_once, rate, -late_s);
+            x = read.x;
+            y = read.y;
+            z = read.z;
         }
     }
 };

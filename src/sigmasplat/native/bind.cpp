@@ -39,7 +39,6 @@ inline double only(bool m, double a) { return m ? a : 0.0; }
 }  // namespace sigmasplat
 
 using namespace sigmasplat;
-template <class T> using Maybe = std::optional<T>;
 
 static std::vector<const Kernels*> supported() {
     std::vector<const Kernels*> found;

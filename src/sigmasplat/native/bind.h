@@ -17,6 +17,7 @@ using ConstFloats = nb::ndarray<const float, nb::c_contig, nb::device::cpu>;
 using Ints = nb::ndarray<int, nb::c_contig, nb::device::cpu>;
 using ConstInts = nb::ndarray<const int, nb::c_contig, nb::device::cpu>;
 using Bytes = nb::ndarray<uint8_t, nb::c_contig, nb::device::cpu>;
+template <class T> using Maybe = std::optional<T>;
 using Doubles = nb::ndarray<double, nb::c_contig, nb::device::cpu>;
 using ConstDoubles = nb::ndarray<const double, nb::c_contig, nb::device::cpu>;
 

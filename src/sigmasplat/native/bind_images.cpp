@@ -50,7 +50,7 @@ static void need_half(const ConstFloats& image, const Floats& half) {
     need(image.ndim() == 2 && half.ndim() == 2 && half.shape(0) == image.shape(0) / 2 && half.shape(1) == image.shape(1) / 2, "halve: [h, w] to [h/2, w/2]");
 }
 static bool compare(ConstFloats reference_depth, ConstFloats reference_gray, ConstFloats live_depth, ConstFloats live_gray,
-                    std::vector<double> intrinsics, ConstDoubles T, std::vector<double> rules, Doubles found, std::optional<ConstFloats> color_depth,
+                    std::vector<double> intrinsics, ConstDoubles T, std::vector<double> rules, Doubles found, Maybe<ConstFloats> color_depth,
                     const std::vector<float>& readouts) {
     need_image(reference_depth);
     need(reference_gray.size() == reference_depth.size() && live_depth.size() == reference_depth.size() && live_gray.size() == reference_depth.size()
@@ -71,15 +71,15 @@ static void free_places(nb::ndarray<const float, nb::ndim<2>, nb::device::cpu> p
                                 {depth.data(), int(depth.shape(1)), int(depth.shape(0)), intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]},
                                 {radius_px, clear_m, clear_relative}, free.data());
 }
-static void read_before(ConstFloats depth, std::vector<double> intrinsics, const std::vector<float>& readout, int rounds, double same_surface, double usual_m,
-                        bool of_color, Floats before, std::optional<Floats> color_at) {
+static void read_before(ConstFloats depth, std::vector<double> intrinsics, const std::vector<float>& readout, int rounds, float same_surface, float usual_m,
+                        Floats before, Maybe<Floats> color_at) {
     need_image(depth);
     need(intrinsics.size() == 4 && readout.size() == sizeof(Readout) / sizeof(float) && rounds > 0, "read_before: four intrinsics, a readout, a round");
     need(before.size() == depth.size() && (!color_at || color_at->size() == 2 * depth.size()), "read_before: images of one size");
     Readout read;
     std::memcpy(&read, readout.data(), sizeof read);
     active->images->read_before({depth.data(), int(depth.shape(1)), int(depth.shape(0)), intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]}, read,
-                                {rounds, same_surface, usual_m, of_color}, before.data(), color_at ? color_at->data() : nullptr);
+                                {rounds, same_surface, usual_m}, before.data(), color_at ? color_at->data() : nullptr);
 }
 
 void sigmasplat::bind_images(nb::module_& m) {
@@ -103,5 +103,5 @@ void sigmasplat::bind_images(nb::module_& m) {
           nb::arg("T_live_reference"), nb::arg("rules"), nb::arg("found"), nb::arg("color_depth").none() = nb::none(), nb::arg("readouts") = std::vector<float>());
     m.def("free_places", free_places);
     m.def("read_before", read_before, nb::arg("depth"), nb::arg("intrinsics"), nb::arg("readout"), nb::arg("rounds"), nb::arg("same_surface"), nb::arg("usual_m"),
-          nb::arg("of_color"), nb::arg("before"), nb::arg("color_at").none() = nb::none());
+          nb::arg("before"), nb::arg("color_at").none() = nb::none());
 }

@@ -97,13 +97,7 @@ static void judge(Point* points, int64_t count, int64_t comparable, int64_t live
     memcpy(found, values, sizeof values);
 }
 
-// Move a position in a camera by its motion in `late_s`, to second order.
-struct Position { double x, y, z; };
-SIGMA_INLINE Position moved(const Position& p, const float* rate, double late_s) {
-    const float *v = rate, *w = rate + 3;
-    const double x = v[0] + w[1] * p.z - w[2] * p.y, y = v[1] + w[2] * p.x - w[0] * p.z, z = v[2] + w[0] * p.y - w[1] * p.x, half = 0.5 * late_s;
-    return {p.x + late_s * (x + half * (w[1] * z - w[2] * y)), p.y + late_s * (y + half * (w[2] * x - w[0] * z)), p.z + late_s * (z + half * (w[0] * y - w[1] * x))};
-}
+using Position = Point3<double>;
 SIGMA_INLINE Position transformed(const double* T, const Position& p) {
     return {T[0] * p.x + T[1] * p.y + T[2] * p.z + T[3], T[4] * p.x + T[5] * p.y + T[6] * p.z + T[7], T[8] * p.x + T[9] * p.y + T[10] * p.z + T[11]};
 }

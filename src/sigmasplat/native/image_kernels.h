@@ -32,8 +32,8 @@ struct DepthImage { const float* depth; int width, height; double fx, fy, cx, cy
 struct FreeRules { int radius_px; double clear_m, clear_relative; };
 
 // How depth is looked up at another time: so often; differences of one surface, a share of depth; depth where none is
-// read; at what time (read_at_once.h).
-struct ReadRules { int rounds; double same_surface, usual_m; bool of_color; };
+// read.
+struct ReadRules { int rounds; float same_surface, usual_m; };
 
 struct ImageKernels {
     // Colour [2h, 2w, 3] to [h, w, 3] (width = w): the mean of 2×2 pixels, limited to [0, 1].

@@ -13,6 +13,7 @@ namespace {
 
 #include "buffer.h"
 #include "resize.h"
+#include "late_points.h"
 #include "compare.h"
 #include "free_space.h"
 #include "read_at_once.h"

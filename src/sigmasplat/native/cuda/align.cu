@@ -30,6 +30,7 @@ inline vf select(Mask mask, vf a, vf b) { return mask ? a : b; }
 
 #include "align_level.h"
 #include "align_loop.h"
+#include "late_points.h"
 #include "align_pixel.h"
 
 struct LivePlanes { const float *gray, *depth; int width; };

@@ -16,7 +16,7 @@ RASTER, FIT, ALIGN = "cuda/raster.cu", "cuda/fit.cu", "cuda/align.cu"
 TEXTS = {
     RASTER: (RASTER, "cuda/gradients.cuh", "cuda/tiles.cuh", "cuda/device.cuh", "cuda/sums.cuh", "splat.h"),
     FIT: (FIT, "cuda/harmonics.cuh", "cuda/track.cuh", "cuda/descend.cuh", "cuda/sums.cuh", "harmonics.h"),
-    ALIGN: (ALIGN, "align_pixel.h", "align_loop.h", "align_level.h", "cuda/sums.cuh"),
+    ALIGN: (ALIGN, "align_pixel.h", "late_points.h", "align_loop.h", "align_level.h", "cuda/sums.cuh"),
 }
 FEATURE_COUNTS = (4, 7, 11, 16)
 """The compiled feature counts, one program each; other counts are padded with zeros."""
