@@ -12,7 +12,7 @@ from torch import Tensor
 from sigmasplat.fit import adam, cpu, tracking_loss
 from sigmasplat.fit.descent import descend
 from sigmasplat.fit.interface import DeviceFits, MappingStep, Twist, Weights
-from sigmasplat.fit.losses import FUSED_TERMS, take
+from sigmasplat.fit.losses import FUSED_TERMS, maps_of
 from sigmasplat.fit.mapping_step import OwnTermsStep, TorchStep, ViewDependentStep
 from sigmasplat.fit.tracking_loss import reference_arrays
 from sigmasplat.registry import Backend, named
@@ -72,7 +72,7 @@ def step_for(view: View, weights: Weights, degree: int) -> MappingStep:
     The device's kernels compute the loss terms that they support; autograd computes the others.
     """
     own = frozenset(name for name, weight in weights.items() if weight) - FUSED_TERMS
-    of_scales = take({name: 1.0 for name in own}, "scales")
+    of_scales = any("scales" in maps_of(name) for name in own)
     fits = TORCH if of_scales else fits_of(view)  # the kernels step splats in the pass that makes their gradient
     step = fits.mapping_step(view)
     if own and fits is not TORCH:

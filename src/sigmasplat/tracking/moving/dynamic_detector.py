@@ -22,7 +22,7 @@ from sigmasplat.tracking.moving.dynamic_mask import (
     smooth,
 )
 from sigmasplat.tracking.moving.free_space import Depth, labelled, widened
-from sigmasplat.tracking.moving.pose_pullers import OBJECT_SHARE, suspected
+from sigmasplat.tracking.moving.pose_pullers import is_scene, suspected
 from sigmasplat.tracking.pose_validation import differs
 from sigmasplat.tracking.prepared_frame import PreparedFrame
 from sigmasplat.types import Matrix, ShouldStop
@@ -188,8 +188,7 @@ class DynamicDetector:
         depth_m, live_m = keyframe.pyramid.kernels.to_host(keyframe.pyramid.depth[0]), seen.target.depth_image.numpy()
         live = Earlier(live_m, se3.inverse(keyframe.T_camera_world @ T_world_camera))
         gone = dynamic_mask(live, None, depth_m, seen.target.camera, whole_objects=True)
-        scene = gone is None or np.count_nonzero(depth_m[gone.hidden]) > OBJECT_SHARE[1] * np.count_nonzero(depth_m)
-        return keyframe if gone is None or scene else keyframe.without(gone.hidden)
+        return keyframe if gone is None or is_scene(gone, depth_m) else keyframe.without(gone.hidden)
 
     def suspected(
         self, keyframe: Reference | None, seen: PreparedFrame, fit: PoseFit, config: TrackingConfig,

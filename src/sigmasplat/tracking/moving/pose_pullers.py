@@ -55,8 +55,13 @@ def suspected(
     for inside in free_standing(thinned(live_m, STEP)):
         if every or _may_have_drawn(_front(*with_margin(inside, STEP, live_m), live_m), keyframe, seen, fit, config):
             thing = _front(*enlarged(inside, STEP, live_m), live_m)
-            if np.count_nonzero(live_m[thing.hidden]) <= OBJECT_SHARE[1] * np.count_nonzero(live_m):
+            if not is_scene(thing, live_m):
                 yield thing
+
+
+def is_scene(thing: DynamicMask, depth_m: Depth) -> bool:
+    """Return whether a thing hides more than half of the readings [H, W]."""
+    return bool(np.count_nonzero(depth_m[thing.hidden]) > OBJECT_SHARE[1] * np.count_nonzero(depth_m))
 
 
 def _may_have_drawn(
