@@ -26,10 +26,9 @@ def read_at_once(frame: Frame, readout: Readout) -> Frame:
     order. Pixels without depth move as those at the median depth.
     """
     cv2, color_at = opencv(), np.empty((2, *frame.depth_m.shape), np.float32)
-    depth_m = _depth_before(frame.camera, frame.depth_m, readout, color_at)
-    if not readout.times.color_rows_s:
-        return replace(frame, depth_m=depth_m)
-    color = cv2.remap(frame.color, *color_at, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE).clip(0.0, 1.0)
+    color, depth_m = frame.color, _depth_before(frame.camera, frame.depth_m, readout, color_at)
+    if readout.times.color_rows_s:
+        color = cv2.remap(color, *color_at, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE).clip(0.0, 1.0)
     return replace(frame, color=color, depth_m=depth_m)
 
 
