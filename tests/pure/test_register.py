@@ -146,8 +146,8 @@ def test_a_submap_whose_splats_are_too_near_does_not_bias_the_pose_relative_to_i
     error = se3.exp(np.array([0.02, -0.01, 0.01, 0.01, 0.01, -0.01]))
     to_map, truth = registered((0, 5), (3, 8), error)
     to_keyframe, _ = registered((0, 5), (3, 8), error, config=TO_KEYFRAME)
-    assert to_map.accepted and to_keyframe.accepted
-    assert off(to_keyframe.T_a_b, truth)[0] < 0.3 * off(to_map.T_a_b, truth)[0]
+    assert to_keyframe.accepted and off(to_keyframe.T_a_b, truth)[0] < 0.005
+    assert off(to_map.T_a_b, truth)[0] > 0.01  # if it is not refused: that hangs on rounding
 
 
 def test_a_pose_relative_to_a_keyframe_needs_no_descent() -> None:
