@@ -33,6 +33,7 @@ class Pair:
     colors: float = 0.4
     depths: float = 0.6
     gate: float = 0.5
+    gain: float = 1.0
 
 
 def waves(seed: int, size: float, level: float) -> Array:
@@ -99,11 +100,11 @@ def warped(p: Pair, T: Array) -> tuple[Array, Array, Array, Array]:
     """Return pixels [2, N], z [N], gray and depth residuals [N] of every reference pixel, seen or not."""
     x, y, z = T[:3, :3] @ (CAMERA.rays().reshape(-1, 3) * p.depth.reshape(-1, 1)).T + T[:3, 3:]
     uv = np.stack([CAMERA.fx * x / z + CAMERA.cx, CAMERA.fy * y / z + CAMERA.cy])
-    return uv, z, bilinear(p.live_gray, uv) - p.gray.ravel(), between_readings(p.live_depth, uv) - z
+    return uv, z, p.gain * bilinear(p.live_gray, uv) - p.gray.ravel(), between_readings(p.live_depth, uv) - z
 
 
-def oracle(p: Pair) -> tuple[Array, Array, Array]:
-    """Compute H, b and sums in float64: weights and masks at p.T, derivatives by central differences."""
+def oracle(p: Pair) -> tuple[Array, Array, Array, Array]:
+    """Compute H, b, sums and grays in float64: weights and masks at p.T, derivatives by central differences."""
     uv, z, r_gray, r_depth = warped(p, p.T)
     inside = (uv >= 0).all(0) & (uv[0] < CAMERA.width - 1) & (uv[1] < CAMERA.height - 1) & (p.depth.ravel() > 0)
     cells = neighbours(p.live_depth, uv)
@@ -124,4 +125,5 @@ def oracle(p: Pair) -> tuple[Array, Array, Array]:
     in_cells = np.array([[mask.reshape(p.depth.shape)[c].sum() for c in CELLS] for mask in (inside, read)])
     common = np.minimum(in_cells[0], 4 * in_cells[1]).sum()
     sums = np.array([cost, colored.sum(), read.sum(), agrees.sum(), common])
-    return (Jg * w_gray) @ Jg.T + (Jd * w_depth) @ Jd.T, (Jg * w_gray) @ r_gray + (Jd * w_depth) @ r_depth, sums
+    grays = np.array([w_gray @ (r_gray + p.gray.ravel()) / p.gain, w_gray @ p.gray.ravel()])
+    return (Jg * w_gray) @ Jg.T + (Jd * w_depth) @ Jd.T, (Jg * w_gray) @ r_gray + (Jd * w_depth) @ r_depth, sums, grays

@@ -1,6 +1,7 @@
 """Direct alignment: it finds known motions, and its normal equations are those of the residuals it claims to have."""
 
 import itertools
+from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 
@@ -86,6 +87,17 @@ def test_either_kind_of_residual_finds_the_motion() -> None:
         assert_same_pose(found.T_live_reference, motion(10, 12), 5e-3, 0.2)
 
 
+@pytest.mark.parametrize("gain", [0.7, 1.4])
+def test_another_exposure_does_not_move_the_pose(gain: float) -> None:
+    """Without the gain, gray alone is off by centimetres."""
+    reference, same = seen(10), seen(12)
+    live = replace(same, gray=[np.float32(gain) * plane for plane in same.gray])
+    for weight_color in (0.5, 1.0):
+        found, alike = (align(reference, image, np.eye(4), 30, weight_color) for image in (live, same))
+        assert_same_pose(found.T_live_reference, alike.T_live_reference, 1e-3, 0.05)
+    assert gray_share(reference, live, motion(10, 12)) > 0.8 * gray_share(reference, same, motion(10, 12))
+
+
 def stained(i: int, gray: float, depth: float) -> Pyramid:
     """Return a frame with a pattern that stays where it is in the image, as reflections in gray and distortions of
     depth do; gray: 0 to 1; depth: a share."""
@@ -168,26 +180,26 @@ def test_half_depth_never_averages_two_surfaces() -> None:
 # ---- one step against an oracle that differentiates its residuals numerically
 
 
-def step(p: Pair, T: Array | None = None) -> tuple[Array, Array, Array]:
-    """Run the kernel: H [6, 6], b [6], sums [5]."""
+def step(p: Pair, T: Array | None = None) -> tuple[Array, Array, Array, Array]:
+    """Run the kernel: H [6, 6], b [6], sums [5], grays [2]."""
     planes = (p.gray, p.depth, p.weight, p.weight_depth, p.live_gray, p.live_depth)
     images = [np.ascontiguousarray(x, np.float32) for x in planes]
-    H, b, S, sums = np.zeros(21), np.zeros(6), np.zeros(21), np.zeros(5)
-    intrinsics = [CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy]
-    level = _core.Level(*images, intrinsics, [p.colors, p.depths, p.huber_gray, p.huber_depth, p.gate])
-    _core.align_step(level, p.T if T is None else T, H, b, S, sums)
+    row, intrinsics = np.zeros(55), [CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy]
+    level = _core.Level(*images, intrinsics, [p.colors, p.depths, p.huber_gray, p.huber_depth, p.gate, p.gain])
+    _core.align_step(level, p.T if T is None else T, row)
     full = np.zeros((6, 6))
-    full[np.triu_indices(6)] = H
-    return full + np.triu(full, 1).T, b, sums
+    full[np.triu_indices(6)] = row[:21]
+    return full + np.triu(full, 1).T, row[21:27], row[27:32], row[53:]
 
 
 def test_normal_equations_are_those_of_the_residuals() -> None:
-    for kinds, huber, holes in itertools.product(
-        [(1.0, 0.0), (0.0, 1.0), (0.4, 0.6)], [(HUGE, HUGE), (0.05, 0.004)], [False, True]
+    for kinds, huber, holes, gain in itertools.product(
+        [(1.0, 0.0), (0.0, 1.0), (0.4, 0.6)], [(HUGE, HUGE), (0.05, 0.004)], [False, True], [1.0, 1.2]
     ):
-        p = pair(*huber, holes)
+        p = replace(pair(*huber, holes), gain=gain)
         p.colors, p.depths = kinds
-        (H, b, sums), (want_H, want_b, want_sums) = step(p), oracle(p)
+        (H, b, sums, grays), (want_H, want_b, want_sums, want_grays) = step(p), oracle(p)
+        np.testing.assert_allclose(grays, want_grays, rtol=1e-4)
         np.testing.assert_array_equal(sums[1:], want_sums[1:])
         assert sums[1] > 800 and (not holes or sums[1] > sums[3] + 20 < sums[2])
         assert sums[0] == pytest.approx(want_sums[0], rel=1e-4)
@@ -201,7 +213,7 @@ def test_missing_readings_leave_the_normal_equations_those_of_the_residuals(shar
     for kinds, huber in itertools.product([(1.0, 0.0), (0.0, 1.0), (0.4, 0.6)], [(HUGE, HUGE), (0.05, 0.004)]):
         p = missing(pair(*huber), share)
         p.colors, p.depths = kinds
-        (H, b, sums), (want_H, want_b, want_sums) = step(p), oracle(p)
+        (H, b, sums, _), (want_H, want_b, want_sums, _) = step(p), oracle(p)
         np.testing.assert_array_equal(sums[1:], want_sums[1:])
         assert sums[0] == pytest.approx(want_sums[0], rel=1e-4)
         assert np.linalg.norm(b - want_b) < 1e-3 * np.linalg.norm(want_b)
@@ -251,8 +263,7 @@ def test_gray_gradient_is_half_the_derivative_of_the_cost_itself() -> None:
 
 def test_a_reference_behind_the_camera_contributes_nothing() -> None:
     away = np.diag([-1.0, 1.0, -1.0, 1.0])
-    H, b, sums = step(pair(), away)
-    assert not H.any() and not b.any() and not sums.any()
+    assert not any(part.any() for part in step(pair(), away))
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.4])

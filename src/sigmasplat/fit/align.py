@@ -6,7 +6,7 @@ replace dozens of renders. Alignment runs on the device that holds the images: t
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -95,11 +95,13 @@ class Alignment:
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """Two images to align, and the weight of gray relative to depth if readings are as sure as usual."""
+    """Two images to align, and the weight of gray relative to depth if readings are as sure as usual; gain: factor on
+    the gray of the live image that makes both as bright."""
 
     reference: Pyramid
     live: Pyramid
     weight_color: float
+    gain: float = 1.0
 
     @property
     def kernels(self) -> ImageKernels:
@@ -112,7 +114,7 @@ class Pair:
         c, scale, noise = r.cameras[k], r.scene_scale, live.noise_per_m / NOISE_PER_M
         weight_gray = balanced(self.weight_color, r.confidence)
         options = [weight_gray, 1.0 - weight_gray]
-        options += [HUBER_GRAY[width], HUBER_DEPTH_RELATIVE[width] * noise, DEPTH_GATES_M[width] * scale]
+        options += [HUBER_GRAY[width], HUBER_DEPTH_RELATIVE[width] * noise, DEPTH_GATES_M[width] * scale, self.gain]
         return LevelPlanes(
             r.gray[k], r.depth[k], r.weight[k], r.weight_depth[k], live.gray[k], live.depth[k],
             [c.fx, c.fy, c.cx, c.cy], options, _noise_at(r.noise[k], width), r.color_depth(k),
@@ -149,7 +151,8 @@ def _noise_at(noise: Plane | None, width: int) -> Plane | None:
 @dataclass(eq=False)
 class Normal:
     """The normal equations of one step, as returned by `_core.align_step`: information H and gradient b with respect to
-    a left twist, and S = Σ b_c b_cᵀ over the cells c of the image."""
+    a left twist, and S = Σ b_c b_cᵀ over the cells c of the image; grays: sums of gray in the live image and in the
+    reference, by the weights of the pixels."""
 
     H: Matrix
     b: Matrix
@@ -157,12 +160,23 @@ class Normal:
     sums: Matrix
     """Weighted cost; number of pixels used; of pixels in view that fall on a live depth reading; of those whose depths
     agree; of pixels that both cameras see (`common_pixels` in native/align_pixel.h)."""
+    grays: Matrix
+
+    @property
+    def gain(self) -> float:
+        """Return the factor on the gray of the live image that makes both as bright.
+
+        A camera that changes its exposure multiplies the light, and with it the gray, also after gamma. Means hardly
+        depend on noise, nor on a motion that is not exact yet.
+        """
+        live, reference = self.grays.tolist()
+        return float(reference / live) if live > 0.0 else 1.0
 
 
 def normal_equations(kernels: ImageKernels, level: LevelPlanes, motions: Sequence[Matrix]) -> list[Normal]:
     """Linearise the residuals of a level at up to 13 motions T_live_reference."""
     rows = kernels.normal_equations(level, motions)
-    return [Normal(_symmetric(row[:21]), row[21:27], _symmetric(row[32:]), row[27:32]) for row in rows]
+    return [Normal(_symmetric(row[:21]), row[21:27], _symmetric(row[32:53]), row[27:32], row[53:]) for row in rows]
 
 
 def align(
@@ -181,8 +195,8 @@ def align(
     change of the gradient along the step before. A level ends when a step is below `update_stop` (m, rad; twice as much
     on each coarser level), or when the relative change of the cost is below `plateau_stop` (0 = off). If the finest
     level meets neither condition, its best iterate is returned. Undetermined directions keep the guess. weight_color in
-    [0, 1] balances gray against depth, each in units of its Huber width. With 0 iterations the guess stays, and is
-    judged. Raises BackendError without the compiled kernels, or if only one image is on a device.
+    [0, 1] balances gray against depth, each in units of its Huber width. Each step also finds the gain of the live
+    image. With 0 iterations the guess stays, and is judged. Raises BackendError without the compiled kernels, or if only one image is on a device.
     """
     if reference.kernels is not live.kernels:
         raise BackendError("the two images to align are on different devices; make both for the same view")
@@ -190,7 +204,10 @@ def align(
     pair = Pair(reference, live, weight_color)
     levels = [pair.level(k) for k in range(len(reference.cameras))]
     found = pair.kernels.align(levels, reference.readings, T_live_reference, rules)
-    sums = found.sums if iterations else normal_equations(pair.kernels, levels[0], [T_live_reference])[0].sums
+    sums, gain = found.sums, found.gain
+    if not iterations:
+        still = normal_equations(pair.kernels, levels[0], [T_live_reference])[0]
+        sums, gain = still.sums, still.gain
     return Alignment(
         se3.orthonormalise(found.T),
         agreement=float(sums[3] / max(sums[2], 1.0)),
@@ -198,7 +215,7 @@ def align(
         degenerate=found.degenerate,
         cost=float(sums[0] / max(sums[1], 1.0)),
         steps=found.steps,
-        pair=pair,
+        pair=replace(pair, gain=gain),
         depth_m=found.depth_m,
     )
 
@@ -213,7 +230,9 @@ def gray_share(reference: Pyramid, live: Pyramid, T_live_reference: Matrix) -> f
     cost = []
     for weight in (1.0, 0.0):
         pair = Pair(reference, live, weight)
-        sums = normal_equations(pair.kernels, pair.level(0), [T_live_reference])[0].sums
+        for _ in range(2):  # the second time as bright
+            found = normal_equations(pair.kernels, pair.level(0), [T_live_reference])[0]
+            sums, pair = found.sums, replace(pair, gain=found.gain)
         cost.append(math.sqrt(sums[0] / max(sums[1], 1.0)))
     return cost[1] / max(cost[0] + cost[1], 1e-9)
 

@@ -66,20 +66,20 @@ def readings_of(finest: Image, coarsest: Image) -> Matrix:
 
 def align(levels: Sequence[LevelPlanes], readings: Matrix, T_live_reference: Matrix, rules: AlignRules) -> AlignedPose:
     """Align from the coarsest level (the last one) to the finest, in one call of the kernels."""
-    (depth_m, n), T, sums = readings.tolist(), np.array(T_live_reference, np.float64), np.zeros(5)
+    (depth_m, n), T, found = readings.tolist(), np.array(T_live_reference, np.float64), np.zeros(6)
     r = rules
     steps, degenerate = _core.align_images(
         [_laid_out(level) for level in levels], r.iterations, r.update_stop, r.plateau_stop, depth_m,
-        r.degenerate_share, r.min_pixels, T, sums,
+        r.degenerate_share, r.min_pixels, T, found,
     )  # fmt: skip
-    return AlignedPose(T, sums, steps, degenerate, depth_m, n)
+    return AlignedPose(T, found[:5], steps, degenerate, depth_m, n, float(found[5]))
 
 
 def normal_equations(level: LevelPlanes, motions: Sequence[Matrix]) -> Matrix:
     """Implement `ImageKernels.normal_equations`."""
     rows, laid_out = np.zeros((len(motions), NORMAL_TERMS)), _laid_out(level)
     for row, T in zip(rows, motions, strict=True):
-        _core.align_step(laid_out, T, row[:21], row[21:27], row[32:], row[27:32])
+        _core.align_step(laid_out, T, row)
     return rows
 
 

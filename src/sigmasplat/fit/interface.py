@@ -113,7 +113,8 @@ class AlignRules(NamedTuple):
 
 class AlignedPose(NamedTuple):
     """The result of an alignment: T_live_reference [4, 4]; sums [5] of the final iterate; steps on all levels; number
-    of undetermined directions; mean depth of the reference in metres, and how many of its pixels have depth."""
+    of undetermined directions; mean depth of the reference in metres, and how many of its pixels have depth; gain: as of
+    `align.Pair`, 1 without a step."""
 
     T: Matrix
     sums: Matrix
@@ -121,6 +122,7 @@ class AlignedPose(NamedTuple):
     degenerate: int
     depth_m: float
     readings: float
+    gain: float
 
 
 class LevelPlanes(NamedTuple):
@@ -143,8 +145,8 @@ class LevelPlanes(NamedTuple):
 
 DEPTH_STEP_M = 0.05
 """Readings of a cell that differ by this much are not averaged, in a room."""
-NORMAL_TERMS = 53
-"""Number of values in one linearisation: H 21, b 6, sums 5, S 21 (native/align_pixel.h)."""
+NORMAL_TERMS = 55
+"""Number of values in one linearisation: H 21, b 6, counts 5, S 21, grays 2 (native/align_pixel.h)."""
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 // Direct alignment on a CPU: the normal equations of one step, and the loop. The loop is in C++ because a step takes
-// only a tenth of a millisecond. H [21] upper triangle, b [6], sums [5], S [21], upper triangle of Σ b_c b_cᵀ over
-// cells c of CELL×CELL pixels.
+// only a tenth of a millisecond. The normal equations are H [21]
+// upper triangle, b [6], counts [5], S [21], upper triangle of Σ b_c b_cᵀ over cells c of CELL×CELL pixels, grays [2].
 #include "align_loop.h"
 #include "late_points.h"
 #include "align_pixel.h"
@@ -102,7 +102,7 @@ static void add_part(const AlignLevel& L, const LivePairs& live, const AlignOpti
 // So few bands take less time than waking the other threads.
 constexpr int FEW_BANDS = 4;
 
-static void linearise(const AlignLevel& L, const LivePairs& live, const AlignOptions* o, const AlignReadouts* times, const double* T, double* H, double* b, double* S, double* sums) {
+static void linearise(const AlignLevel& L, const LivePairs& live, const AlignOptions& o, const AlignReadouts* times, const double* T, double* normal) {
     const Motion motion = motion_of(T);
     const int bands = (L.height + CELL - 1) / CELL, cells = (L.width + CELL - 1) / CELL;
     Buffer<double> band_sums;
@@ -118,7 +118,7 @@ static void linearise(const AlignLevel& L, const LivePairs& live, const AlignOpt
             const vf used = acc[22], read = acc[23], agreeing = acc[24];
             const int bottom = (band + 1) * CELL < L.height ? (band + 1) * CELL : L.height, right = (cell + 1) * CELL < L.width ? (cell + 1) * CELL : L.width;
             for (int y = band * CELL; y < bottom; y += PART_ROWS)
-                (times ? add_part<true> : add_part<false>)(L, live, *o, motion, times, {cell * CELL, right, y, y + PART_ROWS < bottom ? y + PART_ROWS : bottom}, acc, pull);
+                (times ? add_part<true> : add_part<false>)(L, live, o, motion, times, {cell * CELL, right, y, y + PART_ROWS < bottom ? y + PART_ROWS : bottom}, acc, pull);
             double g[6];
             for (int k = 0; k < 6; k++) { g[k] = lane_sum(pull[k]); total[21 + k] += g[k]; }
             // Two counts in one sum, exact below 2²⁴: pixels in view without a reading or agreeing, and readings.
@@ -129,25 +129,22 @@ static void linearise(const AlignLevel& L, const LivePairs& live, const AlignOpt
                 for (int j = i; j < 6; j++, q++) total[q] += g[i] * g[j];
         }
         for (int k = 0; k < 21; k++) total[k] = lane_sum(acc[k]);
-        for (int k = 0; k < 4; k++) total[27 + k] = lane_sum(acc[21 + k]);
+        for (int k = 0; k < COUNTS; k++) total[27 + k] = lane_sum(acc[21 + k]);
+        for (int k = 0; k < 2; k++) total[GRAYS + k] = lane_sum(acc[MATRIX_TERMS + COUNTS + k]);
     }
-    double total[NORMAL_TERMS] = {};
+    for (int k = 0; k < NORMAL_TERMS; k++) normal[k] = 0;
     for (int band = 0; band < bands; band++)
-        for (int k = 0; k < NORMAL_TERMS; k++) total[k] += band_sums[size_t(band) * NORMAL_TERMS + k];
-    memcpy(H, total, 21 * sizeof(double));
-    memcpy(b, total + 21, 6 * sizeof(double));
-    memcpy(sums, total + 27, (SUMS + 1) * sizeof(double));
-    memcpy(S, total + COMMON + 1, 21 * sizeof(double));
+        for (int k = 0; k < NORMAL_TERMS; k++) normal[k] += band_sums[size_t(band) * NORMAL_TERMS + k];
 }
 
-static void align_step(const AlignLevel* level, const AlignOptions* o, const AlignReadouts* times, const double* T, double* H, double* b, double* S, double* sums) {
+static void align_step(const AlignLevel* level, const AlignOptions* o, const AlignReadouts* times, const double* T, double* normal) {
     static thread_local Buffer<float> memory;         // each thread that calls has its own
-    linearise(*level, side_by_side(*level, memory), o, times, T, H, b, S, sums);
+    linearise(*level, side_by_side(*level, memory), *o, times, T, normal);
 }
 
 // times: null if all rows of both images were read at once.
 // Align from the coarsest level, `levels[count - 1]`, to the finest. T is the guess on input and the motion on output.
-// found: sums of the last or best iterate of the finest level. Returns the number of steps.
+// found: counts of the last or best iterate of the finest level, and the gain. Returns the number of steps.
 static int align_images(const AlignLevel* levels, const AlignOptions* options, const AlignReadouts* times, int count, AlignLoop o, double* T, double* found, int* degenerate) {
     double normal[NORMAL_TERMS];
     static thread_local Buffer<float> memory;
@@ -156,11 +153,14 @@ static int align_images(const AlignLevel* levels, const AlignOptions* options, c
     for (int before = count; d.level >= 0 && o.iterations > 0;) {
         const int k = d.level;
         if (k != before) live = side_by_side(levels[before = k], memory);
-        linearise(levels[k], live, &options[k], times, d.T, normal, normal + 21, normal + COMMON + 1, normal + 27);
+        AlignOptions in_its_light = options[k];
+        in_its_light.gain = float(d.gain);
+        linearise(levels[k], live, in_its_light, times, d.T, normal);
         take_step(d, o, normal);
     }
     copy(d.T, 12, T);
-    copy(d.sums, SUMS + 1, found);
+    copy(d.sums, COUNTS + 1, found);
+    found[COUNTS + 1] = d.gain;
     *degenerate = d.degenerate;
     return d.steps;
 }

@@ -12,6 +12,7 @@ struct AlignOptions {
     float weight_color, weight_depth;      // weights of residuals in units of their Huber widths
     float huber_gray, huber_depth_relative;
     float depth_gate;                      // metres
+    float gain;                            // factor on the gray of the live image: that of its exposure
 };
 
 // When the rows of an image were read, s after the time of its colour: depth late by `late_s`; rows take `…_rows_s` from the

@@ -73,9 +73,9 @@ constexpr double UNKNOWN_COST = 1.7976931348623157e308;
 // The progress of an alignment. T: T_live_reference; sums: those of the last step, or of the best one if a level ended
 // with it; best… and previous: values within a level; last…: gradient and update of the step before, an update of 0 at
 // the start of a level; longer: factor of the last step (`lengthening`); degenerate: number of directions that the last
-// step did not change; steps: on all levels.
+// step did not change; steps: on all levels; gain: factor on the gray of the live image, by which both are as bright.
 struct Descent {
-    double T[12], sums[5], best_T[12], best_sums[5], best, previous, last_b[6], last_update[6], longer;
+    double T[12], sums[5], best_T[12], best_sums[5], best, previous, last_b[6], last_update[6], longer, gain;
     int level, taken, steps, degenerate;
 };
 
@@ -91,12 +91,13 @@ inline void begin_level(Descent& d, int level) {
 inline Descent begin_descent(const double* T, int levels) {
     Descent d = {};
     copy(T, 12, d.T);
-    d.longer = 1;
+    d.longer = d.gain = 1;
     begin_level(d, levels - 1);
     return d;
 }
 
 constexpr double LONGEST = 3.0;            // maximum factor of a step
+constexpr double GAIN_STOP = 1e-3;         // a smaller change of the gain changes gray by less than a step of 1/255
 
 // Return by which factor the next step is longer than a Gauss–Newton step: by how much H exceeds the measured change of
 // the gradient along the step before, sᵀHs / sᵀ(b − b₀), from 1 to LONGEST. H is computed from noisy image gradients, so
@@ -131,7 +132,9 @@ inline void take_step(Descent& d, const AlignLoop& o, const double* normal) {
         copy(normal + 21, 6, d.last_b);
         copy(update, 6, d.last_update);
         move_left(update, d.T);
-        settled = true;
+        const double gain = normal[53] > 0 ? normal[54] / normal[53] : d.gain;
+        settled = ::fabs(gain - d.gain) < GAIN_STOP;
+        d.gain = gain;
         for (double u : update) settled = settled && ::fabs(u) < o.update_stop * (1 << d.level);    // coarse pixels are larger
         settled = settled || ::fabs(cost - d.previous) < o.plateau_stop * cost;
         d.previous = cost;

@@ -4,9 +4,11 @@
 // is a vector of one lane (see align.cu). Has no includes and no namespace.
 
 constexpr int CELL = 16;                   // size in pixels: errors are correlated within a cell, hardly between cells
-constexpr int MATRIX_TERMS = 21, SUMS = 4; // upper triangle of a 6×6; cost, pixels used, in view with depth, agreeing
-constexpr int COMMON = MATRIX_TERMS + 6 + SUMS;                        // a fifth sum, over cells: `common_pixels`
-constexpr int NORMAL_TERMS = COMMON + 1 + MATRIX_TERMS;                // H, b, sums, and S = Σ b_c b_cᵀ over cells c
+constexpr int MATRIX_TERMS = 21, COUNTS = 4; // upper triangle of a 6×6; cost, pixels used, in view with depth, agreeing
+constexpr int SUMS = COUNTS + 2;           // and gray of live and of reference pixels, by their weights
+constexpr int COMMON = MATRIX_TERMS + 6 + COUNTS;                      // a fifth count, over cells: `common_pixels`
+constexpr int GRAYS = COMMON + 1 + MATRIX_TERMS;                       // H, b, counts, S = Σ b_c b_cᵀ over cells c; then the grays
+constexpr int NORMAL_TERMS = GRAYS + 2;
 
 struct Bilinear { vf value, dx, dy; };
 SIGMA_INLINE Bilinear interpolate(vf v00, vf v10, vf v01, vf v11, vf a, vf b) {
@@ -144,7 +146,7 @@ SIGMA_INLINE Residuals compared(const AlignOptions& o, const Warped& w, const Ne
         planar = both(ok, s.planar);
         read = both(ok, s.read);
     }
-    const vf r_depth = D.value - w.pz, r_gray = I.value - pixels.gray;
+    const vf r_depth = D.value - w.pz, r_gray = fma(splat(o.gain), I.value, -pixels.gray);
     const Mask agrees = both(read, gt(splat(o.depth_gate), abs(r_depth)));
     // No derivative is used where the neighbours do not determine it or contain a depth step. Without live depth only
     // colour is used.
@@ -158,7 +160,9 @@ SIGMA_INLINE Residuals compared(const AlignOptions& o, const Warped& w, const Ne
     sums[1] += only(color_ok, splat(1.f));
     sums[2] += only(read, splat(1.f));
     sums[3] += only(agrees, splat(1.f));
-    return {r_gray, r_depth, wi, wd, I.dx, I.dy, D.dx, D.dy};
+    sums[4] += wi * I.value;
+    sums[5] += wi * pixels.gray;
+    return {r_gray, r_depth, wi, wd, splat(o.gain) * I.dx, splat(o.gain) * I.dy, D.dx, D.dy};
 }
 
 // Derivatives of both residuals with respect to the left twist.

@@ -72,10 +72,10 @@ struct Level {
     Level(ConstFloats rg, ConstFloats rd, Maybe<ConstFloats> wg, Maybe<ConstFloats> wd, ConstFloats lg, ConstFloats ld, std::vector<float> camera, std::vector<float> o,
           Maybe<ConstFloats> noise_factor, Maybe<ConstFloats> cd, const std::vector<float>& read)
         : reference_gray(rg), reference_depth(rd), weight_gray(wg), weight_depth(wd), live_gray(lg), live_depth(ld), intrinsics(camera), noise(noise_factor), color_depth(cd), readouts(readouts_of(read)) {
-        need(camera.size() == 4 && o.size() == 5, "a level has 4 intrinsics and 5 options");
+        need(camera.size() == 4 && o.size() == 6, "a level has 4 intrinsics and 6 options");
         need(rg.ndim() == 2 && rd.size() == rg.size() && lg.size() == rg.size() && ld.size() == rg.size()
              && (!wg || wg->size() == rg.size()) && (!wd || wd->size() == rg.size()) && (!noise || noise->size() == rg.size()) && (!cd || cd->size() == rg.size()), "the planes of a level are of one size");
-        options = {o[0], o[1], o[2], o[3], o[4]};
+        options = {o[0], o[1], o[2], o[3], o[4], o[5]};
     }
     const AlignReadouts* read() const { return readouts ? &*readouts : nullptr; }
     AlignLevel planes() const {
@@ -308,15 +308,15 @@ NB_MODULE(_core, m) {
         .def(nb::init<ConstFloats, ConstFloats, Maybe<ConstFloats>, Maybe<ConstFloats>, ConstFloats, ConstFloats, std::vector<float>, std::vector<float>, Maybe<ConstFloats>, Maybe<ConstFloats>, std::vector<float>>(),
              nb::arg("reference_gray"), nb::arg("reference_depth"), nb::arg("weight_gray").none(), nb::arg("weight_depth").none(), nb::arg("live_gray"),
              nb::arg("live_depth"), nb::arg("intrinsics"), nb::arg("options"), nb::arg("noise").none() = nb::none(), nb::arg("color_depth").none() = nb::none(), nb::arg("readouts") = std::vector<float>());
-    m.def("align_step", [](const Level& level, Doubles T, Doubles H, Doubles b, Doubles S, Doubles sums) {
-        need(T.size() >= 12 && H.size() == 21 && b.size() == 6 && S.size() == 21 && sums.size() == 5, "align_step: wrong sizes");
+    m.def("align_step", [](const Level& level, Doubles T, Doubles normal) {
+        need(T.size() >= 12 && normal.size() == 55, "align_step: wrong sizes");
         const AlignLevel planes = level.planes();
         nb::gil_scoped_release unlocked;
-        active->align_step(&planes, &level.options, level.read(), T.data(), H.data(), b.data(), S.data(), sums.data());
+        active->align_step(&planes, &level.options, level.read(), T.data(), normal.data());
     });
     m.def("align_images", [](const std::vector<Level*>& levels, int iterations, double update_stop, double plateau_stop, double depth_m, double degenerate_share,
-                             double min_pixels, Doubles T, Doubles sums) {
-        need(!levels.empty() && T.size() >= 12 && sums.size() == 5, "align_images: wrong sizes");
+                             double min_pixels, Doubles T, Doubles found) {
+        need(!levels.empty() && T.size() >= 12 && found.size() == 6, "align_images: wrong sizes");
         std::vector<AlignLevel> planes;
         std::vector<AlignOptions> options;
         for (auto* level : levels) { planes.push_back(level->planes()); options.push_back(level->options); }
@@ -324,7 +324,7 @@ NB_MODULE(_core, m) {
         {
             nb::gil_scoped_release unlocked;
             steps = active->align_images(planes.data(), options.data(), levels[0]->read(), int(planes.size()), {iterations, update_stop, plateau_stop, depth_m, degenerate_share, min_pixels},
-                                         T.data(), sums.data(), &degenerate);
+                                         T.data(), found.data(), &degenerate);
         }
         return std::make_pair(steps, degenerate);
     });

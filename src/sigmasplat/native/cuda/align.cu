@@ -41,7 +41,9 @@ inline Neighbours neighbours(const LivePlanes& live, int i) {
 
 static_assert(CELL * CELL == THREADS, "a thread for each pixel of a cell");
 constexpr int WARPS = THREADS / 32;
-constexpr int PULL = MATRIX_TERMS + SUMS, FLOATS = 32;   // per pixel: H, sums, b, and one unused
+constexpr int PULL = MATRIX_TERMS + SUMS, TERMS = PULL + 6, FLOATS = 32;   // per pixel: H, sums, b
+constexpr int READ = MATRIX_TERMS + 2, AGREEING = READ + 1;               // both counts of a warp share one float
+constexpr float BOTH = 64.f;
 
 // ---- pyramids -------------------------------------------------------------------------------------------------------
 
@@ -89,10 +91,10 @@ inline int cells_of(const AlignLevel& L) { return (L.width + CELL - 1) / CELL * 
 // threads must call this.
 inline void store_cell(const AlignLevel& L, const AlignOptions& o, const AlignReadouts* times, const double* T, int cell, double* stored) {
     __shared__ float of_warps[WARPS][FLOATS];
-    __shared__ double of_cell[FLOATS];
+    __shared__ double of_cell[TERMS];
     const int thread = int(threadIdx.x), cells_x = (L.width + CELL - 1) / CELL;
     const int x = cell % cells_x * CELL + thread % CELL, y = cell / cells_x * CELL + thread / CELL;
-    float terms[FLOATS] = {};
+    float terms[TERMS] = {};
     if (x < L.width && y < L.height) {
         const size_t at = size_t(y) * L.width + x;
         const ReferencePixels pixel = {L.reference_gray[at], L.weight_gray ? L.weight_gray[at] : 1.f, L.weight_depth ? L.weight_depth[at] : 1.f,
@@ -111,12 +113,19 @@ inline void store_cell(const AlignLevel& L, const AlignOptions& o, const AlignRe
             add_rows<0, 6>(&r, &J, 1, terms, terms + PULL);
         }
     }
+    terms[READ] = fmaf(BOTH, terms[READ], terms[AGREEING]);
+    terms[AGREEING] = terms[TERMS - 1];
     of_warps[thread / 32][thread % 32] = sum_of_lanes<16>(terms);
     __syncthreads();
     if (thread < FLOATS) {
-        double sum = 0.0;
-        for (int w = 0; w < WARPS; w++) sum += of_warps[w][thread];
-        of_cell[thread] = sum;
+        double sum = 0.0, agreeing = 0.0;
+        for (int w = 0; w < WARPS; w++) {
+            const float of_warp = of_warps[w][thread], first = thread == READ ? floorf(of_warp / BOTH) : of_warp;
+            sum += first;
+            agreeing += of_warp - BOTH * first;
+        }
+        of_cell[thread == AGREEING ? TERMS - 1 : thread] = sum;
+        if (thread == READ) of_cell[AGREEING] = agreeing;
     }
     __syncthreads();
     if (thread >= NORMAL_TERMS) return;
@@ -128,7 +137,8 @@ inline void store_cell(const AlignLevel& L, const AlignOptions& o, const AlignRe
     else if (thread == COMMON) {
         const double *sums = of_cell + MATRIX_TERMS, read = sums[2];
         value = common_pixels(sums[1] + read - sums[3], read);
-    } else {
+    } else if (thread >= GRAYS) value = of_cell[MATRIX_TERMS + COUNTS + thread - GRAYS];
+    else {
         int row = 0, at = thread - (COMMON + 1);
         for (; at >= 6 - row; row++) at -= 6 - row;
         value = b[row] * b[row + at];
@@ -203,6 +213,7 @@ KERNEL take_align_step(AlignPlanes planes, AlignPinhole pinhole, AlignOptions op
                        int number, AlignState* state, double* of_cells, unsigned* arrived) {
     __shared__ double total[NORMAL_TERMS];
     if (state->descent.level != number) return;
+    options.gain = float(state->descent.gain);
     if (add_cells({planes, pinhole}, options, timed ? &readouts : nullptr, state->descent.T, int(blockIdx.x), of_cells, arrived, total) && threadIdx.x == 0)
         take_step(state->descent, state->loop, total);
 }

@@ -43,8 +43,8 @@ LOOP = np.dtype(
 DESCENT = np.dtype(
     [
         ("T", "f8", 12), ("sums", "f8", 5), ("best_T", "f8", 12), ("best_sums", "f8", 5), ("best", "f8"),
-        ("previous", "f8"), ("last_b", "f8", 6), ("last_update", "f8", 6), ("longer", "f8"), ("level", "i4"),
-        ("taken", "i4"), ("steps", "i4"), ("degenerate", "i4"),
+        ("previous", "f8"), ("last_b", "f8", 6), ("last_update", "f8", 6), ("longer", "f8"), ("gain", "f8"),
+        ("level", "i4"), ("taken", "i4"), ("steps", "i4"), ("degenerate", "i4"),
     ],
     align=True,
 )  # fmt: skip
@@ -77,8 +77,8 @@ class CudaLevel:
         self.device = reference_gray.device
 
     def normal_equations(self, motions: Matrix) -> Matrix:
-        """Linearise at T_live_reference [n, 4, 4], n ≤ `MOTIONS`. Returns rows of H, b, sums and S, [n, 53]. The host
-        waits."""
+        """Linearise at T_live_reference [n, 4, 4], n ≤ `MOTIONS`. Returns rows of H, b, counts, S and grays, [n, 55].
+        The host waits."""
         n, given = len(motions), np.zeros((MOTIONS, 12))
         given[:n] = motions[:, :3].reshape(n, 12)
         of_cells, arrived = _workspace(n, self.cells, self.device)
@@ -123,7 +123,8 @@ def _pose_of(state: np.void) -> AlignedPose:
     d, T = state["descent"], np.eye(4)
     T[:3] = d["T"].reshape(3, 4)
     steps, degenerate = int(d["steps"]), int(d["degenerate"])
-    return AlignedPose(T, d["sums"], steps, degenerate, float(state["loop"]["depth_m"]), float(state["readings"]))
+    given = float(state["loop"]["depth_m"]), float(state["readings"])
+    return AlignedPose(T, d["sums"], steps, degenerate, *given, float(d["gain"]))
 
 
 Half = Tensor | None
