@@ -175,8 +175,10 @@ class Normal:
 
 def normal_equations(kernels: ImageKernels, level: LevelPlanes, motions: Sequence[Matrix]) -> list[Normal]:
     """Linearise the residuals of a level at up to 13 motions T_live_reference."""
-    rows = kernels.normal_equations(level, motions)
-    return [Normal(_symmetric(row[:21]), row[21:27], _symmetric(row[32:53]), row[27:32], row[53:]) for row in rows]
+    return [
+        Normal(_symmetric(row[:21]), row[21:27], _symmetric(row[32:53]), row[27:32], row[53:])
+        for row in kernels.normal_equations(level, motions)
+    ]
 
 
 def align(
@@ -196,7 +198,8 @@ def align(
     on each coarser level), or when the relative change of the cost is below `plateau_stop` (0 = off). If the finest
     level meets neither condition, its best iterate is returned. Undetermined directions keep the guess. weight_color in
     [0, 1] balances gray against depth, each in units of its Huber width. Each step also finds the gain of the live
-    image. With 0 iterations the guess stays, and is judged. Raises BackendError without the compiled kernels, or if only one image is on a device.
+    image. With 0 iterations the guess stays, and is judged. Raises BackendError without the compiled kernels, or if
+    only one image is on a device.
     """
     if reference.kernels is not live.kernels:
         raise BackendError("the two images to align are on different devices; make both for the same view")

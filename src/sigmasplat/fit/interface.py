@@ -113,8 +113,8 @@ class AlignRules(NamedTuple):
 
 class AlignedPose(NamedTuple):
     """The result of an alignment: T_live_reference [4, 4]; sums [5] of the final iterate; steps on all levels; number
-    of undetermined directions; mean depth of the reference in metres, and how many of its pixels have depth; gain: as of
-    `align.Pair`, 1 without a step."""
+    of undetermined directions; mean depth of the reference in metres, and how many of its pixels have depth; gain: as
+    of `align.Pair`, 1 without a step."""
 
     T: Matrix
     sums: Matrix
