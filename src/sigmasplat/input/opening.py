@@ -11,10 +11,11 @@ from pathlib import Path
 from typing import Any, cast
 
 from sigmasplat.config import InputConfig
+from sigmasplat.data.camera_errors import CameraErrors
 from sigmasplat.errors import ConfigError, SourceError, nearest
 from sigmasplat.files.pictures import open_image
 from sigmasplat.files.reading import guarded
-from sigmasplat.input.given import Masked, Posed
+from sigmasplat.input.given import Corrected, Masked, Posed
 from sigmasplat.input.images import COLOR_ENDINGS
 from sigmasplat.input.source import Source, Subset
 from sigmasplat.registry import SourceFormat, rows
@@ -96,6 +97,8 @@ def open_source(path: str | Path, settings: InputConfig | None = None, **changes
     chosen = with_changes(settings or InputConfig(width=0), changes)
     with _guarded(path):
         source = _whole(path, chosen)
+        errors = CameraErrors.given(chosen.calibrate)
+        source = Corrected(source, errors) if any(errors.values) else source
         source = Masked(source, Path(chosen.masks)) if chosen.masks else source
         scales = chosen.poses_scale or 1.0, chosen.predicted_scale or 1.0
         source = Posed(source, chosen.poses, *scales) if chosen.poses else source
