@@ -70,6 +70,7 @@ def calibrate(
 
     A run with this file corrects its images from the first one on. example: sigmasplat calibrate data/kitchen
     """
+    from sigmasplat.data.camera_errors import sensor_said
     from sigmasplat.files.atomic import replacing
     from sigmasplat.files.json_files import write_json
     from sigmasplat.files.lock import output_locked
@@ -90,10 +91,11 @@ def calibrate(
     with output_locked(out, screen.warn):
         with screen.counting("frames") as progress:
             found = measure_sensor(source, config, progress)
-        write_json(out, {"source": source.name, "frames": len(source)} | found.times.noted() | found.camera.noted())
+        noted = found.times.noted() | found.camera.noted()
+        write_json(out, {"source": source.name, "frames": len(source)} | noted)
         with replacing(picture) as temporary:
             draw_sensor_times(found.estimate, found.costs).save(temporary, "PNG")
-    screen.say("; ".join(filter(None, (found.times.said(), found.camera.said()))) + f": {out}, {picture}")
+    screen.say(f"{sensor_said(noted)}: {out}, {picture}")
     screen.next_commands([shlex.join(["sigmasplat", "run", path, "--set", f"input.calibrate={out}"])])
     return OK
 

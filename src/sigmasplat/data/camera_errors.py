@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.frame import Frame
+from sigmasplat.data.readout import SensorTimes
 
 Floats = NDArray[np.float32]
 
@@ -95,6 +96,11 @@ class CameraErrors:
 
 
 KNOWN_NONE = CameraErrors()
+
+
+def sensor_said(facts: Mapping[str, Any]) -> str:
+    """Return what the facts of a run or of a file note of its sensor, in words."""
+    return "; ".join(filter(None, (SensorTimes.noted_in(facts).said(), CameraErrors.noted_in(facts).said())))
 
 
 def corner_share(u: Floats, v: Floats, camera: Camera) -> Floats:

@@ -56,13 +56,13 @@ class Measured:
 
 def measure_sensor(source: Source, config: Config, progress: Progress = no_progress) -> Measured:
     """Measure the sensor of a recording. Raises SourceError if the recording does not show when it reads."""
-    pairs = aligned_pairs(source, config, progress)
-    fit = completed(fitted(pairs, TIMES))
-    camera = camera_errors(pairs, times_of(fit) if fit.sure else SensorTimes())
-    if any(camera.values):  # the times once more, with the true camera
-        pairs = [
-            pair._replace(reference=_true(pair.reference, camera), live=_true(pair.live, camera)) for pair in pairs
-        ]
+    stated = aligned_pairs(source, config, progress)
+    pairs, camera, fit = stated, KNOWN_NONE, completed(fitted(stated, TIMES))
+    for _ in range(1 + fit.sure):  # times and camera pull at each other
+        camera = camera_errors(stated, times_of(fit) if fit.sure else SensorTimes())
+        if not any(camera.values):
+            break
+        pairs = [_of_true(pair, camera) for pair in stated]
         fit = completed(fitted(pairs, TIMES))
     estimate = times_of(fit)
     if estimate.std_s is None:
@@ -100,6 +100,10 @@ def _true(image: Pyramid, errors: CameraErrors) -> Pyramid:
     return replace(image, gray=gray, depth=depth, cameras=true, color_depths=color_depths)
 
 
+def _of_true(pair: Pair, errors: CameraErrors) -> Pair:
+    return pair._replace(reference=_true(pair.reference, errors), live=_true(pair.live, errors))
+
+
 def _images(pair: Pair, values: Matrix) -> tuple[Pyramid, Pyramid]:
     errors = CameraErrors(*values.tolist())
     return _true(pair.reference, errors), _true(pair.live, errors)
@@ -127,7 +131,7 @@ def camera_errors(pairs: Sequence[Pair], times: SensorTimes) -> CameraErrors:
     if len(seen) < BLOCKS:
         return KNOWN_NONE
     even = CameraErrors(falloff=falloff_of(seen, values)[0])
-    bright = [pair._replace(reference=_true(pair.reference, even), live=_true(pair.live, even)) for pair in seen]
+    bright = [_of_true(pair, even) for pair in seen]
     fit = completed(fitted(bright, CAMERA))
     halves = [[pair for pair in bright if pair.number // NEIGHBOURS % 2 == half] for half in (0, 1)]
     if fit.sure and all(_helps(completed(fitted(a, CAMERA)), b) for a, b in (halves, halves[::-1])):

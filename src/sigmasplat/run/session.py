@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sigmasplat.config import Config
+from sigmasplat.data.camera_errors import CameraErrors, sensor_said
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.trajectory import RELOCALISED
 from sigmasplat.errors import RunError
@@ -269,8 +270,9 @@ class Session:
         before, started_s = len(self.slam.loops), time.perf_counter()
         self.slam.finish(progress)
         self.run.note(finish_s=time.perf_counter() - started_s, final_steps=self.slam.refinement_steps)
-        self.run.note(**self.slam.sensor_times.noted())
-        self.outcome.sensor = self.slam.sensor_times.said()
+        camera = CameraErrors.given(self.run.config().input.calibrate)
+        self.run.note(**(noted := self.slam.sensor_times.noted() | camera.noted()))
+        self.outcome.sensor = sensor_said(noted)
         for callback in (*self.callbacks, *self.readers):
             callback.last_loops(self.slam.loops[before:])
 

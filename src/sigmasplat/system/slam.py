@@ -11,7 +11,6 @@ from torch import Tensor
 
 from sigmasplat.config import Config
 from sigmasplat.config.find_preset import configured
-from sigmasplat.config.input import RENDERED
 from sigmasplat.data.atlas import Atlas
 from sigmasplat.data.field import GaussianField, Rows
 from sigmasplat.data.frame import Frame
@@ -21,6 +20,7 @@ from sigmasplat.data.trajectory import Component, Trajectory
 from sigmasplat.final.final_map import final_map, reaching
 from sigmasplat.final.stores import RefinedStore, StorePart, solved_keyframes
 from sigmasplat.final.uncertainty import final_uncertainty
+from sigmasplat.graph.graph_errors import calibration_std
 from sigmasplat.graph.path_covariance import NewestCovariance, PathCovariance, PoseErrors, recorded
 from sigmasplat.render.render import as_refined
 from sigmasplat.slam.main_loop import MainLoop
@@ -121,9 +121,8 @@ class Slam(MainLoop, ArrayInterface):
         refining, measuring = (part_of(progress, first, total) for first in (0, steps))
         known = PathCovariance.of_keyframes(self.atlas, self.closer.valid)
         if self.follows:
-            store, poses = solved_keyframes(
-                self.atlas, known, part, self.keyframe_image, self.graph, self.config.input.sensor == RENDERED
-            )
+            calibration = calibration_std(self.config.input, self.view.camera)
+            store, poses = solved_keyframes(self.atlas, known, part, self.keyframe_image, self.graph, calibration)
             self.atlas.refined = dict(zip(members, poses, strict=True))
         anchors = [self.atlas.anchors[s] for s in members]
         config = replace(self.config, final=reaching(self.config, known))
