@@ -13,7 +13,7 @@ from sigmasplat.plugins.outputs.drawing.colormap import INFERNO
 from sigmasplat.plugins.viewer import layers, snapshot as lines
 from sigmasplat.plugins.viewer.layers import PREDICTED_MODES, Floats, LayerImage, Legend
 from sigmasplat.plugins.viewer.panel import ControlPanel, ControlState, escaped
-from sigmasplat.plugins.viewer.scene import ViserScene, camera_pose, move_camera, set_initial_camera
+from sigmasplat.plugins.viewer.scene import ViserScene, camera_pose, move_camera
 from sigmasplat.plugins.viewer.snapshot import BUDGET, Piece, Snapshot, within_budget
 
 REST_S, LIVE_REST_S = 0.05, 0.5
@@ -132,7 +132,7 @@ class ViewerApp:
     def _draw_path(self, snapshot: Snapshot, controls: ControlState) -> None:
         path, row = snapshot.path, controls.row
         if self._is_new("initial camera", len(path) > 0) and len(path):
-            set_initial_camera(self.server, path.T_world_camera[0], BACK_M, UP_M)
+            move_camera(self.server.initial_camera, path.T_world_camera[0], BACK_M, UP_M)
         if self._is_new("path", (path, row, controls.path)):
             self.scene.show_lines("path", lines.path_segments(path, row) if controls.path else None)
             self.scene.show_lost(lines.lost_points(path, row if controls.path else -1))
@@ -228,7 +228,8 @@ class ViewerApp:
         path = snapshot.path
         if controls.follow and snapshot.live and len(path) and self._is_new("followed", path):
             for client in self.server.get_clients().values():
-                move_camera(client, path.T_world_camera[-1], BACK_M, UP_M)
+                with client.atomic():
+                    move_camera(client.camera, path.T_world_camera[-1], BACK_M, UP_M)
 
     def _welcome(self, client: viser.ClientHandle) -> None:
         client.camera.on_update(lambda _: self.changed())
@@ -254,7 +255,8 @@ class ViewerApp:
 
     def _go(self, client: viser.ClientHandle, snapshot: Snapshot, row: int) -> None:
         """Move a browser's camera to the pose of a frame."""
-        move_camera(client, snapshot.path.T_world_camera[row])
+        with client.atomic():
+            move_camera(client.camera, snapshot.path.T_world_camera[row])
         self.changed()
 
 

@@ -84,7 +84,6 @@ def own_pages_only(host: str) -> Iterator[list[str]]:
 
 HOST, PORT = "127.0.0.1", 8080
 ATTEMPTS = 100
-PORT_BUSY = (errno.EADDRINUSE,)
 
 
 def open_server(host: str, port: int, title: str) -> "ViserServer":
@@ -141,7 +140,7 @@ def free_port(host: str, port: int) -> int:
         except PermissionError:
             continue
         except OSError as problem:
-            if problem.errno not in PORT_BUSY:
+            if problem.errno != errno.EADDRINUSE:
                 raise SigmaSplatError(
                     f"cannot listen on {host} ({problem.strerror or problem}); give an address of this machine as "
                     f"--host, or {HOST} to allow only this machine"
