@@ -109,10 +109,8 @@ class Mesh:
         large = self._longest_edges() > largest_edge_m
         if not large.any():
             return self
-        small, mesh = (
-            [replace(self.with_faces(~large), colors=None, depth_std_m=None, filled=None)],
-            self.with_faces(large),
-        )
+        small = [replace(self.with_faces(~large), colors=None, depth_std_m=None, filled=None)]
+        mesh = self.with_faces(large)
         while len(mesh.faces):
             a, b, c = np.moveaxis(mesh.corners, 1, 0)
             ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
