@@ -29,11 +29,7 @@ class MainLoop(MappingBackend):
     late: NewestFrame | None = None
 
     def step(self, frame: Frame) -> Step:
-        """Process one frame: track it, find it in the whole map if it is lost, map it if it is a keyframe, and cut the
-        submap if a rule ends it here.
-
-        Raises SourceError if the first frame has no depth or a later one comes from another camera.
-        """
+        """Process one frame, as `Slam.step` describes."""
         self._timer, tried = StepTimer(), len(self.closer.loops)
         seen = self._prepared(frame)
         estimate = self._locate(seen) if self.steps else self._begin(seen)
