@@ -133,8 +133,7 @@ def source_of(folder: "RunFolder", moved_to: str | None) -> "Source":
     """Open the sequence of a run. Raises RunError if the run does not contain its path."""
     from sigmasplat.plugins.sources import open_source
 
-    facts = folder.facts()
-    path = moved_to or facts.get("source_path")
+    path = moved_to or folder.facts().get("source_path")
     if not path:
         raise RunError(f"run {folder.path} does not contain the path of its sequence; give --source PATH")
     return open_source(path, folder.config().input)
