@@ -36,10 +36,10 @@ class Range:
             words = "finite" if math.isinf(self.most) else f"at most {self.most:.10g}"
         elif math.isinf(self.most):
             words = below
-        else:
+        elif self.open_below:
             words = f"{below} and at most {self.most:.10g}"
-            if not self.open_below:
-                words = f"between {self.least:.10g} and {self.most:.10g}"
+        else:
+            words = f"between {self.least:.10g} and {self.most:.10g}"
         return f"0 or {words}" if self.or_zero else words
 
 

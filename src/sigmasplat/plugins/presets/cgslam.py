@@ -52,7 +52,6 @@ PAPER = BASE.changed(
         "alpha_above": 0.99,
         "outlier_factor": 10.0,
     },
-    submaps={},
     loops={"close": False, "uncertainty": False},
     registration={"uncertainty": False},
     final={"uncertainty": False},
