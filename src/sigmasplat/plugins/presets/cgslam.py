@@ -39,10 +39,7 @@ PAPER = BASE.changed(
         "prune_opacity": 0.005,
         "window": 4,
     },
-    primitives={
-        "uncertain_m2": 0.025,
-        "densify": "split+clone",
-    },
+    primitives={"uncertain_m2": 0.025, "densify": "split+clone"},
     tracking={
         "descent": "axis-angle",
         "lr_rotation": 1.5e-3,
