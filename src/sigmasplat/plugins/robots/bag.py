@@ -11,19 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from sigmasplat.api import (
-    LOST,
-    RELOCALISED,
-    Atlas,
-    Callback,
-    Frame,
-    Matrix,
-    RunError,
-    Slam,
-    Step,
-    import_optional,
-    se3,
-)
+from sigmasplat.api import LOST, RELOCALISED, Atlas, Callback, Frame, Matrix, RunError, Slam, Step, import_optional, se3
 from sigmasplat.plugins.robots import ros_messages as ros
 from sigmasplat.plugins.robots.ros_messages import Encoded, RosMessages, Topic
 

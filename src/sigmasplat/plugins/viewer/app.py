@@ -182,10 +182,7 @@ class ViewerApp:
         rows = sharp_rows if self._sharp else rows
         if drawn is None or drawn[0] != state or drawn[2] < rows:
             if self._merged[0] != splats:
-                self._merged = (
-                    splats,
-                    (layers.merge_pieces(pieces, most), layers.merged_uncertainty(pieces, most)),
-                )
+                self._merged = (splats, (layers.merge_pieces(pieces, most), layers.merged_uncertainty(pieces, most)))
             camera = layers.browser_camera(c.fov, c.aspect, rows)
             (field, known), how = self._merged[1], (snapshot.options, snapshot.backend)
             made: LayerImage
@@ -202,12 +199,7 @@ class ViewerApp:
         return legend
 
     def _show_texts(
-        self,
-        snapshot: Snapshot,
-        controls: ControlState,
-        pieces: tuple[Piece, ...],
-        most: float,
-        unit: str,
+        self, snapshot: Snapshot, controls: ControlState, pieces: tuple[Piece, ...], most: float, unit: str
     ) -> None:
         path = snapshot.path
         splats, kept = sum(len(p.field) for p in pieces), sum(int(layers.shown(p, most).sum()) for p in pieces)
