@@ -18,7 +18,7 @@ from typing import Annotated, Any, TextIO, get_args, get_origin
 
 import sigmasplat
 from sigmasplat import env
-from sigmasplat.errors import ConfigError, SigmaSplatError, is_out_of_memory, out_of_memory
+from sigmasplat.errors import ConfigError, SigmaSplatError, is_out_of_memory, nearest, out_of_memory
 from sigmasplat.files.reading import cause
 
 REFUSED, INTERRUPTED, CLOSED = 2, 130, 141
@@ -63,8 +63,6 @@ def command(name: str) -> Callable[..., int]:
 def _refuse_unknown(command: str) -> None:
     """Raise ConfigError unless the word is a command or an option."""
     if command not in COMMANDS and not command.startswith("-"):
-        from sigmasplat.errors import nearest
-
         raise ConfigError(f"no command '{command}'{nearest(command, COMMANDS)}; the commands are {', '.join(COMMANDS)}")
 
 
