@@ -50,7 +50,6 @@ Above0 = Annotated[float, Range(0, open_below=True)]
 Share = Annotated[float, Range(0, 1)]
 WIDTHS_PX = Range(8, 8192, or_zero=True)
 
-
 T = TypeVar("T")
 PLAIN = frozenset({bool, int, float, str})
 _VALID: set[tuple[type, str, type, object]] = set()

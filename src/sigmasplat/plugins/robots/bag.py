@@ -85,7 +85,6 @@ class BagSink:
 Images = Literal["none", "keyframes", "all"]
 STATIC = ((ros.MAP, ros.WORLD, ros.T_MAP_WORLD), (ros.LINK, ros.OPTICAL, ros.T_LINK_OPTICAL))
 
-
 FOUND_BY_FEATURES = "inliers"
 """A step has this value if relocalisation decided its pose."""
 
