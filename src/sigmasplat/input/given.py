@@ -108,7 +108,6 @@ class Masked(Subset):
 TUM_WORDS, COLMAP_WORDS, MATRIX_WORDS = 8, 10, (12, 16)
 FORMATS = "give TUM or KITTI text, images.txt of COLMAP, transforms.json, or a folder with one matrix per frame"
 
-
 GivenPoses = Trajectory | list[Matrix | None] | dict[str, Matrix]
 """Poses by time; for each frame in order, None = it has none; or by the name of the image file, without folder and
 ending."""

@@ -3,7 +3,7 @@ no depth (video, photos, stereo pairs) are recognised too."""
 
 import importlib
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from dataclasses import fields, replace
 from itertools import islice
@@ -94,7 +94,11 @@ def open_source(path: str | Path, settings: InputConfig | None = None, **changes
     Raises SourceError if the path does not exist, no format recognises it, or its content cannot be used;
     ConfigError on an unknown setting.
     """
-    chosen = with_changes(settings or InputConfig(width=0), changes)
+    known = [field.name for field in fields(InputConfig)]
+    for name in changes:
+        if name not in known:
+            raise ConfigError(f"unknown setting input.{name}{nearest(name, known)}; there are {', '.join(known)}")
+    chosen = replace(settings or InputConfig(width=0), **changes)
     with _guarded(path):
         source = _whole(path, chosen)
         errors = CameraErrors.given(chosen.calibrate)
@@ -150,15 +154,6 @@ def _sure_format(path: str | Path) -> SourceFormat | None:
     with _guarded(path):
         known = _matching_format(path)
     return known if known is not None and known.priority >= 0 else None
-
-
-def with_changes(settings: InputConfig, changes: Mapping[str, Any]) -> InputConfig:
-    """Return the settings with some of them replaced by name. Raises ConfigError on an unknown name."""
-    known = [field.name for field in fields(InputConfig)]
-    for name in changes:
-        if name not in known:
-            raise ConfigError(f"unknown setting input.{name}{nearest(name, known)}; there are {', '.join(known)}")
-    return replace(settings, **changes)
 
 
 def _unknown_format(path: Path) -> SourceError:

@@ -250,7 +250,9 @@ class Session:
     def _log(self, step: "Step", frame: Frame, arrived_s: float | None) -> None:
         """Append the step to log.jsonl, with the force on the camera and the time since the image arrived if they are
         known, and count the frame."""
-        line = log_line(step)
+        line = {name: getattr(step, name) for name in LOGGED} | {"seconds": dict(step.seconds)}
+        if step.loops:
+            line["loops"] = [loop.record() for loop in step.loops]
         if frame.specific_force_m_s2 is not None:
             line["specific_force_m_s2"] = frame.specific_force_m_s2
         if arrived_s is not None:
@@ -299,10 +301,4 @@ LOGGED = (
     "index", "timestamp_s", "is_keyframe", "lost", "state", "component", "p_off", "splats", "submap", "tracking",
     "seconds", "T_world_camera",
 )  # fmt: skip
-
-
-def log_line(step: "Step") -> dict[str, Any]:
-    """Return a step as a record of log.jsonl: T_world_camera as 4 rows, times in seconds, loops if any were tried."""
-    line = {name: getattr(step, name) for name in LOGGED}
-    line["seconds"] = dict(step.seconds)  # the session adds to it
-    return line | {"loops": [loop.record() for loop in step.loops]} if step.loops else line
+"""The values of a step in log.jsonl: T_world_camera as 4 rows, times in seconds; loops follow if any were tried."""

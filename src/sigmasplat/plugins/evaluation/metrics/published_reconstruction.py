@@ -69,14 +69,13 @@ def score_published(
     *,
     points: int = POINTS,
     views: int = VIEWS,
-    camera: Camera = VIEW_CAMERA,
     seed: int = 0,
     progress: Progress = no_progress,
 ) -> PublishedScores:
     """Score mesh `found` against mesh `truth`, both in the frame of the truth, after aligning them by ICP.
 
-    seen_true, seen_found: the faces of each that count (`reconstruction.visible_parts`); camera: of the random views.
-    Calls `progress(views done, total)`.
+    seen_true, seen_found: the faces of each that count (`reconstruction.visible_parts`). Calls
+    `progress(views done, total)`.
     """
     ours, theirs = found.with_faces(seen_found), truth.with_faces(seen_true)
     T = aligned_by_icp(ours.vertices.astype(np.float64), theirs.vertices.astype(np.float64))
@@ -86,7 +85,7 @@ def score_published(
     ours_dense, theirs_dense = dense_points(ours, theirs, seed + 2)
     precision = share(nearest_m(ours_dense, theirs_dense), CORRECT_M)
     recall = share(nearest_m(theirs_dense, ours_dense), CORRECT_M)
-    errors = depth_errors(ours, truth, seen_true, views=views, camera=camera, seed=seed, progress=progress)
+    errors = depth_errors(ours, truth, seen_true, views=views, seed=seed, progress=progress)
     return PublishedScores(
         mean(accuracy), mean(completion), (mean(accuracy) + mean(completion)) / 2, share(completion, COMPLETE_M),
         precision, recall, f1(precision, recall), mean(errors), len(errors),

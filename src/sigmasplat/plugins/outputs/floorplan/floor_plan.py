@@ -24,12 +24,7 @@ from sigmasplat.api import (
     render,
 )
 from sigmasplat.plugins.evaluation.view_scores import Renderer
-from sigmasplat.plugins.outputs.floorplan.ground import (
-    SurfacePredictor,
-    SurfaceSample,
-    floor_frame,
-    sample_surfaces,
-)
+from sigmasplat.plugins.outputs.floorplan.ground import SurfacePredictor, SurfaceSample, floor_frame, sample_surfaces
 
 CELL_M = 0.05
 UNOBSERVED, FLOOR_UNOBSERVED, FREE, OBJECT, WALL = range(5)
