@@ -80,12 +80,9 @@ def evaluate_run(
 
 
 def score(
-    screen: "Screen",
-    folder: "RunFolder",
-    source: "Source",
-    mesh: bool = False,
+    screen: "Screen", folder: "RunFolder", source: "Source", mesh: bool = False,
     eval_options: EvalOptions = DEFAULT_EVAL_OPTIONS,
-) -> str:
+) -> str:  # fmt: skip
     """Score the run; print the result, the path of the report, which exists even if the truth does not match, and the
     next commands.
 

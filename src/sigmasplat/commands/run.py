@@ -45,12 +45,9 @@ CONTRADICTED_MOST = 0.05
 
 
 def demo(
-    frames: options.Frames = DEMO_FRAMES,
-    preset: options.PresetName = DEFAULT_PRESET,
-    settings: options.Settings = (),
-    out: options.DemoFolder = DEMO_FOLDER,
-    seed: options.Seed = None,
-) -> int:
+    frames: options.Frames = DEMO_FRAMES, preset: options.PresetName = DEFAULT_PRESET,
+    settings: options.Settings = (), out: options.DemoFolder = DEMO_FOLDER, seed: options.Seed = None,
+) -> int:  # fmt: skip
     """Run SLAM on a synthetic room and score it against the exact truth; replaces the last demo.
 
     example: sigmasplat demo --frames 40
@@ -61,20 +58,13 @@ def demo(
 
 
 def run(
-    path: options.SourcePath,
-    preset: options.PresetName = DEFAULT_PRESET,
-    settings: options.Settings = (),
-    out: options.OutFolder = None,
-    overwrite: options.Overwrite = False,
-    input_options: InputOptionsFlat = DEFAULT_INPUT_OPTIONS,
-    seed: options.Seed = None,
-    record: options.Record = None,
-    run_options: options.RunOptionsFlat = options.DEFAULT_RUN_OPTIONS,
-    onto: options.OntoRun = None,
-    final_seconds: options.FinalSeconds = None,
-    robot_options: RobotOptionsFlat = DEFAULT_ROBOT_OPTIONS,
-    realtime: options.RealTime = False,
-) -> int:
+    path: options.SourcePath, preset: options.PresetName = DEFAULT_PRESET, settings: options.Settings = (),
+    out: options.OutFolder = None, overwrite: options.Overwrite = False,
+    input_options: InputOptionsFlat = DEFAULT_INPUT_OPTIONS, seed: options.Seed = None,
+    record: options.Record = None, run_options: options.RunOptionsFlat = options.DEFAULT_RUN_OPTIONS,
+    onto: options.OntoRun = None, final_seconds: options.FinalSeconds = None,
+    robot_options: RobotOptionsFlat = DEFAULT_ROBOT_OPTIONS, realtime: options.RealTime = False,
+) -> int:  # fmt: skip
     """Run SLAM on a sequence, or on a camera until Ctrl-C: trajectory, map, uncertainty, report.
 
     example: sigmasplat run data/kitchen --limit 200 --set input.width=480

@@ -46,14 +46,9 @@ def new_folder(
 
 @contextmanager
 def new_run(
-    out: Path | None,
-    config: Config,
-    source: Source,
-    overwrite: bool = False,
-    keep: Path | None = None,
-    warn: Callable[[str], None] = no_warning,
-    **facts: Any,
-) -> Iterator[RunFolder]:
+    out: Path | None, config: Config, source: Source, overwrite: bool = False, keep: Path | None = None,
+    warn: Callable[[str], None] = no_warning, **facts: Any,
+) -> Iterator[RunFolder]:  # fmt: skip
     """Yield a new run folder, whose run.json has facts, and hold its lock during the block (`files.lock`).
 
     The default is runs/SOURCE-PRESET, numbered if it exists. keep: a run that must not be overwritten. A folder without

@@ -62,16 +62,9 @@ class PublishedScores:
 
 
 def score_published(
-    found: Mesh,
-    truth: Mesh,
-    seen_true: Mask,
-    seen_found: Mask,
-    *,
-    points: int = POINTS,
-    views: int = VIEWS,
-    seed: int = 0,
-    progress: Progress = no_progress,
-) -> PublishedScores:
+    found: Mesh, truth: Mesh, seen_true: Mask, seen_found: Mask, *, points: int = POINTS, views: int = VIEWS,
+    seed: int = 0, progress: Progress = no_progress,
+) -> PublishedScores:  # fmt: skip
     """Score mesh `found` against mesh `truth`, both in the frame of the truth, after aligning them by ICP.
 
     seen_true, seen_found: the faces of each that count (`reconstruction.visible_parts`). Calls
@@ -124,15 +117,9 @@ def aligned_by_icp(points: Matrix, target: Matrix, most: int = POINTS) -> Matrix
 
 
 def depth_errors(
-    found: Mesh,
-    truth: Mesh,
-    seen_true: Mask,
-    *,
-    views: int = VIEWS,
-    camera: Camera = VIEW_CAMERA,
-    seed: int = 0,
+    found: Mesh, truth: Mesh, seen_true: Mask, *, views: int = VIEWS, camera: Camera = VIEW_CAMERA, seed: int = 0,
     progress: Progress = no_progress,
-) -> Matrix:
+) -> Matrix:  # fmt: skip
     """Return the mean |depth difference| of each random view, m, over pixels where both have a surface and the true
     one was seen."""
     errors = list[float]()
