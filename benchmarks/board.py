@@ -43,7 +43,7 @@ ROWS = (
     Row("room, noisy", f"{accuracy.SYNTHETIC},noise=1"),
     Row("corridor", "synthetic:corridor", limit=150),
     Row("redkitchen, kidnapped", "redkitchen", "kidnapped", 2, frames=40, limit=130, start_s=16.0),
-    Row("livingroom, 4 × faster", "livingroom", "speed", 2, frames=60, limit=240),
+    Row("livingroom, 8 × faster", "livingroom", "speed", 3, frames=36, limit=300),
     Row("fr1_xyz, depth late", "fr1_xyz", "desync", 2, frames=80, limit=90),
     Row("fr1_xyz, big object", "fr1_xyz", "moving-object", 2, frames=80, limit=110),
 )

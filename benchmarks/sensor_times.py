@@ -1,9 +1,9 @@
-"""Measure how well the times of a sensor are found: between halves of recordings, after depth was moved in time, and in
-random rooms.
+"""Measure how well a sensor is measured: its times between halves of recordings, and after depth was moved in time; its
+times and its camera in random rooms.
 
 Pairs of keyframes are those of `sigmasplat calibrate`; each half of a recording has half of its pairs. Moved depth: the
 stamps of depth are moved by an offset that the measurement is not told. Random rooms are synthetic recordings with
-noise; late depth and the rows of both images are drawn evenly.
+noise, changing exposure, and faults that are drawn evenly; `calibrate` measures them.
 Writes benchmarks/results/sensor-times-<machine>.json and prints tables.
 
 example: python benchmarks/sensor_times.py --sources fr1_xyz --rooms 2
@@ -22,18 +22,27 @@ import record
 import tyro
 from tables import Section
 
+from sigmasplat.config import Config
 from sigmasplat.config.find_preset import default_preset, preset
-from sigmasplat.graph.sensor_times import Pair, estimated
+from sigmasplat.errors import SourceError
+from sigmasplat.graph.sensor_fit import Pair, fitted
+from sigmasplat.graph.sensor_times import TIMES
 from sigmasplat.plugins.sources import open_source
-from sigmasplat.run.calibrate import aligned_pairs
+from sigmasplat.run.calibrate import aligned_pairs, measure_sensor
 from sigmasplat.types import completed
 
 arg = tyro.conf.arg
 NAMES = ("depth after colour, ms", "depth rows, ms", "colour rows, ms")
+CAMERA = (
+    "focal length, %", "centre to the right, % of the width", "centre down, % of the width", "inverse depth, 1/100 m",
+    "fall-off, %",
+)  # fmt: skip
 MOST = 120
 """Pairs of one measurement with moved depth: every second one of those of `calibrate`."""
 LATE_MS, ROWS_MS = 30.0, 35.0
 """Drawn times: depth is at most so much early or late; rows take between nothing and so long."""
+FOCAL, CENTER_PX, OFFSET, FALLOFF = 0.02, 5.0, 0.01, 0.4
+"""Drawn faults of the stated camera: at most so much to both sides; fall-off is between nothing and so much."""
 
 
 @dataclass(frozen=True)
@@ -54,12 +63,11 @@ class Options:
 def found_in(pairs: Sequence[Pair]) -> dict[str, Any]:
     """Return the times [3] of some pairs in ms with their standard deviations, and whether they are sure not to be 0;
     None where the pairs do not tell."""
-    times, sure = completed(estimated(pairs))
-    found: dict[str, Any] = {"pairs": len(pairs), "sure": sure, "ms": None, "std_ms": None}
-    if times.std_s is None:
+    fit = completed(fitted(pairs, TIMES))
+    found: dict[str, Any] = {"pairs": len(pairs), "sure": fit.sure, "ms": None, "std_ms": None}
+    if fit.std is None:
         return found
-    ms = [1e3 * t for t in (times.depth_late_s, times.depth_rows_s, times.color_rows_s)]
-    return found | {"ms": ms, "std_ms": [1e3 * std_s for std_s in times.std_s]}
+    return found | {"ms": (1e3 * fit.values).tolist(), "std_ms": (1e3 * fit.std).tolist()}
 
 
 def moved(pairs: Sequence[Pair], offset_s: float) -> list[Pair]:
@@ -90,13 +98,34 @@ def measure(options: Options) -> dict[str, Any]:
             print(offsets[-1], file=sys.stderr, flush=True)
     random = np.random.default_rng(0)
     for number in range(options.rooms):
-        true_ms = [float(t) for t in random.uniform((-LATE_MS, 0.0, 0.0), (LATE_MS, ROWS_MS, ROWS_MS)).round(1)]
-        late, depth_rows, rows = (f"{t / 1e3:g}" for t in true_ms)
-        room = f"synthetic:frames={options.frames},width=320,height=240,noise=1,seed={number}"
-        pairs = aligned_pairs(open_source(f"{room},late={late},depth_rows={depth_rows},rows={rows}"), config)
-        rooms.append({"seed": number, "true_ms": true_ms} | found_in(pairs))
+        rooms.append({"seed": number} | room(options.frames, number, random, config))
         print(rooms[-1], file=sys.stderr, flush=True)
     return {"recordings": recordings, "moved": offsets, "rooms": rooms}
+
+
+def room(frames: int, seed: int, random: np.random.Generator, config: Config) -> dict[str, Any]:
+    """Return the true errors of a random room's sensor, and those that `calibrate` measures with their standard
+    deviations, None where it is not clear: three times, then the five of `CameraErrors`."""
+    true_ms = random.uniform((-LATE_MS, 0.0, 0.0), (LATE_MS, ROWS_MS, ROWS_MS)).round(1)
+    most = np.array([FOCAL, CENTER_PX, CENTER_PX, OFFSET])
+    focal, x, y, offset, falloff = (float(v) for v in random.uniform([*-most, 0.0], [*most, FALLOFF]).round(4))
+    names = ("late", "depth_rows", "rows", "focal", "center_x", "center_y", "depth_offset", "falloff")
+    faults = zip(names, [*(true_ms / 1e3).tolist(), focal, x, y, offset, falloff], strict=True)
+    text = ",".join(
+        [f"frames={frames},width=320,height=240,noise=1,seed={seed},exposure=0.2"] + [f"{n}={v:.6g}" for n, v in faults]
+    )
+    true = [
+        *true_ms.tolist(),
+        *(100.0 * np.array([1 / (1 + focal) - 1, -x / 320, -y / 320, -offset, falloff])).tolist(),
+    ]
+    try:
+        found = measure_sensor(open_source(f"synthetic:{text}"), config)
+    except SourceError:
+        return {"true": true, "found": None, "std": None}
+    times, camera = found.estimate, found.camera
+    ms = [1e3 * t for t in (times.depth_late_s, times.depth_rows_s, times.color_rows_s)]
+    std = [*(1e3 * s for s in times.std_s or (0.0,) * 3), *(100.0 * s for s in camera.std or (1.0,) * 5)]
+    return {"true": true, "found": [*ms, *(100.0 * v for v in camera.values)], "std": std}
 
 
 # ---- tables ----
@@ -122,19 +151,19 @@ def sections(measured: dict[str, Any]) -> list[Section]:
         [m["source"], f"{m['moved_ms']:+d}", f"{m['still']['ms'][0] - m['ms'][0]:+.1f}" if m["ms"] else "not clear"]
         for m in figures["moved"]
     ]
-    known = [room for room in figures["rooms"] if room["ms"] is not None]
-    errors, std = (np.array([room[key] for room in known]).reshape(-1, 3) for key in ("ms", "std_ms"))
-    errors = errors - np.array([room["true_ms"] for room in known]).reshape(-1, 3)
+    known = [room for room in figures["rooms"] if room["found"] is not None]
+    found, true, std = (np.array([room[key] for room in known]).reshape(-1, 8) for key in ("found", "true", "std"))
+    errors = found - true
     rooms = [
-        [name, f"{np.median(np.abs(e)):.1f}", f"{np.abs(e).max():.1f}", f"{np.median(s):.1f}",
+        [name, f"{np.median(np.abs(e)):.2f}", f"{np.abs(e).max():.2f}", f"{np.median(s):.2f}",
          f"{100 * (np.abs(e) < 2 * s).mean():.0f} %"]
-        for name, e, s in zip(NAMES, errors.T, std.T, strict=True)
+        for name, e, s in zip(NAMES + CAMERA, errors.T, std.T, strict=True)
     ] if known else []  # fmt: skip
-    note = f"{len(known)} of {len(figures['rooms'])} rooms tell their times; in the others nothing is corrected."
+    note = f"{len(known)} of {len(figures['rooms'])} rooms tell; in the others nothing is corrected. 320 pixels wide."
     return [
         Section("Recordings", ("recording", "part", "pairs", *NAMES), recordings),
         Section("Depth moved in time", ("recording", "moved by, ms", "found, ms"), offsets),
-        Section("Random rooms", ("time", "median error", "largest", "median σ", "within 2 σ"), rooms, note),
+        Section("Random rooms", ("quantity", "median error", "largest", "median σ", "within 2 σ"), rooms, note),
     ]
 
 

@@ -20,6 +20,7 @@ from sigmasplat.config.text import differences as differences, override as overr
 from sigmasplat.data import harmonics as harmonics, se3 as se3
 from sigmasplat.data.atlas import Atlas as Atlas
 from sigmasplat.data.camera import Camera as Camera, exposed as exposed
+from sigmasplat.data.camera_errors import sensor_said as sensor_said
 from sigmasplat.data.field import (
     ATTRIBUTES as ATTRIBUTES,
     COLUMNS as COLUMNS,

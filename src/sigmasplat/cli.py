@@ -18,7 +18,7 @@ from typing import Annotated, Any, TextIO, get_args, get_origin
 
 import sigmasplat
 from sigmasplat import env
-from sigmasplat.errors import ConfigError, SigmaSplatError, is_out_of_memory, out_of_memory
+from sigmasplat.errors import ConfigError, SigmaSplatError, is_out_of_memory, nearest, out_of_memory
 from sigmasplat.files.reading import cause
 
 REFUSED, INTERRUPTED, CLOSED = 2, 130, 141
@@ -63,8 +63,6 @@ def command(name: str) -> Callable[..., int]:
 def _refuse_unknown(command: str) -> None:
     """Raise ConfigError unless the word is a command or an option."""
     if command not in COMMANDS and not command.startswith("-"):
-        from sigmasplat.errors import nearest
-
         raise ConfigError(f"no command '{command}'{nearest(command, COMMANDS)}; the commands are {', '.join(COMMANDS)}")
 
 
@@ -111,24 +109,20 @@ def _postponed(name: str) -> Callable[..., Callable[[], int]]:
 
     @wraps(function)
     def postponed(*given: Any, **named: Any) -> Callable[[], int]:
-        return partial(_checked(function), *given, **named)
+        return partial(_run, function, *given, **named)
 
     return postponed
 
 
-def _checked(command: Callable[..., int]) -> Callable[..., int]:
-    """Return the command with a check of its options. Raises ConfigError with every number out of range."""
+def _run(function: Callable[..., int], *given: Any, **named: Any) -> int:
+    """Check the options of a command and run it. Raises ConfigError with every number out of range."""
     from sigmasplat.config.ranges import refuse
 
-    @wraps(command)
-    def run(*given: Any, **named: Any) -> int:
-        parameters = signature(command)
-        values = parameters.bind(*given, **named).arguments
-        kinds = {name: parameters.parameters[name].annotation for name in values}
-        refuse([problem for name, value in values.items() for problem in _problems(name, kinds[name], value)])
-        return command(*given, **named)
-
-    return run
+    options = signature(function)
+    values = options.bind(*given, **named).arguments
+    kinds = {name: options.parameters[name].annotation for name in values}
+    refuse([problem for name, value in values.items() for problem in _problems(name, kinds[name], value)])
+    return function(*given, **named)
 
 
 def _problems(name: str, kind: Any, value: Any) -> Iterator[str]:

@@ -10,12 +10,21 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.stats import chi2
 
+from sigmasplat.config import InputConfig
 from sigmasplat.data import se3
 from sigmasplat.data.atlas import Atlas
+from sigmasplat.data.camera import Camera
 from sigmasplat.data.relative_pose import Edges, Kind, RelativePose, SolvedGraph
 from sigmasplat.final.stores import KeyframeNodes
 from sigmasplat.graph import graph_errors
-from sigmasplat.graph.graph_errors import STAMP, GraphErrors, moved_by_camera, shared_errors
+from sigmasplat.graph.graph_errors import (
+    CALIBRATION,
+    STAMP,
+    GraphErrors,
+    calibration_std,
+    moved_by_camera,
+    shared_errors,
+)
 from sigmasplat.graph.keyframe_graph import solve
 from sigmasplat.graph.path_covariance import PathCovariance
 from sigmasplat.graph.pose_graph import PoseGraph, minimise
@@ -51,7 +60,7 @@ def solved(edges: list[RelativePose], fixed: int = 1) -> SolvedGraph:
     solution = solve(start, edges, fixed)
     ends = np.array([(edge.a, edge.b) for edge in edges])
     T_a_b = np.stack([edge.T_a_b for edge in edges])
-    shared = shared_errors(edges, np.zeros((NODES, 6)), None)
+    shared = shared_errors(edges, np.zeros((NODES, 6)), [], None)
     return SolvedGraph(np.arange(NODES), solution.T_world_keyframe, fixed, ends, T_a_b, solution.information, shared)
 
 
@@ -150,18 +159,27 @@ def test_a_chain_alone_has_the_errors_of_its_hops() -> None:
 WALL = np.stack(np.meshgrid(np.linspace(-0.6, 0.6, 21), np.linspace(-0.4, 0.4, 15), [1.0]), -1).reshape(-1, 3)
 SEEN = WALL * (1.5 + 0.8 * WALL[:, :1] - 0.5 * np.abs(WALL[:, 1:2]))
 """What each camera sees: two walls that meet."""
+ALL = np.full(4, CALIBRATION)
+
+
+def test_what_is_measured_of_a_camera_has_its_own_error() -> None:
+    camera = Camera(320, 240, 256.0, 256.0, 159.5, 119.5)
+    assert np.array_equal(calibration_std(InputConfig(), camera), ALL)
+    assert calibration_std(InputConfig(sensor="rendered"), camera) is None
+    measured = InputConfig(calibrate="0,0,0,0.1,0.1,0.1,0.02,0,0,0,0,0.001,0.002,0.003,0.1,0.1")
+    assert np.allclose(calibration_std(measured, camera), [CALIBRATION, 0.001, 0.002 * 1.25, 0.003 * 1.25])
 
 
 def test_an_error_of_time_is_that_of_a_later_path() -> None:
     """Motions of the same screw in each step are the same at another time; motions that grow are not."""
     edges = [RelativePose(a, b, se3.inverse(TRUTH[a]) @ TRUTH[b], np.eye(6), kind, bias=SAME) for a, b, kind in pairs()]
     step = se3.log(se3.inverse(TRUTH[0]) @ TRUTH[1])
-    shared = shared_errors(edges, np.tile(step, (NODES, 1)), [SEEN] * NODES)
+    shared = shared_errors(edges, np.tile(step, (NODES, 1)), [SEEN] * NODES, ALL)
     assert np.array_equal(shared[:, :, :6], np.tile(np.diag(SAME), (len(edges), 1, 1)))
     assert np.allclose(shared[:, :, 10], 0.0, atol=1e-12), "motions of the same speed are the same at another time"
-    assert not shared_errors(edges, np.tile(step, (NODES, 1)), None)[:, :, 6:].any(), "renders have no such errors"
+    assert not shared_errors(edges, np.tile(step, (NODES, 1)), [], None)[:, :, 6:].any(), "renders have no such errors"
     faster = step * np.linspace(1.0, 2.0, NODES)[:, None]
-    late = shared_errors(edges, faster, [SEEN] * NODES)[:, :, 10]
+    late = shared_errors(edges, faster, [SEEN] * NODES, ALL)[:, :, 10]
     for edge, found in list(zip(edges, late, strict=True))[::9]:
         T_a, T_b = (TRUTH[n] @ se3.exp(1e-3 * faster[n]) for n in (edge.a, edge.b))
         true = se3.log(se3.inverse(T_a) @ T_b @ se3.inverse(edge.T_a_b)) / 1e-3

@@ -25,10 +25,10 @@ THROUGH = replace(GOOD, close=0.6, front=0.0, behind=0.4)
 """Known surfaces are seen through."""
 
 
-def usual(c: Comparison = GOOD, times: int = 10, hop_m: float = 0.02) -> TrackingStatistics:
+def usual(c: Comparison = GOOD, times: int = 10) -> TrackingStatistics:
     history = TrackingStatistics()
     for _ in range(times):
-        history.add(c, hop_m)
+        history.add(c)
     return history
 
 
@@ -94,7 +94,7 @@ def test_what_is_usual_follows_the_latest_frames() -> None:
     history = usual(GOOD, 3 * RECENT)
     assert history.doubts(worse)
     for _ in range(RECENT):
-        history.add(worse, 0.02)
+        history.add(worse)
     assert not history.doubts(worse) and len(history.scores) == RECENT
 
 
@@ -109,12 +109,6 @@ def test_a_lost_camera_needs_more_than_a_tracked_one() -> None:
     assert confirmed(GOOD) and confirmed(FLAT)
     for weak in (OBJECT, replace(GOOD, common=0.2), replace(GOOD, correlation=0.6), replace(GOOD, residual=3.0)):
         assert not confirmed(weak) and not usual().is_lost(weak, 0.1)
-
-
-def test_a_leap_is_far_from_where_a_camera_that_moves_as_usual_can_be() -> None:
-    slow, fast = usual(hop_m=0.01), usual(hop_m=0.3)
-    assert slow.is_leap(1.0) and not fast.is_leap(1.0) and fast.is_leap(5.0)
-    assert not slow.is_leap(0.02) and not TrackingStatistics().is_leap(0.02)
 
 
 def test_texture_counts_in_the_score_where_there_is_texture() -> None:

@@ -14,7 +14,8 @@ from sigmasplat.data.readout import AT_ONCE, UNKNOWN_TIMES, Readout, SensorTimes
 from sigmasplat.fit.align import Alignment, Pair as Aligned, align, normal_equations
 from sigmasplat.fit.compare import compare
 from sigmasplat.fit.pyramid import Pyramid
-from sigmasplat.graph.sensor_times import LEAST_PAIRS, NEIGHBOURS, Pair, Term, estimated, measured, newton_step
+from sigmasplat.graph.sensor_fit import LEAST_PAIRS, NEIGHBOURS, Pair, Term, fitted, newton_step
+from sigmasplat.graph.sensor_times import TIMES as THREE, measured
 from sigmasplat.types import completed
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
@@ -212,9 +213,9 @@ def test_the_times_of_a_sensor_are_measured(times_s: tuple[float, float, float],
 def test_of_a_sensor_that_reads_at_once_nothing_is_found(seed: int) -> None:
     seen = pairs((0.0, 0.0, 0.0), seed=seed)
     assert completed(measured(seen)) is UNKNOWN_TIMES
-    (times, sure) = completed(estimated(seen))
-    assert not sure and times.std_s is not None
-    assert (np.abs(times_of(times)) < 4.0 * np.array(times.std_s)).all() and max(times.std_s) < 1e-3
+    fit = completed(fitted(seen, THREE))
+    assert not fit.sure and fit.std is not None
+    assert (np.abs(fit.values) < 4.0 * fit.std).all() and fit.std.max() < 1e-3
 
 
 def test_few_pairs_and_cameras_at_rest_tell_nothing() -> None:

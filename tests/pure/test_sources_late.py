@@ -85,7 +85,7 @@ def test_times_in_the_path() -> None:
     assert source.frame(3).depth_m.tobytes() == room.frame(3).depth_m.tobytes()
     assert source.frame(3).color.tobytes() == room.frame(3).color.tobytes()
     for wrong in ("late", "late=soon", "rows=", "depth_rows=1e9", "late=nan", "frames=0.5"):
-        with pytest.raises(SourceError, match=r"unknown option .*seconds for late, rows, depth_rows"):
+        with pytest.raises(SourceError, match=r"unknown option .*decimals for late, rows, depth_rows"):
             open_source(f"synthetic:{wrong}")
     for other in ("stereo=10", "mover=20"):
         with pytest.raises(SourceError, match="read at once"):

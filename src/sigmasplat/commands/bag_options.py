@@ -17,8 +17,7 @@ if TYPE_CHECKING:
     from sigmasplat.system.slam import Slam
 
 Bag = Annotated[
-    Path | None,
-    arg("DIR", "also write a ROS 2 bag (MCAP): transforms, odometry, images; needs no ROS", ""),
+    Path | None, arg("DIR", "also write a ROS 2 bag (MCAP): transforms, odometry, images; needs no ROS", "")
 ]
 
 

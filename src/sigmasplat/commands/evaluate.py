@@ -80,18 +80,15 @@ def evaluate_run(
 
 
 def score(
-    screen: "Screen",
-    folder: "RunFolder",
-    source: "Source",
-    mesh: bool = False,
+    screen: "Screen", folder: "RunFolder", source: "Source", mesh: bool = False,
     eval_options: EvalOptions = DEFAULT_EVAL_OPTIONS,
-) -> str:
+) -> str:  # fmt: skip
     """Score the run; print the result, the path of the report, which exists even if the truth does not match, and the
     next commands.
 
     Returns the line that says why LPIPS is not scored, or "".
     """
-    from sigmasplat.data.readout import SensorTimes
+    from sigmasplat.data.camera_errors import sensor_said
     from sigmasplat.plugins.evaluation.evaluate import evaluate
     from sigmasplat.plugins.evaluation.report.advice import next_commands
     from sigmasplat.plugins.evaluation.report.summary import result_sentence
@@ -108,8 +105,8 @@ def score(
                 lpips=lpips, progress=progress,
             )  # fmt: skip
         screen.results(result_sentence(metrics), key_figures(metrics))
-        if times := SensorTimes.noted_in(folder.facts()).said():
-            screen.say(times)
+        if sensor := sensor_said(folder.facts()):
+            screen.say(sensor)
     except Exception as problem:
         problem.add_note(f"the run is in {folder.path}")
         raise

@@ -38,8 +38,7 @@ class ExportOptions:
         ),
     ] = None
     plain: Annotated[
-        bool,
-        flag("write PLY with only the 62 columns of 3DGS, without σ², for readers that accept no others"),
+        bool, flag("write PLY with only the 62 columns of 3DGS, without σ², for readers that accept no others")
     ] = False
     pictures: Annotated[bool, flag("also write the images of the keyframes, and export only keyframes as views")] = (
         False
@@ -76,10 +75,7 @@ DEFAULT_EXPORT_OPTIONS = ExportOptions()
 def export(
     run: options.RunOrMap,
     out: options.OutFile = None,
-    format: Annotated[
-        str | None,
-        arg("NAME", "format to write", "(default: by the ending of FILE, else ply)"),
-    ] = None,
+    format: Annotated[str | None, arg("NAME", "format to write", "(default: by the ending of FILE, else ply)")] = None,
     overwrite: options.Overwrite = False,
     asked: Annotated[ExportOptions, tyro.conf.arg(name=""), tyro.conf.OmitArgPrefixes] = DEFAULT_EXPORT_OPTIONS,
 ) -> int:

@@ -57,8 +57,7 @@ class InputOptions:
     ] = None
     strict: Annotated[bool, flag("stop at an unreadable image instead of skipping it")] = False
     calibration: Annotated[
-        Path | None,
-        arg("FILE", "calibration.json to use instead of the recorded calibration", ""),
+        Path | None, arg("FILE", "calibration.json to use instead of the recorded calibration", "")
     ] = None
     masks: Annotated[
         Path | None,
@@ -90,8 +89,7 @@ class InputOptions:
         False
     )
     fx: Annotated[
-        From0,
-        arg("PX", "horizontal focal length in pixels; also the vertical one unless --fy is given", ""),
+        From0, arg("PX", "horizontal focal length in pixels; also the vertical one unless --fy is given", "")
     ] = None
     fy: Annotated[From0, arg("PX", "vertical focal length in pixels", "")] = None
     cx: Annotated[From0, arg("PX", "column of the principal point in pixels", "")] = None

@@ -65,15 +65,17 @@ def calibrate(
     settings: options.Settings = (),
     out: Annotated[Path, arg("FILE", "file to write, .json, with a picture beside it, .png")] = TIMES,
 ) -> int:
-    """Measure when a camera reads depth and rows (rolling shutter), from a recording in which it moves.
+    """Measure a camera from a recording in which it moves: when it reads depth and rows (rolling shutter), and what is
+    wrong with its stated focal length, image centre, depth and brightness.
 
     A run with this file corrects its images from the first one on. example: sigmasplat calibrate data/kitchen
     """
+    from sigmasplat.data.camera_errors import sensor_said
     from sigmasplat.files.atomic import replacing
     from sigmasplat.files.json_files import write_json
     from sigmasplat.files.lock import output_locked
     from sigmasplat.plugins.outputs.drawing.sensor_times import draw_sensor_times
-    from sigmasplat.run.calibrate import measure_times
+    from sigmasplat.run.calibrate import measure_sensor
     from sigmasplat.run.scene import open_scene
     from sigmasplat.run.terminal import Screen
 
@@ -88,11 +90,12 @@ def calibrate(
     prepare_torch()
     with output_locked(out, screen.warn):
         with screen.counting("frames") as progress:
-            times, measured, costs = measure_times(source, config, progress)
-        write_json(out, {"source": source.name, "frames": len(source)} | times.noted())
+            found = measure_sensor(source, config, progress)
+        noted = found.times.noted() | found.camera.noted()
+        write_json(out, {"source": source.name, "frames": len(source)} | noted)
         with replacing(picture) as temporary:
-            draw_sensor_times(measured, costs).save(temporary, "PNG")
-    screen.say(f"{times.said()}: {out}, {picture}")
+            draw_sensor_times(found.estimate, found.costs).save(temporary, "PNG")
+    screen.say(f"{sensor_said(noted)}: {out}, {picture}")
     screen.next_commands([shlex.join(["sigmasplat", "run", path, "--set", f"input.calibrate={out}"])])
     return OK
 

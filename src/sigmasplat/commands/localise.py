@@ -1,6 +1,6 @@
 """Find the images of a recording in the map of a finished run: sigmasplat localise."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from sigmasplat.commands import options
@@ -13,9 +13,7 @@ from sigmasplat.errors import ConfigError, RunError
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from sigmasplat.input.source import Source
-    from sigmasplat.run.localise import Localisation, Localiser
-    from sigmasplat.types import Progress
+    from sigmasplat.run.localise import Localisation
 
 OK, NONE_FOUND = 0, 1
 ENDINGS = (".jsonl", ".txt")
@@ -57,7 +55,10 @@ def localise(
     prepare_torch()
     localiser = Localiser(finished, config)
     with screen.counting("localise") as progress:
-        found = list(_located(localiser, source, progress))
+        found = []
+        for frame in source:
+            found.append(localiser.locate(frame))
+            progress(len(found), len(source))
     screen.out.print(_table(found))
     if source.skipped:
         images = "image" if len(source.skipped) == 1 else "images"
@@ -68,12 +69,6 @@ def localise(
         write_localisations(out, found)
         screen.say(f"results: {out}")
     return OK if count else NONE_FOUND
-
-
-def _located(localiser: "Localiser", source: "Source", progress: "Progress") -> Iterator["Localisation"]:
-    for done, frame in enumerate(source, 1):
-        yield localiser.locate(frame)
-        progress(done, len(source))
 
 
 def _table(found: Sequence["Localisation"]) -> "Table":

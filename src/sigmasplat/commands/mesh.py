@@ -37,8 +37,7 @@ def make_mesh(
         ),
     ] = 0.0,
     out: Annotated[
-        Path | None,
-        arg("FILE", "file to write: .glb, .ply or .stl (no colours)", "(default: mesh.ply in RUN)"),
+        Path | None, arg("FILE", "file to write: .glb, .ply or .stl (no colours)", "(default: mesh.ply in RUN)")
     ] = None,
     overwrite: options.Overwrite = False,
 ) -> int:

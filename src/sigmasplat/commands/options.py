@@ -29,10 +29,7 @@ Settings = Annotated[
 ]
 Seed = Annotated[Whole, arg("N", "seed of all random numbers", "(default: 0)")]
 RunPath = Annotated[Path, tyro.conf.Positional, arg("RUN", "run folder")]
-OutFolder = Annotated[
-    Path | None,
-    arg("DIR", "run folder", "(default: a new one in runs/)", aliases=["--output"]),
-]
+OutFolder = Annotated[Path | None, arg("DIR", "run folder", "(default: a new one in runs/)", aliases=["--output"])]
 DemoFolder = Annotated[Path, arg("DIR", "run folder", aliases=["--output"])]
 Frames = Annotated[From1, arg("N", "number of frames")]
 SourcePath = Annotated[
@@ -45,24 +42,16 @@ Overwrite = Annotated[bool, flag("replace an earlier result")]
 SaveEvery = Annotated[float, Range(0), arg("S", "save the state for `resume` every S seconds; 0 = at the end only")]
 RealTime = Annotated[bool, arg(None, "replay a recording at its own times, and track it in real time")]
 View = Annotated[bool, flag("show the run in the browser while it runs, and afterwards until Ctrl-C")]
-Host = Annotated[
-    str,
-    arg("ADDRESS", "address that viewer and stream listen on; the default allows this machine only"),
-]
+Host = Annotated[str, arg("ADDRESS", "address that viewer and stream listen on; the default allows this machine only")]
 Port = Annotated[
     int, Range(0, 65535), arg("N", "port of the viewer; if it is busy, the next free one is used; 0 = any")
 ]
 MovedSource = Annotated[
-    str | None,
-    arg("PATH", "path of the sequence if it has moved", "(default: its path in the run)", name="source"),
+    str | None, arg("PATH", "path of the sequence if it has moved", "(default: its path in the run)", name="source")
 ]
-OutFile = Annotated[
-    Path | None,
-    arg("FILE", "file to write", "(default: named after RUN, in this folder)"),
-]
+OutFile = Annotated[Path | None, arg("FILE", "file to write", "(default: named after RUN, in this folder)")]
 Record = Annotated[
-    Path | None,
-    arg("DIR", "folder for the recording of a live camera", "(default: recording/ in the run folder)"),
+    Path | None, arg("DIR", "folder for the recording of a live camera", "(default: recording/ in the run folder)")
 ]
 VoxelM = Annotated[
     float | None,
@@ -73,15 +62,9 @@ VoxelM = Annotated[
         "(default: 0.01, times the scale of the scene)",
     ),
 ]
-WithMesh = Annotated[
-    bool,
-    flag("also write mesh.ply, and score it if the true surface is known", name="mesh"),
-]
+WithMesh = Annotated[bool, flag("also write mesh.ply, and score it if the true surface is known", name="mesh")]
 InRun = Annotated[Path, arg("RUN", "folder of a finished run, in whose map to search", name="in")]
-OntoRun = Annotated[
-    Path | None,
-    arg("RUN", "continue the map of a finished run in a new run folder", ""),
-]
+OntoRun = Annotated[Path | None, arg("RUN", "continue the map of a finished run in a new run folder", "")]
 FinalSeconds = Annotated[
     From0,
     arg(
@@ -91,8 +74,7 @@ FinalSeconds = Annotated[
     ),
 ]
 PosesFile = Annotated[
-    Path | None,
-    arg("FILE", "file to write: .jsonl (all results) or .txt (poses as TUM text)", "(default: none)"),
+    Path | None, arg("FILE", "file to write: .jsonl (all results) or .txt (poses as TUM text)", "(default: none)")
 ]
 RunOrMap = Annotated[Path, tyro.conf.Positional, arg("RUN", "run folder, or a map as PLY")]
 
@@ -133,8 +115,7 @@ def source_of(folder: "RunFolder", moved_to: str | None) -> "Source":
     """Open the sequence of a run. Raises RunError if the run does not contain its path."""
     from sigmasplat.plugins.sources import open_source
 
-    facts = folder.facts()
-    path = moved_to or facts.get("source_path")
+    path = moved_to or folder.facts().get("source_path")
     if not path:
         raise RunError(f"run {folder.path} does not contain the path of its sequence; give --source PATH")
     return open_source(path, folder.config().input)

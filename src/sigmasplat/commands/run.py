@@ -45,12 +45,9 @@ CONTRADICTED_MOST = 0.05
 
 
 def demo(
-    frames: options.Frames = DEMO_FRAMES,
-    preset: options.PresetName = DEFAULT_PRESET,
-    settings: options.Settings = (),
-    out: options.DemoFolder = DEMO_FOLDER,
-    seed: options.Seed = None,
-) -> int:
+    frames: options.Frames = DEMO_FRAMES, preset: options.PresetName = DEFAULT_PRESET,
+    settings: options.Settings = (), out: options.DemoFolder = DEMO_FOLDER, seed: options.Seed = None,
+) -> int:  # fmt: skip
     """Run SLAM on a synthetic room and score it against the exact truth; replaces the last demo.
 
     example: sigmasplat demo --frames 40
@@ -61,20 +58,13 @@ def demo(
 
 
 def run(
-    path: options.SourcePath,
-    preset: options.PresetName = DEFAULT_PRESET,
-    settings: options.Settings = (),
-    out: options.OutFolder = None,
-    overwrite: options.Overwrite = False,
-    input_options: InputOptionsFlat = DEFAULT_INPUT_OPTIONS,
-    seed: options.Seed = None,
-    record: options.Record = None,
-    run_options: options.RunOptionsFlat = options.DEFAULT_RUN_OPTIONS,
-    onto: options.OntoRun = None,
-    final_seconds: options.FinalSeconds = None,
-    robot_options: RobotOptionsFlat = DEFAULT_ROBOT_OPTIONS,
-    realtime: options.RealTime = False,
-) -> int:
+    path: options.SourcePath, preset: options.PresetName = DEFAULT_PRESET, settings: options.Settings = (),
+    out: options.OutFolder = None, overwrite: options.Overwrite = False,
+    input_options: InputOptionsFlat = DEFAULT_INPUT_OPTIONS, seed: options.Seed = None,
+    record: options.Record = None, run_options: options.RunOptionsFlat = options.DEFAULT_RUN_OPTIONS,
+    onto: options.OntoRun = None, final_seconds: options.FinalSeconds = None,
+    robot_options: RobotOptionsFlat = DEFAULT_ROBOT_OPTIONS, realtime: options.RealTime = False,
+) -> int:  # fmt: skip
     """Run SLAM on a sequence, or on a camera until Ctrl-C: trajectory, map, uncertainty, report.
 
     example: sigmasplat run data/kitchen --limit 200 --set input.width=480
@@ -144,7 +134,8 @@ def _opened(
     screen: "Screen", path: str, config: "Config", record: Path | None, given: Mapping[str, str],
     earlier: "FinishedMap | None",
 ) -> tuple["Source", "Config"]:  # fmt: skip
-    """Open the source and warn of doubtful depth; return it with the settings for its scene, or for the earlier map."""
+    """Open the source, with warnings; return it with the settings for its scene, or for the earlier map."""
+    from sigmasplat.graph.closer import lacks_weights
     from sigmasplat.input.recorded import depth_warning
     from sigmasplat.plugins.checks.motion import time_warnings, times_of
     from sigmasplat.plugins.sources.live import LiveSource, recording_settings
@@ -171,7 +162,8 @@ def _opened(
         _say_of_scale(screen, asked, source, config)
     if source.registrable and not source.depth_registered:
         screen.warn("depth and colour come from different cameras; --register-depth on aligns them (see inspect)")
-    _warn_without_weights(screen, config)
+    if lacks_weights(config.loops) and (config.loops.close or config.mapping.covisibility == "descriptor"):
+        screen.warn("no NetVLAD weights, so the built-in descriptor is used; to use NetVLAD: --set loops.weights=FILE")
     return source, config
 
 
@@ -188,14 +180,6 @@ def _say_of_scale(screen: "Screen", asked: "Config", source: "Source", config: "
         screen.say(f"{poses}: predicted depth is multiplied by {config.input.predicted_scale:.4g} to have their scale")
     elif warning := scale_warning(source, config):
         screen.warn(warning)
-
-
-def _warn_without_weights(screen: "Screen", config: "Config") -> None:
-    """Print a warning if the built-in descriptor replaces the NetVLAD that the preset asks for."""
-    from sigmasplat.graph.closer import lacks_weights
-
-    if lacks_weights(config.loops) and (config.loops.close or config.mapping.covisibility == "descriptor"):
-        screen.warn("no NetVLAD weights, so the built-in descriptor is used; to use NetVLAD: --set loops.weights=FILE")
 
 
 def _viewer(screen: "Screen", run_options: options.RunOptions) -> AbstractContextManager["ViewerApp | None"]:

@@ -23,7 +23,6 @@ __all__ = [
     "SeedConfig", "SubmapConfig", "SurfaceConfig", "TrackingConfig", "UncertaintyConfig",
 ]  # fmt: skip
 
-
 OWN_BACKENDS = ("auto", "cpu", "cuda", "reference")
 """The values of `backend` that need no plug-in of others."""
 

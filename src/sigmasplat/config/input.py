@@ -1,6 +1,7 @@
 """Settings of the input, for every format: which frames, which calibration, which pixels; how sure the depth readings
 of a sensor are: models as numbers, by name."""
 
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -55,28 +56,38 @@ def sensor_model(name: str) -> SensorModel | None:
 RECORDED_POSES = "recorded"
 """Value of `input.poses` for the poses that the recording device estimated itself."""
 TIMES = ("depth_late_s", "depth_rows_s", "color_rows_s", "std_s", "std_s", "std_s")
-"""Numbers of a file for `input.calibrate`, which is JSON."""
+CAMERA = ("focal", "center_x", "center_y", "inverse_depth", "falloff", *["std"] * 5)
+"""Numbers of a file for `input.calibrate`, which is JSON; those of the camera may be missing."""
 TIMES_NEEDED = "input.calibrate needs auto, off, or a file that `sigmasplat calibrate PATH` has written"
 
 
 def sensor_times(given: str) -> str:
-    """Return `TIMES` as numbers with commas, from such text, a file, or the run.json of a run. Raises ConfigError."""
+    """Return `TIMES` and `CAMERA` as numbers with commas, from such text, a file, or the run.json of a run. Raises
+    ConfigError."""
     values: Any = given.split(",")
-    if len(values) == len(TIMES):
+    if len(values) in (len(TIMES), len(TIMES + CAMERA)):
         with suppress(ValueError):
             values = [float(value) for value in values]
     elif exists(Path(given)):
         found = read_json(Path(given), ConfigError)
-        found = found.get("sensor_times", found) if isinstance(found, dict) else None
         found = found if isinstance(found, dict) else {}
-        values = found.get("std_s") if isinstance(found.get("std_s"), list) else []
-        values = [*map(found.get, TIMES[:3]), *[*values, None, None, None][:3]]
+        values = _numbers(found.get("sensor_times", found), TIMES)
+        if found.get("camera_errors"):
+            values += _numbers(found["camera_errors"], CAMERA)
     else:
         raise ConfigError(f"no file {given!r}; {TIMES_NEEDED}")
-    for name, value in zip(TIMES, values, strict=True):
-        if problem := problem_of(Annotated[float, Range(0 if name == "std_s" else -1, 1)], value):
+    for name, value in zip(TIMES + CAMERA, values, strict=False):
+        if problem := problem_of(Annotated[float, Range(0 if name.startswith("std") else -1, 1)], value):
             raise ConfigError(f"{given}: {name} {problem}; {TIMES_NEEDED}")
     return ",".join(f"{value:g}" for value in values)
+
+
+def _numbers(found: Any, names: Sequence[str]) -> list[Any]:
+    """Return the values of a section of a file by name, and those of the list that the last names share; None for each
+    that is missing."""
+    found, single = found if isinstance(found, dict) else {}, [name for name in names if name != names[-1]]
+    listed = found.get(names[-1]) if isinstance(found.get(names[-1]), list) else []
+    return [*map(found.get, single), *[*listed, *[None] * len(names)][: len(names) - len(single)]]
 
 
 @dataclass(frozen=True)
@@ -159,8 +170,8 @@ class InputConfig(Section, name="input"):
     calibrate: str = "auto"
     """When the sensor reads depth and rows (rolling shutter), which is corrected: auto = measured from the keyframes,
     except of rendered images and predicted depth, where keyframes are aligned to each other; off = not known; or the
-    path of a file with these times, which `sigmasplat calibrate` has written. Its six numbers replace the path in a
-    run's settings."""
+    path of a file with these times, and what is wrong with the stated camera, which `sigmasplat calibrate` has written.
+    Its numbers replace the path in a run's settings."""
     denoise_depth: bool = True
     """Whether depth images that are noisier than those of a structured-light sensor are smoothed."""
 

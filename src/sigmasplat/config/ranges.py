@@ -36,10 +36,10 @@ class Range:
             words = "finite" if math.isinf(self.most) else f"at most {self.most:.10g}"
         elif math.isinf(self.most):
             words = below
-        else:
+        elif self.open_below:
             words = f"{below} and at most {self.most:.10g}"
-            if not self.open_below:
-                words = f"between {self.least:.10g} and {self.most:.10g}"
+        else:
+            words = f"between {self.least:.10g} and {self.most:.10g}"
         return f"0 or {words}" if self.or_zero else words
 
 
@@ -49,7 +49,6 @@ NotNegative = Annotated[float, Range(0)]
 Above0 = Annotated[float, Range(0, open_below=True)]
 Share = Annotated[float, Range(0, 1)]
 WIDTHS_PX = Range(8, 8192, or_zero=True)
-
 
 T = TypeVar("T")
 PLAIN = frozenset({bool, int, float, str})

@@ -36,13 +36,9 @@ PREDICTED_NOISE_PER_M = 0.1
 
 
 def for_scene(
-    config: Config,
-    scene_scale: float,
-    depth_noise_per_m: float | None,
-    given: Collection[str] = (),
-    sensor: str | None = None,
-    predicted_depth: bool = False,
-) -> Config:
+    config: Config, scene_scale: float, depth_noise_per_m: float | None, given: Collection[str] = (),
+    sensor: str | None = None, predicted_depth: bool = False,
+) -> Config:  # fmt: skip
     """Return the settings for a scene of this size, depth of this noise, and this sensor (None = unknown, the setting
     stays); predicted_depth: whether a network predicted depth, which is then fitted to the map; other depth of a known
     noise is that of a stereo pair. Poses that `input.poses` gives stay as they are.

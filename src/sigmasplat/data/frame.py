@@ -135,10 +135,8 @@ class Frame:
         if size == (self.camera.width, self.camera.height):
             color, depth_m = self.color, within(self.depth_m, min_depth_m, max_depth_m)
         else:
-            color, depth_m = (
-                resized_color(self.color, *size),
-                resized_depth(self.depth_m, *size, min_depth_m, max_depth_m),
-            )
+            color = resized_color(self.color, *size)
+            depth_m = resized_depth(self.depth_m, *size, min_depth_m, max_depth_m)
         if color is self.color and depth_m is self.depth_m and not crop_px:
             return self
         inner = np.s_[crop_px : crop_px + camera.height, crop_px : crop_px + camera.width]

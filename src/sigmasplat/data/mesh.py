@@ -11,6 +11,7 @@ from sigmasplat.data.camera import Camera
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.native import _core
 
+Doubles = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Indices = NDArray[np.int32]
 
@@ -53,16 +54,16 @@ class Mesh:
                     np.concatenate([*faces, np.empty((0, 3), np.int32)]))  # fmt: skip
 
     @property
-    def corners(self) -> NDArray[np.float64]:
+    def corners(self) -> Doubles:
         """Return the corners of each face [F, 3 corners, 3], m."""
         return self.vertices[self.faces].astype(np.float64)
 
-    def areas(self) -> NDArray[np.float64]:
+    def areas(self) -> Doubles:
         """Return the area of each face [F], m²."""
         a, b, c = np.moveaxis(self.corners, 1, 0)
         return 0.5 * np.asarray(np.linalg.norm(np.cross(b - a, c - a), axis=1))
 
-    def normals(self) -> NDArray[np.float64]:
+    def normals(self) -> Doubles:
         """Return outward unit normals of the vertices [V, 3]: area-weighted means of the normals of their faces, 0
         without a face."""
         a, b, c = np.moveaxis(self.corners, 1, 0)
@@ -73,7 +74,7 @@ class Mesh:
         length = np.linalg.norm(sums, axis=0)
         return np.asarray(np.divide(sums, length, out=np.zeros(sums.shape), where=length > 0).T)
 
-    def sampled(self, points: int, seed: int) -> NDArray[np.float64]:
+    def sampled(self, points: int, seed: int) -> Doubles:
         """Draw random points [points, 3], uniform over the area; no points if the area is 0."""
         rng, areas = np.random.default_rng(seed), self.areas()
         if not float(areas.sum()) > 0.0:
@@ -84,7 +85,7 @@ class Mesh:
         s, t = np.where(s + t > 1.0, 1.0 - s, s), np.where(s + t > 1.0, 1.0 - t, t)  # mirrored into the triangle
         return np.asarray(a + s * (b - a) + t * (c - a))
 
-    def moved(self, T_new_old: NDArray[np.float64]) -> "Mesh":
+    def moved(self, T_new_old: Doubles) -> "Mesh":
         """Return the mesh moved by a rigid 4×4 transform."""
         vertices = self.vertices @ T_new_old[:3, :3].T + T_new_old[:3, 3]
         return replace(self, vertices=vertices.astype(np.float32))
@@ -109,10 +110,8 @@ class Mesh:
         large = self._longest_edges() > largest_edge_m
         if not large.any():
             return self
-        small, mesh = (
-            [replace(self.with_faces(~large), colors=None, depth_std_m=None, filled=None)],
-            self.with_faces(large),
-        )
+        small = [replace(self.with_faces(~large), colors=None, depth_std_m=None, filled=None)]
+        mesh = self.with_faces(large)
         while len(mesh.faces):
             a, b, c = np.moveaxis(mesh.corners, 1, 0)
             ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
@@ -124,7 +123,7 @@ class Mesh:
             mesh = mesh.with_faces(large)
         return Mesh.concatenated(small)
 
-    def _longest_edges(self) -> NDArray[np.float64]:
+    def _longest_edges(self) -> Doubles:
         corners = self.corners
         lengths = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
         return np.asarray(lengths.max(1, initial=0.0))
@@ -142,12 +141,7 @@ class Mesh:
         return self.with_faces(((np.bincount(part) >= vertices) & (area >= share * area.max()))[part[self.faces[:, 0]]])
 
 
-Doubles = NDArray[np.float64]
-
-
-def mesh_depth(
-    mesh: Mesh, camera: Camera, T_camera_world: Doubles, near_m: float = 0.02
-) -> tuple[NDArray[np.float32], Indices]:
+def mesh_depth(mesh: Mesh, camera: Camera, T_camera_world: Doubles, near_m: float = 0.02) -> tuple[Floats, Indices]:
     """Return depth [H, W] along the optical axis, m, 0 without a face, and the nearest face [H, W], −1 = none.
 
     Both sides of a face are visible; a face with a point closer than `near_m` is ignored, so faces near the camera

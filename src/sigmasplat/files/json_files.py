@@ -74,10 +74,7 @@ def read_lines(path: Path) -> list[Any]:
     Raises RunError if the file cannot be read or another line is damaged.
     """
     *complete, _incomplete = read_text(path).split("\n")
-    values = []
-    for number, line in enumerate(complete, 1):
-        values.append(parse_json(line, f"{path}:{number}", RunError))
-    return values
+    return [parse_json(line, f"{path}:{number}", RunError) for number, line in enumerate(complete, 1)]
 
 
 def read_text(path: Path) -> str:

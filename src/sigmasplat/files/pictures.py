@@ -3,9 +3,9 @@
 import io
 import math
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.lib import format as npy
@@ -30,7 +30,8 @@ def open_image(path: Path, data: bytes | None = None) -> Iterator[Image.Image]:
     Raises SourceError naming the file if it is not of `FORMATS`, has more than `MOST_PIXELS`, or if the block cannot
     decode it.
     """
-    with _opened(path, data) as file, guarded(path, REMEDY, SourceError, "unreadable image"):
+    opened = open_regular(path, most=MOST_BYTES) if data is None else nullcontext(io.BytesIO(data))
+    with opened as file, guarded(path, REMEDY, SourceError, "unreadable image"):
         try:
             image = Image.open(file, formats=FORMATS)
         except (Image.DecompressionBombError, UnidentifiedImageError) as problem:
@@ -70,12 +71,3 @@ def _mapped(path: Path) -> NDArray[Any]:
             raise ValueError(f"not a depth image: an array of {values.dtype} with shape {values.shape}")
     check_pixels(path, (values.shape[1], values.shape[0]))
     return values
-
-
-@contextmanager
-def _opened(path: Path, data: bytes | None) -> Iterator[BinaryIO]:
-    if data is not None:
-        yield io.BytesIO(data)
-        return
-    with open_regular(path, most=MOST_BYTES) as file:
-        yield file

@@ -125,10 +125,7 @@ def _without_duplicates(parts: Sequence[OwnedSplats], config: Config) -> OwnedSp
 
 
 def survivors(
-    means: NDArray[np.floating],
-    owner: NDArray[np.int64],
-    log_variance: NDArray[np.float64] | None,
-    spacing_m: float,
+    means: NDArray[np.floating], owner: NDArray[np.int64], log_variance: NDArray[np.float64] | None, spacing_m: float
 ) -> NDArray[np.bool_]:
     """Return which splats to keep, bool [N]: in each voxel of `spacing_m` only the splats of one submap.
 

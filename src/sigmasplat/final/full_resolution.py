@@ -84,15 +84,9 @@ def _like(view: View, camera: Camera, config: Config, refined_fx: float | None) 
 
 
 def refine_on_photos(
-    field: GaussianField,
-    keyframes: KeyframeReader,
-    config: Config,
-    view: View,
-    random: np.random.Generator,
-    progress: Progress,
-    done: int,
-    clock: Clock,
-) -> tuple[int, float | None]:
+    field: GaussianField, keyframes: KeyframeReader, config: Config, view: View, random: np.random.Generator,
+    progress: Progress, done: int, clock: Clock,
+) -> tuple[int, float | None]:  # fmt: skip
     """Fit the field to photos of keyframes, if there are any, and to their working images, in turns, at fixed poses.
 
     view: that of the working images. `done`: the number of steps that the field has already had; those of this stage

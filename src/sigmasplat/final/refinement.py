@@ -122,14 +122,9 @@ class KeyframeReader:
 
 
 def refine(
-    field: GaussianField,
-    keyframes: KeyframeReader,
-    config: Config,
-    view: View,
-    random: np.random.Generator,
-    progress: Progress,
-    clock: "Clock | None" = None,
-) -> list[float]:
+    field: GaussianField, keyframes: KeyframeReader, config: Config, view: View, random: np.random.Generator,
+    progress: Progress, clock: "Clock | None" = None,
+) -> list[float]:  # fmt: skip
     """Fit the field to all keyframes, one per step, and their poses with it; return the loss of each step.
 
     Poses move at the rates `final.lr_pose_translation` and `final.lr_pose_rotation`, about `final.pose_reach_m` at

@@ -234,22 +234,23 @@ def solved_keyframes(
     store: StorePart,
     image: Callable[[int], Pyramid],
     graph: GrowingGraph,
-    rendered: bool,
+    calibration: Matrix | None,
 ) -> tuple[FollowedStore, list[list[Matrix]]]:
     """Solve the whole graph of the keyframes of a component; return the submaps as it has moved them, and the new poses
     T_submap_camera [4, 4] of each submap's keyframes.
 
     Keyframes are aligned to those that they turned out to be near to; image: that of a row. The anchors of the submaps,
     but for the first one, move by the mean motion of their keyframes. The atlas keeps the graph, whose errors are those
-    of the path. rendered: whether calibration and times are exact.
+    of the path. calibration: of `calibration_std`.
     """
     nodes = KeyframeNodes.of(path, {s: store.load(i).frames for i, s in enumerate(store.members)})
     T, aligned = nodes.T_world_keyframe, nodes.numbered(graph.edges)
     more = alignments(T, lambda node: image(int(nodes.rows[node])), graph.most, aligned)
     edges = [*nodes.edges(), *aligned, *more]
     solved = solve(T, edges, nodes.fixed)
-    points = None if rendered else [image(int(row)).points for row in nodes.rows]
-    atlas.graph = nodes.solved(solved, edges, shared_errors(edges, atlas.rates(nodes.frames), points))
+    points = [] if calibration is None else [image(int(row)).points for row in nodes.rows]
+    shared = shared_errors(edges, atlas.rates(nodes.frames), points, calibration)
+    atlas.graph = nodes.solved(solved, edges, shared)
     poses, tracked = nodes.spread(solved.T_world_keyframe), nodes.spread(T)
     in_submaps = list[list[Matrix]]()
     for s in store.members:

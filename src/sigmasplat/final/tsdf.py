@@ -88,12 +88,7 @@ class Tsdf:
         return out
 
     def integrate(
-        self,
-        depth_m: Image,
-        color: Image,
-        camera: Camera,
-        T_world_camera: Matrix,
-        weight: Image | None = None,
+        self, depth_m: Image, color: Image, camera: Camera, T_world_camera: Matrix, weight: Image | None = None
     ) -> None:
         """Add an image: depth [H, W] m, 0 = no reading; color [H, W, 3]; weight [H, W] ≥ 0 per pixel (default 1).
 

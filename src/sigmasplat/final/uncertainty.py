@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.config import Config
@@ -147,7 +146,7 @@ class Samples:
             dict(zip(self.names, planes, strict=True)), errors.mean(1), pulled_to, self.views, LIMIT, FIRM
         )
 
-    def joined(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def joined(self) -> tuple[Matrix, Matrix]:
         """Return the parts [K, P] and the squared errors [P, C] of all pixels."""
         if not self.errors:
             return np.zeros((len(self.names), 0)), np.zeros((0, 1))

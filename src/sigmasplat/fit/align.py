@@ -182,14 +182,9 @@ def normal_equations(kernels: ImageKernels, level: LevelPlanes, motions: Sequenc
 
 
 def align(
-    reference: Pyramid,
-    live: Pyramid,
-    T_live_reference: Matrix,
-    iterations: int = ITERATIONS,
-    weight_color: float = 0.5,
-    update_stop: float = UPDATE_STOP,
-    plateau_stop: float = 0.0,
-) -> Alignment:
+    reference: Pyramid, live: Pyramid, T_live_reference: Matrix, iterations: int = ITERATIONS,
+    weight_color: float = 0.5, update_stop: float = UPDATE_STOP, plateau_stop: float = 0.0,
+) -> Alignment:  # fmt: skip
     """Find the motion from the reference to the live image, starting at an initial guess.
 
     Each level takes at most `iterations` Gauss–Newton steps with Huber weights. H is too steep, as

@@ -111,14 +111,9 @@ def settle(field: Rows, rates: Rates) -> None:
 
 
 def step_rows(
-    view: CpuView,
-    field: GaussianField,
-    rates: Rates,
-    weights: Weights,
-    frozen_colors: int,
-    grad2d: Tensor | None,
+    view: CpuView, field: GaussianField, rates: Rates, weights: Weights, frozen_colors: int, grad2d: Tensor | None,
     harmonics: _core.Harmonics | None,
-) -> tuple[Matrix, float]:
+) -> tuple[Matrix, float]:  # fmt: skip
     """Propagate the view's gradient planes to the splats in view and step them, and their harmonics if given, in one
     pass that stores no gradient rows in memory. Returns what `MappingStep.splats` returns."""
     twist, (g_moment, median_id, g_median_depth) = np.zeros(6), view.depth_gradients()

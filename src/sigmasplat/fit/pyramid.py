@@ -128,17 +128,10 @@ class Pyramid:
 
     @staticmethod
     def of(
-        gray: Plane,
-        depth_m: Plane,
-        camera: Camera,
-        weight: Plane | None = None,
-        levels: int = LEVELS,
-        backend: str = "cpu",
-        scene_scale: float = 1.0,
-        noise_per_m: float = NOISE_PER_M,
-        noise: Plane | None = None,
+        gray: Plane, depth_m: Plane, camera: Camera, weight: Plane | None = None, levels: int = LEVELS,
+        backend: str = "cpu", scene_scale: float = 1.0, noise_per_m: float = NOISE_PER_M, noise: Plane | None = None,
         confidence: float = 1.0,
-    ) -> "Pyramid":
+    ) -> "Pyramid":  # fmt: skip
         """Build a pyramid of at most `levels` sizes from gray [H, W], depth [H, W] and an optional weight [H, W] and
         noise [H, W]."""
         p = Pyramid([], [], [None], [None], [camera], [noise], backend, scene_scale, noise_per_m, confidence)

@@ -109,12 +109,8 @@ def map_reference(
 
 
 def keyframe_reference(
-    params: Tensor,
-    view: View,
-    image: Pyramid,
-    T_camera_world: Matrix,
-    config: TrackingConfig,
-) -> Reference:
+    params: Tensor, view: View, image: Pyramid, T_camera_world: Matrix, config: TrackingConfig,
+) -> Reference:  # fmt: skip
     """Make a reference from a keyframe's own image; each pixel is weighted by w̃ of the map at its pose (VarSplat §3).
 
     params: rows [N, 17]; image: its gray and depth (m) pyramid; T_camera_world [4, 4]: its pose. The sensor's surface

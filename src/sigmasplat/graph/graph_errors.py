@@ -7,7 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from sigmasplat.config import InputConfig
+from sigmasplat.config.input import RENDERED
 from sigmasplat.data import se3
+from sigmasplat.data.camera import Camera
+from sigmasplat.data.camera_errors import CameraErrors
 from sigmasplat.data.relative_pose import RelativePose, SolvedGraph
 from sigmasplat.graph.pose_graph import Sensitivity
 from sigmasplat.types import Matrix
@@ -51,22 +55,35 @@ class GraphErrors:
         return np.swapaxes(np.linalg.inv(np.linalg.cholesky(self.graph.information)), 1, 2)
 
 
-def shared_errors(edges: Sequence[RelativePose], rates: Matrix, points: Sequence[Matrix] | None) -> Matrix:
+def calibration_std(settings: InputConfig, camera: Camera) -> Matrix | None:
+    """Return one standard deviation [4] of the scale of depth and the focal length, as shares, and of the image centre,
+    in focal lengths: as measured, but for the scale, which images cannot show. None for rendered images."""
+    measured = CameraErrors.given(settings.calibrate).std
+    if settings.sensor == RENDERED:
+        return None
+    if measured is None:
+        return np.full(4, CALIBRATION)
+    return np.array([CALIBRATION, *measured[:3]]) * [1.0, 1.0, *[camera.width / camera.fx] * 2]
+
+
+def shared_errors(
+    edges: Sequence[RelativePose], rates: Matrix, points: Sequence[Matrix], calibration: Matrix | None
+) -> Matrix:
     """Return one standard deviation of each error that all edges share [E, 6, 11], as twists of T_a_b: the systematic
     error of alignment in six directions; of the scale of depth, the focal length, the image centre to the right and
     down, and the time of a frame.
 
     rates [N, 6]: the motion of each node's camera in the time of a frame, a twist in its axes; points [P, 3]: what each
-    node sees, m, in its camera. The last five are those of a camera whose calibration nobody has checked: parameters
-    that are considered, not estimated (Schmidt 1966). Rendered images do not have them (no points).
+    node sees, m, in its camera; calibration [4]: of `calibration_std`. The last five are parameters that are
+    considered, not estimated (Schmidt 1966). Rendered images do not have them.
     """
     if not edges:
         return np.empty((0, 6, 11))
     T_a_b, bias = (np.array([getattr(edge, name) for edge in edges]) for name in ("T_a_b", "bias"))
     shared = np.concatenate([bias[:, None] * np.eye(6), np.zeros((len(edges), 6, 5))], 2)
-    if points is not None:
+    if calibration is not None:
         a, b = np.array([(edge.a, edge.b) for edge in edges]).T
-        shared[:, :, 6:10] = [CALIBRATION * moved_by_camera(edge.T_a_b, points[edge.b]) for edge in edges]
+        shared[:, :, 6:10] = [calibration * moved_by_camera(edge.T_a_b, points[edge.b]) for edge in edges]
         shared[:, :, 10] = STAMP * ((se3.adjoint(T_a_b) @ rates[b][..., None])[..., 0] - rates[a])
     return shared
 

@@ -20,6 +20,7 @@ from PIL import Image
 
 from sigmasplat.config import RECORDED_POSES, InputConfig
 from sigmasplat.data import se3
+from sigmasplat.data.camera_errors import CameraErrors
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SourceError
@@ -44,6 +45,22 @@ from sigmasplat.types import Matrix
 
 SAME_SHAPE = 0.02
 """Masks may have another size than the images, but the same ratio of width and height, within this share."""
+
+
+class Corrected(Subset):
+    """Another source without the errors of its stated camera. Raises SourceError for a live camera."""
+
+    def __init__(self, whole: Source, errors: CameraErrors) -> None:
+        if whole.live:
+            raise SourceError("camera_errors of input.calibrate are for recordings; remove them from its file")
+        super().__init__(whole, InputConfig())
+        self._errors, self.camera = errors, errors.camera(whole.camera)
+
+    def frame(self, i: int) -> Frame:
+        return self._errors.frame(super().frame(i))
+
+    def depth_of(self, i: int) -> NDArray[np.float32]:
+        return self._errors.depth(super().depth_of(i))
 
 
 class Masked(Subset):
@@ -90,7 +107,6 @@ class Masked(Subset):
 
 TUM_WORDS, COLMAP_WORDS, MATRIX_WORDS = 8, 10, (12, 16)
 FORMATS = "give TUM or KITTI text, images.txt of COLMAP, transforms.json, or a folder with one matrix per frame"
-
 
 GivenPoses = Trajectory | list[Matrix | None] | dict[str, Matrix]
 """Poses by time; for each frame in order, None = it has none; or by the name of the image file, without folder and

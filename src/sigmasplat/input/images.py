@@ -4,6 +4,7 @@ the file."""
 import re
 import threading
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
@@ -61,23 +62,17 @@ def depth_to_metres(path: Path, raw: NDArray[Any], units_per_metre: float) -> ND
         raise SourceError(
             f"{path}: not a depth image (found {raw.dtype} {raw.shape}); expected 16-bit PNG or float metres"
         )
-    if raw.dtype.kind == "f":
-        return _checked_metres(path, raw.astype(np.float32))
-    return _checked_metres(path, depth_from_integers(raw, units_per_metre))
+    depth_m = raw.astype(np.float32) if raw.dtype.kind == "f" else depth_from_integers(raw, units_per_metre)
+    if bad := int((~np.isfinite(depth_m)).sum()):
+        raise SourceError(f"{path}: depth holds {bad} NaN or inf pixels; write 0 where there is no reading")
+    if float(depth_m.min(initial=0.0)) < 0.0:
+        raise SourceError(f"{path}: depth is negative ({depth_m.min():.3f} m); write 0 where there is no reading")
+    return depth_m
 
 
 def without_nan(depth_m: NDArray[Any]) -> NDArray[np.float32]:
     """Return float depth with 0 for NaN (no reading) and infinity (out of range), see REP 117 of ROS."""
     return np.asarray(np.nan_to_num(depth_m, nan=0.0, posinf=0.0, neginf=0.0), np.float32)
-
-
-def _checked_metres(path: Path, depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
-    bad = int((~np.isfinite(depth_m)).sum())
-    if bad:
-        raise SourceError(f"{path}: depth holds {bad} NaN or inf pixels; write 0 where there is no reading")
-    if float(depth_m.min(initial=0.0)) < 0.0:
-        raise SourceError(f"{path}: depth is negative ({depth_m.min():.3f} m); write 0 where there is no reading")
-    return depth_m
 
 
 def _refuse_missing(path: Path) -> None:
@@ -97,12 +92,9 @@ class Video:
         self.path, self._lock = path, threading.Lock()
         self._cv2 = import_optional("cv2", "iphone", f"{path}: a video")
         self._open()
-        width, height = (
-            int(self._capture.get(p)) for p in (self._cv2.CAP_PROP_FRAME_WIDTH, self._cv2.CAP_PROP_FRAME_HEIGHT)
-        )
-        self.size = width, height
-        self.count = int(self._capture.get(self._cv2.CAP_PROP_FRAME_COUNT))
-        stated = float(self._capture.get(self._cv2.CAP_PROP_FPS))
+        get, cv2 = self._capture.get, self._cv2
+        self.size = int(get(cv2.CAP_PROP_FRAME_WIDTH)), int(get(cv2.CAP_PROP_FRAME_HEIGHT))
+        self.count, stated = int(get(cv2.CAP_PROP_FRAME_COUNT)), float(get(cv2.CAP_PROP_FPS))
         self.frames_per_second = stated if 0.1 < stated < 1000.0 else FRAMES_PER_SECOND
 
     def frame(self, i: int) -> NDArray[np.uint8]:
@@ -127,9 +119,7 @@ class Video:
         self._capture: Any = self._cv2.VideoCapture(str(self.path))
         if not self._capture.isOpened():
             raise SourceError(f"{self.path}: unreadable video; copy it again (OpenCV needs FFmpeg to read HEVC)")
-        self._capture.set(
-            self._cv2.CAP_PROP_ORIENTATION_AUTO, 0
-        )  # keep the recorded orientation: depth is not rotated either
+        self._capture.set(self._cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # depth is not rotated either
 
 
 FRAMES_PER_SECOND = 30.0
@@ -168,13 +158,10 @@ def natural_key(path: Path | str) -> list[tuple[int, str]]:
 
 def times_of_names(paths: Sequence[Path]) -> list[float]:
     """Return the times in the names if all have a decimal point and increase; else frames are 1/30 s apart."""
-    try:
+    with suppress(ValueError):
         times = [float(path.stem) for path in paths]
-    except ValueError:
-        times = []
-    rising = all(a < b for a, b in pairwise(times))
-    if times and rising and all("." in path.stem for path in paths):
-        return times
+        if all(a < b for a, b in pairwise(times)) and all("." in path.stem for path in paths):
+            return times
     return [i / FRAMES_PER_SECOND for i in range(len(paths))]
 
 

@@ -43,9 +43,9 @@ class Gyroscope:
     `MAX_RAD_S`, or timestamps that do not increase.
     """
 
-    timestamps_s: NDArray[np.float64]
-    angular_velocity_rad_s: NDArray[np.float64]
-    _R_inertial_camera: NDArray[np.float64] = field(init=False, repr=False)
+    timestamps_s: Values
+    angular_velocity_rad_s: Values
+    _R_inertial_camera: Values = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         times_s, rates = self.timestamps_s, self.angular_velocity_rad_s
@@ -62,7 +62,7 @@ class Gyroscope:
         steps = Rotation.from_rotvec(means * np.diff(times_s)[:, None]).as_matrix()
         object.__setattr__(self, "_R_inertial_camera", np.stack(list(accumulate([np.eye(3), *steps], np.matmul))))
 
-    def measured_any(self, times_s: NDArray[np.float64]) -> bool:
+    def measured_any(self, times_s: Values) -> bool:
         """Return whether any of the times [N] is between the first and the last sample."""
         return bool(((self.timestamps_s[0] <= times_s) & (times_s <= self.timestamps_s[-1])).any())
 
@@ -82,9 +82,7 @@ class Gyroscope:
         return np.asarray(self._R_inertial_camera[k] @ Rotation.from_rotvec(mean * since_s).as_matrix())
 
 
-def gyroscope_from_samples(
-    times_s: NDArray[np.float64], angular_velocity_rad_s: NDArray[np.float64]
-) -> Gyroscope | None:
+def gyroscope_from_samples(times_s: Values, angular_velocity_rad_s: Values) -> Gyroscope | None:
     """Make a gyroscope of recorded samples [M] and [M, 3] (`in_time_order`), without its bias (`still_bias`); None if
     they are unusable."""
     times, rates = in_time_order(times_s, angular_velocity_rad_s)
@@ -93,7 +91,7 @@ def gyroscope_from_samples(
     return Gyroscope(times, rates - still_bias(times, rates))
 
 
-def still_bias(times_s: NDArray[np.float64], angular_velocity_rad_s: NDArray[np.float64]) -> NDArray[np.float64]:
+def still_bias(times_s: Values, angular_velocity_rad_s: Values) -> Values:
     """Return the bias [3], rad/s: the median over all seconds in which the gyroscope was still; 0 if it never was.
 
     A slow turn without any shaking looks like a bias. The rotation is only a guess for tracking, so this costs no pose.
@@ -105,12 +103,12 @@ def still_bias(times_s: NDArray[np.float64], angular_velocity_rad_s: NDArray[np.
     return np.median(still, axis=0) if still else np.zeros(3)
 
 
-def still_mean(angular_velocity_rad_s: NDArray[np.float64]) -> NDArray[np.float64] | None:
+def still_mean(angular_velocity_rad_s: Values) -> Values | None:
     """Return the mean [3] of the samples [M, 3] of one second, rad/s; None if the gyroscope was not still."""
     rates = angular_velocity_rad_s
     if len(rates) < STILL_SAMPLES or rates.std(0).max() >= STILL_NOISE_RAD_S:
         return None
-    mean: NDArray[np.float64] = rates.mean(0)
+    mean: Values = rates.mean(0)
     return mean if np.linalg.norm(mean) < MAX_BIAS_RAD_S else None
 
 
@@ -130,23 +128,21 @@ class Accelerometer:
     """Specific force over time: timestamps_s [M], increasing, from the clock of the frames; specific_force_m_s2 [M, 3]
     along the axes of the camera (x right, y down, z forward). A camera at rest measures 9.81 m/s² upwards."""
 
-    timestamps_s: NDArray[np.float64]
-    specific_force_m_s2: NDArray[np.float64]
-    _sums: NDArray[np.float64] = field(init=False, repr=False)
+    timestamps_s: Values
+    specific_force_m_s2: Values
+    _sums: Values = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         sums = np.concatenate([np.zeros((1, 3)), np.cumsum(self.specific_force_m_s2, 0)])
         object.__setattr__(self, "_sums", sums)
 
-    def at(self, time_s: float) -> NDArray[np.float64] | None:
+    def at(self, time_s: float) -> Values | None:
         """Return the mean specific force [3] around a time, m/s²; None if nothing was measured then."""
         first, end = np.searchsorted(self.timestamps_s, (time_s - WINDOW_S, time_s + WINDOW_S))
         return None if first == end else np.asarray((self._sums[end] - self._sums[first]) / (end - first))
 
 
-def accelerometer_from_samples(
-    times_s: NDArray[np.float64], specific_force_m_s2: NDArray[np.float64]
-) -> Accelerometer | None:
+def accelerometer_from_samples(times_s: Values, specific_force_m_s2: Values) -> Accelerometer | None:
     """Make an accelerometer of recorded samples [M] and [M, 3] (`in_time_order`); None if they do not measure
     gravity."""
     times, forces = in_time_order(times_s, specific_force_m_s2)
@@ -156,7 +152,7 @@ def accelerometer_from_samples(
     return Accelerometer(times, forces)
 
 
-def up_of_path(T_world_camera: Matrix, specific_force_m_s2: NDArray[np.float64]) -> NDArray[np.float64] | None:
+def up_of_path(T_world_camera: Matrix, specific_force_m_s2: Values) -> Values | None:
     """Return the unit vector [3] that points up in the world; None if it cannot be told.
 
     T_world_camera [N, 4, 4], specific_force_m_s2 [N, 3] of the same frames. The mean acceleration of a camera over a

@@ -141,7 +141,6 @@ MAX_GAP_S = 0.02
 UNIT_RATIO = 200.0
 """Median steps of two lists that differ by this factor are in different units, such as s and ms."""
 
-
 MOST_CANDIDATES = 100
 """Largest mean number of images that may be within the tolerance of an image: a camera of 1000 Hz has 40. Equal times
 would need memory for the square of the number of images."""

@@ -3,7 +3,7 @@ no depth (video, photos, stereo pairs) are recognised too."""
 
 import importlib
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from dataclasses import fields, replace
 from itertools import islice
@@ -11,10 +11,11 @@ from pathlib import Path
 from typing import Any, cast
 
 from sigmasplat.config import InputConfig
+from sigmasplat.data.camera_errors import CameraErrors
 from sigmasplat.errors import ConfigError, SourceError, nearest
 from sigmasplat.files.pictures import open_image
 from sigmasplat.files.reading import guarded
-from sigmasplat.input.given import Masked, Posed
+from sigmasplat.input.given import Corrected, Masked, Posed
 from sigmasplat.input.images import COLOR_ENDINGS
 from sigmasplat.input.source import Source, Subset
 from sigmasplat.registry import SourceFormat, rows
@@ -93,9 +94,15 @@ def open_source(path: str | Path, settings: InputConfig | None = None, **changes
     Raises SourceError if the path does not exist, no format recognises it, or its content cannot be used;
     ConfigError on an unknown setting.
     """
-    chosen = with_changes(settings or InputConfig(width=0), changes)
+    known = [field.name for field in fields(InputConfig)]
+    for name in changes:
+        if name not in known:
+            raise ConfigError(f"unknown setting input.{name}{nearest(name, known)}; there are {', '.join(known)}")
+    chosen = replace(settings or InputConfig(width=0), **changes)
     with _guarded(path):
         source = _whole(path, chosen)
+        errors = CameraErrors.given(chosen.calibrate)
+        source = Corrected(source, errors) if any(errors.values) else source
         source = Masked(source, Path(chosen.masks)) if chosen.masks else source
         scales = chosen.poses_scale or 1.0, chosen.predicted_scale or 1.0
         source = Posed(source, chosen.poses, *scales) if chosen.poses else source
@@ -147,15 +154,6 @@ def _sure_format(path: str | Path) -> SourceFormat | None:
     with _guarded(path):
         known = _matching_format(path)
     return known if known is not None and known.priority >= 0 else None
-
-
-def with_changes(settings: InputConfig, changes: Mapping[str, Any]) -> InputConfig:
-    """Return the settings with some of them replaced by name. Raises ConfigError on an unknown name."""
-    known = [field.name for field in fields(InputConfig)]
-    for name in changes:
-        if name not in known:
-            raise ConfigError(f"unknown setting input.{name}{nearest(name, known)}; there are {', '.join(known)}")
-    return replace(settings, **changes)
 
 
 def _unknown_format(path: Path) -> SourceError:

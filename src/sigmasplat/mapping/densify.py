@@ -8,7 +8,6 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.config import DensifyConfig
@@ -74,9 +73,7 @@ def too_large(field: GaussianField, most_scale_m: float) -> Tensor:
     return _widest(field) > most_scale_m
 
 
-def too_wide(
-    field: GaussianField, T_camera_world: NDArray[np.float64], camera: Camera, most_radius_px: float
-) -> Tensor:
+def too_wide(field: GaussianField, T_camera_world: Matrix, camera: Camera, most_radius_px: float) -> Tensor:
     """Return which splats [N] in front of the camera, with their centres inside the image, have a radius there (3 σ)
     above `most_radius_px`."""
     T = torch.from_numpy(T_camera_world).to(field.params)

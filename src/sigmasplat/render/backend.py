@@ -57,9 +57,7 @@ def backend_module(asked: str, device: torch.device | None = None) -> ModuleType
     name = backend_name(asked, device)
     if row := backend_row(name):
         return row.operators()
-    if name == "reference":
-        return reference
-    return cpu
+    return reference if name == "reference" else cpu
 
 
 def options_on(backend: str, options: RenderConfig) -> RenderConfig:

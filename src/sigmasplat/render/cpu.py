@@ -156,13 +156,9 @@ class CpuView:
         self.seconds = np.zeros(5)
 
     def forward(
-        self,
-        params: Tensor,
-        T_camera_world: Matrix,
-        depth_reference: Tensor | None = None,
-        layers: bool = False,
+        self, params: Tensor, T_camera_world: Matrix, depth_reference: Tensor | None = None, layers: bool = False,
         harmonics: _core.Harmonics | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Render rows [N, 17] as `View.forward` does: planes [K, rows, columns], m and m², padded to whole tiles.
 
         harmonics: the view-dependent part of the colours, if any.

@@ -6,9 +6,7 @@ defined but have no meaning, and a loss masks them (targets have depth 0 there).
 
 from typing import NamedTuple, Protocol
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.config import RenderConfig
@@ -60,7 +58,7 @@ class View(Protocol):
     """Gradients of `moment` and of the layers' median depth: used if the last forward pass rendered those."""
 
     @property
-    def seconds(self) -> NDArray[np.float64]:
+    def seconds(self) -> Matrix:
         """Return the seconds spent so far in project, sort, blend, blend backward, project backward."""
 
     def forward(

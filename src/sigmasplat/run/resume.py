@@ -59,7 +59,6 @@ CLASSES: tuple[type, ...] = (
 )  # fmt: skip
 """The classes that a state may contain."""
 
-
 REMEMBERED = (
     "atlas", "mapper", "tracker", "drift", "steps", "keyframe_indices", "closer", "recovery", "relocaliser",
     "confidence", "validation_views", "graph", "late",

@@ -61,9 +61,8 @@ def scale_warning(source: Source, config: Config) -> str | None:
 def measured_scale(source: Source, config: Config) -> tuple[float, float] | None:
     """Return the factor from depth to the unit of the given poses, the median of some measured motions, and the median
     relative difference of these from it; None if too few can be compared."""
-    extractor, found = Extractor(), list[float | None]()
-    for first in np.unique(np.linspace(0, len(source) - 1, PLACES, endpoint=False).astype(int)).tolist():
-        found.append(_ratio_at(first, source, config, extractor))
+    extractor, rows = Extractor(), np.linspace(0, len(source) - 1, PLACES, endpoint=False).astype(int)
+    found = (_ratio_at(first, source, config, extractor) for first in np.unique(rows).tolist())
     ratios = np.array([ratio for ratio in found if ratio is not None])
     if len(ratios) < FEWEST:
         return None

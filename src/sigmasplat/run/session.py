@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sigmasplat.config import Config
+from sigmasplat.data.camera_errors import CameraErrors, sensor_said
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.trajectory import RELOCALISED
 from sigmasplat.errors import RunError
@@ -45,14 +46,9 @@ def new_folder(
 
 @contextmanager
 def new_run(
-    out: Path | None,
-    config: Config,
-    source: Source,
-    overwrite: bool = False,
-    keep: Path | None = None,
-    warn: Callable[[str], None] = no_warning,
-    **facts: Any,
-) -> Iterator[RunFolder]:
+    out: Path | None, config: Config, source: Source, overwrite: bool = False, keep: Path | None = None,
+    warn: Callable[[str], None] = no_warning, **facts: Any,
+) -> Iterator[RunFolder]:  # fmt: skip
     """Yield a new run folder, whose run.json has facts, and hold its lock during the block (`files.lock`).
 
     The default is runs/SOURCE-PRESET, numbered if it exists. keep: a run that must not be overwritten. A folder without
@@ -249,7 +245,9 @@ class Session:
     def _log(self, step: "Step", frame: Frame, arrived_s: float | None) -> None:
         """Append the step to log.jsonl, with the force on the camera and the time since the image arrived if they are
         known, and count the frame."""
-        line = log_line(step)
+        line = {name: getattr(step, name) for name in LOGGED} | {"seconds": dict(step.seconds)}
+        if step.loops:
+            line["loops"] = [loop.record() for loop in step.loops]
         if frame.specific_force_m_s2 is not None:
             line["specific_force_m_s2"] = frame.specific_force_m_s2
         if arrived_s is not None:
@@ -269,8 +267,9 @@ class Session:
         before, started_s = len(self.slam.loops), time.perf_counter()
         self.slam.finish(progress)
         self.run.note(finish_s=time.perf_counter() - started_s, final_steps=self.slam.refinement_steps)
-        self.run.note(**self.slam.sensor_times.noted())
-        self.outcome.sensor = self.slam.sensor_times.said()
+        camera = CameraErrors.given(self.run.config().input.calibrate)
+        self.run.note(**(noted := self.slam.sensor_times.noted() | camera.noted()))
+        self.outcome.sensor = sensor_said(noted)
         for callback in (*self.callbacks, *self.readers):
             callback.last_loops(self.slam.loops[before:])
 
@@ -297,10 +296,4 @@ LOGGED = (
     "index", "timestamp_s", "is_keyframe", "lost", "state", "component", "p_off", "splats", "submap", "tracking",
     "seconds", "T_world_camera",
 )  # fmt: skip
-
-
-def log_line(step: "Step") -> dict[str, Any]:
-    """Return a step as a record of log.jsonl: T_world_camera as 4 rows, times in seconds, loops if any were tried."""
-    line = {name: getattr(step, name) for name in LOGGED}
-    line["seconds"] = dict(step.seconds)  # the session adds to it
-    return line | {"loops": [loop.record() for loop in step.loops]} if step.loops else line
+"""The values of a step in log.jsonl: T_world_camera as 4 rows, times in seconds; loops follow if any were tried."""

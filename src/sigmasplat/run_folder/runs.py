@@ -88,7 +88,11 @@ class RunFolder:
             "source": source_name, "machine": machine.describe(), "status": "running",
         }  # fmt: skip
         try:
-            run._claim(overwrite, facts)
+            run.refuse_taken(run.path, overwrite)
+            run.path.mkdir(parents=True, exist_ok=True)
+            # First of all files: a run that is killed at any time leaves a folder that the next run can overwrite.
+            write_json(run.path / "run.json", facts)
+            run._clear()
         except OSError as problem:
             reason = problem.strerror or problem
             raise RunError(f"cannot write output {path}: {reason}; choose a writable --out") from problem
@@ -107,36 +111,23 @@ class RunFolder:
         run._refuse_unless_ours()
         return run
 
-    def _claim(self, overwrite: bool, facts: dict[str, Any]) -> None:
-        """Create the folder, write run.json first, then remove the files of an earlier run. Raises RunError.
-
-        With this order, a run that is killed at any time leaves a folder that the next run can overwrite.
-        """
-        self.refuse_taken(self.path, overwrite)
-        self.path.mkdir(parents=True, exist_ok=True)
-        write_json(self.path / "run.json", facts)
-        self._clear()
-
     @staticmethod
     def refuse_taken(path: Path, overwrite: bool) -> None:
         """Raise RunError if a new run cannot have this folder: it has other content, or a run that must be kept."""
         if path.exists() and not path.is_dir():
             raise RunError(f"output {path} is a file; give a folder")
-        if path.is_dir() and any(entry.name not in FIRST_FILES for entry in path.iterdir()):
-            RunFolder(path)._refuse_to_clear(overwrite)
-
-    def _refuse_to_clear(self, overwrite: bool) -> None:
-        """Raise RunError unless the folder is that of an earlier run and may be overwritten."""
+        if not path.is_dir() or all(entry.name in FIRST_FILES for entry in path.iterdir()):
+            return
         if not overwrite:
             raise RunError(
-                f"output {self.path} exists and is not empty; give another --out, or --overwrite to replace its run"
+                f"output {path} exists and is not empty; give another --out, or --overwrite to replace its run"
             )
         try:
-            if not (self.path / "run.json").is_file():
-                raise RunError(f"{self.path} is not a run folder: no run.json")
-            self._refuse_unless_ours()
+            if not (path / "run.json").is_file():
+                raise RunError(f"{path} is not a run folder: no run.json")
+            RunFolder(path)._refuse_unless_ours()
         except RunError as problem:
-            raise RunError(f"not overwriting {self.path}: {problem}; give another --out") from problem
+            raise RunError(f"not overwriting {path}: {problem}; give another --out") from problem
 
     def _refuse_unless_ours(self) -> None:
         if self.facts().get("program") != PROGRAM:

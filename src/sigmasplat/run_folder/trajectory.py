@@ -23,10 +23,8 @@ def write_trajectory(path: Path, trajectory: Trajectory) -> None:
 
     Raises RunError if the file cannot be written.
     """
-    lines = [f"# {COLUMNS} (seconds, metres, camera to world)"]
-    for t, T in zip(trajectory.timestamps_s, trajectory.T_world_camera, strict=True):
-        lines.append(pose_line(t, T))
-    write_text(path, "\n".join(lines) + "\n")
+    lines = map(pose_line, trajectory.timestamps_s, trajectory.T_world_camera)
+    write_text(path, "\n".join([f"# {COLUMNS} (seconds, metres, camera to world)", *lines]) + "\n")
 
 
 def pose_line(t: float, T: Matrix) -> str:

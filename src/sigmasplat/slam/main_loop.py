@@ -1,6 +1,5 @@
 """SLAM: track every frame, map keyframes, cut submaps, close loops. `MainLoop.step` follows the papers' overviews."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +8,6 @@ from sigmasplat.data import se3
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.relative_pose import UNKNOWN_HOP, RelativePose
 from sigmasplat.data.trajectory import APART, RELOCALISED, TRACKED
-from sigmasplat.graph.loops import Loop
 from sigmasplat.slam.mapping_backend import SLICES_PER_FRAME, MappingBackend
 from sigmasplat.slam.results import Step, StepTimer, make_step
 from sigmasplat.tracking.frame_estimate import FrameEstimate
@@ -29,11 +27,7 @@ class MainLoop(MappingBackend):
     late: NewestFrame | None = None
 
     def step(self, frame: Frame) -> Step:
-        """Process one frame: track it, find it in the whole map if it is lost, map it if it is a keyframe, and cut the
-        submap if a rule ends it here.
-
-        Raises SourceError if the first frame has no depth or a later one comes from another camera.
-        """
+        """Process one frame, as `Slam.step` describes."""
         self._timer, tried = StepTimer(), len(self.closer.loops)
         seen = self._prepared(frame)
         estimate = self._locate(seen) if self.steps else self._begin(seen)
@@ -48,7 +42,9 @@ class MainLoop(MappingBackend):
         else:
             self.tracker.follow(found.followed)
         self.atlas.place_frame(estimate.T_submap_camera)
-        self.steps.append(self._result(seen, estimate, self.closer.loops[tried:]))
+        loops, seconds = self.closer.loops[tried:], self._timer.stop(self.view)
+        submap = self.active_submap()
+        self.steps.append(make_step(seen, estimate, submap, self.tracker, self.confidence, loops, seconds))
         return self.steps[-1]
 
     def _prepared(self, frame: Frame) -> PreparedFrame:
@@ -189,7 +185,3 @@ class MainLoop(MappingBackend):
         self.tracker.forget()
         self.recovery.found()
         estimate.T_submap_camera, estimate.state, estimate.mapped = np.eye(4), APART, True
-
-    def _result(self, seen: PreparedFrame, estimate: FrameEstimate, loops: Sequence[Loop]) -> Step:
-        seconds = self._timer.stop(self.view)
-        return make_step(seen, estimate, self.active_submap(), self.tracker, self.confidence, loops, seconds)

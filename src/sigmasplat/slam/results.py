@@ -6,7 +6,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sigmasplat.data.poses import Part, Records
 from sigmasplat.data.trajectory import APART, LOST, STATES, TRACKED
@@ -49,7 +48,7 @@ class Step:
 
     index: int
     timestamp_s: float
-    T_world_camera: NDArray[np.float64]
+    T_world_camera: Matrix
     is_keyframe: bool
     lost: bool
     tracking: dict[str, float]
@@ -60,7 +59,7 @@ class Step:
     state: str = TRACKED
     component: int = 0
     p_off: float = 0.0
-    covariance: NDArray[np.float64] | None = None
+    covariance: Matrix | None = None
 
 
 def make_step(
@@ -87,7 +86,7 @@ class StepTimer(Stopwatch):
     """Wall-clock seconds of one step by stage, including the seconds of the view's kernels. The step begins with it."""
 
     begin_s: float = field(default_factory=time.perf_counter)
-    kernels_before: NDArray[np.float64] = field(default_factory=lambda: np.zeros(len(KERNELS)))
+    kernels_before: Matrix = field(default_factory=lambda: np.zeros(len(KERNELS)))
 
     def start_kernels(self, view: View) -> None:
         """Measure the kernels of the view from now on."""

@@ -191,10 +191,5 @@ class SlamState:
 def merged_field(store: SubmapStore, atlas: Atlas, component: int, active: GaussianField) -> GaussianField:
     """Return the splats of all submaps of a component side by side, in its frame, in host memory; `active` are those of
     the submap that is not finished."""
-    fields = (
-        (store.load(s).field if s < len(store) else active.to(torch.device("cpu"))).moved(
-            torch.from_numpy(atlas.anchors[s])
-        )
-        for s in atlas.members(component)
-    )
-    return GaussianField.side_by_side(fields)
+    fields = ((store.load(s).field if s < len(store) else active.to(HOST), s) for s in atlas.members(component))
+    return GaussianField.side_by_side(field.moved(torch.from_numpy(atlas.anchors[s])) for field, s in fields)

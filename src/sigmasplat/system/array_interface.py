@@ -136,17 +136,10 @@ class ArrayInterface(ABC):
         return None if newest.state == LOST else self.covariance_of(newest)
 
     def track(
-        self,
-        rgb: Array,
-        depth: Array,
-        K: Camera | Array,
-        timestamp: float,
-        *,
-        depth_scale: float | None = None,
-        color_order: ColorOrder = "rgb",
-        R_inertial_camera: Matrix | None = None,
+        self, rgb: Array, depth: Array, K: Camera | Array, timestamp: float, *, depth_scale: float | None = None,
+        color_order: ColorOrder = "rgb", R_inertial_camera: Matrix | None = None,
         T_given_camera: Matrix | None = None,
-    ) -> Step:
+    ) -> Step:  # fmt: skip
         """Process one pair of images from your own camera: `step` for arrays, with the covariance of the pose.
 
         rgb [H, W, 3]: uint8, or float in [0, 1]; color_order: "bgr" for images of OpenCV. depth [H, W]: registered to

@@ -6,12 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.config import Config
 from sigmasplat.config.find_preset import configured
-from sigmasplat.config.input import RENDERED
 from sigmasplat.data.atlas import Atlas
 from sigmasplat.data.field import GaussianField, Rows
 from sigmasplat.data.frame import Frame
@@ -21,6 +19,7 @@ from sigmasplat.data.trajectory import Component, Trajectory
 from sigmasplat.final.final_map import final_map, reaching
 from sigmasplat.final.stores import RefinedStore, StorePart, solved_keyframes
 from sigmasplat.final.uncertainty import final_uncertainty
+from sigmasplat.graph.graph_errors import calibration_std
 from sigmasplat.graph.path_covariance import NewestCovariance, PathCovariance, PoseErrors, recorded
 from sigmasplat.render.render import as_refined
 from sigmasplat.slam.main_loop import MainLoop
@@ -66,7 +65,12 @@ class Slam(MainLoop, ArrayInterface):
 
     def components(self) -> list[Component]:
         """Return the components of the atlas that are not connected to the world."""
-        return components_apart(self.store, self.atlas, self.mapper.field, self.trajectory(), ~self.steps.lost)
+        atlas, path = self.atlas, self.trajectory()
+        component_of, found = np.array(atlas.components, np.int64)[atlas.places.submap], ~self.steps.lost
+        return [
+            Component(n, merged_field(self.store, atlas, n, self.mapper.field), path.at(found & (component_of == n)))
+            for n in sorted(set(atlas.components) - {0})
+        ]
 
     def covariance_of(self, newest: Step) -> Matrix:
         atlas = self.atlas
@@ -107,7 +111,9 @@ class Slam(MainLoop, ArrayInterface):
         completed(self.refining(self.mapper.pending))
         if not self.steps or not (len(self.store) or self.cuts or self.config.final.iterations):
             return
-        steps, measures = self._refinement_steps(), self.config.uncertainty.probes > 0
+        final, photos = self.config.final, any(keyframe.photo for keyframe in self.mapper.keyframes)
+        steps = final.iterations + final.width_iterations * (photos and final.iterations > 0)
+        measures = self.config.uncertainty.probes > 0
         total = max(1, steps + measures * self.atlas.keyframe_poses.total)
         progress(0, total)
         completed(self.finish_submap())
@@ -121,27 +127,21 @@ class Slam(MainLoop, ArrayInterface):
         refining, measuring = (part_of(progress, first, total) for first in (0, steps))
         known = PathCovariance.of_keyframes(self.atlas, self.closer.valid)
         if self.follows:
-            store, poses = solved_keyframes(
-                self.atlas, known, part, self.keyframe_image, self.graph, self.config.input.sensor == RENDERED
-            )
+            calibration = calibration_std(self.config.input, self.view.camera)
+            store, poses = solved_keyframes(self.atlas, known, part, self.keyframe_image, self.graph, calibration)
             self.atlas.refined = dict(zip(members, poses, strict=True))
         anchors = [self.atlas.anchors[s] for s in members]
         config = replace(self.config, final=reaching(self.config, known))
-        final = final_map(store, anchors, config, self.view, self.random, refining)
-        self._final, self.refinement_steps = final.field, final.steps
-        refined = RefinedStore(store, final.keyframe_poses, final.keyframe_exposures)
-        if final.keyframe_poses is not None:
-            self.atlas.refined = dict(zip(members, final.keyframe_poses, strict=True))
-        if final.keyframe_exposures is not None:
-            self.atlas.exposures = dict(zip(members, final.keyframe_exposures, strict=True))
-        shown = replace(self.config, render=as_refined(self.config.render, self.view.camera, final.refined_fx))
+        made = final_map(store, anchors, config, self.view, self.random, refining)
+        self._final, self.refinement_steps = made.field, made.steps
+        refined = RefinedStore(store, made.keyframe_poses, made.keyframe_exposures)
+        if made.keyframe_poses is not None:
+            self.atlas.refined = dict(zip(members, made.keyframe_poses, strict=True))
+        if made.keyframe_exposures is not None:
+            self.atlas.exposures = dict(zip(members, made.keyframe_exposures, strict=True))
+        shown = replace(self.config, render=as_refined(self.config.render, self.view.camera, made.refined_fx))
         self.uncertainty = final_uncertainty(self._final, refined, anchors, shown, self.view, measuring)
         progress(total, total)
-
-    def _refinement_steps(self) -> int:
-        """Return the number of steps of the final map's refinement, at working size and on photos."""
-        final, photos = self.config.final, any(keyframe.photo for keyframe in self.mapper.keyframes)
-        return final.iterations + final.width_iterations * (photos and final.iterations > 0)
 
 
 def checkpoint_of(
@@ -178,14 +178,3 @@ def _rows_of(rows: Rows, prefix: str) -> dict[str, Tensor]:
     """Return the parameters and the optimiser state of rows, in host memory, with a prefix to each name."""
     parts = {f"{prefix}{name}": getattr(rows, name).cpu() for name in ("params", "moment1", "moment2", "last_step")}
     return parts | {f"{prefix}adam_steps": torch.tensor(rows.steps)}
-
-
-def components_apart(
-    store: SubmapStore, atlas: Atlas, active: GaussianField, trajectory: Trajectory, found: NDArray[np.bool_]
-) -> list[Component]:
-    """Return the components that are not connected to the world; trajectory: of all frames, found [F]: not lost."""
-    component_of = np.array(atlas.components, np.int64)[atlas.places.submap]
-    return [
-        Component(n, merged_field(store, atlas, n, active), trajectory.at(found & (component_of == n)))
-        for n in sorted(set(atlas.components) - {0})
-    ]

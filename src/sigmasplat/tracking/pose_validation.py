@@ -40,9 +40,6 @@ another wall, and walls are alike."""
 MOST_SPREAD_M = 0.05
 """A pose without a known path is refused if the standard deviation of its position is larger: where only a wall is in
 view, the images agree as well at every pose along it."""
-LEAP_M, LEAP_HOPS = 0.3, 3.0
-"""Lost: the pose is farther from the predicted one than this distance and this many usual hops between frames. Flat
-walls fit each other across a room."""
 DOUBT_SCORE, FIRST_SCORE = 0.7, 0.8
 """Doubtful: the score falls below this share of the usual one, which is the second value while it is not known. A frame
 and its keyframe share four fifths of their surface, or less: with 1, the fifth frame of a turn was doubtful."""
@@ -155,13 +152,12 @@ class TrackingStatistics:
     closes: list[float] = field(default_factory=list)
     residuals: list[float] = field(default_factory=list)
     correlations: list[float] = field(default_factory=list)
-    hops_m: list[float] = field(default_factory=list)
 
-    def add(self, c: Comparison, hop_m: float) -> None:
-        """Add the values of a frame that is not lost, and its distance from the frame before."""
+    def add(self, c: Comparison) -> None:
+        """Add the values of a frame that is not lost."""
         for values, value in (
             (self.scores, score(c)), (self.closes, c.close), (self.residuals, c.residual),
-            (self.correlations, c.correlation), (self.hops_m, hop_m),
+            (self.correlations, c.correlation),
         ):  # fmt: skip
             if np.isfinite(value):
                 values.append(value)
@@ -181,10 +177,6 @@ class TrackingStatistics:
     def residual(self) -> float:
         """Return the usual median depth difference, in standard deviations of a reading; NaN if it is not known."""
         return _median(self.residuals, float("nan"))
-
-    def is_leap(self, apart_m: float, scene_scale: float = 1.0) -> bool:
-        """Return whether a camera that has moved as usual cannot be this far from where it was expected."""
-        return apart_m > LEAP_M * scene_scale + LEAP_HOPS * _median(self.hops_m, 0.0)
 
     def doubts(self, c: Comparison) -> bool:
         """Return whether a pose is clearly worse than usual."""

@@ -89,7 +89,7 @@ class Tracker:
             self.front, self.lost, self.doubtful = None, False, 0
         else:
             best = self._estimated(given, seen, shown)
-            self.lost = self._is_lost(best) or self._leaps(best, predicted)
+            self.lost = self._is_lost(best)
             self.doubtful = self.doubtful + 1 if self._contradicted(best) else 0
         self.prior = prior
         if self.lost:  # poses of earlier frames do not agree with later ones
@@ -143,7 +143,7 @@ class Tracker:
         found = self._fit(given, shown, predicted)
         # a still thing can seem to be in free space where poses or depth are wrong
         still = front is not None and self.detector.config.find and is_still(front, self.keyframe, seen.live, found)
-        if not still and self._stands(found, predicted, fit.comparison):
+        if not still and self._stands(found, fit.comparison):
             self.front = front
             return found, shown
         self.keyframe = keyframe
@@ -159,7 +159,7 @@ class Tracker:
         self.detector, things = self.detector.suspected(self.keyframe, seen, drawn, self.config, contradicted, urgent)
         for front in unless(given.should_stop, things):
             found = self._fit(given, shown := seen.aside(front), predicted)
-            if self._stands(found, predicted) and has_drawn(front, self.keyframe, seen, drawn, found, contradicted):
+            if self._stands(found) and has_drawn(front, self.keyframe, seen, drawn, found, contradicted):
                 self.front = front
                 return found, shown
         return None
@@ -170,9 +170,8 @@ class Tracker:
         self.keyframe_front = None if self.front is not None and front is None else self.keyframe_front
         self.front, self.detector = front, self.detector.after(seen, front, T_world_camera)
 
-    def _stands(self, fit: PoseFit, predicted: Matrix, whole: Comparison | None = None) -> bool:
-        lost = self._is_lost(fit) or self._contradicted(fit) or self._leaps(fit, predicted)
-        return not (lost or judge.is_missed(fit.comparison, whole))
+    def _stands(self, fit: PoseFit, whole: Comparison | None = None) -> bool:
+        return not (self._is_lost(fit) or self._contradicted(fit) or judge.is_missed(fit.comparison, whole))
 
     def _remember(self, fit: PoseFit, seen: PreparedFrame) -> None:
         """Keep what the next frame needs."""
@@ -183,7 +182,7 @@ class Tracker:
             self.agreements = [*self.agreements, fit.agreement * fit.overlap][-judge.RECENT :]
             self.first_losses = [*self.first_losses, fit.first_loss][-judge.RECENT :]
             if fit.comparison is not None:
-                self.statistics.add(fit.comparison, float(np.linalg.norm(self.motion.velocity[:3, 3])))
+                self.statistics.add(fit.comparison)
         self.previous = T_world_camera
         seen.move(self.motion.rate(), self.times)
         self.last_image, self.started = seen.without(self.front).live, True
@@ -239,13 +238,6 @@ class Tracker:
         if self.lost:  # after a lost frame the path of the camera does not support a pose
             return not judge.confirmed(fit.comparison)
         return self.statistics.is_lost(fit.comparison, self.config.lost_share)
-
-    def _leaps(self, fit: PoseFit, predicted: Matrix) -> bool:
-        """Return whether a verified pose is so far from the predicted one that the camera cannot have moved there."""
-        if fit.comparison is None or self.lost or self.keyframe is None:
-            return False
-        apart = se3.inverse(fit.T_camera_world)[:3, 3] - predicted[:3, 3]
-        return self.statistics.is_leap(float(np.linalg.norm(apart)), self.keyframe.pyramid.scene_scale)
 
     def _doubts(self, fit: PoseFit) -> bool:
         if fit.comparison is not None:

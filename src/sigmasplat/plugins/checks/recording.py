@@ -17,8 +17,11 @@ from sigmasplat.api import (
     SourceError,
     default_preset,
     depth_warning,
+    evenly_spaced,
+    evenly_spread,
     format_name,
     list_presets,
+    to_bytes,
     unlikely_camera,
 )
 from sigmasplat.plugins.checks.depth import EdgeAgreement, edge_agreement, overlay
@@ -60,8 +63,7 @@ class Inspection:
 def inspect_source(path: str | Path, settings: InputConfig, samples: int = SAMPLES) -> Inspection:
     """Open a recording and inspect `samples` frames, evenly spaced. Raises SourceError if it cannot be opened."""
     name, (source, guessed) = format_name(path, settings), _opened(path, settings)
-    spaced = np.linspace(0, len(source) - 1, min(samples, len(source))).round()
-    frames = [*_readable(source, sorted({int(k) for k in spaced}), source.skipped)]
+    frames = [*_readable(source, evenly_spaced(len(source), samples).tolist(), source.skipped)]
     if not frames:
         raise SourceError(f"{source.name}: none of {samples} sampled frames can be read; check the image files")
     agreement = None if source.computed_depth else edge_agreement(frames)  # stereo depth has the left image's pixels
@@ -209,12 +211,12 @@ def _suggested(format_name: str) -> str:
 
 def _sheet(frames: list[Frame]) -> Image.Image:
     """Draw colour, depth, and the image with depth outlines, one row per frame."""
-    chosen = [frames[int(k)] for k in np.linspace(0, len(frames) - 1, min(SHOWN, len(frames))).round()]
+    chosen = evenly_spread(frames, SHOWN)
     depths = np.concatenate([frame.depth_m.reshape(-1) for frame in chosen])
     limits = colormap.value_range(depths, depths > 0)
     strips = [
         draw_view_strip([
-            ViewPanel("colour", (frame.color * 255.0).round().astype(np.uint8), f"{frame.timestamp_s:.2f} s"),
+            ViewPanel("colour", to_bytes(frame.color * 255.0), f"{frame.timestamp_s:.2f} s"),
             coloured("depth", frame.depth_m, frame.depth_m > 0, limits, colormap.VIRIDIS, " m"),
             ViewPanel("depth outlines", overlay(frame)),
         ], SHEET_PX)

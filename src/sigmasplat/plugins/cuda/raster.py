@@ -169,13 +169,9 @@ class Raster:
         )
 
     def gradients(
-        self,
-        planes: Planes,
-        reference: Tensor | None,
-        on_sums: Tensor,
-        on_moment: Tensor | None,
+        self, planes: Planes, reference: Tensor | None, on_sums: Tensor, on_moment: Tensor | None,
         on_alpha: Tensor | None,
-    ) -> tuple[Tensor, int]:
+    ) -> tuple[Tensor, int]:  # fmt: skip
         """Sum the planes' gradients over pixels, per splat. Return the records [n, R], and the position in a record of
         the moment's two sums (0 = none)."""
         self.make_room()

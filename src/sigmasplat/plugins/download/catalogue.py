@@ -134,8 +134,7 @@ def _find_set(set_name: str) -> PublicSet:
 
 def _normalised(name: str, prefix: str) -> str:
     """Normalise a name: fr1/desk, freiburg1_desk and rgbd_dataset_freiburg1_desk are equal."""
-    written = name.lower().removeprefix(prefix).replace("freiburg", "fr")
-    return written.replace("/", "_").replace("-", "_")
+    return name.lower().removeprefix(prefix).replace("freiburg", "fr").replace("/", "_").replace("-", "_")
 
 
 def _suggestion(wanted: str, names: list[str]) -> str:

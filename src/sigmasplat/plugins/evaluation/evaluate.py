@@ -57,19 +57,10 @@ KINDS = {"held-out": False, "training": True}
 
 
 def evaluate(
-    run: RunFolder,
-    source: Source,
-    *,
-    renderer: view_scores.Renderer | None = None,
-    views_per_kind: int = 40,
-    strips_per_kind: int = 3,
-    mesh: bool = False,
-    true_mesh: Mesh | None = None,
-    random_views: int = VIEWS,
-    full_resolution: bool = False,
-    lpips: Lpips | None = None,
-    progress: Progress = no_progress,
-) -> dict[str, Any]:
+    run: RunFolder, source: Source, *, renderer: view_scores.Renderer | None = None, views_per_kind: int = 40,
+    strips_per_kind: int = 3, mesh: bool = False, true_mesh: Mesh | None = None, random_views: int = VIEWS,
+    full_resolution: bool = False, lpips: Lpips | None = None, progress: Progress = no_progress,
+) -> dict[str, Any]:  # fmt: skip
     """Score trajectory, map and uncertainty of a run against its source, and return the metrics written.
 
     Path and views are scored on the frames whose pose is valid: those of trajectory.txt, without lost frames.

@@ -186,11 +186,7 @@ def render_views(
 
 
 def scored_view(
-    frame: Frame,
-    rendered: Render,
-    kind: str,
-    notes: tuple[str, ...] = (),
-    exposure: NDArray[np.float64] | None = None,
+    frame: Frame, rendered: Render, kind: str, notes: tuple[str, ...] = (), exposure: NDArray[np.float64] | None = None
 ) -> ScoredView:
     """Pair a frame with its rendering, in the frame's exposure [3, 2] if given. Depth is Σwz/Σw where the map covers
     the pixel, else 0."""

@@ -6,14 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from sigmasplat.api import (
-    ConfigError,
-    GaussianField,
-    Matrix,
-    RunError,
-    SigmaSplatError,
-    SplatStd,
-)
+from sigmasplat.api import ConfigError, GaussianField, Matrix, RunError, SigmaSplatError, SplatStd
 from sigmasplat.plugins.outputs.axes import AXES, Axes, levelled, transform_to
 
 if TYPE_CHECKING:

@@ -28,12 +28,11 @@ from sigmasplat.api import (
     SourceError,
     Subset,
     Video,
-    exists,
     first_subfolder,
     image_size,
     list_images,
+    read_groundtruth,
     read_npy,
-    read_poses,
     read_values,
     resolve_calibration,
     times_of_names,
@@ -182,16 +181,13 @@ def open_color_only(path: Path, settings: InputConfig) -> Source:
         colors = _color_images(path)
         size, names = image_size(colors[0]), [color.stem for color in colors]
         times_s = times_of_names(colors)
-
     calibration = resolve_calibration(path, None, size, settings, MM_PER_METRE)
-
     predicted = predicted_in_folder(Path(settings.predicted_depth), names, settings.predicted_inverse)
     images = [
         PredictedPair(t, color, depth, number, size, predicted, video)
         for number, (t, color, depth) in enumerate(zip(times_s, colors, predicted.paths, strict=True))
     ]
-    truth_path = path / "groundtruth.txt"
-    truth = read_poses(truth_path) if path.is_dir() and exists(truth_path) else None
+    truth = read_groundtruth(path)
     source = RecordedSource(path.resolve().name, images, replace(calibration, depth_camera=None), settings, truth)
     _say_predicted(source)
     return source

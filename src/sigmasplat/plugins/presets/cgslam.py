@@ -39,10 +39,7 @@ PAPER = BASE.changed(
         "prune_opacity": 0.005,
         "window": 4,
     },
-    primitives={
-        "uncertain_m2": 0.025,
-        "densify": "split+clone",
-    },
+    primitives={"uncertain_m2": 0.025, "densify": "split+clone"},
     tracking={
         "descent": "axis-angle",
         "lr_rotation": 1.5e-3,
@@ -52,7 +49,6 @@ PAPER = BASE.changed(
         "alpha_above": 0.99,
         "outlier_factor": 10.0,
     },
-    submaps={},
     loops={"close": False, "uncertainty": False},
     registration={"uncertainty": False},
     final={"uncertainty": False},

@@ -3,13 +3,8 @@
 from sigmasplat.api import Config, Preset
 
 BASE_VALUES: dict[str, dict[str, object]] = {
-    "input": {
-        "width": 0,
-        "denoise_depth": False,
-    },
-    "render": {
-        "depth": "center",
-    },
+    "input": {"width": 0, "denoise_depth": False},
+    "render": {"depth": "center"},
     "seeding": {
         "first_uniform": 100_000,
         "first_gradient": 50_000,
@@ -34,10 +29,7 @@ BASE_VALUES: dict[str, dict[str, object]] = {
         "lr_log_scales": 0.005,
         "prune_opacity": 0.5,
     },
-    "primitives": {
-        "uncertain_m2": 0.0,
-        "split_radius_px": 0.0,
-    },
+    "primitives": {"uncertain_m2": 0.0, "split_radius_px": 0.0},
     "tracking": {
         "method": "adam",
         "align_weight_color": 0.5,
@@ -46,38 +38,14 @@ BASE_VALUES: dict[str, dict[str, object]] = {
         "features": False,
         "verify": False,
     },
-    "recovery": {
-        "relocalise": False,
-    },
-    "moving": {
-        "find": False,
-    },
-    "submaps": {
-        "distance_m": 0.0,
-        "uncertainty_m": 0.0,
-        "inherit": False,
-    },
-    "loops": {
-        "near_m": 0.0,
-        "most": 4,
-    },
-    "registration": {
-        "iterations": 100,
-        "method": "paper",
-        "tau": 50.0,
-    },
-    "final": {
-        "iterations": 0,
-        "move_poses": False,
-        "schedule": "steady",
-        "sh_degree": 0,
-    },
-    "surface": {
-        "depth": "map",
-    },
-    "uncertainty": {
-        "probes": 0,
-    },
+    "recovery": {"relocalise": False},
+    "moving": {"find": False},
+    "submaps": {"distance_m": 0.0, "uncertainty_m": 0.0, "inherit": False},
+    "loops": {"near_m": 0.0, "most": 4},
+    "registration": {"iterations": 100, "method": "paper", "tau": 50.0},
+    "final": {"iterations": 0, "move_poses": False, "schedule": "steady", "sh_degree": 0},
+    "surface": {"depth": "map"},
+    "uncertainty": {"probes": 0},
 }
 """What is ours alone is off, and a value that both papers share is theirs; the presets name the rest."""
 

@@ -11,19 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from sigmasplat.api import (
-    LOST,
-    RELOCALISED,
-    Atlas,
-    Callback,
-    Frame,
-    Matrix,
-    RunError,
-    Slam,
-    Step,
-    import_optional,
-    se3,
-)
+from sigmasplat.api import LOST, RELOCALISED, Atlas, Callback, Frame, Matrix, RunError, Slam, Step, import_optional, se3
 from sigmasplat.plugins.robots import ros_messages as ros
 from sigmasplat.plugins.robots.ros_messages import Encoded, RosMessages, Topic
 
@@ -96,7 +84,6 @@ class BagSink:
 
 Images = Literal["none", "keyframes", "all"]
 STATIC = ((ros.MAP, ros.WORLD, ros.T_MAP_WORLD), (ros.LINK, ros.OPTICAL, ros.T_LINK_OPTICAL))
-
 
 FOUND_BY_FEATURES = "inliers"
 """A step has this value if relocalisation decided its pose."""

@@ -171,7 +171,6 @@ def _one_camera(bag: Bag, what: str, topics: list[ImageTopic], option: str) -> I
 BROWN_CONRADY = ("", "plumb_bob", "brown conrady", "inverse brown conrady", "modified brown conrady", "none")
 RATIONAL = "rational_polynomial"
 
-
 Optics = tuple[Camera, Distortion | None]
 """Intrinsics, and lens distortion or None."""
 

@@ -23,7 +23,6 @@ DUE = 0.6
 USUAL, FEW = 20, 5
 """What is usual is the median over this many recent frames; with fewer than the second number, it is not known."""
 
-
 Arrival = tuple[Frame, float]
 """A frame, and the time when it arrived."""
 Waiting = SimpleQueue[Arrival | BaseException | None]

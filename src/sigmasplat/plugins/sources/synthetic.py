@@ -19,13 +19,8 @@ from sigmasplat.api import (
     color_from_bytes,
     se3,
 )
-from sigmasplat.plugins.sources.room.capture import (
-    camera_path,
-    drifted_depth,
-    measured_color,
-    measured_depth,
-    predicted_depth,
-)
+from sigmasplat.plugins.sources.room import capture
+from sigmasplat.plugins.sources.room.capture import Image, camera_path
 from sigmasplat.plugins.sources.room.corridor import corridor_path, furnish_corridor, sections
 from sigmasplat.plugins.sources.room.furnish import furnish_rooms, mask_of, mover as moving_ball
 from sigmasplat.plugins.sources.room.render import RoomScene, build_scene, render_scene
@@ -35,13 +30,10 @@ from sigmasplat.plugins.sources.stereo_matching import StereoMatcher
 FRAMES_PER_SECOND = 30.0
 FOCAL_PER_WIDTH, WIDE_FOCAL_PER_WIDTH = 0.8, 0.5
 """Focal length of a room's and of a corridor's camera: a view of 64° and of 90°."""
-EXPOSURE_SWING = 0.08
 AWAY_M, AWAY_RAD = np.array([0.45, 0.25, 0.45]), np.deg2rad([12.0, 40.0, 8.0])
 """Largest motion of a test view from the path, camera x, y, z, and rotation about them."""
 CLEARANCE_M = 0.3
 MOST_MOVER = 50
-
-Floats = NDArray[np.float32]
 
 
 class SyntheticRoom(Source):
@@ -49,7 +41,8 @@ class SyntheticRoom(Source):
 
     seed: appearance of the room, start of the path and all noise. exposure_change None: in rooms, not in a corridor.
     Scored views and the true surface show the room without the ball (`mover`). Each row is seen from where the path is
-    at its time (`late`, `rows`, `depth_rows`). What is wrong with depth is in `room.capture`.
+    at its time (`late`, `rows`, `depth_rows`). `camera` is the stated one: `focal`, `center_x` and `center_y` off the
+    true one of the images. What is wrong with colour and depth is in `room.capture`; `gains` [frames, 3] are true.
 
     A path with loops to close: frames=720,rooms=2,overrun=20,noise=1,drift=6. A round of 600 frames is a slow pace. The
     way back looks in other directions than the way out, so drift accumulates over a whole round; the last 120 frames
@@ -62,84 +55,91 @@ class SyntheticRoom(Source):
         self, frames: int = 200, width: int = 320, height: int = 240, seed: int = 0, noise: bool = False,
         loops: int = 1, exposure_change: bool | None = None, rooms: int = 1, overrun: int = 0, drift: int = 0,
         test_views: int = 0, stereo: int = 0, mover: int = 0, predicted: bool = False, corridor: bool = False,
-        late: float = 0.0, rows: float = 0.0, depth_rows: float = 0.0,
+        late: float = 0.0, rows: float = 0.0, depth_rows: float = 0.0, focal: float = 0.0, center_x: float = 0.0,
+        center_y: float = 0.0, depth_scale: float = 0.0, depth_offset: float = 0.0, falloff: float = 0.0,
+        exposure: float = 0.0, white: float = 0.0,
     ) -> None:  # fmt: skip
-        """Compute the camera path, no image yet. Raises SourceError unless counts and sizes are ≥ 1, the rest ≥ 0."""
+        """Compute the camera path, no image yet. Raises SourceError for values out of range."""
         counts = {"frames": frames, "width": width, "height": height, "loops": loops, "rooms": rooms}
         others = {"seed": seed, "overrun": overrun, "drift": drift, "test_views": test_views, "stereo": stereo}
-        for key, value in (counts | others).items():
+        colors = {"falloff": falloff, "exposure": exposure, "white": white}
+        for key, value in (counts | others | colors).items():
             if value < (key in counts):
                 raise SourceError(f"synthetic room: {key} must be at least {int(key in counts)}, found {value}")
+        for key, value in (colors | {"focal": focal, "depth_scale": depth_scale}).items():
+            if not abs(value) < 1:
+                raise SourceError(f"synthetic room: {key} is a share of size below 1, found {value}")
         if corridor and (rooms, loops, overrun, mover) != (1, 1, 0, 0):
             raise SourceError("synthetic room: a corridor has one way; leave out rooms, loops, overrun and mover")
         if not 0 <= mover <= MOST_MOVER or (mover and rooms > 1):
-            found = f"{mover} and rooms={rooms}" if rooms > 1 else str(mover)
-            raise SourceError(f"synthetic room: mover is 0 to {MOST_MOVER} percent and needs rooms=1, found {found}")
+            raise SourceError(f"synthetic room: mover is 0 to {MOST_MOVER} %, in rooms=1; found {mover}, rooms={rooms}")
         focal_px = (WIDE_FOCAL_PER_WIDTH if corridor else FOCAL_PER_WIDTH) * width
         camera = Camera(width, height, focal_px, focal_px, (width - 1) / 2, (height - 1) / 2)
-        super().__init__("synthetic", camera)
+        stated_px, x, y = focal_px * (1 + focal), camera.cx + center_x, camera.cy + center_y
+        super().__init__("synthetic", Camera(width, height, stated_px, stated_px, x, y))
+        self._true_camera = camera
         if predicted and stereo:
             raise SourceError("synthetic room: depth is either predicted or from stereo; leave out predicted or stereo")
         if (late, rows, depth_rows) != (0.0, 0.0, 0.0) and (stereo or mover):
             raise SourceError("synthetic room: stereo pairs and the ball are read at once; leave out stereo or mover")
         self._late_s, self._rows_s, self._depth_rows_s = late, rows, depth_rows
-        self.predicted_depth, self.sensor = predicted, None if drift or predicted else "rendered"
+        inexact = drift or predicted or self.camera != camera or depth_scale or depth_offset
+        self.predicted_depth, self.sensor = predicted, None if inexact else "rendered"
         self._seed, self._noise, self._corridor = seed, noise, corridor
         self._rooms = sections(frames) if corridor else rooms
-        self._exposure_change = not corridor if exposure_change is None else exposure_change
-        self._drift = drift / 1000
-        self._test_views = test_views
+        self._drift, self._misread, self._test_views = drift / 1000, (depth_scale, depth_offset), test_views
         self.computed_depth, self._baseline_m = stereo > 0, stereo / 100
-        self._matcher = StereoMatcher(camera, self._baseline_m) if stereo else None
+        self._matcher = StereoMatcher(self.camera, self._baseline_m) if stereo else None  # knows the stated camera
         self.depth_noise_per_m = self._matcher.noise_per_m if self._matcher else None
         path = corridor_path(frames, seed) if corridor else camera_path(frames, loops, rooms, seed, overrun / 100)
         self._T_world_camera = path
-        self.mover = moving_ball(self._T_world_camera, camera, mover / 100) if mover else None
+        swings = not corridor if exposure_change is None else exposure_change
+        self.gains = capture.camera_gains(len(path), seed, exposure, white, swings and not (exposure or white))
+        self._shade = capture.shade(camera, falloff)
+        self.mover = moving_ball(path, camera, mover / 100) if mover else None
 
     def __len__(self) -> int:
         return len(self._T_world_camera)
 
     def frame(self, i: int) -> Frame:
         """Render frame i; colour has steps of 1/255, as from a camera."""
-        T_world_camera = self._T_world_camera[self._checked_index(i)]
-        color, depth_m = self._exposed(i, T_world_camera)
+        color, depth_m = self._exposed(i, self._T_world_camera[self._checked_index(i)])
         if self._drift:
-            depth_m = drifted_depth(depth_m, i, self._seed, self._drift)
+            depth_m = capture.drifted_depth(depth_m, i, self._seed, self._drift)
         if self._noise:
             rng = np.random.default_rng((self._seed, i, 7))
-            color, depth_m = measured_color(color, rng), measured_depth(depth_m, self.camera, rng)
+            color, depth_m = capture.measured_color(color, rng), capture.measured_depth(depth_m, self._true_camera, rng)
         if self.predicted_depth:
-            depth_m = predicted_depth(depth_m, i, self._seed, np.random.default_rng((self._seed, i, 12)))
+            depth_m = capture.predicted_depth(depth_m, i, self._seed, np.random.default_rng((self._seed, i, 12)))
         bytes_ = np.rint(color * 255.0).astype(np.uint8)
         if self._matcher:
             depth_m, _ = self._matcher.depth_and_std_m(bytes_, self.right_image(i))
+        depth_m = capture.misread_depth(depth_m, *self._misread)
         return Frame(i, self.timestamp_s(i), color_from_bytes(bytes_), depth_m, self.camera)
 
     def right_image(self, i: int) -> NDArray[np.uint8]:
-        """Render the right image of frame i of the stereo pair, RGB [H, W, 3]: the baseline to the right of the left
-        one, with the same exposure."""
+        """Render the right image of the stereo pair of frame i, RGB [H, W, 3], with the exposure of the left one."""
         T_left_right = np.eye(4)
         T_left_right[0, 3] = self._baseline_m
         T_world_right = self._T_world_camera[self._checked_index(i)] @ T_left_right
         color = self._exposed(i, T_world_right)[0]
         if self._noise:
-            color = measured_color(color, np.random.default_rng((self._seed, i, 9)))
+            color = capture.measured_color(color, np.random.default_rng((self._seed, i, 9)))
         return np.asarray(np.rint(color * 255.0), np.uint8)
 
     def timestamp_s(self, i: int) -> float:
         return self._checked_index(i) / FRAMES_PER_SECOND
 
     def exact_depth_of(self, i: int) -> NDArray[np.float32]:
-        """Return the depth of frame i without noise and drift."""
-        T_world_camera = self._T_world_camera[self._checked_index(i)]
-        return render_scene(self._scene(i), self.camera, T_world_camera)[1]
+        """Return the true depth of frame i."""
+        return render_scene(self._scene(i), self._true_camera, self._T_world_camera[self._checked_index(i)])[1]
 
     def moving_of(self, i: int) -> NDArray[np.bool_]:
         """Return the pixels [H, W] of frame i that show the ball which moves through the room."""
         depth_m = self.exact_depth_of(i)
         if self.mover is None:
             return np.zeros(depth_m.shape, np.bool_)
-        return mask_of(self.mover.shape(i), self.camera, self._T_world_camera[i], depth_m)
+        return mask_of(self.mover.shape(i), self._true_camera, self._T_world_camera[i], depth_m)
 
     def _scene(self, i: int) -> RoomScene:
         room = build_scene(self._rooms, self._seed, self._corridor)
@@ -147,16 +147,14 @@ class SyntheticRoom(Source):
 
     def test_views(self) -> Source | None:
         """Return exact views (no noise, gain 1) up to 0.7 m and 40° away from the path; None without `test_views`."""
-        if not self._test_views:
-            return None
-        return self.views_away(self._test_views, AWAY_M, AWAY_RAD)
+        return self.views_away(self._test_views, AWAY_M, AWAY_RAD) if self._test_views else None
 
     def views_away(self, count: int, away_m: Matrix, away_rad: Matrix) -> Source:
         """Return exact views (no noise, gain 1) near the path: moved by at most away_m [3] along the axes of the camera
         and rotated by a vector of at most away_rad [3]."""
         scene = build_scene(self._rooms, self._seed, self._corridor)
         random = np.random.default_rng((self._seed, 11))
-        return _ViewsAway(self.camera, scene, random, self._T_world_camera, count, (away_m, away_rad))
+        return _ViewsAway(self._true_camera, scene, random, self._T_world_camera, count, (away_m, away_rad))
 
     def truth(self) -> Trajectory:
         """Return the exact pose of every frame, in the room's frame (z up)."""
@@ -167,17 +165,15 @@ class SyntheticRoom(Source):
         furnish = furnish_corridor if self._corridor else furnish_rooms
         return triangulate([shape for shapes in furnish(self._rooms, self._seed) for shape in shapes])
 
-    def _exposed(self, i: int, T_world_camera: Matrix) -> tuple[Floats, Floats]:
-        """Return colour and depth of frame i from a pose; the exposure gain makes one sine period over the sequence."""
-        color, depth_m = render_scene(self._scene(i), self.camera, T_world_camera)
+    def _exposed(self, i: int, T_world_camera: Matrix) -> tuple[Image, Image]:
+        """Return colour and depth of frame i from a pose, before noise."""
+        color, depth_m = render_scene(self._scene(i), self._true_camera, T_world_camera)
         if self._rows_s:
-            color = render_scene(self._scene(i), self.camera, self._poses_of_rows(i, 0.0, self._rows_s))[0]
+            color = render_scene(self._scene(i), self._true_camera, self._poses_of_rows(i, 0.0, self._rows_s))[0]
         if self._late_s or self._depth_rows_s:
             poses = self._poses_of_rows(i, self._late_s, self._depth_rows_s)
-            depth_m = render_scene(self._scene(i), self.camera, poses)[1]
-        swing = EXPOSURE_SWING if self._exposure_change else 0.0
-        gain = 1.0 + swing * float(np.sin(2 * np.pi * i / max(len(self) - 1, 1)))
-        return np.clip(color * np.float32(gain), 0.0, 1.0), depth_m
+            depth_m = render_scene(self._scene(i), self._true_camera, poses)[1]
+        return np.clip(color * np.float32(self.gains[i] * self._shade), 0.0, 1.0), depth_m
 
     def _poses_of_rows(self, i: int, late_s: float, rows_s: float) -> Matrix:
         """Return the poses [H, 4, 4] at which the rows of frame i are read: `late_s` after its time, and one after
@@ -203,7 +199,7 @@ class _ViewsAway(Source):
         on_path = T_world_path[np.linspace(0, len(T_world_path) - 1, count).round().astype(int)]
         self._images = [self._image_near(T, random) for T in on_path]
 
-    def _image_near(self, T_world_path: Matrix, random: np.random.Generator) -> tuple[Matrix, Floats, Floats]:
+    def _image_near(self, T_world_path: Matrix, random: np.random.Generator) -> tuple[Matrix, Image, Image]:
         """Draw poses near one of the path until one is free; return it with its colour and depth."""
         while True:
             T_path_camera = se3.exp(np.concatenate([np.zeros(3), random.uniform(-1, 1, 3) * self._away_rad]))
@@ -221,7 +217,7 @@ class _ViewsAway(Source):
         bytes_ = np.rint(np.clip(color, 0.0, 1.0) * 255.0).astype(np.uint8)
         return Frame(i, i / FRAMES_PER_SECOND, color_from_bytes(bytes_), depth_m, self.camera)
 
-    def exact_depth_of(self, i: int) -> Floats:
+    def exact_depth_of(self, i: int) -> Image:
         return self._images[self._checked_index(i)][2]
 
     def truth(self) -> Trajectory:
@@ -230,33 +226,23 @@ class _ViewsAway(Source):
 
 
 def open_synthetic(text: str) -> SyntheticRoom:
-    """Build a room from "synthetic", "synthetic:frames=200,noise=1" or "synthetic:corridor".
-
-    Raises SourceError on other options.
-    """
+    """Build a room from a path such as "synthetic:frames=200,noise=1". Raises SourceError on other options."""
     options: dict[str, Any] = {}
     for part in filter(None, text.partition(":")[2].split(",")):
         key, equals, value = (word.strip() for word in part.partition("="))
-        kind = type(_OPTIONS[key].default) if key in _OPTIONS else None
+        kind = _OPTIONS.get(key)
         value = value if equals or kind in (int, float) else "1"  # a word alone says yes
-        if kind is float and _SECONDS.fullmatch(value):
-            options[key] = float(value)
-        elif kind in (None, float) or not value.removeprefix("-").isdecimal():
+        if kind is None or not _NUMBERS[kind is float].fullmatch(value):
+            whole, decimal = (", ".join(k for k, of in _OPTIONS.items() if (of is float) == d) for d in (False, True))
             raise SourceError(
-                f"synthetic room: unknown option {part!r}; give whole numbers for {', '.join(_of_type(False))}; "
-                f"seconds for {', '.join(_of_type(True))}"
+                f"synthetic room: unknown option {part!r}; give whole numbers for {whole}; decimals for {decimal}"
             )
-        else:
-            options[key] = int(value) if kind is int else bool(int(value))
+        options[key] = kind(value) if kind in (int, float) else bool(int(value))
     return SyntheticRoom(**options)
 
 
-_OPTIONS = signature(SyntheticRoom).parameters
-_SECONDS = re.compile(r"-?[0-9]{1,2}(\.[0-9]{1,6})?")
-
-
-def _of_type(seconds: bool) -> list[str]:
-    return [key for key, option in _OPTIONS.items() if isinstance(option.default, float) == seconds]
+_OPTIONS = {key: type(option.default) for key, option in signature(SyntheticRoom).parameters.items()}
+_NUMBERS = re.compile(r"-?[0-9]+"), re.compile(r"-?[0-9]{1,3}(\.[0-9]{1,9})?")
 
 
 PLUGIN = SourceFormat(

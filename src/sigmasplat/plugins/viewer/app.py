@@ -8,12 +8,12 @@ from typing import Any
 
 import viser
 
-from sigmasplat.api import SigmaSplatError
+from sigmasplat.api import GaussianField, SigmaSplatError
 from sigmasplat.plugins.outputs.drawing.colormap import INFERNO
 from sigmasplat.plugins.viewer import layers, snapshot as lines
 from sigmasplat.plugins.viewer.layers import PREDICTED_MODES, Floats, LayerImage, Legend
 from sigmasplat.plugins.viewer.panel import ControlPanel, ControlState, escaped
-from sigmasplat.plugins.viewer.scene import ViserScene, camera_pose, move_camera, set_initial_camera
+from sigmasplat.plugins.viewer.scene import ViserScene, camera_pose, move_camera
 from sigmasplat.plugins.viewer.snapshot import BUDGET, Piece, Snapshot, within_budget
 
 REST_S, LIVE_REST_S = 0.05, 0.5
@@ -36,18 +36,6 @@ def release_memory() -> None:
         ctypes.CDLL(None).malloc_trim(0)
 
 
-class IdentityKey:
-    """Compares objects by identity. It keeps the object alive, because a freed object's id can be used again."""
-
-    def __init__(self, thing: object) -> None:
-        self.thing = thing
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, IdentityKey) and self.thing is other.thing
-
-    __hash__ = None  # type: ignore[assignment]
-
-
 class ViewerApp:
     """Shows snapshots in the browser. `show` and the controls only set a flag; a thread draws the newest snapshot."""
 
@@ -57,7 +45,7 @@ class ViewerApp:
         self.scene = ViserScene(server, self._clicked)
         self._snapshot: Snapshot | None = None
         self._drawn: dict[Any, Any] = {}
-        self._unsure: tuple[list[IdentityKey], Floats] = [], layers.sorted_uncertainties(())
+        self._unsure: tuple[list[GaussianField], Floats] = [], layers.sorted_uncertainties(())
         self._merged: tuple[Any, Any] = (None, None)
         self._wake, self._stop = threading.Event(), threading.Event()
         self._sharp, self._can_sharpen = False, False
@@ -127,7 +115,8 @@ class ViewerApp:
             self.panel.show_legend(None if legend is None else layers.draw_legend(legend))
 
     def _is_new(self, what: Any, state: Any) -> bool:
-        """Return whether something was not drawn in this state before, and remember the state."""
+        """Return whether something was not drawn in this state before, and remember the state. Snapshots, paths and
+        fields are equal only to themselves."""
         if what in self._drawn and self._drawn[what] == state:
             return False
         self._drawn[what] = state
@@ -135,7 +124,7 @@ class ViewerApp:
 
     def _uncertainties_of(self, pieces: tuple[Piece, ...]) -> Floats:
         """Return the uncertainties of the splats in ascending order."""
-        fields = [IdentityKey(piece.field) for piece in pieces]
+        fields = [piece.field for piece in pieces]
         if self._unsure[0] != fields:
             self._unsure = fields, layers.sorted_uncertainties(pieces)
         return self._unsure[1]
@@ -143,17 +132,17 @@ class ViewerApp:
     def _draw_path(self, snapshot: Snapshot, controls: ControlState) -> None:
         path, row = snapshot.path, controls.row
         if self._is_new("initial camera", len(path) > 0) and len(path):
-            set_initial_camera(self.server, path.T_world_camera[0], BACK_M, UP_M)
-        if self._is_new("path", (IdentityKey(path), row, controls.path)):
+            move_camera(self.server.initial_camera, path.T_world_camera[0], BACK_M, UP_M)
+        if self._is_new("path", (path, row, controls.path)):
             self.scene.show_lines("path", lines.path_segments(path, row) if controls.path else None)
             self.scene.show_lost(lines.lost_points(path, row if controls.path else -1))
             at = min(row, len(path) - 1)
             current = path.T_world_camera[at] if len(path) and path.inside[at] else None
             self.scene.show_current_camera(snapshot.camera, current, bool(len(path) and path.lost[at]))
         truth = snapshot.true_positions
-        if self._is_new("true path", (IdentityKey(truth), controls.true_path)):
-            shown = truth is not None and controls.true_path
-            self.scene.show_lines("truth", lines.truth_segments(truth) if shown and truth is not None else None)
+        if self._is_new("true path", truth is not None and (snapshot, controls.true_path)):
+            shown = truth if controls.true_path else None
+            self.scene.show_lines("truth", None if shown is None else lines.truth_segments(shown))
 
     def _draw_splats(
         self, pieces: tuple[Piece, ...], controls: ControlState, span: tuple[float, float], most: float
@@ -161,7 +150,7 @@ class ViewerApp:
         if controls.mode != "splats":
             pieces = ()
         ends = None if controls.colouring == "colour" else span  # own colours do not depend on the range
-        state = ([(p.name, IdentityKey(p.field)) for p in pieces], controls.colouring, ends, most)
+        state = ([(p.name, p.field) for p in pieces], controls.colouring, ends, most)
         if self._is_new("splats", state):
             sent = within_budget(pieces, BUDGET)  # a large final map is rendered completely, but sent thinned
             drawn = {p.name: (layers.splat_arrays(p, controls.colouring, span, most), p.T_world_piece) for p in sent}
@@ -171,7 +160,7 @@ class ViewerApp:
 
     def _draw_keyframes(self, snapshot: Snapshot, controls: ControlState) -> None:
         path = snapshot.path
-        if self._is_new("keyframes", (IdentityKey(path), controls.row, controls.keyframes)):
+        if self._is_new("keyframes", (path, controls.row, controls.keyframes)):
             rows = lines.keyframes_to_show(path, controls.row) if controls.keyframes else ()
             poses = {row: path.T_world_camera[row] for row in rows}
             self.scene.show_keyframes(snapshot.camera, poses)
@@ -186,17 +175,14 @@ class ViewerApp:
             if self._drawn.pop(key, None) is not None:
                 client.scene.set_background_image(None)
             return None
-        pose, splats = camera_pose(c), ([(IdentityKey(p.field), p.T_world_piece.tobytes()) for p in pieces], most)
+        pose, splats = camera_pose(c), ([(p.field, p.T_world_piece.tobytes()) for p in pieces], most)
         state = (controls.layer, pose.tobytes(), c.fov, c.aspect, splats)
         drawn, rows = self._drawn.get(key), LIVE_ROWS if snapshot.live else ROWS
         sharp_rows = rows if snapshot.live else max(rows, min(SHARP_ROWS, c.image_height))
         rows = sharp_rows if self._sharp else rows
         if drawn is None or drawn[0] != state or drawn[2] < rows:
             if self._merged[0] != splats:
-                self._merged = (
-                    splats,
-                    (layers.merge_pieces(pieces, most), layers.merged_uncertainty(pieces, most)),
-                )
+                self._merged = (splats, (layers.merge_pieces(pieces, most), layers.merged_uncertainty(pieces, most)))
             camera = layers.browser_camera(c.fov, c.aspect, rows)
             (field, known), how = self._merged[1], (snapshot.options, snapshot.backend)
             made: LayerImage
@@ -213,12 +199,7 @@ class ViewerApp:
         return legend
 
     def _show_texts(
-        self,
-        snapshot: Snapshot,
-        controls: ControlState,
-        pieces: tuple[Piece, ...],
-        most: float,
-        unit: str,
+        self, snapshot: Snapshot, controls: ControlState, pieces: tuple[Piece, ...], most: float, unit: str
     ) -> None:
         path = snapshot.path
         splats, kept = sum(len(p.field) for p in pieces), sum(int(layers.shown(p, most).sum()) for p in pieces)
@@ -237,9 +218,10 @@ class ViewerApp:
 
     def _follow(self, snapshot: Snapshot, controls: ControlState) -> None:
         path = snapshot.path
-        if controls.follow and snapshot.live and len(path) and self._is_new("followed", IdentityKey(path)):
+        if controls.follow and snapshot.live and len(path) and self._is_new("followed", path):
             for client in self.server.get_clients().values():
-                move_camera(client, path.T_world_camera[-1], BACK_M, UP_M)
+                with client.atomic():
+                    move_camera(client.camera, path.T_world_camera[-1], BACK_M, UP_M)
 
     def _welcome(self, client: viser.ClientHandle) -> None:
         client.camera.on_update(lambda _: self.changed())
@@ -265,7 +247,8 @@ class ViewerApp:
 
     def _go(self, client: viser.ClientHandle, snapshot: Snapshot, row: int) -> None:
         """Move a browser's camera to the pose of a frame."""
-        move_camera(client, snapshot.path.T_world_camera[row])
+        with client.atomic():
+            move_camera(client.camera, snapshot.path.T_world_camera[row])
         self.changed()
 
 

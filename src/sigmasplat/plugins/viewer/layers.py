@@ -108,10 +108,8 @@ def merge_pieces(pieces: Sequence[Piece], most: float) -> GaussianField:
 
 def merged_uncertainty(pieces: Sequence[Piece], most: float) -> MapUncertainty | None:
     """Return how sure the splats of `merge_pieces` are; None unless it was measured for the only piece."""
-    if len(pieces) != 1 or pieces[0].uncertainty is None:
-        return None
-    known = pieces[0].uncertainty
-    return known.at(shown(pieces[0], most))
+    known = pieces[0].uncertainty if len(pieces) == 1 else None
+    return None if known is None else known.at(shown(pieces[0], most))
 
 
 MODES = {

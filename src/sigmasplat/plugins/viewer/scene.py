@@ -112,18 +112,12 @@ class ViserScene:
             self._marks.pop(name).remove()
 
 
-def move_camera(client: viser.ClientHandle, T_world_camera: Matrix, back_m: float = 0.0, up_m: float = 0.0) -> None:
-    """Move a browser's camera to a pose, or to a position behind and above it."""
-    position = T_world_camera @ np.array([0.0, -up_m, -back_m, 1.0])
-    with client.atomic():
-        client.camera.position = position[:3]
-        client.camera.look_at = (T_world_camera @ np.array([0.0, 0.0, AHEAD_M, 1.0]))[:3]
-
-
-def set_initial_camera(server: viser.ViserServer, T_world_camera: Matrix, back_m: float, up_m: float) -> None:
-    """Set the camera of browsers that open the page later."""
-    server.initial_camera.position = (T_world_camera @ np.array([0.0, -up_m, -back_m, 1.0]))[:3]
-    server.initial_camera.look_at = (T_world_camera @ np.array([0.0, 0.0, AHEAD_M, 1.0]))[:3]
+def move_camera(
+    camera: viser.CameraHandle | viser.InitialCameraConfig, T_world_camera: Matrix, back_m: float = 0, up_m: float = 0
+) -> None:
+    """Move a browser's camera, or that of pages opened later, to a pose, or to a position behind and above it."""
+    camera.position = (T_world_camera @ np.array([0.0, -up_m, -back_m, 1.0]))[:3]
+    camera.look_at = (T_world_camera @ np.array([0.0, 0.0, AHEAD_M, 1.0]))[:3]
 
 
 def camera_pose(camera: viser.CameraHandle) -> Matrix:

@@ -33,20 +33,15 @@ def is_own_page(origin: str | None, reached: str | None, host: str) -> bool:
     """
     if origin is None:
         return True
-    scheme, address, name = page_of(origin)
-    if scheme not in ("http", "https") or reached is None or address != reached.lower():
+    try:
+        page = urlsplit(origin.lower())
+        name = page.hostname or ""
+    except ValueError:
+        return False
+    if page.scheme not in ("http", "https") or reached is None or page.netloc != reached.lower():
         return False
     machine = socket.gethostname().lower()
     return name in ("localhost", host.lower(), machine, f"{machine}.local") or _ip(name) is not None
-
-
-def page_of(origin: str) -> tuple[str, str, str]:
-    """Return scheme, address and host of the page that a header Origin names; empty if it names none."""
-    try:
-        page = urlsplit(origin.lower())
-        return page.scheme, page.netloc, page.hostname or ""
-    except ValueError:
-        return "", "", ""
 
 
 def _ip(name: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
@@ -84,7 +79,6 @@ def own_pages_only(host: str) -> Iterator[list[str]]:
 
 HOST, PORT = "127.0.0.1", 8080
 ATTEMPTS = 100
-PORT_BUSY = (errno.EADDRINUSE,)
 
 
 def open_server(host: str, port: int, title: str) -> "ViserServer":
@@ -141,7 +135,7 @@ def free_port(host: str, port: int) -> int:
         except PermissionError:
             continue
         except OSError as problem:
-            if problem.errno not in PORT_BUSY:
+            if problem.errno != errno.EADDRINUSE:
                 raise SigmaSplatError(
                     f"cannot listen on {host} ({problem.strerror or problem}); give an address of this machine as "
                     f"--host, or {HOST} to allow only this machine"

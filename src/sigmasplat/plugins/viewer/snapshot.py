@@ -12,16 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sigmasplat.api import (
-    COLUMNS,
-    Camera,
-    GaussianField,
-    MapUncertainty,
-    Matrix,
-    RenderConfig,
-    Rows,
-    evenly_spaced,
-)
+from sigmasplat.api import COLUMNS, Camera, GaussianField, MapUncertainty, Matrix, RenderConfig, Rows, evenly_spaced
 from sigmasplat.plugins.outputs.drawing.colormap import Rgb
 from sigmasplat.plugins.outputs.drawing.plot import ACCENT, BLUE, DARK, GREEN
 

@@ -62,21 +62,13 @@ class PublishedScores:
 
 
 def score_published(
-    found: Mesh,
-    truth: Mesh,
-    seen_true: Mask,
-    seen_found: Mask,
-    *,
-    points: int = POINTS,
-    views: int = VIEWS,
-    camera: Camera = VIEW_CAMERA,
-    seed: int = 0,
-    progress: Progress = no_progress,
-) -> PublishedScores:
+    found: Mesh, truth: Mesh, seen_true: Mask, seen_found: Mask, *, points: int = POINTS, views: int = VIEWS,
+    seed: int = 0, progress: Progress = no_progress,
+) -> PublishedScores:  # fmt: skip
     """Score mesh `found` against mesh `truth`, both in the frame of the truth, after aligning them by ICP.
 
-    seen_true, seen_found: the faces of each that count (`reconstruction.visible_parts`); camera: of the random views.
-    Calls `progress(views done, total)`.
+    seen_true, seen_found: the faces of each that count (`reconstruction.visible_parts`). Calls
+    `progress(views done, total)`.
     """
     ours, theirs = found.with_faces(seen_found), truth.with_faces(seen_true)
     T = aligned_by_icp(ours.vertices.astype(np.float64), theirs.vertices.astype(np.float64))
@@ -86,7 +78,7 @@ def score_published(
     ours_dense, theirs_dense = dense_points(ours, theirs, seed + 2)
     precision = share(nearest_m(ours_dense, theirs_dense), CORRECT_M)
     recall = share(nearest_m(theirs_dense, ours_dense), CORRECT_M)
-    errors = depth_errors(ours, truth, seen_true, views=views, camera=camera, seed=seed, progress=progress)
+    errors = depth_errors(ours, truth, seen_true, views=views, seed=seed, progress=progress)
     return PublishedScores(
         mean(accuracy), mean(completion), (mean(accuracy) + mean(completion)) / 2, share(completion, COMPLETE_M),
         precision, recall, f1(precision, recall), mean(errors), len(errors),
@@ -125,15 +117,9 @@ def aligned_by_icp(points: Matrix, target: Matrix, most: int = POINTS) -> Matrix
 
 
 def depth_errors(
-    found: Mesh,
-    truth: Mesh,
-    seen_true: Mask,
-    *,
-    views: int = VIEWS,
-    camera: Camera = VIEW_CAMERA,
-    seed: int = 0,
+    found: Mesh, truth: Mesh, seen_true: Mask, *, views: int = VIEWS, camera: Camera = VIEW_CAMERA, seed: int = 0,
     progress: Progress = no_progress,
-) -> Matrix:
+) -> Matrix:  # fmt: skip
     """Return the mean |depth difference| of each random view, m, over pixels where both have a surface and the true
     one was seen."""
     errors = list[float]()

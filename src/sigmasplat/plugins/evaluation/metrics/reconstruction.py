@@ -81,11 +81,8 @@ def visible_parts(
 
     `score` describes the rules. Calls `progress(views done, total)`.
     """
-    seen_true, seen_points, centers = (
-        np.zeros(len(truth.faces), bool),
-        np.zeros(len(points), bool),
-        truth.corners.mean(1),
-    )
+    seen_true, seen_points = np.zeros(len(truth.faces), bool), np.zeros(len(points), bool)
+    centers = truth.corners.mean(1)
     for done, T in enumerate(T_world_camera, 1):
         depth_m, face = mesh_depth(truth, camera, se3.inverse(T))
         seen_true[face[face >= 0]] = True

@@ -12,6 +12,8 @@ from scipy.stats import rankdata
 from sigmasplat.api import Matrix, SourceError, Trajectory, se3
 
 Rows = NDArray[np.intp]
+MAX_DIFFERENCE_S = 0.02
+"""Largest difference of two timestamps of one pose."""
 
 
 @dataclass(frozen=True)
@@ -77,8 +79,8 @@ def truth_in_estimate(times_s: Matrix, estimate: Matrix, truth: Trajectory) -> M
     return align_rigid(truth.T_world_camera[truth_rows, :3, 3], estimate[rows])
 
 
-def associate(times_a_s: Matrix, times_b_s: Matrix, max_difference_s: float = 0.02) -> tuple[Rows, Rows]:
-    """Pair timestamps that are mutual nearest neighbours and differ by at most `max_difference_s`: rows of a and of b.
+def associate(times_a_s: Matrix, times_b_s: Matrix) -> tuple[Rows, Rows]:
+    """Pair timestamps that are mutual nearest neighbours and differ by at most `MAX_DIFFERENCE_S`: rows of a and of b.
 
     Pairs are one-to-one. If a low-rate truth paired one pose with two frames, the RPE would see no motion there.
     """
@@ -88,20 +90,20 @@ def associate(times_a_s: Matrix, times_b_s: Matrix, max_difference_s: float = 0.
     nearest_a = np.asarray(cKDTree(times_a_s[:, None]).query(times_b_s[:, None])[1], np.intp)
     rows_a = np.arange(len(times_a_s))
     mutual = nearest_a[nearest_b] == rows_a
-    close = np.abs(times_a_s - times_b_s[nearest_b]) <= max_difference_s
+    close = np.abs(times_a_s - times_b_s[nearest_b]) <= MAX_DIFFERENCE_S
     chosen = rows_a[mutual & close]
     return chosen, nearest_b[chosen]
 
 
-def pair_poses(estimate: Trajectory, truth: Trajectory, max_difference_s: float = 0.02) -> tuple[Matrix, Matrix]:
+def pair_poses(estimate: Trajectory, truth: Trajectory) -> tuple[Matrix, Matrix]:
     """Return T_world_camera of both trajectories [M, 4, 4] at shared timestamps, in the order of the estimate.
 
-    Raises SourceError if no timestamps agree within `max_difference_s`.
+    Raises SourceError if no timestamps agree within `MAX_DIFFERENCE_S`.
     """
-    rows, truth_rows = associate(estimate.timestamps_s, truth.timestamps_s, max_difference_s)
+    rows, truth_rows = associate(estimate.timestamps_s, truth.timestamps_s)
     if not len(rows):
         raise SourceError(
-            f"estimate and truth share no timestamps within {max_difference_s} s: {_span(estimate)} against "
+            f"estimate and truth share no timestamps within {MAX_DIFFERENCE_S} s: {_span(estimate)} against "
             f"{_span(truth)}; are both in seconds, from one clock and one recording?"
         )
     return estimate.T_world_camera[rows], truth.T_world_camera[truth_rows]
@@ -113,12 +115,12 @@ def _span(path: Trajectory) -> str:
     return f"{path.timestamps_s.min():.3f} … {path.timestamps_s.max():.3f} s ({len(path)} poses)"
 
 
-def ate(estimate: Trajectory, truth: Trajectory, max_difference_s: float = 0.02) -> AbsoluteError:
+def ate(estimate: Trajectory, truth: Trajectory) -> AbsoluteError:
     """Measure the absolute trajectory error: position errors after `align_rigid` (Sturm et al. 2012, eq. 3).
 
     Raises SourceError if no timestamps match.
     """
-    ours, theirs = pair_poses(estimate, truth, max_difference_s)
+    ours, theirs = pair_poses(estimate, truth)
     return absolute_error(ours[:, :3, 3], theirs[:, :3, 3])
 
 
@@ -135,14 +137,12 @@ def absolute_error(estimate: Matrix, truth: Matrix) -> AbsoluteError:
     )
 
 
-def rpe(
-    estimate: Trajectory, truth: Trajectory, delta_frames: int = 1, max_difference_s: float = 0.02
-) -> RelativeError:
+def rpe(estimate: Trajectory, truth: Trajectory, delta_frames: int = 1) -> RelativeError:
     """Measure the relative pose error over `delta_frames` paired frames (Sturm et al. 2012, eq. 1), without alignment.
 
     With fewer than delta_frames + 1 pairs the errors are nan and pairs = 0. Raises SourceError if no timestamps match.
     """
-    ours, theirs = pair_poses(estimate, truth, max_difference_s)
+    ours, theirs = pair_poses(estimate, truth)
     motion_ours = se3.inverse(ours[:-delta_frames]) @ ours[delta_frames:]
     motion_theirs = se3.inverse(theirs[:-delta_frames]) @ theirs[delta_frames:]
     error = se3.inverse(motion_theirs) @ motion_ours

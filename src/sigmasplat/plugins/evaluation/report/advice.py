@@ -87,10 +87,7 @@ def _slow(metrics: Metrics, again: str, settings: dict[str, Any]) -> Advice | No
     if not speed or speed >= SLOW_PER_S:
         return None
     smaller = max((width or 640) * 3 // 4 // 16 * 16, 160)
-    return (
-        f"The run is slow: {rate(speed)}. Smaller images are faster:",
-        f"{again} --set input.width={smaller}",
-    )
+    return (f"The run is slow: {rate(speed)}. Smaller images are faster:", f"{again} --set input.width={smaller}")
 
 
 def _no_loop(metrics: Metrics, again: str, settings: dict[str, Any]) -> Advice | None:

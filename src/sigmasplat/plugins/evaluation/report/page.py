@@ -17,13 +17,13 @@ from sigmasplat.api import (
     Config,
     RunFolder,
     RunFrames,
-    SensorTimes,
     SigmaSplatError,
     Trajectory,
     default_preset,
     differences,
     is_preset,
     preset,
+    sensor_said,
 )
 from sigmasplat.plugins.evaluation.report import tables
 from sigmasplat.plugins.evaluation.report.advice import Advice, advice, next_commands
@@ -53,7 +53,7 @@ def write_page(
     made_on = facts.get("machine") or {}
     unsure = [] if frames is None else [frames.log[i]["index"] for i in frames.rows if frames.p_off[i] > LIKELY]
     found = advice(metrics, rerun_command(config, facts), config.to_dict())
-    machine, times = f"{made_on.get('cpu')}, {made_on.get('cores')} cores", SensorTimes.noted_in(facts).said()
+    machine, times = f"{made_on.get('cpu')}, {made_on.get('cores')} cores", sensor_said(facts)
     about = [config.name, f"version {facts.get('version')}", machine, str(facts.get("status")), times]
     contents = Contents(
         title=f"SigmaSplat · {metrics.get('source')}",

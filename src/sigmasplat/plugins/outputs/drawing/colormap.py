@@ -40,11 +40,9 @@ def apply_masked(
     return out
 
 
-def value_range(
-    values: Values, valid: NDArray[np.bool_], percent: tuple[float, float] = (1.0, 99.0)
-) -> tuple[float, float]:
-    """Return two percentiles of the valid values; (0, 1) if no value is valid."""
+def value_range(values: Values, valid: NDArray[np.bool_]) -> tuple[float, float]:
+    """Return the 1st and the 99th percentile of the valid values; (0, 1) if no value is valid."""
     if not valid.any():
         return 0.0, 1.0
-    low, high = np.percentile(values[valid], percent)
+    low, high = np.percentile(values[valid], (1.0, 99.0))
     return float(low), float(high)

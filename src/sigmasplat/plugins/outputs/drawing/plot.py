@@ -63,9 +63,8 @@ def svg(chart: Chart) -> str:
     def place(points: Matrix) -> Matrix:
         return np.asarray([LEFT, BOTTOM] + (points - low) / (high - low) * [RIGHT - LEFT, TOP - BOTTOM])
 
-    parts = [f"<style>{STYLE}</style>", *_grid(chart, low, high), *_head(chart)]
-    for curve in chart.curves:
-        parts.append(_path(curve, place(_drawable(curve.points))))
+    curves = (_path(curve, place(_drawable(curve.points))) for curve in chart.curves)
+    parts = [f"<style>{STYLE}</style>", *_grid(chart, low, high), *_head(chart), *curves]
     size = f"viewBox='0 0 {WIDTH} {HEIGHT}' width='{WIDTH}' height='{HEIGHT}'"
     head = f"<svg class='chart' xmlns='http://www.w3.org/2000/svg' {size} role='img'>"
     return f"{head}<title>{escape(chart.title)}</title>{''.join(parts)}</svg>"

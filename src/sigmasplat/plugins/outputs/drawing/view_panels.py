@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from sigmasplat.api import to_bytes
 from sigmasplat.plugins.evaluation.view_scores import COVERED_ALPHA, ScoredView
 from sigmasplat.plugins.outputs.drawing import colormap
 
@@ -59,11 +60,10 @@ def view_panels(view: ScoredView) -> list[ViewPanel]:
         everywhere, total = np.ones_like(mapped), np.sqrt(view.predicted.color)
         limits = 0.0, max(limits[1], _from_zero(total, everywhere)[1])
         unsure = coloured("predicted colour error", total, everywhere, limits, colormap.INFERNO)
+    recorded, rendered = (to_bytes(color * 255.0) for color in (view.recorded, view.rendered))
     return [
-        ViewPanel("input", _bytes(view.recorded), " · ".join((f"frame {view.index}", view.kind, *view.notes))),
-        ViewPanel(
-            "rendered colour", _bytes(view.rendered), f"PSNR {score['psnr_db']:.1f} dB · SSIM {score['ssim']:.3f}"
-        ),
+        ViewPanel("input", recorded, " · ".join((f"frame {view.index}", view.kind, *view.notes))),
+        ViewPanel("rendered colour", rendered, f"PSNR {score['psnr_db']:.1f} dB · SSIM {score['ssim']:.3f}"),
         coloured("rendered depth", view.rendered_depth_m, mapped, depth_range, colormap.VIRIDIS, " m"),
         unsure,
         coloured("error, RMS", error, view.valid, limits, colormap.INFERNO),
@@ -87,10 +87,6 @@ def coloured(
     digits = 2 if unit and limits[1] >= 1.0 else 3
     ends = (f"{limits[0]:.{digits}f}{unit}", f"{limits[1]:.{digits}f}{unit}")
     return ViewPanel(title, colormap.apply_masked(values, valid, *limits, colours), bar=colours, ends=ends)
-
-
-def _bytes(color: NDArray[np.float32]) -> colormap.Rgb:
-    return (np.clip(color, 0.0, 1.0) * 255.0).round().astype(np.uint8)
 
 
 def _draw_texts(strip: Image.Image, panel: ViewPanel, left: int, width: int, height: int) -> None:

@@ -24,12 +24,7 @@ from sigmasplat.api import (
     render,
 )
 from sigmasplat.plugins.evaluation.view_scores import Renderer
-from sigmasplat.plugins.outputs.floorplan.ground import (
-    SurfacePredictor,
-    SurfaceSample,
-    floor_frame,
-    sample_surfaces,
-)
+from sigmasplat.plugins.outputs.floorplan.ground import SurfacePredictor, SurfaceSample, floor_frame, sample_surfaces
 
 CELL_M = 0.05
 UNOBSERVED, FLOOR_UNOBSERVED, FREE, OBJECT, WALL = range(5)
@@ -97,16 +92,10 @@ class FloorPlan:
 
 
 def floor_plan(
-    field: GaussianField,
-    trajectory: Trajectory,
-    camera: Camera,
-    *,
-    cell_m: float = CELL_M,
-    renderer: Renderer = render,
-    predictor: SurfacePredictor | None = None,
-    up_world: Matrix | None = None,
+    field: GaussianField, trajectory: Trajectory, camera: Camera, *, cell_m: float = CELL_M,
+    renderer: Renderer = render, predictor: SurfacePredictor | None = None, up_world: Matrix | None = None,
     progress: Progress = no_progress,
-) -> FloorPlan:
+) -> FloorPlan:  # fmt: skip
     """Make the floor plan of a map from poses along its path; `camera` gives the field of view.
 
     predictor: predicts the errors of the map, if they are known (`uncertainty.predictive.predict`). up_world: as in

@@ -32,7 +32,6 @@ MAX_DEPTH_STEP = 0.05
 
 Floats = NDArray[np.float32]
 
-
 SurfacePredictor = Callable[[Camera, Matrix], Predicted]
 """Predicts the errors of a field from T_camera_world."""
 

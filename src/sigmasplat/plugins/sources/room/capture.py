@@ -48,19 +48,15 @@ def _through_rooms(loop: Matrix, rooms: int) -> tuple[Matrix, Matrix]:
         out += [(x, -0.12), (PITCH_M * (k + 1), -0.75)]
     back = [(x, -y) for x, y in reversed(out)]
     turn_x = 1.15
-    corners = [*out, (PITCH_M * (rooms - 1) + turn_x, 0.0), *back, (-turn_x, 0.0), out[0]]
-    knots = np.array(corners)
+    knots = np.array([*out, (PITCH_M * (rooms - 1) + turn_x, 0.0), *back, (-turn_x, 0.0), out[0]])
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(knots, axis=0), axis=1))])
     curve = CubicSpline(length, knots, bc_type="periodic")
     fine = np.linspace(0.0, length[-1], PATH_SAMPLES + 1)
     travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve(fine), axis=0), axis=1))])
     where = np.interp(loop * travelled[-1], travelled, fine)
-    yaw_rad = _smooth_yaw(
-        curve(np.interp(np.linspace(0, travelled[-1], PATH_SAMPLES + 1), travelled, fine), 1), travelled[-1]
-    )
-    return np.column_stack([curve(where), np.zeros(len(loop))]), np.interp(
-        loop, np.linspace(0, 1, PATH_SAMPLES + 1), yaw_rad
-    )
+    even_m, even = (np.linspace(0, end, PATH_SAMPLES + 1) for end in (travelled[-1], 1))
+    yaw_rad = _smooth_yaw(curve(np.interp(even_m, travelled, fine), 1), travelled[-1])
+    return np.column_stack([curve(where), np.zeros(len(loop))]), np.interp(loop, even, yaw_rad)
 
 
 def _smooth_yaw(ahead: Matrix, length_m: float) -> Matrix:
@@ -78,8 +74,7 @@ def pose(position: Matrix, yaw_rad: float, pitch_rad: float, roll_rad: float) ->
     down = np.cross(forward, right)
     c, s = np.cos(roll_rad), np.sin(roll_rad)
     T = np.eye(4)
-    T[:3, 0], T[:3, 1], T[:3, 2] = c * right + s * down, c * down - s * right, forward
-    T[:3, 3] = position
+    T[:3, 0], T[:3, 1], T[:3, 2], T[:3, 3] = c * right + s * down, c * down - s * right, forward, position
     return T
 
 
@@ -92,6 +87,37 @@ PREDICTED_SCALE_ERROR, PREDICTED_NOISE = 0.1, 0.1
 """Standard deviations of predicted depth, shares of the depth: of its smooth error, and at each pixel."""
 DRIFT_KNOT_FRAMES = 300
 """Frames between the random values of the calibration drift; it is a spline between them."""
+EXPOSURE_SWING, STEP_FRAMES, MOVE_FRAMES = 0.08, 15, 4
+"""Share by which a gain swings; mean time between steps of automatic exposure, and how long one takes."""
+
+
+def camera_gains(frames: int, seed: int, exposure: float, white: float, swings: bool) -> Matrix:
+    """Return the gains of red, green and blue in each frame [frames, 3].
+
+    With `exposure`, all move to exp(exposure · a) at random times, within `MOVE_FRAMES`; with `white`, red moves to
+    1 + white · b and blue to 1 − white · b, at times of their own. a and b are uniform in [−1, 1]. A gain that `swings`
+    makes one sine period over the sequence.
+    """
+    i, random = np.arange(frames), np.random.default_rng((seed, 13)).random((frames, 4))
+    latest = np.maximum.accumulate(np.where(random[:, :2] < 1 / STEP_FRAMES, i[:, None], 0))
+    wanted = 2 * np.take_along_axis(random[:, 2:], latest, 0) - 1
+    a, b = wanted[np.maximum(i[:, None] - np.arange(MOVE_FRAMES), 0)].mean(1).T
+    sine = 1.0 + EXPOSURE_SWING * swings * np.sin(2 * np.pi * i / max(frames - 1, 1))
+    return np.asarray((sine * np.exp(exposure * a))[:, None] * (1 + white * np.outer(b, [1, 0, -1])))
+
+
+def shade(camera: Camera, falloff: float) -> Image:
+    """Return the share of light [H, W, 1] that a lens lets through: 1 − falloff ρ², with ρ = 1 in the corners."""
+    square = (camera.rays()[..., :2] ** 2).sum(-1, keepdims=True)
+    return np.asarray(1 - falloff * square / (square.max() or 1.0))
+
+
+def misread_depth(depth_m: Image, scale: float, offset: float) -> Image:
+    """Return what a badly calibrated sensor reads for depth z [H, W]: 1/z' = 1/((1 + scale) z) + offset (per metre); 0
+    without a reading, or if z' would be beyond infinity."""
+    far_m = depth_m * np.float32(1 + scale)
+    divisor = 1 + np.float32(offset) * far_m
+    return np.asarray(np.divide(far_m, divisor, out=np.zeros_like(far_m), where=divisor > 0))
 
 
 def noise_sigma_m(depth_m: Image) -> Image:

@@ -34,6 +34,7 @@ HALF_X_M, HALF_Y_M, HEIGHT_M = 2.5, 2.0, 2.6
 WALL_M = 0.15
 PITCH_M = 2 * HALF_X_M + WALL_M
 DOOR_HALF_M, DOOR_HEIGHT_M = 0.55, 2.15
+LEGS = ((-1, -1), (-1, 1), (1, -1), (1, 1))
 
 WALLPAPERS: tuple[tuple[Color, Color], ...] = (
     ((0.78, 0.80, 0.72), (0.45, 0.58, 0.50)),
@@ -191,12 +192,10 @@ def _middle(room: Room, seed: int) -> None:
     place, turn = room.place, 0.25
     carpet = rug(1.15, (0.58, 0.20, 0.18), (0.85, 0.76, 0.58), (0.22, 0.26, 0.40), seed)
     place("drum", (0.1, 0.0, 0.008), (1.15, 1.15, 0.008), carpet)
-    top = wood((0.68, 0.48, 0.30), 0.12, seed + 4, 2.0)
-    place("box", (0.1, 0.0, 0.70), (0.58, 0.36, 0.022), top, turn)
-    for sx in (-1, 1):
-        for sy in (-1, 1):
-            x, y = _rotated(0.5 * sx, 0.29 * sy, turn)
-            place("drum", (0.1 + x, y, 0.34), (0.032, 0.032, 0.34), plain((0.42, 0.30, 0.20), 0.05))
+    place("box", (0.1, 0.0, 0.70), (0.58, 0.36, 0.022), wood((0.68, 0.48, 0.30), 0.12, seed + 4, 2.0), turn)
+    for sx, sy in LEGS:
+        x, y = _rotated(0.5 * sx, 0.29 * sy, turn)
+        place("drum", (0.1 + x, y, 0.34), (0.032, 0.032, 0.34), plain((0.42, 0.30, 0.20), 0.05))
     x, y = _rotated(0.22, 0.06, turn)
     chrome = Material(plain((0.42, 0.44, 0.48), 0.02), mirror=0.3, gloss=0.9)  # the specular sphere
     place("ball", (0.1 + x, y, 0.722 + 0.13), (0.13, 0.13, 0.13), chrome)
@@ -206,12 +205,10 @@ def _middle(room: Room, seed: int) -> None:
     x, y = _rotated(-0.12, -0.17, turn)
     place("box", (0.1 + x, y, 0.722 + 0.03), (0.14, 0.1, 0.03), books(0.06, seed + 9), 0.1)
     x, y = _rotated(0.4, -0.15, turn)
-    cup = Material(plain((0.75, 0.25, 0.2), 0.05), gloss=0.25)
-    place("drum", (0.1 + x, y, 0.722 + 0.05), (0.042, 0.042, 0.05), cup)
+    place("drum", (0.1 + x, y, 0.772), (0.042, 0.042, 0.05), Material(plain((0.75, 0.25, 0.2), 0.05), gloss=0.25))
     for x, y, yaw_rad in ((-0.75, -0.45, 0.5), (0.95, 0.5, 2.9)):
         _chair(room, x, y, yaw_rad, seed)
-    shade = Material(plain((1.0, 0.97, 0.90), 0.01), glow=1.0)
-    place("drum", (0.0, 0.0, HEIGHT_M - 0.06), (0.3, 0.3, 0.05), shade)
+    place("drum", (0.0, 0.0, HEIGHT_M - 0.06), (0.3, 0.3, 0.05), Material(plain((1.0, 0.97, 0.90), 0.01), glow=1.0))
 
 
 def _chair(room: Room, x: float, y: float, yaw_rad: float, seed: int) -> None:
@@ -220,11 +217,10 @@ def _chair(room: Room, x: float, y: float, yaw_rad: float, seed: int) -> None:
     room.place("box", (x, y, 0.44), (0.2, 0.2, 0.025), seat, yaw_rad)
     back_x, back_y = _rotated(-0.19, 0.0, yaw_rad)
     room.place("box", (x + back_x, y + back_y, 0.72), (0.018, 0.2, 0.2), timber, yaw_rad)
-    for sx in (-1, 1):
-        for sy in (-1, 1):
-            leg_x, leg_y = _rotated(0.175 * sx, 0.175 * sy, yaw_rad)
-            height = 0.36 if sx < 0 else 0.21  # the posts of the back are taller
-            room.place("box", (x + leg_x, y + leg_y, height), (0.02, 0.02, height), timber, yaw_rad)
+    for sx, sy in LEGS:
+        leg_x, leg_y = _rotated(0.175 * sx, 0.175 * sy, yaw_rad)
+        height = 0.36 if sx < 0 else 0.21  # the posts of the back are taller
+        room.place("box", (x + leg_x, y + leg_y, height), (0.02, 0.02, height), timber, yaw_rad)
 
 
 def _rotated(x: float, y: float, angle_rad: float) -> tuple[float, float]:

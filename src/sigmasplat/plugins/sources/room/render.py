@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, map_coordinates
 
-from sigmasplat.api import Camera, se3
+from sigmasplat.api import Camera, Matrix, se3
+from sigmasplat.plugins.sources.room.capture import Image
 from sigmasplat.plugins.sources.room.corridor import furnish_corridor
 from sigmasplat.plugins.sources.room.furnish import HALF_X_M, HALF_Y_M, HEIGHT_M, PITCH_M, WALL_M, furnish_rooms
 from sigmasplat.plugins.sources.room.shapes import (
@@ -128,8 +129,7 @@ def _filled(shares: Floats, solid: np.ndarray[tuple[int, ...], np.dtype[np.bool_
     if solid.all() or not solid.any():
         return shares
     nearest = distance_transform_edt(solid, return_distances=False, return_indices=True)
-    grown: Floats = shares[tuple(nearest)]
-    return grown
+    return np.asarray(shares[tuple(nearest)])
 
 
 SUBPIXELS = np.array([[-0.375, -0.125, 0.375, 0.125], [-0.125, 0.375, 0.125, -0.375]], np.float32)
@@ -156,9 +156,7 @@ def build_scene(rooms: int, seed: int, corridor: bool = False) -> RoomScene:
     return RoomScene([shape for shapes in built for shape in shapes], lights)
 
 
-def render_scene(
-    scene: RoomScene, camera: Camera, T_world_camera: NDArray[np.float64]
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def render_scene(scene: RoomScene, camera: Camera, T_world_camera: Matrix) -> tuple[Image, Image]:
     """Return colour [H, W, 3] in [0, 1] and exact depth [H, W] in metres along the optical axis.
 
     Depth and colour are those of the ray through the pixel centre. Where a neighbour shows another shape or face, the
@@ -172,8 +170,7 @@ def render_scene(
     pixels = np.stack([u[edges], v[edges]])[:, :, None] + SUBPIXELS[:, None, :]
     fine, _, _ = _colors(scene, _rays(camera, T_world_camera, pixels.reshape(2, -1)), windows, 2 * camera.fx)
     color[:, edges] = fine.reshape(3, -1, 4).mean(-1)
-    size = (camera.height, camera.width)
-    return color.T.reshape(*size, 3), depth_m.reshape(size)
+    return color.T.reshape(camera.height, camera.width, 3), depth_m.reshape(camera.height, camera.width)
 
 
 def _rays(camera: Camera, T_world_camera: NDArray[np.float64], pixels: Floats) -> Rays:
@@ -263,9 +260,7 @@ def _colors(
 def _light(scene: RoomScene, points: Floats, hits: Hits, mirrored: Floats) -> tuple[Floats, Floats]:
     """Return the light on points [3, N] and the highlight towards the camera [N], room by room."""
     falling, highlight = np.zeros_like(points), np.zeros(points.shape[1], np.float32)
-    in_front_x = (
-        points[0] + np.float32(0.05) * hits.normals[0]
-    )  # the far face of a shared wall belongs to the next room
+    in_front_x = points[0] + np.float32(0.05) * hits.normals[0]  # a shared wall's far face belongs to the next room
     room = np.clip(np.floor((in_front_x + HALF_X_M) / PITCH_M), 0, len(scene.lights) - 1)
     for k in np.unique(room):
         at, light = np.flatnonzero(room == k), scene.lights[int(k)]

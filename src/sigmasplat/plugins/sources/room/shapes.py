@@ -172,8 +172,7 @@ def _window(corners: NDArray[np.float64], camera: Camera) -> tuple[float, float,
         return None
     if z.min() < 0.01:  # partly behind the camera: the projected corners do not bound it
         return -1.0, -1.0, camera.width, camera.height
-    u = camera.fx * corners[:, 0] / z + camera.cx
-    v = camera.fy * corners[:, 1] / z + camera.cy
+    u, v = camera.fx * corners[:, 0] / z + camera.cx, camera.fy * corners[:, 1] / z + camera.cy
     if u.max() < -1 or v.max() < -1 or u.min() > camera.width or v.min() > camera.height:
         return None
     return float(u.min()), float(v.min()), float(u.max()), float(v.max())

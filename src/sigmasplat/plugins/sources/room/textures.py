@@ -142,8 +142,7 @@ def brick(u: Floats, v: Floats, pixel_m: Floats, color: Color, mortar: Color, se
     rough = noise(u, v, pixel_m, 0.03, seed + 1)
     joint_u = draw_line((np.abs(x - column - 0.5) - 0.5) * width_m, 0.011, pixel_m)
     joint_v = draw_line((np.abs(v / np.float32(height_m) - row - 0.5) - 0.5) * height_m, 0.011, pixel_m)
-    body = _column(color) * (1.0 + 0.32 * tone + 0.07 * rough)
-    return mix(body, mortar, np.maximum(joint_u, joint_v))
+    return mix(_column(color) * (1.0 + 0.32 * tone + 0.07 * rough), mortar, np.maximum(joint_u, joint_v))
 
 
 @_texture
@@ -227,10 +226,9 @@ def rug(u: Floats, v: Floats, pixel_m: Floats, radius_m: float, a: Color, b: Col
     """Paint a round rug: rings, petals and pile."""
     r = np.hypot(u, v).astype(np.float32) / np.float32(radius_m)
     angle = np.arctan2(v, u).astype(np.float32)
-    petals = smoothstep(0.5 + 2.0 * np.sin(12 * angle) * np.sin(np.float32(3 * np.pi) * r)) * detail_visibility(
-        0.1, pixel_m
-    )
-    rings = smoothstep(0.5 + 2.0 * np.sin(np.float32(7 * np.pi) * r)) * detail_visibility(0.1, pixel_m)
+    seen = detail_visibility(0.1, pixel_m)
+    petals = smoothstep(0.5 + 2.0 * np.sin(12 * angle) * np.sin(np.float32(3 * np.pi) * r)) * seen
+    rings = smoothstep(0.5 + 2.0 * np.sin(np.float32(7 * np.pi) * r)) * seen
     pile = 1.0 + 0.12 * noise(u, v, pixel_m, 0.03, seed)
     return mix(mix(a, b, petals), c, 0.75 * rings) * pile
 
