@@ -21,7 +21,7 @@ from sigmasplat.system.slam import Slam
 from sigmasplat.types import Matrix, Progress, completed, no_progress
 
 WITHOUT_MAP: Mapping[str, Mapping[str, Any]] = {
-    "input": {"calibrate": "off", "hold_every": 0}, "mapping": {"iterations": 0, "first_iterations": 0},
+    "input": {"calibrate": "off", "hold_every": 0, "crop_px": 0}, "mapping": {"iterations": 0, "first_iterations": 0},
     "seeding": {"max_splats": 1}, "recovery": {"relocalise": False}, "uncertainty": {"probes": 0},
 }  # fmt: skip
 """Settings that align keyframes to each other, and do hardly anything else."""
@@ -134,12 +134,12 @@ def camera_errors(pairs: Sequence[Pair], times: SensorTimes) -> CameraErrors:
     bright = [_of_true(pair, even) for pair in seen]
     fit = completed(fitted(bright, CAMERA))
     halves = [[pair for pair in bright if pair.number // NEIGHBOURS % 2 == half] for half in (0, 1)]
-    if fit.sure and all(_helps(completed(fitted(a, CAMERA)), b) for a, b in (halves, halves[::-1])):
-        values = fit.values
+    used = fit.sure and all(_helps(completed(fitted(a, CAMERA)), b) for a, b in (halves, halves[::-1]))
+    values = fit.values if used else values
     moved = [found for pair in seen if (found := pair.at(values, CAMERA))]
     falloff, std = falloff_of(moved, values)
     focal, x, y, inverse_depth = values.tolist()
-    a, b, c, d = UNCLEAR if fit.std is None else fit.std.tolist()
+    a, b, c, d = UNCLEAR if fit.std is None or fit.sure > used else fit.std.tolist()
     return CameraErrors(focal, x, y, inverse_depth, falloff, (a, b, c, d, std))
 
 
