@@ -152,7 +152,7 @@ PAGES = {
                 ("Ratios",),
             ),
             Shown(
-                "sensor-times", "Times of a sensor without truth: depth moved in time, and random rooms.",
+                "sensor-times", "A sensor measured without truth: depth moved in time, and rooms with random faults.",
                 ("Depth moved in time", "Random rooms"),
             ),
             Shown(
