@@ -53,9 +53,8 @@ PAGES = {
             ),
             Shown(
                 "board", "What changes since an earlier commit have done: one seed, no final map.",
-                without=("frames", "hops, mm", "lost", "CPU, ms a frame"),
+                without=("frames", "hops, mm", "lost", "silent", "CPU, ms a frame"),
             ),
-            Shown("plain", "A system without map and rules: whatever the product does has to be better than this."),
             Shown("loops", "Depth that drifts bends the path: what closing loops gains.", ("Goals",)),
         ),
     ),
