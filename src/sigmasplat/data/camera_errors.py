@@ -12,6 +12,10 @@ from sigmasplat.data.frame import Frame
 from sigmasplat.data.readout import SensorTimes
 
 Floats = NDArray[np.float32]
+SAID = {
+    "focal length": "%", "image centre to the right": "% of the width", "image centre down": "% of the width",
+    "inverse depth": "/100 m", "darker corners": "%",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -56,16 +60,14 @@ class CameraErrors:
         return {} if self.std is None else {"camera_errors": asdict(self)}
 
     def said(self) -> str:
-        """Return the errors in words, empty if they are not known."""
+        """Return the errors in words, empty if none is known."""
         if self.std is None:
             return ""
-        f, x, y, z, v = (
-            f"{100 * value:.2f} ± {100 * std:.2f}" for value, std in zip(self.values, self.std, strict=True)
-        )
-        return (
-            f"focal length {f} %, image centre {x} and {y} % of the width, inverse depth {z} /100 m, "
-            f"darker corners {v} % (corrected)"
-        )
+        found = (
+            f"{name} {100 * value:.2f} ± {100 * std:.2f} {unit}"
+            for (name, unit), value, std in zip(SAID.items(), self.values, self.std, strict=True) if value
+        )  # fmt: skip
+        return f"the stated camera is off by {said} (corrected)" if (said := ", ".join(found)) else ""
 
     def camera(self, stated: Camera) -> Camera:
         """Return the true camera."""
