@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2 as chi2_distribution
+from scipy.special import chdtri
 
 from sigmasplat.data import se3
 from sigmasplat.data.readout import UNKNOWN_TIMES, Readout, SensorTimes
@@ -33,7 +33,7 @@ APART = 4
 """Other keyframes that a keyframe is aligned to are this many keyframes apart: neighbours share most errors."""
 NEAREST = 3
 """The nearest views are taken whatever their distance in time; one of them is the keyframe before."""
-MEDIAN_CHI2 = float(chi2_distribution.median(6))
+MEDIAN_CHI2 = float(chdtri(6, 0.5))
 ROUNDS, STEPS = 10, 5
 """Rounds of weighting and factors, and steps of the solution in each."""
 PROBES = 600

@@ -11,7 +11,7 @@ from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import f as f_distribution
+from scipy.special import fdtri
 
 from sigmasplat.data.readout import Readout
 from sigmasplat.fit.align import align
@@ -115,7 +115,7 @@ def _is_sure(x: Matrix, covariance: Matrix, groups: int, level: float = LEVEL) -
     n = len(x)
     if groups < max(LEAST_GROUPS, n + 2):
         return False
-    limit = n * (groups - 1) / groups * float(f_distribution.ppf(level, n, groups - n))
+    limit = n * (groups - 1) / groups * float(fdtri(n, groups - n, level))
     return bool(x @ np.linalg.solve(covariance, x) > limit)
 
 
