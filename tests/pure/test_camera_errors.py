@@ -73,6 +73,8 @@ def test_a_frame_is_corrected() -> None:
     assert np.allclose([found.camera.fx, found.camera.cx], [CAMERA.fx, CAMERA.cx])
     holes = replace(true, depth_m=np.where(true.depth_m > 1.5, true.depth_m, np.float32(0.0)))
     assert np.array_equal(ERRORS.frame(holes).depth_m > 0, holes.depth_m > 0)
+    black = CameraErrors(falloff=1.0).frame(replace(true, color=np.zeros_like(true.color)))
+    assert np.array_equal(black.color, np.zeros_like(true.color)), "corners without any light stay black"
 
 
 def test_a_source_has_no_errors_once_they_are_known() -> None:

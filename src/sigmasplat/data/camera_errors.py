@@ -93,7 +93,7 @@ class CameraErrors:
     def evened(self, recorded: Floats, camera: Camera) -> Floats:
         """Return gray or colour [H, W, ...] that is as bright in the corners as in the middle; it may exceed 1."""
         v, u = np.mgrid[: camera.height, : camera.width].astype(np.float32)
-        bright = 1.0 - np.float32(self.falloff) * corner_share(u, v, camera)
+        bright = np.maximum(1.0 - np.float32(self.falloff) * corner_share(u, v, camera), np.float32(1e-3))
         return np.asarray(recorded / (bright if recorded.ndim == 2 else bright[..., None]), np.float32)
 
 
