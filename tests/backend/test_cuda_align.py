@@ -100,6 +100,26 @@ def level_of(p: Pair, weighed: bool = True, device: str | None = None) -> LevelP
     return LevelPlanes(*images, [c.fx, c.fy, c.cx, c.cy], options)
 
 
+def as_the_cpu_and_the_residuals(p: Pair, weighed: bool = True) -> aligning.Normal:
+    """Return the normal equations of a pair, which are those of the CPU and of the differentiated residuals."""
+    (got,) = aligning.normal_equations(CUDA_IMAGES, level_of(p, weighed, "cpu"), [p.T])
+    (want,) = aligning.normal_equations(CPU_IMAGES, level_of(p, weighed), [p.T])
+    H, b, sums, grays = oracle(p)
+    np.testing.assert_array_equal(got.sums[1:], want.sums[1:])
+    np.testing.assert_array_equal(got.sums[1:], sums[1:])
+    values = (
+        (got.H, want.H, H),
+        (got.b, want.b, b),
+        (got.sums[:1], want.sums[:1], sums[:1]),
+        (got.grays, want.grays, grays),
+    )
+    for ours, theirs, exact in values:
+        assert np.linalg.norm(ours - theirs) < 1e-5 * np.linalg.norm(theirs)
+        assert np.linalg.norm(ours - exact) < 1e-3 * np.linalg.norm(exact)
+    assert np.linalg.norm(got.S - want.S) < 1e-5 * np.linalg.norm(want.S)
+    return got
+
+
 @pytest.mark.parametrize("weighed", [True, False], ids=["weighed", "unweighed"])
 @pytest.mark.parametrize("holes", [False, True], ids=["whole", "holes"])
 @pytest.mark.parametrize("huber", [(HUGE, HUGE), (0.05, 0.004)], ids=["quadratic", "huber"])
@@ -107,43 +127,14 @@ def test_normal_equations_are_the_cpus_and_those_of_the_residuals(huber: Any, ho
     p = dataclasses.replace(pair(*huber, holes), gain=1.2 if weighed else 1.0)
     if not weighed:
         p = dataclasses.replace(p, weight=np.ones_like(p.weight), weight_depth=np.ones_like(p.weight_depth))
-    (got,) = aligning.normal_equations(CUDA_IMAGES, level_of(p, weighed, "cpu"), [p.T])
-    (want,) = aligning.normal_equations(CPU_IMAGES, level_of(p, weighed), [p.T])
-    H, b, sums, grays = oracle(p)
-    np.testing.assert_array_equal(got.sums[1:], want.sums[1:])
-    np.testing.assert_array_equal(got.sums[1:], sums[1:])
+    got = as_the_cpu_and_the_residuals(p, weighed)
     assert got.sums[1] > 800 and (not holes or got.sums[1] > got.sums[3] + 20 < got.sums[2])
-    values = (
-        (got.H, want.H, H),
-        (got.b, want.b, b),
-        (got.sums[:1], want.sums[:1], sums[:1]),
-        (got.grays, want.grays, grays),
-    )
-    for ours, theirs, exact in values:
-        assert np.linalg.norm(ours - theirs) < 1e-5 * np.linalg.norm(theirs)
-        assert np.linalg.norm(ours - exact) < 1e-3 * np.linalg.norm(exact)
-    assert np.linalg.norm(got.S - want.S) < 1e-5 * np.linalg.norm(want.S)
     assert np.linalg.eigvalsh(got.S).min() > -1e-9 * np.linalg.eigvalsh(got.S).max()
 
 
 @pytest.mark.parametrize("share", MISSING)
 def test_missing_readings_leave_the_normal_equations_those_of_the_cpu_and_of_the_residuals(share: float) -> None:
-    p = missing(pair(0.05, 0.004), share)
-    (got,) = aligning.normal_equations(CUDA_IMAGES, level_of(p, device="cpu"), [p.T])
-    (want,) = aligning.normal_equations(CPU_IMAGES, level_of(p), [p.T])
-    H, b, sums, grays = oracle(p)
-    np.testing.assert_array_equal(got.sums[1:], want.sums[1:])
-    np.testing.assert_array_equal(got.sums[1:], sums[1:])
-    values = (
-        (got.H, want.H, H),
-        (got.b, want.b, b),
-        (got.sums[:1], want.sums[:1], sums[:1]),
-        (got.grays, want.grays, grays),
-    )
-    for ours, theirs, exact in values:
-        assert np.linalg.norm(ours - theirs) < 1e-5 * np.linalg.norm(theirs)
-        assert np.linalg.norm(ours - exact) < 1e-3 * np.linalg.norm(exact)
-    assert np.linalg.norm(got.S - want.S) < 1e-5 * np.linalg.norm(want.S)
+    as_the_cpu_and_the_residuals(missing(pair(0.05, 0.004), share))
 
 
 RATE = np.array([0.4, -0.3, 0.2, 0.3, -0.5, 0.4])

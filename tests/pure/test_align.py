@@ -89,7 +89,7 @@ def test_either_kind_of_residual_finds_the_motion() -> None:
 
 @pytest.mark.parametrize("gain", [0.7, 1.4])
 def test_another_exposure_does_not_move_the_pose(gain: float) -> None:
-    """Without the gain, gray alone is off by centimetres."""
+    """The live image is darker or brighter, by more than a camera changes from frame to frame."""
     reference, same = seen(10), seen(12)
     live = replace(same, gray=[np.float32(gain) * plane for plane in same.gray])
     for weight_color in (0.5, 1.0):

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -86,14 +87,12 @@ class CameraErrors:
 
     def frame(self, stated: Frame) -> Frame:
         """Return a frame as the true camera sees it, and as bright in the corners as in the middle."""
-        color = self.evened(stated.color, stated.camera) if self.falloff else stated.color
-        depth_m = self.depth(stated.depth_m)
-        return replace(stated, camera=self.camera(stated.camera), color=np.minimum(color, 1.0), depth_m=depth_m)
+        color = np.minimum(self.evened(stated.color, stated.camera), 1.0) if self.falloff else stated.color
+        return replace(stated, camera=self.camera(stated.camera), color=color, depth_m=self.depth(stated.depth_m))
 
     def evened(self, recorded: Floats, camera: Camera) -> Floats:
         """Return gray or colour [H, W, ...] that is as bright in the corners as in the middle; it may exceed 1."""
-        v, u = np.mgrid[: camera.height, : camera.width].astype(np.float32)
-        bright = np.maximum(1.0 - np.float32(self.falloff) * corner_share(u, v, camera), np.float32(1e-3))
+        bright = brightness(self.falloff, camera)
         return np.asarray(recorded / (bright if recorded.ndim == 2 else bright[..., None]), np.float32)
 
 
@@ -103,6 +102,13 @@ KNOWN_NONE = CameraErrors()
 def sensor_said(facts: Mapping[str, Any]) -> str:
     """Return what the facts of a run or of a file note of its sensor, in words."""
     return "; ".join(filter(None, (SensorTimes.noted_in(facts).said(), CameraErrors.noted_in(facts).said())))
+
+
+@lru_cache(maxsize=8)
+def brightness(falloff: float, camera: Camera) -> Floats:
+    """Return the share of light [H, W], above 0, that reaches the pixels of a camera with this fall-off."""
+    v, u = np.mgrid[: camera.height, : camera.width].astype(np.float32)
+    return np.asarray(np.maximum(1.0 - falloff * corner_share(u, v, camera), 1e-3), np.float32)
 
 
 def corner_share(u: Floats, v: Floats, camera: Camera) -> Floats:

@@ -225,12 +225,10 @@ def gray_share(reference: Pyramid, live: Pyramid, T_live_reference: Matrix) -> f
     the unit. The inverse of the variance would be right if residuals were nothing but noise. Errors of other kinds do
     not become smaller with it, as in `balanced`.
     """
-    cost = []
+    cost, kernels = [], reference.kernels
+    gain = normal_equations(kernels, Pair(reference, live, 1.0).level(0), [T_live_reference])[0].gain
     for weight in (1.0, 0.0):
-        pair = Pair(reference, live, weight)
-        for _ in range(2):  # the second time as bright
-            found = normal_equations(pair.kernels, pair.level(0), [T_live_reference])[0]
-            sums, pair = found.sums, replace(pair, gain=found.gain)
+        sums = normal_equations(kernels, Pair(reference, live, weight, gain).level(0), [T_live_reference])[0].sums
         cost.append(math.sqrt(sums[0] / max(sums[1], 1.0)))
     return cost[1] / max(cost[0] + cost[1], 1e-9)
 

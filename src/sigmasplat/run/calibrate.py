@@ -105,8 +105,8 @@ def _of_true(pair: Pair, errors: CameraErrors) -> Pair:
 
 
 def _images(pair: Pair, values: Matrix) -> tuple[Pyramid, Pyramid]:
-    errors = CameraErrors(*values.tolist())
-    return _true(pair.reference, errors), _true(pair.live, errors)
+    true = _of_true(pair, CameraErrors(*values.tolist()))
+    return true.reference, true.live
 
 
 CAMERA = Parameters(np.array([0.01, 0.01, 0.01, 0.005]), _images)
