@@ -156,6 +156,16 @@ class Mapper:
         self._note_visible(view)
         self._seed(view, keyframe.target, keyframe.T_world_camera)
 
+    def seeding_again(self, view: View) -> Task[None]:
+        """Forget the splats and seed new ones at each keyframe, whose images or poses are better now, in slices of one;
+        their steps are pending."""
+        c = self.config.mapping
+        self.field.keep(torch.zeros(len(self.field), dtype=torch.bool, device=self.field.params.device))
+        self.half, self.first_pending = None, c.first_iterations + c.iterations * (len(self.keyframes) - 1)
+        for keyframe in self.keyframes:
+            self._seed(view, keyframe.target, keyframe.T_world_camera)
+            yield
+
     def refining(self, view: View, steps: int, should_stop: ShouldStop) -> Task[None]:
         """Fit the map to its keyframes for more steps, in slices of one, until `should_stop` returns True; the
         keyframes keep their poses. Pending steps count as made."""

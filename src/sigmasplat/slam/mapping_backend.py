@@ -53,11 +53,13 @@ class MappingBackend(SlamState):
 
         should_stop: as in `Mapper.mapping`.
         """
-        keyframe = self._keyframe(seen, index, T_submap_camera)
+        keyframe, times = self._keyframe(seen, index, T_submap_camera), self.graph.times
         if self.follows and self.mapper.keyframes:
             with self._timer.stage("graph"):
                 yield from self._align(keyframe, seen.reading, hop, should_stop)
         with self._timer.stage("map"):
+            if self.graph.times != times:
+                yield from self.mapper.seeding_again(self.view)
             fit = yield from self.mapper.mapping(self.view, keyframe, should_stop)
         self._timer.add(fit.seconds, prefix="map_")
         return self._placed(index, hop, seen.reading)
@@ -92,11 +94,14 @@ class MappingBackend(SlamState):
             return image.read(self.graph.times.read(reading_of(row)))
 
         yield from self.graph.aligning(T_world_keyframe, rows, image, should_stop)
+        times, window = self.graph.times, WINDOW
         if self.graph.is_due:
             self.correct_motions()
             yield from self.graph.measuring(image, reading_of)
             yield from self._read_at_once()
-        first = max(newest + 1 - WINDOW, newest + 2 - len(active))
+        if self.graph.times != times:  # all were aligned again
+            window = len(active)
+        first = max(newest + 1 - window, newest + 2 - len(active))
         poses = self.graph.solved(T_world_keyframe, [*atlas.hops[first:], hop], first)
         moved = se3.orthonormalise(se3.inverse(anchor) @ poses)
         for each, T_submap_camera in zip(active[first - newest - 1 :], moved, strict=True):
