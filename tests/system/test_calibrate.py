@@ -94,8 +94,9 @@ def test_once_the_times_are_known_what_was_mapped_before_is_mapped_again() -> No
     assert -10.0 * np.log10(squares).mean() > 44.5  # 43.3 with the splats of before
 
 
-def test_predicted_depth_has_no_times_of_its_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    source = "synthetic:frames=3,width=96,height=72,predicted=1"
+@pytest.mark.parametrize("depth", ["predicted=1", "stereo=10"])
+def test_computed_depth_has_no_times_of_its_own(depth: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source = f"synthetic:frames=3,width=96,height=72,{depth}"
     assert exit_code("calibrate", source, "--out", str(tmp_path / "times.json")) == 2
     assert "calibrate a recording of a sensor" in capsys.readouterr().err and not list(tmp_path.iterdir())
 

@@ -85,8 +85,8 @@ def calibrate(
     source, config = open_scene(path, config, split_settings(settings))
     if source.live:
         raise ConfigError("a live camera cannot be measured; record it first: sigmasplat run realsense")
-    if config.tracking.fit_depth:
-        raise ConfigError("predicted depth is read with its colours; calibrate a recording of a sensor")
+    if config.tracking.fit_depth or source.computed_depth:
+        raise ConfigError("predicted and stereo depth is read with its colours; calibrate a recording of a sensor")
     prepare_torch()
     with output_locked(out, screen.warn):
         with screen.counting("frames") as progress:

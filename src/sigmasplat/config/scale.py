@@ -54,9 +54,13 @@ def for_scene(
         depth_noise_per_m = depth_noise_per_m or PREDICTED_NOISE_PER_M
         if "tracking.fit_depth" not in given:
             config = config.changed(tracking={"fit_depth": True})
-    elif depth_noise_per_m is not None and "tracking.align_weight_color" not in given:
-        weight = max(config.tracking.align_weight_color, LEAST_GRAY)
-        config = config.changed(tracking={"align_weight_color": weight})
+    elif depth_noise_per_m is not None:
+        stereo: dict[str, dict[str, object]] = {
+            "tracking": {"align_weight_color": max(config.tracking.align_weight_color, LEAST_GRAY)}
+        }
+        if config.input.calibrate == "auto":  # depth is read with the colour that it is computed from
+            stereo["input"] = {"calibrate": "off"}
+        config = config.changed(**_not_given(stereo, given))
     if depth_noise_per_m is None or "render.depth_noise_per_m" in given:
         return config
     return config.changed(render={"depth_noise_per_m": depth_noise_per_m})
