@@ -138,7 +138,7 @@ def test_missing_readings_leave_the_normal_equations_those_of_the_cpu_and_of_the
 
 
 RATE = np.array([0.4, -0.3, 0.2, 0.3, -0.5, 0.4])
-TIMES = SensorTimes(0.02, 0.03, -0.025, (0.001, 0.001, 0.001))
+TIMES = SensorTimes(0.02, 0.03, -0.025, std_s=(0.001, 0.001, 0.001))
 LATE = Readout(RATE, 0.005, TIMES), Readout(-0.7 * RATE[::-1], -0.01, TIMES)
 
 

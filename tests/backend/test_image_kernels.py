@@ -126,7 +126,7 @@ def test_depth_at_another_time_is_that_of_its_definition(isa: str, fast: float) 
     """Depth to 10 µm, but for a few pixels that are next to another surface in one of both. Colour is a ramp: it says
     from which column it was taken."""
     readout = Readout(
-        fast * np.array([0.5, -0.4, 0.6, 0.7, -1.0, 0.4]), 0.004, SensorTimes(0.016, 0.03, 0.025, (1e-3,) * 3)
+        fast * np.array([0.5, -0.4, 0.6, 0.7, -1.0, 0.4]), 0.004, SensorTimes(0.016, 0.03, 0.025, std_s=(1e-3,) * 3)
     )
     ramp = np.repeat(np.tile(np.linspace(0, 1, WIDTH, dtype=np.float32), (HEIGHT, 1))[..., None], 3, 2)
     frame = read_at_once(Frame(0, 0.0, ramp, depth(), CAMERA), readout)

@@ -23,7 +23,7 @@ from sigmasplat.run.calibrate import camera_errors
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
 STD = (0.001, 0.002, 0.003, 0.004, 0.005)
-ERRORS = CameraErrors(0.02, -0.0125, 0.0125, 0.01, 0.4, STD)
+ERRORS = CameraErrors(0.02, -0.0125, 0.0125, 0.01, 0.4, std=STD)
 NUMBERS = "0.01,0,0.03,0.001,0.002,0.003,0.02,-0.0125,0.0125,0.01,0.4,0.001,0.002,0.003,0.004,0.005"
 
 
@@ -94,7 +94,7 @@ def test_a_source_has_no_errors_once_they_are_known() -> None:
 
 
 def test_a_file_becomes_sixteen_numbers_and_a_run_notes_them(tmp_path: Path) -> None:
-    times = SensorTimes(0.01, 0.0, 0.03, (0.001, 0.002, 0.003))
+    times = SensorTimes(0.01, 0.0, 0.03, std_s=(0.001, 0.002, 0.003))
     facts = {"source": "x"} | times.noted() | ERRORS.noted()
     (tmp_path / "a.json").write_text(json.dumps(facts))
     settings = InputConfig(calibrate=str(tmp_path / "a.json"))

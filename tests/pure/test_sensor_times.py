@@ -34,7 +34,7 @@ TIMES = {"late": LATE, "depth rows": DEPTH_ROWS, "colour rows": COLOR_ROWS, "all
 
 def readout(rate: Array, times_s: Sequence[float]) -> Readout:
     late_s, depth_s, color_s = times_s
-    return Readout(rate, 0.0, SensorTimes(late_s, depth_s, color_s, STD_S))
+    return Readout(rate, 0.0, SensorTimes(late_s, depth_s, color_s, std_s=STD_S))
 
 
 def times_of(found: SensorTimes) -> Array:
@@ -124,7 +124,7 @@ def test_at_the_true_motion_late_images_look_alike_if_their_times_are_known() ->
 
 
 def test_only_known_times_of_a_moving_camera_matter() -> None:
-    times = SensorTimes(0.01, 0.02, 0.03, STD_S)
+    times = SensorTimes(0.01, 0.02, 0.03, std_s=STD_S)
     assert UNKNOWN_TIMES.read(Readout(SHIFTING)) is None and times.read(Readout(np.zeros(6))) is None
     late = times.read(Readout(SHIFTING, 0.005))
     assert late is not None

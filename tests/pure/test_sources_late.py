@@ -57,7 +57,7 @@ def test_late_depth_is_that_of_a_later_frame_and_colour_stays() -> None:
 
 def test_the_true_times_explain_the_images() -> None:
     """Alignment to an image of a camera at rest finds the true motion only if it knows the times."""
-    times = SensorTimes(0.03, 0.04, 0.05, (1e-3, 1e-3, 1e-3))
+    times = SensorTimes(0.03, 0.04, 0.05, std_s=(1e-3, 1e-3, 1e-3))
     rooms = SyntheticRoom(**SIZE), SyntheticRoom(**SIZE, late=0.03, depth_rows=0.04, rows=0.05)
     reference, live = (
         Pyramid.of(gray_of(f.color), f.depth_m, f.camera) for f in (rooms[0].frame(FRAME - 2), rooms[1].frame(FRAME))

@@ -132,7 +132,7 @@ def test_a_file_becomes_six_numbers(tmp_path: Path, wrap: Callable[[object], obj
     assert settings.calibrate == "-0.01,0,0.03,0.001,0.002,0.003"
     again = replace(settings, limit=3), InputConfig(calibrate=settings.calibrate)
     assert [one.calibrate for one in again] == [settings.calibrate] * 2
-    assert SensorTimes.given(settings.calibrate) == SensorTimes(-0.01, 0.0, 0.03, (0.001, 0.002, 0.003))
+    assert SensorTimes.given(settings.calibrate) == SensorTimes(-0.01, 0.0, 0.03, std_s=(0.001, 0.002, 0.003))
     assert SensorTimes.given("auto") is SensorTimes.given("off") is UNKNOWN_TIMES
 
 

@@ -55,12 +55,9 @@ def for_scene(
         if "tracking.fit_depth" not in given:
             config = config.changed(tracking={"fit_depth": True})
     elif depth_noise_per_m is not None:
-        stereo: dict[str, dict[str, object]] = {
-            "tracking": {"align_weight_color": max(config.tracking.align_weight_color, LEAST_GRAY)}
-        }
-        if config.input.calibrate == "auto":  # depth is read with the colour that it is computed from
-            stereo["input"] = {"calibrate": "off"}
-        config = config.changed(**_not_given(stereo, given))
+        gray = {"align_weight_color": max(config.tracking.align_weight_color, LEAST_GRAY)}
+        times = {"calibrate": config.input.calibrate.replace("auto", "off")}  # depth is read with its colour
+        config = config.changed(**_not_given({"tracking": gray, "input": times}, given))
     if depth_noise_per_m is None or "render.depth_noise_per_m" in given:
         return config
     return config.changed(render={"depth_noise_per_m": depth_noise_per_m})

@@ -1,7 +1,7 @@
 """What is wrong with the camera that a recording states, as `sigmasplat calibrate` measures it."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from typing import Any
 
@@ -34,7 +34,7 @@ class CameraErrors:
     center_y: float = 0.0
     inverse_depth: float = 0.0
     falloff: float = 0.0
-    std: tuple[float, float, float, float, float] | None = None
+    std: tuple[float, ...] | None = field(default=None, kw_only=True)
 
     @staticmethod
     def noted_in(facts: Mapping[str, Any]) -> "CameraErrors":
@@ -45,11 +45,8 @@ class CameraErrors:
     @staticmethod
     def given(text: str) -> "CameraErrors":
         """Return the errors that `input.calibrate` gives as numbers, after those of the times."""
-        numbers = text.split(",")[6:]
-        if len(numbers) != 10:
-            return KNOWN_NONE
-        focal, x, y, inverse_depth, falloff, *std = map(float, numbers)
-        return CameraErrors(focal, x, y, inverse_depth, falloff, (std[0], std[1], std[2], std[3], std[4]))
+        numbers = np.array(text.split(",")[6:], np.float64).tolist()
+        return CameraErrors(*numbers[:5], std=tuple(numbers[5:])) if numbers else KNOWN_NONE
 
     @property
     def values(self) -> tuple[float, float, float, float, float]:

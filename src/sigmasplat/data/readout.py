@@ -1,7 +1,7 @@
 """When a sensor reads its images, and how its camera moves meanwhile."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ class SensorTimes:
     depth_late_s: float = 0.0
     depth_rows_s: float = 0.0
     color_rows_s: float = 0.0
-    std_s: tuple[float, float, float] | None = None
+    std_s: tuple[float, ...] | None = field(default=None, kw_only=True)
 
     @staticmethod
     def noted_in(facts: Mapping[str, Any]) -> "SensorTimes":
@@ -31,10 +31,8 @@ class SensorTimes:
     @staticmethod
     def given(text: str) -> "SensorTimes":
         """Return the times that `input.calibrate` gives as numbers; they are not known if it is a word."""
-        if "," not in text:
-            return UNKNOWN_TIMES
-        late, depth, color, *std_s = map(float, text.split(","))
-        return SensorTimes(late, depth, color, (std_s[0], std_s[1], std_s[2]))
+        numbers = np.array(text.split(",") if "," in text else [], np.float64).tolist()
+        return SensorTimes(*numbers[:3], std_s=tuple(numbers[3:6])) if numbers else UNKNOWN_TIMES
 
     def noted(self) -> dict[str, Any]:
         """Return the times as facts of a run; nothing if they are not known."""

@@ -11,7 +11,7 @@ import numpy as np
 from sigmasplat.data.readout import UNKNOWN_TIMES, SensorTimes
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.graph.sensor_fit import Fit, Pair, Parameters, fitted
-from sigmasplat.types import Matrix, Task
+from sigmasplat.types import Task
 
 FIRST_MEASURED, MOST_MEASURED = 60, 60
 """Alignments before the first measurement, and pairs of one."""
@@ -22,7 +22,7 @@ def read(pair: Pair, times: SensorTimes) -> tuple[Pyramid, Pyramid]:
     return pair.reference.read(times.read(pair.of_reference)), pair.live.read(times.read(pair.of_live))
 
 
-TIMES = Parameters(np.full(3, 0.01), lambda pair, values_s: read(pair, _times(values_s, np.zeros(3))))
+TIMES = Parameters(np.full(3, 0.01), lambda pair, s: read(pair, SensorTimes(*s.tolist(), std_s=(0.0, 0.0, 0.0))))
 """Depth after colour, read-out of depth, and of colour, s. In 10 ms, images of a hand-held camera move by some pixels;
 the longest step is the time of one frame."""
 
@@ -39,10 +39,4 @@ def measured(pairs: Sequence[Pair]) -> Task[SensorTimes]:
 
 def times_of(fit: Fit) -> SensorTimes:
     """Return the times where the pairs agree best; unknown if they are neither sure nor refuted."""
-    return UNKNOWN_TIMES if fit.std is None else _times(fit.values, fit.std)
-
-
-def _times(values_s: Matrix, std_s: Matrix) -> SensorTimes:
-    late, depth_rows, color_rows = values_s.tolist()
-    a, b, c = std_s.tolist()
-    return SensorTimes(late, depth_rows, color_rows, (a, b, c))
+    return UNKNOWN_TIMES if fit.std is None else SensorTimes(*fit.values.tolist(), std_s=tuple(fit.std.tolist()))

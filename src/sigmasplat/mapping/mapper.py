@@ -157,8 +157,7 @@ class Mapper:
         self._seed(view, keyframe.target, keyframe.T_world_camera)
 
     def seeding_again(self, view: View) -> Task[None]:
-        """Forget the splats and seed new ones at each keyframe, whose images or poses are better now, in slices of one;
-        their steps are pending."""
+        """Forget the splats and seed new ones at each keyframe, in slices of one; their steps are pending."""
         c = self.config.mapping
         self.field.keep(torch.zeros(len(self.field), dtype=torch.bool, device=self.field.params.device))
         self.half, self.first_pending = None, c.first_iterations + c.iterations * (len(self.keyframes) - 1)

@@ -138,9 +138,8 @@ def camera_errors(pairs: Sequence[Pair], times: SensorTimes) -> CameraErrors:
     values = fit.values if used else values
     moved = [found for pair in seen if (found := pair.at(values, CAMERA))]
     falloff, std = falloff_of(moved, values)
-    focal, x, y, inverse_depth = values.tolist()
-    a, b, c, d = UNCLEAR if fit.std is None or fit.sure > used else fit.std.tolist()
-    return CameraErrors(focal, x, y, inverse_depth, falloff, (a, b, c, d, std))
+    others = UNCLEAR if fit.std is None or fit.sure > used else fit.std.tolist()
+    return replace(CameraErrors(*values.tolist(), std=(*others, std)), falloff=falloff)
 
 
 def _helps(fit: Fit, others: Sequence[Pair]) -> bool:

@@ -94,14 +94,13 @@ class MappingBackend(SlamState):
             return image.read(self.graph.times.read(reading_of(row)))
 
         yield from self.graph.aligning(T_world_keyframe, rows, image, should_stop)
-        times, window = self.graph.times, WINDOW
+        times, first = self.graph.times, newest + 2 - len(active)
         if self.graph.is_due:
             self.correct_motions()
             yield from self.graph.measuring(image, reading_of)
             yield from self._read_at_once()
-        if self.graph.times != times:  # all were aligned again
-            window = len(active)
-        first = max(newest + 1 - window, newest + 2 - len(active))
+        if self.graph.times == times:  # else all were aligned again
+            first = max(newest + 1 - WINDOW, first)
         poses = self.graph.solved(T_world_keyframe, [*atlas.hops[first:], hop], first)
         moved = se3.orthonormalise(se3.inverse(anchor) @ poses)
         for each, T_submap_camera in zip(active[first - newest - 1 :], moved, strict=True):
