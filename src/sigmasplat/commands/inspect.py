@@ -86,7 +86,7 @@ def calibrate(
     if source.live:
         raise ConfigError("a live camera cannot be measured; record it first: sigmasplat run realsense")
     if config.tracking.fit_depth or source.computed_depth:
-        raise ConfigError("predicted and stereo depth is read with its colours; calibrate a recording of a sensor")
+        raise ConfigError("predicted or stereo depth is read with its colours; calibrate a recording of a sensor")
     prepare_torch()
     with output_locked(out, screen.warn):
         with screen.counting("frames") as progress:

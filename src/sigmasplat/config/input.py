@@ -168,10 +168,10 @@ class InputConfig(Section, name="input"):
     `render.depth_noise_per_m`; rendered = the same law, with an exact calibration and exact times; auto = that of the
     sensor if the source knows it, otherwise generic."""
     calibrate: str = "auto"
-    """When the sensor reads depth and rows (rolling shutter), which is corrected: auto = measured from the keyframes,
-    except of rendered images and of predicted or stereo depth, where keyframes are aligned to each other; off = not
-    known; or the path of a file with these times, and what is wrong with the stated camera, which `sigmasplat
-    calibrate` has written. Its numbers replace the path in a run's settings."""
+    """When the sensor reads depth and rows (rolling shutter), which is corrected: auto = measured from keyframes that
+    are aligned to each other, but not for rendered images, nor for predicted or stereo depth; off = not known; or the
+    path of a file with these times, and what is wrong with the stated camera, which `sigmasplat calibrate` has written.
+    Its numbers replace the path in a run's settings."""
     denoise_depth: bool = True
     """Whether depth images that are noisier than those of a structured-light sensor are smoothed."""
 

@@ -139,7 +139,7 @@ def camera_errors(pairs: Sequence[Pair], times: SensorTimes) -> CameraErrors:
     moved = [found for pair in seen if (found := pair.at(values, CAMERA))]
     falloff, std = falloff_of(moved, values)
     others = UNCLEAR if fit.std is None or fit.sure > used else fit.std.tolist()
-    return replace(CameraErrors(*values.tolist(), std=(*others, std)), falloff=falloff)
+    return CameraErrors(*np.append(values, falloff).tolist(), std=(*others, std))
 
 
 def _helps(fit: Fit, others: Sequence[Pair]) -> bool:

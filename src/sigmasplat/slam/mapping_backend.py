@@ -53,13 +53,11 @@ class MappingBackend(SlamState):
 
         should_stop: as in `Mapper.mapping`.
         """
-        keyframe, times = self._keyframe(seen, index, T_submap_camera), self.graph.times
+        keyframe = self._keyframe(seen, index, T_submap_camera)
         if self.follows and self.mapper.keyframes:
             with self._timer.stage("graph"):
                 yield from self._align(keyframe, seen.reading, hop, should_stop)
         with self._timer.stage("map"):
-            if self.graph.times != times:
-                yield from self.mapper.seeding_again(self.view)
             fit = yield from self.mapper.mapping(self.view, keyframe, should_stop)
         self._timer.add(fit.seconds, prefix="map_")
         return self._placed(index, hop, seen.reading)
@@ -74,7 +72,7 @@ class MappingBackend(SlamState):
 
     def _align(self, keyframe: Keyframe, reading: Readout, hop: RelativePose, should_stop: ShouldStop) -> Task[None]:
         """Align a keyframe to earlier ones that see the same, in slices, and move the newest keyframes of the active
-        submap to where all agree best."""
+        submap to where all agree best. Once the times of the sensor are known, move all of them, and seed again."""
         atlas, anchor, active = self.atlas, self.atlas.anchors[-1], [*self.mapper.keyframes, keyframe]
         T_world_keyframe = np.stack([*atlas.T_world_keyframes, anchor @ keyframe.T_world_camera])
         newest = len(T_world_keyframe) - 1
@@ -94,17 +92,19 @@ class MappingBackend(SlamState):
             return image.read(self.graph.times.read(reading_of(row)))
 
         yield from self.graph.aligning(T_world_keyframe, rows, image, should_stop)
-        times, first = self.graph.times, newest + 2 - len(active)
+        times = self.graph.times
         if self.graph.is_due:
             self.correct_motions()
             yield from self.graph.measuring(image, reading_of)
             yield from self._read_at_once()
-        if self.graph.times == times:  # else all were aligned again
-            first = max(newest + 1 - WINDOW, first)
+        all_again = self.graph.times != times
+        first = max(newest + 2 - len(active), 0 if all_again else newest + 1 - WINDOW)
         poses = self.graph.solved(T_world_keyframe, [*atlas.hops[first:], hop], first)
         moved = se3.orthonormalise(se3.inverse(anchor) @ poses)
         for each, T_submap_camera in zip(active[first - newest - 1 :], moved, strict=True):
             each.T_world_camera = T_submap_camera
+        if all_again:
+            yield from self.mapper.seeding_again(self.view)
 
     def correct_motions(self) -> None:
         """Let the keyframes so far have moved as the frames before and after them say. The motion of tracking, from the
