@@ -19,7 +19,7 @@ from sigmasplat.data.submap import Picture
 from sigmasplat.fit.compare import best_alignment
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import picture_images
-from sigmasplat.graph.pose_graph import PoseGraph, factorised, minimise, most_chi2
+from sigmasplat.graph.pose_graph import ROUGHLY, PoseGraph, factorised, minimise, most_chi2
 from sigmasplat.graph.sensor_fit import Pair
 from sigmasplat.graph.sensor_times import FIRST_MEASURED, MOST_MEASURED, measured
 from sigmasplat.render.view import View
@@ -34,8 +34,9 @@ APART = 4
 NEAREST = 3
 """The nearest views are taken whatever their distance in time; one of them is the keyframe before."""
 MEDIAN_CHI2 = float(chdtri(6, 0.5))
-ROUNDS, STEPS = 10, 5
-"""Rounds of weighting and factors, and steps of the solution in each."""
+ROUNDS, STEPS, STILL = 10, 5, 0.01
+"""Most rounds of weighting and factors, and steps of the solution in each; the last round is the one that changes no
+factor by more than this share."""
 PROBES = 600
 """Redundancies of larger systems than this are estimated with this many random signs (Hutchinson 1990)."""
 
@@ -115,12 +116,14 @@ def solve(T_world_keyframe: Matrix, edges: Sequence[RelativePose], fixed: int = 
         factor = np.sum([factors[kind] * rows for kind, rows in of_kind.items()], axis=0)
         graph.information = claimed / factor[:, None, None]
         weights = (1.0 + graph.chi2(T) / scale) ** -0.5
-        T, _ = minimise(graph, T, weights, STEPS)
-        chi2 = graph.chi2(T) * factor
+        T, _ = minimise(graph, T, weights, STEPS, ROUGHLY)
+        chi2, before = graph.chi2(T) * factor, factors.copy()
         for (kind, rows), free in zip(of_kind.items(), redundancies(graph, T, weights, of_kind.values()), strict=True):
             redundant = float(np.clip(free / 6.0, 1e-3 * rows.sum(), rows.sum()))  # in numbers of edges
             measured = float(np.median(chi2[rows])) / MEDIAN_CHI2 * float(rows.sum()) / redundant
             factors[kind] = (redundant * measured + 1.0) / (redundant + 1.0)
+        if all(abs(factors[kind] - before[kind]) < STILL * before[kind] for kind in kinds):
+            break
     solved = se3.orthonormalise(T_world_keyframe[0] @ T)
     solved[:fixed] = T_world_keyframe[:fixed]
     return KeyframeSolution(solved, factors, graph.information * (1.0 + graph.chi2(T) / scale)[:, None, None] ** -0.5)
@@ -129,14 +132,14 @@ def solve(T_world_keyframe: Matrix, edges: Sequence[RelativePose], fixed: int = 
 def redundancies(graph: PoseGraph, T: Matrix, weights: Matrix, groups: Iterable[Matrix]) -> list[float]:
     """Return how many degrees of freedom the residuals of each group of edges [E] have in a solution: the trace of
     I − J H⁻¹ Jᵀ w Ω over the group."""
-    H, _ = graph.normal_equations(T, weights)
-    size = H.shape[0]
+    blocks, _ = graph.blocks(T, weights)
+    size = 6 * (graph.nodes - graph.fixed)
     signs = np.eye(size)
     if size > PROBES:
         signs = np.random.default_rng(0).choice([-1.0, 1.0], (size, PROBES)) / np.sqrt(PROBES)
-    solved = factorised(H).solve(signs)
+    solved = factorised(graph.assembled(blocks)).solve(signs)
     return [
-        6.0 * float(group.sum()) - float((solved * (graph.normal_equations(T, weights * group)[0] @ signs)).sum())
+        6.0 * float(group.sum()) - float((solved * (graph.assembled(blocks * group[:, None, None]) @ signs)).sum())
         for group in groups
     ]
 

@@ -186,16 +186,24 @@ class PoseGraph:
 
     def normal_equations(self, T_world_node: Matrix, weights: Matrix) -> tuple[csc_array, Matrix]:
         """Return H = Σ w JᵀΩJ and g = Σ w JᵀΩe of the free nodes. H is the graph's Laplacian in 6×6 blocks."""
-        e = self.residuals(T_world_node)
-        J = self.jacobians(T_world_node, e)
-        weighted = weights[:, None, None] * (np.swapaxes(J, 1, 2) @ self.information)
-        block, pull = weighted @ J, (weighted @ e[:, :, None])[..., 0]
-        values = np.stack([block, block, -block, -block])[self._free]
-        size = 6 * (self.nodes - self.fixed)
+        blocks, pull = self.blocks(T_world_node, weights)
         g = np.zeros((self.nodes, 6))
         np.add.at(g, self.b, pull)
         np.add.at(g, self.a, -pull)
-        return coo_array((values, (self._rows, self._columns)), shape=(size, size)).tocsc(), g[self.fixed :].ravel()
+        return self.assembled(blocks), g[self.fixed :].ravel()
+
+    def blocks(self, T_world_node: Matrix, weights: Matrix) -> tuple[Matrix, Matrix]:
+        """Return w JᵀΩJ [E, 6, 6] and w JᵀΩe [E, 6] of every edge."""
+        e = self.residuals(T_world_node)
+        J = self.jacobians(T_world_node, e)
+        weighted = weights[:, None, None] * (np.swapaxes(J, 1, 2) @ self.information)
+        return weighted @ J, (weighted @ e[:, :, None])[..., 0]
+
+    def assembled(self, blocks: Matrix) -> csc_array:
+        """Return H, given the blocks [E, 6, 6] of the edges."""
+        values = np.stack([blocks, blocks, -blocks, -blocks])[self._free]
+        size = 6 * (self.nodes - self.fixed)
+        return coo_array((values, (self._rows, self._columns)), shape=(size, size)).tocsc()
 
 
 def _graduate(
