@@ -205,7 +205,7 @@ def test_the_times_of_a_sensor_are_measured(times_s: tuple[float, float, float],
     found = completed(measured(pairs(times_s, seed=seed)))
     assert found.std_s is not None
     errors_s, std_s = times_of(found) - times_s, np.array(found.std_s)
-    assert np.abs(errors_s).max() < 1e-3 and std_s.max() < 1e-3
+    assert np.abs(errors_s).max() < 1e-3 < std_s.min() and std_s.max() < 2e-3
     assert (np.abs(errors_s) < 3.0 * std_s).all()
 
 
@@ -215,7 +215,7 @@ def test_of_a_sensor_that_reads_at_once_nothing_is_found(seed: int) -> None:
     assert completed(measured(seen)) is UNKNOWN_TIMES
     fit = completed(fitted(seen, THREE))
     assert not fit.sure and fit.std is not None
-    assert (np.abs(fit.values) < 4.0 * fit.std).all() and fit.std.max() < 1e-3
+    assert (np.abs(fit.values) < 4.0 * fit.std).all() and fit.std.max() < 2e-3
 
 
 def test_few_pairs_and_cameras_at_rest_tell_nothing() -> None:

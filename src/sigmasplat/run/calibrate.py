@@ -150,8 +150,9 @@ def _helps(fit: Fit, others: Sequence[Pair]) -> bool:
 
 # ---- the fall-off of light towards the corners ----
 
-SAMPLES, DARK, BRIGHT = 1000, 0.05, 0.95
-"""Points of a pair, about; darker ones are mostly noise, brighter ones may be saturated."""
+SAMPLES, DARK, BRIGHT, GRAY_STEP = 1000, 0.05, 0.95, 1 / 255
+"""Points of a pair, about; darker ones are mostly noise, brighter ones may be saturated; one step of gray is the
+systematic error of the fall-off."""
 SAME = 0.05
 """Two points are the same if their depths differ by less than this share."""
 BLOCKS = 8
@@ -174,7 +175,7 @@ def falloff_of(pairs: Sequence[Pair], values: Matrix) -> tuple[float, float]:
         return float(minimize_scalar(cost, bounds=(-0.5, 0.9), args=(some,), method="bounded").x)
 
     parts = [best([seen[i] for i in part]) for part in np.array_split(np.arange(len(seen)), BLOCKS)]
-    found, std = best(seen), float(np.std(parts, ddof=1)) / BLOCKS**0.5
+    found, std = best(seen), float(np.hypot(np.std(parts, ddof=1) / BLOCKS**0.5, GRAY_STEP))
     return (found if abs(found) > std * t_distribution.ppf((1.0 + LEVEL) / 2.0, BLOCKS - 1) else 0.0), std
 
 
