@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from row_times import color_s, depth_s
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.frame import Frame
@@ -38,7 +39,7 @@ def frame(T_world_camera: Array, readout: Readout | None = None, seed: int | Non
     """Return the image of a camera at a pose [4, 4] that moves meanwhile; seed: of the sensor's noise, None: none."""
     rows = np.arange(CAMERA.height)
     late_s = np.zeros((2, CAMERA.height)) if readout is None else np.stack(
-        [readout.color_s(rows, CAMERA.height), readout.depth_s(rows, CAMERA.height)]
+        [color_s(readout, rows, CAMERA.height), depth_s(readout, rows, CAMERA.height)]
     )  # fmt: skip
     rate = np.zeros(6) if readout is None else readout.rate
     of_color, of_depth = (T_world_camera @ se3.exp_stack(np.outer(times_s, rate)) for times_s in late_s)

@@ -8,6 +8,7 @@ import PIL.Image
 import torch
 from numpy.typing import NDArray
 
+from row_times import color_s, depth_s
 from sigmasplat.data import images, se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.frame import Frame
@@ -207,9 +208,9 @@ def read_before_in_numpy(depth_m: Image, camera: Camera, readout: Readout, of_co
         points = np.stack([x, y, z, np.ones_like(z)], -1).reshape(-1, 4)
         return np.einsum("nij,nj->ni", T[:, :3], points).T.reshape(3, *z.shape)
 
-    z, row, of_row = depth_m.astype(np.float64), own[0], readout.color_s(own[0], height) if of_color else 0.0
+    z, row, of_row = depth_m.astype(np.float64), own[0], color_s(readout, own[0], height) if of_color else 0.0
     for _ in range(2):
-        late_s = readout.depth_s(row, height) - of_row
+        late_s = depth_s(readout, row, height) - of_row
         column, row = seen(np.where(z > 0, z, usual_m), late_s)
         if of_color:
             column, row = column.clip(0, width - 1), row.clip(0, height - 1)
@@ -225,5 +226,5 @@ def read_before_in_numpy(depth_m: Image, camera: Camera, readout: Readout, of_co
         z = np.where(read > 0, moved((column - c.cx) / c.fx * read, (row - c.cy) / c.fy * read, read, -late_s)[2], 0.0)
     at = own[::-1]
     for _ in range(2):
-        at = seen(np.where(z > 0, z, usual_m), readout.color_s(at[1], height))
+        at = seen(np.where(z > 0, z, usual_m), color_s(readout, at[1], height))
     return z.clip(0.0).astype(np.float32), at.astype(np.float32)

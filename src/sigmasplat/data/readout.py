@@ -84,15 +84,6 @@ class Readout:
         t = self.times
         return [*self.rate.tolist(), self.late_s + t.depth_late_s, t.depth_rows_s, t.color_rows_s]
 
-    def depth_s(self, row: Matrix, height: int) -> Matrix:
-        """Return when the depth at some rows of an image was read, s after the middle of its colour."""
-        late_s = self.late_s + self.times.depth_late_s
-        return late_s + self.times.depth_rows_s * ((row + 0.5) / height - 0.5)
-
-    def color_s(self, row: Matrix, height: int) -> Matrix:
-        """Return when the colour at some rows was read, as `depth_s`."""
-        return self.times.color_rows_s * ((row + 0.5) / height - 0.5)
-
 
 AT_ONCE = Readout(np.zeros(6))
 

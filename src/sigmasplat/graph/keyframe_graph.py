@@ -133,10 +133,9 @@ def redundancies(graph: PoseGraph, T: Matrix, weights: Matrix, groups: Iterable[
     """Return how many degrees of freedom the residuals of each group of edges [E] have in a solution: the trace of
     I − J H⁻¹ Jᵀ w Ω over the group."""
     blocks, _ = graph.blocks(T, weights)
-    size = 6 * (graph.nodes - graph.fixed)
-    signs = np.eye(size)
-    if size > PROBES:
-        signs = np.random.default_rng(0).choice([-1.0, 1.0], (size, PROBES)) / np.sqrt(PROBES)
+    signs = np.eye(graph.size)
+    if graph.size > PROBES:
+        signs = np.random.default_rng(0).choice([-1.0, 1.0], (graph.size, PROBES)) / np.sqrt(PROBES)
     solved = factorised(graph.assembled(blocks)).solve(signs)
     return [
         6.0 * float(group.sum()) - float((solved * (graph.assembled(blocks * group[:, None, None]) @ signs)).sum())

@@ -151,11 +151,11 @@ class _Blocks:
 
 
 class PoseGraph:
-    """The edges as arrays, and the position of their blocks in the normal equations. The first `fixed` nodes have no
-    rows."""
+    """The edges as arrays, and the position of their blocks in the normal equations, of `size` rows. The first `fixed`
+    nodes have none."""
 
     def __init__(self, nodes: int, edges: Sequence[RelativePose], fixed: int = 1) -> None:
-        self.nodes, self.fixed = nodes, fixed
+        self.nodes, self.fixed, self.size = nodes, fixed, 6 * (nodes - fixed)
         self.is_large = nodes - fixed > LARGE
         self.solver = Solver(self.is_large)
         self.a = np.array([edge.a for edge in edges], np.intp)
@@ -202,8 +202,7 @@ class PoseGraph:
     def assembled(self, blocks: Matrix) -> csc_array:
         """Return H, given the blocks [E, 6, 6] of the edges."""
         values = np.stack([blocks, blocks, -blocks, -blocks])[self._free]
-        size = 6 * (self.nodes - self.fixed)
-        return coo_array((values, (self._rows, self._columns)), shape=(size, size)).tocsc()
+        return coo_array((values, (self._rows, self._columns)), shape=(self.size, self.size)).tocsc()
 
 
 def _graduate(
@@ -275,7 +274,7 @@ class Sensitivity:
         columns = np.zeros((self.graph.nodes, 6, 6))  # H⁻¹ between every node and this one
         free = node - self.graph.fixed
         if free >= 0:
-            unit = np.zeros((6 * (self.graph.nodes - self.graph.fixed), 6))
+            unit = np.zeros((self.graph.size, 6))
             unit[6 * free : 6 * free + 6] = np.eye(6)
             columns[self.graph.fixed :] = self._solver.solve(unit).reshape(-1, 6, 6)
         return np.asarray(np.swapaxes(columns[self.graph.b] - columns[self.graph.a], 1, 2) @ self._pull)

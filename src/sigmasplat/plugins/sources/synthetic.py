@@ -167,32 +167,23 @@ class SyntheticRoom(Source):
 
     def _exposed(self, i: int, T_world_camera: Matrix) -> tuple[Image, Image]:
         """Return colour and depth of frame i from a pose, before noise."""
-        color_at, depth_at = T_world_camera, T_world_camera
-        if self._rows_s or self._late_s or self._depth_rows_s:
-            color_at = self._poses_of_rows(i, 0.0, self._rows_s)
-            depth_at = self._poses_of_rows(i, self._late_s, self._depth_rows_s)
+        color_at = self._poses_of_rows(i, 0.0, self._rows_s) if self._rows_s else T_world_camera
         color, depth_m = render_scene(self._scene(i), self._true_camera, color_at)
-        if depth_at is not color_at:
-            depth_m = render_scene(self._scene(i), self._true_camera, depth_at)[1]
+        if self._rows_s or self._late_s or self._depth_rows_s:
+            poses = self._poses_of_rows(i, self._late_s, self._depth_rows_s)
+            depth_m = render_scene(self._scene(i), self._true_camera, poses)[1]
         return np.clip(color * np.float32(self.gains[i] * self._shade), 0.0, 1.0), depth_m
 
     def _poses_of_rows(self, i: int, late_s: float, rows_s: float) -> Matrix:
         """Return the poses [H, 4, 4] at which the rows of frame i are read: `late_s` after its time, and one after
-        another in `rows_s`. Between frames the camera changes its velocity smoothly, as a mass does; beyond the
-        path's ends it keeps it."""
+        another in `rows_s`. Between frames, and beyond the path's ends, the camera moves along screws."""
         height, path = self.camera.height, self._T_world_camera
         if len(path) == 1:
             return np.repeat(path, height, 0)
         late = late_s + rows_s * ((np.arange(height) + 0.5) / height - 0.5)
-        when, frames = i + FRAMES_PER_SECOND * late, np.arange(len(path))
-        rates = se3.rates(path, frames, frames, np.ones(len(path), bool))
+        when = i + FRAMES_PER_SECOND * late
         k = np.clip(np.floor(when).astype(int), 0, len(path) - 2)
-        since = (when - k)[:, None]
-        after_k, before_next = (
-            path[at] @ se3.exp_stack((since - at_next) * rates[at]) for at, at_next in ((k, 0.0), (k + 1, 1.0))
-        )
-        share = since[:, 0].clip(0.0, 1.0)
-        return se3.interpolated(after_k, before_next, share**2 * (3.0 - 2.0 * share))
+        return se3.interpolated(path[k], path[k + 1], when - k)
 
 
 class _ViewsAway(Source):
