@@ -224,7 +224,7 @@ def test_poses_that_mapping_moves_are_less_certain() -> None:
     hops = sure.hops
     tracked = hops.T_camera_before
     tracked[1::2] = shift @ tracked[1::2]
-    moved = replace(sure, hops=TrackedHops.joined(tracked, hops.covariance, hops.bias))
+    moved = replace(sure, hops=TrackedHops.joined(tracked, hops.covariance, hops.bias, hops.camera))
     assert moved.between(0, 1)[0, 0] > sure.between(0, 1)[0, 0] + 0.2 * 5e-3**2
 
 

@@ -75,6 +75,25 @@ def test_keyframes_have_moved_as_the_frames_before_and_after_them_say() -> None:
     assert np.abs(found - true)[:, 3:].max() < 0.02 < np.abs(true[:, 3:]).max() / 5
 
 
+def test_a_wrong_scale_of_depth_moves_a_pose_as_its_covariance_says() -> None:
+    """While frames arrive, too: the camera's errors are the same in all hops. Rendered images do not have them."""
+
+    def followed(scale: float, sensor: str) -> Slam:
+        slam = Slam(configured(None, {"input.width": 160, "input.sensor": sensor}).changed(**WITHOUT_MAP))
+        for seen in film(24, (0.0, 0.0, 0.0)):
+            slam.step(replace(seen, depth_m=seen.depth_m * np.float32(scale)))
+        return slam
+
+    stated, wrong, rendered = followed(1.0, "auto"), followed(1.01, "auto"), followed(1.0, "rendered")
+    (T, moved), hops = (slam.atlas.keyframe_poses.last for slam in (stated, wrong)), stated.atlas.hops
+    assert len(T) == len(moved) > 4
+    twist = -sum(se3.adjoint(T[k]) @ hops[k].camera[:, 0] for k in range(1, len(T)))
+    np.testing.assert_allclose((se3.displacement(T[-1]) @ twist)[:3], (moved[-1] - T[-1])[:3, 3], rtol=0.01)
+    off = (wrong.trajectory().T_world_camera - stated.trajectory().T_world_camera)[-1, :3, 3]
+    whole, without = (float(off @ np.linalg.solve(s.covariance()[:3, :3], off)) for s in (stated, rendered))
+    assert 0.3 < whole < 1.1 and without > 4.0
+
+
 def test_once_the_times_are_known_what_was_mapped_before_is_mapped_again() -> None:
     """All keyframes of the submap move and are seeded anew: those mapped as if read at once were off by 19 mm."""
     slam = Slam(configured(None, {"input.width": 160}))

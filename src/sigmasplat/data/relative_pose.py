@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +21,9 @@ class RelativePose:
     """T_a_b [4, 4] of submap or camera b in a, with an error: the true pose is exp(ξ) T_a_b, ξ = (ρ, φ), m and rad.
 
     a, b: numbers of submaps, −1 in a hop. information or covariance [6, 6]: of ξ, the one that was estimated; the other
-    is nan, and so are both for the first keyframe of a submap. bias [6]: standard deviation of the error that is the
-    same in all hops. A loop compares a keyframe of submap a with one of submap b: `keyframes`, counted in their
+    is nan, and so are both for the first keyframe of a submap. bias [6], camera [6, 4]: one standard deviation of the
+    errors that are the same in all hops, of alignment in six directions, and of the stated camera (`calibration_std`).
+    A loop compares a keyframe of submap a with one of submap b: `keyframes`, counted in their
     submaps. drift [6, 6]: the part of its covariance that is the drift from the submaps' first keyframes to these two.
     """
 
@@ -35,13 +36,13 @@ class RelativePose:
     drift: Matrix = field(default_factory=lambda: np.zeros((6, 6)))
     covariance: Matrix = field(default_factory=lambda: np.full((6, 6), np.nan))
     bias: Matrix = field(default_factory=lambda: np.zeros(6))
+    camera: Matrix = field(default_factory=lambda: np.zeros((6, 4)))
 
     @staticmethod
-    def hop(T_camera_before: Matrix, covariance: Matrix | None = None, bias: Matrix | None = None) -> "RelativePose":
-        """Return the motion to a keyframe from the one before; covariance None: it is not known."""
-        known = np.full((6, 6), np.nan) if covariance is None else covariance
-        same = np.zeros(6) if bias is None else bias
-        return RelativePose(-1, -1, T_camera_before, kind="hop", covariance=known, bias=same)
+    def hop(T_camera_before: Matrix, *errors: Matrix) -> "RelativePose":
+        """Return the motion to a keyframe from the one before, with its covariance, bias, and `camera`, if known."""
+        known: dict[str, Any] = dict(zip(("covariance", "bias", "camera"), errors, strict=False))
+        return RelativePose(-1, -1, T_camera_before, kind="hop", **known)
 
     @property
     def loop(self) -> bool:
@@ -69,10 +70,11 @@ class TrackedHops(Records[RelativePose]):
     T_camera_before = Part(np.float64, 4, 4)
     covariance = Part(np.float64, 6, 6)
     bias = Part(np.float64, 6)
+    camera = Part(np.float64, 6, 4)
 
     def append(self, hop: RelativePose) -> None:
         """Append the hop to the next keyframe."""
-        self.add(hop.T_a_b, hop.covariance, hop.bias)
+        self.add(hop.T_a_b, hop.covariance, hop.bias, hop.camera)
 
     def _record(self, i: int) -> RelativePose:
         return RelativePose.hop(*self.values(i))

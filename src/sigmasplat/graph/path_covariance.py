@@ -4,7 +4,8 @@ All errors are small. Three kinds of error move a hop:
 - the error that alignment estimates, and the random part of the disagreement between tracking and mapping, which moves
   keyframes after they were tracked: independent from hop to hop;
 - the mean of this disagreement over all hops: the same in all hops, in the camera's axes;
-- the systematic error of alignment, which its estimate does not contain (`fit.align.BIAS_PX`): the same in all hops.
+- the systematic error of alignment, which its estimate does not contain (`fit.align.BIAS_PX`), and what is wrong with
+  the stated camera (`graph_errors`): the same in all hops.
 The disagreement is measured in the run itself, so no constant describes how well tracking and mapping agree. Once the
 graph of keyframes is solved, the errors of its edges take the place of those of the hops (`graph_errors`).
 
@@ -32,7 +33,7 @@ from sigmasplat.tracking.drift import UNKNOWN, hop_errors
 from sigmasplat.types import Matrix
 
 Numbers = NDArray[np.int64]
-BIAS, MEAN = -2, -1
+BIAS, CAMERA, MEAN = -3, -2, -1
 """Columns of the errors that are the same in all hops."""
 
 
@@ -47,6 +48,7 @@ def recorded(atlas: Atlas, edges: Edges) -> dict[str, Tensor]:
         "hop_T_camera_before": atlas.hops.T_camera_before,
         "hop_covariance": atlas.hops.covariance,
         "hop_bias": atlas.hops.bias,
+        "hop_camera": atlas.hops.camera,
         "edge_submaps": edges.ends,
         "edge_T_a_b": edges.T_a_b,
         "edge_information": edges.information,
@@ -94,7 +96,7 @@ class PathCovariance:
     @staticmethod
     def of(checkpoint: Mapping[str, Tensor]) -> "PathCovariance | None":
         """Read the errors of a path from a checkpoint; None if an older version wrote it."""
-        if "hop_covariance" not in checkpoint:
+        if "hop_camera" not in checkpoint:
             return None
         read = {name: tensor.numpy() for name, tensor in checkpoint.items()}
         edges = zip(
@@ -105,7 +107,7 @@ class PathCovariance:
             read["T_world_submap"], read["submap_component"], read["frame_submap"], read["frame_keyframe"],
             read["T_keyframe_camera"], np.isin(np.arange(len(read["frame_keyframe"])), read["keyframes"]),
             read["keyframe_submap"], read["T_submap_keyframe"],
-            TrackedHops.joined(read["hop_T_camera_before"], read["hop_covariance"], read["hop_bias"]),
+            TrackedHops.joined(*(read[f"hop_{name}"] for name in ("T_camera_before", "covariance", "bias", "camera"))),
             tuple(
                 RelativePose(a, b, T, information, "loop" if loop else "odometry", (in_a, in_b), drift)
                 for (a, b), T, information, loop, (in_a, in_b), drift in edges
@@ -191,12 +193,9 @@ class PathCovariance:
         return between_keyframes(self._row, last)
 
     def _hop_of_frame(self, frame: int) -> Matrix:
-        """Return the covariance [6, 6] of a frame's motion from its keyframe.
-
-        It is that of the hop to the next keyframe, which is tracked against the same image; at the end of a submap,
-        that of the hop before. If the submap has no hop yet, it is that of the newest hop before. Computing it for each
-        frame would double the time of tracking.
-        """
+        """Return the covariance [6, 6] of a frame's motion from its keyframe: that of the hop to the next one, which is
+        tracked against the same image; at the end of a submap that of the hop before, and if it has none, of the newest
+        one before. Computing it for each frame would double the time of tracking."""
         rows, row = self._rows_of_hops(int(self.frame_submap[frame])), int(self._row[frame])
         near = [r for r in (row + 1, row) if rows.start <= r < rows.stop]
         known = (self.hops[r].total_covariance for r in near or range(row, -1, -1))
@@ -212,8 +211,7 @@ class PathCovariance:
 
     @lru_cache(maxsize=8)  # noqa: B019
     def _error_of_submap(self, submap: int) -> Matrix:
-        """Return the error of an anchor as a matrix [6, n, 6]: n is K hops, then all edges, then
-        `_shared`."""
+        """Return the error of an anchor as a matrix [6, n, 6]: n is K hops, then all edges, then `_shared`."""
         count = len(self.keyframe_submap)
         error = np.zeros((6, count + len(self.edges) + len(self._shared), 6))
         submaps, numbers, sensitivity = self._graph(int(self.components[submap]))
@@ -232,7 +230,7 @@ class PathCovariance:
     def _add_hops(self, error: Matrix, A: Matrix, rows: slice) -> None:
         """Add the errors of a chain of hops, transformed by A [6, 6]."""
         error[:, rows] += np.swapaxes(A @ self._independent[rows], 0, 1)
-        for shared, column in zip(self._shared, (BIAS, MEAN), strict=True):
+        for shared, column in zip(self._shared, (BIAS, CAMERA, MEAN), strict=True):
             error[:, column] += A @ shared[rows].sum(0)
 
     def _add_drift(self, error: Matrix, A: Matrix, edge: RelativePose) -> None:
@@ -261,12 +259,12 @@ class PathCovariance:
         return np.asarray(-se3.adjoint(self.T_submap_keyframe) @ roots)
 
     @cached_property
-    def _shared(self) -> tuple[Matrix, Matrix]:
-        """Return the errors that are the same in all hops [K, 6, 6], in the frames of their submaps: of bias, and the
-        mean disagreement."""
+    def _shared(self) -> tuple[Matrix, ...]:
+        """Return the errors that are the same in all hops [K, 6, 6], in the frames of their submaps: of bias, of the
+        camera, and the mean disagreement."""
         A, mean = -se3.adjoint(self.T_submap_keyframe), np.zeros((6, 6))
         mean[:, 0] = self._disagreement[0]
-        return A * self.hops.bias[:, None], A @ mean
+        return A * self.hops.bias[:, None], A @ np.pad(self.hops.camera, ((0, 0), (0, 0), (0, 2))), A @ mean
 
     @cache  # noqa: B019
     def _graph(self, component: int) -> tuple[list[int], list[int], Sensitivity | None]:

@@ -20,13 +20,11 @@ from sigmasplat.errors import SigmaSplatError
 from sigmasplat.types import Matrix
 
 PRUNE_WEIGHT = 0.25
-"""A loop with a lower weight is rejected (VarSplat §6). At μ = 1 the weight is exactly ¼ if r² = c², so this is the χ²
-test."""
+"""A loop with a lower weight is rejected (VarSplat §6): the χ² test, as at μ = 1 the weight is ¼ if r² = c²."""
 GRADUATION = 1.4
 """Factor from one μ to the next (Yang et al. 2020, remark 5)."""
 STEPS_PER_MU = 10
-"""Enough steps to converge. With only two steps, one loop that was wrong by half a turn distorted the first solutions
-so much that thirteen true loops were rejected too (half a metre of drift, 36 submaps)."""
+"""Enough steps to converge: with two, one loop that was wrong by half a turn made thirteen true ones be rejected."""
 LARGE = 100
 """A graph with more free nodes than this is solved iteratively."""
 SETTLED = 1e-10
@@ -274,8 +272,7 @@ class Sensitivity:
         columns = np.zeros((self.graph.nodes, 6, 6))  # H⁻¹ between every node and this one
         free = node - self.graph.fixed
         if free >= 0:
-            unit = np.zeros((self.graph.size, 6))
-            unit[6 * free : 6 * free + 6] = np.eye(6)
+            unit = np.eye(self.graph.size, 6, -6 * free)
             columns[self.graph.fixed :] = self._solver.solve(unit).reshape(-1, 6, 6)
         return np.asarray(np.swapaxes(columns[self.graph.b] - columns[self.graph.a], 1, 2) @ self._pull)
 

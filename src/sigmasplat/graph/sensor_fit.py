@@ -66,12 +66,11 @@ class Pair(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """Values [n] where the pairs agree best, and their standard deviations [n], None if they are neither sure nor
-    refuted; sure: whether it is sure that any is not 0."""
+    """Values [n] where pairs agree best, and their standard deviations, None if they are neither sure nor refuted."""
 
     values: Matrix
     std: Matrix | None = None
-    sure: bool = False
+    sure: bool = False  # that any is not 0
 
 
 def fitted(pairs: Sequence[Pair], parameters: Parameters) -> Task[Fit]:

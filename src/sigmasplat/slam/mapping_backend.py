@@ -18,6 +18,7 @@ from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.target import Keyframe
 from sigmasplat.graph.closer import PendingSearch
 from sigmasplat.graph.confidence import std_of
+from sigmasplat.graph.graph_errors import calibration_std, moved_by_camera
 from sigmasplat.graph.keyframe_graph import WINDOW
 from sigmasplat.mapping.mapper import Mapper
 from sigmasplat.slam.slam_state import SlamState
@@ -165,7 +166,10 @@ class MappingBackend(SlamState):
         T_camera_before = T_camera_submap @ self.atlas.keyframe_poses.last[-1]
         if alignment is None:
             return RelativePose.hop(T_camera_before)
-        return RelativePose.hop(T_camera_before, alignment.covariance, alignment.bias)
+        errors, camera = [alignment.covariance, alignment.bias], calibration_std(self.config.input, self.view.camera)
+        if camera is not None:
+            errors.append(camera * moved_by_camera(T_camera_before, alignment.pair.reference.points))
+        return RelativePose.hop(T_camera_before, *errors)
 
     def add_drift(self, T_submap_camera: Matrix, hop: RelativePose) -> float:
         """Add the hop to a keyframe to the submap's drift; return the standard deviation of its position, metres."""
