@@ -151,7 +151,12 @@ PAGES = {
                 ("Ratios",),
             ),
             Shown(
-                "sensor-times", "A sensor measured without truth, in rooms with random faults.", ("Random rooms",),
+                "sensor-times",
+                "Times of sensors measured without truth, from all pairs and from halves of them.",
+                ("Recordings", "Depth moved in time"),
+            ),
+            Shown(
+                "sensor-rooms", "A sensor measured without truth, in rooms with random faults.", ("Random rooms",),
             ),
             Shown(
                 "relocalisation",
