@@ -232,6 +232,10 @@ def test_an_unknown_hop_is_uncertain_by_a_metre_and_old_checkpoints_have_no_erro
     path = Loopy().covariance(None, hops=False)
     assert path.of_frame(1)[0, 0] > 0.5
     assert PathCovariance.of({"T_world_submap": torch.eye(4)[None]}) is None
+    recent = checkpoint(Loopy().solved({}, None)[0], [])
+    del recent["hop_camera"]  # a version before the camera's errors were kept
+    found = PathCovariance.of(recent)
+    assert found is not None and not found.hops.camera.any() and len(found.hops) == SUBMAPS * (KEYFRAMES + 1)
 
 
 def test_each_component_has_its_own_origin() -> None:

@@ -96,9 +96,10 @@ class PathCovariance:
     @staticmethod
     def of(checkpoint: Mapping[str, Tensor]) -> "PathCovariance | None":
         """Read the errors of a path from a checkpoint; None if an older version wrote it."""
-        if "hop_camera" not in checkpoint:
+        if "hop_covariance" not in checkpoint:
             return None
         read = {name: tensor.numpy() for name, tensor in checkpoint.items()}
+        camera = read.get("hop_camera", np.zeros((len(read["hop_bias"]), 6, 4)))  # a few versions did not have it
         edges = zip(
             read["edge_submaps"].tolist(), read["edge_T_a_b"], read["edge_information"], read["edge_is_loop"],
             read["edge_keyframes"].tolist(), read["edge_drift"], strict=True,
@@ -107,7 +108,7 @@ class PathCovariance:
             read["T_world_submap"], read["submap_component"], read["frame_submap"], read["frame_keyframe"],
             read["T_keyframe_camera"], np.isin(np.arange(len(read["frame_keyframe"])), read["keyframes"]),
             read["keyframe_submap"], read["T_submap_keyframe"],
-            TrackedHops.joined(*(read[f"hop_{name}"] for name in ("T_camera_before", "covariance", "bias", "camera"))),
+            TrackedHops.joined(read["hop_T_camera_before"], read["hop_covariance"], read["hop_bias"], camera),
             tuple(
                 RelativePose(a, b, T, information, "loop" if loop else "odometry", (in_a, in_b), drift)
                 for (a, b), T, information, loop, (in_a, in_b), drift in edges
