@@ -151,9 +151,7 @@ PAGES = {
                 ("Ratios",),
             ),
             Shown(
-                "sensor-times",
-                "Times of sensors measured without truth, from all pairs and from halves of them.",
-                ("Recordings", "Depth moved in time"),
+                "sensor-times", "Stamps of depth were moved, and found again without truth.", ("Depth moved in time",),
             ),
             Shown(
                 "sensor-rooms", "A sensor measured without truth, in rooms with random faults.", ("Random rooms",),

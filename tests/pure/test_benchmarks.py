@@ -428,7 +428,9 @@ def small_config(options: Any, seed: int) -> Config:
 def test_a_followed_pose_has_the_error_of_its_own_motion(monkeypatch: pytest.MonkeyPatch) -> None:
     """Poses that are off by a known twist in the live camera come back as that twist, whatever mapping moves."""
     known, claimed = np.array([1e-3, -2e-3, 3e-3, 1e-3, 2e-3, -1e-3]), np.diag([1e-6] * 6)
-    covering, source = SimpleNamespace(covariance=claimed, bias=np.zeros(6), depth_m=1.0), open_source(ROOM, limit=8)
+    pair = SimpleNamespace(reference=SimpleNamespace(points=np.zeros((0, 3))))
+    covering = SimpleNamespace(covariance=claimed, bias=np.zeros(6), depth_m=1.0, pair=pair)
+    source = open_source(ROOM, limit=8)
     T_world_room = se3.inverse(source.truth().T_world_camera[0])
 
     def off(self: Tracker, field: Any, view: Any, seen_now: Any, R_inertial_camera: Any) -> PoseFit:

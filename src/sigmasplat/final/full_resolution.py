@@ -1,5 +1,4 @@
-"""The last stage of the final map: refine it on images of the camera's own size, after it was refined at working
-size."""
+"""The last stage of the final map, after refinement at working size: refine it on images of the camera's own size."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -33,8 +32,7 @@ WORKING_SHARE = 1 / 3
 
 
 class PhotoReader:
-    """The keyframes of a reader that have photos, with images of the view's camera; a photo is decoded when it is
-    drawn."""
+    """The keyframes of a reader that have photos, with images of the view's camera, which are decoded when drawn."""
 
     def __init__(self, keyframes: KeyframeReader, view: View) -> None:
         self.keyframes, self.camera = keyframes, view.camera

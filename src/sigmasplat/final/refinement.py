@@ -81,8 +81,7 @@ class KeyframeReader:
         return (self[i] for i in range(len(self)))
 
     def __getitem__(self, i: int) -> Keyframe:
-        """Return a keyframe as recorded. Its pose can move, except that of the first keyframe, which fixes the
-        gauge."""
+        """Return a keyframe as recorded. Its pose can move, unless it is the first one, which fixes the gauge."""
         return Keyframe(i, self._target(i), self.poses[i], fixed=i == 0, motion=self.motions[i])
 
     def in_map_exposure(self, i: int) -> Keyframe:

@@ -119,8 +119,7 @@ def followed(field: GaussianField, T_before: Matrix, T_after: Matrix, camera: Ca
 
 
 def nearest_view(points: Matrix, T_world_camera: Matrix, camera: Camera) -> NDArray[np.int64]:
-    """Return for each point [N, 3] the camera [K] that has it in its image and is nearest; the nearest one if none
-    has."""
+    """Return for each point [N, 3] the nearest camera [K] that has it in its image, or the nearest if none has."""
     found, least = np.zeros(len(points), np.int64), np.full(len(points), np.inf)
     for k, T_camera_world in enumerate(se3.inverse(T_world_camera)):
         x, y, z = T_camera_world[:3, :3] @ points.T + T_camera_world[:3, 3:]

@@ -73,8 +73,7 @@ class NetVlad:
         return self._vlad(_vgg(self.weights, image * 255.0 - self.weights.mean[:, None, None])).numpy()
 
     def _vlad(self, features: Tensor) -> Tensor:
-        """Sum residuals to the clusters, features [D, pixels]: V_k = Σ a_k (x − c_k). Normalise per k, then the whole
-        vector."""
+        """Sum residuals to the clusters, features [D, pixels]: V_k = Σ a_k (x − c_k); normalise per k, then all."""
         w = self.weights
         x = F.normalize(features, dim=0)
         a = torch.softmax(w.assign @ x, dim=0)

@@ -111,8 +111,7 @@ def open_source(path: str | Path, settings: InputConfig | None = None, **changes
 
 
 def _whole(path: str | Path, settings: InputConfig) -> Source:
-    """Open a whole sequence: with its own depth; with predicted depth instead; or images without depth, with predicted
-    depth."""
+    """Open a whole sequence: with its own depth, or with predicted depth instead, also where it has none."""
     predicted: Any = None
     if settings.predicted_depth:
         predicted = importlib.import_module("sigmasplat.plugins.predicted_depth.source")

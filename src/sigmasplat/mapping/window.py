@@ -79,8 +79,7 @@ SCORES: dict[str, Callable[[Keyframe, Sequence[Keyframe]], Scores]] = {
 def draw_keyframes(
     keyframes: Sequence[Item], iterations: int, newest_probability: float, random: np.random.Generator
 ) -> Iterator[list[Item]]:
-    """Draw a keyframe for each iteration: the newest with the given probability, else a random older one (VarSplat
-    §2)."""
+    """Draw a keyframe for each iteration: the newest with this probability, else a random older one (VarSplat §2)."""
     *older, newest = keyframes
     for _ in range(iterations):
         yield [newest if not older or random.random() < newest_probability else older[int(random.integers(len(older)))]]

@@ -145,8 +145,7 @@ class RealTime(ArrayInterface):
     # ---- frames ----
 
     def step(self, frame: Frame) -> Step:
-        """Track one frame and hand it to the map. Raises SourceError as `Slam.step`, and what the work on the map has
-        raised."""
+        """Track one frame and hand it to the map. Raises as `Slam.step`, and what the work on the map has raised."""
         timer = StepTimer()
         if self._view is None:
             self._view = self._start(frame)

@@ -56,13 +56,11 @@ class Measured:
 
 def measure_sensor(source: Source, config: Config, progress: Progress = no_progress) -> Measured:
     """Measure the sensor of a recording. Raises SourceError if the recording does not show when it reads."""
-    stated = aligned_pairs(source, config, progress)
-    pairs, camera, fit = stated, KNOWN_NONE, completed(fitted(stated, TIMES))
-    for _ in range(1 + fit.sure):  # times and camera pull at each other
-        camera = camera_errors(stated, times_of(fit) if fit.sure else SensorTimes())
-        if not any(camera.values):
-            break
-        pairs = [_of_true(pair, camera) for pair in stated]
+    pairs = aligned_pairs(source, config, progress)
+    fit = completed(fitted(pairs, TIMES))
+    camera = camera_errors(pairs, _times_beside_camera(pairs, fit))
+    if any(camera.values):
+        pairs = [_of_true(pair, camera) for pair in pairs]
         fit = completed(fitted(pairs, TIMES))
     estimate = times_of(fit)
     if estimate.std_s is None:
@@ -114,6 +112,23 @@ CAMERA = Parameters(np.array([0.01, 0.01, 0.01, 0.005]), _images)
 moves the border of a working image by 1 to 3 pixels."""
 UNCLEAR = (0.01, 0.01, 0.01, 0.003)
 """Standard deviations of errors that the pairs do not show: those of a camera that nobody has checked."""
+
+
+BOTH = Parameters(
+    np.append(TIMES.units, CAMERA.units),
+    lambda pair, v: TIMES.images(_of_true(pair, CameraErrors(*v[3:].tolist())), v[:3]),
+)
+
+
+def _times_beside_camera(pairs: Sequence[Pair], alone: Fit) -> SensorTimes:
+    """Return the times where times and camera together agree best: they pull at each other. Those that were measured
+    alone if both are not clear."""
+    if not alone.sure:
+        return SensorTimes()
+    even = CameraErrors(falloff=falloff_of(pairs, np.zeros(4))[0])
+    some = [_of_true(pair, even) for pair in pairs[:: len(pairs) // CAMERA_PAIRS + 1]]
+    both = completed(fitted(some, BOTH))
+    return SensorTimes(*(both if both.sure else alone).values[:3].tolist(), std_s=(0.0,) * 3)
 
 
 def camera_errors(pairs: Sequence[Pair], times: SensorTimes) -> CameraErrors:

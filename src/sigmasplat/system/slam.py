@@ -59,8 +59,7 @@ class Slam(MainLoop, ArrayInterface):
 
     @property
     def field(self) -> GaussianField:
-        """Return the map in the world, in host memory: the final map after `finish`, before that all submaps side by
-        side."""
+        """Return the map in the world, in host memory: the final map after `finish`, all submaps together before."""
         return super().field if self._final is None else self._final
 
     def components(self) -> list[Component]:

@@ -139,8 +139,7 @@ def landmarks_of(features: Features, depth_m: NDArray[np.float32], depth_camera:
 
 
 def depth_readings(features: Features, depth_m: NDArray[np.float32], depth_camera: Camera) -> Matrix:
-    """Return the depth of each feature [N], metres: the reading of the nearest pixel; 0 = no reading, or a depth
-    step."""
+    """Return the depth of each feature [N], m: the reading of the nearest pixel; 0 = no reading, or a depth step."""
     column, row, inside = nearest_pixels(features, depth_camera)
     padded = np.pad(np.asarray(depth_m, np.float64), 1)
     around = np.stack([padded[row + i, column + k] for i in range(3) for k in range(3)])

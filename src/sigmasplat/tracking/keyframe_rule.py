@@ -14,8 +14,7 @@ from sigmasplat.tracking.recovery import Recovery
 from sigmasplat.tracking.tracker import Tracker
 
 MOVED = 0.125
-"""A view has changed if the image has moved by this share of its width, by rotation and by translation at the mean
-depth."""
+"""A view has changed if rotation, and translation at the mean depth, have moved it by this share of its width."""
 
 
 def is_mappable(fit: PoseFit, tracker: Tracker, recovery: Recovery) -> bool:

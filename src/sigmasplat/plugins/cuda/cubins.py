@@ -1,5 +1,4 @@
-"""Compile the source of the CUDA kernels for a GPU architecture with NVRTC, which needs no driver, and cache the
-result."""
+"""Compile the CUDA kernels for a GPU architecture with NVRTC, which needs no driver, and cache the result."""
 
 import hashlib
 import os

@@ -138,8 +138,7 @@ def _checked(found: tuple[Any, ...], failure: str) -> Any:
 
 
 def missing() -> str | None:
-    """Return one line that says why the CUDA backend cannot run on this machine and how to fix it; None if it can
-    run."""
+    """Return one line that says why the CUDA backend cannot run on this machine and how to fix it; None if it can."""
     if torch.version.cuda is None:
         return f"torch {torch.__version__} is built without CUDA; install a torch with CUDA (https://pytorch.org)"
     if not torch.cuda.is_available():

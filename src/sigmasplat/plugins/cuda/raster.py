@@ -192,8 +192,7 @@ class Raster:
         return self._summed(self._pose_records(planes, on_sums))
 
     def pose_gradients_within(self, planes: Planes, on_sums: Tensor) -> Tensor:
-        """Sum the gradients of colour and depth without allocating more memory; if not all pairs fit, all sums are
-        0."""
+        """Sum the gradients of colour and depth in the memory that there is; if not all pairs fit, all sums are 0."""
         records = self._pose_records(planes, on_sums)
         self.launch_fit("drop_pairs", blocks_for(self.n), self.pairs, self.n, self.counts)
         return self._summed(records)
