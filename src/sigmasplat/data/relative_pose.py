@@ -23,8 +23,8 @@ class RelativePose:
     a, b: numbers of submaps, −1 in a hop. information or covariance [6, 6]: of ξ, the one that was estimated; the other
     is nan, and so are both for the first keyframe of a submap. bias [6], camera [6, 4]: one standard deviation of the
     errors that are the same in all hops, of alignment in six directions, and of the stated camera (`calibration_std`).
-    A loop compares a keyframe of submap a with one of submap b: `keyframes`, counted in their
-    submaps. drift [6, 6]: the part of its covariance that is the drift from the submaps' first keyframes to these two.
+    A loop compares a keyframe of submap a with one of submap b: `keyframes`, counted in their submaps. drift [6, 6]: of
+    its covariance, the drift from the submaps' first keyframes to these two.
     """
 
     a: int

@@ -35,7 +35,7 @@ NEAREST = 3
 """The nearest views are taken whatever their distance in time; one of them is the keyframe before."""
 MEDIAN_CHI2 = float(chdtri(6, 0.5))
 ROUNDS, STEPS, STILL = 10, 5, 0.01
-"""Most rounds of weighting and factors, and steps in each; a round that changes no factor by more is the last one."""
+"""Most rounds of weighting and factors, and steps in each; the last round changes no factor by this share."""
 PROBES = 600
 """Redundancies of larger systems than this are estimated with this many random signs (Hutchinson 1990)."""
 

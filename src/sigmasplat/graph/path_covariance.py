@@ -99,7 +99,7 @@ class PathCovariance:
         if "hop_covariance" not in checkpoint:
             return None
         read = {name: tensor.numpy() for name, tensor in checkpoint.items()}
-        camera = read.get("hop_camera", np.zeros((len(read["hop_bias"]), 6, 4)))  # a few versions did not have it
+        camera = read.get("hop_camera", np.zeros((len(read["hop_bias"]), 6, 4)))  # older checkpoints lack it
         edges = zip(
             read["edge_submaps"].tolist(), read["edge_T_a_b"], read["edge_information"], read["edge_is_loop"],
             read["edge_keyframes"].tolist(), read["edge_drift"], strict=True,
@@ -195,8 +195,8 @@ class PathCovariance:
 
     def _hop_of_frame(self, frame: int) -> Matrix:
         """Return the covariance [6, 6] of a frame's motion from its keyframe: that of the hop to the next one, which is
-        tracked against the same image; at the end of a submap that of the hop before, and if it has none, of the newest
-        one before. Computing it for each frame would double the time of tracking."""
+        tracked against the same image; at the end of a submap, that of the hop before; in a submap without hops, the
+        newest one before it. Computing it for each frame would double the time of tracking."""
         rows, row = self._rows_of_hops(int(self.frame_submap[frame])), int(self._row[frame])
         near = [r for r in (row + 1, row) if rows.start <= r < rows.stop]
         known = (self.hops[r].total_covariance for r in near or range(row, -1, -1))

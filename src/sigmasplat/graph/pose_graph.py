@@ -20,7 +20,7 @@ from sigmasplat.errors import SigmaSplatError
 from sigmasplat.types import Matrix
 
 PRUNE_WEIGHT = 0.25
-"""A loop with a lower weight is rejected (VarSplat §6): the χ² test, as at μ = 1 the weight is ¼ if r² = c²."""
+"""A loop with a lower weight is rejected (VarSplat §6): at μ = 1 this is the χ² test, r² > c²."""
 GRADUATION = 1.4
 """Factor from one μ to the next (Yang et al. 2020, remark 5)."""
 STEPS_PER_MU = 10

@@ -21,13 +21,13 @@ from sigmasplat.types import Matrix, Task
 LONGEST = 3.0
 """The longest Newton step, in units of the parameters."""
 ROUNDS, NO_STEP = 10, 0.01
-"""Most rounds; smaller steps, in units, move no point by a tenth of a millimetre, and no fit is surer."""
+"""Most rounds; smaller steps, in units, move no point by a tenth of a millimetre; also the least spread of a fit."""
 NEIGHBOURS = 3
 """So many keyframes in a row see the same: the errors of their pairs are not independent."""
 BIAS = 0.1
-"""Systematic error of a parameter, in units: differences of costs are taken over a unit, where a cost is not quite a
-parabola. Late depth of synthetic rooms is found 1 to 2 ms too near to 0; differences over less than half a unit remove
-this, and are several times as noisy."""
+"""Systematic error of a parameter, in units. Slopes and bends of costs are differences over a whole unit, where a cost
+is not quite a parabola: late depth is found 1 to 2 ms too near to 0. Differences over less than half a unit are several
+times as noisy."""
 LEAST_PAIRS, LEAST_GROUPS = 10, 5
 LEAST_OVERLAP = 0.25
 LEVEL, HOPELESS = 0.999, 0.9
@@ -70,7 +70,7 @@ class Fit(NamedTuple):
 
     values: Matrix
     std: Matrix | None = None
-    sure: bool = False  # that any is not 0
+    sure: bool = False  # whether any value is surely not 0
 
 
 def fitted(pairs: Sequence[Pair], parameters: Parameters) -> Task[Fit]:

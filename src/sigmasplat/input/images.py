@@ -34,7 +34,7 @@ def read_values(path: Path, data: bytes | None = None) -> NDArray[Any]:
 
 
 def image_size(path: Path, data: bytes | None = None) -> tuple[int, int]:
-    """Return (width, height) in pixels from the header of a file, or of `data`. Raises SourceError if it is none."""
+    """Return (width, height) in pixels in the header of an image file, or of `data`. Raises SourceError for others."""
     if data is None:
         _refuse_missing(path)
         if path.suffix == ".npy":

@@ -140,7 +140,7 @@ class BackEnd:
             state, (T, alignment) = "", self._realigned(each, offer)
             hop = system.hop_to(se3.inverse(T), alignment)
             if system.cuts:
-                system.add_drift(T, hop)
+                system.add_drift(T, alignment)
         may_wait = not first and self._added < MOST_ADDED and not system.submap_ends(number, T)
         if may_wait and self._keyframe_waits():
             system.add_keyframe(seen, number, T, hop)

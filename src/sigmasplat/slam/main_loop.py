@@ -136,8 +136,7 @@ class MainLoop(MappingBackend):
             if estimate.mapped:
                 estimate.alignment = hop_alignment(fit, seen.live, self.tracker)
                 if self.cuts:
-                    hop = self.hop_to(se3.inverse(estimate.T_submap_camera), estimate.alignment)
-                    estimate.drift_m = self.add_drift(estimate.T_submap_camera, hop)
+                    estimate.drift_m = self.add_drift(estimate.T_submap_camera, estimate.alignment)
         elif held_back:
             return estimate  # a search for the camera could make a keyframe of this frame
         elif (place := self.relocalise(seen)) is not None:

@@ -171,9 +171,11 @@ class MappingBackend(SlamState):
             errors.append(camera * moved_by_camera(T_camera_before, alignment.pair.reference.points))
         return RelativePose.hop(T_camera_before, *errors)
 
-    def add_drift(self, T_submap_camera: Matrix, hop: RelativePose) -> float:
-        """Add the hop to a keyframe to the submap's drift; return the standard deviation of its position, metres."""
-        self.drift.hop(T_submap_camera, None if np.isnan(hop.covariance).any() else hop.covariance)
+    def add_drift(self, T_submap_camera: Matrix, alignment: Alignment | None) -> float:
+        """Add the hop to a keyframe to the submap's drift; return the standard deviation of its position, metres.
+        alignment: as of `hop_to`."""
+        covariance = UNKNOWN_HOP.covariance if alignment is None else alignment.covariance
+        self.drift.hop(T_submap_camera, None if np.isnan(covariance).any() else covariance)
         return self.drift.position_m(T_submap_camera)
 
     # ---- submaps ----

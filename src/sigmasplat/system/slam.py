@@ -59,7 +59,7 @@ class Slam(MainLoop, ArrayInterface):
 
     @property
     def field(self) -> GaussianField:
-        """Return the map in the world, in host memory: the final map after `finish`, all submaps together before."""
+        """Return the map in the world, in host memory: all submaps side by side, after `finish` the final map."""
         return super().field if self._final is None else self._final
 
     def components(self) -> list[Component]:

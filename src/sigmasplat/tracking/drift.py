@@ -1,4 +1,4 @@
-"""Accumulate the covariance of tracking within a submap. It can cut the submap, and weights odometry edges."""
+"""Accumulate the covariance of tracking within a submap. It ends submaps, and weights odometry edges."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field

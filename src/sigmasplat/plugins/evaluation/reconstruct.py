@@ -112,7 +112,7 @@ def with_std(mesh: Mesh, field: GaussianField, std: SplatStd) -> Mesh:
 
 
 def nearest_opaque(field: GaussianField, points: Matrix) -> NDArray[np.intp] | None:
-    """Return the nearest splat [V] to each point [V, 3], m, of those with an opacity of at least ½; None: none has."""
+    """Return the nearest splat [V] to each point [V, 3], m, whose opacity is at least ½; None if there is none."""
     opaque = np.flatnonzero((field.opacities >= OPAQUE).cpu().numpy())
     if not len(opaque):
         return None
