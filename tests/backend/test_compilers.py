@@ -74,6 +74,15 @@ def test_a_broken_lane_operation_is_found(operation: str, written: str, broken: 
     assert answer.returncode == 1 and f"differs: {operation}\n" in answer.stdout
 
 
+@needs_compiler
+def test_the_program_that_compares_kernels_calls_them_as_they_are() -> None:
+    """Where compilers are missing, nothing else compiles it."""
+    sizes = [f"-DSIGMASPLAT_TILE_{side}=16" for side in ("WIDTH", "HEIGHT")]
+    command = [COMPILER, "-std=gnu++20", "-fsyntax-only", *sizes, f"-I{NATIVE}", str(CHECKS / "kernels.cpp")]
+    answer = subprocess.run(command, capture_output=True, text=True)
+    assert answer.returncode == 0, answer.stderr
+
+
 @pytest.mark.slow
 def test_all_compilers_and_processors_agree() -> None:
     """Takes minutes where every program is installed; elsewhere the script says which one is missing."""

@@ -264,16 +264,16 @@ static void run_alignment(const Kernels& k, Results& out) {
     const Numbers weight = draw.many(WIDTH * HEIGHT, 0.5f, 2.f);
     const AlignLevel level{{gray[0].data(), depth[0].data(), weight.data(), weight.data(), gray[1].data(), depth[1].data()},
                            {WIDTH, HEIGHT, 60.f, 60.f, 34.5f, 24.5f}};
-    const AlignOptions options{1.f, 0.5f, 0.05f, 0.02f, 0.3f};
+    const AlignOptions options{1.f, 0.5f, 0.05f, 0.02f, 0.3f, 1.f};
     // Not the identity, which puts pixels on pixels: there rounding decides about the derivative.
-    double T[12] = {1, 0, 0, 0.013, 0, 1, 0, -0.007, 0, 0, 1, 0.004}, H[21], b[6], S[21], sums[5];
-    k.align_step(&level, &options, T, H, b, S, sums);
-    out["align H"] = floats_of(H, 21);
-    out["align b"] = floats_of(b, 6);
-    out["align S"] = floats_of(S, 21);
-    out["align sums"] = floats_of(sums, 5);
+    double T[12] = {1, 0, 0, 0.013, 0, 1, 0, -0.007, 0, 0, 1, 0.004}, normal[55], found[6];
+    const AlignReadouts late{{{0.1f, -0.2f, 0.05f, 0.3f, 0.1f, -0.2f}, 0.02f, 0.03f, 0.03f}, {{-0.1f, 0.1f, 0.1f, 0.2f, 0.2f, 0.1f}, 0.02f, 0.03f, 0.03f}};
+    for (const AlignReadouts* times : {static_cast<const AlignReadouts*>(nullptr), &late}) {
+        k.align_step(&level, &options, times, T, normal);
+        out[times ? "align, late rows" : "align"] = floats_of(normal, 55);
+    }
     int degenerate;
-    const int steps = k.align_images(&level, &options, 1, {12, 1e-9, 1e-9, 2.0, 1e-6, 50.0}, T, sums, &degenerate);
+    const int steps = k.align_images(&level, &options, nullptr, 1, {60, 1e-7, 0.0, 2.0, 1e-6, 50.0}, T, found, &degenerate);
     out["align T"] = floats_of(T, 12);
     if (steps < 1 || T[3] == 0.013 || degenerate) out["align T"][0] = NAN;      // nothing was aligned
 }
