@@ -56,10 +56,9 @@ class KeyframeSolution:
 def edge_between(a: int, b: int, reference: Pyramid, live: Pyramid, T_b_a: Matrix) -> RelativePose | None:
     """Align keyframe b to keyframe a from a guess T_b_a [4, 4]; None if the images do not confirm the result."""
     motion, seen = best_alignment(reference, live, T_b_a)
-    covariance = motion.covariance + np.diag(motion.bias**2)
-    if motion.degenerate or not confirmed(seen) or not np.isfinite(covariance).all():
+    if motion.degenerate or not confirmed(seen) or not np.isfinite(motion.covariance).all():
         return None
-    information = np.asarray(np.linalg.inv(covariance))
+    information = np.asarray(np.linalg.inv(motion.covariance + np.diag(motion.bias**2)))
     return RelativePose(b, a, motion.T_live_reference, information, "alignment", bias=motion.bias)
 
 

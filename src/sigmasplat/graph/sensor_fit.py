@@ -59,7 +59,7 @@ class Pair(NamedTuple):
     def at(self, values: Matrix, parameters: Parameters) -> "Pair | None":
         """Return the pair with its motion at some values [n], and the cost per pixel there; None if its images overlap
         too little."""
-        found = align(*parameters.images(self, values), self.T_live_reference, 12, update_stop=5e-5)
+        found = align(*parameters.images(self, values), self.T_live_reference)
         if found.degenerate or found.overlap < LEAST_OVERLAP or not found.cost > 0.0:
             return None
         return self._replace(T_live_reference=found.T_live_reference, cost=found.cost)
