@@ -55,6 +55,7 @@ PAGES = {
                 "board", "What changes since an earlier commit have done: one seed, no final map.",
                 without=("frames", "hops, mm", "lost", "silent", "CPU, ms a frame"),
             ),
+            Shown("variants", "Parts of recordings that a seed drew, beside the plain system."),
             Shown("loops", "Depth that drifts bends the path: what closing loops gains.", ("Goals",)),
         ),
     ),
