@@ -9,7 +9,7 @@ from sigmasplat.commands import options
 from sigmasplat.commands.input_options import DEFAULT_INPUT_OPTIONS, InputOptionsFlat, arg
 from sigmasplat.commands.options import configured, prepare_torch
 from sigmasplat.config.find_preset import default_preset
-from sigmasplat.config.input import sensor_times
+from sigmasplat.config.input import sensor_numbers
 from sigmasplat.config.text import split_settings
 from sigmasplat.errors import ConfigError, RunError
 
@@ -105,6 +105,6 @@ def _refuse_others(out: Path, picture: Path) -> None:
     kept = next((file for file in (out, picture) if file.exists()), None)
     try:
         if kept:
-            sensor_times(str(out))
+            sensor_numbers(str(out))
     except ConfigError as problem:
         raise RunError(f"{kept} exists and was not written by this command; give another --out") from problem

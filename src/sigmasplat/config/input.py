@@ -61,7 +61,7 @@ CAMERA = ("focal", "center_x", "center_y", "inverse_depth", "falloff", *["std"] 
 TIMES_NEEDED = "input.calibrate needs auto, off, or a file that `sigmasplat calibrate PATH` has written"
 
 
-def sensor_times(given: str) -> str:
+def sensor_numbers(given: str) -> str:
     """Return `TIMES` and `CAMERA` as numbers with commas, from such text, a file, or the run.json of a run. Raises
     ConfigError."""
     values: Any = given.split(",")
@@ -177,7 +177,7 @@ class InputConfig(Section, name="input"):
 
     def __post_init__(self) -> None:
         if isinstance(self.calibrate, str) and self.calibrate not in ("auto", "off"):
-            object.__setattr__(self, "calibrate", sensor_times(self.calibrate))
+            object.__setattr__(self, "calibrate", sensor_numbers(self.calibrate))
         super().__post_init__()
 
     @property

@@ -14,6 +14,7 @@ from sigmasplat.data.camera_errors import KNOWN_NONE, CameraErrors, corner_share
 from sigmasplat.data.readout import SensorTimes
 from sigmasplat.errors import SourceError
 from sigmasplat.fit.pyramid import Pyramid
+from sigmasplat.graph.graph_errors import CALIBRATION
 from sigmasplat.graph.sensor_fit import LEVEL, NEIGHBOURS, Fit, Pair, Parameters, fitted
 from sigmasplat.graph.sensor_times import TIMES, read, times_of
 from sigmasplat.input.source import Source
@@ -110,14 +111,13 @@ def _images(pair: Pair, values: Matrix) -> tuple[Pyramid, Pyramid]:
 CAMERA = Parameters(np.array([0.01, 0.01, 0.01, 0.005]), _images)
 """Focal length and image centre as shares, and inverse depth, per metre: the first four of `CameraErrors`. One per cent
 moves the border of a working image by 1 to 3 pixels."""
-UNCLEAR = (0.01, 0.01, 0.01, 0.003)
+UNCLEAR = (CALIBRATION, CALIBRATION, CALIBRATION, 0.003)
 """Standard deviations of errors that the pairs do not show: those of a camera that nobody has checked."""
-
-
 BOTH = Parameters(
     np.append(TIMES.units, CAMERA.units),
     lambda pair, v: TIMES.images(_of_true(pair, CameraErrors(*v[3:].tolist())), v[:3]),
 )
+"""Times and camera together."""
 
 
 def _times_beside_camera(pairs: Sequence[Pair], alone: Fit) -> SensorTimes:
