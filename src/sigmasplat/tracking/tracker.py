@@ -132,15 +132,15 @@ class Tracker:
             slow is None and not self.detector.suspects(fit.comparison, known, given.should_stop)
         ):
             return None
-        keyframe, predicted = self.keyframe, given.prediction.predicted
-        front = together(
-            self.detector.in_front(keyframe, self.keyframe_front, before, self.previous, seen, predicted), slow
-        )
-        self.keyframe = self.detector.without_gone(keyframe, seen, predicted)
+        keyframe, pose = self.keyframe, se3.inverse(fit.T_camera_world)
+        if self._contradicted(fit):  # something may have pulled it; otherwise a fast camera is not where it is expected
+            pose = given.prediction.predicted
+        front = together(self.detector.in_front(keyframe, self.keyframe_front, before, self.previous, seen, pose), slow)
+        self.keyframe = self.detector.without_gone(keyframe, seen, pose)
         if front is None and self.keyframe is keyframe:
             return None
         shown = first if front is None else seen.aside(front)
-        found = self._fit(given, shown, predicted)
+        found = self._fit(given, shown, given.prediction.predicted)
         # a still thing can seem to be in free space where poses or depth are wrong
         still = front is not None and self.detector.config.find and is_still(front, self.keyframe, seen.live, found)
         if not still and self._stands(found, fit.comparison):
