@@ -19,7 +19,7 @@ from sigmasplat.tracking.feature_image import FeatureImage, pose_by_features
 from sigmasplat.tracking.features import Extractor
 from sigmasplat.tracking.moving.dynamic_detector import DynamicDetector, together
 from sigmasplat.tracking.moving.dynamic_mask import DynamicMask
-from sigmasplat.tracking.moving.pose_pullers import has_drawn, is_still
+from sigmasplat.tracking.moving.pose_pullers import has_drawn, is_scene, is_still
 from sigmasplat.tracking.pose_prediction import CameraMotion, Given, PosePrediction, odometry, predict
 from sigmasplat.tracking.pose_validation import TrackingStatistics
 from sigmasplat.tracking.predicted_depth_fit import NOTHING_FITTED, DepthFit
@@ -136,6 +136,8 @@ class Tracker:
         if self._contradicted(fit):  # something may have pulled it; otherwise a fast camera is not where it is expected
             pose = given.prediction.predicted
         front = together(self.detector.in_front(keyframe, self.keyframe_front, before, self.previous, seen, pose), slow)
+        if front is not None and known is None and is_scene(front, seen.target.depth_image.numpy()):
+            front = None  # a thing comes into view by and by
         self.keyframe = self.detector.without_gone(keyframe, seen, pose)
         if front is None and self.keyframe is keyframe:
             return None
