@@ -147,13 +147,23 @@ def is_worse(row: dict[str, Any]) -> bool:
     return plain_m is not None and (row["ate_m"] or math.inf) > max(factor * plain_m, plain_m + least_m)
 
 
+def compared(rows: list[dict[str, Any]]) -> list[str]:
+    """Return how many variants there are, on how many the plain system is better, the geometric mean of the ratio of
+    both ATE where both have one, and the numbers of lost and of silent frames."""
+    both = [row for row in rows if row["plain_ate_m"] and row["ate_m"]]
+    ratio = math.exp(np.mean([math.log(row["ate_m"] / row["plain_ate_m"]) for row in both])) if both else math.nan
+    frames = [str(sum(row[name] for row in rows)) for name in ("lost", "silent")]
+    return [str(len(rows)), str(sum(map(is_worse, rows))), tables.significant(ratio), *frames]
+
+
 def sections(measured: dict[str, Any]) -> list[tables.Section]:
     """Return the table of results written by this benchmark."""
     scored = [row for row in measured["figures"]["rows"] if not row["problem"]]
-    both = [row for row in scored if row["plain_ate_m"] and row["ate_m"]]
-    worse = sum(is_worse(row) for row in scored)
-    ratio = float(np.exp(np.mean([math.log(row["ate_m"] / row["plain_ate_m"]) for row in both]))) if both else math.nan
-    head = ["recording", "frames", "image", "disturbed", "ATE, cm", "plain system", "lost", "silent"]
+    of: dict[str, list[dict[str, Any]]] = {}
+    for row in scored:
+        of.setdefault(row["variant"][0], []).append(row)
+    head = ["recording", "variants", "worse", "ATE / plain", "lost", "silent"]
+    summary = [[name, *compared(rows)] for name, rows in (of | {"all": scored}).items()]
     rows = [
         [
             *row["variant"],
@@ -163,8 +173,8 @@ def sections(measured: dict[str, Any]) -> list[tables.Section]:
         ]
         for row in scored
     ]  # fmt: skip
-    note = f"Worse than the plain system: {worse} of {len(scored)}. Mean ratio of ATE (geometric): {ratio:.2f}."
-    return [tables.Section("Variants", head, rows, note)]
+    columns = ["recording", "frames", "image", "disturbed", "ATE, cm", "plain system", "lost", "silent"]
+    return [tables.Section("By recording", head, summary), tables.Section("Variants", columns, rows)]
 
 
 def main(options: Options) -> int:

@@ -52,8 +52,10 @@ def test_rows_that_are_worse_than_the_plain_system_are_marked() -> None:
     row = {"variant": variant, "problem": None, "frames": 3, "lost": 0, "silent": 0}
     figures = [(0.02, 0.01), (0.02, 0.0199), (0.001, 0.0007), (0.02, None), (None, 0.01)]
     rows = [row | {"ate_m": ate_m, "plain_ate_m": plain_m} for ate_m, plain_m in figures]
-    made = laid_out("variants", {"rows": [*rows, row | {"problem": "gone"}]})["Variants"]
+    measured = {"rows": [*rows, row | {"problem": "gone"}]}
+    both = laid_out("variants", measured)
+    made = both["Variants"]
     assert made.rows[0][:4] == ["desk", "8 … 4 by 2", "middle", "motion blur 15 px"]
     assert [cells[4] for cells in made.rows] == ["2.00 (worse)", "2.00", "0.100", "2.00", "– (worse)"]
     assert [cells[5] for cells in made.rows] == ["1.00", "1.99", "0.0700", "diverged", "1.00"]
-    assert made.note.startswith("Worse than the plain system: 2 of 5.")
+    assert both["By recording"].rows == [[name, "5", "2", "1.42", "0", "0"] for name in ("desk", "all")]
