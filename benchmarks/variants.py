@@ -24,6 +24,7 @@ import record
 import robustness_scores
 import tables
 import tyro
+from board_tables import QUANTITIES, verdict_of
 from disturbances import DISTURBANCES, Plan
 from disturbed_recordings import FRAMES_PER_SECOND, Original, original, write
 from tqdm import tqdm
@@ -38,8 +39,6 @@ FEWEST, MOST = 40, 150
 STEPS, SIZES = (1, 1, 2, 3), ("whole", "whole", "middle", "quarter")
 DISTURBED = ("clean", "clean", "depth-noise", "edge-erosion", "missing", "range-clip", "blur", "color-noise")
 SEVEREST, PROCESSES = 2, 2
-WORSE = 1.05, 0.0005
-"""The board's noise of ATE: beyond this factor and this many metres a path is worse."""
 FAILURES = (SigmaSplatError, ValueError, RuntimeError, OSError)
 """The plain system may diverge: its poses are not finite, or its graph is singular."""
 
@@ -141,10 +140,9 @@ def measure(options: Options) -> dict[str, Any]:
 
 
 def is_worse(row: dict[str, Any]) -> bool:
-    """Return whether the plain system's path is better beyond the noise."""
-    factor, least_m = WORSE
-    plain_m = row["plain_ate_m"]
-    return plain_m is not None and (row["ate_m"] or math.inf) > max(factor * plain_m, plain_m + least_m)
+    """Return whether the plain system's path is better beyond the board's noise, or the only one."""
+    ours, theirs = row["ate_m"], row["plain_ate_m"]
+    return theirs is not None and (ours is None or verdict_of(QUANTITIES["ate_m"], ours, theirs, None) == "worse")
 
 
 def compared(rows: list[dict[str, Any]]) -> list[str]:
@@ -157,7 +155,7 @@ def compared(rows: list[dict[str, Any]]) -> list[str]:
 
 
 def sections(measured: dict[str, Any]) -> list[tables.Section]:
-    """Return the table of results written by this benchmark."""
+    """Return the tables of results written by this benchmark."""
     scored = [row for row in measured["figures"]["rows"] if not row["problem"]]
     of: dict[str, list[dict[str, Any]]] = {}
     for row in scored:

@@ -50,12 +50,12 @@ def test_a_point_stays_where_it_is_in_the_world(size: str, shape: tuple[int, int
 def test_rows_that_are_worse_than_the_plain_system_are_marked() -> None:
     variant = variants.Variant("desk", (8, 6, 4), "middle", "blur", 2).words
     row = {"variant": variant, "problem": None, "frames": 3, "lost": 0, "silent": 0}
-    figures = [(0.02, 0.01), (0.02, 0.0199), (0.001, 0.0007), (0.02, None), (None, 0.01)]
+    figures = [(0.02, 0.01), (0.02, 0.0199), (0.001, 0.0007), (0.00085, 0.0007), (0.02, None), (None, 0.01)]
     rows = [row | {"ate_m": ate_m, "plain_ate_m": plain_m} for ate_m, plain_m in figures]
     measured = {"rows": [*rows, row | {"problem": "gone"}]}
     both = laid_out("variants", measured)
     made = both["Variants"]
     assert made.rows[0][:4] == ["desk", "8 … 4 by 2", "middle", "motion blur 15 px"]
-    assert [cells[4] for cells in made.rows] == ["2.00 (worse)", "2.00", "0.100", "2.00", "– (worse)"]
-    assert [cells[5] for cells in made.rows] == ["1.00", "1.99", "0.0700", "diverged", "1.00"]
-    assert both["By recording"].rows == [[name, "5", "2", "1.42", "0", "0"] for name in ("desk", "all")]
+    assert [cells[4] for cells in made.rows] == ["2.00 (worse)", "2.00", "0.100 (worse)", "0.0850", "2.00", "– (worse)"]
+    assert [cells[5] for cells in made.rows] == ["1.00", "1.99", "0.0700", "0.0700", "diverged", "1.00"]
+    assert both["By recording"].rows == [[name, "6", "3", "1.37", "0", "0"] for name in ("desk", "all")]

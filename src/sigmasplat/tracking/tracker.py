@@ -132,17 +132,17 @@ class Tracker:
             slow is None and not self.detector.suspects(fit.comparison, known, given.should_stop)
         ):
             return None
-        keyframe, pose = self.keyframe, se3.inverse(fit.T_camera_world)
-        if self._contradicted(fit):  # something may have pulled it; otherwise a fast camera is not where it is expected
-            pose = given.prediction.predicted
+        # the expected pose of a fast camera is centimetres off: it is used only if something may have pulled the fit
+        keyframe, predicted = self.keyframe, given.prediction.predicted
+        pose = predicted if self._contradicted(fit) else se3.inverse(fit.T_camera_world)
         front = together(self.detector.in_front(keyframe, self.keyframe_front, before, self.previous, seen, pose), slow)
         if front is not None and known is None and is_scene(front, seen.target.depth_image.numpy()):
-            front = None  # a thing comes into view by and by
+            front = None  # a thing comes into view gradually
         self.keyframe = self.detector.without_gone(keyframe, seen, pose)
         if front is None and self.keyframe is keyframe:
             return None
         shown = first if front is None else seen.aside(front)
-        found = self._fit(given, shown, given.prediction.predicted)
+        found = self._fit(given, shown, predicted)
         # a still thing can seem to be in free space where poses or depth are wrong
         still = front is not None and self.detector.config.find and is_still(front, self.keyframe, seen.live, found)
         if not still and self._stands(found, fit.comparison):
