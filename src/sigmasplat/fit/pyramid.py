@@ -90,6 +90,10 @@ class Pyramid:
         """Return the same images, with when their rows were read."""
         return self if readout is self.readout else replace(self, readout=readout, color_depths={})
 
+    def noisier(self, factor: float) -> "Pyramid":
+        """Return the same images, with this many times as much noise of depth."""
+        return self if factor == 1.0 else replace(self, noise_per_m=factor * self.noise_per_m)
+
     def color_depth(self, k: int) -> Plane | None:
         """Return the depth [H, W] of what the pixels of a level show in colour; None: colour and depth were read at the
         same time."""

@@ -57,7 +57,7 @@ class MappingBackend(SlamState):
         keyframe = self._keyframe(seen, index, T_submap_camera)
         if self.follows and self.mapper.keyframes:
             with self._timer.stage("graph"):
-                yield from self._align(keyframe, seen.reading, hop, should_stop)
+                yield from self._align(keyframe, seen, hop, should_stop)
         with self._timer.stage("map"):
             fit = yield from self.mapper.mapping(self.view, keyframe, should_stop)
         self._timer.add(fit.seconds, prefix="map_")
@@ -71,7 +71,7 @@ class MappingBackend(SlamState):
         image = self.images.of(row, self.view, lambda: self.store.picture(submap, k))
         return image.read(self.graph.times.read(self.atlas.readings[row]))
 
-    def _align(self, keyframe: Keyframe, reading: Readout, hop: RelativePose, should_stop: ShouldStop) -> Task[None]:
+    def _align(self, keyframe: Keyframe, seen: PreparedFrame, hop: RelativePose, should_stop: ShouldStop) -> Task[None]:
         """Align a keyframe to earlier ones that see the same, in slices, and move the newest keyframes of the active
         submap to where all agree best. Once the times of the sensor are known, move all of them, and seed again."""
         atlas, anchor, active = self.atlas, self.atlas.anchors[-1], [*self.mapper.keyframes, keyframe]
@@ -81,16 +81,18 @@ class MappingBackend(SlamState):
         usable &= (np.abs(T_world_keyframe[1:] - T_world_keyframe[:-1]) > SAME).any((1, 2))  # of two copies the second
         rows = np.append(np.flatnonzero(usable), newest)
 
+        noise = seen.live.noise_per_m / self.config.render.depth_noise_per_m
+
         def reading_of(row: int) -> Readout:
-            return reading if row == newest else atlas.readings[row]
+            return seen.reading if row == newest else atlas.readings[row]
 
         def image(row: int) -> Pyramid:
             k = row - newest - 1
             if -k > len(active):
-                return self.keyframe_image(row)
+                return self.keyframe_image(row).noisier(noise)
             target = active[k].target
             image = self.images.of(row, self.view, target.picture, target.valid_pixels)
-            return image.read(self.graph.times.read(reading_of(row)))
+            return image.read(self.graph.times.read(reading_of(row))).noisier(noise)
 
         yield from self.graph.aligning(T_world_keyframe, rows, image, should_stop)
         times = self.graph.times

@@ -9,6 +9,8 @@ import numpy as np
 from sigmasplat.fit.compare import Comparison
 from sigmasplat.fit.pose import PoseFit
 
+MEDIAN_NORMAL = 0.6745
+"""The median of |x| if x is a standard normal number."""
 RECENT = 50
 """What is usual is the median over this many recent frames that were not lost."""
 FEW = 5
@@ -146,7 +148,8 @@ def jumped(value: float, history: Sequence[float], factor: float) -> bool:
 
 @dataclass(eq=False)
 class TrackingStatistics:
-    """Values of recent frames that were not lost; their medians are what is usual."""
+    """Values of recent frames that were not lost; their medians are what is usual. residuals: in standard deviations of
+    the law of the sensor, however noisy depth is."""
 
     scores: list[float] = field(default_factory=list)
     closes: list[float] = field(default_factory=list)
@@ -156,7 +159,7 @@ class TrackingStatistics:
     def add(self, c: Comparison) -> None:
         """Add the values of a frame that is not lost."""
         for values, value in (
-            (self.scores, score(c)), (self.closes, c.close), (self.residuals, c.residual),
+            (self.scores, score(c)), (self.closes, c.close), (self.residuals, c.residual * self.noise),
             (self.correlations, c.correlation),
         ):  # fmt: skip
             if np.isfinite(value):
@@ -168,15 +171,30 @@ class TrackingStatistics:
         return (
             c.close < LOST_CLOSE
             or explained(c) < LOST_EXPLAINED
-            or c.residual > LOST_RESIDUAL * max(1.0, _median(self.residuals, 0.0))
+            or c.residual > LOST_RESIDUAL * max(1.0, _median(self.residuals, 0.0) / self.noise)
             or c.correlation < LOST_CORRELATION * _median(self.correlations, 0.8)
             or c.common < least_share
         )
 
     @property
+    def noise(self) -> float:
+        """Return how many times as noisy as its law depth is, at least 1. Noise that neighbouring pixels share does not
+        show in one image, only between two: half of the differences are then below 0.67 standard deviations."""
+        return max(1.0, median(self.residuals or [0.0]) / MEDIAN_NORMAL)
+
+    def learns_noise(self, c: Comparison | None) -> bool:
+        """Return whether depth is noisier than thought, and learn it, from one of the first frames: gray values confirm
+        its pose."""
+        sure = c is not None and len(self.residuals) < FEW and c.correlation > SURE_CORRELATION
+        if c is None or not sure or c.residual <= MEDIAN_NORMAL:
+            return False
+        self.residuals.append(c.residual * self.noise)
+        return True
+
+    @property
     def residual(self) -> float:
         """Return the usual median depth difference, in standard deviations of a reading; NaN if it is not known."""
-        return _median(self.residuals, float("nan"))
+        return _median(self.residuals, float("nan")) / self.noise
 
     def doubts(self, c: Comparison) -> bool:
         """Return whether a pose is clearly worse than usual."""
@@ -193,7 +211,7 @@ class TrackingStatistics:
         return (
             c.close < COVERED_CLOSE * _median(self.closes, 1.0)
             or explained(c) < DOUBT_EXPLAINED
-            or c.residual > DOUBT_RESIDUAL * max(0.2, _median(self.residuals, 1.0))
+            or c.residual > DOUBT_RESIDUAL * max(0.2, _median(self.residuals, 1.0) / self.noise)
             or c.correlation < DOUBT_CORRELATION * _median(self.correlations, 0.9)
         )
 

@@ -65,7 +65,8 @@ class PreparedFrame:
             return self
         whole = read_at_once(self.whole, readout) if photo else self.whole
         frame = self.frame.with_depth(self.target.depth_image.numpy())  # predicted depth is fitted in the target alone
-        return replace(observe(whole, read_at_once(frame, readout), view, config, None), image=self.image)
+        found = observe(whole, read_at_once(frame, readout), view, config, None)
+        return replace(found, image=self.image, live=found.live.noisier(self.live.noise_per_m / found.live.noise_per_m))
 
     @property
     def shown(self) -> "PreparedFrame":

@@ -80,6 +80,7 @@ class Tracker:
         returns True, that guess and the later ones are left out. A lost frame gets the best available guess (odometry,
         else the last pose), and the motion is reset.
         """
+        seen.live = seen.live.noisier(self.statistics.noise)
         seen.move(self.motion.rate(), self.times)
         given, shown = Given(field, view, self.prediction(prior), should_stop), seen.shown
         predicted = given.prediction.predicted
@@ -102,7 +103,11 @@ class Tracker:
 
     def _estimated(self, given: Given, seen: PreparedFrame, shown: PreparedFrame) -> PoseFit:
         """Return the best of the fits from all guesses; shown: the frame as it is fitted first."""
-        best = self._fit(given, shown, given.prediction.predicted)
+        best, before = self._fit(given, shown, given.prediction.predicted), self.statistics.noise
+        if self.statistics.learns_noise(best.comparison):
+            seen.live = seen.live.noisier(self.statistics.noise / before)
+            shown = seen.shown
+            best = self._fit(given, shown, given.prediction.predicted)
         best, shown = self._uncovered(given, seen, shown, best)
         if self._doubts(best):
             guesses = unless(given.should_stop, self._other_guesses(shown, given.prediction))

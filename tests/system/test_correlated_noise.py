@@ -1,0 +1,53 @@
+"""Depth whose noise neighbouring pixels share, as that of stereo cameras: no single image shows it."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from sigmasplat.config.find_preset import preset
+from sigmasplat.config.text import override
+from sigmasplat.data.frame import Frame
+from sigmasplat.plugins.evaluation.metrics.trajectory import ate
+from sigmasplat.plugins.sources import open_source
+from sigmasplat.system.slam import Slam
+
+pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
+
+LITTLE = {"mapping.first_iterations": "20", "mapping.iterations": "4", "final.iterations": "0"}
+STD_PER_M, WIDTH_PX = 0.012, 4.0
+
+
+def noisy(frame: Frame, random: np.random.Generator) -> Frame:
+    """Return a frame whose depth has noise of `STD_PER_M` z² that is alike within `WIDTH_PX`, and holes."""
+    noise, holes = (
+        cv2.GaussianBlur(random.standard_normal(frame.depth_m.shape, np.float32), (0, 0), width)
+        for width in (WIDTH_PX, 2 * WIDTH_PX)
+    )
+    depth_m = frame.depth_m + STD_PER_M * frame.depth_m**2 * noise / noise.std()
+    seen = (frame.depth_m > 0) & (holes < holes.std())
+    return replace(frame, depth_m=np.where(seen, depth_m, 0.0).astype(np.float32))
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_the_noise_is_measured_and_no_frame_is_lost(seed: int) -> None:
+    source, random = open_source(f"synthetic:frames=120,seed={seed}", limit=45), np.random.default_rng(seed)
+    slam = Slam(override(preset("sigma"), LITTLE))
+    for frame in source:
+        slam.step(noisy(frame, random))
+    assert {step.state for step in slam.steps} == {"tracked"}
+    assert not slam.tracker.doubtful
+    law = slam.config.render.depth_noise_per_m
+    assert 0.5 * STD_PER_M < law * slam.tracker.statistics.noise < 1.5 * STD_PER_M
+    truth = source.truth()
+    assert truth is not None
+    slam.finish()
+    assert ate(slam.trajectory(), truth).rmse_m < 0.03
+
+
+def test_a_sensor_that_keeps_to_its_law_changes_nothing() -> None:
+    source, slam = open_source("synthetic:frames=120,noise=1", limit=20), Slam(override(preset("sigma"), LITTLE))
+    for frame in source:
+        slam.step(frame)
+    assert slam.tracker.statistics.noise == 1.0
