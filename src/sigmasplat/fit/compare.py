@@ -5,7 +5,7 @@ afterwards, with the noise of the sensor as its unit. It also separates the two 
 in front may be new, but seeing through a known surface contradicts the pose.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +39,7 @@ class Comparison:
     live surface is the same, nearer, or farther. Of those that are not in front: residual, the median |depth
     difference| in standard deviations of a reading; correlation of the gray values, −1 to 1, NaN if one image is flat.
     points: the number of compared pixels; covered: their number relative to that of the live readings, at most 1.
+    moved: how far the alignment has moved the image from its guess, as a share of the depth; 0 without one.
     """
 
     common: float
@@ -49,6 +50,7 @@ class Comparison:
     correlation: float
     points: int = 0
     covered: float = 1.0
+    moved: float = 0.0
 
 
 NOTHING = Comparison(0.0, 0.0, 0.0, 0.0, float("inf"), float("nan"))
@@ -86,7 +88,7 @@ def best_alignment(
     found = [align(*pair, T_live_reference, weight_color=weight) for pair in pairs]
     seen = [compare(reference, live, motion.T_live_reference) for motion in found]
     best = int(agreement(seen[1]) > agreement(seen[0]) + UNDECIDED)
-    return found[best], seen[best]
+    return found[best], replace(seen[best], moved=found[best].moved_from(T_live_reference))
 
 
 def agreement(seen: Comparison) -> float:

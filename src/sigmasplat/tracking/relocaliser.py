@@ -23,7 +23,7 @@ from sigmasplat.render.view import View
 from sigmasplat.tracking.drift import UNKNOWN, floor, symmetric
 from sigmasplat.tracking.feature_image import FeatureImage, pose_by_features
 from sigmasplat.tracking.features import VOTE_RATIO, Extractor, Features, Landmarks, matched_by_distance
-from sigmasplat.tracking.pose_validation import MOST_SPREAD_M, recognised, score
+from sigmasplat.tracking.pose_validation import MOST_SPREAD_M, p_wrong, recognised
 from sigmasplat.tracking.prepared_frame import PreparedFrame, TrackedKeyframe
 from sigmasplat.types import Matrix, Task, at_once
 
@@ -68,7 +68,7 @@ INDEX_AT_MOST = 25
 """Maximum number of keyframes whose features are found per call: 25 take about a second."""
 KEPT_LANDMARKS = 64
 """Number of keyframes whose complete landmarks stay in memory, half a megabyte each."""
-ENOUGH = 0.5
+ENOUGH = 0.99
 """A pose with a higher score ends the search."""
 
 
@@ -117,8 +117,8 @@ class Relocation:
 
     @property
     def score(self) -> float:
-        """Return the share of the reference that the pose explains, 0 to 1."""
-        return score(self.comparison)
+        """Return the probability that the pose is right."""
+        return 1.0 - p_wrong(self.comparison)
 
 
 @dataclass(frozen=True, eq=False)

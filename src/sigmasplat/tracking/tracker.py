@@ -32,7 +32,7 @@ class Tracker:
     """Keeps the last pose, the motion, the last image, the reference keyframe, and statistics of recent fits.
 
     prior: that of the last frame; lost: tracking of the last frame failed; doubtful: number of frames in a row whose
-    best pose the images contradict (`_contradicted`); front: what was in front of the scene in the last frame, None if
+    best pose the images contradict (`_doubts`); front: what was in front of the scene in the last frame, None if
     there was nothing or the frame was lost; keyframe_front: the same for the newest keyframe; detector: of moving
     things; depth: the fit of predicted depth; started: a frame was tracked; times: of the sensor. Raises
     ConfigError on settings that do not fit together.
@@ -91,7 +91,7 @@ class Tracker:
         else:
             best = self._estimated(given, seen, shown)
             self.lost = self._is_lost(best)
-            self.doubtful = self.doubtful + 1 if self._contradicted(best) else 0
+            self.doubtful = self.doubtful + 1 if self._doubts(best) else 0
         self.prior = prior
         if self.lost:  # poses of earlier frames do not agree with later ones
             self.front, self.detector = None, self.detector.cleared()
@@ -139,7 +139,7 @@ class Tracker:
             return None
         # the expected pose of a fast camera is centimetres off: it is used only if something may have pulled the fit
         keyframe, predicted = self.keyframe, given.prediction.predicted
-        pose = predicted if self._contradicted(fit) else se3.inverse(fit.T_camera_world)
+        pose = predicted if self._doubts(fit) else se3.inverse(fit.T_camera_world)
         front = together(self.detector.in_front(keyframe, self.keyframe_front, before, self.previous, seen, pose), slow)
         if front is not None and known is None and is_scene(front, seen.target.depth_image.numpy()):
             front = None  # a thing comes into view gradually
@@ -162,8 +162,8 @@ class Tracker:
         """Return the fit and the frame without the thing that moves and has drawn the pose with it; None if there is
         none. known: the last frame had something in front."""
         predicted = given.prediction.predicted
-        contradicted, urgent = self._contradicted(drawn), known or self.statistics.agrees_less(drawn.comparison)
-        self.detector, things = self.detector.suspected(self.keyframe, seen, drawn, self.config, contradicted, urgent)
+        contradicted = self._doubts(drawn)
+        self.detector, things = self.detector.suspected(self.keyframe, seen, drawn, self.config, contradicted, known)
         for front in unless(given.should_stop, things):
             found = self._fit(given, shown := seen.aside(front), predicted)
             if self._stands(found) and has_drawn(front, self.keyframe, seen, drawn, found, contradicted):
@@ -178,7 +178,7 @@ class Tracker:
         self.front, self.detector = front, self.detector.after(seen, front, T_world_camera)
 
     def _stands(self, fit: PoseFit, whole: Comparison | None = None) -> bool:
-        return not (self._is_lost(fit) or self._contradicted(fit) or judge.is_missed(fit.comparison, whole))
+        return not (self._is_lost(fit) or self._doubts(fit) or judge.is_missed(fit.comparison, whole))
 
     def _remember(self, fit: PoseFit, seen: PreparedFrame) -> None:
         """Keep what the next frame needs."""
@@ -237,24 +237,20 @@ class Tracker:
     # ---- verdicts ----
 
     def _score(self, fit: PoseFit) -> float:
-        return fit.agreement * fit.overlap if fit.comparison is None else judge.score(fit.comparison)
+        return fit.agreement * fit.overlap if fit.comparison is None else 1.0 - judge.p_wrong(fit.comparison)
 
     def _is_lost(self, fit: PoseFit) -> bool:
         if fit.comparison is None:
             return judge.is_lost(fit, self.config.lost_agreement, self.config.lost_share)
-        if self.lost:  # after a lost frame the path of the camera does not support a pose
-            return not judge.confirmed(fit.comparison)
-        return self.statistics.is_lost(fit.comparison, self.config.lost_share)
+        # after a lost frame the path of the camera does not support a pose
+        most = judge.SURE if self.lost else judge.LOST
+        return fit.comparison.common < self.config.lost_share or judge.p_wrong(fit.comparison) > most
 
     def _doubts(self, fit: PoseFit) -> bool:
         if fit.comparison is not None:
-            return self.statistics.doubts(fit.comparison)
+            return judge.p_wrong(fit.comparison) > judge.DOUBTFUL
         worse = fit.agreement * fit.overlap < judge.DOUBT * float(np.median(self.agreements or [1.0]))
         return worse or judge.jumped(fit.first_loss, self.first_losses, self.config.reinit_factor)
-
-    def _contradicted(self, fit: PoseFit) -> bool:
-        """Return whether a pose is doubtful for another reason than a small overlap, which a new keyframe mends."""
-        return self._doubts(fit) if fit.comparison is None else self.statistics.contradicts(fit.comparison)
 
     # ---- keyframes ----
 
