@@ -57,6 +57,37 @@ def depth_noise(color: Color, depth: Depth, level: float, at: Moment) -> tuple[C
     return color, np.where(depth > 0, np.maximum(noisy, 0), 0).astype(np.float32)
 
 
+def shared_noise(color: Color, depth: Depth, level: float, at: Moment) -> tuple[Color, Depth]:
+    """Add noise to depth, with a standard deviation of `level` z² m at z m, that is alike within a few pixels, and
+    holes, as of a camera that matches patches of two images."""
+    noise, holes = (
+        cv2.GaussianBlur(at.random.standard_normal(depth.shape, np.float32), (0, 0), width) for width in (4.0, 8.0)
+    )
+    noisy = depth + np.float32(level / noise.std()) * depth**2 * noise
+    return color, np.where((depth > 0) & (holes < holes.std()), np.maximum(noisy, 0), 0).astype(np.float32)
+
+
+def coarse_depth(color: Color, depth: Depth, level: float, at: Moment) -> tuple[Color, Depth]:
+    """Return depth of cells of `level` pixels, interpolated between them, as of a phone's laser: edges are soft."""
+    size = depth.shape[1] // int(level), depth.shape[0] // int(level)
+    cells, read = (cv2.resize(plane, size, interpolation=cv2.INTER_AREA) for plane in (depth, _read(depth)))
+    cells = np.where(read > 0, cells / np.maximum(read, 1e-6), 0).astype(np.float32)
+    soft, known = (
+        cv2.resize(plane, depth.shape[::-1], interpolation=cv2.INTER_LINEAR) for plane in (cells, _read(cells))
+    )
+    return color, np.where(known > 0.99, soft, 0).astype(np.float32)
+
+
+def _read(depth: Depth) -> Depth:
+    return (depth > 0).astype(np.float32)
+
+
+def little_contrast(color: Color, depth: Depth, level: float, at: Moment) -> tuple[Color, Depth]:
+    """Return gray colour that keeps a share `level` of the contrast, with noise of one and a half steps."""
+    gray = 128.0 + (color - 128.0) * level + at.random.normal(0.0, 1.5, color.shape)
+    return np.clip(np.rint(gray), 0, 255).astype(np.uint8), depth
+
+
 def edge_erosion(color: Color, depth: Depth, level: float, at: Moment) -> tuple[Color, Depth]:
     """Within `level` pixels of a depth edge, remove half of the readings and average the others with those around."""
     neighbours = np.ones((3, 3), np.uint8)
@@ -148,6 +179,10 @@ DISTURBANCES = {
     "clean": Disturbance("none", ("–",), (0,)),
     "speed": Disturbance("faster camera", ("×2", "×4", "×8"), (2, 4, 8), order="every"),
     "depth-noise": Disturbance("depth noise, σ / z²", ("0.5 %", "1 %", "2 %"), (0.005, 0.01, 0.02), depth_noise),
+    "shared-noise": Disturbance(
+        "depth noise of patches, σ / z²", ("0.5 %", "0.8 %", "1.2 %"), (0.005, 0.008, 0.012), shared_noise
+    ),
+    "coarse-depth": Disturbance("depth of cells", ("2 px", "4 px", "8 px"), (2, 4, 8), coarse_depth),
     "edge-erosion": Disturbance("depth edges eroded", ("1 px", "3 px", "5 px"), (1, 3, 5), edge_erosion),
     "missing": Disturbance("depth missing at random", ("25 %", "50 %", "75 %"), (0.25, 0.5, 0.75), missing),
     "missing-90": Disturbance(
@@ -158,6 +193,9 @@ DISTURBANCES = {
     ),
     "blur": Disturbance("motion blur", ("7 px", "15 px", "25 px"), (7, 15, 25), blur),
     "color-noise": Disturbance("colour noise, σ", ("0.05", "0.1", "0.2"), (0.05, 0.1, 0.2), color_noise),
+    "little-contrast": Disturbance(
+        "little contrast", ("15 %", "5 %", "2 %"), (0.15, 0.05, 0.02), little_contrast
+    ),
     "brightness": Disturbance(
         "brightness, 30 frames", ("× 0.7", "× 0.4", "× 0.4 / 1.5"), (0.7, 0.4, -1), brightness, (30,) * 3
     ),

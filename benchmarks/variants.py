@@ -37,7 +37,10 @@ SOURCES = ("fr1_xyz", "livingroom", "redkitchen", "hololens", "cubicles", "cabin
 FEWEST, MOST = 40, 150
 """Frames of a variant, if the recording has as many."""
 STEPS, SIZES = (1, 1, 2, 3), ("whole", "whole", "middle", "quarter")
-DISTURBED = ("clean", "clean", "depth-noise", "edge-erosion", "missing", "range-clip", "blur", "color-noise")
+DISTURBED = (
+    "clean", "clean", "depth-noise", "shared-noise", "coarse-depth", "edge-erosion", "missing", "range-clip",
+    "blur", "color-noise",
+)  # fmt: skip
 SEVEREST, PROCESSES = 2, 2
 FAILURES = (SigmaSplatError, ValueError, RuntimeError, OSError)
 """The plain system may diverge: its poses are not finite, or its graph is singular."""

@@ -1,18 +1,22 @@
 """Estimate the probability that the pose of a frame is off by more than 5 cm.
 
-Two things make a pose wrong: the fit of this frame, which the comparison of surfaces judges, and the path to its
-submap, whose spread grows with every hop between keyframes and shrinks with every loop. A logistic model combines them;
+Two things make a pose wrong: the fit of this frame (`tracking.pose_validation`), and the path to its submap, whose
+spread grows with every hop between keyframes and shrinks with every loop. A logistic model combines them;
 `benchmarks/failure_probability.py` fits its weights to disturbed recordings with known truth.
 """
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from typing import Any
 
 import numpy as np
+from scipy.special import logit
 
 from sigmasplat.data.trajectory import APART, LOST, RELOCALISED
+from sigmasplat.fit.compare import Comparison
 from sigmasplat.graph.loops import Loop
+from sigmasplat.tracking.pose_validation import p_wrong
 from sigmasplat.types import Matrix
 
 LOOP_STD_M = 0.01
@@ -21,16 +25,12 @@ NEVER_LOST = 1_000_000
 """Number of frames since the last lost one, before any was lost."""
 MEMORY = 20.0
 """A lost frame is forgotten after about this many tracked ones."""
-BIAS = -1.0
-WEIGHTS: dict[str, float] = {
-    "log_position_std": 1.07,
-    "log_residual": 2.96,
-    "unexplained": 1.52,
-    "not_close": 3.21,
-    "uncorrelated": 4.0,
-    "lately_lost": 1.41,
-}
-"""Weights of the logistic model. Doubtful frames in a row and few compared points added nothing in the fit."""
+BIAS = 0.0
+WEIGHTS: dict[str, float] = {"log_position_std": 1.0, "log_odds_wrong": 1.0, "lately_lost": 1.0}
+"""Weights of the logistic model."""
+LEAST = 1e-3
+"""No pose is more certain than this, by its images alone."""
+COMPARED = [field.name for field in fields(Comparison)]
 CERTAIN = {LOST: 0.85, APART: 0.99}
 """Fixed probabilities: of a lost frame (the share of lost frames whose guess is off), and of a frame whose place in the
 world is not known."""
@@ -74,7 +74,7 @@ class Confidence:
     def probability(self, state: str, tracking: Mapping[str, float]) -> float:
         """Return the probability that the pose of the newest frame is off by more than 5 cm.
 
-        tracking: values of its fit (`metrics_of`), with position_std_m and usual_residual.
+        tracking: values of its fit (`FrameEstimate.logged`), with position_std_m.
         """
         self.since_lost = 0 if state in (LOST, RELOCALISED) else self.since_lost + 1
         if state in CERTAIN:
@@ -85,22 +85,13 @@ class Confidence:
 
 def evidence(tracking: Mapping[str, float], since_lost: int) -> dict[str, float]:
     """Return the inputs of the logistic model by name; without a comparison of surfaces, agreement stands for it."""
-    close, behind = tracking.get("close", tracking.get("agreement", 1.0)), tracking.get("behind", 0.0)
-    residual, usual = tracking.get("residual", 0.0), tracking.get("usual_residual", math.nan)
-    excess = _log_residual(residual) - _log_residual(usual) if math.isfinite(usual) else 0.0
-    correlation = tracking.get("correlation", 0.95)
+    seen: dict[str, Any] = {name: tracking[name] for name in COMPARED if name in tracking}
+    wrong = p_wrong(Comparison(**seen)) if "close" in seen else 1.0 - tracking.get("agreement", 1.0)
     return {
         "log_position_std": math.log(tracking.get("position_std_m", 0.0) + 1e-3),
-        "log_residual": max(excess, 0.0),
-        "unexplained": behind / max(close + behind, 1e-9),
-        "not_close": 1.0 - close,
-        "uncorrelated": 0.1 if math.isnan(correlation) else 1.0 - max(correlation, 0.0),
+        "log_odds_wrong": float(logit(min(max(wrong, LEAST), 1.0 - LEAST))),
         "lately_lost": math.exp(-since_lost / MEMORY),
     }
-
-
-def _log_residual(residual: float) -> float:
-    return math.log((min(residual, 10.0) if math.isfinite(residual) else 10.0) + 0.05)
 
 
 def std_of(information: Matrix) -> float:

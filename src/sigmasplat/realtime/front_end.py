@@ -251,7 +251,7 @@ class FrontEnd:
         """Return whether the frame becomes the reference of the next frames; `estimate.mapped` then says whether it is
         handed to the map."""
         since, least_deg = self.frames - self.newest, self.config.realtime.keyframe_deg
-        if not is_mappable(fit, self.tracker, self.recovery) or not becomes_keyframe(
+        if not is_mappable(self.tracker, self.recovery) or not becomes_keyframe(
             fit, self.tracker, since, self.config.mapping, least_deg
         ):
             return False

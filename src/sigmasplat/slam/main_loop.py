@@ -131,7 +131,7 @@ class MainLoop(MappingBackend):
         estimate = FrameEstimate.of(fit, lost)
         if not lost:
             since = len(self.steps) - self.mapper.keyframes[-1].index
-            mappable = not held_back and is_mappable(fit, self.tracker, self.recovery)
+            mappable = not held_back and is_mappable(self.tracker, self.recovery)
             estimate.mapped = mappable and becomes_keyframe(fit, self.tracker, since, self.config.mapping)
             if estimate.mapped:
                 estimate.alignment = hop_alignment(fit, seen.live, self.tracker)

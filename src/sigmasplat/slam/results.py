@@ -72,7 +72,7 @@ def make_step(
     in_submap_m = submap.drift.position_m(estimate.T_submap_camera)
     tracking = estimate.logged() | {
         "position_std_m": confidence.position_std_m(in_submap_m), "doubtful": float(tracker.doubtful),
-        "usual_residual": tracker.statistics.residual,
+        "depth_noise": tracker.statistics.noise,
     } | ({} if waiting is None else {"waiting": float(waiting)}) | {"moving": share_of(tracker.front)}  # fmt: skip
     p_off = confidence.probability(state, tracking)
     return Step(

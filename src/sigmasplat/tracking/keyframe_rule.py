@@ -9,7 +9,6 @@ from sigmasplat.fit.align import Alignment, align
 from sigmasplat.fit.pose import PoseFit
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.tracking.frame_estimate import FrameEstimate
-from sigmasplat.tracking.pose_validation import stands
 from sigmasplat.tracking.recovery import Recovery
 from sigmasplat.tracking.tracker import Tracker
 
@@ -17,11 +16,10 @@ MOVED = 0.125
 """A view has changed if rotation, and translation at the mean depth, have moved it by this share of its width."""
 
 
-def is_mappable(fit: PoseFit, tracker: Tracker, recovery: Recovery) -> bool:
-    """Return whether the pose of the frame tracked last is certain enough to map the frame."""
-    doubtful = tracker.doubtful if tracker.config.verify else 0
-    certain = not doubtful or (fit.comparison is not None and stands(fit.comparison, doubtful))
-    return not tracker.lost and recovery.is_steady and certain
+def is_mappable(tracker: Tracker, recovery: Recovery) -> bool:
+    """Return whether the pose of the frame tracked last is certain enough to map the frame: a doubtful one is more
+    likely right than wrong, and without it the next frames may find nothing that they share with the map."""
+    return not tracker.lost and recovery.is_steady
 
 
 def hop_alignment(fit: PoseFit, live: Pyramid, tracker: Tracker) -> Alignment | None:

@@ -14,28 +14,21 @@ MEDIAN_NORMAL = 0.6745
 """The median of |x| if x is a standard normal number."""
 RECENT, FEW = 50, 5
 """What is usual is the median over this many recent frames that were not lost; fewer than the second do not tell."""
-WEIGHTS = {
-    "unexplained": 1.25,
-    "residual": 0.51,
-    "uncorrelated": 1.85,
-    "flat": -2.17,
-    "supported": -1.14,
-    "moved": 1.23,
-}
-BIAS = 8.59
+WEIGHTS = {"unexplained": 1.60, "uncorrelated": 2.07, "unsupported": 1.23, "moved": 6.06}
+BIAS = 5.31
 """The log odds that a pose is wrong are BIAS + Σ weight · quantity (`evidence`). `benchmarks/judge.py` fits them to
 pairs of frames with known truth, aligned from random guesses of which a quarter lead to a wrong pose."""
 LOST, DOUBTFUL, SURE = 0.5, 0.1, 0.03
 """Limits of this probability. A tracked pose is lost where it is more likely wrong than right, for a lost frame only
 costs itself. It is doubtful, and not mapped, above the second: a wrong keyframe costs ten times as much as one too few.
 Below the third, a pose counts without a path that leads to it: a wrong loop bends the whole map."""
-PATIENCE = 3
-"""A doubtful pose that is not lost is used for mapping after this number of doubtful frames in a row."""
 DOUBT = 0.7
 """Without a comparison, a pose is doubtful if its agreement × overlap falls below this share of the usual value."""
 FEW_MATCHES = 15
 """A pose from fewer matches, without a known path, must be three times as sure: a dozen features of one wall also match
 another wall, and walls are alike."""
+FLAT = 0.7
+"""Images without texture neither confirm nor refute a pose: as this correlation."""
 LEARNS_CORRELATION = 0.9
 """Gray values that correlate as much confirm a pose by themselves."""
 MOST_SPREAD_M = 0.05
@@ -58,23 +51,23 @@ AGREES_MORE = 0.05
 
 
 def evidence(c: Comparison) -> dict[str, float]:
-    """Return the quantities by which a pose is judged, each as a logarithm in its own unit: the share of the surface
-    that is seen through, the depth difference in standard deviations of a reading, what the gray values miss to a
-    correlation of 1 (or that they are flat), the share of the images that supports the pose, and how far it is from
-    its guess."""
-    flat, seen = np.isnan(c.correlation), c.close + c.behind
+    """Return the quantities by which a pose is judged: logarithms of the share of the surface that is seen through, of
+    what the gray values miss to a correlation of 1, and of the share of the images that supports the pose; and how far
+    it is from its guess. It is not in proportion: staying at the guess does not make a pose right."""
+    seen, correlation = c.close + c.behind, FLAT if np.isnan(c.correlation) else max(c.correlation, 0.0)
     return {
         "unexplained": math.log(c.behind / max(seen, 1e-9) + 0.01),
-        "residual": math.log(min(c.residual, 10.0) + 0.1),
-        "uncorrelated": 0.0 if flat else math.log(1.02 - max(c.correlation, 0.0)),
-        "flat": float(flat),
-        "supported": math.log(min(c.common, c.covered) * seen + 0.05),
-        "moved": math.log(c.moved + 0.003),
+        "uncorrelated": math.log(1.02 - correlation),
+        "unsupported": -math.log(min(c.common, c.covered) * seen + 0.05),
+        "moved": min(c.moved, 1.0),
     }
 
 
 def p_wrong(c: Comparison) -> float:
-    """Return the probability that a pose is wrong: that it shifts the image by more than 5 % of the depth."""
+    """Return the probability that a pose is wrong: that it shifts the image by more than 5 % of the depth. A pose at
+    which the images have next to nothing in common counts as wrong."""
+    if not math.isfinite(c.residual):
+        return 1.0
     odds = BIAS + sum(WEIGHTS[name] * value for name, value in evidence(c).items())
     return 1.0 / (1.0 + math.exp(-odds))
 
@@ -126,11 +119,6 @@ def is_missed(without: Comparison | None, whole: Comparison | None) -> bool:
     return not 1.0 - without.correlation <= DISAGREES * (1.0 - whole.correlation)
 
 
-def stands(c: Comparison, doubtful: int) -> bool:
-    """Return whether a pose is used for mapping although it is the last of this number of doubtful ones in a row."""
-    return doubtful > PATIENCE and p_wrong(c) < LOST
-
-
 def is_lost(fit: PoseFit, least_agreement: float, least_share: float) -> bool:
     """Return whether tracking failed: the depths of map and sensor disagree, or too few pixels are in common."""
     return fit.agreement < least_agreement or fit.agreement * fit.overlap < least_share
@@ -168,8 +156,3 @@ class TrackingStatistics:
             return False
         self.residuals.append(c.residual * self.noise)
         return True
-
-    @property
-    def residual(self) -> float:
-        """Return the usual median depth difference, in standard deviations of a reading; NaN if it is not known."""
-        return median(self.residuals) / self.noise if len(self.residuals) >= FEW else math.nan
