@@ -152,6 +152,10 @@ PAGES = {
                 ("Ratios",),
             ),
             Shown(
+                "judge", "A pose is judged by one probability; each recording by a model without it.",
+                ("Each recording by a model without it", "Stated and true, without the corridor"),
+            ),
+            Shown(
                 "sensor-times", "Stamps of depth were moved, and found again without truth.", ("Depth moved in time",),
             ),
             Shown(
