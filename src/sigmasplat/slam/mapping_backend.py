@@ -68,8 +68,8 @@ class MappingBackend(SlamState):
         ends = np.cumsum(self.atlas.keyframe_poses.counts)
         submap = int(np.searchsorted(ends, row, side="right"))
         k = int(row - ends[submap] + self.atlas.keyframe_poses.counts[submap])
-        image = self.images.of(row, self.view, lambda: self.store.picture(submap, k))
-        return image.read(self.graph.times.read(self.atlas.readings[row]))
+        readout = self.graph.times.read(self.atlas.readings[row])
+        return self.images.of(row, self.view, lambda: self.store.picture(submap, k)).read(readout)
 
     def _align(self, keyframe: Keyframe, seen: PreparedFrame, hop: RelativePose, should_stop: ShouldStop) -> Task[None]:
         """Align a keyframe to earlier ones that see the same, in slices, and move the newest keyframes of the active
@@ -80,8 +80,7 @@ class MappingBackend(SlamState):
         usable = np.repeat(atlas.components, atlas.keyframe_poses.counts) == atlas.components[-1]
         usable &= (np.abs(T_world_keyframe[1:] - T_world_keyframe[:-1]) > SAME).any((1, 2))  # of two copies the second
         rows = np.append(np.flatnonzero(usable), newest)
-
-        noise = seen.live.noise_per_m / self.config.render.depth_noise_per_m
+        noise = seen.live.noise_per_m / self.view.options.depth_noise_per_m
 
         def reading_of(row: int) -> Readout:
             return seen.reading if row == newest else atlas.readings[row]
@@ -90,9 +89,8 @@ class MappingBackend(SlamState):
             k = row - newest - 1
             if -k > len(active):
                 return self.keyframe_image(row).noisier(noise)
-            target = active[k].target
-            image = self.images.of(row, self.view, target.picture, target.valid_pixels)
-            return image.read(self.graph.times.read(reading_of(row))).noisier(noise)
+            target, readout = active[k].target, self.graph.times.read(reading_of(row))
+            return self.images.of(row, self.view, target.picture, target.valid_pixels).read(readout).noisier(noise)
 
         yield from self.graph.aligning(T_world_keyframe, rows, image, should_stop)
         times = self.graph.times
