@@ -24,7 +24,7 @@ from scipy.optimize import minimize
 from scipy.special import expit
 from tables import Section, significant
 
-from sigmasplat.graph.confidence import NEVER_LOST, WEIGHTS, evidence
+from sigmasplat.graph.confidence import hop_wrong, log_position_std
 from sigmasplat.plugins.evaluation.metrics.trajectory import OFF_M, brier
 
 arg = tyro.conf.arg
@@ -44,34 +44,38 @@ class Options:
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Inputs [N, K] of frames that are not lost, whether each is off [N], its sequence [N], and frames lost [N]."""
+    """Probability that the fit of a frame that is not lost is wrong [N], logarithm of the standard deviation of its
+    position [N], whether it is off [N], its sequence [N], and whether lost frames are off [L]."""
 
-    inputs: Values
+    hop: Values
+    log_std: Values
     off: NDArray[np.bool_]
     sequence: NDArray[np.str_]
     lost_off: NDArray[np.bool_]
 
+    def of(self, rows: NDArray[np.bool_]) -> "Samples":
+        """Return some of the frames."""
+        return Samples(self.hop[rows], self.log_std[rows], self.off[rows], self.sequence[rows], self.lost_off)
+
 
 def samples_of(folder: Path) -> Samples:
     """Read the kept runs. Raises OSError or ValueError if a file is missing or damaged."""
-    inputs, off, sequence, lost_off = list[list[float]](), list[bool](), list[str](), list[bool]()
+    known, off, sequence, lost_off = list[tuple[float, float]](), list[bool](), list[str](), list[bool]()
     for path in sorted(folder.glob("*.npz")):
         error_m = np.load(path)["error_tracked_m"]
-        since_lost = NEVER_LOST
         for line in path.with_suffix(".jsonl").read_text().splitlines():
             frame = json.loads(line)
-            since_lost = 0 if frame["state"] in ("lost", "relocalised") else since_lost + 1
             error = error_m[frame["index"]]
             if not frame["tracking"] or not np.isfinite(error) or frame["component"]:
                 continue
             if frame["lost"]:
                 lost_off.append(error > OFF_M)
                 continue
-            values = evidence(_plain(frame["tracking"]), since_lost)
-            inputs.append([values[name] for name in WEIGHTS])
+            values = _plain(frame["tracking"])
+            known.append((hop_wrong(values), log_position_std(values)))
             off.append(error > OFF_M)
             sequence.append(path.name.partition("-")[0])
-    return Samples(np.array(inputs), np.array(off), np.array(sequence), np.array(lost_off))
+    return Samples(*np.array(known).T, np.array(off), np.array(sequence), np.array(lost_off))
 
 
 def _plain(tracking: Mapping[str, float | None]) -> dict[str, float]:
@@ -99,6 +103,22 @@ def probability(weights: Values, inputs: Values) -> Values:
     return np.asarray(expit(weights[0] + inputs @ weights[1:]))
 
 
+def fitted_place(s: Samples) -> Values:
+    """Return bias and weight [2] of the most likely logistic model of the place, if a wrong fit or a wrong place puts a
+    frame off."""
+
+    def loss(weights: Values) -> float:
+        p = np.clip(off_probability(weights, s), 1e-9, 1.0 - 1e-9)
+        return float(-np.log(np.where(s.off, p, 1.0 - p)).sum() + 0.5 * SHRINK * weights[1] ** 2)
+
+    return np.asarray(minimize(loss, np.array([0.0, 1.0]), method="Nelder-Mead", options={"maxiter": 2000}).x)
+
+
+def off_probability(weights: Values, s: Samples) -> Values:
+    """Return the probability of each frame to be off [N]."""
+    return np.asarray(1.0 - (1.0 - s.hop) * (1.0 - expit(weights[0] + weights[1] * s.log_std)))
+
+
 def judged(p: Values, off: NDArray[np.bool_]) -> dict[str, Any]:
     """Return AUROC, Brier score, and mean probability against share of frames that are off."""
     means = {"off": float(off.mean()), "mean": float(p.mean())}
@@ -107,16 +127,15 @@ def judged(p: Values, off: NDArray[np.bool_]) -> dict[str, Any]:
 
 def main(options: Options) -> int:
     """Fit, judge each sequence by a model without it, write and print."""
-    s = samples_of(options.data)
-    held_out = {}
+    s, held_out = samples_of(options.data), {}
     for name in sorted(set(s.sequence.tolist())):
-        test = s.sequence == name
-        held_out[name] = judged(probability(fitted(s.inputs[~test], s.off[~test]), s.inputs[test]), s.off[test])
-    weights = fitted(s.inputs, s.off)
+        test, others = s.of(s.sequence == name), s.of(s.sequence != name)
+        held_out[name] = judged(off_probability(fitted_place(others), test), test.off)
+    weights = fitted_place(s)
     found = {
-        "bias": float(weights[0]), "weights": dict(zip(WEIGHTS, weights[1:].tolist(), strict=True)),
+        "weights": dict(zip(("bias", "log position std"), weights.tolist(), strict=True)),
         "lost": float(s.lost_off.mean()) if len(s.lost_off) else None, "held_out": held_out,
-        "all": judged(probability(weights, s.inputs), s.off),
+        "all": judged(off_probability(weights, s), s.off),
     }  # fmt: skip
     measured = program.keep("failure_probability", found, options, data=options.data.name)
     print(tables.table(measured))
@@ -126,8 +145,7 @@ def main(options: Options) -> int:
 def sections(measured: dict[str, Any]) -> list[Section]:
     """Tabulate the weights, and how well they judge sequences that they were not fitted to."""
     measured = measured["figures"]
-    weights = [["bias", significant(measured["bias"])]]
-    weights += [[name.replace("_", " "), significant(value)] for name, value in measured["weights"].items()]
+    weights = [[name, significant(value)] for name, value in measured["weights"].items()]
     judgements = {f"{name}, fitted to the others": scores for name, scores in measured["held_out"].items()}
     rows = [
         [name, str(s["frames"]), f"{100 * s['off']:.2f} %", f"{100 * s['mean']:.2f} %",

@@ -6,13 +6,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sigmasplat.data.trajectory import APART, LOST, RELOCALISED, TRACKED
+from sigmasplat.data.trajectory import APART, LOST, TRACKED
 from sigmasplat.graph.confidence import Confidence, std_of
 from sigmasplat.graph.loops import Loop
 
 CLEAN: dict[str, float] = {
     "common": 0.9, "close": 0.98, "front": 0.01, "behind": 0.01, "residual": 0.3, "correlation": 0.97, "points": 3000.0,
-    "position_std_m": 0.005, "doubtful": 0.0, "usual_residual": 0.3,
+    "position_std_m": 0.005, "moved": 0.01,
 }  # fmt: skip
 
 
@@ -26,7 +26,7 @@ def test_lost_frames_and_frames_without_a_place_in_the_world_are_almost_surely_o
 
 @pytest.mark.parametrize(
     "worse",
-    [{"position_std_m": 0.1}, {"residual": 3.0}, {"behind": 0.3}, {"close": 0.6, "front": 0.39}, {"correlation": 0.5}],
+    [{"position_std_m": 0.1}, {"behind": 0.3}, {"close": 0.6, "front": 0.39}, {"correlation": 0.5}, {"moved": 0.3}],
     ids=lambda changes: next(iter(changes)),
 )  # fmt: skip
 def test_each_kind_of_evidence_raises_the_probability(worse: dict[str, float]) -> None:
@@ -40,16 +40,14 @@ def test_each_kind_of_evidence_raises_the_probability(worse: dict[str, float]) -
     ids=["first frame", "without comparison", "flat image", "no residual", "undefined residual", "nothing in common"],
 )  # fmt: skip
 def test_missing_values_still_give_a_probability(values: dict[str, float]) -> None:
-    assert 0.0 < Confidence([0.0]).probability(TRACKED, values) < 1.0
+    assert 0.0 < Confidence([0.0]).probability(TRACKED, values) <= 1.0
 
 
-def test_after_a_loss_poses_are_less_sure_for_a_while() -> None:
-    c = Confidence([0.0])
-    before = c.probability(TRACKED, CLEAN)
-    c.probability(LOST, CLEAN)
-    found = c.probability(RELOCALISED, CLEAN)
-    later = [c.probability(TRACKED, CLEAN) for _ in range(200)]
-    assert found > later[0] > later[50] > later[-1] and later[-1] == pytest.approx(before, rel=0.01)
+def test_a_wrong_fit_or_a_wrong_place_alone_puts_a_frame_off() -> None:
+    wrong = {"behind": 0.4, "close": 0.5, "correlation": 0.2, "moved": 0.5}
+    assert probability(**wrong) > 0.95
+    assert probability(position_std_m=100.0) > 0.7
+    assert probability(**wrong, position_std_m=100.0) > max(probability(**wrong), probability(position_std_m=100.0))
 
 
 def loop(query: int, database: int, accepted: bool) -> Loop:

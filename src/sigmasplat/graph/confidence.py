@@ -1,8 +1,8 @@
 """Estimate the probability that the pose of a frame is off by more than 5 cm.
 
-Two things make a pose wrong: the fit of this frame (`tracking.pose_validation`), and the path to its submap, whose
-spread grows with every hop between keyframes and shrinks with every loop. A logistic model combines them;
-`benchmarks/failure_probability.py` fits its weights to disturbed recordings with known truth.
+Either of two things makes it so: the fit of this frame is wrong (`tracking.pose_validation`), or the path to its submap
+is, whose spread grows with every hop between keyframes and shrinks with every loop. `benchmarks/failure_probability.py`
+fits how probable the second is to disturbed recordings with known truth.
 """
 
 import math
@@ -11,9 +11,9 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
-from scipy.special import logit
+from scipy.special import expit
 
-from sigmasplat.data.trajectory import APART, LOST, RELOCALISED
+from sigmasplat.data.trajectory import APART, LOST
 from sigmasplat.fit.compare import Comparison
 from sigmasplat.graph.loops import Loop
 from sigmasplat.tracking.pose_validation import p_wrong
@@ -21,15 +21,8 @@ from sigmasplat.types import Matrix
 
 LOOP_STD_M = 0.01
 """Standard deviation of the position that a loop gives, in a room."""
-NEVER_LOST = 1_000_000
-"""Number of frames since the last lost one, before any was lost."""
-MEMORY = 20.0
-"""A lost frame is forgotten after about this many tracked ones."""
-BIAS = 0.0
-WEIGHTS: dict[str, float] = {"log_position_std": 1.0, "log_odds_wrong": 1.0, "lately_lost": 1.0}
-"""Weights of the logistic model."""
-LEAST = 1e-3
-"""No pose is more certain than this, by its images alone."""
+PLACE_BIAS, PLACE_WEIGHT = -2.66, 0.92
+"""The log odds that the place is off: bias + weight · log(standard deviation of the position, m + 1 mm)."""
 COMPARED = [field.name for field in fields(Comparison)]
 CERTAIN = {LOST: 0.85, APART: 0.99}
 """Fixed probabilities: of a lost frame (the share of lost frames whose guess is off), and of a frame whose place in the
@@ -39,11 +32,10 @@ world is not known."""
 @dataclass(eq=False)
 class Confidence:
     """spread_m: standard deviation of each submap's position in its component; parents: the submap that each began at,
-    None: it began a component; since_lost: number of frames since the last one that was lost or relocalised."""
+    None: it began a component."""
 
     spread_m: list[float] = field(default_factory=list)
     parents: list[int | None] = field(default_factory=list)
-    since_lost: int = NEVER_LOST
 
     def begun(self, parent: int | None, position_m: float) -> None:
         """Add a submap: at position_m (standard deviation, m) from its parent, or the first of a component."""
@@ -76,22 +68,21 @@ class Confidence:
 
         tracking: values of its fit (`FrameEstimate.logged`), with position_std_m.
         """
-        self.since_lost = 0 if state in (LOST, RELOCALISED) else self.since_lost + 1
         if state in CERTAIN:
             return CERTAIN[state]
-        values = evidence(tracking, self.since_lost)
-        return 1.0 / (1.0 + math.exp(-BIAS - sum(WEIGHTS[name] * value for name, value in values.items())))
+        place = float(expit(PLACE_BIAS + PLACE_WEIGHT * log_position_std(tracking)))
+        return 1.0 - (1.0 - hop_wrong(tracking)) * (1.0 - place)
 
 
-def evidence(tracking: Mapping[str, float], since_lost: int) -> dict[str, float]:
-    """Return the inputs of the logistic model by name; without a comparison of surfaces, agreement stands for it."""
+def hop_wrong(tracking: Mapping[str, float]) -> float:
+    """Return the probability that the fit of a frame is wrong; without a comparison, by its agreement."""
     seen: dict[str, Any] = {name: tracking[name] for name in COMPARED if name in tracking}
-    wrong = p_wrong(Comparison(**seen)) if "close" in seen else 1.0 - tracking.get("agreement", 1.0)
-    return {
-        "log_position_std": math.log(tracking.get("position_std_m", 0.0) + 1e-3),
-        "log_odds_wrong": float(logit(min(max(wrong, LEAST), 1.0 - LEAST))),
-        "lately_lost": math.exp(-since_lost / MEMORY),
-    }
+    return p_wrong(Comparison(**seen)) if "close" in seen else 1.0 - tracking.get("agreement", 1.0)
+
+
+def log_position_std(tracking: Mapping[str, float]) -> float:
+    """Return the logarithm of the standard deviation of the position, m, plus 1 mm."""
+    return math.log(tracking.get("position_std_m", 0.0) + 1e-3)
 
 
 def std_of(information: Matrix) -> float:

@@ -261,7 +261,6 @@ class RealTime(ArrayInterface):
         tracker.extractor = slam.tracker.extractor
         slam.tracker = tracker
         slam.recovery.lost, slam.recovery.steady = camera.recovery.lost, camera.recovery.steady
-        slam.confidence.since_lost = camera.confidence.since_lost
 
     # ---- results ----
 
