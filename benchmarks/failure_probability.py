@@ -1,4 +1,4 @@
-"""Fit the weights of the probability that a pose is off by more than 5 cm (graph/confidence.py).
+"""Fit the probability that a pose is off by more than 5 cm (graph/confidence.py).
 
 The data are disturbed recordings with known truth, kept by benchmarks/robustness.py --keep DIR. A model that is fitted
 to all sequences but one is judged on that one. Writes benchmarks/results/<name>-<machine>.json and prints the weights,
@@ -20,11 +20,11 @@ import tables
 import tyro
 from numpy.typing import NDArray
 from robustness_scores import auroc
-from scipy.optimize import minimize
+from scipy.optimize import minimize, minimize_scalar
 from scipy.special import expit
 from tables import Section, significant
 
-from sigmasplat.graph.confidence import hop_wrong, log_position_std
+from sigmasplat.graph.confidence import hop_wrong
 from sigmasplat.plugins.evaluation.metrics.trajectory import OFF_M, brier
 
 arg = tyro.conf.arg
@@ -44,18 +44,18 @@ class Options:
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Probability that the fit of a frame that is not lost is wrong [N], logarithm of the standard deviation of its
-    position [N], whether it is off [N], its sequence [N], and whether lost frames are off [L]."""
+    """Probability that the fit of a frame that is not lost is wrong [N], standard deviation of its position [N] m,
+    whether it is off [N], its sequence [N], and whether lost frames are off [L]."""
 
     hop: Values
-    log_std: Values
+    std_m: Values
     off: NDArray[np.bool_]
     sequence: NDArray[np.str_]
     lost_off: NDArray[np.bool_]
 
     def of(self, rows: NDArray[np.bool_]) -> "Samples":
         """Return some of the frames."""
-        return Samples(self.hop[rows], self.log_std[rows], self.off[rows], self.sequence[rows], self.lost_off)
+        return Samples(self.hop[rows], self.std_m[rows], self.off[rows], self.sequence[rows], self.lost_off)
 
 
 def samples_of(folder: Path) -> Samples:
@@ -72,7 +72,7 @@ def samples_of(folder: Path) -> Samples:
                 lost_off.append(error > OFF_M)
                 continue
             values = _plain(frame["tracking"])
-            known.append((hop_wrong(values), log_position_std(values)))
+            known.append((hop_wrong(values), values["position_std_m"]))
             off.append(error > OFF_M)
             sequence.append(path.name.partition("-")[0])
     return Samples(*np.array(known).T, np.array(off), np.array(sequence), np.array(lost_off))
@@ -103,20 +103,20 @@ def probability(weights: Values, inputs: Values) -> Values:
     return np.asarray(expit(weights[0] + inputs @ weights[1:]))
 
 
-def fitted_place(s: Samples) -> Values:
-    """Return bias and weight [2] of the most likely logistic model of the place, if a wrong fit or a wrong place puts a
-    frame off."""
+def even_std_m(s: Samples) -> float:
+    """Return the most likely standard deviation of a position that is as likely off as not, if a wrong fit or a wrong
+    place puts a frame off."""
 
-    def loss(weights: Values) -> float:
-        p = np.clip(off_probability(weights, s), 1e-9, 1.0 - 1e-9)
-        return float(-np.log(np.where(s.off, p, 1.0 - p)).sum() + 0.5 * SHRINK * weights[1] ** 2)
+    def loss(log_m: float) -> float:
+        p = np.clip(off_probability(float(np.exp(log_m)), s), 1e-9, 1.0 - 1e-9)
+        return float(-np.log(np.where(s.off, p, 1.0 - p)).sum())
 
-    return np.asarray(minimize(loss, np.array([0.0, 1.0]), method="Nelder-Mead", options={"maxiter": 2000}).x)
+    return float(np.exp(minimize_scalar(loss, bounds=np.log((1e-3, 1e3)), method="bounded").x))
 
 
-def off_probability(weights: Values, s: Samples) -> Values:
+def off_probability(even_m: float, s: Samples) -> Values:
     """Return the probability of each frame to be off [N]."""
-    return np.asarray(1.0 - (1.0 - s.hop) * (1.0 - expit(weights[0] + weights[1] * s.log_std)))
+    return np.asarray(1.0 - (1.0 - s.hop) * even_m / (even_m + s.std_m))
 
 
 def judged(p: Values, off: NDArray[np.bool_]) -> dict[str, Any]:
@@ -130,12 +130,12 @@ def main(options: Options) -> int:
     s, held_out = samples_of(options.data), {}
     for name in sorted(set(s.sequence.tolist())):
         test, others = s.of(s.sequence == name), s.of(s.sequence != name)
-        held_out[name] = judged(off_probability(fitted_place(others), test), test.off)
-    weights = fitted_place(s)
+        held_out[name] = judged(off_probability(even_std_m(others), test), test.off)
+    even_m = even_std_m(s)
     found = {
-        "weights": dict(zip(("bias", "log position std"), weights.tolist(), strict=True)),
+        "even_std_m": even_m,
         "lost": float(s.lost_off.mean()) if len(s.lost_off) else None, "held_out": held_out,
-        "all": judged(off_probability(weights, s), s.off),
+        "all": judged(off_probability(even_m, s), s.off),
     }  # fmt: skip
     measured = program.keep("failure_probability", found, options, data=options.data.name)
     print(tables.table(measured))
@@ -145,7 +145,6 @@ def main(options: Options) -> int:
 def sections(measured: dict[str, Any]) -> list[Section]:
     """Tabulate the weights, and how well they judge sequences that they were not fitted to."""
     measured = measured["figures"]
-    weights = [[name, significant(value)] for name, value in measured["weights"].items()]
     judgements = {f"{name}, fitted to the others": scores for name, scores in measured["held_out"].items()}
     rows = [
         [name, str(s["frames"]), f"{100 * s['off']:.2f} %", f"{100 * s['mean']:.2f} %",
@@ -153,7 +152,7 @@ def sections(measured: dict[str, Any]) -> list[Section]:
         for name, s in (judgements | {"all, fitted to all": measured["all"]}).items()
     ]  # fmt: skip
     return [
-        Section("Weights of p_off", ("input", "weight"), weights),
+        Section("Place", ("as likely off as not, m",), [[significant(measured["even_std_m"])]]),
         Section(
             "Tracked frames, without lost ones",
             ("sequence", "frames", "off by > 5 cm", "mean p_off", "AUROC", "Brier"),

@@ -40,7 +40,7 @@ def test_each_kind_of_evidence_raises_the_probability(worse: dict[str, float]) -
     ids=["first frame", "without comparison", "flat image", "no residual", "undefined residual", "nothing in common"],
 )  # fmt: skip
 def test_missing_values_still_give_a_probability(values: dict[str, float]) -> None:
-    assert 0.0 < Confidence([0.0]).probability(TRACKED, values) <= 1.0
+    assert 0.0 <= Confidence([0.0]).probability(TRACKED, values) <= 1.0
 
 
 def test_a_wrong_fit_or_a_wrong_place_alone_puts_a_frame_off() -> None:

@@ -11,7 +11,6 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
-from scipy.special import expit
 
 from sigmasplat.data.trajectory import APART, LOST
 from sigmasplat.fit.compare import Comparison
@@ -21,8 +20,9 @@ from sigmasplat.types import Matrix
 
 LOOP_STD_M = 0.01
 """Standard deviation of the position that a loop gives, in a room."""
-PLACE_BIAS, PLACE_WEIGHT = -2.66, 0.92
-"""The log odds that the place is off: bias + weight · log(standard deviation of the position, m + 1 mm)."""
+EVEN_STD_M = 38.0
+"""A place is as likely off as not if this is the standard deviation of its position; the odds are in proportion. The
+value is large because these deviations, of hops alone, are far too careful: after one hop of unknown error, a metre."""
 COMPARED = [field.name for field in fields(Comparison)]
 CERTAIN = {LOST: 0.85, APART: 0.99}
 """Fixed probabilities: of a lost frame (the share of lost frames whose guess is off), and of a frame whose place in the
@@ -70,19 +70,14 @@ class Confidence:
         """
         if state in CERTAIN:
             return CERTAIN[state]
-        place = float(expit(PLACE_BIAS + PLACE_WEIGHT * log_position_std(tracking)))
-        return 1.0 - (1.0 - hop_wrong(tracking)) * (1.0 - place)
+        std_m = tracking.get("position_std_m", 0.0)
+        return 1.0 - (1.0 - hop_wrong(tracking)) * EVEN_STD_M / (EVEN_STD_M + std_m)
 
 
 def hop_wrong(tracking: Mapping[str, float]) -> float:
     """Return the probability that the fit of a frame is wrong; without a comparison, by its agreement."""
     seen: dict[str, Any] = {name: tracking[name] for name in COMPARED if name in tracking}
     return p_wrong(Comparison(**seen)) if "close" in seen else 1.0 - tracking.get("agreement", 1.0)
-
-
-def log_position_std(tracking: Mapping[str, float]) -> float:
-    """Return the logarithm of the standard deviation of the position, m, plus 1 mm."""
-    return math.log(tracking.get("position_std_m", 0.0) + 1e-3)
 
 
 def std_of(information: Matrix) -> float:
