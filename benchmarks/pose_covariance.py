@@ -24,7 +24,7 @@ from sigmasplat.config.text import override
 from sigmasplat.errors import SourceError
 from sigmasplat.graph.path_covariance import PathCovariance
 from sigmasplat.plugins.evaluation.path_scores import MOTIONS, score_path_covariance
-from sigmasplat.plugins.sources import open_source
+from sigmasplat.run.scene import open_scene
 from sigmasplat.system.slam import Slam
 
 arg = tyro.conf.arg
@@ -71,9 +71,10 @@ class Options:
 
 def measure(path: str, options: Options) -> dict[str, Any]:
     """Run one sequence and score its poses. Raises SourceError if it cannot be read or has no truth."""
-    config = override(preset_of(options.preset), {"final.iterations": "0", "input.width": str(options.width)})
-    source, slam = open_source(path, limit=options.limit or 0), Slam(config)
-    truth = source.truth()
+    settings = {"final.iterations": 0, "input.width": options.width, "input.limit": options.limit or 0}
+    config = override(preset_of(options.preset), {name: str(value) for name, value in settings.items()})
+    source, config = open_scene(path, config)
+    slam, truth = Slam(config), source.truth()
     if truth is None:
         raise SourceError(f"{path} has no ground truth")
     if options.truth_error and truth.error_rms is None:

@@ -105,14 +105,9 @@ PAGES = {
             ),
             Shown(
                 "pose-covariance",
-                "The covariance of poses holds in rendered rooms and not with a real sensor (redkitchen).",
+                "Whether the covariance of motions covers their errors.",
                 without=("NEES, mean", "… median"),
-                only=("livingroom", "redkitchen", "mean of the rooms with noise"),
-            ),
-            Shown(
-                "pose-covariance-mocap",
-                "The same on recordings that were not used in development, with true poses by motion capture.",
-                without=("NEES, mean", "… median"),
+                only=("50 frames",),
             ),
             Shown(
                 "failure-probability",
@@ -154,6 +149,7 @@ PAGES = {
             Shown(
                 "judge", "A pose is judged by one probability; each recording by a model without it.",
                 ("Each recording by a model without it", "Stated and true, without the corridor"),
+                ("lost: right, wrong, %", "not sure: right, wrong, %", "wrong", "poses"),
             ),
             Shown(
                 "sensor-times", "Stamps of depth were moved, and found again without truth.", ("Depth moved in time",),
@@ -186,7 +182,6 @@ PAGES = {
                 "moving-still", "Recordings in which nothing moves: what the search masks by mistake.",
                 without=("lost frames", "splats"),
             ),
-            Shown("search-cost", "What the search costs where nothing moves."),
         ),
     ),
     "data": Page(
