@@ -13,15 +13,15 @@ from sigmasplat.fit.pose import PoseFit
 MEDIAN_NORMAL = 0.6745
 """The median of |x| if x is a standard normal number."""
 RECENT, FEW = 50, 5
-"""What is usual is the median over this many recent frames that were not lost; fewer than the second do not tell."""
+"""Noise is measured by this many recent frames that were not lost; each of the first few corrects it at once."""
 WEIGHTS = {"unexplained": 1.60, "uncorrelated": 2.07, "unsupported": 1.23, "moved": 6.06}
 BIAS = 5.31
 """The log odds that a pose is wrong are BIAS + Σ weight · quantity (`evidence`). `benchmarks/judge.py` fits them to
 pairs of frames with known truth, aligned from random guesses of which a quarter lead to a wrong pose."""
 LOST, DOUBTFUL, SURE = 0.5, 0.1, 0.03
 """Limits of this probability. A tracked pose is lost where it is more likely wrong than right, for a lost frame only
-costs itself. It is doubtful, and not mapped, above the second: a wrong keyframe costs ten times as much as one too few.
-Below the third, a pose counts without a path that leads to it: a wrong loop bends the whole map."""
+costs itself. Above the second it is doubtful, and tried again from other guesses, which cost little. Below the third, a
+pose counts without a path that leads to it: a wrong loop bends the whole map."""
 DOUBT = 0.7
 """Without a comparison, a pose is doubtful if its agreement × overlap falls below this share of the usual value."""
 FEW_MATCHES = 15

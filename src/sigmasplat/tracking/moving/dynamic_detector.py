@@ -198,7 +198,7 @@ class DynamicDetector:
         rest agrees better, there or at another pose; if the images contradict it, all.
 
         Without contradiction, frames in which gray values differ are looked at by turns. urgent: something was in front
-        in the last one, or gray values agree much less than usual.
+        in the last one.
         """
         if keyframe is None or fit.comparison is None:
             return self, iter(())
