@@ -1,8 +1,8 @@
 """Fit the probability that a pose is off by more than 5 cm (graph/confidence.py).
 
 The data are disturbed recordings with known truth, kept by benchmarks/robustness.py --keep DIR. A model that is fitted
-to all sequences but one is judged on that one. Writes benchmarks/results/<name>-<machine>.json and prints the weights,
-which belong into confidence.py.
+to all sequences but one is judged on that one. Writes benchmarks/results/<name>-<machine>.json and prints the standard
+deviation at which a place is as likely off as not, which belongs into confidence.py.
 
 example: python benchmarks/failure_probability.py --data runs/kept
 """
@@ -20,16 +20,13 @@ import tables
 import tyro
 from numpy.typing import NDArray
 from robustness_scores import auroc
-from scipy.optimize import minimize, minimize_scalar
-from scipy.special import expit
+from scipy.optimize import minimize_scalar
 from tables import Section, significant
 
 from sigmasplat.graph.confidence import hop_wrong
 from sigmasplat.plugins.evaluation.metrics.trajectory import OFF_M, brier
 
 arg = tyro.conf.arg
-SHRINK = 1.0
-"""Weight of the squared weights in the loss: correlated inputs share their weight."""
 Values = NDArray[np.float64]
 
 
@@ -83,26 +80,6 @@ def _plain(tracking: Mapping[str, float | None]) -> dict[str, float]:
     return {name: float("nan") if value is None else value for name, value in tracking.items()}
 
 
-def fitted(inputs: Values, off: NDArray[np.bool_]) -> Values:
-    """Return bias and weights [1 + K] of the most likely logistic model; no input may lower the probability."""
-    x = np.column_stack([np.ones(len(inputs)), inputs])
-
-    def loss(weights: Values) -> tuple[float, Values]:
-        z = x @ weights
-        p = expit(z)
-        value = float(np.logaddexp(0.0, z).sum() - z[off].sum() + 0.5 * SHRINK * (weights[1:] ** 2).sum())
-        return value, x.T @ (p - off) + SHRINK * np.concatenate([[0.0], weights[1:]])
-
-    bounds = [(None, None)] + [(0.0, None)] * inputs.shape[1]
-    start = np.zeros(x.shape[1])
-    return np.asarray(minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 2000}).x)
-
-
-def probability(weights: Values, inputs: Values) -> Values:
-    """Return the probability of each frame [N]."""
-    return np.asarray(expit(weights[0] + inputs @ weights[1:]))
-
-
 def even_std_m(s: Samples) -> float:
     """Return the most likely standard deviation of a position that is as likely off as not, if a wrong fit or a wrong
     place puts a frame off."""
@@ -143,7 +120,7 @@ def main(options: Options) -> int:
 
 
 def sections(measured: dict[str, Any]) -> list[Section]:
-    """Tabulate the weights, and how well they judge sequences that they were not fitted to."""
+    """Tabulate the fitted value, and how well it judges sequences that it was not fitted to."""
     measured = measured["figures"]
     judgements = {f"{name}, fitted to the others": scores for name, scores in measured["held_out"].items()}
     rows = [

@@ -24,8 +24,10 @@ import record
 import tyro
 from disturbances import DISTURBANCES, Color, Depth, Moment
 from disturbed_recordings import Original, original
-from failure_probability import Values, fitted, judged, probability
+from failure_probability import Values, judged
 from numpy.typing import NDArray
+from scipy.optimize import minimize
+from scipy.special import expit
 from tables import Section, significant
 
 from sigmasplat.config.find_preset import default_preset, preset
@@ -44,8 +46,12 @@ OF_THE_CAMERA = (
     "clean", "clean", "blur", "color-noise", "depth-noise", "shared-noise", "coarse-depth", "edge-erosion", "missing",
     "range-clip", "little-contrast",
 )  # fmt: skip
+"""Disturbances of both images."""
 OF_ONE_IMAGE = ("moving-object", "brightness")
-"""Disturbances of both images, and of one."""
+"""Disturbances of the second image alone."""
+SHRINK = 1.0
+"""Weight of the squared weights in the loss: correlated quantities share their weight."""
+CONFIG = preset(default_preset())
 RIGHT, WRONG = 0.03, 0.05
 """A pose that shifts the image by less than the first share of the depth is right, by more than the second wrong. In
 between, the truth's own errors decide; such pairs are left out."""
@@ -86,11 +92,10 @@ class Pairs:
 
     def pyramid(self, color: Color, depth: Depth) -> Pyramid:
         """Return a frame as tracking aligns it."""
-        config = preset(default_preset())
         frame = Frame(0, 0.0, color.astype(np.float32) / 255.0, depth, self.images.camera)
-        working = working_frame(frame, config)
-        self.view = self.view or view_of(working.camera, config)
-        return observe(frame, working, self.view, config, None).live
+        working = working_frame(frame, CONFIG)
+        self.view = self.view or view_of(working.camera, CONFIG)
+        return observe(frame, working, self.view, CONFIG, None).live
 
     def drawn(self) -> tuple[Pyramid, Pyramid, NDArray[np.float64]] | None:
         """Return two images and their true motion T_b_a [4, 4]; None if the second frame is outside the recording."""
@@ -111,7 +116,7 @@ def measure_source(source: str, number: int, seed: int, scratch: Path) -> dict[s
     board_runs.one_thread()
     located = source if source.startswith("synthetic") else accuracy.located(source)
     pairs = Pairs(original(located, 0.0, scratch, MOST_FRAMES), np.random.default_rng(seed))
-    weight, inputs, shifts = preset(default_preset()).tracking.align_weight_color, list[list[float]](), list[float]()
+    weight, inputs, shifts = CONFIG.tracking.align_weight_color, list[list[float]](), list[float]()
     while len(shifts) < number:
         found = pairs.drawn()
         if found is None or len(found[0].points) < LEAST_POINTS:
@@ -151,6 +156,24 @@ class Poses:
         """Return the poses of some recordings."""
         return Poses(np.concatenate([p.inputs for p in parts]), np.concatenate([p.wrong for p in parts]))
 
+    def fitted(self) -> Values:
+        """Return bias and weights [1 + K] of the most likely logistic model; no quantity may lower the probability."""
+        x = np.column_stack([np.ones(len(self.inputs)), self.inputs])
+
+        def loss(weights: Values) -> tuple[float, Values]:
+            z = x @ weights
+            value = np.logaddexp(0.0, z).sum() - z[self.wrong].sum() + 0.5 * SHRINK * (weights[1:] ** 2).sum()
+            return float(value), x.T @ (expit(z) - self.wrong) + SHRINK * np.concatenate([[0.0], weights[1:]])
+
+        bounds = [(None, None)] + [(0.0, None)] * self.inputs.shape[1]
+        start, most = np.zeros(x.shape[1]), {"maxiter": 2000}
+        return np.asarray(minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds, options=most).x)
+
+
+def probability(weights: Values, inputs: Values) -> Values:
+    """Return the probability of each pose to be wrong [N]."""
+    return np.asarray(expit(weights[0] + inputs @ weights[1:]))
+
 
 def shares(p: Values, wrong: NDArray[np.bool_]) -> dict[str, list[float]]:
     """Return for each limit the shares of right and of wrong poses above it."""
@@ -163,14 +186,13 @@ def measure(options: Options) -> dict[str, Any]:
         work = partial(measure_source, number=options.number, seed=options.seed, scratch=Path(scratch))
         poses = dict(zip(options.sources, map(Poses.of, pool.map(work, options.sources)), strict=True))
     used = {name: each for name, each in poses.items() if name != ONLY_JUDGED}
-    weights = fitted(*vars(Poses.joined(list(used.values()))).values())
-    held_out, chances = {}, []
+    weights = Poses.joined(list(used.values())).fitted()
+    held_out, chances = {}, dict[str, Values]()
     for name, each in poses.items():
-        without = fitted(*vars(Poses.joined([other for key, other in used.items() if key != name])).values())
-        chances.append(probability(without, each.inputs))
-        held_out[name] = judged(chances[-1], each.wrong) | {"above": shares(chances[-1], each.wrong)}
-    p, wrong = (np.concatenate([each for key, each in zip(poses, of, strict=True) if key != ONLY_JUDGED])
-                for of in (chances, [each.wrong for each in poses.values()]))  # fmt: skip
+        without = Poses.joined([other for key, other in used.items() if key != name]).fitted()
+        p = chances[name] = probability(without, each.inputs)
+        held_out[name] = judged(p, each.wrong) | {"above": shares(p, each.wrong)}
+    p, wrong = np.concatenate([chances[name] for name in used]), Poses.joined(list(used.values())).wrong
     bins = [(p > low) & (p <= high) for low, high in pairwise(BINS)]
     return {
         "bias": float(weights[0]), "weights": dict(zip(WEIGHTS, weights[1:].tolist(), strict=True)),

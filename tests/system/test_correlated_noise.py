@@ -1,11 +1,13 @@
 """Depth whose noise neighbouring pixels share, as that of stereo cameras: no single image shows it."""
 
+import importlib
 from dataclasses import replace
+from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 
+import benchmark_results  # noqa: F401 - finds the programs of the benchmarks
 from sigmasplat.config.find_preset import preset
 from sigmasplat.config.text import override
 from sigmasplat.data.frame import Frame
@@ -15,19 +17,15 @@ from sigmasplat.system.slam import Slam
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
+disturbances: Any = importlib.import_module("disturbances")
 LITTLE = {"mapping.first_iterations": "20", "mapping.iterations": "4", "final.iterations": "0"}
-STD_PER_M, WIDTH_PX = 0.012, 4.0
+STD_PER_M = 0.012
 
 
 def noisy(frame: Frame, random: np.random.Generator) -> Frame:
-    """Return a frame whose depth has noise of `STD_PER_M` z² that is alike within `WIDTH_PX`, and holes."""
-    noise, holes = (
-        cv2.GaussianBlur(random.standard_normal(frame.depth_m.shape, np.float32), (0, 0), width)
-        for width in (WIDTH_PX, 2 * WIDTH_PX)
-    )
-    depth_m = frame.depth_m + STD_PER_M * frame.depth_m**2 * noise / noise.std()
-    seen = (frame.depth_m > 0) & (holes < holes.std())
-    return replace(frame, depth_m=np.where(seen, depth_m, 0.0).astype(np.float32))
+    """Return a frame with noise of `STD_PER_M` z² that patches of pixels share, and holes, as that of robustness.py."""
+    moment = disturbances.Moment(random, 0, 0, 0.0, float)
+    return replace(frame, depth_m=disturbances.shared_noise(frame.color, frame.depth_m, STD_PER_M, moment)[1])
 
 
 @pytest.mark.parametrize("seed", range(2))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from command_line import exit_code
-from sigmasplat.config import Config
+from sigmasplat.config import Config, TrackingConfig
 from sigmasplat.config.find_preset import default_preset, preset
 from sigmasplat.config.text import override
 from sigmasplat.data.frame import Frame
@@ -80,3 +80,15 @@ def test_lost_frames_are_not_scored_and_not_exported(
     out: Path = run.path.parent / "path.txt"
     assert exit_code("export", str(run.path), "--out", str(out)) == 0
     assert len(read_poses(out)) == FRAMES - 2 and "left out: 2 lost" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("least_share", "state"), [(0.2, "tracked"), (0.9, "lost")])
+def test_a_frame_that_shares_too_little_is_lost(
+    monkeypatch: pytest.MonkeyPatch, least_share: float, state: str
+) -> None:
+    monkeypatch.setattr(TrackingConfig, "lost_share", least_share)
+    little = {"mapping.first_iterations": "5", "final.iterations": "0", "recovery.relocalise": "false"}
+    room, slam = SyntheticRoom(frames=120, width=160, height=120), Slam(override(preset("sigma"), little))
+    slam.step(room.frame(0))
+    step = slam.step(replace(room.frame(5), index=1))
+    assert 0.2 < step.tracking["common"] < 0.9 and step.state == state

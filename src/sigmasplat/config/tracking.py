@@ -78,7 +78,7 @@ class TrackingConfig(Section, name="tracking"):
     """Learning rate of the exposure: change per step of the factor's logarithm and of the offset (colours 0 to 1)."""
     features: bool = True
     """Whether sparse features give a second guess of the pose where the first fit is doubtful (ours). The same fit
-    starts from each guess, and the result that explains more is used."""
+    starts from each guess, and the pose that is least likely wrong is used."""
     verify: bool = True
     """Whether a pose is judged by comparing surfaces at it (ours); off = by agreement and overlap only. It needs
     `method` align. Alignment then uses the part of σ that depends on the distance, by the model of `input.sensor`,
@@ -151,7 +151,7 @@ class RecoveryConfig(Section, name="recovery"):
 class MovingConfig(Section, name="moving"):
     """Things that move are left out of tracking and of the map (ours)."""
 
-    find: bool = True  # up to 3 % of the time where nothing moves (benchmarks/search_cost.py)
+    find: bool = True  # what it costs where nothing moves: benchmarks/search_cost.py
     """Whether keyframes are compared with each other: what one shows in space that another has seen to be free is
     masked, and splats there are removed. Off = only what is nearer than the newest keyframe is masked, in tracking with
     `tracking.verify` (papers: nothing)."""

@@ -23,7 +23,7 @@ LOOP_STD_M = 0.01
 EVEN_STD_M = 38.0
 """A place is as likely off as not if this is the standard deviation of its position; the odds are in proportion. The
 value is large because these deviations, of hops alone, are far too careful: after one hop of unknown error, a metre."""
-COMPARED = [field.name for field in fields(Comparison)]
+COMPARED = [each.name for each in fields(Comparison)]
 CERTAIN = {LOST: 0.85, APART: 0.99}
 """Fixed probabilities: of a lost frame (the share of lost frames whose guess is off), and of a frame whose place in the
 world is not known."""

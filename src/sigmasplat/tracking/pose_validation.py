@@ -53,7 +53,7 @@ AGREES_MORE = 0.05
 def evidence(c: Comparison) -> dict[str, float]:
     """Return the quantities by which a pose is judged: logarithms of the share of the surface that is seen through, of
     what the gray values miss to a correlation of 1, and of the share of the images that supports the pose; and how far
-    it is from its guess. It is not in proportion: staying at the guess does not make a pose right."""
+    the pose is from its guess. The last is no logarithm: a small distance does not make a pose right."""
     seen, correlation = c.close + c.behind, FLAT if np.isnan(c.correlation) else max(c.correlation, 0.0)
     return {
         "unexplained": math.log(c.behind / max(seen, 1e-9) + 0.01),
