@@ -99,6 +99,7 @@ class MadeUpStep:
     seconds: dict[str, float] = field(default_factory=lambda: {"total": 0.1})
     state: str = "tracked"
     component: int = 0
+    diagnosis: str = "20% of the image supports the pose"
     p_off: float = 0.25
 
 
@@ -305,7 +306,7 @@ def test_lost_frames_are_printed(corridor: Corridor, capsys: pytest.CaptureFixtu
     MadeUpSlam.lost = {2, 3, 5}
     assert exit_code("run", "corridor") == 0
     said = capsys.readouterr().out
-    assert "frame 2 (t = 2.000 s): tracking lost" in said
+    assert "frame 2 (t = 2.000 s): tracking lost (20% of the image supports the pose)" in said
     assert "frame 4 (t = 4.000 s): tracking recovered; it was lost since frame 2" in said
     assert "3 of 6 images have no pose (2–3, 5)" in said
     assert said.count("tracking lost") == 2

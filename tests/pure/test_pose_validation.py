@@ -1,5 +1,6 @@
 """The verdict on a pose by the probability that it is wrong, and the noise of depth that only two images show."""
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -16,6 +17,7 @@ from sigmasplat.tracking.pose_validation import (
     SURE,
     TrackingStatistics,
     confirmed,
+    diagnosis,
     p_wrong,
     recognised,
 )
@@ -56,6 +58,23 @@ def test_what_is_seen_through_or_shares_nothing_is_wrong() -> None:
 def test_every_quantity_that_is_worse_makes_the_pose_less_sure(c: Comparison, name: str, change: float) -> None:
     worse: dict[str, Any] = {name: getattr(c, name) + change}
     assert p_wrong(replace(c, **worse)) > p_wrong(c)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({}, "90% of the image supports the pose"),
+        ({"behind": 0.5, "close": 0.5, "correlation": 0.7}, "known surfaces are seen through on 50% of it"),
+        ({"correlation": 0.1, "moved": 0.2}, "gray correlates by 0.10"),
+        ({"correlation": math.nan, "behind": 0.02, "moved": 0.4}, "the images have no texture"),
+        ({"correlation": 0.7, "moved": 1.0}, "it is off from the expected one by 100% of the depth"),
+        ({"common": 0.01, "correlation": 0.93, "behind": 0.05}, "1% of the image supports the pose, but that is"),
+        ({"residual": math.inf}, "the images have next to nothing in common"),
+    ],
+)
+def test_the_diagnosis_names_what_speaks_most_against_a_pose(change: dict[str, Any], said: str) -> None:
+    c = replace(GOOD, **({"common": 0.9, "covered": 0.95, "close": 1.0, "front": 0.0, "behind": 0.0} | change))
+    assert said in diagnosis(c) and (", but " in diagnosis(c)) == (DOUBTFUL < p_wrong(c) < 1.0)
 
 
 def test_few_matches_need_images_that_agree_better() -> None:

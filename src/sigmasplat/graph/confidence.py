@@ -74,10 +74,16 @@ class Confidence:
         return 1.0 - (1.0 - hop_wrong(tracking)) * EVEN_STD_M / (EVEN_STD_M + std_m)
 
 
+def compared(tracking: Mapping[str, float]) -> Comparison | None:
+    """Return the comparison of surfaces among the values of a fit, if it was made."""
+    seen: dict[str, Any] = {name: tracking[name] for name in COMPARED if name in tracking}
+    return Comparison(**seen) if "close" in seen else None
+
+
 def hop_wrong(tracking: Mapping[str, float]) -> float:
     """Return the probability that the fit of a frame is wrong; without a comparison, by its agreement."""
-    seen: dict[str, Any] = {name: tracking[name] for name in COMPARED if name in tracking}
-    return p_wrong(Comparison(**seen)) if "close" in seen else 1.0 - tracking.get("agreement", 1.0)
+    seen = compared(tracking)
+    return 1.0 - tracking.get("agreement", 1.0) if seen is None else p_wrong(seen)
 
 
 def std_of(information: Matrix) -> float:

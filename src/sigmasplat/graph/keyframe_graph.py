@@ -55,6 +55,7 @@ class KeyframeSolution:
 
 def edge_between(a: int, b: int, reference: Pyramid, live: Pyramid, T_b_a: Matrix) -> RelativePose | None:
     """Align keyframe b to keyframe a from a guess T_b_a [4, 4]; None if the images do not confirm the result."""
+    live = live.hiding(live.kernels.to_host(live.depth[0]) == 0)
     motion, seen = best_alignment(reference, live, T_b_a)
     if motion.degenerate or not confirmed(seen) or not np.isfinite(motion.covariance).all():
         return None

@@ -160,7 +160,7 @@ class _StepShow(Callback):
         where = f"frame {step.index} (t = {step.timestamp_s:.3f} s)"
         if step.lost and self.lost_since is None:
             self.lost_since = step.index
-            self.say(f"{where}: tracking lost")
+            self.say(f"{where}: tracking lost{f' ({step.diagnosis})' if step.diagnosis else ''}")
         elif not step.lost and self.lost_since is not None:
             how = "relocalised" if step.state == RELOCALISED else "tracking recovered"
             self.say(f"{where}: {how}; it was lost since frame {self.lost_since}")

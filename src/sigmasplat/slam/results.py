@@ -9,12 +9,13 @@ import numpy as np
 
 from sigmasplat.data.poses import Part, Records
 from sigmasplat.data.trajectory import APART, LOST, STATES, TRACKED
-from sigmasplat.graph.confidence import Confidence
+from sigmasplat.graph.confidence import Confidence, compared
 from sigmasplat.graph.loops import Loop
 from sigmasplat.render.view import View
 from sigmasplat.tracking.drift import Drift
 from sigmasplat.tracking.frame_estimate import FrameEstimate
 from sigmasplat.tracking.moving.dynamic_mask import share_of
+from sigmasplat.tracking.pose_validation import diagnosis
 from sigmasplat.tracking.prepared_frame import PreparedFrame
 from sigmasplat.tracking.tracker import Tracker
 from sigmasplat.types import Matrix, Stopwatch
@@ -60,6 +61,12 @@ class Step:
     component: int = 0
     p_off: float = 0.0
     covariance: Matrix | None = None
+
+    @property
+    def diagnosis(self) -> str:
+        """Return in words what supports the pose, and what speaks against it; empty if surfaces were not compared."""
+        seen = compared(self.tracking)
+        return "" if seen is None else diagnosis(seen)
 
 
 def make_step(

@@ -34,20 +34,10 @@ LEARNS_CORRELATION = 0.9
 MOST_SPREAD_M = 0.05
 """A pose without a known path is refused if the standard deviation of its position is larger: where only a wall is in
 view, the images agree as well at every pose along it."""
-DIFFERS, DRAWS = 0.02, 2.5
-"""A moving thing may have pulled the pose if 1 − correlation of the gray values is above the first value. It has pulled
-the pose if 1 − correlation falls by more than the second, a factor, when the thing is left out. For still things in
-recordings the factor was below 2."""
-SUSPECTED = 1.3
-"""A thing is suspected if 1 − correlation falls by this factor when the thing is left out at the same pose. The factor
-is low because a pulled pose lies between the motion of the camera and that of the thing, where the rest of the image
-does not agree either: it is 1.6 to 2.0 for a ball that covers a tenth of the image. The pose is then fitted without the
-thing, and the other tests decide."""
+DIFFERS = 0.02
+"""Gray values of a thing may show that it moves if 1 − their correlation is above this."""
 DISAGREES = 1.5
-"""A suspected thing moves only if it disagrees with the rest of the image: at the pose fitted without the thing,
-1 − correlation is this many times larger with the thing than without it. Otherwise the first pose was a poor fit."""
-AGREES_MORE = 0.05
-"""A thing has also pulled a doubtful pose if leaving it out raises the correlation of the gray values by this."""
+"""A thing disagrees with the rest of the image if 1 − correlation is this many times larger with it than without it."""
 
 
 def evidence(c: Comparison) -> dict[str, float]:
@@ -66,10 +56,33 @@ def evidence(c: Comparison) -> dict[str, float]:
 def p_wrong(c: Comparison) -> float:
     """Return the probability that a pose is wrong: that it shifts the image by more than 5 % of the depth. A pose at
     which the images have next to nothing in common counts as wrong."""
+    odds = wrong_odds(c)
+    return odds / (1.0 + odds) if math.isfinite(odds) else 1.0
+
+
+def wrong_odds(c: Comparison) -> float:
+    """Return the odds of the same."""
     if not math.isfinite(c.residual):
-        return 1.0
-    odds = BIAS + sum(WEIGHTS[name] * value for name, value in evidence(c).items())
-    return 1.0 / (1.0 + math.exp(-odds))
+        return math.inf
+    return math.exp(BIAS + sum(WEIGHTS[name] * value for name, value in evidence(c).items()))
+
+
+def diagnosis(c: Comparison) -> str:
+    """Return in words what supports a pose, and what speaks most against it if it is doubtful."""
+    supported = f"{min(c.common, c.covered) * (c.close + c.behind):.0%} of the image supports the pose"
+    if p_wrong(c) <= DOUBTFUL:
+        return supported
+    if not math.isfinite(c.residual):
+        return "the images have next to nothing in common"
+    texture = "the images have no texture" if np.isnan(c.correlation) else f"gray correlates by {c.correlation:.2f}"
+    words = {
+        "unexplained": f"known surfaces are seen through on {c.behind / max(c.close + c.behind, 1e-9):.0%} of it",
+        "uncorrelated": texture,
+        "unsupported": "that is little",
+        "moved": f"it is off from the expected one by {c.moved:.0%} of the depth",
+    }
+    best, here = evidence(Comparison(1.0, 1.0, 0.0, 0.0, 0.0, 1.0)), evidence(c)
+    return f"{supported}, but {words[max(words, key=lambda name: WEIGHTS[name] * (here[name] - best[name]))]}"
 
 
 def confirmed(c: Comparison) -> bool:
@@ -85,25 +98,6 @@ def recognised(c: Comparison, matches: int) -> bool:
 def differs(c: Comparison) -> bool:
     """Return whether the gray values differ so much that something may have pulled the pose."""
     return 1.0 - c.correlation > DIFFERS
-
-
-def agrees_more(without: Comparison | None, c: Comparison | None, contradicted: bool) -> bool:
-    """Return whether something has pulled a pose, by a comparison without it; contradicted: the pose was doubtful."""
-    if without is None or c is None:
-        return False
-    much = differs(c) and DRAWS * (1.0 - without.correlation) < 1.0 - c.correlation
-    return much or (contradicted and without.correlation > c.correlation + AGREES_MORE)
-
-
-def may_draw(without: Comparison, c: Comparison | None) -> bool:
-    """Return whether something may have pulled a pose, by a comparison without it at the same pose."""
-    return c is not None and differs(c) and SUSPECTED * (1.0 - without.correlation) < 1.0 - c.correlation
-
-
-def gray_gain(c: Comparison, better: Comparison) -> float:
-    """Return what the gray values miss to a correlation of 1, relative to what they miss at a better pose, minus 1; NaN
-    for flat images."""
-    return (1.0 - c.correlation) / max(1.0 - better.correlation, 1e-9) - 1.0
 
 
 def disagrees(whole: Comparison, without: Comparison | None) -> bool:

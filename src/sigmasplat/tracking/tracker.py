@@ -19,7 +19,7 @@ from sigmasplat.tracking.feature_image import FeatureImage, pose_by_features
 from sigmasplat.tracking.features import Extractor
 from sigmasplat.tracking.moving.dynamic_detector import DynamicDetector, together
 from sigmasplat.tracking.moving.dynamic_mask import DynamicMask
-from sigmasplat.tracking.moving.pose_pullers import has_drawn, is_scene, is_still
+from sigmasplat.tracking.moving.pose_pullers import has_pulled, is_scene, is_still, suspected
 from sigmasplat.tracking.pose_prediction import CameraMotion, Given, PosePrediction, odometry, predict
 from sigmasplat.tracking.pose_validation import TrackingStatistics
 from sigmasplat.tracking.predicted_depth_fit import NOTHING_FITTED, DepthFit
@@ -124,7 +124,7 @@ class Tracker:
             return fit, first
         found = self._without_front(given, seen, first, fit, before)
         if found is None and self.detector.config.find and not given.should_stop():
-            found = self._without_object(given, seen, fit, before is not None)
+            found = self._without_puller(given, seen, fit)
         return (fit, first) if found is None else found
 
     def _without_front(
@@ -156,17 +156,13 @@ class Tracker:
         self.keyframe = keyframe
         return None
 
-    def _without_object(
-        self, given: Given, seen: PreparedFrame, drawn: PoseFit, known: bool
+    def _without_puller(
+        self, given: Given, seen: PreparedFrame, pulled: PoseFit
     ) -> tuple[PoseFit, PreparedFrame] | None:
-        """Return the fit and the frame without the thing that moves and has drawn the pose with it; None if there is
-        none. known: the last frame had something in front."""
-        predicted = given.prediction.predicted
-        contradicted = self._doubts(drawn)
-        self.detector, things = self.detector.suspected(self.keyframe, seen, drawn, self.config, contradicted, known)
-        for front in unless(given.should_stop, things):
-            found = self._fit(given, shown := seen.aside(front), predicted)
-            if self._stands(found) and has_drawn(front, self.keyframe, seen, drawn, found, contradicted):
+        """Return the fit and the frame without the thing that moves and has pulled the pose; None if there is none."""
+        for front in unless(given.should_stop, suspected(seen, pulled)):
+            found = self._fit(given, shown := seen.aside(front), given.prediction.predicted)
+            if self._stands(found) and has_pulled(pulled, found):
                 self.front = front
                 return found, shown
         return None

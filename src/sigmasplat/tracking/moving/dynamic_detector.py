@@ -1,16 +1,14 @@
 """Find what moves: relative to the newest keyframe, what came in front of it and what has left its place; relative to
 what recent frames saw, what moves too slowly to show against the keyframe."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from sigmasplat.config import MovingConfig, TrackingConfig
+from sigmasplat.config import MovingConfig
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.fit.compare import Comparison
-from sigmasplat.fit.pose import PoseFit
 from sigmasplat.fit.references import Reference
 from sigmasplat.tracking.moving.dynamic_mask import (
     LEAST_REGION,
@@ -22,8 +20,7 @@ from sigmasplat.tracking.moving.dynamic_mask import (
     smooth,
 )
 from sigmasplat.tracking.moving.free_space import Depth, labelled, widened
-from sigmasplat.tracking.moving.pose_pullers import is_scene, suspected
-from sigmasplat.tracking.pose_validation import differs
+from sigmasplat.tracking.moving.pose_pullers import is_scene
 from sigmasplat.tracking.prepared_frame import PreparedFrame
 from sigmasplat.types import Matrix, ShouldStop
 
@@ -135,19 +132,15 @@ FRONT = 0.03
 
 RENEWED = 0.7
 """A frame with something in front becomes a keyframe if it shares less than this with the newest one."""
-DRAWN_EVERY, IN_VAIN = 2, 3
-"""What draws the pose is looked for in every second frame, in every one if it is urgent: between keyframes, a wrong
-pose does not last. After so many looks in vain, half as often."""
 
 
 @dataclass(frozen=True, eq=False)
 class DynamicDetector:
-    """What is known of moving things between two frames: what recent frames saw, and how often something that draws the
-    pose was looked for since something was in front. Without `config.find` nothing is remembered."""
+    """What is known of moving things between two frames: what recent frames saw. Without `config.find` nothing is
+    remembered."""
 
     config: MovingConfig = field(default_factory=MovingConfig)
     history: DepthHistory = field(default_factory=DepthHistory)
-    looks: int = 0
 
     def suspects(self, found: Comparison, known: DynamicMask | None, should_stop: ShouldStop) -> bool:
         """Return whether something may be in front of the scene, or may have left its place in it; known: what was
@@ -190,23 +183,6 @@ class DynamicDetector:
         gone = dynamic_mask(live, None, depth_m, seen.target.camera, whole_objects=True)
         return keyframe if gone is None or is_scene(gone, depth_m) else keyframe.without(gone.hidden)
 
-    def suspected(
-        self, keyframe: Reference | None, seen: PreparedFrame, fit: PoseFit, config: TrackingConfig,
-        contradicted: bool, urgent: bool,
-    ) -> tuple["DynamicDetector", Iterator[DynamicMask]]:  # fmt: skip
-        """Return the watch after a look, and the things in front that may have pulled a pose: those without which the
-        rest agrees better, there or at another pose; if the images contradict it, all.
-
-        Without contradiction, frames in which gray values differ are looked at by turns. urgent: something was in front
-        in the last one.
-        """
-        if keyframe is None or fit.comparison is None:
-            return self, iter(())
-        every = (1 if urgent else DRAWN_EVERY) * (1 if self.looks < IN_VAIN else 2)
-        if not (contradicted or (self.history.frames % every == 0 and differs(fit.comparison))):
-            return self, iter(())
-        return replace(self, looks=self.looks + 1), suspected(keyframe, seen, fit, config, contradicted)
-
     def renews(self, found: Comparison | None, front: DynamicMask | None) -> bool:
         """Return whether a frame with something in front becomes a keyframe: it shares too little with the newest."""
         if not self.config.find or front is None or found is None:
@@ -225,8 +201,7 @@ class DynamicDetector:
         if not self.config.find:
             return self
         depth_m, most = seen.target.depth_image.numpy(), self.config.still_frames
-        history = self.history.after(depth_m, front, T_world_camera, most)
-        return replace(self, history=history, looks=self.looks if front is None else 0)
+        return replace(self, history=self.history.after(depth_m, front, T_world_camera, most))
 
     def still_moving(
         self, front: DynamicMask | None, seen: PreparedFrame, T_world_camera: Matrix

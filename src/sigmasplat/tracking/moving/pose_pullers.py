@@ -1,62 +1,60 @@
-"""Find the thing that has pulled a pose: it moves, and the images agree much better without it."""
+"""Find the thing that has pulled a pose: the rest of the image asks for another one, by more than its errors explain.
+
+Both tests are those of a misfit that only part of the data has (Hausman 1978). Before a fit: at the pose that all
+pixels agree on, the gradient of the rest is not 0 (a score test). After it: the pose fitted without the thing is
+further away than its covariance says.
+"""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import fdtri
 
-from sigmasplat.config import TrackingConfig
 from sigmasplat.data import se3
-from sigmasplat.data.camera import Camera
-from sigmasplat.fit.align import align
+from sigmasplat.fit.align import Alignment, normal_equations
 from sigmasplat.fit.compare import STEP as COMPARE_STEP
 from sigmasplat.fit.pose import PoseFit
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference
-from sigmasplat.tracking.moving.dynamic_mask import (
-    EDGE_RELATIVE,
-    STEP,
-    DynamicMask,
-    coarse_rays,
-    enlarged,
-    smooth,
-    thinned,
-    with_margin,
-)
+from sigmasplat.tracking.moving.dynamic_mask import EDGE_RELATIVE, STEP, DynamicMask, enlarged, smooth, thinned
 from sigmasplat.tracking.moving.free_space import Depth, Mask, labelled, upper_median, widened
-from sigmasplat.tracking.pose_validation import agrees_more, differs, disagrees, gray_gain, may_draw
+from sigmasplat.tracking.pose_validation import differs, disagrees, wrong_odds
 from sigmasplat.tracking.prepared_frame import PreparedFrame
-from sigmasplat.types import Matrix
 
 OBJECT_SHARE, MOST_OBJECTS = (0.02, 0.5), 3
 """Share of the readings that a thing hides, and how many things are considered. What hides more than half of them is
 the scene: the motion of the camera is that of most of the image."""
 RING, FREE_AROUND = 3, 0.6
 """Something stands free if at least this share of the pixels at this distance around it is farther."""
-SHIFTED = 1e-3
-"""A thing has pulled the pose only if the pose fitted without it shifts the thing by at least this share of the width
-of the image. A thing that stays in place and only changes its brightness shifts less."""
-QUICK_LEVELS, QUICK_GAIN, QUICK_APART, QUICK_CLOSE = 2, 0.5, 2.5e-3, 5e-3
-"""The quick check fits the pose without a thing, on the `QUICK_LEVELS` coarsest images. The thing is suspected if the
-rest of the image gains at least `QUICK_GAIN` (`gray_gain`) and gain × shift is at least `QUICK_APART`.
-The share of close depths may fall by `QUICK_CLOSE`: poses from small images are not more exact."""
+LEVEL, CELL, FEWEST_CELLS = 1e-3, 256, 12
+"""A thing is suspected if the test that nothing moves is rejected at this level, by the scatter of the gradient over
+cells of so many pixels (native/align.h), if there are enough cells."""
+SHRINKS, PULLED = 0.01, 100.0
+"""A thing has pulled the pose if χ², with 6 degrees of freedom, is above the second value; independent errors exceed 22
+in 0.1 % of cases, and covariances of alignment are up to several times too small. They do not contain that alignment
+of noisy images shrinks motions, by about the first value as a share. The limit grows with the odds that the other pose
+is wrong, relative to those of the first one."""
 STILL_SHOWN, STILL_CLOSE = 0.5, 0.8
 """A thing is still if the keyframe shows at least this share of it, and this share of that is as far as before."""
-SHIFT_STEP = 4
-"""Every fourth row and column of a thing is used to find this shift."""
 
 
-def suspected(
-    keyframe: Reference, seen: PreparedFrame, fit: PoseFit, config: TrackingConfig, every: bool
-) -> Iterator[DynamicMask]:
-    """Yield the things in front that may have pulled a pose; with `every`, all that stand free. None hides most of the
-    readings."""
+def suspected(seen: PreparedFrame, fit: PoseFit) -> Iterator[DynamicMask]:
+    """Yield the things that stand free in front, at most half of the readings, and may have pulled a pose."""
+    if fit.alignment is None:
+        return
     live_m = seen.target.depth_image.numpy()
     for inside in free_standing(thinned(live_m, STEP)):
-        if every or _may_have_drawn(_front(*with_margin(inside, STEP, live_m), live_m), keyframe, seen, fit, config):
-            thing = _front(*enlarged(inside, STEP, live_m), live_m)
-            if not is_scene(thing, live_m):
-                yield thing
+        thing = thing_of(inside, live_m)
+        if not is_scene(thing, live_m) and rest_disagrees(fit.alignment, thing.hidden):
+            yield thing
+
+
+def thing_of(inside: Mask, live_m: Depth) -> DynamicMask:
+    """Return what stands free, from its pixels in `thinned` depth; what is behind it is not known."""
+    whole, hidden = enlarged(inside, STEP, live_m)
+    return DynamicMask(hidden, np.where(whole, live_m, np.float32(0.0)), np.where(hidden, np.float32(0.0), live_m))
 
 
 def is_scene(thing: DynamicMask, depth_m: Depth) -> bool:
@@ -64,29 +62,31 @@ def is_scene(thing: DynamicMask, depth_m: Depth) -> bool:
     return bool(np.count_nonzero(depth_m[thing.hidden]) > OBJECT_SHARE[1] * np.count_nonzero(depth_m))
 
 
-def _may_have_drawn(
-    thing: DynamicMask, keyframe: Reference, seen: PreparedFrame, fit: PoseFit, config: TrackingConfig
-) -> bool:
-    """Return whether the gray values agree better without a thing, at the same pose or at one that an alignment of
-    small images finds, where the depth agrees as well."""
-    rest = seen.hiding(thing)
-    here = keyframe.compared(rest, fit.T_camera_world)
-    if may_draw(here, fit.comparison):
-        return True
-    small, guess = keyframe.pyramid.coarse(QUICK_LEVELS), fit.T_camera_world @ se3.inverse(keyframe.T_camera_world)
-    found = align(small, rest.coarse(QUICK_LEVELS), guess, weight_color=config.align_weight_color)
-    T_camera_world = found.T_live_reference @ keyframe.T_camera_world
-    there = keyframe.compared(rest, T_camera_world)
-    gain = gray_gain(here, there)
-    if not gain >= QUICK_GAIN or there.close < here.close - QUICK_CLOSE:
+def rest_disagrees(found: Alignment, hidden: Mask) -> bool:
+    """Return whether the image without some pixels [H, W] has a gradient at the pose that was found with them (T² test
+    of Hotelling, over cells)."""
+    reference, live = found.pair.reference.finest(), found.pair.live.finest().hiding(hidden)
+    rest = replace(found.pair, reference=reference, live=live)
+    n = normal_equations(rest.kernels, rest.level(0), [found.T_live_reference])[0]
+    cells = n.sums[1] / CELL
+    if cells < FEWEST_CELLS:
         return False
-    shift = _shift(thing, seen, fit.T_camera_world, T_camera_world)
-    return shift >= SHIFTED and gain * shift >= QUICK_APART
+    share = min(float(n.b @ np.linalg.lstsq(n.S, n.b)[0]) / cells, 1.0 - 1e-9)  # of what scatters about 0, in the mean
+    return bool(share / (1.0 - share) * (cells - 6.0) / 6.0 > fdtri(6.0, cells - 6.0, 1.0 - LEVEL))
 
 
-def _front(whole: Mask, hidden: Mask, live_m: Depth) -> DynamicMask:
-    """Return a thing that stands free, from its pixels and those that it hides; what is behind it is not known."""
-    return DynamicMask(hidden, np.where(whole, live_m, np.float32(0.0)), np.where(hidden, np.float32(0.0), live_m))
+def has_pulled(fit: PoseFit, without: PoseFit) -> bool:
+    """Return whether a thing has pulled a pose, by a fit without it: the pose is another one, and hardly less likely to
+    be right."""
+    if fit.comparison is None or without.comparison is None or without.alignment is None:
+        return False
+    away, found = se3.log(fit.T_camera_world @ se3.inverse(without.T_camera_world)), without.alignment
+    motion = np.linalg.norm(se3.log(found.T_live_reference).reshape(2, 3), axis=1)
+    covariance = found.covariance + np.diag(found.bias**2 + np.repeat(SHRINKS * motion, 3) ** 2)
+    if not np.isfinite(covariance).all():
+        return False
+    odds = wrong_odds(without.comparison) / wrong_odds(fit.comparison)
+    return bool(away @ np.linalg.solve(covariance, away) > PULLED * odds)
 
 
 def free_standing(depth: Depth) -> Iterator[Mask]:
@@ -112,42 +112,6 @@ def _stands_free(depth: Depth, regions: NDArray[np.int32], region: int, box: NDA
     return bool(ring.any()) and bool((near_m[ring] > far_m).mean() >= FREE_AROUND)
 
 
-def has_drawn(
-    thing: DynamicMask,
-    keyframe: Reference | None,
-    seen: PreparedFrame,
-    drawn: PoseFit,
-    found: PoseFit,
-    contradicted: bool,
-) -> bool:
-    """Return whether a thing has pulled a pose, by the pose that was fitted without it, which shows it elsewhere.
-
-    The rest agrees much more there, the thing does not agree with it, and the pulled pose is not only a poor fit.
-    contradicted: the images contradict the pulled pose.
-    """
-    if keyframe is None or _shift(thing, seen, drawn.T_camera_world, found.T_camera_world) < SHIFTED:
-        return False
-    if not agrees_more(found.comparison, drawn.comparison, contradicted):
-        return False
-    if not disagrees(keyframe.compared(seen.live, found.T_camera_world), found.comparison):
-        return False
-    return contradicted or not _fits_poorly(thing, keyframe, seen, drawn, found)
-
-
-def _shift(thing: DynamicMask, seen: PreparedFrame, T_first: Matrix, T_second: Matrix) -> float:
-    """Return by how much a thing is shifted between two poses T_camera_world [4, 4], as a share of the image width."""
-    return shift_px(thing, seen.target.camera, T_first @ se3.inverse(T_second)) / seen.target.camera.width
-
-
-def _fits_poorly(thing: DynamicMask, keyframe: Reference, seen: PreparedFrame, drawn: PoseFit, found: PoseFit) -> bool:
-    """Return whether the first pose is only a poor fit: the rest agrees hardly better there than with the thing, and
-    the thing itself agrees better at the other pose."""
-    alone = seen.live.hiding(thing.depth_m <= 0)
-    at_drawn, at_found = (keyframe.compared(alone, fit.T_camera_world).correlation for fit in (drawn, found))
-    rest = keyframe.compared(seen.hiding(thing), drawn.T_camera_world)
-    return at_found > at_drawn and not may_draw(rest, drawn.comparison)
-
-
 def is_still(thing: DynamicMask, keyframe: Reference | None, live: Pyramid, found: PoseFit) -> bool:
     """Return whether what may be in front belongs to the scene: the keyframe shows most of it at the same place, with
     gray values that agree as well as those of the rest."""
@@ -157,15 +121,3 @@ def is_still(thing: DynamicMask, keyframe: Reference | None, live: Pyramid, foun
     whole = np.count_nonzero(thing.depth_m) / COMPARE_STEP**2
     in_place = bool(shown.points >= STILL_SHOWN * whole and shown.close >= STILL_CLOSE)
     return in_place and not (differs(shown) and disagrees(shown, found.comparison))
-
-
-def shift_px(thing: DynamicMask, camera: Camera, T_b_a: Matrix) -> float:
-    """Return by how many pixels a thing that camera a sees is shifted in camera b [4, 4]: the median of its pixels."""
-    depth = thing.depth_m[::SHIFT_STEP, ::SHIFT_STEP]
-    v, u = np.nonzero(depth > 0)
-    if not len(u):
-        return 0.0
-    rays = coarse_rays(camera, SHIFT_STEP)[v, u].T
-    x, y, z = T_b_a[:3, :3] @ (rays * depth[v, u]) + T_b_a[:3, 3:]
-    ahead = np.maximum(z, 1e-3)
-    return float(np.median(np.hypot(camera.fx * (x / ahead - rays[0]), camera.fy * (y / ahead - rays[1]))))
