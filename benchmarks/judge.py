@@ -41,7 +41,10 @@ from sigmasplat.tracking.prepared_frame import observe, view_of, working_frame
 
 arg = tyro.conf.arg
 ONLY_JUDGED = "synthetic:corridor"
-SOURCES = ("fr1_xyz", "livingroom", "redkitchen", "hololens", "cubicles", "cabinet58", accuracy.SYNTHETIC, ONLY_JUDGED)
+WALLS = tuple(f"synthetic:wall={paint},noise=1" for paint in (1, 2, 3))
+SOURCES = (
+    "fr1_xyz", "livingroom", "redkitchen", "hololens", "cubicles", "cabinet58", accuracy.SYNTHETIC, *WALLS, ONLY_JUDGED
+)  # fmt: skip
 OF_THE_CAMERA = (
     "clean", "clean", "blur", "color-noise", "depth-noise", "shared-noise", "coarse-depth", "edge-erosion", "missing",
     "range-clip", "little-contrast",

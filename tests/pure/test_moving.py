@@ -62,16 +62,19 @@ def test_splats_in_free_space_are_carved_but_not_those_that_a_keyframe_shows() -
     assert field.means[:, 2].tolist() == pytest.approx([1.0, 3.02])
 
 
-def test_slow_motion_shows_against_older_frames_and_rest_ends_it() -> None:
+def thing(depth_m: NDArray[np.float32]) -> DynamicMask:
+    """Return the box of `with_box` as what is in front."""
+    box = depth_m == BOX_M
+    return DynamicMask(box, np.where(box, depth_m, np.float32(0.0)), np.full_like(depth_m, WALL_M))
+
+
+def test_rest_ends_motion() -> None:
     memory, found = DepthHistory(), list[bool]()
     for n in range(80):
         depth_m = with_box(min(20 + n, 60))
-        front = memory.in_front(depth_m, np.eye(4), CAMERA, FRAMES)
-        if front is not None:
-            front = memory.still_moving(front, depth_m, np.eye(4), CAMERA, FRAMES)
-        found.append(front is not None)
-        memory = memory.after(depth_m, front, np.eye(4), FRAMES)
-    assert all(found[16:40:4]) and not any(found[75:])
+        found.append(memory.still_moving(thing(depth_m), depth_m, np.eye(4), CAMERA, FRAMES) is not None)
+        memory = memory.after(depth_m, np.eye(4), FRAMES)
+    assert all(found[:45]) and not any(found[75:])
 
 
 def test_what_comes_back_to_an_earlier_place_is_not_at_rest() -> None:
@@ -79,10 +82,9 @@ def test_what_comes_back_to_an_earlier_place_is_not_at_rest() -> None:
     moved, found = with_box(60) == BOX_M, None
     for n, column in enumerate(left):
         depth_m = with_box(column)
-        front = DynamicMask(depth_m == BOX_M, np.where(depth_m == BOX_M, depth_m, 0), np.full_like(depth_m, WALL_M))
-        found = memory.still_moving(front, depth_m, np.eye(4), CAMERA, FRAMES)
+        found = memory.still_moving(thing(depth_m), depth_m, np.eye(4), CAMERA, FRAMES)
         assert found is not None, f"frame {n} is taken for at rest"
-        memory = memory.after(depth_m, found, np.eye(4), FRAMES)
+        memory = memory.after(depth_m, np.eye(4), FRAMES)
     assert found is not None and found.hidden[moved].all()
 
 

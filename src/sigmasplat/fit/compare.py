@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.data.readout import readouts
-from sigmasplat.fit.align import Alignment, align, gray_share
+from sigmasplat.fit.align import Alignment, Pair, align, gray_share, normal_equations
 from sigmasplat.fit.pyramid import HIDDEN_M, NOISE_PER_M, Pyramid
 from sigmasplat.native import _core
 from sigmasplat.types import Matrix
@@ -27,6 +27,8 @@ CLOSE_SIGMA, CLOSE_M = 3.0, 0.02
 LEAST_PIXELS = 50
 FLAT = 0.01
 """A gray image with a smaller standard deviation (0 to 1) has no texture to compare."""
+SLIDE, COARSE = 0.05, 2
+"""How strongly images hold a pose is measured by a motion of this share of the depth, at this level of the pyramids."""
 UNDECIDED = 1e-3
 """The finest size alone replaces coarse to fine only if it agrees better by more than this."""
 
@@ -39,7 +41,8 @@ class Comparison:
     live surface is the same, nearer, or farther. Of those that are not in front: residual, the median |depth
     difference| in standard deviations of a reading; correlation of the gray values, −1 to 1, NaN if one image is flat.
     points: the number of compared pixels; covered: their number relative to that of the live readings, at most 1.
-    moved: how far the alignment has moved the image from its guess, as a share of the depth; 0 without one.
+    moved: how far the alignment has moved the image from its guess, as a share of the depth; 0 without one. held: how
+    strongly the images hold the pose (`held`).
     """
 
     common: float
@@ -51,6 +54,7 @@ class Comparison:
     points: int = 0
     covered: float = 1.0
     moved: float = 0.0
+    held: float = 0.3
 
 
 NOTHING = Comparison(0.0, 0.0, 0.0, 0.0, float("inf"), float("nan"))
@@ -88,7 +92,22 @@ def best_alignment(
     found = [align(*pair, T_live_reference, weight_color=weight) for pair in pairs]
     seen = [compare(reference, live, motion.T_live_reference) for motion in found]
     best = int(agreement(seen[1]) > agreement(seen[0]) + UNDECIDED)
-    return found[best], replace(seen[best], moved=found[best].moved_from(T_live_reference))
+    moved, holds = found[best].moved_from(T_live_reference), held(reference, live, found[best])
+    return found[best], replace(seen[best], moved=moved, held=holds)
+
+
+def held(reference: Pyramid, live: Pyramid, found: Alignment) -> float:
+    """Return how strongly two images hold their motion: by how many Huber widths residuals change (root mean square) if
+    it changes by `SLIDE` of the depth in the direction that changes them least.
+
+    Along a bare wall depth hardly changes. A coarse size is used: at the finest, the noise of gradients pretends to
+    hold any pose.
+    """
+    level = Pair(reference, live, 0.5, found.pair.gain).level(min(COARSE, len(reference.cameras) - 1))
+    n = normal_equations(reference.kernels, level, [found.T_live_reference])[0]
+    unit = np.repeat([found.depth_m, 1.0], 3)
+    least = np.linalg.eigvalsh(n.H * np.outer(unit, unit))[0]
+    return SLIDE * float(np.sqrt(max(least, 0.0) / max(n.sums[1], 1.0)))
 
 
 def agreement(seen: Comparison) -> float:

@@ -14,8 +14,8 @@ MEDIAN_NORMAL = 0.6745
 """The median of |x| if x is a standard normal number."""
 RECENT, FEW = 50, 5
 """Noise is measured by this many recent frames that were not lost; each of the first few corrects it at once."""
-WEIGHTS = {"unexplained": 1.60, "uncorrelated": 2.07, "unsupported": 1.23, "moved": 6.06}
-BIAS = 5.31
+WEIGHTS = {"unexplained": 1.11, "uncorrelated": 1.92, "moved": 6.14}
+BIAS = 4.65
 """The log odds that a pose is wrong are BIAS + Σ weight · quantity (`evidence`). `benchmarks/judge.py` fits them to
 pairs of frames with known truth, aligned from random guesses of which a quarter lead to a wrong pose."""
 LOST, DOUBTFUL, SURE = 0.5, 0.1, 0.03
@@ -27,29 +27,25 @@ DOUBT = 0.7
 FEW_MATCHES = 15
 """A pose from fewer matches, without a known path, must be three times as sure: a dozen features of one wall also match
 another wall, and walls are alike."""
-FLAT = 0.7
-"""Images without texture neither confirm nor refute a pose: as this correlation."""
+HELD_FLAT = 0.12
+"""Images without texture confirm a pose as far as depth holds it: as a correlation of 1 − exp(−held / HELD_FLAT)."""
 LEARNS_CORRELATION = 0.9
 """Gray values that correlate as much confirm a pose by themselves."""
 MOST_SPREAD_M = 0.05
 """A pose without a known path is refused if the standard deviation of its position is larger: where only a wall is in
 view, the images agree as well at every pose along it."""
-DIFFERS = 0.02
-"""Gray values of a thing may show that it moves if 1 − their correlation is above this."""
-DISAGREES = 1.5
-"""A thing disagrees with the rest of the image if 1 − correlation is this many times larger with it than without it."""
 
 
 def evidence(c: Comparison) -> dict[str, float]:
-    """Return the quantities by which a pose is judged: logarithms of the share of the surface that is seen through, of
-    what the gray values miss to a correlation of 1, and of the share of the images that supports the pose; and how far
-    the pose is from its guess. The last is no logarithm: a small distance does not make a pose right."""
-    seen, correlation = c.close + c.behind, FLAT if np.isnan(c.correlation) else max(c.correlation, 0.0)
+    """Return the quantities by which a pose is judged: logarithms of the share of the surface that is seen through and
+    of what the gray values miss to a correlation of 1, and how far the pose is from its guess, more so if the images
+    hardly hold it. The last is no logarithm: a small distance does not make a pose right."""
+    seen, flat = c.close + c.behind, np.isnan(c.correlation)
+    correlation = 1.0 - math.exp(-c.held / HELD_FLAT) if flat else max(c.correlation, 0.0)
     return {
         "unexplained": math.log(c.behind / max(seen, 1e-9) + 0.01),
         "uncorrelated": math.log(1.02 - correlation),
-        "unsupported": -math.log(min(c.common, c.covered) * seen + 0.05),
-        "moved": min(c.moved, 1.0),
+        "moved": min(c.moved, 1.0) * max(-math.log(c.held + 0.01), 0.0),
     }
 
 
@@ -78,7 +74,6 @@ def diagnosis(c: Comparison) -> str:
     words = {
         "unexplained": f"known surfaces are seen through on {c.behind / max(c.close + c.behind, 1e-9):.0%} of it",
         "uncorrelated": texture,
-        "unsupported": "that is little",
         "moved": f"it is off from the expected one by {c.moved:.0%} of the depth",
     }
     best, here = evidence(Comparison(1.0, 1.0, 0.0, 0.0, 0.0, 1.0)), evidence(c)
@@ -93,24 +88,6 @@ def confirmed(c: Comparison) -> bool:
 def recognised(c: Comparison, matches: int) -> bool:
     """Return whether the images confirm a pose that this number of features has led to."""
     return p_wrong(c) < (SURE if matches >= FEW_MATCHES else SURE / 3.0)
-
-
-def differs(c: Comparison) -> bool:
-    """Return whether the gray values differ so much that something may have pulled the pose."""
-    return 1.0 - c.correlation > DIFFERS
-
-
-def disagrees(whole: Comparison, without: Comparison | None) -> bool:
-    """Return whether something does not agree with the rest, by comparisons with and without it at the same pose."""
-    return without is not None and 1.0 - whole.correlation > DISAGREES * (1.0 - without.correlation)
-
-
-def is_missed(without: Comparison | None, whole: Comparison | None) -> bool:
-    """Return whether a thing that was left out belongs to the still scene: the fit is worse without it. The images
-    agree less, in depth and in gray, at the pose fitted without the thing than with the thing at the first pose."""
-    if without is None or whole is None or without.close >= whole.close:
-        return False
-    return not 1.0 - without.correlation <= DISAGREES * (1.0 - whole.correlation)
 
 
 def is_lost(fit: PoseFit, least_agreement: float, least_share: float) -> bool:

@@ -9,7 +9,6 @@ from sigmasplat.config import Config, TrackingConfig
 from sigmasplat.data import se3
 from sigmasplat.data.frame import NO_PRIOR, PosePrior
 from sigmasplat.data.readout import UNKNOWN_TIMES, SensorTimes
-from sigmasplat.fit.compare import Comparison
 from sigmasplat.fit.pose import PoseFit, fit_pose_adam, fit_pose_align
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference
@@ -17,9 +16,9 @@ from sigmasplat.render.view import View
 from sigmasplat.tracking import pose_validation as judge
 from sigmasplat.tracking.feature_image import FeatureImage, pose_by_features
 from sigmasplat.tracking.features import Extractor
-from sigmasplat.tracking.moving.dynamic_detector import DynamicDetector, together
+from sigmasplat.tracking.moving.dynamic_detector import DynamicDetector
 from sigmasplat.tracking.moving.dynamic_mask import DynamicMask
-from sigmasplat.tracking.moving.pose_pullers import has_pulled, is_scene, is_still, suspected
+from sigmasplat.tracking.moving.pose_pullers import has_pulled, is_scene, suspected
 from sigmasplat.tracking.pose_prediction import CameraMotion, Given, PosePrediction, odometry, predict
 from sigmasplat.tracking.pose_validation import TrackingStatistics
 from sigmasplat.tracking.predicted_depth_fit import NOTHING_FITTED, DepthFit
@@ -132,15 +131,13 @@ class Tracker:
     ) -> tuple[PoseFit, PreparedFrame] | None:
         """Return the fit and the frame without what is in space that was free, or None; before: in front in the last
         frame. The newest keyframe loses what has left it."""
-        slow, known = self.detector.slow(seen, se3.inverse(fit.T_camera_world)), before or self.keyframe_front
-        if fit.comparison is None or (
-            slow is None and not self.detector.suspects(fit.comparison, known, given.should_stop)
-        ):
+        known = before or self.keyframe_front
+        if fit.comparison is None or not self.detector.suspects(fit.comparison, known, given.should_stop):
             return None
         # the expected pose of a fast camera is centimetres off: it is used only if something may have pulled the fit
         keyframe, predicted = self.keyframe, given.prediction.predicted
         pose = predicted if self._doubts(fit) else se3.inverse(fit.T_camera_world)
-        front = together(self.detector.in_front(keyframe, self.keyframe_front, before, self.previous, seen, pose), slow)
+        front = self.detector.in_front(keyframe, self.keyframe_front, before, self.previous, seen, pose)
         if front is not None and known is None and is_scene(front, seen.target.depth_image.numpy()):
             front = None  # a thing comes into view gradually
         self.keyframe = self.detector.without_gone(keyframe, seen, pose)
@@ -148,9 +145,7 @@ class Tracker:
             return None
         shown = first if front is None else seen.aside(front)
         found = self._fit(given, shown, predicted)
-        # a still thing can seem to be in free space where poses or depth are wrong
-        still = front is not None and self.detector.config.find and is_still(front, self.keyframe, seen.live, found)
-        if not still and self._stands(found, fit.comparison):
+        if self._stands(found):
             self.front = front
             return found, shown
         self.keyframe = keyframe
@@ -171,10 +166,10 @@ class Tracker:
         """Take what has come to rest for a part of the scene, and remember the frame."""
         front = self.detector.still_moving(self.front, seen, T_world_camera)
         self.keyframe_front = None if self.front is not None and front is None else self.keyframe_front
-        self.front, self.detector = front, self.detector.after(seen, front, T_world_camera)
+        self.front, self.detector = front, self.detector.after(seen, T_world_camera)
 
-    def _stands(self, fit: PoseFit, whole: Comparison | None = None) -> bool:
-        return not (self._is_lost(fit) or self._doubts(fit) or judge.is_missed(fit.comparison, whole))
+    def _stands(self, fit: PoseFit) -> bool:
+        return not (self._is_lost(fit) or self._doubts(fit))
 
     def _remember(self, fit: PoseFit, seen: PreparedFrame) -> None:
         """Keep what the next frame needs."""

@@ -21,10 +21,11 @@ from sigmasplat.api import (
 )
 from sigmasplat.plugins.sources.room import capture
 from sigmasplat.plugins.sources.room.capture import Image, camera_path
-from sigmasplat.plugins.sources.room.corridor import corridor_path, furnish_corridor, sections
-from sigmasplat.plugins.sources.room.furnish import furnish_rooms, mask_of, mover as moving_ball
+from sigmasplat.plugins.sources.room.corridor import corridor_path, sections
+from sigmasplat.plugins.sources.room.furnish import mask_of, mover as moving_ball
 from sigmasplat.plugins.sources.room.render import RoomScene, build_scene, render_scene
 from sigmasplat.plugins.sources.room.shapes import triangulate
+from sigmasplat.plugins.sources.room.wall import PAINTS, wall_path, wall_sections
 from sigmasplat.plugins.sources.stereo_matching import StereoMatcher
 
 FRAMES_PER_SECOND = 30.0
@@ -55,9 +56,9 @@ class SyntheticRoom(Source):
         self, frames: int = 200, width: int = 320, height: int = 240, seed: int = 0, noise: bool = False,
         loops: int = 1, exposure_change: bool | None = None, rooms: int = 1, overrun: int = 0, drift: int = 0,
         test_views: int = 0, stereo: int = 0, mover: int = 0, predicted: bool = False, corridor: bool = False,
-        late: float = 0.0, rows: float = 0.0, depth_rows: float = 0.0, focal: float = 0.0, center_x: float = 0.0,
-        center_y: float = 0.0, depth_scale: float = 0.0, depth_offset: float = 0.0, falloff: float = 0.0,
-        exposure: float = 0.0, white: float = 0.0,
+        wall: int = 0, late: float = 0.0, rows: float = 0.0, depth_rows: float = 0.0, focal: float = 0.0,
+        center_x: float = 0.0, center_y: float = 0.0, depth_scale: float = 0.0, depth_offset: float = 0.0,
+        falloff: float = 0.0, exposure: float = 0.0, white: float = 0.0,
     ) -> None:  # fmt: skip
         """Compute the camera path, no image yet. Raises SourceError for values out of range."""
         counts = {"frames": frames, "width": width, "height": height, "loops": loops, "rooms": rooms}
@@ -69,8 +70,12 @@ class SyntheticRoom(Source):
         for key, value in (colors | {"focal": focal, "depth_scale": depth_scale}).items():
             if not abs(value) < 1:
                 raise SourceError(f"synthetic room: {key} is a share of size below 1, found {value}")
-        if corridor and (rooms, loops, overrun, mover) != (1, 1, 0, 0):
-            raise SourceError("synthetic room: a corridor has one way; leave out rooms, loops, overrun and mover")
+        if not 0 <= wall <= len(PAINTS):
+            raise SourceError(f"synthetic room: wall is 0 (none) to {len(PAINTS)} ({', '.join(PAINTS)}), found {wall}")
+        if (corridor or wall) and (corridor and wall, rooms, loops, overrun, mover) != (0, 1, 1, 0, 0):
+            raise SourceError(
+                "synthetic room: a corridor or a wall has one way; leave out rooms, loops, overrun, mover"
+            )
         if not 0 <= mover <= MOST_MOVER or (mover and rooms > 1):
             raise SourceError(f"synthetic room: mover is 0 to {MOST_MOVER} %, in rooms=1; found {mover}, rooms={rooms}")
         focal_px = (WIDE_FOCAL_PER_WIDTH if corridor else FOCAL_PER_WIDTH) * width
@@ -85,15 +90,16 @@ class SyntheticRoom(Source):
         self._late_s, self._rows_s, self._depth_rows_s = late, rows, depth_rows
         inexact = drift or predicted or self.camera != camera or depth_scale or depth_offset
         self.predicted_depth, self.sensor = predicted, None if inexact else "rendered"
-        self._seed, self._noise, self._corridor = seed, noise, corridor
-        self._rooms = sections(frames) if corridor else rooms
+        self._seed, self._noise, self._built = seed, noise, (corridor, wall)
+        self._rooms = sections(frames) if corridor else wall_sections(frames) if wall else rooms
         self._drift, self._misread, self._test_views = drift / 1000, (depth_scale, depth_offset), test_views
         self.computed_depth, self._baseline_m = stereo > 0, stereo / 100
         self._matcher = StereoMatcher(self.camera, self._baseline_m) if stereo else None  # knows the stated camera
         self.depth_noise_per_m = self._matcher.noise_per_m if self._matcher else None
-        path = corridor_path(frames, seed) if corridor else camera_path(frames, loops, rooms, seed, overrun / 100)
+        along = corridor_path if corridor else wall_path if wall else None
+        path = along(frames, seed) if along else camera_path(frames, loops, rooms, seed, overrun / 100)
         self._T_world_camera = path
-        swings = not corridor if exposure_change is None else exposure_change
+        swings = not along if exposure_change is None else exposure_change
         self.gains = capture.camera_gains(len(path), seed, exposure, white, swings and not (exposure or white))
         self._shade = capture.shade(camera, falloff)
         self.mover = moving_ball(path, camera, mover / 100) if mover else None
@@ -142,7 +148,7 @@ class SyntheticRoom(Source):
         return mask_of(self.mover.shape(i), self._true_camera, self._T_world_camera[i], depth_m)
 
     def _scene(self, i: int) -> RoomScene:
-        room = build_scene(self._rooms, self._seed, self._corridor)
+        room = build_scene(self._rooms, self._seed, *self._built)
         return room if self.mover is None else RoomScene([*room.shapes, self.mover.shape(i)], room.lights)
 
     def test_views(self) -> Source | None:
@@ -152,7 +158,7 @@ class SyntheticRoom(Source):
     def views_away(self, count: int, away_m: Matrix, away_rad: Matrix) -> Source:
         """Return exact views (no noise, gain 1) near the path: moved by at most away_m [3] along the axes of the camera
         and rotated by a vector of at most away_rad [3]."""
-        scene = build_scene(self._rooms, self._seed, self._corridor)
+        scene = build_scene(self._rooms, self._seed, *self._built)
         random = np.random.default_rng((self._seed, 11))
         return _ViewsAway(self._true_camera, scene, random, self._T_world_camera, count, (away_m, away_rad))
 
@@ -162,8 +168,7 @@ class SyntheticRoom(Source):
 
     def true_surface(self) -> Mesh:
         """Return the surfaces of all shapes in the room's frame, including hidden parts."""
-        furnish = furnish_corridor if self._corridor else furnish_rooms
-        return triangulate([shape for shapes in furnish(self._rooms, self._seed) for shape in shapes])
+        return triangulate(build_scene(self._rooms, self._seed, *self._built).shapes)
 
     def _exposed(self, i: int, T_world_camera: Matrix) -> tuple[Image, Image]:
         """Return colour and depth of frame i from a pose, before noise."""

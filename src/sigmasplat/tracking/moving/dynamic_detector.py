@@ -1,5 +1,5 @@
-"""Find what moves: relative to the newest keyframe, what came in front of it and what has left its place; relative to
-what recent frames saw, what moves too slowly to show against the keyframe."""
+"""Find what moves: what came in front of the newest keyframe, and what has left its place in it; when it has come to
+rest, by what recent frames saw."""
 
 from dataclasses import dataclass, field, replace
 
@@ -28,9 +28,6 @@ from sigmasplat.types import Matrix, ShouldStop
 
 EVERY = 5
 """Every fifth frame is remembered."""
-AGES, LOOK_EVERY = (3, 6), 4
-"""Every fourth frame is compared with a remembered one, at these places in turn, counted from the newest one. What was
-in front in the last frame is found without it."""
 COLUMNS_TESTED = 80
 """About so many columns of an image are tested."""
 AT_REST, KNOWN = 0.85, 0.3
@@ -39,12 +36,10 @@ AT_REST, KNOWN = 0.85, 0.3
 
 @dataclass(frozen=True, eq=False)
 class RememberedDepth:
-    """A remembered frame: its number, its depth [H, W] m, the same with what is behind moving things (0 = unknown), and
-    T_world_camera [4, 4]."""
+    """A remembered frame: its number, its depth [H, W] m, and T_world_camera [4, 4]."""
 
     number: int
     depth_m: Depth
-    scene_m: Depth
     T_world_camera: Matrix
 
 
@@ -55,32 +50,16 @@ class DepthHistory:
     frames: int = 0
     seen: tuple[RememberedDepth, ...] = ()
 
-    def after(
-        self, depth_m: Depth, front: DynamicMask | None, T_world_camera: Matrix, most_frames: int
-    ) -> "DepthHistory":
+    def after(self, depth_m: Depth, T_world_camera: Matrix, most_frames: int) -> "DepthHistory":
         """Return the history after one more frame, of at most `most_frames`."""
         if self.frames % EVERY:
             return replace(self, frames=self.frames + 1)
-        scene_m = depth_m if front is None else np.where(front.hidden, front.scene_m, depth_m)
-        kept = max(AGES[-1], most_frames // EVERY + 1)
-        seen = (*self.seen, RememberedDepth(self.frames, depth_m, scene_m, T_world_camera))[-kept:]
+        seen = (*self.seen, RememberedDepth(self.frames, depth_m, T_world_camera))[-(most_frames // EVERY + 1) :]
         return DepthHistory(self.frames + 1, seen)
 
     def moved_by(self, T_new_old: Matrix) -> "DepthHistory":
         """Return the history in other coordinates [4, 4]."""
         return replace(self, seen=tuple(replace(s, T_world_camera=T_new_old @ s.T_world_camera) for s in self.seen))
-
-    def in_front(self, depth_m: Depth, T_world_camera: Matrix, camera: Camera, most_frames: int) -> DynamicMask | None:
-        """Find what is in places that a remembered frame, at most `most_frames` old (0 = any), saw to be free; None in
-        the frames that are not compared."""
-        turn, rest = divmod(self.frames, LOOK_EVERY)
-        if rest or not self.seen:
-            return None
-        earlier = self.seen[max(len(self.seen) - AGES[turn % len(AGES)], 0)]
-        if most_frames and self.frames - earlier.number > most_frames:
-            return None
-        scene = Earlier(earlier.scene_m, se3.inverse(earlier.T_world_camera) @ T_world_camera)
-        return dynamic_mask(scene, None, depth_m, camera, whole_objects=True, step=_step(camera))
 
     def still_moving(
         self, front: DynamicMask, depth_m: Depth, T_world_camera: Matrix, camera: Camera, frames: int
@@ -89,7 +68,7 @@ class DepthHistory:
         before = [k for k, earlier in enumerate(self.seen) if self.frames - earlier.number >= frames]
         if not frames or not before:
             return front
-        step = _step(camera)
+        step = max(2, camera.width // COLUMNS_TESTED)
         depth = np.where(front.depth_m > 0, depth_m, np.float32(0.0))[::step, ::step]
         regions, boxes = labelled(smooth(depth))
         count = len(boxes)
@@ -111,18 +90,6 @@ class DepthHistory:
         whole, hidden = whole & (front.depth_m > 0), hidden & front.hidden
         depths = np.where(whole, front.depth_m, np.float32(0.0)), np.where(hidden, front.scene_m, depth_m)
         return DynamicMask(hidden, *depths)
-
-
-def _step(camera: Camera) -> int:
-    return max(2, camera.width // COLUMNS_TESTED)
-
-
-def together(a: DynamicMask | None, b: DynamicMask | None) -> DynamicMask | None:
-    """Return all that is in front by one finding or the other."""
-    if a is None or b is None:
-        return b if a is None else a
-    scene_m = np.where(a.hidden & b.hidden, np.maximum(a.scene_m, b.scene_m), np.where(b.hidden, b.scene_m, a.scene_m))
-    return DynamicMask(a.hidden | b.hidden, np.maximum(a.depth_m, b.depth_m), scene_m)
 
 
 # ---- what moves ----
@@ -189,19 +156,12 @@ class DynamicDetector:
             return False
         return min(found.common, found.covered) < RENEWED
 
-    def slow(self, seen: PreparedFrame, T_world_camera: Matrix) -> DynamicMask | None:
-        """Find what moves too slowly to show against the newest keyframe."""
-        if not self.config.find:
-            return None
-        target, most = seen.target, self.config.still_frames
-        return self.history.in_front(target.depth_image.numpy(), T_world_camera, target.camera, most)
-
-    def after(self, seen: PreparedFrame, front: DynamicMask | None, T_world_camera: Matrix) -> "DynamicDetector":
+    def after(self, seen: PreparedFrame, T_world_camera: Matrix) -> "DynamicDetector":
         """Return what is known after a frame that is not lost."""
         if not self.config.find:
             return self
-        depth_m, most = seen.target.depth_image.numpy(), self.config.still_frames
-        return replace(self, history=self.history.after(depth_m, front, T_world_camera, most))
+        depth_m = seen.target.depth_image.numpy()
+        return replace(self, history=self.history.after(depth_m, T_world_camera, self.config.still_frames))
 
     def still_moving(
         self, front: DynamicMask | None, seen: PreparedFrame, T_world_camera: Matrix

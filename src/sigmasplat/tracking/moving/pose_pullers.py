@@ -14,13 +14,10 @@ from scipy.special import fdtri
 
 from sigmasplat.data import se3
 from sigmasplat.fit.align import Alignment, normal_equations
-from sigmasplat.fit.compare import STEP as COMPARE_STEP
 from sigmasplat.fit.pose import PoseFit
-from sigmasplat.fit.pyramid import Pyramid
-from sigmasplat.fit.references import Reference
 from sigmasplat.tracking.moving.dynamic_mask import EDGE_RELATIVE, STEP, DynamicMask, enlarged, smooth, thinned
 from sigmasplat.tracking.moving.free_space import Depth, Mask, labelled, upper_median, widened
-from sigmasplat.tracking.pose_validation import differs, disagrees, wrong_odds
+from sigmasplat.tracking.pose_validation import wrong_odds
 from sigmasplat.tracking.prepared_frame import PreparedFrame
 
 OBJECT_SHARE, MOST_OBJECTS = (0.02, 0.5), 3
@@ -36,8 +33,6 @@ SHRINKS, PULLED = 0.01, 100.0
 in 0.1 % of cases, and covariances of alignment are up to several times too small. They do not contain that alignment
 of noisy images shrinks motions, by about the first value as a share. The limit grows with the odds that the other pose
 is wrong, relative to those of the first one."""
-STILL_SHOWN, STILL_CLOSE = 0.5, 0.8
-"""A thing is still if the keyframe shows at least this share of it, and this share of that is as far as before."""
 
 
 def suspected(seen: PreparedFrame, fit: PoseFit) -> Iterator[DynamicMask]:
@@ -110,14 +105,3 @@ def _stands_free(depth: Depth, regions: NDArray[np.int32], region: int, box: NDA
     far_m = upper_median(near_m[inside]) * (1 + EDGE_RELATIVE)
     ring = widened(inside, 2 * RING + 1) & ~widened(inside, 2 * RING - 1) & (near_m > 0)
     return bool(ring.any()) and bool((near_m[ring] > far_m).mean() >= FREE_AROUND)
-
-
-def is_still(thing: DynamicMask, keyframe: Reference | None, live: Pyramid, found: PoseFit) -> bool:
-    """Return whether what may be in front belongs to the scene: the keyframe shows most of it at the same place, with
-    gray values that agree as well as those of the rest."""
-    if keyframe is None or found.comparison is None:
-        return False
-    shown = keyframe.compared(live.hiding(thing.depth_m <= 0), found.T_camera_world)
-    whole = np.count_nonzero(thing.depth_m) / COMPARE_STEP**2
-    in_place = bool(shown.points >= STILL_SHOWN * whole and shown.close >= STILL_CLOSE)
-    return in_place and not (differs(shown) and disagrees(shown, found.comparison))

@@ -24,6 +24,7 @@ from sigmasplat.plugins.sources.room.shapes import (
     surface_at,
 )
 from sigmasplat.plugins.sources.room.textures import Floats
+from sigmasplat.plugins.sources.room.wall import furnish_wall
 
 CELL_M = 0.14
 AMBIENT_REACH_M = 0.7
@@ -145,10 +146,11 @@ class RoomScene:
 
 
 @lru_cache(maxsize=4)
-def build_scene(rooms: int, seed: int, corridor: bool = False) -> RoomScene:
-    """Build and light the rooms, about a second per room, or as many sections of a corridor; the result is cached."""
-    if corridor:
-        sections = furnish_corridor(rooms, seed)
+def build_scene(rooms: int, seed: int, corridor: bool = False, wall: int = 0) -> RoomScene:
+    """Build and light the rooms, about a second per room, or as many sections of a corridor or a wall; the result is
+    cached."""
+    if corridor or wall:
+        sections = furnish_corridor(rooms, seed) if corridor else furnish_wall(rooms, seed, wall)
         return RoomScene([shape for shapes in sections for shape in shapes], [even_light(k) for k in range(rooms)])
     built = furnish_rooms(rooms, seed)
     neighbours = [built[max(k - 1, 0)] + built[k] if k else built[k] for k in range(rooms)]

@@ -146,6 +146,15 @@ def brick(u: Floats, v: Floats, pixel_m: Floats, color: Color, mortar: Color, se
 
 
 @_texture
+def tiles(u: Floats, v: Floats, pixel_m: Floats, color: Color, joint: Color, size_m: float) -> Floats:
+    """Paint square tiles that are all alike."""
+    lines = [
+        draw_line(np.abs(x / size_m - np.floor(x / size_m) - 0.5) * size_m - size_m / 2, 0.008, pixel_m) for x in (u, v)
+    ]
+    return mix(color, joint, np.maximum(*lines))
+
+
+@_texture
 def two_tone(
     u: Floats, v: Floats, pixel_m: Floats, upper: Color, lower: Color, height_m: float, seed: int = 0
 ) -> Floats:
