@@ -73,9 +73,7 @@ class SyntheticRoom(Source):
         if not 0 <= wall <= len(PAINTS):
             raise SourceError(f"synthetic room: wall is 0 (none) to {len(PAINTS)} ({', '.join(PAINTS)}), found {wall}")
         if (corridor or wall) and (corridor and wall, rooms, loops, overrun, mover) != (0, 1, 1, 0, 0):
-            raise SourceError(
-                "synthetic room: a corridor or a wall has one way; leave out rooms, loops, overrun, mover"
-            )
+            raise SourceError("synthetic room: corridor, wall: one way; leave out rooms, loops, overrun and mover")
         if not 0 <= mover <= MOST_MOVER or (mover and rooms > 1):
             raise SourceError(f"synthetic room: mover is 0 to {MOST_MOVER} %, in rooms=1; found {mover}, rooms={rooms}")
         focal_px = (WIDE_FOCAL_PER_WIDTH if corridor else FOCAL_PER_WIDTH) * width
