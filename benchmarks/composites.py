@@ -63,7 +63,7 @@ class Options:
     """Draw a moving ball into recordings; measure path, masks, and what is left of the ball in the map."""
 
     sources: Annotated[tuple[str, ...], arg(help="sequences: names in the data folder, or paths")] = (
-        "redkitchen", "livingroom",
+        "redkitchen", "livingroom", "hololens", "cubicles",
     )  # fmt: skip
     shares: Annotated[tuple[int, ...], arg(help="percent of the image that the ball covers; 0 is without it")] = (
         0, 10,
