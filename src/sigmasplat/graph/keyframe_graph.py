@@ -55,8 +55,7 @@ class KeyframeSolution:
 
 def edge_between(a: int, b: int, reference: Pyramid, live: Pyramid, T_b_a: Matrix) -> RelativePose | None:
     """Align keyframe b to keyframe a from a guess T_b_a [4, 4]; None if the images contradict the result."""
-    unread = live.kernels.to_host(live.depth[0]) == 0  # also what moves: it is in the gray image
-    motion, seen = best_alignment(reference, live.hiding(unread), T_b_a)
+    motion, seen = best_alignment(reference, live, T_b_a)
     if motion.degenerate or p_wrong(seen) > DOUBTFUL or not np.isfinite(motion.covariance).all():
         return None
     information = np.asarray(np.linalg.inv(motion.covariance + np.diag(motion.bias**2)))
