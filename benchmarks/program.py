@@ -72,5 +72,5 @@ def run(
     except refused as problem:
         return refuse(benchmark, problem)
     print(tables.table(keep(benchmark, figures, options, seeds, write, **config)))
-    lists = [value for value in figures.values() if isinstance(value, list)]
-    return int(any(item.get("problem") for items in lists for item in items))
+    items = [item for value in figures.values() if isinstance(value, list) for item in value]
+    return int(any(item.get("problem") for item in items if isinstance(item, dict)))  # others say what was left out

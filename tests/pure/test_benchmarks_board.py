@@ -70,6 +70,17 @@ def test_the_revision_is_the_only_word_without_a_name(monkeypatch: pytest.Monkey
     assert [(options.before, options.seeds) for options in seen] == [("", (0,)), ("HEAD~3", (0, 1))]
 
 
+@pytest.mark.parametrize(("problem", "code"), [(None, 0), ("it failed", 1)])
+def test_only_a_failed_run_makes_a_program_fail_not_what_was_left_out(
+    monkeypatch: pytest.MonkeyPatch, problem: str | None, code: int
+) -> None:
+    program = importlib.import_module("program")
+    monkeypatch.setattr(program, "keep", lambda *_, **__: {})
+    monkeypatch.setattr(program.tables, "table", lambda _: "")
+    figures = {"runs": [{"problem": problem}], "left_out": ["missing: gone"]}
+    assert program.run("board", None, lambda _: figures) == code
+
+
 def test_rows_without_a_recording_or_too_short_are_left_out_and_said(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
