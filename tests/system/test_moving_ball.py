@@ -27,7 +27,7 @@ FRAMES = 9
 
 @pytest.mark.parametrize(
     ("share", "seed", "exposure_change", "found_from"),
-    [(0, 0, True, 1), (20, 0, True, 1), (10, 4, False, 3), pytest.param(10, 5, False, 3, marks=pytest.mark.slow)],
+    [(0, 0, True, 1), (20, 0, True, 2), (10, 4, False, 3), pytest.param(10, 5, False, 3, marks=pytest.mark.slow)],
 )
 def test_a_ball_in_view_from_the_first_frame_on_does_not_draw_the_pose(
     share: int, seed: int, exposure_change: bool, found_from: int

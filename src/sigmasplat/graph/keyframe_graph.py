@@ -24,7 +24,7 @@ from sigmasplat.graph.sensor_fit import Pair
 from sigmasplat.graph.sensor_times import FIRST_MEASURED, MOST_MEASURED, measured
 from sigmasplat.render.view import View
 from sigmasplat.tracking.drift import UNKNOWN
-from sigmasplat.tracking.pose_validation import DOUBTFUL, p_wrong
+from sigmasplat.tracking.pose_validation import confirmed
 from sigmasplat.types import Matrix, ShouldStop, Task, never
 
 NEAR = 0.5
@@ -54,9 +54,9 @@ class KeyframeSolution:
 
 
 def edge_between(a: int, b: int, reference: Pyramid, live: Pyramid, T_b_a: Matrix) -> RelativePose | None:
-    """Align keyframe b to keyframe a from a guess T_b_a [4, 4]; None if the images contradict the result."""
+    """Align keyframe b to keyframe a from a guess T_b_a [4, 4]; None if the images do not confirm the result."""
     motion, seen = best_alignment(reference, live, T_b_a)
-    if motion.degenerate or p_wrong(seen) > DOUBTFUL or not np.isfinite(motion.covariance).all():
+    if motion.degenerate or not confirmed(seen) or not np.isfinite(motion.covariance).all():
         return None
     information = np.asarray(np.linalg.inv(motion.covariance + np.diag(motion.bias**2)))
     return RelativePose(b, a, motion.T_live_reference, information, "alignment", bias=motion.bias)

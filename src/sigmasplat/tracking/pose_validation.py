@@ -20,8 +20,8 @@ BIAS = 4.65
 pairs of frames with known truth, aligned from random guesses of which a quarter lead to a wrong pose."""
 LOST, DOUBTFUL, SURE = 0.5, 0.1, 0.03
 """Limits of this probability. A tracked pose is lost where it is more likely wrong than right, for a lost frame only
-costs itself. Above the second it is doubtful: tried again from other guesses, which cost little, and no edge between
-keyframes. Below the third, a pose counts without a path that leads to it: a wrong loop bends the whole map."""
+costs itself. Above the second it is doubtful, and tried again from other guesses, which cost little. Below the third, a
+pose counts without a path that leads to it: a wrong loop bends the whole map."""
 DOUBT = 0.7
 """Without a comparison, a pose is doubtful if its agreement × overlap falls below this share of the usual value."""
 FEW_MATCHES = 15

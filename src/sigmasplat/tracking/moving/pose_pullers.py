@@ -28,11 +28,11 @@ RING, FREE_AROUND = 3, 0.6
 LEVEL, CELL, FEWEST_CELLS = 1e-3, 256, 12
 """A thing is suspected if the test that nothing moves is rejected at this level, by the scatter of the gradient over
 cells of so many pixels (native/align.h), if there are enough cells."""
-SHRINKS, PULLED = 0.01, 100.0
-"""A thing has pulled the pose if χ², with 6 degrees of freedom, is above the second value; independent errors exceed 22
-in 0.1 % of cases, and covariances of alignment are up to several times too small. They do not contain that alignment
-of noisy images shrinks motions, by about the first value as a share. The limit grows with the odds that the other pose
-is wrong, relative to those of the first one."""
+SHRINKS, PULLED = 0.01, 225.0
+"""A thing has pulled the pose if χ², with 6 degrees of freedom, is above the second value, ten times what independent
+errors exceed in 0.1 % of cases: covariances of alignment are that much too small. They do not contain that alignment of
+noisy images shrinks motions, by about the first value as a share. The limit grows with the odds that the other pose is
+wrong, relative to those of the first one."""
 
 
 def suspected(seen: PreparedFrame, fit: PoseFit) -> Iterator[DynamicMask]:
