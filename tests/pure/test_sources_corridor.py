@@ -118,6 +118,6 @@ def test_options_of_the_corridor() -> None:
     assert (noisy.frame(1).depth_m == 0).any() and len(noisy.test_views()) == 2
     assert open_source("synthetic:corridor=0,frames=3").camera.fx == 256.0
     for option in ("rooms=2", "loops=2", "overrun=10", "mover=20"):
-        with pytest.raises(SourceError, match="one way; leave out rooms, loops, overrun and mover"):
+        with pytest.raises(SourceError, match="a corridor has one way; leave out rooms, loops, overrun and mover"):
             open_source(f"synthetic:corridor,{option}")
     assert len(open_source("synthetic:corridor,frames=3").true_surface().vertices) > 100

@@ -8,8 +8,8 @@ from sigmasplat.errors import SourceError
 from sigmasplat.fit.compare import best_alignment
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.plugins.sources import SyntheticRoom, open_source
-from sigmasplat.plugins.sources.room.render import render_scene
-from sigmasplat.plugins.sources.room.wall import AWAY_M, PAINTS, STEP_M, TILE_M
+from sigmasplat.plugins.sources.room.render import build_scene, render_scene
+from sigmasplat.plugins.sources.room.wall import AWAY_M, PAINTS, STEP_M, TILE_M, wall_sections
 from sigmasplat.tracking.pose_validation import DOUBTFUL, SURE, p_wrong
 
 PAINTED, TILED, BLANK = (PAINTS.index(name) + 1 for name in ("painted", "tiles", "blank"))
@@ -28,22 +28,24 @@ def test_every_ray_hits_the_wall_and_the_camera_moves_along_it(frames: int) -> N
     for i in (0, frames - 1):
         depth_m = source.exact_depth_of(i)
         assert depth_m.min() > AWAY_M * 0.95 and depth_m.max() < AWAY_M * 1.05
+    y = source.true_surface().vertices[:, 1]
+    assert y.min() == 0.0 and T[0, 1, 3] == -AWAY_M
 
 
 def test_tiles_look_the_same_one_tile_further_and_paint_does_not() -> None:
     for paint, same in ((TILED, True), (PAINTED, False)):
-        source = wall(paint)
+        source, scene = wall(paint), build_scene(wall_sections(40), 0, wall=paint)
         T = source.truth().T_world_camera[0]
         further = T.copy()
         further[0, 3] += TILE_M
-        here, there = (render_scene(source._scene(0), source.camera, pose)[0] for pose in (T, further))
+        here, there = (render_scene(scene, source.camera, pose)[0] for pose in (T, further))
         assert (np.abs(here - there).mean() < 0.002) == same
     assert wall(BLANK).frame(0).color.std((0, 1)).max() < 0.005
 
 
 def test_walls_do_not_mix_with_rooms() -> None:
-    for options, said in [("wall=4", "found 4"), ("wall=-1", "found -1"), ("wall=1,rooms=2", "one way"),
-                          ("wall=1,corridor", "one way")]:  # fmt: skip
+    for options, said in [("wall=4", "found 4"), ("wall=-1", "found -1"), ("wall=1,rooms=2", "a wall has one way"),
+                          ("wall=1,corridor", "either a corridor or a wall")]:  # fmt: skip
         with pytest.raises(SourceError, match=said):
             open_source(f"synthetic:{options}")
 

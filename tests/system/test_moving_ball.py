@@ -13,6 +13,7 @@ import benchmark_results  # noqa: F401 - finds the programs of the benchmarks
 from sigmasplat.config.find_preset import preset
 from sigmasplat.config.text import override
 from sigmasplat.data import se3
+from sigmasplat.plugins.evaluation.metrics.trajectory import associate
 from sigmasplat.plugins.sources import SyntheticRoom, open_source
 from sigmasplat.system.slam import Slam
 
@@ -65,7 +66,7 @@ def test_a_ball_in_a_recording_does_not_pull_the_pose(data_folder: Callable[[str
     source, truth = composites.WithBall(recording, 0.1), recording.truth()
     assert truth is not None
     first = {"livingroom": 0, "hololens": 47}[name]  # the ball is in view
-    rows = composites.associate(np.array([recording.timestamp_s(i) for i in range(120)]), truth.timestamps_s)[1]
+    rows = associate(np.array([recording.timestamp_s(i) for i in range(120)]), truth.timestamps_s)[1]
     slam, off_m = Slam(override(preset("sigma"), SMALL | {"input.width": "320"})), list[float]()
     for i in range(first, first + FRAMES):
         step = slam.step(replace(source.frame(i), index=i - first))

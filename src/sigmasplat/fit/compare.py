@@ -42,7 +42,7 @@ class Comparison:
     difference| in standard deviations of a reading; correlation of the gray values, −1 to 1, NaN if one image is flat.
     points: the number of compared pixels; covered: their number relative to that of the live readings, at most 1.
     moved: how far the alignment has moved the image from its guess, as a share of the depth; 0 without one. held: how
-    strongly the images hold the pose (`held`).
+    strongly the images hold the pose (`held`); without an alignment, the usual value.
     """
 
     common: float

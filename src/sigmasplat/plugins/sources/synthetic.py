@@ -23,7 +23,7 @@ from sigmasplat.plugins.sources.room import capture
 from sigmasplat.plugins.sources.room.capture import Image, camera_path
 from sigmasplat.plugins.sources.room.corridor import corridor_path, sections
 from sigmasplat.plugins.sources.room.furnish import mask_of, mover as moving_ball
-from sigmasplat.plugins.sources.room.render import RoomScene, build_scene, render_scene
+from sigmasplat.plugins.sources.room.render import RoomScene, build_scene, furnished, render_scene
 from sigmasplat.plugins.sources.room.shapes import triangulate
 from sigmasplat.plugins.sources.room.wall import PAINTS, wall_path, wall_sections
 from sigmasplat.plugins.sources.stereo_matching import StereoMatcher
@@ -72,8 +72,11 @@ class SyntheticRoom(Source):
                 raise SourceError(f"synthetic room: {key} is a share of size below 1, found {value}")
         if not 0 <= wall <= len(PAINTS):
             raise SourceError(f"synthetic room: wall is 0 (none) to {len(PAINTS)} ({', '.join(PAINTS)}), found {wall}")
-        if (corridor or wall) and (corridor and wall, rooms, loops, overrun, mover) != (0, 1, 1, 0, 0):
-            raise SourceError("synthetic room: corridor, wall: one way; leave out rooms, loops, overrun and mover")
+        if corridor and wall:
+            raise SourceError("synthetic room: a scene is either a corridor or a wall; leave out corridor or wall")
+        if (corridor or wall) and (rooms, loops, overrun, mover) != (1, 1, 0, 0):
+            scene = "corridor" if corridor else "wall"
+            raise SourceError(f"synthetic room: a {scene} has one way; leave out rooms, loops, overrun and mover")
         if not 0 <= mover <= MOST_MOVER or (mover and rooms > 1):
             raise SourceError(f"synthetic room: mover is 0 to {MOST_MOVER} %, in rooms=1; found {mover}, rooms={rooms}")
         focal_px = (WIDE_FOCAL_PER_WIDTH if corridor else FOCAL_PER_WIDTH) * width
@@ -166,7 +169,8 @@ class SyntheticRoom(Source):
 
     def true_surface(self) -> Mesh:
         """Return the surfaces of all shapes in the room's frame, including hidden parts."""
-        return triangulate(build_scene(self._rooms, self._seed, *self._built).shapes)
+        built = furnished(self._rooms, self._seed, *self._built)
+        return triangulate([shape for shapes in built for shape in shapes])
 
     def _exposed(self, i: int, T_world_camera: Matrix) -> tuple[Image, Image]:
         """Return colour and depth of frame i from a pose, before noise."""

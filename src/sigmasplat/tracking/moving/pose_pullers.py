@@ -66,13 +66,14 @@ def rest_disagrees(found: Alignment, hidden: Mask) -> bool:
     cells = n.sums[1] / CELL
     if cells < FEWEST_CELLS:
         return False
-    share = min(float(n.b @ np.linalg.lstsq(n.S, n.b)[0]) / cells, 1.0 - 1e-9)  # of what scatters about 0, in the mean
+    # χ² / cells, from the scatter of the cells about 0; the ratio below is that from the scatter about their mean
+    share = min(float(n.b @ np.linalg.lstsq(n.S, n.b)[0]) / cells, 1.0 - 1e-9)
     return bool(share / (1.0 - share) * (cells - 6.0) / 6.0 > fdtri(6.0, cells - 6.0, 1.0 - LEVEL))
 
 
 def has_pulled(fit: PoseFit, without: PoseFit) -> bool:
-    """Return whether a thing has pulled a pose, by a fit without it: the pose is another one, and hardly less likely to
-    be right."""
+    """Return whether a thing has pulled a pose, by a fit without it: the pose is another one, and not much more likely
+    wrong."""
     if fit.comparison is None or without.comparison is None or without.alignment is None:
         return False
     away, found = se3.log(fit.T_camera_world @ se3.inverse(without.T_camera_world)), without.alignment

@@ -145,14 +145,20 @@ class RoomScene:
     lights: Sequence[Light]
 
 
+def furnished(rooms: int, seed: int, corridor: bool = False, wall: int = 0) -> list[list[Shape]]:
+    """Build the rooms, or as many sections of a corridor or a wall, without light; return the shapes of each."""
+    if wall:
+        return furnish_wall(rooms, seed, wall)
+    return furnish_corridor(rooms, seed) if corridor else furnish_rooms(rooms, seed)
+
+
 @lru_cache(maxsize=4)
 def build_scene(rooms: int, seed: int, corridor: bool = False, wall: int = 0) -> RoomScene:
     """Build and light the rooms, about a second per room, or as many sections of a corridor or a wall; the result is
     cached."""
+    built = furnished(rooms, seed, corridor, wall)
     if corridor or wall:
-        sections = furnish_corridor(rooms, seed) if corridor else furnish_wall(rooms, seed, wall)
-        return RoomScene([shape for shapes in sections for shape in shapes], [even_light(k) for k in range(rooms)])
-    built = furnish_rooms(rooms, seed)
+        return RoomScene([shape for shapes in built for shape in shapes], [even_light(k) for k in range(rooms)])
     neighbours = [built[max(k - 1, 0)] + built[k] if k else built[k] for k in range(rooms)]
     lights = [light_room(k, shapes) for k, shapes in enumerate(neighbours)]
     return RoomScene([shape for shapes in built for shape in shapes], lights)

@@ -24,17 +24,16 @@ def wall_sections(frames: int) -> int:
 
 def paint_of(number: int, seed: int) -> Texture:
     """Return a paint of `PAINTS`, from 1 on."""
-    grain, cell_m = (0.5, 0.12) if PAINTS[number - 1] == "painted" else (0.0, 0.1)
-    return tiles(COLOR, JOINT, TILE_M) if PAINTS[number - 1] == "tiles" else plain(COLOR, grain, cell_m, seed)
+    paints = plain(COLOR, 0.5, 0.12, seed), tiles(COLOR, JOINT, TILE_M), plain(COLOR, 0.0)
+    return dict(zip(PAINTS, paints, strict=True))[PAINTS[number - 1]]
 
 
 def furnish_wall(count: int, seed: int, paint: int) -> list[list[Shape]]:
-    """Build a wall of sections along x, painted as `PAINTS` says; return the shapes of each."""
-    middle = (count - 1) * PITCH_M / 2
-    half = np.array([PITCH_M * count / 2, WALL_M / 2, HEIGHT_M])
-    whole = Room(0, seed)
-    whole.place("box", (middle, WALL_M / 2, HEIGHT_M / 2), tuple(half.tolist()), paint_of(paint, 1000 * seed))
-    return [whole.shapes, *([] for _ in range(count - 1))]
+    """Build a wall as long as `count` sections, painted as `PAINTS` says; return its shapes, all as of one section."""
+    whole, middle_x = Room(0, seed), (count - 1) * PITCH_M / 2
+    half = PITCH_M * count / 2, WALL_M / 2, HEIGHT_M
+    whole.place("box", (middle_x, WALL_M / 2, HEIGHT_M / 2), half, paint_of(paint, 1000 * seed))
+    return [whole.shapes]
 
 
 def wall_path(frames: int, seed: int) -> Matrix:
