@@ -148,9 +148,9 @@ def test_rows_that_are_read_late_give_the_normal_equations_of_the_cpu(holes: boo
     p = pair(0.05, 0.004, holes)
     late = readouts(*(readout if known else None for readout, known in zip(LATE, which, strict=True)))
     motions = [se3.exp(sign * 0.004 * np.ones(6)) @ p.T for sign in (0.0, 1.0, -1.0)]
-    at_once = aligning.normal_equations(CPU_IMAGES, level_of(p), motions)
-    found = aligning.normal_equations(CUDA_IMAGES, level_of(p, device="cpu")._replace(readouts=late), motions)
-    expected = aligning.normal_equations(CPU_IMAGES, level_of(p)._replace(readouts=late), motions)
+    at_once = aligning.normal_equations(CPU_IMAGES, level_of(p), motions, whole=2)
+    found = aligning.normal_equations(CUDA_IMAGES, level_of(p, device="cpu")._replace(readouts=late), motions, whole=2)
+    expected = aligning.normal_equations(CPU_IMAGES, level_of(p)._replace(readouts=late), motions, whole=2)
     for got, want, without in zip(found, expected, at_once, strict=True):
         np.testing.assert_array_equal(got.sums[1:], want.sums[1:])
         assert (want.sums[1:] > 0).all() and want.sums[4] <= (p.depth > 0).sum()

@@ -151,7 +151,7 @@ def align() -> Outputs:
         shapes[0].gray[0], shapes[0].depth[0], b[1][crop].numpy().copy(), b[2][crop].numpy().copy(), shapes[1].gray[0],
         shapes[1].depth[0], intrinsics, [0.5, 0.5, 0.02, 0.3, 4.0, 1.0],
     )  # fmt: skip
-    _core.align_step(level, T, row)
+    _core.align_steps(level, T, 1, row)
     assert row[27:32].min() > 100, "the test needs residuals of both kinds"
     return {"normal": torch.as_tensor(row)}
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from align_oracle import CAMERA, HUGE, MISSING, Pair, missing, oracle, pair
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
-from sigmasplat.fit.align import align, gray_share
+from sigmasplat.fit.align import Pair as Aligned, align, gray_share, normal_equations
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.target import gray_of
 from sigmasplat.plugins.sources import SyntheticRoom
@@ -123,6 +123,21 @@ def test_covariance_is_positive_definite_and_grows_with_the_residual() -> None:
     assert np.trace(covariances[1]) > 3 * np.trace(covariances[0])
 
 
+def test_every_other_cell_is_a_chessboard_of_the_reference() -> None:
+    """The sums are those of a reference without depth in the other cells, and tell the same slope."""
+    reference, live = seen(10), seen(12)
+    level = Aligned(reference, live, 0.5).level(0)
+    v, u = np.indices(level.reference_depth.shape) // 16
+    black = level._replace(reference_depth=np.where((u + v) % 2 == 0, level.reference_depth, np.float32(0.0)))
+    motions = [motion(10, 12), se3.exp(np.full(6, 1e-3)) @ motion(10, 12)]
+    first, half = normal_equations(reference.kernels, level, motions, whole=1)
+    whole, _ = normal_equations(reference.kernels, level, motions)
+    _, masked = normal_equations(reference.kernels, black, motions)
+    np.testing.assert_array_equal(first.values, whole.values)
+    np.testing.assert_allclose(half.values, masked.values, rtol=1e-12, atol=1e-12)
+    assert half.sums[1] == pytest.approx(0.5 * whole.sums[1], rel=0.1)
+
+
 def test_weight_zero_silences_a_part_of_the_reference() -> None:
     frame = room().frame(10)
     gray, depth, weight = gray_of(frame.color).copy(), frame.depth_m.copy(), np.ones((120, 160), np.float32)
@@ -186,7 +201,7 @@ def step(p: Pair, T: Array | None = None) -> tuple[Array, Array, Array, Array]:
     images = [np.ascontiguousarray(x, np.float32) for x in planes]
     row, intrinsics = np.zeros(55), [CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy]
     level = _core.Level(*images, intrinsics, [p.colors, p.depths, p.huber_gray, p.huber_depth, p.gate, p.gain])
-    _core.align_step(level, p.T if T is None else T, row)
+    _core.align_steps(level, p.T if T is None else T, 1, row)
     full = np.zeros((6, 6))
     full[np.triu_indices(6)] = row[:21]
     return full + np.triu(full, 1).T, row[21:27], row[27:32], row[53:]

@@ -62,24 +62,25 @@ class Alignment:
 
     @cached_property
     def covariance(self) -> Matrix:
-        """Estimate the covariance [6, 6] of the left twist (ρ, φ), m and rad, on first access. It costs as much as 13
+        """Estimate the covariance [6, 6] of the left twist (ρ, φ), m and rad, on first access. It costs as much as 8
         steps.
 
         The result is D⁻¹ S D⁻ᵀ. S sums outer products of the gradient per cell of the image, because residuals of
         neighbouring pixels are correlated (cluster-robust sandwich estimator, Liang & Zeger 1986). D is the measured
-        change of the gradient within half a pixel. H is not used for D: it is computed from noisy image gradients, so
-        it is several times too steep. An undetermined direction has the standard deviation `UNKNOWN_M`. Without common
-        pixels the covariance is infinite.
+        change of the gradient within half a pixel, by half of the cells, which are enough. H is not used for D: it is
+        computed from noisy image gradients, so it is several times too steep. An undetermined direction has the
+        standard deviation `UNKNOWN_M`. Without common pixels the covariance is infinite.
         """
         half_rad = 0.5 / self.pair.reference.cameras[0].fx
         steps = np.repeat([half_rad * self.depth_m, half_rad], 3)
         aside = [se3.exp(sign * twist) @ self.T_live_reference for twist in np.diag(steps) for sign in (1.0, -1.0)]
-        n, *around = normal_equations(self.pair.kernels, self.pair.level(0), [self.T_live_reference, *aside])
-        if n.sums[1] < MIN_PIXELS:
+        n, *around = normal_equations(self.pair.kernels, self.pair.level(0), [self.T_live_reference, *aside], whole=1)
+        used = np.mean([other.sums[1] for other in around])
+        if min(used, n.sums[1]) < MIN_PIXELS:
             return np.diag(np.full(6, np.inf))
         directions, decided = _axes(n, self.depth_m)
         basis, unknown = directions[:, decided], directions[:, ~decided]
-        slope = basis.T @ _slope(around, steps) @ basis
+        slope = basis.T @ _slope(around, steps) @ basis * n.sums[1] / used
         bread = basis @ np.linalg.inv(slope) @ basis.T
         return np.asarray(
             bread @ n.S @ bread.T + (UNKNOWN_M * self.pair.reference.scene_scale) ** 2 * unknown @ unknown.T
@@ -155,17 +156,35 @@ def _noise_at(noise: Plane | None, width: int) -> Plane | None:
 
 @dataclass(eq=False)
 class Normal:
-    """The normal equations of one step, as returned by `_core.align_step`: information H and gradient b with respect to
-    a left twist, and S = Σ b_c b_cᵀ over the cells c of the image; grays: sums of gray in the live image and in the
-    reference, by the weights of the pixels."""
+    """The normal equations of one step; values: as the kernels return them (native/align_pixel.h)."""
 
-    H: Matrix
-    b: Matrix
-    S: Matrix
-    sums: Matrix
-    """Weighted cost; number of pixels used; of pixels in view that fall on a live depth reading; of those whose depths
-    agree; of pixels that both cameras see (`common_pixels` in native/align_pixel.h)."""
-    grays: Matrix
+    values: Matrix
+
+    @property
+    def H(self) -> Matrix:
+        """Return the information [6, 6] with respect to a left twist."""
+        return _symmetric(self.values[:21])
+
+    @property
+    def b(self) -> Matrix:
+        """Return the gradient [6]."""
+        return self.values[21:27]
+
+    @property
+    def sums(self) -> Matrix:
+        """Return the weighted cost, and the number of pixels used, of pixels in view that fall on a live depth reading,
+        of those whose depths agree, and of pixels that both cameras see."""
+        return self.values[27:32]
+
+    @property
+    def S(self) -> Matrix:
+        """Return Σ b_c b_cᵀ [6, 6] over the cells c of the image."""
+        return _symmetric(self.values[32:53])
+
+    @property
+    def grays(self) -> Matrix:
+        """Return the sums of gray in the live image and in the reference, by the weights of the pixels."""
+        return self.values[53:]
 
     @property
     def gain(self) -> float:
@@ -178,12 +197,13 @@ class Normal:
         return float(reference / live) if live > 0.0 else 1.0
 
 
-def normal_equations(kernels: ImageKernels, level: LevelPlanes, motions: Sequence[Matrix]) -> list[Normal]:
-    """Linearise the residuals of a level at up to 13 motions T_live_reference."""
-    return [
-        Normal(_symmetric(row[:21]), row[21:27], _symmetric(row[32:53]), row[27:32], row[53:])
-        for row in kernels.normal_equations(level, motions)
-    ]
+def normal_equations(
+    kernels: ImageKernels, level: LevelPlanes, motions: Sequence[Matrix], whole: int | None = None
+) -> list[Normal]:
+    """Linearise the residuals of a level at up to 13 motions T_live_reference; from number `whole` on, if it is given,
+    by every other cell of the image."""
+    found = kernels.normal_equations(level, motions, len(motions) if whole is None else whole)
+    return [Normal(values) for values in found]
 
 
 def align(
@@ -228,14 +248,16 @@ def gray_share(reference: Pyramid, live: Pyramid, T_live_reference: Matrix) -> f
 
     Each is weighted by the inverse of its size: the root of its mean cost at the finest size, where its Huber width is
     the unit. The inverse of the variance would be right if residuals were nothing but noise. Errors of other kinds do
-    not become smaller with it, as in `balanced`.
+    not become smaller with it, as in `balanced`. Half of the cells are enough.
     """
-    cost, kernels = [], reference.kernels
-    gain = normal_equations(kernels, Pair(reference, live, 1.0).level(0), [T_live_reference])[0].gain
-    for weight in (1.0, 0.0):
-        sums = normal_equations(kernels, Pair(reference, live, weight, gain).level(0), [T_live_reference])[0].sums
-        cost.append(math.sqrt(sums[0] / max(sums[1], 1.0)))
-    return cost[1] / max(cost[0] + cost[1], 1e-9)
+
+    def at(weight: float, gain: float = 1.0) -> Normal:
+        level = Pair(reference, live, weight, gain).level(0)
+        return normal_equations(reference.kernels, level, [T_live_reference], whole=0)[0]
+
+    gain = at(1.0).gain
+    gray, depth = (math.sqrt(n.sums[0] / max(n.sums[1], 1.0)) for n in (at(1.0, gain), at(0.0, gain)))
+    return depth / max(gray + depth, 1e-9)
 
 
 def _axes(n: Normal, depth_m: float) -> tuple[Matrix, NDArray[np.bool_]]:

@@ -80,18 +80,18 @@ def compare(reference: Pyramid, live: Pyramid, T_live_reference: Matrix) -> Comp
 
 
 def best_alignment(
-    reference: Pyramid, live: Pyramid, T_live_reference: Matrix, weight_color: float | None = None
+    reference: Pyramid, live: Pyramid, T_live_reference: Matrix, weight_color: float | None = None, near: bool = False
 ) -> tuple[Alignment, Comparison]:
     """Align two images coarse to fine, and at the finest size alone; return what agrees better at full resolution.
 
     Coarse sizes reach far, but where the scene repeats they pull the pose away, and fine sizes cannot come back.
-    weight_color: as of `align`; None: measured (`gray_share`).
+    weight_color: as of `align`; None: measured (`gray_share`). near: the guess needs no coarse sizes.
     """
     weight = gray_share(reference, live, T_live_reference) if weight_color is None else weight_color
-    pairs = (reference, live), (reference.finest(), live.finest())
+    pairs = [(reference.finest(), live.finest())] if near else [(reference, live), (reference.finest(), live.finest())]
     found = [align(*pair, T_live_reference, weight_color=weight) for pair in pairs]
     seen = [compare(reference, live, motion.T_live_reference) for motion in found]
-    best = int(agreement(seen[1]) > agreement(seen[0]) + UNDECIDED)
+    best = int(not near and agreement(seen[1]) > agreement(seen[0]) + UNDECIDED)
     moved, holds = found[best].moved_from(T_live_reference), held(reference, live, found[best])
     return found[best], replace(seen[best], moved=moved, held=holds)
 

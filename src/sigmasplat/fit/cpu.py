@@ -75,11 +75,10 @@ def align(levels: Sequence[LevelPlanes], readings: Matrix, T_live_reference: Mat
     return AlignedPose(T, found[:5], steps, degenerate, depth_m, n, float(found[5]))
 
 
-def normal_equations(level: LevelPlanes, motions: Sequence[Matrix]) -> Matrix:
+def normal_equations(level: LevelPlanes, motions: Sequence[Matrix], whole: int) -> Matrix:
     """Implement `ImageKernels.normal_equations`."""
-    rows, laid_out = np.zeros((len(motions), NORMAL_TERMS)), _laid_out(level)
-    for row, T in zip(rows, motions, strict=True):
-        _core.align_step(laid_out, T, row)
+    rows = np.zeros((len(motions), NORMAL_TERMS))
+    _core.align_steps(_laid_out(level), np.ascontiguousarray(motions, np.float64), whole, rows)
     return rows
 
 

@@ -53,9 +53,12 @@ class KeyframeSolution:
 # ---- edges ----
 
 
-def edge_between(a: int, b: int, reference: Pyramid, live: Pyramid, T_b_a: Matrix) -> RelativePose | None:
-    """Align keyframe b to keyframe a from a guess T_b_a [4, 4]; None if the images do not confirm the result."""
-    motion, seen = best_alignment(reference, live, T_b_a)
+def edge_between(
+    a: int, b: int, reference: Pyramid, live: Pyramid, T_b_a: Matrix, near: bool = False
+) -> RelativePose | None:
+    """Align keyframe b to keyframe a from a guess T_b_a [4, 4]; None if the images do not confirm the result. near: as
+    of `best_alignment`."""
+    motion, seen = best_alignment(reference, live, T_b_a, near=near)
     if motion.degenerate or not confirmed(seen) or not np.isfinite(motion.covariance).all():
         return None
     information = np.asarray(np.linalg.inv(motion.covariance + np.diag(motion.bias**2)))
@@ -207,7 +210,7 @@ class GrowingGraph:
         again = Alignments()
         again.rows.folder = self.edges.rows.folder
         for edge in self.edges:
-            found = edge_between(edge.b, edge.a, image(edge.b), image(edge.a), edge.T_a_b)
+            found = edge_between(edge.b, edge.a, image(edge.b), image(edge.a), edge.T_a_b, near=True)
             if found is not None:
                 again.append(found)
             yield

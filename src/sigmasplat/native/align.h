@@ -54,10 +54,11 @@ SIGMA_INLINE vf load_lanes(const float* plane, size_t at, int lanes, float other
 // Warp the pixels of a part; return the number of vectors with a pixel that is used. With times, gray is warped by itself: it
 // was read at another time than depth. A pixel is used if both are in view: `linearise` counts on it.
 struct Bounds { int left, right, top, bottom; };
-template <bool TIMED> static int warp_part(const AlignLevel& L, const Motion& T, const AlignReadouts* times, Bounds in, Part& part) {
+struct RowMotions { Motion depth[CELL], gray[CELL]; };       // of the rows of a band
+template <bool TIMED> static int warp_part(const AlignLevel& L, const Motion& T, const RowMotions& rows, const AlignReadouts* times, Bounds in, Part& part) {
     int n = 0;
     for (int y = in.top; y < in.bottom; y++) {
-        const Motion of_depth = TIMED ? motion_of_depth_row(L, T, times->reference, y) : T, of_gray = TIMED ? motion_of_gray_row(L, T, times->reference, y) : T;
+        const Motion &of_depth = TIMED ? rows.depth[y % CELL] : T, &of_gray = rows.gray[y % CELL];
         fetch_ahead(L, size_t(y) * L.width + in.left);
         for (int x = in.left; x < in.right; x += W) {
             const size_t at = part.at[n] = size_t(y) * L.width + x;
@@ -79,9 +80,9 @@ template <bool TIMED> static int warp_part(const AlignLevel& L, const Motion& T,
 
 // Add residuals and derivatives of reference pixels to H and sums (acc) and to b (pull).
 template <bool TIMED>
-static void add_part(const AlignLevel& L, const LivePairs& live, const AlignOptions& o, const Motion& T, const AlignReadouts* times, Bounds in, vf* acc, vf* pull) {
+static void add_part(const AlignLevel& L, const LivePairs& live, const AlignOptions& o, const Motion& T, const RowMotions& rows, const AlignReadouts* times, Bounds in, vf* acc, vf* pull) {
     Part part;
-    const int n = warp_part<TIMED>(L, T, times, in, part);
+    const int n = warp_part<TIMED>(L, T, rows, times, in, part);
     for (int i = 0; i < n; i++) {
         const Warped& w = part.warped[i];
         const size_t at = part.at[i];
@@ -102,7 +103,8 @@ static void add_part(const AlignLevel& L, const LivePairs& live, const AlignOpti
 // So few bands take less time than waking the other threads.
 constexpr int FEW_BANDS = 4;
 
-static void linearise(const AlignLevel& L, const LivePairs& live, const AlignOptions& o, const AlignReadouts* times, const double* T, double* normal) {
+// half: by every other cell (`is_black`).
+static void linearise(const AlignLevel& L, const LivePairs& live, const AlignOptions& o, const AlignReadouts* times, bool half, const double* T, double* normal) {
     const Motion motion = motion_of(T);
     const int bands = (L.height + CELL - 1) / CELL, cells = (L.width + CELL - 1) / CELL;
     Buffer<double> band_sums;
@@ -112,13 +114,19 @@ static void linearise(const AlignLevel& L, const LivePairs& live, const AlignOpt
         vf acc[MATRIX_TERMS + SUMS];                  // H and sums; b is summed per cell
         for (auto& a : acc) a = splat(0.f);
         double* total = &band_sums[size_t(band) * NORMAL_TERMS];
+        RowMotions rows;
+        for (int y = band * CELL; times && y < (band + 1) * CELL; y++) {
+            rows.depth[y % CELL] = motion_of_depth_row(L, motion, times->reference, y);
+            rows.gray[y % CELL] = motion_of_gray_row(L, motion, times->reference, y);
+        }
         for (int cell = 0; cell < cells; cell++) {
+            if (half && !is_black(cell, band)) continue;
             vf pull[6];
             for (auto& a : pull) a = splat(0.f);
             const vf used = acc[22], read = acc[23], agreeing = acc[24];
             const int bottom = (band + 1) * CELL < L.height ? (band + 1) * CELL : L.height, right = (cell + 1) * CELL < L.width ? (cell + 1) * CELL : L.width;
             for (int y = band * CELL; y < bottom; y += PART_ROWS)
-                (times ? add_part<true> : add_part<false>)(L, live, o, motion, times, {cell * CELL, right, y, y + PART_ROWS < bottom ? y + PART_ROWS : bottom}, acc, pull);
+                (times ? add_part<true> : add_part<false>)(L, live, o, motion, rows, times, {cell * CELL, right, y, y + PART_ROWS < bottom ? y + PART_ROWS : bottom}, acc, pull);
             double g[6];
             for (int k = 0; k < 6; k++) { g[k] = lane_sum(pull[k]); total[21 + k] += g[k]; }
             // Two counts in one sum, exact below 2²⁴: pixels in view without a reading or agreeing, and readings.
@@ -137,9 +145,12 @@ static void linearise(const AlignLevel& L, const LivePairs& live, const AlignOpt
         for (int k = 0; k < NORMAL_TERMS; k++) normal[k] += band_sums[size_t(band) * NORMAL_TERMS + k];
 }
 
-static void align_step(const AlignLevel* level, const AlignOptions* o, const AlignReadouts* times, const double* T, double* normal) {
+// The normal equations at `count` motions T [count][16], one after another in `normal`; from motion number `whole` on, by
+// every other cell.
+static void align_steps(const AlignLevel* level, const AlignOptions* o, const AlignReadouts* times, int count, int whole, const double* T, double* normal) {
     static thread_local Buffer<float> memory;         // each thread that calls has its own
-    linearise(*level, side_by_side(*level, memory), *o, times, T, normal);
+    const LivePairs live = side_by_side(*level, memory);
+    for (int k = 0; k < count; k++) linearise(*level, live, *o, times, k >= whole, T + 16 * k, normal + NORMAL_TERMS * k);
 }
 
 // times: null if all rows of both images were read at once.
@@ -155,7 +166,7 @@ static int align_images(const AlignLevel* levels, const AlignOptions* options, c
         if (k != before) live = side_by_side(levels[before = k], memory);
         AlignOptions in_its_light = options[k];
         in_its_light.gain = float(d.gain);
-        linearise(levels[k], live, in_its_light, times, d.T, normal);
+        linearise(levels[k], live, in_its_light, times, false, d.T, normal);
         take_step(d, o, normal);
     }
     copy(d.T, 12, T);

@@ -4,6 +4,8 @@
 // is a vector of one lane (see align.cu). Has no includes and no namespace.
 
 constexpr int CELL = 16;                   // size in pixels: errors are correlated within a cell, hardly between cells
+// Every other cell, as on a chessboard: enough where sums are only compared with others of the same cells.
+SIGMA_INLINE bool is_black(int column, int row) { return (column + row) % 2 == 0; }
 constexpr int MATRIX_TERMS = 21, COUNTS = 4; // upper triangle of a 6×6; cost, pixels used, in view with depth, agreeing
 constexpr int SUMS = COUNTS + 2;           // and gray of live and of reference pixels, by their weights
 constexpr int COMMON = MATRIX_TERMS + 6 + COUNTS;                      // a fifth count, over cells: `common_pixels`
@@ -71,9 +73,11 @@ struct RowByRow {
     float first_s, rows_s, fy, cy;         // when the first row is read; from it to the last, over the height
     void operator()(vf& x, vf& y, vf& z) const {
         const Point3<vf> at_once = {x, y, z};
+        vf iz = 1.f / max(z, splat(0.05f));
         for (int round = 0; round < 2; round++) {                  // the row is another one when it is read
-            const vf row = fy * (y / max(z, splat(0.05f))) + cy, late_s = fma(row, splat(rows_s), splat(first_s));
+            const vf row = fma(fy * y, iz, splat(cy)), late_s = fma(row, splat(rows_s), splat(first_s));
             const Point3<vf> read = moved(at_once, rate, -late_s);
+            iz = clamp(iz * (2.f - read.z * iz), 0.f, 20.f);       // a Newton step: z hardly changes
             x = read.x;
             y = read.y;
             z = read.z;

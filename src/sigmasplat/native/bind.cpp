@@ -308,11 +308,12 @@ NB_MODULE(_core, m) {
         .def(nb::init<ConstFloats, ConstFloats, Maybe<ConstFloats>, Maybe<ConstFloats>, ConstFloats, ConstFloats, std::vector<float>, std::vector<float>, Maybe<ConstFloats>, Maybe<ConstFloats>, std::vector<float>>(),
              nb::arg("reference_gray"), nb::arg("reference_depth"), nb::arg("weight_gray").none(), nb::arg("weight_depth").none(), nb::arg("live_gray"),
              nb::arg("live_depth"), nb::arg("intrinsics"), nb::arg("options"), nb::arg("noise").none() = nb::none(), nb::arg("color_depth").none() = nb::none(), nb::arg("readouts") = std::vector<float>());
-    m.def("align_step", [](const Level& level, Doubles T, Doubles normal) {
-        need(T.size() >= 12 && normal.size() == 55, "align_step: wrong sizes");
+    m.def("align_steps", [](const Level& level, ConstDoubles T, int whole, Doubles normal) {
+        const int count = int(T.size() / 16);
+        need(T.size() == 16 * size_t(count) && normal.size() == 55 * size_t(count), "align_steps: wrong sizes");
         const AlignLevel planes = level.planes();
         nb::gil_scoped_release unlocked;
-        active->align_step(&planes, &level.options, level.read(), T.data(), normal.data());
+        active->align_steps(&planes, &level.options, level.read(), count, whole, T.data(), normal.data());
     });
     m.def("align_images", [](const std::vector<Level*>& levels, int iterations, double update_stop, double plateau_stop, double depth_m, double degenerate_share,
                              double min_pixels, Doubles T, Doubles found) {

@@ -101,7 +101,7 @@ struct Kernels {
                             double* g_exposure);
     void (*reference_maps)(const float* sums, const float* alpha, const float* moment, bool variance, Plane, TrackOptions,
                            float* gray, float* depth, float* weight_gray, float* weight_depth);
-    void (*align_step)(const AlignLevel*, const AlignOptions*, const AlignReadouts*, const double* T, double* normal);
+    void (*align_steps)(const AlignLevel*, const AlignOptions*, const AlignReadouts*, int count, int whole, const double* T, double* normal);
     int (*align_images)(const AlignLevel*, const AlignOptions*, const AlignReadouts*, int levels, AlignLoop, double* T, double* found, int* degenerate);
     const ImageKernels* images;
 };

@@ -49,7 +49,7 @@ const Kernels table = {
     create, destroy, bytes,
     project_forward, project_backward, blend_forward, blend_backward, gather_planes,
     view_forward, view_backward, view_step, adam_settle, view_backward_pose, view_visible,
-    ssim_target, ssim, mapping_losses, tracking_loss, reference_maps, align_step, align_images, &image_table,
+    ssim_target, ssim, mapping_losses, tracking_loss, reference_maps, align_steps, align_images, &image_table,
 };
 
 }  // namespace sigmasplat::SIGMASPLAT_ISA

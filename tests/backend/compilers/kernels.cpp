@@ -269,7 +269,7 @@ static void run_alignment(const Kernels& k, Results& out) {
     double T[12] = {1, 0, 0, 0.013, 0, 1, 0, -0.007, 0, 0, 1, 0.004}, normal[55], found[6];
     const AlignReadouts late{{{0.1f, -0.2f, 0.05f, 0.3f, 0.1f, -0.2f}, 0.02f, 0.03f, 0.03f}, {{-0.1f, 0.1f, 0.1f, 0.2f, 0.2f, 0.1f}, 0.02f, 0.03f, 0.03f}};
     for (const AlignReadouts* times : {static_cast<const AlignReadouts*>(nullptr), &late}) {
-        k.align_step(&level, &options, times, T, normal);
+        k.align_steps(&level, &options, times, 1, 1, T, normal);
         out[times ? "align, late rows" : "align"] = floats_of(normal, 55);
     }
     int degenerate;

@@ -76,16 +76,16 @@ class CudaLevel:
         self.cells = -(-width // CELL) * -(-height // CELL)
         self.device = reference_gray.device
 
-    def normal_equations(self, motions: Matrix) -> Matrix:
-        """Linearise at T_live_reference [n, 4, 4], n ≤ `MOTIONS`. Returns rows of H, b, counts, S and grays, [n, 55].
-        The host waits."""
+    def normal_equations(self, motions: Matrix, whole: int) -> Matrix:
+        """Linearise at T_live_reference [n, 4, 4], n ≤ `MOTIONS`; from number `whole` on, by every other cell. Returns
+        rows of H, b, counts, S and grays, [n, 55]. The host waits."""
         n, given = len(motions), np.zeros((MOTIONS, 12))
         given[:n] = motions[:, :3].reshape(n, 12)
         of_cells, arrived = _workspace(n, self.cells, self.device)
         found = torch.empty(n, NORMAL_TERMS, dtype=torch.float64, device=self.device)
         cuda_launch.launcher_for(self.device)(
             ALIGNING, "normal_equations", n * self.cells, self.planes, self.pinhole, self.options,
-            *self.readouts, given, of_cells, arrived, found,
+            *self.readouts, given, whole, of_cells, arrived, found,
         )  # fmt: skip
         return np.asarray(found.cpu().numpy())
 
@@ -96,9 +96,9 @@ def _workspace(motions: int, cells: int, device: torch.device) -> tuple[Tensor, 
     return of_cells, torch.zeros(motions, dtype=torch.int32, device=device)
 
 
-def normal_equations(level: LevelPlanes, motions: Sequence[Matrix]) -> Matrix:
+def normal_equations(level: LevelPlanes, motions: Sequence[Matrix], whole: int) -> Matrix:
     """Implement `ImageKernels.normal_equations`. The host waits once."""
-    return CudaLevel(*level).normal_equations(np.stack(motions))
+    return CudaLevel(*level).normal_equations(np.stack(motions), whole)
 
 
 def align(planes: Sequence[LevelPlanes], readings: Tensor, T_live_reference: Matrix, rules: AlignRules) -> AlignedPose:

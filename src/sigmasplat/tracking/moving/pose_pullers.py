@@ -15,7 +15,15 @@ from scipy.special import fdtri
 from sigmasplat.data import se3
 from sigmasplat.fit.align import Alignment, normal_equations
 from sigmasplat.fit.pose import PoseFit
-from sigmasplat.tracking.moving.dynamic_mask import EDGE_RELATIVE, STEP, DynamicMask, enlarged, smooth, thinned
+from sigmasplat.tracking.moving.dynamic_mask import (
+    EDGE_RELATIVE,
+    STEP,
+    DynamicMask,
+    enlarged,
+    smooth,
+    thinned,
+    with_margin,
+)
 from sigmasplat.tracking.moving.free_space import Depth, Mask, labelled, upper_median, widened
 from sigmasplat.tracking.pose_validation import wrong_odds
 from sigmasplat.tracking.prepared_frame import PreparedFrame
@@ -41,9 +49,10 @@ def suspected(seen: PreparedFrame, fit: PoseFit) -> Iterator[DynamicMask]:
         return
     live_m = seen.target.depth_image.numpy()
     for inside in free_standing(thinned(live_m, STEP)):
-        thing = thing_of(inside, live_m)
-        if not is_scene(thing, live_m) and rest_disagrees(fit.alignment, thing.hidden):
-            yield thing
+        if rest_disagrees(fit.alignment, with_margin(inside, STEP, live_m)[1]):
+            thing = thing_of(inside, live_m)
+            if not is_scene(thing, live_m):
+                yield thing
 
 
 def thing_of(inside: Mask, live_m: Depth) -> DynamicMask:
