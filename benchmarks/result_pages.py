@@ -111,7 +111,7 @@ PAGES = {
             ),
             Shown(
                 "failure-probability",
-                "The probability of a wrong pose, on the recordings that it was fitted to and with one left out.",
+                "The probability of a wrong pose, on disturbed recordings.",
                 ("Tracked frames, without lost ones",),
             ),
             Shown(

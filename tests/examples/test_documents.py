@@ -54,7 +54,7 @@ def unknown_names(path: Path) -> list[str]:
     settings = re.findall(rf"`({'|'.join(SECTIONS)})\.([a-z]\w+)`", text)
     presets = re.findall(r"`((?:varsplat|loopsplat|cgslam)-[a-z0-9-]*[a-z0-9])`", text)
     fitted = {"agreement", "overlap", "first_loss", "loss", "iterations", "inliers", "doubtful"}
-    fitted |= {"position_std_m", "depth_noise", "waiting", "moving"}
+    fitted |= {"doubt", "depth_noise", "waiting", "moving"}
     compared = {field.name for field in dataclasses.fields(Comparison)}
     logged = fitted | compared if path.name == "runs.md" else set()
 

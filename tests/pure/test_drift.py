@@ -10,8 +10,8 @@ from paper_settings import SubmapConfig
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.fit.pyramid import Pyramid
-from sigmasplat.slam.mapping_backend import ends_submap
 from sigmasplat.tracking.drift import BIAS, HOP_M, HOP_RAD, Drift
+from sigmasplat.tracking.keyframe_rule import ends_submap
 
 Matrix = NDArray[np.float64]
 OWN = np.diag(np.repeat([HOP_M**2, HOP_RAD**2], 3))

@@ -1,23 +1,21 @@
-"""The probability that a pose is wrong: which evidence raises it, and how the spread of positions accumulates."""
+"""The probability that a pose is wrong: which evidence raises it, and how doubts add up from keyframe to keyframe."""
 
 import math
-from typing import Any
 
-import numpy as np
 import pytest
 
 from sigmasplat.data.trajectory import APART, LOST, TRACKED
-from sigmasplat.graph.confidence import Confidence, std_of
-from sigmasplat.graph.loops import Loop
+from sigmasplat.graph.confidence import Confidence, off_probability
+from sigmasplat.tracking.pose_validation import SURE
 
 CLEAN: dict[str, float] = {
     "common": 0.9, "close": 0.98, "front": 0.01, "behind": 0.01, "residual": 0.3, "correlation": 0.97, "points": 3000.0,
-    "position_std_m": 0.005, "moved": 0.01,
+    "moved": 0.01,
 }  # fmt: skip
 
 
 def probability(state: str = TRACKED, **changes: float) -> float:
-    return Confidence([0.0]).probability(state, CLEAN | changes)
+    return off_probability(state, CLEAN | changes)
 
 
 def test_lost_frames_and_frames_without_a_place_in_the_world_are_almost_surely_off() -> None:
@@ -26,7 +24,7 @@ def test_lost_frames_and_frames_without_a_place_in_the_world_are_almost_surely_o
 
 @pytest.mark.parametrize(
     "worse",
-    [{"position_std_m": 0.1}, {"behind": 0.3}, {"close": 0.6, "front": 0.39}, {"correlation": 0.5}, {"moved": 0.3}],
+    [{"doubt": 0.1}, {"behind": 0.3}, {"close": 0.6, "front": 0.39}, {"correlation": 0.5}, {"moved": 0.3}],
     ids=lambda changes: next(iter(changes)),
 )  # fmt: skip
 def test_each_kind_of_evidence_raises_the_probability(worse: dict[str, float]) -> None:
@@ -40,43 +38,50 @@ def test_each_kind_of_evidence_raises_the_probability(worse: dict[str, float]) -
     ids=["first frame", "without comparison", "flat image", "no residual", "undefined residual", "nothing in common"],
 )  # fmt: skip
 def test_missing_values_still_give_a_probability(values: dict[str, float]) -> None:
-    assert 0.0 <= Confidence([0.0]).probability(TRACKED, values) <= 1.0
+    assert 0.0 <= off_probability(TRACKED, values) <= 1.0
 
 
 def test_a_wrong_fit_or_a_wrong_place_alone_puts_a_frame_off() -> None:
     wrong = {"behind": 0.4, "close": 0.5, "correlation": 0.2, "moved": 0.5}
     assert probability(**wrong) > 0.95
-    assert probability(position_std_m=100.0) > 0.7
-    assert probability(**wrong, position_std_m=100.0) > max(probability(**wrong), probability(position_std_m=100.0))
+    assert probability(doubt=0.8) > 0.7
+    assert probability(**wrong, doubt=0.8) > max(probability(**wrong), probability(doubt=0.8))
 
 
-def loop(query: int, database: int, accepted: bool) -> Loop:
-    nothing: dict[str, Any] = {name: 0 for name in Loop.__dataclass_fields__}
-    return Loop(**nothing | {"query": query, "database": database, "accepted": accepted})
-
-
-def test_spread_grows_along_the_path_and_shrinks_with_an_accepted_loop() -> None:
+def chain(*hops: float) -> Confidence:
+    """Keyframes in a row, of which only hops tell where they are."""
     c = Confidence()
-    c.begun(None, 0.0)
-    for parent in range(3):
-        c.begun(parent, 0.1)
-    assert c.position_std_m(0.0) == pytest.approx(0.1 * math.sqrt(3))
-    assert c.position_std_m(0.3) == pytest.approx(math.hypot(0.3, 0.1 * math.sqrt(3)))
-    c.closed([loop(3, 0, accepted=False)])
-    assert c.position_std_m(0.0) == pytest.approx(0.1 * math.sqrt(3))
-    c.closed([loop(3, 0, accepted=True)])
-    assert 0.0 < c.position_std_m(0.0) < 0.05
+    for number, wrong in enumerate(hops):
+        c.placed(number, wrong, [])
+    return c
 
 
-def test_a_component_begins_at_its_own_origin_and_joins_with_the_spread_of_the_path_to_it() -> None:
-    c = Confidence()
-    for parent, std_m in ((None, 0.0), (0, 0.3), (None, 0.0), (2, 0.1)):
-        c.begun(parent, std_m)
-    assert c.position_std_m(0.0) == pytest.approx(0.1)
-    c.joined([2, 3], submap=3, kept=1, link_m=0.02)
-    assert min(c.spread_m[2:]) >= math.hypot(0.3, 0.02) and c.spread_m[:2] == [0.0, pytest.approx(0.3)]
+def test_doubts_of_hops_add_up_and_sure_hops_add_none() -> None:
+    assert chain(0.0, *[0.8 * SURE] * 1000).newest == 0.0
+    assert chain(0.0, 0.2).newest == pytest.approx(0.2)
+    assert chain(0.0, 0.2, 0.0, 0.3).newest == pytest.approx(1.0 - 0.8 * 0.7)
+    assert probability(doubt=chain(0.0, *[0.4] * 3).newest) > 0.7
 
 
-def test_the_spread_of_an_information_matrix_is_that_of_its_position() -> None:
-    deviations = np.array([0.03, 0.04, 0.12, 1.0, 1.0, 1.0])
-    assert std_of(np.diag(deviations**-2)) == pytest.approx(0.13)
+def test_an_alignment_to_an_earlier_keyframe_confirms_the_place() -> None:
+    c = chain(0.0, 0.1, 0.4, 0.4)
+    c.placed(4, 0.4, [3])
+    assert c.newest == pytest.approx(1.0 - 0.9 * 0.6**2), "no better than the place that it is aligned to"
+    c.placed(5, 0.4, [1, 4])
+    assert c.newest == pytest.approx(0.1)
+    c.placed(5, 0.0, [])  # mapped again
+    assert len(c.doubts) == 6
+
+
+def test_a_camera_that_was_found_again_is_as_sure_as_that_place() -> None:
+    c = chain(0.0, 0.1, 0.4)
+    c.begins(1)
+    c.placed(3, 0.0, [])
+    assert c.newest == pytest.approx(0.1)
+    c.begins()
+    c.placed(4, 0.0, [])
+    assert c.newest == 0.0, "a component begins at its own origin"
+    earlier = Confidence()
+    earlier.begins(7)  # a keyframe of a map that was finished before
+    earlier.placed(9, 0.0, [])
+    assert earlier.newest == 0.0 and len(earlier.doubts) == 10

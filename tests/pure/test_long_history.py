@@ -208,10 +208,10 @@ def follow(slam: Slam, frames: range) -> None:
                     closer.edges.append(RelativePose(submap - 1, submap, T, np.eye(6)))
                     closer.loops.append(loop(i))
             atlas.begin_submap(T if submap else None)
-            slam.confidence.begun(None, 0.0)
         if k % 5 == 0 or k == PER_SUBMAP - 1:
             atlas.set_keyframes([T.copy() for _ in range(1 + len(atlas.keyframe_poses[-1]))], UNKNOWN_HOP)
             slam.keyframe_indices.append(i)
+            slam.confidence.placed(len(slam.confidence.doubts), 0.0, [])
         atlas.places.append(Place(submap, len(atlas.keyframe_poses[-1]) - 1, T))
         slam.steps.append(Step(i, i / 30, T.copy(), k % 5 == 0, False, {}, 1000, submap))
         slam.steps.whole.clear()

@@ -24,7 +24,8 @@ class RelativePose:
     is nan, and so are both for the first keyframe of a submap. bias [6], camera [6, 4]: one standard deviation of the
     errors that are the same in all hops, of alignment in six directions, and of the stated camera (`calibration_std`).
     A loop compares a keyframe of submap a with one of submap b: `keyframes`, counted in their submaps. drift [6, 6]: of
-    its covariance, the drift from the submaps' first keyframes to these two.
+    its covariance, the drift from the submaps' first keyframes to these two. wrong: the probability that a hop is wrong
+    by more than its errors, as the images judge it.
     """
 
     a: int
@@ -37,12 +38,13 @@ class RelativePose:
     covariance: Matrix = field(default_factory=lambda: np.full((6, 6), np.nan))
     bias: Matrix = field(default_factory=lambda: np.zeros(6))
     camera: Matrix = field(default_factory=lambda: np.zeros((6, 4)))
+    wrong: float = 0.0
 
     @staticmethod
-    def hop(T_camera_before: Matrix, *errors: Matrix) -> "RelativePose":
+    def hop(T_camera_before: Matrix, *errors: Matrix, wrong: float = 0.0) -> "RelativePose":
         """Return the motion to a keyframe from the one before, with its covariance, bias, and `camera`, if known."""
         known: dict[str, Any] = dict(zip(("covariance", "bias", "camera"), errors, strict=False))
-        return RelativePose(-1, -1, T_camera_before, kind="hop", **known)
+        return RelativePose(-1, -1, T_camera_before, kind="hop", wrong=wrong, **known)
 
     @property
     def loop(self) -> bool:

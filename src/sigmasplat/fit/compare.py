@@ -96,14 +96,14 @@ def best_alignment(
     return found[best], replace(seen[best], moved=moved, held=holds)
 
 
-def held(reference: Pyramid, live: Pyramid, found: Alignment) -> float:
+def held(reference: Pyramid, live: Pyramid, found: Alignment, weight_color: float = 0.5) -> float:
     """Return how strongly two images hold their motion: by how many Huber widths residuals change (root mean square) if
     it changes by `SLIDE` of the depth in the direction that changes them least.
 
     Along a bare wall depth hardly changes. A coarse size is used: at the finest, the noise of gradients pretends to
-    hold any pose.
+    hold any pose. weight_color: as of `align`.
     """
-    level = Pair(reference, live, 0.5, found.pair.gain).level(min(COARSE, len(reference.cameras) - 1))
+    level = Pair(reference, live, weight_color, found.pair.gain).level(min(COARSE, len(reference.cameras) - 1))
     n = normal_equations(reference.kernels, level, [found.T_live_reference])[0]
     unit = np.repeat([found.depth_m, 1.0], 3)
     least = np.linalg.eigvalsh(n.H * np.outer(unit, unit))[0]

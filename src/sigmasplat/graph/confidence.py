@@ -1,11 +1,11 @@
 """Estimate the probability that the pose of a frame is off by more than 5 cm.
 
-Either of two things makes it so: the fit of this frame is wrong (`tracking.pose_validation`), or the path to its submap
-is, whose spread grows with every hop between keyframes and shrinks with every loop. `benchmarks/failure_probability.py`
-fits how probable the second is to disturbed recordings with known truth.
+Either of two things makes it so: the fit of this frame is wrong (`tracking.pose_validation`), or the place of the
+keyframe that it was fitted to is. A place is as doubtful as the hops that led to it, unless images confirm another way
+there: an alignment to an earlier keyframe, or a search of the whole map. What looks the same from several places, as a
+tiled wall does, confirms none of them.
 """
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
@@ -13,65 +13,69 @@ from typing import Any
 import numpy as np
 
 from sigmasplat.data.trajectory import APART, LOST
-from sigmasplat.fit.compare import Comparison
-from sigmasplat.graph.loops import Loop
-from sigmasplat.tracking.pose_validation import p_wrong
-from sigmasplat.types import Matrix
+from sigmasplat.fit.align import align
+from sigmasplat.fit.compare import SLIDE, Comparison, compare, held
+from sigmasplat.fit.pyramid import Pyramid
+from sigmasplat.tracking.pose_validation import HELD_FLAT, SURE, confirmed, p_wrong
 
-LOOP_STD_M = 0.01
-"""Standard deviation of the position that a loop gives, in a room."""
-EVEN_STD_M = 38.0
-"""A place is as likely off as not if this is the standard deviation of its position; the odds are in proportion. The
-value is large because these deviations, of hops alone, are far too careful: after one hop of unknown error, a metre."""
 COMPARED = [each.name for each in fields(Comparison)]
 CERTAIN = {LOST: 0.85, APART: 0.99}
 """Fixed probabilities: of a lost frame (the share of lost frames whose guess is off), and of a frame whose place in the
 world is not known."""
+SHIFTS = (1 / 16, 1 / 8, 3 / 16, 1 / 4)
+"""A keyframe is aligned to itself from places beside it: those that move its image by these shares of its width, as a
+camera in a hand does from frame to frame."""
 
 
 @dataclass(eq=False)
 class Confidence:
-    """spread_m: standard deviation of each submap's position in its component; parents: the submap that each began at,
-    None: it began a component."""
+    """doubts: the probability of each keyframe that its place in its component is wrong; newest: the same of the
+    keyframe that frames are fitted to now."""
 
-    spread_m: list[float] = field(default_factory=list)
-    parents: list[int | None] = field(default_factory=list)
+    doubts: list[float] = field(default_factory=list)
+    newest: float = 0.0
 
-    def begun(self, parent: int | None, position_m: float) -> None:
-        """Add a submap: at position_m (standard deviation, m) from its parent, or the first of a component."""
-        self.parents.append(parent)
-        self.spread_m.append(0.0 if parent is None else math.hypot(self.spread_m[parent], position_m))
+    def begins(self, place: int | None = None) -> None:
+        """Continue at keyframe number `place`, where images confirm the camera; None: a component begins."""
+        self.newest = self.doubts[place] if place is not None and place < len(self.doubts) else 0.0
 
-    def joined(self, members: Sequence[int], submap: int, kept: int, link_m: float) -> None:
-        """Add the path to the component that the submaps `members` join: from `submap`, one of them, by a link of
-        link_m (standard deviation, m) to submap `kept`."""
-        path_m = math.hypot(self.spread_m[kept], link_m, self.spread_m[submap])
-        for s in members:
-            self.spread_m[s] = math.hypot(path_m, self.spread_m[s])
+    def placed(self, number: int, wrong: float, confirmed: Sequence[int], alike: int = 1) -> None:
+        """Add a keyframe; wrong: the probability that the hop to it is; confirmed: numbers of the earlier keyframes
+        that it was aligned to; alike: how many places look like its own. A hop that counts as sure adds no doubt: there
+        are thousands of them."""
+        by_hop = self.newest if wrong <= SURE else either(self.newest, wrong)
+        ways = [by_hop] if alike > 1 else [by_hop, *(self.doubts[k] for k in confirmed)]
+        self.newest = either(min(ways), 1.0 - 1.0 / alike)
+        self.doubts[number:] = [*[0.0] * (number - len(self.doubts)), self.newest]
 
-    def closed(self, loops: Sequence[Loop], scene_scale: float = 1.0) -> None:
-        """Take the loops of a finished submap into account, also for the submaps that began at it before its loops were
-        known; scene_scale: size of the scene relative to a room."""
-        for loop in loops:
-            if loop.accepted:
-                ours, theirs = loop.query, math.hypot(self.spread_m[loop.database], LOOP_STD_M * scene_scale)
-                lower = max(0.0, self.spread_m[ours] ** 2 - theirs**2)
-                for s in (ours, *(s for s, parent in enumerate(self.parents) if parent == ours)):
-                    self.spread_m[s] = math.sqrt(max(0.0, self.spread_m[s] ** 2 - lower))
 
-    def position_std_m(self, in_submap_m: float) -> float:
-        """Return the standard deviation of the camera's position in its component, given that in its submap, metres."""
-        return math.hypot(self.spread_m[-1], in_submap_m)
+def off_probability(state: str, tracking: Mapping[str, float]) -> float:
+    """Return the probability that the pose of a frame is off by more than 5 cm; tracking: values of its fit
+    (`FrameEstimate.logged`)."""
+    return CERTAIN[state] if state in CERTAIN else either(tracking.get("doubt", 0.0), hop_wrong(tracking))
 
-    def probability(self, state: str, tracking: Mapping[str, float]) -> float:
-        """Return the probability that the pose of the newest frame is off by more than 5 cm.
 
-        tracking: values of its fit (`FrameEstimate.logged`), with position_std_m.
-        """
-        if state in CERTAIN:
-            return CERTAIN[state]
-        std_m = tracking.get("position_std_m", 0.0)
-        return 1.0 - (1.0 - hop_wrong(tracking)) * EVEN_STD_M / (EVEN_STD_M + std_m)
+def either(p: float, q: float) -> float:
+    """Return the probability that one of two independent things is wrong, or both."""
+    return 1.0 - (1.0 - p) * (1.0 - q)
+
+
+def places_alike(image: Pyramid) -> int:
+    """Return from how many places, its own and those beside, above and below it, a camera would see the same as in an
+    image, as far as the judge of poses can tell. They are sought where depth alone does not hold the pose."""
+    small, c = image.coarse(1), image.cameras[0]
+    own = align(small, small, np.eye(4), 0)
+    if held(image, image, own, weight_color=0.0) >= HELD_FLAT:
+        return 1
+
+    def is_alike(axis: int, share: float) -> bool:
+        T = np.eye(4)
+        T[axis, 3] = share * own.depth_m * c.width / c.fx
+        T = align(image, image, T).T_live_reference
+        moved_m = np.linalg.norm(image.points @ (T[:3, :3] - np.eye(3)).T + T[:3, 3], axis=1)
+        return float(np.median(moved_m)) > SLIDE * own.depth_m and confirmed(compare(image, image, T))
+
+    return 1 + 2 * sum(any(is_alike(axis, share) for share in SHIFTS) for axis in (0, 1))
 
 
 def compared(tracking: Mapping[str, float]) -> Comparison | None:
@@ -84,8 +88,3 @@ def hop_wrong(tracking: Mapping[str, float]) -> float:
     """Return the probability that the fit of a frame is wrong; without a comparison, by its agreement."""
     seen = compared(tracking)
     return 1.0 - tracking.get("agreement", 1.0) if seen is None else p_wrong(seen)
-
-
-def std_of(information: Matrix) -> float:
-    """Return the standard deviation of the position, m, from the information [6, 6] of a twist."""
-    return float(np.sqrt(np.trace(np.linalg.inv(information)[:3, :3])))

@@ -138,7 +138,7 @@ class BackEnd:
             state, T, hop = ("" if place is None else RELOCALISED), np.eye(4), UNKNOWN_HOP
         else:
             state, (T, alignment) = "", self._realigned(each, offer)
-            hop = system.hop_to(se3.inverse(T), alignment)
+            hop = system.hop_to(se3.inverse(T), alignment, offer.wrong)
             if system.cuts:
                 system.add_drift(T, alignment)
         may_wait = not first and self._added < MOST_ADDED and not system.submap_ends(number, T)
@@ -214,6 +214,7 @@ class BackEnd:
             c, params = system.config.tracking, system.mapper.field.params
             keyframe = self._described(place.keyframe.weighed(params, system.view, c))
             newest = {self._newest: system.atlas.keyframe_poses.last[-1]}
+            system.found_at(place)
             self._publish(number, keyframe, newest | {number: place.T_submap_camera}, RELOCALISED)
             return
         yield from system.branch_at(place)
@@ -241,7 +242,7 @@ class BackEnd:
         self._hand_over(
             Snapshot(
                 number, self._newest, poses, state, system.mapper.field.params.clone(), keyframe,
-                system.active_submap(), system.confidence.spread_m[-1], system.loops.copied(), number, seconds, errors,
+                system.active_submap(), system.confidence.newest, system.loops.copied(), number, seconds, errors,
                 correction, system.graph.times,
             )
         )  # fmt: skip

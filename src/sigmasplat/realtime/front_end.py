@@ -19,7 +19,6 @@ from sigmasplat.data.trajectory import APART, RELOCALISED, TRACKED
 from sigmasplat.fit.align import Alignment
 from sigmasplat.fit.pose import PoseFit
 from sigmasplat.fit.target import Target
-from sigmasplat.graph.confidence import Confidence
 from sigmasplat.graph.loops import Loop, Loops
 from sigmasplat.graph.path_covariance import NO_ERRORS, PoseErrors
 from sigmasplat.mapping.window import ValidationViews
@@ -47,8 +46,8 @@ class Snapshot:
 
     frame: number of the frame that was mapped or found; poses: of this frame and of the newest keyframe, in the active
     submap; state: how the frame came into the map, "" if it was tracked; params [N, 17]: rows of the splats; keyframe:
-    reference of the next frames; spread_m: standard deviation of the submap's position; loops:
-    all pairs tried so far; searched: number of the last frame that was searched for in the whole map; seconds: of the
+    reference of the next frames; doubt: the probability that its place is wrong; loops: all pairs
+    tried so far; searched: number of the last frame that was searched for in the whole map; seconds: of the
     work since the snapshot before; errors: of poses relative to the newest keyframe, if the system computes them;
     correction: of earlier poses since the snapshot before, if a function of the caller wants it; times: of the sensor.
     """
@@ -60,7 +59,7 @@ class Snapshot:
     params: Tensor
     keyframe: TrackedKeyframe
     active: SubmapState
-    spread_m: float
+    doubt: float
     loops: Loops = field(default_factory=Loops)
     searched: int = -1
     seconds: float = 0.0
@@ -79,12 +78,14 @@ class Search:
 
 @dataclass(frozen=True, eq=False)
 class Offer:
-    """A keyframe for the map; alignment: to the keyframe before it; front: what is in front of the scene."""
+    """A keyframe for the map; alignment: to the keyframe before it; front: what is in front of the scene; wrong: the
+    probability that tracking is."""
 
     seen: PreparedFrame
     alignment: Alignment | None = None
     front: DynamicMask | None = None
     exposure: tuple[float, float] = (0.0, 0.0)
+    wrong: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +125,6 @@ class FrontEnd:
     config: Config
     tracker: Tracker
     recovery: Recovery
-    confidence: Confidence = field(default_factory=lambda: Confidence([0.0]))
     snapshot: Snapshot | None = None
     poses: Mapping[int, Matrix] = field(default_factory=dict)
     frames: int = 0
@@ -140,7 +140,7 @@ class FrontEnd:
     def copied(self) -> "FrontEnd":
         """Return a copy that later frames do not change."""
         tracker = replace(self.tracker, statistics=copy.deepcopy(self.tracker.statistics))
-        return replace(self, tracker=tracker, recovery=copy.copy(self.recovery), confidence=copy.copy(self.confidence))
+        return replace(self, tracker=tracker, recovery=copy.copy(self.recovery))
 
     # ---- a new snapshot ----
 
@@ -163,7 +163,7 @@ class FrontEnd:
         self.waits = tuple(number for number in self.waits if number > snapshot.newest)
         if snapshot.searched >= self.searching:
             self.searching = -1
-        self.confidence.spread_m, self.snapshot = [snapshot.spread_m], snapshot
+        self.snapshot = snapshot
         self.tracker.times = snapshot.times
 
     def _found(self, snapshot: Snapshot) -> None:
@@ -287,11 +287,13 @@ class FrontEnd:
         active, loops = SubmapState(), tuple[Loop, ...]()
         if self.snapshot is not None:
             active, loops = self.snapshot.active, tuple(self.snapshot.loops[self.loops :])
+            estimate.doubt = self.snapshot.doubt
         self.loops += len(loops)
         seconds, waiting = timer.stop(view), len(self.waits)
-        return make_step(seen, estimate, active, self.tracker, self.confidence, loops, seconds, waiting)
+        return make_step(seen, estimate, active, self.tracker, loops, seconds, waiting)
 
 
 def _offered(found: NewestFrame) -> Offer:
     """Return what the map gets of a keyframe: images that tracking does not change."""
-    return Offer(found.seen.without(found.front).separate(), found.alignment, found.front, found.exposure)
+    seen = found.seen.without(found.front).separate()
+    return Offer(seen, found.alignment, found.front, found.exposure, found.wrong)

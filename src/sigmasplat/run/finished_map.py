@@ -161,7 +161,6 @@ def continued(config: Config, store: GrowingStore, anchors: Sequence[Matrix]) ->
         slam.atlas.add_finished(T_world_submap, list(submap.T_submap_camera))
         pictures = (store.picture(index, k) for k in range(len(submap.frames)))
         described = [slam.descriptor.describe(p.unit_color, p.depth_m) for p in pictures] if config.loops.close else []
-        slam.confidence.begun(None, 0.0)
         slam.closer.add_finished(submap, described, se3.inverse(anchors[0]) @ T_world_submap)
     slam.prepare(store.load(0).camera, resample=True)
     return slam

@@ -31,6 +31,7 @@ class MainLoop(MappingBackend):
         self._timer, tried = StepTimer(), len(self.closer.loops)
         seen = self._prepared(frame)
         estimate = self._locate(seen) if self.steps else self._begin(seen)
+        estimate.doubt = self.confidence.newest
         found = NewestFrame.of(seen, estimate, self.tracker, len(self.steps))
         self.late = found if found.reads_late else None
         if not estimate.mapped:
@@ -44,7 +45,7 @@ class MainLoop(MappingBackend):
         self.atlas.place_frame(estimate.T_submap_camera)
         loops, seconds = self.closer.loops[tried:], self._timer.stop(self.view)
         submap = self.active_submap()
-        self.steps.append(make_step(seen, estimate, submap, self.tracker, self.confidence, loops, seconds))
+        self.steps.append(make_step(seen, estimate, submap, self.tracker, loops, seconds))
         return self.steps[-1]
 
     def _prepared(self, frame: Frame) -> PreparedFrame:
@@ -89,7 +90,7 @@ class MainLoop(MappingBackend):
         seen = fitted_keyframe(tracker, self.mapper.field, view, seen, T, found.connected).without(found.front)
         if self.config.tracking.exposure and self.config.mapping.colors == "code":
             seen = seen.without_exposure(found.exposure)
-        hop = self.hop_to(se3.inverse(T), found.alignment) if found.connected else UNKNOWN_HOP
+        hop = self.hop_to(se3.inverse(T), found.alignment, found.wrong) if found.connected else UNKNOWN_HOP
         T = self._mapped(seen, found, T, hop)
         if self.submap_ends(number, T):
             completed(self.cut(T))
@@ -171,6 +172,7 @@ class MainLoop(MappingBackend):
         estimate.state, submap = RELOCALISED, place.where[0]
         estimate.comparison, estimate.inliers = place.comparison, place.inliers
         if submap == len(self.store):
+            self.found_at(place)
             estimate.T_submap_camera = place.T_submap_camera
             self.tracker.move_to(self.mapper.field, self.view, place.keyframe, place.T_submap_camera)
         else:

@@ -8,7 +8,6 @@ from math import inf
 
 import numpy as np
 
-from sigmasplat.config import SubmapConfig
 from sigmasplat.data import se3
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.readout import AT_ONCE, Readout
@@ -17,12 +16,13 @@ from sigmasplat.fit.align import Alignment
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.target import Keyframe
 from sigmasplat.graph.closer import PendingSearch
-from sigmasplat.graph.confidence import std_of
+from sigmasplat.graph.confidence import places_alike
 from sigmasplat.graph.graph_errors import calibration_std, moved_by_camera
 from sigmasplat.graph.keyframe_graph import WINDOW
 from sigmasplat.mapping.mapper import Mapper
 from sigmasplat.slam.slam_state import SlamState
 from sigmasplat.tracking.drift import Drift
+from sigmasplat.tracking.keyframe_rule import ends_submap
 from sigmasplat.tracking.prepared_frame import PreparedFrame
 from sigmasplat.tracking.recovery import usable
 from sigmasplat.tracking.relocaliser import INDEX_AT_MOST, KnownMap, Relocation
@@ -61,7 +61,7 @@ class MappingBackend(SlamState):
         with self._timer.stage("map"):
             fit = yield from self.mapper.mapping(self.view, keyframe, should_stop)
         self._timer.add(fit.seconds, prefix="map_")
-        return self._placed(index, hop, seen.reading)
+        return self._placed(index, hop, seen)
 
     def keyframe_image(self, row: int) -> Pyramid:
         """Return the images of a keyframe of a finished submap; row: in `Atlas.T_world_keyframes`."""
@@ -136,7 +136,7 @@ class MappingBackend(SlamState):
     def add_keyframe(self, seen: PreparedFrame, index: int, T_submap_camera: Matrix, hop: RelativePose) -> Matrix:
         """Add frame number `index` to the keyframes of the active submap without fitting the map; return its pose."""
         self.mapper.add(self.view, self._keyframe(seen, index, T_submap_camera))
-        return self._placed(index, hop, seen.reading)
+        return self._placed(index, hop, seen)
 
     def refining(self, steps: int, should_stop: ShouldStop = never) -> Task[None]:
         """Make this many of the pending steps of the active submap's keyframes, in slices, until `should_stop`
@@ -154,22 +154,27 @@ class MappingBackend(SlamState):
             photo = seen.photo(self.config)
         return Keyframe(index, seen.target, T_submap_camera, descriptor=descriptor, detail=detail, photo=photo)
 
-    def _placed(self, index: int, hop: RelativePose, reading: Readout) -> Matrix:
+    def _placed(self, index: int, hop: RelativePose, seen: PreparedFrame) -> Matrix:
         """Write the poses of the active submap's keyframes to the atlas; return that of the newest."""
         if self.keyframe_indices[-1:] != [index]:  # a keyframe that two submaps share is counted once
             self.keyframe_indices.append(index)
-        self.atlas.set_keyframes([keyframe.T_world_camera for keyframe in self.mapper.keyframes], hop, reading)
+        self.atlas.set_keyframes([keyframe.T_world_camera for keyframe in self.mapper.keyframes], hop, seen.reading)
+        number = len(self.atlas.readings) - 1
+        aligned = [edge.b for edge in self.graph.edges.touching(number)]
+        alike = places_alike(seen.live) if self.config.tracking.verify else 1
+        self.confidence.placed(number, hop.wrong, aligned, alike)
         return self.atlas.keyframe_poses.last[-1]
 
-    def hop_to(self, T_camera_submap: Matrix, alignment: Alignment | None) -> RelativePose:
-        """Return the motion from the newest keyframe to a new one, with its errors; alignment: of the new one to it."""
+    def hop_to(self, T_camera_submap: Matrix, alignment: Alignment | None, wrong: float) -> RelativePose:
+        """Return the motion from the newest keyframe to a new one, with its errors; alignment: of the new one to it;
+        wrong: the probability that it is."""
         T_camera_before = T_camera_submap @ self.atlas.keyframe_poses.last[-1]
         if alignment is None:
-            return RelativePose.hop(T_camera_before)
+            return RelativePose.hop(T_camera_before, wrong=wrong)
         errors, camera = [alignment.covariance, alignment.bias], calibration_std(self.config.input, self.view.camera)
         if camera is not None:
             errors.append(camera * moved_by_camera(T_camera_before, alignment.pair.reference.points))
-        return RelativePose.hop(T_camera_before, *errors)
+        return RelativePose.hop(T_camera_before, *errors, wrong=wrong)
 
     def add_drift(self, T_submap_camera: Matrix, alignment: Alignment | None) -> float:
         """Add the hop to a keyframe to the submap's drift; return the standard deviation of its position, metres.
@@ -207,13 +212,18 @@ class MappingBackend(SlamState):
 
     def branch_at(self, place: Relocation) -> Task[None]:
         """Finish the active submap and start the next one where the camera was found, in slices."""
+        self.found_at(place)
         return self.branch(place.relative_pose(len(self.store) + 1), self._splats_of(place))
+
+    def found_at(self, place: Relocation) -> None:
+        """Take note of where the camera was found."""
+        submap, k = place.where
+        self.confidence.begins(int(np.sum(self.atlas.keyframe_poses.counts[:submap])) + k)
 
     def begin_at(self, start: RelativePose, field: GaussianField) -> None:
         """Start a submap at the camera, connected to another one, as `branch` does."""
         self.closer.edges.append(start)
         self.atlas.begin_submap(start.T_a_b, start.a)
-        self.confidence.begun(start.a, std_of(start.information))
         self.mapper = Mapper(self.config, self.random, field).successor(self.view, start.T_a_b)
         self.drift = Drift(scene_scale=self.config.render.scene_scale)
 
@@ -237,7 +247,7 @@ class MappingBackend(SlamState):
     def _begin_component(self) -> None:
         """Begin a map at the camera, which is its origin."""
         self.atlas.begin_submap()
-        self.confidence.begun(None, 0.0)
+        self.confidence.begins()
 
     def finish_submap(self, should_stop: ShouldStop = never) -> Task[None]:
         """Move the active submap to the store, in slices, and look for its loops, or leave that to the next frames
@@ -270,8 +280,7 @@ class MappingBackend(SlamState):
                     next(self._search)
             try:
                 next(self._search)
-            except StopIteration as end:
-                self.confidence.closed(end.value, self.config.render.scene_scale)
+            except StopIteration:
                 self.closer.pending.pop(0)
                 self._search = None
                 continue
@@ -327,23 +336,5 @@ class MappingBackend(SlamState):
         link = RelativePose(place.where[0], submap, T_other_submap, place.information, "join")
         if self.recovery.confirms(link, self.atlas, self.config.render.scene_scale):
             yield from self.closing()
-            kept, moved = sorted((link.a, link.b), key=self.atlas.components.__getitem__)
-            members = self.atlas.members(self.atlas.components[moved])
-            self.confidence.joined(members, moved, kept, std_of(link.information))
             self.atlas.join(link.a, link.b, link.T_a_b)
             self.closer.edges.append(link)
-
-
-def ends_submap(T_submap_camera: Matrix, frames_since: int, uncertainty_m: float, config: SubmapConfig) -> str:
-    """Return the name of the rule that ends the active submap at this keyframe, or "" if none does (VarSplat §2).
-
-    frames_since: frames since the submap began; uncertainty_m: `Drift.position_m` of the keyframe.
-    """
-    c = config
-    found = {
-        "distance": (float(np.linalg.norm(T_submap_camera[:3, 3])), c.distance_m),
-        "angle": (float(np.rad2deg(se3.rotation_angle(T_submap_camera[:3, :3]))), c.angle_deg),
-        "frames": (float(frames_since), c.frames - 1e-9 if c.frames else 0.0),
-        "uncertainty": (uncertainty_m, c.uncertainty_m),
-    }
-    return next((rule for rule, (value, limit) in found.items() if limit and value > limit), "")

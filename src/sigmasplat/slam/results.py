@@ -9,13 +9,12 @@ import numpy as np
 
 from sigmasplat.data.poses import Part, Records
 from sigmasplat.data.trajectory import APART, LOST, STATES, TRACKED
-from sigmasplat.graph.confidence import Confidence, compared
+from sigmasplat.graph.confidence import compared, off_probability
 from sigmasplat.graph.loops import Loop
 from sigmasplat.render.view import View
-from sigmasplat.tracking.drift import Drift
 from sigmasplat.tracking.frame_estimate import FrameEstimate
 from sigmasplat.tracking.moving.dynamic_mask import share_of
-from sigmasplat.tracking.pose_validation import diagnosis
+from sigmasplat.tracking.pose_validation import LOST as LIKELY_WRONG, diagnosis
 from sigmasplat.tracking.prepared_frame import PreparedFrame
 from sigmasplat.tracking.tracker import Tracker
 from sigmasplat.types import Matrix, Stopwatch
@@ -23,12 +22,11 @@ from sigmasplat.types import Matrix, Stopwatch
 
 @dataclass(frozen=True, eq=False)
 class SubmapState:
-    """The active submap as a step reports it: number, component, T_world_submap [4, 4], drift, number of splats."""
+    """The active submap as a step reports it: number, component, T_world_submap [4, 4], number of splats."""
 
     number: int = 0
     component: int = 0
     T_world_submap: Matrix = field(default_factory=lambda: np.eye(4))
-    drift: Drift = field(default_factory=Drift)
     splats: int = 0
 
 
@@ -66,22 +64,23 @@ class Step:
     def diagnosis(self) -> str:
         """Return in words what supports the pose, and what speaks against it; empty if surfaces were not compared."""
         seen = compared(self.tracking)
-        return "" if seen is None else diagnosis(seen)
+        if seen is None:
+            return ""
+        unconfirmed = self.tracking.get("doubt", 0.0) > LIKELY_WRONG
+        return diagnosis(seen) + "; nothing confirms the place of its keyframe" * unconfirmed
 
 
 def make_step(
-    seen: PreparedFrame, estimate: FrameEstimate, submap: SubmapState, tracker: Tracker, confidence: Confidence,
+    seen: PreparedFrame, estimate: FrameEstimate, submap: SubmapState, tracker: Tracker,
     loops: Sequence[Loop], seconds: dict[str, float], waiting: int | None = None,
 ) -> Step:  # fmt: skip
     """Return the result of a frame; submap: the active one; waiting: number of keyframes that wait to be mapped, on two
     clocks."""
     state = APART if submap.component and estimate.state != LOST else estimate.state
-    in_submap_m = submap.drift.position_m(estimate.T_submap_camera)
     tracking = estimate.logged() | {
-        "position_std_m": confidence.position_std_m(in_submap_m), "doubtful": float(tracker.doubtful),
-        "depth_noise": tracker.statistics.noise,
+        "doubtful": float(tracker.doubtful), "depth_noise": tracker.statistics.noise,
     } | ({} if waiting is None else {"waiting": float(waiting)}) | {"moving": share_of(tracker.front)}  # fmt: skip
-    p_off = confidence.probability(state, tracking)
+    p_off = off_probability(state, tracking)
     return Step(
         seen.frame.index, seen.frame.timestamp_s, submap.T_world_submap @ estimate.T_submap_camera, estimate.mapped,
         state == LOST, tracking, submap.splats, submap.number, tuple(loops), seconds, state, submap.component, p_off,

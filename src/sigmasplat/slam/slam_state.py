@@ -1,7 +1,5 @@
 """The state of SLAM, and how to read it: map, path, components, checkpoint."""
 
-from dataclasses import replace
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -85,8 +83,7 @@ class SlamState:
     def active_submap(self) -> SubmapState:
         """Return a copy of the active submap's state, as steps report it."""
         atlas, splats = self.atlas, len(self.mapper.field)
-        drift = replace(self.drift)
-        return SubmapState(len(atlas.anchors) - 1, atlas.components[-1], atlas.anchors[-1], drift, splats)
+        return SubmapState(len(atlas.anchors) - 1, atlas.components[-1], atlas.anchors[-1], splats)
 
     @property
     def loops(self) -> Loops:

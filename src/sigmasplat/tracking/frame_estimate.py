@@ -16,7 +16,7 @@ class FrameEstimate:
 
     fit: of tracking, None for the first frame; comparison: with the map at the pose, if it was made;
     alignment: to the newest keyframe, if it is to be mapped; inliers: matches of the relocalisation; drift_m: of the
-    submap, if a rule reads it.
+    submap, if a rule reads it; doubt: the probability that the place of the keyframe it was fitted to is wrong.
     """
 
     T_submap_camera: Matrix
@@ -27,6 +27,7 @@ class FrameEstimate:
     alignment: Alignment | None = None
     inliers: int | None = None
     drift_m: float | None = None
+    doubt: float = 0.0
 
     @staticmethod
     def of(fit: PoseFit, lost: bool) -> "FrameEstimate":
@@ -41,7 +42,7 @@ class FrameEstimate:
 
     def logged(self) -> dict[str, float]:
         """Return the values by the names of the log; what is not known is left out."""
-        fit, values = self.fit, dict[str, float]()
+        fit, values = self.fit, {"doubt": self.doubt}
         if fit is not None:
             values |= {"agreement": fit.agreement, "overlap": fit.overlap, "first_loss": fit.first_loss}
             values |= {"loss": fit.loss, "iterations": float(fit.iterations)}

@@ -1,8 +1,8 @@
-"""Decide which frames become keyframes; both clocks use these rules."""
+"""Decide which frames become keyframes, and which end a submap; both clocks use these rules."""
 
 import numpy as np
 
-from sigmasplat.config import MappingConfig
+from sigmasplat.config import MappingConfig, SubmapConfig
 from sigmasplat.data import se3
 from sigmasplat.data.trajectory import TRACKED
 from sigmasplat.fit.align import Alignment, align
@@ -11,6 +11,7 @@ from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.tracking.frame_estimate import FrameEstimate
 from sigmasplat.tracking.recovery import Recovery
 from sigmasplat.tracking.tracker import Tracker
+from sigmasplat.types import Matrix
 
 MOVED = 0.125
 """A view has changed if rotation, and translation at the mean depth, have moved it by this share of its width."""
@@ -66,3 +67,18 @@ def may_validate(estimate: FrameEstimate, tracker: Tracker, recovery: Recovery) 
     """Return whether a frame may become a validation view: it is not mapped, and its pose is not doubtful."""
     tracked = estimate.state == TRACKED and not estimate.mapped
     return tracked and recovery.is_steady and not tracker.doubtful
+
+
+def ends_submap(T_submap_camera: Matrix, frames_since: int, uncertainty_m: float, config: SubmapConfig) -> str:
+    """Return the name of the rule that ends the active submap at this keyframe, or "" if none does (VarSplat §2).
+
+    frames_since: frames since the submap began; uncertainty_m: `Drift.position_m` of the keyframe.
+    """
+    c = config
+    found = {
+        "distance": (float(np.linalg.norm(T_submap_camera[:3, 3])), c.distance_m),
+        "angle": (float(np.rad2deg(se3.rotation_angle(T_submap_camera[:3, :3]))), c.angle_deg),
+        "frames": (float(frames_since), c.frames - 1e-9 if c.frames else 0.0),
+        "uncertainty": (uncertainty_m, c.uncertainty_m),
+    }
+    return next((rule for rule, (value, limit) in found.items() if limit and value > limit), "")

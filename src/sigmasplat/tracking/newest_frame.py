@@ -13,6 +13,7 @@ from sigmasplat.fit.references import Reference
 from sigmasplat.tracking.frame_estimate import FrameEstimate
 from sigmasplat.tracking.moving.dynamic_mask import DynamicMask
 from sigmasplat.tracking.pose_prediction import CameraMotion
+from sigmasplat.tracking.pose_validation import p_wrong
 from sigmasplat.tracking.prepared_frame import PreparedFrame, TrackedKeyframe
 from sigmasplat.tracking.tracker import Tracker
 from sigmasplat.types import Matrix
@@ -29,7 +30,7 @@ class NewestFrame:
     it is a keyframe; connected: whether tracking found it from the keyframes before; reads_late: whether it waits;
     reference: the keyframe that it was aligned to, None if there is none; explained: agreement × overlap of this
     alignment; alignment: only of a frame that does not wait; front: what was in front of the scene; exposure: relative
-    to the map.
+    to the map; wrong: the probability that tracking is.
     """
 
     number: int
@@ -44,6 +45,7 @@ class NewestFrame:
     alignment: Alignment | None
     front: DynamicMask | None
     exposure: tuple[float, float]
+    wrong: float
 
     @staticmethod
     def of(seen: PreparedFrame, estimate: FrameEstimate, tracker: Tracker, number: int) -> "NewestFrame":
@@ -54,6 +56,7 @@ class NewestFrame:
             number, seen, estimate.T_submap_camera, tracker.motion, estimate.mapped, tracked and number > 0, late,
             tracker.keyframe if number else None, 0.0 if fit is None else fit.agreement * fit.overlap,
             None if late else estimate.alignment, tracker.front, estimate.exposure,
+            0.0 if estimate.comparison is None else p_wrong(estimate.comparison),
         )  # fmt: skip
 
     @property
