@@ -66,6 +66,18 @@ def test_images_of_the_same_walk_are_found(run: Path, tmp_path: Path, capsys: py
     assert np.allclose(path.T_world_camera, [record["T_world_camera"] for record in records], atol=1e-6)
 
 
+def test_the_error_of_the_map_is_a_part_of_the_covariance(localiser: Localiser) -> None:
+    """At the first keyframe the map has no error; further away it has that of its path."""
+    first, last = (localiser.locate(SyntheticRoom(frames=200, width=160, height=120).frame(i)) for i in (0, 24))
+    assert localiser.errors is not None and first.covariance is not None and last.covariance is not None
+    assert localiser.errors.of_keyframe(0, 0) == pytest.approx(np.zeros((6, 6)))
+    of_map = localiser.errors.of_keyframe(last.submap, last.keyframe)
+    assert np.trace(of_map[:3, :3]) > 1e-8 and (last.submap, last.keyframe) > (0, 0)
+    moved = se3.adjoint(last.T_world_camera)
+    in_world = moved @ last.covariance @ moved.T
+    assert np.linalg.eigvalsh(in_world - of_map).min() > 0, "what is left is the error of the search"
+
+
 def test_images_of_another_room_are_not_found(localiser: Localiser) -> None:
     """No room that was seen looks like its own mirror image."""
     for i in range(0, 40, 10):

@@ -129,7 +129,9 @@ class PathCovariance:
 
     def of_keyframe(self, submap: int, keyframe: int) -> Matrix:
         """Return the covariance [6, 6] of a keyframe's pose, as `of_frame`; keyframe: counted in its submap."""
-        error = self._error_of_keyframe(int(self._first[submap]) + keyframe)
+        row = int(self._first[submap]) + keyframe
+        node = -1 if self.graph is None else int(self.graph.node[row])
+        error = self._error_of_keyframe(row) if node < 0 else self._graph_errors.of(node)
         return np.asarray(error @ error.T)
 
     def between(self, a: int, b: int) -> Matrix:

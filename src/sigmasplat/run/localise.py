@@ -8,15 +8,18 @@ from typing import Any
 import numpy as np
 
 from sigmasplat.config import Config
+from sigmasplat.data import se3
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.files.atomic import write_text
 from sigmasplat.files.json_files import json_line
 from sigmasplat.fit.compare import Comparison
+from sigmasplat.graph.path_covariance import PathCovariance
 from sigmasplat.run.finished_map import FinishedMap
 from sigmasplat.run_folder.trajectory import write_trajectory
 from sigmasplat.tracking.depth_filters import frame_filter
+from sigmasplat.tracking.drift import symmetric
 from sigmasplat.tracking.features import Extractor
 from sigmasplat.tracking.prepared_frame import observe, view_of, working_frame
 from sigmasplat.tracking.recovery import usable
@@ -33,8 +36,9 @@ class Localisation:
 
     verdict: found, apart or not found; reason: why it was not found, else empty; T_world_camera [4, 4]: the pose in the
     frame of its component, None if not found; covariance [6, 6]: of translation and rotation (m, rad) in the axes of
-    the camera, relative to the submap; component, submap, keyframe: where it was found, −1 if nowhere; matches: number
-    of features that support the pose; comparison: of the image with the map, at the pose or at the best refused one.
+    the camera, with the error of the map there; component, submap, keyframe: where it was found, −1 if nowhere;
+    matches: number of features that support the pose; comparison: of the image with the map, at the pose or at the
+    best refused one.
     """
 
     index: int
@@ -74,6 +78,7 @@ class Localiser:
         self.extractor = Extractor()
         self.view = view_of(finished.camera, config)
         self.relocaliser = Relocaliser(config, self.extractor)
+        self.errors = PathCovariance.of(finished.run.read_checkpoint()[0])
         self.known = KnownMap(finished.store, finished.keyframe_poses, (), GaussianField.empty())
 
     def locate(self, frame: Frame) -> Localisation:
@@ -93,9 +98,13 @@ class Localiser:
         submap, keyframe = place.where
         component, T_world_submap = self.finished.components[submap], self.finished.anchors[submap]
         verdict, reason = (APART, f"in component {component}") if component else (FOUND, "")
+        T_world_camera, covariance = T_world_submap @ place.T_submap_camera, place.covariance
+        if self.errors is not None:
+            A = se3.adjoint(se3.inverse(T_world_camera))
+            covariance = symmetric(covariance + A @ self.errors.of_keyframe(submap, keyframe) @ A.T)
         return Localisation(
-            frame.index, frame.timestamp_s, verdict, reason, T_world_submap @ place.T_submap_camera, place.covariance,
-            component, submap, keyframe, place.inliers, place.comparison,
+            frame.index, frame.timestamp_s, verdict, reason, T_world_camera, covariance, component, submap, keyframe,
+            place.inliers, place.comparison,
         )  # fmt: skip
 
 
