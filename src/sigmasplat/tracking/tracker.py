@@ -23,6 +23,7 @@ from sigmasplat.tracking.pose_prediction import CameraMotion, Given, PosePredict
 from sigmasplat.tracking.pose_validation import TrackingStatistics
 from sigmasplat.tracking.predicted_depth_fit import NOTHING_FITTED, DepthFit
 from sigmasplat.tracking.prepared_frame import PreparedFrame, Splats, TrackedKeyframe, mapped_keyframe
+from sigmasplat.tracking.recovery import usable
 from sigmasplat.types import Matrix, ShouldStop, never, unless
 
 
@@ -108,6 +109,9 @@ class Tracker:
             shown = seen.shown
             best = self._fit(given, shown, given.prediction.predicted)
         best, shown = self._uncovered(given, seen, shown, best)
+        if self._doubts(best) and not usable(seen):  # a covered lens: no other guess can help
+            best.T_camera_world = se3.inverse(given.prediction.last)
+            return best
         if self._doubts(best):
             guesses = unless(given.should_stop, self._other_guesses(shown, given.prediction))
             best = max([best, *(self._fit(given, shown, guess) for guess in guesses)], key=self._score)
