@@ -14,9 +14,10 @@ import numpy as np
 
 from sigmasplat.data.trajectory import APART, LOST
 from sigmasplat.fit.align import align
-from sigmasplat.fit.compare import SLIDE, Comparison, compare, held
+from sigmasplat.fit.compare import COARSE, SLIDE, Comparison, compare, held
 from sigmasplat.fit.pyramid import Pyramid
-from sigmasplat.tracking.pose_validation import HELD_FLAT, SURE, confirmed, p_wrong
+from sigmasplat.tracking.pose_validation import HELD_FLAT, LOST as LIKELY_WRONG, SURE, p_wrong
+from sigmasplat.types import Matrix
 
 COMPARED = [each.name for each in fields(Comparison)]
 CERTAIN = {LOST: 0.85, APART: 0.99}
@@ -63,17 +64,20 @@ def either(p: float, q: float) -> float:
 def places_alike(image: Pyramid) -> int:
     """Return from how many places, its own and those beside, above and below it, a camera would see the same as in an
     image, as far as the judge of poses can tell. They are sought where depth alone does not hold the pose."""
-    small, c = image.coarse(1), image.cameras[0]
+    small, c = image.coarse(COARSE), image.cameras[0]
     own = align(small, small, np.eye(4), 0)
     if held(image, image, own, weight_color=0.0) >= HELD_FLAT:
         return 1
 
+    def judged(T: Matrix) -> float:
+        moved_m = np.linalg.norm(image.points @ (T[:3, :3] - np.eye(3)).T + T[:3, 3], axis=1)
+        return p_wrong(compare(image, image, T)) if np.median(moved_m) > SLIDE * own.depth_m else 1.0
+
     def is_alike(axis: int, share: float) -> bool:
         T = np.eye(4)
         T[axis, 3] = share * own.depth_m * c.width / c.fx
-        T = align(image, image, T).T_live_reference
-        moved_m = np.linalg.norm(image.points @ (T[:3, :3] - np.eye(3)).T + T[:3, 3], axis=1)
-        return float(np.median(moved_m)) > SLIDE * own.depth_m and confirmed(compare(image, image, T))
+        T = align(small, small, T).T_live_reference
+        return judged(T) < LIKELY_WRONG and judged(align(image, image, T).T_live_reference) < SURE
 
     return 1 + 2 * sum(any(is_alike(axis, share) for share in SHIFTS) for axis in (0, 1))
 
