@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from command_line import exit_code
 from sigmasplat.config.find_preset import preset
 from sigmasplat.config.text import override
 from sigmasplat.data import se3
@@ -62,6 +63,19 @@ def test_the_tiles_of_a_user_are_never_wrong_in_silence() -> None:
     found_m = np.stack([step.T_world_camera[:3, 3] for step in steps])
     off = np.linalg.norm(found_m - (true_m - true_m[0]), axis=1) > OFF_M
     assert off.any() and declared(steps)[off].all()
+
+
+@pytest.mark.skipif(not TILES.is_dir(), reason=f"no {TILES}")
+def test_a_run_says_at_its_end_that_nothing_confirms_the_path(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    few = [word for pair in FEW_STEPS.items() for word in ("--set", "=".join(pair))]
+    asked = ("--limit", "12", "--no-eval", "--set", "input.width=160", *few)
+    assert exit_code("run", str(TILES / "rec"), "--out", str(tmp_path / "tiles"), *asked) == 0
+    assert "the images do not confirm the path in" in " ".join(capsys.readouterr().err.split())
+    walk = "synthetic:frames=200,width=160,height=120"
+    assert exit_code("run", walk, "--out", str(tmp_path / "room"), *asked) == 0
+    assert "do not confirm" not in " ".join(capsys.readouterr().err.split())
 
 
 def test_a_furnished_room_looks_like_no_other_place() -> None:

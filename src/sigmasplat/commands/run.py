@@ -41,7 +41,7 @@ OK, INTERRUPTED = 0, 130
 DEFAULT_PRESET = default_preset()
 DEMO_FOLDER, DEMO_FRAMES = Path("runs/demo"), 120
 CONTRADICTED_MOST = 0.05
-"""Given poses are reported if the images contradict a larger share of them."""
+"""Poses are reported if the images contradict, or cannot confirm, a larger share of them."""
 
 
 def demo(
@@ -272,6 +272,7 @@ def warn_at_the_end(
 
     source: the sequence; read: the one that was read from, in real time the arrivals of the other one.
     """
+    from sigmasplat.data.trajectory import TRACKED
     from sigmasplat.plugins.sources.live import LiveSource
 
     if source.skipped:
@@ -290,12 +291,16 @@ def warn_at_the_end(
         screen.warn(f"the recording was never recognised in the map of {onto['run']}; its path and map are in {apart}")
     for warning in motion.warnings():
         screen.warn(warning)
-    frames = folder.read_log() if chosen.poses else []
-    wrong = sum((frame.get("p_off") or 0.0) > 0.5 for frame in frames)
-    if wrong > CONTRADICTED_MOST * len(frames):
+    frames = folder.read_log()
+    wrong = [frame["index"] for frame in frames if frame["state"] == TRACKED and (frame.get("p_off") or 0.0) > 0.5]
+    if len(wrong) > CONTRADICTED_MOST * len(frames):
+        counted = f"{len(wrong)} of {len(frames)} frames (p_off above 0.5)"
         screen.warn(
-            f"the images contradict the given pose in {wrong} of {len(frames)} frames (p_off above 0.5); are they "
+            f"the images contradict the given pose in {counted}; are they "
             "poses of the colour camera, camera to world, x right, y down, z forward?"
+            if chosen.poses
+            else f"the images do not confirm the path in {counted}, first in frame {wrong[0]}: what they show is too "
+            "bare, or looks the same from several places; show more around it, or return to what was seen before"
         )
     if source.predicted_depth and not chosen.poses_scale_depth:
         screen.say("the scale is arbitrary, because a network predicted depth: lengths are not in metres")
