@@ -7,7 +7,7 @@ tiled wall does, confirms none of them.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -26,6 +26,8 @@ world is not known."""
 SHIFTS = (1 / 16, 1 / 8, 3 / 16, 1 / 4)
 """A keyframe is aligned to itself from places beside it: those that move its image by these shares of its width, as a
 camera in a hand does from frame to frame."""
+NEARLY = 2.0
+"""Another place is as good if the pose there is at most so many times as likely wrong as at the own one."""
 
 
 @dataclass(eq=False)
@@ -63,21 +65,28 @@ def either(p: float, q: float) -> float:
 
 def places_alike(image: Pyramid) -> int:
     """Return from how many places, its own and those beside, above and below it, a camera would see the same as in an
-    image, as far as the judge of poses can tell. They are sought where depth alone does not hold the pose."""
+    image: the judge of poses would accept them, or finds them nearly as good. They are sought where depth alone does
+    not hold the pose."""
     small, c = image.coarse(COARSE), image.cameras[0]
-    own = align(small, small, np.eye(4), 0)
-    if held(image, image, own, weight_color=0.0) >= HELD_FLAT:
+    found = align(small, small, np.eye(4), 0)
+    if held(image, image, found, weight_color=0.0) >= HELD_FLAT:
         return 1
+    holds = held(image, image, found)
 
     def judged(T: Matrix) -> float:
-        moved_m = np.linalg.norm(image.points @ (T[:3, :3] - np.eye(3)).T + T[:3, 3], axis=1)
-        return p_wrong(compare(image, image, T)) if np.median(moved_m) > SLIDE * own.depth_m else 1.0
+        return p_wrong(replace(compare(image, image, T), held=holds))
+
+    most = max(SURE, NEARLY * judged(np.eye(4)))
 
     def is_alike(axis: int, share: float) -> bool:
         T = np.eye(4)
-        T[axis, 3] = share * own.depth_m * c.width / c.fx
+        T[axis, 3] = share * found.depth_m * c.width / c.fx
         T = align(small, small, T).T_live_reference
-        return judged(T) < LIKELY_WRONG and judged(align(image, image, T).T_live_reference) < SURE
+        if judged(T) > LIKELY_WRONG:
+            return False
+        T = align(image, image, T).T_live_reference
+        moved_m = np.linalg.norm(image.points @ (T[:3, :3] - np.eye(3)).T + T[:3, 3], axis=1)
+        return float(np.median(moved_m)) > SLIDE * found.depth_m and judged(T) < most
 
     return 1 + 2 * sum(any(is_alike(axis, share) for share in SHIFTS) for axis in (0, 1))
 

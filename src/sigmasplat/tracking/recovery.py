@@ -18,10 +18,14 @@ SAME_M, SAME_RAD = 0.1, np.deg2rad(5.0)
 """Two observations of the pose between two components agree if they differ by less than this, in a room."""
 
 
+def has_depth(seen: PreparedFrame) -> bool:
+    """Return whether a frame has enough readings of depth to be used at all."""
+    return seen.target.valid_pixels >= LEAST_READINGS * seen.target.camera.width * seen.target.camera.height
+
+
 def usable(seen: PreparedFrame) -> bool:
     """Return whether a frame shows enough to be recognised or to begin a map."""
-    readings = seen.target.valid_pixels / (seen.target.camera.width * seen.target.camera.height)
-    return readings >= LEAST_READINGS and (seen.image is None or float(seen.image.detail.gray.std()) >= LEAST_CONTRAST)
+    return has_depth(seen) and (seen.image is None or float(seen.image.detail.gray.std()) >= LEAST_CONTRAST)
 
 
 @dataclass(eq=False)

@@ -23,7 +23,7 @@ from sigmasplat.tracking.pose_prediction import CameraMotion, Given, PosePredict
 from sigmasplat.tracking.pose_validation import TrackingStatistics
 from sigmasplat.tracking.predicted_depth_fit import NOTHING_FITTED, DepthFit
 from sigmasplat.tracking.prepared_frame import PreparedFrame, Splats, TrackedKeyframe, mapped_keyframe
-from sigmasplat.tracking.recovery import usable
+from sigmasplat.tracking.recovery import has_depth
 from sigmasplat.types import Matrix, ShouldStop, never, unless
 
 
@@ -109,7 +109,7 @@ class Tracker:
             shown = seen.shown
             best = self._fit(given, shown, given.prediction.predicted)
         best, shown = self._uncovered(given, seen, shown, best)
-        if self._doubts(best) and not usable(seen):  # a covered lens: no other guess can help
+        if self._is_lost(best) and not has_depth(seen):  # a covered lens: no other guess can help
             best.T_camera_world = se3.inverse(given.prediction.last)
             return best
         if self._doubts(best):
