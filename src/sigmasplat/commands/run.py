@@ -294,13 +294,15 @@ def warn_at_the_end(
     frames = folder.read_log()
     wrong = [frame["index"] for frame in frames if frame["state"] == TRACKED and (frame.get("p_off") or 0.0) > 0.5]
     if len(wrong) > CONTRADICTED_MOST * len(frames):
-        counted = f"{len(wrong)} of {len(frames)} frames (p_off above 0.5)"
-        screen.warn(
-            f"the images contradict the given pose in {counted}; are they "
+        contradicted = (
+            f"the images contradict the given pose in {len(wrong)} of {len(frames)} frames (p_off above 0.5); are they "
             "poses of the colour camera, camera to world, x right, y down, z forward?"
-            if chosen.poses
-            else f"the images do not confirm the path in {counted}, first in frame {wrong[0]}: what they show is too "
-            "bare, or looks the same from several places; show more around it, or return to what was seen before"
         )
+        unconfirmed = (
+            f"the images do not confirm the path in {len(wrong)} of {len(frames)} frames (p_off above 0.5), first in "
+            f"frame {wrong[0]}: what they show is too bare, or looks the same from several places; show more around "
+            "it, or return to what was seen before"
+        )
+        screen.warn(contradicted if chosen.poses else unconfirmed)
     if source.predicted_depth and not chosen.poses_scale_depth:
         screen.say("the scale is arbitrary, because a network predicted depth: lengths are not in metres")

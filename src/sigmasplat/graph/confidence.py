@@ -16,7 +16,7 @@ from sigmasplat.data.trajectory import APART, LOST
 from sigmasplat.fit.align import align
 from sigmasplat.fit.compare import COARSE, SLIDE, Comparison, compare, held
 from sigmasplat.fit.pyramid import Pyramid
-from sigmasplat.tracking.pose_validation import HELD_FLAT, LOST as LIKELY_WRONG, SURE, p_wrong
+from sigmasplat.tracking.pose_validation import DOUBTFUL, HELD_FLAT, LOST as LIKELY_WRONG, SURE, p_wrong
 from sigmasplat.types import Matrix
 
 COMPARED = [each.name for each in fields(Comparison)]
@@ -44,9 +44,9 @@ class Confidence:
 
     def placed(self, number: int, wrong: float, confirmed: Sequence[int], alike: int = 1) -> None:
         """Add a keyframe; wrong: the probability that the hop to it is; confirmed: numbers of the earlier keyframes
-        that it was aligned to; alike: how many places look like its own. A hop that counts as sure adds no doubt: there
+        that it was aligned to; alike: how many places look like its own. A hop that is not doubtful adds nothing: there
         are thousands of them."""
-        by_hop = self.newest if wrong <= SURE else either(self.newest, wrong)
+        by_hop = self.newest if wrong <= DOUBTFUL else either(self.newest, wrong)
         ways = [by_hop] if alike > 1 else [by_hop, *(self.doubts[k] for k in confirmed)]
         self.newest = either(min(ways), 1.0 - 1.0 / alike)
         self.doubts[number:] = [*[0.0] * (number - len(self.doubts)), self.newest]
