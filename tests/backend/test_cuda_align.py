@@ -161,6 +161,23 @@ def test_rows_that_are_read_late_give_the_normal_equations_of_the_cpu(holes: boo
         assert np.linalg.norm(got.b - without.b) > 0.1 * np.linalg.norm(without.b), "the times matter"
 
 
+def test_fewer_rows_of_a_high_image_are_those_of_the_cpu() -> None:
+    v, u = np.indices((250, 40), dtype=np.float32)
+    planes = [np.float32(0.5 + 0.3 * np.sin(0.3 * u) * np.cos(0.2 * v)), np.float32(2.0 + 0.1 * np.sin(0.1 * (u + v)))]
+    on_cpu = LevelPlanes(*planes, None, None, *planes, [60.0, 60.0, 19.5, 124.5], [0.5, 0.5, 0.02, 0.003, 0.1, 1.0])
+    tensors = [torch.from_numpy(plane) for plane in planes]
+    on_device = on_cpu._replace(
+        reference_gray=tensors[0], reference_depth=tensors[1], live_gray=tensors[0], live_depth=tensors[1]
+    )
+    motions = [se3.exp(np.full(6, 1e-3)), se3.exp(np.full(6, 2e-3))]
+    found = aligning.normal_equations(CUDA_IMAGES, on_device, motions, whole=1)
+    expected = aligning.normal_equations(CPU_IMAGES, on_cpu, motions, whole=1)
+    for got, want in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(got.sums[1:], want.sums[1:])
+        assert np.linalg.norm(got.H - want.H) < 1e-5 * np.linalg.norm(want.H)
+    assert expected[1].sums[1] < 0.6 * expected[0].sums[1]
+
+
 def test_several_motions_at_once_are_each_alone() -> None:
     p = pair(0.05, 0.004, True)
     motions = [se3.exp(0.002 * k * np.ones(6)) @ p.T for k in range(MOTIONS)]

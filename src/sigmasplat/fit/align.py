@@ -67,7 +67,7 @@ class Alignment:
 
         The result is D⁻¹ S D⁻ᵀ. S sums outer products of the gradient per cell of the image, because residuals of
         neighbouring pixels are correlated (cluster-robust sandwich estimator, Liang & Zeger 1986). D is the measured
-        change of the gradient within half a pixel, by half of the cells, which are enough. H is not used for D: it is
+        change of the gradient within half a pixel, by some 120 rows, which are enough. H is not used for D: it is
         computed from noisy image gradients, so it is several times too steep. An undetermined direction has the
         standard deviation `UNKNOWN_M`. Without common pixels the covariance is infinite.
         """
@@ -201,7 +201,7 @@ def normal_equations(
     kernels: ImageKernels, level: LevelPlanes, motions: Sequence[Matrix], whole: int | None = None
 ) -> list[Normal]:
     """Linearise the residuals of a level at up to 13 motions T_live_reference; from number `whole` on, if it is given,
-    by every other cell of the image."""
+    by fewer rows of the image, at least 120."""
     found = kernels.normal_equations(level, motions, len(motions) if whole is None else whole)
     return [Normal(values) for values in found]
 
@@ -248,7 +248,7 @@ def gray_share(reference: Pyramid, live: Pyramid, T_live_reference: Matrix) -> f
 
     Each is weighted by the inverse of its size: the root of its mean cost at the finest size, where its Huber width is
     the unit. The inverse of the variance would be right if residuals were nothing but noise. Errors of other kinds do
-    not become smaller with it, as in `balanced`. Half of the cells are enough.
+    not become smaller with it, as in `balanced`. Some 120 rows are enough.
     """
 
     def at(weight: float, gain: float = 1.0) -> Normal:

@@ -173,8 +173,8 @@ class ImageKernels:
     align: Callable[[Sequence[LevelPlanes], Any, Matrix, AlignRules], AlignedPose]
     """Align levels, finest first, starting at T_live_reference [4, 4]; `readings` is the result of `readings_of`."""
     normal_equations: Callable[[LevelPlanes, Sequence[Matrix], int], Matrix]
-    """Linearise at up to 13 motions T_live_reference, from the number given on by every other cell; returns rows [n,
-    `NORMAL_TERMS`]."""
+    """Linearise at up to 13 motions T_live_reference, from the number given on by fewer rows of the image
+    (native/align_pixel.h); returns rows [n, `NORMAL_TERMS`]."""
 
 
 # ---- the record ----

@@ -55,9 +55,10 @@ SIGMA_INLINE vf load_lanes(const float* plane, size_t at, int lanes, float other
 // was read at another time than depth. A pixel is used if both are in view: `linearise` counts on it.
 struct Bounds { int left, right, top, bottom; };
 struct RowMotions { Motion depth[CELL], gray[CELL]; };       // of the rows of a band
-template <bool TIMED> static int warp_part(const AlignLevel& L, const Motion& T, const RowMotions& rows, const AlignReadouts* times, Bounds in, Part& part) {
+template <bool TIMED> static int warp_part(const AlignLevel& L, const Motion& T, const RowMotions& rows, const AlignReadouts* times, Bounds in, int apart, Part& part) {
     int n = 0;
     for (int y = in.top; y < in.bottom; y++) {
+        if (y % apart) continue;
         const Motion &of_depth = TIMED ? rows.depth[y % CELL] : T, &of_gray = rows.gray[y % CELL];
         fetch_ahead(L, size_t(y) * L.width + in.left);
         for (int x = in.left; x < in.right; x += W) {
@@ -80,9 +81,9 @@ template <bool TIMED> static int warp_part(const AlignLevel& L, const Motion& T,
 
 // Add residuals and derivatives of reference pixels to H and sums (acc) and to b (pull).
 template <bool TIMED>
-static void add_part(const AlignLevel& L, const LivePairs& live, const AlignOptions& o, const Motion& T, const RowMotions& rows, const AlignReadouts* times, Bounds in, vf* acc, vf* pull) {
+static void add_part(const AlignLevel& L, const LivePairs& live, const AlignOptions& o, const Motion& T, const RowMotions& rows, const AlignReadouts* times, Bounds in, int apart, vf* acc, vf* pull) {
     Part part;
-    const int n = warp_part<TIMED>(L, T, rows, times, in, part);
+    const int n = warp_part<TIMED>(L, T, rows, times, in, apart, part);
     for (int i = 0; i < n; i++) {
         const Warped& w = part.warped[i];
         const size_t at = part.at[i];
@@ -103,8 +104,8 @@ static void add_part(const AlignLevel& L, const LivePairs& live, const AlignOpti
 // So few bands take less time than waking the other threads.
 constexpr int FEW_BANDS = 4;
 
-// half: by every other cell (`is_black`).
-static void linearise(const AlignLevel& L, const LivePairs& live, const AlignOptions& o, const AlignReadouts* times, bool half, const double* T, double* normal) {
+// apart: by every so many rows.
+static void linearise(const AlignLevel& L, const LivePairs& live, const AlignOptions& o, const AlignReadouts* times, int apart, const double* T, double* normal) {
     const Motion motion = motion_of(T);
     const int bands = (L.height + CELL - 1) / CELL, cells = (L.width + CELL - 1) / CELL;
     Buffer<double> band_sums;
@@ -120,13 +121,12 @@ static void linearise(const AlignLevel& L, const LivePairs& live, const AlignOpt
             rows.gray[y % CELL] = motion_of_gray_row(L, motion, times->reference, y);
         }
         for (int cell = 0; cell < cells; cell++) {
-            if (half && !is_black(cell, band)) continue;
             vf pull[6];
             for (auto& a : pull) a = splat(0.f);
             const vf used = acc[22], read = acc[23], agreeing = acc[24];
             const int bottom = (band + 1) * CELL < L.height ? (band + 1) * CELL : L.height, right = (cell + 1) * CELL < L.width ? (cell + 1) * CELL : L.width;
             for (int y = band * CELL; y < bottom; y += PART_ROWS)
-                (times ? add_part<true> : add_part<false>)(L, live, o, motion, rows, times, {cell * CELL, right, y, y + PART_ROWS < bottom ? y + PART_ROWS : bottom}, acc, pull);
+                (times ? add_part<true> : add_part<false>)(L, live, o, motion, rows, times, {cell * CELL, right, y, y + PART_ROWS < bottom ? y + PART_ROWS : bottom}, apart, acc, pull);
             double g[6];
             for (int k = 0; k < 6; k++) { g[k] = lane_sum(pull[k]); total[21 + k] += g[k]; }
             // Two counts in one sum, exact below 2²⁴: pixels in view without a reading or agreeing, and readings.
@@ -146,11 +146,11 @@ static void linearise(const AlignLevel& L, const LivePairs& live, const AlignOpt
 }
 
 // The normal equations at `count` motions T [count][16], one after another in `normal`; from motion number `whole` on, by
-// every other cell.
+// fewer rows.
 static void align_steps(const AlignLevel* level, const AlignOptions* o, const AlignReadouts* times, int count, int whole, const double* T, double* normal) {
     static thread_local Buffer<float> memory;         // each thread that calls has its own
     const LivePairs live = side_by_side(*level, memory);
-    for (int k = 0; k < count; k++) linearise(*level, live, *o, times, k >= whole, T + 16 * k, normal + NORMAL_TERMS * k);
+    for (int k = 0; k < count; k++) linearise(*level, live, *o, times, k < whole ? 1 : rows_apart(level->height), T + 16 * k, normal + NORMAL_TERMS * k);
 }
 
 // times: null if all rows of both images were read at once.
@@ -166,7 +166,7 @@ static int align_images(const AlignLevel* levels, const AlignOptions* options, c
         if (k != before) live = side_by_side(levels[before = k], memory);
         AlignOptions in_its_light = options[k];
         in_its_light.gain = float(d.gain);
-        linearise(levels[k], live, in_its_light, times, false, d.T, normal);
+        linearise(levels[k], live, in_its_light, times, 1, d.T, normal);
         take_step(d, o, normal);
     }
     copy(d.T, 12, T);

@@ -4,8 +4,8 @@
 // is a vector of one lane (see align.cu). Has no includes and no namespace.
 
 constexpr int CELL = 16;                   // size in pixels: errors are correlated within a cell, hardly between cells
-// Every other cell, as on a chessboard: enough where sums are only compared with others of the same cells.
-SIGMA_INLINE bool is_black(int column, int row) { return (column + row) % 2 == 0; }
+// Fewer rows are enough where sums are only compared with others of the same rows: every so many, at least 120 of them.
+SIGMA_INLINE int rows_apart(int height) { return height < 240 ? 1 : height / 120; }
 constexpr int MATRIX_TERMS = 21, COUNTS = 4; // upper triangle of a 6×6; cost, pixels used, in view with depth, agreeing
 constexpr int SUMS = COUNTS + 2;           // and gray of live and of reference pixels, by their weights
 constexpr int COMMON = MATRIX_TERMS + 6 + COUNTS;                      // a fifth count, over cells: `common_pixels`

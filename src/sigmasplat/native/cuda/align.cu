@@ -88,14 +88,14 @@ template <int HALF> inline float sum_of_lanes(float* values) {
 inline int cells_of(const AlignLevel& L) { return (L.width + CELL - 1) / CELL * ((L.height + CELL - 1) / CELL); }
 
 // Store the sums of one cell's pixels in the order of NORMAL_TERMS: float within a warp, double across warps. All
-// threads must call this. half: by every other cell (`is_black`).
-inline void store_cell(const AlignLevel& L, const AlignOptions& o, const AlignReadouts* times, bool half, const double* T, int cell, double* stored) {
+// threads must call this. apart: by every so many rows.
+inline void store_cell(const AlignLevel& L, const AlignOptions& o, const AlignReadouts* times, int apart, const double* T, int cell, double* stored) {
     __shared__ float of_warps[WARPS][FLOATS];
     __shared__ double of_cell[TERMS];
     const int thread = int(threadIdx.x), cells_x = (L.width + CELL - 1) / CELL;
     const int x = cell % cells_x * CELL + thread % CELL, y = cell / cells_x * CELL + thread / CELL;
     float terms[TERMS] = {};
-    if (x < L.width && y < L.height && (!half || is_black(cell % cells_x, cell / cells_x))) {
+    if (x < L.width && y < L.height && y % apart == 0) {
         const size_t at = size_t(y) * L.width + x;
         const ReferencePixels pixel = {L.reference_gray[at], L.weight_gray ? L.weight_gray[at] : 1.f, L.weight_depth ? L.weight_depth[at] : 1.f,
                                        L.noise ? L.noise[at] : 1.f};
@@ -148,13 +148,13 @@ inline void store_cell(const AlignLevel& L, const AlignOptions& o, const AlignRe
 
 // Store a cell's sums. The last block to arrive adds all cells in order to `total` and returns true. arrived: 0 before
 // and after. All threads must call this.
-inline bool add_cells(const AlignLevel& L, const AlignOptions& o, const AlignReadouts* times, bool half, const double* T, int cell,
+inline bool add_cells(const AlignLevel& L, const AlignOptions& o, const AlignReadouts* times, int apart, const double* T, int cell,
                       double* of_cells, unsigned* arrived, double* total) {
     constexpr int GROUPS = THREADS / NORMAL_TERMS;
     __shared__ bool last;
     __shared__ double of_groups[GROUPS * NORMAL_TERMS];
     const int thread = int(threadIdx.x), cells = cells_of(L);
-    store_cell(L, o, times, half, T, cell, of_cells + size_t(cell) * NORMAL_TERMS);
+    store_cell(L, o, times, apart, T, cell, of_cells + size_t(cell) * NORMAL_TERMS);
     __threadfence();                       // make this thread's data visible before the block is counted
     __syncthreads();
     if (thread == 0) last = atomicAdd(arrived, 1u) == unsigned(cells) - 1u;
@@ -181,14 +181,14 @@ constexpr int MOTIONS = 13;                // maximum of one launch: one motion,
 struct Motions { double T[MOTIONS][12]; };
 
 // Linearise a level at several motions, with one block per cell and motion; timed: whether `readouts` are known: found [motions, NORMAL_TERMS], of_cells
-// [motions, cells, NORMAL_TERMS], arrived [motions]. From motion number `whole` on, by every other cell.
+// [motions, cells, NORMAL_TERMS], arrived [motions]. From motion number `whole` on, by fewer rows.
 KERNEL normal_equations(AlignPlanes planes, AlignPinhole pinhole, AlignOptions options, AlignReadouts readouts, int timed,
                         Motions motions, int whole, double* of_cells, unsigned* arrived, double* found) {
     __shared__ double total[NORMAL_TERMS];
     const AlignLevel level = {planes, pinhole};
     const int cells = cells_of(level), motion = int(blockIdx.x) / cells;
     double* stored = of_cells + size_t(motion) * cells * NORMAL_TERMS;
-    if (add_cells(level, options, timed ? &readouts : nullptr, motion >= whole, motions.T[motion], int(blockIdx.x) % cells, stored, arrived + motion, total) && threadIdx.x < NORMAL_TERMS)
+    if (add_cells(level, options, timed ? &readouts : nullptr, motion < whole ? 1 : rows_apart(level.height), motions.T[motion], int(blockIdx.x) % cells, stored, arrived + motion, total) && threadIdx.x < NORMAL_TERMS)
         found[motion * NORMAL_TERMS + int(threadIdx.x)] = total[threadIdx.x];
 }
 
@@ -214,7 +214,7 @@ KERNEL take_align_step(AlignPlanes planes, AlignPinhole pinhole, AlignOptions op
     __shared__ double total[NORMAL_TERMS];
     if (state->descent.level != number) return;
     options.gain = float(state->descent.gain);
-    if (add_cells({planes, pinhole}, options, timed ? &readouts : nullptr, false, state->descent.T, int(blockIdx.x), of_cells, arrived, total) && threadIdx.x == 0)
+    if (add_cells({planes, pinhole}, options, timed ? &readouts : nullptr, 1, state->descent.T, int(blockIdx.x), of_cells, arrived, total) && threadIdx.x == 0)
         take_step(state->descent, state->loop, total);
 }
 

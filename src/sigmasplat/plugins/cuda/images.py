@@ -77,7 +77,7 @@ class CudaLevel:
         self.device = reference_gray.device
 
     def normal_equations(self, motions: Matrix, whole: int) -> Matrix:
-        """Linearise at T_live_reference [n, 4, 4], n ≤ `MOTIONS`; from number `whole` on, by every other cell. Returns
+        """Linearise at T_live_reference [n, 4, 4], n ≤ `MOTIONS`; from number `whole` on, by fewer rows. Returns
         rows of H, b, counts, S and grays, [n, 55]. The host waits."""
         n, given = len(motions), np.zeros((MOTIONS, 12))
         given[:n] = motions[:, :3].reshape(n, 12)
