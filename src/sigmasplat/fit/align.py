@@ -62,8 +62,8 @@ class Alignment:
 
     @cached_property
     def covariance(self) -> Matrix:
-        """Estimate the covariance [6, 6] of the left twist (ρ, φ), m and rad, on first access. It costs as much as 8
-        steps.
+        """Estimate the covariance [6, 6] of the left twist (ρ, φ), m and rad, on first access. It costs as much as 7
+        steps in images of 240 rows.
 
         The result is D⁻¹ S D⁻ᵀ. S sums outer products of the gradient per cell of the image, because residuals of
         neighbouring pixels are correlated (cluster-robust sandwich estimator, Liang & Zeger 1986). D is the measured

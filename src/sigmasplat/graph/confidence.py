@@ -43,9 +43,9 @@ class Confidence:
         self.newest = self.doubts[place] if place is not None and place < len(self.doubts) else 0.0
 
     def placed(self, number: int, wrong: float, confirmed: Sequence[int], alike: int = 1) -> None:
-        """Add a keyframe; wrong: the probability that the hop to it is; confirmed: numbers of the earlier keyframes
-        that it was aligned to; alike: how many places look like its own. A hop that is not doubtful adds nothing: there
-        are thousands of them."""
+        """Add a keyframe; wrong: the probability that the hop to it is wrong; confirmed: numbers of the earlier
+        keyframes that it was aligned to; alike: how many places look like its own. A hop that is not doubtful adds
+        nothing: there are thousands of them."""
         by_hop = self.newest if wrong <= DOUBTFUL else either(self.newest, wrong)
         ways = [by_hop] if alike > 1 else [by_hop, *(self.doubts[k] for k in confirmed)]
         self.newest = either(min(ways), 1.0 - 1.0 / alike)

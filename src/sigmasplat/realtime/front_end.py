@@ -79,7 +79,7 @@ class Search:
 @dataclass(frozen=True, eq=False)
 class Offer:
     """A keyframe for the map; alignment: to the keyframe before it; front: what is in front of the scene; wrong: the
-    probability that tracking is."""
+    probability that its tracked pose is wrong."""
 
     seen: PreparedFrame
     alignment: Alignment | None = None

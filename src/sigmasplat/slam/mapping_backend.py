@@ -156,18 +156,19 @@ class MappingBackend(SlamState):
 
     def _placed(self, index: int, hop: RelativePose, seen: PreparedFrame) -> Matrix:
         """Write the poses of the active submap's keyframes to the atlas; return that of the newest."""
-        if self.keyframe_indices[-1:] != [index]:  # a keyframe that two submaps share is counted once
+        is_new = self.keyframe_indices[-1:] != [index]  # a keyframe that two submaps share is counted once
+        if is_new:
             self.keyframe_indices.append(index)
         self.atlas.set_keyframes([keyframe.T_world_camera for keyframe in self.mapper.keyframes], hop, seen.reading)
         number = len(self.atlas.readings) - 1
         aligned = [edge.b for edge in self.graph.edges.touching(number)]
-        alike = places_alike(seen.live) if self.config.tracking.verify else 1
+        alike = places_alike(seen.live) if is_new and self.config.tracking.verify else 1
         self.confidence.placed(number, hop.wrong, aligned, alike)
         return self.atlas.keyframe_poses.last[-1]
 
     def hop_to(self, T_camera_submap: Matrix, alignment: Alignment | None, wrong: float) -> RelativePose:
         """Return the motion from the newest keyframe to a new one, with its errors; alignment: of the new one to it;
-        wrong: the probability that it is."""
+        wrong: the probability that the motion is wrong."""
         T_camera_before = T_camera_submap @ self.atlas.keyframe_poses.last[-1]
         if alignment is None:
             return RelativePose.hop(T_camera_before, wrong=wrong)

@@ -30,7 +30,7 @@ class NewestFrame:
     it is a keyframe; connected: whether tracking found it from the keyframes before; reads_late: whether it waits;
     reference: the keyframe that it was aligned to, None if there is none; explained: agreement × overlap of this
     alignment; alignment: only of a frame that does not wait; front: what was in front of the scene; exposure: relative
-    to the map; wrong: the probability that tracking is.
+    to the map; wrong: the probability that its tracked pose is wrong.
     """
 
     number: int
