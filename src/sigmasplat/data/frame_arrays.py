@@ -32,18 +32,17 @@ NARROWEST = 0.05
 MEDIAN_OF = 4096
 """The median depth is that of about this many pixels."""
 
-_COLOR_OF_BYTE = (np.arange(256) / 255.0).astype(np.float32)
-
 
 def color_from_bytes(values: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Convert 8-bit colour to float32 in [0, 1], same shape."""
-    return _COLOR_OF_BYTE[values]
+    return np.divide(values, np.float32(255.0))
 
 
 def depth_from_integers(values: NDArray[Any], units_per_metre: float) -> NDArray[np.float32]:
     """Convert whole-number depth to float32 metres, same shape; 65535 becomes 0, no reading."""
-    readings = np.where(values == UINT16_MAX, 0, values)
-    return (readings / units_per_metre).astype(np.float32)
+    depth_m = np.divide(values, units_per_metre, dtype=np.float64).astype(np.float32)
+    depth_m[values == UINT16_MAX] = 0.0
+    return depth_m
 
 
 def frame_from_arrays(

@@ -58,9 +58,11 @@ class Pyramid:
 
     @property
     def points(self) -> Matrix:
-        """Return the points [P, 3] that the coarsest size shows, m, in the axes of the camera."""
-        depth_m: Matrix = np.asarray(self.kernels.to_host(self.depth[-1]), np.float64)[..., None]
-        return np.asarray((self.cameras[-1].rays() * depth_m)[depth_m[..., 0] > 0])
+        """Return the points [P, 3] that the coarsest size shows, m, in the axes of the camera; as many fewer as coarser
+        sizes are left out here."""
+        step = 2 ** (LEVELS - len(self.cameras))
+        depth_m: Matrix = np.asarray(self.kernels.to_host(self.depth[-1])[::step, ::step], np.float64)[..., None]
+        return np.asarray((self.cameras[-1].rays()[::step, ::step] * depth_m)[depth_m[..., 0] > 0])
 
     def weighed(self, weight: Plane | None, weight_depth: Plane | None = None) -> "Pyramid":
         """Return the same images with other weights [H, W] of gray and depth; without a depth weight, gray's weight is

@@ -24,7 +24,7 @@ def read_color(path: Path, data: bytes | None = None) -> NDArray[np.uint8]:
     if data is None:
         _refuse_missing(path)
     with open_image(path, data) as image:
-        return np.asarray(image.convert("RGB"))
+        return np.asarray(image if image.mode == "RGB" else image.convert("RGB"))
 
 
 def read_values(path: Path, data: bytes | None = None) -> NDArray[Any]:
@@ -62,7 +62,8 @@ def depth_to_metres(path: Path, raw: NDArray[Any], units_per_metre: float) -> ND
             f"{path}: not a depth image (found {raw.dtype} {raw.shape}); expected 16-bit PNG or float metres"
         )
     depth_m = raw.astype(np.float32) if raw.dtype.kind == "f" else depth_from_integers(raw, units_per_metre)
-    if bad := int((~np.isfinite(depth_m)).sum()):
+    if not (read := np.isfinite(depth_m)).all():
+        bad = int((~read).sum())
         raise SourceError(f"{path}: depth holds {bad} NaN or inf pixels; write 0 where there is no reading")
     if float(depth_m.min(initial=0.0)) < 0.0:
         raise SourceError(f"{path}: depth is negative ({depth_m.min():.3f} m); write 0 where there is no reading")

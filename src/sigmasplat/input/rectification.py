@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from sigmasplat.config import InputConfig
 from sigmasplat.data.camera import Camera
+from sigmasplat.env import opencv
 from sigmasplat.errors import SourceError
 from sigmasplat.input.calibration import Calibration
 
@@ -45,42 +46,23 @@ class Undistortion:
         self.coefficients = coefficients
 
     @cached_property
-    def _source_uv(self) -> NDArray[np.float32]:
-        """Position of each ideal pixel in the recorded image, [H·W, 2] pixels."""
+    def _source_uv(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Column and row of each ideal pixel in the recorded image, [H, W] each."""
         c = self.camera
         lens = distort(c.rays()[..., :2].astype(np.float64), self.coefficients)
-        return (lens * [c.fx, c.fy] + [c.cx, c.cy]).reshape(-1, 2).astype(np.float32)
-
-    @cached_property
-    def _corners(self) -> tuple[list[NDArray[np.intp]], list[NDArray[np.float32]]]:
-        """Flat indices and weights of the four recorded pixels around each ideal pixel; clamped to the image."""
-        width, height = self.camera.width, self.camera.height
-        u = self._source_uv[:, 0].clip(0, width - 1)
-        v = self._source_uv[:, 1].clip(0, height - 1)
-        u0, v0 = np.floor(u).astype(np.intp), np.floor(v).astype(np.intp)
-        u1, v1 = np.minimum(u0 + 1, width - 1), np.minimum(v0 + 1, height - 1)
-        a, b = (u - u0)[:, None], (v - v0)[:, None]
-        indices = [v0 * width + u0, v0 * width + u1, v1 * width + u0, v1 * width + u1]
-        return indices, [(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b]
-
-    @cached_property
-    def _nearest(self) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-        width, height = self.camera.width, self.camera.height
-        uv = np.rint(self._source_uv).astype(np.intp)
-        inside = np.asarray((uv >= 0).all(1) & (uv < [width, height]).all(1))
-        return np.where(inside, uv[:, 1] * width + uv[:, 0], 0), inside
+        u, v = (lens * [c.fx, c.fy] + [c.cx, c.cy]).astype(np.float32).transpose(2, 0, 1)
+        return np.ascontiguousarray(u), np.ascontiguousarray(v)
 
     def color(self, recorded: NDArray[np.float32]) -> NDArray[np.float32]:
         """Resample colour [H, W, 3] bilinearly; outside the recorded image edge pixels repeat (depth is 0)."""
-        flat = recorded.reshape(-1, 3)
-        indices, weights = self._corners
-        total = sum((flat[i] * w for i, w in zip(indices, weights, strict=True)), np.zeros_like(flat))
-        return np.clip(total, 0.0, 1.0).astype(np.float32).reshape(recorded.shape)
+        cv2 = opencv()
+        resampled = cv2.remap(recorded, *self._source_uv, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(np.minimum(resampled, 1.0, out=resampled))
 
     def depth(self, recorded_m: NDArray[np.float32]) -> NDArray[np.float32]:
         """Resample depth [H, W] by the nearest reading; 0 outside the recorded image."""
-        index, inside = self._nearest
-        return np.where(inside, recorded_m.reshape(-1)[index], 0.0).astype(np.float32).reshape(recorded_m.shape)
+        cv2 = opencv()
+        return np.asarray(cv2.remap(recorded_m, *self._source_uv, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT))
 
 
 OVERLAP = 1.1
