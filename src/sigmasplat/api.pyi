@@ -133,15 +133,19 @@ from sigmasplat.fit.tracking_loss import reference_maps as reference_maps, track
 from sigmasplat.graph.loops import Loop as Loop
 from sigmasplat.graph.path_covariance import PathCovariance as PathCovariance
 from sigmasplat.input.calibration import (
+    ASSUMED as ASSUMED,
+    MEASURED as MEASURED,
     MM_PER_METRE as MM_PER_METRE,
     TUM_UNITS_PER_METRE as TUM_UNITS_PER_METRE,
     Calibration as Calibration,
     CameraUnknown as CameraUnknown,
     Distortion as Distortion,
+    Origin as Origin,
     build_camera as build_camera,
     check_positive as check_positive,
     freiburg_calibration as freiburg_calibration,
     json_number as json_number,
+    published as published,
     read_json_object as read_json_object,
     resolve_calibration as resolve_calibration,
     unlikely_camera as unlikely_camera,

@@ -76,7 +76,11 @@ def test_the_folders_name_selects_the_camera(tmp_path):
         ("afr1ca", None),
         ("office", None),
     ]:
-        assert freiburg_calibration(tmp_path / name) == (FREIBURG[expected] if expected else None)
+        found = freiburg_calibration(tmp_path / name)
+        assert (found and (found.camera, found.distortion)) == (
+            (FREIBURG[expected].camera, FREIBURG[expected].distortion) if expected else None
+        )
+        assert found is None or f"freiburg{expected}, named by {name}" in found.origins["camera"].value
 
 
 def test_calibration_json_overrides_the_folders_name(tiny_tum):

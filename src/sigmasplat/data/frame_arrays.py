@@ -35,12 +35,12 @@ MEDIAN_OF = 4096
 
 def color_from_bytes(values: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Convert 8-bit colour to float32 in [0, 1], same shape."""
-    return np.divide(values, np.float32(255.0))
+    return np.asarray(values / np.float32(255.0))
 
 
 def depth_from_integers(values: NDArray[Any], units_per_metre: float) -> NDArray[np.float32]:
     """Convert whole-number depth to float32 metres, same shape; 65535 becomes 0, no reading."""
-    depth_m = np.divide(values, units_per_metre, dtype=np.float64).astype(np.float32)
+    depth_m: NDArray[np.float32] = np.divide(values, units_per_metre, dtype=np.float64).astype(np.float32)
     depth_m[values == UINT16_MAX] = 0.0
     return depth_m
 

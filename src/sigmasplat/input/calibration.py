@@ -1,9 +1,10 @@
 """Read the calibration of a recording, and check it."""
 
 import re
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,23 @@ Distortion = tuple[float, ...]
 """Radial and tangential distortion k1, k2, p1, p2, k3 [, k4, k5, k6 of the rational model's denominator]."""
 
 
+GIVEN, MEASURED, ASSUMED = "given", "measured", "assumed"
+
+
+class Origin(NamedTuple):
+    """A value that decides the result, in words, and where it comes from: given, measured, assumed, or "read from
+    FILE"; option: what gives it, if it is assumed."""
+
+    value: str
+    origin: str
+    option: str = ""
+
+
+def published(camera: str) -> dict[str, Origin]:
+    """Return the origin of the published calibration of a camera, which a recording is assumed to be from."""
+    return {"camera": Origin(camera, ASSUMED, "--calibration FILE")}
+
+
 @dataclass(frozen=True, eq=False)
 class Calibration:
     """The cameras of a recording.
@@ -26,7 +44,7 @@ class Calibration:
     camera, distortion: of the colour image, None for no distortion; depth_units_per_metre: of whole-number depth;
     depth_camera, depth_distortion: of depth images that are not registered to colour, None if they are registered;
     T_color_depth [4, 4]: transforms points of the depth camera to the colour camera, metres;
-    sensor: the depth sensor (`config.input`), None if it is unknown.
+    sensor: the depth sensor (`config.input`), None if it is unknown; origins: of these values, by name.
     """
 
     camera: Camera
@@ -36,6 +54,7 @@ class Calibration:
     depth_distortion: Distortion | None = None
     T_color_depth: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
     sensor: str | None = None
+    origins: Mapping[str, Origin] = field(default_factory=dict)
 
 
 class CameraUnknown(SourceError):
@@ -70,31 +89,44 @@ def freiburg_calibration(folder: Path) -> Calibration | None:
     for part in reversed(folder.resolve().parts):
         match = re.search(r"freiburg([123])|(?:^|[^a-z0-9])fr([123])(?:[^0-9]|$)", part.lower())
         if match:
-            return FREIBURG[match.group(1) or match.group(2)]
+            number = match.group(1) or match.group(2)
+            return replace(FREIBURG[number], origins=published(f"TUM's freiburg{number}, named by {part}"))
     return None
 
 
-def read_calibration(path: Path, size: tuple[int, int], default_units_per_metre: float) -> Calibration:
+def read_calibration(
+    path: Path, size: tuple[int, int], default_units_per_metre: float, known: Calibration | None = None
+) -> Calibration:
     """Read `calibration.json`: fx, fy, cx, cy; optional width, height, depth_scale (PNG units per metre), distortion,
-    sensor (`config.input`).
+    sensor (`config.input`). If the recording's own calibration is `known`, each of them is optional.
 
     For depth that is not registered to colour: depth_camera, an object of the same fields, and T_color_depth, 4 rows.
     `size` (width, height) in pixels is the default for a missing size. Raises SourceError naming file and field.
     """
-    fields = read_json_object(path)
-    units = json_number(path, fields, "depth_scale", default_units_per_metre)
-    lens, sensor = read_distortion(path, fields), fields.get("sensor")
+    written, read = read_json_object(path), Origin("", f"read from {path}")
+    fields = (asdict(known.camera) if known else {}) | written
+    units = json_number(path, fields, "depth_scale", known.depth_units_per_metre if known else default_units_per_metre)
+    sensor = written.get("sensor", known.sensor if known else None)
     if sensor and (problem := problem_of(kinds_of(InputConfig)["sensor"], sensor)):
         raise SourceError(f'{path}: field "sensor" {problem}')
-    scale = check_positive(path, "depth_scale", units)
-    calibration = Calibration(read_camera(path, fields, size), scale, lens, sensor=sensor)
-    inner = fields.get("depth_camera")
+    origins = dict(known.origins if known else {})
+    origins |= {"camera": read} if written.keys() & {"fx", "fy", "cx", "cy"} else {}
+    origins |= {"depth unit": read} if "depth_scale" in written else {}
+    if "camera" in origins and "fx" in written and not {"width", "height"} <= written.keys():
+        origins["size of the calibration"] = Origin("that of the images", ASSUMED, f"width and height in {path}")
+    camera, scale = read_camera(path, fields, size), check_positive(path, "depth_scale", units)
+    lens = known.distortion if known and "distortion" not in written else read_distortion(path, written)
+    calibration = replace(
+        known or Calibration(camera, scale), camera=camera, depth_units_per_metre=scale, distortion=lens,
+        sensor=sensor, origins=origins,
+    )  # fmt: skip
+    inner = written.get("depth_camera")
     if inner is None:
         return calibration
     if not isinstance(inner, dict):
         raise SourceError(f'{path}: field "depth_camera" is {inner!r}, expected an object with fx, fy, cx, cy')
     camera, lens = read_camera(path, inner, size), read_distortion(path, inner)
-    T_color_depth = read_rigid_transform(path, fields, "T_color_depth")
+    T_color_depth = read_rigid_transform(path, written, "T_color_depth")
     return replace(calibration, depth_camera=camera, depth_distortion=lens, T_color_depth=T_color_depth)
 
 
@@ -108,7 +140,7 @@ def resolve_calibration(
     """
     beside = folder / "calibration.json"
     if settings.calibration or exists(beside):
-        recorded = read_calibration(Path(settings.calibration or beside), size, default_units)
+        recorded = read_calibration(Path(settings.calibration or beside), size, default_units, recorded)
     if recorded is None and not settings.fx:
         place = "a file for --calibration" if folder.is_file() else beside
         raise CameraUnknown(
@@ -119,9 +151,33 @@ def resolve_calibration(
     if recorded is None:
         centred = Camera(*size, settings.fx, settings.fy or settings.fx, (size[0] - 1) / 2, (size[1] - 1) / 2)
         recorded = Calibration(centred, default_units)
+        if not (settings.cx and settings.cy):
+            middle = Origin("the middle of the image", ASSUMED, "--cx PX --cy PX")
+            recorded = replace(recorded, origins={"image centre": middle})
     units = settings.depth_scale or recorded.depth_units_per_metre
     given = {key: value for key in ("fx", "fy", "cx", "cy") if (value := getattr(settings, key))}
-    return replace(recorded, camera=replace(recorded.camera, **given), depth_units_per_metre=units)
+    found = replace(recorded, camera=replace(recorded.camera, **given), depth_units_per_metre=units)
+    return replace(found, origins=_origins(found, bool(given), bool(settings.depth_scale)))
+
+
+def _origins(found: Calibration, camera_given: bool, units_given: bool) -> dict[str, Origin]:
+    """Return the origins of all values of a calibration, in words; what nothing states is assumed."""
+    c, known = found.camera, dict(found.origins)
+    origins = {"camera": known.pop("camera", Origin("", "read from the recording"))}
+    if camera_given:
+        origins["camera"] = Origin("", GIVEN)
+    if not origins["camera"].value:
+        words = f"fx {c.fx:.6g}, fy {c.fy:.6g}, cx {c.cx:.6g}, cy {c.cy:.6g} pixels"
+        origins["camera"] = origins["camera"]._replace(value=words)
+        if not found.distortion:
+            origins["lens"] = Origin("no distortion", ASSUMED, "distortion in calibration.json")
+        if not found.depth_camera:
+            option = "depth_camera and T_color_depth in calibration.json"
+            origins["depth and colour"] = Origin("one camera, registered", ASSUMED, option)
+    units = f"{found.depth_units_per_metre:g} per metre, and metres if not whole numbers"
+    unit = known.pop("depth unit", Origin("", ASSUMED, "--depth-scale UNITS"))
+    unit = Origin("", GIVEN) if units_given else unit
+    return origins | {"depth unit": unit._replace(value=units)} | known
 
 
 def read_json_object(path: Path) -> dict[str, Any]:

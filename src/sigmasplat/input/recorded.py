@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, TypeVar
 
 import numpy as np
@@ -16,7 +17,7 @@ from sigmasplat.data.frame_arrays import color_from_bytes
 from sigmasplat.data.images import resized_color
 from sigmasplat.data.trajectory import Trajectory, evenly_spaced
 from sigmasplat.errors import SourceError
-from sigmasplat.input.calibration import Calibration, refuse_impossible_camera, resolve_calibration
+from sigmasplat.input.calibration import Calibration, Origin, refuse_impossible_camera, resolve_calibration
 from sigmasplat.input.images import FRAMES_PER_SECOND, image_size, pair_images, read_color, read_depth
 from sigmasplat.input.imu import Accelerometer, Gyroscope
 from sigmasplat.input.rectification import Rectification, check_image_sizes
@@ -126,12 +127,12 @@ class RecordedSource(Source):
         self, name: str, images: Sequence[ImagePair], calibration: Calibration, settings: InputConfig,
         truth: Trajectory | None = None, skipped: Sequence[str] = (), test: Source | None = None,
         gyroscope: Gyroscope | None = None, accelerometer: Accelerometer | None = None, surface: Path | None = None,
-        estimated: bool = False,
+        estimated: bool = False, origins: Mapping[str, Origin] = MappingProxyType({}),
     ) -> None:  # fmt: skip
         """Store image pairs in order of time; `truth` is the path of the colour camera; `skipped` lists files left out.
 
         test: separate test views; gyroscope, accelerometer: in the axes of the colour camera; surface: file of the true
-        surface; estimated: whether `truth` is an estimate of the recording device.
+        surface; estimated: whether `truth` is an estimate of the recording device; origins: of times, pairs and others.
         Raises SourceError if the first images do not match the calibration, no image has a depth reading, or no image
         was taken while the gyroscope measured.
         """
@@ -141,7 +142,7 @@ class RecordedSource(Source):
         self.depth_units_per_metre: float = calibration.depth_units_per_metre
         self.depth_registered = self._rectified.moves_depth
         self.registrable, self.sensor = calibration.depth_camera is not None, calibration.sensor
-        self.skipped = list(skipped)
+        self.skipped, self.origins = list(skipped), dict(calibration.origins) | dict(origins)
         self._images, self._truth, self._test = images, truth, test
         self._gyroscope, self._accelerometer = gyroscope, accelerometer
         self._surface, self._estimated = surface, estimated

@@ -18,6 +18,7 @@ from sigmasplat.data.mesh import Mesh
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SourceError
 from sigmasplat.files.reading import guarded
+from sigmasplat.input.calibration import ASSUMED, Origin
 from sigmasplat.native.threads import yield_to_others
 
 Item = TypeVar("Item")
@@ -43,7 +44,7 @@ def read_ahead(items: Iterable[Item], length: int = 4) -> Iterator[Item]:
 
 FACTS = (
     "depth_units_per_metre", "depth_registered", "registrable", "computed_depth", "predicted_depth",
-    "scene_scale", "depth_noise_per_m", "sensor",
+    "scene_scale", "depth_noise_per_m", "sensor", "origins",
 )  # fmt: skip
 """What a source that wraps another one has in common with it."""
 
@@ -61,6 +62,7 @@ class Source(ABC):
     scene_scale: size of the scene relative to a room, above 1 outdoors; depth_noise_per_m: standard deviation
     of depth, times z²; None if it is unknown (`config.scale.for_scene` uses both);
     sensor: the depth sensor (`config.input`), None if it is unknown;
+    origins: where the values that decide the result come from, by name (`assumptions`);
     live: whether frames come from a live camera: each only once, and their number is unknown (LiveSource);
     arrived_s: when the last frame arrived, by `time.perf_counter`, if frames do not wait for the consumer (Arrivals);
     dropped: number of frames that were dropped because the consumer was late.
@@ -86,6 +88,12 @@ class Source(ABC):
         self.camera = camera
         self.strict = strict
         self.skipped: list[str] = []
+        self.origins: dict[str, Origin] = {}
+
+    @property
+    def assumptions(self) -> list[str]:
+        """Return what is assumed because the recording does not say it, and the option that changes it."""
+        return [f"{name}: {o.value} ({o.option})" for name, o in self.origins.items() if o.origin == ASSUMED]
 
     @abstractmethod
     def __len__(self) -> int:

@@ -17,14 +17,15 @@ SAME_SHARE = 1e-6
 
 
 def start_facts(source: Source) -> dict[str, Any]:
-    """Return what run.json keeps: the sequence, to recognise it on resume, its scene, and the kernels' instruction set.
+    """Return what run.json keeps: the sequence, to recognise it on resume, its scene, the origin of its values, and the
+    kernels' instruction set.
 
     A live camera is compared by its image size and intrinsics alone: its recording has its own depth unit.
     """
     facts: dict[str, Any] = {"camera": asdict(source.camera), "isa": instruction_set()}
     if not source.live:
         facts |= {"source_frames": len(source), "depth_units_per_metre": source.depth_units_per_metre}
-    return facts | scene_facts(source)
+    return facts | {"origins": {name: o._asdict() for name, o in source.origins.items()}} | scene_facts(source)
 
 
 def refuse_other_sequence(run: RunFolder, source: Source) -> None:
