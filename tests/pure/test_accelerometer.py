@@ -18,7 +18,7 @@ from sigmasplat.errors import RunError, SourceError
 from sigmasplat.input.imu import Accelerometer, accelerometer_from_samples, up_of_path
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.outputs.axes import level_cameras
-from sigmasplat.plugins.outputs.floorplan.ground import floor_frame, sample_surfaces
+from sigmasplat.plugins.outputs.floorplan.ground import MEASURED_COS, Up, floor_frame, sample_surfaces, up_of
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.run_folder.frames import RunFrames, noted_up
 from sigmasplat.run_folder.runs import RunFolder
@@ -81,8 +81,11 @@ def test_a_map_of_a_camera_that_was_held_sideways_stands_upright(rolled_deg: flo
     samples = list(sample_surfaces(splats(WORLD), sideways, CAMERA, seer(WORLD), max_poses=8))
     measured = Rotation.from_rotvec([0.03, -0.02, 0.03]).apply(up)  # 3 degrees off
     assert floor_frame(samples)[2, :3] @ up < 0.1, "the camera alone misleads"
-    assert floor_frame(samples, measured)[2, :3] @ up > np.cos(np.deg2rad(0.2))
-    np.testing.assert_allclose(level_cameras(sideways, measured)[2], measured, atol=1e-12)
+    edge = {90.0: "left", 180.0: "bottom"}[rolled_deg]
+    told = up_of(poses, edge=edge)
+    assert floor_frame(samples, told)[2, :3] @ up > np.cos(np.deg2rad(0.2)) and edge in told.how
+    assert floor_frame(samples, Up(measured, MEASURED_COS, ""))[2, :3] @ up > np.cos(np.deg2rad(0.2))
+    np.testing.assert_allclose(level_cameras(sideways, Up(measured, MEASURED_COS, ""))[2], measured, atol=1e-12)
 
 
 def test_a_run_knows_up_by_the_forces_on_its_valid_frames(tmp_path: Path) -> None:

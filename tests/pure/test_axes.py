@@ -36,7 +36,8 @@ def test_a_run_of_a_tilted_camera_stands_upright(tmp_path: Path, monkeypatch: py
     """The camera looks 29° down; the room's floor and walls give the vertical direction."""
     monkeypatch.setattr(module, "FieldRenderer", lambda *_: seer(WORLD))
     run = made_run(tmp_path / "run", submaps=True)
-    R = levelled(RunReader(run))
+    R, said, confirmed = levelled(RunReader(run))
+    assert confirmed and "--up left" in said and "is level" in said
     up = WORLD[:3, 2]
     for axes, row in UP_ROW.items():
         np.testing.assert_allclose((transform_to(axes, R)[:3, :3] @ up)[row], 1.0, atol=1e-4)

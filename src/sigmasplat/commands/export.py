@@ -37,6 +37,7 @@ class ExportOptions:
             "(default: y-up for SPZ, y-down for PLY)",
         ),
     ] = None
+    up: options.UpEdge = "auto"
     plain: Annotated[
         bool, flag("write PLY with only the 62 columns of 3DGS, without σ², for readers that accept no others")
     ] = False

@@ -28,6 +28,7 @@ def make_mesh(
     voxel_m: options.VoxelM = None,
     triangles: Annotated[int, Range(0), arg("N", "largest number of triangles; 0 = no limit")] = 300_000,
     axes: MeshAxes = None,
+    up: options.UpEdge = "auto",
     fill_gaps: Annotated[
         float,
         Range(0),
@@ -75,7 +76,9 @@ def make_mesh(
             screen.say(f"{len(surface.faces):,} triangles are reduced to {triangles:,} (--triangles)")
             surface = decimated(surface, triangles)
         if chosen != "camera":
-            surface = surface.moved(transform_to(chosen, levelled(reader)))
+            R_floor_world, said, confirmed = levelled(reader, up)
+            (screen.say if confirmed else screen.warn)(said)
+            surface = surface.moved(transform_to(chosen, R_floor_world))
         write_mesh(target, surface, f"sigmasplat, unit metre, axes {chosen}")
         screen.say(f"axes {chosen}, {len(surface.vertices):,} vertices, {len(surface.faces):,} triangles: {target}")
     return 0

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -52,6 +52,13 @@ MovedSource = Annotated[
 OutFile = Annotated[Path | None, arg("FILE", "file to write", "(default: named after RUN, in this folder)")]
 Record = Annotated[
     Path | None, arg("DIR", "folder for the recording of a live camera", "(default: recording/ in the run folder)")
+]
+UpEdge = Annotated[
+    Literal["auto", "top", "left", "right", "bottom"],
+    arg(
+        None,
+        "edge of the images that was up; auto: as an accelerometer measured, else top; the floor refines it",
+    ),
 ]
 VoxelM = Annotated[
     float | None,

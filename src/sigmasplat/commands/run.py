@@ -85,6 +85,7 @@ def run(
     if earlier:
         earlier.refuse_other_size(config)
     source, config = _opened(screen, path, config, record, split_settings(settings), earlier)
+    screen.assumptions(source.assumptions)
     with (
         _viewer(screen, run_options) as viewer,
         new_run(out, config, source, overwrite, onto, screen.warn, source_path=full_path(path)) as folder,

@@ -48,6 +48,13 @@ class Screen:
         """Print a warning line."""
         self.err.print(f"warning: {line}")
 
+    def assumptions(self, assumed: Sequence[str]) -> None:
+        """Print what is assumed because a recording does not say it, in one block."""
+        if assumed:
+            self.say("assumed, because the recording does not say it (in brackets what changes it):")
+        for line in assumed:
+            self.say(f"  {line}")
+
     @contextmanager
     def steps(self, total: int | None, done: int = 0) -> Iterator["_StepShow"]:
         """Show a session of `total` frames, None if unknown.

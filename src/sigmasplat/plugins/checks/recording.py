@@ -47,17 +47,21 @@ MAX_BRIGHTNESS_STEP = 0.2
 
 @dataclass(frozen=True, eq=False)
 class Inspection:
-    """Results: rows of (name, value), warnings with a fix, a contact sheet, and the check of depth registration."""
+    """Results: rows of (name, value), what is assumed, warnings with a fix, a contact sheet, and the check of depth
+    registration."""
 
     title: str
     rows: list[tuple[str, str]]
+    assumed: list[str]
     warnings: list[str]
     sheet: Image.Image
     agreement: EdgeAgreement | None
 
     def record(self) -> dict[str, Any]:
         """Return what was found as values for JSON."""
-        return {"title": self.title, "found": dict(self.rows), "warnings": self.warnings}
+        return {"title": self.title, "found": dict(self.rows)} | {
+            name: getattr(self, name) for name in ("assumed", "warnings")
+        }
 
 
 def inspect_source(path: str | Path, settings: InputConfig, samples: int = SAMPLES) -> Inspection:
@@ -91,7 +95,7 @@ def inspect_source(path: str | Path, settings: InputConfig, samples: int = SAMPL
         ("skipped", f"{len(source.skipped)} files (first: {source.skipped[0]})" if source.skipped else "nothing"),
         ("suggested preset", _suggested(name)),
     ]
-    return Inspection(source.name, rows, warnings, _sheet(frames), agreement)
+    return Inspection(source.name, rows, source.assumptions, warnings, _sheet(frames), agreement)
 
 
 def _opened(path: str | Path, settings: InputConfig) -> tuple[Source, list[str]]:

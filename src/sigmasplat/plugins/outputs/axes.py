@@ -14,8 +14,18 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from sigmasplat.api import FieldRenderer, Matrix, SigmaSplatError, Trajectory, noted_up
-from sigmasplat.plugins.outputs.floorplan.ground import floor_frame, horizontal, sample_surfaces, unit
+from sigmasplat.api import FieldRenderer, Matrix, SigmaSplatError, Trajectory
+from sigmasplat.plugins.outputs.floorplan.ground import (
+    MEASURED_COS,
+    MIN_LEVEL_SHARE,
+    Edge as Edge,
+    Up,
+    floor_frame,
+    horizontal,
+    level_share,
+    sample_surfaces,
+    up_of,
+)
 from sigmasplat.plugins.outputs.run_reader import RunReader
 
 Axes = Literal["y-up", "z-up", "y-down", "camera"]
@@ -42,27 +52,30 @@ def transform_to(axes: Axes, R_floor_world: Matrix = R_FLOOR_CAMERA) -> Matrix:
     return T
 
 
-def levelled(reader: RunReader) -> Matrix:
-    """Return R_floor_world [3, 3] of a run: x right, y ahead along the walls, z up.
+def levelled(reader: RunReader, edge: Edge = "auto") -> tuple[Matrix, str, bool]:
+    """Return R_floor_world [3, 3] of a run, x right, y ahead along the walls, z up; how up was found, in words; and
+    whether level surfaces or an accelerometer confirm it.
 
     The vertical direction comes from the floor and the walls of the map, rendered along the path, and is the same in
-    every export and in the floor plan. They are looked for near the direction that an accelerometer measured, or else
-    near the mean vertical direction of the cameras, which is used alone if no surface is visible.
-    Raises RunError if the run has no map or no path.
+    every export and in the floor plan. They are looked for near the direction of `up_of`, which is used alone if no
+    surface is visible. Raises RunError if the run has no map or no path.
     """
     field, path, config = reader.run.read_map(), reader.valid_path(), reader.config
-    up_world = noted_up(reader.run.facts())
-    samples = sample_surfaces(field, path, reader.camera, FieldRenderer(config.render, config.backend))
+    up = up_of(path.T_world_camera, reader.run.facts(), edge)
+    samples = list(sample_surfaces(field, path, reader.camera, FieldRenderer(config.render, config.backend)))
     try:
-        return floor_frame(list(samples), up_world)[:3, :3]
+        R, share = floor_frame(samples, up)[:3, :3], 0.0
+        share = level_share(samples, R[2])
     except SigmaSplatError:
-        return level_cameras(path, up_world)
+        R, share = level_cameras(path, up), 0.0
+    level = share > MIN_LEVEL_SHARE
+    found = f"{share:.0%} of what is seen is level" if level else "no floor and no table confirms it"
+    return R, f"up is {up.how}; {found}", level or up.within_cos == MEASURED_COS
 
 
-def level_cameras(path: Trajectory, up_world: Matrix | None = None) -> Matrix:
-    """Return R_floor_world [3, 3] without a map: z is the measured up direction `up_world` [3], or else the mean
-    vertical direction of the cameras; y is level and ahead."""
+def level_cameras(path: Trajectory, up: Up | None = None) -> Matrix:
+    """Return R_floor_world [3, 3] without a map: z is up, by default as the cameras are held; y is level and ahead."""
     poses = path.T_world_camera
-    up = unit(-poses[:, :3, 1].sum(0), -poses[0, :3, 1]) if up_world is None else up_world
-    ahead = horizontal(poses[0], up)
-    return np.stack([np.cross(ahead, up), ahead, up])
+    about = (up or up_of(poses)).about
+    ahead = horizontal(poses[0], about)
+    return np.stack([np.cross(ahead, about), ahead, about])

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from sigmasplat.api import ConfigError, GaussianField, Matrix, RunError, SigmaSplatError, SplatStd
-from sigmasplat.plugins.outputs.axes import AXES, Axes, levelled, transform_to
+from sigmasplat.plugins.outputs.axes import AXES, Axes, Edge, levelled, transform_to
 
 if TYPE_CHECKING:
     from sigmasplat.plugins.outputs.source import ExportSource
@@ -20,14 +20,19 @@ WriteSplats = Callable[[GaussianField, SplatStd | None], None]
 
 
 def write_splats(
-    source: "ExportSource", own: Axes, write: WriteSplats, std_below_m: float | None, axes: Axes | None
+    source: "ExportSource",
+    own: Axes,
+    write: WriteSplats,
+    std_below_m: float | None,
+    axes: Axes | None,
+    up: Edge = "auto",
 ) -> str:
     """Write the splats whose standard deviation of depth (m) is below a bound, if there is one; return how many were
     written and dropped, and the axes.
 
     own: the axes of the format, used without `axes`. If it defines y as up, the field that `write` gets is rotated by
-    180° about x, because the writer rotates it back. Raises ConfigError on axes that the format cannot have, or if the
-    splats lack the value that is bounded; RunError if no splat is left.
+    180° about x, because the writer rotates it back. up: as of `levelled`. Raises ConfigError on axes that the format
+    cannot have, or if the splats lack the value that is bounded; RunError if no splat is left.
     """
     axes, allowed = axes or own, Y_UP_FORMATS if own == "y-up" else AXES
     if axes not in allowed:
@@ -46,7 +51,7 @@ def write_splats(
             raise RunError(f"no splat of {source.path} is left (median depth_std_m is {median}); use a weaker bound")
         field.keep(kept.to(field.params.device))
         std = std.at(kept.cpu())
-    T, note = _transform(source, axes, own)
+    T, note = _transform(source, axes, own, up)
     field = field if np.array_equal(T, np.eye(4)) else field.moved(torch.from_numpy(T))
     print(f"writing {len(field):,} splats …", flush=True)
     write(field, std)
@@ -54,14 +59,15 @@ def write_splats(
     return f"{len(field):,} splats, axes {axes}{note}{dropped}"
 
 
-def _transform(source: "ExportSource", axes: Axes, own: Axes) -> tuple[Matrix, str]:
-    """Return the transform [4, 4] before writing, and a note if the file is not levelled though the axes say so."""
+def _transform(source: "ExportSource", axes: Axes, own: Axes, up: Edge) -> tuple[Matrix, str]:
+    """Return the transform [4, 4] before writing, and how up was found."""
     if axes == "camera":
         return np.eye(4), ""
     turn = HALF_TURN if own == "y-up" else np.eye(4)
     if source.path.is_file():
         return turn @ transform_to(axes), " (a map without a path is not levelled)"
     try:
-        return turn @ transform_to(axes, levelled(source.reader())), ""
+        R_floor_world, said, _ = levelled(source.reader(), up)
+        return turn @ transform_to(axes, R_floor_world), f" ({said})"
     except SigmaSplatError:
         return turn @ transform_to(axes), " (not levelled: the run has no path or no images)"

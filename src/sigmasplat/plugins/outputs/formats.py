@@ -11,7 +11,7 @@ from sigmasplat.plugins.outputs.source import ExportSource as ExportSource
 
 if TYPE_CHECKING:
     from sigmasplat.api import GaussianField, SplatStd
-    from sigmasplat.plugins.outputs.axes import Axes
+    from sigmasplat.plugins.outputs.axes import Axes, Edge
 
 
 def owners(formats: tuple[Output, ...]) -> dict[str, Output]:
@@ -61,21 +61,23 @@ def refuse_unused(chosen: Output, formats: tuple[Output, ...], given: list[str])
             )
 
 
-def _spz(source: ExportSource, target: Path, *, std_below_m: float | None, axes: "Axes | None") -> str:
+def _spz(source: ExportSource, target: Path, *, std_below_m: float | None, axes: "Axes | None", up: "Edge") -> str:
     from sigmasplat.plugins.outputs.chosen_splats import write_splats
     from sigmasplat.plugins.outputs.spz import write_field
 
-    return write_splats(source, "y-up", lambda field, std: write_field(target, field), std_below_m, axes)
+    return write_splats(source, "y-up", lambda field, std: write_field(target, field), std_below_m, axes, up)
 
 
-def _ply(source: ExportSource, target: Path, *, std_below_m: float | None, axes: "Axes | None", plain: bool) -> str:
+def _ply(
+    source: ExportSource, target: Path, *, std_below_m: float | None, axes: "Axes | None", up: "Edge", plain: bool
+) -> str:
     from sigmasplat.api import splat_ply
     from sigmasplat.plugins.outputs.chosen_splats import write_splats
 
     def write(field: "GaussianField", std: "SplatStd | None") -> None:
         splat_ply.write_field(target, field, plain=plain, std=std)
 
-    return write_splats(source, "y-down", write, std_below_m, axes)
+    return write_splats(source, "y-down", write, std_below_m, axes, up)
 
 
 def _trajectory(source: ExportSource, target: Path) -> str:
@@ -111,26 +113,27 @@ def _colmap(source: ExportSource, target: Path, *, pictures: bool) -> str:
 
 
 def _video(
-    source: ExportSource, target: Path, *, size: int, fps: float, seconds: float | None, path: str, panels: str
-) -> str:
+    source: ExportSource, target: Path, *, size: int, fps: float, seconds: float | None, path: str, panels: str,
+    up: "Edge",
+) -> str:  # fmt: skip
     from sigmasplat.api import Screen
     from sigmasplat.plugins.outputs.video import export_video
 
     with Screen().counting("film") as progress:
         count = export_video(
             source.reader(), target, width_px=size, fps=fps, seconds=seconds, orbit=path == "orbit",
-            panels=panels == "all", progress=progress,
+            panels=panels == "all", up=up, progress=progress,
         )  # fmt: skip
     return f"{count:,} images, {count / fps:.1f} s"
 
 
-def _plan(source: ExportSource, target: Path, *, cell_m: float) -> str:
+def _plan(source: ExportSource, target: Path, *, cell_m: float, up: "Edge") -> str:
     from sigmasplat.api import Screen
     from sigmasplat.plugins.outputs.floorplan.floor_plan import FREE
     from sigmasplat.plugins.outputs.floorplan.picture import export_plan
 
     with Screen().counting("floor plan") as progress:
-        plan = export_plan(source.reader(), target, cell_m=cell_m, progress=progress)
+        plan = export_plan(source.reader(), target, cell_m=cell_m, up=up, progress=progress)
     return f"{plan.area_m2(FREE):.1f} m² of free floor, also in {target.with_suffix('.json').name}"
 
 

@@ -22,7 +22,6 @@ from sigmasplat.api import (
     Trajectory,
     evenly_spread,
     no_progress,
-    noted_up,
     replacing,
     se3,
 )
@@ -30,7 +29,7 @@ from sigmasplat.plugins.evaluation.view_scores import COVERED_ALPHA, Renderer
 from sigmasplat.plugins.outputs.drawing import colormap
 from sigmasplat.plugins.outputs.drawing.colormap import Rgb
 from sigmasplat.plugins.outputs.drawing.view_panels import ViewPanel, coloured, draw_view_strip
-from sigmasplat.plugins.outputs.floorplan.ground import Floats, floor_frame, sample_surfaces
+from sigmasplat.plugins.outputs.floorplan.ground import Edge, Floats, Up, floor_frame, sample_surfaces, up_of
 from sigmasplat.plugins.outputs.run_reader import RunReader
 
 SMOOTHING_S = 0.25
@@ -117,20 +116,24 @@ def export_video(
     seconds: float | None = None,
     orbit: bool = False,
     panels: bool = True,
+    up: Edge = "auto",
     renderer: Renderer | None = None,
     progress: Progress = no_progress,
 ) -> int:
     """Write a video and return its number of images. Calls `progress(done, total)` at the start and after each image.
 
     width_px: width of a panel (0: that of the run's images); orbit: not along the run's path; panels: depth and
-    uncertainty beside colour. Raises RunError on an unknown ending, or without a map or path.
+    uncertainty beside colour; up: at this edge of the images, for an orbit. Raises RunError on an unknown ending, or
+    without a map or path.
     """
     config, path = reader.config, reader.valid_path()
     renderer = renderer or FieldRenderer(config.render, config.backend)
     field, camera = reader.run.read_map(), film_camera(reader.camera, width_px)
     count = image_count(float(path.timestamps_s[-1] - path.timestamps_s[0]), fps, seconds, orbit)
     if orbit:
-        field, poses = orbit_view(field, path, camera, count, renderer, noted_up(reader.run.facts()))
+        field, poses = orbit_view(
+            field, path, camera, count, renderer, up_of(path.T_world_camera, reader.run.facts(), up)
+        )
     else:
         poses = smooth_path(path, count)
     film = Film(field, camera, renderer)
@@ -195,12 +198,12 @@ def orbit_view(
     camera: Camera,
     images: int,
     renderer: Renderer,
-    up_world: Matrix | None = None,
+    up: Up | None = None,
 ) -> tuple[GaussianField, Matrix]:
     """Return the map without its ceiling, and poses [images, 4, 4] on a circle above it from which it is visible;
-    up_world: as in `floor_frame`."""
+    up: as in `floor_frame`."""
     samples = list(sample_surfaces(field, path, camera, renderer, SURFACE_VIEWS))
-    T = floor_frame(samples, up_world)
+    T = floor_frame(samples, up)
     points = np.concatenate([sample.points for sample in samples]) @ T[:3, :3].T + T[:3, 3]
     low, high = np.quantile(points, [0.02, 0.98], axis=0)
     ceiling_m = float(np.median(path.T_world_camera[:, :3, 3] @ T[2, :3] + T[2, 3])) + CEILING_M

@@ -33,6 +33,7 @@ from sigmasplat.api import (
     Camera,
     ImagePair,
     InputConfig,
+    Origin,
     RecordedSource,
     SourceError,
     SourceFormat,
@@ -52,6 +53,7 @@ from sigmasplat.api import (
     pair_images,
     pair_times,
     parse_numbers,
+    published,
     read_groundtruth,
     read_json_object,
     read_lines,
@@ -95,7 +97,9 @@ def _pairs(folder: Path, colors: list[Path], depths: list[Path]) -> tuple[list[t
 
 
 INTRINSIC_NAMES = ("intrinsic.json", "intrinsics.json", "camera_intrinsic.json", "camera_intrinsics.json")
-PRIMESENSE = Calibration(Camera(640, 480, 525.0, 525.0, 319.5, 239.5), MM_PER_METRE)
+PRIMESENSE = Calibration(
+    Camera(640, 480, 525.0, 525.0, 319.5, 239.5), MM_PER_METRE, origins=published("PrimeSense's factory values")
+)
 """Open3D's PrimeSenseDefault."""
 
 _TIMED = re.compile(r"([0-9]+)-([0-9]{9,})")
@@ -137,7 +141,9 @@ def _recorded(path: Path, fields: dict[str, object]) -> Calibration:
     fx, fy, cx, cy = (json_number(path, {"intrinsic_matrix": values[i]}, "intrinsic_matrix") for i in (0, 4, 6, 7))
     width, height = (int(json_number(path, fields, key)) for key in ("width", "height"))
     units = check_positive(path, "depth_scale", json_number(path, fields, "depth_scale", MM_PER_METRE))
-    return Calibration(build_camera(path, width, height, [fx, fy, cx, cy]), units)
+    read = Origin("", f"read from {path.name}")
+    origins = {"camera": read} | ({"depth unit": read} if "depth_scale" in fields else {})
+    return Calibration(build_camera(path, width, height, [fx, fy, cx, cy]), units, origins=origins)
 
 
 def _truth(folder: Path, images: list[ImagePair]) -> Trajectory | None:

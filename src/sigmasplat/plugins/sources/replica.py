@@ -15,6 +15,7 @@ from sigmasplat.api import (
     Calibration,
     Camera,
     InputConfig,
+    Origin,
     RecordedSource,
     SourceError,
     SourceFormat,
@@ -31,12 +32,15 @@ from sigmasplat.api import (
     list_images,
     numbered_pairs,
     parse_numbers,
+    published,
     read_json_object,
     read_text,
     to_matrix,
 )
 
-CAMERA = Calibration(Camera(1200, 680, 600.0, 600.0, 599.5, 339.5), 6553.5)
+CAMERA = Calibration(
+    Camera(1200, 680, 600.0, 600.0, 599.5, 339.5), 6553.5, origins=published("that of Replica's renders")
+)
 
 
 def open_replica(path: str, settings: InputConfig) -> RecordedSource:
@@ -63,7 +67,11 @@ def _calibration(path: Path) -> Calibration:
     if not isinstance(fields, dict):
         raise SourceError(f'{path}: no "camera" object with w, h, fx, fy, cx, cy, scale')
     w, h, *focal, scale = (json_number(path, fields, key) for key in ("w", "h", "fx", "fy", "cx", "cy", "scale"))
-    return Calibration(build_camera(path, int(w), int(h), focal), check_positive(path, "scale", scale))
+    read = Origin("", f"read from {path.name}")
+    return Calibration(
+        build_camera(path, int(w), int(h), focal), check_positive(path, "scale", scale),
+        origins={"camera": read, "depth unit": read},
+    )  # fmt: skip
 
 
 def _truth(path: Path, numbers: list[int]) -> Trajectory | None:

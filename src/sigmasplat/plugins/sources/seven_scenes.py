@@ -26,6 +26,7 @@ from sigmasplat.api import (
     frame_files,
     has_frame_files,
     numbered_pairs,
+    published,
     read_pose_files,
     registers_depth,
     resolve_calibration,
@@ -35,7 +36,9 @@ from sigmasplat.api import (
 # 585, 320, 240 are the values of the 7-Scenes page. They belong to the depth camera, and so do the published poses. The
 # colour camera and its position were fitted to the RedKitchen sequence by maximising the agreement of neighbouring
 # images (andyzeng/tsdf-fusion-python, data/; the fit is in shared/data/redkitchen/calibration.json).
-DEPTH_CAMERA = Calibration(Camera(640, 480, 585.0, 585.0, 320.0, 240.0), MM_PER_METRE)
+DEPTH_CAMERA = Calibration(
+    Camera(640, 480, 585.0, 585.0, 320.0, 240.0), MM_PER_METRE, origins=published("that of 7-Scenes")
+)
 BOTH_CAMERAS = Calibration(
     Camera(640, 480, 528.12, 528.12, 318.96, 232.91),
     MM_PER_METRE,
@@ -46,6 +49,7 @@ BOTH_CAMERAS = Calibration(
         [-0.001738, -0.005719, 0.999982, 0.006997],
         [0.0, 0.0, 0.0, 1.0],
     ]),
+    origins=published("that of 7-Scenes, both cameras"),
 )  # fmt: skip
 
 

@@ -67,6 +67,7 @@ def write_page(
         commands=next_commands(str(run.path)),
         advice=found[1:],
         plan=plan_panels(plan) if plan else [],
+        origins=facts.get("origins") or {},
     )
     run.write_report(build_report(contents))
 
@@ -117,7 +118,7 @@ class Contents:
     """What a report shows.
 
     verdicts: shown first; commands: what to do with the map; advice: what else to try; strips: panels of views by
-    heading; plots: charts by name; plan: panels of the floor plan.
+    heading; plots: charts by name; plan: panels of the floor plan; origins: of the values that decide the result.
     """
 
     title: str
@@ -131,6 +132,7 @@ class Contents:
     commands: list[Advice] = field(default_factory=list)
     advice: list[Advice] = field(default_factory=list)
     plan: list[ViewPanel] = field(default_factory=list)
+    origins: dict[str, dict[str, str]] = field(default_factory=dict)
 
 
 def build_report(contents: Contents) -> str:
@@ -147,6 +149,7 @@ def build_report(contents: Contents) -> str:
         _part("States of the frames", _states(contents)),
         _part("Views", _strips(contents)),
         _part("Scores", _scores(contents)),
+        _part("Given, read, measured or assumed", _origins(contents.origins)),
         _part("Settings (config.json)", contents.config and f"<pre>{html.escape(contents.config)}</pre>"),
     ]
     head = "<meta charset=utf-8><meta name=viewport content='width=device-width, initial-scale=1'>"
@@ -160,6 +163,12 @@ def build_report(contents: Contents) -> str:
 def _part(title: str, body: str) -> str:
     """Return a folded part of the page; nothing if it is empty."""
     return f"<details class=part><summary><h2>{title}</h2></summary>{body}</details>" if body else ""
+
+
+def _origins(origins: dict[str, dict[str, str]]) -> str:
+    """Show where the values come from that decide the result; what is assumed, with the option that changes it."""
+    rows = [[name, o["value"], o["origin"], o["option"]] for name, o in origins.items()]
+    return f"<div class=card>{_table([['what', 'value', 'origin', 'what changes it'], *rows])}</div>" if rows else ""
 
 
 def _map(contents: Contents) -> str:

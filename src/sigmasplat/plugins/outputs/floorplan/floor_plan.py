@@ -19,12 +19,19 @@ from sigmasplat.api import (
     SigmaSplatError,
     Trajectory,
     no_progress,
-    noted_up,
     predict,
     render,
 )
 from sigmasplat.plugins.evaluation.view_scores import Renderer
-from sigmasplat.plugins.outputs.floorplan.ground import SurfacePredictor, SurfaceSample, floor_frame, sample_surfaces
+from sigmasplat.plugins.outputs.floorplan.ground import (
+    Edge,
+    SurfacePredictor,
+    SurfaceSample,
+    Up,
+    floor_frame,
+    sample_surfaces,
+    up_of,
+)
 
 CELL_M = 0.05
 UNOBSERVED, FLOOR_UNOBSERVED, FREE, OBJECT, WALL = range(5)
@@ -93,19 +100,19 @@ class FloorPlan:
 
 def floor_plan(
     field: GaussianField, trajectory: Trajectory, camera: Camera, *, cell_m: float = CELL_M,
-    renderer: Renderer = render, predictor: SurfacePredictor | None = None, up_world: Matrix | None = None,
+    renderer: Renderer = render, predictor: SurfacePredictor | None = None, up: Up | None = None,
     progress: Progress = no_progress,
 ) -> FloorPlan:  # fmt: skip
     """Make the floor plan of a map from poses along its path; `camera` gives the field of view.
 
-    predictor: predicts the errors of the map, if they are known (`uncertainty.predictive.predict`). up_world: as in
+    predictor: predicts the errors of the map, if they are known (`uncertainty.predictive.predict`). up: as in
     `floor_frame`. Calls `progress(poses done, total)`. Raises ConfigError unless 1 mm ≤ cell_m ≤ 1 m; SigmaSplatError
     if no surface is visible, or the plan has more than `MOST_CELLS`.
     """
     if not 0.001 <= cell_m <= 1.0:
         raise ConfigError(f"a cell of the floor plan must be 0.001 to 1 m wide, found {cell_m}")
     samples = list(sample_surfaces(field, trajectory, camera, renderer, progress=progress, predictor=predictor))
-    T_floor_world = floor_frame(samples, up_world)
+    T_floor_world = floor_frame(samples, up)
     to_floor = partial(_transformed, T_floor_world)
     path = to_floor(trajectory.T_world_camera[:, :3, 3])
     grid = _Cells.around([to_floor(sample.points) for sample in samples], path, cell_m)
@@ -119,11 +126,13 @@ def floor_plan(
 
 
 def run_floor_plan(
-    run: RunFolder, path: Trajectory, camera: Camera, *, cell_m: float = CELL_M, progress: Progress = no_progress
-) -> FloorPlan:
+    run: RunFolder, path: Trajectory, camera: Camera, *, cell_m: float = CELL_M, up: Edge = "auto",
+    progress: Progress = no_progress,
+) -> FloorPlan:  # fmt: skip
     """Make the floor plan of a run's map.
 
-    path: the believed poses; camera: that of the images the run worked on. It is rendered with the run's settings, and
+    path: the believed poses; camera: that of the images the run worked on; up: at this edge of the images.
+    It is rendered with the run's settings, and
     its errors are predicted if the run has measured how sure its map is. Calls `progress(poses done, total)`. Raises
     RunError without a map, or if the uncertainty belongs to another map; ConfigError unless 1 mm ≤ cell_m ≤ 1 m;
     SigmaSplatError if no surface is visible.
@@ -134,7 +143,7 @@ def run_floor_plan(
         predictor = partial(predict, field, known, options=config.render, backend=config.backend)
     return floor_plan(
         field, path, camera, cell_m=cell_m, renderer=FieldRenderer(config.render, config.backend),
-        predictor=predictor, up_world=noted_up(run.facts()), progress=progress,
+        predictor=predictor, up=up_of(path.T_world_camera, run.facts(), up), progress=progress,
     )  # fmt: skip
 
 

@@ -1,7 +1,8 @@
 """Sample the surfaces of a map from poses along its path, and find the floor: its height, up, and the walls."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -18,6 +19,7 @@ from sigmasplat.api import (
     Trajectory,
     evenly_spaced,
     no_progress,
+    noted_up,
     se3,
 )
 from sigmasplat.plugins.evaluation.view_scores import COVERED_ALPHA, Renderer, as_array
@@ -112,6 +114,9 @@ def _smooth(depth_m: Floats, covered: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return on
 
 
+Edge = Literal["auto", "top", "left", "right", "bottom"]
+EDGES = {"top": (1, -1.0), "left": (0, -1.0), "right": (0, 1.0), "bottom": (1, 1.0)}
+"""The axis of the camera, and its sign, that point to each edge of an image."""
 MAX_TILT_COS = np.cos(np.deg2rad(40.0))
 """Cameras are assumed upright within 40°."""
 MEASURED_COS = np.cos(np.deg2rad(6.0))
@@ -127,19 +132,46 @@ MAX_POINTS = 16_000
 """Samples are reduced to about this many points."""
 
 
-def floor_frame(samples: Sequence[SurfaceSample], up_world: Matrix | None = None) -> Matrix:
+class Up(NamedTuple):
+    """About where up is: a unit vector [3] of the world, and the cosine of the largest angle to it; how it is known."""
+
+    about: Matrix
+    within_cos: float
+    how: str
+
+
+def up_of(T_world_camera: Matrix, facts: Mapping[str, Any] | None = None, edge: Edge = "auto") -> Up:
+    """Return about where up is for a path [N, 4, 4]: at an edge of the images, as the user says; else as an
+    accelerometer measured it (facts: run.json of the run); else at the top, as cameras are mostly held."""
+    measured = noted_up(facts or {})
+    if edge == "auto" and measured is not None:
+        return Up(measured, MEASURED_COS, "measured by the accelerometer")
+    axis, sign = EDGES["top" if edge == "auto" else edge]
+    towards = sign * T_world_camera[:, :3, axis]
+    how = "the top of the images, if the camera was held upright: --up left, right or bottom turn it"
+    return Up(unit(towards.sum(0), towards[0]), MAX_TILT_COS, how if edge == "auto" else f"the {edge} of the images")
+
+
+def level_share(samples: Sequence[SurfaceSample], up: Matrix) -> float:
+    """Return the share of the visible area that is level, if up [3] is up."""
+    _, normals, area = _subsampled(samples)
+    return float(area[np.abs(normals @ up) > PARALLEL_COS].sum() / area.sum())
+
+
+def floor_frame(samples: Sequence[SurfaceSample], up: Up | None = None) -> Matrix:
     """Return T_floor_world: z up, floor at z = 0, origin below the first camera, x and y along the walls.
 
-    up_world [3]: unit vector that points up, if an accelerometer measured it; the floor and the walls make it exact. y
-    is the direction along the walls that is nearest to the viewing direction of the first camera. Raises
-    SigmaSplatError if no surface is visible.
+    up: about where it is; None: as the cameras of the samples are held. The floor and the walls make it exact. y is the
+    direction along the walls that is nearest to the viewing direction of the first camera. Raises SigmaSplatError if no
+    surface is visible.
     """
     points, normals, area = _subsampled(samples)
     poses = np.stack([sample.T_world_camera for sample in samples])
-    if up_world is None:
-        up = up_direction(normals, area, unit(-poses[:, :3, 1].sum(0), -poses[0, :3, 1]))
-    else:
-        up = up_direction(normals, area, up_world, MEASURED_COS)
+    about, within_cos, _ = up or up_of(poses)
+    return _floor_frame(points, normals, area, poses, up_direction(normals, area, about, within_cos))
+
+
+def _floor_frame(points: Matrix, normals: Matrix, area: Matrix, poses: Matrix, up: Matrix) -> Matrix:
     height_m = floor_height(points @ up, normals @ up, area, float((poses[:, :3, 3] @ up).min()))
     ahead = horizontal(poses[0], up)
     ahead = along_walls(normals, area, up, ahead)

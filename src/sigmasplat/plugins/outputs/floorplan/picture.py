@@ -26,7 +26,7 @@ from sigmasplat.plugins.outputs.floorplan.floor_plan import (
     FloorPlan,
     run_floor_plan,
 )
-from sigmasplat.plugins.outputs.floorplan.ground import WRONG_BY
+from sigmasplat.plugins.outputs.floorplan.ground import WRONG_BY, Edge
 from sigmasplat.plugins.outputs.run_reader import RunReader
 
 SCALE = 2
@@ -60,16 +60,16 @@ def draw_floor_plan(plan: FloorPlan) -> Image.Image:
 
 
 def export_plan(
-    reader: RunReader, target: Path, *, cell_m: float = CELL_M, progress: Progress = no_progress
+    reader: RunReader, target: Path, *, cell_m: float = CELL_M, up: Edge = "auto", progress: Progress = no_progress
 ) -> FloorPlan:
-    """Write the image (.png) and the data of the plan beside it (.json); return the plan.
+    """Write the image (.png) and the data of the plan beside it (.json); return the plan. up: at this edge of images.
 
     Calls `progress(done, total)` for each rendered view. Raises RunError on another ending, without a map or path, or
     if a file cannot be written; ConfigError unless 1 mm ≤ cell_m ≤ 1 m.
     """
     if target.suffix.lower() != ".png":
         raise RunError(f"cannot write a floor plan as {target.name}; give a name that ends in .png")
-    plan = run_floor_plan(reader.run, reader.valid_path(), reader.camera, cell_m=cell_m, progress=progress)
+    plan = run_floor_plan(reader.run, reader.valid_path(), reader.camera, cell_m=cell_m, up=up, progress=progress)
     picture = draw_floor_plan(plan)
     with replacing(target) as temporary:
         picture.save(temporary, "PNG")
