@@ -71,7 +71,7 @@ from sigmasplat.files.atomic import make_folder as make_folder, replacing as rep
 from sigmasplat.files.json_files import read_json as read_json, write_json as write_json
 from sigmasplat.files.lock import locked as locked
 from sigmasplat.files.machine import INSTALLED as INSTALLED, code_digest as code_digest, usable_cores as usable_cores
-from sigmasplat.files.pictures import check_pixels as check_pixels, read_npy as read_npy
+from sigmasplat.files.pictures import check_pixels as check_pixels
 from sigmasplat.files.ply_elements import (
     PLY_TYPES as PLY_TYPES,
     Element as Element,
@@ -159,6 +159,7 @@ from sigmasplat.input.images import (
     FrameFiles as FrameFiles,
     Video as Video,
     depth_to_metres as depth_to_metres,
+    depth_values as depth_values,
     first_file as first_file,
     first_subfolder as first_subfolder,
     frame_files as frame_files,

@@ -12,6 +12,7 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
+from sigmasplat.env import import_optional
 from sigmasplat.errors import SourceError
 from sigmasplat.files.reading import guarded, open_regular, refuse_special
 
@@ -52,22 +53,41 @@ def check_pixels(path: Path, size: tuple[int, int]) -> None:
         )
 
 
-def npy_shape(path: Path) -> tuple[int, ...]:
-    """Return the shape of a .npy file from its header. Raises SourceError as `read_npy` does."""
-    return _mapped(path).shape
-
-
 def read_npy(path: Path) -> NDArray[Any]:
     """Read a .npy file. Raises SourceError if it is not one, holds objects, or is shorter than its header says."""
-    return np.array(_mapped(path))
-
-
-def _mapped(path: Path) -> NDArray[Any]:
-    """Map a .npy file into memory, which refuses objects and short files."""
-    refuse_special(path, most=MOST_BYTES)
+    refuse_special(path, most=MOST_BYTES)  # then the file is mapped into memory, which refuses objects and short files
     with guarded(path, REMEDY, SourceError, "unreadable image"):
         values = npy.open_memmap(path, mode="r")
         if len(values.shape) not in (2, 3):
             raise ValueError(f"not a depth image: an array of {values.dtype} with shape {values.shape}")
     check_pixels(path, (values.shape[1], values.shape[0]))
-    return values
+    return np.array(values)
+
+
+def read_npz(path: Path) -> NDArray[Any]:
+    """Read the only array with two dimensions of a .npz file, whatever its name. Raises SourceError as `read_npy`."""
+    refuse_special(path, most=MOST_BYTES)
+    with guarded(path, REMEDY, SourceError, "unreadable image"), np.load(path) as file:
+        if sum(member.file_size for member in file.zip.infolist()) > MOST_BYTES:
+            raise ValueError(f"unzips to more than {MOST_BYTES / 1e6:.0f} MB")
+        arrays = [file[name] for name in file.files]
+    images: list[NDArray[Any]] = [values for values in arrays if values.ndim == 2]
+    if len(images) != 1:
+        found = f"found arrays of {[values.shape for values in arrays]}"
+        raise SourceError(f"{path}: not one depth image ({found}); save one array [H, W] for each frame")
+    return images[0]
+
+
+def read_exr(path: Path) -> NDArray[np.float32]:
+    """Read the channel Z, Y or R, else the first, of an EXR file, 0 for NaN, which Record3D writes where there is no
+    reading. Raises SourceError if it cannot be read."""
+    openexr = import_optional("OpenEXR", "iphone", f"{path}: depth as EXR")
+    refuse_special(path, most=MOST_BYTES)
+    try:
+        low, high = openexr.File(str(path), header_only=True).header()["dataWindow"]
+        check_pixels(path, (int(high[0] - low[0]) + 1, int(high[1] - low[1]) + 1))
+        channels = openexr.File(str(path), separate_channels=True).channels()
+        name = next((name for name in ("Z", "Y", "R") if name in channels), next(iter(channels)))
+        return np.nan_to_num(np.asarray(channels[name].pixels, np.float32), posinf=0.0, neginf=0.0)
+    except Exception as error:  # the library can raise any C++ exception
+        raise SourceError(f"{path}: unreadable EXR file ({error}); export it again") from error

@@ -98,7 +98,7 @@ class Masked(Subset):
 
     def _ignored(self, i: int) -> NDArray[np.bool_]:
         """Return the pixels [H, W] of frame i that are ignored. Raises SourceError if its mask cannot be used."""
-        values, c = read_values(self._masks[i]), self.camera
+        values, c = read_values(self._masks[i], turned=True), self.camera
         chosen = values != 0 if values.ndim == 2 else (values[..., :3] != 0).any(-1)
         if chosen.shape != (c.height, c.width):
             chosen = np.asarray(Image.fromarray(chosen).resize((c.width, c.height), Image.Resampling.NEAREST))

@@ -11,55 +11,89 @@ from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import ExifTags, Image, ImageOps
 
 from sigmasplat.data.frame_arrays import depth_from_integers
 from sigmasplat.env import import_optional
 from sigmasplat.errors import SourceError
-from sigmasplat.files.pictures import npy_shape, open_image, read_npy
+from sigmasplat.files.pictures import open_image, read_exr, read_npy, read_npz
+from sigmasplat.files.reading import DAMAGED
+from sigmasplat.input.calibration import ASSUMED, Origin
+
+TURNS = {2: "mirrored left to right", 3: "180°", 4: "mirrored top to bottom", 5: "mirrored, 90° anticlockwise",
+         6: "90° clockwise", 7: "mirrored, 90° clockwise", 8: "90° anticlockwise"}  # fmt: skip
+"""How viewers turn an image by its EXIF tag of orientation."""
 
 
-def read_color(path: Path, data: bytes | None = None) -> NDArray[np.uint8]:
-    """Read an image file, or `data` of one, as 8-bit RGB [H, W, 3]. Raises SourceError naming a missing, truncated or
-    damaged file."""
+def read_color(path: Path, data: bytes | None = None) -> NDArray[Any]:
+    """Read an image file, or `data` of one, as 8-bit RGB [H, W, 3], turned by its EXIF tag. Gray of more than 8 bits
+    is returned as stored [H, W]. Raises SourceError naming a missing, truncated or damaged file."""
     if data is None:
         _refuse_missing(path)
-    with open_image(path, data) as image:
-        return np.asarray(image if image.mode == "RGB" else image.convert("RGB"))
+    with open_image(path, data) as opened:
+        image = _turned(opened)
+        return np.asarray(image if image.mode == "RGB" or image.mode[0] in "IF" else image.convert("RGB"))
 
 
-def read_values(path: Path, data: bytes | None = None) -> NDArray[Any]:
-    """Decode an image file, or `data` of one, without converting its values. Raises SourceError if it is damaged."""
+def read_values(path: Path, data: bytes | None = None, turned: bool = False) -> NDArray[Any]:
+    """Decode an image file, or `data` of one, without converting its values; `turned`: by its EXIF tag. Raises
+    SourceError if it is damaged."""
     with open_image(path, data) as image:
-        return np.asarray(image)
+        return np.asarray(_turned(image) if turned else image)
 
 
 def image_size(path: Path, data: bytes | None = None) -> tuple[int, int]:
-    """Return (width, height) in pixels in the header of an image file, or of `data`. Raises SourceError for others."""
+    """Return (width, height) of an image file, or of `data`, turned by its EXIF tag. Raises SourceError for others."""
     if data is None:
         _refuse_missing(path)
-        if path.suffix == ".npy":
-            height, width = npy_shape(path)[:2]
-            return width, height
     with open_image(path, data) as image:
-        return image.size
+        upright = image.format == "PNG" and "exif" not in image.info  # without decoding all of it to know
+        return (image if upright or _orientation(image) < 5 else _turned(image)).size
+
+
+def color_origins(path: Path) -> dict[str, Origin]:
+    """Return how an image file is turned by its EXIF tag, and that its transparency is ignored; empty if neither."""
+    found: dict[str, Origin] = {}
+    with suppress(SourceError), open_image(path) as image:
+        if turn := TURNS.get(_orientation(image)):
+            found["orientation"] = Origin(f"turned by the EXIF tag of the images ({turn})", f"read from {path}")
+        if image.has_transparency_data and np.asarray(image.convert("RGBA"))[..., 3].min() < 255:
+            found["transparency"] = Origin("ignored, such pixels are used as the others", ASSUMED, "--masks FOLDER")
+    return found
+
+
+def _orientation(image: Image.Image) -> int:
+    with suppress(*DAMAGED):  # a damaged tag turns nothing
+        return int(image.getexif().get(ExifTags.Base.Orientation, 1))
+    return 1
+
+
+def _turned(image: Image.Image) -> Image.Image:
+    image.load()  # this turns TIFF, and deletes its tag
+    return ImageOps.exif_transpose(image) if _orientation(image) in TURNS else image
+
+
+def depth_values(path: Path) -> NDArray[Any]:
+    """Read the stored values of a depth image, [H, W] if it is one. Raises SourceError naming an unreadable file."""
+    _refuse_missing(path)
+    return {".npy": read_npy, ".npz": read_npz, ".exr": read_exr}.get(path.suffix.lower(), read_values)(path)
 
 
 def read_depth(path: Path, units_per_metre: float) -> NDArray[np.float32]:
     """Read depth along the optical axis as float32 metres [H, W], 0 = no reading.
 
-    Whole numbers (16-bit PNG, integer .npy) are divided by `units_per_metre`; floats (.tiff, .npy) are in metres.
+    Whole numbers (16-bit PNG, integer .npy) are divided by `units_per_metre`; floats (.tiff, .npy, .exr) are in metres.
     Raises SourceError if the file is unreadable, not a single-channel depth image, negative, or holds NaN or inf.
     """
-    _refuse_missing(path)
-    raw = read_npy(path) if path.suffix == ".npy" else read_values(path)
-    return depth_to_metres(path, raw, units_per_metre)
+    return depth_to_metres(path, depth_values(path), units_per_metre)
 
 
 def depth_to_metres(path: Path, raw: NDArray[Any], units_per_metre: float) -> NDArray[np.float32]:
     """Convert a stored depth image to float32 metres, as `read_depth` does; `path` names it. Raises SourceError."""
     if raw.ndim != 2 or raw.dtype == np.uint8 or raw.dtype.kind not in "iuf":
         raise SourceError(
-            f"{path}: not a depth image (found {raw.dtype} {raw.shape}); expected 16-bit PNG or float metres"
+            f"{path}: not a depth image (found {raw.dtype} {raw.shape}); JPEG and 8 bits hold no metric depth: "
+            "export 16-bit PNG or float metres"
         )
     depth_m = raw.astype(np.float32) if raw.dtype.kind == "f" else depth_from_integers(raw, units_per_metre)
     if not (read := np.isfinite(depth_m)).all():
@@ -128,7 +162,7 @@ FRAMES_PER_SECOND = 30.0
 COLOR_FOLDERS = ("color", "colour", "rgb", "image", "images")
 DEPTH_FOLDERS = ("depth", "depths")
 COLOR_ENDINGS = (".jpg", ".jpeg", ".png", ".bmp", ".ppm", ".tif", ".tiff", ".webp")
-DEPTH_ENDINGS = (".png", ".pgm", ".tif", ".tiff", ".npy")
+DEPTH_ENDINGS = (".png", ".pgm", ".pfm", ".tif", ".tiff", ".npy", ".npz", ".exr")
 
 Key = TypeVar("Key", int, str)
 
@@ -179,8 +213,13 @@ def pair_images(
     color_name, depth_name: file patterns for messages. Raises SourceError if one kind is missing or no key is shared.
     """
     if not depths:
+        place = first_subfolder(folder, DEPTH_FOLDERS) or folder / Path(depth_name).parent
+        found = sorted(path for path in place.glob(f"{Path(depth_name).stem}.*") if path.suffix and path.is_file())
         raise SourceError(
-            f"no depth images in {folder} (looked for {depth_name}); is this the RGB-only download? "
+            f"no depth images in {place} (found {len(found)} other files, such as {found[0].name}); "
+            f"export 16-bit PNG, or float metres (JPEG loses depth): {', '.join(DEPTH_ENDINGS)}"
+            if found
+            else f"no depth images in {folder} (looked for {depth_name}); is this the RGB-only download? "
             "see docs/data.md#without-depth"
         )
     if not colors:

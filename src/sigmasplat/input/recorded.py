@@ -17,8 +17,8 @@ from sigmasplat.data.frame_arrays import color_from_bytes
 from sigmasplat.data.images import resized_color
 from sigmasplat.data.trajectory import Trajectory, evenly_spaced
 from sigmasplat.errors import SourceError
-from sigmasplat.input.calibration import Calibration, Origin, refuse_impossible_camera, resolve_calibration
-from sigmasplat.input.images import FRAMES_PER_SECOND, image_size, pair_images, read_color, read_depth
+from sigmasplat.input.calibration import ASSUMED, MEASURED, Calibration, Origin, resolve_calibration
+from sigmasplat.input.images import FRAMES_PER_SECOND, color_origins, image_size, pair_images, read_color, read_depth
 from sigmasplat.input.imu import Accelerometer, Gyroscope
 from sigmasplat.input.rectification import Rectification, check_image_sizes
 from sigmasplat.input.source import Source
@@ -79,10 +79,10 @@ def _unit_guess(median_m: float, units_per_metre: float | None) -> str:
     raw = median_m * (units_per_metre or 1.0)
     guesses = {units: raw / units for units in KNOWN_UNITS_PER_METRE if 0.4 <= raw / units <= 8.0}
     if not guesses:
-        return "; set depth_scale (PNG units per metre) in calibration.json"
+        return "; give --depth-scale UNITS, the units of the depth images per metre"
     units = min(guesses, key=lambda u: abs(np.log(guesses[u] / 2.0)))
     name, would_be_m = KNOWN_UNITS_PER_METRE[units], guesses[units]
-    return f"; depth_scale {units:g} ({name}) in calibration.json would make it {would_be_m:.2f} m"
+    return f"; --depth-scale {units:g} ({name}) would make it {would_be_m:.2f} m"
 
 
 Size = tuple[int, int]
@@ -103,21 +103,22 @@ class ImagePair:
     depth: Path
     depth_late_s: float = field(default=0.0, kw_only=True)
 
-    def read_color(self) -> NDArray[np.uint8]:
-        """Read 8-bit RGB [H, W, 3]. Raises SourceError naming `color`."""
+    def read_color(self) -> NDArray[Any]:
+        """Read 8-bit RGB [H, W, 3], or gray of more bits as stored [H, W]. Raises SourceError naming `color`."""
         return read_color(self.color)
 
     def read_depth(self, units_per_metre: float) -> NDArray[np.float32]:
         """Read depth in metres [H, W], 0 = no reading; whole numbers are divided. Raises SourceError naming `depth`."""
         return read_depth(self.depth, units_per_metre)
 
-    def read(self, units_per_metre: float) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    def read(self, units_per_metre: float) -> tuple[NDArray[Any], NDArray[np.float32]]:
         """Read both images, as `read_color` and `read_depth` do."""
         return self.read_color(), self.read_depth(units_per_metre)
 
     def sizes(self) -> tuple[Size, Size]:
         """Return (width, height) of colour and of depth in pixels. Raises SourceError naming the unreadable file."""
-        return image_size(self.color), image_size(self.depth)
+        height, width = self.read_depth(1.0).shape
+        return image_size(self.color), (width, height)
 
 
 class RecordedSource(Source):
@@ -136,10 +137,8 @@ class RecordedSource(Source):
         Raises SourceError if the first images do not match the calibration, no image has a depth reading, or no image
         was taken while the gyroscope measured.
         """
-        refuse_impossible_camera(name, calibration.camera)
         self._rectified = Rectification(name, calibration, settings)
         super().__init__(name, self._rectified.camera, settings.strict)
-        self.depth_units_per_metre: float = calibration.depth_units_per_metre
         self.depth_registered = self._rectified.moves_depth
         self.registrable, self.sensor = calibration.depth_camera is not None, calibration.sensor
         self.skipped, self.origins = list(skipped), dict(calibration.origins) | dict(origins)
@@ -148,6 +147,13 @@ class RecordedSource(Source):
         self._surface, self._estimated = surface, estimated
         files, (size, depth_size) = first_readable(images, lambda pair: (pair, pair.sizes()))
         check_image_sizes(self._rectified, files.color, size, files.depth, depth_size)
+        self.origins |= color_origins(files.color)
+        self._white, self._units = self._measured_white(), calibration.depth_units_per_metre
+        floats = not self.computed_depth and self._stores_floats()
+        self._float_units = np.float32(settings.depth_scale or 1.0 if floats else 1.0)
+        self.depth_units_per_metre = None if floats and not settings.depth_scale else self._units
+        if self.depth_units_per_metre is None:
+            self.origins["depth unit"] = Origin("metres, as usual for floats", ASSUMED, "--depth-scale UNITS")
         self._refuse_other_clock()
         refuse_without_depth(self)
 
@@ -160,8 +166,8 @@ class RecordedSource(Source):
     def frame(self, i: int) -> Frame:
         """Read frame i: colour and depth of one camera, lens distortion removed."""
         files = self._images[self._checked_index(i)]
-        recorded, depth_m = files.read(self.depth_units_per_metre)
-        color = color_from_bytes(recorded)
+        recorded, depth_m = files.read(self._units)
+        depth_m, color = depth_m / self._float_units, color_from_bytes(self._rgb(files.color, recorded))
         check_image_sizes(self._rectified, files.color, color.shape[1::-1], files.depth, depth_m.shape[::-1])
         color, depth_m = self._rectified(color, depth_m)
         color = resized_color(color, self.camera.width, self.camera.height)
@@ -174,7 +180,7 @@ class RecordedSource(Source):
 
     def depth_of(self, i: int) -> NDArray[np.float32]:
         files = self._images[self._checked_index(i)]
-        depth_m, camera = files.read_depth(self.depth_units_per_metre), self._rectified.calibration.camera
+        depth_m, camera = files.read_depth(self._units) / self._float_units, self._rectified.calibration.camera
         check_image_sizes(self._rectified, files.color, (camera.width, camera.height), files.depth, depth_m.shape[::-1])
         return self._rectified.depth(depth_m)
 
@@ -193,6 +199,35 @@ class RecordedSource(Source):
 
     def true_surface_file(self) -> Path | None:
         return self._surface
+
+    def _stores_floats(self) -> bool:
+        """Return whether depth is stored as floats: readings stay if there are ever so many units in a metre."""
+        for i in evenly_spaced(len(self), 5):
+            with suppress(SourceError):
+                if largest := float(self._images[i].read_depth(1e30).max()):
+                    return largest > 1e-20
+        return False
+
+    def _measured_white(self) -> float:
+        """Return the value of gray of more than 8 bits that becomes white, 0 for 8-bit images: one power of two for the
+        recording, so that brightness stays comparable; only specks are brighter."""
+        largest = 0.0
+        for i in evenly_spaced(len(self), 20):
+            with suppress(SourceError):
+                if (values := self._images[i].read_color()).ndim == 3:
+                    return 0.0
+                largest = max(largest, float(np.percentile(values, 99.9)))
+        white = float(2.0 ** np.ceil(np.log2(largest or 65536.0)))
+        self.origins["gray"] = Origin(f"more than 8 bits, value {white:g} becomes white", MEASURED)
+        return white
+
+    def _rgb(self, path: Path, recorded: NDArray[Any]) -> NDArray[np.uint8]:
+        if recorded.ndim == 3:
+            return recorded
+        if not (self._white and np.isfinite(recorded).all()):
+            raise SourceError(f"{path}: gray of more than 8 bits, among 8-bit images or with NaN; convert it to 8 bits")
+        gray = np.clip(recorded * (256.0 / self._white), 0.0, 255.0).astype(np.uint8)
+        return np.repeat(gray[..., None], 3, axis=2)
 
     def _refuse_other_clock(self) -> None:
         """Raise SourceError before a run if the gyroscope measured at another time than the images were taken."""

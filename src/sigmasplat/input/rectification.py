@@ -10,7 +10,8 @@ from sigmasplat.config import InputConfig
 from sigmasplat.data.camera import Camera
 from sigmasplat.env import opencv
 from sigmasplat.errors import SourceError
-from sigmasplat.input.calibration import Calibration
+from sigmasplat.input.calibration import Calibration, refuse_impossible_camera
+from sigmasplat.input.images import color_origins
 
 Points = NDArray[np.float64]
 
@@ -148,7 +149,8 @@ class Rectification:
     """
 
     def __init__(self, name: str, calibration: Calibration, settings: InputConfig) -> None:
-        """Prepare the remap tables. Raises SourceError if depth must be registered but the depth camera is unknown."""
+        """Prepare the remap tables. Raises SourceError if a camera is impossible, or depth's unknown but needed."""
+        refuse_impossible_camera(name, calibration.camera)
         self.calibration = calibration
         lens = calibration.distortion if settings.undistort else None
         depth_lens = calibration.depth_distortion if settings.undistort else None
@@ -204,6 +206,7 @@ def check_image_sizes(
     if tuple(color_size) != tuple(depth_size) and not rectification.moves_depth:
         raise SourceError(
             f"{color} is {color_size[0]}×{color_size[1]} but {depth} is {depth_size[0]}×{depth_size[1]}; "
+            f"{_turned(color, color_size, depth_size)}"
             "register depth to colour at the same size, or give depth_camera in calibration.json"
         )
     for what, path, size, wanted in (
@@ -213,8 +216,16 @@ def check_image_sizes(
         if tuple(size) != wanted:
             raise SourceError(
                 f"{path} is {size[0]}×{size[1]} but the calibration is for {wanted[0]}×{wanted[1]}; "
+                f"{_turned(color, color_size, wanted)}"
                 f"take images of that size, or correct the calibration of the {what} camera"
             )
+
+
+def _turned(path: Path, size: tuple[int, ...], wanted: tuple[int, ...]) -> str:
+    """Return the likely remedy if an EXIF tag exchanges width and height of an image; empty for others."""
+    if tuple(size) != tuple(wanted)[::-1] or not (turned := color_origins(path).get("orientation")):
+        return ""
+    return f"colour is {turned.value}: turn depth alike, or delete the tag (exiftool -Orientation= {path.parent}); or "
 
 
 def _undistortion(camera: Camera, coefficients: tuple[float, ...] | None) -> Undistortion | None:

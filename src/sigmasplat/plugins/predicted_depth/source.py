@@ -28,12 +28,11 @@ from sigmasplat.api import (
     SourceError,
     Subset,
     Video,
+    depth_values,
     first_subfolder,
     image_size,
     list_images,
     read_groundtruth,
-    read_npy,
-    read_values,
     resolve_calibration,
     times_of_names,
 )
@@ -73,7 +72,7 @@ class PredictedDepth:
 
     def _depth(self, i: int) -> Floats:
         path = self.paths[i]
-        values = read_npy(path) if path.suffix.lower() == ".npy" else read_values(path)
+        values = depth_values(path)
         if values.ndim == 3 and 1 in values.shape[::2]:
             values = values[..., 0] if values.shape[2] == 1 else values[0]
         if values.ndim != 2 or values.dtype.kind not in "uif":

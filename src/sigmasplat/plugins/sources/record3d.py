@@ -11,7 +11,7 @@ issues 7 and 27; nerfstudio, record3d_utils.py. Depth has fewer pixels than colo
 
 import re
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,19 +32,16 @@ from sigmasplat.api import (
     SourceFormat,
     Trajectory,
     build_camera,
-    check_pixels,
     check_positive,
     depth_to_metres,
     first_readable,
     folder_source,
     guarded,
-    image_size,
     import_optional,
     json_number,
     parse_json,
     read_bytes,
     read_color,
-    refuse_special,
     rigid_transform,
     without_nan,
 )
@@ -123,36 +120,6 @@ class R3dImagePair(ImagePair):
             ) from error
 
 
-@dataclass(frozen=True)
-class ExrImagePair(ImagePair):
-    """One frame of the export: a colour image and an EXR file."""
-
-    openexr: Any
-
-    def read_depth(self, units_per_metre: float) -> NDArray[np.float32]:
-        channels = self._read(lambda file: file.channels())
-        name = next((name for name in ("R", "Y", "Z") if name in channels), next(iter(channels)))
-        depth_m = np.asarray(channels[name].pixels, np.float32)
-        return depth_to_metres(self.depth, without_nan(depth_m), units_per_metre)
-
-    def sizes(self) -> tuple[Size, Size]:
-        return image_size(self.color), self._size()
-
-    def _size(self) -> Size:
-        low, high = self._read(lambda file: file.header()["dataWindow"], header_only=True)
-        return int(high[0] - low[0]) + 1, int(high[1] - low[1]) + 1
-
-    def _read(self, part: Callable[[Any], Any], header_only: bool = False) -> Any:
-        """Return a part of the file. Raises SourceError if it cannot be read."""
-        if not header_only:
-            check_pixels(self.depth, self._size())
-        refuse_special(self.depth)
-        try:
-            return part(self.openexr.File(str(self.depth), separate_channels=True, header_only=header_only))
-        except Exception as error:  # the library can raise any C++ exception
-            raise SourceError(f"{self.depth}: unreadable EXR file ({error}); export it again") from error
-
-
 def open_record3d(place: str, settings: InputConfig) -> RecordedSource:
     """Open a .r3d file, packed or unpacked, or an export. Raises SourceError if metadata or images cannot be used."""
     path = Path(place)
@@ -172,14 +139,11 @@ def open_record3d(place: str, settings: InputConfig) -> RecordedSource:
         )
     times_s = _times_s(path / name, metadata, numbers)
     pairs = [(float(t), path / colors[n], path / depths[n]) for t, n in zip(times_s, numbers, strict=True)]
-    images: Sequence[ImagePair]
+    images: Sequence[ImagePair] = [ImagePair(*pair) for pair in pairs]
     if native:
         lzfse = import_optional("lzfse", "iphone", f"{path}: depth of Record3D")
         size = _depth_size(path / name, metadata)
         images = [R3dImagePair(*pair, archive, n, size, lzfse) for pair, n in zip(pairs, numbers, strict=True)]
-    else:
-        openexr = import_optional("OpenEXR", "iphone", f"{path}: depth of Record3D")
-        images = [ExrImagePair(*pair, openexr) for pair in pairs]
     known = _calibration(path / name, metadata, images)
     skipped = [f"{path / colors[n]}: no depth image {n}" for n in sorted(colors.keys() - depths.keys())]
     truth = _truth(path / name, metadata, numbers, times_s)

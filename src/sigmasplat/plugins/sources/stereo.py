@@ -54,6 +54,8 @@ class StereoPair(ImagePair):
 
     def _read(self, path: Path) -> NDArray[np.uint8]:
         image, c = read_color(path), self.matcher.camera
+        if image.ndim != 3:
+            raise SourceError(f"{path}: gray of more than 8 bits; convert the stereo pair to 8 bits")
         if image.shape[:2] != (c.height, c.width):
             raise SourceError(
                 f"{path} is {image.shape[1]}×{image.shape[0]} but the calibration is for {c.width}×{c.height}; "
