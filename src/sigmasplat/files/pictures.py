@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
+from PIL import Image, ImageFile, UnidentifiedImageError
 
 from sigmasplat.env import import_optional
 from sigmasplat.errors import SourceError
@@ -25,7 +25,7 @@ REMEDY = "download or copy it again"
 
 
 @contextmanager
-def open_image(path: Path, data: bytes | None = None) -> Iterator[Image.Image]:
+def open_image(path: Path, data: bytes | None = None) -> Iterator[ImageFile.ImageFile]:
     """Open an image file, or `data` of one that `path` names, and yield it before its pixels are decoded.
 
     Raises SourceError naming the file if it is not of `FORMATS`, has more than `MOST_PIXELS`, or if the block cannot
@@ -73,14 +73,12 @@ def read_npz(path: Path) -> NDArray[Any]:
         arrays = [file[name] for name in file.files]
     images: list[NDArray[Any]] = [values for values in arrays if values.ndim == 2]
     if len(images) != 1:
-        found = f"found arrays of {[values.shape for values in arrays]}"
-        raise SourceError(f"{path}: not one depth image ({found}); save one array [H, W] for each frame")
+        raise SourceError(f"{path}: holds {[a.shape for a in arrays]}, not one depth image; save one [H, W] per frame")
     return images[0]
 
 
 def read_exr(path: Path) -> NDArray[np.float32]:
-    """Read the channel Z, Y or R, else the first, of an EXR file, 0 for NaN, which Record3D writes where there is no
-    reading. Raises SourceError if it cannot be read."""
+    """Read channel Z, Y or R, else the first, of an EXR file; NaN, Record3D's no reading, is 0. Raises SourceError."""
     openexr = import_optional("OpenEXR", "iphone", f"{path}: depth as EXR")
     refuse_special(path, most=MOST_BYTES)
     try:

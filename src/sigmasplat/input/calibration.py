@@ -174,7 +174,7 @@ def _origins(found: Calibration, camera_given: bool, units_given: bool) -> dict[
         if not found.depth_camera:
             option = "depth_camera and T_color_depth in calibration.json"
             origins["depth and colour"] = Origin("one camera, registered", ASSUMED, option)
-    units = f"{found.depth_units_per_metre:g} per metre" + ", and metres if not whole numbers" * (not units_given)
+    units = f"{found.depth_units_per_metre:g} per metre"
     unit = known.pop("depth unit", Origin("", ASSUMED, "--depth-scale UNITS"))
     unit = Origin("", GIVEN) if units_given else unit
     return origins | {"depth unit": unit._replace(value=units)} | known

@@ -39,7 +39,10 @@ def read_values(path: Path, data: bytes | None = None, turned: bool = False) -> 
     """Decode an image file, or `data` of one, without converting its values; `turned`: by its EXIF tag. Raises
     SourceError if it is damaged."""
     with open_image(path, data) as image:
-        return np.asarray(_turned(image) if turned else image)
+        tile: Any = image.tile and image.tile[0]
+        stretched = image.mode == "I" and tile[0].startswith("ppm")  # by Pillow: the largest of the file to 65535
+        values = np.asarray(_turned(image) if turned else image)
+    return np.rint(values * (tile[3][-1] / 65535)).astype(np.uint16) if stretched else values
 
 
 def image_size(path: Path, data: bytes | None = None) -> tuple[int, int]:
@@ -47,8 +50,7 @@ def image_size(path: Path, data: bytes | None = None) -> tuple[int, int]:
     if data is None:
         _refuse_missing(path)
     with open_image(path, data) as image:
-        upright = image.format == "PNG" and "exif" not in image.info  # without decoding all of it to know
-        return (image if upright or _orientation(image) < 5 else _turned(image)).size
+        return (image if _orientation(image) < 5 else _turned(image)).size
 
 
 def color_origins(path: Path) -> dict[str, Origin]:
@@ -63,8 +65,8 @@ def color_origins(path: Path) -> dict[str, Origin]:
 
 
 def _orientation(image: Image.Image) -> int:
-    with suppress(*DAMAGED):  # a damaged tag turns nothing
-        return int(image.getexif().get(ExifTags.Base.Orientation, 1))
+    with suppress(*DAMAGED):  # a damaged tag turns nothing; the method of PNG would decode the image
+        return int(Image.Image.getexif(image).get(ExifTags.Base.Orientation, 1))
     return 1
 
 

@@ -209,8 +209,7 @@ class RecordedSource(Source):
         return False
 
     def _measured_white(self) -> float:
-        """Return the value of gray of more than 8 bits that becomes white, 0 for 8-bit images: one power of two for the
-        recording, so that brightness stays comparable; only specks are brighter."""
+        """Return the value of gray above 8 bits that becomes white: one power of two for all frames; 0 for 8 bits."""
         largest = 0.0
         for i in evenly_spaced(len(self), 20):
             with suppress(SourceError):

@@ -187,6 +187,7 @@ def open_color_only(path: Path, settings: InputConfig) -> Source:
         for number, (t, color, depth) in enumerate(zip(times_s, colors, predicted.paths, strict=True))
     ]
     truth = read_groundtruth(path)
+    settings = replace(settings, depth_scale=0.0)
     source = RecordedSource(path.resolve().name, images, replace(calibration, depth_camera=None), settings, truth)
     _say_predicted(source)
     return source
@@ -198,4 +199,5 @@ def _color_images(folder: Path) -> list[Path]:
 
 def _say_predicted(source: Source) -> None:
     source.predicted_depth, source.computed_depth = True, False
+    source.origins = {name: origin for name, origin in source.origins.items() if name != "depth unit"}
     source.depth_noise_per_m, source.sensor, source.depth_registered = None, None, False

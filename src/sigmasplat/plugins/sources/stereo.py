@@ -54,11 +54,9 @@ class StereoPair(ImagePair):
 
     def _read(self, path: Path) -> NDArray[np.uint8]:
         image, c = read_color(path), self.matcher.camera
-        if image.ndim != 3:
-            raise SourceError(f"{path}: gray of more than 8 bits; convert the stereo pair to 8 bits")
-        if image.shape[:2] != (c.height, c.width):
+        if image.shape != (c.height, c.width, 3):
             raise SourceError(
-                f"{path} is {image.shape[1]}×{image.shape[0]} but the calibration is for {c.width}×{c.height}; "
+                f"{path} is {image.shape[1]}×{image.shape[0]} but the calibration is for {c.width}×{c.height}, 8 bits; "
                 "take images of that size, or correct the calibration of the stereo pair"
             )
         return image
