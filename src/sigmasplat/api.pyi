@@ -145,17 +145,20 @@ from sigmasplat.input.calibration import (
     check_positive as check_positive,
     freiburg_calibration as freiburg_calibration,
     json_number as json_number,
+    median_calibration as median_calibration,
     published as published,
     read_json_object as read_json_object,
     resolve_calibration as resolve_calibration,
     unlikely_camera as unlikely_camera,
 )
 from sigmasplat.input.images import (
+    ASSUMED_TIMES as ASSUMED_TIMES,
     COLOR_ENDINGS as COLOR_ENDINGS,
     COLOR_FOLDERS as COLOR_FOLDERS,
     DEPTH_ENDINGS as DEPTH_ENDINGS,
     DEPTH_FOLDERS as DEPTH_FOLDERS,
     FRAMES_PER_SECOND as FRAMES_PER_SECOND,
+    NAMED as NAMED,
     FrameFiles as FrameFiles,
     Video as Video,
     depth_to_metres as depth_to_metres,
@@ -172,6 +175,7 @@ from sigmasplat.input.images import (
     read_color as read_color,
     read_depth as read_depth,
     read_values as read_values,
+    seconds_of as seconds_of,
     times_of_names as times_of_names,
     without_nan as without_nan,
 )

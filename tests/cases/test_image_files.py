@@ -113,7 +113,8 @@ def test_colour_without_a_tag_or_with_a_damaged_one_stays(tmp_path: Path) -> Non
 def test_portrait_by_exif_with_landscape_depth_is_refused_with_a_remedy_that_works(tmp_path: Path) -> None:
     folder = write(tmp_path / "a", lambda path, image, i: tagged(f"{path}.jpg", Image.fromarray(image), 6))
     message = refusal(folder)
-    assert f"is {HEIGHT}×{WIDTH} but" in message and "by the EXIF tag of the images (90° clockwise)" in message
+    assert f"colour is {HEIGHT}×{WIDTH} (portrait)" in message
+    assert "by the EXIF tag of the images (90° clockwise)" in message
     assert f"delete the tag (exiftool -Orientation= {folder / 'color'})" in message
     for path in folder.glob("color/*"):
         Image.open(path).save(path, exif=b"", quality="keep")

@@ -209,7 +209,7 @@ MISTAKES: dict[str, dict[str, tuple[Damage, tuple[str, ...]]]] = {
             ("depth_file_path", "export"),
         ),
         "several cameras": (
-            fields("transforms.json", lambda f: f["frames"][1].update(fl_x=55.0)), ("several cameras", "fl_x"),
+            fields("transforms.json", lambda f: f["frames"][1].update(w=55)), ("several cameras", "w 32 and 55"),
         ),
         "a fisheye": (fields("transforms.json", lambda f: f.update(camera_model="OPENCV_FISHEYE")), ("undistort",)),
         "no focal length": (fields("transforms.json", lambda f: f.pop("fl_x")), ("fl_x", "missing")),
@@ -226,7 +226,7 @@ MISTAKES: dict[str, dict[str, tuple[Damage, tuple[str, ...]]]] = {
         "sizes differ": (resized("depth/*"), ("20×14", "32×24", "depth_camera")),
         "a missing frame and different names": (
             one_lost,
-            ("no number in common",),
+            ("no name, time or number in common", "rgb.txt"),
         ),
         "depth as a colour image": (painted("depth/*"), ("not a depth image",)),
         "depth blank": (blank("depth/*"), ("depth is zero",)),

@@ -44,7 +44,8 @@ class Calibration:
     camera, distortion: of the colour image, None for no distortion; depth_units_per_metre: of whole-number depth;
     depth_camera, depth_distortion: of depth images that are not registered to colour, None if they are registered;
     T_color_depth [4, 4]: transforms points of the depth camera to the colour camera, metres;
-    sensor: the depth sensor (`config.input`), None if it is unknown; origins: of these values, by name.
+    sensor: the depth sensor (`config.input`), None if it is unknown; origins: of these values, by name; own: the camera
+    of each frame, if they differ, from which its images are resampled.
     """
 
     camera: Camera
@@ -55,6 +56,7 @@ class Calibration:
     T_color_depth: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
     sensor: str | None = None
     origins: Mapping[str, Origin] = field(default_factory=dict)
+    own: tuple[Camera, ...] = ()
 
 
 class CameraUnknown(SourceError):
@@ -211,6 +213,20 @@ def build_camera(path: Path, width: int, height: int, focal: list[float]) -> Cam
         return Camera(width, height, *focal)
     except ConfigError as error:
         raise SourceError(f"{path}: {error}") from error
+
+
+SAME_CAMERA = 0.015
+"""Autofocus changes intrinsics by less than this share of fx; images that differ more are resampled to one camera."""
+
+
+def median_calibration(path: Path, size: tuple[int, int], focals: Any, units: float) -> Calibration:
+    """Build the camera with the median of fx, fy, cx, cy [N, 4] of the frames. Raises SourceError if one is invalid."""
+    middle = np.median(focals, 0).tolist()
+    share = float(np.abs(np.subtract(focals, middle)).max()) / middle[0]
+    said = f"{MEASURED}, median of {len(focals)} frames, they differ by {100 * share:.1f} %"
+    own = tuple(build_camera(path, *size, [*focal]) for focal in focals if share > SAME_CAMERA)
+    origin = Origin("", said + ", resampled" * bool(own) if share > 1e-6 else f"read from {path}")
+    return Calibration(build_camera(path, *size, middle), units, origins={"camera": origin}, own=own)
 
 
 POSSIBLE_VIEW_DEG = (2.0, 170.0)

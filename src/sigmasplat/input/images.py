@@ -5,7 +5,6 @@ import re
 import threading
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -180,11 +179,12 @@ def first_file(folder: Path, names: Iterable[str | Path]) -> Path | None:
 
 
 def list_images(folder: Path | None, endings: Sequence[str]) -> list[Path]:
-    """Return the images of a folder in the order of the numbers in their names: 2.png before 10.png."""
+    """Return the images of a folder in the order of the times in their names, else of the numbers: 2 before 10."""
     if folder is None or not folder.is_dir():
         return []
     found = (path for path in folder.iterdir() if path.suffix.lower() in endings and not path.name.startswith("."))
-    return sorted(found, key=natural_key)
+    paths = sorted(found, key=natural_key)
+    return [paths[i] for i in np.argsort(times_of_names(paths)[0])]
 
 
 def natural_key(path: Path | str) -> list[tuple[int, str]]:
@@ -192,19 +192,60 @@ def natural_key(path: Path | str) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"([0-9]+)", str(path)) if part]
 
 
-def times_of_names(paths: Sequence[Path]) -> list[float]:
-    """Return the times in the names if all have a decimal point and increase; else frames are 1/30 s apart."""
-    with suppress(ValueError):
-        times = [float(path.stem) for path in paths]
-        if all(a < b for a, b in pairwise(times)) and all("." in path.stem for path in paths):
-            return times
-    return [i / FRAMES_PER_SECOND for i in range(len(paths))]
+def numbers_of_names(paths: Sequence[Path]) -> list[tuple[str, ...]]:
+    """Return the numbers that differ in names that are alike otherwise, for each place in the names one per path."""
+    stems = (re.sub(r"(?<!\d)(\d{10})[-_](\d{9})(?!\d)", r"\1.\2", path.stem) for path in paths)  # seconds and ns
+    parts = [re.split(r"([0-9]+(?:\.[0-9]+)?)", stem) for stem in stems]
+    alike = len({tuple(words[::2]) for words in parts}) == 1
+    return [row for row in zip(*(words[1::2] for words in parts), strict=True) if len({*row}) > 1] if alike else []
+
+
+def times_of_names(paths: Sequence[Path]) -> tuple[NDArray[np.float64], Origin]:
+    """Return times [N], s, and their origin: read from names whose numbers can only be times (`seconds_of`), and have
+    the order of the other numbers; else assumed to be 1/30 s apart."""
+    columns = numbers_of_names(paths)
+    rows = [[float(word) for word in row] for row in zip(*columns, strict=True)]
+    for column in columns:
+        times_s = seconds_of(np.array(column, np.float64), "." in "".join(column))
+        if times_s is not None and sorted(rows) == [rows[i] for i in np.argsort(times_s)]:
+            return times_s, Origin(f"{times_s.min():.3f} … {times_s.max():.3f} s", NAMED)
+    return np.arange(len(paths)) / FRAMES_PER_SECOND, ASSUMED_TIMES
+
+
+NAMED = "read from the names"
+ASSUMED_TIMES = Origin("1/30 s apart", ASSUMED, "write rgb.txt and depth.txt with times")
+DATES_S, STEPS_S = (946684800.0, 4102444800.0), (1 / 200, 2.0, 8.0)
+"""The years 2000 to 2099, and median steps of the images of a recording; the longer one is for images with a date."""
+
+
+def seconds_of(values: NDArray[np.float64], decimal: bool) -> NDArray[np.float64] | None:
+    """Return numbers [N] in seconds if they can only be times in s, ms, µs or ns, by their steps and dates; else None.
+
+    decimal: whether they have a point, and may be seconds from any start. Every n-th of numbered images is no time.
+    """
+    ordered = np.sort(values)
+    steps = np.diff(ordered)
+    if not len(steps) or not 0 < steps.min() <= steps.max() < 1e18:
+        return None
+    step = float(np.median(steps))
+    nth = ordered[0] < 1e6 and step < 5000 and np.gcd.reduce(steps.astype(np.int64)) == step
+    running = step > 9 and np.mean(np.abs(steps - step) <= step / 4) > 0.5 and not nth
+    for unit in (1.0, 1e-3, 1e-6, 1e-9):
+        dated = DATES_S[0] < ordered[0] * unit and ordered[-1] * unit < DATES_S[1]
+        known = dated or (running and ordered[-1] * unit < 1e7) or (decimal and unit == 1.0)
+        if known and STEPS_S[0] <= step * unit <= STEPS_S[1 + dated]:
+            return values * unit
+    return values if decimal and step > 1e-3 else None
 
 
 def index_by_number(paths: Iterable[Path]) -> dict[int, Path]:
-    """Map the last number in each file name to its path, ascending; names without a number are left out."""
-    numbers = ((re.findall(r"[0-9]+", path.stem), path) for path in paths)
-    return dict(sorted((int(found[-1]), path) for found, path in numbers if found))
+    """Map the last number in each file name to its path, ascending; names without a number are left out. If the names
+    are alike, it is the last number that differs: 8 of 008_16bit."""
+    listed = list(paths)
+    numbers = [re.findall(r"[0-9]+", path.stem)[-1:] for path in listed]
+    if (columns := numbers_of_names(listed)) and "".join(columns[-1]).isdecimal():
+        numbers = [[word] for word in columns[-1]]
+    return dict(sorted((int(found[0]), path) for found, path in zip(numbers, listed, strict=True) if found))
 
 
 def pair_images(

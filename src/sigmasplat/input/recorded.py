@@ -18,9 +18,10 @@ from sigmasplat.data.images import resized_color
 from sigmasplat.data.trajectory import Trajectory, evenly_spaced
 from sigmasplat.errors import SourceError
 from sigmasplat.input.calibration import ASSUMED, MEASURED, Calibration, Origin, resolve_calibration
+from sigmasplat.input.given import SAME_SHAPE
 from sigmasplat.input.images import FRAMES_PER_SECOND, color_origins, image_size, pair_images, read_color, read_depth
 from sigmasplat.input.imu import Accelerometer, Gyroscope
-from sigmasplat.input.rectification import Rectification, check_image_sizes
+from sigmasplat.input.rectification import Rectification, check_image_sizes, resampled, turned_by_tag
 from sigmasplat.input.source import Source
 
 PLAUSIBLE_MEDIAN_M = (0.2, 15.0)
@@ -169,7 +170,7 @@ class RecordedSource(Source):
         recorded, depth_m = files.read(self._units)
         depth_m, color = depth_m / self._float_units, color_from_bytes(self._rgb(files.color, recorded))
         check_image_sizes(self._rectified, files.color, color.shape[1::-1], files.depth, depth_m.shape[::-1])
-        color, depth_m = self._rectified(color, depth_m)
+        color, depth_m = self._rectified(self._of_one_camera(i, color), self._of_one_camera(i, depth_m))
         color = resized_color(color, self.camera.width, self.camera.height)
         R_inertial_camera = None if self._gyroscope is None else self._gyroscope.R_inertial_camera(files.timestamp_s)
         force = None if self._accelerometer is None else self._accelerometer.at(files.timestamp_s)
@@ -182,7 +183,11 @@ class RecordedSource(Source):
         files = self._images[self._checked_index(i)]
         depth_m, camera = files.read_depth(self._units) / self._float_units, self._rectified.calibration.camera
         check_image_sizes(self._rectified, files.color, (camera.width, camera.height), files.depth, depth_m.shape[::-1])
-        return self._rectified.depth(depth_m)
+        return self._rectified.depth(self._of_one_camera(i, depth_m))
+
+    def _of_one_camera(self, i: int, image: NDArray[np.float32]) -> NDArray[np.float32]:
+        known = self._rectified.calibration
+        return resampled(image, known.own[i], known.camera) if known.own else image
 
     def truth(self) -> Trajectory | None:
         return self._truth
@@ -252,9 +257,25 @@ def folder_source(
     size, depth_size = first_readable(images, lambda pair: pair.sizes())
     calibration = resolve_calibration(folder, known, size, settings, units_per_metre)
     camera, lens = calibration.camera, calibration.distortion
+    if known and known.own and camera != known.camera:
+        calibration = replace(calibration, own=())  # one camera is given for all frames
+    if not calibration.depth_camera:
+        _refuse_other_shape(folder, images, size, depth_size)
     if one_camera and depth_size != (camera.width, camera.height) and not calibration.depth_camera:
         calibration = replace(calibration, depth_camera=camera.resized(*depth_size), depth_distortion=lens)
     return RecordedSource(name or folder.resolve().name, images, calibration, settings, truth, skipped, **more)
+
+
+def _refuse_other_shape(folder: Path, images: Sequence[ImagePair], *sizes: Size) -> None:
+    """Raise SourceError if colour and depth of such sizes are not of one view; those of small images are rounded."""
+    (w, h), (depth_w, depth_h) = sizes
+    if abs(depth_h - depth_w * h / w) <= max(SAME_SHAPE * depth_h, 1.0):
+        return
+    pair = first_readable(images, lambda pair: (pair, pair.read_depth(1.0)))[0]  # wrong metadata are named first
+    color, depth = (f"{a}×{b} ({'portrait' if b > a else 'landscape'})" for a, b in sizes)
+    remedy = "rotate one of them" if (w > h) != (depth_w > depth_h) else "give depth_camera in calibration.json"
+    turned = turned_by_tag(pair.color, (w, h), (depth_w, depth_h))
+    raise SourceError(f"{folder}: colour is {color}, depth is {depth}; {turned}{remedy}")
 
 
 def numbered_pairs(

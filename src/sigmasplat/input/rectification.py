@@ -66,6 +66,17 @@ class Undistortion:
         return np.asarray(cv2.remap(recorded_m, *self._source_uv, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT))
 
 
+def resampled(image: NDArray[np.float32], own: Camera, camera: Camera) -> NDArray[np.float32]:
+    """Resample colour [H, W, 3] or depth [H, W] of a frame's own camera as if `camera` had taken it with its lens."""
+    cv2, size, depth = opencv(), image.shape[1::-1], image.ndim == 2
+    own, camera = own.resized(*size), camera.resized(*size)
+    x, y = own.fx / camera.fx, own.fy / camera.fy
+    M = np.array([[x, 0.0, own.cx - x * camera.cx], [0.0, y, own.cy - y * camera.cy]])
+    flags = cv2.WARP_INVERSE_MAP | (cv2.INTER_NEAREST if depth else cv2.INTER_LINEAR)
+    border = cv2.BORDER_CONSTANT if depth else cv2.BORDER_REPLICATE
+    return np.asarray(cv2.warpAffine(image, M, size, flags=flags, borderMode=border))
+
+
 OVERLAP = 1.1
 """Footprints are enlarged by this factor, so that rotation leaves no gaps between neighbours."""
 MAX_HALF_FOOTPRINT_PX = 32.0
@@ -206,7 +217,7 @@ def check_image_sizes(
     if tuple(color_size) != tuple(depth_size) and not rectification.moves_depth:
         raise SourceError(
             f"{color} is {color_size[0]}×{color_size[1]} but {depth} is {depth_size[0]}×{depth_size[1]}; "
-            f"{_turned(color, color_size, depth_size)}"
+            f"{turned_by_tag(color, color_size, depth_size)}"
             "register depth to colour at the same size, or give depth_camera in calibration.json"
         )
     for what, path, size, wanted in (
@@ -216,12 +227,12 @@ def check_image_sizes(
         if tuple(size) != wanted:
             raise SourceError(
                 f"{path} is {size[0]}×{size[1]} but the calibration is for {wanted[0]}×{wanted[1]}; "
-                f"{_turned(color, color_size, wanted)}"
+                f"{turned_by_tag(color, color_size, wanted)}"
                 f"take images of that size, or correct the calibration of the {what} camera"
             )
 
 
-def _turned(path: Path, size: tuple[int, ...], wanted: tuple[int, ...]) -> str:
+def turned_by_tag(path: Path, size: tuple[int, ...], wanted: tuple[int, ...]) -> str:
     """Return the likely remedy if an EXIF tag exchanges width and height of an image; empty for others."""
     if tuple(size) != tuple(wanted)[::-1] or not (turned := color_origins(path).get("orientation")):
         return ""

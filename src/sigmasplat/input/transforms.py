@@ -1,27 +1,28 @@
 """Read the transforms.json of instant-ngp and nerfstudio: one camera, poses with OpenGL axes.
 
-fl_x fl_y cx cy w h [k1 k2 k3 p1 p2] [camera_model]     at the top, or equal in every frame
+fl_x fl_y cx cy w h [k1 k2 k3 p1 p2] [camera_model]     at the top, or in every frame
 frames: file_path, depth_file_path, transform_matrix    camera to world; camera x right, y up, z backward
 
 In these files the centre of the first pixel is at (½, ½), in ours at (0, 0): half a pixel is subtracted from cx and cy.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from sigmasplat.errors import SourceError
-from sigmasplat.input.calibration import Calibration, Distortion, build_camera, json_number
+from sigmasplat.input.calibration import Calibration, Distortion, json_number, median_calibration
 from sigmasplat.input.lists import FLIP_YZ, checked_pose, to_matrix
 from sigmasplat.types import Matrix
 
 Fields = dict[str, Any]
 
 PINHOLE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
-CAMERA_TOLERANCE_PX = 0.5
-"""Two frames have the same camera if their intrinsics differ by less than this."""
+LENS = ("k1", "k2", "p1", "p2", "k3", "k4")
+SAME_LENS = 0.01
 
 
 def read_frames(path: Path, fields: Fields, key: str = "frames") -> list[Fields]:
@@ -38,9 +39,9 @@ def read_frames(path: Path, fields: Fields, key: str = "frames") -> list[Fields]
 def read_transforms_camera(
     path: Path, fields: Fields, frames: Sequence[Fields], size: tuple[int, int], units: float
 ) -> Calibration:
-    """Build the camera shared by all frames; `size` (width, height) is the default for a missing size.
+    """Build the camera of the frames (`median_calibration`); `size` (width, height) is the default for a missing size.
 
-    Raises SourceError naming a missing field, a frame with other intrinsics, or a lens that is not a pinhole's.
+    Raises SourceError naming a missing field, a frame of other size or lens, or a lens that is not a pinhole's.
     """
     first = {**fields, **frames[0]}
     model = str(first.get("camera_model", "OPENCV")).upper()
@@ -49,18 +50,16 @@ def read_transforms_camera(
             f"{path}: camera_model is {model}; only pinhole cameras are supported, undistort the images first"
         )
     for frame in frames[1:]:
-        for key in ("fl_x", "fl_y", "cx", "cy", "w", "h"):
-            if key not in first:
-                continue
-            a, b = json_number(path, first, key), json_number(path, {**first, **frame}, key)
-            if abs(a - b) > CAMERA_TOLERANCE_PX:
+        for key in ("w", "h", *LENS):
+            a, b = (json_number(path, found, key, 0.0) for found in (first, {**first, **frame}))
+            if abs(a - b) > (SAME_LENS if key in LENS else 0.0):
                 raise SourceError(
                     f"{path}: the frames have several cameras ({key} {a:g} and {b:g}, {frame['file_path']}); "
                     "all frames must have one camera: undistort the images to one camera, or remove the others"
                 )
     width, height = (int(json_number(path, first, key, size[i])) for i, key in enumerate(("w", "h")))
-    camera = build_camera(path, width, height, _focal(path, first, width, height))
-    return Calibration(camera, units, _lens(path, first))
+    focals = np.array([_focal(path, {**first, **frame}, width, height) for frame in frames])
+    return replace(median_calibration(path, (width, height), focals, units), distortion=_lens(path, first))
 
 
 def read_pose(path: Path, frame: Fields) -> Matrix | None:
@@ -90,7 +89,7 @@ def _focal(path: Path, fields: Fields, width: int, height: int) -> list[float]:
 
 
 def _lens(path: Path, fields: Fields) -> Distortion | None:
-    k1, k2, p1, p2, k3, k4 = (json_number(path, fields, key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3", "k4"))
+    k1, k2, p1, p2, k3, k4 = (json_number(path, fields, key, 0.0) for key in LENS)
     if k4:
         raise SourceError(f"{path}: the lens has k4 = {k4:g}, which is not supported; undistort the images first")
     return (k1, k2, p1, p2, k3) if any((k1, k2, p1, p2, k3)) else None

@@ -22,6 +22,7 @@ from sigmasplat.api import (
     Frame,
     ImagePair,
     InputConfig,
+    Origin,
     RecordedSource,
     Size,
     Source,
@@ -175,20 +176,21 @@ def open_color_only(path: Path, settings: InputConfig) -> Source:
     video = Video(path) if path.is_file() else None
     if video:
         colors, size, names = [path] * video.count, video.size, [""] * video.count
-        times_s = [i / video.frames_per_second for i in range(video.count)]
+        times_s, times = np.arange(video.count) / video.frames_per_second, Origin("frame rate", f"read from {path}")
     else:
         colors = _color_images(path)
         size, names = image_size(colors[0]), [color.stem for color in colors]
-        times_s = times_of_names(colors)
+        times_s, times = times_of_names(colors)
     calibration = resolve_calibration(path, None, size, settings, MM_PER_METRE)
     predicted = predicted_in_folder(Path(settings.predicted_depth), names, settings.predicted_inverse)
     images = [
         PredictedPair(t, color, depth, number, size, predicted, video)
-        for number, (t, color, depth) in enumerate(zip(times_s, colors, predicted.paths, strict=True))
+        for number, (t, color, depth) in enumerate(zip(times_s.tolist(), colors, predicted.paths, strict=True))
     ]
     truth = read_groundtruth(path)
     settings = replace(settings, depth_scale=0.0)
     source = RecordedSource(path.resolve().name, images, replace(calibration, depth_camera=None), settings, truth)
+    source.origins["times"] = times
     _say_predicted(source)
     return source
 

@@ -1,18 +1,27 @@
-"""Read a nerfstudio folder with depth: transforms.json whose frames name the images.
+"""Read a folder of nerfstudio or instant-ngp (NeRFCapture) with depth, transforms.json, and raw exports of Polycam.
 
-transforms.json        see `input/transforms.py`; depth_unit_scale_factor is metres per unit, default 0.001
-images/…  depths/…     file_path and depth_file_path, relative to the folder, ordered by the numbers in the names
+transforms.json        see `input/transforms.py`; depth_unit_scale_factor or integer_depth_scale is metres per unit,
+                       default 0.001; timestamp in every frame, or times in the names, else 1/30 s apart
+images/…  depths/…     file_path and depth_file_path or depth_path, relative to the folder, ordered by time or number
+
+keyframes/cameras/TIME.json  images/TIME.jpg  depth/TIME.png     Polycam: time in µs, fx fy cx cy width height, t_00 …
+                       t_23 (camera to world, ARKit's axes), depth in mm; corrected_cameras/ and corrected_images/, if
+                       they exist, have better poses and no lens distortion (layout: PolyCam/polyform)
 
 If depth has another size than colour (as on phones), both are assumed to share one camera.
 """
 
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from sigmasplat.api import (
-    FRAMES_PER_SECOND,
     Fields,
     ImagePair,
     InputConfig,
+    Origin,
     RecordedSource,
     SourceError,
     SourceFormat,
@@ -21,46 +30,91 @@ from sigmasplat.api import (
     first_size,
     folder_source,
     json_number,
+    list_images,
     natural_key,
     read_frames,
     read_json_object,
     read_pose,
     read_transforms_camera,
+    seconds_of,
+    times_of_names,
 )
 
 NAME = "transforms.json"
-METRES_PER_UNIT = 0.001
+UNIT_KEYS = ("depth_unit_scale_factor", "integer_depth_scale")
+DEPTH, METRES_PER_UNIT = "depth_file_path", 0.001
 """nerfstudio's default of depth_unit_scale_factor."""
 
 
 def open_nerfstudio(place: str, settings: InputConfig) -> RecordedSource:
     """Open a folder with depth. Raises SourceError if its JSON file, images or camera cannot be used."""
-    folder, path = Path(place), Path(place) / NAME
-    fields = read_json_object(path)
+    path = Path(place) / NAME
+    return _open(path.parent, path, read_json_object(path), settings)
+
+
+def _open(folder: Path, path: Path, fields: Fields, settings: InputConfig) -> RecordedSource:
     named = sorted(read_frames(path, fields), key=lambda frame: natural_key(frame["file_path"]))
-    frames = [frame for frame in named if isinstance(frame.get("depth_file_path"), str)]
+    named = [frame | {DEPTH: frame.get(DEPTH, frame.get("depth_path"))} for frame in named]
+    frames = [frame for frame in named if isinstance(frame[DEPTH], str)]
     if not frames:
         raise SourceError(
-            f'{path}: no frame has a "depth_file_path"; export depth with the images, see docs/data.md#without-depth'
+            f'{path}: no frame has a "depth_file_path" or "depth_path" (found {", ".join(fields["frames"][0])}); '
+            "export depth with the images, see docs/data.md#without-depth"
         )
-    skipped = [
-        f"{path}: {frame['file_path']} has no depth_file_path"
-        for frame in named
-        if not isinstance(frame.get("depth_file_path"), str)
-    ]
-    images = [ImagePair(i / FRAMES_PER_SECOND, *_files(folder, frame)) for i, frame in enumerate(frames)]
-    per_unit = json_number(path, fields, "depth_unit_scale_factor", METRES_PER_UNIT)
-    units = round(1.0 / check_positive(path, "depth_unit_scale_factor", per_unit), 6)
+    skipped = [f"{path}: {frame['file_path']} has no {DEPTH}" for frame in named if not isinstance(frame[DEPTH], str)]
+    files, read = [_files(folder, frame) for frame in frames], Origin("", f"read from {path}")
+    times_s, times = times_of_names([color for color, _ in files])
+    found = [frame.get("timestamp") for frame in frames]
+    stamps = np.array([stamp if isinstance(stamp, int | float) else np.nan for stamp in found])
+    if (stamps_s := seconds_of(stamps, bool((stamps % 1).any()))) is not None:
+        times_s, times = stamps_s, read._replace(value="timestamp of each frame")
+    order = np.argsort(times_s)
+    frames, images = [frames[i] for i in order], [ImagePair(float(times_s[i]), *files[i]) for i in order]
+    key = next((key for key in UNIT_KEYS if key in fields), "")
+    units = round(1.0 / check_positive(path, key, json_number(path, fields, key, METRES_PER_UNIT)), 6)
     known = read_transforms_camera(path, fields, frames, first_size([i.color for i in images]), units)
+    known = replace(known, origins={**known.origins, "depth unit": read}) if key else known
     truth = build_trajectory((i.timestamp_s, read_pose(path, frame)) for i, frame in zip(images, frames, strict=True))
-    return folder_source(folder, settings, images, known, units, truth, skipped, one_camera=True, estimated=True)
+    return folder_source(
+        folder, settings, images, known, units, truth, skipped, one_camera=True, estimated=True,
+        origins={"times": times, "pairs": read._replace(value="named in each frame")},
+    )  # fmt: skip
 
 
 def _files(folder: Path, frame: Fields) -> tuple[Path, Path]:
     """Return the colour and the depth file of a frame; instant-ngp omits the file ending of colour."""
-    color, depth = folder / frame["file_path"], folder / frame["depth_file_path"]
+    color, depth = folder / frame["file_path"], folder / frame[DEPTH]
     bare = not color.suffix and not color.is_file()
     return (color.with_suffix(".png") if bare else color), depth
 
 
-PLUGIN = SourceFormat("nerfstudio", NAME, lambda path: (Path(path) / NAME).is_file(), open_nerfstudio)
+def open_polycam(place: str, settings: InputConfig) -> RecordedSource:
+    """Open a raw export or its folder keyframes. Raises SourceError as `open_nerfstudio`."""
+    folder = _keyframes(place)
+    kind = "corrected_" if all((folder / f"corrected_{part}").is_dir() for part in ("cameras", "images")) else ""
+    frames = []
+    for path in list_images(folder / f"{kind}cameras", (".json",)):
+        number = partial(json_number, path, read_json_object(path))
+        frame: Fields = {"file_path": f"{kind}images/{path.stem}.jpg", DEPTH: f"depth/{path.stem}.png"}
+        frame |= {"fl_x": number("fx"), "fl_y": number("fy"), "w": number("width"), "h": number("height")}
+        frame |= {key: number(key) + 0.5 for key in ("cx", "cy")}  # ARKit measures from the centre of the first pixel
+        frame |= {"transform_matrix": [number(f"t_{i // 4}{i % 4}") for i in range(12)]}
+        frames.append(frame | ({"timestamp": int(path.stem) * 1e-6} if path.stem.isdecimal() else {}))
+    return _open(folder, folder / f"{kind}cameras", {"frames": frames}, settings)
+
+
+def _keyframes(place: str) -> Path:
+    inner = Path(place) / "keyframes"
+    return inner if inner.is_dir() else Path(place)
+
+
+PLUGIN = (
+    SourceFormat("nerfstudio", NAME, lambda path: (Path(path) / NAME).is_file(), open_nerfstudio),
+    SourceFormat(
+        "Polycam",
+        "keyframes/ with images/, depth/ and cameras/*.json",
+        lambda path: (_keyframes(path) / "depth").is_dir() and any((_keyframes(path) / "cameras").glob("*.json")),
+        open_polycam,
+        sensor="lidar-iphone",
+    ),
+)

@@ -1,11 +1,11 @@
 """Read plain folders of colour and depth images, and those of Open3D's reconstruction system and of Redwood.
 
-color|colour|rgb|image|images/   depth|depths/     paired by name, else by the number in it, else by order
+color|colour|rgb|image|images/   depth|depths/     paired by the time in the name, or name, number, order
 calibration.json                                   fx fy cx cy [width height depth_scale …], or --fx on the command line
 groundtruth.txt                                    optional: "t tx ty tz qx qy qz qw", t as for the images
 
-Names such as 12.033333.png are times in seconds; otherwise frames are 1/30 s apart. Depth is in mm by default. This
-format is tried last. Open3D and Redwood, recognised by these files:
+Names such as 12.033333.png or 1612345678033333333.png are times; otherwise frames are 1/30 s apart. Depth is in mm by
+default. This format is tried last. Open3D and Redwood, recognised by these files:
 
 color|rgb|image/000000.jpg  depth/000000.png              paired by the number in the name
 rgb/0000001-000000033000.jpg  depth/0000001-0000….png     Redwood: number and time in µs; paired by time
@@ -17,11 +17,15 @@ Without an intrinsic file, PrimeSense's factory values are used (Redwood's camer
 """
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sigmasplat.api import (
+    ASSUMED,
+    ASSUMED_TIMES,
     COLOR_ENDINGS,
     COLOR_FOLDERS,
     DEPTH_ENDINGS,
@@ -29,6 +33,7 @@ from sigmasplat.api import (
     FRAMES_PER_SECOND,
     MAX_GAP_S,
     MM_PER_METRE,
+    NAMED,
     Calibration,
     Camera,
     ImagePair,
@@ -63,6 +68,7 @@ from sigmasplat.api import (
 )
 
 NAMES = "color|rgb|images/*", "depth/*"
+REMEDY = "write rgb.txt and depth.txt with 'time path' lines, or give each pair the same name"
 
 
 def open_plain(path: str, settings: InputConfig) -> RecordedSource:
@@ -72,28 +78,50 @@ def open_plain(path: str, settings: InputConfig) -> RecordedSource:
     if depth_folder is None and (problem := without_depth(folder)):
         raise problem
     colors = list_images(first_subfolder(folder, COLOR_FOLDERS), COLOR_ENDINGS)
-    pairs, skipped = _pairs(folder, colors, list_images(depth_folder, DEPTH_ENDINGS))
-    times_s = times_of_names([color for color, _ in pairs])
-    images = [ImagePair(t, *pair) for t, pair in zip(times_s, pairs, strict=True)]
-    return folder_source(folder, settings, images, None, MM_PER_METRE, read_groundtruth(folder), skipped)
+    images, skipped, origins = _pairs(folder, colors, list_images(depth_folder, DEPTH_ENDINGS))
+    truth = read_groundtruth(folder)
+    return folder_source(folder, settings, images, None, MM_PER_METRE, truth, skipped, origins=origins)
 
 
-def _pairs(folder: Path, colors: list[Path], depths: list[Path]) -> tuple[list[tuple[Path, Path]], list[str]]:
-    """Pair images by name, else by number, else by order if both kinds have the same count."""
-    stems, depth_stems = {path.stem: path for path in colors}, {path.stem: path for path in depths}
-    if stems.keys() & depth_stems.keys():
-        names, skipped = pair_images(folder, stems, depth_stems, *NAMES)
-        return [(stems[name], depth_stems[name]) for name in names], skipped
-    color_by_number, depth_by_number = index_by_number(colors), index_by_number(depths)
-    if colors and len(colors) == len(depths) and not color_by_number.keys() & depth_by_number.keys():
-        return list(zip(colors, depths, strict=True)), []
-    if colors and depths and (len(color_by_number), len(depth_by_number)) != (len(colors), len(depths)):
-        raise SourceError(
-            f"{folder}: {len(colors)} colour and {len(depths)} depth images share no names, and their numbers are not "
-            "unique; give each pair the same name"
-        )
-    keys, skipped = pair_images(folder, color_by_number, depth_by_number, *NAMES)
-    return [(color_by_number[n], depth_by_number[n]) for n in keys], skipped
+Found = tuple[list[ImagePair], list[str], dict[str, Origin]]
+"""Pairs of images, why others are left out, and the origins of times and pairs."""
+
+
+def _pairs(folder: Path, colors: list[Path], depths: list[Path]) -> Found:
+    """Pair images by the times in their names, else by name, by number, or by order if names do no more than count."""
+    (color_s, read), (depth_s, depth_read) = times_of_names(colors), times_of_names(depths)
+    timed = [read.origin, depth_read.origin].count(NAMED)
+    if timed == 2:
+        return _timed_pairs(folder, colors, depths, color_s, depth_s)
+    found, skipped, how = list(zip(colors, depths, strict=False)), list[str](), Origin("by order", ASSUMED, REMEDY)
+    by_name = [{path.stem: path for path in paths} for paths in (colors, depths)]
+    by_number = [{str(n): path for n, path in index_by_number(paths).items()} for paths in (colors, depths)]
+    for way, (color_of, depth_of) in {"by name": by_name, "by number": by_number}.items():
+        unique = way == "by name" or (len(color_of) + len(depth_of) == len(colors) + len(depths) and not timed)
+        if not colors or not depths or (unique and color_of.keys() & depth_of.keys()):
+            keys, skipped = pair_images(folder, color_of, depth_of, *NAMES)
+            found, how = [(color_of[key], depth_of[key]) for key in keys], Origin(way, NAMED)
+            break
+    else:
+        steps = [set(np.diff([*index_by_number(paths)]).tolist()) for paths in (colors, depths)]
+        if len(colors) != len(depths) or max(map(len, steps)) > 1 or timed:
+            raise SourceError(
+                f"{folder}: {len(colors)} colour and {len(depths)} depth images have no name, time or number in common "
+                f"(found {colors[0].name} and {depths[0].name}); {REMEDY}"
+            )
+    times_s, times = times_of_names([color for color, _ in found])
+    images = [ImagePair(t, *pair) for t, pair in zip(times_s.tolist(), found, strict=True)]
+    return images, skipped, {"times": times, "pairs": how}
+
+
+def _timed_pairs(folder: Path, colors: list[Path], depths: list[Path], *times_s: NDArray[np.float64]) -> Found:
+    color_s, depth_s = times_s
+    pairs, alone = pair_times(folder, {"colour": color_s, "depth": depth_s})
+    late_s = {(i, j): float(depth_s[j] - color_s[i]) for i, j in pairs}
+    images = [ImagePair(float(color_s[i]), colors[i], depths[j], depth_late_s=s) for (i, j), s in late_s.items()]
+    times = Origin(f"{color_s.min():.3f} … {color_s.max():.3f} s", NAMED)
+    origins = {"times": times, "pairs": Origin(f"by time, within {MAX_GAP_S:g} s", NAMED)}
+    return images, [f"{colors[i]}: no depth within {MAX_GAP_S:g} s" for i in alone], origins
 
 
 INTRINSIC_NAMES = ("intrinsic.json", "intrinsics.json", "camera_intrinsic.json", "camera_intrinsics.json")
@@ -113,25 +141,18 @@ def open_redwood(path: str, settings: InputConfig) -> RecordedSource:
     rate = check_positive(file or folder, "fps", json_number(file or folder, fields, "fps", FRAMES_PER_SECOND))
     colors = list_images(first_subfolder(folder, COLOR_FOLDERS), COLOR_ENDINGS)
     depths = list_images(folder / "depth", DEPTH_ENDINGS)
-    found = _timed_pairs(folder, colors, depths)
-    if found is None:
+    if colors and depths and all(_TIMED.fullmatch(path.stem) for path in colors + depths):
+        stamps = [np.array([int(p.stem.split("-")[1]) * 1e-6 for p in paths]) for paths in (colors, depths)]
+        images, skipped, origins = _timed_pairs(folder, colors, depths, *stamps)
+        images = [replace(i, timestamp_s=i.timestamp_s + i.depth_late_s) for i in images]  # poses are those of depth
+    else:
         names = f"{'|'.join(COLOR_FOLDERS)}/*.jpg", "depth/*.png"
         numbered, skipped = numbered_pairs(folder, index_by_number(colors), index_by_number(depths), *names, rate)
-        found = [*numbered.values()], skipped
-    images, skipped = found
+        times = Origin(f"{rate:g} per second", f"read from {file}") if "fps" in fields else ASSUMED_TIMES
+        images, origins = [*numbered.values()], {"times": times, "pairs": Origin("by number", NAMED)}
     known = _recorded(file, fields) if file else PRIMESENSE
     truth = _truth(folder, images)
-    return folder_source(folder, settings, images, known, known.depth_units_per_metre, truth, skipped)
-
-
-def _timed_pairs(folder: Path, colors: list[Path], depths: list[Path]) -> tuple[list[ImagePair], list[str]] | None:
-    """Pair images by the time in their names, None if the names contain no time."""
-    if not (colors and depths and all(_TIMED.fullmatch(path.stem) for path in colors + depths)):
-        return None
-    color_s, depth_s = (np.array([int(p.stem.split("-")[1]) * 1e-6 for p in paths]) for paths in (colors, depths))
-    pairs, alone = pair_times(folder, {"colour": color_s, "depth": depth_s})
-    skipped = [f"{colors[i]}: no depth within {MAX_GAP_S:g} s" for i in alone]
-    return [ImagePair(float(depth_s[j]), colors[i], depths[j]) for i, j in pairs], skipped
+    return folder_source(folder, settings, images, known, known.depth_units_per_metre, truth, skipped, origins=origins)
 
 
 def _recorded(path: Path, fields: dict[str, object]) -> Calibration:

@@ -12,7 +12,7 @@ issues 7 and 27; nerfstudio, record3d_utils.py. Depth has fewer pixels than colo
 import re
 import zipfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +31,6 @@ from sigmasplat.api import (
     SourceError,
     SourceFormat,
     Trajectory,
-    build_camera,
     check_positive,
     depth_to_metres,
     first_readable,
@@ -39,6 +38,7 @@ from sigmasplat.api import (
     guarded,
     import_optional,
     json_number,
+    median_calibration,
     parse_json,
     read_bytes,
     read_color,
@@ -144,7 +144,7 @@ def open_record3d(place: str, settings: InputConfig) -> RecordedSource:
         lzfse = import_optional("lzfse", "iphone", f"{path}: depth of Record3D")
         size = _depth_size(path / name, metadata)
         images = [R3dImagePair(*pair, archive, n, size, lzfse) for pair, n in zip(pairs, numbers, strict=True)]
-    known = _calibration(path / name, metadata, images)
+    known = _calibration(path / name, metadata, images, numbers)
     skipped = [f"{path / colors[n]}: no depth image {n}" for n in sorted(colors.keys() - depths.keys())]
     truth = _truth(path / name, metadata, numbers, times_s)
     return folder_source(
@@ -159,7 +159,9 @@ def _depth_size(path: Path, metadata: dict[str, Any]) -> Size:
     return int(json_number(path, metadata, "dw", wide[0])), int(json_number(path, metadata, "dh", wide[1]))
 
 
-def _calibration(where: Path, metadata: dict[str, Any], images: Sequence[ImagePair]) -> Calibration | None:
+def _calibration(
+    where: Path, metadata: dict[str, Any], images: Sequence[ImagePair], numbers: list[int]
+) -> Calibration | None:
     """Read the camera, scaled to the image size, which is larger in exports than in the metadata."""
     size, _ = first_readable(images, lambda pair: pair.sizes())
     width, height = (int(json_number(where, metadata, key, value)) for key, value in zip(("w", "h"), size, strict=True))
@@ -169,8 +171,9 @@ def _calibration(where: Path, metadata: dict[str, Any], images: Sequence[ImagePa
         focal = None if k is None else k[:, [0, 4, 6, 7]]
     if focal is None:
         return None
-    middle = np.median(focal, 0).tolist()
-    return Calibration(build_camera(where, width, height, middle).resized(*size), 1.0)
+    focal = focal[numbers] if len(focal) > numbers[-1] else focal[:1].repeat(len(numbers), 0)
+    known = median_calibration(where, (width, height), focal, 1.0)
+    return replace(known, camera=known.camera.resized(*size), own=tuple(c.resized(*size) for c in known.own))
 
 
 def _times_s(where: Path, metadata: dict[str, Any], numbers: list[int]) -> NDArray[np.float64]:

@@ -36,6 +36,7 @@ from sigmasplat.api import (
     folder_source,
     gyroscope_from_samples,
     image_size,
+    median_calibration,
     parse_numbers,
     read_depth,
     read_lines,
@@ -102,7 +103,7 @@ def open_stray_scanner(path: str, settings: InputConfig) -> RecordedSource:
     ]  # fmt: skip
     kept = set(numbers)
     skipped = [f"{depths[n]}: no frame {n} in rgb.mp4 or odometry.csv" for n in sorted(depths) if n not in kept]
-    known = _calibration(folder, rows, video.size)
+    known = _calibration(folder, [rows[n] for n in numbers], video.size)
     truth, (moved_s, rates, forces) = _truth(rows, numbers), _imu(folder / "imu.csv")
     gyroscope = gyroscope_from_samples(moved_s, rates)
     if gyroscope and not gyroscope.measured_any(np.array([rows[n]["timestamp"] for n in numbers])):
@@ -136,12 +137,12 @@ def _odometry(path: Path) -> Rows:
     return rows
 
 
-def _calibration(folder: Path, rows: Rows, size: Size) -> Calibration | None:
+def _calibration(folder: Path, rows: list[dict[str, float]], size: Size) -> Calibration | None:
     """Read the camera: the median of all frames if they have intrinsics, because autofocus changes them slightly."""
     path, file = folder / "camera_matrix.csv", folder / "odometry.csv"
-    if set(INTRINSICS) <= set(next(iter(rows.values()))):
-        focal = np.median([[row[name] for name in INTRINSICS] for row in rows.values()], 0)
-        return Calibration(build_camera(file, *size, focal.tolist()), MM_PER_METRE)
+    if set(INTRINSICS) <= set(rows[0]):
+        focals = np.array([[row[name] for name in INTRINSICS] for row in rows])
+        return median_calibration(file, size, focals, MM_PER_METRE)
     return Calibration(build_camera(path, *size, _matrix(path)), MM_PER_METRE) if path.is_file() else None
 
 
