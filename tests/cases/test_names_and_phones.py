@@ -160,6 +160,16 @@ def test_redwood_says_how_late_depth_is_and_whose_camera_it_takes(tmp_path: Path
     assert source.origins["camera"].origin == ASSUMED and source.origins["times"].origin == READ
 
 
+@pytest.mark.parametrize("write", [lambda t: f"{EPOCH + t:.4f}", lambda t: f"{EPOCH * 10**9 + round(t * 1e9)}"])
+def test_times_in_names_beside_open3ds_intrinsics(write: Callable[[float], str], tmp_path: Path) -> None:
+    folder = named(tmp_path / "rec", [write(t) for t in TIMES], [write(t + 0.004) for t in TIMES[3:]])
+    camera = {"width": 32, "height": 24, "intrinsic_matrix": [30.0, 0, 0, 0, 30.0, 0, 15.5, 11.5, 1]}
+    (folder / "camera_intrinsic.json").write_text(json.dumps(camera))
+    source = open_source(folder)
+    assert len(source) == 9 and source.timestamp_s(0) == pytest.approx(EPOCH + 0.1, abs=1e-3)
+    assert source.frame(0).depth_m[0, 0] == 1.0 and source.origins["pairs"].origin == READ
+
+
 # transforms.json
 
 

@@ -187,7 +187,8 @@ class RecordedSource(Source):
 
     def _of_one_camera(self, i: int, image: NDArray[np.float32]) -> NDArray[np.float32]:
         known = self._rectified.calibration
-        return resampled(image, known.own[i], known.camera) if known.own else image
+        other = image.ndim == 2 and known.depth_camera not in (None, known.camera.resized(*image.shape[1::-1]))
+        return resampled(image, known.own[i], known.camera) if known.own and not other else image
 
     def truth(self) -> Trajectory | None:
         return self._truth

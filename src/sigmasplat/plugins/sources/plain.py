@@ -145,6 +145,8 @@ def open_redwood(path: str, settings: InputConfig) -> RecordedSource:
         stamps = [np.array([int(p.stem.split("-")[1]) * 1e-6 for p in paths]) for paths in (colors, depths)]
         images, skipped, origins = _timed_pairs(folder, colors, depths, *stamps)
         images = [replace(i, timestamp_s=i.timestamp_s + i.depth_late_s) for i in images]  # poses are those of depth
+    elif NAMED in (times_of_names(colors)[1].origin, times_of_names(depths)[1].origin):
+        images, skipped, origins = _pairs(folder, colors, depths)
     else:
         names = f"{'|'.join(COLOR_FOLDERS)}/*.jpg", "depth/*.png"
         numbered, skipped = numbered_pairs(folder, index_by_number(colors), index_by_number(depths), *names, rate)
