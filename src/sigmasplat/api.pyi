@@ -188,27 +188,29 @@ from sigmasplat.input.imu import (
 )
 from sigmasplat.input.lists import (
     FLIP_YZ as FLIP_YZ,
-    MAX_GAP_S as MAX_GAP_S,
     associate as associate,
     build_trajectory as build_trajectory,
     checked_pose as checked_pose,
+    listed_file as listed_file,
     nearest_gaps_s as nearest_gaps_s,
-    no_pairs as no_pairs,
     pair_times as pair_times,
     parse_numbers as parse_numbers,
     read_groundtruth as read_groundtruth,
     read_lines as read_lines,
+    read_listed as read_listed,
     read_matrix as read_matrix,
     read_pose_files as read_pose_files,
     read_poses as read_poses,
-    refuse_other_units as refuse_other_units,
+    refuse_unpaired as refuse_unpaired,
     rigid_transform as rigid_transform,
+    time_origins as time_origins,
     to_matrix as to_matrix,
 )
 from sigmasplat.input.opening import (
     VIDEO_ENDINGS as VIDEO_ENDINGS,
     format_name as format_name,
     open_source as open_source,
+    sqlite_tables as sqlite_tables,
     without_depth as without_depth,
 )
 from sigmasplat.input.recorded import (

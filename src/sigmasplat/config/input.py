@@ -107,6 +107,10 @@ class InputConfig(Section, name="input"):
     strict: bool = False
     """Whether an unreadable image stops the run. If off, such images are skipped and counted."""
 
+    max_gap_s: Above0 = 0.02  # as in TUM's own tool; half a step at 25 Hz
+    """Colour and depth that are paired by time differ by less than this, in seconds."""
+    depth_delay_s: Annotated[float, Range()] = 0.0
+    """How much too late depth (or the right image of a pair) is stamped, in seconds, if images are paired by time."""
     color_topic: str = ""
     """Topic of the colour images in a ROS bag; empty = detected from the messages."""
     depth_topic: str = ""

@@ -2,7 +2,7 @@
 
 Masks: a folder with one image per frame, non-zero = ignore. Poses are used as they are, and no frame is tracked:
 
-TUM text                 timestamp tx ty tz qx qy qz qw             camera to world; frames are found by their times
+TUM text                 timestamp tx ty tz qx qy qz qw [id]        camera to world; frames are found by their times
 KITTI text               12 or 16 numbers, a matrix by rows         camera to world; one line per frame
 images.txt of COLMAP     number qw qx qy qz tx ty tz camera name    world to camera; frames are found by their names
 transforms.json          frames with file_path, transform_matrix    nerfstudio; frames are found by their names
@@ -12,7 +12,7 @@ Cameras look along z, with x to the right and y down; transforms.json has its ow
 """
 
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,8 +105,8 @@ class Masked(Subset):
         return np.asarray(chosen, np.bool_)
 
 
-TUM_WORDS, COLMAP_WORDS, MATRIX_WORDS = 8, 10, (12, 16)
-FORMATS = "give TUM or KITTI text, images.txt of COLMAP, transforms.json, or a folder with one matrix per frame"
+TUM_WORDS, COLMAP_WORDS, MATRIX_WORDS = (8, 9), 10, (12, 16)
+FORMATS = "give TUM or KITTI text, with no more columns, COLMAP's images.txt, transforms.json, or a folder of matrices"
 
 GivenPoses = Trajectory | list[Matrix | None] | dict[str, Matrix]
 """Poses by time; for each frame in order, None = it has none; or by the name of the image file, without folder and
@@ -125,15 +125,15 @@ def read_given_poses(path: Path) -> GivenPoses:
         return [checked_pose(str(file), read_matrix(file)) for file in paths]
     if path.suffix.lower() == ".json":
         return _named_poses(path)
-    _, words = next(read_lines(path), (0, []))
-    if len(words) == TUM_WORDS:
+    words = next((words for _, words in read_lines(path) if _is_number(words[0])), list[str]())
+    if (count := len(words)) in TUM_WORDS:
         return read_poses(path)
-    if len(words) in MATRIX_WORDS:
+    if count in MATRIX_WORDS:
         rows = ((f"{path}:{line}", parse_any_numbers(path, line, words)) for line, words in read_lines(path))
         return [checked_pose(where, to_matrix(where, values)) for where, values in rows]
-    if len(words) >= COLMAP_WORDS and not _is_number(words[COLMAP_WORDS - 1]):
+    if count >= COLMAP_WORDS and not _is_number(words[COLMAP_WORDS - 1]):
         return _colmap_poses(path)
-    found = f"a line of {len(words)} values" if words else "no poses"
+    found = f"a line of {count} values" if words else "no poses"
     raise SourceError(f"{path}: poses of an unknown format ({found}); {FORMATS}")
 
 
@@ -145,13 +145,13 @@ def _colmap_poses(path: Path) -> dict[str, Matrix]:
             continue
         qw, qx, qy, qz, x, y, z = parse_numbers(path, line, words[1 : COLMAP_WORDS - 2])
         T_camera_world = rigid_transform(f"{path}:{line}", [x, y, z], [qw, qx, qy, qz])
-        poses[Path(" ".join(words[COLMAP_WORDS - 1 :])).stem] = se3.inverse(T_camera_world)
+        poses[PureWindowsPath(" ".join(words[COLMAP_WORDS - 1 :])).stem] = se3.inverse(T_camera_world)
     return poses
 
 
 def _named_poses(path: Path) -> dict[str, Matrix]:
     frames = read_frames(path, read_json_object(path))
-    poses = {Path(frame["file_path"]).stem: T for frame in frames if (T := read_pose(path, frame)) is not None}
+    poses = {PureWindowsPath(f["file_path"]).stem: T for f in frames if (T := read_pose(path, f)) is not None}
     if not poses:
         raise SourceError(f'{path}: no frame has a "transform_matrix"; {FORMATS}')
     return poses

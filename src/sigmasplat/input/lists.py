@@ -1,17 +1,20 @@
 """Read text files of numbers and poses, and pair times; each problem becomes a SourceError that names file and line."""
 
+import re
 from collections.abc import Iterable, Iterator, Mapping
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
+from sigmasplat.config import InputConfig
 from sigmasplat.data import se3
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SourceError
 from sigmasplat.files.reading import exists, read_text
+from sigmasplat.input.calibration import Origin
 from sigmasplat.types import Matrix
 
 MOST_MATRIX_BYTES = 1 << 16
@@ -86,16 +89,23 @@ def read_pose_files(timed: Iterable[tuple[float, Path]]) -> Trajectory | None:
 
 
 def read_poses(path: Path, may_be_empty: bool = False) -> Trajectory:
-    """Read TUM text, a pose "t tx ty tz qx qy qz qw" per line. Raises SourceError naming the line whose pose is not
-    finite or not rigid, or if there is no pose, unless it `may_be_empty`."""
+    """Read TUM's lines "t tx ty tz qx qy qz qw"; a whole number before or after is an id, a header may put qw first.
+    Raises SourceError naming a line that is not finite or not rigid, or if there is none, unless it `may_be_empty`."""
     lines, rows = list(read_lines(path)), list[list[float]]()
+    lines = lines[not re.match(r"[-+.\d]|nan|inf", lines[0][1][0], re.IGNORECASE) :] if lines else []  # no header
+    for id_column, first in ((8, 0), (0, 1)):
+        if all(len(words) == 9 and words[id_column].isdecimal() for _, words in lines):
+            lines = [(line, words[first : first + 8]) for line, words in lines]
     for line, words in lines:
         if len(words) != 8:
-            raise SourceError(f"{path}:{line}: expected 't tx ty tz qx qy qz qw', found {len(words)} values")
+            remedy = "; remove the columns that are none of these" * (len(words) > 8)
+            raise SourceError(f"{path}:{line}: expected 't tx ty tz qx qy qz qw', found {len(words)} values{remedy}")
         rows.append(parse_numbers(path, line, words))
     if not rows and not may_be_empty:
         raise SourceError(f"{path}: holds no poses; delete it or add poses")
     table, T = np.array(rows, np.float64).reshape(-1, 8), np.tile(np.eye(4), (len(rows), 1, 1))
+    if re.match(r"\W*[a-z].*\bq\w*w\b.*\bq\w*x\b", read_text(path).partition("\n")[0], re.IGNORECASE):
+        table = table[:, [0, 1, 2, 3, 5, 6, 7, 4]]
     for (line, _), length in zip(lines, np.linalg.norm(table[:, 4:], axis=1), strict=True):
         _refuse_unless_unit(f"{path}:{line}", length)
     T[:, :3, :3], T[:, :3, 3] = se3.rotation_from_quaternion(table[:, [7, 4, 5, 6]]), table[:, 1:4]
@@ -117,6 +127,28 @@ def read_lines(path: Path) -> Iterator[tuple[int, list[str]]]:
             yield number, words
 
 
+def read_listed(path: Path, form: str) -> Iterator[tuple[list[float], list[Path]]]:
+    """Yield times and image files of each line; form: "time path", or "time path time path". Raises SourceError without
+    lines, or naming one of another form."""
+    lines = [(i, line.strip(" ,\t")) for i, line in enumerate(read_text(path).split("\n"), 1)]
+    if not (lines := [(i, line) for i, line in lines if line and not line.startswith("#")]):
+        raise SourceError(f"{path}: lists no images")
+    pattern = r"([^\s,]+)[\s,]+(\S.*?)" + r"[\s,]+([-+.\deE]+)[\s,]+(\S.*?)" * (form.count("path") - 1)
+    for i, line in lines:
+        if not (found := re.fullmatch(pattern, line)):
+            raise SourceError(f"{path}:{i}: expected {form!r}, found {line[:60]!r}")
+        names = [listed_file(path.parent, name) for name in found.groups()[1::2]]
+        yield parse_numbers(path, i, list(found.groups()[::2])), names
+
+
+def listed_file(folder: Path, written: str) -> Path:
+    """Return the file that a list in a folder names: as written, else without a comment, with "\\" as a separator, and
+    by the last two parts of an absolute path, which was another machine's."""
+    name = PureWindowsPath(re.sub(r"\s+#.*", "", written).strip("\"'"))
+    tries = folder / written, folder / name.as_posix(), folder.joinpath(*name.parts[-2 if name.anchor else 0 :])
+    return next((path for path in tries if path.is_file()), tries[1])
+
+
 def parse_any_numbers(path: Path, line: int, words: list[str]) -> list[float]:
     """Read numbers, which may be infinite or nan. Raises SourceError naming file and line."""
     try:
@@ -135,8 +167,7 @@ def parse_numbers(path: Path, line: int, words: list[str]) -> list[float]:
 
 Times = NDArray[np.float64]
 
-MAX_GAP_S = 0.02
-"""Largest time difference of a colour and a depth image of one camera at 30 Hz; TUM's own tool uses the same."""
+MAX_GAP_S = InputConfig.max_gap_s
 
 UNIT_RATIO = 200.0
 """Median steps of two lists that differ by this factor are in different units, such as s and ms."""
@@ -166,27 +197,60 @@ def associate(first_s: Times, second_s: Times, tolerance_s: float = MAX_GAP_S) -
     return np.array(pairs, np.intp).reshape(-1, 2)
 
 
-def pair_times(path: Path, times_s: Mapping[str, Times]) -> tuple[list[tuple[int, int]], list[int]]:
-    """Pair two kinds of images of a recording by time; return the index pairs by time, and the first images left alone.
+def pair_times(path: Path, times_s: Mapping[str, Times], settings: InputConfig) -> tuple[NDArray[np.intp], list[int]]:
+    """Pair two kinds of images of a recording by time; return index pairs [K, 2] by time, and first ones left alone.
 
-    times_s: of colour and depth, or left and right, by name, seconds [N] and [M]. Raises SourceError if their units
-    differ, or nothing pairs.
+    times_s: of colour and depth, or left and right, by name, seconds [N] and [M], the second without
+    `input.depth_delay_s`. Raises SourceError as `refuse_unpaired`.
     """
     first_s, second_s = times_s.values()
+    pairs = associate(first_s, second_s, settings.max_gap_s)
+    refuse_unpaired(path, times_s, len(pairs), settings)
+    return pairs, sorted({*range(len(first_s))} - {*pairs[:, 0].tolist()})
+
+
+def time_origins(settings: InputConfig, how: str, origin: str, option: str = "") -> dict[str, Origin]:
+    """Return where the pairs of a recording come from: `how` they were made, from which times."""
+    delay = f", depth stamped {settings.depth_delay_s:g} s late" * bool(settings.depth_delay_s)
+    return {"pairs": Origin(f"{how}, within {settings.max_gap_s:g} s{delay}", origin, option)}
+
+
+def refuse_unpaired(path: Path, times_s: Mapping[str, Times], pairs: int, settings: InputConfig) -> None:
+    """Raise SourceError if the units of times differ, or there are no pairs, or few because of a constant delay: it
+    names the delay and the settings that correct it. `times_s` as for `pair_times`."""
     refuse_other_units(path, times_s)
-    pairs = [(int(i), int(j)) for i, j in associate(first_s, second_s)]
-    if not pairs:
-        raise no_pairs(path, times_s)
-    paired = {i for i, _ in pairs}
-    return pairs, [i for i in range(len(first_s)) if i not in paired]
-
-
-def no_pairs(path: Path, times_s: Mapping[str, Times]) -> SourceError:
-    """Return the error for a recording in which no colour image has depth; `times_s` of colour and depth by name."""
+    first_s, second_s = times_s.values()
+    common = min(np.sum((a >= b.min()) & (a <= b.max())) for a, b in ((first_s, second_s), (second_s, first_s)))
+    if 2 * pairs > common:
+        return
+    delay_s, step_s = _delay_s(first_s, second_s, settings.max_gap_s)
+    if pairs and delay_s is None:
+        return
+    remedy = "are both from one recording?"
+    if delay_s is not None:
+        whole_s, gap_s = delay_s + settings.depth_delay_s, abs(delay_s) + step_s / 8
+        remedy += f" then depth is stamped {whole_s:.3f} s late: --set input.depth_delay_s={whole_s:.3f}"
+        remedy += f" (or pair them as they are: --set input.max_gap_s={gap_s:.3f})" * (abs(delay_s) < step_s / 2)
     spans = ", ".join(f"{name} {t.min():.3f} … {t.max():.3f} s" for name, t in times_s.items())
-    return SourceError(
-        f"no colour image of {path} has depth within {MAX_GAP_S:g} s ({spans}); are both from one recording?"
-    )
+    subject = f"only {pairs} colour images of {path} have" if pairs else f"no colour image of {path} has"
+    raise SourceError(f"{subject} depth within {settings.max_gap_s:g} s ({spans}); {remedy}")
+
+
+def _delay_s(first_s: Times, second_s: Times, most_s: float) -> tuple[float | None, float]:
+    """Return by how much nearly all of the second times are later, None if by no constant, and their step, seconds."""
+    few, many = sorted((first_s, second_s), key=len)
+    step_s = max(1e-9, min(float(np.median(np.abs(np.diff(t)))) if len(t) > 1 else 0.0 for t in (few, many)))
+
+    def rest_s(shift_s: float) -> Times:
+        gaps_s = nearest_gaps_s(few + shift_s, many)
+        return gaps_s[np.abs(gaps_s) < min(step_s / 8, most_s)]
+
+    shifts = many - few[len(few) // 2]  # clocks may differ by years: also the first to the first, the last to the last
+    shifts = sorted([*sorted(shifts, key=abs)[:100], many[0] - few[0], many[-1] - few[-1]], key=abs)
+    best = max(shifts, key=lambda s: len(rest_s(s)) / (1 + 0.02 * abs(s) / step_s + (abs(s) > step_s)))
+    if len(rest_s(best)) <= max(2, 0.8 * len(few)):
+        return None, step_s
+    return float(best + np.median(rest_s(best))) * (1 if many is second_s else -1), step_s
 
 
 def refuse_other_units(path: Path, times_s: Mapping[str, Times]) -> None:
@@ -199,8 +263,8 @@ def refuse_other_units(path: Path, times_s: Mapping[str, Times]) -> None:
 
 
 def nearest_gaps_s(first_s: Times, second_s: Times) -> Times:
-    """Return the time from each of the first times to the nearest of the second, seconds [N]."""
-    return np.asarray(cKDTree(second_s[:, None]).query(first_s[:, None])[0])
+    """Return by how much the nearest of the second times is later than each of the first times, seconds [N]."""
+    return np.asarray(second_s[cKDTree(second_s[:, None]).query(first_s[:, None])[1]] - first_s)
 
 
 def _near_pairs(first_s: Times, second_s: Times, tolerance_s: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

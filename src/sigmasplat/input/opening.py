@@ -3,8 +3,9 @@ no depth (video, photos, stereo pairs) are recognised too."""
 
 import importlib
 import os
+import sqlite3
 from collections.abc import Iterator
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, closing, suppress
 from dataclasses import fields, replace
 from itertools import islice
 from pathlib import Path
@@ -14,7 +15,7 @@ from sigmasplat.config import InputConfig
 from sigmasplat.data.camera_errors import CameraErrors
 from sigmasplat.errors import ConfigError, SourceError, nearest
 from sigmasplat.files.pictures import open_image
-from sigmasplat.files.reading import guarded
+from sigmasplat.files.reading import guarded, open_regular
 from sigmasplat.input.given import Corrected, Masked, Posed
 from sigmasplat.input.images import COLOR_ENDINGS
 from sigmasplat.input.source import Source, Subset
@@ -155,6 +156,16 @@ def _sure_format(path: str | Path) -> SourceFormat | None:
     return known if known is not None and known.priority >= 0 else None
 
 
+def sqlite_tables(path: Path) -> set[str]:
+    """Return the names of the tables of an SQLite file; empty if it is damaged or another file."""
+    with open_regular(path) as file:
+        found = file.read(15) == b"SQLite format 3"
+    place = f"{path.resolve().as_uri()}?mode=ro&immutable=1" if found else ":memory:"
+    with suppress(sqlite3.Error), closing(sqlite3.connect(place, uri=True)) as database:
+        return {name for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+    return set()
+
+
 def _unknown_format(path: Path) -> SourceError:
     """Return the error for a path that no format recognises: missing, of several sequences, without depth, unknown."""
     if not path.exists():  # a loop of links, or a name that is too long, was refused before
@@ -171,6 +182,12 @@ def _unknown_format(path: Path) -> SourceError:
         return SourceError(
             f"{path} holds sequences: {names}; give the path of one of them, for example {path / inner[0][0]}"
         )
+    for file in sorted(path.glob("*.db")) if path.is_dir() else [path]:
+        if tables := sqlite_tables(file):
+            what = f"an SQLite file, but not a ROS 2 bag (tables {', '.join(sorted(tables)[:8])}); export its images"
+            if {"Node", "Data"} <= tables:
+                what = f"a database of RTAB-Map; export its images with: rtabmap-export --images {file}"
+            return SourceError(f"{file} is {what}, then name their folders rgb and depth, and give what holds both")
     if problem := without_depth(path):
         return problem
     known_names = ", ".join(known.name for known in formats())

@@ -5,7 +5,7 @@ Intrinsics are in sensor_msgs/CameraInfo beside the images (camera_info). Camera
 /device_0/sensor_0/Depth_0/ (librealsense, ros_file_format.h): info/camera_info, tf/N, option/Depth_Units/value.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 
@@ -85,16 +85,19 @@ REGISTERED_NAMES = ("aligned_depth_to_color", "depth_registered", "depth_to_rgb"
 """Parts of topic names for depth registered to colour (RealSense; OpenNI, Kinect; Azure Kinect)."""
 NOT_DEPTH_NAMES = ("infra", "/ir/", "confidence")
 """Parts of topic names for 16-bit images that are not depth."""
+NOT_GRAY_NAMES = ("confidence", "mask", "label", "segment", "semantic", "disparity", "depth")
+"""Parts of topic names for 8-bit images that no camera took."""
 
 
 @dataclass(frozen=True)
 class ImageTopic:
-    """A topic of images: their kind, optical frame, and (width, height) of the first image."""
+    """A topic of images: kind, optical frame, (width, height) and encoding of the first image."""
 
     name: str
     kind: ImageKind
     frame: str
     size: tuple[int, int]
+    encoding: str
 
     @property
     def base(self) -> str:
@@ -113,28 +116,31 @@ class ImageTopic:
 
 
 def color_topic(bag: Bag, requested: str) -> ImageTopic:
-    """Return the requested topic, or the only one with colour images. Raises SourceError if it is ambiguous."""
+    """Return the requested topic, else the only one with colour or gray images. Raises SourceError as `depth_topic`."""
     found = [topic_by_name(bag, requested)] if requested else image_topics(bag, "colour")
+    found = found or image_topics(bag, "gray", NOT_GRAY_NAMES)
+    for i, t in enumerate(found):
+        if t.kind == "gray" or (t.encoding.startswith(("16UC1", "mono16")) and "depth" not in t.name.lower()):
+            found[i] = replace(t, kind="colour")
     named = [topic for topic in found if any(word in topic.name.lower() for word in ("color", "rgb"))]
     return _one_camera(bag, "colour", named or found, "color")
 
 
-def depth_topic(bag: Bag, requested: str) -> ImageTopic:
-    """Return the requested topic, or the only one with depth; depth registered to colour is preferred.
+def depth_topic(bag: Bag, requested: str, color: ImageTopic) -> ImageTopic:
+    """Return the requested topic, or the only one with depth, not `color`; depth registered to colour is preferred.
 
     Raises SourceError if there is no such topic or more than one.
     """
     if requested:
         return _one_camera(bag, "depth", [topic_by_name(bag, requested)], "depth")
-    topics = image_topics(bag, "depth")
-    found = [topic for topic in topics if not any(word in topic.name.lower() for word in NOT_DEPTH_NAMES)]
+    found = [topic for topic in image_topics(bag, "depth", NOT_DEPTH_NAMES) if topic.name != color.name]
     return _one_camera(bag, "depth", [topic for topic in found if topic.registered] or found, "depth")
 
 
-def image_topics(bag: Bag, kind: ImageKind) -> list[ImageTopic]:
-    """Return the topics whose first message is of this kind. Raises SourceError if the bag is damaged."""
+def image_topics(bag: Bag, kind: ImageKind, other_names: Sequence[str] = ()) -> list[ImageTopic]:
+    """Return the topics whose first message is of this kind, without names that contain one of `other_names`."""
     found = [_described(bag, topic.name) for topic in bag.topics_of_type(RAW, COMPRESSED)]
-    return [topic for topic in found if topic.kind == kind]
+    return [t for t in found if t.kind == kind and not any(word in t.name.lower() for word in other_names)]
 
 
 def topic_by_name(bag: Bag, name: str) -> ImageTopic:
@@ -150,16 +156,19 @@ def topic_by_name(bag: Bag, name: str) -> ImageTopic:
 
 def _described(bag: Bag, name: str) -> ImageTopic:
     message = bag.first_message(name)
-    size = message_size(bag.path / name.lstrip("/"), message)
-    return ImageTopic(name, image_kind(message), message.header.frame_id.lstrip("/"), size)
+    size, (kind, encoding) = message_size(bag.path / name.lstrip("/"), message), image_kind(message)
+    return ImageTopic(name, kind, message.header.frame_id.lstrip("/"), size, encoding)
 
 
 def _one_camera(bag: Bag, what: str, topics: list[ImageTopic], option: str) -> ImageTopic:
     """Return the topic of the only camera: rectified before raw, uncompressed before compressed."""
     if not topics or any(topic.kind != what for topic in topics):
+        images = topics or [_described(bag, topic.name) for topic in bag.topics_of_type(RAW, COMPRESSED)]
+        stored = "".join(f"; {image.name} is encoded as {image.encoding}" for image in images[:4])
         raise SourceError(
             f"{bag.path}: no {what} images in {topics[0].name if topics else 'any topic'}; "
-            f"the bag holds {list_topics(bag.topics.values())}"
+            f"the bag holds {list_topics(bag.topics.values())}{stored}; record colour as rgb8, mono8 or JPEG and depth "
+            f"as 16UC1 or 32FC1, or choose another topic: --{option}-topic NAME"
         )
     cameras = sorted({topic.camera for topic in topics})
     if len(cameras) > 1:

@@ -23,9 +23,11 @@ from sigmasplat.api import (
     image_size,
     import_optional,
     open_regular,
+    opencv,
     read_color,
     read_values,
     refuse_special,
+    sqlite_tables,
     without_nan,
 )
 
@@ -151,14 +153,15 @@ class Bag:
 
 
 def is_bag(path: Path) -> bool:
-    """Return whether a path is a ROS bag: a file by its first bytes, a folder by its metadata.yaml."""
+    """Return whether a path is a ROS bag: a file by its first bytes and tables, a folder by its metadata.yaml."""
     if path.is_dir():
         metadata = path / METADATA
         if not metadata.is_file():
             return False
         with open_regular(metadata) as file:
             return b"rosbag2_bagfile_information" in file.read(4096)
-    return path.is_file() and _magic(path).startswith((ROS1_MAGIC, MCAP_MAGIC, SQLITE_MAGIC))
+    known = path.is_file() and _magic(path).startswith((ROS1_MAGIC, MCAP_MAGIC, SQLITE_MAGIC))
+    return known and (not (tables := sqlite_tables(path)) or {"topics", "messages"} <= tables)
 
 
 def list_topics(topics: Iterable[Topic], most: int = 12) -> str:
@@ -173,25 +176,29 @@ def _magic(path: Path) -> bytes:
 
 
 RAW, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
-ImageKind = Literal["colour", "depth", ""]
+ImageKind = Literal["colour", "gray", "depth", ""]
 
-COLOR_ORDER = {
-    **dict.fromkeys(("rgb8", "rgba8"), (0, 1, 2)),
-    **dict.fromkeys(("bgr8", "8UC3", "bgra8", "8UC4"), (2, 1, 0)),
+COLOR_FORMS: dict[str, tuple[int, Sequence[int] | str]] = {
+    **{"rgb8": (3, (0, 1, 2)), "rgba8": (4, (0, 1, 2)), "mono8": (1, (0, 0, 0)), "8UC1": (1, (0, 0, 0))},
+    **{name: (3 + (name in ("bgra8", "8UC4")), (2, 1, 0)) for name in ("bgr8", "8UC3", "bgra8", "8UC4")},
+    **{name: (2, "COLOR_YUV2RGB_UYVY") for name in ("yuv422", "uyvy")},
+    **{name: (2, "COLOR_YUV2RGB_YUY2") for name in ("yuv422_yuy2", "yuyv")},
+    **{f"bayer_{order}8": (1, f"COLOR_Bayer{order.upper()}2RGB") for order in ("rggb", "bggr", "gbrg", "grbg")},
 }
-"""Positions of red, green and blue in a pixel."""
+"""Channels of an image, and the positions of red, green and blue in a pixel, or OpenCV's conversion. Images of 16 bits,
+such as rgb16, are read as those of 8."""
 DEPTH_TYPE = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 HEADER_BYTES = 12
 
 
-def image_kind(message: Message) -> ImageKind:
-    """Return the kind of an image message; "" if it is neither colour nor depth, such as infrared."""
-    if hasattr(message, "encoding"):
-        return "colour" if message.encoding in COLOR_ORDER else "depth" if message.encoding in DEPTH_TYPE else ""
-    text = message.format
-    if "compressedDepth" in text or text.startswith(("16UC1", "mono16")):
-        return "depth"
-    return "" if text.startswith(("mono8", "8UC1")) else "colour"
+def image_kind(message: Message) -> tuple[ImageKind, str]:
+    """Return the kind of an image message, "" if it cannot be read, and how its pixels are stored, in words of ROS."""
+    raw = hasattr(message, "encoding")
+    text = str(message.encoding if raw else message.format)
+    if "compressedDepth" in text or text.startswith(tuple(DEPTH_TYPE)):
+        return "depth", text
+    known: ImageKind = "gray" if text.startswith(("mono8", "8UC1")) else "colour"
+    return known if not raw or text.replace("16", "8") in COLOR_FORMS else "", text
 
 
 def message_size(path: Path, message: Message) -> tuple[int, int]:
@@ -207,10 +214,14 @@ def decode_color_message(path: Path, message: Message) -> NDArray[np.uint8]:
     """Return 8-bit RGB [H, W, 3]. Raises SourceError naming `path` if the message is damaged or not colour."""
     if not hasattr(message, "encoding"):
         return read_color(path, message.data.tobytes())
-    if message.encoding not in COLOR_ORDER:
-        raise _encoding(path, "colour", message.encoding, COLOR_ORDER)
-    pixels = _pixels(path, message, "u1", 4 if message.encoding in ("rgba8", "bgra8", "8UC4") else 3)
-    return np.ascontiguousarray(pixels[..., COLOR_ORDER[message.encoding]])
+    wide, name = "16" in message.encoding, message.encoding.replace("16", "8")
+    if name not in COLOR_FORMS:
+        raise _encoding(path, "colour", message.encoding, COLOR_FORMS)
+    channels, order = COLOR_FORMS[name]
+    pixels = (_pixels(path, message, "u2" if wide else "u1", channels) >> (8 * wide)).astype(np.uint8)
+    if isinstance(order, str):
+        return np.asarray(opencv().cvtColor(pixels, getattr(opencv(), order)), np.uint8)
+    return np.ascontiguousarray(pixels[..., order])
 
 
 def decode_depth_message(path: Path, message: Message, units_per_metre: float) -> NDArray[np.float32]:

@@ -31,6 +31,7 @@ from sigmasplat.api import (
     folder_source,
     json_number,
     list_images,
+    listed_file,
     natural_key,
     read_frames,
     read_json_object,
@@ -83,7 +84,7 @@ def _open(folder: Path, path: Path, fields: Fields, settings: InputConfig) -> Re
 
 def _files(folder: Path, frame: Fields) -> tuple[Path, Path]:
     """Return the colour and the depth file of a frame; instant-ngp omits the file ending of colour."""
-    color, depth = folder / frame["file_path"], folder / frame[DEPTH]
+    color, depth = (listed_file(folder, frame[key]) for key in ("file_path", DEPTH))
     bare = not color.suffix and not color.is_file()
     return (color.with_suffix(".png") if bare else color), depth
 

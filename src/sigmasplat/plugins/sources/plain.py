@@ -31,7 +31,6 @@ from sigmasplat.api import (
     DEPTH_ENDINGS,
     DEPTH_FOLDERS,
     FRAMES_PER_SECOND,
-    MAX_GAP_S,
     MM_PER_METRE,
     NAMED,
     Calibration,
@@ -62,6 +61,7 @@ from sigmasplat.api import (
     read_groundtruth,
     read_json_object,
     read_lines,
+    time_origins,
     times_of_names,
     to_matrix,
     without_depth,
@@ -78,7 +78,7 @@ def open_plain(path: str, settings: InputConfig) -> RecordedSource:
     if depth_folder is None and (problem := without_depth(folder)):
         raise problem
     colors = list_images(first_subfolder(folder, COLOR_FOLDERS), COLOR_ENDINGS)
-    images, skipped, origins = _pairs(folder, colors, list_images(depth_folder, DEPTH_ENDINGS))
+    images, skipped, origins = _pairs(folder, colors, list_images(depth_folder, DEPTH_ENDINGS), settings)
     truth = read_groundtruth(folder)
     return folder_source(folder, settings, images, None, MM_PER_METRE, truth, skipped, origins=origins)
 
@@ -87,12 +87,12 @@ Found = tuple[list[ImagePair], list[str], dict[str, Origin]]
 """Pairs of images, why others are left out, and the origins of times and pairs."""
 
 
-def _pairs(folder: Path, colors: list[Path], depths: list[Path]) -> Found:
+def _pairs(folder: Path, colors: list[Path], depths: list[Path], settings: InputConfig) -> Found:
     """Pair images by the times in their names, else by name, by number, or by order if names do no more than count."""
     (color_s, read), (depth_s, depth_read) = times_of_names(colors), times_of_names(depths)
     timed = [read.origin, depth_read.origin].count(NAMED)
     if timed == 2:
-        return _timed_pairs(folder, colors, depths, color_s, depth_s)
+        return _timed_pairs(folder, colors, depths, settings, color_s, depth_s)
     found, skipped, how = list(zip(colors, depths, strict=False)), list[str](), Origin("by order", ASSUMED, REMEDY)
     by_name = [{path.stem: path for path in paths} for paths in (colors, depths)]
     by_number = [{str(n): path for n, path in index_by_number(paths).items()} for paths in (colors, depths)]
@@ -114,14 +114,16 @@ def _pairs(folder: Path, colors: list[Path], depths: list[Path]) -> Found:
     return images, skipped, {"times": times, "pairs": how}
 
 
-def _timed_pairs(folder: Path, colors: list[Path], depths: list[Path], *times_s: NDArray[np.float64]) -> Found:
-    color_s, depth_s = times_s
-    pairs, alone = pair_times(folder, {"colour": color_s, "depth": depth_s})
+def _timed_pairs(
+    folder: Path, colors: list[Path], depths: list[Path], settings: InputConfig, *times_s: NDArray[np.float64]
+) -> Found:
+    color_s, depth_s = times_s[0], times_s[1] - settings.depth_delay_s
+    pairs, alone = pair_times(folder, {"colour": color_s, "depth": depth_s}, settings)
     late_s = {(i, j): float(depth_s[j] - color_s[i]) for i, j in pairs}
     images = [ImagePair(float(color_s[i]), colors[i], depths[j], depth_late_s=s) for (i, j), s in late_s.items()]
     times = Origin(f"{color_s.min():.3f} … {color_s.max():.3f} s", NAMED)
-    origins = {"times": times, "pairs": Origin(f"by time, within {MAX_GAP_S:g} s", NAMED)}
-    return images, [f"{colors[i]}: no depth within {MAX_GAP_S:g} s" for i in alone], origins
+    origins = {"times": times} | time_origins(settings, "by time", NAMED)
+    return images, [f"{colors[i]}: no depth within {settings.max_gap_s:g} s" for i in alone], origins
 
 
 INTRINSIC_NAMES = ("intrinsic.json", "intrinsics.json", "camera_intrinsic.json", "camera_intrinsics.json")
@@ -143,10 +145,10 @@ def open_redwood(path: str, settings: InputConfig) -> RecordedSource:
     depths = list_images(folder / "depth", DEPTH_ENDINGS)
     if colors and depths and all(_TIMED.fullmatch(path.stem) for path in colors + depths):
         stamps = [np.array([int(p.stem.split("-")[1]) * 1e-6 for p in paths]) for paths in (colors, depths)]
-        images, skipped, origins = _timed_pairs(folder, colors, depths, *stamps)
+        images, skipped, origins = _timed_pairs(folder, colors, depths, settings, *stamps)
         images = [replace(i, timestamp_s=i.timestamp_s + i.depth_late_s) for i in images]  # poses are those of depth
     elif NAMED in (times_of_names(colors)[1].origin, times_of_names(depths)[1].origin):
-        images, skipped, origins = _pairs(folder, colors, depths)
+        images, skipped, origins = _pairs(folder, colors, depths, settings)
     else:
         names = f"{'|'.join(COLOR_FOLDERS)}/*.jpg", "depth/*.png"
         numbered, skipped = numbered_pairs(folder, index_by_number(colors), index_by_number(depths), *names, rate)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.api import (
-    MAX_GAP_S,
+    ASSUMED,
     Accelerometer,
     Gyroscope,
     ImagePair,
@@ -28,8 +28,8 @@ from sigmasplat.api import (
     accelerometer_from_samples,
     associate,
     gyroscope_from_samples,
-    no_pairs,
-    refuse_other_units,
+    refuse_unpaired,
+    time_origins,
 )
 from sigmasplat.plugins.sources.bag_cameras import (
     ImageTopic,
@@ -137,16 +137,16 @@ class BagImagePair(ImagePair):
 def open_bag(place: str, settings: InputConfig) -> RecordedSource:
     """Open a bag. Raises SourceError if it is damaged, its topics are ambiguous, or its cameras are unknown."""
     bag = Bag(Path(place))
-    color, depth = color_topic(bag, settings.color_topic), depth_topic(bag, settings.depth_topic)
+    color = color_topic(bag, settings.color_topic)
+    depth = depth_topic(bag, settings.depth_topic, color)
     calibration, topics = read_bag_calibration(bag, color, depth, settings), (color.name, depth.name)
     found = bag.index(*topics)
     entries = found[color.name], found[depth.name]
-    pairs, recorded_time = _paired(entries)
+    pairs, recorded_time = _paired(entries, settings)
     color_s, depth_s = (_times_s(part, recorded_time) for part in entries)
-    refuse_other_units(bag.path, {color.name: color_s, depth.name: depth_s})
-    if not len(pairs):
-        raise no_pairs(bag.path, {name: _times_s(found[name], True) for name in topics})
     colors, depths = _message_paths(bag, color.name, color_s), _message_paths(bag, depth.name, depth_s)
+    depth_s = depth_s - settings.depth_delay_s
+    refuse_unpaired(bag.path, {color.name: color_s, depth.name: depth_s}, len(pairs), settings)
     known = 0.0 if recorded_time else 1.0  # how long messages travel says nothing about the images
     times = [(i, j, float(color_s[i]), known * float(depth_s[j] - color_s[i])) for i, j in pairs]
     images = [
@@ -154,14 +154,16 @@ def open_bag(place: str, settings: InputConfig) -> RecordedSource:
         for i, j, t, late in times
     ]
     alone = sorted(set(range(len(colors))) - set(pairs[:, 0].tolist()))
-    skipped = [f"{colors[i]}: no depth within {MAX_GAP_S:g} s" for i in alone]
+    skipped = [f"{colors[i]}: no depth within {settings.max_gap_s:g} s" for i in alone]
+    clock = ("recording time", ASSUMED, "header times") if recorded_time else ("header time", "read from the bag")
     gyroscope, accelerometer = read_bag_imu(bag, color, color_s)
     return RecordedSource(
-        bag.path.resolve().stem, images, calibration, settings, None, skipped, None, gyroscope, accelerometer
-    )
+        bag.path.resolve().stem, images, calibration, settings, None, skipped, None, gyroscope, accelerometer,
+        origins=time_origins(settings, f"by {clock[0]}", *clock[1:]),
+    )  # fmt: skip
 
 
-def _paired(entries: tuple[Sequence[Entry], Sequence[Entry]]) -> tuple[NDArray[np.intp], bool]:
+def _paired(entries: tuple[Sequence[Entry], Sequence[Entry]], settings: InputConfig) -> tuple[NDArray[np.intp], bool]:
     """Pair colour with depth by header time, or by recording time if that finds more pairs.
 
     Some drivers leave the headers empty, or use a different clock for each sensor.
@@ -171,7 +173,7 @@ def _paired(entries: tuple[Sequence[Entry], Sequence[Entry]]) -> tuple[NDArray[n
     found = []
     for recorded in clocks:
         color_s, depth_s = (_times_s(part, recorded) for part in entries)
-        found.append((associate(color_s, depth_s), recorded))
+        found.append((associate(color_s, depth_s - settings.depth_delay_s, settings.max_gap_s), recorded))
     return max(found, key=lambda answer: len(answer[0]))
 
 

@@ -88,7 +88,7 @@ def open_stereo(place: str, settings: InputConfig) -> StereoSource:
     """Open a folder of stereo pairs. Raises SourceError if lists, images, calibration or poses cannot be used."""
     folder = Path(place)
     (left_s, lefts), (right_s, rights) = (read_list(folder / name) for name in ("rgb.txt", "right.txt"))
-    indices, alone = pair_times(folder, {"left": left_s, "right": right_s})
+    indices, alone = pair_times(folder, {"left": left_s, "right": right_s - settings.depth_delay_s}, settings)
     skipped = [f"{lefts[i]}: no right image" for i in alone]
     pairs = [(float(left_s[i]), lefts[i], rights[j]) for i, j in indices]
     path = Path(settings.calibration or folder / "calibration.json")

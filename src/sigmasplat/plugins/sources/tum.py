@@ -32,8 +32,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from sigmasplat.api import (
+    ASSUMED,
     FRAMES_PER_SECOND,
-    MAX_GAP_S,
     TUM_UNITS_PER_METRE,
     UINT16_MAX,
     Calibration,
@@ -42,6 +42,7 @@ from sigmasplat.api import (
     Gyroscope,
     ImagePair,
     InputConfig,
+    Origin,
     RecordedSource,
     RunError,
     SourceError,
@@ -58,8 +59,10 @@ from sigmasplat.api import (
     published,
     read_groundtruth,
     read_lines,
+    read_listed,
     read_poses,
     se3,
+    time_origins,
 )
 
 MOTION_CAPTURE = 0.004, float(np.deg2rad(0.3))
@@ -80,19 +83,18 @@ def open_tum(
     camera_path: converts the recorded path to the camera's path, if another body was recorded.
     """
     folder = Path(path)
-    color_times_s, colors = read_list(folder / "rgb.txt")
-    depth_times_s, depths = _depth_list(folder)
-    pairs, alone = pair_times(folder, {"rgb.txt": color_times_s, "depth.txt": depth_times_s})
+    color_s, colors = read_list(folder / "rgb.txt")
+    depth_s, depths = _depth_list(folder)
+    depth_s -= settings.depth_delay_s
+    pairs, alone = pair_times(folder, {"rgb.txt": color_s, "depth.txt": depth_s}, settings)
     images = [
-        ImagePair(
-            float(color_times_s[i]), colors[i], depths[j], depth_late_s=float(depth_times_s[j] - color_times_s[i])
-        )
+        ImagePair(float(color_s[i]), colors[i], depths[j], depth_late_s=float(depth_s[j] - color_s[i]))
         for i, j in pairs
     ]
-    gaps_s = nearest_gaps_s(color_times_s, depth_times_s)
+    gaps_s = np.abs(nearest_gaps_s(color_s, depth_s))
     skipped = [
-        f"{colors[i]}: no depth within {MAX_GAP_S:g} s, nearest {gaps_s[i]:.3f} s away"
-        + " (used by another image)" * bool(gaps_s[i] < MAX_GAP_S)
+        f"{colors[i]}: no depth within {settings.max_gap_s:g} s, nearest {gaps_s[i]:.3f} s away"
+        + " (used by another image)" * bool(gaps_s[i] < settings.max_gap_s)
         for i in alone
     ]
     truth = read_groundtruth(folder)
@@ -100,33 +102,28 @@ def open_tum(
     known = camera or freiburg_calibration(folder)
     truth = replace(truth, error_rms=MOTION_CAPTURE) if truth and known else truth
     gyroscope = read_gyroscope(folder / "gyroscope.txt") if exists(folder / "gyroscope.txt") else None
-    return folder_source(folder, settings, images, known, TUM_UNITS_PER_METRE, truth, skipped, gyroscope=gyroscope)
+    return folder_source(
+        folder, settings, images, known, TUM_UNITS_PER_METRE, truth, skipped, gyroscope=gyroscope,
+        origins=time_origins(settings, "by time", "read from rgb.txt and depth.txt"),
+    )  # fmt: skip
 
 
 def _depth_list(folder: Path) -> tuple[NDArray[np.float64], list[Path]]:
-    path = folder / "depth.txt"
+    path, looked_for, remedy = folder / "depth.txt", "depth.txt", ""
     if path.is_file():
         times_s, paths = read_list(path)
         if any(p.is_file() for p in paths):
             return times_s, paths
-    looked_for = f"the {len(paths)} files of depth.txt" if path.is_file() else "depth.txt"
-    raise SourceError(
-        f"no depth images in {folder} (looked for {looked_for}); is this the RGB-only download? "
-        "see docs/data.md#without-depth"
-    )
+        looked_for = f"the {len(paths)} files of depth.txt, first {paths[0]}"
+        remedy = "correct its paths" if any((folder / "depth").glob("*.*")) else ""
+    remedy = remedy or "is this the RGB-only download? see docs/data.md#without-depth"
+    raise SourceError(f"no depth images in {folder} (looked for {looked_for}); {remedy}")
 
 
 def read_list(path: Path) -> tuple[NDArray[np.float64], list[Path]]:
     """Read "t path" lines: timestamps [N] seconds and image paths. Raises SourceError naming file and line."""
-    times, paths = [], []
-    for line, words in read_lines(path):
-        if len(words) < 2:
-            raise SourceError(f"{path}:{line}: expected 'timestamp path', found {' '.join(words)!r}")
-        times.append(parse_numbers(path, line, words[:1])[0])
-        paths.append(path.parent / " ".join(words[1:]))
-    if not paths:
-        raise SourceError(f"{path}: lists no images")
-    return np.array(times), paths
+    lines = list(read_listed(path, "timestamp path"))
+    return np.array([t for (t,), _ in lines]), [file for _, (file,) in lines]
 
 
 def read_gyroscope(path: Path) -> Gyroscope:
@@ -228,7 +225,7 @@ def open_icl_nuim(path: str, settings: InputConfig) -> RecordedSource:
         raise SourceError(
             f"{folder}: text depth is not supported; take the set's TUM-compatible PNGs (…_frei_png.tar.gz)"
         )
-    images = _listed_pairs(listed)
+    images, numbered = _listed_pairs(listed)
     mirrored = next(iter(sorted(folder.glob("*.gt.freiburg"))), None)
     rendered = mirrored is not None or "frei_png" in folder.resolve().name
     known = ICL_NUIM if rendered else freiburg_calibration(folder)
@@ -237,27 +234,26 @@ def open_icl_nuim(path: str, settings: InputConfig) -> RecordedSource:
         truth = Trajectory(truth.timestamps_s / FRAMES_PER_SECOND, MIRROR @ truth.T_world_camera @ MIRROR)
     if truth and known:
         truth = replace(truth, error_rms=(0.0, 0.0) if rendered else MOTION_CAPTURE)
-    source = folder_source(folder, settings, images, known, TUM_UNITS_PER_METRE, truth)
+    origins = {"pairs": Origin("by line", f"read from {listed.name}")}
+    if numbered:
+        origins["times"] = Origin(f"1/{FRAMES_PER_SECOND:g} s apart", ASSUMED, f"times in seconds in {listed.name}")
+    source = folder_source(folder, settings, images, known, TUM_UNITS_PER_METRE, truth, origins=origins)
     source.sensor = source.sensor or ("rendered" if rendered else None)
     return source
 
 
-def _listed_pairs(path: Path) -> list[ImagePair]:
-    """Read the list; the path with "depth" in it is the depth image."""
+def _listed_pairs(path: Path) -> tuple[list[ImagePair], bool]:
+    """Read the list, and whether it has frame numbers, not times; the path with "depth" in it is the depth image."""
     images = []
-    for line, words in read_lines(path):
-        if len(words) != 4 or ("depth" in words[1]) == ("depth" in words[3]):
-            raise SourceError(
-                f"{path}:{line}: expected 'time depth/image time rgb/image', found {' '.join(words)[:60]!r}"
-            )
-        times = parse_numbers(path, line, [words[0], words[2]])
-        color, depth = (3, 1) if "depth" in words[1] else (1, 3)
-        images.append(ImagePair(times[color // 2], path.parent / words[color], path.parent / words[depth]))
-    if not images:
-        raise SourceError(f"{path}: lists no images")
-    if all(image.timestamp_s.is_integer() for image in images):  # frame numbers, not seconds
+    for times, files in read_listed(path, "time depth/path time rgb/path"):
+        is_depth = ["depth" in "/".join(file.parts[-2:]) for file in files]
+        if sum(is_depth) != 1:
+            raise SourceError(f"{path}: expected 'depth' in one path of each line, found {files[0]} and {files[1]}")
+        color, depth = is_depth.index(False), is_depth.index(True)
+        images.append(ImagePair(times[color], files[color], files[depth]))
+    if numbered := all(image.timestamp_s.is_integer() for image in images):
         images = [ImagePair(i.timestamp_s / FRAMES_PER_SECOND, i.color, i.depth) for i in images]
-    return sorted(images, key=lambda image: image.timestamp_s)
+    return sorted(images, key=lambda image: image.timestamp_s), numbered
 
 
 def _has_lists(path: str) -> bool:
