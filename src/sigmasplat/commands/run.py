@@ -137,8 +137,8 @@ def _opened(
 ) -> tuple["Source", "Config"]:  # fmt: skip
     """Open the source, with warnings; return it with the settings for its scene, or for the earlier map."""
     from sigmasplat.graph.closer import lacks_weights
-    from sigmasplat.input.recorded import depth_warning
     from sigmasplat.plugins.checks.motion import time_warnings, times_of
+    from sigmasplat.plugins.checks.recording import first_look
     from sigmasplat.plugins.sources.live import LiveSource, recording_settings
     from sigmasplat.run.scene import open_scene
 
@@ -156,9 +156,11 @@ def _opened(
     elif record:
         raise ConfigError("--record is for a live camera only; this sequence is already a recording")
     else:
-        for warning in (depth_warning(source), *time_warnings(times_of(source))):
-            if warning:
-                screen.warn(warning)
+        found, warnings = first_look(source)
+        if found:
+            screen.say(f"{source.name}: {found}")
+        for warning in (*warnings, *time_warnings(times_of(source))):
+            screen.warn(warning)
     if config.input.poses:
         _say_of_scale(screen, asked, source, config)
     if source.registrable and not source.depth_registered:

@@ -152,6 +152,10 @@ class InputConfig(Section, name="input"):
     depth_scale: NotNegative = 0.0
     """Units of the depth images per metre; 0 = as recorded."""
 
+    depth_along: Literal["auto", "z", "ray"] = "auto"
+    """What a depth value is: z = depth along the optical axis, and no value is dropped; ray = distance along the ray of
+    the pixel, which is converted; auto = what planes in the images show, z if they show nothing. With auto and ray, a
+    largest value that many readings have, which stands for no reading, is dropped."""
     register_depth: Literal["auto", "on", "off"] = "auto"
     """Whether depth is registered to the pixels of the colour camera; auto = if the recording has a separate depth
     camera."""

@@ -70,6 +70,11 @@ class Camera:
         x, y = (u - self.cx) / self.fx, (v - self.cy) / self.fy
         return np.stack([x, y, np.ones_like(x)], -1).astype(np.float32)
 
+    def ray_lengths(self) -> NDArray[np.float32]:
+        """Return the length of each of the `rays`, [H, W]: distance along a ray divided by it is depth."""
+        x, y = (np.arange(self.width) - self.cx) / self.fx, (np.arange(self.height) - self.cy) / self.fy
+        return np.asarray(np.sqrt(1.0 + x * x + (y * y)[:, None]), np.float32)
+
 
 def _inside(pixels: NDArray[np.float64], count: int) -> NDArray[np.bool_]:
     """Return which of the coordinates are on an image with `count` pixels."""

@@ -261,6 +261,12 @@ def unlikely_camera(camera: Camera) -> str | None:
     if not 0.8 <= camera.fx / camera.fy <= 1.25:
         return f"fx = {camera.fx:g} and fy = {camera.fy:g} differ; pixels are usually square: check both"
     x, y = camera.cx - (camera.width - 1) / 2, camera.cy - (camera.height - 1) / 2
+    turned_x, turned_y = camera.cx - (camera.height - 1) / 2, camera.cy - (camera.width - 1) / 2
+    if max(abs(turned_x), abs(turned_y)) < 0.25 * max(abs(x), abs(y)) > 0.01 * camera.width:
+        return (
+            f"the principal point ({camera.cx:g}, {camera.cy:g}) fits an image of {camera.height}×{camera.width}, "
+            f"these are {camera.width}×{camera.height}; give the camera of the turned images: --fx, --fy, --cx, --cy"
+        )
     if abs(x) > CENTRED * camera.width or abs(y) > CENTRED * camera.height:
         return f"the principal point is ({x:+.0f}, {y:+.0f}) pixels from the image centre; check cx and cy"
     return None

@@ -18,6 +18,7 @@ from sigmasplat.data.images import resized_color
 from sigmasplat.data.trajectory import Trajectory, evenly_spaced
 from sigmasplat.errors import SourceError
 from sigmasplat.input.calibration import ASSUMED, MEASURED, Calibration, Origin, resolve_calibration
+from sigmasplat.input.depth_meaning import MOST_PIXELS, SAMPLES, meaning_of, thinned
 from sigmasplat.input.given import SAME_SHAPE
 from sigmasplat.input.images import FRAMES_PER_SECOND, color_origins, image_size, pair_images, read_color, read_depth
 from sigmasplat.input.imu import Accelerometer, Gyroscope
@@ -30,13 +31,14 @@ PLAUSIBLE_MEDIAN_M = (0.2, 15.0)
 KNOWN_UNITS_PER_METRE = {1000.0: "millimetres", 5000.0: "TUM's unit", 6553.5: "Replica's unit", 1.0: "metres"}
 
 
-def depth_warning(source: Source, samples: int = 5) -> str | None:
+def depth_warning(source: Source, samples: int = 5, read: Sequence[Frame] = ()) -> str | None:
     """Return a warning if the depth scale looks wrong, with the median and a suggestion; None if it is plausible.
 
     It is also None if the source computes depth in metres from a stereo pair, because streets are deeper than rooms.
-    The median is over all readings of `samples` frames spread evenly; unreadable frames are left out.
+    The median is over all readings of `samples` frames spread evenly, or of those that have been `read` already;
+    unreadable frames are left out.
     """
-    medians = list(_medians_m(source, evenly_spaced(len(source), samples)))
+    medians = list(_medians_m(source, evenly_spaced(len(source), samples), read))
     if medians and source.computed_depth:
         return None
     if not medians:
@@ -66,11 +68,11 @@ def refuse_without_depth(source: Source, samples: int = 5) -> None:
     )
 
 
-def _medians_m(source: Source, indices: Iterable[int]) -> Iterator[float]:
-    """Yield the median reading of each frame that is readable and not blank."""
-    for i in indices:
+def _medians_m(source: Source, indices: Iterable[int], read: Sequence[Frame] = ()) -> Iterator[float]:
+    """Yield the median reading of each frame that is readable and not blank: of those `read`, otherwise of indices."""
+    for i in read or indices:
         with suppress(SourceError):  # reported when the source is iterated
-            depth_m = source.depth_of(i)
+            depth_m = i.depth_m if isinstance(i, Frame) else source.depth_of(i)
             if (depth_m > 0).any():
                 yield float(np.median(depth_m[depth_m > 0]))
 
@@ -156,6 +158,8 @@ class RecordedSource(Source):
         if self.depth_units_per_metre is None:
             self.origins["depth unit"] = Origin("metres, as usual for floats", ASSUMED, "--depth-scale UNITS")
         self._refuse_other_clock()
+        if not (settings.predicted_depth or self.computed_depth):
+            self._look_at_depth(settings.depth_along)
         refuse_without_depth(self)
 
     def __len__(self) -> int:
@@ -233,6 +237,20 @@ class RecordedSource(Source):
             raise SourceError(f"{path}: gray of more than 8 bits, among 8-bit images or with NaN; convert it to 8 bits")
         gray = np.clip(recorded * (256.0 / self._white), 0.0, 255.0).astype(np.uint8)
         return np.repeat(gray[..., None], 3, axis=2)
+
+    def _look_at_depth(self, along: str) -> None:
+        """Find out from a few images what depth values mean, and read them so."""
+        found, images = self._rectified, list[NDArray[np.float32]]()
+        count = min(SAMPLES, max(3, MOST_PIXELS // int(np.prod(found.depth_size))))
+        for i in evenly_spaced(len(self), count if along != "z" else 0):
+            with suppress(SourceError):  # reported when the source is iterated
+                depth_m = self._images[i].read_depth(self._units) / self._float_units
+                if depth_m.shape[::-1] == found.depth_size:
+                    images.append(thinned(found.without_lens(depth_m)))
+        meaning = meaning_of(images, found.depth_camera, self._units, along)
+        found.beyond_m = meaning.beyond_m
+        found.ray_lengths = found.depth_camera.ray_lengths() if meaning.ray else None
+        self.origins, self.depth_doubts = meaning.origins | self.origins, meaning.doubts
 
     def _refuse_other_clock(self) -> None:
         """Raise SourceError before a run if the gyroscope measured at another time than the images were taken."""

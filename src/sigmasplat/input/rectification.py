@@ -163,6 +163,8 @@ class Rectification:
         """Prepare the remap tables. Raises SourceError if a camera is impossible, or depth's unknown but needed."""
         refuse_impossible_camera(name, calibration.camera)
         self.calibration = calibration
+        self.ray_lengths: NDArray[np.float32] | None = None  # if depth is stored along the ray
+        self.beyond_m = float("inf")  # from here on, a value is no reading
         lens = calibration.distortion if settings.undistort else None
         depth_lens = calibration.depth_distortion if settings.undistort else None
         depth_camera = self._depth_camera(name, settings)
@@ -193,10 +195,14 @@ class Rectification:
         return self._registration is not None
 
     @property
+    def depth_camera(self) -> Camera:
+        """Return the camera of recorded depth images, without its lens distortion."""
+        return self._registration.depth_camera if self._registration else self.calibration.camera
+
+    @property
     def depth_size(self) -> tuple[int, int]:
         """Return (width, height) that depth images must have."""
-        camera = self._registration.depth_camera if self._registration else self.calibration.camera
-        return camera.width, camera.height
+        return self.depth_camera.width, self.depth_camera.height
 
     def __call__(self, color: Image, depth_m: Image) -> tuple[Image, Image]:
         """Return colour [H, W, 3] and depth [H, W] of `camera` from the recorded ones."""
@@ -204,9 +210,16 @@ class Rectification:
 
     def depth(self, depth_m: Image) -> Image:
         """Return depth [H, W] of `camera` from recorded depth."""
-        if self._depth_lens:
-            depth_m = self._depth_lens.depth(depth_m)
+        depth_m = self.without_lens(depth_m)
+        if self.beyond_m < np.inf:
+            depth_m = np.where(depth_m < self.beyond_m, depth_m, np.float32(0.0))
+        if self.ray_lengths is not None:
+            depth_m = depth_m / self.ray_lengths
         return self._registration(depth_m) if self._registration else depth_m
+
+    def without_lens(self, depth_m: Image) -> Image:
+        """Return recorded depth without lens distortion, its values as they are."""
+        return self._depth_lens.depth(depth_m) if self._depth_lens else depth_m
 
 
 def check_image_sizes(

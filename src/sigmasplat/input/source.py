@@ -44,7 +44,7 @@ def read_ahead(items: Iterable[Item], length: int = 4) -> Iterator[Item]:
 
 FACTS = (
     "depth_units_per_metre", "depth_registered", "registrable", "computed_depth", "predicted_depth",
-    "scene_scale", "depth_noise_per_m", "sensor", "origins",
+    "scene_scale", "depth_noise_per_m", "sensor", "origins", "depth_doubts",
 )  # fmt: skip
 """What a source that wraps another one has in common with it."""
 
@@ -63,6 +63,7 @@ class Source(ABC):
     of depth, times z²; None if it is unknown (`config.scale.for_scene` uses both);
     sensor: the depth sensor (`config.input`), None if it is unknown;
     origins: where the values that decide the result come from, by name (`assumptions`);
+    depth_doubts: what the values of depth images seem to mean, if that is not depth in metres;
     live: whether frames come from a live camera: each only once, and their number is unknown (LiveSource);
     arrived_s: when the last frame arrived, by `time.perf_counter`, if frames do not wait for the consumer (Arrivals);
     dropped: number of frames that were dropped because the consumer was late.
@@ -89,6 +90,7 @@ class Source(ABC):
         self.strict = strict
         self.skipped: list[str] = []
         self.origins: dict[str, Origin] = {}
+        self.depth_doubts: list[str] = []
 
     @property
     def assumptions(self) -> list[str]:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
-from scipy import ndimage, signal
+from scipy import fft, ndimage
 
 from sigmasplat.api import Frame
 
@@ -112,13 +112,15 @@ def _correlations(strength: Plane, found: NDArray[np.bool_]) -> NDArray[np.float
     height, width = strength.shape
     y, x = np.nonzero(found)
     padded = np.pad(strength, REACH_PX)
-    sums = []
+    size = [fft.next_fast_len(n, real=True) for n in padded.shape]
+    spectrum, reach, sums = fft.rfft2(padded, size), 2 * REACH_PX + 1, []
     for magnification in MAGNIFICATIONS:
         column = np.rint((x - width / 2) * (1 + magnification) + width / 2).astype(np.intp)
         row = np.rint((y - height / 2) * (1 + magnification) + height / 2).astype(np.intp)
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
         moved = np.bincount(row[inside] * width + column[inside], minlength=height * width).reshape(height, width)
-        sums.append(signal.correlate(padded, moved.astype(np.float32), "valid", method="fft"))
+        product = spectrum * fft.rfft2(moved.astype(np.float32), size).conj()
+        sums.append(fft.irfft2(product, size)[:reach, :reach])
     return np.stack(sums).astype(np.float64)
 
 

@@ -202,17 +202,21 @@ def _correlation(first: Numbers, second: Numbers, lag: int) -> float:
 
 def motion_warnings(motion: Motion, first: int = 0) -> list[str]:
     """Return warnings about consecutive frames; `first` is the number of the first one in the recording."""
-    warnings = []
-    delay = motion.delay_frames()
-    if delay is not None:
-        seconds = abs(delay) * float(np.median(np.diff(motion.times_s)))
-        late, early = ("depth", "colour") if delay > 0 else ("colour", "depth")
-        warnings.append(
-            f"{late} is {seconds:.3f} s ({abs(delay):.1f} frames) behind {early}, judged by the motion of both; "
-            "`sigmasplat calibrate PATH` measures it, and a run corrects it; if neither finds it, subtract it from the "
-            f"times of {late}"
-        )
-    watch = MotionWatch()
+    late, watch = late_warning(motion), MotionWatch()
     for i, gray in enumerate(motion.gray):
         watch.add(first + i, gray)
-    return warnings + watch.warnings()
+    return [late] * bool(late) + watch.warnings()
+
+
+def late_warning(motion: Motion) -> str:
+    """Return a warning if depth is behind colour, or colour behind depth, by consecutive frames; otherwise ""."""
+    delay = motion.delay_frames()
+    if delay is None:
+        return ""
+    seconds = abs(delay) * float(np.median(np.diff(motion.times_s)))
+    late, early = ("depth", "colour") if delay > 0 else ("colour", "depth")
+    return (
+        f"{late} is {seconds:.3f} s ({abs(delay):.1f} frames) behind {early}, judged by the motion of both; "
+        "`sigmasplat calibrate PATH` measures it, and a run corrects it; if neither finds it, subtract it from the "
+        f"times of {late}"
+    )

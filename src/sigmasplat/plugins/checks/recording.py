@@ -1,6 +1,7 @@
 """Inspect a recording before a run: format, size, depth and poses; problems that degrade the map, and their fixes."""
 
-from collections.abc import Iterable, Iterator
+import time
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,12 +26,13 @@ from sigmasplat.api import (
     unlikely_camera,
 )
 from sigmasplat.plugins.checks.depth import EdgeAgreement, edge_agreement, overlay
-from sigmasplat.plugins.checks.motion import Motion, motion_warnings, rate, time_warnings, times_of
+from sigmasplat.plugins.checks.motion import Motion, late_warning, motion_warnings, rate, time_warnings, times_of
 from sigmasplat.plugins.outputs.drawing import colormap
 from sigmasplat.plugins.outputs.drawing.view_panels import ViewPanel, coloured, draw_view_strip
 from sigmasplat.plugins.sources import open_source
 
-SAMPLES = 16
+SAMPLES, SMALL_PX = 16, 640
+"""Frames that are kept for the checks, reduced to this width."""
 SHOWN, SHEET_PX = 4, 240
 """Frames on the contact sheet, and the width of each of their pictures."""
 USUAL_FOCAL = 0.9
@@ -43,6 +45,12 @@ MANY_HOLES = 0.45
 """If more than this share of the pixels has no depth, warn of holes in the map."""
 MAX_BRIGHTNESS_STEP = 0.2
 """If the median change of brightness between sampled frames is larger than this share, suggest `tracking.exposure`."""
+
+
+FIRST, LOOKED_AT, ENOUGH_S = 150, 4, 0.5
+"""Before a run, so many of the first frames are looked at, fewer if they are not read in this time."""
+QUICK_PX, QUICK = 320 * 240, 80
+"""If images have so few pixels, the motion in so many of the first frames is checked too."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,13 +75,14 @@ class Inspection:
 def inspect_source(path: str | Path, settings: InputConfig, samples: int = SAMPLES) -> Inspection:
     """Open a recording and inspect `samples` frames, evenly spaced. Raises SourceError if it cannot be opened."""
     name, (source, guessed) = format_name(path, settings), _opened(path, settings)
-    frames = [*_readable(source, evenly_spaced(len(source), samples).tolist(), source.skipped)]
+    first = max(0, (len(source) - CONSECUTIVE) // 2)
+    consecutive, frames = range(first, min(first + CONSECUTIVE, len(source))), list[Frame]()
+    sampled = evenly_spaced(len(source), samples).tolist()
+    motion = Motion.of(_readable(source, sampled, consecutive, frames, source.skipped))
     if not frames:
         raise SourceError(f"{source.name}: none of {samples} sampled frames can be read; check the image files")
-    agreement = None if source.computed_depth else edge_agreement(frames)  # stereo depth has the left image's pixels
+    agreement = _agreement(source, frames)
     times_s = times_of(source)
-    first = max(0, (len(source) - CONSECUTIVE) // 2)
-    consecutive = range(first, min(first + CONSECUTIVE, len(source)))
     warnings = [
         *guessed,
         *filter(None, [unlikely_camera(source.camera)]),
@@ -82,11 +91,11 @@ def inspect_source(path: str | Path, settings: InputConfig, samples: int = SAMPL
         *_depth_warnings(source, frames, settings),
         *_registration_warnings(source, agreement),
         *_brightness_warnings(frames),
-        *motion_warnings(Motion.of(_readable(source, consecutive, [])), first),
+        *motion_warnings(motion, first),
     ]
     rows = [
         ("format", name),
-        *_size_rows(source, frames[0], times_s),
+        *_size_rows(source, times_s),
         *_depth_rows(source, frames, settings),
         ("depth sensor", source.sensor or "unknown"),
         ("colour–depth alignment", "unknown: no outlines in depth" if agreement is None else agreement.sentence()),
@@ -107,13 +116,57 @@ def _opened(path: str | Path, settings: InputConfig) -> tuple[Source, list[str]]
         return open_source(path, settings, fx=float(fx)), [f"{problem}; this inspection assumes fx = {fx} pixels"]
 
 
-def _readable(source: Source, numbers: Iterable[int], skipped: list[str]) -> Iterator[Frame]:
-    """Yield the frames with these numbers; what is wrong with the others is added to `skipped`."""
-    for i in numbers:
+def first_look(source: Source) -> tuple[str, list[str]]:
+    """Look at the first frames before a run: what they show, in one line, "" if none can be read; and warnings."""
+    frames, started_s = list[Frame](), time.perf_counter()
+    for i in evenly_spaced(min(FIRST, len(source)), LOOKED_AT).tolist():
+        [*_readable(source, [i], (), frames, [])]
+        if time.perf_counter() - started_s > ENOUGH_S:
+            break
+    if not frames:
+        return "", []
+    agreement = None if source.registrable and not source.depth_registered else _agreement(source, frames)
+    warnings = [
+        *filter(None, [unlikely_camera(source.camera), depth_warning(source, read=frames)]),
+        *source.depth_doubts,
+        *_registration_warnings(source, agreement),
+    ]
+    if source.camera.width * source.camera.height <= QUICK_PX and source.depth_units_per_metre:
+        delay = late_warning(Motion.of(_readable(source, (), range(min(QUICK, len(source))), [], [])))
+        warnings += [delay] if delay else []
+    unit, readings = "" if source.predicted_depth else " m", _readings(frames)
+    low, middle, high = np.percentile(readings, (1, 50, 99)) if len(readings) else (0.0, 0.0, 0.0)
+    depth = f"depth {low:.2f} to {high:.2f}{unit}, median {middle:.2f}{unit}, {_holes(frames):.0%} without"
+    light = f"brightness {np.mean([frame.color.mean() for frame in frames]):.0%}"
+    aligned = f", on colour {agreement.sentence()}" if agreement and agreement.known else ""
+    return f"looked at {len(frames)} of the first frames: {depth}, {light}{aligned}", warnings
+
+
+def _agreement(source: Source, frames: list[Frame]) -> EdgeAgreement | None:
+    return None if source.computed_depth else edge_agreement(frames)  # stereo depth has the left image's pixels
+
+
+def _readable(
+    source: Source, sampled: Collection[int], consecutive: Collection[int], kept: list[Frame], skipped: list[str]
+) -> Iterator[Frame]:
+    """Yield the consecutive frames, and keep the sampled ones, at most `SMALL_PX` wide; what is wrong with the sampled
+    ones is added to `skipped`. Each frame is read once."""
+    for i in sorted({*sampled, *consecutive}):
         try:
-            yield source.frame(i)
+            frame = source.frame(i)
         except SourceError as problem:
-            skipped.append(str(problem))
+            skipped += [str(problem)] * (i in sampled)
+            continue
+        width = min(SMALL_PX, frame.camera.width)
+        frame = frame.resized(width, max(1, round(frame.camera.height * width / frame.camera.width)))
+        if i in sampled:
+            kept.append(frame)
+        if i in consecutive:
+            yield frame
+
+
+def _readings(frames: list[Frame]) -> NDArray[np.float32]:
+    return np.concatenate([frame.depth_m[frame.depth_m > 0] for frame in frames])
 
 
 def _unused_warnings(source: Source) -> list[str]:
@@ -123,7 +176,7 @@ def _unused_warnings(source: Source) -> list[str]:
     return [f"{unused} of {len(source) + unused} images are not used (first: {source.skipped[0]})"]
 
 
-def _size_rows(source: Source, first: Frame, times_s: NDArray[np.float64]) -> list[tuple[str, str]]:
+def _size_rows(source: Source, times_s: NDArray[np.float64]) -> list[tuple[str, str]]:
     count, camera = len(source), source.camera
     span_s = float(np.ptp(times_s)) if len(times_s) else 0.0
     times = f"{rate(times_s)} per second, {span_s:.1f} s" if span_s > 0 else "no times"
@@ -136,7 +189,7 @@ def _size_rows(source: Source, first: Frame, times_s: NDArray[np.float64]) -> li
 
 def _depth_rows(source: Source, frames: list[Frame], settings: InputConfig) -> list[tuple[str, str]]:
     unit = f"{source.depth_units_per_metre:g} per metre" if source.depth_units_per_metre else "metres"
-    readings = np.concatenate([frame.depth_m[frame.depth_m > 0] for frame in frames])
+    readings = _readings(frames)
     if not len(readings):
         return [("depth", "no depth reading in the sampled frames")]
     low, middle, high = np.percentile(readings, (1, 50, 99))
@@ -174,7 +227,7 @@ def _holes(frames: list[Frame]) -> float:
 
 
 def _depth_warnings(source: Source, frames: list[Frame], settings: InputConfig) -> list[str]:
-    warnings = [*filter(None, [depth_warning(source)])]
+    warnings = [*filter(None, [depth_warning(source, read=frames)]), *source.depth_doubts]
     if _holes(frames) > MANY_HOLES:
         warnings.append(f"{_holes(frames):.0%} of the pixels have no depth; the map will have holes")
     max_depth_m = settings.max_depth_m * source.scene_scale
