@@ -12,14 +12,13 @@ used, with a warning. Uncertain splats are not pruned, no splat is cloned, and t
 iterations.
 """
 
-import tomllib
 from collections.abc import Callable
-from functools import cache, partial
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 from sigmasplat.api import Config, ConfigError, Preset, nearest
 from sigmasplat.plugins.presets import cgslam, varsplat
+from sigmasplat.plugins.presets.shared_by_papers import read_values
 
 # min_interval: the code's limit + 1, because it asks for more than the limit. max_depth_m: no reading is removed, the
 # PNGs of TUM and ScanNet end at 13 and 66 m.
@@ -63,7 +62,7 @@ def _cgslam(row: dict[str, Any]) -> Config:
         tracking={
             "iterations": row["iterations"], "lr_rotation": row["lr_rotation"],
             "lr_translation": row["lr_translation"],
-            "weight_color": cgslam.color_share(row["color"], row["depth"]), "descent": "axis-angle-start",
+            "weight_color": row["color"] / (row["color"] + row["depth"]), "descent": "axis-angle-start",
         },
         render={"covariance_pose_gradient": False},
         primitives={"uncertain_m2": 0.0, "densify": "split"},
@@ -74,15 +73,9 @@ def _cgslam(row: dict[str, Any]) -> Config:
     return cgslam.sized(config, row["extent"], **rates)
 
 
-@cache
-def _scenes(paper: str) -> dict[str, dict[str, Any]]:
-    """Return the rows of a paper's table by scene."""
-    return tomllib.loads((Path(__file__).parent / "scenes" / f"{paper}.toml").read_text(encoding="utf-8"))
-
-
 def _released(paper: str, make: Callable[[dict[str, Any]], Config], scene: str) -> Config:
     """Return the settings of a scene. Raises ConfigError if the table has no such scene."""
-    known = _scenes(paper)
+    known = read_values(f"scenes/{paper}")
     if scene not in known:
         what = f"no scene {scene!r}{nearest(scene, known)}" if scene else "no scene"
         raise ConfigError(f"{what} in preset {paper}-released-SCENE; known: {', '.join(known)}")
@@ -90,6 +83,6 @@ def _released(paper: str, make: Callable[[dict[str, Any]], Config], scene: str) 
 
 
 PLUGIN = tuple(
-    Preset(f"{paper}-released", partial(_released, paper, make), partial(_scenes, paper))
+    Preset(f"{paper}-released", partial(_released, paper, make), partial(read_values, f"scenes/{paper}"))
     for paper, make in (("cgslam", _cgslam), ("varsplat", _varsplat))
 )

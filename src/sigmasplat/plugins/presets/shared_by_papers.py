@@ -1,55 +1,33 @@
-"""The settings that the papers' presets build on: those in which the papers differ from our defaults, as values."""
+"""The settings that the papers' presets build on, and those of the presets by data set: tables of values/*.toml."""
+
+import tomllib
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any
 
 from sigmasplat.api import Config, Preset
 
-BASE_VALUES: dict[str, dict[str, object]] = {
-    "input": {"width": 0, "denoise_depth": False},
-    "render": {"depth": "center"},
-    "seeding": {
-        "first_uniform": 100_000,
-        "first_gradient": 50_000,
-        "first_edges": True,
-        "later_max": 30_000,
-        "depth_error_least_m": 0.0,
-        "shape": "neighbours",
-        "max_splats": 0,
-    },
-    "mapping": {
-        "every": 1,
-        "overlap_below": 0.0,
-        "iterations": 100,
-        "first_iterations": 100,
-        "divided": False,
-        "few_steps": False,
-        "weight_depth": 1.0,
-        "weight_mean_depth": 0.0,
-        "weight_moment": 0.0,
-        "weight_nll_color": 0.0001,
-        "lr_means": 0.0001,
-        "lr_log_scales": 0.005,
-        "prune_opacity": 0.5,
-    },
-    "primitives": {"uncertain_m2": 0.0, "split_radius_px": 0.0},
-    "tracking": {
-        "method": "adam",
-        "align_weight_color": 0.5,
-        "uncertainty": True,
-        "tau": 50.0,
-        "features": False,
-        "verify": False,
-    },
-    "recovery": {"relocalise": False},
-    "moving": {"find": False},
-    "submaps": {"distance_m": 0.0, "uncertainty_m": 0.0, "inherit": False},
-    "loops": {"near_m": 0.0, "most": 4},
-    "registration": {"iterations": 100, "method": "paper", "tau": 50.0},
-    "final": {"iterations": 0, "move_poses": False, "schedule": "steady", "sh_degree": 0},
-    "surface": {"depth": "map"},
-    "uncertainty": {"probes": 0},
-}
-"""What is ours alone is off, and a value that both papers share is theirs; the presets name the rest."""
+Table = Mapping[str, Mapping[str, Any]]
+FOLDER = Path(__file__).parent
 
+
+@cache
+def read_values(name: str) -> dict[str, dict[str, Any]]:
+    """Read a file of this folder: values by section, or tables by name."""
+    return tomllib.loads((FOLDER / f"{name}.toml").read_text(encoding="utf-8"))
+
+
+BASE_VALUES = read_values("values/shared_by_papers")
+"""What is ours alone is off, and a value that both papers share is theirs; the presets name the rest."""
 BASE = Config().changed(**BASE_VALUES)
+
+
+def made(tables: Table, name: str) -> Config:
+    """Return the settings of a table: its sections change those of the table `like`, or else those of `BASE`."""
+    table = tables[name]
+    base = made(tables, table["like"]) if "like" in table else BASE
+    return base.changed(**{section: values for section, values in table.items() if isinstance(values, dict)})
 
 
 def fixed(name: str, config: Config) -> Preset:
