@@ -34,8 +34,8 @@ from sigmasplat.input.lists import read_poses
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.outputs.mesh_files import write_mesh
 from sigmasplat.plugins.presets.shared_by_papers import BASE
+from sigmasplat.run.callbacks import ENDING
 from sigmasplat.run.session import Session
-from sigmasplat.run.signals import ENDING
 from sigmasplat.run.terminal import Screen
 from sigmasplat.run_folder.frames import noted_up
 from sigmasplat.run_folder.runs import RunFolder

@@ -87,12 +87,7 @@ def picture_images(view: View, picture: Picture, camera: Camera) -> tuple[Target
     return target, live_image(view, picture.unit_color, picture.depth_m, target)
 
 
-def map_reference(
-    params: Tensor,
-    view: View,
-    T_camera_world: Matrix,
-    config: TrackingConfig,
-) -> Reference:
+def map_reference(params: Tensor, view: View, T_camera_world: Matrix, config: TrackingConfig) -> Reference:
     """Render the map as a reference: gray C/A and depth D/A in m where it is opaque, weighted by w̃ (VarSplat §3).
 
     params: rows [N, 17]; T_camera_world [4, 4]: the pose to render from. To weight depth by U the map is rendered

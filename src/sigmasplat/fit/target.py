@@ -5,7 +5,6 @@ from dataclasses import dataclass, field as dataclass_field, replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.ndimage import sobel
 from torch import Tensor
 
 from sigmasplat.data import se3
@@ -35,11 +34,6 @@ def luma(color: Tensor) -> Tensor:
     red, green, blue = map(float, LUMA)
     gray: Tensor = red * color[0] + green * color[1] + blue * color[2]
     return gray
-
-
-def gradient_magnitude(gray: Image) -> Image:
-    """Return the Sobel gradient magnitude of gray [H, W]."""
-    return np.hypot(sobel(gray, 0), sobel(gray, 1))
 
 
 @dataclass(eq=False)

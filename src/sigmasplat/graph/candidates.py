@@ -225,10 +225,7 @@ def _differences(a: Matrix, b: Matrix) -> tuple[Matrix, Matrix]:
 
 
 def pairs_to_register(
-    candidates: Sequence[Candidate],
-    query: SubmapDescriptor,
-    known: DescribedSubmaps,
-    keyframes: int = 2,
+    candidates: Sequence[Candidate], query: SubmapDescriptor, known: DescribedSubmaps, keyframes: int = 2
 ) -> list[SubmapPair]:
     """Group a query's candidates by submap, the best pairs first, and choose the keyframes to localise
     (VarSplat §5).

@@ -160,24 +160,21 @@ class LoopCloser:
         return self.edges.taken(valid)
 
     def _described(self, submap: Submap, descriptors: Sequence[NDArray[np.float32]]) -> SubmapDescriptor:
-        return SubmapDescriptor(submap.index, np.stack(descriptors), self.opacity_ratio(submap))
-
-    def opacity_ratio(self, submap: Submap) -> float:
-        """Return the variance-weighted opacity ratio of a submap (VarSplat §4)."""
         c, log_variances = self.config.loops, submap.field.params[:, COLUMNS["log_variances"]].numpy()
-        return opacity_ratio(submap.field.opacities.numpy(), log_variances, c.tau, c.weight_max)
+        ratio = opacity_ratio(submap.field.opacities.numpy(), log_variances, c.tau, c.weight_max)
+        return SubmapDescriptor(submap.index, np.stack(descriptors), ratio)
 
     def closing(
         self, submap: Submap, descriptors: Sequence[NDArray[np.float32]], atlas: Atlas, view: View
-    ) -> Task[list[Loop]]:
+    ) -> Task[None]:
         """Look for loops from a finished submap to earlier ones, in slices of one alignment; if one is found, correct
-        the anchors. Returns the pairs that were tried, each with the latest verdict.
+        the anchors. `loops` then has the pairs that were tried.
 
         descriptors [D]: one per keyframe, in order, of unit norm or zero. Nothing changes before the last
         slice: a search that was begun can be made again from its first slice, as long as the anchors stay.
         """
         if not self.config.loops.close or not descriptors:
-            return []
+            return
         query = self._described(submap, descriptors)
         registrar = Registrar(self.config, self.store, view, self.extractor)
         tried = list[tuple[Loop, RelativePose | None]]()
@@ -193,7 +190,6 @@ class LoopCloser:
         if len(self.edges) > known:
             self._correct_at(atlas, submap.index, known)
         self.release()
-        return self.loops[len(self.loops) - len(tried) :]
 
     @property
     def columns(self) -> tuple[Column, ...]:

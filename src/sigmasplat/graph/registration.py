@@ -99,7 +99,9 @@ class Registrar:
         A = se3.adjoint(T_own_camera)
         covariance, comparison = self._checked(other_rows, live, fit.T_camera_world)
         nearest = _nearest_keyframe(other, fit.T_camera_world, target)
-        covariance = covariance + _errors_of_motion(fit.T_camera_world @ other.T_submap_camera[nearest])
+        moved = fit.T_camera_world @ other.T_submap_camera[nearest]  # errors grow with the motion from this keyframe
+        moved_m = float(np.linalg.norm(moved[:3, 3]))
+        covariance = covariance + systematic_errors(moved_m, se3.rotation_angle(moved[:3, :3]))
         T_own_other, covariance = T_own_camera @ fit.T_camera_world, A @ covariance @ A.T
         return Localisation(
             T_own_other, fit.loss, covariance, fit.agreement, fit.overlap, comparison, at_keyframe, (keyframe, nearest)
@@ -244,12 +246,6 @@ def _nearest_keyframe(submap: Submap, T_camera_submap: Matrix, target: Target) -
     depth_m, T_submap_camera = target.depth_image[target.depth_image > 0], se3.inverse(T_camera_submap)
     mean_m = float(depth_m.double().mean()) if len(depth_m) else np.inf
     return int(np.argmin([se3.angle_between(T, T_submap_camera, mean_m) for T in submap.T_submap_camera]))
-
-
-def _errors_of_motion(T_camera_keyframe: Matrix) -> Matrix:
-    """Return the covariance [6, 6] of the errors that grow with the motion from the submap's nearest keyframe."""
-    moved_m = float(np.linalg.norm(T_camera_keyframe[:3, 3]))
-    return systematic_errors(moved_m, se3.rotation_angle(T_camera_keyframe[:3, :3]))
 
 
 def drift_between(a: Submap, b: Submap, keyframes: tuple[int, int], T_a_b: Matrix, scene_scale: float) -> Matrix:

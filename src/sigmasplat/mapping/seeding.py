@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.ndimage import binary_dilation
+from scipy.ndimage import binary_dilation, sobel
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from skimage.feature import canny
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from sigmasplat.config import SeedConfig
 from sigmasplat.data.field import GaussianField
-from sigmasplat.fit.target import Target, gradient_magnitude, gray_of
+from sigmasplat.fit.target import Target, gray_of
 from sigmasplat.fit.tracking_loss import PoseMaps
 
 Mask = NDArray[np.bool_]
@@ -24,7 +24,7 @@ def first_pixels(target: Target, config: SeedConfig, random: np.random.Generator
     """Choose pixels for an empty map, bool [H, W]: uniform, by gradient, and on Canny edges; only with depth."""
     valid, gray = target.depth_image.numpy() > 0, gray_of(target.image.numpy())
     chosen = _draw(valid * 1.0, config.first_uniform, random)
-    chosen |= _draw(gradient_magnitude(gray).astype(np.float64) * valid, config.first_gradient, random)
+    chosen |= _draw(np.hypot(sobel(gray, 0), sobel(gray, 1)).astype(np.float64) * valid, config.first_gradient, random)
     if config.first_edges:
         edges = canny(gray, low_threshold=100 / 255, high_threshold=200 / 255)  # type: ignore[no-untyped-call]
         chosen |= binary_dilation(edges, np.ones((2, 2), bool))

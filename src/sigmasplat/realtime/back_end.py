@@ -191,7 +191,9 @@ class BackEnd:
     def _search(self, each: TrackedFrame, search: Search) -> Iterator[None]:
         """Search the whole map for a frame, and tell tracking the result."""
         system, number = self.system, each.number
-        self._timer, recovered = system.start_timer(), self._has_recovered()
+        self._timer = system.start_timer()
+        waiting = (each for each in self._pending if isinstance(each, TrackedFrame))
+        recovered = self._take() and any(not each.step.lost for each in waiting)  # the camera was tracked again
         place = None if recovered else (yield from system.relocalising(search.seen))
         yield
         if place is not None:
@@ -202,11 +204,6 @@ class BackEnd:
         elif self.last is not None:
             last = replace(self.last, state="", searched=number, loops=system.loops.copied(), seconds=0.0)
             self._hand_over(replace(last, correction=None))
-
-    def _has_recovered(self) -> bool:
-        """Return whether a lost camera was tracked again meanwhile."""
-        frames = (each for each in self._pending if isinstance(each, TrackedFrame))
-        return self._take() and any(not each.step.lost for each in frames)
 
     def _go_to(self, place: Relocation, number: int, seen: PreparedFrame) -> Iterator[None]:
         system = self.system

@@ -25,10 +25,9 @@ from sigmasplat.mapping.window import ValidationViews
 from sigmasplat.render.view import View
 from sigmasplat.slam.results import Step, StepTimer, SubmapState, make_step
 from sigmasplat.system.array_interface import Correction
-from sigmasplat.tracking.frame_estimate import FrameEstimate
 from sigmasplat.tracking.keyframe_rule import becomes_keyframe, hop_alignment, is_held_back, is_mappable, may_validate
 from sigmasplat.tracking.moving.dynamic_mask import DynamicMask
-from sigmasplat.tracking.newest_frame import NewestFrame
+from sigmasplat.tracking.newest_frame import FrameEstimate, NewestFrame
 from sigmasplat.tracking.pose_prediction import CameraMotion
 from sigmasplat.tracking.predicted_depth_frames import fitted_keyframe, fitted_to_map
 from sigmasplat.tracking.prepared_frame import PreparedFrame, TrackedKeyframe, refuse_first_without_depth

@@ -43,7 +43,8 @@ def project(
     T = T_camera_world.to(means)
     in_view = (means @ T[:3, :3].T + T[:3, 3])[:, 2].detach() > options.near_m
     T_covariance = T if options.covariance_pose_gradient else T.detach()
-    means2d = _pinhole(_to_camera(means, T, in_view), camera)
+    x, y, depth = _to_camera(means, T, in_view).unbind(1)
+    means2d = torch.stack([camera.fx * x / depth + camera.cx, camera.fy * y / depth + camera.cy], 1)
     A, _ = _footprints(means, quats, scales, T_covariance, in_view, camera)
     conics, radii = _whiten(A, options.low_pass_px2)
     z = means @ T[2, :3] + T[2, 3]
@@ -81,11 +82,6 @@ def _to_camera(means: Tensor, T: Tensor, in_view: Tensor) -> Tensor:
     """Transform positions [N, 3] to the camera frame; culled ones become (0, 0, 1), where every gradient is finite."""
     p = means @ T[:3, :3].T + T[:3, 3]
     return torch.where(in_view[:, None], p, p.new_tensor([0.0, 0.0, 1.0]))
-
-
-def _pinhole(p: Tensor, camera: Camera) -> Tensor:
-    x, y, z = p.unbind(1)
-    return torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], 1)
 
 
 def _footprints(
@@ -155,7 +151,8 @@ def blend(
     tiles. Ids and their weights have no gradient. With slopes [N, 2] m/px the moment is that of the depth along the ray
     (`depth_slopes`); only this definition has them.
     """
-    order, pixels = _near_to_far(z, radii), _pixels(camera).to(means2d)
+    order, pixels = torch.sort(z.detach(), stable=True).indices, _pixels(camera).to(means2d)
+    order = order[radii[order, 0] > 0]  # without culled ones
     ref = torch.zeros(len(pixels)).to(z) if ref_depth is None else ref_depth.detach().reshape(-1).to(z)
     step = max(1, PAIRS_AT_ONCE // (len(order) + 1))
     parts = [
@@ -173,12 +170,6 @@ def blend(
     sums, moment, *maps = (torch.cat(part) for part in zip(*parts, strict=True))
     images = [m.reshape(size) for m in maps]
     return Blended(sums.reshape(*size, -1), None if ref_depth is None else moment.reshape(size), *images)
-
-
-def _near_to_far(z: Tensor, radii: Tensor) -> Tensor:
-    """Return the rows of the splats that are not culled, sorted by z, equal ones by index."""
-    order = torch.sort(z.detach(), stable=True).indices
-    return order[radii[order, 0] > 0]
 
 
 def _pixels(camera: Camera) -> Tensor:

@@ -21,9 +21,8 @@ from sigmasplat.data.trajectory import RELOCALISED
 from sigmasplat.errors import RunError
 from sigmasplat.files.lock import LOCK, locked, no_warning
 from sigmasplat.input.source import Source
-from sigmasplat.run.callbacks import Callback, run_now
+from sigmasplat.run.callbacks import Callback, interrupt_event, run_now
 from sigmasplat.run.same_conditions import start_facts
-from sigmasplat.run.signals import interrupt_event
 from sigmasplat.run_folder.frames import RunFrames
 from sigmasplat.run_folder.runs import RunFolder
 

@@ -10,9 +10,8 @@ from sigmasplat.data.relative_pose import UNKNOWN_HOP, RelativePose
 from sigmasplat.data.trajectory import APART, RELOCALISED, TRACKED
 from sigmasplat.slam.mapping_backend import SLICES_PER_FRAME, MappingBackend
 from sigmasplat.slam.results import Step, StepTimer, make_step
-from sigmasplat.tracking.frame_estimate import FrameEstimate
 from sigmasplat.tracking.keyframe_rule import becomes_keyframe, hop_alignment, is_held_back, is_mappable, may_validate
-from sigmasplat.tracking.newest_frame import NewestFrame
+from sigmasplat.tracking.newest_frame import FrameEstimate, NewestFrame
 from sigmasplat.tracking.pose_prediction import CameraMotion
 from sigmasplat.tracking.predicted_depth_frames import fitted_keyframe, fitted_to_map
 from sigmasplat.tracking.prepared_frame import PreparedFrame, refuse_first_without_depth

@@ -12,8 +12,8 @@ from sigmasplat.data.trajectory import APART, LOST, STATES, TRACKED
 from sigmasplat.graph.confidence import compared, off_probability
 from sigmasplat.graph.loops import Loop
 from sigmasplat.render.view import View
-from sigmasplat.tracking.frame_estimate import FrameEstimate
 from sigmasplat.tracking.moving.dynamic_mask import share_of
+from sigmasplat.tracking.newest_frame import FrameEstimate
 from sigmasplat.tracking.pose_validation import LOST as LIKELY_WRONG, diagnosis
 from sigmasplat.tracking.prepared_frame import PreparedFrame
 from sigmasplat.tracking.tracker import Tracker

@@ -18,7 +18,7 @@ from sigmasplat.errors import ConfigError, SourceError
 from sigmasplat.graph.closer import LoopCloser, make_descriptor
 from sigmasplat.graph.confidence import Confidence
 from sigmasplat.graph.keyframe_graph import GrowingGraph, KeyframeImages
-from sigmasplat.graph.loops import Loop, Loops
+from sigmasplat.graph.loops import Loops
 from sigmasplat.mapping.mapper import Mapper
 from sigmasplat.mapping.window import ValidationViews
 from sigmasplat.render.view import View
@@ -65,7 +65,7 @@ class SlamState:
         self._view: View | None = None
         self._resample = False
         self._timer = StepTimer()
-        self._search: Task[list[Loop]] | None = None
+        self._search: Task[None] | None = None
         self.keep_on_disk()
 
     @property

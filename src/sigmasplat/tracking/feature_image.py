@@ -10,15 +10,7 @@ from sigmasplat.data.camera import Camera
 from sigmasplat.data.frame import Detail, Frame
 from sigmasplat.data.submap import Picture
 from sigmasplat.env import opencv
-from sigmasplat.tracking.features import (
-    Extractor,
-    Features,
-    Landmarks,
-    PnP,
-    landmarks_of,
-    pose_from_landmarks,
-    reduced,
-)
+from sigmasplat.tracking.features import Extractor, Features, Landmarks, PnP, landmarks_of, pose_from_landmarks, reduced
 
 
 def detail_of(frame: Frame) -> Detail:

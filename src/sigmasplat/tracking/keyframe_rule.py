@@ -8,7 +8,7 @@ from sigmasplat.data.trajectory import TRACKED
 from sigmasplat.fit.align import Alignment, align
 from sigmasplat.fit.pose import PoseFit
 from sigmasplat.fit.pyramid import Pyramid
-from sigmasplat.tracking.frame_estimate import FrameEstimate
+from sigmasplat.tracking.newest_frame import FrameEstimate
 from sigmasplat.tracking.recovery import Recovery
 from sigmasplat.tracking.tracker import Tracker
 from sigmasplat.types import Matrix

@@ -201,19 +201,17 @@ def _joined(mesh: Mesh, patches: list[Patch]) -> Mesh:
         faces.append(np.concatenate([patch.loop, start + np.arange(len(patch.points))])[patch.faces])
         start += len(patch.points)
 
-    def with_new(values: NDArray[np.float32], new: list[Matrix]) -> NDArray[np.float32]:
-        return np.concatenate([values, *(part.astype(np.float32) for part in new)])
+    def with_new(values: NDArray[np.float32], name: str) -> NDArray[np.float32]:
+        return np.concatenate([values, *(getattr(patch, name).astype(np.float32) for patch in patches)])
 
     colors, std = mesh.colors, mesh.depth_std_m
     marks = np.zeros(len(mesh.vertices), bool) if mesh.filled is None else mesh.filled
     return replace(
         mesh,
-        vertices=with_new(mesh.vertices, [patch.points for patch in patches]),
+        vertices=with_new(mesh.vertices, "points"),
         faces=np.concatenate(faces).astype(np.int32),
-        colors=None if colors is None else with_new(colors, [p.colors for p in patches if p.colors is not None]),
-        depth_std_m=None
-        if std is None
-        else with_new(std, [p.depth_std_m for p in patches if p.depth_std_m is not None]),
+        colors=None if colors is None else with_new(colors, "colors"),
+        depth_std_m=None if std is None else with_new(std, "depth_std_m"),
         filled=np.concatenate([marks, np.ones(start - len(marks), bool)]),
     )
 

@@ -120,11 +120,6 @@ def field_without_moments(params: Tensor, attributes: Mapping[str, Tensor]) -> G
     return GaussianField(params, moments[0], moments[0], attributes=rows)
 
 
-def without_moments(splats: GaussianField) -> GaussianField:
-    """Return the splats without Adam's moments; parameters are shared, not copied."""
-    return field_without_moments(splats.params, {name: rows.params for name, rows in splats.attributes.items()})
-
-
 def thinned_rows(n: int, most: int) -> Tensor:
     """Return the rows of at most `most` of `n` splats, spread evenly."""
     return torch.arange(n) if n <= most else (torch.arange(max(most, 0)) * n).div(most, rounding_mode="floor")

@@ -29,9 +29,9 @@ from sigmasplat.plugins.viewer.snapshot import (
     CameraPath,
     Piece,
     Snapshot,
+    field_without_moments,
     thin,
     within_budget,
-    without_moments,
 )
 
 if TYPE_CHECKING:
@@ -47,13 +47,14 @@ def finished_snapshot(run: RunFolder, budget: int = BUDGET) -> Snapshot:
     Raises RunError if the run stopped before it had a map, or if its uncertainty belongs to another map.
     """
     final, frames, tensors = run.read_map(), run.read_frames(), run.read_checkpoint()[0]
+    splats = field_without_moments(final.params, {name: rows.params for name, rows in final.attributes.items()})
     config, true_file = run.config(), run.path / TRUTH
     cache = SubmapCache(run.submaps, budget)
     cache.load(np.asarray(tensors["T_world_submap"], np.float64))  # for the images of keyframes
     return Snapshot(
         run.path.resolve().name,
         _final_path(frames, tensors),
-        Piece(None, without_moments(final), uncertainty=run.uncertainty_of(final)),
+        Piece(None, splats, uncertainty=run.uncertainty_of(final)),
         (),
         read_poses(true_file).T_world_camera[:, :3, 3] if true_file.is_file() else None,
         cache.camera or DEFAULT_CAMERA,
