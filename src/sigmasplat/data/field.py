@@ -157,8 +157,7 @@ class GaussianField(Rows):
 
         log_variances defaults to s₀ = −7 (VarSplat §1).
         """
-        n = len(means)
-        params = means.new_zeros(n, WIDTH)
+        params = means.new_zeros(len(means), WIDTH)
         params[:, COLUMNS["means"]] = means
         params[:, 3] = 1.0
         if quats is not None:

@@ -182,8 +182,7 @@ class Records(Sequence[Record], Generic[Record]):
 
     def values(self, i: int) -> list[Any]:
         """Return the values of the parts of a record."""
-        row = self.rows.used[i]
-        return [part.of(row) for part in self.parts]
+        return [part.of(self.rows.used[i]) for part in self.parts]
 
     @abstractmethod
     def _record(self, i: int) -> Record:

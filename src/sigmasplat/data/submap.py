@@ -66,15 +66,12 @@ class SubmapStore(Protocol):
 
     def load(self, index: int) -> Submap:
         """Return a submap; the caller may change it."""
-        ...
 
     def picture(self, index: int, keyframe: int) -> Picture:
         """Return the images of one keyframe of a submap."""
-        ...
 
     def probe(self, index: int, probe: int) -> Picture:
         """Return the images of one probe view of a submap."""
-        ...
 
 
 class GrowingStore(SubmapStore, Protocol):

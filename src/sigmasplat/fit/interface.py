@@ -34,11 +34,9 @@ class Accumulator(Protocol):
     def add(self, field: GaussianField, share: float, grad2d: Tensor | None = None) -> Twist:
         """Add the view's gradient planes, weighted by their share of the mean. Return the image's own pose twist
         [6]."""
-        ...
 
     def step(self, field: GaussianField, rates: Rates, weights: Weights, frozen_colors: int) -> float | Tensor:
         """Add the gradient of the shape terms and take Adam's step. Return the cost of the shape terms."""
-        ...
 
 
 class MappingStep(Protocol):
@@ -56,7 +54,6 @@ class MappingStep(Protocol):
 
     def images(self, target: Target, weights: Weights) -> float | Tensor:
         """Write the gradient of every image term to the view's gradient planes; return the loss."""
-        ...
 
     def splats(
         self, field: GaussianField, rates: Rates, weights: Weights, frozen_colors: int, grad2d: Tensor | None = None
@@ -65,11 +62,9 @@ class MappingStep(Protocol):
 
         The first `frozen_colors` splats keep their colours. grad2d [N]: filled as by `View.backward`.
         """
-        ...
 
     def accumulator(self, field: GaussianField) -> Accumulator:
         """Allocate the gradient sum of several images. Raises ConfigError if the step takes one image only."""
-        ...
 
 
 # ---- tracking ----

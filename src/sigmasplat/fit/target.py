@@ -78,8 +78,7 @@ class Target:
         """Return the same colour with other depth [H, W], m."""
         depth = torch.zeros_like(self.depth)
         depth[: self.camera.height, : self.camera.width] = torch.from_numpy(depth_m)
-        readings = int((depth_m > 0).sum())
-        return Target(self.camera, self.color, depth, readings)
+        return Target(self.camera, self.color, depth, int((depth_m > 0).sum()))
 
     def read_at_once(self, readout: Readout) -> "Target":
         """Return the images as the camera sees them at one time (`data.read_at_once`)."""

@@ -88,8 +88,7 @@ class Registrar:
         keyframes and by features if that explains too little; then refine the best pose."""
         T_own_camera, other_rows = own.T_submap_camera[keyframe], other.field.params.to(self.view.sums.device)
         target, live = self._images_of(own, keyframe)
-        expected = se3.inverse(T_own_camera) @ T_own_other
-        fits = yield from self._all_aligned(other_rows, live, [expected])
+        fits = yield from self._all_aligned(other_rows, live, [se3.inverse(T_own_camera) @ T_own_other])
         if score(fits[0]) < DOUBTFUL:
             fits += yield from self._all_aligned(other_rows, live, map(se3.inverse, other.T_submap_camera[[*alike]]))
         if max(map(score, fits)) < DOUBTFUL:

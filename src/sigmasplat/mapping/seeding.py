@@ -50,8 +50,7 @@ def later_pixels(maps: PoseMaps, target: Target, config: SeedConfig) -> Mask:
 def thin_out(pixels: Mask, config: SeedConfig, random: np.random.Generator) -> Mask:
     """Keep a random share of the pixels, bool [H, W]: `density` of them, at most `later_max`."""
     count = round(config.density * int(pixels.sum()))
-    most = min(count, config.later_max) if config.later_max else count
-    return _draw(pixels * 1.0, most, random)
+    return _draw(pixels * 1.0, min(count, config.later_max or count), random)
 
 
 def _draw(weight: NDArray[np.floating], count: int, random: np.random.Generator) -> Mask:

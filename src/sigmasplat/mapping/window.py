@@ -31,8 +31,7 @@ def choose_window(keyframes: Sequence[Keyframe], size: int, by: str) -> list[Key
     window = latest[::-1][:size]
     if size <= 2 or not older:
         return window
-    scores = SCORES[by](keyframes[-1], older)
-    best = np.lexsort((-np.arange(len(older)), -scores))[: size - 2]
+    best = np.lexsort((-np.arange(len(older)), -SCORES[by](keyframes[-1], older)))[: size - 2]
     return window + [older[k] for k in best]
 
 

@@ -19,6 +19,7 @@ from sigmasplat.graph.sensor_fit import LEVEL, NEIGHBOURS, Fit, Pair, Parameters
 from sigmasplat.graph.sensor_times import TIMES, read, times_of
 from sigmasplat.input.source import Source
 from sigmasplat.system.slam import Slam
+from sigmasplat.tracking.moving.free_space import on_image
 from sigmasplat.types import Matrix, Progress, completed, no_progress
 
 WITHOUT_MAP: Mapping[str, Mapping[str, Any]] = {
@@ -151,8 +152,7 @@ def camera_errors(pairs: Sequence[Pair], times: SensorTimes) -> CameraErrors:
     halves = [[pair for pair in bright if pair.number // NEIGHBOURS % 2 == half] for half in (0, 1)]
     used = fit.sure and all(_helps(completed(fitted(a, CAMERA)), b) for a, b in (halves, halves[::-1]))
     values = fit.values if used else values
-    moved = [found for pair in seen if (found := pair.at(values, CAMERA))]
-    falloff, std = falloff_of(moved, values)
+    falloff, std = falloff_of([found for pair in seen if (found := pair.at(values, CAMERA))], values)
     others = UNCLEAR if fit.std is None or fit.sure > used else fit.std.tolist()
     return CameraErrors(*np.append(values, falloff).tolist(), std=(*others, std))
 
@@ -208,10 +208,8 @@ def _same_points(pair: Pair, values: Matrix) -> Matrix:
     v, u = (step * k for k in np.nonzero(depth_m[::step, ::step]))
     z = depth_m[v, u]
     there = pair.T_live_reference @ np.stack([(u - c.cx) / c.fx * z, (v - c.cy) / c.fy * z, z, np.ones_like(z)])
-    ahead = np.maximum(there[2], 1e-3)
-    x, y = np.rint(c.fx * there[0] / ahead + c.cx).astype(int), np.rint(c.fy * there[1] / ahead + c.cy).astype(int)
-    inside = (there[2] > 0.05) & (x >= 0) & (y >= 0) & (x < c.width) & (y < c.height)
-    u, v, x, y, ahead = (values[inside] for values in (u, v, x, y, ahead))
+    inside, y, x = on_image(there[0], there[1], there[2], c)
+    u, v, x, y, ahead = (values[inside] for values in (u, v, x, y, there[2]))
     grays = np.stack([gray[v, u], live_gray[y, x]])
     known = (np.abs(live_m[y, x] - ahead) < SAME * ahead) & (grays.min(0) > DARK) & (grays.max(0) < BRIGHT)
     before, after = np.log(grays[:, known])

@@ -23,7 +23,7 @@ from sigmasplat.errors import SourceError
 from sigmasplat.files.atomic import replacing
 from sigmasplat.files.ply_elements import header_of, read_header
 from sigmasplat.files.reading import open_binary
-from sigmasplat.run_folder.splat_values import SH_C0, by_channel, check_finite, check_values
+from sigmasplat.run_folder.splat_values import SH_C0, check_finite, check_values
 from sigmasplat.uncertainty.map_uncertainty import SplatStd
 
 PLY_COLUMNS: dict[str, list[str]] = {
@@ -73,7 +73,8 @@ def _rows(field: GaussianField, std: SplatStd | None, columns: list[str], part: 
         _fill(rows, PLY_COLUMNS[group], values)
     if "harmonics" in field.attributes:
         harmonics = field.attributes["harmonics"].params[part].detach().cpu().numpy()
-        _fill(rows, [f"{REST}{i}" for i in range(harmonics.shape[1])], by_channel(harmonics.astype(np.float32)))
+        by_channel = harmonics.astype(np.float32).reshape(-1, harmonics.shape[1] // 3, 3).swapaxes(1, 2)
+        _fill(rows, [f"{REST}{i}" for i in range(harmonics.shape[1])], by_channel.reshape(harmonics.shape))
     if std is not None:
         _fill(rows, STD_COLUMNS, np.stack([getattr(std, name)[part].numpy() for name in STD_COLUMNS], 1))
     return rows

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 import torch
@@ -36,7 +35,6 @@ SH_C0 = 0.28209479177387814
 """Y₀₀ = 1/(2√π): the constant spherical harmonic."""
 R_RUB_RDF = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
 """Rotates axes x right, y down, z forward to x right, y up, z back, and back."""
-Number = TypeVar("Number", bound=np.generic)
 MORTON_BITS, ROUNDING = 20, 1e-6
 
 
@@ -97,12 +95,6 @@ def _harmonics(field: GaussianField) -> Doubles:
     values = field.attributes["harmonics"].params.detach().cpu().double().numpy()
     needed = int(np.flatnonzero((np.abs(values) > ROUNDING).any(0)).max(initial=-1)) + 1
     return values[:, : next(n for n in (3 * count(degree) for degree in range(DEGREES + 1)) if n >= needed)]
-
-
-def by_channel(harmonics: NDArray[Number]) -> NDArray[Number]:
-    """Return harmonics [N, 3·k] with columns 3·i + channel in the order of PLY files: all of red, green, then blue."""
-    rows, columns = harmonics.shape
-    return harmonics.reshape(rows, columns // 3, 3).swapaxes(1, 2).reshape(rows, columns)
 
 
 def to_bytes(values: NDArray[np.floating]) -> NDArray[np.uint8]:

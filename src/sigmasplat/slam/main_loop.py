@@ -43,8 +43,7 @@ class MainLoop(MappingBackend):
             self.tracker.follow(found.followed)
         self.atlas.place_frame(estimate.T_submap_camera)
         loops, seconds = self.closer.loops[tried:], self._timer.stop(self.view)
-        submap = self.active_submap()
-        self.steps.append(make_step(seen, estimate, submap, self.tracker, loops, seconds))
+        self.steps.append(make_step(seen, estimate, self.active_submap(), self.tracker, loops, seconds))
         return self.steps[-1]
 
     def _prepared(self, frame: Frame) -> PreparedFrame:

@@ -38,7 +38,6 @@ class Descriptor(Protocol):
 
         color [H, W, 3] RGB in [0, 1]; depth_m [H, W] metres, 0 = no reading. D does not depend on H and W.
         """
-        ...
 
 
 def similarity(a: NDArray[np.float32], b: NDArray[np.float32]) -> Matrix:

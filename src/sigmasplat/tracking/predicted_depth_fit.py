@@ -79,8 +79,7 @@ class DepthShape:
             a, b = pairs.T
             found = found._measured(old.take(a), old_z[a], new.take(b), T)
             found = found._measured(new.take(b), z[b], old.take(a), se3.inverse(T))
-        kept = tuple([*views, (image, np.eye(4))][-VIEWS:])
-        return replace(found, views=kept)
+        return replace(found, views=(*views, (image, np.eye(4)))[-VIEWS:])
 
     def _measured(self, first: Features, z: Matrix, second: Features, T_second_first: Matrix) -> "DepthShape":
         """Return the shape after matched features [M] of two views, the first with predicted depth z [M]."""

@@ -84,8 +84,7 @@ def _border(mesh: Mesh) -> dict[tuple[int, int], int]:
     _, which, uses = np.unique(
         np.minimum(start, end) * n + np.maximum(start, end), return_inverse=True, return_counts=True
     )
-    open_edges = np.flatnonzero(uses[which] == 1)
-    return {(int(end[i]), int(start[i])): int(third[i]) for i in open_edges}
+    return {(int(end[i]), int(start[i])): int(third[i]) for i in np.flatnonzero(uses[which] == 1)}
 
 
 def _loops(edges: dict[tuple[int, int], int]) -> list[Indices]:

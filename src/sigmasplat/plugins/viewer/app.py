@@ -162,8 +162,7 @@ class ViewerApp:
         path = snapshot.path
         if self._is_new("keyframes", (path, controls.row, controls.keyframes)):
             rows = lines.keyframes_to_show(path, controls.row) if controls.keyframes else ()
-            poses = {row: path.T_world_camera[row] for row in rows}
-            self.scene.show_keyframes(snapshot.camera, poses)
+            self.scene.show_keyframes(snapshot.camera, {row: path.T_world_camera[row] for row in rows})
 
     def _draw_layer(
         self, client: viser.ClientHandle, snapshot: Snapshot, controls: ControlState, pieces: tuple[Piece, ...],

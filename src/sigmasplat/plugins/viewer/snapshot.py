@@ -176,8 +176,7 @@ def path_segments(path: CameraPath, row: int, most: int = MAX_SEGMENTS) -> Segme
 
     A long path is reduced to about `most` evenly spaced segments. Frames outside the world are left out.
     """
-    count = min(row + 1, len(path))
-    rows = evenly_spaced(count, most + 1)
+    rows = evenly_spaced(min(row + 1, len(path)), most + 1)
     colors = np.array(SUBMAP_COLOURS, np.uint8)[path.submaps[rows] % len(SUBMAP_COLOURS)]
     colors[path.lost[rows]] = LOST_COLOUR
     segments, inside = _segments(path.T_world_camera[rows, :3, 3], colors), path.inside[rows]
