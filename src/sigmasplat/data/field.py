@@ -145,14 +145,9 @@ class GaussianField(Rows):
 
     @staticmethod
     def from_values(
-        means: Tensor,
-        scales: Tensor,
-        colors: Tensor,
-        *,
-        quats: Tensor | None = None,
-        opacities: Tensor | float = 0.5,
+        means: Tensor, scales: Tensor, colors: Tensor, *, quats: Tensor | None = None, opacities: Tensor | float = 0.5,
         log_variances: Tensor | float = INITIAL_LOG_VARIANCE,
-    ) -> "GaussianField":
+    ) -> "GaussianField":  # fmt: skip
         """Build a field from activated values: means [N, 3] m, scales [N, 3] or [N] m, colors [N, 3].
 
         log_variances defaults to s₀ = −7 (VarSplat §1).

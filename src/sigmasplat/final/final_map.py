@@ -50,13 +50,9 @@ class FinalMap(NamedTuple):
 
 
 def final_map(
-    store: SubmapStore,
-    anchors: Sequence[Matrix],
-    config: Config,
-    view: View,
-    random: np.random.Generator,
+    store: SubmapStore, anchors: Sequence[Matrix], config: Config, view: View, random: np.random.Generator,
     progress: Progress = no_progress,
-) -> FinalMap:
+) -> FinalMap:  # fmt: skip
     """Return the map in the world: made from submaps at `anchors` (T_world_submap [4, 4] each), then refined with
     `view`.
 

@@ -51,13 +51,9 @@ class FusionView:
 
 
 def surface_views(
-    read_field: Callable[[], GaussianField],
-    store: SubmapStore,
-    anchors: Sequence[Matrix],
-    config: Config,
-    outside: Collection[int] = (),
-    T_world_keyframe: Matrix | None = None,
-) -> Iterator[FusionView]:
+    read_field: Callable[[], GaussianField], store: SubmapStore, anchors: Sequence[Matrix], config: Config,
+    outside: Collection[int] = (), T_world_keyframe: Matrix | None = None,
+) -> Iterator[FusionView]:  # fmt: skip
     """Yield the views of a finished run's surface at its keyframes, as `surface.depth` says.
 
     read_field: returns the final map in the world, called if it is fused; anchors: T_world_submap of each submap;
@@ -100,14 +96,9 @@ def _inside(store: SubmapStore, outside: Collection[int]) -> list[int]:
 
 
 def fuse(
-    views: Iterable[FusionView],
-    total: int,
-    config: Config,
-    *,
-    voxel_m: float | None = None,
-    renderer: Renderer | None = None,
-    progress: Progress = no_progress,
-) -> Mesh:
+    views: Iterable[FusionView], total: int, config: Config, *, voxel_m: float | None = None,
+    renderer: Renderer | None = None, progress: Progress = no_progress,
+) -> Mesh:  # fmt: skip
     """Fuse depth and colour, rendered at `total` views, into a mesh in the world.
 
     A view with a picture is fused with its readings (`with_readings`). Depth outside the range of the input settings is

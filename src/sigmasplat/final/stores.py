@@ -228,13 +228,9 @@ class KeyframeNodes:
 
 
 def solved_keyframes(
-    atlas: Atlas,
-    path: PathCovariance,
-    store: StorePart,
-    image: Callable[[int], Pyramid],
-    graph: GrowingGraph,
+    atlas: Atlas, path: PathCovariance, store: StorePart, image: Callable[[int], Pyramid], graph: GrowingGraph,
     calibration: Matrix | None,
-) -> tuple[FollowedStore, list[list[Matrix]]]:
+) -> tuple[FollowedStore, list[list[Matrix]]]:  # fmt: skip
     """Solve the whole graph of the keyframes of a component; return the submaps as it has moved them, and the new poses
     T_submap_camera [4, 4] of each submap's keyframes.
 

@@ -54,13 +54,9 @@ def probe_views(store: SubmapStore, anchors: Sequence[Matrix], size: tuple[int, 
 
 
 def final_uncertainty(
-    field: GaussianField,
-    store: SubmapStore,
-    anchors: Sequence[Matrix],
-    config: Config,
-    view: View,
+    field: GaussianField, store: SubmapStore, anchors: Sequence[Matrix], config: Config, view: View,
     progress: Progress = no_progress,
-) -> MapUncertainty | None:
+) -> MapUncertainty | None:  # fmt: skip
     """Return how sure a map in the world is and the standard deviations of its splats, from its submaps' keyframes and
     probe views; None if `uncertainty.probes` is 0 or there is no splat. Calls `progress(keyframes read, total)`."""
     if not config.uncertainty.probes or not len(field):
@@ -72,14 +68,9 @@ def final_uncertainty(
 
 
 def map_uncertainty(
-    field: GaussianField,
-    store: SubmapStore,
-    anchors: Sequence[Matrix],
-    config: Config,
-    view: View,
-    pulled_to: Calibration = SHIPPED,
-    progress: Progress = no_progress,
-) -> MapUncertainty:
+    field: GaussianField, store: SubmapStore, anchors: Sequence[Matrix], config: Config, view: View,
+    pulled_to: Calibration = SHIPPED, progress: Progress = no_progress,
+) -> MapUncertainty:  # fmt: skip
     """Return how sure a map is that was fitted to the keyframes of submaps at `anchors` (T_map_submap [4, 4] each).
 
     The weights are fitted to the submaps' probe views and pulled to `pulled_to`; without probe views they equal it.

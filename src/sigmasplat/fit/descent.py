@@ -98,14 +98,9 @@ TrackingLoss = Callable[[Any, Target, TrackingConfig, Tensor], tuple[float, Tens
 
 
 def descend(
-    params: Tensor,
-    view: View,
-    target: Target,
-    T_camera_world: Matrix,
-    config: TrackingConfig,
-    iterations: int,
+    params: Tensor, view: View, target: Target, T_camera_world: Matrix, config: TrackingConfig, iterations: int,
     tracking_loss: TrackingLoss = tracking_gradient,
-) -> Descent:
+) -> Descent:  # fmt: skip
     """Minimise L_track over the parameters that `parametrisation` makes of the pose; return the best iterate.
 
     params [N, 17] and target are on the view's device; `tracking_loss` computes the loss on that device. The descent

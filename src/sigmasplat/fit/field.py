@@ -65,15 +65,9 @@ def loss_weights(config: MappingConfig) -> dict[str, float]:
 
 
 def fitting(
-    field: GaussianField,
-    view: View,
-    batches: Iterable[Sequence[Keyframe]],
-    config: MappingConfig,
-    schedule: Iterable[Rates] | None = None,
-    frozen_colors: int = 0,
-    degree: int = 0,
-    stats: DensifyStats | None = None,
-) -> Task[FieldFit]:
+    field: GaussianField, view: View, batches: Iterable[Sequence[Keyframe]], config: MappingConfig,
+    schedule: Iterable[Rates] | None = None, frozen_colors: int = 0, degree: int = 0, stats: DensifyStats | None = None,
+) -> Task[FieldFit]:  # fmt: skip
     """Take one Adam step on the field for each batch of keyframes, in the given order, with the mean loss of the batch.
     A slice is one step.
 
@@ -116,14 +110,9 @@ class _Steps:
     """Adam's steps of one fit."""
 
     def __init__(
-        self,
-        field: GaussianField,
-        view: View,
-        weights: dict[str, float],
-        frozen_colors: int,
-        degree: int,
+        self, field: GaussianField, view: View, weights: dict[str, float], frozen_colors: int, degree: int,
         stats: DensifyStats | None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.field, self.weights, self.frozen_colors, self.stats = field, weights, frozen_colors, stats
         field.moment1[:frozen_colors, COLUMNS["colors"]] = 0.0  # otherwise Adam would keep moving them
         self.step, self.to_host = step_for(view, weights, degree), fits_of(view).to_host

@@ -141,14 +141,9 @@ def self_similarity(descriptors: Descriptors, min_similarity: float = 0.5) -> Ma
 
 
 def find_candidates(
-    query: SubmapDescriptor,
-    known: DescribedSubmaps,
-    min_similarity: float = 0.5,
-    min_interval: int = 2,
-    similarity_floor: float = 0.0,
-    uncertainty: bool = True,
-    among: NDArray[np.bool_] | None = None,
-) -> list[Candidate]:
+    query: SubmapDescriptor, known: DescribedSubmaps, min_similarity: float = 0.5, min_interval: int = 2,
+    similarity_floor: float = 0.0, uncertainty: bool = True, among: NDArray[np.bool_] | None = None,
+) -> list[Candidate]:  # fmt: skip
     """List the keyframe pairs of the query and other submaps that may show the same place (VarSplat §4), best first.
 
     A pair counts if its submaps are at least `min_interval` apart, if similarity × gate exceeds the query keyframe's
@@ -174,15 +169,9 @@ def find_candidates(
 
 
 def find_nearby(
-    query: SubmapDescriptor,
-    known: DescribedSubmaps,
-    T_world_keyframe: Mapping[int, Matrix],
-    near_m: float,
-    near_rad: float,
-    min_interval: int = 2,
-    keyframes: int = 2,
-    among: NDArray[np.bool_] | None = None,
-) -> list[SubmapPair]:
+    query: SubmapDescriptor, known: DescribedSubmaps, T_world_keyframe: Mapping[int, Matrix], near_m: float,
+    near_rad: float, min_interval: int = 2, keyframes: int = 2, among: NDArray[np.bool_] | None = None,
+) -> list[SubmapPair]:  # fmt: skip
     """List pairs of submaps that show the same place according to the current poses, nearest first.
 
     An addition to the paper: while drift is small, poses find more revisits than descriptors do. T_world_keyframe:

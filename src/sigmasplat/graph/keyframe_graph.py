@@ -166,12 +166,9 @@ class GrowingGraph:
     measured: int = 0
 
     def aligning(
-        self,
-        T_world_keyframe: Matrix,
-        rows: NDArray[np.int64],
-        image: Callable[[int], Pyramid],
+        self, T_world_keyframe: Matrix, rows: NDArray[np.int64], image: Callable[[int], Pyramid],
         should_stop: ShouldStop = never,
-    ) -> Task[None]:
+    ) -> Task[None]:  # fmt: skip
         """Align the newest keyframe of T_world_keyframe [K, 4, 4] to earlier ones, one per slice, until `should_stop`.
 
         rows [n]: which keyframes may be used, in order; the newest is the last one.

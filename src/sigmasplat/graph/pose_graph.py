@@ -54,13 +54,9 @@ class PoseGraphSolution:
 
 
 def optimise(
-    T_world_node: Matrix,
-    edges: Sequence[RelativePose],
-    confidence: float = 0.99,
-    max_iterations: int = 100,
-    fixed: int = 1,
-    rejected: Sequence[bool] = (),
-) -> PoseGraphSolution:
+    T_world_node: Matrix, edges: Sequence[RelativePose], confidence: float = 0.99, max_iterations: int = 100,
+    fixed: int = 1, rejected: Sequence[bool] = (),
+) -> PoseGraphSolution:  # fmt: skip
     """Find the poses [N, 4, 4] that agree best with the edges; the first `fixed` nodes, at least node 0, stay.
 
     A loop is rejected if its χ² exceeds the `confidence` quantile of 6 degrees of freedom; with confidence = 1 every

@@ -124,14 +124,9 @@ class Mapper:
         return fit
 
     def _second_half(
-        self,
-        view: View,
-        window: list[Keyframe],
-        half: SecondHalf,
-        rates: Iterator[Rates],
-        should_stop: ShouldStop,
+        self, view: View, window: list[Keyframe], half: SecondHalf, rates: Iterator[Rates], should_stop: ShouldStop,
         at_most: int | None = None,
-    ) -> Task[FieldFit]:
+    ) -> Task[FieldFit]:  # fmt: skip
         """Make the steps of the second half that are left, or some of them; after the last one, prune."""
         steps, share = (half.steps, LEAST_SHARE) if at_most is None else (min(at_most, half.steps), 0.0)
         fit = yield from self._fit(view, window, steps, rates, half.frozen_below, None, should_stop, share)
@@ -205,16 +200,9 @@ class Mapper:
             newest.visible_ids = dominating(view, self.field)
 
     def _fit(
-        self,
-        view: View,
-        window: list[Keyframe],
-        steps: int,
-        rates: Iterator[Rates],
-        frozen_below: int,
-        stats: DensifyStats | None,
-        should_stop: ShouldStop,
-        least_share: float = LEAST_SHARE,
-    ) -> Task[FieldFit]:
+        self, view: View, window: list[Keyframe], steps: int, rates: Iterator[Rates], frozen_below: int,
+        stats: DensifyStats | None, should_stop: ShouldStop, least_share: float = LEAST_SHARE,
+    ) -> Task[FieldFit]:  # fmt: skip
         """Fit the field to the window, in slices; splats with ids below `frozen_below` keep their colours."""
         c = self.config.mapping
         drawn = draw_keyframes(window[::-1], steps, c.newest_probability, self.random)

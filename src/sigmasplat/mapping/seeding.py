@@ -67,13 +67,9 @@ def _draw(weight: NDArray[np.floating], count: int, random: np.random.Generator)
 
 
 def make_splats(
-    target: Target,
-    T_world_camera: NDArray[np.float64],
-    pixels: Mask,
-    spacing_px: float,
-    field: GaussianField,
+    target: Target, T_world_camera: NDArray[np.float64], pixels: Mask, spacing_px: float, field: GaussianField,
     config: SeedConfig,
-) -> GaussianField:
+) -> GaussianField:  # fmt: skip
     """Unproject pixels to splats: opacity from the settings, colour from the image, σ² = e⁻⁷, isotropic scale, or discs
     with `thickness` below 1.
 

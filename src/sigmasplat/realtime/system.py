@@ -120,12 +120,9 @@ class RealTime(ArrayInterface):
     """
 
     def __init__(
-        self,
-        slam: Slam,
-        schedule: MappingThread | None = None,
-        covariances: bool = True,
+        self, slam: Slam, schedule: MappingThread | None = None, covariances: bool = True,
         should_stop: ShouldStop = never,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.slam, self._hurried, c = slam, should_stop, slam.config
         self._extractor = extractor_of(c)  # not shared with the mapping thread
         tracker = replace(Tracker.of(c, self._extractor), times=slam.sensor_times)

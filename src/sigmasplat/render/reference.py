@@ -132,17 +132,9 @@ def _whiten(A: Tensor, low_pass_px2: float) -> tuple[Tensor, Tensor]:
 
 
 def blend(
-    means2d: Tensor,
-    conics: Tensor,
-    z: Tensor,
-    radii: Tensor,
-    opacities: Tensor,
-    features: Tensor,
-    ref_depth: Tensor | None,
-    camera: Camera,
-    options: RenderConfig,
-    slopes: Tensor | None = None,
-) -> Blended:
+    means2d: Tensor, conics: Tensor, z: Tensor, radii: Tensor, opacities: Tensor, features: Tensor,
+    ref_depth: Tensor | None, camera: Camera, options: RenderConfig, slopes: Tensor | None = None,
+) -> Blended:  # fmt: skip
     """Composite splats front to back at every pixel (3DGS eq. 3; VarSplat §1; CG-SLAM eq. 3, 6, 8-10).
 
     means2d, conics, z, radii as `project` returns them; opacities [N]; features [N, K]; ref_depth [H, W] m or None.

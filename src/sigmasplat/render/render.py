@@ -55,13 +55,9 @@ def colors_from(field: GaussianField, T_camera_world: Tensor, rows: Tensor | Non
 
 
 def render(
-    field: GaussianField,
-    camera: Camera,
-    T_camera_world: Tensor | NDArray[np.floating],
-    depth_reference: Tensor | None = None,
-    options: RenderConfig | None = None,
-    backend: str = "auto",
-) -> Render:
+    field: GaussianField, camera: Camera, T_camera_world: Tensor | NDArray[np.floating],
+    depth_reference: Tensor | None = None, options: RenderConfig | None = None, backend: str = "auto",
+) -> Render:  # fmt: skip
     """Render a field at a pose (4×4, world to camera); differentiable in `field.params` and in a tensor pose.
 
     The pose gradient is the sum of the paths through 2D means, 2D covariances (unless `options` leaves them out),
@@ -111,12 +107,9 @@ class FieldRenderer:
         self._kept: deque[tuple[GaussianField, GaussianField]] = deque(maxlen=2)
 
     def __call__(
-        self,
-        field: GaussianField,
-        camera: Camera,
-        T_camera_world: Tensor | NDArray[np.floating],
+        self, field: GaussianField, camera: Camera, T_camera_world: Tensor | NDArray[np.floating],
         depth_reference: Tensor | None = None,
-    ) -> Render:
+    ) -> Render:  # fmt: skip
         """Render a field as `render` does."""
         copied = next((copy for one, copy in self._kept if one is field), None)
         if copied is None:

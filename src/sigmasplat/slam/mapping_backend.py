@@ -43,13 +43,9 @@ class MappingBackend(SlamState):
     # ---- keyframes ----
 
     def map_keyframe(
-        self,
-        seen: PreparedFrame,
-        index: int,
-        T_submap_camera: Matrix,
-        hop: RelativePose = UNKNOWN_HOP,
+        self, seen: PreparedFrame, index: int, T_submap_camera: Matrix, hop: RelativePose = UNKNOWN_HOP,
         should_stop: ShouldStop = never,
-    ) -> Task[Matrix]:
+    ) -> Task[Matrix]:  # fmt: skip
         """Map frame number `index`, which `hop` leads to, in slices; return its pose, which mapping may have moved.
 
         should_stop: as in `Mapper.mapping`.

@@ -42,12 +42,9 @@ class Slam(MainLoop, ArrayInterface):
     """
 
     def __init__(
-        self,
-        config: Config | str | None = None,
-        store: GrowingStore | None = None,
-        *,
+        self, config: Config | str | None = None, store: GrowingStore | None = None, *,
         settings: Mapping[str, object] | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         super().__init__(configured(config, settings), store)
         self.listeners: Listeners = []
         self._newest_covariance = NewestCovariance()

@@ -193,13 +193,9 @@ class TrackedKeyframe:
 
 
 def mapped_keyframe(
-    params: Tensor,
-    view: View,
-    seen: PreparedFrame,
-    T_world_camera: Matrix,
-    config: TrackingConfig,
+    params: Tensor, view: View, seen: PreparedFrame, T_world_camera: Matrix, config: TrackingConfig,
     front: DynamicMask | None,
-) -> TrackedKeyframe:
+) -> TrackedKeyframe:  # fmt: skip
     """Return a keyframe that was just mapped, weighed by the map with rows `params` [N, 17]."""
     T_camera_world = se3.inverse(T_world_camera)
     return TrackedKeyframe(keyframe_reference(params, view, seen.live, T_camera_world, config), seen.image, front)

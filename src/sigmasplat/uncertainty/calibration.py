@@ -103,13 +103,9 @@ REWEIGHTED = 6
 
 
 def fit_weights(
-    parts: Mapping[str, Values],
-    squared_error: Values,
-    pulled_to: Mapping[str, float],
-    views: int,
-    limit: float = np.inf,
-    firm: Collection[str] = (),
-) -> dict[str, float]:
+    parts: Mapping[str, Values], squared_error: Values, pulled_to: Mapping[str, float], views: int,
+    limit: float = np.inf, firm: Collection[str] = (),
+) -> dict[str, float]:  # fmt: skip
     """Return the weights a > 0 that maximise the Gaussian likelihood of errors with variance V = Σ_k a_k V_k, and a
     log-normal prior about `pulled_to`.
 
@@ -154,12 +150,9 @@ LEAST = 1e-12
 
 
 def splat_std(
-    field: GaussianField,
-    uncertainty: MapUncertainty,
-    keyframes: Iterable[Keyframe],
-    options: RenderConfig,
+    field: GaussianField, uncertainty: MapUncertainty, keyframes: Iterable[Keyframe], options: RenderConfig,
     backend: str,
-) -> SplatStd:
+) -> SplatStd:  # fmt: skip
     """Return the standard deviations of a map's splats from keyframes with poses in the map's frame.
 
     The variance of splat i is the weighted geometric mean of the variance V_p that the map predicts for pixels,

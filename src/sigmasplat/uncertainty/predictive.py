@@ -83,14 +83,9 @@ def reaching(p: Projection, camera: Camera, options: RenderConfig) -> Tensor:
 
 
 def blend_values(
-    field: GaussianField,
-    camera: Camera,
-    T_camera_map: NDArray[np.floating],
-    values: Tensor | Callable[[Tensor], Tensor],
-    options: RenderConfig,
-    backend: str,
-    gather: bool = False,
-) -> BlendedValues:
+    field: GaussianField, camera: Camera, T_camera_map: NDArray[np.floating],
+    values: Tensor | Callable[[Tensor], Tensor], options: RenderConfig, backend: str, gather: bool = False,
+) -> BlendedValues:  # fmt: skip
     """Blend values [N, K] of a field's splats at a pose (4×4), on the device that holds the field.
 
     values: all of them, or a function that returns those of some rows [n].
@@ -187,15 +182,9 @@ class Predicted:
 
 
 def variance_parts(
-    field: GaussianField,
-    splats: Tensor,
-    background: Background,
-    camera: Camera,
-    T_camera_map: NDArray[np.floating],
-    options: RenderConfig,
-    backend: str,
-    gather: bool = False,
-) -> VarianceParts:
+    field: GaussianField, splats: Tensor, background: Background, camera: Camera, T_camera_map: NDArray[np.floating],
+    options: RenderConfig, backend: str, gather: bool = False,
+) -> VarianceParts:  # fmt: skip
     """Render the parts of a map's variance at a pose (4×4); splats [N, 6] as in `MapUncertainty`, gather as in
     `blend_values`."""
     field = on_device(field, backend)
@@ -285,13 +274,9 @@ def predicted(parts: VarianceParts, calibration: Calibration) -> Predicted:
 
 
 def predict(
-    field: GaussianField,
-    uncertainty: MapUncertainty,
-    camera: Camera,
-    T_camera_map: NDArray[np.floating],
-    options: RenderConfig | None = None,
-    backend: str = "auto",
-) -> Predicted:
+    field: GaussianField, uncertainty: MapUncertainty, camera: Camera, T_camera_map: NDArray[np.floating],
+    options: RenderConfig | None = None, backend: str = "auto",
+) -> Predicted:  # fmt: skip
     """Predict the variance of colour and depth of a map at a pose (4×4). Raises BackendError as `render` does."""
     known = uncertainty.splats, uncertainty.background
     parts = variance_parts(field, *known, camera, T_camera_map, options or CENTER, backend)

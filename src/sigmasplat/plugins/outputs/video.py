@@ -108,18 +108,10 @@ def image_count(path_s: float, fps: float = 25.0, seconds: float | None = None, 
 
 
 def export_video(
-    reader: RunReader,
-    target: Path,
-    *,
-    width_px: int = 0,
-    fps: float = 25.0,
-    seconds: float | None = None,
-    orbit: bool = False,
-    panels: bool = True,
-    up: Edge = "auto",
-    renderer: Renderer | None = None,
+    reader: RunReader, target: Path, *, width_px: int = 0, fps: float = 25.0, seconds: float | None = None,
+    orbit: bool = False, panels: bool = True, up: Edge = "auto", renderer: Renderer | None = None,
     progress: Progress = no_progress,
-) -> int:
+) -> int:  # fmt: skip
     """Write a video and return its number of images. Calls `progress(done, total)` at the start and after each image.
 
     width_px: width of a panel (0: that of the run's images); orbit: not along the run's path; panels: depth and
@@ -193,13 +185,8 @@ def film_camera(camera: Camera, width_px: int) -> Camera:
 
 
 def orbit_view(
-    field: GaussianField,
-    path: Trajectory,
-    camera: Camera,
-    images: int,
-    renderer: Renderer,
-    up: Up | None = None,
-) -> tuple[GaussianField, Matrix]:
+    field: GaussianField, path: Trajectory, camera: Camera, images: int, renderer: Renderer, up: Up | None = None,
+) -> tuple[GaussianField, Matrix]:  # fmt: skip
     """Return the map without its ceiling, and poses [images, 4, 4] on a circle above it from which it is visible;
     up: as in `floor_frame`."""
     samples = list(sample_surfaces(field, path, camera, renderer, SURFACE_VIEWS))

@@ -120,14 +120,9 @@ class DynamicDetector:
         )
 
     def in_front(
-        self,
-        keyframe: Reference | None,
-        keyframe_front: DynamicMask | None,
-        last: DynamicMask | None,
-        T_world_last: Matrix,
-        seen: PreparedFrame,
-        T_world_camera: Matrix,
-    ) -> DynamicMask | None:
+        self, keyframe: Reference | None, keyframe_front: DynamicMask | None, last: DynamicMask | None,
+        T_world_last: Matrix, seen: PreparedFrame, T_world_camera: Matrix,
+    ) -> DynamicMask | None:  # fmt: skip
         """Find what is in front of the scene at a pose: in places that the newest keyframe saw to be free.
 
         keyframe_front, last: what was in front in the newest keyframe and in the last frame, whose pose is given.

@@ -116,14 +116,9 @@ def thinned(live_m: Depth, step: int) -> Depth:
 
 
 def dynamic_mask(
-    scene: Earlier,
-    before: Earlier | None,
-    live_m: Depth,
-    camera: Camera,
-    whole_objects: bool = False,
-    step: int = STEP,
-    scene_scale: float = 1.0,
-) -> DynamicMask | None:
+    scene: Earlier, before: Earlier | None, live_m: Depth, camera: Camera, whole_objects: bool = False,
+    step: int = STEP, scene_scale: float = 1.0,
+) -> DynamicMask | None:  # fmt: skip
     """Find what has moved in front of the camera; None without.
 
     scene: the reference; before: what was in front in the last image; live_m [H, W]: live depth, m. A whole region

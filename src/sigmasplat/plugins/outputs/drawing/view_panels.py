@@ -76,13 +76,9 @@ def _from_zero(values: NDArray[np.float32], valid: NDArray[np.bool_]) -> tuple[f
 
 
 def coloured(
-    title: str,
-    values: NDArray[np.float32],
-    valid: NDArray[np.bool_],
-    limits: tuple[float, float],
-    colours: NDArray[np.float64],
-    unit: str = "",
-) -> ViewPanel:
+    title: str, values: NDArray[np.float32], valid: NDArray[np.bool_], limits: tuple[float, float],
+    colours: NDArray[np.float64], unit: str = "",
+) -> ViewPanel:  # fmt: skip
     """Return a panel of values [H, W] in a colour map, with its range."""
     digits = 2 if unit and limits[1] >= 1.0 else 3
     ends = (f"{limits[0]:.{digits}f}{unit}", f"{limits[1]:.{digits}f}{unit}")

@@ -57,14 +57,9 @@ class SurfaceSample:
 
 
 def sample_surfaces(
-    field: GaussianField,
-    trajectory: Trajectory,
-    camera: Camera,
-    renderer: Renderer,
-    max_poses: int = MAX_POSES,
-    progress: Progress = no_progress,
-    predictor: SurfacePredictor | None = None,
-) -> Iterator[SurfaceSample]:
+    field: GaussianField, trajectory: Trajectory, camera: Camera, renderer: Renderer, max_poses: int = MAX_POSES,
+    progress: Progress = no_progress, predictor: SurfacePredictor | None = None,
+) -> Iterator[SurfaceSample]:  # fmt: skip
     """Sample from at most `max_poses` poses, evenly spaced over the path, including the first and the last."""
     small = camera.resized(WIDTH_PX, max(1, round(camera.height * WIDTH_PX / camera.width)))
     rows = evenly_spaced(len(trajectory), max_poses)
@@ -74,12 +69,9 @@ def sample_surfaces(
 
 
 def sample_surface(
-    field: GaussianField,
-    camera: Camera,
-    T_world_camera: Matrix,
-    renderer: Renderer,
+    field: GaussianField, camera: Camera, T_world_camera: Matrix, renderer: Renderer,
     predictor: SurfacePredictor | None = None,
-) -> SurfaceSample:
+) -> SurfaceSample:  # fmt: skip
     """Sample from one pose: render depth, and predict its error if a predictor is given."""
     T_camera_world = se3.inverse(T_world_camera)
     with torch.inference_mode():
