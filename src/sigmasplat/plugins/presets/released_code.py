@@ -20,53 +20,30 @@ from sigmasplat.api import Config, ConfigError, Preset, nearest
 from sigmasplat.plugins.presets import cgslam, varsplat
 from sigmasplat.plugins.presets.shared_by_papers import read_values
 
-# min_interval: the code's limit + 1, because it asks for more than the limit. max_depth_m: no reading is removed, the
-# PNGs of TUM and ScanNet end at 13 and 66 m.
-VARSPLAT_DATA: dict[str, dict[str, dict[str, Any]]] = {
-    "replica": {"loops": {"min_interval": 3}, "input": {"max_depth_m": 10.0}},
-    "tum": {"loops": {"min_interval": 4}, "input": {"max_depth_m": 13.5}},
-    "scannet": {
-        "loops": {"min_interval": 5}, "input": {"max_depth_m": 66.0}, "registration": {"method": "rendered"},
-    },
-    "scannetpp": {"loops": {"min_interval": 2}, "input": {"max_depth_m": 66.0, "limit": 250}},
-}  # fmt: skip
+CODE = read_values("values/released_code")
 
 
 def _varsplat(row: dict[str, Any]) -> Config:
     """Return the settings of a scene of VarSplat's code."""
     like: str = row["like"]
     base = varsplat.DATASETS[like]
-    return base.changed(**VARSPLAT_DATA[like]).changed(
+    return base.changed(**CODE["varsplat"]).changed(**CODE[f"varsplat-{like}"]).changed(
         input={"crop_px": row["crop_px"]},
         seeding={"outliers": "remove-later" if base.seeding.outliers == "remove" else "keep"},
-        mapping={
-            "colors": "code",
-            "weight_nll_depth": 1e-4 if row["nll_depth"] else 0.0,
-        },
-        tracking={"descent": "amsgrad", "tau": row["tau_tracking"]},
-        submaps={"uncertainty_m": 0.0},
-        loops={"most": 0, "tau": row["tau_loops"]},
-        registration={"tau": 3.0},
-        final={"schedule": "falling"},
+        mapping={"weight_nll_depth": 1e-4 if row["nll_depth"] else 0.0},
+        tracking={"tau": row["tau_tracking"]}, loops={"tau": row["tau_loops"]},
     )  # fmt: skip
 
 
 def _cgslam(row: dict[str, Any]) -> Config:
     """Return the settings of a scene of CG-SLAM's code."""
-    config = cgslam.DATASETS[row["like"]].changed(
+    config = cgslam.DATASETS[row["like"]].changed(**CODE["cgslam"]).changed(
         mapping={
             "every": row["every"], "iterations": row["map_iterations"], "window": row["window"],
-            "adjustment": "window-newest", "weight_l1": row["map_color"] - 0.1, "weight_depth": row["map_depth"],
-            "weight_alignment": 0.25, "weight_moment": 0.15,
+            "weight_l1": row["map_color"] - 0.1, "weight_depth": row["map_depth"],
         },
-        tracking={
-            "iterations": row["iterations"], "lr_rotation": row["lr_rotation"],
-            "lr_translation": row["lr_translation"],
-            "weight_color": row["color"] / (row["color"] + row["depth"]), "descent": "axis-angle-start",
-        },
-        render={"covariance_pose_gradient": False},
-        primitives={"uncertain_m2": 0.0, "densify": "split"},
-        loops={"descriptor": "netvlad-or-grid"},
+        tracking={name: row[name] for name in ("iterations", "lr_rotation", "lr_translation")}
+        | {"weight_color": row["color"] / (row["color"] + row["depth"])},
     )  # fmt: skip
     rates = dict(zip(("first", "last"), row.get("lr_means", ()), strict=False))
     rates |= {"log_scales": row["lr_log_scales"]} if "lr_log_scales" in row else {}
