@@ -228,11 +228,9 @@ def refinement(config: Config) -> MappingConfig:
     likelihood if `final.uncertainty` is off."""
     final = config.final
     ours = replace(
-        config.mapping,
-        lr_pose_translation=final.lr_pose_translation,
-        lr_pose_rotation=final.lr_pose_rotation,
+        config.mapping, lr_pose_translation=final.lr_pose_translation, lr_pose_rotation=final.lr_pose_rotation,
         weight_moment=config.mapping.weight_moment if final.weight_moment else 0.0,
-    )
+    )  # fmt: skip
     return ours if final.uncertainty else replace(ours, weight_nll_color=0.0, weight_nll_depth=0.0)
 
 

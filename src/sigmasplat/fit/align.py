@@ -232,15 +232,11 @@ def align(
         still = normal_equations(pair.kernels, levels[0], [T_live_reference])[0]
         sums, gain = still.sums, still.gain
     return Alignment(
-        se3.orthonormalise(found.T),
-        agreement=float(sums[3] / max(sums[2], 1.0)),
-        overlap=float(sums[4] / max(found.readings, 1.0)),
-        degenerate=found.degenerate,
-        cost=float(sums[0] / max(sums[1], 1.0)),
-        steps=found.steps,
-        pair=replace(pair, gain=gain),
+        se3.orthonormalise(found.T), agreement=float(sums[3] / max(sums[2], 1.0)),
+        overlap=float(sums[4] / max(found.readings, 1.0)), degenerate=found.degenerate,
+        cost=float(sums[0] / max(sums[1], 1.0)), steps=found.steps, pair=replace(pair, gain=gain),
         depth_m=found.depth_m,
-    )
+    )  # fmt: skip
 
 
 def gray_share(reference: Pyramid, live: Pyramid, T_live_reference: Matrix) -> float:

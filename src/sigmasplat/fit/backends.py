@@ -25,25 +25,15 @@ def _on_host(twists: Sequence[Twist], costs: Sequence[float | Tensor]) -> tuple[
 
 
 TORCH = DeviceFits(
-    mapping_step=TorchStep,
-    view_dependent_step=ViewDependentStep,
-    settle=adam.settle,
-    to_host=_on_host,
-    tracking_loss=tracking_loss.tracking_gradient,
-    descend=descend,
-    reference_maps=reference_arrays,
-    live_planes=cpu.live_planes,
-    images=cpu.CPU_IMAGES,
-)
+    mapping_step=TorchStep, view_dependent_step=ViewDependentStep, settle=adam.settle, to_host=_on_host,
+    tracking_loss=tracking_loss.tracking_gradient, descend=descend, reference_maps=reference_arrays,
+    live_planes=cpu.live_planes, images=cpu.CPU_IMAGES,
+)  # fmt: skip
 CPU = replace(
-    TORCH,
-    mapping_step=cpu.CompiledStep,
-    view_dependent_step=cpu.CompiledViewDependentStep,
-    settle=cpu.settle,
-    tracking_loss=cpu.tracking_gradient,
-    descend=partial(descend, tracking_loss=cpu.tracking_gradient),
+    TORCH, mapping_step=cpu.CompiledStep, view_dependent_step=cpu.CompiledViewDependentStep, settle=cpu.settle,
+    tracking_loss=cpu.tracking_gradient, descend=partial(descend, tracking_loss=cpu.tracking_gradient),
     reference_maps=cpu.reference_maps,
-)
+)  # fmt: skip
 OWN = {"reference": TORCH, "cpu": CPU}
 
 

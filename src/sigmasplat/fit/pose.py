@@ -88,15 +88,9 @@ def fit_pose_align(
         if config.verify:
             seen = compare(reference.pyramid, live, found.T_live_reference)
     return PoseFit(
-        found.T_live_reference @ reference.T_camera_world,
-        found.agreement,
-        found.overlap,
-        float("nan"),
-        found.cost,
-        found.steps,
-        alignment=found,
-        comparison=seen,
-    )
+        found.T_live_reference @ reference.T_camera_world, found.agreement, found.overlap, float("nan"), found.cost,
+        found.steps, alignment=found, comparison=seen,
+    )  # fmt: skip
 
 
 EVERY = 47

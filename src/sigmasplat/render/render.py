@@ -80,16 +80,9 @@ def render(
     if rays:
         depth, nearest = depth_of(b.sums[..., channels:], camera), depth_at(rows, p, slopes, camera)
     return Render(
-        sums[..., 0:3],
-        depth,
-        b.alpha,
-        variance_of(sums),
-        b.moment,
-        torch.where(crossed, nearest, 0.0),
-        b.median_id,
-        b.dominant_id,
-        b.dominant_weight,
-    )
+        sums[..., 0:3], depth, b.alpha, variance_of(sums), b.moment, torch.where(crossed, nearest, 0.0), b.median_id,
+        b.dominant_id, b.dominant_weight,
+    )  # fmt: skip
 
 
 class FieldRenderer:

@@ -38,24 +38,15 @@ class Calibration:
 
 SHIPPED = Calibration(
     color={
-        "mixture": 0.036,
-        "residual": 0.78,
-        "unexplained": 0.78,
-        "edges": 7.2e-07,
-        "extrapolated": 5.8,
+        "mixture": 0.036, "residual": 0.78, "unexplained": 0.78, "edges": 7.2e-07, "extrapolated": 5.8,
         "floor": 1.6e-07,
     },
     depth={
-        "ray": 0.0026,
-        "residual": 0.8,
-        "unexplained": 0.013,
-        "edges": 1.2e-06,
-        "extrapolated": 0.59,
-        "sensor": 3.3e-09,
-        "floor": 4.2e-08,
+        "ray": 0.0026, "residual": 0.8, "unexplained": 0.013, "edges": 1.2e-06, "extrapolated": 0.59,
+        "sensor": 3.3e-09, "floor": 4.2e-08,
     },
     temperature={"color": 0.9, "depth": 0.95},
-)
+)  # fmt: skip
 """Weights and temperatures of the presets, fitted by `benchmarks/uncertainty_weights.py` to several sequences with
 `sigma`. The fit of a run starts at these weights."""
 
