@@ -46,8 +46,7 @@ class Submap:
     field: its splats; frames [K]: the frame numbers of its keyframes, counted from the first frame of the run (those of
     an earlier session are negative, −1 is its last frame: `run --onto`); T_submap_camera [K, 4, 4]: their poses;
     camera: shared by all keyframes. The `SubmapStore` keeps the keyframes' images, the `Atlas` the submap's pose in the
-    world.
-    probe_frames [P], T_submap_probe [P, 4, 4]: the same of its probe views, to which nothing is fitted.
+    world. probe_frames [P], T_submap_probe [P, 4, 4]: the same of its probe views, to which nothing is fitted.
     """
 
     index: int

@@ -1,5 +1,4 @@
-"""The final map: merge all submaps, or seed new splats on their surface, and refine over all keyframes (VarSplat
-§7).
+"""The final map: merge all submaps, or seed new splats on their surface, and refine over all keyframes (VarSplat §7).
 
 What moves is kept out, as `mapping.moving` keeps it out of each submap: keyframes are compared across submaps.
 """

@@ -28,8 +28,7 @@ class PoseFit:
 
     agreement: share of the pixels visible to both map and sensor whose depths agree; overlap: share of sensor readings
     where the map has a surface; first and last loss; iterations; alignment: the alignment that found the pose, or None;
-    exposure (a, b) of exp(a)·Ĉ + b;
-    comparison: of the two images at the pose, if it was made.
+    exposure (a, b) of exp(a)·Ĉ + b; comparison: of the two images at the pose, if it was made.
     """
 
     T_camera_world: Matrix

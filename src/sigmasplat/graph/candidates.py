@@ -216,8 +216,7 @@ def _differences(a: Matrix, b: Matrix) -> tuple[Matrix, Matrix]:
 def pairs_to_register(
     candidates: Sequence[Candidate], query: SubmapDescriptor, known: DescribedSubmaps, keyframes: int = 2
 ) -> list[SubmapPair]:
-    """Group a query's candidates by submap, the best pairs first, and choose the keyframes to localise
-    (VarSplat §5).
+    """Group a query's candidates by submap, the best pairs first, and choose the keyframes to localise (VarSplat §5).
 
     candidates: the result of `find_candidates` for the same submaps. Of each side, the `keyframes` most
     similar to any keyframe of the other side are chosen, most similar first.

@@ -112,11 +112,10 @@ class RealTime(ArrayInterface):
     back snapshots of the map.
 
     Between `step` calls the state of `slam` belongs to the mapping thread: read it in a task (`between_frames`), or
-    after `settle`. The results depend on how fast the machine is, so they are not reproducible. schedule: runs
-    the work on the map; covariances: whether `track` and `covariance` return covariances, which
-    cost some milliseconds of work per keyframe; should_stop: whether the next frame waits or is due soon, then no
-    further guess of a doubtful pose is tried. Functions of `on_correction` are called by the thread that calls `step`,
-    when it learns of the correction.
+    after `settle`. The results depend on how fast the machine is, so they are not reproducible. schedule: runs the work
+    on the map; covariances: whether `track` and `covariance` return covariances, which cost some milliseconds of work
+    per keyframe; should_stop: whether the next frame waits or is due soon, then no further guess of a doubtful pose is
+    tried. Functions of `on_correction` are called by the thread that calls `step`, when it learns of the correction.
     """
 
     def __init__(

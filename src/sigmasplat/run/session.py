@@ -140,9 +140,8 @@ class Session:
     """A run of SLAM on a source, from its frame `first_index` on; a resumed run has already taken `wall_s` seconds.
 
     callbacks: called after each step and with the progress of the end; readers: called too, but `later`, because they
-    read the system and not only the step.
-    watch: gets each frame before its step. later: runs a task that no frame needs to wait for; at once by default,
-    beside the frames in real time.
+    read the system and not only the step. watch: gets each frame before its step. later: runs a task that no frame
+    needs to wait for; at once by default, beside the frames in real time.
     """
 
     slam: "Slam | RealTime"

@@ -68,8 +68,7 @@ def _writes(name: str, write: Callable[[Path, Value], None]) -> Callable[["RunFo
 @dataclass(frozen=True)
 class RunFolder:
     """One run on disk: config.json, run.json (source, version, machine, status), log.jsonl (one line per frame),
-    trajectory.txt, map.ply, checkpoint.safetensors, loops.json, metrics.json, report.html, submaps/,
-    components/.
+    trajectory.txt, map.ply, checkpoint.safetensors, loops.json, metrics.json, report.html, submaps/, components/.
 
     Files are replaced atomically, and the log grows by complete lines, so an interrupted run can still be read.
     """

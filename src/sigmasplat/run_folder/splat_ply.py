@@ -2,12 +2,11 @@
 
 Columns: x y z, nx ny nz (0), f_dc_0..2 = (colour − ½)/C0, f_rest_0..44 for view-dependent colours (all harmonics of
 red, then green, then blue), opacity (logit), scale_0..2 (log metres), rot_0..3 (wxyz), and our own at the end:
-log_variance_0..2, then depth_std_m and color_std if they are
-known. Our reader ignores the last two. Readers that find columns by name skip ours: SuperSplat and splat-transform
-(PlayCanvas), antimatter15/splat, nianticlabs/spz. Readers that assume the fixed 62-float layout and ignore the names
-would read garbage: the original 3DGS viewer (SIBR), 3DGS.cpp, older Unity importers. `plain` writes exactly these 62
-columns, with f_rest 0 if a map has no harmonics. The header has no comments, because SIBR expects the number of splats
-in line 3.
+log_variance_0..2, then depth_std_m and color_std if they are known. Our reader ignores the last two. Readers that find
+columns by name skip ours: SuperSplat and splat-transform (PlayCanvas), antimatter15/splat, nianticlabs/spz. Readers
+that assume the fixed 62-float layout and ignore the names would read garbage: the original 3DGS viewer (SIBR),
+3DGS.cpp, older Unity importers. `plain` writes exactly these 62 columns, with f_rest 0 if a map has no harmonics. The
+header has no comments, because SIBR expects the number of splats in line 3.
 """
 
 from collections.abc import Sequence

@@ -42,9 +42,8 @@ MORTON_BITS, ROUNDING = 20, 1e-6
 class SplatValues:
     """N splats as float64 arrays, without σ², which other programs' formats cannot hold.
 
-    means [N, 3] m; quats [N, 4] wxyz, unit length; log_scales [N, 3] log metres; opacities [N] in [0, 1];
-    colors [N, 3]; harmonics [N, 3·k] of the lowest sufficient degree: k = 0, 3, 8 or 15 per channel, columns
-    3·i + channel.
+    means [N, 3] m; quats [N, 4] wxyz, unit length; log_scales [N, 3] log metres; opacities [N] in [0, 1]; colors [N,
+    3]; harmonics [N, 3·k] of the lowest sufficient degree: k = 0, 3, 8 or 15 per channel, columns 3·i + channel.
     """
 
     means: Doubles

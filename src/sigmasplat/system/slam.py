@@ -144,8 +144,7 @@ def checkpoint_of(
     active: GaussianField, path: Trajectory, atlas: Atlas, keyframes: Sequence[int], edges: Edges
 ) -> dict[str, Tensor]:
     """Return the active submap's field with its attributes and its optimiser state, poses, times, keyframes, anchors,
-    the submap of each frame, the exposures of frames if they are known, and the errors of the path, in host
-    memory."""
+    the submap of each frame, the exposures of frames if they are known, and the errors of the path, in host memory."""
     return {
         **_rows_of(active, ""),
         **{key: part for name, rows in active.attributes.items() for key, part in _rows_of(rows, f"{name}_").items()},
