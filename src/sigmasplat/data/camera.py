@@ -64,8 +64,7 @@ class Camera:
         return columns, rows
 
     def rays(self) -> NDArray[np.float32]:
-        """Return the point at depth 1 m on each pixel's ray [H, W, 3], camera frame; multiply by depth for the
-        surface."""
+        """Return the point at depth 1 m on each pixel's ray [H, W, 3], camera frame; times depth it is the surface."""
         u, v = np.meshgrid(np.arange(self.width), np.arange(self.height))
         x, y = (u - self.cx) / self.fx, (v - self.cy) / self.fy
         return np.stack([x, y, np.ones_like(x)], -1).astype(np.float32)

@@ -47,8 +47,7 @@ def resized_depth(
     outside [least_m, most_m].
 
     Depth is interpolated where the four readings around the centre are on one surface (`interpolated_depth`). Elsewhere
-    it is the reading of the area that is nearest to the centre: the mean of a near and a far surface is on neither of
-    them.
+    it is the reading of the area that is nearest to the centre: the mean of a near and a far surface is on neither.
     """
     if depth_m.shape == (height, width):
         return within(depth_m.copy(), least_m, most_m)
@@ -141,8 +140,7 @@ def distance_std(depth_m: Floats, model: SensorModel) -> Floats:
 def alignment_std(depth_m: Floats, model: SensorModel) -> Floats:
     """Return the standard deviation of readings in alignment, m [H, W], which does not average out `shared`.
 
-    Only the distance counts: readings at edges and on slanted surfaces are noisier, but they are those that decide the
-    pose.
+    Only the distance counts: readings at edges and on slanted surfaces are noisier, but they decide the pose.
     """
     return np.asarray(np.hypot(distance_std(depth_m, model), np.float32(model.shared) * depth_m * depth_m), np.float32)
 

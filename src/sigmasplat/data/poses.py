@@ -219,8 +219,7 @@ class Poses(Records[Matrix]):
 
 @dataclass(eq=False)
 class KeyframePoses(Records[Sequence[Matrix]]):
-    """T_submap_camera [4, 4] of the keyframes of each submap. Those of the last submap may change; the others are
-    final.
+    """T_submap_camera [4, 4] of the keyframes of each submap. Only those of the last submap may change.
 
     rows [K, 4, 4]: those of all submaps but the last; ends [S - 1]: number of keyframes up to the end of each of these
     submaps; newest: those of the last submap, None before the first one.

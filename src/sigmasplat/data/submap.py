@@ -33,8 +33,7 @@ class Picture:
         return self.color.astype(np.float32) / np.float32(255.0)
 
     def without_exposure(self, exposure: Matrix) -> "Picture":
-        """Return the same images with the colour in the exposure of the map (`data.camera`); photo and detail are
-        not changed."""
+        """Return the same images with the colour in the exposure of the map (`data.camera`), not photo and detail."""
         color = np.rint(unexposed(self.unit_color, exposure) * 255.0).astype(np.uint8)
         return replace(self, color=color)
 

@@ -28,8 +28,7 @@ REMEDY = "download or copy it again"
 def open_image(path: Path, data: bytes | None = None) -> Iterator[ImageFile.ImageFile]:
     """Open an image file, or `data` of one that `path` names, and yield it before its pixels are decoded.
 
-    Raises SourceError naming the file if it is not of `FORMATS`, has more than `MOST_PIXELS`, or if the block cannot
-    decode it.
+    Raises SourceError naming the file if it is not of `FORMATS`, has more than `MOST_PIXELS`, or cannot be decoded.
     """
     opened = open_regular(path, most=MOST_BYTES) if data is None else nullcontext(io.BytesIO(data))
     with opened as file, guarded(path, REMEDY, SourceError, "unreadable image"):

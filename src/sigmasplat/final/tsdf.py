@@ -204,8 +204,7 @@ class _Image:
 def _slope(w: Floats, axis: int) -> Floats:
     """Return the smaller of the differences to both neighbours along an axis, 0 if their signs differ (minmod).
 
-    At an edge, the last pixel of a surface thus gets no slope from the other surface, and w stays positive in the
-    pixel.
+    At an edge, the last pixel of a surface thus gets no slope from the other surface, and w stays positive in it.
     """
     w = np.moveaxis(w, axis, 0)
     step = np.where((w[1:] > 0) & (w[:-1] > 0), w[1:] - w[:-1], np.float32(0.0))
@@ -268,8 +267,7 @@ def extract_surface(volume: Tsdf) -> Mesh:
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """A brick's surface: vertices [V, 3] m, the lattice edge of each vertex [V] as a key, colors [V, 3], faces [F,
-    3]."""
+    """A brick's surface: vertices [V, 3] m, the lattice edge of each [V] as a key, colors [V, 3], faces [F, 3]."""
 
     vertices: Floats
     edges: Ints

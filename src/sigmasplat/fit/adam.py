@@ -105,8 +105,7 @@ def _catch_up(field: Rows, rows: Tensor, rates: Rates, to: int) -> tuple[Tensor,
 def _move(
     params: Tensor, moment1: Tensor, moment2: Tensor, rates: Rates, unbias1: Tensor | float, unbias2: Tensor | float
 ) -> None:
-    """Apply Adam's step to rows in place. unbias1 and unbias2 correct the bias of moment1 and of the root of
-    moment2."""
+    """Apply Adam's step to rows in place. unbias1, unbias2: for the bias of moment1 and of the root of moment2."""
     spread = moment2.sqrt().mul_(unbias2).add_(EPSILON)
     params.addcmul_((moment1 * unbias1).div_(spread), rates.per_column.to(params.device), value=-1.0)
 

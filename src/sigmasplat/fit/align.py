@@ -257,8 +257,7 @@ def gray_share(reference: Pyramid, live: Pyramid, T_live_reference: Matrix) -> f
 
 
 def _axes(n: Normal, depth_m: float) -> tuple[Matrix, NDArray[np.bool_]]:
-    """Split the information into principal directions; rotations are measured by the shift they cause at the mean
-    depth.
+    """Split the information into principal directions; rotations count by the shift they cause at the mean depth.
 
     Returns the directions as columns [6, 6], and which of them the images determine [6] (Zhang et al. 2016).
     """
@@ -268,8 +267,7 @@ def _axes(n: Normal, depth_m: float) -> tuple[Matrix, NDArray[np.bool_]]:
 
 
 def _slope(around: Sequence[Normal], steps: Matrix) -> Matrix:
-    """Return the derivative of the gradient with respect to the twist, made symmetric. Uses central differences with
-    steps [6]."""
+    """Return the derivative of the gradient by the twist, made symmetric: central differences with steps [6]."""
     pulls = np.stack([n.b for n in around])
     D = ((pulls[::2] - pulls[1::2]) / (2.0 * steps[:, None])).T
     return np.asarray(0.5 * (D + D.T))

@@ -45,8 +45,7 @@ class QuaternionMotion:
         return motion @ self.guess
 
     def gradient(self, numbers: Vector, twist: Vector) -> Vector:
-        """Convert the gradient [6] with respect to the left twist (ρ, φ) of T_camera_world to that with respect to the
-        parameters.
+        """Convert the gradient [6] by the left twist (ρ, φ) of T_camera_world to that by the parameters.
 
         The motion's rotation turns the pose about the motion's translation t, so its gradient is g = g_φ − t × g_ρ.
         With respect to a quaternion q the gradient is 2 (0, g) ⊗ q / |q|².

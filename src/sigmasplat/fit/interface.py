@@ -1,5 +1,4 @@
-"""Define what the fits need from a device: one record, `DeviceFits`, with an instance per backend in
-fit/backends.py."""
+"""Define what the fits need from a device: one record, `DeviceFits`, one per backend in fit/backends.py."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,8 +18,7 @@ from sigmasplat.types import Matrix
 Weights = Mapping[str, float]
 """Weights of the loss terms (`fit.losses`) by name."""
 Twist = Matrix | Tensor
-"""Gradient with respect to a pose's left twist (ρ, φ) [6]. A tensor, like a cost, may still be in computation on a
-device."""
+"""Gradient with respect to a pose's left twist (ρ, φ) [6]. A tensor, like a cost, may still be computed on a device."""
 Plane = Any
 """An image [H, W], float32: an array in host memory, or a tensor on the device that aligns it."""
 
@@ -32,8 +30,7 @@ class Accumulator(Protocol):
     """Sums the gradient of the mean loss of several images, then steps every splat that is visible in any of them."""
 
     def add(self, field: GaussianField, share: float, grad2d: Tensor | None = None) -> Twist:
-        """Add the view's gradient planes, weighted by their share of the mean. Return the image's own pose twist
-        [6]."""
+        """Add the view's gradient planes, weighted by their share of the mean. Return the image's pose twist [6]."""
 
     def step(self, field: GaussianField, rates: Rates, weights: Weights, frozen_colors: int) -> float | Tensor:
         """Add the gradient of the shape terms and take Adam's step. Return the cost of the shape terms."""
@@ -178,8 +175,7 @@ class ImageKernels:
 @dataclass(frozen=True)
 class DeviceFits:
     """What a backend offers to `fit` and `slam`. The instance of plain torch (fit/backends.py) works for every view.
-    The other instances replace the parts that their device computes itself; their functions take views of their own
-    backend."""
+    The other instances replace the parts that their device computes itself, and take views of their own backend."""
 
     mapping_step: Callable[[Any], MappingStep]
     """Make the mapping step of a view; it computes `fit.losses.FUSED_TERMS`."""

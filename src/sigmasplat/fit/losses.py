@@ -145,16 +145,14 @@ def mean_depth(depth: Tensor, alpha: Tensor, depth_target: Tensor, valid: Tensor
 
 @term
 def isotropy(scales: Tensor) -> Tensor:
-    """Return the mean of |s_i − mean(s_i)| of scales [N, 3] m over splats × 3, m (VarSplat §2, L_reg); 0 without
-    splats."""
+    """Return the mean of |s_i − mean(s_i)| of scales [N, 3] m, over splats × 3, m (VarSplat §2, L_reg); 0 if N = 0."""
     off = scales - scales.mean(1, keepdim=True)
     return off.abs().sum() / max(off.numel(), 1)
 
 
 @term
 def isotropy_ratio(scales: Tensor) -> Tensor:
-    """Return the mean of max(s_i) / min(s_i) − 1 of scales [N, 3] m in view (CG-SLAM eq. 17, ε = 1); 0 without
-    splats."""
+    """Return the mean of max(s_i) / min(s_i) − 1 of scales [N, 3] m in view (CG-SLAM eq. 17, ε = 1); 0 if N = 0."""
     return (scales.amax(1) / scales.amin(1) - 1.0).sum() / max(len(scales), 1)
 
 
@@ -162,8 +160,7 @@ def isotropy_ratio(scales: Tensor) -> Tensor:
 def nll_color(color: Tensor, color_target: Tensor, variance: Tensor, valid: Tensor) -> Tensor:
     """Return the Gaussian NLL of colours [H, W, 3] under V [H, W, 3] (VarSplat §2, L_var).
 
-    The residual has no gradient, V has: it trains σ², and, because V = Σ w (σ² + c²) − Ĉ², also colours, shapes and
-    poses.
+    The residual has no gradient, V has: it trains σ² and, as V = Σ w (σ² + c²) − Ĉ², also colours, shapes and poses.
     """
     return gaussian_nll(color - color_target, variance, valid)
 

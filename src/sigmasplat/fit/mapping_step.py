@@ -26,8 +26,7 @@ def render_for(view: View, params: Tensor, T_camera_world: Matrix, target: Targe
 
 
 def shape_gradient(log_scales: Tensor, weights: Weights, of_all: float, of_visible: float) -> tuple[Tensor, float]:
-    """Return the gradient of the weighted shape terms with respect to the log scales [n, 3] of some splats, and the
-    cost.
+    """Return the gradient of the weighted shape terms by the log scales [n, 3] of some splats, and the cost.
 
     of_all, of_visible: the number of these splats relative to all splats, over which `isotropy` is a mean, and to those
     in view, over which the other terms are.

@@ -51,8 +51,7 @@ class PoseFit:
 def fit_pose_adam(
     params: Tensor, view: View, target: Target, T_camera_world: Matrix, config: TrackingConfig, iterations: int
 ) -> PoseFit:
-    """Minimise L_track by Adam (`fit.descent`) and return the best iterate. On a CUDA device the loop runs without the
-    host.
+    """Minimise L_track by Adam (`fit.descent`) and return the best iterate. On CUDA the loop runs without the host.
 
     params [N, 17] and σ² are fixed (VarSplat §3). The descent stops early when
     `plateau_window` steps have not lowered the loss by the share `plateau_stop`. Without common pixels the guess is

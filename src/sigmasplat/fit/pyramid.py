@@ -65,8 +65,7 @@ class Pyramid:
         return np.asarray((self.cameras[-1].rays()[::step, ::step] * depth_m)[depth_m[..., 0] > 0])
 
     def weighed(self, weight: Plane | None, weight_depth: Plane | None = None) -> "Pyramid":
-        """Return the same images with other weights [H, W] of gray and depth; without a depth weight, gray's weight is
-        used."""
+        """Return the same images with other weights [H, W] of gray and depth; without one for depth, gray's is used."""
         given = (None if w is None else self.kernels.contiguous(w) for w in (weight, weight_depth))
         gray_weights, depth_weights = ([w] for w in given)
         for _ in self.cameras[1:]:

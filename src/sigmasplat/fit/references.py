@@ -58,8 +58,7 @@ def relative_noise(depth_m: Image, sensor: SensorModel, noise_per_m: float = NOI
 
 
 def confidence_of(sensor: SensorModel, noise_per_m: float = NOISE_PER_M, scene_scale: float = 1.0) -> float:
-    """Return how many times as sure as the law noise_per_m · z² a sensor's readings are in alignment, at the distance
-    of a wall."""
+    """Return how many times as sure as noise_per_m · z² a sensor's readings are in alignment, at a wall's distance."""
     wall_m = np.full(1, USUAL_M * scene_scale, np.float32)
     return float((generic_std(wall_m, noise_per_m) / alignment_std(wall_m, sensor))[0])
 

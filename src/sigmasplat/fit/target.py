@@ -38,9 +38,7 @@ def luma(color: Tensor) -> Tensor:
 
 @dataclass(eq=False)
 class Target:
-    """The image that a view should render: color [3, rows, columns], depth [rows, columns] m (0 = no reading or
-    padding).
-    """
+    """What a view should render: color [3, rows, columns], depth [rows, columns] m (0 = no reading or padding)."""
 
     camera: Camera
     color: Tensor
@@ -132,7 +130,6 @@ class Keyframe:
         return replace(self.target.picture(), detail=self.detail, photo=self.photo)
 
     def move(self, gradient: NDArray[np.float64], rates: NDArray[np.float64]) -> None:
-        """Take an Adam step on the pose; gradient [6] with respect to the left twist of T_camera_world, rates [6] in m
-        and rad."""
+        """Take an Adam step on the pose; gradient [6] by the left twist of T_camera_world, rates [6] in m and rad."""
         update = self.motion.step(gradient, self.pose_rate * rates)
         self.T_world_camera = se3.orthonormalise(self.T_world_camera @ se3.exp(-update))

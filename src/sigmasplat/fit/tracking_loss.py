@@ -84,8 +84,7 @@ def per_value(weight: float, mask: Tensor, channels: int, average: str) -> float
 
 @torch.no_grad()
 def tracking_gradient(view: View, target: Target, config: TrackingConfig, exposure: Tensor) -> tuple[float, Tensor]:
-    """Write ∂L_track/∂(color, depth) to the view's planes; return the loss and its gradient with respect to exposure
-    (a, b).
+    """Write ∂L_track/∂(color, depth) to the view's planes; return the loss and its gradient by exposure (a, b).
 
     L_track = Σ A³ M (λ_c w̃ |exp(a) Ĉ + b − C| + (1 − λ_c) |D̂ − D|). Here it is a mean over all pixels (VarSplat §3),
     or over the pixels used for colour and for depth (CG-SLAM §6). The choice of pixels M and their weights A³ and w̃

@@ -30,8 +30,7 @@ class SubmapDescriptor:
 class DescribedSubmaps(Records[SubmapDescriptor]):
     """Descriptors of S submaps, in the order in which their loops were searched.
 
-    rows [K, D]: of all keyframes, submap by submap; facts [S, 3]: number of the submap, opacity_ratio, and the end of
-    its rows.
+    rows [K, D]: of all keyframes, submap by submap; facts [S, 3]: number of the submap, opacity_ratio, end of its rows.
     """
 
     rows: Column = field(default_factory=lambda: Column.of(np.float32, 0))

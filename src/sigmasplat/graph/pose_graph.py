@@ -202,8 +202,7 @@ class PoseGraph:
 def _graduate(
     graph: PoseGraph, T: Matrix, chi2_limit: float, judged_first: NDArray[np.bool_]
 ) -> tuple[Matrix, Matrix, int]:
-    """Solve for decreasing μ: return poses, weights [E] of the Geman–McClure loss with c² = chi2_limit, and steps
-    taken.
+    """Solve for decreasing μ: return poses, weights [E] of the Geman–McClure loss with c² = chi2_limit, steps taken.
 
     w = (μc² / (r² + μc²))², μ from 2 max r² / c² down to 1 (Yang et al. 2020, eq. 12 and remark 5). The first r²
     is that of the loops `judged_first` [E] at the given poses. It is not that of a solution with equal weights, because

@@ -272,8 +272,7 @@ class LocalisationConfig(TrackingConfig):
 
 
 def tracking_of(config: Config) -> TrackingConfig:
-    """Return the settings for localising keyframes: alignment as in tracking, the loss and its descent as in
-    registration.
+    """Return the settings for localising keyframes: alignment as in tracking, loss and descent as in registration.
 
     The loss is a mean over all pixels (VarSplat §5). Tracking sums the colour errors over the channels; where
     registration takes their mean, the weight of colour is a third of that. Adam does not depend on the loss's scale.

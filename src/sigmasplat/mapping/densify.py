@@ -178,8 +178,7 @@ def still_uncertain(
     """Return which faded splats [N] did not recover: still too uncertain, or opacity below `least_opacity`.
 
     faded: their ids; ids that no longer exist are ignored. uncertainty [N] m²: the current `splat_uncertainty`. A faded
-    splat rarely owns a pixel, so its opacity decides. Within a few dozen steps the opacity cannot fall from 0.07 to
-    1/255.
+    splat rarely owns a pixel, so its opacity decides. In a few dozen steps it cannot fall from 0.07 to 1/255.
     """
     named = torch.zeros(field.next_id, dtype=torch.bool, device=field.ids.device)
     named[faded] = True

@@ -105,8 +105,7 @@ def make_splats(
 
 
 def discs(target: Target, pixels: Mask) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the axes of discs on the surface at pixels [H, W] with depth: camera frame, [P, 3, 3], and their stretch
-    [P].
+    """Return the axes of discs on the surface at pixels [H, W] with depth: camera frame, [P, 3, 3], and stretch [P].
 
     Columns: along the surface away from the camera, across it, and the normal. The first axis is longer than the second
     by the stretch 1 / cos of the viewing angle, at most `STRETCH_MOST`; the stretch is 0, and the axes are those of the

@@ -144,8 +144,7 @@ class StartPoint:
 def resume(run: RunFolder, source: Source) -> StartPoint:
     """Restore SLAM from the run's last saved state, and remove what the run wrote after it.
 
-    Raises RunError if the run is complete, has no state, was made from another sequence, or has fewer files than its
-    state requires.
+    Raises RunError if the run is complete, has no state, was made from another sequence, or lacks files of its state.
     """
     if run.facts().get("status") == "complete":
         raise RunError(f"{run.path} is complete, so it cannot be resumed; to repeat it, use run --overwrite")

@@ -166,8 +166,7 @@ class Session:
         at the next progress report of the final map; a second one stops immediately. Both end as "interrupted", and a
         session interrupted between frames makes no final map. A live source ends only with Ctrl-C: the first one ends
         its frames, and the final map is made. SIGTERM and SIGHUP do the same as Ctrl-C. Any other exception marks the
-        run as "failed" and gets a note with the path of the run folder. Raises RunError if another process holds the
-        run folder.
+        run as "failed" and gets a note with the path of the run folder. Raises RunError if another process holds it.
         """
         with self.run.locked():
             return self._execute()

@@ -157,8 +157,7 @@ ROUNDS = 5
 LEAST_SIGMA = 0.005
 HUBER = 1.5
 STIFF_SCALE, STIFF_SHIFT = 1.0, 10.0
-"""Weight of s = 1 and of b = 0 against the cells. Without the first, small errors of the map would add up from keyframe
-to keyframe."""
+"""Weight of s = 1 and of b = 0 against the cells. Without the first, errors of the map would add up over keyframes."""
 LEAST_INVERSE = 1e-3
 """Predicted surfaces farther than the inverse of this, m, have no depth."""
 DIAMETER_PX, SPREAD_PX, SPREAD_SIGMA = 9, 3.0, 3.0

@@ -84,8 +84,7 @@ class PreparedFrame:
         return replace(self._read_as(depth_m), live=self.live.with_depth(depth_m))
 
     def aside(self, front: DynamicMask | None) -> "PreparedFrame":
-        """Return the frame for fits of its pose, which are to use neither depth nor colour of what is in front or
-        ignored."""
+        """Return the frame for fits of its pose, without depth and colour of what is in front or ignored."""
         depth_m = self.target.depth_image.numpy()
         unread = self if front is None else self._read_as(np.where(front.hidden, np.float32(0.0), depth_m))
         hidden_m = np.where(self._unused(front), np.float32(HIDDEN_M), depth_m)

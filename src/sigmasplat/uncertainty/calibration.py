@@ -27,8 +27,7 @@ SQUARE_OF_MEAN = (3.0 * math.pi / 8.0, math.pi / 2.0)
 RESIDUAL_PIXELS = 1.0
 """Weight of the mean residual of the map in the variance of a splat, in pixels: it decides for splats hardly seen."""
 FARTHEST_M = 0.3
-"""Limit of a depth residual in the mean of a splat's residuals, m, in a room: beyond it the reading is of another
-surface."""
+"""Limit of a depth residual in the mean of a splat's residuals, m, in a room: beyond it is another surface."""
 
 
 def background_of(keyframes: Iterable[Keyframe]) -> Background:

@@ -1,7 +1,6 @@
 """Write surfaces as PLY or GLB with a normal and a colour per vertex, or as STL; read PLY.
 
-PLY and GLB also contain depth_std_m, if it is known; PLY also `filled`, the vertices that only close gaps. The unit is
-the metre.
+PLY and GLB have depth_std_m too, if it is known; PLY also `filled`, the vertices that only close gaps. Unit: metre.
 
 A GLB looks in every viewer as it was recorded. Colours of a map contain the light of the room, so the material is unlit
 (KHR_materials_unlit). Viewers without the extension use it as a rough surface that is no metal: glTF's default is
@@ -171,8 +170,7 @@ def _colors(vertices: NDArray[np.void]) -> NDArray[np.float32] | None:
 
 
 def _rows(file: BinaryIO, path: Path, element: Element) -> NDArray[np.void]:
-    """Read one element. All lists are read with the length of the first one; their lengths are returned as column
-    "NAME count"."""
+    """Read one element. All lists are read with the length of the first one; their lengths are column "NAME count"."""
     fields: list[tuple[str, str] | tuple[str, str, int]] = []
     length, order, count = 0, element.order, element.count
     if count < 0:

@@ -6,8 +6,7 @@ A file is one gzip stream of a header of 16 bytes, then one stream for all splat
 (24-bit fixed point), opacities (0 to 255), colours (f_dc · 0.15 + ½, 0 to 255), log scales (steps of 1/16 from −10),
 rotations (2 bits for the index of the largest of x, y, z, w, then sign and 9 bits of each other one), harmonics (steps
 of 1/128, 128 is 0). Axes are x right, y up, z back: the writer rotates maps by 180° about x. Splats are in Morton
-order, because similar neighbours compress better. The format cannot hold σ². Layout: nianticlabs/spz, README.md and
-load-spz.cc.
+order, because similar neighbours compress better. The format cannot hold σ². Layout: nianticlabs/spz, load-spz.cc.
 """
 
 import gzip

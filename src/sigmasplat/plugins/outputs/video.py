@@ -101,8 +101,7 @@ CEILING_M = 0.1
 
 
 def image_count(path_s: float, fps: float = 25.0, seconds: float | None = None, orbit: bool = False) -> int:
-    """Return the number of images of a film of some seconds (None: those of the path, `path_s`, within 4 to 20 s; 12 s
-    for an orbit)."""
+    """Return the number of images of a film of some seconds (None: `path_s`, within 4 to 20 s; 12 s for an orbit)."""
     usual = ORBIT_S if orbit else float(np.clip(path_s, SHORTEST_S, LONGEST_S))
     return max(1, round((seconds or usual) * fps))
 

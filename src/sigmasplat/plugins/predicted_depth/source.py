@@ -63,8 +63,7 @@ class PredictedDepth:
             self._factor = MEDIAN_M / median
 
     def depth_of(self, i: int, width: int, height: int) -> Floats:
-        """Return the depth of frame i [height, width], 0 where it is unknown. Raises SourceError if it cannot be
-        used."""
+        """Return the depth of frame i [height, width], 0 where it is unknown. Raises SourceError if it is unusable."""
         depth_m = self._depth(i) * np.float32(self._factor)
         if depth_m.shape == (height, width):
             return depth_m

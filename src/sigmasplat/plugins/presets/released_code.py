@@ -1,6 +1,5 @@
 """Presets with the values of the papers' released code, by scene: rows of the tables in `scenes/`, and the code's
-methods where the paper differs. Mistakes of the code are not reproduced, such as the calibration of another camera for
-fr3.
+methods where the paper differs. Mistakes of the code are not reproduced, such as another camera's calibration for fr3.
 
 VarSplat: the colours of all splats are frozen in the first half of a keyframe's steps: pruning makes them trainable
 again. Adam starts anew at each keyframe, the pose's Adam is AMSGrad, and tau of registration is 3 in all scenes (the
@@ -8,8 +7,7 @@ arguments are given by position, so w_max is used as tau). Deviations: docs/vars
 
 CG-SLAM: bundle adjustment moves only the newest pose, with a gradient without the path through the covariance. The
 window is chosen by the similarity of NetVLAD; without a file of weights (`loops.weights`) the built-in descriptor is
-used, with a warning. Uncertain splats are not pruned, no splat is cloned, and the second frame has its own number of
-iterations.
+used, with a warning. Uncertain splats are not pruned, no splat is cloned, and the second frame has its own iterations.
 """
 
 from collections.abc import Callable

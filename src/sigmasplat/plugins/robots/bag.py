@@ -118,8 +118,7 @@ class LiveOdometry:
         return self.T_odom_camera
 
     def _motion(self, last: int) -> Matrix:
-        """Return the motion to the newest frame from the last one that was not lost; none if they are in different
-        components.
+        """Return the motion to the newest frame from the last one that was not lost; none between components.
 
         Both poses are read now, so that changes of their keyframes by mapping are no motion.
         """

@@ -28,8 +28,7 @@ def is_own_page(origin: str | None, reached: str | None, host: str) -> bool:
     """Return whether a request with the headers Origin and Host comes from a page of the viewer at `host`.
 
     Also true without an Origin: the client is not a browser. The page's address must equal the requested one, and it
-    must be an IP address or a name of the viewer's host: the owner of any other name can point that name to this
-    machine.
+    must be an IP address or a name of the viewer's host: the owner of another name can point it to this machine.
     """
     if origin is None:
         return True

@@ -103,8 +103,7 @@ RENEWED = 0.7
 
 @dataclass(frozen=True, eq=False)
 class DynamicDetector:
-    """What is known of moving things between two frames: what recent frames saw. Without `config.find` nothing is
-    remembered."""
+    """What is known of moving things between two frames: what recent frames saw; nothing without `config.find`."""
 
     config: MovingConfig = field(default_factory=MovingConfig)
     history: DepthHistory = field(default_factory=DepthHistory)

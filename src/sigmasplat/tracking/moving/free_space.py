@@ -17,8 +17,7 @@ Floats = NDArray[np.floating]
 CLEAR_M, CLEAR_RELATIVE = 0.05, 0.05
 """A place was free if the reference saw a surface farther than it by this distance plus this share of its depth."""
 AROUND_PX = 5
-"""Least size of the window around a pixel of the reference in which all readings must be farther: the pose is not
-exact."""
+"""Least size of the window around a pixel of the reference in which all readings must be farther: poses have errors."""
 
 
 def free_places(
@@ -64,8 +63,7 @@ def widened(mask: NDArray[np.bool_], size: int) -> NDArray[np.bool_]:
 
 def labelled(mask: NDArray[np.bool_]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """Return the number of the connected region of each pixel [H, W], from 1 on in the order of rows, 0 outside of the
-    mask; and left, top, width, height and size of each region [count, 5], in pixels. Regions also connect at their
-    corners."""
+    mask; and left, top, width, height and size of each region [count, 5], in pixels. Regions connect at corners too."""
     cv2, image = opencv(), np.ascontiguousarray(mask).view(np.uint8)
     _, labels, stats, _ = cv2.connectedComponentsWithStatsWithAlgorithm(image, 8, cv2.CV_32S, cv2.CCL_SAUF)
     return np.asarray(labels, np.int32), np.asarray(stats[1:], np.int32)
