@@ -165,7 +165,7 @@ def test_height_points_up_and_the_truth_may_have_gaps() -> None:
     truth = estimate.copy()
     truth[1] = np.nan
     laid_out = charts.trajectory_charts(estimate, truth, np.array([False, True, False]))
-    assert [curve.name for curve in laid_out[1].curves] == ["truth", "estimate", "lost"]
+    assert [curve.name for curve in laid_out[1].curves] == ["recorded", "estimate", "lost"]
     assert laid_out[1].curves[1].points[:, 1].tolist() == [0, 1.5, 3]
     estimate_shown = drawn(laid_out[1])[1][1]
     assert (np.diff(estimate_shown[:, 1]) < 0).all() and [len(places) for _, places in drawn(laid_out[1])] == [2, 3, 1]

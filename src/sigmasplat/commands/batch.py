@@ -176,5 +176,8 @@ def _show(screen: "Screen", made: "Batch") -> None:
     for job in made.finished():
         metrics = RunFolder(made.out / job.name).read_metrics()
         table.add_row(job.name, *(number(score.value(metrics), score.digits) for score in shown))
+    for name, why in made.failed.items():
+        table.add_row(name, "failed")
+        screen.say(f"{name}: {why}", "bold red")
     screen.out.print(table)
     screen.say(f"{len(made.finished())} of {len(made.jobs)} runs: {made.out}")

@@ -114,5 +114,5 @@ def score(
         report = folder.path / "report.html"
         if report.exists():
             screen.say(f"report: {report.resolve()}")
-    screen.next_commands(command for _, command in next_commands(str(folder.path)))
+    screen.next_commands((command for _, command in next_commands(str(folder.path))), alarms=metrics.get("alarms", {}))
     return unscored

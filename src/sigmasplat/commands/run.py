@@ -214,6 +214,7 @@ def _run_and_score(
     realtime: track frames when they arrive. Raises KeyboardInterrupt if Ctrl-C came before the first frame was done.
     """
     from sigmasplat.plugins.checks.motion import MotionWatch
+    from sigmasplat.plugins.evaluation.failure import failure
     from sigmasplat.plugins.sources.live import Arrivals, LiveSource
     from sigmasplat.realtime.system import RealTime
     from sigmasplat.run.resume import StateFile
@@ -250,7 +251,8 @@ def _run_and_score(
     if run_options.evaluate:
         score(screen, folder, source)
     else:
-        screen.next_commands([f"sigmasplat eval {folder.path}"], f"{outcome.summary()}: {folder.path}")
+        kept, failed = f"{outcome.summary()}: {folder.path}", failure(folder, source)
+        screen.next_commands([f"sigmasplat eval {folder.path}"], kept, failed)
     if viewer:
         keep_showing(screen, viewer, folder)
     return OK
@@ -307,5 +309,7 @@ def warn_at_the_end(
             "it, or return to what was seen before"
         )
         screen.warn(contradicted if chosen.poses else unconfirmed)
+    if source.path_by and not chosen.poses:
+        screen.say(f"the recording has poses of {source.path_by}; a run with --poses recorded uses them")
     if source.predicted_depth and not chosen.poses_scale_depth:
         screen.say("the scale is arbitrary, because a network predicted depth: lengths are not in metres")

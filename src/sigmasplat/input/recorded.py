@@ -131,12 +131,12 @@ class RecordedSource(Source):
         self, name: str, images: Sequence[ImagePair], calibration: Calibration, settings: InputConfig,
         truth: Trajectory | None = None, skipped: Sequence[str] = (), test: Source | None = None,
         gyroscope: Gyroscope | None = None, accelerometer: Accelerometer | None = None, surface: Path | None = None,
-        estimated: bool = False, origins: Mapping[str, Origin] = MappingProxyType({}),
+        estimated: bool | str = False, origins: Mapping[str, Origin] = MappingProxyType({}),
     ) -> None:  # fmt: skip
         """Store image pairs in order of time; `truth` is the path of the colour camera; `skipped` lists files left out.
 
         test: separate test views; gyroscope, accelerometer: in the axes of the colour camera; surface: file of the true
-        surface; estimated: whether `truth` is an estimate of the recording device; origins: of times, pairs and others.
+        surface; estimated: whether the device, or which program, estimated `truth`; origins: of times, pairs and more.
         Raises SourceError if the first images do not match the calibration, no image has a depth reading, or no image
         was taken while the gyroscope measured.
         """
@@ -147,7 +147,8 @@ class RecordedSource(Source):
         self.skipped, self.origins = list(skipped), dict(calibration.origins) | dict(origins)
         self._images, self._truth, self._test = images, truth, test
         self._gyroscope, self._accelerometer = gyroscope, accelerometer
-        self._surface, self._estimated = surface, estimated
+        self._surface, by = surface, f" ({estimated})" * isinstance(estimated, str)
+        self.path_by = f"the device{by}" * bool(estimated)
         files, (size, depth_size) = first_readable(images, lambda pair: (pair, pair.sizes()))
         check_image_sizes(self._rectified, files.color, size, files.depth, depth_size)
         self.origins |= color_origins(files.color)
@@ -202,7 +203,7 @@ class RecordedSource(Source):
 
     def device_path(self) -> Trajectory | None:
         """Return the recorded path if the device estimated it."""
-        return self._truth if self._estimated else None
+        return self._truth if self.path_by else None
 
     def test_views(self) -> Source | None:
         return self._test

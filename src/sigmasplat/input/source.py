@@ -44,7 +44,7 @@ def read_ahead(items: Iterable[Item], length: int = 4) -> Iterator[Item]:
 
 FACTS = (
     "depth_units_per_metre", "depth_registered", "registrable", "computed_depth", "predicted_depth",
-    "scene_scale", "depth_noise_per_m", "sensor", "origins", "depth_doubts",
+    "scene_scale", "depth_noise_per_m", "sensor", "origins", "depth_doubts", "path_by",
 )  # fmt: skip
 """What a source that wraps another one has in common with it."""
 
@@ -62,6 +62,7 @@ class Source(ABC):
     scene_scale: size of the scene relative to a room, above 1 outdoors; depth_noise_per_m: standard deviation
     of depth, times z²; None if it is unknown (`config.scale.for_scene` uses both);
     sensor: the depth sensor (`config.input`), None if it is unknown;
+    path_by: whose estimate the path of `truth` is, in words; empty if it is a ground truth;
     origins: where the values that decide the result come from, by name (`assumptions`);
     depth_doubts: what the values of depth images seem to mean, if that is not depth in metres;
     live: whether frames come from a live camera: each only once, and their number is unknown (LiveSource);
@@ -80,6 +81,7 @@ class Source(ABC):
     scene_scale: float = 1.0
     depth_noise_per_m: float | None = None
     sensor: str | None = None
+    path_by: str = ""
     live: bool = False
     arrived_s: float | None = None
     dropped: int = 0
@@ -122,12 +124,14 @@ class Source(ABC):
         """Return the ground-truth path as recorded, with its own timestamps and world frame; None if it is unknown."""
 
     def described_truth(self) -> str | None:
-        """Describe the size of the ground-truth path in words, not the path itself; None if it is unknown."""
+        """Describe the size of the recorded path in words, not the path itself; None if it is unknown."""
         path = self.truth()
         if path is None:
             return None
         length_m = float(np.linalg.norm(np.diff(path.T_world_camera[:, :3, 3], axis=0), axis=1).sum())
-        return f"{len(path)} true poses, {length_m:.1f} m long"
+        what = f"poses of {self.path_by}" if self.path_by else "true poses"
+        use = "; not a ground truth; to use them: --poses recorded" * bool(self.path_by)
+        return f"{len(path)} {what}, {length_m:.1f} m long{use}"
 
     def image_name(self, i: int) -> str:
         """Return the name of the file of colour image i; "" if images are not files."""

@@ -243,6 +243,7 @@ class Session:
         """Append the step to log.jsonl, with the force on the camera and the time since the image arrived if they are
         known, and count the frame."""
         line = {name: getattr(step, name) for name in LOGGED} | {"seconds": dict(step.seconds)}
+        line |= {"diagnosis": step.diagnosis} if step.lost else {}
         if step.loops:
             line["loops"] = [loop.record() for loop in step.loops]
         if frame.specific_force_m_s2 is not None:
@@ -293,4 +294,4 @@ LOGGED = (
     "index", "timestamp_s", "is_keyframe", "lost", "state", "component", "p_off", "splats", "submap", "tracking",
     "seconds", "T_world_camera",
 )  # fmt: skip
-"""The values of a step in log.jsonl: T_world_camera as 4 rows, times in seconds; loops follow if any were tried."""
+"""The values of a step in log.jsonl: T_world_camera as 4 rows, times in seconds; diagnosis and loops follow if any."""

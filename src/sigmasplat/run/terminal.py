@@ -1,9 +1,10 @@
 """Show a run on a terminal, or as plain lines if the output is not a terminal."""
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from rich.console import Console
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
     from sigmasplat.graph.loops import Loop
     from sigmasplat.slam.results import Step
 
+Alarms = Mapping[str, Sequence[str]]
+"""What is wrong, each in one line, and the commands to try instead."""
 PLAIN_LINES_EVERY_S = 10.0
 Show = Callable[[int, int | None, str], None]
 """Shows (done, total, text); total None: as given at the start."""
@@ -40,9 +43,9 @@ class Screen:
         self.out = out or _console(stderr=False)
         self.err = err or _console(stderr=True)
 
-    def say(self, line: str) -> None:
-        """Print a line."""
-        self.out.print(line)
+    def say(self, line: str, style: str | None = None) -> None:
+        """Print a line, on a terminal in a style of rich."""
+        self.out.print(line, style=style)
 
     def warn(self, line: str) -> None:
         """Print a warning line."""
@@ -105,11 +108,13 @@ class Screen:
             table.add_row(*row)
         self.out.print(table)
 
-    def next_commands(self, commands: Iterable[str], result: str = "") -> None:
-        """Print a result in one line, and what to do next, one command a line."""
+    def next_commands(self, commands: Iterable[str], result: str = "", alarms: Alarms = MappingProxyType({})) -> None:
+        """Print a result in one line, and what to do next, one command a line; alarms come in red, with their own."""
         if result:
             self.say(result)
-        for number, command in enumerate(commands):
+        for said in alarms:
+            self.say(said, "bold red")
+        for number, command in enumerate([other for others in alarms.values() for other in others] or commands):
             self.say(f"{'      ' if number else 'next: '}{command}")
 
 

@@ -41,7 +41,7 @@ LOG: Mapping[str, Kind] = {
     "state": lambda value: value in (TRACKED, RELOCALISED, LOST, APART), "component": int, "p_off": (float, None),
     "splats": int, "submap": int, "tracking": {"": (float, None, bool)}, "seconds": {"": float},
     "T_world_camera": lambda value: fits(value, [[float]]) and list(map(len, value)) == [4] * 4,
-    "loops": [dict], "specific_force_m_s2": _vector,
+    "loops": [dict], "diagnosis": str, "specific_force_m_s2": _vector,
 }  # fmt: skip
 """Values of a line of log.jsonl."""
 FACTS: Mapping[str, Kind] = {

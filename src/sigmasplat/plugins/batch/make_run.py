@@ -17,6 +17,7 @@ import torch
 
 from sigmasplat.api import (
     Config,
+    RunError,
     RunFolder,
     Session,
     SigmaSplatError,
@@ -42,7 +43,7 @@ REFUSED, INTERRUPTED = 2, 130
 def make_run(job: Job, folder: Path, data: str | None, save_every_s: float) -> None:
     """Make, resume or only score the run of a job, whichever is left to do.
 
-    Raises SigmaSplatError if the sequence or the run cannot be used, KeyboardInterrupt if Ctrl-C stopped the run.
+    Raises SigmaSplatError if the sequence or the result cannot be used, KeyboardInterrupt if Ctrl-C stopped the run.
     """
     try:
         with locked(folder, wait=True):  # a second process waits
@@ -68,7 +69,8 @@ def _make_and_score(
             raise KeyboardInterrupt
     started_s = time.perf_counter()
     lpips, _ = find_lpips(env.LPIPS_FOLDER)
-    evaluate(run, source, mesh=job.mesh, lpips=lpips)
+    if why := evaluate(run, source, mesh=job.mesh, lpips=lpips)["failure"]:
+        raise RunError(why)
     run.note(batch=job.facts() | {"scored": True, "scoring_s": time.perf_counter() - started_s})
 
 

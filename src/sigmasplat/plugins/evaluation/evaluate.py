@@ -30,6 +30,7 @@ from sigmasplat.api import (
     write_trajectory,
 )
 from sigmasplat.plugins.evaluation import reconstruct, view_scores
+from sigmasplat.plugins.evaluation.failure import failure, scale_to_truth, wrong_scale
 from sigmasplat.plugins.evaluation.metrics.lpips import Lpips
 from sigmasplat.plugins.evaluation.metrics.published_reconstruction import VIEWS
 from sigmasplat.plugins.evaluation.metrics.trajectory import aligned_truth, score_path, truth_in_estimate
@@ -88,8 +89,14 @@ def evaluate(
         _predicting(maps, run, frames, config, fx) if standard else (maps, view_scores.PredictionScores())
     )
     scoring = ViewScoring(source, config.input, maps, chosen, renderer, views_per_kind, aligned, lpips, readouts)
-    metrics = _facts(run, source, records, field) | score_states(run, frames, known)
-    metrics |= in_metres(path_scores | score_frame_sets(run, frames, known), scale) | {"path_scale": scale}
+    true = None if source.path_by else known  # an estimate of the device judges nothing
+    metrics = _facts(run, source, records, field) | score_states(run, frames, true)
+    metrics |= in_metres(path_scores | score_frame_sets(run, frames, true), scale) | {"path_scale": scale}
+    if source.path_by and metrics["ate"]:
+        metrics |= dict.fromkeys(path_scores) | {"device_path": metrics["ate"] | {"by": source.path_by}}
+    failed, to_truth = failure(run, source), None if scale or true is None else scale_to_truth(path, true)
+    alarms = failed | wrong_scale(run, source, to_truth)
+    metrics |= {"scale_to_truth": to_truth, "failure": "".join(failed).removeprefix("FAILED: "), "alarms": alarms}
     metrics |= _score_views(scoring, config.final, predictions, strips, progress)
     metrics |= {"lpips_network": lpips.net if lpips else None, "reconstruction": None, "reconstruction_published": None}
     metrics["full_resolution"] = score_full_resolution(scoring, config, full_resolution, progress)
@@ -97,13 +104,13 @@ def evaluate(
         surface = None if scale else true_mesh or reconstruct.known_surface(source)  # it is in metres
         how = surface, known, random_views, renderer, progress
         metrics |= reconstruct.fuse_and_score(run, source.camera, *how)
-    metrics["pose_covariance"] = score_pose_covariance(run, frames, known)
+    metrics["pose_covariance"] = score_pose_covariance(run, frames, true)
     metrics["calibration"] = _calibration(run) if standard else None
     metrics["test_views"] = None if scale else score_test_views(scoring, config.input, strips)
     run.write_metrics(metrics)
     plan = report_plan(run, path, source.camera) if standard else None
-    warnings = [str(problem)] if problem else []
-    write_page(run, metrics, strips.panels, _draw_plots(run, frames, known), warnings, plan, frames)
+    warnings, plots = [*alarms] + ([str(problem)] if problem else []), _draw_plots(run, frames, known, known is true)
+    write_page(run, metrics, strips.panels, plots, warnings, plan, frames)
     if problem:
         raise problem
     return metrics
@@ -252,8 +259,8 @@ def _facts(run: RunFolder, source: Source, log: Log, field: GaussianField) -> di
     }
 
 
-def _draw_plots(run: RunFolder, frames: RunFrames, truth: Trajectory | None) -> dict[str, charts.Plot]:
-    """Return the charts of path and states by name, and write truth.txt."""
+def _draw_plots(run: RunFolder, frames: RunFrames, truth: Trajectory | None, is_true: bool) -> dict[str, charts.Plot]:
+    """Return the charts of path and states by name, and write truth.txt if it is the truth."""
     times, estimate = frames.path.timestamps_s, frames.path.T_world_camera[:, :3, 3]
     known: NDArray[np.float64] | None = None
     aligned: Trajectory | None = None
@@ -261,7 +268,7 @@ def _draw_plots(run: RunFolder, frames: RunFrames, truth: Trajectory | None) -> 
         rows, aligned = aligned_truth(times, estimate, truth)
         known = np.full_like(estimate, np.nan)
         known[rows] = aligned.T_world_camera[:, :3, 3]
-    if aligned is None:
+    if aligned is None or not is_true:
         (run.path / TRUTH).unlink(missing_ok=True)  # of an earlier evaluation
     else:
         write_trajectory(run.path / TRUTH, aligned)  # for the viewer

@@ -53,7 +53,7 @@ def open_nerfstudio(place: str, settings: InputConfig) -> RecordedSource:
     return _open(path.parent, path, read_json_object(path), settings)
 
 
-def _open(folder: Path, path: Path, fields: Fields, settings: InputConfig) -> RecordedSource:
+def _open(folder: Path, path: Path, fields: Fields, settings: InputConfig, by: str = NAME) -> RecordedSource:
     named = sorted(read_frames(path, fields), key=lambda frame: natural_key(frame["file_path"]))
     named = [frame | {DEPTH: frame.get(DEPTH, frame.get("depth_path"))} for frame in named]
     frames = [frame for frame in named if isinstance(frame[DEPTH], str)]
@@ -77,7 +77,7 @@ def _open(folder: Path, path: Path, fields: Fields, settings: InputConfig) -> Re
     known = replace(known, origins={**known.origins, "depth unit": read}) if key else known
     truth = build_trajectory((i.timestamp_s, read_pose(path, frame)) for i, frame in zip(images, frames, strict=True))
     return folder_source(
-        folder, settings, images, known, units, truth, skipped, one_camera=True, estimated=True,
+        folder, settings, images, known, units, truth, skipped, one_camera=True, estimated=by,
         origins={"times": times, "pairs": read._replace(value="named in each frame")},
     )  # fmt: skip
 
@@ -101,7 +101,7 @@ def open_polycam(place: str, settings: InputConfig) -> RecordedSource:
         frame |= {key: number(key) + 0.5 for key in ("cx", "cy")}  # ARKit measures from the centre of the first pixel
         frame |= {"transform_matrix": [number(f"t_{i // 4}{i % 4}") for i in range(12)]}
         frames.append(frame | ({"timestamp": int(path.stem) * 1e-6} if path.stem.isdecimal() else {}))
-    return _open(folder, folder / f"{kind}cameras", {"frames": frames}, settings)
+    return _open(folder, folder / f"{kind}cameras", {"frames": frames}, settings, "ARKit")
 
 
 def _keyframes(place: str) -> Path:

@@ -148,7 +148,7 @@ def open_record3d(place: str, settings: InputConfig) -> RecordedSource:
     skipped = [f"{path / colors[n]}: no depth image {n}" for n in sorted(colors.keys() - depths.keys())]
     truth = _truth(path / name, metadata, numbers, times_s)
     return folder_source(
-        path, settings, images, known, 1.0, truth, skipped, path.resolve().stem, one_camera=True, estimated=True
+        path, settings, images, known, 1.0, truth, skipped, path.resolve().stem, one_camera=True, estimated="ARKit"
     )
 
 

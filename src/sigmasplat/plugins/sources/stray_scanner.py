@@ -109,7 +109,7 @@ def open_stray_scanner(path: str, settings: InputConfig) -> RecordedSource:
     if gyroscope and not gyroscope.measured_any(np.array([rows[n]["timestamp"] for n in numbers])):
         gyroscope = None
     return folder_source(
-        folder, settings, images, known, MM_PER_METRE, truth, skipped, one_camera=True, estimated=True,
+        folder, settings, images, known, MM_PER_METRE, truth, skipped, one_camera=True, estimated="ARKit",
         gyroscope=gyroscope, accelerometer=accelerometer_from_samples(moved_s, forces),
     )  # fmt: skip
 

@@ -33,7 +33,7 @@ def advice(metrics: Metrics, again: str, settings: dict[str, Any]) -> list[Advic
 
 
 def _lost(metrics: Metrics, again: str, settings: dict[str, Any]) -> Advice | None:
-    if not metrics.get("lost"):
+    if not metrics.get("lost") or metrics.get("failure"):
         return None
     stride = (settings.get("input") or {}).get("stride", 1)
     if stride > 1:

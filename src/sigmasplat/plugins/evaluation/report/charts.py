@@ -31,7 +31,7 @@ def run_charts(frames: RunFrames, truth: Matrix | None) -> dict[str, Plot]:
         return {}
     estimate = frames.path.T_world_camera[:, :3, 3]
     before_lost = np.array([row + 1 < len(frames) and frames.states[row + 1] == LOST for row in frames.rows], np.bool_)
-    caption = "In the frame of the first camera." + ("" if truth is None else " The true path is rigidly aligned.")
+    caption = "In the frame of the first camera." + ("" if truth is None else " The recorded path is rigidly aligned.")
     if before_lost.any():
         caption += " A dot marks the last pose before tracking was lost."
     found = {"trajectory": (trajectory_charts(estimate, truth, before_lost), caption)}
@@ -49,8 +49,8 @@ def trajectory_charts(estimate: Matrix, truth: Matrix | None, lost: NDArray[np.b
     top, height = [], []
     frames = np.arange(len(estimate))
     if truth is not None:
-        top.append(Curve("truth", truth[:, [0, 2]], BLUE))
-        height.append(Curve("truth", np.stack([frames, -truth[:, 1]], 1), BLUE))
+        top.append(Curve("recorded", truth[:, [0, 2]], BLUE))
+        height.append(Curve("recorded", np.stack([frames, -truth[:, 1]], 1), BLUE))
     rise = np.stack([frames, -estimate[:, 1]], 1)
     top.append(Curve("estimate", estimate[:, [0, 2]], ACCENT))
     height.append(Curve("estimate", rise, ACCENT))
@@ -79,14 +79,10 @@ def _strip(state: str, numbers: Matrix, at: NDArray[np.bool_]) -> list[Curve]:
     half = 0.5 if state == TRACKED else max(0.5, STRIP_SHORTEST * np.ptp(numbers))
     ranges = zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1, strict=True)
     return [
-        Curve(
-            "" if i else state,
-            np.array([[numbers[a] - half, STRIP_Y], [numbers[b] + half, STRIP_Y]]),
-            STATE_COLOURS[state],
-            width=STRIP_WIDTH,
-        )
+        Curve("" if i else state, np.array([[numbers[a] - half, STRIP_Y], [numbers[b] + half, STRIP_Y]]),
+              STATE_COLOURS[state], width=STRIP_WIDTH)
         for i, (a, b) in enumerate(ranges)
-    ]
+    ]  # fmt: skip
 
 
 def _p_off_chart(frames: RunFrames) -> Chart:

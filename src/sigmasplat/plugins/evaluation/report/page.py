@@ -39,36 +39,24 @@ LIKELY = 0.5
 
 
 def write_page(
-    run: RunFolder,
-    metrics: dict[str, Any],
-    strips: dict[str, list[list[ViewPanel]]],
-    plots: dict[str, Plot],
-    warnings: list[str],
-    plan: FloorPlan | None = None,
-    frames: RunFrames | None = None,
-) -> None:
+    run: RunFolder, metrics: dict[str, Any], strips: dict[str, list[list[ViewPanel]]], plots: dict[str, Plot],
+    warnings: list[str], plan: FloorPlan | None = None, frames: RunFrames | None = None,
+) -> None:  # fmt: skip
     """Write report.html from metrics and pictures; `strips`: panels of views by heading, `plots`: charts by name,
     `frames`: to name those whose pose is doubtful. Raises RunError if the page cannot be written."""
     config, facts = run.config(), run.facts()
     made_on = facts.get("machine") or {}
     unsure = [] if frames is None else [frames.log[i]["index"] for i in frames.rows if frames.p_off[i] > LIKELY]
-    found = advice(metrics, rerun_command(config, facts), config.to_dict())
+    found = [(said, " ".join(commands[:1])) for said, commands in (metrics.get("alarms") or {}).items()]
+    found += advice(metrics, rerun_command(config, facts), config.to_dict())
     machine, times = f"{made_on.get('cpu')}, {made_on.get('cores')} cores", sensor_said(facts)
     about = [config.name, f"version {facts.get('version')}", machine, str(facts.get("status")), times]
     contents = Contents(
-        title=f"SigmaSplat · {metrics.get('source')}",
-        subtitle=" · ".join(filter(None, about)),
-        metrics=metrics,
-        strips=strips,
-        plots=plots,
-        config=json.dumps(config.to_dict(), indent=2),
-        warnings=warnings,
-        verdicts=verdicts(metrics, unsure, found),
-        commands=next_commands(str(run.path)),
-        advice=found[1:],
-        plan=plan_panels(plan) if plan else [],
+        f"SigmaSplat · {metrics.get('source')}", " · ".join(filter(None, about)), metrics, strips, plots,
+        config=json.dumps(config.to_dict(), indent=2), warnings=warnings, verdicts=verdicts(metrics, unsure, found),
+        commands=next_commands(str(run.path)), advice=found[1:], plan=plan_panels(plan) if plan else [],
         origins=facts.get("origins") or {},
-    )
+    )  # fmt: skip
     run.write_report(build_report(contents))
 
 
@@ -84,18 +72,15 @@ def report_plan(run: RunFolder, path: Trajectory, camera: Camera) -> FloorPlan |
         return None
 
 
-def rerun_command(config: Config, facts: dict[str, Any]) -> str:
-    """Return the command that makes the run again: its preset, and every setting that differs from the preset."""
-    words = ["sigmasplat", "run", str(facts.get("source_path") or "PATH")]
-    if onto := facts.get("onto"):
+def rerun_command(config: Config, facts: dict[str, Any], command: str = "run") -> str:
+    """Return the command that makes the run again, or inspects its recording: its preset, and what differs from it."""
+    words, of_run = ["sigmasplat", command, str(facts.get("source_path") or "PATH")], command == "run"
+    if of_run and (onto := facts.get("onto")):
         words += ["--onto", str(onto["run"])]
-    if not is_preset(config.name):
-        return shlex.join(words)
-    if config.name != default_preset():
+    pairs = differences(config, preset(config.name)) if is_preset(config.name) else []
+    if of_run and config.name != default_preset() and is_preset(config.name):
         words += ["--preset", config.name]
-    return shlex.join(
-        [*words, *(word for pair in differences(config, preset(config.name)) for word in ("--set", pair))]
-    )
+    return shlex.join([*words, *(w for p in pairs if of_run or p.startswith("input.") for w in ("--set", p))])
 
 
 QUALITY, EFFORT = 86, 2

@@ -27,7 +27,7 @@ def verdicts(metrics: Metrics, unsure: Sequence[int], advice: Sequence[Advice]) 
     """
     words, command = advice[0] if advice else ("The checks of the report found nothing to repair.", "")
     todo = Verdict("Next", "Try this" if advice else "Use the map", words, command)
-    meaning = " ".join([*_images(metrics), *_depth(metrics)])
+    meaning = "" if metrics.get("failure") else " ".join([*_images(metrics), *_depth(metrics)])
     known = f"{path_words(metrics)}, {len(unsure)} of them doubtful" if unsure else path_words(metrics)
     path = " ".join([_path(metrics, unsure) + _continued(metrics), *_pose_covariance(metrics)])
     return [Verdict("Path", known, path), Verdict("Map", map_words(metrics), meaning), todo]
@@ -46,16 +46,16 @@ def map_words(metrics: Metrics) -> str:
     """Return how good rendered images are."""
     found = (metrics.get(name) or {} for name in ("held_out", "training"))
     psnr_db = next((scores["psnr_db"] for scores in found if scores.get("psnr_db") is not None), None)
-    if psnr_db is None:
-        return "Not compared with images"
+    if psnr_db is None or metrics.get("failure"):
+        return "Not compared with images" if psnr_db is None else "Of a part of the images only"
     rating = next((words for least, words in PSNR_WORDS if psnr_db >= least), "poor")
     return f"{rating.capitalize()}: {number(psnr_db, 1)} dB PSNR"
 
 
 def result_sentence(metrics: Metrics) -> str:
     """Return the result of a run as one sentence, for the terminal."""
-    error_m = (metrics.get("ate") or {}).get("rmse_m")
-    error = "" if error_m is None else f", the RMS error of the path is {number(error_m, 1, 100.0)} cm"
+    ate = {} if metrics.get("failure") else metrics.get("device_path") or metrics.get("ate") or {}
+    error = f", the RMS {_compared(ate)} is {number(ate['rmse_m'], 1, 100.0)} cm" if ate else ""
     apart = f", of which {metrics['apart']} are in components/" if metrics.get("apart") else ""
     words = map_words(metrics)
     return f"{path_words(metrics)}{apart}{error}; the map is {words[0].lower()}{words[1:]}."
@@ -72,7 +72,7 @@ def _continued(metrics: Metrics) -> str:
 
 def _path(metrics: Metrics, unsure: Sequence[int]) -> str:
     """Return where the path is not sure, and its error if the true path is known."""
-    ate = metrics.get("ate") or {}
+    ate = metrics.get("device_path") or metrics.get("ate") or {}
     doubtful = f" Probably off by more than 5 cm: images {format_ranges([*unsure])}." if unsure else ""
     tracked = f"{_tracked(metrics)}{_apart_sentence(metrics)}{doubtful}"
     if ate.get("rmse_m") is None:
@@ -86,9 +86,13 @@ def _path(metrics: Metrics, unsure: Sequence[int]) -> str:
     factor = metrics.get("path_scale")
     aligned = f" The scale is arbitrary: the path is aligned with scale factor {number(factor, 2)}." if factor else ""
     return (
-        f"{tracked} The RMS error of the path is {error} cm; the largest error is {largest} cm."
+        f"{tracked} The RMS {_compared(ate)} is {error} cm; the largest {_compared(ate).split()[0]} is {largest} cm."
         f"{aligned}{undeclared}{loops}"
     )
+
+
+def _compared(ate: Metrics) -> str:
+    return f"difference to the path of {ate['by']}" if "by" in ate else "error of the path"
 
 
 def _tracked(metrics: Metrics) -> str:

@@ -12,9 +12,11 @@ def key_figures(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
     scores, kind = metrics.get(views) or {}, views.replace("_", "-")
     frames = metrics.get("frames") or 0
     posed = frames - (metrics.get("lost") or 0) - (metrics.get("apart") or 0)
-    path = [("ATE RMSE", number(metrics["ate"]["rmse_m"], 2, 100.0), "cm")] if metrics.get("ate") else []
+    ate = metrics.get("device_path") or metrics.get("ate") or {}
+    name = "Difference to the device's path" if "by" in ate else "ATE RMSE"
+    path = [(name, number(ate["rmse_m"], 2, 100.0), "cm")] if ate else []
     speed, unit = rate(metrics.get("frames_per_s")).split(" ", 1)
-    return [
+    figures = [
         ("Images with a pose", number(posed, 0), f"of {frames}"),
         *path,
         (f"PSNR, {kind} images", number(scores.get("psnr_db"), 2), "dB"),
@@ -22,6 +24,7 @@ def key_figures(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
         ("Speed", speed, unit),
         ("Map", number(metrics.get("splats"), 0), f"splats, {number(metrics.get('map_bytes'), 1, 1e-6)} MB"),
     ]
+    return [figures[0], *figures[-2:]] if metrics.get("failure") else figures
 
 
 def state_rows(metrics: dict[str, Any]) -> list[list[str]]:
