@@ -165,7 +165,7 @@ def test_the_warning_of_a_wrong_depth_unit_has_the_median(
     err = capsys.readouterr().err
     (warning,) = [line for line in err.splitlines() if line.startswith("warning: ")]
     assert "median depth is 0.16 m over 4 frames" in warning
-    assert "depth_scale 1000 (millimetres) in calibration.json would make it 2.00 m" in warning
+    assert "--depth-scale 1000 (millimetres) would make it 2.00 m" in warning
     assert RunFolder.open(tmp_path / "run").facts()["status"] == "complete"
 
 

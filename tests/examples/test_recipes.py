@@ -53,7 +53,8 @@ def test_a_preset_is_values_and_a_setting_is_a_field(package: Path, run: Callabl
         'PLUGIN = Preset("robot", lambda: override(preset("sigma"), SET))\n',
         encoding="utf-8",
     )
-    replace(presets / "varsplat.py", '"fast": FAST}', '"fast": FAST, "office": TUM}')
+    with (presets / "values" / "varsplat.toml").open("a", encoding="utf-8") as tables:
+        tables.write('[office]\nlike = "tum"\n')
     frames = package / "config" / "tracking.py"
     source = frames.read_text(encoding="utf-8")
     method = source.index("\n    method: ", source.index("class TrackingConfig")) + 1

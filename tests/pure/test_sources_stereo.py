@@ -163,7 +163,11 @@ def test_every_caller_gets_the_settings_of_the_scene_and_keeps_those_that_are_gi
     assert config.render.scene_scale == source.scene_scale and config.render.near_m == 0.05
     assert config.submaps.distance_m == source.scene_scale * usual.submaps.distance_m
     assert open_scene("synthetic:frames=2,width=64,height=48", usual)[1] == usual.changed(input={"sensor": "rendered"})
-    no_scores = lambda run, *_, **__: run.write_metrics({})  # noqa: E731
+
+    def no_scores(run, *_, **__):
+        run.write_metrics({})
+        return {"failure": ""}
+
     monkeypatch.setattr("sigmasplat.plugins.batch.make_run.evaluate", no_scores)
     monkeypatch.setattr("sigmasplat.plugins.evaluation.evaluate.evaluate", no_scores)
     given = ("render.near_m",)

@@ -85,7 +85,6 @@ def run(
     if earlier:
         earlier.refuse_other_size(config)
     source, config = _opened(screen, path, config, record, split_settings(settings), earlier)
-    screen.assumptions(source.assumptions)
     with (
         _viewer(screen, run_options) as viewer,
         new_run(out, config, source, overwrite, onto, screen.warn, source_path=full_path(path)) as folder,
@@ -95,6 +94,7 @@ def run(
         slam = (
             continue_map(earlier, config, source, folder) if earlier else Slam(config, folder.submaps.in_background())
         )
+        _look(screen, source)
         at_once = realtime or (source.live and config.realtime.live)
         return _run_and_score(screen, StartPoint(slam), source, folder, run_options, viewer, robot_options, at_once)
 
@@ -137,8 +137,6 @@ def _opened(
 ) -> tuple["Source", "Config"]:  # fmt: skip
     """Open the source, with warnings; return it with the settings for its scene, or for the earlier map."""
     from sigmasplat.graph.closer import lacks_weights
-    from sigmasplat.plugins.checks.motion import time_warnings, times_of
-    from sigmasplat.plugins.checks.recording import first_look
     from sigmasplat.plugins.sources.live import LiveSource, recording_settings
     from sigmasplat.run.scene import open_scene
 
@@ -155,12 +153,6 @@ def _opened(
             source.record_to(record)
     elif record:
         raise ConfigError("--record is for a live camera only; this sequence is already a recording")
-    else:
-        found, warnings = first_look(source)
-        if found:
-            screen.say(f"{source.name}: {found}")
-        for warning in (*warnings, *time_warnings(times_of(source))):
-            screen.warn(warning)
     if config.input.poses:
         _say_of_scale(screen, asked, source, config)
     if source.registrable and not source.depth_registered:
@@ -168,6 +160,21 @@ def _opened(
     if lacks_weights(config.loops) and (config.loops.close or config.mapping.covisibility == "descriptor"):
         screen.warn("no NetVLAD weights, so the built-in descriptor is used; to use NetVLAD: --set loops.weights=FILE")
     return source, config
+
+
+def _look(screen: "Screen", source: "Source") -> None:
+    """Print what is assumed, and what the first frames of a recording show, with warnings."""
+    from sigmasplat.plugins.checks.motion import time_warnings, times_of
+    from sigmasplat.plugins.checks.recording import first_look
+
+    screen.assumptions(source.assumptions)
+    if source.live:
+        return
+    found, warnings = first_look(source)
+    if found:
+        screen.say(f"{source.name}: {found}")
+    for warning in (*warnings, *time_warnings(times_of(source))):
+        screen.warn(warning)
 
 
 def _say_of_scale(screen: "Screen", asked: "Config", source: "Source", config: "Config") -> None:

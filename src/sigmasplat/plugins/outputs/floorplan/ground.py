@@ -141,7 +141,8 @@ def up_of(T_world_camera: Matrix, facts: Mapping[str, Any] | None = None, edge: 
     axis, sign = EDGES["top" if edge == "auto" else edge]
     towards = sign * T_world_camera[:, :3, axis]
     how = "the top of the images, if the camera was held upright: --up left, right or bottom turn it"
-    return Up(unit(towards.sum(0), towards[0]), MAX_TILT_COS, how if edge == "auto" else f"the {edge} of the images")
+    first = towards[0] if len(towards) else sign * np.eye(3)[axis]
+    return Up(unit(towards.sum(0), first), MAX_TILT_COS, how if edge == "auto" else f"the {edge} of the images")
 
 
 def level_share(samples: Sequence[SurfaceSample], up: Matrix) -> float:
