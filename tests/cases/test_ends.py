@@ -78,7 +78,7 @@ def test_a_run_that_lost_its_images_ends_with_the_cause_and_a_command(
     assert exit_code("run", str(rec), "--out", "lost", *SHORT) == 0
     said = capsys.readouterr().out
     assert "FAILED: 9 of 12 images have no pose in the map (3–11). Likely cause: " in said
-    assert "Assumed: " in said and "--depth-scale UNITS" in said
+    assert "Assumed: " in said and "--depth-scale " in said
     assert not [words for words in PRAISE if words in said.partition("evaluation")[2]], said
     metrics, page = RunFolder.open(tmp_path / "lost").read_metrics(), (tmp_path / "lost/report.html").read_text()
     assert metrics["failure"].startswith("9 of 12") and "<p class=alarm>FAILED: 9 of 12" in page

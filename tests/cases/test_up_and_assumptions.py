@@ -82,9 +82,9 @@ def test_a_run_prints_and_keeps_its_assumptions(tmp_path: Path, capsys: pytest.C
     assert exit_code("run", str(recording), "--limit", "2", "--no-eval", *QUICK, "--out", str(out)) == 0
     printed = capsys.readouterr().out
     assert "assumed, because the recording does not say it" in printed
-    assert "depth unit: 5000 per metre" in printed and "--depth-scale UNITS" in printed
+    assert "depth unit: 5000 per metre" in printed and "--depth-scale 1000, if in mm" in printed
     kept = json.loads((out / "run.json").read_text())["origins"]["depth unit"]
-    assert kept["origin"] == "assumed" and kept["option"] == "--depth-scale UNITS"
+    assert kept["origin"] == "assumed" and kept["option"] == "--depth-scale 1000, if in mm"
 
 
 def test_a_camera_that_was_held_sideways_is_said_and_turned(
@@ -101,3 +101,14 @@ def test_a_camera_that_was_held_sideways_is_said_and_turned(
         "up is the top of the images, if the camera was held upright: --up left, right or bottom turn it" in up["auto"]
     )
     assert "up is the left of the images" in up["left"] and "up is the right of the images" in up["right"]
+
+
+def test_what_is_corrected_is_said_too(tmp_path: Path) -> None:
+    folder = small_folder(tmp_path)
+    for path in folder.glob("color/*.png"):
+        exif = Image.Exif()
+        exif[0x0112] = 3
+        Image.open(path).save(path, exif=exif)
+    source = open_source(folder, fx=30.0)
+    assert source.corrections == ["orientation: turned by the EXIF tag of the images (180°)"]
+    assert not open_source(small_folder(tmp_path / "b"), fx=30.0).corrections

@@ -47,7 +47,7 @@ def inspect(
     for name, value in found.rows:
         table.add_row(name, value)
     screen.out.print(table)
-    screen.assumptions(found.assumed)
+    screen.assumptions(found.assumed, found.corrected)
     for warning in found.warnings:
         screen.warn(warning)
     target = out or SHEETS / f"{found.title}.png"

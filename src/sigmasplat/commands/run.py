@@ -167,7 +167,7 @@ def _look(screen: "Screen", source: "Source") -> None:
     from sigmasplat.plugins.checks.motion import time_warnings, times_of
     from sigmasplat.plugins.checks.recording import first_look
 
-    screen.assumptions(source.assumptions)
+    screen.assumptions(source.assumptions, source.corrections)
     if source.live:
         return
     found, warnings = first_look(source)

@@ -21,6 +21,8 @@ Distortion = tuple[float, ...]
 
 
 GIVEN, MEASURED, ASSUMED = "given", "measured", "assumed"
+ALONG_RAY = "along the ray, converted to z"
+"""What depth values are that are converted."""
 
 
 class Origin(NamedTuple):
@@ -177,7 +179,9 @@ def _origins(found: Calibration, camera_given: bool, units_given: bool) -> dict[
             option = "depth_camera and T_color_depth in calibration.json"
             origins["depth and colour"] = Origin("one camera, registered", ASSUMED, option)
     units = f"{found.depth_units_per_metre:g} per metre"
-    unit = known.pop("depth unit", Origin("", ASSUMED, "--depth-scale UNITS"))
+    other = {TUM_UNITS_PER_METRE: f"{MM_PER_METRE:g}, if in mm", MM_PER_METRE: f"{TUM_UNITS_PER_METRE:g}, if TUM's"}
+    option = f"--depth-scale {other.get(found.depth_units_per_metre, 'UNITS')}"
+    unit = known.pop("depth unit", Origin("", ASSUMED, option))
     unit = Origin("", GIVEN) if units_given else unit
     return origins | {"depth unit": unit._replace(value=units)} | known
 

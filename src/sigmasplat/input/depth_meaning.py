@@ -15,7 +15,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from sigmasplat.data.camera import Camera
-from sigmasplat.input.calibration import ASSUMED, GIVEN, MEASURED, Origin
+from sigmasplat.input.calibration import ALONG_RAY, ASSUMED, GIVEN, MEASURED, Origin
 
 SAMPLES, MOST_PIXELS = 8, 2_500_000
 """Number of images that are looked at; of large ones as many as have so many pixels, but three."""
@@ -76,7 +76,7 @@ def meaning_of(images: Sequence[Image], camera: Camera, units_per_metre: float, 
         is_ray, origin = ray == 1 and inverse != 1, MEASURED if ray in (0, 1) and inverse != 1 else ASSUMED
         doubts += [INVERSE] * (inverse == 1)
     option = "--set input.depth_along=ray" if origin == ASSUMED else ""
-    value = "along the ray, converted to z" if is_ray else "along the optical axis"
+    value = ALONG_RAY if is_ray else "along the optical axis"
     return Meaning(is_ray, most if sure else np.inf, known | {"depth": Origin(value, origin, option)}, doubts)
 
 

@@ -18,7 +18,7 @@ from sigmasplat.data.mesh import Mesh
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SourceError
 from sigmasplat.files.reading import guarded
-from sigmasplat.input.calibration import ASSUMED, Origin
+from sigmasplat.input.calibration import ALONG_RAY, ASSUMED, MEASURED, Origin
 from sigmasplat.native.threads import yield_to_others
 
 Item = TypeVar("Item")
@@ -47,6 +47,8 @@ FACTS = (
     "scene_scale", "depth_noise_per_m", "sensor", "origins", "depth_doubts", "path_by",
 )  # fmt: skip
 """What a source that wraps another one has in common with it."""
+CORRECTED = ("orientation", "gray", "farthest depth")
+"""Origins of how images are changed when they are read."""
 
 
 class Source(ABC):
@@ -98,6 +100,15 @@ class Source(ABC):
     def assumptions(self) -> list[str]:
         """Return what is assumed because the recording does not say it, and the option that changes it."""
         return [f"{name}: {o.value} ({o.option})" for name, o in self.origins.items() if o.origin == ASSUMED]
+
+    @property
+    def corrections(self) -> list[str]:
+        """Return how images are read in another way than they are stored, because of what they show or say."""
+        changed = {name: o for name, o in self.origins.items() if name in CORRECTED and o.origin != ASSUMED}
+        changed |= {name: o for name, o in self.origins.items() if o.value == ALONG_RAY}
+        said = {name: f"{name}: {o.value}" + f" ({o.option})" * bool(o.option) for name, o in changed.items()}
+        camera = self.origins.get("camera", Origin("", "")).origin
+        return [*said.values()] + [f"camera: {camera}"] * camera.startswith(MEASURED)
 
     @abstractmethod
     def __len__(self) -> int:

@@ -36,6 +36,10 @@ Begin = Callable[[str, int | None], Show]
 """Starts a counter with (title, total); total None: not known yet."""
 
 
+ASSUMED = "assumed, because the recording does not say it (in brackets what changes it):"
+CORRECTED = "corrected, because of what the images show or say:"
+
+
 class Screen:
     """Write to standard output; warnings to standard error."""
 
@@ -51,12 +55,11 @@ class Screen:
         """Print a warning line."""
         self.err.print(f"warning: {line}")
 
-    def assumptions(self, assumed: Sequence[str]) -> None:
-        """Print what is assumed because a recording does not say it, in one block."""
-        if assumed:
-            self.say("assumed, because the recording does not say it (in brackets what changes it):")
-        for line in assumed:
-            self.say(f"  {line}")
+    def assumptions(self, assumed: Sequence[str], corrections: Sequence[str]) -> None:
+        """Print what is assumed because a recording does not say it, and how its images are corrected, in one block."""
+        for title, lines in {ASSUMED: assumed, CORRECTED: corrections}.items():
+            for line in [title, *(f"  {line}" for line in lines)] if lines else ():
+                self.say(line)
 
     @contextmanager
     def steps(self, total: int | None, done: int = 0) -> Iterator["_StepShow"]:

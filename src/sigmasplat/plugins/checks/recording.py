@@ -55,12 +55,13 @@ QUICK_PX, QUICK = 320 * 240, 80
 
 @dataclass(frozen=True, eq=False)
 class Inspection:
-    """Results: rows of (name, value), what is assumed, warnings with a fix, a contact sheet, and the check of depth
-    registration."""
+    """Results: rows of (name, value), what is assumed and corrected, warnings with a fix, a contact sheet, and how well
+    depth is registered."""
 
     title: str
     rows: list[tuple[str, str]]
     assumed: list[str]
+    corrected: list[str]
     warnings: list[str]
     sheet: Image.Image
     agreement: EdgeAgreement | None
@@ -68,7 +69,7 @@ class Inspection:
     def record(self) -> dict[str, Any]:
         """Return what was found as values for JSON."""
         return {"title": self.title, "found": dict(self.rows)} | {
-            name: getattr(self, name) for name in ("assumed", "warnings")
+            name: getattr(self, name) for name in ("assumed", "corrected", "warnings")
         }
 
 
@@ -104,7 +105,7 @@ def inspect_source(path: str | Path, settings: InputConfig, samples: int = SAMPL
         ("skipped", f"{len(source.skipped)} files (first: {source.skipped[0]})" if source.skipped else "nothing"),
         ("suggested preset", _suggested(name)),
     ]
-    return Inspection(source.name, rows, source.assumptions, warnings, _sheet(frames), agreement)
+    return Inspection(source.name, rows, source.assumptions, source.corrections, warnings, _sheet(frames), agreement)
 
 
 def _opened(path: str | Path, settings: InputConfig) -> tuple[Source, list[str]]:
