@@ -221,7 +221,6 @@ def _run_and_score(
     realtime: track frames when they arrive. Raises KeyboardInterrupt if Ctrl-C came before the first frame was done.
     """
     from sigmasplat.plugins.checks.motion import MotionWatch
-    from sigmasplat.plugins.evaluation.failure import failure
     from sigmasplat.plugins.sources.live import Arrivals, LiveSource
     from sigmasplat.realtime.system import RealTime
     from sigmasplat.run.resume import StateFile
@@ -258,6 +257,8 @@ def _run_and_score(
     if run_options.evaluate:
         score(screen, folder, source)
     else:
+        from sigmasplat.plugins.evaluation.failure import failure  # scipy.stats is not loaded before the frames
+
         kept, failed = f"{outcome.summary()}: {folder.path}", failure(folder, source)
         screen.next_commands([f"sigmasplat eval {folder.path}"], kept, failed)
     if viewer:
