@@ -186,6 +186,7 @@ from sigmasplat.input.imu import (
     accelerometer_from_samples as accelerometer_from_samples,
     gyroscope_from_samples as gyroscope_from_samples,
 )
+from sigmasplat.input.intrinsics import intrinsics_beside as intrinsics_beside
 from sigmasplat.input.lists import (
     FLIP_YZ as FLIP_YZ,
     associate as associate,

@@ -22,13 +22,17 @@ from sigmasplat.input.depth_meaning import MOST_PIXELS, SAMPLES, meaning_of, thi
 from sigmasplat.input.given import SAME_SHAPE
 from sigmasplat.input.images import FRAMES_PER_SECOND, color_origins, image_size, pair_images, read_color, read_depth
 from sigmasplat.input.imu import Accelerometer, Gyroscope
+from sigmasplat.input.intrinsics import intrinsics_beside
 from sigmasplat.input.rectification import Rectification, check_image_sizes, resampled, turned_by_tag
 from sigmasplat.input.source import Source
 
 PLAUSIBLE_MEDIAN_M = (0.2, 15.0)
 """The median depth of indoor sequences is well inside this range; with a wrong power of ten it is outside."""
 
-KNOWN_UNITS_PER_METRE = {1000.0: "millimetres", 5000.0: "TUM's unit", 6553.5: "Replica's unit", 1.0: "metres"}
+KNOWN_UNITS_PER_METRE = {
+    1000.0: "millimetres", 5000.0: "TUM's unit", 6553.5: "Replica's unit", 1.0: "metres", 10_000.0: "tenths of mm",
+    256.0: "KITTI's unit", 100.0: "centimetres",
+}  # fmt: skip
 
 
 def depth_warning(source: Source, samples: int = 5, read: Sequence[Frame] = ()) -> str | None:
@@ -275,6 +279,7 @@ def folder_source(
     pixels than colour has the same camera, as on phones; more: as for RecordedSource. Raises SourceError as it does.
     """
     size, depth_size = first_readable(images, lambda pair: pair.sizes())
+    known = known or intrinsics_beside(folder, size, units_per_metre)
     calibration = resolve_calibration(folder, known, size, settings, units_per_metre)
     camera, lens = calibration.camera, calibration.distortion
     if known and known.own and camera != known.camera:

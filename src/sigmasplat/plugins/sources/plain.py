@@ -47,9 +47,11 @@ from sigmasplat.api import (
     check_positive,
     checked_pose,
     first_file,
+    first_size,
     first_subfolder,
     folder_source,
     index_by_number,
+    intrinsics_beside,
     json_number,
     list_images,
     numbered_pairs,
@@ -154,7 +156,9 @@ def open_redwood(path: str, settings: InputConfig) -> RecordedSource:
         numbered, skipped = numbered_pairs(folder, index_by_number(colors), index_by_number(depths), *names, rate)
         times = Origin(f"{rate:g} per second", f"read from {file}") if "fps" in fields else ASSUMED_TIMES
         images, origins = [*numbered.values()], {"times": times, "pairs": Origin("by number", NAMED)}
-    known = _recorded(file, fields) if file else PRIMESENSE
+    size = first_size([image.color for image in images])
+    beside = None if "intrinsic_matrix" in fields else intrinsics_beside(folder, size, MM_PER_METRE)
+    known = beside or (_recorded(file, fields) if file else PRIMESENSE)
     truth = _truth(folder, images)
     return folder_source(folder, settings, images, known, known.depth_units_per_metre, truth, skipped, origins=origins)
 
