@@ -32,22 +32,14 @@ OUT = Path("runs/batch")
 
 def batch(
     recordings: Annotated[
-        tuple[str, ...],
-        tyro.conf.Positional,
+        tuple[str, ...], tyro.conf.Positional,
         arg("FOLDER", "recordings: folders or synthetic[:frames=N,…]", "(at least one)"),
     ],
-    preset: options.PresetName = DEFAULT_PRESET,
-    settings: options.Settings = (),
-    seed: options.Seed = None,
+    preset: options.PresetName = DEFAULT_PRESET, settings: options.Settings = (), seed: options.Seed = None,
     seeds: Annotated[From1, arg("N", "number of runs of each recording, with N seeds from --seed on")] = 1,
-    input_options: InputOptionsFlat = DEFAULT_INPUT_OPTIONS,
-    data: DataFolder = None,
-    mesh: options.WithMesh = False,
-    out: BatchFolder = None,
-    overwrite: ReplaceRuns = False,
-    jobs: Jobs = 1,
-    save_every: options.SaveEvery = 60.0,
-) -> int:
+    input_options: InputOptionsFlat = DEFAULT_INPUT_OPTIONS, data: DataFolder = None, mesh: options.WithMesh = False,
+    out: BatchFolder = None, overwrite: ReplaceRuns = False, jobs: Jobs = 1, save_every: options.SaveEvery = 60.0,
+) -> int:  # fmt: skip
     """Run SLAM on many recordings, each in a run folder in DIR (default: runs/batch), and score them.
 
     Finished runs are kept, stopped ones resume. example: sigmasplat batch data/kitchen data/hall --jobs 2
@@ -76,23 +68,17 @@ def batch(
 def bench(
     what: Annotated[Literal["table"], tyro.conf.Positional, arg("table", "what to make")],
     table: Annotated[
-        str,
-        tyro.conf.Positional,
+        str, tyro.conf.Positional,
         arg("TABLE", "name of the table, path of a definition (.toml), or `list` to list all tables"),
     ],
     data: DataFolder = None,
     scenes: Annotated[tuple[str, ...], arg("SCENE", "scenes to run", "(default: all of the table)")] = (),
     systems: Annotated[
-        tuple[str, ...], arg("SYSTEM", "systems of the table to run, or presets", "(default: those of the table)")
+        tuple[str, ...], arg("SYSTEM", "systems of the table to run, or presets", "(default: those of the table)"),
     ] = (),
-    seeds: options.Runs = 3,
-    settings: options.Settings = (),
-    limit: Limit = None,
-    out: BatchFolder = None,
-    overwrite: ReplaceRuns = False,
-    jobs: Jobs = 1,
-    save_every: options.SaveEvery = 60.0,
-) -> int:
+    seeds: options.Runs = 3, settings: options.Settings = (), limit: Limit = None, out: BatchFolder = None,
+    overwrite: ReplaceRuns = False, jobs: Jobs = 1, save_every: options.SaveEvery = 60.0,
+) -> int:  # fmt: skip
     """Make the table of a paper: scenes × systems × seeds, with the published numbers beside ours.
 
     Finished runs are kept, stopped ones resume. Missing scenes are listed, and the others are run.

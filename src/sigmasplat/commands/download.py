@@ -17,16 +17,14 @@ Overwrite = Annotated[bool, flag("download existing recordings again")]
 
 def download(
     dataset: Annotated[
-        str, tyro.conf.Positional, arg("SET", "tum, replica, icl, 7scenes, bonn, redwood; lpips; or list")
+        str, tyro.conf.Positional, arg("SET", "tum, replica, icl, 7scenes, bonn, redwood; lpips; or list"),
     ] = "list",
     names: Annotated[
-        tuple[str, ...],
-        tyro.conf.Positional,
+        tuple[str, ...], tyro.conf.Positional,
         arg("NAME", "names of recordings; `download list SET` lists them", "(none if there is only one)"),
     ] = (),
-    out: Annotated[Path, arg("DIR", "folder for the data sets")] = Path("data"),
-    overwrite: Overwrite = False,
-) -> int:
+    out: Annotated[Path, arg("DIR", "folder for the data sets")] = Path("data"), overwrite: Overwrite = False,
+) -> int:  # fmt: skip
     """Download recordings of a public data set, or weights: resumable, verified, safely unpacked.
 
     example: sigmasplat download tum fr1/desk

@@ -22,26 +22,18 @@ if TYPE_CHECKING:
 class EvalOptions:
     """Options of eval: what to score besides path, views and uncertainty."""
 
-    true_mesh: Annotated[
-        Path | None,
-        arg(
-            "FILE",
-            "also write mesh.ply, and score it against this PLY in the world frame of the true path",
-            "(default: that of the data set)",
-        ),
-    ] = None
+    true_mesh: Annotated[Path | None, arg(
+        "FILE", "also write mesh.ply, and score it against this PLY in the world frame of the true path",
+        "(default: that of the data set)",
+    )] = None  # fmt: skip
     random_views: Annotated[
         int, arg("N", "number of random views that score the depth of mesh.ply; papers use 1000")
     ] = 1000
     full_resolution: Annotated[bool, flag("also score the views at the resolution of the recording")] = False
-    lpips: Annotated[
-        Path | None,
-        arg(
-            "DIR",
-            "folder of the weights of LPIPS; `sigmasplat download lpips alex` gets them",
-            f"(default: {LPIPS_FOLDER}, if it exists)",
-        ),
-    ] = None
+    lpips: Annotated[Path | None, arg(
+        "DIR", "folder of the weights of LPIPS; `sigmasplat download lpips alex` gets them",
+        f"(default: {LPIPS_FOLDER}, if it exists)",
+    )] = None  # fmt: skip
 
     def network(self) -> tuple["Lpips | None", str]:
         """Load the network of LPIPS, or return the line that says why it is not scored. Raises ConfigError if weights
@@ -57,11 +49,9 @@ DEFAULT_EVAL_OPTIONS = EvalOptions()
 
 
 def evaluate_run(
-    run: options.RunPath,
-    mesh: options.WithMesh = False,
-    moved_to: options.MovedSource = None,
+    run: options.RunPath, mesh: options.WithMesh = False, moved_to: options.MovedSource = None,
     eval_options: Annotated[EvalOptions, tyro.conf.arg(name=""), tyro.conf.OmitArgPrefixes] = DEFAULT_EVAL_OPTIONS,
-) -> int:
+) -> int:  # fmt: skip
     """Score an existing run again. This replaces its metrics, pictures and report.
 
     example: sigmasplat eval runs/kitchen-sigma

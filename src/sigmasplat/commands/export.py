@@ -19,42 +19,30 @@ from sigmasplat.registry import Output, rows
 class ExportOptions:
     """Options that only some formats accept, under their names on the command line (`Output.options`)."""
 
-    std_below_m: Annotated[
-        From0,
-        arg(
-            "M",
-            "keep only splats whose surface has a standard deviation of depth below M metres (depth_std_m, "
-            "docs/exports.md); needs a run with uncertainty.json",
-            "(default: all)",
-        ),
-    ] = None
-    axes: Annotated[
-        Literal["y-up", "z-up", "y-down", "camera"] | None,
-        arg(
-            "{y-up,z-up,y-down,camera}",
-            "axes of a map: y-up, z-up and y-down are levelled; camera: those of the run's path; SPZ: only y-up "
-            "and camera",
-            "(default: y-up for SPZ, y-down for PLY)",
-        ),
-    ] = None
+    std_below_m: Annotated[From0, arg(
+        "M", "keep only splats whose surface has a standard deviation of depth below M metres (depth_std_m, "
+        "docs/exports.md); needs a run with uncertainty.json", "(default: all)",
+    )] = None  # fmt: skip
+    axes: Annotated[Literal["y-up", "z-up", "y-down", "camera"] | None, arg(
+        "{y-up,z-up,y-down,camera}", "axes of a map: y-up, z-up and y-down are levelled; camera: those of the run's "
+        "path; SPZ: only y-up and camera", "(default: y-up for SPZ, y-down for PLY)",
+    )] = None  # fmt: skip
     up: options.UpEdge = "auto"
     plain: Annotated[
         bool, flag("write PLY with only the 62 columns of 3DGS, without σ², for readers that accept no others")
     ] = False
-    pictures: Annotated[bool, flag("also write the images of the keyframes, and export only keyframes as views")] = (
-        False
-    )
+    pictures: Annotated[
+        bool, flag("also write the images of the keyframes, and export only keyframes as views")
+    ] = False  # fmt: skip
     size: Annotated[
-        int,
-        Range(32, 4096, or_zero=True),
+        int, Range(32, 4096, or_zero=True),
         arg("PX", "width of each panel of a video in pixels", "(default: that of the run's images)"),
-    ] = 0
+    ] = 0  # fmt: skip
     fps: Annotated[float, Range(1, 120), arg("N", "images per second of a video")] = 25.0
     seconds: Annotated[
-        Number,
-        Range(0.04, 3600),
+        Number, Range(0.04, 3600),
         arg("S", "length of a video in seconds", "(default: that of the path, 4 to 20; orbit: 12)"),
-    ] = None
+    ] = None  # fmt: skip
     path: Annotated[
         Literal["run", "orbit"],
         arg(None, "camera path of a video: along the run's path, or in a circle above the room"),
@@ -74,12 +62,11 @@ DEFAULT_EXPORT_OPTIONS = ExportOptions()
 
 
 def export(
-    run: options.RunOrMap,
-    out: options.OutFile = None,
+    run: options.RunOrMap, out: options.OutFile = None,
     format: Annotated[str | None, arg("NAME", "format to write", "(default: by the ending of FILE, else ply)")] = None,
     overwrite: options.Overwrite = False,
     asked: Annotated[ExportOptions, tyro.conf.arg(name=""), tyro.conf.OmitArgPrefixes] = DEFAULT_EXPORT_OPTIONS,
-) -> int:
+) -> int:  # fmt: skip
     """Write the map or the path of a run, or a map from a PLY, in a format of other programs.
 
     {formats}

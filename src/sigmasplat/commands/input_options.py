@@ -27,12 +27,10 @@ def flag(help: str, **more: Any) -> Any:
 def _number(read: Callable[[str], float]) -> tyro.constructors.PrimitiveConstructorSpec[float | None]:
     """Describe an optional number: None if it is not given; a given text is always read as a number, never as None."""
     return tyro.constructors.PrimitiveConstructorSpec(
-        nargs=1,
-        metavar="NUMBER",
-        instance_from_str=lambda given: read(given[0]),
+        nargs=1, metavar="NUMBER", instance_from_str=lambda given: read(given[0]),
         is_instance=lambda value: value is None or isinstance(value, int | float),
         str_from_instance=lambda value: [str(value)],
-    )
+    )  # fmt: skip
 
 
 Whole = Annotated[int | None, _number(int)]
@@ -51,40 +49,25 @@ class InputOptions:
     start: Annotated[From0, arg("S", "start S seconds after the first frame", "")] = None
     end: Annotated[From0, arg("S", "stop S seconds after the first frame", "")] = None
     hold_out: Annotated[
-        Whole,
-        Range(2, or_zero=True),
+        Whole, Range(2, or_zero=True),
         arg("N", "hold back every N-th frame: it is tracked but not mapped, so that it can test the map", ""),
-    ] = None
+    ] = None  # fmt: skip
     strict: Annotated[bool, flag("stop at an unreadable image instead of skipping it")] = False
     calibration: Annotated[
         Path | None, arg("FILE", "calibration.json to use instead of the recorded calibration", "")
     ] = None
-    masks: Annotated[
-        Path | None,
-        arg(
-            "FOLDER",
-            "ignore pixels: one image per frame of the recording, not 0 = ignored, such as people found by a segmenter",
-            "",
-        ),
-    ] = None
-    poses: Annotated[
-        str | None,
-        arg(
-            "FILE",
-            "known camera poses, used instead of tracking: TUM or KITTI text, images.txt of COLMAP, "
-            'transforms.json, or a folder of matrices; "recorded" = those of the device, such as ARKit\'s',
-            "",
-        ),
-    ] = None
-    predicted_depth: Annotated[
-        Path | None,
-        arg(
-            "FOLDER",
-            "depth that a network predicted, one image per frame: for a video, for colour images, or instead of the "
-            "recorded depth. The scale of the result is arbitrary",
-            "",
-        ),
-    ] = None
+    masks: Annotated[Path | None, arg(
+        "FOLDER", "ignore pixels: one image per frame of the recording, not 0 = ignored, such as people found by a "
+        "segmenter", "",
+    )] = None  # fmt: skip
+    poses: Annotated[str | None, arg(
+        "FILE", "known camera poses, used instead of tracking: TUM or KITTI text, images.txt of COLMAP, "
+        'transforms.json, or a folder of matrices; "recorded" = those of the device, such as ARKit\'s', "",
+    )] = None  # fmt: skip
+    predicted_depth: Annotated[Path | None, arg(
+        "FOLDER", "depth that a network predicted, one image per frame: for a video, for colour images, or instead of "
+        "the recorded depth. The scale of the result is arbitrary", "",
+    )] = None  # fmt: skip
     predicted_inverse: Annotated[bool, flag("predicted depth is inverse depth, as that of MiDaS or Depth Anything")] = (
         False
     )

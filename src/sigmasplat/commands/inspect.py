@@ -18,18 +18,10 @@ SHEETS, TIMES = Path("runs/inspect"), Path("sensor_times.json")
 
 
 def inspect(
-    path: options.SourcePath,
-    input_options: InputOptionsFlat = DEFAULT_INPUT_OPTIONS,
-    settings: options.Settings = (),
-    out: Annotated[
-        Path | None,
-        arg("FILE", "contact sheet, PNG", "(default: runs/inspect/NAME.png)"),
-    ] = None,
-    json: Annotated[
-        Path | None,
-        arg("FILE", "write what was found as JSON", ""),
-    ] = None,
-) -> int:
+    path: options.SourcePath, input_options: InputOptionsFlat = DEFAULT_INPUT_OPTIONS, settings: options.Settings = (),
+    out: Annotated[Path | None, arg("FILE", "contact sheet, PNG", "(default: runs/inspect/NAME.png)")] = None,
+    json: Annotated[Path | None, arg("FILE", "write what was found as JSON", "")] = None,
+) -> int:  # fmt: skip
     """Check a recording before a run: format, depth, poses, and problems; draws a contact sheet.
 
     exit code 1 if there are warnings; example: sigmasplat inspect data/kitchen
@@ -61,11 +53,9 @@ def inspect(
 
 
 def calibrate(
-    path: options.SourcePath,
-    input_options: InputOptionsFlat = DEFAULT_INPUT_OPTIONS,
-    settings: options.Settings = (),
+    path: options.SourcePath, input_options: InputOptionsFlat = DEFAULT_INPUT_OPTIONS, settings: options.Settings = (),
     out: Annotated[Path, arg("FILE", "file to write, .json, with a picture beside it, .png")] = TIMES,
-) -> int:
+) -> int:  # fmt: skip
     """Measure a camera from a recording in which it moves: when it reads depth and rows (rolling shutter), and what is
     wrong with its stated focal length, image centre, depth and brightness.
 

@@ -22,13 +22,9 @@ MOST_ROWS = 60
 
 
 def localise(
-    path: options.SourcePath,
-    run: options.InRun,
-    out: options.PosesFile = None,
-    overwrite: options.Overwrite = False,
-    input_options: InputOptionsFlat = DEFAULT_INPUT_OPTIONS,
-    settings: options.Settings = (),
-) -> int:
+    path: options.SourcePath, run: options.InRun, out: options.PosesFile = None, overwrite: options.Overwrite = False,
+    input_options: InputOptionsFlat = DEFAULT_INPUT_OPTIONS, settings: options.Settings = (),
+) -> int:  # fmt: skip
     """Find the images of a recording in the map of a finished run: pose, uncertainty, and a verdict for each image.
 
     exit code 1 if no image was found; example: sigmasplat localise data/kitchen2 --in runs/kitchen-sigma --stride 10

@@ -12,36 +12,24 @@ from sigmasplat.errors import ConfigError
 if TYPE_CHECKING:
     from sigmasplat.plugins.outputs.axes import Axes
 
-MeshAxes = Annotated[
-    Literal["y-up", "z-up", "y-down", "camera"] | None,
-    arg(
-        "{y-up,z-up,y-down,camera}",
-        "axes of the file: y-up for viewers, z-up for CAD, y-down, or camera, those of the run's path; all but "
-        "camera are levelled (docs/exports.md)",
-        "(default: y-up; mesh.ply in RUN: camera)",
-    ),
-]
+MeshAxes = Annotated[Literal["y-up", "z-up", "y-down", "camera"] | None, arg(
+    "{y-up,z-up,y-down,camera}", "axes of the file: y-up for viewers, z-up for CAD, y-down, or camera, those of the "
+    "run's path; all but camera are levelled (docs/exports.md)", "(default: y-up; mesh.ply in RUN: camera)",
+)]  # fmt: skip
 
 
 def make_mesh(
-    run: options.RunPath,
-    voxel_m: options.VoxelM = None,
+    run: options.RunPath, voxel_m: options.VoxelM = None,
     triangles: Annotated[int, Range(0), arg("N", "largest number of triangles; 0 = no limit")] = 300_000,
-    axes: MeshAxes = None,
-    up: options.UpEdge = "auto",
-    fill_gaps: Annotated[
-        float,
-        Range(0),
-        arg(
-            "M",
-            "close gaps that are at most M metres across by smooth patches, which have a high depth_std_m; 0 = none",
-        ),
-    ] = 0.0,
+    axes: MeshAxes = None, up: options.UpEdge = "auto",
+    fill_gaps: Annotated[float, Range(0), arg(
+        "M", "close gaps that are at most M metres across by smooth patches, which have a high depth_std_m; 0 = none",
+    )] = 0.0,
     out: Annotated[
-        Path | None, arg("FILE", "file to write: .glb, .ply or .stl (no colours)", "(default: mesh.ply in RUN)")
+        Path | None, arg("FILE", "file to write: .glb, .ply or .stl (no colours)", "(default: mesh.ply in RUN)"),
     ] = None,
     overwrite: options.Overwrite = False,
-) -> int:
+) -> int:  # fmt: skip
     """Extract a coloured triangle mesh from a run's map, upright and in metres.
 
     example: sigmasplat mesh runs/kitchen-sigma --out kitchen.glb

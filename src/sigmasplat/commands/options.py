@@ -23,20 +23,18 @@ if TYPE_CHECKING:
 
 PresetName = Annotated[str, arg("NAME", f"preset of settings to start from: {', '.join(FAMILIES)}")]
 Settings = Annotated[
-    tuple[str, ...],
-    tyro.conf.UseAppendAction,
+    tuple[str, ...], tyro.conf.UseAppendAction,
     arg("SECTION.NAME=VALUE", "change one setting; docs/settings.md lists them", name="set"),
-]
+]  # fmt: skip
 Seed = Annotated[Whole, arg("N", "seed of all random numbers", "(default: 0)")]
 RunPath = Annotated[Path, tyro.conf.Positional, arg("RUN", "run folder")]
 OutFolder = Annotated[Path | None, arg("DIR", "run folder", "(default: a new one in runs/)", aliases=["--output"])]
 DemoFolder = Annotated[Path, arg("DIR", "run folder", aliases=["--output"])]
 Frames = Annotated[From1, arg("N", "number of frames")]
 SourcePath = Annotated[
-    str,
-    tyro.conf.Positional,
+    str, tyro.conf.Positional,
     arg("PATH", "a recording, synthetic[:frames=N] for the synthetic room, or realsense for the camera"),
-]
+]  # fmt: skip
 Runs = Annotated[From1, arg("N", "number of runs of each sequence, with seeds 0 to N − 1")]
 Overwrite = Annotated[bool, flag("replace an earlier result")]
 SaveEvery = Annotated[float, Range(0), arg("S", "save the state for `resume` every S seconds; 0 = at the end only")]
@@ -55,31 +53,19 @@ Record = Annotated[
 ]
 UpEdge = Annotated[
     Literal["auto", "top", "left", "right", "bottom"],
-    arg(
-        None,
-        "edge of the images that was up; auto: as an accelerometer measured, else top; the floor refines it",
-    ),
-]
-VoxelM = Annotated[
-    float | None,
-    Range(0, open_below=True),
-    arg(
-        "M",
-        "edge of a voxel in metres; the truncation distance is 4 voxels",
-        "(default: 0.01, times the scale of the scene)",
-    ),
-]
+    arg(None, "edge of the images that was up; auto: as an accelerometer measured, else top; the floor refines it"),
+]  # fmt: skip
+VoxelM = Annotated[float | None, Range(0, open_below=True), arg(
+    "M", "edge of a voxel in metres; the truncation distance is 4 voxels",
+    "(default: 0.01, times the scale of the scene)",
+)]  # fmt: skip
 WithMesh = Annotated[bool, flag("also write mesh.ply, and score it if the true surface is known", name="mesh")]
 InRun = Annotated[Path, arg("RUN", "folder of a finished run, in whose map to search", name="in")]
 OntoRun = Annotated[Path | None, arg("RUN", "continue the map of a finished run in a new run folder", "")]
-FinalSeconds = Annotated[
-    From0,
-    arg(
-        "S",
-        "time budget of the final map's refinement in seconds: short form of --set final.seconds=S",
-        "(default: no limit)",
-    ),
-]
+FinalSeconds = Annotated[From0, arg(
+    "S", "time budget of the final map's refinement in seconds: short form of --set final.seconds=S",
+    "(default: no limit)",
+)]  # fmt: skip
 PosesFile = Annotated[
     Path | None, arg("FILE", "file to write: .jsonl (all results) or .txt (poses as TUM text)", "(default: none)")
 ]

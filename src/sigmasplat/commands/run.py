@@ -100,11 +100,10 @@ def run(
 
 
 def resume(
-    run: options.RunPath,
-    moved_to: options.MovedSource = None,
+    run: options.RunPath, moved_to: options.MovedSource = None,
     run_options: options.RunOptionsFlat = options.DEFAULT_RUN_OPTIONS,
     robot_options: RobotOptionsFlat = DEFAULT_ROBOT_OPTIONS,
-) -> int:
+) -> int:  # fmt: skip
     """Resume a run that was stopped or killed, from its last saved state.
 
     The result has the same bytes as an uninterrupted run. example: sigmasplat resume runs/kitchen-sigma

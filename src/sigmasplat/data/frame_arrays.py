@@ -46,17 +46,9 @@ def depth_from_integers(values: NDArray[Any], units_per_metre: float) -> NDArray
 
 
 def frame_from_arrays(
-    rgb: Array,
-    depth: Array,
-    K: Camera | Array,
-    timestamp: float,
-    *,
-    index: int = 0,
-    depth_scale: float | None = None,
-    color_order: ColorOrder = "rgb",
-    R_inertial_camera: Matrix | None = None,
-    T_given_camera: Matrix | None = None,
-) -> Frame:
+    rgb: Array, depth: Array, K: Camera | Array, timestamp: float, *, index: int = 0, depth_scale: float | None = None,
+    color_order: ColorOrder = "rgb", R_inertial_camera: Matrix | None = None, T_given_camera: Matrix | None = None,
+) -> Frame:  # fmt: skip
     """Convert one pair of images to a `Frame`; the arrays are copied.
 
     rgb [H, W, 3]: uint8, or float in [0, 1]; its channels are in `color_order`. depth [H, W]: along the optical axis, 0

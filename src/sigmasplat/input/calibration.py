@@ -76,14 +76,12 @@ TUM_UNITS_PER_METRE = 5000.0
 
 # The values published with the TUM RGB-D benchmark (CG-SLAM's loaders use the same), 640×480.
 FREIBURG = {
-    "1": Calibration(
-        Camera(640, 480, 517.3, 516.5, 318.6, 255.3), TUM_UNITS_PER_METRE, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)
-    ),
-    "2": Calibration(
-        Camera(640, 480, 520.9, 521.0, 325.1, 249.7), TUM_UNITS_PER_METRE, (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)
-    ),
+    "1": Calibration(Camera(640, 480, 517.3, 516.5, 318.6, 255.3), TUM_UNITS_PER_METRE,
+                     (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
+    "2": Calibration(Camera(640, 480, 520.9, 521.0, 325.1, 249.7), TUM_UNITS_PER_METRE,
+                     (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
     "3": Calibration(Camera(640, 480, 535.4, 539.2, 320.1, 247.6), TUM_UNITS_PER_METRE),
-}
+}  # fmt: skip
 
 MM_PER_METRE = 1000.0
 

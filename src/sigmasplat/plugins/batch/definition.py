@@ -149,11 +149,9 @@ class Table:
                 raise ConfigError(f"table {self.name} has no scene {name!r}{nearest(name, known)}; it has {there}")
         return [
             Cell(scene.name, system.name, seed, self._job(scene, system, seed, settings, limit))
-            for seed in range(seeds)
-            for scene in self.scenes
-            if not scenes or scene.name in scenes
+            for seed in range(seeds) for scene in self.scenes if not scenes or scene.name in scenes
             for system in self.systems
-        ]
+        ]  # fmt: skip
 
     def _job(self, scene: Scene, system: System, seed: int, settings: Mapping[str, str], limit: int | None) -> Job:
         length = {"input.limit": str(self.limit if limit is None else limit)}

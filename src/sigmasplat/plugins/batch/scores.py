@@ -155,21 +155,14 @@ class Written:
 
     def values(self) -> dict[str, Any]:
         """Return the table as values for JSON: the conditions, the rows and the runs."""
-        return {
-            "table": self.table.name,
-            "title": self.table.title,
-            **self.conditions,
-            "remarks": list(self.lines),
-            "rows": [
-                {"score": row.score.name, "unit": row.score.unit, "system": row.system, "origin": row.origin}
-                | {"values": {scene: asdict(value) for scene, value in row.values.items()}}
-                for row in self.rows
-            ],
-            "runs": [
-                {"scene": cell.scene, "system": cell.system, "seed": cell.seed, "folder": cell.job.name}
-                for cell in self.cells
-            ],
-        }
+        rows = [
+            {"score": row.score.name, "unit": row.score.unit, "system": row.system, "origin": row.origin}
+            | {"values": {scene: asdict(value) for scene, value in row.values.items()}}
+            for row in self.rows
+        ]
+        runs = [{"scene": c.scene, "system": c.system, "seed": c.seed, "folder": c.job.name} for c in self.cells]
+        head = {"table": self.table.name, "title": self.table.title, **self.conditions}
+        return head | {"remarks": list(self.lines), "rows": rows, "runs": runs}
 
 
 def _remarks(table: Table, cells: Sequence[Cell], batch: Batch, conditions: Mapping[str, Any]) -> list[str]:

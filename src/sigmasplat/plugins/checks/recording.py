@@ -83,26 +83,18 @@ def inspect_source(path: str | Path, settings: InputConfig, samples: int = SAMPL
     agreement = _agreement(source, frames)
     times_s = times_of(source)
     warnings = [
-        *guessed,
-        *filter(None, [unlikely_camera(source.camera)]),
-        *time_warnings(times_s),
-        *_unused_warnings(source),
-        *_depth_warnings(source, frames, settings),
-        *_registration_warnings(source, agreement),
-        *_brightness_warnings(frames),
-        *motion_warnings(motion, first),
-    ]
+        *guessed, *filter(None, [unlikely_camera(source.camera)]), *time_warnings(times_s), *_unused_warnings(source),
+        *_depth_warnings(source, frames, settings), *_registration_warnings(source, agreement),
+        *_brightness_warnings(frames), *motion_warnings(motion, first),
+    ]  # fmt: skip
     rows = [
-        ("format", name),
-        *_size_rows(source, times_s),
-        *_depth_rows(source, frames, settings),
+        ("format", name), *_size_rows(source, times_s), *_depth_rows(source, frames, settings),
         ("depth sensor", source.sensor or "unknown"),
         ("colour–depth alignment", "unknown: no outlines in depth" if agreement is None else agreement.sentence()),
-        ("poses", source.described_truth() or "none: the error of the path cannot be measured"),
-        *_imu_rows(frames),
+        ("poses", source.described_truth() or "none: the error of the path cannot be measured"), *_imu_rows(frames),
         ("skipped", f"{len(source.skipped)} files (first: {source.skipped[0]})" if source.skipped else "nothing"),
         ("suggested preset", _suggested(name)),
-    ]
+    ]  # fmt: skip
     return Inspection(source.name, rows, source.assumptions, source.corrections, warnings, _sheet(frames), agreement)
 
 
@@ -126,10 +118,9 @@ def first_look(source: Source) -> tuple[str, list[str]]:
         return "", []
     agreement = None if source.registrable and not source.depth_registered else _agreement(source, frames)
     warnings = [
-        *filter(None, [unlikely_camera(source.camera), depth_warning(source, read=frames)]),
-        *source.depth_doubts,
+        *filter(None, [unlikely_camera(source.camera), depth_warning(source, read=frames)]), *source.depth_doubts,
         *_registration_warnings(source, agreement),
-    ]
+    ]  # fmt: skip
     if source.camera.width * source.camera.height <= QUICK_PX and source.depth_units_per_metre:
         delay = late_warning(Motion.of(_readable(source, (), range(min(QUICK, len(source))), [], [])))
         warnings += [delay] if delay else []

@@ -240,23 +240,17 @@ def _facts(run: RunFolder, source: Source, log: Log, field: GaussianField) -> di
     wall_s, finish_s = facts.get("wall_s"), facts.get("finish_s")
     seconds = wall_s or sum(frame_seconds(record) for record in log)
     return {
-        "source": source.name,
-        "status": facts.get("status"),
-        "frames": len(log),
+        "source": source.name, "status": facts.get("status"), "frames": len(log),
         "keyframes": sum(bool(record["is_keyframe"]) for record in log),
-        "skipped": facts.get("skipped", list(source.skipped)),
-        "splats": len(field),
-        "map_bytes": run.map_bytes(),
+        "skipped": facts.get("skipped", list(source.skipped)), "splats": len(field), "map_bytes": run.map_bytes(),
         "frames_per_s": len(log) / seconds if seconds else None,
         # The first frame, which creates the map, does not count.
         "worst_frame_s": max(map(frame_seconds, log[1:]), default=0.0) or None,
-        "submaps": _submaps(log),
-        "onto": (facts.get("onto") or {}).get("run"),
+        "submaps": _submaps(log), "onto": (facts.get("onto") or {}).get("run"),
         "loops": {"tried": len(loops), "accepted": sum(bool(loop.get("accepted")) for loop in loops)},
-        "finish_s": finish_s,
-        "final_steps": facts.get("final_steps"),
+        "finish_s": finish_s, "final_steps": facts.get("final_steps"),
         "total_s": None if wall_s is None or finish_s is None else float(wall_s + finish_s),
-    }
+    }  # fmt: skip
 
 
 def _draw_plots(run: RunFolder, frames: RunFrames, truth: Trajectory | None, is_true: bool) -> dict[str, charts.Plot]:

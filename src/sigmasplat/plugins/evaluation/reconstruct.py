@@ -130,14 +130,9 @@ def known_surface(source: Source) -> Mesh | None:
 
 
 def fuse_and_score(
-    run: RunFolder,
-    camera: Camera,
-    true_surface: Mesh | None,
-    true_path: Trajectory | None,
-    random_views: int = VIEWS,
-    renderer: Renderer | None = None,
-    progress: Progress = no_progress,
-) -> dict[str, Any]:
+    run: RunFolder, camera: Camera, true_surface: Mesh | None, true_path: Trajectory | None, random_views: int = VIEWS,
+    renderer: Renderer | None = None, progress: Progress = no_progress,
+) -> dict[str, Any]:  # fmt: skip
     """Write the run's mesh.ply and return its scores, as `score` does; they are None if the true surface or the true
     path is unknown."""
     fusion_input = FusionInput.of(run, camera)
@@ -149,13 +144,9 @@ def fuse_and_score(
 
 
 def score(
-    fusion_input: FusionInput,
-    mesh: Mesh,
-    true_surface: Mesh,
-    true_path: Trajectory,
-    random_views: int = VIEWS,
+    fusion_input: FusionInput, mesh: Mesh, true_surface: Mesh, true_path: Trajectory, random_views: int = VIEWS,
     progress: Progress = no_progress,
-) -> dict[str, Any]:
+) -> dict[str, Any]:  # fmt: skip
     """Score a run's mesh and its splats against the true surface, after the same alignment as for the ATE.
 
     Returns `reconstruction`, our scores, and `reconstruction_published`, those of the papers' protocol. The training

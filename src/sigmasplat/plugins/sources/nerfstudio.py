@@ -112,10 +112,8 @@ def _keyframes(place: str) -> Path:
 PLUGIN = (
     SourceFormat("nerfstudio", NAME, lambda path: (Path(path) / NAME).is_file(), open_nerfstudio),
     SourceFormat(
-        "Polycam",
-        "keyframes/ with images/, depth/ and cameras/*.json",
+        "Polycam", "keyframes/ with images/, depth/ and cameras/*.json",
         lambda path: (_keyframes(path) / "depth").is_dir() and any((_keyframes(path) / "cameras").glob("*.json")),
-        open_polycam,
-        sensor="lidar-iphone",
+        open_polycam, sensor="lidar-iphone",
     ),
-)
+)  # fmt: skip

@@ -222,17 +222,11 @@ def _is_redwood(path: str) -> bool:
 
 PLUGIN = (
     SourceFormat(
-        "Redwood / Open3D",
-        "color/, depth/ and camera_intrinsic.json or trajectory.log",
-        _is_redwood,
-        open_redwood,
+        "Redwood / Open3D", "color/, depth/ and camera_intrinsic.json or trajectory.log", _is_redwood, open_redwood,
         sensor="kinect-v1",
     ),
     SourceFormat(
-        "plain folder",
-        "color/ (or rgb/, images/) and depth/",
-        lambda path: first_subfolder(Path(path), (*COLOR_FOLDERS, *DEPTH_FOLDERS)) is not None,
-        open_plain,
-        priority=-1,
+        "plain folder", "color/ (or rgb/, images/) and depth/",
+        lambda path: first_subfolder(Path(path), (*COLOR_FOLDERS, *DEPTH_FOLDERS)) is not None, open_plain, priority=-1,
     ),
-)
+)  # fmt: skip

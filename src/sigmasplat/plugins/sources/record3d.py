@@ -221,9 +221,6 @@ def _recognises(path: str) -> bool:
 
 
 PLUGIN = SourceFormat(
-    "Record3D",
-    "a .r3d file, or metadata.json with rgb/ and depth/*.exr",
-    _recognises,
-    open_record3d,
+    "Record3D", "a .r3d file, or metadata.json with rgb/ and depth/*.exr", _recognises, open_record3d,
     sensor="lidar-iphone",
-)
+)  # fmt: skip

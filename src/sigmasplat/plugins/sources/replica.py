@@ -90,9 +90,7 @@ def _truth(path: Path, numbers: list[int]) -> Trajectory | None:
 
 
 PLUGIN = SourceFormat(
-    "Replica",
-    "results/frame*.jpg and results/depth*.png",
-    lambda path: bool(_numbered(Path(path), "frame") or _numbered(Path(path), "depth")),
-    open_replica,
+    "Replica", "results/frame*.jpg and results/depth*.png",
+    lambda path: bool(_numbered(Path(path), "frame") or _numbered(Path(path), "depth")), open_replica,
     sensor="rendered",
-)
+)  # fmt: skip

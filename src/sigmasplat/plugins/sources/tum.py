@@ -71,11 +71,9 @@ much, whatever the time between two poses."""
 
 
 def open_tum(
-    path: str,
-    settings: InputConfig,
-    camera: Calibration | None = None,
+    path: str, settings: InputConfig, camera: Calibration | None = None,
     camera_path: Callable[[Trajectory], Trajectory] | None = None,
-) -> RecordedSource:
+) -> RecordedSource:  # fmt: skip
     """Open a folder. Raises SourceError if its lists, images, calibration, ground-truth poses or gyroscope cannot be
     used.
 
@@ -185,11 +183,9 @@ class TumWriter:
 
 
 BONN = Calibration(
-    Camera(640, 480, 542.822841, 542.57687, 315.59352, 237.756098),
-    TUM_UNITS_PER_METRE,
-    (0.039903, -0.099343, -0.00073, -0.000144, 0.0),
-    origins=published("that of the Bonn data set"),
-)
+    Camera(640, 480, 542.822841, 542.57687, 315.59352, 237.756098), TUM_UNITS_PER_METRE,
+    (0.039903, -0.099343, -0.00073, -0.000144, 0.0), origins=published("that of the Bonn data set"),
+)  # fmt: skip
 T_ROS = np.array([[-1.0, 0, 0, 0], [0, 0, 1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 T_MARKERS_CAMERA = se3.orthonormalise(
     np.array([

@@ -48,15 +48,9 @@ class MeshScores:
 
 
 def score(
-    found: Mesh,
-    truth: Mesh,
-    camera: Camera,
-    T_world_camera: Matrix,
-    *,
-    points: int = POINTS,
-    seed: int = 0,
+    found: Mesh, truth: Mesh, camera: Camera, T_world_camera: Matrix, *, points: int = POINTS, seed: int = 0,
     seen: tuple[Mask, Mask] | None = None,
-) -> MeshScores:
+) -> MeshScores:  # fmt: skip
     """Score mesh `found` against mesh `truth`, both in the frame of the truth, as seen from true poses [K, 4, 4].
 
     The true faces should be small (a few cm). A true face counts if a training view shows it at a pixel, or if its
@@ -184,16 +178,9 @@ class SplatScores:
 
 
 def score_splats(
-    centers: Matrix,
-    opacities: Matrix,
-    truth: Mesh,
-    camera: Camera,
-    T_world_camera: Matrix,
-    *,
-    points: int = POINTS,
-    seed: int = 0,
-    seen: tuple[Mask, Mask] | None = None,
-) -> SplatScores:
+    centers: Matrix, opacities: Matrix, truth: Mesh, camera: Camera, T_world_camera: Matrix, *, points: int = POINTS,
+    seed: int = 0, seen: tuple[Mask, Mask] | None = None,
+) -> SplatScores:  # fmt: skip
     """Score splats, centers [N, 3] m and opacities [N], in the frame of the truth, as seen from true poses [K, 4, 4].
 
     The Chamfer distance uses splats of every opacity, and only parts that a training view could see

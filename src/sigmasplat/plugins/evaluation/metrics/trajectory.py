@@ -129,12 +129,9 @@ def absolute_error(estimate: Matrix, truth: Matrix) -> AbsoluteError:
     T = align_rigid(estimate, truth)
     distance = np.linalg.norm(estimate @ T[:3, :3].T + T[:3, 3] - truth, axis=1)
     return AbsoluteError(
-        _root_mean_square(distance),
-        float(distance.mean()),
-        float(np.median(distance)),
-        float(distance.max()),
+        _root_mean_square(distance), float(distance.mean()), float(np.median(distance)), float(distance.max()),
         len(distance),
-    )
+    )  # fmt: skip
 
 
 def rpe(estimate: Trajectory, truth: Trajectory, delta_frames: int = 1) -> RelativeError:
@@ -198,14 +195,10 @@ def score_failures(error_m: Values, p_off: Values, valid: Mask) -> dict[str, Any
     known = np.isfinite(error_m) & np.isfinite(p_off)
     off, p = error_m[known] > OFF_M, p_off[known]
     return {
-        "frames": int(np.isfinite(error_m).sum()),
-        "off": int((error_m > OFF_M).sum()),
-        "silent": int(silent.sum()),
-        "silent_rows": np.flatnonzero(silent).tolist(),
-        "auroc": auroc(p, off),
-        "brier": brier(p, off),
+        "frames": int(np.isfinite(error_m).sum()), "off": int((error_m > OFF_M).sum()), "silent": int(silent.sum()),
+        "silent_rows": np.flatnonzero(silent).tolist(), "auroc": auroc(p, off), "brier": brier(p, off),
         "calibration": calibration(p, off),
-    }
+    }  # fmt: skip
 
 
 def auroc(p: Values, off: Mask) -> float:
@@ -267,14 +260,9 @@ def score_covariances(T_estimate: Matrix, T_true: Matrix, covariance: Matrix) ->
     full, position = nees(twists, covariance), nees(shifts, J @ covariance @ np.swapaxes(J, 1, 2))
     median = float(np.median(position))
     return CovarianceScore(
-        len(full),
-        float(full.mean()),
-        float(np.median(full)),
-        float((full <= chi2_quantile(LEVEL, 6)).mean()),
-        median,
-        median / chi2_quantile(0.5, 3),
-        float((position <= chi2_quantile(LEVEL, 3)).mean()),
-    )
+        len(full), float(full.mean()), float(np.median(full)), float((full <= chi2_quantile(LEVEL, 6)).mean()), median,
+        median / chi2_quantile(0.5, 3), float((position <= chi2_quantile(LEVEL, 3)).mean()),
+    )  # fmt: skip
 
 
 def nees(errors: Matrix, covariance: Matrix) -> Matrix:

@@ -95,24 +95,19 @@ def calibration_scores(variance: Values, squared_error: Values, epsilon: float =
     """Return the scores that a scale of V changes: nll, auce, coverage_68, coverage_95, z_rms, z_68."""
     at_68, at_95 = coverage(variance, squared_error, np.array([0.6827, 0.95]), epsilon)
     return {
-        "nll": gaussian_nll(variance, squared_error, epsilon),
-        "auce": auce(variance, squared_error, epsilon),
-        "coverage_68": float(at_68),
-        "coverage_95": float(at_95),
-        **z_scores(variance, squared_error, epsilon),
-    }
+        "nll": gaussian_nll(variance, squared_error, epsilon), "auce": auce(variance, squared_error, epsilon),
+        "coverage_68": float(at_68), "coverage_95": float(at_95), **z_scores(variance, squared_error, epsilon),
+    }  # fmt: skip
 
 
 def score(variance: Values, squared_error: Values) -> dict[str, Any]:
     """Return all scores of this module, the means of V and r², and the number of pixels, as plain values."""
     return {
-        "pixels": int(variance.size),
-        "spearman": spearman(variance, squared_error),
-        "nll": gaussian_nll(variance, squared_error),
-        "ause": ause(variance, squared_error),
+        "pixels": int(variance.size), "spearman": spearman(variance, squared_error),
+        "nll": gaussian_nll(variance, squared_error), "ause": ause(variance, squared_error),
         "mean_variance": float(variance.mean()) if variance.size else float("nan"),
         "mean_squared_error": float(squared_error.mean()) if variance.size else float("nan"),
-    }
+    }  # fmt: skip
 
 
 def over_channels(variance: Values, squared_error: Values) -> Values:

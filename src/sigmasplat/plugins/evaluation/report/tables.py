@@ -17,13 +17,11 @@ def key_figures(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
     path = [(name, number(ate["rmse_m"], 2, 100.0), "cm")] if ate else []
     speed, unit = rate(metrics.get("frames_per_s")).split(" ", 1)
     figures = [
-        ("Images with a pose", number(posed, 0), f"of {frames}"),
-        *path,
+        ("Images with a pose", number(posed, 0), f"of {frames}"), *path,
         (f"PSNR, {kind} images", number(scores.get("psnr_db"), 2), "dB"),
-        (f"Depth L1, {kind} images", number(scores.get("depth_l1_m"), 2, 100.0), "cm"),
-        ("Speed", speed, unit),
+        (f"Depth L1, {kind} images", number(scores.get("depth_l1_m"), 2, 100.0), "cm"), ("Speed", speed, unit),
         ("Map", number(metrics.get("splats"), 0), f"splats, {number(metrics.get('map_bytes'), 1, 1e-6)} MB"),
-    ]
+    ]  # fmt: skip
     return [figures[0], *figures[-2:]] if metrics.get("failure") else figures
 
 
@@ -120,12 +118,10 @@ def _path_rows(metrics: dict[str, Any]) -> list[list[str]]:
     if without:
         rows.append(["ATE rmse without loop closure, cm", number(without["rmse_m"], 3, 100.0)])
     return [
-        [f"valid frames, {alignment}", f"{ate['pairs']} poses"],
-        *rows,
+        [f"valid frames, {alignment}", f"{ate['pairs']} poses"], *rows,
         ["RPE translation, cm per frame", number(rpe["translation_rmse_m"], 3, 100.0)],
-        ["RPE rotation, ° per frame", number(rpe["rotation_rmse_deg"], 3)],
-        *_failure_rows(metrics),
-    ]
+        ["RPE rotation, ° per frame", number(rpe["rotation_rmse_deg"], 3)], *_failure_rows(metrics),
+    ]  # fmt: skip
 
 
 def _failure_rows(metrics: dict[str, Any]) -> list[list[str]]:
