@@ -40,9 +40,7 @@ class EvalOptions:
         are damaged, or missing in a folder that was given."""
         from sigmasplat.plugins.evaluation.metrics.lpips import Lpips, find_lpips
 
-        if self.lpips is not None:
-            return Lpips.load(self.lpips), ""
-        return find_lpips(LPIPS_FOLDER)
+        return (Lpips.load(self.lpips), "") if self.lpips is not None else find_lpips(LPIPS_FOLDER)
 
 
 DEFAULT_EVAL_OPTIONS = EvalOptions()

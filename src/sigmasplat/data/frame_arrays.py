@@ -23,14 +23,12 @@ UINT16_MAX = 65535
 """Several sensors write the largest 16-bit number for no reading."""
 COLOR_MARGIN = 0.01
 """Colour may be outside [0, 1] by this much: filters that interpolate can overshoot."""
-MEDIAN_DEPTH_M = (0.01, 100.0)
-"""If the median depth of an image is outside these limits, its unit is wrong."""
+MEDIAN_DEPTH_M, MEDIAN_OF = (0.01, 100.0), 4096
+"""If the median depth of an image is outside these limits, its unit is wrong; it is that of about so many pixels."""
 LATEST_S = 1e11
 """A larger timestamp is not in seconds: this is the year 5138, and milliseconds passed it in 1973."""
 NARROWEST = 0.05
 """A focal length below this share of the image width belongs to a normalised matrix."""
-MEDIAN_OF = 4096
-"""The median depth is that of about this many pixels."""
 
 
 def color_from_bytes(values: NDArray[np.uint8]) -> NDArray[np.float32]:

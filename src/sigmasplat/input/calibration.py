@@ -72,7 +72,7 @@ class CameraUnknown(SourceError):
 MOST_NUMBER = 1e100
 """Larger numbers are refused: their squares are not finite, and no field of a recording needs them."""
 
-TUM_UNITS_PER_METRE = 5000.0
+TUM_UNITS_PER_METRE, MM_PER_METRE = 5000.0, 1000.0
 
 # The values published with the TUM RGB-D benchmark (CG-SLAM's loaders use the same), 640×480.
 FREIBURG = {
@@ -82,8 +82,6 @@ FREIBURG = {
                      (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
     "3": Calibration(Camera(640, 480, 535.4, 539.2, 320.1, 247.6), TUM_UNITS_PER_METRE),
 }  # fmt: skip
-
-MM_PER_METRE = 1000.0
 
 
 def freiburg_calibration(folder: Path) -> Calibration | None:
@@ -233,10 +231,9 @@ def median_calibration(path: Path, size: tuple[int, int], focals: Any, units: fl
 
 POSSIBLE_VIEW_DEG = (2.0, 170.0)
 """A pinhole image with a field of view outside this range is taken for a mistake in the calibration."""
-USUAL_VIEW_DEG = (25.0, 120.0)
-"""Horizontal field of view of depth cameras and phones."""
-CENTRED = 0.2
-"""Principal points are usually within this share of the image size from its centre."""
+USUAL_VIEW_DEG, CENTRED = (25.0, 120.0), 0.2
+"""Horizontal field of view of depth cameras and phones; principal points are usually within this share of the image
+size from its centre."""
 
 
 def refuse_impossible_camera(name: str, camera: Camera) -> None:

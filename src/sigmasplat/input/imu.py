@@ -25,13 +25,10 @@ def in_time_order(times_s: Values, values: Values) -> tuple[Values, Values]:
 
 MAX_RAD_S = 40.0
 """Gyroscopes of phones and cameras measure up to 2000 °/s = 35 rad/s. Larger values are probably in degrees."""
-STILL_SAMPLES = 20
-"""A second with fewer samples is not judged."""
-STILL_NOISE_RAD_S = 0.01
+STILL_SAMPLES, STILL_NOISE_RAD_S, MAX_BIAS_RAD_S = 20, 0.01, 0.05
 """A gyroscope is still if its samples of one second vary by less than this (standard deviation): more than the noise of
-phones and cameras, less than a hand shakes."""
-MAX_BIAS_RAD_S = 0.05
-"""Biases of such gyroscopes are below 3 °/s; a larger mean is a turn."""
+phones and cameras, less than a hand shakes. A second with fewer samples is not judged. Biases of such gyroscopes are
+below 3 °/s; a larger mean is a turn."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,8 +115,7 @@ WINDOW_S = 0.1
 OFF_GRAVITY = 0.2
 """The median length of the samples may differ from gravity by this share; otherwise gravity was removed from them, or
 their unit is another one."""
-LEAST_FRAMES = 10
-LEAST_MEAN = 0.8
+LEAST_FRAMES, LEAST_MEAN = 10, 0.8
 """Length of the mean over a path, relative to gravity. It is shorter if poses and samples do not belong together."""
 
 
@@ -147,9 +143,7 @@ def accelerometer_from_samples(times_s: Values, specific_force_m_s2: Values) -> 
     gravity."""
     times, forces = in_time_order(times_s, specific_force_m_s2)
     length_m_s2 = float(np.median(np.linalg.norm(forces, axis=1))) if len(times) else 0.0
-    if abs(length_m_s2 / GRAVITY_M_S2 - 1.0) > OFF_GRAVITY:
-        return None
-    return Accelerometer(times, forces)
+    return None if abs(length_m_s2 / GRAVITY_M_S2 - 1.0) > OFF_GRAVITY else Accelerometer(times, forces)
 
 
 def up_of_path(T_world_camera: Matrix, specific_force_m_s2: Values) -> Values | None:

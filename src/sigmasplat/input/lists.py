@@ -18,13 +18,9 @@ from sigmasplat.input.calibration import Origin
 from sigmasplat.types import Matrix
 
 MOST_MATRIX_BYTES = 1 << 16
-
-RIGID_TOLERANCE = 1e-2
-"""Published poses are rounded; a matrix within this tolerance of a rotation is orthonormalised."""
-
-QUATERNION_TOLERANCE = 1e-2
-"""Largest deviation of a recorded quaternion's length from 1."""
-
+RIGID_TOLERANCE, QUATERNION_TOLERANCE = 1e-2, 1e-2
+"""Published poses are rounded; a matrix within this tolerance of a rotation is orthonormalised, and the length of a
+quaternion may differ from 1 by this."""
 FLIP_YZ = np.diag([1.0, -1.0, -1.0, 1.0])
 """Transforms camera axes with y down and z forward to axes with y up and z backward (OpenGL)."""
 
@@ -168,10 +164,8 @@ def parse_numbers(path: Path, line: int, words: list[str]) -> list[float]:
 Times = NDArray[np.float64]
 
 MAX_GAP_S = InputConfig.max_gap_s
-
 UNIT_RATIO = 200.0
 """Median steps of two lists that differ by this factor are in different units, such as s and ms."""
-
 MOST_CANDIDATES = 100
 """Largest mean number of images that may be within the tolerance of an image: a camera of 1000 Hz has 40. Equal times
 would need memory for the square of the number of images."""

@@ -25,13 +25,8 @@ def distort(points: Points, coefficients: Points) -> Points:
     x, y = points[..., 0], points[..., 1]
     r2 = x * x + y * y
     radial = (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)))
-    return np.stack(
-        [
-            x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
-            y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
-        ],
-        -1,
-    )
+    along_x = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
+    return np.stack([along_x, y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y], -1)
 
 
 class Undistortion:
@@ -77,10 +72,9 @@ def resampled(image: NDArray[np.float32], own: Camera, camera: Camera) -> NDArra
     return np.asarray(cv2.warpAffine(image, M, size, flags=flags, borderMode=border))
 
 
-OVERLAP = 1.1
-"""Footprints are enlarged by this factor, so that rotation leaves no gaps between neighbours."""
-MAX_HALF_FOOTPRINT_PX = 32.0
-"""Half of the largest footprint: a reading near the camera centre must not fill the image."""
+OVERLAP, MAX_HALF_FOOTPRINT_PX = 1.1, 32.0
+"""Footprints are enlarged by this factor, so that rotation leaves no gaps between neighbours. Half of the largest one:
+a reading near the camera centre must not fill the image."""
 CHUNK_READINGS = 8192
 """Readings processed together: few enough for the processor's cache."""
 

@@ -20,13 +20,11 @@ from sigmasplat.types import Matrix
 PLACES, STEPS = 12, (32, 16, 8, 4, 2, 1)
 """Number of places of the sequence where depth is compared, and the numbers of frames that a motion may take, the first
 choice first."""
-FEWEST = 3
-"""A scale is measured from at least this many motions."""
+FEWEST, TOLERANCE = 3, 0.1
+"""A scale is measured from at least this many motions; poses whose scale differs from 1 by less are in metres."""
 LEAST_MATCHES, LEAST_PARALLAX_DEG, MOST_OFF_PX = 20, 1.5, 2.0
 """Features are triangulated if at least this many are seen from directions that differ by this angle, and at most this
 far from where the given motion can show them."""
-TOLERANCE = 0.1
-"""Poses whose measured scale differs from 1 by less than this are taken to be in metres."""
 
 
 def with_measured_scale(source: Source, config: Config) -> Config:

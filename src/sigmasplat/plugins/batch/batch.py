@@ -20,10 +20,9 @@ from sigmasplat.plugins.sources import open_source
 if TYPE_CHECKING:
     from sigmasplat.api import Screen
 
-TRIES = 3
-"""A run whose process is killed this many times is given up: the machine may not have enough memory for it."""
-STOP_S = 120.0
-"""Time for running processes to save their state after Ctrl-C."""
+TRIES, STOP_S = 3, 120.0
+"""A run whose process is killed this many times is given up: the machine may not have enough memory for it. Time for
+running processes to save their state after Ctrl-C."""
 
 
 class Executor:

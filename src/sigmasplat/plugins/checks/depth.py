@@ -16,16 +16,13 @@ from sigmasplat.api import Frame
 
 Plane = NDArray[np.float32]
 
-WIDTH = 320
-"""Image width, pixels, at which edges are compared."""
-REACH_PX = 20
-"""Largest trial shift in each direction, pixels at that width."""
+WIDTH, REACH_PX = 320, 20
+"""Image width, pixels, at which edges are compared; largest trial shift in each direction, pixels at that width."""
 MAGNIFICATIONS = np.round(np.arange(-0.2, 0.2001, 0.02), 2)
 """Trial magnifications of depth about the image centre, for cameras with another focal length."""
-MIN_DEVIATIONS = 5.0
-"""The best trial must be above the median of all trials by this many robust standard deviations."""
-MIN_SCORE = 0.5
-"""Below this score, colour and depth are taken to come from two cameras."""
+MIN_DEVIATIONS, MIN_SCORE = 5.0, 0.5
+"""The best trial must be above the median of all trials by this many robust standard deviations. Below this score,
+colour and depth are taken to come from two cameras."""
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,7 @@ from sigmasplat.api import Frame, Source, SourceError
 
 PLAUSIBLE_RATE_HZ = (0.1, 1000.0)
 """Frame rates of cameras, also of recordings that keep every tenth frame; with times in another unit it is outside."""
-GAP_S = 1.0
-GAP_STEPS = 10.0
+GAP_S, GAP_STEPS = 1.0, 10.0
 """A gap is longer than `GAP_S` and than this multiple of the median step."""
 
 
@@ -70,24 +69,15 @@ def time_warnings(times_s: NDArray[np.float64]) -> list[str]:
 
 Numbers = NDArray[np.float64]
 
-WIDTH = 80
-"""Image width, pixels, at which frames are compared."""
-REACH = 8
-"""Largest delay that is searched, frames."""
-FEWEST = 40
-"""A delay is estimated from at least this many frames."""
-MIN_CORRELATION = 0.6
-"""Below this correlation of the motion energies the delay is unknown."""
-MIN_GAIN = 0.1
-"""A delay is reported if its correlation is above that without a delay by this."""
-MIN_DELAY = 0.7
-"""Shorter delays, in frames, are not reported."""
-JUMP = 2.8
-"""A view jumps if the image changes by more than this multiple of the median change around it."""
-JUMP_LEAST = 0.08
-"""Smallest mean change of a jump, colours 0 to 1."""
-BLACK = 0.02
-"""A frame is black if 99 % of its pixels are below this, colours 0 to 1."""
+WIDTH, REACH, FEWEST = 80, 8, 40
+"""Image width, pixels, at which frames are compared; largest delay that is searched, frames; a delay is estimated from
+at least this many frames."""
+MIN_CORRELATION, MIN_GAIN, MIN_DELAY = 0.6, 0.1, 0.7
+"""Below this correlation of the motion energies the delay is unknown. It is reported if its correlation is above that
+without a delay by this, and if it has at least so many frames."""
+JUMP, JUMP_LEAST, BLACK = 2.8, 0.08, 0.02
+"""A view jumps if the image changes by more than this multiple of the median change around it, and by at least this on
+average; a frame is black if 99 % of its pixels are below this; colours 0 to 1."""
 
 
 @dataclass(frozen=True, eq=False)

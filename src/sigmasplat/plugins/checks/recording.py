@@ -37,14 +37,10 @@ USUAL_FOCAL = 0.9
 """Typical focal length of depth cameras, in image widths: a field of view of 58°. Enough to inspect, not to map."""
 CONSECUTIVE = 300
 """Number of consecutive frames, in the middle of the recording, whose motion is checked."""
-MANY_UNUSED = 0.05
-"""If more than this share of the images is not used, warn."""
-MANY_HOLES = 0.45
-"""If more than this share of the pixels has no depth, warn of holes in the map."""
+MANY_UNUSED, MANY_HOLES = 0.05, 0.45
+"""If more than these shares of the images are not used, or of the pixels have no depth, warn."""
 MAX_BRIGHTNESS_STEP = 0.2
 """If the median change of brightness between sampled frames is larger than this share, suggest `tracking.exposure`."""
-
-
 FIRST, LOOKED_AT, ENOUGH_S = 150, 4, 0.5
 """Before a run, so many of the first frames are looked at, fewer if they are not read in this time."""
 QUICK_PX, QUICK = 320 * 240, 80

@@ -99,10 +99,9 @@ Renderer = Callable[[GaussianField, Camera, NDArray[np.float64]], Render]
 """Renders a field from T_camera_world."""
 Predictor = Callable[[Camera, NDArray[np.float64]], Predicted]
 """Predicts the variances of a view of the final map from T_camera_world."""
-HELD_OUT = "held-out"
-"""The kind of views that no map was fitted to."""
-PIXELS_PER_VIEW = 20_000
-"""At most this many valid pixels per view, every k-th one, go into the uncertainty scores: sorting stays fast."""
+HELD_OUT, PIXELS_PER_VIEW = "held-out", 20_000
+"""The kind of views that no map was fitted to. At most this many valid pixels per view, every k-th one, go into the
+uncertainty scores: sorting stays fast."""
 
 
 @dataclass(eq=False)

@@ -84,9 +84,8 @@ def _chained(edges: dict[str, dict[str, Matrix]], target: str, source: str) -> M
 REGISTERED_NAMES = ("aligned_depth_to_color", "depth_registered", "depth_to_rgb")
 """Parts of topic names for depth registered to colour (RealSense; OpenNI, Kinect; Azure Kinect)."""
 NOT_DEPTH_NAMES = ("infra", "/ir/", "confidence")
-"""Parts of topic names for 16-bit images that are not depth."""
 NOT_GRAY_NAMES = ("confidence", "mask", "label", "segment", "semantic", "disparity", "depth")
-"""Parts of topic names for 8-bit images that no camera took."""
+"""Parts of topic names for 16-bit images that are not depth, and for 8-bit images that no camera took."""
 
 
 @dataclass(frozen=True)

@@ -17,17 +17,13 @@ Floats = NDArray[np.float32]
 
 FIT_REACH_PX, SPREAD_PX = 5, 3.3
 """The window: its half edge, and the standard deviation of its Gaussian weights."""
-SMOOTH_PX = 0.7
-"""Standard deviation of the smoothing of both images: their noise, and less aliasing in the gradient."""
-STEPS = 2
-FAR_OFF = 10.0
-"""A pixel whose gray values differ by this much counts half (of 255; Geman–McClure)."""
-FLAT = 4.0
-"""Prior of no slope: like this much squared gradient one pixel from the centre of the window."""
-PRIOR = 1.0
-"""Weight of the disparity that matching found, as squared gradient in gray values per pixel."""
-LARGEST_PX = 1.0
-"""Largest change of a disparity."""
+SMOOTH_PX, STEPS = 0.7, 2
+"""Standard deviation of the smoothing of both images: their noise, and less aliasing in the gradient; iterations."""
+FAR_OFF, LARGEST_PX = 10.0, 1.0
+"""A pixel whose gray values differ by this much counts half (of 255; Geman–McClure). Largest change of a disparity."""
+FLAT, PRIOR = 4.0, 1.0
+"""Prior of no slope: like this much squared gradient one pixel from the centre of the window. Weight of the disparity
+that matching found, as squared gradient in gray values per pixel."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,45 +89,37 @@ def _window(image: Floats, powers_x: int = 0, powers_y: int = 0) -> Floats:
     return np.asarray(cv2.sepFilter2D(image, cv2.CV_32F, *along, borderType=cv2.BORDER_CONSTANT), np.float32)
 
 
-BLOCK_PX = 5
-"""Edge of the matched blocks."""
+BLOCK_PX, PREFILTER, SUBPIXELS = 5, 31, 16.0
+"""Edge of the matched blocks; largest value of the horizontal derivative that is compared; OpenCV's unit of disparity,
+per pixel."""
 SMALL_STEP, LARGE_STEP = 8 * BLOCK_PX**2, 32 * BLOCK_PX**2
 """Penalties of a disparity step of 1 px, and of a larger one (OpenCV's recommendation for one channel)."""
-PREFILTER = 31
-"""Largest value of the horizontal derivative that is compared."""
-CONSISTENT_PX = 1
-"""Left–right check: largest difference of the disparities that the two images find."""
-UNIQUE_PERCENT = 10
-"""The best match must be better than the second one by this."""
+CONSISTENT_PX, UNIQUE_PERCENT = 1, 10
+"""Left–right check: largest difference of the disparities that the two images find. The best match must be better than
+the second one by this."""
 SPECKLE_PX, SPECKLE_STEP_PX = 100, 1
 """Regions with fewer pixels are removed; within a region neighbours differ by at most this disparity."""
-SUBPIXELS = 16.0
-"""OpenCV's unit of disparity, per pixel."""
 REACH_PX, MOST_BEND_PX = 2, 0.6
 """Readings are removed where the disparity differs by more than `MOST_BEND_PX` from the mean of its neighbours at this
 distance, or next to such places, before or after the refinement: those are edges and wrong matches."""
-STD_PX = 0.15
-"""Standard deviation σ_d of the disparity where matching is sure. Stereo depth z has σ_z = z²·σ_d / (f·b)."""
-MAX_STD = 0.05
-"""Depth is ignored where its standard deviation σ_z is larger than this share of it."""
+STD_PX, MAX_STD = 0.15, 0.05
+"""Standard deviation σ_d of the disparity where matching is sure. Stereo depth z has σ_z = z²·σ_d / (f·b); depth is
+ignored where σ_z is larger than this share of it."""
 STD_MATCH, STD_HOLE, STD_RANGE, STD_BEND = 1.04, 3.8, 0.51, 7.15
 """Parts of σ_d in units of `STD_PX`. For each gray value by which the images differ after the refinement:
 divided by the gradient that decides it; at a pixel without a reading, where the surface ends, falling by e every
 `HOLE_PX`; for each pixel in the range of disparities around, as a near surface looks wider than it is. Besides: for
 each pixel by which the disparity bends. Fitted to exact depth of synthetic rooms (seeds 1 to 4; baselines of 6, 10 and
 18 cm)."""
-TAILS = 2.0
-"""Root mean square of the errors in the disparity relative to `STD_PX`: a few are much larger than σ_d."""
-LEAST_TEXTURE = 0.5
-"""Smallest gradient that is divided by, in gray values per pixel."""
-HOLE_PX, AROUND_PX, MOST_RANGE_PX = 8.0, 13, 2.0
-"""The window of the range of disparities, and its largest value."""
-LEAST_TOGETHER = 0.85
-"""Readings are removed where a smaller share of this window has a match: those are often wrong by several pixels."""
-INDOOR_MEDIAN_M = 2.0
-"""Median depth of a usual indoor recording: the default settings are made for it."""
-SMALL_SCENE = 2.0
-"""Scenes below this multiple of `INDOOR_MEDIAN_M` use the default settings."""
+TAILS, LEAST_TEXTURE = 2.0, 0.5
+"""Root mean square of the errors in the disparity relative to `STD_PX`: a few are much larger than σ_d. Smallest
+gradient that is divided by, in gray values per pixel."""
+HOLE_PX, AROUND_PX, MOST_RANGE_PX, LEAST_TOGETHER = 8.0, 13, 2.0, 0.85
+"""The window of the range of disparities, and its largest value. Readings are removed where a smaller share of this
+window has a match: those are often wrong by several pixels."""
+INDOOR_MEDIAN_M, SMALL_SCENE = 2.0, 2.0
+"""Median depth of a usual indoor recording, for which the default settings are made; scenes below this multiple of it
+use them."""
 
 
 class StereoMatcher:
@@ -199,18 +187,13 @@ def _relative_std(fine: Subpixel, matched: NDArray[np.bool_], smooth: NDArray[np
     far, near = (np.where(matched, sign * fine.disparity, np.float32(-1e6)) for sign in (-1.0, 1.0))
     range_px = cv2.dilate(near, window) + cv2.dilate(far.astype(np.float32), window)
     to_hole_px = cv2.distanceTransform(smooth.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    return np.asarray(
-        np.sqrt(
-            fine.residual**2
-            * (
-                (STD_MATCH / np.maximum(fine.texture, LEAST_TEXTURE)) ** 2
-                + (STD_HOLE * np.exp(-to_hole_px / HOLE_PX)) ** 2
-                + (STD_RANGE * np.clip(range_px, 0.0, MOST_RANGE_PX)) ** 2
-            )
-            + (STD_BEND * np.where(smooth, bend_px, 0.0)) ** 2
-        ),
-        np.float32,
+    per_gray_value = (
+        (STD_MATCH / np.maximum(fine.texture, LEAST_TEXTURE)) ** 2
+        + (STD_HOLE * np.exp(-to_hole_px / HOLE_PX)) ** 2
+        + (STD_RANGE * np.clip(range_px, 0.0, MOST_RANGE_PX)) ** 2
     )
+    bent = (STD_BEND * np.where(smooth, bend_px, 0.0)) ** 2
+    return np.asarray(np.sqrt(fine.residual**2 * per_gray_value + bent), np.float32)
 
 
 def _bend(disparity: Floats, seen: NDArray[np.bool_]) -> Floats:

@@ -14,20 +14,14 @@ from sigmasplat.api import Camera, Matrix, Mesh, Progress, mesh_depth, no_progre
 
 Mask = NDArray[np.bool_]
 
-POINTS = 200_000
-"""Points sampled on each surface."""
-COMPLETE_M = 0.05
-"""Completion ratio: the share of the true surface with a reconstructed surface within this distance."""
-CORRECT_M = 0.01
-"""Precision, recall and F1 use this distance."""
-SLACK_M = 0.005
+POINTS, POINTS_AT_ONCE, CANDIDATES = 200_000, 20_000, 8
+"""Points sampled on each surface, and measured at once; faces tested for each: those with the nearest centroids."""
+COMPLETE_M, CORRECT_M = 0.05, 0.01
+"""Completion ratio: the share of the true surface with a reconstructed surface within the first distance. Precision,
+recall and F1 use the second one."""
+SLACK_M, BEHIND_M = 0.005, 0.05
 """A true face may be smaller than a pixel and lie between pixel centres. It is also visible if its centre is at most
-this far behind the rendered depth."""
-BEHIND_M = 0.05
-"""A reconstructed face more than this far behind the true surface is hidden."""
-CANDIDATES = 8
-"""Faces tested for each point: those with the nearest centroids."""
-POINTS_AT_ONCE = 20_000
+this far behind the rendered depth. A reconstructed face more than this far behind the true surface is hidden."""
 
 
 @dataclass(frozen=True)
@@ -156,10 +150,8 @@ def share(distance_m: Matrix, limit_m: float) -> float:
     return float((distance_m < limit_m).mean()) if distance_m.size else float("nan")
 
 
-OPAQUE = 0.1
-"""Only a splat above this opacity can be a floater."""
-FLOATER_M = 0.1
-"""A floater is an opaque splat whose centre is farther than this from every true surface."""
+OPAQUE, FLOATER_M = 0.1, 0.1
+"""A floater is a splat above this opacity whose centre is farther than this from every true surface."""
 
 
 @dataclass(frozen=True)

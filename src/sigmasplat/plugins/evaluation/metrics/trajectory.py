@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from scipy.special import gammaincinv
-from scipy.stats import rankdata
+from scipy.stats import chi2, rankdata
 
 from sigmasplat.api import Matrix, SourceError, Trajectory, se3
 
@@ -172,11 +171,9 @@ def score_path(
         return unknown, problem
 
 
-OFF_M = 0.05
-"""`p_off` is the probability that a pose is off by more than this."""
-SILENT_M = 0.10
-"""A valid pose that is off by more than this is a silent failure."""
-BINS = 10
+OFF_M, SILENT_M, BINS = 0.05, 0.10, 10
+"""`p_off` is the probability that a pose is off by more than the first; a valid pose that is off by more than the
+second is a silent failure."""
 
 Values = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -260,16 +257,11 @@ def score_covariances(T_estimate: Matrix, T_true: Matrix, covariance: Matrix) ->
     full, position = nees(twists, covariance), nees(shifts, J @ covariance @ np.swapaxes(J, 1, 2))
     median = float(np.median(position))
     return CovarianceScore(
-        len(full), float(full.mean()), float(np.median(full)), float((full <= chi2_quantile(LEVEL, 6)).mean()), median,
-        median / chi2_quantile(0.5, 3), float((position <= chi2_quantile(LEVEL, 3)).mean()),
+        len(full), float(full.mean()), float(np.median(full)), float((full <= chi2.ppf(LEVEL, 6)).mean()), median,
+        median / float(chi2.ppf(0.5, 3)), float((position <= chi2.ppf(LEVEL, 3)).mean()),
     )  # fmt: skip
 
 
 def nees(errors: Matrix, covariance: Matrix) -> Matrix:
     """Return eᵀ Σ⁻¹ e [N] of errors [N, D] with covariances [N, D, D]."""
     return np.asarray((errors * np.linalg.solve(covariance, errors[:, :, None])[..., 0]).sum(1))
-
-
-def chi2_quantile(share: float, freedom: int) -> float:
-    """Return the value that a χ² variable with `freedom` degrees of freedom stays below with probability `share`."""
-    return 2.0 * float(gammaincinv(freedom / 2.0, share))

@@ -85,10 +85,9 @@ def rerun_command(config: Config, facts: dict[str, Any], command: str = "run") -
 
 QUALITY, EFFORT = 86, 2
 """Quality of WebP, and the effort to compress (0 to 6; a larger one takes longer and hardly saves space)."""
-PAGE_WIDTH = 1152
-"""Width of the page's text column at twice the resolution of a panel, in pixels."""
-VIEW_PANELS = 5
-"""Number of panels of a view; fewer are not of one view, or of its predicted errors."""
+PAGE_WIDTH, VIEW_PANELS = 1152, 5
+"""Width of the page's text column at twice the resolution of a panel, in pixels. Number of panels of a view; fewer are
+not of one view, or of its predicted errors."""
 
 STYLE = Path(__file__).with_name("page.css").read_text(encoding="utf-8")
 

@@ -54,10 +54,10 @@ def score_tables(metrics: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
         ("Rendered images", _image_rows(metrics)),
         _full_resolution_table(metrics),
         ("Path", _path_rows(metrics)),
-        ("Surface", _surface_rows(metrics)),
-        ("Surface, by the protocol of published systems", _published_rows(metrics)),
-        (f"Uncertainty V, {views}", _uncertainty_rows(metrics.get("uncertainty"))),
-        (f"Uncertainty V, {kind}, final map", _uncertainty_rows(metrics.get("uncertainty_final"))),
+        ("Surface", _column(metrics, "reconstruction", RUN_SURFACE)),
+        ("Surface, by the protocol of published systems", _column(metrics, "reconstruction_published", PUBLISHED)),
+        (f"Uncertainty V, {views}", _column(metrics, "uncertainty", UNCERTAINTY)),
+        (f"Uncertainty V, {kind}, final map", _column(metrics, "uncertainty_final", UNCERTAINTY)),
         ("Predicted errors, held-out, final map", _predictive_rows(metrics.get("predictive"))),
         ("Covariance of poses", _covariance_rows(metrics.get("pose_covariance"))),
     ]
@@ -70,15 +70,9 @@ def _run_rows(metrics: dict[str, Any]) -> list[list[str]]:
              ("Splats", "splats", 0, 1.0, ""), ("Map file", "map_bytes", 1, 1e-6, "MB")]  # fmt: skip
     loops, submaps = metrics.get("loops") or {}, metrics.get("submaps") or 1
     closed = f"{submaps}; {loops.get('accepted', 0)} of {loops.get('tried', 0)}"
-    return [
-        ["size and time", ""],
-        *(
-            [name, f"{number(metrics[key], digits, scale)} {unit}"]
-            for name, key, digits, scale, unit in lines
-            if metrics.get(key) is not None
-        ),
-        *([["Submaps; loops accepted", closed]] if submaps > 1 else []),
-    ]
+    known = [line for line in lines if metrics.get(line[1]) is not None]
+    figures = [[name, f"{number(metrics[key], digits, scale)} {unit}"] for name, key, digits, scale, unit in known]
+    return [["size and time", ""], *figures, *[["Submaps; loops accepted", closed]] * (submaps > 1)]
 
 
 def _image_rows(metrics: dict[str, Any]) -> list[list[str]]:
@@ -137,43 +131,35 @@ def _failure_rows(metrics: dict[str, Any]) -> list[list[str]]:
     ]
 
 
-SURFACE_LINES = (
+SURFACE = (
     ("Accuracy, cm", "accuracy_m", 2, 100.0), ("Completion, cm", "completion_m", 2, 100.0),
     ("Completion ratio (< 5 cm), %", "completion_ratio", 1, 100.0), ("Precision (< 1 cm), %", "precision", 1, 100.0),
     ("Recall (< 1 cm), %", "recall", 1, 100.0), ("F1 (1 cm), %", "f1", 1, 100.0),
 )  # fmt: skip
 
 
-def _surface_rows(metrics: dict[str, Any]) -> list[list[str]]:
-    found = metrics.get("reconstruction")
-    if not found:
-        return []
-    lines = [*SURFACE_LINES, ("Splats to surface, cm", "splats_accuracy_m", 2, 100.0),
-             ("Surface to splats, cm", "splats_completion_m", 2, 100.0),
-             ("Chamfer distance of splats, cm", "splats_chamfer_m", 2, 100.0),
-             ("Floaters (> 10 cm) among opaque splats, %", "floaters", 2, 100.0)]  # fmt: skip
-    return [["parts visible from keyframes", "mesh.ply, map.ply"], *figure_rows(lines, found)]
+RUN_SURFACE = "parts visible from keyframes", "mesh.ply, map.ply", "", (
+    *SURFACE, ("Splats to surface, cm", "splats_accuracy_m", 2, 100.0),
+    ("Surface to splats, cm", "splats_completion_m", 2, 100.0),
+    ("Chamfer distance of splats, cm", "splats_chamfer_m", 2, 100.0),
+    ("Floaters (> 10 cm) among opaque splats, %", "floaters", 2, 100.0),
+)  # fmt: skip
+PUBLISHED = "points on both surfaces", "{} random views", "depth_views", (
+    *SURFACE, ("Chamfer distance, cm", "chamfer_m", 2, 100.0), ("Depth L1, random views, cm", "depth_l1_m", 2, 100.0),
+)  # fmt: skip
+UNCERTAINTY = "pixels with a depth reading", "{} pixels", "pixels", (
+    ("Spearman of V and squared error", "spearman", 3, 1.0),
+    ("Spearman, only covered pixels", "spearman_covered", 3, 1.0), ("AUSE (0 = perfect ranking)", "ause", 3, 1.0),
+    ("Gaussian NLL", "nll", 3, 1.0), ("mean V, 10⁻³", "mean_variance", 3, 1e3),
+    ("mean squared error, 10⁻³", "mean_squared_error", 3, 1e3),
+)  # fmt: skip
+"""Tables of one column: both parts of the head, the key of the number in it, and the lines."""
 
 
-def _published_rows(metrics: dict[str, Any]) -> list[list[str]]:
-    found = metrics.get("reconstruction_published")
-    if not found:
-        return []
-    lines = [*SURFACE_LINES, ("Chamfer distance, cm", "chamfer_m", 2, 100.0),
-             ("Depth L1, random views, cm", "depth_l1_m", 2, 100.0)]  # fmt: skip
-    return [["points on both surfaces", f"{number(found['depth_views'], 0)} random views"], *figure_rows(lines, found)]
-
-
-def _uncertainty_rows(scores: dict[str, Any] | None) -> list[list[str]]:
-    if not scores:
-        return []
-    lines = [("Spearman of V and squared error", "spearman", 3, 1.0),
-             ("Spearman, only covered pixels", "spearman_covered", 3, 1.0),
-             ("AUSE (0 = perfect ranking)", "ause", 3, 1.0), ("Gaussian NLL", "nll", 3, 1.0),
-             ("mean V, 10⁻³", "mean_variance", 3, 1e3),
-             ("mean squared error, 10⁻³", "mean_squared_error", 3, 1e3)]  # fmt: skip
-    head = ["pixels with a depth reading", f"{number(scores['pixels'], 0)} pixels"]
-    return [head, *figure_rows(lines, scores)]
+def _column(metrics: dict[str, Any], key: str, table: tuple[str, str, str, Lines]) -> list[list[str]]:
+    """Return such a table of the scores under a key of the metrics; [] without them."""
+    (left, right, counted, lines), found = table, metrics.get(key)
+    return [[left, right.format(number(found.get(counted), 0))], *figure_rows(lines, found)] if found else []
 
 
 def _predictive_rows(scores: dict[str, Any] | None) -> list[list[str]]:

@@ -8,10 +8,9 @@ from scipy.ndimage import gaussian_filter1d, map_coordinates, maximum_filter, mi
 from sigmasplat.api import Camera, Matrix
 from sigmasplat.plugins.sources.room.furnish import HALF_X_M, PITCH_M
 
-PATH_SAMPLES = 4000
-"""Samples for measuring the length of a path."""
-YAW_SMOOTHING_M = 0.9
-"""Standard deviation, along the path, of the Gaussian that smooths the viewing direction."""
+PATH_SAMPLES, YAW_SMOOTHING_M = 4000, 0.9
+"""Samples for measuring the length of a path. Standard deviation, along it, of the Gaussian that smooths the viewing
+direction."""
 
 
 def camera_path(frames: int, loops: int, rooms: int, seed: int, overrun: float = 0.0) -> Matrix:
@@ -80,9 +79,7 @@ def pose(position: Matrix, yaw_rad: float, pitch_rad: float, roll_rad: float) ->
 
 Image = NDArray[np.float32]
 
-JITTER_PX = 0.6
-RANGE_M = (0.35, 7.0)
-COLOR_SIGMA = 0.008
+JITTER_PX, RANGE_M, COLOR_SIGMA = 0.6, (0.35, 7.0), 0.008
 PREDICTED_SCALE_ERROR, PREDICTED_NOISE = 0.1, 0.1
 """Standard deviations of predicted depth, shares of the depth: of its smooth error, and at each pixel."""
 DRIFT_KNOT_FRAMES = 300

@@ -13,9 +13,8 @@ from sigmasplat.plugins.sources.room.furnish import HALF_X_M, HEIGHT_M, PITCH_M,
 from sigmasplat.plugins.sources.room.shapes import Shape
 from sigmasplat.plugins.sources.room.textures import painting, plain
 
-HALF_WIDTH_M = 1.1
-STEP_M = 0.08
-"""Distance between the cameras of successive frames."""
+HALF_WIDTH_M, STEP_M = 1.1, 0.08
+"""Half of the width, and the distance between the cameras of successive frames."""
 START_X_M, AHEAD_M = -1.8, 5.0
 """Place of the first frame, and the least length of the corridor beyond the last one."""
 EYE_M, SWAY_M, BOB_M = 1.45, 0.12, 0.03

@@ -30,8 +30,7 @@ from sigmasplat.plugins.sources.room.textures import (
 )
 
 Triple = tuple[float, float, float]
-HALF_X_M, HALF_Y_M, HEIGHT_M = 2.5, 2.0, 2.6
-WALL_M = 0.15
+HALF_X_M, HALF_Y_M, HEIGHT_M, WALL_M = 2.5, 2.0, 2.6, 0.15
 PITCH_M = 2 * HALF_X_M + WALL_M
 DOOR_HALF_M, DOOR_HEIGHT_M = 0.55, 2.15
 LEGS = ((-1, -1), (-1, 1), (1, -1), (1, 1))

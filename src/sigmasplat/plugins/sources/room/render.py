@@ -26,12 +26,9 @@ from sigmasplat.plugins.sources.room.shapes import (
 from sigmasplat.plugins.sources.room.textures import Floats
 from sigmasplat.plugins.sources.room.wall import furnish_wall
 
-CELL_M = 0.14
-AMBIENT_REACH_M = 0.7
-"""Largest distance at which a surface reduces the ambient light."""
-
-LAMP_M = (0.0, 0.0, HEIGHT_M - 0.16)
-WINDOW_M = (-0.85, -HALF_Y_M + 0.1, 1.6)
+CELL_M, AMBIENT_REACH_M = 0.14, 0.7
+"""Distance of the lattice's points, and the largest one at which a surface reduces the ambient light."""
+LAMP_M, WINDOW_M = (0.0, 0.0, HEIGHT_M - 0.16), (-0.85, -HALF_Y_M + 0.1, 1.6)
 LAMP_COLOR = np.array([[1.0], [0.93], [0.82]], np.float32) * np.float32(1.35)
 WINDOW_COLOR = np.array([[0.86], [0.95], [1.08]], np.float32) * np.float32(0.75)
 AMBIENT_COLOR = np.array([[0.46], [0.47], [0.48]], np.float32)

@@ -178,10 +178,9 @@ def _window(corners: NDArray[np.float64], camera: Camera) -> tuple[float, float,
     return float(u.min()), float(v.min()), float(u.max()), float(v.max())
 
 
-EDGE_M = 0.05
-"""Longest face along a shape's axes; small faces are either visible or hidden."""
-MIN_SIDES = 48
-"""Faces around a ball or a drum; the error of a ball of 13 cm is then 0.3 mm."""
+EDGE_M, MIN_SIDES = 0.05, 48
+"""Longest face along a shape's axes, as small faces are either visible or hidden; faces around a ball or a drum: the
+error of a ball of 13 cm is then 0.3 mm."""
 
 Doubles = NDArray[np.float64]
 
