@@ -39,10 +39,9 @@ def localise(
         raise ConfigError(f"--out must end in {' or '.join(ENDINGS)}, found {out.name}")
     refuse_existing(out, overwrite)
     screen, finished = Screen(), FinishedMap.of(RunFolder.open(run))
-    given = input_options.settings() | split_settings(settings)
-    config = override(
-        finished.config, working_images(finished.config) | given
-    )  # frames and calibration are not those of the run
+    # Frames and calibration are not those of the run.
+    given = working_images(finished.config) | input_options.settings() | split_settings(settings)
+    config = override(finished.config, given)
     source = open_source(path, config.input)
     config = for_scene(config, 1.0, source.depth_noise_per_m, split_settings(settings))  # its lengths are the map's
     if source.live:

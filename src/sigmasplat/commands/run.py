@@ -9,14 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sigmasplat.commands import options
-from sigmasplat.commands.bag_options import (
-    DEFAULT_ROBOT_OPTIONS,
-    RobotOptions,
-    RobotOptionsFlat,
-    check_robot_output,
-    robot_output,
-)
+from sigmasplat.commands import bag_options, options
 from sigmasplat.commands.evaluate import score
 from sigmasplat.commands.input_options import DEFAULT_INPUT_OPTIONS, InputOptions, InputOptionsFlat
 from sigmasplat.commands.options import configured, prepare_torch, source_of
@@ -63,7 +56,7 @@ def run(
     input_options: InputOptionsFlat = DEFAULT_INPUT_OPTIONS, seed: options.Seed = None,
     record: options.Record = None, run_options: options.RunOptionsFlat = options.DEFAULT_RUN_OPTIONS,
     onto: options.OntoRun = None, final_seconds: options.FinalSeconds = None,
-    robot_options: RobotOptionsFlat = DEFAULT_ROBOT_OPTIONS, realtime: options.RealTime = False,
+    robot_options: bag_options.RobotOptionsFlat = bag_options.DEFAULT_ROBOT_OPTIONS, realtime: options.RealTime = False,
 ) -> int:  # fmt: skip
     """Run SLAM on a sequence, or on a camera until Ctrl-C: trajectory, map, uncertainty, report.
 
@@ -78,7 +71,7 @@ def run(
     from sigmasplat.run_folder.runs import RunFolder
     from sigmasplat.system.slam import Slam
 
-    check_robot_output(robot_options)
+    bag_options.check_robot_output(robot_options)
     settings += () if final_seconds is None else (f"final.seconds={final_seconds:g}",)
     screen, earlier = Screen(), FinishedMap.of(RunFolder.open(onto)) if onto else None
     config = configured(preset, settings, seed, input_options, earlier.config if earlier else None)
@@ -102,7 +95,7 @@ def run(
 def resume(
     run: options.RunPath, moved_to: options.MovedSource = None,
     run_options: options.RunOptionsFlat = options.DEFAULT_RUN_OPTIONS,
-    robot_options: RobotOptionsFlat = DEFAULT_ROBOT_OPTIONS,
+    robot_options: bag_options.RobotOptionsFlat = bag_options.DEFAULT_ROBOT_OPTIONS,
 ) -> int:  # fmt: skip
     """Resume a run that was stopped or killed, from its last saved state.
 
@@ -112,7 +105,7 @@ def resume(
     from sigmasplat.run.terminal import Screen
     from sigmasplat.run_folder.runs import RunFolder
 
-    check_robot_output(robot_options)
+    bag_options.check_robot_output(robot_options)
     screen, folder = Screen(), RunFolder.open(run)
     source = source_of(folder, moved_to)
     prepare_torch()
@@ -213,7 +206,7 @@ def _announce(screen: "Screen", preset: str, source: "Source", folder: "RunFolde
 
 def _run_and_score(
     screen: "Screen", start: "StartPoint", source: "Source", folder: "RunFolder", run_options: options.RunOptions,
-    viewer: "ViewerApp | None", robot_options: RobotOptions, realtime: bool = False,
+    viewer: "ViewerApp | None", robot_options: bag_options.RobotOptions, realtime: bool = False,
 ) -> int:  # fmt: skip
     """Run the session, then score it, and keep showing it in the viewer until Ctrl-C; return the exit code.
 
@@ -233,7 +226,7 @@ def _run_and_score(
         folder.note(realtime=True)
     motion = MotionWatch()
     with (
-        robot_output(screen, start.slam, folder, robot_options) as robot,
+        bag_options.robot_output(screen, start.slam, folder, robot_options) as robot,
         screen.steps(None if source.live else len(source), start.next_index) as steps,
     ):
         session = Session(

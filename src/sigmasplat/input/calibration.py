@@ -34,11 +34,6 @@ class Origin(NamedTuple):
     option: str = ""
 
 
-def published(camera: str) -> dict[str, Origin]:
-    """Return the origin of the published calibration of a camera, which a recording is assumed to be from."""
-    return {"camera": Origin(camera, ASSUMED, "--calibration FILE")}
-
-
 @dataclass(frozen=True, eq=False)
 class Calibration:
     """The cameras of a recording.
@@ -59,6 +54,15 @@ class Calibration:
     sensor: str | None = None
     origins: Mapping[str, Origin] = field(default_factory=dict)
     own: tuple[Camera, ...] = ()
+
+
+def published(
+    name: str, camera: Camera, units_per_metre: float, distortion: Distortion | None = None, **more: Any
+) -> Calibration:
+    """Return the published calibration of a camera, which a recording is assumed to be from; name: its origin, in
+    words; more: other fields of `Calibration`."""
+    origins = {"camera": Origin(name, ASSUMED, "--calibration FILE")}
+    return Calibration(camera, units_per_metre, distortion, origins=origins, **more)
 
 
 class CameraUnknown(SourceError):
@@ -89,8 +93,9 @@ def freiburg_calibration(folder: Path) -> Calibration | None:
     for part in reversed(folder.resolve().parts):
         match = re.search(r"freiburg([123])|(?:^|[^a-z0-9])fr([123])(?:[^0-9]|$)", part.lower())
         if match:
-            number = match.group(1) or match.group(2)
-            return replace(FREIBURG[number], origins=published(f"TUM's freiburg{number}, named by {part}"))
+            known = FREIBURG[number := match.group(1) or match.group(2)]
+            name = f"TUM's freiburg{number}, named by {part}"
+            return published(name, known.camera, known.depth_units_per_metre, known.distortion)
     return None
 
 

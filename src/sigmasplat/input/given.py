@@ -25,20 +25,10 @@ from sigmasplat.data.frame import Frame
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SourceError
 from sigmasplat.files.reading import exists
+from sigmasplat.input import lists
 from sigmasplat.input.calibration import read_json_object
 from sigmasplat.input.images import COLOR_ENDINGS, image_size, list_images, read_values
-from sigmasplat.input.lists import (
-    MAX_GAP_S,
-    associate,
-    checked_pose,
-    parse_any_numbers,
-    parse_numbers,
-    read_lines,
-    read_matrix,
-    read_poses,
-    rigid_transform,
-    to_matrix,
-)
+from sigmasplat.input.lists import MAX_GAP_S, associate, checked_pose, read_lines
 from sigmasplat.input.source import Source, Subset
 from sigmasplat.input.transforms import read_frames, read_pose
 from sigmasplat.types import Matrix
@@ -122,15 +112,15 @@ def read_given_poses(path: Path) -> GivenPoses:
         paths = list_images(path, (".txt",))
         if not paths:
             raise SourceError(f"{path}: holds no .txt files with matrices; {FORMATS}")
-        return [checked_pose(str(file), read_matrix(file)) for file in paths]
+        return [checked_pose(str(file), lists.read_matrix(file)) for file in paths]
     if path.suffix.lower() == ".json":
         return _named_poses(path)
     words = next((words for _, words in read_lines(path) if _is_number(words[0])), list[str]())
     if (count := len(words)) in TUM_WORDS:
-        return read_poses(path)
+        return lists.read_poses(path)
     if count in MATRIX_WORDS:
-        rows = ((f"{path}:{line}", parse_any_numbers(path, line, words)) for line, words in read_lines(path))
-        return [checked_pose(where, to_matrix(where, values)) for where, values in rows]
+        rows = ((f"{path}:{line}", lists.parse_any_numbers(path, line, words)) for line, words in read_lines(path))
+        return [checked_pose(where, lists.to_matrix(where, values)) for where, values in rows]
     if count >= COLMAP_WORDS and not _is_number(words[COLMAP_WORDS - 1]):
         return _colmap_poses(path)
     found = f"a line of {count} values" if words else "no poses"
@@ -143,8 +133,8 @@ def _colmap_poses(path: Path) -> dict[str, Matrix]:
     for line, words in read_lines(path):
         if len(words) < COLMAP_WORDS or _is_number(words[COLMAP_WORDS - 1]):
             continue
-        qw, qx, qy, qz, x, y, z = parse_numbers(path, line, words[1 : COLMAP_WORDS - 2])
-        T_camera_world = rigid_transform(f"{path}:{line}", [x, y, z], [qw, qx, qy, qz])
+        qw, qx, qy, qz, x, y, z = lists.parse_numbers(path, line, words[1 : COLMAP_WORDS - 2])
+        T_camera_world = lists.rigid_transform(f"{path}:{line}", [x, y, z], [qw, qx, qy, qz])
         poses[PureWindowsPath(" ".join(words[COLMAP_WORDS - 1 :])).stem] = se3.inverse(T_camera_world)
     return poses
 

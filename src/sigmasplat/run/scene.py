@@ -40,9 +40,8 @@ def with_measured_scale(source: Source, config: Config) -> Config:
         what = of_depth if source.predicted_depth else of_poses
         raise SourceError(f"{config.input.poses}: the images do not show the {what}")
     factor, _ = measured
-    return config.changed(
-        input={"predicted_scale": factor} if config.input.poses_scale else {"poses_scale": 1 / factor}
-    )
+    found = {"predicted_scale": factor} if config.input.poses_scale else {"poses_scale": 1 / factor}
+    return config.changed(input=found)
 
 
 def scale_warning(source: Source, config: Config) -> str | None:

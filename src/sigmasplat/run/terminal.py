@@ -7,16 +7,9 @@ from functools import partial
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
+from rich import progress
 from rich.console import Console
 from rich.filesize import decimal
-from rich.progress import (
-    BarColumn,
-    DownloadColumn,
-    MofNCompleteColumn,
-    Progress as Bars,
-    TextColumn,
-    TimeRemainingColumn,
-)
 from rich.table import Table
 
 from sigmasplat.data.trajectory import APART, RELOCALISED
@@ -97,9 +90,9 @@ class Screen:
         if not self.out.is_terminal:
             yield partial(_PlainShow, self.say, decimal if of_bytes else str)
             return
-        count = DownloadColumn() if of_bytes else MofNCompleteColumn()
-        columns = ("{task.description}", BarColumn(), count, TextColumn("{task.fields[text]}"))
-        with Bars(*columns, TimeRemainingColumn(), console=self.out) as bars:
+        count = progress.DownloadColumn() if of_bytes else progress.MofNCompleteColumn()
+        columns = "{task.description}", progress.BarColumn(), count, progress.TextColumn("{task.fields[text]}")
+        with progress.Progress(*columns, progress.TimeRemainingColumn(), console=self.out) as bars:
             yield partial(_bar, bars)
 
     def results(self, sentence: str, figures: Iterable[tuple[str, str, str]]) -> None:
@@ -125,7 +118,7 @@ def _console(stderr: bool) -> Console:
     return Console(stderr=stderr, highlight=False, markup=False, emoji=False, soft_wrap=True)
 
 
-def _bar(bars: Bars, title: str, total: int | None) -> Show:
+def _bar(bars: progress.Progress, title: str, total: int | None) -> Show:
     task = bars.add_task(title, total=total, text="")
     return lambda done, known, text: bars.update(task, completed=done, total=known or total, text=text)
 

@@ -156,9 +156,7 @@ class MotionWatch:
         usual = ndimage.median_filter(change, size=min(21, len(change)), mode="nearest") if len(change) else change
         jumps = np.array(self.numbers)[1:][(change > JUMP * usual) & (change > JUMP_LEAST)].tolist()
         if self.black:
-            warnings.append(
-                f"{len(self.black)} frames are black (first: frame {self.black[0]}); remove or correct them"
-            )
+            warnings += [f"{len(self.black)} frames are black (first: frame {self.black[0]}); remove or correct them"]
         if jumps:
             where = f"the view jumps {len(jumps)} times (first: before frame {jumps[0]})"
             warnings.append(f"{where}; tracking may be lost there")

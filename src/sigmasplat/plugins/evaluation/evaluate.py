@@ -29,7 +29,7 @@ from sigmasplat.api import (
     predict,
     write_trajectory,
 )
-from sigmasplat.plugins.evaluation import reconstruct, view_scores
+from sigmasplat.plugins.evaluation import reconstruct, run_views, view_scores
 from sigmasplat.plugins.evaluation.failure import failure, scale_to_truth, wrong_scale
 from sigmasplat.plugins.evaluation.metrics.lpips import Lpips
 from sigmasplat.plugins.evaluation.metrics.published_reconstruction import VIEWS
@@ -44,13 +44,7 @@ from sigmasplat.plugins.evaluation.path_scores import (
 )
 from sigmasplat.plugins.evaluation.report import charts
 from sigmasplat.plugins.evaluation.report.page import report_plan, write_page
-from sigmasplat.plugins.evaluation.run_views import (
-    ViewScoring,
-    ViewStrips,
-    refined_fx,
-    score_full_resolution,
-    score_test_views,
-)
+from sigmasplat.plugins.evaluation.run_views import ViewScoring, ViewStrips
 
 Log = list[dict[str, Any]]
 KINDS = {"held-out": False, "training": True}
@@ -81,7 +75,7 @@ def evaluate(
     kinds = {kind: [r for r in log if bool(r["is_keyframe"]) == of_map] for kind, of_map in KINDS.items()}
     chosen = {kind: evenly_spread(records, views_per_kind) for kind, records in kinds.items()}
     strips, config = ViewStrips(strips_per_kind), run.config()
-    fx, path = refined_fx(config, source.camera), frames.path
+    fx, path = run_views.refined_fx(config, source.camera), frames.path
     aligned = None if known is None else truth_in_estimate(path.timestamps_s, path.T_world_camera[:, :3, 3], known)
     standard, renderer = renderer is None, renderer or FieldRenderer(config.render, config.backend, (field, fx))
     maps, readouts = _map_sources(run, field, records, config.final), frames.readouts(run.facts())
@@ -99,14 +93,14 @@ def evaluate(
     metrics |= {"scale_to_truth": to_truth, "failure": "".join(failed).removeprefix("FAILED: "), "alarms": alarms}
     metrics |= _score_views(scoring, config.final, predictions, strips, progress)
     metrics |= {"lpips_network": lpips.net if lpips else None, "reconstruction": None, "reconstruction_published": None}
-    metrics["full_resolution"] = score_full_resolution(scoring, config, full_resolution, progress)
+    metrics["full_resolution"] = run_views.score_full_resolution(scoring, config, full_resolution, progress)
     if mesh:
         surface = None if scale else true_mesh or reconstruct.known_surface(source)  # it is in metres
         how = surface, known, random_views, renderer, progress
         metrics |= reconstruct.fuse_and_score(run, source.camera, *how)
     metrics["pose_covariance"] = score_pose_covariance(run, frames, true)
     metrics["calibration"] = _calibration(run) if standard else None
-    metrics["test_views"] = None if scale else score_test_views(scoring, config.input, strips)
+    metrics["test_views"] = None if scale else run_views.score_test_views(scoring, config.input, strips)
     run.write_metrics(metrics)
     plan = report_plan(run, path, source.camera) if standard else None
     warnings, plots = [*alarms] + ([str(problem)] if problem else []), _draw_plots(run, frames, known, known is true)

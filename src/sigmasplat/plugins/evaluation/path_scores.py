@@ -9,14 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.api import APART, LOST, RELOCALISED, PathCovariance, RunFolder, RunFrames, Trajectory, se3
-from sigmasplat.plugins.evaluation.metrics.trajectory import (
-    absolute_error,
-    align_rigid,
-    align_similarity,
-    associate,
-    score_covariances,
-    score_failures,
-)
+from sigmasplat.plugins.evaluation.metrics import trajectory
+from sigmasplat.plugins.evaluation.metrics.trajectory import associate
 
 
 def score_frame_sets(run: RunFolder, frames: RunFrames, truth: Trajectory | None) -> dict[str, Any]:
@@ -44,7 +38,7 @@ def arbitrary_scale(run: RunFolder, path: Trajectory, truth: Trajectory | None) 
     rows, truth_rows = associate(path.timestamps_s, truth.timestamps_s)
     if not len(rows):
         return None
-    scale, _ = align_similarity(path.T_world_camera[rows, :3, 3], truth.T_world_camera[truth_rows, :3, 3])
+    scale, _ = trajectory.align_similarity(path.T_world_camera[rows, :3, 3], truth.T_world_camera[truth_rows, :3, 3])
     return scale if scale > 0 else None
 
 
@@ -72,7 +66,7 @@ def _error(times_s: NDArray[np.float64], positions: NDArray[np.float64], truth: 
     known = np.isfinite(positions[rows]).all(1)
     if not known.any():
         return None
-    return asdict(absolute_error(positions[rows][known], truth.T_world_camera[truth_rows][known, :3, 3]))
+    return asdict(trajectory.absolute_error(positions[rows][known], truth.T_world_camera[truth_rows][known, :3, 3]))
 
 
 def score_states(run: RunFolder, frames: RunFrames, truth: Trajectory | None) -> dict[str, Any]:
@@ -103,9 +97,9 @@ def _failures(run: RunFolder, frames: RunFrames, truth: Trajectory | None) -> di
     true_positions = np.full_like(positions, np.nan)
     true_positions[rows] = truth.T_world_camera[truth_rows, :3, 3]
     fitted = frames.valid & np.isfinite(true_positions).all(1)
-    T = align_rigid(positions[fitted], true_positions[fitted])
+    T = trajectory.align_rigid(positions[fitted], true_positions[fitted])
     error_m = np.linalg.norm(positions @ T[:3, :3].T + T[:3, 3] - true_positions, axis=1)
-    scores = score_failures(error_m, frames.p_off, frames.valid)
+    scores = trajectory.score_failures(error_m, frames.p_off, frames.valid)
     silent_rows = scores.pop("silent_rows")
     return scores | {"silent_frames": [frames.log[row]["index"] for row in silent_rows]}
 
@@ -168,8 +162,8 @@ def score_path_covariance(
             for poses in (errors.T_world_camera, T_world_camera)
         )
         covariance = np.array([errors.between(a, b) for a, b in between]).reshape(-1, 6, 6)
-        score, A = score_covariances(estimate, true, covariance), se3.adjoint(estimate)
-        truths = score_covariances(estimate, true, covariance + own + A @ own @ np.swapaxes(A, 1, 2))
+        score, A = trajectory.score_covariances(estimate, true, covariance), se3.adjoint(estimate)
+        truths = trajectory.score_covariances(estimate, true, covariance + own + A @ own @ np.swapaxes(A, 1, 2))
         if score is None or truths is None:
             return None
         beside = {f"{name}_with_truth": getattr(truths, name) for name in WITH_TRUTH} if own.any() else {}

@@ -25,16 +25,8 @@ from sigmasplat.api import (
     rigid_transform,
     se3,
 )
-from sigmasplat.plugins.sources.bag_messages import (
-    COMPRESSED,
-    RAW,
-    Bag,
-    ImageKind,
-    Message,
-    image_kind,
-    list_topics,
-    message_size,
-)
+from sigmasplat.plugins.sources import bag_messages
+from sigmasplat.plugins.sources.bag_messages import COMPRESSED, RAW, Bag, ImageKind, Message, image_kind
 
 MAX_TF_MESSAGES = 2000
 """Number of messages of /tf to read; transforms between the cameras of one device are repeated."""
@@ -52,9 +44,7 @@ def lookup_transform(bag: Bag, target: str, source: str, use_tf: bool = True) ->
         for message in islice(bag.messages(name), most):
             for link in message.transforms:
                 parent, child = link.header.frame_id.lstrip("/"), link.child_frame_id.lstrip("/")
-                T = transform_of(
-                    f"{bag.path}: {name}: {parent} to {child}", link.transform.translation, link.transform.rotation
-                )
+                T = transform_of(f"{bag.path}: {name}: {parent} to {child}", link.transform)
                 edges.setdefault(parent, {}).setdefault(child, T)
                 edges.setdefault(child, {}).setdefault(parent, se3.inverse(T))
         if (found := _chained(edges, target, source)) is not None:
@@ -62,11 +52,10 @@ def lookup_transform(bag: Bag, target: str, source: str, use_tf: bool = True) ->
     return None
 
 
-def transform_of(where: str, position: Message, rotation: Message) -> Matrix:
-    """Build a transform from geometry_msgs fields. Raises SourceError naming `where` unless it is rigid."""
-    return rigid_transform(
-        where, [position.x, position.y, position.z], [rotation.w, rotation.x, rotation.y, rotation.z]
-    )
+def transform_of(where: str, message: Message) -> Matrix:
+    """Build a transform of a geometry_msgs/Transform. Raises SourceError naming `where` unless it is rigid."""
+    t, q = message.translation, message.rotation
+    return rigid_transform(where, [t.x, t.y, t.z], [q.w, q.x, q.y, q.z])
 
 
 def _chained(edges: dict[str, dict[str, Matrix]], target: str, source: str) -> Matrix | None:
@@ -148,14 +137,14 @@ def topic_by_name(bag: Bag, name: str) -> ImageTopic:
     if name not in topics:
         raise SourceError(
             f"{bag.path}: no images in topic {name}{nearest(name, list(topics))}; "
-            f"there are {list_topics(topics.values())}"
+            f"there are {bag_messages.list_topics(topics.values())}"
         )
     return _described(bag, name)
 
 
 def _described(bag: Bag, name: str) -> ImageTopic:
     message = bag.first_message(name)
-    size, (kind, encoding) = message_size(bag.path / name.lstrip("/"), message), image_kind(message)
+    size, (kind, encoding) = bag_messages.message_size(bag.path / name.lstrip("/"), message), image_kind(message)
     return ImageTopic(name, kind, message.header.frame_id.lstrip("/"), size, encoding)
 
 
@@ -166,8 +155,8 @@ def _one_camera(bag: Bag, what: str, topics: list[ImageTopic], option: str) -> I
         stored = "".join(f"; {image.name} is encoded as {image.encoding}" for image in images[:4])
         raise SourceError(
             f"{bag.path}: no {what} images in {topics[0].name if topics else 'any topic'}; "
-            f"the bag holds {list_topics(bag.topics.values())}{stored}; record colour as rgb8, mono8 or JPEG and depth "
-            f"as 16UC1 or 32FC1, or choose another topic: --{option}-topic NAME"
+            f"the bag holds {bag_messages.list_topics(bag.topics.values())}{stored}; record colour as rgb8, mono8 or "
+            f"JPEG and depth as 16UC1 or 32FC1, or choose another topic: --{option}-topic NAME"
         )
     cameras = sorted({topic.camera for topic in topics})
     if len(cameras) > 1:
@@ -205,9 +194,8 @@ def read_bag_calibration(bag: Bag, color: ImageTopic, depth: ImageTopic, setting
             "or give --calibration FILE with depth_camera and T_color_depth"
         )
     camera, lens = depth_optics
-    return replace(
-        calibration, depth_camera=camera, depth_distortion=lens, T_color_depth=_color_depth(bag, color, depth)
-    )
+    T_color_depth = _color_depth(bag, color, depth)
+    return replace(calibration, depth_camera=camera, depth_distortion=lens, T_color_depth=T_color_depth)
 
 
 def read_optics(bag: Bag, topic: ImageTopic) -> Optics | None:
@@ -271,8 +259,7 @@ def _sdk_pose(bag: Bag, stream: str) -> Matrix | None:
     names = [topic.name for topic in found if topic.name.startswith(f"{stream}/tf/")]
     if not (stream and names):
         return None
-    message = bag.first_message(names[0])
-    return transform_of(f"{bag.path}: {names[0]}", message.translation, message.rotation)
+    return transform_of(f"{bag.path}: {names[0]}", bag.first_message(names[0]))
 
 
 def _lens(where: str, info: Message) -> Distortion | None:

@@ -129,9 +129,7 @@ def _timed_pairs(
 
 
 INTRINSIC_NAMES = ("intrinsic.json", "intrinsics.json", "camera_intrinsic.json", "camera_intrinsics.json")
-PRIMESENSE = Calibration(
-    Camera(640, 480, 525.0, 525.0, 319.5, 239.5), MM_PER_METRE, origins=published("PrimeSense's factory values")
-)
+PRIMESENSE = published("PrimeSense's factory values", Camera(640, 480, 525.0, 525.0, 319.5, 239.5), MM_PER_METRE)
 """Open3D's PrimeSenseDefault."""
 
 _TIMED = re.compile(r"([0-9]+)-([0-9]{9,})")

@@ -38,9 +38,7 @@ from sigmasplat.api import (
     to_matrix,
 )
 
-CAMERA = Calibration(
-    Camera(1200, 680, 600.0, 600.0, 599.5, 339.5), 6553.5, origins=published("that of Replica's renders")
-)
+CAMERA = published("that of Replica's renders", Camera(1200, 680, 600.0, 600.0, 599.5, 339.5), 6553.5)
 
 
 def open_replica(path: str, settings: InputConfig) -> RecordedSource:

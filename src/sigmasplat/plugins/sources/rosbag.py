@@ -31,24 +31,9 @@ from sigmasplat.api import (
     refuse_unpaired,
     time_origins,
 )
-from sigmasplat.plugins.sources.bag_cameras import (
-    ImageTopic,
-    color_topic,
-    depth_topic,
-    lookup_transform,
-    read_bag_calibration,
-    sdk_transform,
-)
-from sigmasplat.plugins.sources.bag_messages import (
-    Bag,
-    Entry,
-    Message,
-    Topic,
-    decode_color_message,
-    decode_depth_message,
-    is_bag,
-    message_size,
-)
+from sigmasplat.plugins.sources import bag_cameras, bag_messages
+from sigmasplat.plugins.sources.bag_cameras import ImageTopic
+from sigmasplat.plugins.sources.bag_messages import Bag, Entry, Message, Topic, is_bag, message_size
 
 IMU = "sensor_msgs/msg/Imu"
 Values = NDArray[np.float64]
@@ -102,14 +87,14 @@ def _measured(bag: Bag, name: str) -> tuple[Values, Values]:
 
 def _axes(bag: Bag, color: ImageTopic, name: str) -> Matrix | None:
     if name.startswith("/device_"):
-        T = sdk_transform(bag, color, name.removesuffix("/imu/data"))
+        T = bag_cameras.sdk_transform(bag, color, name.removesuffix("/imu/data"))
         return None if T is None else T[:3, :3]
     frame = bag.first_message(name).header.frame_id.lstrip("/")
     if not (frame and color.frame):
         return None
     if frame == color.frame:
         return np.eye(3)
-    T = lookup_transform(bag, color.frame, frame, use_tf=False)
+    T = bag_cameras.lookup_transform(bag, color.frame, frame, use_tf=False)
     return None if T is None else T[:3, :3]
 
 
@@ -122,10 +107,10 @@ class BagImagePair(ImagePair):
     entries: tuple[Entry, Entry]
 
     def read_color(self) -> NDArray[np.uint8]:
-        return decode_color_message(self.color, self._message(0))
+        return bag_messages.decode_color_message(self.color, self._message(0))
 
     def read_depth(self, units_per_metre: float) -> NDArray[np.float32]:
-        return decode_depth_message(self.depth, self._message(1), units_per_metre)
+        return bag_messages.decode_depth_message(self.depth, self._message(1), units_per_metre)
 
     def sizes(self) -> tuple[Size, Size]:
         return message_size(self.color, self._message(0)), message_size(self.depth, self._message(1))
@@ -137,9 +122,9 @@ class BagImagePair(ImagePair):
 def open_bag(place: str, settings: InputConfig) -> RecordedSource:
     """Open a bag. Raises SourceError if it is damaged, its topics are ambiguous, or its cameras are unknown."""
     bag = Bag(Path(place))
-    color = color_topic(bag, settings.color_topic)
-    depth = depth_topic(bag, settings.depth_topic, color)
-    calibration, topics = read_bag_calibration(bag, color, depth, settings), (color.name, depth.name)
+    color = bag_cameras.color_topic(bag, settings.color_topic)
+    depth = bag_cameras.depth_topic(bag, settings.depth_topic, color)
+    calibration, topics = bag_cameras.read_bag_calibration(bag, color, depth, settings), (color.name, depth.name)
     found = bag.index(*topics)
     entries = found[color.name], found[depth.name]
     pairs, recorded_time = _paired(entries, settings)

@@ -15,7 +15,6 @@ import numpy as np
 
 from sigmasplat.api import (
     MM_PER_METRE,
-    Calibration,
     Camera,
     InputConfig,
     RecordedSource,
@@ -36,12 +35,9 @@ from sigmasplat.api import (
 # 585, 320, 240 are the values of the 7-Scenes page. They belong to the depth camera, and so do the published poses. The
 # colour camera and its position were fitted to the RedKitchen sequence by maximising the agreement of neighbouring
 # images (andyzeng/tsdf-fusion-python, data/; the fit is in shared/data/redkitchen/calibration.json).
-DEPTH_CAMERA = Calibration(
-    Camera(640, 480, 585.0, 585.0, 320.0, 240.0), MM_PER_METRE, origins=published("that of 7-Scenes")
-)
-BOTH_CAMERAS = Calibration(
-    Camera(640, 480, 528.12, 528.12, 318.96, 232.91),
-    MM_PER_METRE,
+DEPTH_CAMERA = published("that of 7-Scenes", Camera(640, 480, 585.0, 585.0, 320.0, 240.0), MM_PER_METRE)
+BOTH_CAMERAS = published(
+    "that of 7-Scenes, both cameras", Camera(640, 480, 528.12, 528.12, 318.96, 232.91), MM_PER_METRE,
     depth_camera=DEPTH_CAMERA.camera,
     T_color_depth=np.array([
         [0.999969, -0.007635, 0.001694, -0.02421],
@@ -49,7 +45,6 @@ BOTH_CAMERAS = Calibration(
         [-0.001738, -0.005719, 0.999982, 0.006997],
         [0.0, 0.0, 0.0, 1.0],
     ]),
-    origins=published("that of 7-Scenes, both cameras"),
 )  # fmt: skip
 
 

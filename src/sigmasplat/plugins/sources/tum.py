@@ -182,9 +182,9 @@ class TumWriter:
         return guarded(self.folder, "choose a writable place", RunError, "the sequence cannot be written")
 
 
-BONN = Calibration(
-    Camera(640, 480, 542.822841, 542.57687, 315.59352, 237.756098), TUM_UNITS_PER_METRE,
-    (0.039903, -0.099343, -0.00073, -0.000144, 0.0), origins=published("that of the Bonn data set"),
+BONN = published(
+    "that of the Bonn data set", Camera(640, 480, 542.822841, 542.57687, 315.59352, 237.756098), TUM_UNITS_PER_METRE,
+    (0.039903, -0.099343, -0.00073, -0.000144, 0.0),
 )  # fmt: skip
 T_ROS = np.array([[-1.0, 0, 0, 0], [0, 0, 1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 T_MARKERS_CAMERA = se3.orthonormalise(
@@ -206,9 +206,7 @@ def open_bonn(path: str, settings: InputConfig) -> RecordedSource:
     return open_tum(path, settings, BONN, camera_path)
 
 
-ICL_NUIM = Calibration(
-    Camera(640, 480, 481.2, 480.0, 319.5, 239.5), TUM_UNITS_PER_METRE, origins=published("that of ICL-NUIM")
-)
+ICL_NUIM = published("that of ICL-NUIM", Camera(640, 480, 481.2, 480.0, 319.5, 239.5), TUM_UNITS_PER_METRE)
 LIST_NAMES = ("associations.txt", "association.txt", "associate.txt")
 MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 

@@ -201,13 +201,12 @@ def _strips(contents: Contents) -> str:
     """Show the views of each kind, each as a row of panels that wraps on narrow pages."""
     if not any(contents.strips.values()):
         return ""
-    explanation = (
+    parts = [
         "<p class=soft>Images are rendered at the estimated poses. The map predicts V, the variance of colour along "
         "each ray. The root of V and the RMS error have separate colour scales. Where both look alike, V predicts "
         "the error well. If the run has predicted errors, held-out views show them instead, one standard deviation "
         "in the colours of the error. Slate pixels: no depth reading, or no surface in the map.</p>"
-    )
-    parts = [explanation]
+    ]
     for kind, strips in contents.strips.items():
         if strips:
             parts.append(f"<h3>{html.escape(kind)}</h3>")
