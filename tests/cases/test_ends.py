@@ -25,7 +25,7 @@ from sigmasplat.run_folder.runs import RunFolder
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
 CASES = Path(__file__).parents[2].parent / "shared" / "cases"
-SHORT = ("--final-seconds", "0.3", "--set", "input.width=0")
+SHORT = ("--set", "final.iterations=0", "--set", "input.width=0")
 PRAISE = ("very close", "good", "PSNR", "ATE", "error of the path")
 
 
@@ -112,7 +112,7 @@ def test_a_batch_counts_a_lost_run_as_failed(
 ) -> None:
     good, bad = write(tmp_path / "good"), write(tmp_path / "bad", shown=2)
     monkeypatch.setattr(Executor, "make", made)
-    words = ["batch", str(good), str(bad), "--out", str(tmp_path / "out"), "--set", "final.seconds=0.3"]
+    words = ["batch", str(good), str(bad), "--out", str(tmp_path / "out"), "--set", "final.iterations=0"]
     assert exit_code(*words) == 1
     said = capsys.readouterr().out
     assert "bad failed: 10 of 12 images have no pose" in said and "1 of 2 runs" in said
