@@ -100,6 +100,7 @@ FILES = {
     "calibration.txt": (f"{FX} {FY} {CX} {CY} 0.01 -0.02 0.001 0.002\n", LENS, None),
     "camera.json": (json.dumps({"fx": FX, "fy": FY, "cx": CX, "cy": CY, "width": 32, "height": 24}), None, None),
     "intrinsics.json": (json.dumps({"K": K_LIST}, indent=1), None, None),
+    "focal.txt": (f"{FX}\n", None, None),
     "rgb_intrinsics.json": (json.dumps({"camera_matrix": [K_LIST[:3], K_LIST[3:6], K_LIST[6:]]}), None, None),
 }
 
@@ -119,7 +120,7 @@ def test_the_usual_files_are_read_and_named(name: str, tmp_path: Path) -> None:
     text, lens, units = FILES[name]
     source = open_source(written(tmp_path, name, text))
     c = source.camera
-    assert (c.fx, c.fy, c.cx, c.cy) == pytest.approx(FOCAL)
+    assert (c.fx, c.fy, c.cx, c.cy) == pytest.approx((FX, FX, 15.5, 11.5) if name == "focal.txt" else FOCAL)
     assert source.origins["camera"].origin == f"read from {tmp_path / name}"
     assert source.depth_units_per_metre == (units or 1000.0)
     assert (source.origins["depth unit"].origin == "assumed") == (units is None)

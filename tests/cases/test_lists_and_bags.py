@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from bag_recordings import CAMERA_TOPICS, FOCAL, Recorder, aligned
 from command_line import exit_code
@@ -304,3 +305,16 @@ def test_case_19_by_the_command_line(capsys: pytest.CaptureFixture[str]) -> None
     for name in ("depth_delay_s", "max_gap_s"):
         source = open_source(folder, **follow(message, name))
         assert len(source) == 30 and source.origins["pairs"].origin == "read from the bag"
+
+
+def test_openloris_names_and_unit_are_read(tmp_path: Path) -> None:
+    for part in ("color", "aligned_depth"):
+        (tmp_path / part).mkdir()
+        lines = [f"{n / 30:.6f} {part}/{n}.png" for n in range(2)]
+        (tmp_path / f"{part}.txt").write_text("\n".join(lines))
+    for n in range(2):
+        Image.fromarray(np.full((24, 32, 3), 90 + n, np.uint8)).save(tmp_path / f"color/{n}.png")
+        Image.fromarray(np.full((24, 32), 1500, np.uint16)).save(tmp_path / f"aligned_depth/{n}.png")
+    (tmp_path / "depth.txt").write_text("0.0 depth/0.png\n")
+    source = open_source(tmp_path, fx=30.0)
+    assert len(source) == 2 and float(source.frame(1).depth_m.max()) == pytest.approx(1.5)

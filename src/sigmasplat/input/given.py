@@ -26,7 +26,7 @@ from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SourceError
 from sigmasplat.files.reading import exists
 from sigmasplat.input import lists
-from sigmasplat.input.calibration import read_json_object
+from sigmasplat.input.calibration import ASSUMED, Origin, read_json_object
 from sigmasplat.input.images import COLOR_ENDINGS, image_size, list_images, read_values
 from sigmasplat.input.lists import MAX_GAP_S, associate, checked_pose, read_lines
 from sigmasplat.input.source import Source, Subset
@@ -168,6 +168,9 @@ class Posed(Subset):
             raise SourceError(f"{given}: poses are for recordings only; record the camera, then run the recording")
         super().__init__(whole, InputConfig())
         found = _poses_of(whole, given)
+        if given != RECORDED_POSES and not given.lower().endswith((".json", "images.txt")):
+            axes = Origin("camera to world, x right, y down, z ahead", ASSUMED, "convert the file")
+            self.origins = self.origins | {"poses": axes}
         self._depth_scale = np.float32(depth_scale if whole.predicted_depth else 1.0)
         self._poses = [_scaled(T, scale) for T in found if T is not None]
         self._indices = [i for i, T in enumerate(found) if T is not None]

@@ -10,7 +10,7 @@ from sigmasplat.files.reading import read_text
 from sigmasplat.input.calibration import Calibration, Origin, build_camera
 
 NAMES = re.compile(
-    r"(cam(era)?|colou?r|rgb|calib\w*|ost|k|tum\d|(\w*[-_])?(intrinsics?|camera_info|cam(era)?_k)(_\w+)?)"
+    r"(cam(era)?|colou?r|rgb|calib\w*|ost|k|tum\d|focal|(\w*[-_])?(intrinsics?|camera_info|cam(era)?_k)(_\w+)?)"
 )
 """Names of files, without their ending: of ROS, kalibr, ORB-SLAM, BOP, 3DMatch, SUN3D, DROID-SLAM and others."""
 ENDINGS = (".txt", ".yaml", ".yml", ".json", ".csv", ".cfg")
@@ -42,6 +42,8 @@ def _calibration(path: Path, text: str, size: tuple[int, int], units: float) -> 
     lens = lens or [n for key in ("k1", "k2", "p1", "p2", "k3") for n in _numbers(text, rf"(?:\w*[._])?{key}")[:1]]
     if len(focal) != 4:
         plain = [float(word) for word in re.findall(NUMBER, text)] if not re.search(r"[a-df-z]", text) else []
+        if path.stem.lower() == "focal" and len(plain) == 1:
+            plain = [*plain, *plain, (size[0] - 1) / 2, (size[1] - 1) / 2]
         focal, rest = _focal(_numbers(text, MATRICES) or plain)
         lens = lens or rest
     if len(focal) != 4 or not all(np.isfinite(focal)):

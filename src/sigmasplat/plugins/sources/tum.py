@@ -34,6 +34,7 @@ from PIL import Image
 from sigmasplat.api import (
     ASSUMED,
     FRAMES_PER_SECOND,
+    MM_PER_METRE,
     TUM_UNITS_PER_METRE,
     UINT16_MAX,
     Calibration,
@@ -65,6 +66,8 @@ from sigmasplat.api import (
     time_origins,
 )
 
+COLOR_LISTS, DEPTH_LISTS = ("rgb.txt", "color.txt"), ("aligned_depth.txt", "depth.txt")
+"""The second name of colour, and the first of depth, are OpenLORIS's, whose depth is in millimetres."""
 MOTION_CAPTURE = 0.004, float(np.deg2rad(0.3))
 """Errors of a true pose, rms, m and rad: on fr1/xyz calibrated paths differ from the truth by 5 to 6 mm, √2 times as
 much, whatever the time between two poses."""
@@ -81,10 +84,11 @@ def open_tum(
     camera_path: converts the recorded path to the camera's path, if another body was recorded.
     """
     folder = Path(path)
-    color_s, colors = read_list(folder / "rgb.txt")
+    colors_of = first_file(folder, COLOR_LISTS) or folder / COLOR_LISTS[0]
+    color_s, colors = read_list(colors_of)
     depth_s, depths = _depth_list(folder)
     depth_s -= settings.depth_delay_s
-    pairs, alone = pair_times(folder, {"rgb.txt": color_s, "depth.txt": depth_s}, settings)
+    pairs, alone = pair_times(folder, {colors_of.name: color_s, "depth.txt": depth_s}, settings)
     images = [
         ImagePair(float(color_s[i]), colors[i], depths[j], depth_late_s=float(depth_s[j] - color_s[i]))
         for i, j in pairs
@@ -100,19 +104,20 @@ def open_tum(
     known = camera or freiburg_calibration(folder)
     truth = replace(truth, error_rms=MOTION_CAPTURE) if truth and known else truth
     gyroscope = read_gyroscope(folder / "gyroscope.txt") if exists(folder / "gyroscope.txt") else None
+    units = TUM_UNITS_PER_METRE if colors_of.name == COLOR_LISTS[0] else MM_PER_METRE
     return folder_source(
-        folder, settings, images, known, TUM_UNITS_PER_METRE, truth, skipped, gyroscope=gyroscope,
-        origins=time_origins(settings, "by time", "read from rgb.txt and depth.txt"),
+        folder, settings, images, known, units, truth, skipped, gyroscope=gyroscope,
+        origins=time_origins(settings, "by time", "read from their lists"),
     )  # fmt: skip
 
 
 def _depth_list(folder: Path) -> tuple[NDArray[np.float64], list[Path]]:
-    path, looked_for, remedy = folder / "depth.txt", "depth.txt", ""
+    path, looked_for, remedy = first_file(folder, DEPTH_LISTS) or folder / "depth.txt", "depth.txt", ""
     if path.is_file():
         times_s, paths = read_list(path)
         if any(p.is_file() for p in paths):
             return times_s, paths
-        looked_for = f"the {len(paths)} files of depth.txt, first {paths[0]}"
+        looked_for = f"the {len(paths)} files of {path.name}, first {paths[0]}"
         remedy = "correct its paths" if any((folder / "depth").glob("*.*")) else ""
     remedy = remedy or "is this the RGB-only download? see docs/data.md#without-depth"
     raise SourceError(f"no depth images in {folder} (looked for {looked_for}); {remedy}")
@@ -251,7 +256,7 @@ def _listed_pairs(path: Path) -> tuple[list[ImagePair], bool]:
 
 
 def _has_lists(path: str) -> bool:
-    return (Path(path) / "rgb.txt").is_file() or (Path(path) / "depth.txt").is_file()
+    return first_file(Path(path), (*COLOR_LISTS, *DEPTH_LISTS)) is not None
 
 
 def _is_bonn(path: str) -> bool:
